@@ -1,8 +1,9 @@
-"""Evaluators: a log and a map in, metric series out; then one value per rollout, and tables with intervals over rollouts.
+"""Evaluators: a log and a map in, metric series out; then one value per rollout, and tables with
+    intervals over rollouts.
 
 Example:
-    ``series = score(rollout, scene)``; ``reduction = reduce_rollout(series)``;
-    ``row = {"renderer": ..., "policy": ..., "scene": ..., "seed": ..., "status": "ok", **reduction.as_row()}``;
+    ``series = score(rollout, scene)``; ``reduction = reduce_rollout(series)``; ``row = {"renderer":
+    ..., "policy": ..., "scene": ..., "seed": ..., "status": "ok", **reduction.as_row()}``;
     ``metrics = aggregate(rows)``.
 """
 
@@ -22,9 +23,24 @@ if TYPE_CHECKING:
     from evaluators.statistics.summary import aggregate, censoring
 
 __all__ = [
-    "METRICS", "PRESETS", "ContactEvent", "MetricInfo", "Preset", "Reduction", "RolloutValue", "aggregate", "censoring", "contact_events",
-    "paired", "preset", "reduce_rollout", "resolve_evaluators", "rollout_values", "score", "series",
-]  # fmt: skip
+    "METRICS",
+    "PRESETS",
+    "ContactEvent",
+    "MetricInfo",
+    "Preset",
+    "Reduction",
+    "RolloutValue",
+    "aggregate",
+    "censoring",
+    "contact_events",
+    "paired",
+    "preset",
+    "reduce_rollout",
+    "resolve_evaluators",
+    "rollout_values",
+    "score",
+    "series",
+]
 
 _HOMES = {
     ".metrics": ("METRICS", "MetricInfo"),

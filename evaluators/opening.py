@@ -1,4 +1,6 @@
-"""Open a run folder together with what its metrics are: the one place where readers of run folders meet `evaluators.metrics`."""
+"""Open a run folder together with what its metrics are: the one place where readers of run folders
+meet `evaluators.metrics`.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ class Run(reader.Run):
 
 
 def read_run(run_dir: Path | str | Run) -> Run:
-    """Read a run folder, whose rates must lie in [0, 1]; see `alpasim_plugin.log.run_folder.reader.read_run`.
+    """Read a run folder, whose rates must lie in [0, 1]; see
+    `alpasim_plugin.log.run_folder.reader.read_run`.
 
     A run that was read is returned as it is.
     """
@@ -38,6 +41,8 @@ def read_run(run_dir: Path | str | Run) -> Run:
 
 
 def read_so_far(root: Path) -> RunSoFar[Run]:
-    """Read a run folder that may still be written; see `alpasim_plugin.log.run_folder.reader.read_so_far`."""
+    """Read a run folder that may still be written; see
+    `alpasim_plugin.log.run_folder.reader.read_so_far`.
+    """
     found = reader.read_so_far(root)
     return RunSoFar(Run.of(found.run), found.planned, found.damage, found.finished)

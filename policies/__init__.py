@@ -19,9 +19,17 @@ if TYPE_CHECKING:
     from policies.simple import PurePursuit as PurePursuit
 
 __all__ = [
-    "Check", "ConstantVelocity", "LaneCamera", "Learned", "LogReplay", "PurePursuit", "Report",
-    "canned_scenario", "check_policy", "make_policy",
-]  # fmt: skip
+    "Check",
+    "ConstantVelocity",
+    "LaneCamera",
+    "Learned",
+    "LogReplay",
+    "PurePursuit",
+    "Report",
+    "canned_scenario",
+    "check_policy",
+    "make_policy",
+]
 
 __getattr__ = lazy_names(
     __name__,

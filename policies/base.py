@@ -1,5 +1,5 @@
-"""Policies by name, and what policies share: the times of a plan, the camera to look through and its newest frame, and the way from a path
-and a wish for speed to a plan that a car can drive.
+"""Policies by name, and what policies share: the times of a plan, the camera to look through and
+its newest frame, and the way from a path and a wish for speed to a plan that a car can drive.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.parts import build, unidentified
 from alpasim_plugin.core.types import F64, I64, CameraSpec, Frame, Observation, Scenario
 
-PLAN_HORIZON_S = 5.0  # AlpaSim's minADE needs samples that reach its longest horizon, 5 s; shorter ones lose all four metrics
+# AlpaSim's minADE needs samples that reach its longest horizon, 5 s; shorter ones lose all four
+# metrics
+PLAN_HORIZON_S = 5.0
 PLAN_STEP_US = 100_000
 
 
@@ -23,8 +25,10 @@ def make_policy(name: str, scenario: Scenario) -> Policy:
     """Return a policy for a scenario.
 
     Args:
-        name: A policy as `alpasim_plugin.core.parts.resolve` takes it: a registered name, ``package.module:Class`` or ``file.py:Class``.
-        scenario: What the policy will drive in. A policy under test should take no more from it than its cameras.
+        name: A policy as `alpasim_plugin.core.parts.resolve` takes it: a registered name,
+            ``package.module:Class`` or ``file.py:Class``.
+        scenario: What the policy will drive in. A policy under test should take no more from it
+            than its cameras.
 
     Raises:
         InputError: The name is unknown, the import fails, or what it makes is not a policy.
@@ -35,18 +39,23 @@ def make_policy(name: str, scenario: Scenario) -> Policy:
 
 
 def plan_times(t_us: int, horizon_s: float = PLAN_HORIZON_S) -> I64:
-    """Return the times ``(T,)`` of a plan made at ``t_us``: now and every 0.1 s up to the horizon."""
+    """Return the times ``(T,)`` of a plan made at ``t_us``: now and every 0.1 s up to the
+    horizon.
+    """
     n = round(horizon_s * 1_000_000 / PLAN_STEP_US)
     return t_us + PLAN_STEP_US * np.arange(n + 1, dtype=np.int64)
 
 
 def seconds(times_us: I64) -> F64:
-    """Return the seconds ``(T,)`` from the first of the times; the difference is taken in integers."""
+    """Return the seconds ``(T,)`` from the first of the times; the difference is taken in
+    integers.
+    """
     return np.asarray((times_us - times_us[0]).astype(np.float64) * 1e-6)
 
 
 def front_camera(scenario: Scenario, policy: str = "lane-camera") -> CameraSpec:
-    """Return the camera to look through: the first one with "front" in its name, else the first one that looks ahead.
+    """Return the camera to look through: the first one with "front" in its name, else the first one
+    that looks ahead.
 
     Raises:
         InputError: No camera looks ahead.
@@ -76,7 +85,11 @@ def camera_frame(observation: Observation, camera: CameraSpec, policy: str) -> F
     frame = observation.frames.get(camera.name)
     expected = (camera.height, camera.width, 3)
     if frame is None or frame.rgb.shape != expected:
-        found = f"frames of {sorted(observation.frames)}" if frame is None else f"a frame of shape {frame.rgb.shape}"
+        found = (
+            f"frames of {sorted(observation.frames)}"
+            if frame is None
+            else f"a frame of shape {frame.rgb.shape}"
+        )
         raise PolicyError(
             "planning by camera",
             f"policy {policy!r} at {observation.t_us} us",
@@ -107,7 +120,8 @@ class Path:
 
 
 def route_left(route_rig: F64) -> F64 | None:
-    """Return the points ``(M, 2)`` of the route ``(20, 3)`` before its NaN rows; None where less than half a metre of it is left.
+    """Return the points ``(M, 2)`` of the route ``(20, 3)`` before its NaN rows; None where less
+    than half a metre of it is left.
 
     The route begins at the ego's projection, so the first point may lie beside the ego.
     """
@@ -128,7 +142,8 @@ def route_points(route_rig: F64) -> F64:
 def smooth_line(points: F64, spacing_m: float = 1.0) -> F64:
     """Return the cubic spline through points ``(M, 2)``, at every ``spacing_m`` of chord length.
 
-    A route comes as points 4.2 m apart; on a bend of 10 m radius its polyline runs 0.2 m inside the road.
+    A route comes as points 4.2 m apart; on a bend of 10 m radius its polyline runs 0.2 m inside the
+    road.
     """
     s = arc_lengths(points)
     keep = np.concatenate([[True], s[1:] - s[:-1] > 1e-6])
@@ -139,7 +154,9 @@ def smooth_line(points: F64, spacing_m: float = 1.0) -> F64:
 
 
 def extended(points: F64, length_m: float) -> F64:
-    """Return a line through points ``(M, 2)``, one every `Path.SPACING_M`, that goes straight on up to ``length_m``."""
+    """Return a line through points ``(M, 2)``, one every `Path.SPACING_M`, that goes straight on up
+    to ``length_m``.
+    """
     s = arc_lengths(points)
     tail = points[-1] - resample(points, [max(s[-1] - 5.0, 0.0)], s)[0]
     tail = tail / max(float(np.hypot(*tail)), 1e-9)
@@ -151,8 +168,8 @@ def extended(points: F64, length_m: float) -> F64:
 def make_path(points: F64, length_m: float = 120.0, speed_mps: float = 0.0) -> Path:
     """Return a path through points ``(M, 2)``, resampled and extended straight to ``length_m``.
 
-    Its curvature is that of a heading averaged over what is driven in `SMOOTH_S`, at least 5 m: a coarse polyline has corners,
-    an estimate wobbles, and a car feels neither.
+    Its curvature is that of a heading averaged over what is driven in `SMOOTH_S`, at least 5 m: a
+    coarse polyline has corners, an estimate wobbles, and a car feels neither.
 
     Args:
         points: In driving order, at least two apart by more than a centimetre.
@@ -171,12 +188,19 @@ def make_path(points: F64, length_m: float = 120.0, speed_mps: float = 0.0) -> P
 def shifted(line: F64, left_m: float) -> F64:
     """Return a line ``(M, 2)`` shifted to the left."""
     step = np.gradient(line, axis=0)
-    normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)[:, None]
+    normal = (
+        np.stack([-step[:, 1], step[:, 0]], axis=1)
+        / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)[:, None]
+    )
     return np.asarray(line + left_m * normal)
 
 
-def curve_speeds(path: Path, cruise_mps: float, brake_mps2: float = 2.0, lateral_mps2: float = MAX_LATERAL_MPS2) -> F64:
-    """Return the speed limit ``(N,)`` along the path: comfort in curves, reached with a comfortable brake."""
+def curve_speeds(
+    path: Path, cruise_mps: float, brake_mps2: float = 2.0, lateral_mps2: float = MAX_LATERAL_MPS2
+) -> F64:
+    """Return the speed limit ``(N,)`` along the path: comfort in curves, reached with a comfortable
+    brake.
+    """
     curve = np.sqrt(lateral_mps2 / np.maximum(np.abs(path.curvature), 1e-4))
     limit = np.minimum(curve, cruise_mps)
     # Backward pass: v_i^2 <= v_j^2 + 2 a (s_j - s_i) for every j > i.
@@ -185,8 +209,12 @@ def curve_speeds(path: Path, cruise_mps: float, brake_mps2: float = 2.0, lateral
     return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
 
 
-def speed_profile(speed_mps: float, limits: F64, t_s: F64, accel_mps2: float = 1.5, brake_mps2: float = 4.0) -> F64:
-    """Return the progress ``(T,)`` at times ``(T,)`` of a car that nears the limits ``(N,)`` along its path within its comfort."""
+def speed_profile(
+    speed_mps: float, limits: F64, t_s: F64, accel_mps2: float = 1.5, brake_mps2: float = 4.0
+) -> F64:
+    """Return the progress ``(T,)`` at times ``(T,)`` of a car that nears the limits ``(N,)`` along
+    its path within its comfort.
+    """
     progress, speed = np.zeros_like(t_s), speed_mps
     ahead = limits.tolist()
     for k in range(1, len(t_s)):
@@ -199,10 +227,12 @@ def speed_profile(speed_mps: float, limits: F64, t_s: F64, accel_mps2: float = 1
 
 
 def follow(path: Path, progress: F64, speed_mps: float) -> tuple[F64, F64]:
-    """Return positions ``(T, 2)`` and headings ``(T,)`` of a car that starts at the rig origin and pursues the path.
+    """Return positions ``(T, 2)`` and headings ``(T,)`` of a car that starts at the rig origin and
+    pursues the path.
 
-    Pure pursuit (Coulter 1992, CMU-RI-TR-92-01): at each moment an arc to the path point one lookahead away. Each step of the roll-out is
-    an exact arc, so the plan starts at the car's pose and heading and can be driven.
+    Pure pursuit (Coulter 1992, CMU-RI-TR-92-01): at each moment an arc to the path point one
+    lookahead away. Each step of the roll-out is an exact arc, so the plan starts at the car's pose
+    and heading and can be driven.
     """
     lookahead = max(MIN_LOOKAHEAD_M, LOOKAHEAD_S * speed_mps)
     # On an arc of curvature k the chord of a lookahead cuts the corner by lookahead^2 k / 8.
@@ -228,8 +258,12 @@ def follow(path: Path, progress: F64, speed_mps: float) -> tuple[F64, F64]:
     return poses[:, :2].copy(), poses[:, 2].copy()
 
 
-def _targets(points: list[list[float]], x: float, y: float, start: int, far_m2: float) -> tuple[int, int]:
-    """Return the index of the nearest of eight points from ``start`` on, and of the first later point at least so far away, squared."""
+def _targets(
+    points: list[list[float]], x: float, y: float, start: int, far_m2: float
+) -> tuple[int, int]:
+    """Return the index of the nearest of eight points from ``start`` on, and of the first later
+    point at least so far away, squared.
+    """
     near = [(dx := px - x) * dx + (dy := py - y) * dy for px, py in points[start : start + 8]]
     nearest = near.index(min(near))
     for i in range(nearest, len(near)):

@@ -1,8 +1,9 @@
 """Conformance test of a policy: synthetic situations, and a readable sentence for every fault.
 
-What is checked: the policy's cameras exist; plans are finite, begin now, at the ego, in the rig frame (x forward, y left), in metres,
-radians and microseconds; they reach two seconds ahead; the same seed gives the same plans; a reset forgets the drive before; an
-older frame is accepted; the plan is in time.
+What is checked: the policy's cameras exist; plans are finite, begin now, at the ego, in the rig
+frame (x forward, y left), in metres, radians and microseconds; they reach two seconds ahead; the
+same seed gives the same plans; a reset forgets the drive before; an older frame is accepted; the
+plan is in time.
 """
 
 from __future__ import annotations
@@ -19,8 +20,22 @@ import numpy as np
 from alpasim_plugin.core.errors import PolicyError, SimrunError
 from alpasim_plugin.core.geometry import inverse, se2, trajectory_from_poses, transform_points
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.plan_check import blank_scenario, sensors_problem, shape_problem, unit_guess
-from alpasim_plugin.core.types import F64, CameraSpec, EgoState, Frame, Observation, Plan, Route, Scenario
+from alpasim_plugin.core.plan_check import (
+    blank_scenario,
+    sensors_problem,
+    shape_problem,
+    unit_guess,
+)
+from alpasim_plugin.core.types import (
+    F64,
+    CameraSpec,
+    EgoState,
+    Frame,
+    Observation,
+    Plan,
+    Route,
+    Scenario,
+)
 from policies.base import make_policy
 from policies.painted_road import PaintedRoad, pinhole_camera
 
@@ -36,7 +51,11 @@ def sensors_fault(sensors: Any, known: Collection[str]) -> str:
     if found:
         return found
     unknown = [sensor.camera for sensor in sensors if sensor.camera not in known]
-    return f"the policy asks for cameras {unknown}; the scenario has {sorted(known)}" if unknown else ""
+    return (
+        f"the policy asks for cameras {unknown}; the scenario has {sorted(known)}"
+        if unknown
+        else ""
+    )
 
 
 def shape_fault(plans: Sequence[Plan], asked_us: Sequence[int], T_world_first: F64) -> str:
@@ -45,7 +64,9 @@ def shape_fault(plans: Sequence[Plan], asked_us: Sequence[int], T_world_first: F
 
 
 def time_fault(plans: Sequence[Plan], asked_us: Sequence[int], T_world_first: F64) -> str:
-    """Check that times are integer microseconds, begin at the observation, increase, and reach far enough in fine enough steps."""
+    """Check that times are integer microseconds, begin at the observation, increase, and reach far
+    enough in fine enough steps.
+    """
     for step, (plan, now) in enumerate(zip(plans, asked_us, strict=True)):
         times = plan.times_us
         if not np.issubdtype(times.dtype, np.integer):
@@ -57,7 +78,11 @@ def time_fault(plans: Sequence[Plan], asked_us: Sequence[int], T_world_first: F6
             return f"times_us does not increase strictly after row {int(np.argmax(steps <= 0))}"
         horizon_s, widest_s = int(times[-1] - times[0]) * 1e-6, int(steps.max()) * 1e-6
         if horizon_s < MIN_HORIZON_S:
-            guess = "; the steps look like milliseconds" if horizon_s * 1000 >= MIN_HORIZON_S and horizon_s < 0.02 else ""
+            guess = (
+                "; the steps look like milliseconds"
+                if horizon_s * 1000 >= MIN_HORIZON_S and horizon_s < 0.02
+                else ""
+            )
             return f"the plan ends {horizon_s:.3f} s ahead; the controller needs {MIN_HORIZON_S:.0f} s{guess}"
         if widest_s > MAX_STEP_S:
             return f"poses of the plan are up to {widest_s:.2f} s apart; {MAX_STEP_S} s is the most"
@@ -71,16 +96,24 @@ def _time_guess(first: int, now: int, earlier: Sequence[int]) -> str:
         return "it looks like milliseconds"
     if abs(first - now // 1_000_000) < 10:
         return "it looks like seconds"
-    return "it looks like times relative to now" if first == 0 else "a plan begins at its observation"
+    return (
+        "it looks like times relative to now" if first == 0 else "a plan begins at its observation"
+    )
 
 
 def frame_fault(plans: Sequence[Plan], asked_us: Sequence[int], T_world_first: F64) -> str:
-    """Check that plans begin at the rig's origin, that yaw is in radians, and that it follows the motion."""
+    """Check that plans begin at the rig's origin, that yaw is in radians, and that it follows the
+    motion.
+    """
     for plan in plans:
         away = float(np.hypot(*plan.xy[0]))
         if away > FIRST_POSE_M:
             near_world = float(np.hypot(*(plan.xy[0] - T_world_first[:2, 3]))) < 100.0
-            guess = "it looks like world coordinates" if near_world else "a plan begins at the ego, in its rig frame"
+            guess = (
+                "it looks like world coordinates"
+                if near_world
+                else "a plan begins at the ego, in its rig frame"
+            )
             return f"the first pose lies {away:.1f} m from the rig's origin: {guess}"
         widest = float(np.abs(plan.yaw).max())
         if widest > 2 * np.pi:
@@ -104,7 +137,11 @@ def unit_fault(plan: Plan) -> str:
     unit = unit_guess(distance / 10.0)
     guess = f"it looks like {unit}" if unit else "a car does between 4 and 14 m, forwards"
     if 4.0 <= distance <= 14.0:
-        guess = "it runs backwards, x is forward" if -x > abs(y) else "it runs sideways, x is forward and y is left"
+        guess = (
+            "it runs backwards, x is forward"
+            if -x > abs(y)
+            else "it runs sideways, x is forward and y is left"
+        )
     return f"at 10 m/s on a free straight the plan advances {distance:.2f} in the first second: {guess}"
 
 
@@ -117,27 +154,43 @@ def side_fault(left: Plan, right: Plan) -> str:
 
 
 def difference(a: Sequence[Plan], b: Sequence[Plan]) -> float:
-    """Return the largest difference of two drives' plans in metres or radians; infinite where times or shapes differ."""
-    if len(a) != len(b) or any(p.xy.shape != q.xy.shape or not np.array_equal(p.times_us, q.times_us) for p, q in zip(a, b, strict=True)):
+    """Return the largest difference of two drives' plans in metres or radians; infinite where times
+    or shapes differ.
+    """
+    if len(a) != len(b) or any(
+        p.xy.shape != q.xy.shape or not np.array_equal(p.times_us, q.times_us)
+        for p, q in zip(a, b, strict=True)
+    ):
         return float("inf")
-    return max(max(float(np.abs(p.xy - q.xy).max()), float(np.abs(p.yaw - q.yaw).max())) for p, q in zip(a, b, strict=True))
+    return max(
+        max(float(np.abs(p.xy - q.xy).max()), float(np.abs(p.yaw - q.yaw).max()))
+        for p, q in zip(a, b, strict=True)
+    )
 
 
 def remarks(plans: Mapping[str, Sequence[Plan]]) -> list[str]:
     """List legal but unusual properties."""
     out = []
     if {"left", "right"} <= plans.keys() and difference(plans["left"], plans["right"]) == 0:
-        out.append("the plan depends neither on the route nor on the frames: left and right give the same")
+        out.append(
+            "the plan depends neither on the route nor on the frames: left and right give the same"
+        )
     if "standing" in plans:
         last = plans["standing"][-1]
-        out.append(f"from standstill on a free road it moves {float(np.hypot(*(last.xy[-1] - last.xy[0]))):.1f} m within its horizon")
+        out.append(
+            f"from standstill on a free road it moves {float(np.hypot(*(last.xy[-1] - last.xy[0]))):.1f} m within its horizon"
+        )
     if not any(plan.samples for drive in plans.values() for plan in drive):
         out.append("it carries no sampled alternatives, so plan metrics see one trajectory")
     return out
 
 
-START_US = 1_700_000_000_000_000  # recordings use epoch time: a policy that counts in float32 is found out
-T_WORLD_ROAD = se2(1200.0, -800.0, 0.7)  # away from the origin: world coordinates differ from rig coordinates
+START_US = (
+    1_700_000_000_000_000  # recordings use epoch time: a policy that counts in float32 is found out
+)
+T_WORLD_ROAD = se2(
+    1200.0, -800.0, 0.7
+)  # away from the origin: world coordinates differ from rig coordinates
 STEPS = 6
 STEP_US = 100_000
 
@@ -176,14 +229,24 @@ class Report:
         return tuple(check.sentence for check in self.checks if not check.ok)
 
     def __str__(self) -> str:
-        lines = [f"{'ok  ' if check.ok else 'FAIL'} {check.name}: {check.sentence}" for check in self.checks]
+        lines = [
+            f"{'ok  ' if check.ok else 'FAIL'} {check.name}: {check.sentence}"
+            for check in self.checks
+        ]
         lines += [f"note {note}" for note in self.notes]
-        return "\n".join([*lines, f"plans in {self.latency_ms[0]:.1f} ms (median), {self.latency_ms[1]:.1f} ms (worst)"])
+        return "\n".join(
+            [
+                *lines,
+                f"plans in {self.latency_ms[0]:.1f} ms (median), {self.latency_ms[1]:.1f} ms (worst)",
+            ]
+        )
 
 
 @dataclass(frozen=True)
 class Situation:
-    """A stretch of road driven at a constant speed, with a policy query every 0.1 s; a blank one shows the policy a grey picture."""
+    """A stretch of road driven at a constant speed, with a policy query every 0.1 s; a blank one
+    shows the policy a grey picture.
+    """
 
     name: str
     curvature_1pm: float = 0.0
@@ -193,23 +256,36 @@ class Situation:
     is_blank: bool = False
 
 
-STRAIGHT, LEFT, RIGHT = Situation("straight"), Situation("left", 1 / 60), Situation("right", -1 / 60)
-STANDING, OLD_FRAME = Situation("standing", speed_mps=0.0), Situation("old frame", frame_age_us=STEP_US)
-LONG, BLANK = Situation("long drive", 1 / 200, steps=40), Situation("nothing to see", steps=12, is_blank=True)
+STRAIGHT = Situation("straight")
+LEFT = Situation("left", 1 / 60)
+RIGHT = Situation("right", -1 / 60)
+STANDING, OLD_FRAME = (
+    Situation("standing", speed_mps=0.0),
+    Situation("old frame", frame_age_us=STEP_US),
+)
+LONG, BLANK = (
+    Situation("long drive", 1 / 200, steps=40),
+    Situation("nothing to see", steps=12, is_blank=True),
+)
 
 
 def canned_scenario(cameras: Sequence[CameraSpec] = (pinhole_camera(),)) -> Scenario:
-    """Return the scenario that `check_policy` plays by default: straight on at 10 m/s, no actors, an empty map."""
+    """Return the scenario that `check_policy` plays by default: straight on at 10 m/s, no actors,
+    an empty map.
+    """
     t_us = START_US - 1_000_000 + STEP_US * np.arange(80)
     poses = [T_WORLD_ROAD @ se2(10.0 * (int(t) - START_US) * 1e-6, 0.0, 0.0) for t in t_us]
     log = trajectory_from_poses(t_us, np.array(poses))
     return replace(blank_scenario("conformance", log, cameras), start_us=START_US)
 
 
-def check_policy(policy: Policy | str, scenario: Scenario | None = None, latency_limit_ms: float = 100.0) -> Report:
+def check_policy(
+    policy: Policy | str, scenario: Scenario | None = None, latency_limit_ms: float = 100.0
+) -> Report:
     """Drive a policy through the canned situations and report every breach of the contract.
 
-    A policy with ``controller = "perfect"`` replays a recording, so it is only queried where `canned_scenario` has a recording.
+    A policy with ``controller = "perfect"`` replays a recording, so it is only queried where
+    `canned_scenario` has a recording.
 
     Args:
         policy: A policy made for ``scenario``, or its name (see `make_policy`).
@@ -224,7 +300,9 @@ def check_policy(policy: Policy | str, scenario: Scenario | None = None, latency
         try:
             made = make_policy(policy, scenario)
         except PolicyError as error:
-            return Report((Check("made", False, f"{error.doing} failed: {error.found}"),), (), (0.0, 0.0))
+            return Report(
+                (Check("made", False, f"{error.doing} failed: {error.found}"),), (), (0.0, 0.0)
+            )
         report = _checked(made, scenario, latency_limit_ms)
         with suppress(SimrunError):  # what it did before is the finding
             made.close()
@@ -243,7 +321,11 @@ def _checked(policy: Policy, scenario: Scenario, latency_limit_ms: float) -> Rep
     plans: dict[str, list[Plan]] = {}
     durations: list[float] = []
     broken: list[Check] = []
-    for situation in (STRAIGHT, OLD_FRAME) if replays else (STRAIGHT, OLD_FRAME, LEFT, RIGHT, STANDING, LONG, BLANK):
+    for situation in (
+        (STRAIGHT, OLD_FRAME)
+        if replays
+        else (STRAIGHT, OLD_FRAME, LEFT, RIGHT, STANDING, LONG, BLANK)
+    ):
         made = _drive(policy, situation, used, durations)
         if isinstance(made, str):
             broken.append(Check("plans", False, made))
@@ -253,13 +335,29 @@ def _checked(policy: Policy, scenario: Scenario, latency_limit_ms: float) -> Rep
     checks += broken
     if not broken:
         checks += [Check(name, True, sentence) for name, _, sentence in PLAN_FAULTS]
-        checks.append(_check("units", unit_fault(plans["straight"][0]), "at 10 m/s a plan advances as a car does"))
+        checks.append(
+            _check(
+                "units", unit_fault(plans["straight"][0]), "at 10 m/s a plan advances as a car does"
+            )
+        )
         if not replays:
-            checks.append(_check("side", side_fault(plans["left"][-1], plans["right"][-1]), "no road leads to its wrong side"))
+            checks.append(
+                _check(
+                    "side",
+                    side_fault(plans["left"][-1], plans["right"][-1]),
+                    "no road leads to its wrong side",
+                )
+            )
         checks += _memory_checks(policy, used, plans["straight"], OLD_FRAME if replays else LEFT)
     median, worst = (float(np.median(durations)), max(durations)) if durations else (0.0, 0.0)
     if durations:
-        checks.append(Check("latency", median <= latency_limit_ms, f"plans in {median:.1f} ms, the limit is {latency_limit_ms:.0f} ms"))
+        checks.append(
+            Check(
+                "latency",
+                median <= latency_limit_ms,
+                f"plans in {median:.1f} ms, the limit is {latency_limit_ms:.0f} ms",
+            )
+        )
     return Report(tuple(checks), () if broken else tuple(remarks(plans)), (median, worst))
 
 
@@ -283,18 +381,30 @@ def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterat
             frames[name] = Frame(seen_us, name, rgb)
         ahead = situation.speed_mps * (now - START_US) * 1e-6 + 80 / 19 * np.arange(20)
         route = np.array([(T_WORLD_ROAD @ road.pose(float(s)))[:3, 3] for s in ahead])
-        ego = EgoState(now, T_world_rig, situation.speed_mps, 0.0, situation.speed_mps * situation.curvature_1pm)
+        ego = EgoState(
+            now,
+            T_world_rig,
+            situation.speed_mps,
+            0.0,
+            situation.speed_mps * situation.curvature_1pm,
+        )
         history = trajectory_from_poses(times, np.array([pose(int(t)) for t in times]))
-        yield Observation(now, frames, cameras, ego, history, transform_points(inverse(T_world_rig), route))
+        yield Observation(
+            now, frames, cameras, ego, history, transform_points(inverse(T_world_rig), route)
+        )
 
 
-def _drive(policy: Policy, situation: Situation, cameras: dict[str, CameraSpec], durations: list[float]) -> list[Plan] | str:
+def _drive(
+    policy: Policy, situation: Situation, cameras: dict[str, CameraSpec], durations: list[float]
+) -> list[Plan] | str:
     """Return the plans, or a sentence where the policy raised."""
     road = PaintedRoad(situation.curvature_1pm)
     where = f"in the situation {situation.name!r} the policy"
     plans: list[Plan] = []
     try:
-        policy.reset(0, Route(np.array([(T_WORLD_ROAD @ road.pose(float(s)))[:3, 3] for s in range(120)])))
+        policy.reset(
+            0, Route(np.array([(T_WORLD_ROAD @ road.pose(float(s)))[:3, 3] for s in range(120)]))
+        )
         for step, observation in enumerate(observations(situation, cameras)):
             began = time.perf_counter()
             plans.append(policy.act(observation))
@@ -302,7 +412,9 @@ def _drive(policy: Policy, situation: Situation, cameras: dict[str, CameraSpec],
                 durations.append(1e3 * (time.perf_counter() - began))
     except SimrunError as error:
         return f"{where} failed: {error.doing}: {error.found}"
-    except Exception as error:  # whatever a foreign policy raises is a finding, not a crash of the check
+    except (
+        Exception
+    ) as error:  # whatever a foreign policy raises is a finding, not a crash of the check
         at = traceback.extract_tb(error.__traceback__)[-1]
         return f"{where} raised {type(error).__name__}: {error} in query {len(plans) + 1} ({at.filename}:{at.lineno})"
     return plans
@@ -318,7 +430,9 @@ def _plan_faults(situation: Situation, plans: list[Plan]) -> list[Check]:
     return []
 
 
-def _memory_checks(policy: Policy, cameras: dict[str, CameraSpec], straight: list[Plan], other: Situation) -> list[Check]:
+def _memory_checks(
+    policy: Policy, cameras: dict[str, CameraSpec], straight: list[Plan], other: Situation
+) -> list[Check]:
     """Compare fresh drives with the one that was driven first of all."""
     again = _drive(policy, STRAIGHT, cameras, [])
     # The drive before ended elsewhere, at another speed, and was itself a first.
@@ -327,10 +441,20 @@ def _memory_checks(policy: Policy, cameras: dict[str, CameraSpec], straight: lis
     same = "the same seed and observations give the same plans"
     apart = float("inf") if isinstance(again, str) else difference(straight, again)
     if apart > 0:
-        return [Check("determinism", False, f"it does not hold that {same}: they differ by up to {apart:.3g} m")]
+        return [
+            Check(
+                "determinism",
+                False,
+                f"it does not hold that {same}: they differ by up to {apart:.3g} m",
+            )
+        ]
     forgets = "a reset forgets the drive before"
     apart = float("inf") if isinstance(after, str) else difference(straight, after)
-    sentence = forgets if apart == 0 else f"it does not hold that {forgets}: plans differ by up to {apart:.3g} m"
+    sentence = (
+        forgets
+        if apart == 0
+        else f"it does not hold that {forgets}: plans differ by up to {apart:.3g} m"
+    )
     return [Check("determinism", True, same), Check("reset", apart == 0, sentence)]
 
 

@@ -39,10 +39,20 @@ from policies.lane_plan import (
     sample_sigma_m,
     sampled,
 )
-from policies.obstacle_vision import ObstacleTrack, RoadColour, anomaly, find_foot, learn_road, track_obstacle
+from policies.obstacle_vision import (
+    ObstacleTrack,
+    RoadColour,
+    anomaly,
+    find_foot,
+    learn_road,
+    track_obstacle,
+)
 from policies.road_vision import GroundGrid, PaintPoints, RidgeFilter, find_paint, make_grid
 
-NAVIGATION_SIGMA_M, NAVIGATION_LIMIT_M = 0.7, 1.0  # a satellite receiver knows the lane, not the place in it
+NAVIGATION_SIGMA_M, NAVIGATION_LIMIT_M = (
+    0.7,
+    1.0,
+)  # a satellite receiver knows the lane, not the place in it
 MIN_CRUISE_MPS = 8.0
 MAX_HEADING_RAD = 0.45  # a lane that points further away is not the ego's any more
 UNCERTAIN_M, UNCERTAIN_PAINT_M = 1.2, 3.0
@@ -58,9 +68,10 @@ OBSTACLE_RANGE_M = 48.0
 class LaneCamera(Policy):
     """Keep the lane that the paint shows and stop for what stands on it.
 
-    It reads the newest frame of one camera, its own motion, and the route. The lateral position comes from the paint: the route's weight
-    is its variance against the paint's, which near the car is below one percent. The route decides which lane, where to turn, and
-    everything when no paint is seen for long. ``Plan.debug["mode"]`` names the source of the plan: ``lane`` (paint in this
+    It reads the newest frame of one camera, its own motion, and the route. The lateral position
+    comes from the paint: the route's weight is its variance against the paint's, which near the car
+    is below one percent. The route decides which lane, where to turn, and everything when no paint
+    is seen for long. ``Plan.debug["mode"]`` names the source of the plan: ``lane`` (paint in this
     frame), ``memory`` (the estimate of earlier frames), ``route`` or ``straight`` (neither).
     """
 
@@ -76,7 +87,9 @@ class LaneCamera(Policy):
     def reset(self, seed: int, route: Route) -> None:
         """Forget everything of the drive before."""
         self.seed, self.step = seed, 0
-        error_m = NAVIGATION_SIGMA_M * float(stream(self.scene_id, seed, "policy/navigation").normal())
+        error_m = NAVIGATION_SIGMA_M * float(
+            stream(self.scene_id, seed, "policy/navigation").normal()
+        )
         self.navigation_error_m = float(np.clip(error_m, -NAVIGATION_LIMIT_M, NAVIGATION_LIMIT_M))
         self.noise: F64 | None = None  # the samples' errors, which last for seconds
         self.acted_us = 0
@@ -100,7 +113,9 @@ class LaneCamera(Policy):
         if left is not None:  # with a lateral navigation error that is constant over the drive
             line = smooth_line(left)
             step = np.gradient(line, axis=0)
-            normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
+            normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(
+                np.linalg.norm(step, axis=1, keepdims=True), 1e-9
+            )
             route = line + self.navigation_error_m * normal
         speed = observation.ego.speed_mps
         if self.cruise_mps is None:
@@ -125,7 +140,9 @@ class LaneCamera(Policy):
         debug = self._debug(lane, route, blended)
         return Plan(observation.t_us, times, xy, yaw, tuple(others), debug)
 
-    def _look(self, frame: Frame, pose: F64, route: F64 | None, pose_now: F64, speed: float) -> None:
+    def _look(
+        self, frame: Frame, pose: F64, route: F64 | None, pose_now: F64, speed: float
+    ) -> None:
         """Update lane, road colour and obstacle from a new frame."""
         dt_s = 0.0 if self.seen_us is None else (frame.t_us - self.seen_us) * 1e-6
         if self.lane is not None:
@@ -154,32 +171,59 @@ class LaneCamera(Policy):
 
         def seen(lane: LaneState | None) -> LaneState | None:
             updated = None if lane is None else update(lane, points, row_m)
-            return None if updated is None or self._is_lost(updated, None if route is None else guess) else updated
+            return (
+                None
+                if updated is None or self._is_lost(updated, None if route is None else guess)
+                else updated
+            )
 
         lane = seen(self.lane)
         if lane is None:
-            lane = seen(search(points, row_m, guess.offset_m, guess.heading_rad, guess.curvature_1pm))
-        self.lane = lane if lane is None or route is None else self._choose_lane(lane, route, points, row_m, speed)
+            lane = seen(
+                search(points, row_m, guess.offset_m, guess.heading_rad, guess.curvature_1pm)
+            )
+        self.lane = (
+            lane
+            if lane is None or route is None
+            else self._choose_lane(lane, route, points, row_m, speed)
+        )
 
-    def _choose_lane(self, lane: LaneState, route: F64, points: PaintPoints, row_m: F64, speed: float) -> LaneState | None:
-        """Change to the lane that the route is in, once it has run beside the present one over several frames.
+    def _choose_lane(
+        self, lane: LaneState, route: F64, points: PaintPoints, row_m: F64, speed: float
+    ) -> LaneState | None:
+        """Change to the lane that the route is in, once it has run beside the present one over
+        several frames.
 
-        A route that points elsewhere than the lane does not run beside it: it turns off, which `blend` sees to.
+        A route that points elsewhere than the lane does not run beside it: it turns off, which
+        `blend` sees to.
         """
         x, y = _increasing(route)
         at = np.array([max(CHOOSE_AT_M, CHOOSE_AT_S * speed)])
         beside_m = float((np.interp(at, x, y) - lane.centre(at))[0])
-        turn = float(np.arctan2(np.interp(at + 2, x, y) - np.interp(at - 2, x, y), 4.0)[0] - np.arctan(lane.slope(at))[0])
-        runs_beside = abs(beside_m) > OTHER_LANE * lane.mean[4] and abs(turn) < SAME_HEADING_RAD and x[-1] > at[0] + 2
+        turn = float(
+            np.arctan2(np.interp(at + 2, x, y) - np.interp(at - 2, x, y), 4.0)[0]
+            - np.arctan(lane.slope(at))[0]
+        )
+        runs_beside = (
+            abs(beside_m) > OTHER_LANE * lane.mean[4]
+            and abs(turn) < SAME_HEADING_RAD
+            and x[-1] > at[0] + 2
+        )
         self.other_lane_frames = self.other_lane_frames + 1 if runs_beside else 0
         if self.other_lane_frames < OTHER_LANE_FRAMES:
             return lane
         self.other_lane_frames = 0
-        found = search(points, row_m, float(lane.mean[0]) + beside_m, float(lane.mean[1]), float(lane.mean[2]))
+        found = search(
+            points, row_m, float(lane.mean[0]) + beside_m, float(lane.mean[1]), float(lane.mean[2])
+        )
         if found is not None:
             return found
         lanes = round(beside_m / float(lane.mean[4]))
-        return shift(lane, lanes) if abs(beside_m - lanes * lane.mean[4]) < 0.3 * lane.mean[4] else None
+        return (
+            shift(lane, lanes)
+            if abs(beside_m - lanes * lane.mean[4]) < 0.3 * lane.mean[4]
+            else None
+        )
 
     def _is_lost(self, lane: LaneState, route: RoutePrior | None) -> bool:
         if route is not None:
@@ -188,12 +232,22 @@ class LaneCamera(Policy):
             if abs(turn) > TURN_OFF_RAD:
                 return True
             # Beside the route, a lane needs both borders: a single line is ambiguous.
-            beside_m = route.offset_m + at * route.heading_rad + at**2 / 2 * route.curvature_1pm - float(lane.centre(np.array([at]))[0])
+            beside_m = (
+                route.offset_m
+                + at * route.heading_rad
+                + at**2 / 2 * route.curvature_1pm
+                - float(lane.centre(np.array([at]))[0])
+            )
             if abs(beside_m) > UNCERTAIN_M and min(lane.left_m, lane.right_m) < UNCERTAIN_PAINT_M:
                 return True
         sigma = float(lane.sigma(np.array([5.0]))[0])
         heading, width = float(lane.mean[1]), float(lane.mean[4])
-        return sigma > LOST_SIGMA_M or lane.blind_m > LOST_BLIND_M or abs(heading) > MAX_HEADING_RAD or not 2.4 < width < 4.8
+        return (
+            sigma > LOST_SIGMA_M
+            or lane.blind_m > LOST_BLIND_M
+            or abs(heading) > MAX_HEADING_RAD
+            or not 2.4 < width < 4.8
+        )
 
     def _obstacle_now(self, observation: Observation) -> ObstacleTrack | None:
         """Return the confirmed obstacle ahead, moved from the frame's time to now."""
@@ -205,18 +259,34 @@ class LaneCamera(Policy):
         return track_obstacle(self.obstacle, None, observation.ego.speed_mps, age_s)
 
     def _debug(self, lane: LaneState | None, route: F64 | None, blended: Blend) -> dict[str, Any]:
-        mode = ("straight" if route is None else "route") if lane is None else ("lane" if lane.blind_m == 0 else "memory")
-        out: dict[str, Any] = {"mode": mode, "route_weight": blended.route_weight, "route_leaves_m": blended.route_leaves_m}
+        mode = (
+            ("straight" if route is None else "route")
+            if lane is None
+            else ("lane" if lane.blind_m == 0 else "memory")
+        )
+        out: dict[str, Any] = {
+            "mode": mode,
+            "route_weight": blended.route_weight,
+            "route_leaves_m": blended.route_leaves_m,
+        }
         out["line_path"] = blended.path.xy  # the page of causes draws it on the road
         if lane is not None:
-            names = ("lane_offset_m", "lane_heading_rad", "lane_curvature_1pm", "lane_bend_1pm2", "lane_width_m")
+            names = (
+                "lane_offset_m",
+                "lane_heading_rad",
+                "lane_curvature_1pm",
+                "lane_bend_1pm2",
+                "lane_width_m",
+            )
             out.update({name: float(value) for name, value in zip(names, lane.mean, strict=True)})
             out.update(lane_sigma_m=float(np.sqrt(lane.cov[0, 0])), blind_m=lane.blind_m)
         if self.lane is not None:
             out.update(paint_left_m=self.lane.left_m, paint_right_m=self.lane.right_m)
         if self.obstacle is not None:
             o = self.obstacle
-            out.update(obstacle_m=o.distance_m, obstacle_mps=o.speed_mps, obstacle_confirmed=o.confirmed)
+            out.update(
+                obstacle_m=o.distance_m, obstacle_mps=o.speed_mps, obstacle_confirmed=o.confirmed
+            )
         return out
 
 
@@ -239,7 +309,9 @@ def _points_in(points: F64, T_world_a: F64, T_world_b: F64) -> F64:
 
 
 def _increasing(points: F64) -> tuple[F64, F64]:
-    """Return x and y of the leading points ``(M, 2)`` whose x increases, for interpolation over x."""
+    """Return x and y of the leading points ``(M, 2)`` whose x increases, for interpolation over
+    x.
+    """
     x = points[:, 0]
     back = x[1:] - x[:-1] <= 0.05
     stop = int(np.argmax(back)) + 1 if back.any() else len(x)
@@ -247,5 +319,7 @@ def _increasing(points: F64) -> tuple[F64, F64]:
 
 
 def _range_of(path: F64) -> float:
-    """Return how far ahead the path stays within 60 degrees of the view; beyond that a corridor over x has no meaning."""
+    """Return how far ahead the path stays within 60 degrees of the view; beyond that a corridor
+    over x has no meaning.
+    """
     return float(_increasing(path[1:])[0][-1])

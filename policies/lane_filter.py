@@ -1,9 +1,10 @@
 """Lane tracking: a Kalman filter whose measurements are points of lane markings.
 
-In the rig frame the lane's centre is ``y(x) = offset + heading x + curvature x^2 / 2 + bend x^3 / 6`` (the cubic of a clothoid for small
-angles; Dickmanns and Mysliwetz 1992) and its two painted borders lie half a width to either side, measured across the
-lane. All five numbers are carried with their covariance: the ego's own motion predicts them, every point of paint near a border
-corrects them, and a frame with much paint therefore counts for more than a frame with little.
+In the rig frame the lane's centre is ``y(x) = offset + heading x + curvature x^2 / 2 + bend x^3 /
+6`` (the cubic of a clothoid for small angles; Dickmanns and Mysliwetz 1992) and its two painted
+borders lie half a width to either side, measured across the lane. All five numbers are carried with
+their covariance: the ego's own motion predicts them, every point of paint near a border corrects
+them, and a frame with much paint therefore counts for more than a frame with little.
 """
 
 from __future__ import annotations
@@ -17,12 +18,16 @@ from policies.road_vision import PaintPoints
 
 OFFSET, HEADING, CURVATURE, BEND, WIDTH = range(5)
 MEAN_WIDTH_M = 3.5
-WIDTH_MEMORY_M = 40.0  # a border that is not seen is assumed at the mean width again after some such lengths
+WIDTH_MEMORY_M = (
+    40.0  # a border that is not seen is assumed at the mean width again after some such lengths
+)
 ONE_SIDED_M = 1.0
 START_SIGMA = np.array([0.3, 0.05, 0.02, 1e-3, 0.3])
 # Standard deviations per square root of a metre driven: how fast roads change.
 DRIFT_PER_SQRT_M = np.array([0.03, 0.01, 0.004, 4e-4, 0.03])
-CORRELATION = 4.0  # neighbouring points of one stroke share their error; this many of them are worth one
+CORRELATION = (
+    4.0  # neighbouring points of one stroke share their error; this many of them are worth one
+)
 SHAPE_ERROR_1PM = 0.0008  # a cubic misses a real road by about this times x^2
 GATE_M = (0.3, 0.7)
 ITERATIONS = 3
@@ -45,11 +50,15 @@ class LaneState:
         return np.asarray(_basis(x_m) @ self.mean[:4])
 
     def sigma(self, x_m: F64) -> F64:
-        """Return the standard deviation (K,) of `centre`, growing beyond the paint that was seen."""
+        """Return the standard deviation (K,) of `centre`, growing beyond the paint that was
+        seen.
+        """
         basis = _basis(x_m)
         var = np.einsum("ki,ij,kj->k", basis, self.cov[:4, :4], basis)
         beyond = np.maximum(x_m - self.seen_to_m, 0.0)
-        return np.asarray(np.sqrt(np.maximum(var, 0.0) + (SHAPE_ERROR_1PM * x_m**2) ** 2 + (0.06 * beyond) ** 2))
+        return np.asarray(
+            np.sqrt(np.maximum(var, 0.0) + (SHAPE_ERROR_1PM * x_m**2) ** 2 + (0.06 * beyond) ** 2)
+        )
 
     def slope(self, x_m: F64 | float) -> F64:
         """Return dy/dx (K,) of the centre, or () at one distance."""
@@ -57,13 +66,19 @@ class LaneState:
         return np.asarray(heading + curvature * x_m + 0.5 * bend * (x_m * x_m))
 
 
-def start(offset_m: float, heading_rad: float, curvature_1pm: float, width_m: float = MEAN_WIDTH_M) -> LaneState:
+def start(
+    offset_m: float, heading_rad: float, curvature_1pm: float, width_m: float = MEAN_WIDTH_M
+) -> LaneState:
     """Return a fresh estimate with the starting uncertainty."""
-    return LaneState(np.array([offset_m, heading_rad, curvature_1pm, 0.0, width_m]), np.diag(START_SIGMA**2))
+    return LaneState(
+        np.array([offset_m, heading_rad, curvature_1pm, 0.0, width_m]), np.diag(START_SIGMA**2)
+    )
 
 
 def predict(lane: LaneState, forward_m: float, left_m: float, turn_rad: float) -> LaneState:
-    """Move the estimate into the rig frame after the ego moved by (forward, left) and turned by ``turn_rad``."""
+    """Move the estimate into the rig frame after the ego moved by (forward, left) and turned by
+    ``turn_rad``.
+    """
     d = forward_m
     transition = np.eye(5)
     transition[OFFSET, :4] = [1.0, d, d * d / 2, d**3 / 6]
@@ -75,14 +90,22 @@ def predict(lane: LaneState, forward_m: float, left_m: float, turn_rad: float) -
     mean[WIDTH] = MEAN_WIDTH_M + (mean[WIDTH] - MEAN_WIDTH_M) * np.exp(-abs(d) / WIDTH_MEMORY_M)
     noise = DRIFT_PER_SQRT_M**2 * abs(d) + np.array([0.003, 0.0005, 0, 0, 0]) ** 2
     cov = transition @ lane.cov @ transition.T + np.diag(noise)
-    return replace(lane, mean=mean, cov=cov, left_m=0.0, right_m=0.0, seen_to_m=max(lane.seen_to_m - d, 0.0), blind_m=lane.blind_m + abs(d))
+    return replace(
+        lane,
+        mean=mean,
+        cov=cov,
+        left_m=0.0,
+        right_m=0.0,
+        seen_to_m=max(lane.seen_to_m - d, 0.0),
+        blind_m=lane.blind_m + abs(d),
+    )
 
 
 def update(lane: LaneState, points: PaintPoints, row_m: F64) -> LaneState:
     """Correct the estimate by points of paint.
 
-    Each point belongs to the nearer border if it lies within a gate; inside the gate a Cauchy weight lets outliers fade. A few rounds,
-    as association and weights depend on the estimate.
+    Each point belongs to the nearer border if it lies within a gate; inside the gate a Cauchy
+    weight lets outliers fade. A few rounds, as association and weights depend on the estimate.
 
     Args:
         lane: The predicted estimate.
@@ -103,18 +126,29 @@ def update(lane: LaneState, points: PaintPoints, row_m: F64) -> LaneState:
         residual, jacobian[:, WIDTH], _ = _residuals(mean, x, y, basis)
         gate = GATE_M[0] + (GATE_M[1] - GATE_M[0]) / (1 + iteration)
         spread = 0.1 + np.sqrt(var / CORRELATION)
-        weight = np.where(np.abs(residual) < gate, 1.0 / (1.0 + (residual / spread) ** 2), 0.0) / var
+        weight = (
+            np.where(np.abs(residual) < gate, 1.0 / (1.0 + (residual / spread) ** 2), 0.0) / var
+        )
         weighted = jacobian * weight[:, None]
         # Gauss-Newton on prior and points together: the information form of the Kalman update.
         total = information + jacobian.T @ weighted
-        mean = mean + np.linalg.solve(total, weighted.T @ residual + information @ (lane.mean - mean))
+        mean = mean + np.linalg.solve(
+            total, weighted.T @ residual + information @ (lane.mean - mean)
+        )
     residual, _, side = _residuals(mean, x, y, basis)
     used = np.abs(residual) < GATE_M[0]
     rows = row_m[near]
     left, right = _length(x, rows, used & (side > 0)), _length(x, rows, used & (side < 0))
     seen = left + right > 2.0
     far = float(np.percentile(x[used], 95)) if seen else lane.seen_to_m
-    return LaneState(mean, np.asarray(np.linalg.inv(total)), left, right, max(far, 0.0), 0.0 if seen else lane.blind_m)
+    return LaneState(
+        mean,
+        np.asarray(np.linalg.inv(total)),
+        left,
+        right,
+        max(far, 0.0),
+        0.0 if seen else lane.blind_m,
+    )
 
 
 def shift(lane: LaneState, lanes_left: int) -> LaneState:
@@ -125,12 +159,14 @@ def shift(lane: LaneState, lanes_left: int) -> LaneState:
     return replace(lane, mean=mean, cov=cov)
 
 
-def search(points: PaintPoints, row_m: F64, offset_m: float, heading_rad: float, curvature_1pm: float) -> LaneState | None:
+def search(
+    points: PaintPoints, row_m: F64, offset_m: float, heading_rad: float, curvature_1pm: float
+) -> LaneState | None:
     """Find the lane in one frame around a rough guess; None where the paint does not show one.
 
-    For every heading and curvature on a small grid the paint is collapsed along the curve into a histogram over the lateral position;
-    where the curve is right the piles are sharp. In the sharpest histogram the pair of piles that is a lane wide and nearest to the
-    guess wins.
+    For every heading and curvature on a small grid the paint is collapsed along the curve into a
+    histogram over the lateral position; where the curve is right the piles are sharp. In the
+    sharpest histogram the pair of piles that is a lane wide and nearest to the guess wins.
     """
     near = points.x_m < 30.0
     x, y = points.x_m[near], points.y_m[near]
@@ -146,20 +182,37 @@ def search(points: PaintPoints, row_m: F64, offset_m: float, heading_rad: float,
     bins = np.floor((lateral + half) / cell).astype(np.intp)
     valid = (bins >= 0) & (bins < n)
     flat = (np.arange(len(shapes))[:, None] * n + bins)[valid]
-    histogram = np.bincount(flat, np.broadcast_to(paint, bins.shape)[valid], len(shapes) * n).reshape(len(shapes), n)
+    histogram = np.bincount(
+        flat, np.broadcast_to(paint, bins.shape)[valid], len(shapes) * n
+    ).reshape(len(shapes), n)
     padded = np.pad(histogram, ((0, 0), (1, 1)))
     histogram = histogram + 0.5 * (padded[:, :-2] + padded[:, 2:])
     # Prefer the guess where the paint is ambiguous.
-    doubt = ((shapes[:, 0] - heading_rad) / 0.15) ** 2 + ((shapes[:, 1] - curvature_1pm) / 0.03) ** 2
+    doubt = ((shapes[:, 0] - heading_rad) / 0.15) ** 2 + (
+        (shapes[:, 1] - curvature_1pm) / 0.03
+    ) ** 2
     best = int(np.argmax(np.sum(histogram**2, axis=1) / (1.0 + 0.1 * doubt)))
     pile = histogram[best]
     widths = np.arange(2.6, 4.7, 0.1)
     centres = np.arange(-4.0, 4.0 + 1e-9, cell)
     left, right = (
-        pile[np.clip(np.floor((centres[:, None] + side * widths / 2 + half) / cell).astype(np.intp), 0, n - 1)] for side in (1, -1)
+        pile[
+            np.clip(
+                np.floor((centres[:, None] + side * widths / 2 + half) / cell).astype(np.intp),
+                0,
+                n - 1,
+            )
+        ]
+        for side in (1, -1)
     )
-    score = np.minimum(left, 6.0) + np.minimum(right, 6.0) + np.minimum(np.minimum(left, right), 3.0)
-    score = score - 1.5 * ((centres[:, None] - offset_m) / 0.8) ** 2 - 0.5 * ((widths - MEAN_WIDTH_M) / 0.4) ** 2
+    score = (
+        np.minimum(left, 6.0) + np.minimum(right, 6.0) + np.minimum(np.minimum(left, right), 3.0)
+    )
+    score = (
+        score
+        - 1.5 * ((centres[:, None] - offset_m) / 0.8) ** 2
+        - 0.5 * ((widths - MEAN_WIDTH_M) / 0.4) ** 2
+    )
     i, j = np.unravel_index(int(np.argmax(score)), score.shape)
     if left[i, j] + right[i, j] < 3.0 or abs(centres[i] - offset_m) > 2.0:
         return None
@@ -172,7 +225,9 @@ def search(points: PaintPoints, row_m: F64, offset_m: float, heading_rad: float,
 
 
 def _residuals(mean: F64, x: F64, y: F64, basis: F64) -> tuple[F64, F64, F64]:
-    """Return residual (N,), its derivative by the width (N,), and side (N,) of the points against the nearer border."""
+    """Return residual (N,), its derivative by the width (N,), and side (N,) of the points against
+    the nearer border.
+    """
     centre = basis @ mean[:4]
     slope = mean[HEADING] + mean[CURVATURE] * x + 0.5 * mean[BEND] * x**2
     stretch = np.sqrt(1 + slope**2)  # the width is measured across the lane, not across the rig

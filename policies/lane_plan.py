@@ -16,15 +16,22 @@ from policies.obstacle_vision import ObstacleTrack
 ROUTE_SIGMA_M = 0.75  # how far a lane's centre may lie from the route, for all the policy knows
 SAME_LANE_M = 1.5
 PATH_M = 70.0
-LEAVE_M, LEAVE_RAD = 1.2, 0.2  # the route leaves the lane where it is this far off and points this much elsewhere
+LEAVE_M, LEAVE_RAD = (
+    1.2,
+    0.2,
+)  # the route leaves the lane where it is this far off and points this much elsewhere
 LEAVE_BEFORE_M = 8.0
 
 HEADWAY_S, MIN_GAP_M = 1.3, 3.5
-IDM_ACCEL_MPS2, IDM_BRAKE_MPS2, HARD_BRAKE_MPS2 = 1.5, 2.0, 7.0
+IDM_ACCEL_MPS2 = 1.5
+IDM_BRAKE_MPS2 = 2.0
+HARD_BRAKE_MPS2 = 7.0
 IDM_TWICE_MPS2 = 2 * math.sqrt(IDM_ACCEL_MPS2 * IDM_BRAKE_MPS2)
 
 N_SAMPLES = 6
-NOISE_LATERAL_M, NOISE_SPEED, NOISE_S = 0.15, 0.03, 3.0
+NOISE_LATERAL_M = 0.15
+NOISE_SPEED = 0.03
+NOISE_S = 3.0
 DRIFT_STEPS = 40  # rows of a plan over which a sample drifts by NOISE_SPEED: 4 s
 MAX_NOISE_M = 0.5
 NOISE_RAMP_M = 12.0
@@ -66,11 +73,13 @@ def blend(lane: LaneState | None, route: F64 | None, speed_mps: float) -> Blend:
 
 
 def fuse(lane: LaneState | None, route: F64 | None) -> tuple[F64, float, float]:
-    """Fuse the lane seen and the route ``(M, 2)``, each weighted by its inverse variance, distance by distance.
+    """Fuse the lane seen and the route ``(M, 2)``, each weighted by its inverse variance, distance
+    by distance.
 
-    Near the car the paint's standard deviation is a few centimetres against `ROUTE_SIGMA_M` of the route, so the route does not affect the
-    lateral position; it takes over beyond the paint that is seen, where it turns away from the lane (an intersection, an exit), and
-    where the two are more than `SAME_LANE_M` apart.
+    Near the car the paint's standard deviation is a few centimetres against `ROUTE_SIGMA_M` of the
+    route, so the route does not affect the lateral position; it takes over beyond the paint that is
+    seen, where it turns away from the lane (an intersection, an exit), and where the two are more
+    than `SAME_LANE_M` apart.
 
     Returns:
         Points ``(N, 2)``, and the other two of `Blend`.
@@ -91,7 +100,9 @@ def fuse(lane: LaneState | None, route: F64 | None) -> tuple[F64, float, float]:
     y_lane = _straight_beyond(lane, x, max(lane.seen_to_m + 15.0, 25.0))
     sigma = lane.sigma(np.maximum(x, 0.0))
     apart = np.abs((y - y_lane) - (y[0] - y_lane[0])) > LEAVE_M
-    turned = np.abs(heading - np.arctan(lane.slope(np.minimum(np.maximum(x, 0.0), 30.0)))) > LEAVE_RAD
+    turned = (
+        np.abs(heading - np.arctan(lane.slope(np.minimum(np.maximum(x, 0.0), 30.0)))) > LEAVE_RAD
+    )
     leaves = np.inf
     if (apart & turned & usable).any():
         leaves = float(x[np.argmax(apart & turned & usable)])
@@ -104,23 +115,41 @@ def fuse(lane: LaneState | None, route: F64 | None) -> tuple[F64, float, float]:
     if not usable.all():
         last = max(int(np.argmin(usable)) - 1, 0)
         beyond = np.arange(len(x)) > last
-        correction = np.where(beyond, correction[last] * np.exp(-(np.arange(len(x)) - last) / 8.0), correction)
+        correction = np.where(
+            beyond, correction[last] * np.exp(-(np.arange(len(x)) - last) / 8.0), correction
+        )
     normal = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
-    # The correction is measured along the rig's y axis; along the path's normal it is shorter by the cosine.
+    # The correction is measured along the rig's y axis; along the path's normal it is shorter by
+    # the cosine.
     fused = points + normal * (correction * np.cos(heading))[:, None]
     at_10 = int(np.argmin(np.abs(x - 10.0)))
     return fused, float(1.0 - lane_share[at_10]), leaves
 
 
-def idm_progress(speed_mps: float, limits: F64, t_s: F64, obstacle: ObstacleTrack | None, bumper_m: float, cruise_mps: float) -> F64:
-    """Return the progress ``(T,)`` of a car that keeps the limits along its path and its distance to the obstacle ahead.
+def idm_progress(
+    speed_mps: float,
+    limits: F64,
+    t_s: F64,
+    obstacle: ObstacleTrack | None,
+    bumper_m: float,
+    cruise_mps: float,
+) -> F64:
+    """Return the progress ``(T,)`` of a car that keeps the limits along its path and its distance
+    to the obstacle ahead.
 
-    Intelligent driver model (Treiber, Hennecke, Helbing 2000), the obstacle ahead continuing at its speed.
+    Intelligent driver model (Treiber, Hennecke, Helbing 2000), the obstacle ahead continuing at its
+    speed.
     """
     ahead = limits.tolist()
     end, cruise = len(ahead) - 1, max(float(cruise_mps), 0.1)
-    progress, s, v = [0.0], 0.0, max(float(speed_mps), 0.0)
-    other_m, other = (math.inf, 0.0) if obstacle is None else (float(obstacle.distance_m), max(float(obstacle.speed_mps), 0.0))
+    progress = [0.0]
+    s = 0.0
+    v = max(float(speed_mps), 0.0)
+    other_m, other = (
+        (math.inf, 0.0)
+        if obstacle is None
+        else (float(obstacle.distance_m), max(float(obstacle.speed_mps), 0.0))
+    )
     for t, dt in zip(t_s.tolist(), np.diff(t_s).tolist(), strict=False):
         at = int(s / Path.SPACING_M)
         limit = ahead[at if at < end else end]
@@ -139,10 +168,11 @@ def idm_progress(speed_mps: float, limits: F64, t_s: F64, obstacle: ObstacleTrac
 
 
 def correlated_noise(before: F64 | None, dt_s: float, random: np.random.Generator) -> F64:
-    """Return the noise ``(N_SAMPLES, 2)`` of a step, lateral and speed in standard deviations, given that of the step before.
+    """Return the noise ``(N_SAMPLES, 2)`` of a step, lateral and speed in standard deviations,
+    given that of the step before.
 
-    A first-order Markov process with `NOISE_S` as its time: a policy that errs keeps erring for a while. White noise would be
-    filtered away by the vehicle.
+    A first-order Markov process with `NOISE_S` as its time: a policy that errs keeps erring for a
+    while. White noise would be filtered away by the vehicle.
     """
     fresh = random.normal(0.0, 1.0, (N_SAMPLES, 2))
     if before is None:
@@ -161,10 +191,11 @@ def sample_sigma_m(lane_sigma_m: float) -> float:
 
 
 def sampled(xy: F64, yaw: F64, noise: F64, sigma_m: float) -> list[F64]:
-    """Return `N_SAMPLES` versions ``(T, 3)`` of a plan; the first is the plan, which was made with the first sample's errors.
+    """Return `N_SAMPLES` versions ``(T, 3)`` of a plan; the first is the plan, which was made with
+    the first sample's errors.
 
-    The others differ from it as their errors do: shifted to a side over the first metres, and drifting ahead or back over the horizon, so
-    that each is as drivable as the plan itself.
+    The others differ from it as their errors do: shifted to a side over the first metres, and
+    drifting ahead or back over the horizon, so that each is as drivable as the plan itself.
 
     Args:
         xy: ``(T, 2)`` the plan.
@@ -180,13 +211,19 @@ def sampled(xy: F64, yaw: F64, noise: F64, sigma_m: float) -> list[F64]:
     shift_m, faster = (noise[1:] - noise[0]).T[:, :, None]
     shift_m = sigma_m * shift_m  # (N_SAMPLES - 1, 1)
     lines = np.empty((len(shift_m), len(s), 3))
-    lines[..., :2] = xy + (shift_m * ramp)[..., None] * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
+    lines[..., :2] = xy + (shift_m * ramp)[..., None] * np.stack(
+        [-np.sin(yaw), np.cos(yaw)], axis=1
+    )
     lines[..., 2] = yaw + np.arctan(shift_m * ramp_slope)
-    return [np.column_stack([xy, yaw]), *_retimed(lines, s, s * (1.0 + NOISE_SPEED * faster * ahead))]
+    return [
+        np.column_stack([xy, yaw]),
+        *_retimed(lines, s, s * (1.0 + NOISE_SPEED * faster * ahead)),
+    ]
 
 
 def _retimed(lines: F64, s: F64, at: F64) -> F64:
-    """Return ``lines`` (K, T, 3) at progress ``at`` (K, T), straight on beyond the end; a standing plan is unchanged.
+    """Return ``lines`` (K, T, 3) at progress ``at`` (K, T), straight on beyond the end; a standing
+    plan is unchanged.
 
     Args:
         lines: Rows at progress ``s``.
@@ -208,7 +245,9 @@ def _retimed(lines: F64, s: F64, at: F64) -> F64:
 
 
 def _straight_beyond(lane: LaneState, x: F64, limit_m: float) -> F64:
-    """Return the lane's centre, carried on along its tangent beyond ``limit_m``, where a cubic would run away."""
+    """Return the lane's centre, carried on along its tangent beyond ``limit_m``, where a cubic
+    would run away.
+    """
     inside = np.minimum(np.maximum(x, 0.0), limit_m)
     return lane.centre(inside) + (x - inside) * lane.slope(inside)
 

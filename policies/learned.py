@@ -1,4 +1,6 @@
-"""Drive by a small network trained by imitation on clean frames: image, speed and a navigation command in, trajectory out."""
+"""Drive by a small network trained by imitation on clean frames: image, speed and a navigation
+command in, trajectory out.
+"""
 
 from __future__ import annotations
 
@@ -27,28 +29,39 @@ STANDS_MPS = 0.3
 class Learned(Policy):
     """Predict a path and a speed profile with a network, and drive a sample of the prediction.
 
-    It reads two frames of one camera, 0.5 s apart, the car's speed, the initial speed of the drive as the desired speed, and one of five
-    commands computed from the route (`policies.learned_input`). It gets no other information on the route: the position in the lane
+    It reads two frames of one camera, 0.5 s apart, the car's speed, the initial speed of the drive
+    as the desired speed, and one of five commands computed from the route
+    (`policies.learned_input`). It gets no other information on the route: the position in the lane
     comes from the image. It was trained on frames of the renderer ``clean`` only.
 
     Args:
         scenario: Gives the camera, the scene's id for the random streams, and nothing else.
-        weights: File that ``simrun train policy`` wrote; None takes the class's ``files``. In runs, name a subclass whose
-            ``files`` is the file: a rollout's content key holds that file's digest.
-        temperature: Scale of the network's own standard deviations when a plan is drawn; 0 drives the mean.
+        weights: File that ``simrun train policy`` wrote; None takes the class's ``files``. In runs,
+            name a subclass whose ``files`` is the file: a rollout's content key holds that file's
+            digest.
+        temperature: Scale of the network's own standard deviations when a plan is drawn; 0 drives
+            the mean.
 
     Raises:
-        InputError: No camera looks ahead, the weights are missing or of another network, or the temperature is negative.
+        InputError: No camera looks ahead, the weights are missing or of another network, or the
+            temperature is negative.
     """
 
     files: ClassVar[tuple[Path, ...]] = (WEIGHTS,)  # part of a rollout's key
     trained = True
 
-    def __init__(self, scenario: Scenario, weights: Path | str | None = None, temperature: float = 1.0) -> None:
+    def __init__(
+        self, scenario: Scenario, weights: Path | str | None = None, temperature: float = 1.0
+    ) -> None:
         from policies.learned_net import knot_weights, load_net, path_grid  # imports torch
 
         if not (np.isfinite(temperature) and temperature >= 0):
-            raise InputError("making the policy 'learned'", "temperature", f"{temperature}", "give 0 or a positive number")
+            raise InputError(
+                "making the policy 'learned'",
+                "temperature",
+                f"{temperature}",
+                "give 0 or a positive number",
+            )
         self.camera = front_camera(scenario, "learned")
         self.sensors: Sequence[SensorSpec] = (SensorSpec(self.camera.name),)
         self.scene_id, self.temperature = scenario.scene_id, float(temperature)
@@ -86,13 +99,26 @@ class Learned(Policy):
         self.step, self.acted_us = self.step + 1, observation.t_us
         lateral_m, share = self.temperature * np.minimum(sigma, [MAX_SIGMA_M, MAX_SIGMA_SPEED])
         drawn = np.concatenate([np.zeros((1, 2)), self.noise * [1.0, share / NOISE_SPEED]])
-        plans = sampled(xy, yaw, drawn, float(lateral_m))[1:] if self.temperature else [np.column_stack([xy, yaw])] * N_SAMPLES
+        plans = (
+            sampled(xy, yaw, drawn, float(lateral_m))[1:]
+            if self.temperature
+            else [np.column_stack([xy, yaw])] * N_SAMPLES
+        )
         debug: dict[str, Any] = {"command": command, "desired_mps": self.desired_mps}
         debug.update(sigma_m=float(sigma[0]), sigma_speed=float(sigma[1]))
-        return Plan(observation.t_us, times, plans[0][:, :2].copy(), plans[0][:, 2].copy(), tuple(plans[1:]), debug)
+        return Plan(
+            observation.t_us,
+            times,
+            plans[0][:, :2].copy(),
+            plans[0][:, 2].copy(),
+            tuple(plans[1:]),
+            debug,
+        )
 
     def _predict(self, speed_mps: float, command: str) -> tuple[F64, F64, F64]:
-        """Return headings at the knots ``(9,)``, changes of speed ``(8,)`` and the standard deviations ``(2,)``."""
+        """Return headings at the knots ``(9,)``, changes of speed ``(8,)`` and the standard
+        deviations ``(2,)``.
+        """
         import torch
 
         from policies.learned_net import SPEED_UNIT_MPS
@@ -104,30 +130,50 @@ class Learned(Policy):
         state = [speed_mps / SPEED_UNIT_MPS, self.desired_mps / SPEED_UNIT_MPS, float(real)]
         threads = torch.get_num_threads()
         if threads != 1:
-            torch.set_num_threads(1)  # the order of summation in a convolution depends on the thread count
+            torch.set_num_threads(
+                1
+            )  # the order of summation in a convolution depends on the thread count
         try:
             with torch.inference_mode():
                 image = torch.from_numpy(network_input(now, earlier[1] if real else now))[None]
-                prediction = self.net(image, torch.tensor([state]), torch.tensor([COMMANDS.index(command)]))
+                prediction = self.net(
+                    image, torch.tensor([state]), torch.tensor([COMMANDS.index(command)])
+                )
         finally:
             if threads != 1:
                 torch.set_num_threads(threads)
-        heading, speed_change, sigma = (part[0].double().numpy() for part in (prediction.heading, prediction.speed, prediction.sigma))
+        heading, speed_change, sigma = (
+            part[0].double().numpy()
+            for part in (prediction.heading, prediction.speed, prediction.sigma)
+        )
         return heading, speed_change, sigma
 
     def _mean(self, heading: F64, speed_change: F64, speed_mps: float, t_s: F64) -> tuple[F64, F64]:
-        """Return positions ``(T, 2)`` and headings ``(T,)`` at times ``(T,)`` of the mean prediction."""
+        """Return positions ``(T, 2)`` and headings ``(T,)`` at times ``(T,)`` of the mean
+        prediction.
+        """
         from policies.learned_net import TIMES_S
 
-        speeds = np.maximum(np.interp(t_s, [0.0, *TIMES_S], speed_mps + np.array([0.0, *speed_change])), 0.0)
+        speeds = np.maximum(
+            np.interp(t_s, [0.0, *TIMES_S], speed_mps + np.array([0.0, *speed_change])), 0.0
+        )
         speeds[speeds < STANDS_MPS * min(1.0, speed_mps)] = 0.0
-        progress = np.concatenate([[0.0], np.cumsum(0.5 * (speeds[1:] + speeds[:-1]) * np.diff(t_s))])
+        progress = np.concatenate(
+            [[0.0], np.cumsum(0.5 * (speeds[1:] + speeds[:-1]) * np.diff(t_s))]
+        )
         yaw = self.weights @ heading
         middle = 0.5 * (yaw[1:] + yaw[:-1])
-        xy = np.concatenate([np.zeros((1, 2)), np.cumsum(np.stack([np.cos(middle), np.sin(middle)], axis=1), axis=0)])
+        xy = np.concatenate(
+            [
+                np.zeros((1, 2)),
+                np.cumsum(np.stack([np.cos(middle), np.sin(middle)], axis=1), axis=0),
+            ]
+        )
         over = np.maximum(progress - self.grid_m[-1], 0.0)  # straight beyond the last knot
         at = [np.interp(progress, self.grid_m, column) for column in (xy[:, 0], xy[:, 1], yaw)]
-        return np.stack([at[0] + over * np.cos(yaw[-1]), at[1] + over * np.sin(yaw[-1])], axis=1), at[2]
+        return np.stack(
+            [at[0] + over * np.cos(yaw[-1]), at[1] + over * np.sin(yaw[-1])], axis=1
+        ), at[2]
 
 
 class LearnedMean(Learned):

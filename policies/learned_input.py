@@ -1,4 +1,6 @@
-"""Navigation command of the learned policy: one of five, computed from the shape of the route ahead."""
+"""Navigation command of the learned policy: one of five, computed from the shape of the route
+ahead.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,9 @@ AHEAD_M, NOW_M = 40.0, 6.0
 def route_command(route_rig: F64, late_m: float = 0.0) -> Command:
     """Return the command for a route ahead ``(20, 3)`` in the rig frame, NaN where it ends.
 
-    A turn is a stretch of two route segments on which the route bends tighter than `TURN_RADIUS_M`. The nearest one within `AHEAD_M` is
-    announced, with "now" from `NOW_M` before it. The command does not depend on the route's lateral position in the lane.
+    A turn is a stretch of two route segments on which the route bends tighter than `TURN_RADIUS_M`.
+    The nearest one within `AHEAD_M` is announced, with "now" from `NOW_M` before it. The command
+    does not depend on the route's lateral position in the lane.
 
     Args:
         route_rig: As in `Observation`.
@@ -33,7 +36,9 @@ def route_command(route_rig: F64, late_m: float = 0.0) -> Command:
     step = np.diff(points, axis=0)
     heading = np.arctan2(step[:, 1], step[:, 0])
     length = np.hypot(step[:, 0], step[:, 1])
-    bend = wrap_angle(heading[2:] - heading[:-2]) / np.maximum(0.5 * (length[2:] + length[:-2]) + length[1:-1], 1e-6)
+    bend = wrap_angle(heading[2:] - heading[:-2]) / np.maximum(
+        0.5 * (length[2:] + length[:-2]) + length[1:-1], 1e-6
+    )
     begins_m = np.cumsum(length)[:-2] + late_m
     turns = np.flatnonzero((np.abs(bend) > 1.0 / TURN_RADIUS_M) & (begins_m < AHEAD_M))
     if len(turns) == 0:
@@ -59,8 +64,8 @@ _GREY = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 def view_homography(camera: CameraSpec, yaw_rad: float = 0.0) -> F64:
     """Return the homography ``(3, 3)`` from pixels of the view to pixels of the camera.
 
-    The view is level along the rig's x axis, rotated to the left by ``yaw_rad``, at the camera's position: a pure rotation, so no depth is
-    needed.
+    The view is level along the rig's x axis, rotated to the left by ``yaw_rad``, at the camera's
+    position: a pure rotation, so no depth is needed.
     """
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -78,11 +83,18 @@ def level_view(rgb: U8, camera: CameraSpec, yaw_rad: float = 0.0) -> U8:
     if shrink > 1:
         size = (rgb.shape[1] // shrink, rgb.shape[0] // shrink)
         scale = np.diag([size[0] / rgb.shape[1], size[1] / rgb.shape[0], 1.0])
-        centre = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # pixel centres lie at halves
+        centre = np.array(
+            [[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]]
+        )  # pixel centres lie at halves
         rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         to_camera = np.linalg.inv(centre) @ scale @ centre @ to_camera
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpPerspective(rgb, to_camera, (WIDTH, HEIGHT), flags=flags, borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
+    return np.asarray(
+        cv2.warpPerspective(
+            rgb, to_camera, (WIDTH, HEIGHT), flags=flags, borderMode=cv2.BORDER_REPLICATE
+        ),
+        dtype=np.uint8,
+    )
 
 
 def network_input(now: U8, before: U8) -> F32:

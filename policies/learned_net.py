@@ -1,4 +1,6 @@
-"""The learned policy's network: image, two speeds and a command to a path and a speed profile, with heteroscedastic sigma."""
+"""The learned policy's network: image, two speeds and a command to a path and a speed profile, with
+heteroscedastic sigma.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,17 @@ from alpasim_plugin.core.reading import check_regular, parsing
 from alpasim_plugin.core.types import F64
 from policies.learned_input import CHANNELS, COMMANDS, HEIGHT, WIDTH
 
-KNOTS_M = (2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0, 42.0, 60.0)  # distances along the path of the predicted headings
+KNOTS_M = (
+    2.0,
+    4.0,
+    7.0,
+    11.0,
+    16.0,
+    22.0,
+    30.0,
+    42.0,
+    60.0,
+)  # distances along the path of the predicted headings
 TIMES_S = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)  # times of the predicted speeds
 STATES = 3  # speed and desired speed in `SPEED_UNIT_MPS`; 1 if there is an earlier frame, else 0
 SPEED_UNIT_MPS = 15.0
@@ -35,28 +47,45 @@ class Prediction:
 
     heading: Tensor  # (B, 9) radians to the left of the rig's x axis at `KNOTS_M`
     speed: Tensor  # (B, 8) change of speed until `TIMES_S`, metres per second
-    sigma: Tensor  # (B, 2) standard deviations: to the side 16 m ahead, metres; of the mean speed over the plan, as a share
-    leader: Tensor  # (B, 2) proximity of the leader, exp(-gap / 20 m), and its speed, metres per second; auxiliary
+    # (B, 2) standard deviations: to the side 16 m ahead, metres; of the mean speed over the plan,
+    # as a share
+    sigma: Tensor
+    # (B, 2) proximity of the leader, exp(-gap / 20 m), and its speed, metres per second; auxiliary
+    leader: Tensor
 
 
 class LearnedNet(nn.Module):
-    """Six convolutions over the image, then two fully connected layers with speeds and command; attribute names are checkpoint keys."""
+    """Six convolutions over the image, then two fully connected layers with speeds and command;
+    attribute names are checkpoint keys.
+    """
 
     def __init__(self, seed: int = 0) -> None:
         super().__init__()
         self.see = nn.Sequential(
-            nn.Conv2d(CHANNELS, 16, 5, 2, 2), nn.ReLU(),
-            nn.Conv2d(16, 32, 3, 2, 1), nn.GroupNorm(4, 32), nn.ReLU(),
-            nn.Conv2d(32, 48, 3, 2, 1), nn.GroupNorm(6, 48), nn.ReLU(),
-            nn.Conv2d(48, 64, 3, 1, 1), nn.GroupNorm(8, 64), nn.ReLU(),
-            nn.Conv2d(64, 96, 3, 2, 1), nn.GroupNorm(12, 96), nn.ReLU(),
-            nn.Conv2d(96, 24, 1), nn.ReLU(),
+            nn.Conv2d(CHANNELS, 16, 5, 2, 2),
+            nn.ReLU(),
+            nn.Conv2d(16, 32, 3, 2, 1),
+            nn.GroupNorm(4, 32),
+            nn.ReLU(),
+            nn.Conv2d(32, 48, 3, 2, 1),
+            nn.GroupNorm(6, 48),
+            nn.ReLU(),
+            nn.Conv2d(48, 64, 3, 1, 1),
+            nn.GroupNorm(8, 64),
+            nn.ReLU(),
+            nn.Conv2d(64, 96, 3, 2, 1),
+            nn.GroupNorm(12, 96),
+            nn.ReLU(),
+            nn.Conv2d(96, 24, 1),
+            nn.ReLU(),
             nn.Flatten(),
-        )  # fmt: skip
+        )
         self.word = nn.Embedding(len(COMMANDS), 16)
         self.state = nn.Sequential(nn.Linear(STATES, 32), nn.ReLU())
         features = 24 * (HEIGHT // 16) * (WIDTH // 16)
-        self.plan = nn.Sequential(nn.Linear(features + 16 + 32, 160), nn.ReLU(), nn.Linear(160, 128), nn.ReLU())
+        self.plan = nn.Sequential(
+            nn.Linear(features + 16 + 32, 160), nn.ReLU(), nn.Linear(160, 128), nn.ReLU()
+        )
         self.out = nn.Linear(128, sum(_PARTS))
         self._init_weights(torch.Generator().manual_seed(seed))
         self.register_buffer("knot_scale", torch.tensor(_KNOT_SCALE), persistent=False)
@@ -75,7 +104,9 @@ class LearnedNet(nn.Module):
         nn.init.zeros_(self.out.bias)
 
     def forward(self, image: Tensor, state: Tensor, command: Tensor) -> Prediction:
-        """Predict from images ``(B, 4, 80, 192)``, states ``(B, 3)`` and indices of commands ``(B,)``."""
+        """Predict from images ``(B, 4, 80, 192)``, states ``(B, 3)`` and indices of commands
+        ``(B,)``.
+        """
         features = torch.cat([self.see(image), self.state(state), self.word(command)], dim=1)
         heading, speed, sigma, leader = self.out(self.plan(features)).split(_PARTS, dim=1)
         sigma = _MIN_SIGMA + 0.1 * torch.exp(sigma.clamp(-4.0, 3.0))
@@ -84,18 +115,24 @@ class LearnedNet(nn.Module):
 
 
 def path_grid() -> F64:
-    """Return the distances ``(G,)`` along the path of its points: every metre from 0 to the last knot."""
+    """Return the distances ``(G,)`` along the path of its points: every metre from 0 to the last
+    knot.
+    """
     return np.arange(0.0, KNOTS_M[-1] + 0.5 * GRID_M, GRID_M)
 
 
 def knot_weights() -> F64:
-    """Return the interpolation matrix ``(G, 9)`` from headings at the knots to headings on `path_grid`: linear, 0 at the car."""
+    """Return the interpolation matrix ``(G, 9)`` from headings at the knots to headings on
+    `path_grid`: linear, 0 at the car.
+    """
     knots = np.array((0.0, *KNOTS_M))
     return np.stack([np.interp(path_grid(), knots, row) for row in np.eye(len(knots))[1:]], axis=1)
 
 
 def integrate_path(heading: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return points ``(B, G, 2)`` and headings ``(B, G)`` of paths with headings ``(B, 9)`` at the knots, in metres and radians."""
+    """Return points ``(B, G, 2)`` and headings ``(B, G)`` of paths with headings ``(B, 9)`` at the
+    knots, in metres and radians.
+    """
     yaw = heading @ weights.T
     middle = 0.5 * (yaw[:, 1:] + yaw[:, :-1])
     steps = GRID_M * torch.stack([torch.cos(middle), torch.sin(middle)], dim=-1)
@@ -104,7 +141,9 @@ def integrate_path(heading: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 
 def save_net(net: LearnedNet, path: Path, metadata: dict[str, str]) -> None:
     """Write the weights in float16."""
-    write_safetensors(path, {name: value.half() for name, value in net.state_dict().items()}, metadata)
+    write_safetensors(
+        path, {name: value.half() for name, value in net.state_dict().items()}, metadata
+    )
 
 
 def load_net(path: Path) -> LearnedNet:
@@ -121,8 +160,12 @@ def load_net(path: Path) -> LearnedNet:
         state = load_file(str(path))
     found = {name: tuple(value.shape) for name, value in state.items()}
     if found != wanted:
-        odd = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
+        odd = sorted(
+            name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name)
+        )
         text = f"{len(odd)} tensors that are missing, foreign or of another shape, first {odd[0]}"
-        raise InputError(doing, str(path), text, "give weights that 'simrun train policy' of this version wrote")
+        raise InputError(
+            doing, str(path), text, "give weights that 'simrun train policy' of this version wrote"
+        )
     net.load_state_dict({name: value.float() for name, value in state.items()})
     return net.eval().requires_grad_(False)

@@ -1,8 +1,10 @@
-"""Obstacles from pixels: regions in front of the car that do not look like the road, from their ground contact up.
+"""Obstacles from pixels: regions in front of the car that do not look like the road, from their
+ground contact up.
 
-An obstacle of height ``H`` at distance ``d`` from a camera of height ``h`` hides the ground behind it up to ``d h / (h - H)``. On the
-ground grid it is therefore a long patch that starts at its foot (the ground contact point); paint, a shadow or new asphalt makes a short
-one. The foot gives the distance by the ground plane.
+An obstacle of height ``H`` at distance ``d`` from a camera of height ``h`` hides the ground behind
+it up to ``d h / (h - H)``. On the ground grid it is therefore a long patch that starts at its foot
+(the ground contact point); paint, a shadow or new asphalt makes a short one. The foot gives the
+distance by the ground plane.
 """
 
 from __future__ import annotations
@@ -18,14 +20,20 @@ from policies.road_vision import CELL_M, GroundGrid
 
 STRIPS = 4
 CORRIDOR_HALF_M = 1.05  # half the ego's width: what stands outside can be passed
-EDGES_M = np.linspace(CORRIDOR_HALF_M, -CORRIDOR_HALF_M, STRIPS + 1)  # of the strips, to the left of the path
+EDGES_M = np.linspace(
+    CORRIDOR_HALF_M, -CORRIDOR_HALF_M, STRIPS + 1
+)  # of the strips, to the left of the path
 TALL = 0.8  # how high to look, as a share of the camera's height
 LOW = 0.35  # the least share required where a curve ends the line of sight
 LEAVE_LANE_M = 2.6
 NARROW_M, WIDE_M = 0.35, 0.8  # thinner patches are paint: lines, and the bars of a crosswalk
-ROAD_NEAR_M, ROAD_FAR_M, ROAD_HALF_M = 5.5, 12.0, 0.9
+ROAD_NEAR_M = 5.5
+ROAD_FAR_M = 12.0
+ROAD_HALF_M = 0.9
 LEARN = 0.1
-FILLED, FILLED_TOP, CLEAR = 0.7, 0.55, 0.35
+FILLED = 0.7
+FILLED_TOP = 0.55
+CLEAR = 0.35
 
 
 @dataclass(frozen=True)
@@ -36,8 +44,11 @@ class RoadColour:
     tolerance: F64  # (3,)
 
 
-def learn_road(colour: RoadColour | None, lab: U8, grid: GroundGrid, centre_y: F64, free_to_m: float) -> RoadColour | None:
-    """Refine the road's colour from the patch in front of the car, as far as it is known to be free.
+def learn_road(
+    colour: RoadColour | None, lab: U8, grid: GroundGrid, centre_y: F64, free_to_m: float
+) -> RoadColour | None:
+    """Refine the road's colour from the patch in front of the car, as far as it is known to be
+    free.
 
     Args:
         colour: Current estimate.
@@ -46,10 +57,15 @@ def learn_road(colour: RoadColour | None, lab: U8, grid: GroundGrid, centre_y: F
         centre_y: ``(R,)`` lateral position of the ego's path.
         free_to_m: Nothing stands nearer than this.
     """
-    rows = np.flatnonzero((grid.x_m >= ROAD_NEAR_M) & (grid.x_m <= min(ROAD_FAR_M, free_to_m - 2.0)))
+    rows = np.flatnonzero(
+        (grid.x_m >= ROAD_NEAR_M) & (grid.x_m <= min(ROAD_FAR_M, free_to_m - 2.0))
+    )
     if len(rows) < 3:
         return colour
-    columns = grid.column_of(centre_y[rows])[:, None] + np.arange(-ROAD_HALF_M, ROAD_HALF_M, 2 * CELL_M) / CELL_M
+    columns = (
+        grid.column_of(centre_y[rows])[:, None]
+        + np.arange(-ROAD_HALF_M, ROAD_HALF_M, 2 * CELL_M) / CELL_M
+    )
     index = np.minimum(np.maximum(np.rint(columns).astype(np.intp), 0), lab.shape[1] - 1)
     patch = lab[rows[:, None], index].reshape(-1, 3).astype(np.float64)
     patch = patch[grid.inside[rows[:, None], index].reshape(-1)]
@@ -62,26 +78,37 @@ def learn_road(colour: RoadColour | None, lab: U8, grid: GroundGrid, centre_y: F
         return new
     # A sudden change is more likely an obstacle than a new road surface: adapt slowly.
     step = np.clip(new.centre - colour.centre, -20.0, 20.0)
-    return RoadColour(colour.centre + LEARN * step, colour.tolerance + LEARN * (new.tolerance - colour.tolerance))
+    return RoadColour(
+        colour.centre + LEARN * step, colour.tolerance + LEARN * (new.tolerance - colour.tolerance)
+    )
 
 
 def anomaly(lab: U8, colour: RoadColour, grid: GroundGrid) -> U8:
-    """Return 0..255 per cell ``(R, C)``: how far its colour is from the road's, by the worst channel."""
+    """Return 0..255 per cell ``(R, C)``: how far its colour is from the road's, by the worst
+    channel.
+    """
     level = np.arange(256, dtype=np.float64)[:, None]
     away = np.abs(level - colour.centre) / colour.tolerance
     table = (255 * np.clip((away - 0.7) / 0.6, 0.0, 1.0)).astype(np.uint8)
-    light, a, b = (cv2.LUT(channel, column) for channel, column in zip(cv2.split(lab), np.ascontiguousarray(table.T), strict=True))
+    light, a, b = (
+        cv2.LUT(channel, column)
+        for channel, column in zip(cv2.split(lab), np.ascontiguousarray(table.T), strict=True)
+    )
     return np.asarray(cv2.max(light, cv2.max(a, b)) * grid.inside.view(np.uint8))
 
 
-def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_m: float) -> tuple[float, float] | None:
-    """Return (distance, its standard deviation) of the nearest obstacle in the corridor along ``centre_y`` (R,), or None.
+def find_foot(
+    value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_m: float
+) -> tuple[float, float] | None:
+    """Return (distance, its standard deviation) of the nearest obstacle in the corridor along
+    ``centre_y`` (R,), or None.
 
-    The corridor is cut into strips. In each, a row is a foot if the ground in front of it is clear and what lies behind it on the
-    camera's line of sight is filled, up to where an obstacle of `TALL` times the camera's height would hide the ground: a crosswalk does
-    not reach that far, so the furthest quarter must be filled as well. In a curve the line of sight leaves the lane, and what is seen
-    there is not evidence; such a row must be filled by something wider than the bars of a crosswalk, and it is no candidate where even
-    an object of `LOW` could not be detected.
+    The corridor is cut into strips. In each, a row is a foot if the ground in front of it is clear
+    and what lies behind it on the camera's line of sight is filled, up to where an obstacle of
+    `TALL` times the camera's height would hide the ground: a crosswalk does not reach that far, so
+    the furthest quarter must be filled as well. In a curve the line of sight leaves the lane, and
+    what is seen there is not evidence; such a row must be filled by something wider than the bars
+    of a crosswalk, and it is no candidate where even an object of `LOW` could not be detected.
 
     Args:
         value: `anomaly` of the frame.
@@ -95,9 +122,12 @@ def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_
     rows = np.arange(len(distance))
     full = np.searchsorted(distance, distance / (1 - TALL))
     least = np.searchsorted(distance, distance / (1 - LOW))
-    # Where the line of sight through each strip at row i leaves the lane, at a later row k: in a curve, and to the sides.
+    # Where the line of sight through each strip at row i leaves the lane, at a later row k: in a
+    # curve, and to the sides.
     middle = centre_y[:, None] + 0.5 * (EDGES_M[1:] + EDGES_M[:-1]) - grid.camera_y
-    sight = middle[:, :, None] * (distance / distance[:, None, None])  # (R, STRIPS, R); in place from here on, as it is large
+    sight = middle[:, :, None] * (
+        distance / distance[:, None, None]
+    )  # (R, STRIPS, R); in place from here on, as it is large
     sight += grid.camera_y
     sight -= centre_y
     has_left = np.abs(sight, out=sight) > LEAVE_LANE_M
@@ -105,14 +135,18 @@ def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_
     left_at = np.argmax(has_left, axis=2)  # 0: nowhere, as no row is later than itself
     last = np.minimum(full[:, None], np.where(left_at > 0, left_at, len(rows)))
     candidate = ((grid.x_m >= min_x_m) & (grid.x_m <= max_x_m))[:, None]
-    usable = candidate & (last >= np.minimum(least, len(rows))[:, None]) & (last - rows[:, None] >= 3)
+    usable = (
+        candidate & (last >= np.minimum(least, len(rows))[:, None]) & (last - rows[:, None] >= 3)
+    )
     u = np.rint(grid.sight_column(centre_y[:, None] + EDGES_M, rows)).astype(np.intp)
     u = np.minimum(np.maximum(u, 0), grid.sight_index.shape[1])
     begin = rows[:, None]
     narrow, in_curve = _sums_along_sight(value, NARROW_M, grid), last < full[:, None]
     filled = _box_mean(narrow, begin, last, u)
     if (in_curve & usable).any():
-        filled = np.where(in_curve, _box_mean(_sums_along_sight(value, WIDE_M, grid), begin, last, u), filled)
+        filled = np.where(
+            in_curve, _box_mean(_sums_along_sight(value, WIDE_M, grid), begin, last, u), filled
+        )
     hit = (filled > FILLED) & usable
     if not hit.any():
         return None
@@ -124,7 +158,8 @@ def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_
         return None
     first = int(np.argmax(hit.any(axis=1)))
     strips = np.flatnonzero(hit[first])
-    # A box that is mostly filled may begin before the obstacle does: the foot is where its rows become anomalous.
+    # A box that is mostly filled may begin before the obstacle does: the foot is where its rows
+    # become anomalous.
     behind = np.arange(first, int(last[first, strips].max()))[:, None]
     level = _box_mean(narrow, behind, behind + 1, u[first : first + 1])[:, strips].mean(axis=1)
     i = first + int(np.argmax(level > 0.5))
@@ -132,15 +167,20 @@ def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_
 
 
 def _sums_along_sight(value: U8, width_m: float, grid: GroundGrid) -> F64:
-    """Return the integral image ``(R + 1, U + 1)``, over grid rows and image columns, of the anomaly in 0..1 that is at least so wide."""
+    """Return the integral image ``(R + 1, U + 1)``, over grid rows and image columns, of the
+    anomaly in 0..1 that is at least so wide.
+    """
     bar = np.ones((1, round(width_m / CELL_M) | 1), dtype=np.uint8)
     seen = np.take(cv2.morphologyEx(value, cv2.MORPH_OPEN, bar), grid.sight_index)
     table = cv2.integral(seen, sdepth=cv2.CV_64F)
     return np.asarray(np.divide(table, 255.0, out=table))
 
 
-def _box_mean(table: F64, first: npt.NDArray[np.intp], last: npt.NDArray[np.intp], u: npt.NDArray[np.intp]) -> F64:
-    """Return the means ``(N, STRIPS)`` over rows first..last-1 and columns between neighbouring edges ``u``.
+def _box_mean(
+    table: F64, first: npt.NDArray[np.intp], last: npt.NDArray[np.intp], u: npt.NDArray[np.intp]
+) -> F64:
+    """Return the means ``(N, STRIPS)`` over rows first..last-1 and columns between neighbouring
+    edges ``u``.
 
     Args:
         table: From `_sums_along_sight`.
@@ -152,7 +192,9 @@ def _box_mean(table: F64, first: npt.NDArray[np.intp], last: npt.NDArray[np.intp
     left = u[:, :-1]
     right = np.minimum(np.maximum(u[:, 1:], left + 1), width - 1)
     a, b = first * width, last * width
-    total = table.take(b + right) - table.take(a + right) - table.take(b + left) + table.take(a + left)
+    total = (
+        table.take(b + right) - table.take(a + right) - table.take(b + left) + table.take(a + left)
+    )
     return np.asarray(total / np.maximum((last - first) * (right - left), 1))
 
 
@@ -173,11 +215,17 @@ class ObstacleTrack:
 
 
 def track_obstacle(
-    track: ObstacleTrack | None, foot: tuple[float, float] | None, ego_mps: float, dt_s: float, nearest_m: float = 0.0
+    track: ObstacleTrack | None,
+    foot: tuple[float, float] | None,
+    ego_mps: float,
+    dt_s: float,
+    nearest_m: float = 0.0,
 ) -> ObstacleTrack | None:
-    """Predict the track over ``dt_s`` and correct it by a new detection; None where there is no obstacle.
+    """Predict the track over ``dt_s`` and correct it by a new detection; None where there is no
+    obstacle.
 
-    A foot at ``nearest_m``, the lower edge of the image, may be nearer than that: it confirms a track that says so.
+    A foot at ``nearest_m``, the lower edge of the image, may be nearer than that: it confirms a
+    track that says so.
     """
     if track is not None:
         transition = np.array([[1.0, dt_s], [0.0, 1.0]])
@@ -195,12 +243,22 @@ def track_obstacle(
     measured, sigma = foot
     if track is not None and measured <= nearest_m + 0.1 and track.distance_m < measured:
         return replace(track, hits=track.hits + 1, misses=0)
-    if track is None or abs(measured - track.distance_m) > 4.0 * np.sqrt(track.cov[0, 0] + sigma**2) + 2.0:
-        # Nothing is known of its speed: as fast as the ego, give or take 5 m/s, until it is watched.
-        return ObstacleTrack(measured, 0.6 * ego_mps, np.diag([sigma**2, (2.0 + 0.4 * ego_mps) ** 2]))
+    if (
+        track is None
+        or abs(measured - track.distance_m) > 4.0 * np.sqrt(track.cov[0, 0] + sigma**2) + 2.0
+    ):
+        # Nothing is known of its speed: as fast as the ego, give or take 5 m/s, until it is
+        # watched.
+        return ObstacleTrack(
+            measured, 0.6 * ego_mps, np.diag([sigma**2, (2.0 + 0.4 * ego_mps) ** 2])
+        )
     gain = track.cov[:, 0] / (track.cov[0, 0] + sigma**2)
     surprise = measured - track.distance_m
     cov = track.cov - np.outer(gain, track.cov[0])
     return ObstacleTrack(
-        track.distance_m + float(gain[0]) * surprise, max(track.speed_mps + float(gain[1]) * surprise, -2.0), cov, track.hits + 1, 0
+        track.distance_m + float(gain[0]) * surprise,
+        max(track.speed_mps + float(gain[1]) * surprise, -2.0),
+        cov,
+        track.hits + 1,
+        0,
     )

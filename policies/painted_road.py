@@ -57,7 +57,9 @@ class Patch:
 
 @dataclass(frozen=True)
 class Block:
-    """A cuboid on the road; its face towards the ego is darker and stands on a dark edge, as cars do."""
+    """A cuboid on the road; its face towards the ego is darker and stands on a dark edge, as cars
+    do.
+    """
 
     s_m: float  # of its centre
     offset_m: float = 0.0
@@ -67,7 +69,9 @@ class Block:
 
 @dataclass(frozen=True)
 class PaintedRoad:
-    """A road of constant curvature through the world's origin, where its ego lane runs along x; grass and sky around it."""
+    """A road of constant curvature through the world's origin, where its ego lane runs along x;
+    grass and sky around it.
+    """
 
     curvature_1pm: float = 0.0  # left positive
     lines: tuple[Line, ...] = (Line(1.75, dashed=True), Line(-1.75), Line(5.25, colour=YELLOW))
@@ -81,12 +85,18 @@ class PaintedRoad:
     sky: Colour = (170, 195, 225)
 
     def pose(self, s_m: float, offset_m: float = 0.0, yaw_rad: float = 0.0) -> F64:
-        """Return the pose ``(4, 4)`` at arc length s of the ego lane, ``offset_m`` to its left and turned by ``yaw_rad`` from it."""
+        """Return the pose ``(4, 4)`` at arc length s of the ego lane, ``offset_m`` to its left and
+        turned by ``yaw_rad`` from it.
+        """
         k = self.curvature_1pm
         angle = k * s_m
         x = s_m if k == 0 else float(np.sin(angle)) / k
         y = 0.0 if k == 0 else (1 - float(np.cos(angle))) / k
-        return se2(x - offset_m * float(np.sin(angle)), y + offset_m * float(np.cos(angle)), angle + yaw_rad)
+        return se2(
+            x - offset_m * float(np.sin(angle)),
+            y + offset_m * float(np.cos(angle)),
+            angle + yaw_rad,
+        )
 
     def coordinates(self, x_m: F64, y_m: F64) -> tuple[F64, F64]:
         """Return arc length and offset to the left of world points."""
@@ -97,7 +107,9 @@ class PaintedRoad:
         angle = np.arctan2(x_m * sign, (1 / k - y_m) * sign)
         return np.asarray(angle / k * sign), np.asarray(sign * (abs(1 / k) - radius))
 
-    def image(self, camera: CameraSpec, T_world_rig: F64, seed: int = 0, supersample: int = 2) -> U8:
+    def image(
+        self, camera: CameraSpec, T_world_rig: F64, seed: int = 0, supersample: int = 2
+    ) -> U8:
         """Draw the road ``(H, W, 3)`` as the camera sees it from a rig pose."""
         n = supersample
         T = T_world_rig @ camera.T_rig_camera
@@ -106,12 +118,17 @@ class PaintedRoad:
         v = (np.arange(camera.height * n) + 0.5) / n
         # A ray is linear in the pixel: one outer sum per axis.
         across, down = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
-        ray = [rotation[i, 0] * across[None, :] + (rotation[i, 1] * down + rotation[i, 2])[:, None] for i in range(3)]
+        ray = [
+            rotation[i, 0] * across[None, :] + (rotation[i, 1] * down + rotation[i, 2])[:, None]
+            for i in range(3)
+        ]
         image = np.empty((len(v), len(u), 3), dtype=np.float32)
         image[:] = self.sky
         ground = ray[2] < -T[2, 3] / 400.0
         depth = -T[2, 3] / ray[2][ground]
-        s, offset = self.coordinates(T[0, 3] + depth * ray[0][ground], T[1, 3] + depth * ray[1][ground])
+        s, offset = self.coordinates(
+            T[0, 3] + depth * ray[0][ground], T[1, 3] + depth * ray[1][ground]
+        )
         image[ground] = self._colours(s, offset)
         for block in sorted(self.blocks, key=lambda b: -b.s_m):
             self._draw(image, K, T, block, n)
@@ -132,14 +149,24 @@ class PaintedRoad:
             index[paint] = len(paints)
             paints.append(line.colour)
         for patch in self.patches:
-            inside = (s_m > patch.s_m[0]) & (s_m < patch.s_m[1]) & (offset_m > patch.offset_m[0]) & (offset_m < patch.offset_m[1])
+            inside = (
+                (s_m > patch.s_m[0])
+                & (s_m < patch.s_m[1])
+                & (offset_m > patch.offset_m[0])
+                & (offset_m < patch.offset_m[1])
+            )
             index[on_road & inside] = len(paints)
             paints.append(patch.colour)
         return np.asarray(np.array(paints, dtype=np.float32)[index])
 
     def _draw(self, image: F32, K: F64, T_world_camera: F64, block: Block, n: int) -> None:
         length, width, height = block.size_m
-        ends = [(sx * length / 2, sy * width / 2, z, 1.0) for sx in (-1, 1) for z in (0.0, height) for sy in (-1, 1)]
+        ends = [
+            (sx * length / 2, sy * width / 2, z, 1.0)
+            for sx in (-1, 1)
+            for z in (0.0, height)
+            for sy in (-1, 1)
+        ]
         T = inverse(T_world_camera) @ self.pose(block.s_m, block.offset_m)
         corners = (T @ np.array(ends).T).T[:, :3]
         if (corners[:, 2] < 0.2).all():

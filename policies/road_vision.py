@@ -1,4 +1,6 @@
-"""The road in a frame: a fixed grid of ground points with their pixels (inverse perspective mapping), and points of lane markings on it."""
+"""The road in a frame: a fixed grid of ground points with their pixels (inverse perspective
+mapping), and points of lane markings on it.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +24,11 @@ MAX_ROWS = 72
 
 @dataclass(frozen=True)
 class GroundGrid:
-    """Rows across the road, about one per image row, so that no image row is read twice and none is skipped.
+    """Rows across the road, about one per image row, so that no image row is read twice and none is
+    skipped.
 
-    The ground is the plane z = 0 of the rig. ``x_m`` grows with the row index, ``y_m`` falls with the column index (left to right as in
-    the image).
+    The ground is the plane z = 0 of the rig. ``x_m`` grows with the row index, ``y_m`` falls with
+    the column index (left to right as in the image).
     """
 
     x_m: F64  # (R,) metres, rig
@@ -35,19 +38,36 @@ class GroundGrid:
     inside: Bool  # (R, C) the point is in the image
     pixel_m: F64  # (R,) width of one pixel on the ground
     row_m: F64  # (R,) length of one grid row along the road
-    camera_xz: tuple[float, float]  # metres, rig: where along the rig the camera stands, and how high
+    camera_xz: tuple[
+        float, float
+    ]  # metres, rig: where along the rig the camera stands, and how high
     camera_y: float  # metres, rig
     focal_px: float
-    sight_index: npt.NDArray[np.intp]  # (R, U) cell of the grid, counted row by row, that image column u sees on each row
+    sight_index: npt.NDArray[
+        np.intp
+    ]  # (R, U) cell of the grid, counted row by row, that image column u sees on each row
 
     def warp(self, image: U8) -> U8:
         """Return the image over the grid ``(R, C, 3)`` or ``(R, C)``; 0 outside the image."""
-        return np.asarray(cv2.remap(image, self.map_u, self.map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
+        return np.asarray(
+            cv2.remap(
+                image,
+                self.map_u,
+                self.map_v,
+                cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_CONSTANT,
+                borderValue=0,
+            )
+        )
 
     def sight_column(self, y_m: F64, rows: npt.NDArray[np.intp]) -> F64:
-        """Return the image columns ``(N, K)``, counted from the middle of `sight_index`, of lateral positions (N, K) on rows (N,)."""
+        """Return the image columns ``(N, K)``, counted from the middle of `sight_index`, of lateral
+        positions (N, K) on rows (N,).
+        """
         distance = (self.x_m - self.camera_xz[0])[rows][:, None]
-        return np.asarray(self.sight_index.shape[1] / 2 - (y_m - self.camera_y) / distance * self.focal_px)
+        return np.asarray(
+            self.sight_index.shape[1] / 2 - (y_m - self.camera_y) / distance * self.focal_px
+        )
 
     def column_of(self, y_m: F64) -> F64:
         """Return fractional columns of lateral positions; may lie outside the grid."""
@@ -58,13 +78,16 @@ def make_grid(camera: CameraSpec) -> GroundGrid:
     """Lay the grid for a camera.
 
     Raises:
-        PolicyError: The camera does not see the ground between `NEAR_M` and `FAR_M` in front of the rear axle.
+        PolicyError: The camera does not see the ground between `NEAR_M` and `FAR_M` in front of the
+            rear axle.
     """
     T_camera_rig = inverse(camera.T_rig_camera)
     x_camera, height = float(camera.T_rig_camera[0, 3]), float(camera.T_rig_camera[2, 3])
     near = max(NEAR_M, x_camera + 1.0)
     candidates = np.geomspace(near, FAR_M, 2000)
-    rows_v = _project(camera, T_camera_rig, np.stack([candidates, 0 * candidates, 0 * candidates], axis=1))[:, 1]
+    rows_v = _project(
+        camera, T_camera_rig, np.stack([candidates, 0 * candidates, 0 * candidates], axis=1)
+    )[:, 1]
     v = rows_v[[0, -1]]
     if height < 0.3 or not np.isfinite(v).all() or v[0] - v[1] < 8 or v[1] > camera.height - 8:
         raise PolicyError(
@@ -75,7 +98,8 @@ def make_grid(camera: CameraSpec) -> GroundGrid:
         )
     first, last = min(v[0], camera.height - 1.0), v[1]
     n = int(min(MAX_ROWS, max(first - last, 8) + 1))
-    # Equal steps in the image row are steps of x^2 on the ground: each grid row has its own image row.
+    # Equal steps in the image row are steps of x^2 on the ground: each grid row has its own image
+    # row.
     x = np.asarray(np.interp(-np.linspace(first, last, n), -rows_v, candidates), dtype=np.float64)
     y = HALF_WIDTH_M - CELL_M * np.arange(round(2 * HALF_WIDTH_M / CELL_M) + 1, dtype=np.float64)
     points = np.stack([np.repeat(x, len(y)), np.tile(y, len(x)), np.zeros(len(x) * len(y))], axis=1)
@@ -85,14 +109,30 @@ def make_grid(camera: CameraSpec) -> GroundGrid:
     f, y_camera = float(camera.K[0, 0]), float(camera.T_rig_camera[1, 3])
     column = np.arange(camera.width) + 0.5 - camera.width / 2
     sight = (HALF_WIDTH_M - y_camera + column[None, :] * distance[:, None] / f) / CELL_M
-    seen = np.clip(np.rint(sight), 0, len(y) - 1).astype(np.intp) + len(y) * np.arange(len(x))[:, None]
+    seen = (
+        np.clip(np.rint(sight), 0, len(y) - 1).astype(np.intp) + len(y) * np.arange(len(x))[:, None]
+    )
     map_u, map_v = uv[..., 0].astype(np.float32), uv[..., 1].astype(np.float32)
     pixel_m = np.asarray(np.hypot(distance, height) / f, dtype=np.float64)
-    return GroundGrid(x, y, map_u, map_v, inside, pixel_m, np.asarray(np.gradient(x)), (x_camera, height), y_camera, f, seen)
+    return GroundGrid(
+        x,
+        y,
+        map_u,
+        map_v,
+        inside,
+        pixel_m,
+        np.asarray(np.gradient(x)),
+        (x_camera, height),
+        y_camera,
+        f,
+        seen,
+    )
 
 
 def _project(camera: CameraSpec, T_camera_rig: F64, points: F64) -> F64:
-    """Return pixel coordinates (N, 2) of rig points (N, 3); pixel centres at integers. NaN behind the camera."""
+    """Return pixel coordinates (N, 2) of rig points (N, 3); pixel centres at integers. NaN behind
+    the camera.
+    """
     at = points @ T_camera_rig[:3, :3].T + T_camera_rig[:3, 3]
     z = np.where(at[:, 2] > 0.1, at[:, 2], np.nan)
     uvw = at @ camera.K.T
@@ -120,19 +160,24 @@ class PaintPoints:
 
 
 def brightness(ground: U8) -> U8:
-    """Return the channel ``(R, C)`` in which both white and yellow paint are bright: the mean of red and green."""
+    """Return the channel ``(R, C)`` in which both white and yellow paint are bright: the mean of
+    red and green.
+    """
     return np.asarray(cv2.addWeighted(ground[..., 0], 0.5, ground[..., 1], 0.5, 0.0))
 
 
 class RidgeFilter:
     """Contrast of each ground cell against the road on *both* sides of it.
 
-    The stroke's width and the distance of the two flanks grow with the pixel's size on the ground, so far paint, blurred over a
-    pixel or two, still stands out. A step (kerb, shadow, the side of a car) outshines one side only and gives no response.
+    The stroke's width and the distance of the two flanks grow with the pixel's size on the ground,
+    so far paint, blurred over a pixel or two, still stands out. A step (kerb, shadow, the side of a
+    car) outshines one side only and gives no response.
     """
 
     def __init__(self, grid: GroundGrid) -> None:
-        sizes = np.stack(_windows(grid), axis=1).astype(np.intp)  # (R, 3) cells: half the stroke, start and length of a flank
+        sizes = np.stack(_windows(grid), axis=1).astype(
+            np.intp
+        )  # (R, 3) cells: half the stroke, start and length of a flank
         starts = [0, *(np.flatnonzero(np.diff(sizes, axis=0).any(axis=1)) + 1).tolist(), len(sizes)]
         # Rows of equal windows are neighbours, and a few runs of them make the grid.
         self._runs = [(slice(a, b), *sizes[a].tolist()) for a, b in itertools.pairwise(starts)]
@@ -141,59 +186,87 @@ class RidgeFilter:
         self._seen = _erode_rows(grid.inside, self._gap + flank).astype(np.float32)
 
     def response(self, value: U8) -> F32:
-        """Return the response ``(R, C)`` of a brightness ``(R, C)``; 0 where a flank is out of the image."""
+        """Return the response ``(R, C)`` of a brightness ``(R, C)``; 0 where a flank is out of the
+        image.
+        """
         total, n = _running_sums(value), value.shape[1]
         out = np.zeros(value.shape, dtype=np.float32)
         for rows, half, gap, flank in self._runs:
             reach = gap + flank
             if 2 * reach >= n:
                 continue
-            # Means of all flanks of a row by the column they begin at; that to the right of a cell is that to the left of one further on.
+            # Means of all flanks of a row by the column they begin at; that to the right of a cell
+            # is that to the left of one further on.
             flanks = _means(total[rows], flank + 1)
             centre = _means(total[rows, reach - half : n - reach + half + 1], 2 * half + 1)
-            np.subtract(centre, np.maximum(flanks[:, : n - 2 * reach], flanks[:, reach + gap :]), out=out[rows, reach : n - reach])
+            np.subtract(
+                centre,
+                np.maximum(flanks[:, : n - 2 * reach], flanks[:, reach + gap :]),
+                out=out[rows, reach : n - reach],
+            )
         np.maximum(out, 0.0, out=out)
         out *= self._seen
         return out
 
-    def worse_side(self, value: U8, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp]) -> F32:
-        """Return the larger mean ``(N,)`` of a map ``(R, C)`` over the near halves of the two flanks of cells."""
+    def worse_side(
+        self, value: U8, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp]
+    ) -> F32:
+        """Return the larger mean ``(N,)`` of a map ``(R, C)`` over the near halves of the two
+        flanks of cells.
+        """
         total, n = _running_sums(value), value.shape[1]
         gap, beside = self._gap[rows], self._beside[rows]
 
         def mean(first: npt.NDArray[np.intp], last: npt.NDArray[np.intp]) -> F32:
             a, b = np.minimum(np.maximum(first, 0), n), np.minimum(np.maximum(last + 1, 0), n)
-            return np.asarray((total[rows, b] - total[rows, a]) * (1.0 / np.maximum(b - a, 1)).astype(np.float32))
+            return np.asarray(
+                (total[rows, b] - total[rows, a]) * (1.0 / np.maximum(b - a, 1)).astype(np.float32)
+            )
 
-        return np.asarray(np.maximum(mean(columns - gap - beside, columns - gap), mean(columns + gap, columns + gap + beside)))
+        return np.asarray(
+            np.maximum(
+                mean(columns - gap - beside, columns - gap),
+                mean(columns + gap, columns + gap + beside),
+            )
+        )
 
 
 def _running_sums(value: U8) -> F32:
-    """Return the sums ``(R, C + 1)`` of each row up to a column: exact, as float32 holds the sum of all 72 x 321 bytes of a grid."""
+    """Return the sums ``(R, C + 1)`` of each row up to a column: exact, as float32 holds the sum of
+    all 72 x 321 bytes of a grid.
+    """
     table = cv2.integral(value, sdepth=cv2.CV_32F)
     return np.asarray(table[1:] - table[:-1])
 
 
 def _means(total: F32, width: int) -> F32:
-    """Return the means ``(R, C + 1 - width)`` over ``width`` cells, by the first of them, of `_running_sums` ``(R, C + 1)``."""
+    """Return the means ``(R, C + 1 - width)`` over ``width`` cells, by the first of them, of
+    `_running_sums` ``(R, C + 1)``.
+    """
     return np.asarray((total[:, width:] - total[:, :-width]) * np.float32(1.0 / width))
 
 
-def find_paint(ground: U8, grid: GroundGrid, ridges: RidgeFilter, not_road: U8 | None = None) -> tuple[PaintPoints, Bool]:
-    """Return the points of lines in a warped frame ``(R, C, 3)``, and the cells ``(R, C)`` that bars of a crosswalk cover.
+def find_paint(
+    ground: U8, grid: GroundGrid, ridges: RidgeFilter, not_road: U8 | None = None
+) -> tuple[PaintPoints, Bool]:
+    """Return the points of lines in a warped frame ``(R, C, 3)``, and the cells ``(R, C)`` that
+    bars of a crosswalk cover.
 
-    Where it is known what does not look like the road, 0..255 in ``not_road`` (R, C), a line must have road on both sides: kerbs and the
-    edges of cars have it on one.
+    Where it is known what does not look like the road, 0..255 in ``not_road`` (R, C), a line must
+    have road on both sides: kerbs and the edges of cars have it on one.
 
-    Points are local maxima of the ridge response above each row's noise. A row of three and more that stand closer than any lane is wide
-    are bars and no lines; they are taken for a crosswalk where they are at least four and reach further than a car is wide.
+    Points are local maxima of the ridge response above each row's noise. A row of three and more
+    that stand closer than any lane is wide are bars and no lines; they are taken for a crosswalk
+    where they are at least four and reach further than a car is wide.
     """
     response = ridges.response(brightness(ground))
     # Paint is long and noise is not: average over three rows before looking for maxima.
     smooth = cv2.blur(response, (1, 3))
     near = round(MERGE_M / CELL_M)
     peak = cv2.dilate(smooth, np.ones((1, 2 * near + 1), np.uint8))
-    spread = np.sort(smooth, axis=1)[:, smooth.shape[1] // 2]  # the median, of an odd number of columns
+    spread = np.sort(smooth, axis=1)[
+        :, smooth.shape[1] // 2
+    ]  # the median, of an odd number of columns
     threshold = np.maximum(MIN_CONTRAST, NOISE_FACTOR * spread)
     is_peak = (smooth >= peak) & (smooth > threshold[:, None])
     rows, cols = np.divmod(np.flatnonzero(is_peak), smooth.shape[1])
@@ -213,11 +286,17 @@ def find_paint(ground: U8, grid: GroundGrid, ridges: RidgeFilter, not_road: U8 |
     if not_road is not None:
         line &= ridges.worse_side(not_road, rows, cols) < 255 * SIDE_NOT_ROAD
     rows = rows[line]
-    return PaintPoints(grid.x_m[rows], y[line], strength[line], np.hypot(0.05, 0.5 * grid.pixel_m[rows])), crosswalk
+    return PaintPoints(
+        grid.x_m[rows], y[line], strength[line], np.hypot(0.05, 0.5 * grid.pixel_m[rows])
+    ), crosswalk
 
 
-def _cells_around(rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], y: F64, shape: tuple[int, ...]) -> Bool:
-    """Return the cells ``(R, C)`` within `BAR_HALF_M` of bars, on rows where they make a crosswalk."""
+def _cells_around(
+    rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], y: F64, shape: tuple[int, ...]
+) -> Bool:
+    """Return the cells ``(R, C)`` within `BAR_HALF_M` of bars, on rows where they make a
+    crosswalk.
+    """
     mask = np.zeros(shape, dtype=np.uint8)
     if len(rows):
         count = np.bincount(rows, minlength=shape[0])
@@ -226,7 +305,9 @@ def _cells_around(rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], y: 
         np.minimum.at(low, rows, y)
         wide = (count >= 4) & (high - low > CROSSWALK_M)
         mask[rows[wide[rows]], columns[wide[rows]]] = 1
-        mask = np.asarray(cv2.dilate(mask, np.ones((1, 2 * round(BAR_HALF_M / CELL_M) + 1), np.uint8)))
+        mask = np.asarray(
+            cv2.dilate(mask, np.ones((1, 2 * round(BAR_HALF_M / CELL_M) + 1), np.uint8))
+        )
     return np.asarray(mask > 0)
 
 
@@ -239,7 +320,9 @@ def _windows(grid: GroundGrid) -> tuple[F64, F64, F64]:
 
 
 def _erode_rows(inside: Bool, reach: F64) -> Bool:
-    """Return where the whole window of ``reach`` cells to both sides is inside the image; rows of a pinhole view are intervals."""
+    """Return where the whole window of ``reach`` cells to both sides is inside the image; rows of a
+    pinhole view are intervals.
+    """
     n = inside.shape[1]
     any_inside = inside.any(axis=1)
     first = np.where(any_inside, np.argmax(inside, axis=1), n)

@@ -1,4 +1,6 @@
-"""The policies without a camera: constant velocity, the lower bound; log replay, the upper one; pure pursuit of the route."""
+"""The policies without a camera: constant velocity, the lower bound; log replay, the upper one;
+pure pursuit of the route.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,17 @@ import numpy as np
 from alpasim_plugin.core.geometry import interpolate, inverse, yaw_of
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.types import Observation, Plan, Route, Scenario, SensorSpec
-from policies.base import MIN_CRUISE_MPS, curve_speeds, follow, make_path, plan_times, route_points, seconds, smooth_line, speed_profile
+from policies.base import (
+    MIN_CRUISE_MPS,
+    curve_speeds,
+    follow,
+    make_path,
+    plan_times,
+    route_points,
+    seconds,
+    smooth_line,
+    speed_profile,
+)
 
 
 class ConstantVelocity(Policy):
@@ -27,14 +39,17 @@ class ConstantVelocity(Policy):
         """Return a straight plan."""
         times = plan_times(observation.t_us)
         x = observation.ego.speed_mps * seconds(times)
-        return Plan(observation.t_us, times, np.stack([x, np.zeros_like(x)], axis=1), np.zeros_like(x))
+        return Plan(
+            observation.t_us, times, np.stack([x, np.zeros_like(x)], axis=1), np.zeros_like(x)
+        )
 
 
 class LogReplay(Policy):
-    """Return the recorded future in the rig frame. With the perfect controller the rollout is the log.
+    """Return the recorded future in the rig frame. With the perfect controller the rollout is the
+    log.
 
-    It knows the scenario's ego log, so it is a reference and not a policy under test. Where the log ends before the horizon the plan
-    ends there as well.
+    It knows the scenario's ego log, so it is a reference and not a policy under test. Where the log
+    ends before the horizon the plan ends there as well.
     """
 
     sensors: Sequence[SensorSpec] = ()
@@ -65,8 +80,9 @@ class LogReplay(Policy):
 class PurePursuit(Policy):
     """Follow the route at the speed of the first observation, slower where curves ask for it.
 
-    Blind by design: it looks at no camera and knows no actor, so it drives into whatever stands on its route. It measures what vehicle,
-    tracker and route alone can do. Where the route ends it goes straight on; without a route it keeps its heading.
+    Blind by design: it looks at no camera and knows no actor, so it drives into whatever stands on
+    its route. It measures what vehicle, tracker and route alone can do. Where the route ends it
+    goes straight on; without a route it keeps its heading.
     """
 
     sensors: Sequence[SensorSpec] = ()

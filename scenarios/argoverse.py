@@ -1,7 +1,7 @@
 """Argoverse 2 sensor logs: HD map, ego poses, tracked actors, calibration.
 
-Formats and facts: the Argoverse 2 sensor data set (Wilson et al. 2021) and its public documentation. The data are licensed CC BY-NC-SA
-4.0 and do not ship with this package.
+Formats and facts: the Argoverse 2 sensor data set (Wilson et al. 2021) and its public
+documentation. The data are licensed CC BY-NC-SA 4.0 and do not ship with this package.
 """
 
 from __future__ import annotations
@@ -15,14 +15,33 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from alpasim_plugin.core.geometry import centre_line, matrix_from_quat, quat_from_matrix, se3, wrap_angle
+from alpasim_plugin.core.geometry import (
+    centre_line,
+    matrix_from_quat,
+    quat_from_matrix,
+    se3,
+    wrap_angle,
+)
 from alpasim_plugin.core.reading.tables import Kind
-from alpasim_plugin.core.types import F64, I64, Actor, Box, CameraSpec, HeightField, Lane, LaneMap, Paint, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    F64,
+    I64,
+    Actor,
+    Box,
+    CameraSpec,
+    HeightField,
+    Lane,
+    LaneMap,
+    Paint,
+    Trajectory,
+    Vehicle,
+)
 from alpasim_plugin.world.ground import from_points
 from scenarios.map_lines import border_lines, lane_edges, merge_areas
 from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory
 
-# Argoverse 2 mark types -> the paints a scene can show. Mixed lines take their solid half; double white is drawn as one line.
+# Argoverse 2 mark types -> the paints a scene can show. Mixed lines take their solid half; double
+# white is drawn as one line.
 PAINTS: dict[str, Paint] = {
     "NONE": "none",
     "UNKNOWN": "unknown",
@@ -41,12 +60,14 @@ PAINTS: dict[str, Paint] = {
     "SOLID_BLUE": "unknown",
 }
 KINDS = {"VEHICLE": "vehicle", "BIKE": "bike", "BUS": "bus"}
-RASTER_BLOCK = 5  # 0.3 m pixels are averaged in blocks: float16 heights near 64 m come in steps of 0.03 to 0.06 m
+# 0.3 m pixels are averaged in blocks: float16 heights near 64 m come in steps of 0.03 to 0.06 m
+RASTER_BLOCK = 5
 GROUND_CELL_M = 1.5
 
 
 def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tuple[str, ...]]:
-    """Read ``log_map_archive_*.json`` into a lane map around ``origin (3,)``, with notes on what could not be kept.
+    """Read ``log_map_archive_*.json`` into a lane map around ``origin (3,)``, with notes on what
+    could not be kept.
 
     Raises:
         InputError: A layer or a lane's edge is missing, or a lane type is unknown to Argoverse 2.
@@ -57,15 +78,24 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
     if not raw_lanes:
         raise files.fail(path, "a map without lanes", "use a log whose map has lane_segments")
     if not raw_areas:
-        raise files.fail(path, "a map without drivable areas, so without road edges", "use a log whose map has drivable_areas")
+        raise files.fail(
+            path,
+            "a map without drivable areas, so without road edges",
+            "use a log whose map has drivable_areas",
+        )
     strange: Counter[str] = Counter()
     lanes: dict[str, Lane] = {}
     for key, raw in raw_lanes.items():
         where = f"{path}, lane {key}"
-        left, right = (_line(files, where, raw, f"{side}_lane_boundary", origin, least=2) for side in ("left", "right"))
+        left, right = (
+            _line(files, where, raw, f"{side}_lane_boundary", origin, least=2)
+            for side in ("left", "right")
+        )
         kind = KINDS.get(str(raw.get("lane_type")))
         if kind is None:
-            raise files.fail(where, f"lane type {raw.get('lane_type')!r}", f"use one of {', '.join(KINDS)}")
+            raise files.fail(
+                where, f"lane type {raw.get('lane_type')!r}", f"use one of {', '.join(KINDS)}"
+            )
         marks = [str(raw.get(f"{side}_lane_mark_type")) for side in ("left", "right")]
         strange.update(mark for mark in marks if mark not in PAINTS)
         paints = [PAINTS.get(mark, "unknown") for mark in marks]
@@ -83,46 +113,76 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
             is_intersection=bool(raw.get("is_intersection")),
         )
     lanes = {key: _same_way_neighbours(lane, lanes) for key, lane in lanes.items()}
-    areas = tuple(_closed(_line(files, f"{path}, drivable area {k}", a, "area_boundary", origin, least=3)) for k, a in raw_areas.items())
+    areas = tuple(
+        _closed(_line(files, f"{path}, drivable area {k}", a, "area_boundary", origin, least=3))
+        for k, a in raw_areas.items()
+    )
     crossings = []
     for key, raw in raw_crossings.items():
-        one, two = (_line(files, f"{path}, crossing {key}", raw, edge, origin, least=2) for edge in ("edge1", "edge2"))
+        one, two = (
+            _line(files, f"{path}, crossing {key}", raw, edge, origin, least=2)
+            for edge in ("edge1", "edge2")
+        )
         crossings.append(_closed(np.concatenate([one, two[::-1]])))
     surface = merge_areas([shapely.Polygon(a[:, :2]) for a in areas])
     edges = border_lines(surface, np.concatenate(areas))
-    lane_map = LaneMap(lanes=lanes, road_edges=edges, drivable_areas=areas, crosswalks=tuple(crossings))
-    notes = ["road edges are the border of the union of the drivable areas; where the map is cut off, its border is an edge too"]
-    notes += [f"{count} lane edges have the mark type {mark!r}: taken as paint 'unknown'" for mark, count in sorted(strange.items())]
+    lane_map = LaneMap(
+        lanes=lanes, road_edges=edges, drivable_areas=areas, crosswalks=tuple(crossings)
+    )
+    notes = [
+        "road edges are the border of the union of the drivable areas; where the map is cut off, its border is an edge too"
+    ]
+    notes += [
+        f"{count} lane edges have the mark type {mark!r}: taken as paint 'unknown'"
+        for mark, count in sorted(strange.items())
+    ]
     return lane_map, tuple(notes)
 
 
-def read_ground(files: SourceFiles, folder: Path, lane_map: LaneMap, wheels: F64, origin: F64) -> HeightField:
-    """Fit the ground to the log's own height raster, the lanes' edges and the wheels' path ``(N, 3)``.
+def read_ground(
+    files: SourceFiles, folder: Path, lane_map: LaneMap, wheels: F64, origin: F64
+) -> HeightField:
+    """Fit the ground to the log's own height raster, the lanes' edges and the wheels' path ``(N,
+    3)``.
 
-    The raster is averaged over blocks of 1.5 m; its holes are bridged by the fit. Edges and path carry centimetres where it matters.
+    The raster is averaged over blocks of 1.5 m; its holes are bridged by the fit. Edges and path
+    carry centimetres where it matters.
     """
     transform_path = files.only(folder, ("*___img_Sim2_city.json",), "the raster's Sim2 transform")
-    raster_path = files.only(folder, ("*_ground_height_surface____*.npy",), "the ground height raster")
+    raster_path = files.only(
+        folder, ("*_ground_height_surface____*.npy",), "the ground height raster"
+    )
     sim2 = files.read_json(transform_path)
     raster = np.asarray(files.parse_npy(files.read_bytes(raster_path), raster_path))
     try:
         scale, shift = float(sim2["s"]), np.asarray(sim2["t"], dtype=np.float64)
         rotation = np.asarray(sim2["R"], dtype=np.float64).reshape(2, 2)
     except (KeyError, TypeError, ValueError) as error:
-        raise files.fail(transform_path, f"no Sim2 transform: {error}", "give the keys R, t and s") from error
+        raise files.fail(
+            transform_path, f"no Sim2 transform: {error}", "give the keys R, t and s"
+        ) from error
     if raster.ndim != 2 or raster.dtype.kind != "f" or shift.shape != (2,) or scale <= 0:
         found = f"raster {raster.dtype} {raster.shape}, scale {scale}"
-        raise files.fail(raster_path, found, "give a 2-D floating-point raster with a positive scale")
+        raise files.fail(
+            raster_path, found, "give a 2-D floating-point raster with a positive scale"
+        )
     heights, rows, columns = _block_means(raster.astype(np.float64), RASTER_BLOCK)
-    # Pixel = s * (R city + t), so city = R^T (pixel / s - t); block centres lie at half-integer pixels.
+    # Pixel = s * (R city + t), so city = R^T (pixel / s - t); block centres lie at half-integer
+    # pixels.
     city = (np.stack([columns, rows], axis=1) / scale - shift) @ rotation
     known = np.isfinite(heights)
     grid = files.near(raster_path, np.column_stack([city[known], heights[known]]) - origin)
-    return from_points(np.concatenate([grid, *lane_edges(lane_map.lanes), *lane_map.drivable_areas, wheels]), GROUND_CELL_M, wheels)
+    return from_points(
+        np.concatenate([grid, *lane_edges(lane_map.lanes), *lane_map.drivable_areas, wheels]),
+        GROUND_CELL_M,
+        wheels,
+    )
 
 
 def _block_means(raster: F64, block: int) -> tuple[F64, F64, F64]:
-    """Return means of the finite pixels of square blocks and the blocks' centres in pixels: heights, rows, columns, each ``(B,)``."""
+    """Return means of the finite pixels of square blocks and the blocks' centres in pixels:
+    heights, rows, columns, each ``(B,)``.
+    """
     ny, nx = raster.shape
     padded = np.full((-(-ny // block) * block, -(-nx // block) * block), np.nan)
     padded[:ny, :nx] = raster
@@ -141,18 +201,28 @@ def _block_means(raster: F64, block: int) -> tuple[F64, F64, F64]:
 def _layer(files: SourceFiles, path: Path, document: Any, key: str) -> dict[str, Any]:
     layer = document.get(key) if isinstance(document, dict) else None
     if not isinstance(layer, dict) or not all(isinstance(v, dict) for v in layer.values()):
-        raise files.fail(path, f"no object {key!r}", "use a log_map_archive file of the Argoverse 2 sensor set")
+        raise files.fail(
+            path, f"no object {key!r}", "use a log_map_archive file of the Argoverse 2 sensor set"
+        )
     return layer
 
 
-def _line(files: SourceFiles, where: str, raw: dict[str, Any], key: str, origin: F64, least: int) -> F64:
+def _line(
+    files: SourceFiles, where: str, raw: dict[str, Any], key: str, origin: F64, least: int
+) -> F64:
     """Return a polyline ``(N, 3)`` minus the origin."""
     try:
-        points = np.array([[p["x"], p["y"], p["z"]] for p in raw[key]], dtype=np.float64).reshape(-1, 3)
+        points = np.array([[p["x"], p["y"], p["z"]] for p in raw[key]], dtype=np.float64).reshape(
+            -1, 3
+        )
     except (KeyError, TypeError, ValueError) as error:
-        raise files.fail(where, f"no usable {key}: {error!r}", "give a list of points with x, y and z") from error
+        raise files.fail(
+            where, f"no usable {key}: {error!r}", "give a list of points with x, y and z"
+        ) from error
     if len(points) < least or not np.isfinite(points).all():
-        raise files.fail(where, f"{key} with {len(points)} finite points", f"give at least {least} finite points")
+        raise files.fail(
+            where, f"{key} with {len(points)} finite points", f"give at least {least} finite points"
+        )
     return files.near(where, points - origin)
 
 
@@ -170,7 +240,12 @@ def _same_way_neighbours(lane: Lane, lanes: dict[str, Lane]) -> Lane:
     def keep(other: str) -> str | None:
         if other not in lanes:
             return None
-        return other if abs(float(wrap_angle(heading(lanes[other].centre) - heading(lane.centre)))) < np.pi / 2 else None
+        return (
+            other
+            if abs(float(wrap_angle(heading(lanes[other].centre) - heading(lane.centre))))
+            < np.pi / 2
+            else None
+        )
 
     left, right = keep(str(lane.left_neighbour)), keep(str(lane.right_neighbour))
     return replace(lane, left_neighbour=left, right_neighbour=right)
@@ -179,8 +254,8 @@ def _same_way_neighbours(lane: Lane, lanes: dict[str, Lane]) -> Lane:
 EGO_CATEGORY = "EGO_VEHICLE"
 # Ford Fusion Hybrid of the recording fleet; size as annotated in logs that carry EGO_VEHICLE rows.
 VEHICLE = Vehicle(box=Box(4.877, 2.0, 1.473), rear_axle_to_centre_m=1.422, wheelbase_m=2.85)
-# The recorded frame sits in the rear axle, one wheel radius above the road: measured against the ground rasters of three logs the median
-# height is 0.324, 0.324 and 0.321 m.
+# The recorded frame sits in the rear axle, one wheel radius above the road: measured against the
+# ground rasters of three logs the median height is 0.324, 0.324 and 0.321 m.
 WHEEL_RADIUS_M = 0.33
 POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _NUMBERS: dict[str, Kind] = dict.fromkeys(POSE, "number")
@@ -195,7 +270,16 @@ _CATEGORIES = {
     "CONSTRUCTION_BARREL CONSTRUCTION_CONE MOBILE_PEDESTRIAN_CROSSING_SIGN SIGN STOP_SIGN",
 }
 LABELS = {category: label for label, names in _CATEGORIES.items() for category in names.split()}
-FIXED = frozenset({"BOLLARD", "CONSTRUCTION_BARREL", "CONSTRUCTION_CONE", "MOBILE_PEDESTRIAN_CROSSING_SIGN", "SIGN", "STOP_SIGN"})
+FIXED = frozenset(
+    {
+        "BOLLARD",
+        "CONSTRUCTION_BARREL",
+        "CONSTRUCTION_CONE",
+        "MOBILE_PEDESTRIAN_CROSSING_SIGN",
+        "SIGN",
+        "STOP_SIGN",
+    }
+)
 
 
 @dataclass(frozen=True)
@@ -210,8 +294,9 @@ class EgoPoses:
 def read_argoverse(path: str | Path) -> RecordedLog:
     """Read one log folder.
 
-    The folder holds ``city_SE3_egovehicle.feather``, ``annotations*.feather`` and ``map/`` with the vector map, the ground raster and its
-    transform. Cuboids come in the ego frame of their sweep and are brought to the world with the pose of exactly that time.
+    The folder holds ``city_SE3_egovehicle.feather``, ``annotations*.feather`` and ``map/`` with the
+    vector map, the ground raster and its transform. Cuboids come in the ego frame of their sweep
+    and are brought to the world with the pose of exactly that time.
 
     Raises:
         InputError: A file is missing, damaged, or holds what no log may hold; the message names it.
@@ -219,7 +304,9 @@ def read_argoverse(path: str | Path) -> RecordedLog:
     folder = Path(path)
     files = SourceFiles("reading an Argoverse 2 log")
     pose_path = files.only(folder, ("city_SE3_egovehicle.feather",), "the ego poses")
-    box_path = files.only(folder, ("annotations.feather", "annotations*.feather"), "the annotated cuboids")
+    box_path = files.only(
+        folder, ("annotations.feather", "annotations*.feather"), "the annotated cuboids"
+    )
     map_path = files.only(folder / "map", ("log_map_archive_*.json",), "the vector map")
     poses = read_ego_poses(files, pose_path)
     origin = np.round(poses.xyz[0])  # whole metres: the subtraction loses nothing
@@ -227,7 +314,11 @@ def read_argoverse(path: str | Path) -> RecordedLog:
     lane_map, notes = read_map(files, map_path, origin)
     ground = read_ground(files, folder / "map", lane_map, ego_log.xyz, origin)
     actors, actor_notes = read_actors(files, box_path, poses, origin)
-    own = [f"{dropped} ego poses share their microsecond with the pose before and were dropped"] if dropped else []
+    own = (
+        [f"{dropped} ego poses share their microsecond with the pose before and were dropped"]
+        if dropped
+        else []
+    )
     own += [
         f"ego poses lowered by {WHEEL_RADIUS_M} m along the body's z axis: from the rear axle to the ground under it",
         "no camera taken from the calibration: the fleet's front camera is a portrait of 47 degrees width; see read_calibration",
@@ -252,7 +343,8 @@ def read_ego_poses(files: SourceFiles, path: Path) -> EgoPoses:
     """Read ``city_SE3_egovehicle.feather`` without changing it.
 
     Raises:
-        InputError: Fewer than two poses, times that do not increase, values that are not finite, quaternions that are not unit.
+        InputError: Fewer than two poses, times that do not increase, values that are not finite,
+            quaternions that are not unit.
     """
     table = files.read_feather(path, {"timestamp_ns": "integer", **_NUMBERS})
     t_ns = table["timestamp_ns"].astype(np.int64)
@@ -261,24 +353,36 @@ def read_ego_poses(files: SourceFiles, path: Path) -> EgoPoses:
     return EgoPoses(checked.t_us, checked.xyz, checked.quat)
 
 
-def _rig_log(files: SourceFiles, path: Path, poses: EgoPoses, origin: F64) -> tuple[Trajectory, int]:
-    """Return the rig's trajectory (ground under the rear axle, local, microseconds) and how many poses fell on a taken microsecond."""
+def _rig_log(
+    files: SourceFiles, path: Path, poses: EgoPoses, origin: F64
+) -> tuple[Trajectory, int]:
+    """Return the rig's trajectory (ground under the rear axle, local, microseconds) and how many
+    poses fell on a taken microsecond.
+    """
     t_us = poses.t_ns // 1000
     keep = np.concatenate([[True], np.diff(t_us) > 0])
     up = matrix_from_quat(poses.quat)[:, :, 2]  # (T, 3) body z in the city
     xyz = files.near(path, poses.xyz - origin - WHEEL_RADIUS_M * up)
-    return checked_trajectory(files, path, t_us[keep], xyz[keep], poses.quat[keep], least=2), int((~keep).sum())
+    return checked_trajectory(files, path, t_us[keep], xyz[keep], poses.quat[keep], least=2), int(
+        (~keep).sum()
+    )
 
 
-def read_actors(files: SourceFiles, path: Path, poses: EgoPoses, origin: F64) -> tuple[tuple[Actor, ...], tuple[str, ...]]:
-    """Read the annotated cuboids as actors in the world, in order of first appearance; rows of the ego itself are left out.
+def read_actors(
+    files: SourceFiles, path: Path, poses: EgoPoses, origin: F64
+) -> tuple[tuple[Actor, ...], tuple[str, ...]]:
+    """Read the annotated cuboids as actors in the world, in order of first appearance; rows of the
+    ego itself are left out.
 
     Raises:
-        InputError: No cuboid, a sweep without an ego pose at its time, a bad size, or a track whose times do not increase.
+        InputError: No cuboid, a sweep without an ego pose at its time, a bad size, or a track whose
+            times do not increase.
     """
     sizes = ("length_m", "width_m", "height_m")
     numbers: dict[str, Kind] = dict.fromkeys((*sizes, *POSE), "number")
-    table = files.read_feather(path, {"timestamp_ns": "integer", "track_uuid": "text", "category": "text", **numbers})
+    table = files.read_feather(
+        path, {"timestamp_ns": "integer", "track_uuid": "text", "category": "text", **numbers}
+    )
     t_ns = table["timestamp_ns"].astype(np.int64)
     uuid, category = table["track_uuid"].astype(str), table["category"].astype(str)
     others = np.nonzero(category != EGO_CATEGORY)[0]
@@ -293,7 +397,11 @@ def read_actors(files: SourceFiles, path: Path, poses: EgoPoses, origin: F64) ->
     boxes = se3(_columns(table, POSE[4:]), _columns(table, POSE[:4]))
     bad = ~np.isfinite(boxes).all(axis=(1, 2))
     if bad.any():
-        raise files.fail(path, f"a cuboid pose that is not finite in row {int(np.argmax(bad))}", "repair or drop this row")
+        raise files.fail(
+            path,
+            f"a cuboid pose that is not finite in row {int(np.argmax(bad))}",
+            "repair or drop this row",
+        )
     T_local_ego = se3(poses.xyz[row] - origin, poses.quat[row])
     T_local_box = T_local_ego @ boxes
     size = _columns(table, sizes)
@@ -306,20 +414,41 @@ def read_actors(files: SourceFiles, path: Path, poses: EgoPoses, origin: F64) ->
         where = f"{path}, track {name}"
         norm = np.linalg.norm(_columns(table, POSE[:4])[mine], axis=1)
         if (np.abs(norm - 1) > 1e-2).any():
-            raise files.fail(where, f"a quaternion of length {norm[np.argmax(np.abs(norm - 1))]:.3g}", "give unit quaternions")
+            raise files.fail(
+                where,
+                f"a quaternion of length {norm[np.argmax(np.abs(norm - 1))]:.3g}",
+                "give unit quaternions",
+            )
         length, width, height = np.median(size[mine], axis=0).tolist()
         if not (min(length, width, height) > 0 and np.isfinite([length, width, height]).all()):
-            raise files.fail(where, f"a size of {length} x {width} x {height} m", "give positive sizes")
+            raise files.fail(
+                where, f"a size of {length} x {width} x {height} m", "give positive sizes"
+            )
         changed += bool((np.ptp(size[mine], axis=0) > 0.01).any())
         kind = str(category[mine[0]])
         if kind not in LABELS:
             unknown[kind] += 1
         poses_of = T_local_box[mine]
-        track = checked_trajectory(files, where, t_ns[mine] // 1000, poses_of[:, :3, 3].copy(), quat_from_matrix(poses_of[:, :3, :3]))
-        parts = actors_of_track(str(name), LABELS.get(kind, "other"), Box(length, width, height), track, fixed=kind in FIXED)
+        track = checked_trajectory(
+            files,
+            where,
+            t_ns[mine] // 1000,
+            poses_of[:, :3, 3].copy(),
+            quat_from_matrix(poses_of[:, :3, :3]),
+        )
+        parts = actors_of_track(
+            str(name),
+            LABELS.get(kind, "other"),
+            Box(length, width, height),
+            track,
+            fixed=kind in FIXED,
+        )
         split += len(parts) > 1
         actors += parts
-    notes = [f"{count} tracks of the unknown category {kind!r} are labelled 'other'" for kind, count in sorted(unknown.items())]
+    notes = [
+        f"{count} tracks of the unknown category {kind!r} are labelled 'other'"
+        for kind, count in sorted(unknown.items())
+    ]
     if split:
         notes.append(f"{split} tracks have holes longer than 0.5 s and were split")
     if changed:
@@ -328,7 +457,8 @@ def read_actors(files: SourceFiles, path: Path, poses: EgoPoses, origin: F64) ->
 
 
 def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:
-    """Read the pinhole part of a log's camera calibration at full resolution; radial distortion is left out.
+    """Read the pinhole part of a log's camera calibration at full resolution; radial distortion is
+    left out.
 
     Raises:
         InputError: The log has no ``calibration`` folder, or a file in it is damaged.
@@ -337,19 +467,33 @@ def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:
     files = SourceFiles("reading an Argoverse 2 calibration")
     inner_path = files.only(folder, ("intrinsics.feather",), "the intrinsics")
     outer_path = files.only(folder, ("egovehicle_SE3_sensor.feather",), "the sensor poses")
-    lens: dict[str, Kind] = dict.fromkeys(("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px"), "number")
+    lens: dict[str, Kind] = dict.fromkeys(
+        ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px"), "number"
+    )
     inner = files.read_feather(inner_path, {"sensor_name": "text", **lens})
     outer = files.read_feather(outer_path, {"sensor_name": "text", **_NUMBERS})
-    mounts = dict(zip(outer["sensor_name"].astype(str), se3(_columns(outer, POSE[4:]), _columns(outer, POSE[:4])), strict=True))
+    mounts = dict(
+        zip(
+            outer["sensor_name"].astype(str),
+            se3(_columns(outer, POSE[4:]), _columns(outer, POSE[:4])),
+            strict=True,
+        )
+    )
     cameras: list[CameraSpec] = []
     for i, name in enumerate(inner["sensor_name"].astype(str)):
         if name not in mounts:
-            raise files.fail(outer_path, f"no pose of camera {name!r}", "use calibration files of the same log")
+            raise files.fail(
+                outer_path, f"no pose of camera {name!r}", "use calibration files of the same log"
+            )
         fx, fy, cx, cy = (float(inner[k][i]) for k in ("fx_px", "fy_px", "cx_px", "cy_px"))
         T_rig_camera = mounts[name].copy()
         T_rig_camera[2, 3] += WHEEL_RADIUS_M  # the rig's origin is on the ground
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        cameras.append(CameraSpec(str(name), int(inner["width_px"][i]), int(inner["height_px"][i]), K, T_rig_camera))
+        cameras.append(
+            CameraSpec(
+                str(name), int(inner["width_px"][i]), int(inner["height_px"][i]), K, T_rig_camera
+            )
+        )
     return tuple(cameras)
 
 

@@ -1,10 +1,12 @@
-"""What a scenario may hold and cost, computed before anything is built: the one gate that every source passes.
+"""What a scenario may hold and cost, computed before anything is built: the one gate that every
+source passes.
 
-`check_specification` looks at a built road's file before the road is made, `check_record` at what a reader returned, `check_scenario` at
-the finished scenario of either kind. Ranges of single quantities are in `alpasim_plugin.core.limits`.
+`check_specification` looks at a built road's file before the road is made, `check_record` at what a
+reader returned, `check_scenario` at the finished scenario of either kind. Ranges of single
+quantities are in `alpasim_plugin.core.limits`.
 
-The cost of the Gaussians follows what was counted on built roads of 0.1 to 5 km (docs/reliability.md): ground and kerbs by the drive's
-length, trees and walls by the surroundings.
+The cost of the Gaussians follows what was counted on built roads of 0.1 to 5 km
+(docs/reliability.md): ground and kerbs by the drive's length, trees and walls by the surroundings.
 """
 
 from __future__ import annotations
@@ -16,7 +18,16 @@ import numpy as np
 from alpasim_plugin.core import limits as b
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths
-from alpasim_plugin.core.types import F64, Actor, Box, CameraSpec, Environment, LaneMap, Scenario, Trajectory
+from alpasim_plugin.core.types import (
+    F64,
+    Actor,
+    Box,
+    CameraSpec,
+    Environment,
+    LaneMap,
+    Scenario,
+    Trajectory,
+)
 from scenarios.recorded import RecordedLog
 from scenarios.schema_parts import IdmActor, NarrowGapSegment, ParkedActor
 from scenarios.variation import Drawn
@@ -31,9 +42,15 @@ ACTORS = b.Bound("road users", "", 0, 1_000, "recorded scenes have a few hundred
 REACTIVE = b.Bound("reactive drivers", "", 0, 200, "each follows its lane in every step")
 LANES = b.Bound("lanes", "", 1, 50_000, "the map of a town has some thousands")
 VERTICES = b.Bound("vertices of a map", "", 0, 5_000_000, "the map of a town has some 100,000")
-POSES = b.Bound("poses of all tracks", "", 0, 5_000_000, "an hour of a hundred road users at 10 a second")
-GAUSSIANS = b.Bound("Gaussians", "", 0, 20_000_000, "they would take more than 4 GB and a minute to build")
-PLAN_CELLS = b.Bound("cells of the ground plan", "", 0, 50_000_000, "a square of 1.7 km at 0.25 m takes about 1 GB")
+POSES = b.Bound(
+    "poses of all tracks", "", 0, 5_000_000, "an hour of a hundred road users at 10 a second"
+)
+GAUSSIANS = b.Bound(
+    "Gaussians", "", 0, 20_000_000, "they would take more than 4 GB and a minute to build"
+)
+PLAN_CELLS = b.Bound(
+    "cells of the ground plan", "", 0, 50_000_000, "a square of 1.7 km at 0.25 m takes about 1 GB"
+)
 BUDGETS = (ACTORS, REACTIVE, LANES, VERTICES, POSES, GAUSSIANS, PLAN_CELLS)
 
 
@@ -44,7 +61,8 @@ def check_specification(drawn: Drawn) -> None:
         drawn: Specification with ``road``.
 
     Raises:
-        InputError: The road, its actors or their number are more than a scenario may have; the number is named.
+        InputError: The road, its actors or their number are more than a scenario may have; the
+            number is named.
     """
     spec = drawn.spec
     assert spec.road is not None
@@ -52,20 +70,39 @@ def check_specification(drawn: Drawn) -> None:
     def fail(key: tuple[str, ...], found: str, do_this: str) -> InputError:
         return drawn.document.error("reading a scenario", key, found, do_this)
 
-    lengths = [getattr(segment, "length_m", 2 * getattr(segment, "arm_length_m", 0.0)) for segment in spec.road.segments]
+    lengths = [
+        getattr(segment, "length_m", 2 * getattr(segment, "arm_length_m", 0.0))
+        for segment in spec.road.segments
+    ]
     if not b.ROAD_M.holds(sum(lengths)):
-        raise fail(("road", "segments"), _found(b.ROAD_M, sum(lengths)), "shorten segments, or make several scenarios")
-    gaps = sum(s.cars_left + s.cars_right for s in spec.road.segments if isinstance(s, NarrowGapSegment))
-    actors = gaps + sum(actor.count if isinstance(actor, ParkedActor) else 1 for actor in spec.actors)
+        raise fail(
+            ("road", "segments"),
+            _found(b.ROAD_M, sum(lengths)),
+            "shorten segments, or make several scenarios",
+        )
+    gaps = sum(
+        s.cars_left + s.cars_right for s in spec.road.segments if isinstance(s, NarrowGapSegment)
+    )
+    actors = gaps + sum(
+        actor.count if isinstance(actor, ParkedActor) else 1 for actor in spec.actors
+    )
     reactive = sum(isinstance(actor, IdmActor) for actor in spec.actors)
     for bound, value in ((ACTORS, actors), (REACTIVE, reactive)):
         if not bound.holds(value):
-            raise fail(("actors",), _found(bound, value), "leave out those that the ego never meets")
-    driven_m = min(spec.built_until_us * 1e-6 * max(spec.ego.cruise_mps, spec.ego.speed_mps), sum(lengths))
+            raise fail(
+                ("actors",), _found(bound, value), "leave out those that the ego never meets"
+            )
+    driven_m = min(
+        spec.built_until_us * 1e-6 * max(spec.ego.cruise_mps, spec.ego.speed_mps), sum(lengths)
+    )
     if spec.background is None:
         count = gaussians(spec.environment, driven_m, driven_m, 0.0)
         if not GAUSSIANS.holds(count):
-            raise fail(("environment",), _cost(count), "shorten timing.duration_us, lower building_height_m or trees_per_100m")
+            raise fail(
+                ("environment",),
+                _cost(count),
+                "shorten timing.duration_us, lower building_height_m or trees_per_100m",
+            )
 
 
 def check_record(record: RecordedLog, where: str) -> None:
@@ -76,9 +113,15 @@ def check_record(record: RecordedLog, where: str) -> None:
         where: The log, for messages.
 
     Raises:
-        InputError: A number that is not finite or out of range, or more of something than a scenario may have.
+        InputError: A number that is not finite or out of range, or more of something than a
+            scenario may have.
     """
-    b.COORDINATE_M.check(_reach(record.ego_log.xyz, *_lines(record.lane_map)), DOING, f"{where}, map", "farthest point")
+    b.COORDINATE_M.check(
+        _reach(record.ego_log.xyz, *_lines(record.lane_map)),
+        DOING,
+        f"{where}, map",
+        "farthest point",
+    )
     _check_map(record.lane_map, where)
     _check_track(record.ego_log, f"{where}, ego")
     _check_actors(record.actors, where)
@@ -87,11 +130,17 @@ def check_record(record: RecordedLog, where: str) -> None:
     for name in ("rear_axle_to_centre_m", "wheelbase_m"):
         b.AXLE_M.check(getattr(record.vehicle, name), DOING, f"{where}, ego", name)
     if not (np.isfinite(record.ground.z).all() and record.ground.cell_m > 0):
-        raise InputError(DOING, f"{where}, ground", "a height that is not finite", "repair the heights of the map")
+        raise InputError(
+            DOING,
+            f"{where}, ground",
+            "a height that is not finite",
+            "repair the heights of the map",
+        )
 
 
 def check_scenario(scenario: Scenario, where: str) -> None:
-    """Check a finished scenario of any source: its road users, its length and what building it would cost.
+    """Check a finished scenario of any source: its road users, its length and what building it
+    would cost.
 
     Raises:
         InputError: More than a scenario may have; the number is named.
@@ -103,14 +152,23 @@ def check_scenario(scenario: Scenario, where: str) -> None:
         return
     xy = scenario.ego_log.xyz[:, :2]
     wide, high = np.ptp(xy, axis=0) + 2 * REACH_M
-    count = gaussians(scenario.environment, float(arc_lengths(scenario.ego_log.xyz)[-1]), float(wide), float(high))
+    count = gaussians(
+        scenario.environment, float(arc_lengths(scenario.ego_log.xyz)[-1]), float(wide), float(high)
+    )
     if not GAUSSIANS.holds(count):
-        raise InputError(DOING, where, _cost(count), "drive a shorter part of it, or lower environment.building_height_m")
+        raise InputError(
+            DOING,
+            where,
+            _cost(count),
+            "drive a shorter part of it, or lower environment.building_height_m",
+        )
     cells = wide * high / PLAN_CELL_M2
     PLAN_CELLS.check(float(cells), DOING, f"{where}: a drive through {wide:.0f} x {high:.0f} m")
 
 
-def gaussians(environment: Environment | object, driven_m: float, wide_m: float, high_m: float) -> float:
+def gaussians(
+    environment: Environment | object, driven_m: float, wide_m: float, high_m: float
+) -> float:
     """Estimate how many Gaussians a scene takes, within about half of the true number.
 
     Args:
@@ -118,11 +176,20 @@ def gaussians(environment: Environment | object, driven_m: float, wide_m: float,
         driven_m: Length of the logged path.
         wide_m, high_m: Sides of the rectangle around it, with what is built beside it.
     """
-    trees_per_100m, buildings = getattr(environment, "trees_per_100m", 0.0), getattr(environment, "buildings", 0.0)
+    trees_per_100m, buildings = (
+        getattr(environment, "trees_per_100m", 0.0),
+        getattr(environment, "buildings", 0.0),
+    )
     length = driven_m + 40.0
     area = max(wide_m, 2 * REACH_M) * max(high_m, 2 * REACH_M)
     trees = trees_per_100m * (0.02 * length + 0.00022 * area)
-    walls_m2 = buildings * 2 * length * float(np.mean(getattr(environment, "building_height_m", (0.0, 0.0)))) * 2.3
+    walls_m2 = (
+        buildings
+        * 2
+        * length
+        * float(np.mean(getattr(environment, "building_height_m", (0.0, 0.0))))
+        * 2.3
+    )
     spacing = getattr(environment, "poles_spacing_m", 0.0)
     poles = 2 * length / spacing if spacing > 0 else 0.0
     return 1500.0 * (length + 100.0) + 760.0 * trees + 22.0 * walls_m2 + 100.0 * poles
@@ -144,7 +211,13 @@ def _lines(lane_map: LaneMap) -> Iterable[F64]:
             yield lane.left
         if lane.right is not None:
             yield lane.right
-    for group in (lane_map.road_edges, lane_map.drivable_areas, lane_map.crosswalks, lane_map.stop_lines, lane_map.poles):
+    for group in (
+        lane_map.road_edges,
+        lane_map.drivable_areas,
+        lane_map.crosswalks,
+        lane_map.stop_lines,
+        lane_map.poles,
+    ):
         yield from group
     for marking in lane_map.markings:
         yield marking.xyz
@@ -192,7 +265,19 @@ def _check_box(box: Box, where: str, bound: b.Bound) -> None:
 def _check_cameras(cameras: tuple[CameraSpec, ...], where: str) -> None:
     for camera in cameras:
         for name in ("width", "height"):
-            b.IMAGE_SIDE_PX.check(getattr(camera, name), DOING, f"{where}, camera {camera.name}", name)
-        if not (np.isfinite(camera.K).all() and np.isfinite(camera.T_rig_camera).all() and camera.K[0, 0] > 0 and camera.K[1, 1] > 0):
-            raise InputError(DOING, f"{where}, camera {camera.name}", "a lens or mount that is not finite", "repair the calibration")
+            b.IMAGE_SIDE_PX.check(
+                getattr(camera, name), DOING, f"{where}, camera {camera.name}", name
+            )
+        if not (
+            np.isfinite(camera.K).all()
+            and np.isfinite(camera.T_rig_camera).all()
+            and camera.K[0, 0] > 0
+            and camera.K[1, 1] > 0
+        ):
+            raise InputError(
+                DOING,
+                f"{where}, camera {camera.name}",
+                "a lens or mount that is not finite",
+                "repair the calibration",
+            )
         b.MOUNT_M.check(_reach(camera.T_rig_camera[:3, 3]), DOING, f"{where}, camera {camera.name}")

@@ -1,4 +1,6 @@
-"""A built road: from the specification to map, expert log and actors, and the check that the drive is on the road and clear of all."""
+"""A built road: from the specification to map, expert log and actors, and the check that the drive
+is on the road and clear of all.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ from scenarios.variation import Drawn
 MIN_GAP_M = 0.3
 STEP_US = 50_000
 SEAM_M = 1e-3  # lanes that share an edge are joined over rounding
-TAIL_US = 4_000_000  # scripts go on for so long after the end, so that the expert's lookahead does not see them stop
+# scripts go on for so long after the end, so that the expert's lookahead does not see them stop
+TAIL_US = 4_000_000
 
 
 def built_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
@@ -51,7 +54,9 @@ def built_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
     assert spec.road is not None
     check_specification(drawn)
     with drawn.at("road", "segments"):
-        road = build_road(elements(spec.road), profile(spec.road), (0.0, 0.0, np.deg2rad(spec.road.heading_deg)))
+        road = build_road(
+            elements(spec.road), profile(spec.road), (0.0, 0.0, np.deg2rad(spec.road.heading_deg))
+        )
     with drawn.at("ego"):
         ego_path = _ego_path(spec, spec.road, road)
     length_m = ego_path.path.length_m
@@ -65,25 +70,48 @@ def built_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
     if reached_us < end_us:
         driven_m, _ = ego_path.path.project(run.ego_log.xyz[-1:, :2])
         with drawn.at("road", "segments"):
-            raise _too_short(length_m, float(driven_m[0]), f" after {reached_us / 1e6:.1f} s of {end_us / 1e6:.1f} s")
+            raise _too_short(
+                length_m,
+                float(driven_m[0]),
+                f" after {reached_us / 1e6:.1f} s of {end_us / 1e6:.1f} s",
+            )
     actors = traffic.actors(run)
     _check_drive(drawn, road.lane_map, run.ego_log, vehicle, actors)
     route = Route(ego_path.path.xyz[::4], ego_path.lane_ids)
     origin = (0.0, 0.0, 0.0)
-    return RecordedLog(drawn.scene_id, "yaml", road.lane_map, flat(0.0), run.ego_log, vehicle, actors, (), origin, "", route=route)
+    return RecordedLog(
+        drawn.scene_id,
+        "yaml",
+        road.lane_map,
+        flat(0.0),
+        run.ego_log,
+        vehicle,
+        actors,
+        (),
+        origin,
+        "",
+        route=route,
+    )
 
 
 def _ego_path(spec: ScenarioSpec, written: RoadSpec, road: Road) -> EgoPath:
     """Return the ego's line, moved aside in narrow gaps."""
     ego = spec.ego
-    changes = [LaneChange(ego.start_m + change.at_m, change.to_lane, change.length_m) for change in ego.lane_changes]
+    changes = [
+        LaneChange(ego.start_m + change.at_m, change.to_lane, change.length_m)
+        for change in ego.lane_changes
+    ]
     plain = make_ego_path(road, ego.lane, changes)
     shifts = []
     for i, segment in enumerate(written.segments):
         if isinstance(segment, NarrowGapSegment) and segment.shift_m:
             begin, end = plain.stretch_s[i], plain.stretch_s[i + 1]
             quarter = (end - begin) / 4
-            shifts.append(LateralShift(begin + quarter, end - quarter, max(2 * quarter, 12.0), segment.shift_m))
+            shifts.append(
+                LateralShift(
+                    begin + quarter, end - quarter, max(2 * quarter, 12.0), segment.shift_m
+                )
+            )
     return make_ego_path(road, ego.lane, changes, shifts)
 
 
@@ -101,9 +129,15 @@ def elements(spec: RoadSpec) -> list[Element]:
             case StraightSegment() | NarrowGapSegment():
                 out.append(Curve(segment.length_m))
             case ArcSegment():
-                out.append(Curve(segment.length_m, segment.curvature_per_m, segment.curvature_per_m))
+                out.append(
+                    Curve(segment.length_m, segment.curvature_per_m, segment.curvature_per_m)
+                )
             case ClothoidSegment():
-                out.append(Curve(segment.length_m, segment.start_curvature_per_m, segment.end_curvature_per_m))
+                out.append(
+                    Curve(
+                        segment.length_m, segment.start_curvature_per_m, segment.end_curvature_per_m
+                    )
+                )
             case MergeSegment() | SplitSegment():
                 out.append(LaneTaper(segment.kind, segment.length_m))
             case IntersectionSegment():
@@ -114,18 +148,30 @@ def elements(spec: RoadSpec) -> list[Element]:
 def profile(spec: RoadSpec) -> Profile:
     """Return the cross-section."""
     return Profile(
-        spec.lanes_forward, spec.lanes_backward, spec.lane_width_m, spec.median_m, spec.shoulder_m, spec.parking_m,
-        spec.speed_limit_mps, spec.centre_paint,
-    )  # fmt: skip
+        spec.lanes_forward,
+        spec.lanes_backward,
+        spec.lane_width_m,
+        spec.median_m,
+        spec.shoulder_m,
+        spec.parking_m,
+        spec.speed_limit_mps,
+        spec.centre_paint,
+    )
 
 
-def _check_drive(drawn: Drawn, lane_map: LaneMap, ego_log: Trajectory, vehicle: Vehicle, actors: Sequence[Actor]) -> None:
-    """Check that the ego's footprint stays on the vehicle lanes and `MIN_GAP_M` clear of all actors.
+def _check_drive(
+    drawn: Drawn, lane_map: LaneMap, ego_log: Trajectory, vehicle: Vehicle, actors: Sequence[Actor]
+) -> None:
+    """Check that the ego's footprint stays on the vehicle lanes and `MIN_GAP_M` clear of all
+    actors.
 
     Raises:
         InputError: It does not, with the position of the road or of the actor.
     """
-    doing, last_us = "checking the expert's drive", min(drawn.spec.built_until_us, int(ego_log.t_us[-1]))
+    doing, last_us = (
+        "checking the expert's drive",
+        min(drawn.spec.built_until_us, int(ego_log.t_us[-1])),
+    )
     t_us = np.arange(int(ego_log.t_us[0]), last_us + 1, STEP_US, dtype=np.int64)
     ego = _footprints(interpolate(ego_log, t_us), vehicle.box, vehicle.rear_axle_to_centre_m)
     lanes = [lane for lane in lane_map.lanes.values() if lane.kind == "vehicle"]
@@ -136,12 +182,27 @@ def _check_drive(drawn: Drawn, lane_map: LaneMap, ego_log: Trajectory, vehicle: 
         outside_m2 = shapely.area(shapely.difference(ego[off[0]], road))
         found = f"at {t_us[off[0]] / 1e6:.2f} s {outside_m2:.2f} m2 of the ego leave the lanes"
         with drawn.at("road", "segments"):
-            raise InputError(doing, "the road", found, "use wider lanes, gentler bends, a larger corner_radius_m, or a smaller shift_m")
-    gap, when, who = min(((*_least_gap(ego, t_us, actor), actor.actor_id) for actor in actors), default=(np.inf, 0, ""))
+            raise InputError(
+                doing,
+                "the road",
+                found,
+                "use wider lanes, gentler bends, a larger corner_radius_m, or a smaller shift_m",
+            )
+    gap, when, who = min(
+        ((*_least_gap(ego, t_us, actor), actor.actor_id) for actor in actors),
+        default=(np.inf, 0, ""),
+    )
     if gap < MIN_GAP_M:
-        found = f"at {when / 1e6:.2f} s the gap to the ego is {gap:.2f} m (least allowed {MIN_GAP_M} m)"
+        found = (
+            f"at {when / 1e6:.2f} s the gap to the ego is {gap:.2f} m (least allowed {MIN_GAP_M} m)"
+        )
         with drawn.at(*_key_of(drawn.spec, who)):
-            raise InputError(doing, f"actor {who}", found, "start the actor farther away, change its timing, or slow the ego down")
+            raise InputError(
+                doing,
+                f"actor {who}",
+                found,
+                "start the actor farther away, change its timing, or slow the ego down",
+            )
 
 
 def _key_of(spec: ScenarioSpec, name: str) -> tuple[str | int, ...]:
@@ -153,18 +214,31 @@ def _key_of(spec: ScenarioSpec, name: str) -> tuple[str | int, ...]:
 
 
 def _footprints(poses: F64, box: Box, ahead_m: float = 0.0) -> F64:
-    """Return rectangles (object array of polygons) of bodies at poses ``(T, 4, 4)``, their middle ``ahead_m`` in front of the pose."""
+    """Return rectangles (object array of polygons) of bodies at poses ``(T, 4, 4)``, their middle
+    ``ahead_m`` in front of the pose.
+    """
     x, y = box.length_m / 2, box.width_m / 2
-    corners = np.array([[ahead_m + x, y, 0, 1], [ahead_m - x, y, 0, 1], [ahead_m - x, -y, 0, 1], [ahead_m + x, -y, 0, 1]])
+    corners = np.array(
+        [
+            [ahead_m + x, y, 0, 1],
+            [ahead_m - x, y, 0, 1],
+            [ahead_m - x, -y, 0, 1],
+            [ahead_m + x, -y, 0, 1],
+        ]
+    )
     rings: F64 = shapely.polygons((corners @ np.swapaxes(poses, -1, -2))[..., :2])
     return rings
 
 
 def _least_gap(ego: F64, t_us: I64, actor: Actor) -> tuple[float, int]:
-    """Return the least distance of an actor to the ego's footprints ``(T,)`` and when it is; infinite where they never meet in time."""
+    """Return the least distance of an actor to the ego's footprints ``(T,)`` and when it is;
+    infinite where they never meet in time.
+    """
     there = np.flatnonzero((t_us >= actor.track.t_us[0]) & (t_us <= actor.track.t_us[-1]))
     if len(there) == 0:
         return float("inf"), 0
-    distance = shapely.distance(ego[there], _footprints(interpolate(actor.track, t_us[there]), actor.box))
+    distance = shapely.distance(
+        ego[there], _footprints(interpolate(actor.track, t_us[there]), actor.box)
+    )
     k = int(np.argmin(distance))
     return float(distance[k]), int(t_us[there[k]])

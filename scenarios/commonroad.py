@@ -1,7 +1,8 @@
 """CommonRoad scenarios (XML 2018b and 2020a) with recorded traffic.
 
-The format is read directly from its public description (Althoff, Koschi, Manzinger 2017; commonroad.in.tum.de). A file names no recorded
-ego: its planning problem asks for one. Here a recorded vehicle takes that role, so that there is a human drive to compare with.
+The format is read directly from its public description (Althoff, Koschi, Manzinger 2017;
+commonroad.in.tum.de). A file names no recorded ego: its planning problem asks for one. Here a
+recorded vehicle takes that role, so that there is a human drive to compare with.
 """
 
 from __future__ import annotations
@@ -19,7 +20,16 @@ import shapely
 from alpasim_plugin.core.geometry import offset_trajectory, quat_from_yaw, rectangle_corners
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.limits import STEP, TIME_STEP_S
-from alpasim_plugin.core.types import F64, I64, Actor, Box, HeightField, LaneMap, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    F64,
+    I64,
+    Actor,
+    Box,
+    HeightField,
+    LaneMap,
+    Trajectory,
+    Vehicle,
+)
 from alpasim_plugin.world.ground import flat, from_points
 from scenarios.commonroad_map import number, point, read_lanelets
 from scenarios.map_lines import lane_edges, merge_areas, predecessors
@@ -36,7 +46,15 @@ LABELS = {
     "motorcycle": "motorcycle",
     "pedestrian": "pedestrian",
 }  # all else (train, pillar, constructionZone, building, ...) is "other"
-HEIGHTS_M = {"car": 1.5, "truck": 3.2, "bus": 3.2, "pedestrian": 1.75, "cyclist": 1.75, "motorcycle": 1.5, "other": 1.5}
+HEIGHTS_M = {
+    "car": 1.5,
+    "truck": 3.2,
+    "bus": 3.2,
+    "pedestrian": 1.75,
+    "cyclist": 1.75,
+    "motorcycle": 1.5,
+    "other": 1.5,
+}
 
 
 @dataclass(frozen=True)
@@ -56,11 +74,16 @@ class Obstacle:
         """Return the poses of the box centre, time in integer microseconds."""
         t_us = np.round(self.steps * (dt_s * 1e6)).astype(np.int64)
         xyz = self.centre + np.array([0.0, 0.0, self.box.height_m / 2])
-        return checked_trajectory(files, f"{path}, obstacle {self.obstacle_id}", t_us, xyz, quat_from_yaw(self.yaw))
+        return checked_trajectory(
+            files, f"{path}, obstacle {self.obstacle_id}", t_us, xyz, quat_from_yaw(self.yaw)
+        )
 
 
-def read_obstacles(files: SourceFiles, path: Path, root: Element, origin: F64) -> tuple[tuple[Obstacle, ...], tuple[str, ...]]:
-    """Read static and dynamic obstacles in file order, with notes on those that are not recorded tracks.
+def read_obstacles(
+    files: SourceFiles, path: Path, root: Element, origin: F64
+) -> tuple[tuple[Obstacle, ...], tuple[str, ...]]:
+    """Read static and dynamic obstacles in file order, with notes on those that are not recorded
+    tracks.
 
     Raises:
         InputError: A number is missing or broken, an id occurs twice, or a state has no time.
@@ -70,9 +93,17 @@ def read_obstacles(files: SourceFiles, path: Path, root: Element, origin: F64) -
     for element in (e for e in root if e.tag in ("obstacle", "staticObstacle", "dynamicObstacle")):
         where = f"{path}, obstacle {element.get('id')}"
         static = element.tag == "staticObstacle" or element.findtext("role") == "static"
-        states = [s for s in (element.find("initialState"), *element.findall("trajectory/state")) if s is not None]
+        states = [
+            s
+            for s in (element.find("initialState"), *element.findall("trajectory/state"))
+            if s is not None
+        ]
         places = [place for s in states if (place := s.find("position/point")) is not None]
-        if not states or len(places) < len(states) or any(s.find("orientation/exact") is None for s in states):
+        if (
+            not states
+            or len(places) < len(states)
+            or any(s.find("orientation/exact") is None for s in states)
+        ):
             skipped["have states without an exact position and orientation"] += 1
             continue
         if element.find("occupancySet") is not None or (static and len(states) > 1):
@@ -83,32 +114,48 @@ def read_obstacles(files: SourceFiles, path: Path, root: Element, origin: F64) -
             raise files.fail(where, "no shape", "give a rectangle, circle or polygon")
         size, offset, turn = _bounding_box(files, where, shape)
         label = LABELS.get(str(element.findtext("type")), "other")
-        yaw = np.array([number(files, where, s.find("orientation/exact"), "orientation") for s in states])
+        yaw = np.array(
+            [number(files, where, s.find("orientation/exact"), "orientation") for s in states]
+        )
         centre = np.array([point(files, where, place) for place in places]) - origin
         c, s = np.cos(yaw), np.sin(yaw)
-        centre[:, :2] += np.stack([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]], axis=1)
+        centre[:, :2] += np.stack(
+            [c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]], axis=1
+        )
         times = [number(files, where, s.find("time/exact"), "time") for s in states]
         for time in times:
             STEP.check(time, files.doing, where, "time step")
         steps = np.array([round(time) for time in times], dtype=np.int64)
         speeds = [s.find("velocity/exact") for s in states]
-        speed = np.array([np.nan if v is None else number(files, where, v, "velocity") for v in speeds])
+        speed = np.array(
+            [np.nan if v is None else number(files, where, v, "velocity") for v in speeds]
+        )
         box = Box(size[0], size[1], HEIGHTS_M[label])
-        obstacles.append(Obstacle(str(element.get("id")), label, static, box, steps, centre, yaw + turn, speed))
+        obstacles.append(
+            Obstacle(str(element.get("id")), label, static, box, steps, centre, yaw + turn, speed)
+        )
     ids = Counter(o.obstacle_id for o in obstacles)
     if ids and max(ids.values()) > 1:
-        raise files.fail(path, f"obstacle id {ids.most_common(1)[0][0]} twice", "give each obstacle its own id")
+        raise files.fail(
+            path, f"obstacle id {ids.most_common(1)[0][0]} twice", "give each obstacle its own id"
+        )
     notes = [f"{n} obstacles {why} and were left out" for why, n in sorted(skipped.items())]
     notes += [
-        f"{len(found)} {tag} elements were left out" for tag in ("environmentObstacle", "phantomObstacle") if (found := root.findall(tag))
+        f"{len(found)} {tag} elements were left out"
+        for tag in ("environmentObstacle", "phantomObstacle")
+        if (found := root.findall(tag))
     ]
     return tuple(obstacles), tuple(notes)
 
 
-def _bounding_box(files: SourceFiles, where: str, shape: Element) -> tuple[tuple[float, float], tuple[float, float], float]:
-    """Return (length, width), the box centre in the obstacle's frame, and the box's turn against it.
+def _bounding_box(
+    files: SourceFiles, where: str, shape: Element
+) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """Return (length, width), the box centre in the obstacle's frame, and the box's turn against
+    it.
 
-    A single rectangle is kept as it is; circles, polygons and groups of shapes become the box around them.
+    A single rectangle is kept as it is; circles, polygons and groups of shapes become the box
+    around them.
     """
     parts = list(shape)
     if len(parts) == 1 and parts[0].tag == "rectangle":
@@ -121,7 +168,9 @@ def _bounding_box(files: SourceFiles, where: str, shape: Element) -> tuple[tuple
             middle = np.array(_centre(files, where, part))
             clouds.append(np.array([middle - radius, middle + radius]))
         elif part.tag == "polygon":
-            clouds.append(np.array([point(files, where, p)[:2] for p in part.findall("point")]).reshape(-1, 2))
+            clouds.append(
+                np.array([point(files, where, p)[:2] for p in part.findall("point")]).reshape(-1, 2)
+            )
         elif part.tag == "rectangle":
             (length, width), turn, centre = _rectangle(files, where, part)
             half = np.array([[length, width], [length, -width]]) / 2
@@ -140,12 +189,18 @@ def _bounding_box(files: SourceFiles, where: str, shape: Element) -> tuple[tuple
     return (float(size[0]), float(size[1])), (float(middle[0]), float(middle[1])), 0.0
 
 
-def _rectangle(files: SourceFiles, where: str, part: Element) -> tuple[tuple[float, float], float, tuple[float, float]]:
+def _rectangle(
+    files: SourceFiles, where: str, part: Element
+) -> tuple[tuple[float, float], float, tuple[float, float]]:
     length, width = (number(files, where, part.find(k), k) for k in ("length", "width"))
     if length <= 0 or width <= 0:
         raise files.fail(where, f"a shape of {length} x {width} m", "give positive sizes")
     turn = part.find("orientation")
-    return (length, width), 0.0 if turn is None else number(files, where, turn, "orientation"), _centre(files, where, part)
+    return (
+        (length, width),
+        0.0 if turn is None else number(files, where, turn, "orientation"),
+        _centre(files, where, part),
+    )
 
 
 def _centre(files: SourceFiles, where: str, part: Element) -> tuple[float, float]:
@@ -162,12 +217,15 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
 
     Args:
         path: The XML file.
-        ego: Id of the recorded vehicle that becomes the ego; None picks the car with the longest drive among those that are present
-            all the time, keep inside one lane (if none does: stay on the lanelets) and touch nobody; ties go to the smaller id. Lanes
-            and gaps are tested with a footprint at least as large as the default vehicle's, because the evaluators score with that one.
+        ego: Id of the recorded vehicle that becomes the ego; None picks the car with the longest
+            drive among those that are present all the time, keep inside one lane (if none does:
+            stay on the lanelets) and touch nobody; ties go to the smaller id. Lanes and gaps are
+            tested with a footprint at least as large as the default vehicle's, because the
+            evaluators score with that one.
 
     Raises:
-        InputError: The file is missing, malformed or no CommonRoad scenario; no vehicle can be the ego; ``ego`` names none.
+        InputError: The file is missing, malformed or no CommonRoad scenario; no vehicle can be the
+            ego; ``ego`` names none.
     """
     file = Path(path)
     files = SourceFiles("reading a CommonRoad scenario")
@@ -175,27 +233,46 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
     version = root.get("commonRoadVersion")
     if root.tag != "commonRoad" or version not in VERSIONS:
         found = f"root element {root.tag!r}, version {version!r}"
-        raise files.fail(file, found, f"give a CommonRoad XML file of version {' or '.join(VERSIONS)}")
+        raise files.fail(
+            file, found, f"give a CommonRoad XML file of version {' or '.join(VERSIONS)}"
+        )
     dt_s = _time_step(files, file, root)
     obstacles, obstacle_notes = read_obstacles(files, file, root, np.zeros(3))
     if not obstacles:
-        raise files.fail(file, "no recorded traffic, so no drive to take the ego from", "use a scenario with dynamic obstacles")
-    origin = np.array([*np.round(obstacles[0].centre[0, :2]), 0.0])  # whole metres: the subtraction loses nothing
+        raise files.fail(
+            file,
+            "no recorded traffic, so no drive to take the ego from",
+            "use a scenario with dynamic obstacles",
+        )
+    origin = np.array(
+        [*np.round(obstacles[0].centre[0, :2]), 0.0]
+    )  # whole metres: the subtraction loses nothing
     obstacles = tuple(replace(o, centre=o.centre - origin) for o in obstacles)
     for obstacle in obstacles:
         files.near(f"{file}, obstacle {obstacle.obstacle_id}", obstacle.centre)
     lane_map, map_notes = read_lanelets(files, file, root, origin)
     chosen, why = _choose_ego(files, file, obstacles, lane_map, ego)
-    scale = chosen.box.length_m / DEFAULT.box.length_m  # the file has sizes and no axles: the default chassis in proportion
-    vehicle = Vehicle(chosen.box, DEFAULT.rear_axle_to_centre_m * scale, DEFAULT.wheelbase_m * scale)
+    scale = (
+        chosen.box.length_m / DEFAULT.box.length_m
+    )  # the file has sizes and no axles: the default chassis in proportion
+    vehicle = Vehicle(
+        chosen.box, DEFAULT.rear_axle_to_centre_m * scale, DEFAULT.wheelbase_m * scale
+    )
     centre_log = chosen.trajectory(files, file, dt_s)
     if len(centre_log) < 2:
-        raise files.fail(f"{file}, obstacle {chosen.obstacle_id}", "1 state", "choose an ego with a trajectory")
+        raise files.fail(
+            f"{file}, obstacle {chosen.obstacle_id}", "1 state", "choose an ego with a trajectory"
+        )
     T_centre_rig = np.eye(4)
     T_centre_rig[:3, 3] = (-vehicle.rear_axle_to_centre_m, 0.0, -chosen.box.height_m / 2)
     steps = _step_range([o for o in obstacles if not o.static] or obstacles)
     first, last = (round(step * dt_s * 1e6) for step in steps)
-    actors = [actor for o in obstacles if o is not chosen for actor in _actors(files, file, o, dt_s, first, last)]
+    actors = [
+        actor
+        for o in obstacles
+        if o is not chosen
+        for actor in _actors(files, file, o, dt_s, first, last)
+    ]
     notes = (
         why,
         f"ego box {chosen.box.length_m} x {chosen.box.width_m} m from the file; rear axle assumed {vehicle.rear_axle_to_centre_m:.2f} m "
@@ -224,43 +301,70 @@ def _time_step(files: SourceFiles, path: Path, root: Element) -> float:
     try:
         dt_s = float(str(root.get("timeStepSize")))
     except ValueError as error:
-        raise files.fail(path, f"timeStepSize = {root.get('timeStepSize')!r}", "give the time step in seconds") from error
+        raise files.fail(
+            path, f"timeStepSize = {root.get('timeStepSize')!r}", "give the time step in seconds"
+        ) from error
     TIME_STEP_S.check(dt_s, files.doing, path, "timeStepSize")
     return dt_s
 
 
 def _step_range(obstacles: Sequence[Obstacle]) -> tuple[int, int]:
     """Return the first and the last time step at which any of the obstacles is seen."""
-    return min((int(o.steps[0]) for o in obstacles), default=0), max((int(o.steps[-1]) for o in obstacles), default=0)
+    return min((int(o.steps[0]) for o in obstacles), default=0), max(
+        (int(o.steps[-1]) for o in obstacles), default=0
+    )
 
 
-def _actors(files: SourceFiles, path: Path, obstacle: Obstacle, dt_s: float, first_us: int, last_us: int) -> list[Actor]:
-    """Make an obstacle's actors; a static obstacle, given by one state, is there for the whole recording."""
+def _actors(
+    files: SourceFiles, path: Path, obstacle: Obstacle, dt_s: float, first_us: int, last_us: int
+) -> list[Actor]:
+    """Make an obstacle's actors; a static obstacle, given by one state, is there for the whole
+    recording.
+    """
     track = obstacle.trajectory(files, path, dt_s)
     if not obstacle.static:
         return actors_of_track(obstacle.obstacle_id, obstacle.label, obstacle.box, track)
     if last_us > first_us:
-        track = Trajectory(np.array([first_us, last_us]), np.repeat(track.xyz, 2, axis=0), np.repeat(track.quat, 2, axis=0))
+        track = Trajectory(
+            np.array([first_us, last_us]),
+            np.repeat(track.xyz, 2, axis=0),
+            np.repeat(track.quat, 2, axis=0),
+        )
     return [Actor(obstacle.obstacle_id, obstacle.label, obstacle.box, track, is_static=True)]
 
 
 def _choose_ego(
-    files: SourceFiles, path: Path, obstacles: tuple[Obstacle, ...], lane_map: LaneMap, ego: str | None
+    files: SourceFiles,
+    path: Path,
+    obstacles: tuple[Obstacle, ...],
+    lane_map: LaneMap,
+    ego: str | None,
 ) -> tuple[Obstacle, str]:
     moving = {o.obstacle_id: o for o in obstacles if not o.static}
     if ego is not None:
         if ego not in moving:
-            raise files.fail(path, f"no moving obstacle {ego!r}", f"choose the ego among {', '.join(sorted(moving)) or 'none'}")
+            raise files.fail(
+                path,
+                f"no moving obstacle {ego!r}",
+                f"choose the ego among {', '.join(sorted(moving)) or 'none'}",
+            )
         return moving[ego], f"ego is the recorded vehicle {ego}, as asked"
     first, last = _step_range(list(moving.values()))
-    always = [o for o in moving.values() if o.label == "car" and (o.steps[0], o.steps[-1], len(o.steps)) == (first, last, last - first + 1)]
+    always = [
+        o
+        for o in moving.values()
+        if o.label == "car"
+        and (o.steps[0], o.steps[-1], len(o.steps)) == (first, last, last - first + 1)
+    ]
     always.sort(key=lambda o: (-_driven_m(o), len(o.obstacle_id), o.obstacle_id))
     surface = merge_areas([lane_polygon(lane) for lane in lane_map.lanes.values()])
     corridors = _corridors(lane_map)
     best, manner = None, "stay on the lanelets and touch nobody (none keeps inside one lane)"
     for candidate in always:
         footprints = _rectangles(candidate, least=DEFAULT.box)
-        if not shapely.covers(surface, footprints).all() or _touches(candidate, footprints, obstacles):
+        if not shapely.covers(surface, footprints).all() or _touches(
+            candidate, footprints, obstacles
+        ):
             continue
         best = best or candidate
         if shapely.covers(corridors[:, None], footprints[None, :]).any(axis=0).all():
@@ -268,7 +372,10 @@ def _choose_ego(
             break
     if best is not None:
         drive = f"ego is the recorded car {best.obstacle_id}: the longest drive ({_driven_m(best):.1f} m)"
-        return best, f"{drive} among cars that are present all the time, {manner}; choose another with ego=ID"
+        return (
+            best,
+            f"{drive} among cars that are present all the time, {manner}; choose another with ego=ID",
+        )
     found = f"{len(moving)} moving obstacles, none a car that is present all the time, stays on the lanelets and touches nobody"
     raise files.fail(path, found, "name the recorded vehicle that shall be the ego")
 
@@ -278,12 +385,16 @@ def _driven_m(obstacle: Obstacle) -> float:
 
 
 def _corridors(lane_map: LaneMap) -> Any:
-    """Return each lane's area joined with its predecessors and successors ``(L,)``: where a car is that keeps its lane."""
+    """Return each lane's area joined with its predecessors and successors ``(L,)``: where a car is
+    that keeps its lane.
+    """
     lanes, before = lane_map.lanes, predecessors(lane_map.lanes)
     joined = []
     for key, lane in lanes.items():
         after = [successor for successor in lane.successors if successor in lanes]
-        joined.append(merge_areas([lane_polygon(lanes[one]) for one in (key, *before[key], *after)]))
+        joined.append(
+            merge_areas([lane_polygon(lanes[one]) for one in (key, *before[key], *after)])
+        )
     return np.array(joined, dtype=object)
 
 
@@ -291,7 +402,9 @@ def _rectangles(obstacle: Obstacle, least: Box | None = None) -> Any:
     """Return the plan-view rectangles ``(T,)`` of an obstacle, at least as large as ``least``."""
     size = np.array([obstacle.box.length_m, obstacle.box.width_m])
     size = size if least is None else np.maximum(size, [least.length_m, least.width_m])
-    corners = rectangle_corners(obstacle.centre[:, :2], obstacle.yaw, np.broadcast_to(size, (len(obstacle.centre), 2)))
+    corners = rectangle_corners(
+        obstacle.centre[:, :2], obstacle.yaw, np.broadcast_to(size, (len(obstacle.centre), 2))
+    )
     return shapely.polygons(corners)
 
 
@@ -314,4 +427,8 @@ def _touches(ego: Obstacle, footprints: Any, obstacles: tuple[Obstacle, ...]) ->
 def _ground(lane_map: LaneMap, drive: F64) -> HeightField:
     """Return a level ground for planar files, a fitted one where points have heights."""
     points = np.concatenate(lane_edges(lane_map.lanes))
-    return flat(0.0) if np.ptp(points[:, 2]) == 0 and points[0, 2] == 0 else from_points(points, drive=drive)
+    return (
+        flat(0.0)
+        if np.ptp(points[:, 2]) == 0 and points[0, 2] == 0
+        else from_points(points, drive=drive)
+    )

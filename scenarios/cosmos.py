@@ -1,7 +1,7 @@
 """Cosmos-Drive-Dreams clips in RDS-HQ form: lane map, ego poses, f-theta calibration.
 
-Layout and facts: the public data set description of NVIDIA Cosmos-Drive-Dreams (arXiv 2506.09042); data CC-BY-4.0, (c) NVIDIA. The world is
-the rig frame of frame 0.
+Layout and facts: the public data set description of NVIDIA Cosmos-Drive-Dreams (arXiv 2506.09042);
+data CC-BY-4.0, (c) NVIDIA. The world is the rig frame of frame 0.
 """
 
 from __future__ import annotations
@@ -15,7 +15,13 @@ from typing import Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import centre_line, densify, quat_from_matrix, wrap_angle, yaw_from_quat
+from alpasim_plugin.core.geometry import (
+    centre_line,
+    densify,
+    quat_from_matrix,
+    wrap_angle,
+    yaw_from_quat,
+)
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Marking, Paint, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
@@ -30,7 +36,9 @@ class Label:
 
     where: str  # file and feature, for messages
     attributes: dict[str, Any]
-    lines: tuple[F64, ...]  # each (N, 3) metres, world; one for a polyline or surface, the eight corners for a cuboid
+    lines: tuple[
+        F64, ...
+    ]  # each (N, 3) metres, world; one for a polyline or surface, the eight corners for a cuboid
 
     @property
     def feature_id(self) -> str:
@@ -45,14 +53,17 @@ class Label:
     def one_id(self, name: str) -> str | None:
         """Return a single id; the text -1 means none."""
         value = self.attributes.get(name)
-        return None if value is None or isinstance(value, list) or str(value) == "-1" else str(value)
+        return (
+            None if value is None or isinstance(value, list) or str(value) == "-1" else str(value)
+        )
 
 
 def read_layer(files: SourceFiles, folder: Path, layer: str) -> tuple[Label, ...]:
     """Read one layer folder, such as ``3d_lanes``; labels marked empty are left out.
 
     Raises:
-        InputError: The folder, its tar or its JSON is missing or damaged, or a feature has no finite geometry.
+        InputError: The folder, its tar or its JSON is missing or damaged, or a feature has no
+            finite geometry.
     """
     path = files.only(folder / layer, ("*.tar",), f"layer {layer}")
     members = {name: data for name, data in files.read_tar(path).items() if name.endswith(".json")}
@@ -73,7 +84,9 @@ def read_layer(files: SourceFiles, folder: Path, layer: str) -> tuple[Label, ...
             attributes = {a["name"]: _value(a) for a in shape.get("attributes", ())}
             lines = tuple(np.array(v, dtype=np.float64).reshape(-1, 3) for v in _vertices(shape))
         except (KeyError, TypeError, ValueError) as error:
-            raise files.fail(where, f"no readable shape: {error!r}", "use a file of the RDS-HQ layout") from error
+            raise files.fail(
+                where, f"no readable shape: {error!r}", "use a file of the RDS-HQ layout"
+            ) from error
         if not lines or any(len(line) == 0 or not np.isfinite(line).all() for line in lines):
             raise files.fail(where, "a shape without finite vertices", "repair or drop this label")
         for line in lines:
@@ -83,7 +96,9 @@ def read_layer(files: SourceFiles, folder: Path, layer: str) -> tuple[Label, ...
 
 
 def _value(attribute: dict[str, Any]) -> Any:
-    """Unpack an attribute: ``{"name": ..., KIND: value}``, where lists come one level deeper and may be absent when empty."""
+    """Unpack an attribute: ``{"name": ..., KIND: value}``, where lists come one level deeper and
+    may be absent when empty.
+    """
     values = [v for k, v in attribute.items() if k != "name"]
     if not values:
         return None
@@ -101,13 +116,18 @@ def _vertices(shape: dict[str, Any]) -> list[Any]:
 
 
 def paint_of(styles: Any, colours: Any) -> Paint:
-    """Return the paint of a line from its styles and colours a vertex; the most frequent pair decides.
+    """Return the paint of a line from its styles and colours a vertex; the most frequent pair
+    decides.
 
     Kerbs, barriers, virtual lines and road boundaries carry no paint.
     """
     if not isinstance(styles, list) or not styles:
         return "unknown"
-    given = colours if isinstance(colours, list) and len(colours) == len(styles) else ["UNKNOWN"] * len(styles)
+    given = (
+        colours
+        if isinstance(colours, list) and len(colours) == len(styles)
+        else ["UNKNOWN"] * len(styles)
+    )
     style, colour = Counter(zip(styles, given, strict=True)).most_common(1)[0][0]
     yellow = colour == "YELLOW"
     if style in ("VIRTUAL", "BARRIER", "ROAD_BOUNDARY") or "CURB" in style:
@@ -124,7 +144,8 @@ def paint_of(styles: Any, colours: Any) -> Paint:
 
 
 def sign_pose(corners: F64) -> tuple[F64, Box]:
-    """Return ``(T_world_sign (4, 4), size)`` of a cuboid ``(8, 3)``: x along its thinnest side, z as upright as it goes.
+    """Return ``(T_world_sign (4, 4), size)`` of a cuboid ``(8, 3)``: x along its thinnest side, z
+    as upright as it goes.
 
     Corners 0 to 3 go round one face and corner 4 lies opposite corner 0.
     """
@@ -144,12 +165,14 @@ def sign_pose(corners: F64) -> tuple[F64, Box]:
 MPH = 0.44704  # m/s
 
 
-def oriented_lanes(files: SourceFiles, labels: tuple[Label, ...], ego_log: Trajectory) -> tuple[dict[str, Lane], tuple[str, ...]]:
+def oriented_lanes(
+    files: SourceFiles, labels: tuple[Label, ...], ego_log: Trajectory
+) -> tuple[dict[str, Lane], tuple[str, ...]]:
     """Make lanes with edges in driving direction, left edge left.
 
-    A lane runs towards the lanes named by its ``next_lane_ids``: the end of its edges that lies nearer to them is its end. A lane without
-    links takes the direction of the ego that drove in it, else the order of its points. Left and right then follow from the turn of the
-    ring.
+    A lane runs towards the lanes named by its ``next_lane_ids``: the end of its edges that lies
+    nearer to them is its end. A lane without links takes the direction of the ego that drove in it,
+    else the order of its points. Left and right then follow from the turn of the ring.
 
     Raises:
         InputError: A lane has not exactly two edges, or two lanes share an id.
@@ -157,12 +180,21 @@ def oriented_lanes(files: SourceFiles, labels: tuple[Label, ...], ego_log: Traje
     raw: dict[str, tuple[F64, F64]] = {}
     for label in labels:
         if len(label.lines) != 2 or min(len(line) for line in label.lines) < 2:
-            raise files.fail(label.where, f"{len(label.lines)} edges", "give each lane two edges of at least 2 points")
+            raise files.fail(
+                label.where,
+                f"{len(label.lines)} edges",
+                "give each lane two edges of at least 2 points",
+            )
         if label.feature_id in raw:
-            raise files.fail(label.where, f"lane id {label.feature_id} twice", "give each lane its own id")
+            raise files.fail(
+                label.where, f"lane id {label.feature_id} twice", "give each lane its own id"
+            )
         one, two = label.lines
         raw[label.feature_id] = (one, _same_order(one, two))
-    links = {label.feature_id: tuple(i for i in label.ids("next_lane_ids") if i in raw) for label in labels}
+    links = {
+        label.feature_id: tuple(i for i in label.ids("next_lane_ids") if i in raw)
+        for label in labels
+    }
     before: dict[str, list[str]] = {key: [] for key in raw}
     for key, followers in links.items():
         for follower in followers:
@@ -172,12 +204,22 @@ def oriented_lanes(files: SourceFiles, labels: tuple[Label, ...], ego_log: Traje
     for label in labels:
         key = label.feature_id
         one, two = raw[key]
-        vote = sum(_runs_towards(raw[key], raw[n]) for n in links[key]) - sum(_runs_towards(raw[key], raw[p]) for p in before[key])
+        vote = sum(_runs_towards(raw[key], raw[n]) for n in links[key]) - sum(
+            _runs_towards(raw[key], raw[p]) for p in before[key]
+        )
         if vote == 0 and not links[key] and not before[key]:
             vote = _ego_vote(one, two, ego_log)
         if vote < 0:
-            one, two, turned = one[::-1], two[::-1], turned + 1
-        styles = [(label.attributes.get(f"{side}_edge_styles"), label.attributes.get(f"{side}_edge_colors")) for side in ("left", "right")]
+            one = one[::-1]
+            two = two[::-1]
+            turned = turned + 1
+        styles = [
+            (
+                label.attributes.get(f"{side}_edge_styles"),
+                label.attributes.get(f"{side}_edge_colors"),
+            )
+            for side in ("left", "right")
+        ]
         if is_left_of(two, one):
             one, two, swapped = two, one, swapped + 1
             # Attributes are named by side, not by order: they stay with their side.
@@ -187,7 +229,9 @@ def oriented_lanes(files: SourceFiles, labels: tuple[Label, ...], ego_log: Traje
             centre=centre_line(one, two),
             left=one,
             right=two,
-            kind="shoulder" if "SHOULDER_LANE" in (label.attributes.get("use_types") or ()) else "vehicle",
+            kind="shoulder"
+            if "SHOULDER_LANE" in (label.attributes.get("use_types") or ())
+            else "vehicle",
             successors=label.ids("next_lane_ids"),
             left_neighbour=label.one_id("left_lane_id"),
             right_neighbour=label.one_id("right_lane_id"),
@@ -197,21 +241,29 @@ def oriented_lanes(files: SourceFiles, labels: tuple[Label, ...], ego_log: Traje
             speed_limit_mps=_speed_limit(label),
         )
     notes = ["speed limits are taken as miles per hour"]
-    notes += [f"{turned} lanes were stored against their driving direction and were turned"] if turned else []
+    notes += (
+        [f"{turned} lanes were stored against their driving direction and were turned"]
+        if turned
+        else []
+    )
     notes += [f"{swapped} lanes had their edges exchanged and were put right"] if swapped else []
     notes += [f"the recorded drive runs against {against} lanes"] if against else []
     return lanes, tuple(notes)
 
 
 def _same_order(one: F64, two: F64) -> F64:
-    """Return the second edge, turned round where its far end lies nearer to the start of the first."""
+    """Return the second edge, turned round where its far end lies nearer to the start of the
+    first.
+    """
     straight = np.linalg.norm(one[0] - two[0]) + np.linalg.norm(one[-1] - two[-1])
     crossed = np.linalg.norm(one[0] - two[-1]) + np.linalg.norm(one[-1] - two[0])
     return two[::-1] if straight > crossed else two
 
 
 def _runs_towards(lane: tuple[F64, F64], other: tuple[F64, F64]) -> int:
-    """Return 1 if the lane's last points lie nearer to the other lane than its first ones, else -1."""
+    """Return 1 if the lane's last points lie nearer to the other lane than its first ones, else
+    -1.
+    """
     ends = np.stack([(other[0][i] + other[1][i]) / 2 for i in (0, -1)])
     first, last = ((lane[0][i] + lane[1][i]) / 2 for i in (0, -1))
     distance = [float(np.linalg.norm(ends - p, axis=1).min()) for p in (first, last)]
@@ -219,7 +271,9 @@ def _runs_towards(lane: tuple[F64, F64], other: tuple[F64, F64]) -> int:
 
 
 def _ego_vote(one: F64, two: F64, ego_log: Trajectory) -> int:
-    """Return 1 if the ego drove through the lane in the order of its points, -1 if against it, 0 if it was not there or crossed."""
+    """Return 1 if the ego drove through the lane in the order of its points, -1 if against it, 0 if
+    it was not there or crossed.
+    """
     ring = lane_polygon(Lane("", one, one, two))
     inside = shapely.contains_xy(ring, ego_log.xyz[:, 0], ego_log.xyz[:, 1])
     if not inside.any():
@@ -237,7 +291,15 @@ def _speed_limit(label: Label) -> float | None:
 
 
 FRAME_RATE_HZ = 30
-LAYERS = ("lanes", "lanelines", "road_boundaries", "wait_lines", "crosswalks", "poles", "traffic_signs")
+LAYERS = (
+    "lanes",
+    "lanelines",
+    "road_boundaries",
+    "wait_lines",
+    "crosswalks",
+    "poles",
+    "traffic_signs",
+)
 EDGE_STEP_M = 2.0
 GROUND_CELL_M = 2.0
 
@@ -246,7 +308,8 @@ def read_cosmos(path: str | Path) -> RecordedLog:
     """Read one clip: the folder that holds ``3d_lanes``, ``vehicle_pose`` and the other layers.
 
     Raises:
-        InputError: A layer is missing or damaged, there are no lanes or no road boundaries, or the poses are not a drive.
+        InputError: A layer is missing or damaged, there are no lanes or no road boundaries, or the
+            poses are not a drive.
     """
     folder = Path(path)
     files = SourceFiles("reading a Cosmos-Drive-Dreams clip")
@@ -257,24 +320,52 @@ def read_cosmos(path: str | Path) -> RecordedLog:
     if not layers["lanes"]:
         raise files.fail(folder / "3d_lanes", "a map without lanes", "use a clip with lanes")
     if not layers["road_boundaries"]:
-        raise files.fail(folder / "3d_road_boundaries", "a map without road edges", "use a clip with road boundaries")
+        raise files.fail(
+            folder / "3d_road_boundaries",
+            "a map without road edges",
+            "use a clip with road boundaries",
+        )
     lanes, lane_notes = oriented_lanes(files, layers["lanes"], ego_log)
-    stops = [label for label in layers["wait_lines"] if label.attributes.get("is_implicit") is not True]
+    stops = [
+        label for label in layers["wait_lines"] if label.attributes.get("is_implicit") is not True
+    ]
     lane_map = LaneMap(
         lanes=lanes,
-        road_edges=tuple(densify(label.lines[0], EDGE_STEP_M) for label in layers["road_boundaries"] if len(label.lines[0]) > 1),
-        crosswalks=tuple(np.concatenate([label.lines[0], label.lines[0][:1]]) for label in layers["crosswalks"]),
+        road_edges=tuple(
+            densify(label.lines[0], EDGE_STEP_M)
+            for label in layers["road_boundaries"]
+            if len(label.lines[0]) > 1
+        ),
+        crosswalks=tuple(
+            np.concatenate([label.lines[0], label.lines[0][:1]]) for label in layers["crosswalks"]
+        ),
         stop_lines=tuple(label.lines[0] for label in stops),
         markings=tuple(
-            Marking(line.lines[0], paint_of(line.attributes.get("styles"), line.attributes.get("colors"))) for line in layers["lanelines"]
+            Marking(
+                line.lines[0],
+                paint_of(line.attributes.get("styles"), line.attributes.get("colors")),
+            )
+            for line in layers["lanelines"]
         ),
         poles=tuple(label.lines[0] for label in layers["poles"]),
-        signs=tuple(sign_pose(label.lines[0]) for label in layers["traffic_signs"] if len(label.lines[0]) == 8),
+        signs=tuple(
+            sign_pose(label.lines[0])
+            for label in layers["traffic_signs"]
+            if len(label.lines[0]) == 8
+        ),
     )
     lenses = read_lenses(files, folder)
     if FRONT_WIDE not in lenses:
-        raise files.fail(folder / "ftheta_intrinsic", f"no lens {FRONT_WIDE}", "use a clip with the front wide camera")
-    ground = from_points(np.concatenate([*lane_edges(lanes), *lane_map.road_edges, ego_log.xyz]), GROUND_CELL_M, ego_log.xyz)
+        raise files.fail(
+            folder / "ftheta_intrinsic",
+            f"no lens {FRONT_WIDE}",
+            "use a clip with the front wide camera",
+        )
+    ground = from_points(
+        np.concatenate([*lane_edges(lanes), *lane_map.road_edges, ego_log.xyz]),
+        GROUND_CELL_M,
+        ego_log.xyz,
+    )
     notes = (
         "no actor tracks in this copy: the road is empty",
         "no camera extrinsics in this copy: the front wide camera is mounted as on another car of the fleet",
@@ -303,7 +394,8 @@ def read_cosmos(path: str | Path) -> RecordedLog:
 def read_poses(files: SourceFiles, folder: Path) -> tuple[Trajectory, str]:
     """Read ``vehicle_pose``: one 4x4 rig-to-world matrix a frame at 30 Hz, and the clip's name.
 
-    Times count from the clip's first microsecond, which stands in the file's name; 0 where it does not.
+    Times count from the clip's first microsecond, which stands in the file's name; 0 where it does
+    not.
 
     Raises:
         InputError: Frames are missing, or a matrix is not a rigid motion.
@@ -316,16 +408,30 @@ def read_poses(files: SourceFiles, folder: Path) -> tuple[Trajectory, str]:
             continue
         where = f"{path}, {name}"
         matrix = np.asarray(files.parse_npy(data, where), dtype=np.float64)
-        if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:3, :3]) - 1) > 1e-3:
-            raise files.fail(where, f"an array of shape {matrix.shape} that is not a rigid motion", "give 4x4 rig-to-world matrices")
+        if (
+            matrix.shape != (4, 4)
+            or not np.isfinite(matrix).all()
+            or abs(np.linalg.det(matrix[:3, :3]) - 1) > 1e-3
+        ):
+            raise files.fail(
+                where,
+                f"an array of shape {matrix.shape} that is not a rigid motion",
+                "give 4x4 rig-to-world matrices",
+            )
         frames[int(match.group(1))] = matrix
     if sorted(frames) != list(range(len(frames))):
         missing = next(i for i in range(len(frames) + 1) if i not in frames)
-        raise files.fail(path, f"no frame {missing:06d} among {len(frames)} poses", "give frames numbered from 000000 without holes")
+        raise files.fail(
+            path,
+            f"no frame {missing:06d} among {len(frames)} poses",
+            "give frames numbered from 000000 without holes",
+        )
     stamp = re.match(r"(?P<clip>.+)_(?P<start>\d+)_(?P<end>\d+)$", path.stem)
     start_us = int(stamp["start"]) if stamp else 0
     poses = np.stack([frames[i] for i in range(len(frames))]) if frames else np.zeros((0, 4, 4))
     t_us = start_us + np.round(np.arange(len(poses)) * (1e6 / FRAME_RATE_HZ)).astype(np.int64)
     files.near(path, poses[:, :3, 3])
     quat = quat_from_matrix(poses[:, :3, :3])
-    return checked_trajectory(files, path, t_us, poses[:, :3, 3].copy(), quat, least=2), stamp["clip"] if stamp else path.stem
+    return checked_trajectory(files, path, t_us, poses[:, :3, 3].copy(), quat, least=2), stamp[
+        "clip"
+    ] if stamp else path.stem

@@ -1,7 +1,8 @@
-"""Cameras of a Cosmos-Drive-Dreams clip and of an AlpaSim scene: f-theta lenses, and the pinhole that is rendered.
+"""Cameras of a Cosmos-Drive-Dreams clip and of an AlpaSim scene: f-theta lenses, and the pinhole
+that is rendered.
 
-What is written to the calibration table of an AlpaSim scene are the pinholes that are rendered, as the f-theta lenses that AlpaSim's
-renderers expect.
+What is written to the calibration table of an AlpaSim scene are the pinholes that are rendered, as
+the f-theta lenses that AlpaSim's renderers expect.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ from scenarios.usdz_archive import Archive
 FRONT_WIDE = "camera_front_wide_120fov"
 WIDTH, HEIGHT = 512, 288  # rendered size; the recorded frames are 1920 x 1080
 HORIZONTAL_FOV_RAD = np.pi / 2
-# Nominal mount of the front wide camera (camera to rig). The clip has no extrinsics. This is the calibration of another car of the same
-# fleet; with it the clip's own map falls on the publisher's renders of this clip.
+# Nominal mount of the front wide camera (camera to rig). The clip has no extrinsics. This is the
+# calibration of another car of the same fleet; with it the clip's own map falls on the publisher's
+# renders of this clip.
 T_RIG_FRONT_WIDE = np.array(
     [
         [-0.0110549, -0.0181034, 0.9997750, 1.849283],
@@ -38,20 +40,25 @@ T_RIG_FRONT_WIDE = np.array(
 
 @dataclass(frozen=True)
 class RecordedLens:
-    """An f-theta lens as calibrated: principal point and size in pixels of the recorded image, and both polynomials."""
+    """An f-theta lens as calibrated: principal point and size in pixels of the recorded image, and
+    both polynomials.
+    """
 
     cx: float
     cy: float
     width: int
     height: int
     lens: FTheta
-    backward_given: bool  # the file's polynomial maps pixels to angle; the other direction is fitted
+    backward_given: (
+        bool  # the file's polynomial maps pixels to angle; the other direction is fitted
+    )
 
 
 def read_lenses(files: SourceFiles, folder: Path) -> dict[str, RecordedLens]:
     """Read ``ftheta_intrinsic``: one array of 11 numbers a camera.
 
-    Layout: cx, cy, width, height, six coefficients from the constant upwards, and a flag: 1 where they map pixel radius to angle, 0 where
+    Layout: cx, cy, width, height, six coefficients from the constant upwards, and a flag: 1 where
+        they map pixel radius to angle, 0 where
     they map angle to radius.
 
     Raises:
@@ -64,7 +71,13 @@ def read_lenses(files: SourceFiles, folder: Path) -> dict[str, RecordedLens]:
             continue
         where = f"{path}, {name}"
         values = np.asarray(files.parse_npy(data, where), dtype=np.float64)
-        if values.shape != (11,) or not np.isfinite(values).all() or values[2] < 1 or values[3] < 1 or values[10] not in (0.0, 1.0):
+        if (
+            values.shape != (11,)
+            or not np.isfinite(values).all()
+            or values[2] < 1
+            or values[3] < 1
+            or values[10] not in (0.0, 1.0)
+        ):
             found = f"an array of shape {values.shape} that is not an f-theta lens"
             raise files.fail(where, found, "give cx, cy, width, height, 6 coefficients, flag")
         lenses[name.rsplit(".", 2)[-2]] = lens_of(values)
@@ -72,7 +85,9 @@ def read_lenses(files: SourceFiles, folder: Path) -> dict[str, RecordedLens]:
 
 
 def lens_of(values: F64) -> RecordedLens:
-    """Make a lens of the 11 numbers ``(11,)`` of `read_lenses`; the direction that is not given is fitted over the image's reach."""
+    """Make a lens of the 11 numbers ``(11,)`` of `read_lenses`; the direction that is not given is
+    fitted over the image's reach.
+    """
     cx, cy, width, height = values[:4]
     corners = np.array([[0, 0], [width, 0], [0, height], [width, height]]) - (cx, cy)
     reach_px = float(np.linalg.norm(corners, axis=1).max())
@@ -100,7 +115,9 @@ def _polynomial(x: F64, coefficients: F64) -> F64:
 
 
 def _fit(x: F64, y: F64) -> F64:
-    """Return six coefficients of the least-squares inverse through the origin (constant term zero)."""
+    """Return six coefficients of the least-squares inverse through the origin (constant term
+    zero).
+    """
     scale = x[-1]
     powers = np.stack([(x / scale) ** k for k in range(1, 6)], axis=1)
     coefficients = np.linalg.lstsq(powers, y, rcond=None)[0]
@@ -110,7 +127,8 @@ def _fit(x: F64, y: F64) -> F64:
 def front_camera(lens: RecordedLens, T_rig_camera: F64 = T_RIG_FRONT_WIDE) -> CameraSpec:
     """Return the pinhole of 90 degrees width inside the front wide lens.
 
-    Its principal point is the recorded one scaled to the rendered size, so every rendered pixel lies inside the recorded image.
+    Its principal point is the recorded one scaled to the rendered size, so every rendered pixel
+    lies inside the recorded image.
 
     Args:
         lens: The calibrated lens.
@@ -139,7 +157,8 @@ def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...
     """Return the front wide camera where the scene holds its calibration, with notes.
 
     Raises:
-        InputError: The table is there, but damaged or its front wide camera is not an f-theta camera.
+        InputError: The table is there, but damaged or its front wide camera is not an f-theta
+            camera.
     """
     member = next((name for name in TABLES if name in archive), None)
     if member is None:
@@ -147,18 +166,30 @@ def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...
     where = f"{archive.path}, {member}"
     rows = archive.table(member)
     try:
-        rig = archive.files.parse_json(str(rows[0]["calibration_estimate"]["rig_json"]).encode(), where)
+        rig = archive.files.parse_json(
+            str(rows[0]["calibration_estimate"]["rig_json"]).encode(), where
+        )
         sensors = {str(s["name"]).replace(":", "_"): s for s in rig["rig"]["sensors"]}
     except (IndexError, KeyError, TypeError) as error:
-        raise archive.files.fail(where, f"{type(error).__name__}: {error}", "give one row with rig_json") from error
+        raise archive.files.fail(
+            where, f"{type(error).__name__}: {error}", "give one row with rig_json"
+        ) from error
     sensor = sensors.get(FRONT_WIDE)
     if sensor is None:
-        return (), (f"no {FRONT_WIDE} among {len(sensors)} calibrated sensors: the default front camera is used",)
+        return (), (
+            f"no {FRONT_WIDE} among {len(sensors)} calibrated sensors: the default front camera is used",
+        )
     try:
         camera = front_camera(lens_of(_lens_numbers(sensor["properties"])), mount(sensor))
     except (KeyError, TypeError, ValueError) as error:
-        raise archive.files.fail(f"{where}, {FRONT_WIDE}", f"{type(error).__name__}: {error}", "give an f-theta calibration") from error
-    return (camera,), ("rendered through a pinhole of 90 degrees width inside the calibrated 120 degree f-theta lens",)
+        raise archive.files.fail(
+            f"{where}, {FRONT_WIDE}",
+            f"{type(error).__name__}: {error}",
+            "give an f-theta calibration",
+        ) from error
+    return (camera,), (
+        "rendered through a pinhole of 90 degrees width inside the calibrated 120 degree f-theta lens",
+    )
 
 
 def _lens_numbers(properties: dict[str, Any]) -> F64:
@@ -167,13 +198,17 @@ def _lens_numbers(properties: dict[str, Any]) -> F64:
     coefficients = [float(v) for v in str(properties["polynomial"]).split()]
     if not 1 <= len(coefficients) <= 6:
         raise ValueError(f"a polynomial of {len(coefficients)} coefficients")
-    backward = str(properties.get("polynomial-type", "pixeldistance-to-angle")) == "pixeldistance-to-angle"
+    backward = (
+        str(properties.get("polynomial-type", "pixeldistance-to-angle")) == "pixeldistance-to-angle"
+    )
     size = [float(properties[name]) for name in ("cx", "cy", "width", "height")]
     return np.array([*size, *coefficients, *[0.0] * (6 - len(coefficients)), float(backward)])
 
 
 def mount(sensor: dict[str, Any]) -> F64:
-    """Return the ``(4, 4)`` pose of a camera in the rig: the nominal mount, turned and shifted by the estimated corrections."""
+    """Return the ``(4, 4)`` pose of a camera in the rig: the nominal mount, turned and shifted by
+    the estimated corrections.
+    """
     nominal = sensor["nominalSensor2Rig_FLU"]
     turn = (sensor.get("correction_sensor_R_FLU") or {}).get("roll-pitch-yaw", (0.0, 0.0, 0.0))
     shift = sensor.get("correction_rig_T") or (0.0, 0.0, 0.0)
@@ -185,7 +220,9 @@ def mount(sensor: dict[str, Any]) -> F64:
 
 def _rotation(roll_pitch_yaw_deg: Any) -> F64:
     """Return Rz(yaw) Ry(pitch) Rx(roll)."""
-    (cr, cp, cy), (sr, sp, sy) = (f(np.deg2rad(np.asarray(roll_pitch_yaw_deg, dtype=np.float64))) for f in (np.cos, np.sin))
+    (cr, cp, cy), (sr, sp, sy) = (
+        f(np.deg2rad(np.asarray(roll_pitch_yaw_deg, dtype=np.float64))) for f in (np.cos, np.sin)
+    )
     x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
     y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
@@ -205,18 +242,31 @@ def calibration_table(cameras: Mapping[str, CameraSpec], clip_id: str) -> bytes:
     sensors = [_sensor(name, camera) for name, camera in cameras.items()]
     text = json.dumps({"rig": {"sensors": sensors}})
     own = pa.struct([("rig_json", pa.string())])
-    schema = pa.schema([("key", pa.struct([("clip_id", pa.string())])), ("calibration_estimate", own)])
+    schema = pa.schema(
+        [("key", pa.struct([("clip_id", pa.string())])), ("calibration_estimate", own)]
+    )
     stream = io.BytesIO()
-    pq.write_table(pa.Table.from_pylist([{"key": {"clip_id": clip_id}, "calibration_estimate": {"rig_json": text}}], schema=schema), stream)
+    pq.write_table(
+        pa.Table.from_pylist(
+            [{"key": {"clip_id": clip_id}, "calibration_estimate": {"rig_json": text}}],
+            schema=schema,
+        ),
+        stream,
+    )
     return stream.getvalue()
 
 
 def pixel_to_angle(camera: CameraSpec) -> F64:
-    """Return coefficients ``(6,)`` of the angle (rad) as a polynomial of the distance (pixels) from the principal point.
+    """Return coefficients ``(6,)`` of the angle (rad) as a polynomial of the distance (pixels) from
+    the principal point.
 
-    A pinhole has theta = atan(r / f). Least squares over the image, with the constant zero; f is the mean of both focal lengths.
+    A pinhole has theta = atan(r / f). Least squares over the image, with the constant zero; f is
+    the mean of both focal lengths.
     """
-    corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]]) - camera.K[:2, 2]
+    corners = (
+        np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]])
+        - camera.K[:2, 2]
+    )
     reach = float(np.linalg.norm(corners, axis=1).max())
     radius = np.linspace(0.0, 1.0, 1000)
     powers = np.stack([radius**k for k in range(1, DEGREE + 1)], axis=1)
@@ -255,5 +305,8 @@ def _sensor(name: str, camera: CameraSpec) -> dict[str, object]:
 def _roll_pitch_yaw_deg(rotation: F64) -> list[float]:
     """Return the angles of Rz(yaw) Ry(pitch) Rx(roll) in degrees."""
     pitch = np.arcsin(np.clip(-rotation[2, 0], -1.0, 1.0))
-    roll, yaw = np.arctan2(rotation[2, 1], rotation[2, 2]), np.arctan2(rotation[1, 0], rotation[0, 0])
+    roll, yaw = (
+        np.arctan2(rotation[2, 1], rotation[2, 2]),
+        np.arctan2(rotation[1, 0], rotation[0, 0]),
+    )
     return [float(angle) for angle in np.rad2deg([roll, pitch, yaw])]

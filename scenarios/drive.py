@@ -1,7 +1,9 @@
-"""Imported drives: the folder that ``simrun import`` writes and reads again (docs/real-drives.md says what stands in it).
+"""Imported drives: the folder that ``simrun import`` writes and reads again (docs/real-drives.md
+says what stands in it).
 
-Coordinates are metres in the scenario's world, rotations are matrices or ``wxyz``, cameras are OpenCV's. Photographs are the frames of the
-folder's ``transforms.json``: pinhole pictures without distortion, each with its time, camera and use.
+Coordinates are metres in the scenario's world, rotations are matrices or ``wxyz``, cameras are
+OpenCV's. Photographs are the frames of the folder's ``transforms.json``: pinhole pictures without
+distortion, each with its time, camera and use.
 """
 
 from __future__ import annotations
@@ -35,7 +37,10 @@ from alpasim_plugin.core.types import (
 )
 from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory, stands_still
 
-DRIVE_FILE, TRANSFORMS_FILE, GROUND_FILE, MODEL_FOLDER = "drive.json", "transforms.json", "ground.npy", "model"
+DRIVE_FILE = "drive.json"
+TRANSFORMS_FILE = "transforms.json"
+GROUND_FILE = "ground.npy"
+MODEL_FOLDER = "model"
 DOING = "reading an imported drive"
 DO_THIS = "import the drive again: simrun import drive FOLDER -o OUT"
 Numbers = list[float]
@@ -168,7 +173,9 @@ class Obstacle:
     uncertainty_m: float
 
 
-def write_drive(folder: Path, log: RecordedLog, tracks: Sequence[Actor], obstacles: Sequence[Obstacle] | None) -> None:
+def write_drive(
+    folder: Path, log: RecordedLog, tracks: Sequence[Actor], obstacles: Sequence[Obstacle] | None
+) -> None:
     """Write ``drive.json`` and ``ground.npy``; pictures and model are written by who makes them.
 
     Args:
@@ -185,34 +192,54 @@ def write_drive(folder: Path, log: RecordedLog, tracks: Sequence[Actor], obstacl
         "scene_id": log.scene_id,
         "ego": _poses(log.ego_log),
         "vehicle": {
-            "length_m": box.length_m, "width_m": box.width_m, "height_m": box.height_m,
+            "length_m": box.length_m,
+            "width_m": box.width_m,
+            "height_m": box.height_m,
             "rear_axle_to_centre_m": log.vehicle.rear_axle_to_centre_m,
         },
         "cameras": [
-            {"name": c.name, "width": c.width, "height": c.height, "K": c.K.tolist(), "T_rig_camera": c.T_rig_camera.tolist()}
+            {
+                "name": c.name,
+                "width": c.width,
+                "height": c.height,
+                "K": c.K.tolist(),
+                "T_rig_camera": c.T_rig_camera.tolist(),
+            }
             for c in log.cameras
         ],
         "map": _map_document(log.lane_map),
         "ground": {"x0_m": log.ground.x0_m, "y0_m": log.ground.y0_m, "cell_m": log.ground.cell_m},
-        "tracks": [{"id": a.actor_id, "label": a.label, "size_m": _size(a.box), "poses": _poses(a.track)} for a in tracks],
+        "tracks": [
+            {"id": a.actor_id, "label": a.label, "size_m": _size(a.box), "poses": _poses(a.track)}
+            for a in tracks
+        ],
         "obstacles": None if obstacles is None else [_obstacle_document(one) for one in obstacles],
         "world_origin": list(log.world_origin),
         "notes": list(log.notes),
-    }  # fmt: skip
+    }
     write_json(folder / DRIVE_FILE, document)
 
 
 def read_drive(folder: Path) -> RecordedLog:
-    """Read what ``simrun import`` has written, as a recorded log with its photographs and the folder of its model.
+    """Read what ``simrun import`` has written, as a recorded log with its photographs and the
+    folder of its model.
 
     Raises:
-        InputError: A file is missing or damaged, or holds what no drive may hold; the message names it.
+        InputError: A file is missing or damaged, or holds what no drive may hold; the message names
+            it.
     """
     files = SourceFiles(DOING)
     path = folder / DRIVE_FILE
     document = as_shape(DriveDocument, files.read_json(path), path, DOING, DO_THIS)
     ego = document["ego"]
-    log = checked_trajectory(files, path, np.array(ego["t_us"], np.int64), _rows(ego["xyz"]), _rows(ego["quat"], 4), least=2)
+    log = checked_trajectory(
+        files,
+        path,
+        np.array(ego["t_us"], np.int64),
+        _rows(ego["xyz"]),
+        _rows(ego["quat"], 4),
+        least=2,
+    )
     model = folder / MODEL_FOLDER
     _note_files(files, model)
     obstacles = [_obstacle_actor(one, log) for one in document["obstacles"] or ()]
@@ -224,12 +251,23 @@ def read_drive(folder: Path) -> RecordedLog:
         lane_map=_map_of(document["map"]),
         ground=_ground_of(files, folder, document["ground"]),
         ego_log=log,
-        vehicle=Vehicle(Box(body["length_m"], body["width_m"], body["height_m"]), body["rear_axle_to_centre_m"]) if body else Vehicle(),
+        vehicle=Vehicle(
+            Box(body["length_m"], body["width_m"], body["height_m"]), body["rear_axle_to_centre_m"]
+        )
+        if body
+        else Vehicle(),
         actors=(*tracks, *obstacles),
         cameras=tuple(
-            CameraSpec(c["name"], c["width"], c["height"], _rows(c["K"]), _rows(c["T_rig_camera"], 4)) for c in document["cameras"]
+            CameraSpec(
+                c["name"], c["width"], c["height"], _rows(c["K"]), _rows(c["T_rig_camera"], 4)
+            )
+            for c in document["cameras"]
         ),
-        world_origin=(document["world_origin"][0], document["world_origin"][1], document["world_origin"][2]),
+        world_origin=(
+            document["world_origin"][0],
+            document["world_origin"][1],
+            document["world_origin"][2],
+        ),
         content_hash=files.content_hash,
         notes=tuple(document["notes"]),
         recording=_recording(files, folder),
@@ -254,13 +292,21 @@ def _rows(values: Any, width: int = 3) -> F64:
 def _map_document(lane_map: LaneMap) -> _Map:
     lanes: list[_Lane] = [
         {
-            "lane_id": lane.lane_id, "centre": lane.centre.tolist(), "left": None if lane.left is None else lane.left.tolist(),
-            "right": None if lane.right is None else lane.right.tolist(), "kind": lane.kind, "successors": list(lane.successors),
-            "left_neighbour": lane.left_neighbour, "right_neighbour": lane.right_neighbour, "left_paint": lane.left_paint,
-            "right_paint": lane.right_paint, "is_intersection": lane.is_intersection, "speed_limit_mps": lane.speed_limit_mps,
+            "lane_id": lane.lane_id,
+            "centre": lane.centre.tolist(),
+            "left": None if lane.left is None else lane.left.tolist(),
+            "right": None if lane.right is None else lane.right.tolist(),
+            "kind": lane.kind,
+            "successors": list(lane.successors),
+            "left_neighbour": lane.left_neighbour,
+            "right_neighbour": lane.right_neighbour,
+            "left_paint": lane.left_paint,
+            "right_paint": lane.right_paint,
+            "is_intersection": lane.is_intersection,
+            "speed_limit_mps": lane.speed_limit_mps,
         }
         for lane in lane_map.lanes.values()
-    ]  # fmt: skip
+    ]
     return {
         "lanes": lanes,
         "road_edges": [line.tolist() for line in lane_map.road_edges],
@@ -273,12 +319,21 @@ def _map_document(lane_map: LaneMap) -> _Map:
 def _map_of(document: _Map) -> LaneMap:
     lanes = {
         lane["lane_id"]: Lane(
-            lane["lane_id"], _rows(lane["centre"]), None if lane["left"] is None else _rows(lane["left"]),
-            None if lane["right"] is None else _rows(lane["right"]), lane["kind"], tuple(lane["successors"]), lane["left_neighbour"],
-            lane["right_neighbour"], lane["left_paint"], lane["right_paint"], lane["is_intersection"], lane["speed_limit_mps"],
+            lane["lane_id"],
+            _rows(lane["centre"]),
+            None if lane["left"] is None else _rows(lane["left"]),
+            None if lane["right"] is None else _rows(lane["right"]),
+            lane["kind"],
+            tuple(lane["successors"]),
+            lane["left_neighbour"],
+            lane["right_neighbour"],
+            lane["left_paint"],
+            lane["right_paint"],
+            lane["is_intersection"],
+            lane["speed_limit_mps"],
         )
         for lane in document["lanes"]
-    }  # fmt: skip
+    }
     return LaneMap(
         lanes,
         road_edges=tuple(_rows(line) for line in document["road_edges"]),
@@ -299,8 +354,20 @@ def _ground_of(files: SourceFiles, folder: Path, grid: _Grid) -> HeightField:
 
 def _track_actor(files: SourceFiles, path: Path, track: _Track) -> Actor:
     poses, where = track["poses"], f"{path}, track {track['id']}"
-    one = checked_trajectory(files, where, np.array(poses["t_us"], np.int64), _rows(poses["xyz"]), _rows(poses["quat"], 4))
-    return Actor(track["id"], track["label"], Box(*track["size_m"]), one, stands_still(one.t_us, one.xyz, track["label"]))
+    one = checked_trajectory(
+        files,
+        where,
+        np.array(poses["t_us"], np.int64),
+        _rows(poses["xyz"]),
+        _rows(poses["quat"], 4),
+    )
+    return Actor(
+        track["id"],
+        track["label"],
+        Box(*track["size_m"]),
+        one,
+        stands_still(one.t_us, one.xyz, track["label"]),
+    )
 
 
 def _obstacle_document(one: Obstacle) -> _Obstacle:
@@ -318,7 +385,13 @@ def _obstacle_actor(one: _Obstacle, ego: Trajectory) -> Actor:
     half = one["yaw_rad"] / 2
     ends = np.array([ego.t_us[0], ego.t_us[-1]])
     quat = np.tile([np.cos(half), 0.0, 0.0, np.sin(half)], (2, 1))
-    return Actor(one["id"], "other", Box(*one["size_m"]), Trajectory(ends, np.tile(_rows(one["xyz"]), (2, 1)), quat), is_static=True)
+    return Actor(
+        one["id"],
+        "other",
+        Box(*one["size_m"]),
+        Trajectory(ends, np.tile(_rows(one["xyz"]), (2, 1)), quat),
+        is_static=True,
+    )
 
 
 def _recording(files: SourceFiles, folder: Path) -> tuple[Photograph, ...]:
@@ -328,11 +401,19 @@ def _recording(files: SourceFiles, folder: Path) -> tuple[Photograph, ...]:
 
 
 def _photograph(folder: Path, frame: _Frame) -> Photograph:
-    K = np.array([[frame["fl_x"], 0.0, frame["cx"]], [0.0, frame["fl_y"], frame["cy"]], [0.0, 0.0, 1.0]])
+    K = np.array(
+        [[frame["fl_x"], 0.0, frame["cx"]], [0.0, frame["fl_y"], frame["cy"]], [0.0, 0.0, 1.0]]
+    )
     one = Photograph(
-        frame["t_us"], frame["camera"], frame["w"], frame["h"], K, _rows(frame["transform_matrix"], 4), str(folder / frame["file_path"]),
+        frame["t_us"],
+        frame["camera"],
+        frame["w"],
+        frame["h"],
+        K,
+        _rows(frame["transform_matrix"], 4),
+        str(folder / frame["file_path"]),
         frame["use"],
-    )  # fmt: skip
+    )
     gains = frame.get("exposure")
     return one if gains is None else replace(one, exposure=(gains[0], gains[1], gains[2]))
 
@@ -341,8 +422,14 @@ def _note_files(files: SourceFiles, model: Path) -> None:
     """Enter the files of the model into the content, each by its digest: they are large."""
     found = sorted(path for path in model.rglob("*") if path.is_file()) if model.is_dir() else []
     if not found:
-        raise files.fail(model, "no model: the import was not finished", "give the same import command again; it goes on where it stopped")
+        raise files.fail(
+            model,
+            "no model: the import was not finished",
+            "give the same import command again; it goes on where it stopped",
+        )
     for path in found:
         check_regular(path, DOING)
         with path.open("rb") as stream:
-            files.note_bytes(path.relative_to(model).as_posix(), hashlib.file_digest(stream, "sha256").digest())
+            files.note_bytes(
+                path.relative_to(model).as_posix(), hashlib.file_digest(stream, "sha256").digest()
+            )

@@ -1,4 +1,6 @@
-"""Lines that ego and actors drive along on a built road, and the tracks of scripted road users, made once when a scene is loaded."""
+"""Lines that ego and actors drive along on a built road, and the tracks of scripted road users,
+made once when a scene is loaded.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ class LaneChange:
 
 @dataclass(frozen=True)
 class LateralShift:
-    """A lateral shift of the ego's line and back: full from ``begin_m`` to ``end_m``, ``ramp_m`` on either side."""
+    """A lateral shift of the ego's line and back: full from ``begin_m`` to ``end_m``, ``ramp_m`` on
+    either side.
+    """
 
     begin_m: float
     end_m: float
@@ -43,44 +47,70 @@ class EgoPath:
     stretch_s: tuple[float, ...]  # arc length at which each stretch begins, one more at the end
 
     def stretch_at(self, s_m: float) -> int:
-        """Return the number of the road's stretch at an arc length; the first or the last one beyond the ends."""
+        """Return the number of the road's stretch at an arc length; the first or the last one
+        beyond the ends.
+        """
         i = np.searchsorted(self.stretch_s, s_m, side="right") - 1
         return int(np.clip(i, 0, len(self.stretch_s) - 2))
 
 
-def make_ego_path(road: Road, lane: int, changes: Sequence[LaneChange] = (), shifts: Sequence[LateralShift] = ()) -> EgoPath:
+def make_ego_path(
+    road: Road, lane: int, changes: Sequence[LaneChange] = (), shifts: Sequence[LateralShift] = ()
+) -> EgoPath:
     """Return the rear axle's line from forward lane ``lane`` at the road's beginning.
 
     Raises:
-        InputError: A lane that does not exist, or that ends before the road or the lane change does.
+        InputError: A lane that does not exist, or that ends before the road or the lane change
+            does.
     """
     chain = road.forward_chain(lane)
     if not chain:
-        raise InputError("placing the ego", f"lane {lane}", "the road has no such forward lane", "choose a smaller lane number")
+        raise InputError(
+            "placing the ego",
+            f"lane {lane}",
+            "the road has no such forward lane",
+            "choose a smaller lane number",
+        )
     parts = [road.lane_map.lanes[i].centre for i, _ in chain]
     for change in changes:
         parts, chain = _change(road, parts, chain, change)
     if len(chain) < len(road.stretches):
         found = f"that lane leaves the main road after {chain[-1][0]} (element {len(chain) - 1})"
-        raise InputError("placing the ego", f"lane {lane}", found, "start in a lane that goes on, or change lanes before")
+        raise InputError(
+            "placing the ego",
+            f"lane {lane}",
+            found,
+            "start in a lane that goes on, or change lanes before",
+        )
     line = np.concatenate([parts[0]] + [p[1:] for p in parts[1:]])
     s = arc_lengths(line)
     begins = np.cumsum([0] + [len(p) - 1 for p in parts])
     for shift in shifts:
         line = _shift(line, s, shift)
-    return EgoPath(smooth_path(line), tuple(i for i, _ in chain), tuple(float(s[i]) for i in begins))
+    return EgoPath(
+        smooth_path(line), tuple(i for i, _ in chain), tuple(float(s[i]) for i in begins)
+    )
 
 
-def _change(road: Road, parts: list[F64], chain: list[tuple[str, int]], change: LaneChange) -> tuple[list[F64], list[tuple[str, int]]]:
+def _change(
+    road: Road, parts: list[F64], chain: list[tuple[str, int]], change: LaneChange
+) -> tuple[list[F64], list[tuple[str, int]]]:
     lengths = np.array([arc_lengths(p)[-1] for p in parts])
     begin = np.concatenate([[0.0], np.cumsum(lengths)])
     first = int(np.searchsorted(begin, change.at_m, side="right")) - 1
     where = f"lane change at {change.at_m:.0f} m to lane {change.to_lane}"
     if first >= len(parts):
-        raise InputError("placing the ego", where, f"the road ends at {begin[-1]:.0f} m", "change lanes earlier")
+        raise InputError(
+            "placing the ego", where, f"the road ends at {begin[-1]:.0f} m", "change lanes earlier"
+        )
     stretch = road.stretches[first]
     if change.to_lane >= len(stretch.forward) or stretch.forward[change.to_lane] is None:
-        raise InputError("placing the ego", where, f"element {first} has no such lane", "choose a lane that exists there")
+        raise InputError(
+            "placing the ego",
+            where,
+            f"element {first} has no such lane",
+            "choose a lane that exists there",
+        )
     target = road.forward_chain(change.to_lane, first)
     out, new_chain = parts[:first], chain[:first]
     for n, (lane_id, k) in enumerate(target):
@@ -89,8 +119,12 @@ def _change(road: Road, parts: list[F64], chain: list[tuple[str, int]], change: 
         if begin[min(i, len(begin) - 1)] < change.at_m + change.length_m:
             if i >= len(parts) or len(parts[i]) != len(goal):
                 do_this = "change lanes earlier or within a shorter length"
-                raise InputError("placing the ego", where, f"the lanes part at element {i}", do_this)
-            share = smoothstep((begin[i] + arc_lengths(parts[i]) - change.at_m) / change.length_m)[:, None]
+                raise InputError(
+                    "placing the ego", where, f"the lanes part at element {i}", do_this
+                )
+            share = smoothstep((begin[i] + arc_lengths(parts[i]) - change.at_m) / change.length_m)[
+                :, None
+            ]
             goal = (1 - share) * parts[i] + share * goal
         out.append(goal)
         new_chain.append((lane_id, k))
@@ -98,7 +132,9 @@ def _change(road: Road, parts: list[F64], chain: list[tuple[str, int]], change: 
 
 
 def _shift(line: F64, s: F64, shift: LateralShift) -> F64:
-    share = smoothstep((s - shift.begin_m + shift.ramp_m) / shift.ramp_m) * smoothstep((shift.end_m + shift.ramp_m - s) / shift.ramp_m)
+    share = smoothstep((s - shift.begin_m + shift.ramp_m) / shift.ramp_m) * smoothstep(
+        (shift.end_m + shift.ramp_m - s) / shift.ramp_m
+    )
     d = np.gradient(line[:, :2], s, axis=0)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     out = line.copy()
@@ -110,10 +146,12 @@ def _shift(line: F64, s: F64, shift: LateralShift) -> F64:
 def lane_chain(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) -> tuple[str, ...]:
     """Return the lanes that a car drives along, one after the other.
 
-    They are those of a lane of the main road that is present where the ego's line is at ``at_s_m``, or of a lane given by its id.
+    They are those of a lane of the main road that is present where the ego's line is at ``at_s_m``,
+    or of a lane given by its id.
 
-    A forward lane (``>= 0``) is followed back to where it begins and on to where it ends; an oncoming lane (``< 0``, -1 is next to
-    the centre line) runs in its own driving direction; a lane id is followed along its first successors.
+    A forward lane (``>= 0``) is followed back to where it begins and on to where it ends; an
+    oncoming lane (``< 0``, -1 is next to the centre line) runs in its own driving direction; a lane
+    id is followed along its first successors.
 
     Raises:
         InputError: No such lane there.
@@ -124,11 +162,16 @@ def lane_chain(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) ->
     stretch = road.stretches[i]
     ids: list[str] = []
     if lane >= 0 and lane < len(stretch.forward) and stretch.forward[lane] is not None:
-        ids = [lane_id for lane_id, _ in _back(road, i, lane)] + [lane_id for lane_id, _ in road.forward_chain(lane, i)]
+        ids = [lane_id for lane_id, _ in _back(road, i, lane)] + [
+            lane_id for lane_id, _ in road.forward_chain(lane, i)
+        ]
     elif lane < 0 and -lane - 1 < len(stretch.backward) and stretch.backward[-lane - 1] is not None:
         ids = road.backward_chain(-lane - 1)
     if not ids:
-        n = sum(f is not None for f in stretch.forward), sum(b is not None for b in stretch.backward)
+        n = (
+            sum(f is not None for f in stretch.forward),
+            sum(b is not None for b in stretch.backward),
+        )
         found = f"{n[0]} forward and {n[1]} oncoming lanes at {at_s_m:.0f} m"
         raise InputError("placing an actor", f"lane {lane}", found, "choose one that exists")
     return tuple(ids)
@@ -138,7 +181,9 @@ def _back(road: Road, stretch: int, lane: int) -> list[tuple[str, int]]:
     out: list[tuple[str, int]] = []
     k = lane
     for part in reversed(road.stretches[:stretch]):
-        before = [j for j, nxt in enumerate(part.forward_next) if nxt == k and part.forward[j] is not None]
+        before = [
+            j for j, nxt in enumerate(part.forward_next) if nxt == k and part.forward[j] is not None
+        ]
         if not before:
             break
         k = before[0]
@@ -149,7 +194,12 @@ def _back(road: Road, stretch: int, lane: int) -> list[tuple[str, int]]:
 def _follow(road: Road, lane_id: str) -> list[str]:
     lanes = road.lane_map.lanes
     if lane_id not in lanes:
-        raise InputError("placing an actor", f"lane {lane_id!r}", f"the road's lanes are {', '.join(lanes)}", "choose one of them")
+        raise InputError(
+            "placing an actor",
+            f"lane {lane_id!r}",
+            f"the road's lanes are {', '.join(lanes)}",
+            "choose one of them",
+        )
     out = [lane_id]
     while lanes[out[-1]].successors and len(out) < 100:
         following = lanes[out[-1]].successors[0]
@@ -169,14 +219,21 @@ def grid(start_us: int, end_us: int, step_us: int = STEP_US) -> I64:
 
 
 def speed_profile(t_us: I64, rows: Sequence[tuple[float, float]]) -> F64:
-    """Return speeds ``(T,)`` of rows (time in seconds after ``t_us[0]``, m/s), linear in between, constant outside."""
+    """Return speeds ``(T,)`` of rows (time in seconds after ``t_us[0]``, m/s), linear in between,
+    constant outside.
+    """
     t_s = (t_us - t_us[0]).astype(np.float64) * 1e-6
     times, values = np.array([r[0] for r in rows]), np.array([r[1] for r in rows])
     return np.asarray(np.interp(t_s, times, values))
 
 
 def brake_rows(
-    speed_mps: float, brake_at_us: int, decel_mps2: float, end_speed_mps: float, resume_at_us: int | None, accel_mps2: float = 2.0
+    speed_mps: float,
+    brake_at_us: int,
+    decel_mps2: float,
+    end_speed_mps: float,
+    resume_at_us: int | None,
+    accel_mps2: float = 2.0,
 ) -> list[tuple[float, float]]:
     """Return the speed rows of a driver who brakes and may drive on."""
     t0 = brake_at_us * 1e-6
@@ -194,8 +251,11 @@ def integrate(t_us: I64, speed_mps: F64, s0_m: float) -> F64:
     return np.concatenate([[s0_m], s0_m + np.cumsum(dt * 0.5 * (speed_mps[1:] + speed_mps[:-1]))])
 
 
-def track_on_path(path: Path, t_us: I64, s_m: F64, box: Box, offset_m: npt.ArrayLike = 0.0) -> Trajectory:
-    """Return the box-centre track of a body at arc lengths ``(T,)`` of a path, cut where the path ends (the body leaves the scene).
+def track_on_path(
+    path: Path, t_us: I64, s_m: F64, box: Box, offset_m: npt.ArrayLike = 0.0
+) -> Trajectory:
+    """Return the box-centre track of a body at arc lengths ``(T,)`` of a path, cut where the path
+    ends (the body leaves the scene).
 
     A lateral offset that changes turns the body by the slope of its motion.
     """
@@ -211,7 +271,9 @@ def track_on_path(path: Path, t_us: I64, s_m: F64, box: Box, offset_m: npt.Array
     return Trajectory(t_us[keep], xyz[keep], quat_from_yaw(yaw[keep]))
 
 
-def cut_in_track(path_from: Path, path_to: Path, t_us: I64, s_m: F64, box: Box, at_us: int, change_us: int) -> Trajectory:
+def cut_in_track(
+    path_from: Path, path_to: Path, t_us: I64, s_m: F64, box: Box, at_us: int, change_us: int
+) -> Trajectory:
     """Return the track of a lane change: quintic in time between two neighbouring paths.
 
     Args:
@@ -229,8 +291,11 @@ def cut_in_track(path_from: Path, path_to: Path, t_us: I64, s_m: F64, box: Box, 
     return track_on_path(path_from, t_us, s_m, box, -distance * share)
 
 
-def walk_track(start: F64, end: F64, t_us: I64, begin_us: int, speed_mps: float, box: Box) -> Trajectory:
-    """Return the track of someone who stands at ``start``, walks to ``end`` from ``begin_us`` on, and stands there.
+def walk_track(
+    start: F64, end: F64, t_us: I64, begin_us: int, speed_mps: float, box: Box
+) -> Trajectory:
+    """Return the track of someone who stands at ``start``, walks to ``end`` from ``begin_us`` on,
+    and stands there.
 
     Speed rises and falls within 0.4 s at the ends; the mean crossing is at ``speed_mps``.
     """
@@ -241,7 +306,9 @@ def walk_track(start: F64, end: F64, t_us: I64, begin_us: int, speed_mps: float,
     t = np.clip(t_s, 0.0, total_s)
     up = np.minimum(t, ramp_s)
     down = np.maximum(t - (total_s - ramp_s), 0.0)
-    s = speed_mps * (up * up / (2 * ramp_s) + np.maximum(t - ramp_s, 0.0) - down * down / (2 * ramp_s))
+    s = speed_mps * (
+        up * up / (2 * ramp_s) + np.maximum(t - ramp_s, 0.0) - down * down / (2 * ramp_s)
+    )
     share = np.clip(s / distance, 0.0, 1.0)[:, None]
     xyz = start + share * (end - start)
     xyz = xyz + np.array([0.0, 0.0, box.height_m / 2])
@@ -249,7 +316,9 @@ def walk_track(start: F64, end: F64, t_us: I64, begin_us: int, speed_mps: float,
     return Trajectory(t_us, xyz, quat_from_yaw(np.full(len(t_us), yaw)))
 
 
-def standing_track(x_m: float, y_m: float, z_m: float, yaw_rad: float, t_us: I64, box: Box) -> Trajectory:
+def standing_track(
+    x_m: float, y_m: float, z_m: float, yaw_rad: float, t_us: I64, box: Box
+) -> Trajectory:
     """Return the track of a body that never moves: two poses, at the first and the last time."""
     ends = np.array([t_us[0], t_us[-1]], dtype=np.int64)
     xyz = np.tile([x_m, y_m, z_m + box.height_m / 2], (2, 1))

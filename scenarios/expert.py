@@ -1,7 +1,8 @@
 """The expert that writes the ego's log on a built road, driven together with the reactive traffic.
 
-The expert follows whoever is in its corridor with the Intelligent Driver Model. It predicts who will enter the corridor within the next
-seconds (`yielding_acceleration`) and yields early and smoothly. Bends limit the speed; acceleration and jerk are bounded.
+The expert follows whoever is in its corridor with the Intelligent Driver Model. It predicts who
+will enter the corridor within the next seconds (`yielding_acceleration`) and yields early and
+smoothly. Bends limit the speed; acceleration and jerk are bounded.
 """
 
 from __future__ import annotations
@@ -49,15 +50,27 @@ class ScriptedTracks:
 
     def __init__(self, scripts: Sequence[Actor], end_us: int, step_us: int) -> None:
         self.step_us = step_us
-        self.times = np.arange(0, end_us + int(LOOKAHEAD_S[-1] * 1e6) + step_us, step_us, dtype=np.int64)
-        still = [s for s in scripts if np.ptp(s.track.xyz[:, :2], axis=0).max() < STANDING_M and s.track.t_us[-1] >= end_us]
+        self.times = np.arange(
+            0, end_us + int(LOOKAHEAD_S[-1] * 1e6) + step_us, step_us, dtype=np.int64
+        )
+        still = [
+            s
+            for s in scripts
+            if np.ptp(s.track.xyz[:, :2], axis=0).max() < STANDING_M and s.track.t_us[-1] >= end_us
+        ]
         going = [s for s in scripts if not any(s is other for other in still)]
-        xy, yaw = np.array([s.track.xyz[0, :2] for s in still]), np.array([float(yaw_from_quat(s.track.quat[0])) for s in still])
+        xy, yaw = (
+            np.array([s.track.xyz[0, :2] for s in still]),
+            np.array([float(yaw_from_quat(s.track.quat[0])) for s in still]),
+        )
         self.standing = bodies_from(xy, yaw, [s.box for s in still], np.zeros((len(still), 2)))
         n = len(self.times)
         self.boxes = [s.box for s in going]
         self.xy, self.yaw = np.zeros((n, len(going), 2)), np.zeros((n, len(going)))
-        self.velocity, self.present = np.zeros((n, len(going), 2)), np.zeros((n, len(going)), dtype=np.bool_)
+        self.velocity, self.present = (
+            np.zeros((n, len(going), 2)),
+            np.zeros((n, len(going)), dtype=np.bool_),
+        )
         for j, script in enumerate(going):
             track = script.track
             t = np.clip(self.times, track.t_us[0], track.t_us[-1])
@@ -65,8 +78,11 @@ class ScriptedTracks:
                 self.xy[:, j, d] = np.interp(t, track.t_us, track.xyz[:, d])
             self.yaw[:, j] = np.interp(t, track.t_us, np.unwrap(yaw_from_quat(track.quat)))
             self.velocity[:, j] = np.gradient(self.xy[:, j], step_us * 1e-6, axis=0)
-            # A track that ends with the scene (and not by leaving the road) goes on standing in the look-ahead.
-            self.present[:, j] = (self.times >= track.t_us[0]) & ((self.times <= track.t_us[-1]) | (track.t_us[-1] >= end_us))
+            # A track that ends with the scene (and not by leaving the road) goes on standing in the
+            # look-ahead.
+            self.present[:, j] = (self.times >= track.t_us[0]) & (
+                (self.times <= track.t_us[-1]) | (track.t_us[-1] >= end_us)
+            )
 
     def moving(self, t_us: int) -> Bodies:
         """Return the moving bodies present at a time on the grid."""
@@ -74,7 +90,12 @@ class ScriptedTracks:
             return NO_BODIES
         i = min(t_us // self.step_us, len(self.times) - 1)
         keep = np.flatnonzero(self.present[i])
-        return bodies_from(self.xy[i, keep], self.yaw[i, keep], [self.boxes[k] for k in keep], self.velocity[i, keep])
+        return bodies_from(
+            self.xy[i, keep],
+            self.yaw[i, keep],
+            [self.boxes[k] for k in keep],
+            self.velocity[i, keep],
+        )
 
     def rows(self, t_us: int) -> I64:
         """Return the grid rows of now and of the look-ahead."""
@@ -94,13 +115,17 @@ class PredictedBodies:
     yields: Bool  # (K,) reactive: it lets the ego go first when it is behind
 
 
-def yielding_acceleration(path: Path, front_s: float, speed_mps: float, box: Box, ahead: PredictedBodies, min_gap_m: float) -> float:
-    """Return the largest acceleration that keeps behind everyone who will come into the corridor; infinite without such a one.
+def yielding_acceleration(
+    path: Path, front_s: float, speed_mps: float, box: Box, ahead: PredictedBodies, min_gap_m: float
+) -> float:
+    """Return the largest acceleration that keeps behind everyone who will come into the corridor;
+    infinite without such a one.
 
-    For a body that will be in the corridor after ``tau`` seconds with its rear at ``r``, the own front must then not be beyond
-    ``r - gap``: with constant acceleration ``a <= 2 (r - gap - front - v tau) / tau^2``. Not counted are bodies that are in the
-    corridor already (they are followed, or come from behind), bodies that the ego will have passed by then, and reactive cars that
-    are behind the own front now (they are the ones to yield).
+    For a body that will be in the corridor after ``tau`` seconds with its rear at ``r``, the own
+    front must then not be beyond ``r - gap``: with constant acceleration ``a <= 2 (r - gap - front
+    - v tau) / tau^2``. Not counted are bodies that are in the corridor already (they are followed,
+    or come from behind), bodies that the ego will have passed by then, and reactive cars that are
+    behind the own front now (they are the ones to yield).
 
     Args:
         path: The ego's line.
@@ -113,16 +138,25 @@ def yielding_acceleration(path: Path, front_s: float, speed_mps: float, box: Box
     n, k = ahead.yaw.shape
     if k == 0:
         return float("inf")
-    flat = bodies_from(ahead.xy.reshape(-1, 2), ahead.yaw.reshape(-1), ahead.boxes * n, ahead.velocity.reshape(-1, 2))
+    flat = bodies_from(
+        ahead.xy.reshape(-1, 2),
+        ahead.yaw.reshape(-1),
+        ahead.boxes * n,
+        ahead.velocity.reshape(-1, 2),
+    )
     span = spans(path, front_s, flat, HORIZON_M)
     if span is None:
         return float("inf")
     half = box.width_m / 2 + SIDE_M
-    rear, front, speed = np.full(n * k, np.inf), np.full(n * k, -np.inf), np.zeros(n * k)
+    rear = np.full(n * k, np.inf)
+    front = np.full(n * k, -np.inf)
+    speed = np.zeros(n * k)
     inside = np.zeros(n * k, dtype=np.bool_)
     rear[span.index], front[span.index], speed[span.index] = span.rear, span.front, span.speed
     inside[span.index] = (span.low < half) & (span.high > -half)
-    rear, front, speed, inside = (a.reshape(n, k) for a in (rear, front, speed, inside & ahead.present.reshape(-1)))
+    rear, front, speed, inside = (
+        a.reshape(n, k) for a in (rear, front, speed, inside & ahead.present.reshape(-1))
+    )
     tau = TIMES_S[:, None]
     passed = front < front_s + speed_mps * tau - box.length_m - 1.0
     behind = ahead.yields & (rear[0] < front_s + 0.5)
@@ -137,7 +171,9 @@ def yielding_acceleration(path: Path, front_s: float, speed_mps: float, box: Box
 LOG_STEP_US = 10_000  # 100 Hz
 DECISION_US = 50_000
 LOOKAHEAD_US = 100_000
-MAX_ACCEL_MPS2, MAX_BRAKE_MPS2, MAX_JERK_MPS3 = 2.0, 7.0, 10.0
+MAX_ACCEL_MPS2 = 2.0
+MAX_BRAKE_MPS2 = 7.0
+MAX_JERK_MPS3 = 10.0
 STOP_JERK_MPS3 = 5.0
 COMFORT_BRAKE_MPS2 = 1.5
 MIN_GAP_M = 2.5
@@ -195,7 +231,10 @@ def drive(
     """
     table = ScriptedTracks(scripts, end_us, DECISION_US)
     expert = _Expert(path, s0_m, vehicle, style, table)
-    standing = {id(f.path): spans(f.path, 0.0, table.standing, f.path.length_m + 100.0, window=False) for f in followers}
+    standing = {
+        id(f.path): spans(f.path, 0.0, table.standing, f.path.length_m + 100.0, window=False)
+        for f in followers
+    }
     cars = [_Car(f, standing[id(f.path)]) for f in followers]
     log_s, log_t = [expert.s], [0]
     sub_s = LOG_STEP_US * 1e-6
@@ -204,12 +243,19 @@ def drive(
         moving = concatenate([table.moving(t), _bodies(driving)])
         wanted = expert.decide(moving, cars, t)
         everybody = concatenate([expert.bodies(), moving])
-        own_row = {id(car): row for row, car in enumerate(driving, start=len(everybody.xy) - len(driving))}
+        own_row = {
+            id(car): row for row, car in enumerate(driving, start=len(everybody.xy) - len(driving))
+        }
         for path_of, rows in _by_path(cars):
             group = [cars[i] for i in rows]
-            fronts, halves = np.array([car.front_s for car in group]), np.array([car.f.box.width_m / 2 for car in group])
+            fronts, halves = (
+                np.array([car.front_s for car in group]),
+                np.array([car.f.box.width_m / 2 for car in group]),
+            )
             own_rows = np.array([own_row.get(id(car), -1) for car in group])
-            for car, leader in zip(group, find_leaders(path_of, fronts, halves, everybody, own_rows), strict=True):
+            for car, leader in zip(
+                group, find_leaders(path_of, fronts, halves, everybody, own_rows), strict=True
+            ):
                 car.decide(leader)
         for _ in range(DECISION_US // LOG_STEP_US):
             expert.advance(wanted, sub_s)
@@ -223,28 +269,40 @@ def drive(
     times = t_us[:: DECISION_US // LOG_STEP_US]
     keep = t_us < end_us + LOG_STEP_US  # the first pose at or after the end is the last
     xyz, yaw = path.at(np.array(log_s)[keep])
-    return Drive(Trajectory(t_us[keep], xyz, quat_from_yaw(yaw)), tuple(car.track(times) for car in cars))
+    return Drive(
+        Trajectory(t_us[keep], xyz, quat_from_yaw(yaw)), tuple(car.track(times) for car in cars)
+    )
 
 
 def speed_limits(path: Path, style: ExpertStyle) -> F64:
-    """Return the speed ``(N,)`` that bends allow, reachable with a comfortable brake from everywhere before them."""
+    """Return the speed ``(N,)`` that bends allow, reachable with a comfortable brake from
+    everywhere before them.
+    """
     k = np.abs(path.curvature)
     v2 = np.minimum(style.cruise_mps**2, style.max_lateral_accel_mps2 / np.maximum(k, 1e-6))
     # v^2(s) <= v^2(s') + 2 b (s' - s) for all s' > s: a running minimum from the far end.
     rising = v2 + 2 * COMFORT_BRAKE_MPS2 * path.s
-    return np.asarray(np.sqrt(np.minimum.accumulate(rising[::-1])[::-1] - 2 * COMFORT_BRAKE_MPS2 * path.s))
+    return np.asarray(
+        np.sqrt(np.minimum.accumulate(rising[::-1])[::-1] - 2 * COMFORT_BRAKE_MPS2 * path.s)
+    )
 
 
 class _Expert:
     """The ego while it drives."""
 
-    def __init__(self, path: Path, s0_m: float, vehicle: Vehicle, style: ExpertStyle, table: ScriptedTracks) -> None:
+    def __init__(
+        self, path: Path, s0_m: float, vehicle: Vehicle, style: ExpertStyle, table: ScriptedTracks
+    ) -> None:
         self.path, self.vehicle, self.table = path, vehicle, table
-        self.lookup = path.coarser(4)  # projections search every station; 1 m apart is enough for them
+        self.lookup = path.coarser(
+            4
+        )  # projections search every station; 1 m apart is enough for them
         self.limit = speed_limits(path, style)
         self.s, self.a, self.cap = s0_m, 0.0, float("inf")
         self.v = min(style.speed_mps, float(np.interp(s0_m, path.s, self.limit)))
-        self.params = IdmParams(style.cruise_mps, style.headway_s, MIN_GAP_M, MAX_ACCEL_MPS2 * 0.75, 2.0, MAX_BRAKE_MPS2)
+        self.params = IdmParams(
+            style.cruise_mps, style.headway_s, MIN_GAP_M, MAX_ACCEL_MPS2 * 0.75, 2.0, MAX_BRAKE_MPS2
+        )
         self.front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
         self.standing = spans(path, 0.0, table.standing, path.length_m + 100.0, window=False)
 
@@ -255,7 +313,12 @@ class _Expert:
     def bodies(self) -> Bodies:
         xyz, yaw = self.path.at(self.s)
         direction = np.array([np.cos(float(yaw)), np.sin(float(yaw))])
-        return bodies_from(xyz[:2] + self.vehicle.rear_axle_to_centre_m * direction, yaw, [self.vehicle.box], self.v * direction)
+        return bodies_from(
+            xyz[:2] + self.vehicle.rear_axle_to_centre_m * direction,
+            yaw,
+            [self.vehicle.box],
+            self.v * direction,
+        )
 
     def decide(self, others: Bodies, cars: Sequence[_Car], t_us: int) -> float:
         """Return the wanted acceleration."""
@@ -265,10 +328,18 @@ class _Expert:
         moving = find_leader(self.lookup, self.front_s, half, others, margin_m=0.3)
         for leader in (moving, nearest_ahead(self.standing, self.front_s, half)):
             if leader.index >= 0:
-                wanted = min(wanted, idm_acceleration(self.v, leader.gap_m, self.v - leader.speed_mps, self.params))
+                wanted = min(
+                    wanted,
+                    idm_acceleration(self.v, leader.gap_m, self.v - leader.speed_mps, self.params),
+                )
         if t_us % LOOKAHEAD_US == 0:
             self.cap = yielding_acceleration(
-                self.lookup, self.front_s, self.v, self.vehicle.box, _predicted(self.table, cars, t_us), MIN_GAP_M
+                self.lookup,
+                self.front_s,
+                self.v,
+                self.vehicle.box,
+                _predicted(self.table, cars, t_us),
+                MIN_GAP_M,
             )
         return max(min(wanted, self.cap), -MAX_BRAKE_MPS2)
 
@@ -297,7 +368,12 @@ class _Car:
         a = idm_acceleration(self.v, np.inf, 0.0, self.f.params)
         for leader in (moving, nearest_ahead(self.standing, self.front_s, self.f.box.width_m / 2)):
             if leader.index >= 0:
-                a = min(a, idm_acceleration(self.v, leader.gap_m, self.v - leader.speed_mps, self.f.params))
+                a = min(
+                    a,
+                    idm_acceleration(
+                        self.v, leader.gap_m, self.v - leader.speed_mps, self.f.params
+                    ),
+                )
         self.a = a
 
     def advance(self, dt_s: float) -> None:
@@ -305,7 +381,9 @@ class _Car:
         self.log_s.append(self.s)
 
     def track(self, times: I64) -> Trajectory:
-        return track_on_path(self.f.path, times, np.array(self.log_s[: len(times)]), self.f.box, self.f.offset_m)
+        return track_on_path(
+            self.f.path, times, np.array(self.log_s[: len(times)]), self.f.box, self.f.offset_m
+        )
 
 
 def _bodies(cars: Sequence[_Car]) -> Bodies:
@@ -314,9 +392,13 @@ def _bodies(cars: Sequence[_Car]) -> Bodies:
         return NO_BODIES
     xy, yaw = np.empty((len(cars), 2)), np.empty(len(cars))
     for path, rows in _by_path(cars):
-        xyz, yaw[rows] = path.at(np.array([cars[i].s for i in rows]), np.array([cars[i].f.offset_m for i in rows]))
+        xyz, yaw[rows] = path.at(
+            np.array([cars[i].s for i in rows]), np.array([cars[i].f.offset_m for i in rows])
+        )
         xy[rows] = xyz[:, :2]
-    velocity = np.array([car.v for car in cars])[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    velocity = np.array([car.v for car in cars])[:, None] * np.stack(
+        [np.cos(yaw), np.sin(yaw)], axis=1
+    )
     return bodies_from(xy, yaw, [car.f.box for car in cars], velocity)
 
 
@@ -329,7 +411,9 @@ def _by_path(cars: Sequence[_Car]) -> list[tuple[Path, list[int]]]:
 
 
 def _predicted(table: ScriptedTracks, cars: Sequence[_Car], t_us: int) -> PredictedBodies:
-    """Return scripted tracks as they are written, and reactive cars at their present speed on their own lines."""
+    """Return scripted tracks as they are written, and reactive cars at their present speed on their
+    own lines.
+    """
     rows = table.rows(t_us)
     xy, yaw = [table.xy[rows]], [table.yaw[rows]]
     velocity, present = [table.velocity[rows]], [table.present[rows]]
@@ -343,6 +427,10 @@ def _predicted(table: ScriptedTracks, cars: Sequence[_Car], t_us: int) -> Predic
         velocity.append(v[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1))
         present.append(s <= path.length_m)
     return PredictedBodies(
-        np.concatenate(xy, axis=1), np.concatenate(yaw, axis=1), np.concatenate(velocity, axis=1), np.concatenate(present, axis=1),
-        (*table.boxes, *(cars[i].f.box for i in order)), np.arange(len(table.boxes) + len(cars)) >= len(table.boxes),
-    )  # fmt: skip
+        np.concatenate(xy, axis=1),
+        np.concatenate(yaw, axis=1),
+        np.concatenate(velocity, axis=1),
+        np.concatenate(present, axis=1),
+        (*table.boxes, *(cars[i].f.box for i in order)),
+        np.arange(len(table.boxes) + len(cars)) >= len(table.boxes),
+    )

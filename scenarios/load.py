@@ -1,4 +1,6 @@
-"""From a path or a shipped name to a `Scenario`, read from top to bottom: document, specification, recording, scenario."""
+"""From a path or a shipped name to a `Scenario`, read from top to bottom: document, specification,
+recording, scenario.
+"""
 
 from __future__ import annotations
 
@@ -48,16 +50,23 @@ ALPASIM_WARMUP_US = 1_700_000  # its default force_gt_duration_us
 _RIG_FROM_FORWARD_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: Sequence[str] = (), source: str | None = None) -> Scenario:
+def load_scenario(
+    path_or_name: str | Path,
+    seed: int | None = None,
+    overrides: Sequence[str] = (),
+    source: str | None = None,
+) -> Scenario:
     """Load a scenario file, a recorded log, or a shipped scenario by name.
 
     Args:
-        path_or_name: Scenario YAML, Argoverse 2 log folder, CommonRoad XML, Cosmos-Drive-Dreams folder, or a name such as
-            ``smoke/straight``.
-        seed: Scene seed; None takes the file's. Another seed than the file's makes another scene, with the seed in its id. Seed 0 is the
-            file as written, but for its ``variations`` and ``samples``.
+        path_or_name: Scenario YAML, Argoverse 2 log folder, CommonRoad XML, Cosmos-Drive-Dreams
+            folder, or a name such as ``smoke/straight``.
+        seed: Scene seed; None takes the file's. Another seed than the file's makes another scene,
+            with the seed in its id. Seed 0 is the file as written, but for its ``variations`` and
+            ``samples``.
         overrides: ``key=value`` with dotted keys, applied before validation.
-        source: Who reads a recorded log, as `plugins.parts.resolve` takes it; None finds the source that recognises the path.
+        source: Who reads a recorded log, as `plugins.parts.resolve` takes it; None finds the source
+            that recognises the path.
 
     Returns:
         The scenario. The same input and seed give a bit-identical one.
@@ -68,7 +77,9 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
     document = open_document(find(path_or_name), source)
     drawn = draw(document, seed, overrides)
     default = drawn.spec.vehicle or VehicleSpec()
-    drive = built_drive(drawn, _vehicle(default)) if drawn.spec.log is None else recorded_drive(drawn)
+    drive = (
+        built_drive(drawn, _vehicle(default)) if drawn.spec.log is None else recorded_drive(drawn)
+    )
     scenario = _scenario(drawn, drive)
     check_scenario(scenario, drawn.document.path)
     if scenario.source != "usdz":  # the map of an AlpaSim scene is in its form already
@@ -78,7 +89,9 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
 
 
 def code_digest_of(scenario: Scenario) -> str | None:
-    """Return what identifies the code that made a scenario: this package's, and that of its source; None where it has no digest."""
+    """Return what identifies the code that made a scenario: this package's, and that of its source;
+    None where it has no digest.
+    """
     own = own_code_digest("scenarios.load")
     if scenario.source_part is None:
         return own
@@ -88,14 +101,25 @@ def code_digest_of(scenario: Scenario) -> str | None:
 
 def _scenario(drawn: Drawn, drive: RecordedLog) -> Scenario:
     """Put the settings of the specification beside a map, a drive and its traffic."""
-    spec, timing, kind = drawn.spec, drawn.spec.timing, None if drawn.spec.log is None else drawn.spec.log.recorded[0]
+    spec = drawn.spec
+    timing = drawn.spec.timing
+    kind = None if drawn.spec.log is None else drawn.spec.log.recorded[0]
     is_file = Path(drawn.document.path).suffix in (".yaml", ".yml")
-    scene_id = spec.scene_id or (drawn.scene_id if is_file else drive.scene_id)  # a bare log keeps its id whatever is overridden
-    cameras = tuple(camera_spec(camera) for camera in spec.cameras or ()) or drive.cameras or (camera_spec(),)
+    scene_id = spec.scene_id or (
+        drawn.scene_id if is_file else drive.scene_id
+    )  # a bare log keeps its id whatever is overridden
+    cameras = (
+        tuple(camera_spec(camera) for camera in spec.cameras or ())
+        or drive.cameras
+        or (camera_spec(),)
+    )
     start, end = _window(drawn, drive)
     background = _background(drawn)
-    # Where the street itself is built its paint is chosen; paint that nobody knows of a recorded street stays unknown.
-    recorded = drive.source in RECORDED_STREETS or (background is not None and not background.keep_road)
+    # Where the street itself is built its paint is chosen; paint that nobody knows of a recorded
+    # street stays unknown.
+    recorded = drive.source in RECORDED_STREETS or (
+        background is not None and not background.keep_road
+    )
     lane_map = drive.lane_map if recorded else with_default_paint(drive.lane_map)
     return Scenario(
         scene_id=f"{scene_id}-seed{spec.seed}" if drawn.reseeded else scene_id,
@@ -131,7 +155,9 @@ def _scenario(drawn: Drawn, drive: RecordedLog) -> Scenario:
 
 def _window(drawn: Drawn, drive: RecordedLog) -> tuple[int, int]:
     """Return the times of the first frame and of the end."""
-    timing, first, last = drawn.spec.timing, int(drive.ego_log.t_us[0]), int(drive.ego_log.t_us[-1])
+    timing = drawn.spec.timing
+    first = int(drive.ego_log.t_us[0])
+    last = int(drive.ego_log.t_us[-1])
     start = first + timing.start_us
     if drawn.spec.log is None:
         return start + timing.start_time_offset_us, drawn.spec.built_until_us
@@ -141,12 +167,16 @@ def _window(drawn: Drawn, drive: RecordedLog) -> tuple[int, int]:
     end = last if timing.duration_us is None else start + timing.duration_us
     if end > last:
         found = f"ends at {(end - first) / 1e6:.2f} s of a log {(last - first) / 1e6:.2f} s long"
-        raise drawn.document.error(DOING, ("timing", "duration_us"), found, "shorten timing.duration_us or leave it out")
+        raise drawn.document.error(
+            DOING, ("timing", "duration_us"), found, "shorten timing.duration_us or leave it out"
+        )
     return start, end
 
 
 def _actors(drawn: Drawn, drive: RecordedLog) -> tuple[Actor, ...]:
-    """Return the traffic; that of a recorded log is replayed, reacts, or is left out, as ``log.actors`` says."""
+    """Return the traffic; that of a recorded log is replayed, reacts, or is left out, as
+    ``log.actors`` says.
+    """
     log = drawn.spec.log
     if log is None or log.actors == "replay":
         return drive.actors
@@ -169,19 +199,37 @@ def _check_timing(drawn: Drawn, scenario: Scenario) -> None:
     try:
         clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
     except InputError as e:
-        key = next((k for k in ("control_us", "camera_us", "policy_us") if f"rates.{k}" in e.with_what), None)
+        key = next(
+            (k for k in ("control_us", "camera_us", "policy_us") if f"rates.{k}" in e.with_what),
+            None,
+        )
         loc: tuple[str, ...] = ("rates", key) if key else ("timing", "duration_us")
         raise document.error(DOING, loc, f"{e.with_what}: {e.found}", e.do_this) from e
     if timing.timeline == "alpasim" and warmup_us % control_us:
         found = f"a control period of {control_us} us, of which {warmup_us} us is not a multiple"
-        raise document.error(DOING, ("timing", "timeline"), found, "choose a rates.control_us that divides AlpaSim's 1.7 s")
+        raise document.error(
+            DOING,
+            ("timing", "timeline"),
+            found,
+            "choose a rates.control_us that divides AlpaSim's 1.7 s",
+        )
     if timing.start_time_offset_us and timing.timeline != "alpasim":
         found = f"an offset of {timing.start_time_offset_us} us in the scenario's own time line"
-        raise document.error(DOING, ("timing", "start_time_offset_us"), found, "set timing.start_us, or timing.timeline: alpasim")
+        raise document.error(
+            DOING,
+            ("timing", "start_time_offset_us"),
+            found,
+            "set timing.start_us, or timing.timeline: alpasim",
+        )
     length_us = clock.n_steps * control_us
     if warmup_us >= length_us:
         found = f"warmup_us = {warmup_us} of a scene of {length_us} us: nothing is left to drive"
-        raise document.error(DOING, ("timing", "warmup_us"), found, "shorten timing.warmup_us or lengthen timing.duration_us")
+        raise document.error(
+            DOING,
+            ("timing", "warmup_us"),
+            found,
+            "shorten timing.warmup_us or lengthen timing.duration_us",
+        )
 
 
 def camera_spec(model: CameraModel | None = None) -> CameraSpec:
@@ -190,14 +238,19 @@ def camera_spec(model: CameraModel | None = None) -> CameraSpec:
     focal = 0.5 * m.width / np.tan(np.deg2rad(m.hfov_deg) / 2)
     K = np.array([[focal, 0.0, m.width / 2], [0.0, focal, m.height / 2], [0.0, 0.0, 1.0]])
     T = np.eye(4)
-    T[:3, :3] = _rotation(np.deg2rad(m.yaw_deg), np.deg2rad(m.pitch_down_deg)) @ _RIG_FROM_FORWARD_CAMERA
+    T[:3, :3] = (
+        _rotation(np.deg2rad(m.yaw_deg), np.deg2rad(m.pitch_down_deg)) @ _RIG_FROM_FORWARD_CAMERA
+    )
     T[:3, 3] = m.x_m, m.y_m, m.z_m
     return CameraSpec(m.name, m.width, m.height, K, T, m.shutter_us)
 
 
 def _rotation(yaw: float, pitch_down: float) -> F64:
     """Return Rz(yaw) Ry(pitch): positive pitch about y (left) turns x (forward) down."""
-    cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch_down), np.sin(pitch_down)
+    cy = np.cos(yaw)
+    sy = np.sin(yaw)
+    cp = np.cos(pitch_down)
+    sp = np.sin(pitch_down)
     about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
     about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
     return np.asarray(about_z @ about_y)
@@ -214,21 +267,29 @@ def _background(drawn: Drawn) -> BackgroundFile | None:
         return None
     path = document.folder_of(("background", "file")) / background.file
     if not path.is_file():
-        raise document.error(DOING, ("background", "file"), f"{path} does not exist", "correct the path")
+        raise document.error(
+            DOING, ("background", "file"), f"{path} does not exist", "correct the path"
+        )
     matrix = np.eye(4) if background.transform is None else np.array(background.transform)
     if abs(np.linalg.det(matrix[:3, :3])) < 1e-12 or not np.allclose(matrix[3], [0, 0, 0, 1]):
         found = "no inverse, or a last row other than 0 0 0 1"
-        raise document.error(DOING, ("background", "transform"), found, "give rotation, scale and shift")
+        raise document.error(
+            DOING, ("background", "transform"), found, "give rotation, scale and shift"
+        )
     return BackgroundFile(str(path), matrix, background.keep_road)
 
 
 def _hash(drawn: Drawn, scene_id: str, source_hash: str) -> str:
-    """Hash the resolved specification, the scene id (it keys the random streams) and the bytes of every data file.
+    """Hash the resolved specification, the scene id (it keys the random streams) and the bytes of
+    every data file.
 
-    Words for people, the places where data files lie, and where a rollout ends do not matter: they do not change the scene.
+    Words for people, the places where data files lie, and where a rollout ends do not matter: they
+    do not change the scene.
     """
     spec = drawn.spec
-    content = spec.model_dump(mode="json", exclude={"description": True, "tags": True, "timing": {"stop_at_path_end"}})
+    content = spec.model_dump(
+        mode="json", exclude={"description": True, "tags": True, "timing": {"stop_at_path_end"}}
+    )
     if spec.log is not None:
         content["log"][spec.log.recorded[2]] = "given by its content"
     if spec.background is not None:

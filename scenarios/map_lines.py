@@ -1,9 +1,12 @@
-"""Lines of lane maps: lanes' edges and order, borders of the drivable surface, and a map as AlpaSim's loader reads it.
+"""Lines of lane maps: lanes' edges and order, borders of the drivable surface, and a map as
+AlpaSim's loader reads it.
 
-AlpaSim's rules look for lane centres and road edges by vertex, so the places of vertices matter. Its map tables hold two rails a lane with
-the same number of points, and nothing else of its shape: the centre is halfway between the rails, point by point. So a lane's own centre
-line is not used where it has both rails, and rails with different numbers of points get points added on their own segments, which leaves
-the lane's area as it is. The view so made is the form in which scenes are exported and in which preset ``alpasim`` scores.
+AlpaSim's rules look for lane centres and road edges by vertex, so the places of vertices matter.
+Its map tables hold two rails a lane with the same number of points, and nothing else of its shape:
+the centre is halfway between the rails, point by point. So a lane's own centre line is not used
+where it has both rails, and rails with different numbers of points get points added on their own
+segments, which leaves the lane's area as it is. The view so made is the form in which scenes are
+exported and in which preset ``alpasim`` scores.
 """
 
 from __future__ import annotations
@@ -39,17 +42,21 @@ def predecessors(lanes: Mapping[str, Lane]) -> dict[str, list[str]]:
 
 
 def is_left_of(one: F64, other: F64) -> bool:
-    """Return whether ``one`` ``(N, 2+)`` runs on the left of ``other``: the ring one + reversed other is clockwise."""
+    """Return whether ``one`` ``(N, 2+)`` runs on the left of ``other``: the ring one + reversed
+    other is clockwise.
+    """
     x, y = np.concatenate([one[:, :2], other[::-1, :2]]).T
     return bool(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) < 0)
 
 
 def with_vertices(line: F64) -> F64:
-    """Put ``floor(length / 2 m)`` equally spaced points into every segment of a polyline ``(N, 3)``; lengths are measured in 3-D.
+    """Put ``floor(length / 2 m)`` equally spaced points into every segment of a polyline ``(N,
+    3)``; lengths are measured in 3-D.
 
-    Unlike `alpasim_plugin.core.geometry.densify` it also splits a segment of exactly 2 m. Vertices stay as they are, and a new point is
-    ``start + step * k`` with ``step = segment / pieces``, rounded in that order: neighbouring lanes share edges but not vertices, and
-    rounding decides whether their union has a crack there, which a distance to its border sees.
+    Unlike `alpasim_plugin.core.geometry.densify` it also splits a segment of exactly 2 m. Vertices
+    stay as they are, and a new point is ``start + step * k`` with ``step = segment / pieces``,
+    rounded in that order: neighbouring lanes share edges but not vertices, and rounding decides
+    whether their union has a crack there, which a distance to its border sees.
     """
     segments = np.diff(line, axis=0)
     pieces = (np.linalg.norm(segments, axis=1) // MAX_STEP_M).astype(np.int64) + 1
@@ -62,26 +69,38 @@ def with_vertices(line: F64) -> F64:
     return np.concatenate([line[:1], points])
 
 
-NO_LANES_OF_CARS = ("sidewalk",)  # every other kind counts: without shoulders the distance to the lane boundary is half a metre off
+NO_LANES_OF_CARS = (
+    "sidewalk",
+)  # every other kind counts: without shoulders the distance to the lane boundary is half a metre off
 
 
 def alpasim_view(lane_map: LaneMap) -> LaneMap:
-    """Return a map as AlpaSim's loader would give it after `scenarios.usdz_tables` has written it."""
+    """Return a map as AlpaSim's loader would give it after `scenarios.usdz_tables` has written
+    it.
+    """
     kept = {key: lane for key, lane in lane_map.lanes.items() if lane.kind not in NO_LANES_OF_CARS}
     lanes = {}
     for key, lane in kept.items():
         left, right = rails(lane)
         lanes[key] = replace(
-            lane, centre=with_vertices((left + right) / 2), left=with_vertices(left), right=with_vertices(right),
+            lane,
+            centre=with_vertices((left + right) / 2),
+            left=with_vertices(left),
+            right=with_vertices(right),
             successors=tuple(s for s in lane.successors if s in kept),
             left_neighbour=lane.left_neighbour if lane.left_neighbour in kept else None,
             right_neighbour=lane.right_neighbour if lane.right_neighbour in kept else None,
-        )  # fmt: skip
-    return replace(lane_map, lanes=lanes, road_edges=tuple(with_vertices(edge) for edge in lane_map.road_edges if len(edge) > 1))
+        )
+    return replace(
+        lane_map,
+        lanes=lanes,
+        road_edges=tuple(with_vertices(edge) for edge in lane_map.road_edges if len(edge) > 1),
+    )
 
 
 def rails(lane: Lane) -> tuple[F64, F64]:
-    """Return the left and the right rail ``(N, 3)`` of a lane, in driving direction, with the same number of points.
+    """Return the left and the right rail ``(N, 3)`` of a lane, in driving direction, with the same
+    number of points.
 
     A lane that lacks an edge is its centre widened by `HALF_WIDTH_M` to both sides.
     """
@@ -102,13 +121,17 @@ def _at(wanted: F64, shares: F64, line: F64) -> F64:
 
 
 def _shares(line: F64) -> F64:
-    """Return how far along a polyline ``(N, 3)`` each vertex lies, 0..1 of its length in the plane."""
+    """Return how far along a polyline ``(N, 3)`` each vertex lies, 0..1 of its length in the
+    plane.
+    """
     s = arc_lengths(line[:, :2])
     return np.asarray(s / s[-1]) if s[-1] > 0 else np.linspace(0.0, 1.0, len(line))
 
 
 def _beside(centre: F64, left_m: float) -> F64:
-    """Return a polyline ``(N, 3)`` shifted to the left by the mean of the normals of its adjoining segments."""
+    """Return a polyline ``(N, 3)`` shifted to the left by the mean of the normals of its adjoining
+    segments.
+    """
     along = np.gradient(centre[:, :2], axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
     out = centre.copy()
@@ -129,18 +152,27 @@ def merge_areas(areas: Sequence[Any], seam_m: float = SEAM_M) -> Any:
     half = seam_m / 2
     merged = shapely.union_all([shapely.make_valid(a) for a in areas])
     closed = shapely.buffer(merged, half, join_style="mitre", mitre_limit=2.0)
-    closed = shapely.union_all([merged, shapely.buffer(closed, -half, join_style="mitre", mitre_limit=2.0)])
+    closed = shapely.union_all(
+        [merged, shapely.buffer(closed, -half, join_style="mitre", mitre_limit=2.0)]
+    )
     parts = [p for p in shapely.get_parts(closed) if shapely.get_type_id(p) == 3]
-    filled = [shapely.Polygon(p.exterior, [h for h in p.interiors if shapely.Polygon(h).area >= MIN_HOLE_M2]) for p in parts]
+    filled = [
+        shapely.Polygon(
+            p.exterior, [h for h in p.interiors if shapely.Polygon(h).area >= MIN_HOLE_M2]
+        )
+        for p in parts
+    ]
     return shapely.union_all(filled)
 
 
 def border_lines(area: Any, heights: F64, step_m: float = STEP_M) -> tuple[F64, ...]:
-    """Return the borders of a shapely area as closed polylines ``(N, 3)``, exterior rings first in each part.
+    """Return the borders of a shapely area as closed polylines ``(N, 3)``, exterior rings first in
+    each part.
 
     Args:
         area: Polygon or MultiPolygon.
-        heights: ``(M, 3)`` points of the source; a border vertex takes the height of the nearest one.
+        heights: ``(M, 3)`` points of the source; a border vertex takes the height of the nearest
+            one.
         step_m: Largest distance between neighbouring vertices.
     """
     tree = scipy.spatial.KDTree(heights[:, :2])

@@ -1,7 +1,8 @@
-"""OpenDRIVE maps as lane maps: lanes of every section with edges, links and paint, the border of the drivable surface, and the place.
+"""OpenDRIVE maps as lane maps: lanes of every section with edges, links and paint, the border of
+the drivable surface, and the place.
 
-Lanes follow one another along sections, from road to road, and through junctions. A map lies in a scene's local frame by its geographic
-origin and the scene's pose on the earth.
+Lanes follow one another along sections, from road to road, and through junctions. A map lies in a
+scene's local frame by its geographic origin and the scene's pose on the earth.
 
 Source: ASAM OpenDRIVE 1.4 to 1.8. `scenarios.usdz` reads the same roads by AlpaSim's rule instead.
 """
@@ -37,12 +38,16 @@ from scenarios.recorded import SourceFiles
 
 
 def following(odr: OdrMap, lanes: Mapping[str, Lane]) -> dict[str, Lane]:
-    """Return the lanes with their successors in driving direction; links to lanes that are not in ``lanes`` are left out."""
+    """Return the lanes with their successors in driving direction; links to lanes that are not in
+    ``lanes`` are left out.
+    """
     roads = {road.road_id: road for road in odr.roads}
     turns: dict[tuple[str, int], list[tuple[str, bool, int]]] = {}
     for connection in odr.connections:
         for here, there in connection.lanes:
-            turns.setdefault((connection.incoming, here), []).append((connection.connecting, connection.at_start, there))
+            turns.setdefault((connection.incoming, here), []).append(
+                (connection.connecting, connection.at_start, there)
+            )
     out = dict(lanes)
     for road in odr.roads:
         for index, section in enumerate(road.sections):
@@ -50,12 +55,18 @@ def following(odr: OdrMap, lanes: Mapping[str, Lane]) -> dict[str, Lane]:
                 key = lane_key(road, index, lane.lane_id)
                 if key in out:
                     ahead = _ahead(road, index, lane, roads, turns)
-                    out[key] = replace(out[key], successors=tuple(dict.fromkeys(k for k in ahead if k in lanes)))
+                    out[key] = replace(
+                        out[key], successors=tuple(dict.fromkeys(k for k in ahead if k in lanes))
+                    )
     return out
 
 
 def _ahead(
-    road: Road, index: int, lane: OdrLane, roads: Mapping[str, Road], turns: Mapping[tuple[str, int], list[tuple[str, bool, int]]]
+    road: Road,
+    index: int,
+    lane: OdrLane,
+    roads: Mapping[str, Road],
+    turns: Mapping[tuple[str, int], list[tuple[str, bool, int]]],
 ) -> list[str]:
     along = (lane.lane_id < 0) != road.left_hand
     linked = lane.successors if along else lane.predecessors
@@ -66,7 +77,11 @@ def _ahead(
     if link is None:
         return []
     if link.kind == "junction":
-        found = [(roads[r], at_start, i) for r, at_start, i in turns.get((road.road_id, lane.lane_id), ()) if r in roads]
+        found = [
+            (roads[r], at_start, i)
+            for r, at_start, i in turns.get((road.road_id, lane.lane_id), ())
+            if r in roads
+        ]
         return [lane_key(r, 0 if at_start else len(r.sections) - 1, i) for r, at_start, i in found]
     target = roads.get(link.target)
     if target is None:
@@ -80,10 +95,12 @@ FLATTENING = 1.0 / 298.257223563
 
 
 def T_local_map(geo_reference: str, T_earth_local: F64) -> F64:
-    """Return the ``(4, 4)`` transform from map coordinates to the local frame, as AlpaSim places a map.
+    """Return the ``(4, 4)`` transform from map coordinates to the local frame, as AlpaSim places a
+    map.
 
-    The map's coordinates are taken as east, north, up at the ``lat_0``, ``lon_0`` (and ``alt_0`` or ``h_0``) of its projection string;
-    the projection itself is not applied. Without a usable origin the map lies in the local frame as it is.
+    The map's coordinates are taken as east, north, up at the ``lat_0``, ``lon_0`` (and ``alt_0`` or
+    ``h_0``) of its projection string; the projection itself is not applied. Without a usable origin
+    the map lies in the local frame as it is.
 
     Args:
         geo_reference: PROJ string of the map.
@@ -96,28 +113,43 @@ def T_local_map(geo_reference: str, T_earth_local: F64) -> F64:
 
 
 def geographic_origin(geo_reference: str) -> tuple[float, float, float] | None:
-    """Return latitude and longitude in degrees and height in metres of a PROJ string; None where it names none or an impossible one."""
+    """Return latitude and longitude in degrees and height in metres of a PROJ string; None where it
+    names none or an impossible one.
+    """
     values: dict[str, float] = {}
     for word in geo_reference.split():
         key, _, text = word.partition("=")
-        name = next((n for n in ("lat_0", "lon_0", "alt_0", "h_0") if key.startswith(f"+{n}")), None)
+        name = next(
+            (n for n in ("lat_0", "lon_0", "alt_0", "h_0") if key.startswith(f"+{n}")), None
+        )
         try:
             if name is not None:
                 values["alt_0" if name == "h_0" else name] = float(text)
         except ValueError:
             continue  # AlpaSim passes over words it cannot read; real files hold some
-    if "lat_0" not in values or "lon_0" not in values or abs(values["lat_0"]) > 90 or abs(values["lon_0"]) > 180:
+    if (
+        "lat_0" not in values
+        or "lon_0" not in values
+        or abs(values["lat_0"]) > 90
+        or abs(values["lon_0"]) > 180
+    ):
         return None
     return values["lat_0"], values["lon_0"], values.get("alt_0", 0.0)
 
 
 def T_enu_earth(lat_deg: float, lon_deg: float, height_m: float) -> F64:
-    """Return the ``(4, 4)`` transform from earth-centred coordinates to east, north, up at a place."""
+    """Return the ``(4, 4)`` transform from earth-centred coordinates to east, north, up at a
+    place.
+    """
     lat, lon = np.deg2rad(lat_deg), np.deg2rad(lon_deg)
     e2 = FLATTENING * (2.0 - FLATTENING)
     n = SEMI_MAJOR_M / np.sqrt(1.0 - e2 * np.sin(lat) ** 2)
     place = np.array(
-        [(n + height_m) * np.cos(lat) * np.cos(lon), (n + height_m) * np.cos(lat) * np.sin(lon), (n * (1.0 - e2) + height_m) * np.sin(lat)]
+        [
+            (n + height_m) * np.cos(lat) * np.cos(lon),
+            (n + height_m) * np.cos(lat) * np.sin(lon),
+            (n * (1.0 - e2) + height_m) * np.sin(lat),
+        ]
     )
     east = [-np.sin(lon), np.cos(lon), 0.0]
     north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
@@ -133,7 +165,19 @@ STRAIGHT_STEP_M = 2.0
 MAX_ASIDE_M = ASIDE_M.high
 MIN_WIDTH_M = 0.1  # lanes that never reach this width are ignored
 KINDS = {
-    **dict.fromkeys(("driving", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane", "bidirectional"), "vehicle"),
+    **dict.fromkeys(
+        (
+            "driving",
+            "entry",
+            "exit",
+            "onRamp",
+            "offRamp",
+            "connectingRamp",
+            "slipLane",
+            "bidirectional",
+        ),
+        "vehicle",
+    ),
     **dict.fromkeys(("bus", "taxi", "HOV"), "bus"),
     **dict.fromkeys(("shoulder", "stop"), "shoulder"),
     "biking": "bike",
@@ -142,10 +186,13 @@ KINDS = {
 _SOLID = ("solid", "solid solid", "solid broken", "broken solid")
 
 
-def lane_map_of(files: SourceFiles, where: Path | str, odr: OdrMap, T_local_map: F64) -> tuple[LaneMap, tuple[str, ...]]:
+def lane_map_of(
+    files: SourceFiles, where: Path | str, odr: OdrMap, T_local_map: F64
+) -> tuple[LaneMap, tuple[str, ...]]:
     """Return the lane map of a parsed file in the local frame, with notes on what was left out.
 
-    Lane ids are ``ROAD.SECTION.LANE``. Edges and centres are sampled every 0.5 m on bends and where a width changes, else every 2 m.
+    Lane ids are ``ROAD.SECTION.LANE``. Edges and centres are sampled every 0.5 m on bends and where
+    a width changes, else every 2 m.
 
     Raises:
         InputError: No road has a lane for vehicles.
@@ -158,25 +205,39 @@ def lane_map_of(files: SourceFiles, where: Path | str, odr: OdrMap, T_local_map:
                 found = _section(road, index, section, T_local_map, left_out)
                 if found is None:
                     here = f"{where}, road {road.road_id}, section {index}"
-                    raise files.fail(here, "points that are not finite or not on a road", "repair its numbers")
+                    raise files.fail(
+                        here, "points that are not finite or not on a road", "repair its numbers"
+                    )
                 lanes.update({one.lane_id: one for one in found})
     if not any(lane.kind == "vehicle" for lane in lanes.values()):
-        raise files.fail(where, "a map without a lane for vehicles", "use a map with lanes of type driving")
+        raise files.fail(
+            where, "a map without a lane for vehicles", "use a map with lanes of type driving"
+        )
     linked = following(odr, lanes)
     surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
     notes = [f"lanes of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
-    notes += [f"{odr.n_signals} signals and {odr.n_objects} objects of the map are not used"] if odr.n_signals + odr.n_objects else []
+    notes += (
+        [f"{odr.n_signals} signals and {odr.n_objects} objects of the map are not used"]
+        if odr.n_signals + odr.n_objects
+        else []
+    )
     return LaneMap(linked, border_lines(surface, np.concatenate(lane_edges(lanes)))), tuple(notes)
 
 
-def _section(road: Road, index: int, section: Section, T_local_map: F64, left_out: Counter[str]) -> list[Lane] | None:
+def _section(
+    road: Road, index: int, section: Section, T_local_map: F64, left_out: Counter[str]
+) -> list[Lane] | None:
     """Return the lanes of a section; None where its numbers give no road."""
     s = _stations(road, section)
     line = reference_line(road.records, s)
     tilt = np.tan(cubics_at(road.superelevation, s))
     height = cubics_at(road.elevation, s)
     middle = cubics_at(road.lane_offset, s)
-    if not (np.abs(line[:, :2] - line[0, :2]).max() <= MAX_ROAD_M and np.abs(height).max() <= MAX_ROAD_M and np.isfinite(tilt).all()):
+    if not (
+        np.abs(line[:, :2] - line[0, :2]).max() <= MAX_ROAD_M
+        and np.abs(height).max() <= MAX_ROAD_M
+        and np.isfinite(tilt).all()
+    ):
         return None
 
     def points(t: F64) -> F64:
@@ -184,7 +245,10 @@ def _section(road: Road, index: int, section: Section, T_local_map: F64, left_ou
 
     out: list[Lane] = []
     for sign in (1, -1):
-        inner_t, inner_mark = middle, next((one.mark for one in section.lanes if one.lane_id == 0), None)
+        inner_t, inner_mark = (
+            middle,
+            next((one.mark for one in section.lanes if one.lane_id == 0), None),
+        )
         along = (sign < 0) != road.left_hand  # runs with s
         side = section.side(sign)
         for k, lane in enumerate(side):
@@ -194,47 +258,84 @@ def _section(road: Road, index: int, section: Section, T_local_map: F64, left_ou
             kind = KINDS.get(lane.kind)
             wide = float(np.abs(outer_t - inner_t).max()) >= MIN_WIDTH_M
             if kind is None or not wide:
-                left_out[lane.kind if kind is None else f"{lane.kind}, nowhere {MIN_WIDTH_M} m wide"] += 1
+                left_out[
+                    lane.kind if kind is None else f"{lane.kind}, nowhere {MIN_WIDTH_M} m wide"
+                ] += 1
             else:
-                # Seen in driving direction the middle of the road is on the left, with left-hand traffic on the right.
-                near, far, turn = points(inner_t), points(outer_t), 1 if along else -1
+                # Seen in driving direction the middle of the road is on the left, with left-hand
+                # traffic on the right.
+                near = points(inner_t)
+                far = points(outer_t)
+                turn = 1 if along else -1
                 edges = (far, near) if road.left_hand else (near, far)
-                paints = (_paint(lane.mark), _paint(inner_mark)) if road.left_hand else (_paint(inner_mark), _paint(lane.mark))
-                beside_ids = [lane_key(road, index, n.lane_id) if n is not None and n.kind in KINDS else None for n in _neighbours(side, k)]
+                paints = (
+                    (_paint(lane.mark), _paint(inner_mark))
+                    if road.left_hand
+                    else (_paint(inner_mark), _paint(lane.mark))
+                )
+                beside_ids = [
+                    lane_key(road, index, n.lane_id) if n is not None and n.kind in KINDS else None
+                    for n in _neighbours(side, k)
+                ]
                 if road.left_hand:
                     beside_ids.reverse()
                 left, right = (edge[::turn] for edge in edges)
-                out.append(Lane(
-                    lane_key(road, index, lane.lane_id), densify((left + right) / 2), left, right, kind,
-                    left_neighbour=beside_ids[0], right_neighbour=beside_ids[1], left_paint=paints[0], right_paint=paints[1],
-                    is_intersection=road.junction != "-1",
-                ))  # fmt: skip
+                out.append(
+                    Lane(
+                        lane_key(road, index, lane.lane_id),
+                        densify((left + right) / 2),
+                        left,
+                        right,
+                        kind,
+                        left_neighbour=beside_ids[0],
+                        right_neighbour=beside_ids[1],
+                        left_paint=paints[0],
+                        right_paint=paints[1],
+                        is_intersection=road.junction != "-1",
+                    )
+                )
             inner_t, inner_mark = outer_t, lane.mark
     return out
 
 
 def _neighbours(side: tuple[OdrLane, ...], k: int) -> tuple[OdrLane | None, OdrLane | None]:
-    """Return the next lane towards the road's middle and the next one outwards, on the same side."""
+    """Return the next lane towards the road's middle and the next one outwards, on the same
+    side.
+    """
     return (side[k - 1] if k > 0 else None), (side[k + 1] if k + 1 < len(side) else None)
 
 
 def _outer(lane: OdrLane, sign: int, s: F64, inner_t: F64, middle: F64) -> F64:
-    """Return ``(N,)`` the signed distance of a lane's outer border: by widths, or by borders where it has those instead."""
+    """Return ``(N,)`` the signed distance of a lane's outer border: by widths, or by borders where
+    it has those instead.
+    """
     if lane.borders and not lane.widths:
         return np.asarray(middle + cubics_at(lane.borders, s))
     return np.asarray(inner_t + sign * np.maximum(cubics_at(lane.widths, s), 0.0))
 
 
 def _stations(road: Road, section: Section) -> F64:
-    """Return the arc lengths of a section's stations: its ends, the start of every record, and no gap above the step."""
-    cubics = [*road.lane_offset, *(c for lane in section.lanes for c in (*lane.widths, *lane.borders))]
+    """Return the arc lengths of a section's stations: its ends, the start of every record, and no
+    gap above the step.
+    """
+    cubics = [
+        *road.lane_offset,
+        *(c for lane in section.lanes for c in (*lane.widths, *lane.borders)),
+    ]
     bends = curved(road.records) or any(abs(c.b) + abs(c.c) + abs(c.d) > 0 for c in cubics)
-    starts = [*(r.s_m for r in road.records), *(c.s_m for c in cubics), *(c.s_m for c in road.elevation)]
+    starts = [
+        *(r.s_m for r in road.records),
+        *(c.s_m for c in cubics),
+        *(c.s_m for c in road.elevation),
+    ]
     inside = [at for at in starts if section.s_m < at < section.end_m]
     knots = np.unique([section.s_m, *inside, section.end_m])
     step = STEP_M if bends or len(road.elevation) > 1 else STRAIGHT_STEP_M
     pieces = np.maximum(np.ceil(np.diff(knots) / step - 1e-9).astype(np.int64), 1)
-    parts = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots[:-1], knots[1:], pieces, strict=True)]
+    parts = [
+        np.linspace(a, b, n, endpoint=False)
+        for a, b, n in zip(knots[:-1], knots[1:], pieces, strict=True)
+    ]
     # A section ends where the next one begins: the values just before it count.
     return np.concatenate([*parts, [np.nextafter(section.end_m, section.s_m)]])
 
@@ -245,7 +346,11 @@ def _paint(mark: tuple[str, str] | None) -> Paint:
         return "none"
     kind, colour = mark
     if kind in _SOLID:
-        return ("double_yellow" if " " in kind else "solid_yellow") if colour == "yellow" else "solid_white"
+        return (
+            ("double_yellow" if " " in kind else "solid_yellow")
+            if colour == "yellow"
+            else "solid_white"
+        )
     if kind in ("broken", "broken broken"):
         return "dashed_yellow" if colour == "yellow" else "dashed_white"
     return "none" if kind in ("curb", "grass", "edge") else "unknown"

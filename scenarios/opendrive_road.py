@@ -1,7 +1,9 @@
-"""OpenDRIVE roads as written: plan view, elevation, lane sections and links, and their reference lines at any arc length.
+"""OpenDRIVE roads as written: plan view, elevation, lane sections and links, and their reference
+lines at any arc length.
 
-Reference lines are line, arc, spiral, poly3 and paramPoly3 records. Source: ASAM OpenDRIVE 1.4 to 1.8, chapter on geometry: x east, y
-north, heading from x towards y, ``s`` along the line, ``t`` to the left.
+Reference lines are line, arc, spiral, poly3 and paramPoly3 records. Source: ASAM OpenDRIVE 1.4 to
+1.8, chapter on geometry: x east, y north, heading from x towards y, ``s`` along the line, ``t`` to
+the left.
 """
 
 from __future__ import annotations
@@ -46,20 +48,27 @@ class Geometry:
     heading_rad: float
     length_m: float
     kind: Kind
-    # line: none; arc: curvature; spiral: start and end curvature; poly3: a b c d; paramPoly3: aU bU cU dU aV bV cV dV.
+    # line: none; arc: curvature; spiral: start and end curvature; poly3: a b c d; paramPoly3: aU bU
+    # cU dU aV bV cV dV.
     numbers: tuple[float, ...] = ()
     normalised: bool = True  # paramPoly3: the parameter runs 0..1, else 0..length
 
     def at(self, s_m: F64) -> F64:
-        """Return ``(N, 3)`` x, y and heading at arc lengths ``(N,)`` from the record's own start."""
+        """Return ``(N, 3)`` x, y and heading at arc lengths ``(N,)`` from the record's own
+        start.
+        """
         if self.kind in ("line", "arc", "spiral"):
             return self._clothoid(s_m)
         u, v, heading = self._poly3(s_m) if self.kind == "poly3" else self._param_poly3(s_m)
         c, s = np.cos(self.heading_rad), np.sin(self.heading_rad)
-        return np.column_stack([self.x_m + u * c - v * s, self.y_m + u * s + v * c, self.heading_rad + heading])
+        return np.column_stack(
+            [self.x_m + u * c - v * s, self.y_m + u * s + v * c, self.heading_rad + heading]
+        )
 
     def _clothoid(self, s_m: F64) -> F64:
-        """Integrate the heading, which is quadratic in s; 32-point Gauss-Legendre is exact to rounding for any road's turn."""
+        """Integrate the heading, which is quadratic in s; 32-point Gauss-Legendre is exact to
+        rounding for any road's turn.
+        """
         start = self.numbers[0] if self.numbers else 0.0
         rate = (self.numbers[1] - start) / self.length_m if self.kind == "spiral" else 0.0
         at = 0.5 * s_m[:, None] * (1.0 + _NODES)  # (N, 32)
@@ -69,7 +78,9 @@ class Geometry:
         return np.column_stack([x, y, self.heading_rad + s_m * (start + 0.5 * rate * s_m)])
 
     def _poly3(self, s_m: F64) -> tuple[F64, F64, F64]:
-        """Return u, v and heading of ``v = a + b u + c u^2 + d u^3``; u follows from the arc length."""
+        """Return u, v and heading of ``v = a + b u + c u^2 + d u^3``; u follows from the arc
+        length.
+        """
         a, b, c, d = self.numbers
         reach = max(self.length_m, 1e-9)
         table_u = np.linspace(0.0, reach, _TABLE)  # an arc is never shorter than its u
@@ -79,12 +90,17 @@ class Geometry:
 
         half = 0.5 * np.diff(table_u)[:, None]
         nodes = 0.5 * (table_u[1:] + table_u[:-1])[:, None] + half * _NODES
-        lengths = np.concatenate([[0.0], np.cumsum(np.sum(half * _WEIGHTS * np.hypot(1.0, slope(nodes)), axis=1))])
+        lengths = np.concatenate(
+            [[0.0], np.cumsum(np.sum(half * _WEIGHTS * np.hypot(1.0, slope(nodes)), axis=1))]
+        )
         u = np.interp(s_m, lengths, table_u)
         for _ in range(3):  # Newton on the arc length from the table's station below
             below = np.clip(np.searchsorted(table_u, u, side="right") - 1, 0, _TABLE - 1)
             gap = 0.5 * (u - table_u[below])
-            part = gap * (np.hypot(1.0, slope(table_u[below][:, None] + gap[:, None] * (1.0 + _NODES))) @ _WEIGHTS)
+            part = gap * (
+                np.hypot(1.0, slope(table_u[below][:, None] + gap[:, None] * (1.0 + _NODES)))
+                @ _WEIGHTS
+            )
             u = u - (lengths[below] + part - s_m) / np.hypot(1.0, slope(u))
         return u, a + u * (b + u * (c + d * u)), np.arctan(slope(u))
 
@@ -96,7 +112,9 @@ class Geometry:
 
 
 def reference_line(records: Sequence[Geometry], s_m: F64) -> F64:
-    """Return ``(N, 3)`` x, y and heading (not wrapped) of a road's reference line at arc lengths ``(N,)``."""
+    """Return ``(N, 3)`` x, y and heading (not wrapped) of a road's reference line at arc lengths
+    ``(N,)``.
+    """
     starts = np.array([one.s_m for one in records])
     owner = np.clip(np.searchsorted(starts, s_m, side="right") - 1, 0, len(records) - 1)
     out = np.empty((len(s_m), 3))
@@ -107,18 +125,26 @@ def reference_line(records: Sequence[Geometry], s_m: F64) -> F64:
 
 
 def cubics_at(records: Sequence[Cubic], s_m: F64) -> F64:
-    """Return ``(N,)`` the value of the record in force at each arc length; before the first record that one is extended, none gives 0."""
+    """Return ``(N,)`` the value of the record in force at each arc length; before the first record
+    that one is extended, none gives 0.
+    """
     if not records:
         return np.zeros(len(s_m))
     table = np.array([[one.s_m, one.a, one.b, one.c, one.d] for one in records])
-    s0, a, b, c, d = table[np.clip(np.searchsorted(table[:, 0], s_m, side="right") - 1, 0, len(records) - 1)].T
+    s0, a, b, c, d = table[
+        np.clip(np.searchsorted(table[:, 0], s_m, side="right") - 1, 0, len(records) - 1)
+    ].T
     ds = s_m - s0
     return np.asarray(a + ds * (b + ds * (c + d * ds)))
 
 
 def beside(line: F64, t_m: F64) -> F64:
-    """Return points ``(N, 2)`` at signed distances ``t_m (N,)``, left positive, across a line ``(N, 3)`` of x, y, heading."""
-    return np.column_stack([line[:, 0] - t_m * np.sin(line[:, 2]), line[:, 1] + t_m * np.cos(line[:, 2])])
+    """Return points ``(N, 2)`` at signed distances ``t_m (N,)``, left positive, across a line ``(N,
+    3)`` of x, y, heading.
+    """
+    return np.column_stack(
+        [line[:, 0] - t_m * np.sin(line[:, 2]), line[:, 1] + t_m * np.cos(line[:, 2])]
+    )
 
 
 MAX_ROAD_M = MAP_ROAD_M.high
@@ -155,7 +181,12 @@ class Section:
 
     def side(self, sign: int) -> tuple[OdrLane, ...]:
         """Return the lanes of one side (1 left, -1 right), from the middle outwards."""
-        return tuple(sorted((one for one in self.lanes if one.lane_id * sign > 0), key=lambda one: abs(one.lane_id)))
+        return tuple(
+            sorted(
+                (one for one in self.lanes if one.lane_id * sign > 0),
+                key=lambda one: abs(one.lane_id),
+            )
+        )
 
 
 @dataclass(frozen=True)
@@ -214,20 +245,30 @@ def parse_map(files: SourceFiles, where: Path | str, root: Element) -> OdrMap:
     for element in root.iter():  # without namespaces
         element.tag = element.tag.rpartition("}")[2]
     if root.tag != "OpenDRIVE":
-        raise files.fail(where, f"a document <{root.tag}>", "give an OpenDRIVE file, whose root is <OpenDRIVE>")
+        raise files.fail(
+            where, f"a document <{root.tag}>", "give an OpenDRIVE file, whose root is <OpenDRIVE>"
+        )
     roads = tuple(_road(files, where, element) for element in root.findall("road"))
     if not roads:
         raise files.fail(where, "a map without roads", "use a map with at least one road")
     connections = tuple(
         Connection(
-            c.get("incomingRoad", ""), c.get("connectingRoad", ""), c.get("contactPoint", "start") == "start",
-            tuple((_integer(files, where, link, "from"), _integer(files, where, link, "to")) for link in c.findall("laneLink")),
+            c.get("incomingRoad", ""),
+            c.get("connectingRoad", ""),
+            c.get("contactPoint", "start") == "start",
+            tuple(
+                (_integer(files, where, link, "from"), _integer(files, where, link, "to"))
+                for link in c.findall("laneLink")
+            ),
         )
-        for j in root.findall("junction") for c in j.findall("connection")
-    )  # fmt: skip
+        for j in root.findall("junction")
+        for c in j.findall("connection")
+    )
     reference = root.find(".//geoReference")
     counts = [len(root.findall(f".//{name}")) for name in ("signal", "object")]
-    return OdrMap(roads, connections, (reference.text or "").strip() if reference is not None else "", *counts)
+    return OdrMap(
+        roads, connections, (reference.text or "").strip() if reference is not None else "", *counts
+    )
 
 
 def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
@@ -245,9 +286,13 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
             raise files.fail(here, f"<{owner.tag}> with {name} = {text!r}", "give a finite number")
         return value
 
-    def cubics(owner: Element | None, tag: str, at: str = "s", start_m: float = 0.0) -> tuple[Cubic, ...]:
+    def cubics(
+        owner: Element | None, tag: str, at: str = "s", start_m: float = 0.0
+    ) -> tuple[Cubic, ...]:
         found = owner.findall(tag) if owner is not None else []
-        records = [Cubic(start_m + number(r, at), *(number(r, k, 0.0) for k in _ABCD)) for r in found]
+        records = [
+            Cubic(start_m + number(r, at), *(number(r, k, 0.0) for k in _ABCD)) for r in found
+        ]
         return tuple(sorted(records, key=lambda r: r.s_m))
 
     road_m = number(element, "length")
@@ -256,57 +301,111 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
     def geometry(record: Element) -> Geometry:
         shape = next((child for child in record if child.tag in KINDS), None)
         if shape is None:
-            raise files.fail(here, f"a <geometry> of {[child.tag for child in record]}", f"use {', '.join(KINDS)}")
+            raise files.fail(
+                here,
+                f"a <geometry> of {[child.tag for child in record]}",
+                f"use {', '.join(KINDS)}",
+            )
         numbers = tuple(number(shape, name) for name in _PARAMETERS[shape.tag])
-        s, x, y, heading, length = (number(record, name) for name in ("s", "x", "y", "hdg", "length"))
+        s, x, y, heading, length = (
+            number(record, name) for name in ("s", "x", "y", "hdg", "length")
+        )
         MAP_ROAD_M.check(length, files.doing, here, "length of a <geometry>")
         if not -1.0 <= s <= road_m + 1.0:
-            raise files.fail(here, f"a <geometry> at s = {s:g} of a road of {road_m:g} m", "start every record on the road")
+            raise files.fail(
+                here,
+                f"a <geometry> at s = {s:g} of a road of {road_m:g} m",
+                "start every record on the road",
+            )
         if shape.tag in ("arc", "spiral"):
             for value in numbers:
                 MAP_CURVATURE_PER_M.check(value, files.doing, here)
         kind = next(k for k in KINDS if k == shape.tag)
-        return Geometry(s, x, y, heading, length, kind, numbers, shape.get("pRange", "normalized") != "arcLength")
+        return Geometry(
+            s,
+            x,
+            y,
+            heading,
+            length,
+            kind,
+            numbers,
+            shape.get("pRange", "normalized") != "arcLength",
+        )
 
     def lane(one: Element, start_m: float) -> OdrLane:
         mark = one.find("roadMark")
-        links = {tag: tuple(_integer(files, here, e, "id") for e in one.findall(f"link/{tag}")) for tag in ("successor", "predecessor")}
+        links = {
+            tag: tuple(_integer(files, here, e, "id") for e in one.findall(f"link/{tag}"))
+            for tag in ("successor", "predecessor")
+        }
         return OdrLane(
-            _integer(files, here, one, "id"), one.get("type", "none"), cubics(one, "width", "sOffset", start_m),
-            cubics(one, "border", "sOffset", start_m), links["successor"], links["predecessor"],
+            _integer(files, here, one, "id"),
+            one.get("type", "none"),
+            cubics(one, "width", "sOffset", start_m),
+            cubics(one, "border", "sOffset", start_m),
+            links["successor"],
+            links["predecessor"],
             None if mark is None else (mark.get("type", "none"), mark.get("color", "standard")),
-        )  # fmt: skip
+        )
 
     lanes = element.find("lanes")
-    elements = sorted(lanes.findall("laneSection") if lanes is not None else [], key=lambda e: number(e, "s", 0.0))
+    elements = sorted(
+        lanes.findall("laneSection") if lanes is not None else [], key=lambda e: number(e, "s", 0.0)
+    )
     starts = [number(e, "s", 0.0) for e in elements]
     sections = tuple(
-        Section(start, end, tuple(lane(one, start) for side in ("left", "center", "right") for one in e.findall(f"{side}/lane")))
+        Section(
+            start,
+            end,
+            tuple(
+                lane(one, start)
+                for side in ("left", "center", "right")
+                for one in e.findall(f"{side}/lane")
+            ),
+        )
         for e, start, end in zip(elements, starts, [*starts[1:], road_m], strict=True)
     )
     if any(not 0 <= start <= road_m for start in starts):
-        raise files.fail(here, f"lane sections at {starts} of a road of {road_m} m", "start every section on the road")
+        raise files.fail(
+            here,
+            f"lane sections at {starts} of a road of {road_m} m",
+            "start every section on the road",
+        )
     view = element.find("planView")
     records = tuple(geometry(r) for r in (view.findall("geometry") if view is not None else []))
     return Road(
-        str(element.get("id")), road_m, element.get("junction", "-1"), element.get("rule") == "LHT", records,
-        cubics(element.find("elevationProfile"), "elevation"), cubics(element.find("lateralProfile"), "superelevation"),
-        cubics(lanes, "laneOffset"), sections, _link(element, "successor"), _link(element, "predecessor"),
-    )  # fmt: skip
+        str(element.get("id")),
+        road_m,
+        element.get("junction", "-1"),
+        element.get("rule") == "LHT",
+        records,
+        cubics(element.find("elevationProfile"), "elevation"),
+        cubics(element.find("lateralProfile"), "superelevation"),
+        cubics(lanes, "laneOffset"),
+        sections,
+        _link(element, "successor"),
+        _link(element, "predecessor"),
+    )
 
 
 def _integer(files: SourceFiles, where: Path | str, element: Element, name: str) -> int:
     try:
         return int(str(element.get(name)))
     except ValueError as error:
-        raise files.fail(where, f"<{element.tag}> with {name} = {element.get(name)!r}", "give an integer") from error
+        raise files.fail(
+            where, f"<{element.tag}> with {name} = {element.get(name)!r}", "give an integer"
+        ) from error
 
 
 def _link(road: Element, tag: str) -> RoadLink | None:
     found = road.find(f"link/{tag}")
     if found is None:
         return None
-    return RoadLink(found.get("elementType", "road"), str(found.get("elementId")), found.get("contactPoint", "start") == "start")
+    return RoadLink(
+        found.get("elementType", "road"),
+        str(found.get("elementId")),
+        found.get("contactPoint", "start") == "start",
+    )
 
 
 def lane_key(road: Road, section: int, lane_id: int) -> str:

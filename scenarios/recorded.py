@@ -1,4 +1,5 @@
-"""What all readers of recorded data share: source files, what a reader returns before it becomes a `Scenario`, trajectories and actors.
+"""What all readers of recorded data share: source files, what a reader returns before it becomes a
+`Scenario`, trajectories and actors.
 
 Every failure names the file, and every byte read enters one hash.
 """
@@ -64,15 +65,22 @@ class SourceFiles:
         return InputError(self.doing, str(path), found, do_this)
 
     def near(self, where: Path | str, xyz: F64) -> F64:
-        """Return local points ``(..., 3)`` after checking that they are finite and within `MAX_REACH_M` of the origin."""
+        """Return local points ``(..., 3)`` after checking that they are finite and within
+        `MAX_REACH_M` of the origin.
+        """
         distance = float(np.abs(xyz).max(initial=0.0))  # NaN stays NaN
         if not distance <= MAX_REACH_M:
-            found = "a coordinate that is not finite" if not np.isfinite(distance) else f"a point {distance / 1000:.1f} km from the drive"
+            found = (
+                "a coordinate that is not finite"
+                if not np.isfinite(distance)
+                else f"a point {distance / 1000:.1f} km from the drive"
+            )
             raise self.fail(where, found, "repair the coordinates of this file")
         return xyz
 
     def only(self, folder: Path, patterns: tuple[str, ...], what: str) -> Path:
-        """Return the one file of a folder that matches one of the glob patterns, the first pattern with a match deciding.
+        """Return the one file of a folder that matches one of the glob patterns, the first pattern
+        with a match deciding.
 
         Raises:
             InputError: There is none, or more than one.
@@ -85,7 +93,11 @@ class SourceFiles:
                 return found[0]
             if found:
                 names = ", ".join(f.name for f in found[:3])
-                raise self.fail(folder, f"{len(found)} files match {pattern}: {names}", f"keep exactly one file with {what}")
+                raise self.fail(
+                    folder,
+                    f"{len(found)} files match {pattern}: {names}",
+                    f"keep exactly one file with {what}",
+                )
         raise self.fail(folder, f"no file {' or '.join(patterns)}", f"add the file with {what}")
 
     def read_bytes(self, path: Path) -> bytes:
@@ -111,13 +123,18 @@ class SourceFiles:
 
     def parse_json(self, data: bytes, where: Path | str) -> Any:
         """Parse a JSON document that came out of ``where``."""
-        return reading.parse_json(data, where, self.doing, "fetch the file again; it may be truncated")
+        return reading.parse_json(
+            data, where, self.doing, "fetch the file again; it may be truncated"
+        )
 
-    def read_feather(self, path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarray[Any, Any]]:
+    def read_feather(
+        self, path: Path, columns: Mapping[str, Kind]
+    ) -> dict[str, np.ndarray[Any, Any]]:
         """Read columns of a feather file (Arrow IPC).
 
         Raises:
-            InputError: The file is damaged or truncated, lacks a column, or has one of another type or with empty values.
+            InputError: The file is damaged or truncated, lacks a column, or has one of another type
+                or with empty values.
         """
         data, do = self.read_bytes(path), "fetch the file again; it may be truncated"
         with reading.parsing(self.doing, path, do, "no readable Arrow IPC file"):
@@ -126,7 +143,9 @@ class SourceFiles:
         check_columns(table, columns, path, self.doing, "use a file of the Argoverse 2 sensor set")
         nulls = next((name for name in columns if table.column(name).null_count), None)
         if nulls is not None:
-            raise self.fail(path, f"column {nulls!r} with empty values", "repair or drop these rows")
+            raise self.fail(
+                path, f"column {nulls!r} with empty values", "repair or drop these rows"
+            )
         return {c: table.column(c).to_numpy(zero_copy_only=False) for c in columns}
 
     def parse_npy(self, data: bytes, where: Path | str) -> np.ndarray[Any, Any]:
@@ -136,7 +155,9 @@ class SourceFiles:
     def read_tar(self, path: Path) -> dict[str, bytes]:
         """Read the regular files of an uncompressed tar, in memory, by member name."""
         data = self.read_bytes(path)
-        damaged = reading.parsing(self.doing, path, "fetch the file again; it may be truncated", "a damaged tar")
+        damaged = reading.parsing(
+            self.doing, path, "fetch the file again; it may be truncated", "a damaged tar"
+        )
         members: dict[str, bytes] = {}
         with damaged, tarfile.open(fileobj=io.BytesIO(data), mode="r:") as archive:
             for info in archive:
@@ -145,11 +166,18 @@ class SourceFiles:
                 if handle is not None:
                     content = handle.read()
                     if len(content) != info.size:
-                        raise tarfile.ReadError(f"member {info.name} has {len(content)} of {info.size} bytes")
+                        raise tarfile.ReadError(
+                            f"member {info.name} has {len(content)} of {info.size} bytes"
+                        )
                     members[info.name] = content
-        # A cut between two members leaves a readable tar: only the two empty blocks at its end show that it is complete.
+        # A cut between two members leaves a readable tar: only the two empty blocks at its end show
+        # that it is complete.
         if any(data[-2 * tarfile.BLOCKSIZE :]):
-            raise self.fail(path, "a damaged tar: no end-of-archive blocks", "fetch the file again; it may be truncated")
+            raise self.fail(
+                path,
+                "a damaged tar: no end-of-archive blocks",
+                "fetch the file again; it may be truncated",
+            )
         if not members:
             raise self.fail(path, "a tar without files", "fetch the file again")
         return members
@@ -171,8 +199,9 @@ class SourceFiles:
 class RecordedLog:
     """A map, a drive and the traffic around it, in metres around a local origin.
 
-    The reader has subtracted ``world_origin`` from every coordinate, converted time to integer microseconds and put the ego's pose at
-    the rear axle on the ground. ``notes`` says what it assumed or left out.
+    The reader has subtracted ``world_origin`` from every coordinate, converted time to integer
+    microseconds and put the ego's pose at the rear axle on the ground. ``notes`` says what it
+    assumed or left out.
     """
 
     scene_id: str
@@ -186,8 +215,12 @@ class RecordedLog:
     world_origin: tuple[float, float, float]
     content_hash: str  # sha256 over the bytes that were read
     notes: tuple[str, ...] = ()
-    first_frame_us: int | None = None  # when the first recorded camera frame ends, where the source says it
-    alpasim_map: LaneMap | None = None  # the same road as AlpaSim's own loader reads it, where that differs
+    first_frame_us: int | None = (
+        None  # when the first recorded camera frame ends, where the source says it
+    )
+    alpasim_map: LaneMap | None = (
+        None  # the same road as AlpaSim's own loader reads it, where that differs
+    )
     route: Route | None = None  # None: the recorded path, carried on along the lanes
     recording: tuple[Photograph, ...] = ()  # see `Scenario.recording`
     model: str | None = None  # see `Scenario.model`
@@ -195,12 +228,18 @@ class RecordedLog:
 
 
 MAX_GAP_US = 500_000  # a track is not interpolated across a longer hole: it becomes two actors
-STATIC_REACH_M = {"pedestrian": 0.5, "cyclist": 0.5, "motorcycle": 0.75}  # largest distance from the median position
+STATIC_REACH_M = {
+    "pedestrian": 0.5,
+    "cyclist": 0.5,
+    "motorcycle": 0.75,
+}  # largest distance from the median position
 STATIC_REACH_DEFAULT_M = 1.0  # annotated boxes of far parked cars drift by up to 0.8 m in 15 s
 STATIC_SPEED_MPS = 0.3
 
 
-def checked_trajectory(files: SourceFiles, path: Path | str, t_us: I64, xyz: F64, quat: F64, least: int = 1) -> Trajectory:
+def checked_trajectory(
+    files: SourceFiles, path: Path | str, t_us: I64, xyz: F64, quat: F64, least: int = 1
+) -> Trajectory:
     """Build a trajectory after checking what every stage relies on; quaternions are normalised.
 
     Args:
@@ -212,7 +251,8 @@ def checked_trajectory(files: SourceFiles, path: Path | str, t_us: I64, xyz: F64
         least: Fewest poses that make sense here.
 
     Raises:
-        InputError: Too few poses, times that do not increase, values that are not finite, or quaternions far from unit length.
+        InputError: Too few poses, times that do not increase, values that are not finite, or
+            quaternions far from unit length.
     """
     if len(t_us) < least:
         found = f"{len(t_us)} pose" + ("" if len(t_us) == 1 else "s")
@@ -220,7 +260,11 @@ def checked_trajectory(files: SourceFiles, path: Path | str, t_us: I64, xyz: F64
     for name, values in (("positions", xyz), ("rotations", quat)):
         bad = ~np.isfinite(values).all(axis=1)
         if bad.any():
-            raise files.fail(path, f"{name} that are not finite, first in row {int(np.argmax(bad))}", "repair or drop these rows")
+            raise files.fail(
+                path,
+                f"{name} that are not finite, first in row {int(np.argmax(bad))}",
+                "repair or drop these rows",
+            )
     steps = np.diff(t_us)
     if (steps <= 0).any():
         row = int(np.argmax(steps <= 0)) + 1
@@ -230,8 +274,14 @@ def checked_trajectory(files: SourceFiles, path: Path | str, t_us: I64, xyz: F64
     bad = np.abs(norms - 1.0) > 1e-2
     if bad.any():
         row = int(np.argmax(bad))
-        raise files.fail(path, f"a quaternion of length {norms[row]:.3g} in row {row}", "give unit quaternions (w, x, y, z)")
-    return Trajectory(np.ascontiguousarray(t_us, dtype=np.int64), np.ascontiguousarray(xyz), quat / norms[:, None])
+        raise files.fail(
+            path,
+            f"a quaternion of length {norms[row]:.3g} in row {row}",
+            "give unit quaternions (w, x, y, z)",
+        )
+    return Trajectory(
+        np.ascontiguousarray(t_us, dtype=np.int64), np.ascontiguousarray(xyz), quat / norms[:, None]
+    )
 
 
 def split_at_gaps(t_us: I64, max_gap_us: int = MAX_GAP_US) -> list[slice]:
@@ -244,8 +294,9 @@ def split_at_gaps(t_us: I64, max_gap_us: int = MAX_GAP_US) -> list[slice]:
 def stands_still(t_us: I64, xyz: F64, label: str, fixed: bool = False) -> bool:
     """Return whether a track is that of a standing object, given the noise of annotated boxes.
 
-    It stands if it never leaves its median position by more than its class's reach and that reach, over its duration, is slower than
-    `STATIC_SPEED_MPS`; a glimpse too short to tell counts as moving. ``fixed`` classes (bollards, signs) stand whatever their duration.
+    It stands if it never leaves its median position by more than its class's reach and that reach,
+    over its duration, is slower than `STATIC_SPEED_MPS`; a glimpse too short to tell counts as
+    moving. ``fixed`` classes (bollards, signs) stand whatever their duration.
     """
     reach = float(np.linalg.norm(xyz[:, :2] - np.median(xyz[:, :2], axis=0), axis=1).max())
     duration_s = float(t_us[-1] - t_us[0]) * 1e-6
@@ -254,14 +305,28 @@ def stands_still(t_us: I64, xyz: F64, label: str, fixed: bool = False) -> bool:
     return fixed or (duration_s > 0 and 2 * reach / duration_s < STATIC_SPEED_MPS)
 
 
-def actors_of_track(actor_id: str, label: str, box: Box, track: Trajectory, fixed: bool = False) -> list[Actor]:
-    """Make the actors of one recorded track: one, or one a run where the track has holes longer than `MAX_GAP_US`.
+def actors_of_track(
+    actor_id: str, label: str, box: Box, track: Trajectory, fixed: bool = False
+) -> list[Actor]:
+    """Make the actors of one recorded track: one, or one a run where the track has holes longer
+    than `MAX_GAP_US`.
 
-    Runs after the first are called ``ID~2``, ``ID~3``, ... so that no actor is interpolated across a gap in the recording.
+    Runs after the first are called ``ID~2``, ``ID~3``, ... so that no actor is interpolated across
+    a gap in the recording.
     """
     actors: list[Actor] = []
     for run, part in enumerate(split_at_gaps(track.t_us), start=1):
-        t, xyz, quat = track.t_us[part], track.xyz[part], track.quat[part]
+        t = track.t_us[part]
+        xyz = track.xyz[part]
+        quat = track.quat[part]
         name = actor_id if run == 1 else f"{actor_id}~{run}"
-        actors.append(Actor(name, label, box, Trajectory(t, xyz, quat), is_static=stands_still(t, xyz, label, fixed)))
+        actors.append(
+            Actor(
+                name,
+                label,
+                box,
+                Trajectory(t, xyz, quat),
+                is_static=stands_still(t, xyz, label, fixed),
+            )
+        )
     return actors

@@ -1,4 +1,6 @@
-"""The scenario file: versioned, strict, with units in its key names. ``python -m scenarios.schema`` writes the JSON Schema."""
+"""The scenario file: versioned, strict, with units in its key names. ``python -m scenarios.schema``
+writes the JSON Schema.
+"""
 
 from __future__ import annotations
 
@@ -19,19 +21,29 @@ DEFAULT_DURATION_US = 8_000_000  # of the drive on a built road
 class LaneChangeSpec(Part):
     """A lane change of the ego."""
 
-    at_m: float = within(b.DISTANCE_M, "Start of the change, metres along the ego's path from where it starts.")
+    at_m: float = within(
+        b.DISTANCE_M, "Start of the change, metres along the ego's path from where it starts."
+    )
     to_lane: int = within(b.LANE_INDEX, "Target forward lane; 0 is next to the centre line.")
     length_m: float = within(b.SEGMENT_M, "Length of the change along the road.", 60.0)
 
 
 class EgoSpec(Part):
-    """How the expert that writes the ego's log drives. It follows the road, keeps its distance and slows down for bends."""
+    """How the expert that writes the ego's log drives. It follows the road, keeps its distance and
+    slows down for bends.
+    """
 
     lane: int = within(b.LANE_INDEX, "Forward lane at the start; 0 is next to the centre line.", 0)
-    start_m: float = within(b.DISTANCE_M, "Distance of the rear axle from the road's beginning at the log's start.", 20.0)
+    start_m: float = within(
+        b.DISTANCE_M,
+        "Distance of the rear axle from the road's beginning at the log's start.",
+        20.0,
+    )
     speed_mps: float = within(b.SPEED_MPS, "Speed at the log's start.", 10.0)
     cruise_mps: float = within(b.CRUISE_MPS, "Desired speed on a free straight.", 10.0)
-    max_lateral_accel_mps2: float = within(b.ACCEL_MPS2, "Limit that slows the expert in bends.", 2.0)
+    max_lateral_accel_mps2: float = within(
+        b.ACCEL_MPS2, "Limit that slows the expert in bends.", 2.0
+    )
     headway_s: float = within(b.HEADWAY_S, "Time gap to a leader.", 1.5)
     lane_changes: tuple[LaneChangeSpec, ...] = Field(
         default=(), max_length=int(b.ELEMENTS.high), description="Lane changes, in driving order."
@@ -41,21 +53,31 @@ class EgoSpec(Part):
 class EnvironmentSpec(Part):
     """Surroundings generated beside the road."""
 
-    buildings: float = Field(default=0.7, ge=0, le=1, description="Share of free roadside frontage covered by facades.")
+    buildings: float = Field(
+        default=0.7, ge=0, le=1, description="Share of free roadside frontage covered by facades."
+    )
     building_height_m: tuple[BuildingHeight, BuildingHeight] = Field(
         default=(6.0, 18.0), description="Least and greatest height of facades."
     )
     trees_per_100m: float = within(b.TREES_PER_100M, "Trees per road side.", 4.0)
-    poles_spacing_m: float = Field(default=30.0, ge=0, le=b.POLES_M.high, description="Distance between lamp posts; 0: none.")
+    poles_spacing_m: float = Field(
+        default=30.0, ge=0, le=b.POLES_M.high, description="Distance between lamp posts; 0: none."
+    )
     sky: Literal["clear", "overcast", "dusk"] = Field(default="clear", description="Sky and light.")
-    texture: float = Field(default=1.0, ge=0, le=1, description="Contrast of ground and facade texture.")
+    texture: float = Field(
+        default=1.0, ge=0, le=1, description="Contrast of ground and facade texture."
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> EnvironmentSpec:
         if self.building_height_m[0] > self.building_height_m[1]:
-            raise ValueError(f"building_height_m = {list(self.building_height_m)} | give the smaller height first")
+            raise ValueError(
+                f"building_height_m = {list(self.building_height_m)} | give the smaller height first"
+            )
         if 0 < self.poles_spacing_m < b.POLES_M.low:
-            raise ValueError(f"poles_spacing_m = {self.poles_spacing_m} | give at least {b.POLES_M.low:g} m, or 0 for none")
+            raise ValueError(
+                f"poles_spacing_m = {self.poles_spacing_m} | give at least {b.POLES_M.low:g} m, or 0 for none"
+            )
         return self
 
 
@@ -68,7 +90,9 @@ class CameraModel(Part):
     hfov_deg: float = Field(default=75.0, gt=1, lt=170, description="Horizontal field of view.")
     x_m: float = within(b.MOUNT_M, "Mount, metres ahead of the rear axle.", 1.6)
     y_m: float = within(b.MOUNT_M, "Mount, metres to the left.", 0.0)
-    z_m: float = Field(default=1.5, gt=0, le=b.MOUNT_M.high, description="Mount, metres above the ground.")
+    z_m: float = Field(
+        default=1.5, gt=0, le=b.MOUNT_M.high, description="Mount, metres above the ground."
+    )
     yaw_deg: float = Field(default=0.0, ge=-180, le=180, description="Turned to the left.")
     pitch_down_deg: float = Field(default=4.0, gt=-90, lt=90, description="Tilted downwards.")
     shutter_us: int = within(b.SHUTTER_US, "Exposure from shutter start to shutter end.", 0)
@@ -85,37 +109,51 @@ class RatesSpec(Part):
 class TimingSpec(Part):
     """Which part of the log is driven."""
 
-    start_us: int = within(b.TIME_US, "First frame, after the log's first pose; the log before it is context.", 500_000)
+    start_us: int = within(
+        b.TIME_US, "First frame, after the log's first pose; the log before it is context.", 500_000
+    )
     duration_us: int | None = Field(
         default=None,
         gt=0,
         le=b.TIME_US.high,
         description="Length from the first frame to the end; none: 8 s on a built road, to the end of a recorded log.",
     )
-    warmup_us: int = within(b.TIME_US, "The log is forced for so long after the first frame.", 500_000)
+    warmup_us: int = within(
+        b.TIME_US, "The log is forced for so long after the first frame.", 500_000
+    )
     stop_at_path_end: bool = Field(
-        default=True, description="A rollout ends where the recorded path ends, unless the recorded car stands there."
+        default=True,
+        description="A rollout ends where the recorded path ends, unless the recorded car stands there.",
     )
     timeline: Literal["scenario", "alpasim"] = Field(
         default="scenario",
         description="alpasim: start at the recording's first camera frame, where it has any, and force 1.7 s, whatever the keys above say.",
     )
     start_time_offset_us: int = within(
-        b.TIME_US, "With timeline alpasim: skipped at the start, as by AlpaSim's field of that name (since wire 0.55).", 0
+        b.TIME_US,
+        "With timeline alpasim: skipped at the start, as by AlpaSim's field of that name (since wire 0.55).",
+        0,
     )
 
 
 class LatencySpec(Part):
     """Delay from observation to the plan taking effect."""
 
-    kind: Literal["none", "fixed", "measured"] = Field(default="none", description="No delay, a fixed one, or the measured one.")
+    kind: Literal["none", "fixed", "measured"] = Field(
+        default="none", description="No delay, a fixed one, or the measured one."
+    )
     fixed_us: int = within(b.TIME_US, "Delay where kind is fixed.", 0)
-    fixer: bool = Field(default=False, description="Where kind is measured: the policy also waits for the fixer of its frames.")
+    fixer: bool = Field(
+        default=False,
+        description="Where kind is measured: the policy also waits for the fixer of its frames.",
+    )
 
     @model_validator(mode="after")
     def _fitting(self) -> LatencySpec:
         if self.fixer and self.kind != "measured":
-            raise ValueError(f"fixer = true with kind: {self.kind}, to which it means nothing | say kind: measured, or remove fixer")
+            raise ValueError(
+                f"fixer = true with kind: {self.kind}, to which it means nothing | say kind: measured, or remove fixer"
+            )
         return self
 
 
@@ -126,14 +164,48 @@ class DegradationSpec(Part):
         default="reconstruction",
         description="A model fitted to the logged drive and stopped early; one fitted to views beside it; seeded perturbations; none.",
     )
-    share: float = Field(default=0.15, gt=0, le=1, description="Reconstruction and cycle: share of the fit's whole schedule.")
-    shift_m: float = Field(default=1.0, ge=-10, le=10, description="Cycle: how far to the left the views lie that the model is fitted to.")
-    views_per_s: float = Field(default=6.0, gt=0, le=30, description="Reconstruction and cycle: views per second of log that are fitted.")
-    depth_error: float = Field(default=0.1, ge=0, le=0.5, description="Reconstruction and cycle: spread of the first points' depth, share.")
-    pose_error_m: float = Field(default=0.0, ge=0, le=1, description="Reconstruction and cycle: spread of the poses of these views.")
-    severity: float = Field(default=1.5, ge=0, le=100, description="Surrogate: scales all terms; 0 leaves the scene as built.")
-    onset_m: float = within(b.GAP_M, "Surrogate: distance from the logged path where the error starts to grow.", 0.1)
-    full_m: float = Field(default=2.0, gt=0, le=b.GAP_M.high, description="Surrogate: distance where it is full.")
+    share: float = Field(
+        default=0.15,
+        gt=0,
+        le=1,
+        description="Reconstruction and cycle: share of the fit's whole schedule.",
+    )
+    shift_m: float = Field(
+        default=1.0,
+        ge=-10,
+        le=10,
+        description="Cycle: how far to the left the views lie that the model is fitted to.",
+    )
+    views_per_s: float = Field(
+        default=6.0,
+        gt=0,
+        le=30,
+        description="Reconstruction and cycle: views per second of log that are fitted.",
+    )
+    depth_error: float = Field(
+        default=0.1,
+        ge=0,
+        le=0.5,
+        description="Reconstruction and cycle: spread of the first points' depth, share.",
+    )
+    pose_error_m: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Reconstruction and cycle: spread of the poses of these views.",
+    )
+    severity: float = Field(
+        default=1.5,
+        ge=0,
+        le=100,
+        description="Surrogate: scales all terms; 0 leaves the scene as built.",
+    )
+    onset_m: float = within(
+        b.GAP_M, "Surrogate: distance from the logged path where the error starts to grow.", 0.1
+    )
+    full_m: float = Field(
+        default=2.0, gt=0, le=b.GAP_M.high, description="Surrogate: distance where it is full."
+    )
 
     @model_validator(mode="after")
     def _fitting(self) -> DegradationSpec:
@@ -141,9 +213,13 @@ class DegradationSpec(Part):
             kinds = [kind for kind, names in DEGRADATION_KEYS.items() if name in names]
             if self.kind not in kinds:
                 found = f"{name} = {getattr(self, name)} with kind: {self.kind}"
-                raise ValueError(f"{found}, to which it means nothing | say kind: {' or '.join(kinds)}, or remove {name}")
+                raise ValueError(
+                    f"{found}, to which it means nothing | say kind: {' or '.join(kinds)}, or remove {name}"
+                )
         if self.full_m <= self.onset_m:
-            raise ValueError(f"full_m = {self.full_m} is not beyond onset_m = {self.onset_m} | make full_m larger")
+            raise ValueError(
+                f"full_m = {self.full_m} is not beyond onset_m = {self.onset_m} | make full_m larger"
+            )
         return self
 
 
@@ -160,9 +236,15 @@ class BackgroundSpec(Part):
 
     file: str = Field(min_length=1, description="Path, relative to this file.")
     transform: tuple[tuple[float, float, float, float], ...] | None = Field(
-        default=None, min_length=4, max_length=4, description="4 x 4 matrix from the file's frame to the world, row by row; may scale."
+        default=None,
+        min_length=4,
+        max_length=4,
+        description="4 x 4 matrix from the file's frame to the world, row by row; may scale.",
     )
-    keep_road: bool = Field(default=False, description="Draw the built road with the file; otherwise the file replaces road and houses.")
+    keep_road: bool = Field(
+        default=False,
+        description="Draw the built road with the file; otherwise the file replaces road and houses.",
+    )
 
 
 class VehicleSpec(Part):
@@ -171,22 +253,41 @@ class VehicleSpec(Part):
     length_m: float = within(b.VEHICLE_M, "Body length.", 4.855)
     width_m: float = within(b.VEHICLE_M, "Body width.", 1.88)
     height_m: float = within(b.VEHICLE_M, "Body height.", 1.6)
-    rear_axle_to_centre_m: float = within(b.AXLE_M, "From the rear axle forwards to the body's middle.", 1.4)
+    rear_axle_to_centre_m: float = within(
+        b.AXLE_M, "From the rear axle forwards to the body's middle.", 1.4
+    )
     wheelbase_m: float = within(b.VEHICLE_M, "Distance between the axles.", 2.85)
-    max_steer_rad: float = Field(default=0.6, ge=b.STEER_RAD.low, lt=b.STEER_RAD.high, description="Largest road-wheel angle.")
+    max_steer_rad: float = Field(
+        default=0.6,
+        ge=b.STEER_RAD.low,
+        lt=b.STEER_RAD.high,
+        description="Largest road-wheel angle.",
+    )
     max_steer_rate_radps: float = within(b.STEER_RATE_RADPS, "Largest steering rate.", 0.8)
     max_accel_mps2: float = within(b.ACCEL_MPS2, "Largest acceleration.", 3.5)
     max_brake_mps2: float = within(b.ACCEL_MPS2, "Largest deceleration.", 8.0)
 
 
 class JitterSpec(Part):
-    """Ranges within which scenes of other seeds than 0 differ from the file; 0 switches a term off. Uniform, relative unless in a unit."""
+    """Ranges within which scenes of other seeds than 0 differ from the file; 0 switches a term off.
+    Uniform, relative unless in a unit.
+    """
 
-    length: float = Field(default=0.05, ge=0, le=0.5, description="Relative change of element lengths.")
-    curvature: float = Field(default=0.1, ge=0, le=0.5, description="Relative change of curvatures.")
-    lane_width: float = Field(default=0.02, ge=0, le=0.2, description="Relative change of the lane width.")
-    speed: float = Field(default=0.05, ge=0, le=0.5, description="Relative change of the speeds of ego and actors.")
-    position_m: float = Field(default=1.5, ge=0, le=20, description="Shift of actors along the road, each way.")
+    length: float = Field(
+        default=0.05, ge=0, le=0.5, description="Relative change of element lengths."
+    )
+    curvature: float = Field(
+        default=0.1, ge=0, le=0.5, description="Relative change of curvatures."
+    )
+    lane_width: float = Field(
+        default=0.02, ge=0, le=0.2, description="Relative change of the lane width."
+    )
+    speed: float = Field(
+        default=0.05, ge=0, le=0.5, description="Relative change of the speeds of ego and actors."
+    )
+    position_m: float = Field(
+        default=1.5, ge=0, le=20, description="Shift of actors along the road, each way."
+    )
     time_us: int = within(b.TIME_US, "Shift of scripted moments, each way.", 150_000)
 
 
@@ -206,7 +307,9 @@ class RangeSpec(Part):
 class ChoiceSpec(Part):
     """One of several values, drawn with equal chance."""
 
-    choice: tuple[Any, ...] = Field(min_length=1, max_length=int(b.LISTED.high), description="Values to choose from.")
+    choice: tuple[Any, ...] = Field(
+        min_length=1, max_length=int(b.LISTED.high), description="Values to choose from."
+    )
 
 
 class ScenarioSpec(Part):
@@ -220,30 +323,52 @@ class ScenarioSpec(Part):
         description="Name of the scene; none: the file's folder and name.",
     )
     description: str = Field(default="", description="One sentence.")
-    tags: tuple[str, ...] = Field(default=(), max_length=int(b.LISTED.high), description="Keywords.")
+    tags: tuple[str, ...] = Field(
+        default=(), max_length=int(b.LISTED.high), description="Keywords."
+    )
     seed: int = Field(
-        default=0, ge=0, le=int(b.SEED.high), description="Scene seed; 0: the numbers are used as written, others jitter them."
+        default=0,
+        ge=0,
+        le=int(b.SEED.high),
+        description="Scene seed; 0: the numbers are used as written, others jitter them.",
     )
     road: RoadSpec | None = Field(default=None, description="A road to build; give this or log.")
-    log: LogSpec | None = Field(default=None, description="A recorded drive to use; give this or road.")
+    log: LogSpec | None = Field(
+        default=None, description="A recorded drive to use; give this or road."
+    )
     ego: EgoSpec = Field(default=EgoSpec(), description="The expert that drives a built road.")
-    actors: tuple[ActorSpec, ...] = Field(default=(), max_length=int(b.ACTOR_ENTRIES.high), description="Other road users.")
+    actors: tuple[ActorSpec, ...] = Field(
+        default=(), max_length=int(b.ACTOR_ENTRIES.high), description="Other road users."
+    )
     environment: EnvironmentSpec = Field(default=EnvironmentSpec(), description="Surroundings.")
     cameras: tuple[CameraModel, ...] | None = Field(
-        default=None, min_length=1, max_length=int(b.CAMERAS.high), description="Cameras; none: the log's own, or one named front."
+        default=None,
+        min_length=1,
+        max_length=int(b.CAMERAS.high),
+        description="Cameras; none: the log's own, or one named front.",
     )
     rates: RatesSpec = Field(default=RatesSpec(), description="Periods of the loop.")
     timing: TimingSpec = Field(default=TimingSpec(), description="Start, length and warm-up.")
     latency: LatencySpec = Field(default=LatencySpec(), description="Delay of the policy.")
-    degradation: DegradationSpec = Field(default=DegradationSpec(), description="Degradation of the renderer 3dgs.")
-    background: BackgroundSpec | None = Field(default=None, description="A Gaussian file as background.")
-    vehicle: VehicleSpec | None = Field(default=None, description="The ego vehicle; none: the log's own, or the default one.")
-    jitter: JitterSpec = Field(default=JitterSpec(), description="How scenes of other seeds than 0 differ from the file.")
+    degradation: DegradationSpec = Field(
+        default=DegradationSpec(), description="Degradation of the renderer 3dgs."
+    )
+    background: BackgroundSpec | None = Field(
+        default=None, description="A Gaussian file as background."
+    )
+    vehicle: VehicleSpec | None = Field(
+        default=None, description="The ego vehicle; none: the log's own, or the default one."
+    )
+    jitter: JitterSpec = Field(
+        default=JitterSpec(), description="How scenes of other seeds than 0 differ from the file."
+    )
     variations: dict[str, RangeSpec | ChoiceSpec] = Field(
-        default={}, description="Dotted key to {low, high} or {choice: [...]}, drawn with the scene seed."
+        default={},
+        description="Dotted key to {low, high} or {choice: [...]}, drawn with the scene seed.",
     )
     samples: tuple[dict[str, Any], ...] = Field(
-        default=(), description="Explicit samples, each dotted key to value; the scene seed picks one, cyclically."
+        default=(),
+        description="Explicit samples, each dotted key to value; the scene seed picks one, cyclically.",
     )
 
     @property
@@ -255,13 +380,19 @@ class ScenarioSpec(Part):
     @model_validator(mode="after")
     def _one_source(self) -> ScenarioSpec:
         if (self.road is None) == (self.log is None):
-            raise ValueError("give exactly one of 'road' and 'log' | add road: {segments: [...]} or log: {commonroad: FILE}")
+            raise ValueError(
+                "give exactly one of 'road' and 'log' | add road: {segments: [...]} or log: {commonroad: FILE}"
+            )
         if self.log is not None and self.log.drive is not None:
             given = [
-                key for key in ("degradation", "background", "environment") if getattr(self, key) != type(self).model_fields[key].default
+                key
+                for key in ("degradation", "background", "environment")
+                if getattr(self, key) != type(self).model_fields[key].default
             ]
             if given:
-                raise ValueError(f"{given[0]} with log.drive, whose look is its reconstruction's | remove {given[0]}")
+                raise ValueError(
+                    f"{given[0]} with log.drive, whose look is its reconstruction's | remove {given[0]}"
+                )
         return self
 
 
@@ -274,18 +405,33 @@ def json_schema() -> str:
 
 
 def models() -> dict[str, type[BaseModel]]:
-    """Return every section's model by the key path under which it stands in a file, for the documentation."""
+    """Return every section's model by the key path under which it stands in a file, for the
+    documentation.
+    """
     from scenarios.schema_parts import ACTOR_KINDS, SEGMENT_KINDS
 
-    out: dict[str, type[BaseModel]] = {"": ScenarioSpec, "road": RoadSpec, "log": LogSpec, "ego": EgoSpec}
+    out: dict[str, type[BaseModel]] = {
+        "": ScenarioSpec,
+        "road": RoadSpec,
+        "log": LogSpec,
+        "ego": EgoSpec,
+    }
     out["ego.lane_changes[]"] = LaneChangeSpec
     out |= {f"road.segments[] kind: {kind}": model for kind, model in SEGMENT_KINDS.items()}
     out |= {f"actors[] kind: {kind}": model for kind, model in ACTOR_KINDS.items()}
     out |= {
-        "environment": EnvironmentSpec, "cameras[]": CameraModel, "rates": RatesSpec, "timing": TimingSpec, "latency": LatencySpec,
-        "degradation": DegradationSpec, "background": BackgroundSpec, "vehicle": VehicleSpec, "jitter": JitterSpec,
-        "variations.KEY (a range)": RangeSpec, "variations.KEY (a choice)": ChoiceSpec,
-    }  # fmt: skip
+        "environment": EnvironmentSpec,
+        "cameras[]": CameraModel,
+        "rates": RatesSpec,
+        "timing": TimingSpec,
+        "latency": LatencySpec,
+        "degradation": DegradationSpec,
+        "background": BackgroundSpec,
+        "vehicle": VehicleSpec,
+        "jitter": JitterSpec,
+        "variations.KEY (a range)": RangeSpec,
+        "variations.KEY (a choice)": ChoiceSpec,
+    }
     return out
 
 

@@ -1,4 +1,6 @@
-"""The sections of a scenario file that say where things are: the road or the log in its place, and the actors."""
+"""The sections of a scenario file that say where things are: the road or the log in its place, and
+the actors.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ from alpasim_plugin.core import limits as b
 
 
 def within(bound: b.Bound, description: str | None = None, default: Any = ...) -> Any:
-    """Return the field of a number within a bound, which is required without a default; alone, the constraint for a type."""
+    """Return the field of a number within a bound, which is required without a default; alone, the
+    constraint for a type.
+    """
     return Field(default, ge=bound.low, le=bound.high, description=description)
 
 
@@ -30,7 +34,9 @@ class Part(BaseModel):
 
 
 Turn = Literal["left", "straight", "right"]
-CentrePaint = Literal["double_yellow", "solid_yellow", "dashed_yellow", "dashed_white", "solid_white", "none"]
+CentrePaint = Literal[
+    "double_yellow", "solid_yellow", "dashed_yellow", "dashed_white", "solid_white", "none"
+]
 
 
 class StraightSegment(Part):
@@ -53,7 +59,9 @@ class ClothoidSegment(Part):
 
     kind: Literal["clothoid"]
     length_m: float = within(b.SEGMENT_M, "Length along the road's middle.")
-    start_curvature_per_m: float = within(b.CURVATURE_PER_M, "Curvature at the start; left is positive.", 0.0)
+    start_curvature_per_m: float = within(
+        b.CURVATURE_PER_M, "Curvature at the start; left is positive.", 0.0
+    )
     end_curvature_per_m: float = within(b.CURVATURE_PER_M, "Curvature at the end.", 0.0)
 
 
@@ -76,21 +84,40 @@ class IntersectionSegment(Part):
 
     kind: Literal["intersection"]
     turn: Turn = Field(default="straight", description="Where the road goes on.")
-    arms: tuple[Turn, ...] = Field(default=("left", "straight", "right"), min_length=1, description="Arms seen from the entry.")
-    cross_lanes: int = Field(default=1, ge=1, le=4, description="Lanes per direction on the arms beside the road.")
-    arm_length_m: float = Field(default=40.0, ge=b.SEGMENT_M.low, le=1000, description="Length of those arms.")
-    corner_radius_m: float = Field(default=8.0, ge=3, le=40, description="Size of the kerb's corners.")
+    arms: tuple[Turn, ...] = Field(
+        default=("left", "straight", "right"), min_length=1, description="Arms seen from the entry."
+    )
+    cross_lanes: int = Field(
+        default=1, ge=1, le=4, description="Lanes per direction on the arms beside the road."
+    )
+    arm_length_m: float = Field(
+        default=40.0, ge=b.SEGMENT_M.low, le=1000, description="Length of those arms."
+    )
+    corner_radius_m: float = Field(
+        default=8.0, ge=3, le=40, description="Size of the kerb's corners."
+    )
     crosswalks: bool = Field(default=True, description="Crosswalks on every arm.")
-    guide_lines: bool = Field(default=True, description="Dashed lines through the junction along the road.")
+    guide_lines: bool = Field(
+        default=True, description="Dashed lines through the junction along the road."
+    )
 
 
 class NarrowGapSegment(Part):
     """A straight on which parked cars on both sides leave a narrow gap for the ego."""
 
     kind: Literal["narrow_gap"]
-    length_m: float = within(b.SEGMENT_M, "Length of the straight; the cars stand in its middle half.", 40.0)
-    gap_m: float = Field(default=3.0, gt=2.0, le=8, description="Free width between the rows of parked cars.")
-    shift_m: float = Field(default=0.0, ge=-3, le=3, description="The gap's middle, metres left of the ego lane's middle.")
+    length_m: float = within(
+        b.SEGMENT_M, "Length of the straight; the cars stand in its middle half.", 40.0
+    )
+    gap_m: float = Field(
+        default=3.0, gt=2.0, le=8, description="Free width between the rows of parked cars."
+    )
+    shift_m: float = Field(
+        default=0.0,
+        ge=-3,
+        le=3,
+        description="The gap's middle, metres left of the ego lane's middle.",
+    )
     cars_left: int = Field(default=2, ge=0, le=8, description="Parked cars on the left.")
     cars_right: int = Field(default=2, ge=0, le=8, description="Parked cars on the right.")
 
@@ -106,51 +133,100 @@ SEGMENT_KINDS: dict[str, type[Part]] = {
 }
 
 SegmentSpec = Annotated[
-    StraightSegment | ArcSegment | ClothoidSegment | IntersectionSegment | MergeSegment | SplitSegment | NarrowGapSegment,
+    StraightSegment
+    | ArcSegment
+    | ClothoidSegment
+    | IntersectionSegment
+    | MergeSegment
+    | SplitSegment
+    | NarrowGapSegment,
     Field(discriminator="kind"),
 ]
 
 
 class RoadSpec(Part):
-    """A road built from segments that follow one another along the ego's path. Driving is on the right."""
+    """A road built from segments that follow one another along the ego's path. Driving is on the
+    right.
+    """
 
-    lanes_forward: int = Field(default=1, ge=1, le=6, description="Lanes in the ego's direction at the start.")
+    lanes_forward: int = Field(
+        default=1, ge=1, le=6, description="Lanes in the ego's direction at the start."
+    )
     lanes_backward: int = Field(default=1, ge=0, le=6, description="Oncoming lanes; 0: one-way.")
     lane_width_m: float = Field(default=3.5, ge=2.2, le=6, description="Width of every lane.")
-    median_m: float = Field(default=0.0, ge=0, le=30, description="Raised median between the directions; 0: markings only.")
-    shoulder_m: float = Field(default=0.5, ge=0, le=6, description="Paved strip outside the outer lanes.")
-    parking_m: float = Field(default=0.0, ge=0, le=6, description="Parking strip outside the outer lanes, instead of the shoulder.")
+    median_m: float = Field(
+        default=0.0,
+        ge=0,
+        le=30,
+        description="Raised median between the directions; 0: markings only.",
+    )
+    shoulder_m: float = Field(
+        default=0.5, ge=0, le=6, description="Paved strip outside the outer lanes."
+    )
+    parking_m: float = Field(
+        default=0.0,
+        ge=0,
+        le=6,
+        description="Parking strip outside the outer lanes, instead of the shoulder.",
+    )
     speed_limit_mps: float | None = within(b.LIMIT_MPS, "Speed limit of all lanes.", None)
-    centre_paint: CentrePaint = Field(default="double_yellow", description="Line between the directions.")
-    heading_deg: float = within(b.ANGLE_DEG, "Direction of the road's beginning, from east to the left.", 0.0)
-    segments: tuple[SegmentSpec, ...] = Field(min_length=1, max_length=int(b.ELEMENTS.high), description="Segments in driving order.")
+    centre_paint: CentrePaint = Field(
+        default="double_yellow", description="Line between the directions."
+    )
+    heading_deg: float = within(
+        b.ANGLE_DEG, "Direction of the road's beginning, from east to the left.", 0.0
+    )
+    segments: tuple[SegmentSpec, ...] = Field(
+        min_length=1, max_length=int(b.ELEMENTS.high), description="Segments in driving order."
+    )
 
 
 SHIPPED = ("argoverse", "commonroad", "cosmos", "drive", "usdz")
 
 
 class LogSpec(Part):
-    """A recorded drive. Exactly one of the sources is given; relative paths start at this file's folder."""
+    """A recorded drive. Exactly one of the sources is given; relative paths start at this file's
+    folder.
+    """
 
-    argoverse: str | None = Field(default=None, min_length=1, description="Folder of one Argoverse 2 log.")
+    argoverse: str | None = Field(
+        default=None, min_length=1, description="Folder of one Argoverse 2 log."
+    )
     commonroad: str | None = Field(default=None, min_length=1, description="CommonRoad XML file.")
-    cosmos: str | None = Field(default=None, min_length=1, description="Folder of one Cosmos-Drive-Dreams clip.")
-    drive: str | None = Field(default=None, min_length=1, description="Folder that simrun import has written.")
+    cosmos: str | None = Field(
+        default=None, min_length=1, description="Folder of one Cosmos-Drive-Dreams clip."
+    )
+    drive: str | None = Field(
+        default=None, min_length=1, description="Folder that simrun import has written."
+    )
     usdz: str | None = Field(default=None, min_length=1, description="AlpaSim scene file.")
     source: str | None = Field(
-        default=None, min_length=1, description="A source of an installed package, or package.module:Class; it reads path."
+        default=None,
+        min_length=1,
+        description="A source of an installed package, or package.module:Class; it reads path.",
     )
-    path: str | None = Field(default=None, min_length=1, description="File or folder that source reads.")
-    ego: int | str | None = Field(default=None, description="CommonRoad: the recorded vehicle that becomes the ego; none: chosen.")
-    actors: Literal["replay", "idm", "none"] = Field(default="replay", description="Replay the recorded traffic, let it react, or drop it.")
+    path: str | None = Field(
+        default=None, min_length=1, description="File or folder that source reads."
+    )
+    ego: int | str | None = Field(
+        default=None,
+        description="CommonRoad: the recorded vehicle that becomes the ego; none: chosen.",
+    )
+    actors: Literal["replay", "idm", "none"] = Field(
+        default="replay", description="Replay the recorded traffic, let it react, or drop it."
+    )
 
     @model_validator(mode="after")
     def _one(self) -> LogSpec:
         given = [key for key in (*SHIPPED, "source") if getattr(self, key) is not None]
         if len(given) != 1:
-            raise ValueError(f"{len(given)} sources ({', '.join(given) or 'none'}) | give one of {', '.join(SHIPPED)}, or source and path")
+            raise ValueError(
+                f"{len(given)} sources ({', '.join(given) or 'none'}) | give one of {', '.join(SHIPPED)}, or source and path"
+            )
         if (self.source is None) != (self.path is None):
-            raise ValueError("only one of source and path | give both, or one of the shipped sources")
+            raise ValueError(
+                "only one of source and path | give both, or one of the shipped sources"
+            )
         return self
 
     @property
@@ -163,18 +239,27 @@ class LogSpec(Part):
 
 
 Label = Literal["car", "truck", "bus", "motorcycle", "cyclist", "pedestrian", "other"]
-ActorId = Annotated[str, Field(max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", description="Unique name.")]
+ActorId = Annotated[
+    str, Field(max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", description="Unique name.")
+]
 
 
 class _Actor(Part):
     id: ActorId
     label: Label = Field(default="car", description="Class of road user.")
-    size_m: tuple[Side, Side, Side] | None = Field(default=None, description="Length, width, height; none: as usual.")
+    size_m: tuple[Side, Side, Side] | None = Field(
+        default=None, description="Length, width, height; none: as usual."
+    )
 
 
 class _InLane(_Actor):
-    lane: int | str = Field(default=0, description="Forward lane (0: at the centre line), oncoming lane (-1: beside it), or a lane id.")
-    s_m: float = within(b.STATION_M, "Centre, along the road from the ego's start (lane id: that lane's beginning).")
+    lane: int | str = Field(
+        default=0,
+        description="Forward lane (0: at the centre line), oncoming lane (-1: beside it), or a lane id.",
+    )
+    s_m: float = within(
+        b.STATION_M, "Centre, along the road from the ego's start (lane id: that lane's beginning)."
+    )
     offset_m: float = within(b.OFFSET_M, "Left of the lane's middle, in driving direction.", 0.0)
 
 
@@ -184,10 +269,14 @@ class ParkedActor(_Actor):
     kind: Literal["parked"]
     s_m: float = within(b.STATION_M, "Centre, metres along the road from the ego's start.")
     side: Literal["left", "right"] = Field(default="right", description="Side of the road.")
-    clearance_m: float = within(b.OFFSET_M, "From the outer lane's edge to the body; negative: it stands in the lane.", 0.3)
+    clearance_m: float = within(
+        b.OFFSET_M, "From the outer lane's edge to the body; negative: it stands in the lane.", 0.3
+    )
     count: int = Field(default=1, ge=1, le=40, description="Vehicles in the row.")
     spacing_m: float = within(b.SPACING_M, "Distance between their centres.", 7.0)
-    yaw_deg: float = Field(default=0.0, ge=-180, le=180, description="Turned to the left against the lane.")
+    yaw_deg: float = Field(
+        default=0.0, ge=-180, le=180, description="Turned to the left against the lane."
+    )
 
 
 class LoggedActor(_Actor):
@@ -204,16 +293,22 @@ class LoggedActor(_Actor):
     def _ordered(self) -> LoggedActor:
         times = [p[0] for p in self.points]
         if any(b - a < 1e-6 for a, b in itertools.pairwise(times)):
-            raise ValueError("the times of points do not increase | order the rows by time, each time once")
+            raise ValueError(
+                "the times of points do not increase | order the rows by time, each time once"
+            )
         return self
 
 
 class IdmActor(_InLane):
-    """A driver who follows the lane, keeps the distance (also to the ego) and reacts in the closed loop."""
+    """A driver who follows the lane, keeps the distance (also to the ego) and reacts in the closed
+    loop.
+    """
 
     kind: Literal["idm"]
     speed_mps: float = within(b.SPEED_MPS, "Speed at the start.")
-    desired_speed_mps: float | None = within(b.CRUISE_MPS, "Desired speed; none: the speed at the start, at least 1.", None)
+    desired_speed_mps: float | None = within(
+        b.CRUISE_MPS, "Desired speed; none: the speed at the start, at least 1.", None
+    )
     headway_s: float = within(b.HEADWAY_S, "Time gap.", 1.5)
     min_gap_m: float = Field(default=2.0, gt=0, le=b.GAP_M.high, description="Gap at standstill.")
     accel_mps2: float = within(b.ACCEL_MPS2, "Acceleration.", 1.5)
@@ -234,7 +329,9 @@ class DriveActor(_InLane):
     def _ordered(self) -> DriveActor:
         times = [p[0] for p in self.speeds]
         if any(b <= a for a, b in itertools.pairwise(times)):
-            raise ValueError("the times of speeds do not increase | order the rows by time, each time once")
+            raise ValueError(
+                "the times of speeds do not increase | order the rows by time, each time once"
+            )
         return self
 
 
@@ -243,7 +340,9 @@ class OncomingActor(_Actor):
 
     kind: Literal["oncoming"]
     lane: int = within(b.LANE_INDEX, "Oncoming lane; 0 is next to the centre line.", 0)
-    s_m: float = within(b.STATION_M, "Centre at the start, metres along the ego's path from the ego's start.")
+    s_m: float = within(
+        b.STATION_M, "Centre at the start, metres along the ego's path from the ego's start."
+    )
     speed_mps: float = within(b.SPEED_MPS, "Speed.")
     offset_m: float = within(b.OFFSET_M, "Left of the lane's middle, in driving direction.", 0.0)
 
@@ -256,12 +355,16 @@ class HardBrakeActor(_InLane):
     brake_at_us: int = within(b.TIME_US, "Start of braking after the log's start.")
     decel_mps2: float = Field(default=6.0, ge=b.ACCEL_MPS2.low, le=10, description="Deceleration.")
     end_speed_mps: float = within(b.SPEED_MPS, "Speed after braking.", 0.0)
-    resume_at_us: int | None = within(b.TIME_US, "When it accelerates again to its first speed; none: never.", None)
+    resume_at_us: int | None = within(
+        b.TIME_US, "When it accelerates again to its first speed; none: never.", None
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> HardBrakeActor:
         if self.end_speed_mps >= self.speed_mps:
-            raise ValueError(f"end_speed_mps = {self.end_speed_mps} is not below speed_mps = {self.speed_mps} | lower it")
+            raise ValueError(
+                f"end_speed_mps = {self.end_speed_mps} is not below speed_mps = {self.speed_mps} | lower it"
+            )
         if self.resume_at_us is not None and self.resume_at_us <= self.brake_at_us:
             raise ValueError("resume_at_us is not after brake_at_us | give a later time")
         return self
@@ -271,19 +374,32 @@ class CutInActor(_Actor):
     """A vehicle that changes into another lane with a quintic lateral motion."""
 
     kind: Literal["cut_in"]
-    from_lane: int = within(b.LANE_INDEX, "Forward lane at the start; 0 is next to the centre line.")
+    from_lane: int = within(
+        b.LANE_INDEX, "Forward lane at the start; 0 is next to the centre line."
+    )
     to_lane: int = within(b.LANE_INDEX, "Forward lane afterwards.")
-    s_m: float = within(b.STATION_M, "Centre at the start, metres along the road from the ego's start.")
+    s_m: float = within(
+        b.STATION_M, "Centre at the start, metres along the road from the ego's start."
+    )
     speed_mps: float = within(b.CRUISE_MPS, "Speed.")
     at_us: int = within(b.TIME_US, "Start of the lateral motion after the log's start.")
-    change_us: int = Field(default=2_500_000, ge=b.PERIOD_US.low, le=b.TIME_US.high, description="Duration of the lateral motion.")
+    change_us: int = Field(
+        default=2_500_000,
+        ge=b.PERIOD_US.low,
+        le=b.TIME_US.high,
+        description="Duration of the lateral motion.",
+    )
     end_speed_mps: float | None = within(b.SPEED_MPS, "Speed afterwards; none: the same.", None)
-    decel_mps2: float = within(b.ACCEL_MPS2, "How fast the speed changes after the lateral motion has begun.", 2.0)
+    decel_mps2: float = within(
+        b.ACCEL_MPS2, "How fast the speed changes after the lateral motion has begun.", 2.0
+    )
 
     @model_validator(mode="after")
     def _two_lanes(self) -> CutInActor:
         if self.from_lane == self.to_lane:
-            raise ValueError(f"from_lane and to_lane are both {self.to_lane} | give two different lanes")
+            raise ValueError(
+                f"from_lane and to_lane are both {self.to_lane} | give two different lanes"
+            )
         return self
 
 
@@ -292,8 +408,12 @@ class CrossingActor(_Actor):
 
     kind: Literal["crossing_pedestrian"]
     label: Label = Field(default="pedestrian", description="Class of road user.")
-    s_m: float = within(b.STATION_M, "Place of crossing, metres along the road from the ego's start.")
-    side: Literal["left", "right"] = Field(default="right", description="Side that the crossing starts from.")
+    s_m: float = within(
+        b.STATION_M, "Place of crossing, metres along the road from the ego's start."
+    )
+    side: Literal["left", "right"] = Field(
+        default="right", description="Side that the crossing starts from."
+    )
     speed_mps: float = within(b.CRUISE_MPS, "Walking speed.", 1.4)
     before_ego_s: float = Field(
         default=1.0,
@@ -301,7 +421,9 @@ class CrossingActor(_Actor):
         le=b.TIME_US.high * 1e-6,
         description="How long before the ego would be there, undisturbed, the middle of the ego's lane is reached.",
     )
-    margin_m: float = within(b.GAP_M, "Distance behind the road edge at which the walk starts and ends.", 1.0)
+    margin_m: float = within(
+        b.GAP_M, "Distance behind the road edge at which the walk starts and ends.", 1.0
+    )
 
 
 ACTOR_KINDS: dict[str, type[Part]] = {
@@ -316,6 +438,13 @@ ACTOR_KINDS: dict[str, type[Part]] = {
 }
 
 ActorSpec = Annotated[
-    ParkedActor | LoggedActor | IdmActor | DriveActor | OncomingActor | HardBrakeActor | CutInActor | CrossingActor,
+    ParkedActor
+    | LoggedActor
+    | IdmActor
+    | DriveActor
+    | OncomingActor
+    | HardBrakeActor
+    | CutInActor
+    | CrossingActor,
     Field(discriminator="kind"),
 ]

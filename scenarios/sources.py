@@ -1,4 +1,6 @@
-"""From a path to its document, and from a specification to its recording: the formats of recorded drives and their readers."""
+"""From a path to its document, and from a specification to its recording: the formats of recorded
+drives and their readers.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ class Argoverse(Source):
 
     def matches(self, path: Path) -> bool:
         """Look for the ego's poses or the map."""
-        return path.is_dir() and ((path / "city_SE3_egovehicle.feather").exists() or (path / "map").is_dir())
+        return path.is_dir() and (
+            (path / "city_SE3_egovehicle.feather").exists() or (path / "map").is_dir()
+        )
 
     def read(self, path: Path, ego: str | None) -> RecordedLog:
         """Read a log; the ego is the recording vehicle."""
@@ -58,7 +62,9 @@ class Cosmos(Source):
 
     def matches(self, path: Path) -> bool:
         """Look for one of the dataset's folders."""
-        return path.is_dir() and any((path / name).is_dir() for name in ("vehicle_pose", "3d_lanes", "pinhole_intrinsic"))
+        return path.is_dir() and any(
+            (path / name).is_dir() for name in ("vehicle_pose", "3d_lanes", "pinhole_intrinsic")
+        )
 
     def read(self, path: Path, ego: str | None) -> RecordedLog:
         """Read a clip; the ego is the recording vehicle."""
@@ -116,12 +122,19 @@ def open_document(path: Path, source: str | None) -> Document:
         return Document({"version": 1, "log": log}, {}, str(path))
     document = load_yaml(path, DOING)
     if isinstance(document.data, dict) and "scenarios" in document.data:
-        raise document.error(DOING, ("scenarios",), "a suite, not a scenario", "use load_suite, or run it with simrun")
+        raise document.error(
+            DOING,
+            ("scenarios",),
+            "a suite, not a scenario",
+            "use load_suite, or run it with simrun",
+        )
     return document
 
 
 def source_of(path: Path) -> str | None:
-    """Return the name of the source that recognises a path; None where none does. Scenario files are recognised by none."""
+    """Return the name of the source that recognises a path; None where none does. Scenario files
+    are recognised by none.
+    """
     return next((name for name in names("source") if _source(name)[1].matches(path)), None)
 
 
@@ -136,7 +149,11 @@ def detect(path: Path) -> str:
     name = source_of(path)
     if name is not None:
         return name
-    what = f"a folder with {', '.join(sorted(p.name for p in path.iterdir())[:5]) or 'nothing'}" if path.is_dir() else "a file"
+    what = (
+        f"a folder with {', '.join(sorted(p.name for p in path.iterdir())[:5]) or 'nothing'}"
+        if path.is_dir()
+        else "a file"
+    )
     formats = ", ".join(_source(name)[1].help or name for name in names("source"))
     do = f"give a scenario .yaml, or one of: {formats}; a reader of your own is named with --source (docs/extending.md)"
     raise InputError(DOING, str(path), f"{what} that no reader recognises", do)
@@ -146,20 +163,31 @@ def recorded_drive(drawn: Drawn) -> RecordedLog:
     """Read the recorded log that a specification names, and check what the reader returns.
 
     Raises:
-        InputError: Nothing is there, anything is wrong with the log, or the reader gives something else than a `RecordedLog`.
+        InputError: Nothing is there, anything is wrong with the log, or the reader gives something
+            else than a `RecordedLog`.
     """
     document, log = drawn.document, drawn.spec.log
     assert log is not None
     kind, text, key = log.recorded
     path = document.folder_of(("log", key)) / text if document.marks else Path(text)
     if not path.exists():
-        raise document.error(DOING, ("log", key), f"{path} does not exist", "correct the path; it is relative to the scenario file")
+        raise document.error(
+            DOING,
+            ("log", key),
+            f"{path} does not exist",
+            "correct the path; it is relative to the scenario file",
+        )
     spec, source = _source(kind)
     with parsing(DOING, path, "repair this log, or use another one"):
         record = source.read(path, None if log.ego is None else str(log.ego))
         if not isinstance(record, RecordedLog):
             found = f"a {type(record).__name__}"
-            raise InputError(DOING, f"source {spec.name!r}, {path}", found, "make the reader return a scenarios.recorded.RecordedLog")
+            raise InputError(
+                DOING,
+                f"source {spec.name!r}, {path}",
+                found,
+                "make the reader return a scenarios.recorded.RecordedLog",
+            )
         check_record(record, str(path))
     return record
 

@@ -1,4 +1,6 @@
-"""What a path or a name stands for: the scenarios and suites that ship, and suites: lists of scenarios with seeds and overrides."""
+"""What a path or a name stands for: the scenarios and suites that ship, and suites: lists of
+scenarios with seeds and overrides.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,11 @@ LIBRARY = Path(__file__).resolve().parent
 
 def shipped_names() -> dict[str, Path]:
     """Return the shipped scenarios: name without ending, to file. Suites are not among them."""
-    files = (file for file in sorted(LIBRARY.glob("*/*.yaml")) if file.parent.name not in ("suites", "base"))
+    files = (
+        file
+        for file in sorted(LIBRARY.glob("*/*.yaml"))
+        if file.parent.name not in ("suites", "base")
+    )
     return {f"{file.parent.name}/{file.stem}": file for file in files}
 
 
@@ -36,10 +42,14 @@ def suites() -> dict[str, Path]:
 
 def shipped() -> dict[str, str]:
     """Return every shipped scenario and suite with its one-line description."""
-    # The plain loader of libyaml: positions of keys, which messages about other people's files need, take most of a listing's time.
+    # The plain loader of libyaml: positions of keys, which messages about other people's files
+    # need, take most of a listing's time.
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     found = {**shipped_names(), **suites()}
-    return {name: str(yaml.load(file.read_text(), loader).get("description", "")) for name, file in found.items()}
+    return {
+        name: str(yaml.load(file.read_text(), loader).get("description", ""))
+        for name, file in found.items()
+    }
 
 
 def find(path_or_name: str | Path) -> Path:
@@ -58,7 +68,9 @@ def find(path_or_name: str | Path) -> Path:
 
 
 def unknown(doing: str, text: str, kind: str, names: Mapping[str, Path]) -> InputError:
-    """Make the error for a text that is neither a path nor one of the shipped names, with the nearest of these."""
+    """Make the error for a text that is neither a path nor one of the shipped names, with the
+    nearest of these.
+    """
     try:
         Path(text).stat()
     except PermissionError as error:  # it may be there
@@ -73,7 +85,9 @@ def unknown(doing: str, text: str, kind: str, names: Mapping[str, Path]) -> Inpu
         near = difflib.get_close_matches(name.rsplit("/", 1)[-1], last_parts, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     found = f"no such file or folder, and no shipped {kind} has that name"
-    return InputError(doing, text, found, f"{hint}give a path, or a name that 'simrun list scenarios' shows")
+    return InputError(
+        doing, text, found, f"{hint}give a path, or a name that 'simrun list scenarios' shows"
+    )
 
 
 DOING = "reading a suite"
@@ -93,7 +107,10 @@ class ScenarioRef:
 class SuiteItem(Part):
     """One entry of a suite."""
 
-    path: str = Field(min_length=1, description="Scenario, suite or folder (relative to this file), or a shipped name.")
+    path: str = Field(
+        min_length=1,
+        description="Scenario, suite or folder (relative to this file), or a shipped name.",
+    )
     seeds: tuple[Annotated[int, within(SEED)], ...] = Field(
         default=(), max_length=int(SEEDS.high), description="Scene seeds; none: the file's own."
     )
@@ -106,14 +123,18 @@ class SuiteSpec(Part):
     version: Literal[1] = Field(description="Version of this schema: 1.")
     description: str = Field(default="", description="One sentence for people.")
     scenarios: tuple[Annotated[str, Field(min_length=1)] | SuiteItem, ...] = Field(
-        min_length=1, max_length=int(LISTED.high), description="Entries: a path or name, or {path, seeds, set}."
+        min_length=1,
+        max_length=int(LISTED.high),
+        description="Entries: a path or name, or {path, seeds, set}.",
     )
 
 
 def load_suite(path_or_name: str | Path) -> list[ScenarioRef]:
-    """Return the scenarios of a suite file, of a folder, of a shipped suite (``suites/smoke`` or ``smoke``), or of one scenario.
+    """Return the scenarios of a suite file, of a folder, of a shipped suite (``suites/smoke`` or
+    ``smoke``), or of one scenario.
 
-    A folder gives every scenario file directly inside it, sorted by name; its suite files are left out.
+    A folder gives every scenario file directly inside it, sorted by name; its suite files are left
+    out.
 
     Raises:
         InputError: Nothing there, an empty folder, or a bad suite file.
@@ -121,7 +142,9 @@ def load_suite(path_or_name: str | Path) -> list[ScenarioRef]:
     return _expand(str(path_or_name), None, (), [])
 
 
-def expand(item: str, overrides: Sequence[str] = (), source: str | None = None) -> list[ScenarioRef]:
+def expand(
+    item: str, overrides: Sequence[str] = (), source: str | None = None
+) -> list[ScenarioRef]:
     """Return what one command-line argument stands for, with overrides on top of the suite's own.
 
     With a ``source`` the argument is the path of one recorded log, which that source reads.
@@ -131,14 +154,25 @@ def expand(item: str, overrides: Sequence[str] = (), source: str | None = None) 
     return [ScenarioRef(r.path, r.seed, (*r.overrides, *overrides)) for r in load_suite(item)]
 
 
-def _expand(text: str, base: Path | None, chain: tuple[Path, ...], opened: list[Path]) -> list[ScenarioRef]:
+def _expand(
+    text: str, base: Path | None, chain: tuple[Path, ...], opened: list[Path]
+) -> list[ScenarioRef]:
     path = _locate(text, base)
     if path.is_dir():
         if source_of(path) is not None:
             return [ScenarioRef(str(path))]
-        files = [f for f in sorted(path.iterdir()) if f.suffix in (".yaml", ".yml") and "scenarios" not in _head(f)]
+        files = [
+            f
+            for f in sorted(path.iterdir())
+            if f.suffix in (".yaml", ".yml") and "scenarios" not in _head(f)
+        ]
         if not files:
-            raise InputError(DOING, str(path), "a folder without scenario files", "give a folder of scenario .yaml files, or a log folder")
+            raise InputError(
+                DOING,
+                str(path),
+                "a folder without scenario files",
+                "give a folder of scenario .yaml files, or a log folder",
+            )
         return [ScenarioRef(str(f)) for f in files]
     if path.suffix not in (".yaml", ".yml") or "scenarios" not in _head(path):
         return [ScenarioRef(str(path))]
@@ -158,7 +192,11 @@ def _expand(text: str, base: Path | None, chain: tuple[Path, ...], opened: list[
         except InputError as e:
             raise _placed(document, i, e) from e
         extra = tuple(f"{key}={json.dumps(value)}" for key, value in item.set.items())
-        out += [ScenarioRef(r.path, seed, (*r.overrides, *extra)) for r in refs for seed in (item.seeds or (r.seed,))]
+        out += [
+            ScenarioRef(r.path, seed, (*r.overrides, *extra))
+            for r in refs
+            for seed in (item.seeds or (r.seed,))
+        ]
     return out
 
 
@@ -177,7 +215,9 @@ def _locate(text: str, base: Path | None) -> Path:
 
 
 def _placed(document: Document, i: int, e: InputError) -> InputError:
-    return InputError(e.doing, f"{document.mark(('scenarios', i))} ({e.with_what})", e.found, e.do_this)
+    return InputError(
+        e.doing, f"{document.mark(('scenarios', i))} ({e.with_what})", e.found, e.do_this
+    )
 
 
 def _head(path: Path) -> dict[str, Any]:

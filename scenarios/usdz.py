@@ -1,18 +1,24 @@
 """AlpaSim scenes (``.usdz``): map, recorded drive, traffic, vehicle and front camera.
 
-The local frame of the scene is kept, so rollout logs of AlpaSim and of this package fit the same map. A scene's 3D reconstruction is a
-checkpoint of a closed renderer and is not read: the map is dressed instead.
+The local frame of the scene is kept, so rollout logs of AlpaSim and of this package fit the same
+map. A scene's 3D reconstruction is a checkpoint of a closed renderer and is not read: the map is
+dressed instead.
 
-An OpenDRIVE map is also read as AlpaSim's own loader reads it (`alpasim_map`), so that its road metrics can be reproduced. Facts from its
-copy of trajdata (Apache-2.0, ``dataset_specific/xodr``). Where it departs from OpenDRIVE:
+An OpenDRIVE map is also read as AlpaSim's own loader reads it (`alpasim_map`), so that its road
+metrics can be reproduced. Facts from its copy of trajdata (Apache-2.0, ``dataset_specific/xodr``).
+Where it departs from OpenDRIVE:
 
-- Only lines and arcs are sampled; other records are passed over, and elevations after them slip by their length.
-- Records are sampled at ``max(2, ceil(length / 0.5))`` stations, both ends included; widths and lane offsets are read at multiples of
-  0.5 m by station number, which drifts from the true arc length with every record.
-- A lane exists along the whole road with the widths of all sections together; a sidewalk is none, every other type is one.
-- Road edges are the outer borders of the outermost lanes on each side, sidewalks included. A road outside junctions without lanes on a
-  side gets an edge 1 cm beside its reference line there, at height 0. Edges that come within 0.2 m of a coarsened lane centre are dropped,
-  and of two edges with nearly the same middle the shorter one.
+- Only lines and arcs are sampled; other records are passed over, and elevations after them slip by
+  their length.
+- Records are sampled at ``max(2, ceil(length / 0.5))`` stations, both ends included; widths and
+  lane offsets are read at multiples of 0.5 m by station number, which drifts from the true arc
+  length with every record.
+- A lane exists along the whole road with the widths of all sections together; a sidewalk is none,
+  every other type is one.
+- Road edges are the outer borders of the outermost lanes on each side, sidewalks included. A road
+  outside junctions without lanes on a side gets an edge 1 cm beside its reference line there, at
+  height 0. Edges that come within 0.2 m of a coarsened lane centre are dropped, and of two edges
+  with nearly the same middle the shorter one.
 """
 
 from __future__ import annotations
@@ -43,15 +49,27 @@ RECONSTRUCTIONS = ("checkpoint.ckpt", "nerf.ingp", "volume.nurec")
 GROUND_CELL_M = 2.0
 # Words in AlpaSim's free-text labels, the first match deciding; all else is "other".
 LABELS = (
-    ("cyclist", "cyclist"), ("bicycle", "cyclist"), ("motor", "motorcycle"), ("bike", "cyclist"), ("rider", "cyclist"),
-    ("pedestrian", "pedestrian"), ("person", "pedestrian"), ("bus", "bus"), ("truck", "truck"), ("trailer", "truck"),
-    ("automobile", "car"), ("car", "car"), ("vehicle", "car"),
-)  # fmt: skip
+    ("cyclist", "cyclist"),
+    ("bicycle", "cyclist"),
+    ("motor", "motorcycle"),
+    ("bike", "cyclist"),
+    ("rider", "cyclist"),
+    ("pedestrian", "pedestrian"),
+    ("person", "pedestrian"),
+    ("bus", "bus"),
+    ("truck", "truck"),
+    ("trailer", "truck"),
+    ("automobile", "car"),
+    ("car", "car"),
+    ("vehicle", "car"),
+)
 
 
 @dataclass(frozen=True)
 class RoadMap:
-    """The map of a scene as read by its own rules, and as AlpaSim's loader reads it where that differs."""
+    """The map of a scene as read by its own rules, and as AlpaSim's loader reads it where that
+    differs.
+    """
 
     lane_map: LaneMap
     alpasim: LaneMap | None
@@ -63,7 +81,8 @@ def read_usdz(path: str | Path, rails: bool = True, needs_map: bool = True) -> R
 
     Args:
         path: The scene.
-        rails: False drops the lanes' rails after the centres are made, so that scorers widen the centres by 1.85 m.
+        rails: False drops the lanes' rails after the centres are made, so that scorers widen the
+            centres by 1.85 m.
         needs_map: False accepts a scene without a map: scorers say what they lack.
 
     Raises:
@@ -76,20 +95,33 @@ def read_usdz(path: str | Path, rails: bool = True, needs_map: bool = True) -> R
         rig = _Rig(archive)
         road = _road(archive, rig)
         if needs_map and not road.lane_map.lanes:
-            raise files.fail(path, "a scene without a map", "use a scene with map tables or map.xodr: its road is what gets dressed")
+            raise files.fail(
+                path,
+                "a scene without a map",
+                "use a scene with map tables or map.xodr: its road is what gets dressed",
+            )
         actors, static = _actors(archive)
         cameras, camera_notes = front_wide(archive)
         vehicle, vehicle_notes = rig.vehicle()
-        inside = [f"{name} ({archive.sizes[name]} bytes)" for name in RECONSTRUCTIONS if name in archive]
+        inside = [
+            f"{name} ({archive.sizes[name]} bytes)" for name in RECONSTRUCTIONS if name in archive
+        ]
     surface = [*lane_edges(road.lane_map.lanes), *road.lane_map.road_edges, rig.ego_log.xyz]
     ground = from_points(np.concatenate(surface), GROUND_CELL_M, rig.ego_log.xyz)
     notes = (
-        f"{inside[0]} is a checkpoint of a closed renderer and is not read; the map is dressed instead" if inside
+        f"{inside[0]} is a checkpoint of a closed renderer and is not read; the map is dressed instead"
+        if inside
         else "no reconstruction in this scene; the map is dressed instead",
         "tracks are replayed as stored, without AlpaSim's smoothing",
-        *((f"{static} of {len(actors)} tracks are not marked CONTROLLABLE and stand still",) if static else ()),
-        *road.notes, *camera_notes, *vehicle_notes,
-    )  # fmt: skip
+        *(
+            (f"{static} of {len(actors)} tracks are not marked CONTROLLABLE and stand still",)
+            if static
+            else ()
+        ),
+        *road.notes,
+        *camera_notes,
+        *vehicle_notes,
+    )
     return RecordedLog(
         scene_id=scene_id,
         source="usdz",
@@ -110,7 +142,9 @@ def read_usdz(path: str | Path, rails: bool = True, needs_map: bool = True) -> R
 def read_usdz_scene(path: str | Path, rails: bool = True) -> Scene:
     """Read what scorers see of a scene; see `read_usdz`."""
     record = read_usdz(path, rails, needs_map=False)
-    return Scene(record.scene_id, record.lane_map, record.ego_log, record.vehicle, record.alpasim_map)
+    return Scene(
+        record.scene_id, record.lane_map, record.ego_log, record.vehicle, record.alpasim_map
+    )
 
 
 def usdz_scene_id(path: str | Path) -> str:
@@ -127,7 +161,9 @@ def _scene_id(archive: Archive) -> str:
     document = archive.yaml("metadata.yaml")
     scene_id = document.get("scene_id") if isinstance(document, dict) else None
     if not isinstance(scene_id, str) or not scene_id:
-        raise archive.files.fail(f"{archive.path}, metadata.yaml", f"scene_id {scene_id!r}", "state the scene's id")
+        raise archive.files.fail(
+            f"{archive.path}, metadata.yaml", f"scene_id {scene_id!r}", "state the scene's id"
+        )
     return scene_id
 
 
@@ -152,20 +188,39 @@ class _Rig:
         self._document = archive.json("rig_trajectories.json")
         rigs = self._document.get("rig_trajectories") if isinstance(self._document, dict) else None
         if not isinstance(rigs, list) or len(rigs) != 1 or not isinstance(rigs[0], dict):
-            raise self.files.fail(self.where, f"{len(rigs) if isinstance(rigs, list) else 0} rigs", "give exactly one rig trajectory")
+            raise self.files.fail(
+                self.where,
+                f"{len(rigs) if isinstance(rigs, list) else 0} rigs",
+                "give exactly one rig trajectory",
+            )
         self._rig: dict[str, Any] = rigs[0]
         poses = self._array(self._rig, "T_rig_worlds", (-1, 4, 4))
         times = self._array(self._rig, "T_rig_world_timestamps_us", (-1,))
         t_us = times.astype(np.int64)
         if (t_us != times).any():
-            raise self.files.fail(self.where, "times that are not whole microseconds", "give integers")
+            raise self.files.fail(
+                self.where, "times that are not whole microseconds", "give integers"
+            )
         if len(poses) != len(t_us):
-            raise self.files.fail(self.where, f"{len(poses)} poses and {len(t_us)} times", "give one time for each pose")
+            raise self.files.fail(
+                self.where,
+                f"{len(poses)} poses and {len(t_us)} times",
+                "give one time for each pose",
+            )
         turned = np.abs(np.linalg.det(poses[:, :3, :3]) - 1.0) if len(poses) else np.zeros(0)
         if len(poses) and not float(turned.max()) < 1e-3:
-            raise self.files.fail(self.where, f"pose {int(np.argmax(turned))} is not a rigid motion", "give rotation matrices")
+            raise self.files.fail(
+                self.where,
+                f"pose {int(np.argmax(turned))} is not a rigid motion",
+                "give rotation matrices",
+            )
         self.ego_log: Trajectory = checked_trajectory(
-            self.files, self.where, t_us, poses[:, :3, 3].copy(), quat_from_matrix(poses[:, :3, :3]), least=2
+            self.files,
+            self.where,
+            t_us,
+            poses[:, :3, 3].copy(),
+            quat_from_matrix(poses[:, :3, :3]),
+            least=2,
         )
 
     def T_earth_local(self) -> F64:
@@ -173,7 +228,8 @@ class _Rig:
         return self._array(self._document, "T_world_base", (4, 4))
 
     def first_frame_us(self) -> int | None:
-        """Return when the first frame of the front wide camera ends, of all cameras where it has none; None without frames.
+        """Return when the first frame of the front wide camera ends, of all cameras where it has
+        none; None without frames.
 
         Raises:
             InputError: A frame's times are not a pair of integers.
@@ -181,23 +237,35 @@ class _Rig:
         frames = self._rig.get("cameras_frame_timestamps_us") or {}
         calibrated = self._document.get("camera_calibrations") or {}
         try:
-            ends = {str(calibrated[uid]["logical_sensor_name"]): int(times[0][1]) for uid, times in frames.items() if times}
+            ends = {
+                str(calibrated[uid]["logical_sensor_name"]): int(times[0][1])
+                for uid, times in frames.items()
+                if times
+            }
         except (AttributeError, KeyError, IndexError, TypeError, ValueError) as error:
             found = f"camera frames: {type(error).__name__} {error}"
-            raise self.files.fail(self.where, found, "give every camera a calibration and its frames as [start, end]") from error
+            raise self.files.fail(
+                self.where, found, "give every camera a calibration and its frames as [start, end]"
+            ) from error
         return ends.get(FRONT_WIDE, min(ends.values(), default=None))
 
     def vehicle(self) -> tuple[Vehicle, tuple[str, ...]]:
         """Return the ego's body and notes."""
         box = self._rig.get("rig_bbox")
         if not isinstance(box, dict):
-            return Vehicle(), ("no rig_bbox: the default vehicle is assumed; AlpaSim wants its size in the run's settings",)
+            return Vehicle(), (
+                "no rig_bbox: the default vehicle is assumed; AlpaSim wants its size in the run's settings",
+            )
         centre, size = self._array(box, "centroid", (3,)), self._array(box, "dim", (3,))
         if not (size > 0).all():
-            raise self.files.fail(self.where, f"a rig_bbox of {size.tolist()} m", "give positive sizes")
+            raise self.files.fail(
+                self.where, f"a rig_bbox of {size.tolist()} m", "give positive sizes"
+            )
         off = [float(centre[1]), float(centre[2] - size[2] / 2)]
         notes = (
-            (f"the box is {off[0]:.3f} m left of and {off[1]:.3f} m above the rig's origin; both are ignored",)
+            (
+                f"the box is {off[0]:.3f} m left of and {off[1]:.3f} m above the rig's origin; both are ignored",
+            )
             if max(map(abs, off)) > 1e-3
             else ()
         )
@@ -209,9 +277,13 @@ class _Rig:
             # Times are integers beyond float32; float64 holds microseconds since 1970 exactly.
             values = np.array(raw, dtype=np.float64).reshape(shape if len(raw) else (0, *shape[1:]))
         except (KeyError, TypeError, ValueError) as error:
-            raise self.files.fail(self.where, f"{key}: {type(error).__name__} {error}", f"give {key} of shape {shape}") from error
+            raise self.files.fail(
+                self.where, f"{key}: {type(error).__name__} {error}", f"give {key} of shape {shape}"
+            ) from error
         if not np.isfinite(values).all():
-            raise self.files.fail(self.where, f"{key} with a value that is not finite", "repair the file")
+            raise self.files.fail(
+                self.where, f"{key} with a value that is not finite", "repair the file"
+            )
         return values
 
 
@@ -220,17 +292,37 @@ def _actors(archive: Archive) -> tuple[tuple[Actor, ...], int]:
     where, files = f"{archive.path}, sequence_tracks.json", archive.files
     document = archive.json("sequence_tracks.json")
     if not isinstance(document, dict) or len(document) != 1:
-        raise files.fail(where, f"{len(document) if isinstance(document, dict) else 0} sequences", "give exactly one sequence")
+        raise files.fail(
+            where,
+            f"{len(document) if isinstance(document, dict) else 0} sequences",
+            "give exactly one sequence",
+        )
     try:
         sequence = next(iter(document.values()))
         tracks, sizes = sequence["tracks_data"], sequence["cuboidtracks_data"]["cuboids_dims"]
-        columns = [tracks[f"tracks_{name}"] for name in ("id", "label_class", "flags", "timestamps_us", "poses")]
+        columns = [
+            tracks[f"tracks_{name}"]
+            for name in ("id", "label_class", "flags", "timestamps_us", "poses")
+        ]
         rows = list(zip(*columns, sizes, strict=True))
     except (KeyError, TypeError, ValueError) as error:
-        raise files.fail(where, f"{type(error).__name__}: {error}", "give lists of equal length for every track") from error
-    odd = next((row for row in rows if not isinstance(row[0], str | int) or not isinstance(row[2], str | list)), None)
+        raise files.fail(
+            where, f"{type(error).__name__}: {error}", "give lists of equal length for every track"
+        ) from error
+    odd = next(
+        (
+            row
+            for row in rows
+            if not isinstance(row[0], str | int) or not isinstance(row[2], str | list)
+        ),
+        None,
+    )
     if odd is not None:
-        raise files.fail(where, f"a track with id {odd[0]!r} and flags {odd[2]!r}", "give text as id and a list of texts as flags")
+        raise files.fail(
+            where,
+            f"a track with id {odd[0]!r} and flags {odd[2]!r}",
+            "give text as id and a list of texts as flags",
+        )
     twice = [name for name, n in Counter(row[0] for row in rows).items() if n > 1]
     if twice:
         raise files.fail(where, f"track id {twice[0]!r} twice", "give each track its own id")
@@ -242,11 +334,19 @@ def _actors(archive: Archive) -> tuple[tuple[Actor, ...], int]:
             box = Box(*(float(v) for v in size))
             t_us = np.array(times, dtype=np.int64)
         except (TypeError, ValueError, OverflowError) as error:
-            raise files.fail(here, f"{type(error).__name__}: {error}", "give 7 numbers a pose and 3 a size") from error
+            raise files.fail(
+                here, f"{type(error).__name__}: {error}", "give 7 numbers a pose and 3 a size"
+            ) from error
         if min(box.length_m, box.width_m, box.height_m) <= 0:
             raise files.fail(here, f"a box of {size} m", "give positive sizes")
-        track = checked_trajectory(files, here, t_us, table[:, :3].copy(), table[:, [6, 3, 4, 5]].copy())
-        actors.append(Actor(str(name), label_of(str(label)), box, track, is_static="CONTROLLABLE" not in flags))
+        track = checked_trajectory(
+            files, here, t_us, table[:, :3].copy(), table[:, [6, 3, 4, 5]].copy()
+        )
+        actors.append(
+            Actor(
+                str(name), label_of(str(label)), box, track, is_static="CONTROLLABLE" not in flags
+            )
+        )
     return tuple(actors), sum(a.is_static for a in actors)
 
 
@@ -262,7 +362,9 @@ def label_of(text: str) -> str:
 
 STEP_M = 0.5
 CROSSING_M = 0.2  # an edge nearer than this to a lane centre crosses it
-LANE_STRIDE, SAME_MIDDLE_M, PARALLEL_RAD = 3, 2.0, math.radians(11.0)
+LANE_STRIDE = 3
+SAME_MIDDLE_M = 2.0
+PARALLEL_RAD = math.radians(11.0)
 LONE_EDGE_M = 0.01
 
 
@@ -276,11 +378,15 @@ def alpasim_map(odr: OdrMap, T_local_map: F64) -> LaneMap:
 
     def local(line: F64) -> F64:
         moved = transform_points(T_local_map, line)
-        # A width that is read far beyond its section can be very large; AlpaSim would then fill the memory with vertices.
+        # A width that is read far beyond its section can be very large; AlpaSim would then fill the
+        # memory with vertices.
         return with_vertices(moved) if np.abs(moved - moved[0]).max() <= MAX_ROAD_M else moved
 
     return LaneMap(
-        {key: Lane(key, local(centre), local(left), local(right)) for key, (centre, left, right) in lanes.items()},
+        {
+            key: Lane(key, local(centre), local(left), local(right))
+            for key, (centre, left, right) in lanes.items()
+        },
         tuple(local(edge) for edge in kept.values()),
     )
 
@@ -304,7 +410,10 @@ def _add_road(road: Road, lanes: dict[str, tuple[F64, F64, F64]], edges: dict[st
         for lane_id in sorted((i for i in by_id if i * sign > 0), key=abs):
             width = cubics_at(sorted(by_id[lane_id], key=lambda one: one.s_m), s)
             at = np.column_stack([inner, line[:, 2]])
-            rows = [np.column_stack([xy, z]) for xy in (beside(at, sign * width / 2), inner, beside(at, sign * width))]
+            rows = [
+                np.column_stack([xy, z])
+                for xy in (beside(at, sign * width / 2), inner, beside(at, sign * width))
+            ]
             centre, left, right = (row[::-1] for row in rows) if sign > 0 else rows
             if kinds[lane_id] != "sidewalk":
                 lanes[f"{road.road_id}_{lane_id}"] = (centre, left, right)
@@ -312,23 +421,31 @@ def _add_road(road: Road, lanes: dict[str, tuple[F64, F64, F64]], edges: dict[st
             edges[f"{road.road_id}_{name}"] = rows[2]
     if by_id and road.junction == "-1":
         for sign, name in ((1, "L"), (-1, "R")):
-            lone = np.column_stack([beside(line[:, :3], np.full(len(line), sign * LONE_EDGE_M)), np.zeros(len(line))])
+            lone = np.column_stack(
+                [beside(line[:, :3], np.full(len(line), sign * LONE_EDGE_M)), np.zeros(len(line))]
+            )
             edges.setdefault(f"{road.road_id}_{name}", lone)
 
 
 def _stations(road: Road) -> F64:
-    """Return ``(N, 4)`` x, y, heading, z at the loader's stations; where records meet, the point stands twice."""
+    """Return ``(N, 4)`` x, y, heading, z at the loader's stations; where records meet, the point
+    stands twice.
+    """
     rows, passed_m = [], 0.0
     for record in road.records:
         if record.kind not in ("line", "arc"):
             continue
-        s = np.linspace(0.0, record.length_m, max(2, math.ceil(record.length_m / STEP_M)), dtype=np.float64)
+        s = np.linspace(
+            0.0, record.length_m, max(2, math.ceil(record.length_m / STEP_M)), dtype=np.float64
+        )
         rows.append(np.column_stack([record.at(s), cubics_at(road.elevation, passed_m + s)]))
         passed_m += record.length_m
     return np.concatenate(rows) if rows else np.zeros((0, 4))
 
 
-def _without_crossing(edges: Mapping[str, F64], lanes: Mapping[str, tuple[F64, F64, F64]]) -> dict[str, F64]:
+def _without_crossing(
+    edges: Mapping[str, F64], lanes: Mapping[str, tuple[F64, F64, F64]]
+) -> dict[str, F64]:
     coarse = [centre[::LANE_STRIDE, :2] for centre, _, _ in lanes.values()]
     pairs = [np.stack([line[:-1], line[1:]], axis=1) for line in coarse if len(line) > 1]
     if not pairs:
@@ -341,8 +458,14 @@ def _without_crossing(edges: Mapping[str, F64], lanes: Mapping[str, tuple[F64, F
         near = segments[tree.query(line, predicate="dwithin", distance=CROSSING_M)]
         low_x, low_y, high_x, high_y = shapely.bounds(line)
         box = shapely.bounds(near).reshape(-1, 4)
-        # The loader queries its tree by bounding box only, and takes a segment with the edge's own box for a parallel one.
-        looked_at = (box[:, 0] <= high_x) & (box[:, 2] >= low_x) & (box[:, 1] <= high_y) & (box[:, 3] >= low_y)
+        # The loader queries its tree by bounding box only, and takes a segment with the edge's own
+        # box for a parallel one.
+        looked_at = (
+            (box[:, 0] <= high_x)
+            & (box[:, 2] >= low_x)
+            & (box[:, 1] <= high_y)
+            & (box[:, 3] >= low_y)
+        )
         looked_at &= ~np.all(box == (low_x, low_y, high_x, high_y), axis=1)
         if not np.any(shapely.distance(line, near[looked_at]) < CROSSING_M):
             out[key] = edge
@@ -350,7 +473,9 @@ def _without_crossing(edges: Mapping[str, F64], lanes: Mapping[str, tuple[F64, F
 
 
 def _without_duplicates(edges: Mapping[str, F64]) -> dict[str, F64]:
-    """Drop of two edges whose middles are within 2 m the shorter one, if they are within 11 degrees or their middles within 1 m."""
+    """Drop of two edges whose middles are within 2 m the shorter one, if they are within 11 degrees
+    or their middles within 1 m.
+    """
     keys = list(edges)
     lines = np.array([shapely.linestrings(edges[k][:, :2]) for k in keys], dtype=object)
     length = shapely.length(lines)

@@ -1,4 +1,6 @@
-"""Members of an AlpaSim ``.usdz``: a plain ZIP that may come from anywhere, read in memory, member by member, within limits."""
+"""Members of an AlpaSim ``.usdz``: a plain ZIP that may come from anywhere, read in memory, member
+by member, within limits.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from scenarios.recorded import SourceFiles
 
 
 class Archive:
-    """An open archive. Nothing is extracted to the disk, and no member is ever unpickled or executed.
+    """An open archive. Nothing is extracted to the disk, and no member is ever unpickled or
+    executed.
 
     Raises:
         InputError: It is no ZIP, or a member's name is unsafe or stands twice.
@@ -27,7 +30,9 @@ class Archive:
         self.files, self.path = files, path
         with contextlib.ExitStack() as opening:
             stream = opening.enter_context(open_regular(path, files.doing, ARCHIVE_BYTES))
-            with parsing(files.doing, path, "fetch the file again; it may be truncated", "no readable ZIP"):
+            with parsing(
+                files.doing, path, "fetch the file again; it may be truncated", "no readable ZIP"
+            ):
                 self._zip = zipfile.ZipFile(stream)
                 infos = self._zip.infolist()
             check_names([info.filename for info in infos], path, files.doing)
@@ -37,7 +42,12 @@ class Archive:
     def __enter__(self) -> Archive:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         self._zip.close()
         self._open.close()
 
@@ -53,7 +63,8 @@ class Archive:
         """Read a member; its name and bytes enter the hash of `files`.
 
         Raises:
-            InputError: It is missing, encrypted, damaged, or larger than the limit, whatever size the archive states.
+            InputError: It is missing, encrypted, damaged, or larger than the limit, whatever size
+                the archive states.
         """
         where = f"{self.path}, {member}"
         info = self._infos.get(member)
@@ -61,9 +72,14 @@ class Archive:
             raise self.files.fail(where, "no such member", "give a complete AlpaSim scene")
         most = int(SOURCE_BYTES.high)
         if info.file_size > most:
-            raise self.files.fail(where, f"{info.file_size} bytes", f"give a member below {most} bytes")
+            raise self.files.fail(
+                where, f"{info.file_size} bytes", f"give a member below {most} bytes"
+            )
         do = "fetch the file again; it may be damaged"
-        with parsing(self.files.doing, where, do, "it cannot be read"), self._zip.open(info) as stream:
+        with (
+            parsing(self.files.doing, where, do, "it cannot be read"),
+            self._zip.open(info) as stream,
+        ):
             data = stream.read(most + 1)
         if len(data) > most:
             raise self.files.fail(where, f"more than {most} bytes", "do not use this file")
@@ -75,7 +91,9 @@ class Archive:
         return self.files.parse_json(self.read(member), f"{self.path}, {member}")
 
     def yaml(self, member: str) -> Any:
-        """Read a YAML member; only plain data is built, within the bounds of a configuration file."""
+        """Read a YAML member; only plain data is built, within the bounds of a configuration
+        file.
+        """
         where, data = f"{self.path}, {member}", self.read(member)
         YAML_BYTES.check(len(data), self.files.doing, where)
         with parsing(self.files.doing, where, "fetch the file again", "broken YAML"):
@@ -85,7 +103,9 @@ class Archive:
     def table(self, member: str) -> list[dict[str, Any]]:
         """Read a parquet member as rows."""
         where = f"{self.path}, {member}"
-        table = parse_parquet(self.read(member), where, self.files.doing, do_this="fetch the file again")
+        table = parse_parquet(
+            self.read(member), where, self.files.doing, do_this="fetch the file again"
+        )
         with parsing(self.files.doing, where, "fetch the file again", "no readable parquet"):
             rows: list[dict[str, Any]] = table.to_pylist()
         return rows

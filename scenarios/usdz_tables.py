@@ -1,10 +1,14 @@
-"""The map tables of an AlpaSim scene, read from ``map_data``, ``clipgt`` or ``fastmap`` and written to ``clipgt``.
+"""The map tables of an AlpaSim scene, read from ``map_data``, ``clipgt`` or ``fastmap`` and written
+to ``clipgt``.
 
-Layout: structs ``key`` and one named after the table. Lanes have a left and a right rail with the same number of points, seen in driving
-direction; the centre is halfway, point by point. Vertices are set as AlpaSim's loader sets them (`scenarios.map_lines`).
+Layout: structs ``key`` and one named after the table. Lanes have a left and a right rail with the
+    same number of points, seen in driving
+direction; the centre is halfway, point by point. Vertices are set as AlpaSim's loader sets them
+(`scenarios.map_lines`).
 
-AlpaSim passes over a folder of tables, without an error, if one of the six is missing or if one that it indexes by column has no row. So
-a table without content gets one row that changes no score: a link of a lane to no sign, a sign without an id, a stop line marked implicit.
+AlpaSim passes over a folder of tables, without an error, if one of the six is missing or if one
+that it indexes by column has no row. So a table without content gets one row that changes no score:
+a link of a lane to no sign, a sign without an id, a stop line marked implicit.
 """
 
 from __future__ import annotations
@@ -30,7 +34,8 @@ SIGN = Box(0.1, 0.75, 0.75)  # the table has no size
 
 
 def clipgt_map(archive: Archive) -> tuple[LaneMap | None, tuple[str, ...]]:
-    """Return the lane map of the first usable folder of tables, with notes; None where there is none.
+    """Return the lane map of the first usable folder of tables, with notes; None where there is
+    none.
 
     A folder is usable if it has all six tables and at least one lane.
 
@@ -49,7 +54,11 @@ def clipgt_map(archive: Archive) -> tuple[LaneMap | None, tuple[str, ...]]:
         if not lanes:
             notes.append(f"map tables in {folder}/ passed over: no lane")
             continue
-        notes += ["fastmap tables: heights are taken as stored, not from the ground mesh"] if folder == "fastmap" else []
+        notes += (
+            ["fastmap tables: heights are taken as stored, not from the ground mesh"]
+            if folder == "fastmap"
+            else []
+        )
         return _read(archive, folder, lanes), tuple(notes)
     return None, tuple(notes)
 
@@ -74,7 +83,11 @@ def _rows(archive: Archive, folder: str, table: str) -> list[_Row]:
     for i, row in enumerate(archive.table(f"{folder}/{table}.parquet")):
         key, own = ({} if row.get(name) is None else row[name] for name in ("key", table))
         if not isinstance(key, dict) or not isinstance(own, dict):
-            raise archive.files.fail(f"{where}, row {i}", f"columns key and {table} that are not structs", "write the table again")
+            raise archive.files.fail(
+                f"{where}, row {i}",
+                f"columns key and {table} that are not structs",
+                "write the table again",
+            )
         out.append(_Row(f"{where}, {key.get('map_id', f'row {i}')}", key, own))
     return out
 
@@ -87,32 +100,54 @@ def _read(archive: Archive, folder: str, rows: list[_Row]) -> LaneMap:
         absent = [side for side in ("left_rail", "right_rail") if not fields.get(side)]
         if key is None or absent:
             lacks = f"{absent[0]}, only {', '.join(fields) or 'nothing'}" if absent else "an id"
-            raise archive.files.fail(row.where, f"lane {key} without {lacks}", "give every lane both rails; AlpaSim refuses this scene too")
-        left, right = (points(archive, row.where, fields[side]) for side in ("left_rail", "right_rail"))
+            raise archive.files.fail(
+                row.where,
+                f"lane {key} without {lacks}",
+                "give every lane both rails; AlpaSim refuses this scene too",
+            )
+        left, right = (
+            points(archive, row.where, fields[side]) for side in ("left_rail", "right_rail")
+        )
         if len(left) != len(right) or len(left) < 2:
             found = f"lane {key} with rails of {len(left)} and {len(right)} points"
-            raise archive.files.fail(row.where, found, "give both rails the same number of points, at least two")
+            raise archive.files.fail(
+                row.where, found, "give both rails the same number of points, at least two"
+            )
         lanes[key] = Lane(
-            key, with_vertices((left + right) / 2), with_vertices(left), with_vertices(right),
+            key,
+            with_vertices((left + right) / 2),
+            with_vertices(left),
+            with_vertices(right),
             successors=links.get(("NEXT_LANE", key), ()),
             left_neighbour=next(iter(links.get(("LEFT_LANE", key), ())), None),
             right_neighbour=next(iter(links.get(("RIGHT_LANE", key), ())), None),
-        )  # fmt: skip
+        )
     edges: dict[str, F64] = {}
     for row in _rows(archive, folder, "road_boundary"):
         edges.setdefault(str(row.map_id), _location(archive, row))  # the first of an id counts
-    stops = [row for row in _rows(archive, folder, "wait_line") if row.own.get("is_implicit") is not True]
+    stops = [
+        row for row in _rows(archive, folder, "wait_line") if row.own.get("is_implicit") is not True
+    ]
     return LaneMap(
         {key: _known(lane, lanes) for key, lane in lanes.items()},
         tuple(with_vertices(edge) for edge in edges.values() if len(edge) > 1),
-        stop_lines=tuple(line for line in (_location(archive, row) for row in stops) if len(line) > 1),
-        signs=tuple(sign for row in _rows(archive, folder, "traffic_sign") if (sign := _sign(archive, row)) is not None),
-    )  # fmt: skip
+        stop_lines=tuple(
+            line for line in (_location(archive, row) for row in stops) if len(line) > 1
+        ),
+        signs=tuple(
+            sign
+            for row in _rows(archive, folder, "traffic_sign")
+            if (sign := _sign(archive, row)) is not None
+        ),
+    )
 
 
 def without_rails(lane_map: LaneMap) -> LaneMap:
     """Return a map whose lanes have only their centres, so that scorers widen those by 1.85 m."""
-    return replace(lane_map, lanes={key: replace(lane, left=None, right=None) for key, lane in lane_map.lanes.items()})
+    return replace(
+        lane_map,
+        lanes={key: replace(lane, left=None, right=None) for key, lane in lane_map.lanes.items()},
+    )
 
 
 def points(archive: Archive, where: str, raw: Any) -> F64:
@@ -123,9 +158,15 @@ def points(archive: Archive, where: str, raw: Any) -> F64:
         else:
             xyz = np.array([[p["x"], p["y"], p["z"]] for p in raw], dtype=np.float64).reshape(-1, 3)
     except (KeyError, TypeError, ValueError) as error:
-        raise archive.files.fail(where, f"points that are not x, y, z: {error}", "write the table again") from error
+        raise archive.files.fail(
+            where, f"points that are not x, y, z: {error}", "write the table again"
+        ) from error
     if len(xyz) and not np.abs(xyz - xyz[0]).max() <= MAX_REACH_M:
-        raise archive.files.fail(where, "points that are not finite or kilometres apart", "repair the coordinates of this table")
+        raise archive.files.fail(
+            where,
+            "points that are not finite or kilometres apart",
+            "repair the coordinates of this table",
+        )
     return xyz
 
 
@@ -137,7 +178,9 @@ def _link_table(archive: Archive, folder: str) -> dict[tuple[str, str], tuple[st
     """Return (kind, lane) -> lanes; of several rows for a lane and kind the first counts."""
     out: dict[tuple[str, str], tuple[str, ...]] = {}
     for row in _rows(archive, folder, "association"):
-        kind, subject, objects = row.key.get("kind"), row.own.get("subjects"), row.own.get("objects") or []
+        kind = row.key.get("kind")
+        subject = row.own.get("subjects")
+        objects = row.own.get("objects") or []
         if not isinstance(objects, list):
             raise archive.files.fail(row.where, f"objects {objects!r}", "give a list of ids")
         if kind and subject is not None:
@@ -147,12 +190,22 @@ def _link_table(archive: Archive, folder: str) -> dict[tuple[str, str], tuple[st
 
 def _known(lane: Lane, lanes: dict[str, Lane]) -> Lane:
     left, right = (n if n in lanes else None for n in (lane.left_neighbour, lane.right_neighbour))
-    return replace(lane, successors=tuple(s for s in lane.successors if s in lanes), left_neighbour=left, right_neighbour=right)
+    return replace(
+        lane,
+        successors=tuple(s for s in lane.successors if s in lanes),
+        left_neighbour=left,
+        right_neighbour=right,
+    )
 
 
 def _sign(archive: Archive, row: _Row) -> tuple[F64, Box] | None:
     centre = row.own.get("center")
-    if row.map_id is None or not centre or not isinstance(centre, dict) or any(centre.get(axis) is None for axis in "xyz"):
+    if (
+        row.map_id is None
+        or not centre
+        or not isinstance(centre, dict)
+        or any(centre.get(axis) is None for axis in "xyz")
+    ):
         return None
     pose = np.eye(4)
     pose[:3, 3] = points(archive, row.where, [centre])[0]
@@ -161,14 +214,21 @@ def _sign(archive: Archive, row: _Row) -> tuple[F64, Box] | None:
 
 _XYZ = pa.struct([("x", pa.float64()), ("y", pa.float64()), ("z", pa.float64())])
 _LINE = pa.list_(_XYZ)
-_KEY = pa.struct([(name, pa.string()) for name in ("clip_id", "label_class_id", "map_id", "map_id_version", "kind")])
+_KEY = pa.struct(
+    [
+        (name, pa.string())
+        for name in ("clip_id", "label_class_id", "map_id", "map_id_version", "kind")
+    ]
+)
 _OWN = {
     "lane": pa.struct([("left_rail", _LINE), ("right_rail", _LINE)]),
     "association": pa.struct([("subjects", pa.string()), ("objects", pa.list_(pa.string()))]),
     "road_boundary": pa.struct([("location", _LINE)]),
     "clip": pa.struct([("label_class_id", pa.string())]),
     "traffic_sign": pa.struct([("center", _XYZ), ("category", pa.string())]),
-    "wait_line": pa.struct([("location", _LINE), ("category", pa.string()), ("is_implicit", pa.bool_())]),
+    "wait_line": pa.struct(
+        [("location", _LINE), ("category", pa.string()), ("is_implicit", pa.bool_())]
+    ),
 }
 
 
@@ -181,22 +241,30 @@ def map_tables(lane_map: LaneMap, clip_id: str) -> dict[str, bytes]:
     """
     lanes = {key: lane for key, lane in lane_map.lanes.items() if lane.kind not in NO_LANES_OF_CARS}
     ids = table_ids(list(lanes))
-    own = {key: dict(zip(("left_rail", "right_rail"), map(_line, rails(lane)), strict=True)) for key, lane in lanes.items()}
+    own = {
+        key: dict(zip(("left_rail", "right_rail"), map(_line, rails(lane)), strict=True))
+        for key, lane in lanes.items()
+    }
     rows = {
         "lane": [_row(ids[key], "lane", fields) for key, fields in own.items()],
         "association": _links(lanes, ids),
         "road_boundary": [
-            _row(f"edge{i}", "road_boundary", {"location": _line(e)}) for i, e in enumerate(lane_map.road_edges) if len(e) > 1
+            _row(f"edge{i}", "road_boundary", {"location": _line(e)})
+            for i, e in enumerate(lane_map.road_edges)
+            if len(e) > 1
         ],
         "clip": [_row("clip", "clip", {"label_class_id": "clip"})],
         "traffic_sign": _signs(lane_map),
         "wait_line": _wait_lines(lane_map, lanes, ids),
     }
-    return {f"clipgt/{name}.parquet": _parquet(name, table, clip_id) for name, table in rows.items()}
+    return {
+        f"clipgt/{name}.parquet": _parquet(name, table, clip_id) for name, table in rows.items()
+    }
 
 
 def table_ids(names: Sequence[str]) -> dict[str, str]:
-    """Return the id of each lane in the tables: its name, without the hyphen that parts a stop line's id from its lane's there.
+    """Return the id of each lane in the tables: its name, without the hyphen that parts a stop
+    line's id from its lane's there.
 
     Example:
         >>> table_ids(["road1/-2", "road1/2"])
@@ -206,15 +274,25 @@ def table_ids(names: Sequence[str]) -> dict[str, str]:
     taken = set(out.values())
     if len(taken) == len(names):
         return out
-    return {name: f"lane{i}" for i, name in enumerate(names)}  # two names that differ only in these two characters
+    return {
+        name: f"lane{i}" for i, name in enumerate(names)
+    }  # two names that differ only in these two characters
 
 
-def _row(map_id: str | None, label: str, own: Mapping[str, Any], kind: str | None = None) -> dict[str, Any]:
-    return {"key": {"label_class_id": label, "map_id": map_id, "map_id_version": "0", "kind": kind}, label: dict(own), "version": 1}
+def _row(
+    map_id: str | None, label: str, own: Mapping[str, Any], kind: str | None = None
+) -> dict[str, Any]:
+    return {
+        "key": {"label_class_id": label, "map_id": map_id, "map_id_version": "0", "kind": kind},
+        label: dict(own),
+        "version": 1,
+    }
 
 
 def _links(lanes: Mapping[str, Lane], ids: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return a row per lane and kind of neighbour; AlpaSim's routes follow NEXT_LANE and end where it is missing."""
+    """Return a row per lane and kind of neighbour; AlpaSim's routes follow NEXT_LANE and end where
+    it is missing.
+    """
     before = predecessors(lanes)
     out: list[dict[str, Any]] = []
     for key, lane in lanes.items():
@@ -227,8 +305,22 @@ def _links(lanes: Mapping[str, Lane], ids: Mapping[str, str]) -> list[dict[str, 
         for kind, others in found.items():
             objects = [ids[other] for other in others if other is not None and other in ids]
             if objects:
-                out.append(_row(f"a{len(out)}", "association", {"subjects": ids[key], "objects": objects}, kind))
-    return out or [_row("a0", "association", {"subjects": next(iter(ids.values())), "objects": []}, "SIGN_TO_LANE")]
+                out.append(
+                    _row(
+                        f"a{len(out)}",
+                        "association",
+                        {"subjects": ids[key], "objects": objects},
+                        kind,
+                    )
+                )
+    return out or [
+        _row(
+            "a0",
+            "association",
+            {"subjects": next(iter(ids.values())), "objects": []},
+            "SIGN_TO_LANE",
+        )
+    ]
 
 
 def _signs(lane_map: LaneMap) -> list[dict[str, Any]]:
@@ -236,10 +328,14 @@ def _signs(lane_map: LaneMap) -> list[dict[str, Any]]:
         _row(f"sign{i}", "traffic_sign", {"center": _point(pose[:3, 3]), "category": "UNKNOWN"})
         for i, (pose, _) in enumerate(lane_map.signs)
     ]
-    return signs or [_row(None, "traffic_sign", {"center": _point(np.zeros(3)), "category": "UNKNOWN"})]
+    return signs or [
+        _row(None, "traffic_sign", {"center": _point(np.zeros(3)), "category": "UNKNOWN"})
+    ]
 
 
-def _wait_lines(lane_map: LaneMap, lanes: Mapping[str, Lane], ids: Mapping[str, str]) -> list[dict[str, Any]]:
+def _wait_lines(
+    lane_map: LaneMap, lanes: Mapping[str, Lane], ids: Mapping[str, str]
+) -> list[dict[str, Any]]:
     """Return a row per stop line, with the lane whose end it is nearest to in its id."""
     keys = list(lanes)
     ends = shapely.points(np.array([lane.centre[-1, :2] for lane in lanes.values()]))
@@ -251,7 +347,11 @@ def _wait_lines(lane_map: LaneMap, lanes: Mapping[str, Lane], ids: Mapping[str, 
     if out:
         return out
     left, right = rails(lanes[keys[0]])
-    own = {"location": _line(np.stack([left[-1], right[-1]])), "category": "STOP", "is_implicit": True}
+    own = {
+        "location": _line(np.stack([left[-1], right[-1]])),
+        "category": "STOP",
+        "is_implicit": True,
+    }
     return [_row(f"wait0-{ids[keys[0]]}", "wait_line", own)]
 
 

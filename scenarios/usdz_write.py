@@ -1,7 +1,9 @@
-"""Write a scenario as an AlpaSim scene (``.usdz``), whatever its source: map, recorded drive, traffic, vehicle, cameras and ground.
+"""Write a scenario as an AlpaSim scene (``.usdz``), whatever its source: map, recorded drive,
+traffic, vehicle, cameras and ground.
 
-The local frame and the times of the scenario are kept, so that its rollout logs fit the scene. There is no reconstruction in it: AlpaSim's
-closed renderer cannot render it; ours, and every service that needs only map, rig and tracks, can use it.
+The local frame and the times of the scenario are kept, so that its rollout logs fit the scene.
+There is no reconstruction in it: AlpaSim's closed renderer cannot render it; ours, and every
+service that needs only map, rig and tracks, can use it.
 """
 
 from __future__ import annotations
@@ -20,7 +22,15 @@ from alpasim_plugin import __version__
 from alpasim_plugin.core.atomic import atomic_file
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se3
-from alpasim_plugin.core.types import F64, Actor, CameraSpec, HeightField, Scenario, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    F64,
+    Actor,
+    CameraSpec,
+    HeightField,
+    Scenario,
+    Trajectory,
+    Vehicle,
+)
 from alpasim_plugin.world.ground import height_at
 from scenarios.cosmos_camera import FRONT_WIDE, calibration_table
 from scenarios.usdz_tables import map_tables
@@ -28,24 +38,36 @@ from scenarios.usdz_tables import map_tables
 DOING = "writing an AlpaSim scene"
 SHUTTER_US = 30_000  # of a camera that has none: AlpaSim wants every frame's end after its start
 GROUND_MARGIN_M, GROUND_NODES = 30.0, 200_000
-_LABELS = {"car": "automobile", "truck": "heavy_truck", "pedestrian": "person"}  # the words that AlpaSim classes by; others are kept
+_LABELS = {
+    "car": "automobile",
+    "truck": "heavy_truck",
+    "pedestrian": "person",
+}  # the words that AlpaSim classes by; others are kept
 
 
 def write_usdz(path: Path, scenario: Scenario) -> None:
     """Write a scene; the same scenario gives the same bytes.
 
     Raises:
-        InputError: It has no lane that AlpaSim could drive on, or its recording is too short for one frame.
+        InputError: It has no lane that AlpaSim could drive on, or its recording is too short for
+            one frame.
         InfrastructureError: The disk refuses.
     """
     clip = scenario.scene_id
     cameras = alpasim_cameras(scenario.cameras)
     lane_map = scenario.lane_map
     if all(lane.kind == "sidewalk" for lane in lane_map.lanes.values()):
-        raise InputError(DOING, f"scene {clip!r}", "no lane", "export a scene with a map: AlpaSim routes and scores along lanes")
+        raise InputError(
+            DOING,
+            f"scene {clip!r}",
+            "no lane",
+            "export a scene with a map: AlpaSim routes and scores along lanes",
+        )
     mesh = ground_mesh(scenario)
     members: dict[str, bytes] = {
-        "metadata.yaml": yaml.safe_dump(_metadata(scenario, list(cameras)), sort_keys=False).encode(),
+        "metadata.yaml": yaml.safe_dump(
+            _metadata(scenario, list(cameras)), sort_keys=False
+        ).encode(),
         "rig_trajectories.json": json.dumps(_rig(scenario, cameras)).encode(),
         "sequence_tracks.json": json.dumps({clip: _tracks(scenario)}).encode(),
         **map_tables(lane_map, clip),
@@ -53,18 +75,26 @@ def write_usdz(path: Path, scenario: Scenario) -> None:
         "mesh.ply": mesh,
         "mesh_ground.ply": mesh,
     }
-    with atomic_file(path, DOING) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
+    with (
+        atomic_file(path, DOING) as partial,
+        zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive,
+    ):
         for name, data in members.items():
-            archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data, zipfile.ZIP_DEFLATED)
+            archive.writestr(
+                zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data, zipfile.ZIP_DEFLATED
+            )
 
 
 def alpasim_cameras(cameras: tuple[CameraSpec, ...]) -> dict[str, CameraSpec]:
-    """Return the cameras by the logical ids that AlpaSim's tools know: the main one is called `FRONT_WIDE`, the others keep their names.
+    """Return the cameras by the logical ids that AlpaSim's tools know: the main one is called
+    `FRONT_WIDE`, the others keep their names.
 
     The main camera is the one of that name, else ``front``, else the first.
     """
     names = [camera.name for camera in cameras]
-    main = next((name for name in (FRONT_WIDE, "front") if name in names), names[0] if names else "")
+    main = next(
+        (name for name in (FRONT_WIDE, "front") if name in names), names[0] if names else ""
+    )
     return {FRONT_WIDE if camera.name == main else camera.name: camera for camera in cameras}
 
 
@@ -78,7 +108,10 @@ def _metadata(scenario: Scenario, cameras: list[str]) -> dict[str, Any]:
         "is_resumable": False,
         "sensors": {"camera_ids": cameras, "lidar_ids": []},
         "logger": {},
-        "time_range": {"start": int(scenario.ego_log.t_us[0]) * 1e-6, "end": int(scenario.ego_log.t_us[-1]) * 1e-6},
+        "time_range": {
+            "start": int(scenario.ego_log.t_us[0]) * 1e-6,
+            "end": int(scenario.ego_log.t_us[-1]) * 1e-6,
+        },
         "training_step_outputs": {},
     }
 
@@ -90,14 +123,17 @@ def _rig(scenario: Scenario, cameras: Mapping[str, CameraSpec]) -> dict[str, Any
         "world_to_nre": {"matrix": np.eye(4).tolist()},
         "T_world_base": np.eye(4).tolist(),
         "camera_calibrations": {
-            f"{name}@0": {"logical_sensor_name": name, "T_sensor_rig": camera.T_rig_camera.tolist()} for name, camera in cameras.items()
+            f"{name}@0": {"logical_sensor_name": name, "T_sensor_rig": camera.T_rig_camera.tolist()}
+            for name, camera in cameras.items()
         },
         "rig_trajectories": [
             {
                 "sequence_id": scenario.scene_id,
                 "T_rig_world_timestamps_us": log.t_us.tolist(),
                 "T_rig_worlds": se3(log.xyz, log.quat).tolist(),
-                "cameras_frame_timestamps_us": {f"{name}@0": times for name, times in frames.items()},
+                "cameras_frame_timestamps_us": {
+                    f"{name}@0": times for name, times in frames.items()
+                },
                 "rig_bbox": rig_box(scenario.vehicle),
             }
         ],
@@ -108,14 +144,19 @@ def rig_box(vehicle: Vehicle) -> dict[str, Any]:
     """Return the ego's box in the rig, as ``rig_trajectories.json`` holds it."""
     box = vehicle.box
     size = [box.length_m, box.width_m, box.height_m]
-    return {"centroid": [vehicle.rear_axle_to_centre_m, 0.0, box.height_m / 2], "dim": size, "rot": [0.0, 0.0, 0.0]}
+    return {
+        "centroid": [vehicle.rear_axle_to_centre_m, 0.0, box.height_m / 2],
+        "dim": size,
+        "rot": [0.0, 0.0, 0.0],
+    }
 
 
 def frame_times(scenario: Scenario, camera: CameraSpec) -> list[list[int]]:
     """Return start and end of every frame of a camera, integer microseconds.
 
-    The first one ends where the scenario starts, since AlpaSim renders first there; a frame that would begin before the first recorded
-    pose is left out, since AlpaSim cannot place the camera at its start.
+    The first one ends where the scenario starts, since AlpaSim renders first there; a frame that
+    would begin before the first recorded pose is left out, since AlpaSim cannot place the camera at
+    its start.
     """
     first_us, last_us = int(scenario.ego_log.t_us[0]), int(scenario.ego_log.t_us[-1])
     shutter_us = camera.shutter_us or SHUTTER_US
@@ -136,40 +177,62 @@ def _tracks(scenario: Scenario) -> dict[str, Any]:
             "tracks_label_class": [_LABELS.get(actor.label, actor.label) for actor in actors],
             "tracks_flags": [[] if actor.is_static else ["CONTROLLABLE"] for actor in actors],
             "tracks_timestamps_us": [track.t_us.tolist() for track in tracks],
-            "tracks_poses": [np.column_stack([track.xyz, track.quat[:, [1, 2, 3, 0]]]).tolist() for track in tracks],
+            "tracks_poses": [
+                np.column_stack([track.xyz, track.quat[:, [1, 2, 3, 0]]]).tolist()
+                for track in tracks
+            ],
         },
-        "cuboidtracks_data": {"cuboids_dims": [[a.box.length_m, a.box.width_m, a.box.height_m] for a in actors]},
+        "cuboidtracks_data": {
+            "cuboids_dims": [[a.box.length_m, a.box.width_m, a.box.height_m] for a in actors]
+        },
     }
 
 
 def _lasting(actor: Actor, log: Trajectory) -> Trajectory:
-    """Return a track of at least two poses, which AlpaSim's smoothing needs: one that has a single pose stands there all the time."""
+    """Return a track of at least two poses, which AlpaSim's smoothing needs: one that has a single
+    pose stands there all the time.
+    """
     track = actor.track
     if len(track) > 1:
         return track
-    t_us = np.array([min(int(log.t_us[0]), int(track.t_us[0])), max(int(log.t_us[-1]), int(track.t_us[0]) + 1)])
+    t_us = np.array(
+        [min(int(log.t_us[0]), int(track.t_us[0])), max(int(log.t_us[-1]), int(track.t_us[0]) + 1)]
+    )
     return Trajectory(t_us, np.repeat(track.xyz, 2, axis=0), np.repeat(track.quat, 2, axis=0))
 
 
 def ground_mesh(scenario: Scenario) -> bytes:
-    """Return the ground around lanes and drive as a triangle mesh, binary PLY, for services that cast rays onto it."""
-    points = [scenario.ego_log.xyz[:, :2], *(lane.centre[:, :2] for lane in scenario.lane_map.lanes.values())]
+    """Return the ground around lanes and drive as a triangle mesh, binary PLY, for services that
+    cast rays onto it.
+    """
+    points = [
+        scenario.ego_log.xyz[:, :2],
+        *(lane.centre[:, :2] for lane in scenario.lane_map.lanes.values()),
+    ]
     low = np.min([p.min(axis=0) for p in points], axis=0) - GROUND_MARGIN_M
     high = np.max([p.max(axis=0) for p in points], axis=0) + GROUND_MARGIN_M
     return mesh_of(scenario.ground, low, high)
 
 
 def mesh_of(ground: HeightField, low: F64, high: F64) -> bytes:
-    """Return the part of a height field between two corners ``(2,)`` as binary PLY; the step is coarser where the part is large."""
+    """Return the part of a height field between two corners ``(2,)`` as binary PLY; the step is
+    coarser where the part is large.
+    """
     flat = float(np.ptp(ground.z)) == 0.0
     size = np.maximum(high - low, 1.0)
-    step = float(size.max()) if flat else max(ground.cell_m, float(np.sqrt(size[0] * size[1] / GROUND_NODES)))
+    step = (
+        float(size.max())
+        if flat
+        else max(ground.cell_m, float(np.sqrt(size[0] * size[1] / GROUND_NODES)))
+    )
     xs, ys = (low[d] + step * np.arange(int(np.ceil(size[d] / step)) + 1) for d in range(2))
     xy = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
     vertices = np.column_stack([xy, height_at(ground, xy)]).astype("<f4")
     corner = (np.arange(len(ys) - 1)[:, None] * len(xs) + np.arange(len(xs) - 1)).ravel()
     right, up = corner + 1, corner + len(xs)
-    faces = np.concatenate([np.column_stack([corner, right, up]), np.column_stack([right, up + 1, up])])
+    faces = np.concatenate(
+        [np.column_stack([corner, right, up]), np.column_stack([right, up + 1, up])]
+    )
     table = np.zeros(len(faces), dtype=[("n", "u1"), ("v", "<i4", (3,))])
     table["n"], table["v"] = 3, faces
     head = (

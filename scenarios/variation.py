@@ -1,6 +1,8 @@
-"""Seeds make scenes: declared variations, explicit samples, and, for other seeds than 0, jitter of the numbers of a scenario file.
+"""Seeds make scenes: declared variations, explicit samples, and, for other seeds than 0, jitter of
+the numbers of a scenario file.
 
-Every drawn number has its own stream, keyed by scene, seed and the number's key path, so adding an actor does not change the others.
+Every drawn number has its own stream, keyed by scene, seed and the number's key path, so adding an
+actor does not change the others.
 """
 
 from __future__ import annotations
@@ -31,7 +33,9 @@ AS_WRITTEN = 0  # the scene seed that jitters nothing
 class Drawn:
     """A scenario file as a scene seed makes it."""
 
-    document: Document  # with overrides, variations and sample written into it, for the positions of keys
+    document: (
+        Document  # with overrides, variations and sample written into it, for the positions of keys
+    )
     spec: ScenarioSpec
     scene_id: str
     reseeded: bool  # the seed is another one than the file's
@@ -43,7 +47,9 @@ class Drawn:
         try:
             yield
         except InputError as e:
-            raise InputError(e.doing, f"{self.document.mark(loc)} ({e.with_what})", e.found, e.do_this) from e
+            raise InputError(
+                e.doing, f"{self.document.mark(loc)} ({e.with_what})", e.found, e.do_this
+            ) from e
 
 
 def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Drawn:
@@ -55,7 +61,8 @@ def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Draw
         overrides: ``key=value`` with dotted keys; what they fix is neither varied nor jittered.
 
     Raises:
-        InputError: A key or value that the schema refuses, or a name that stands twice, with its position.
+        InputError: A key or value that the schema refuses, or a name that stands twice, with its
+            position.
     """
     document = apply_overrides(document, overrides, DOING)
     own_seed = document.data.get("seed", 0) if isinstance(document.data, dict) else 0
@@ -84,18 +91,37 @@ def _check_names(document: Document, spec: ScenarioSpec) -> None:
     for i, actor in enumerate(spec.actors):
         if actor.id in seen:
             first = document.mark(("actors", seen[actor.id], "id"))
-            raise document.error(DOING, ("actors", i, "id"), f"duplicate actor id {actor.id!r}, first at {first}", "give it another id")
+            raise document.error(
+                DOING,
+                ("actors", i, "id"),
+                f"duplicate actor id {actor.id!r}, first at {first}",
+                "give it another id",
+            )
         seen[actor.id] = i
     names = [camera.name for camera in spec.cameras or ()]
     for i, name in enumerate(names):
         if name in names[:i]:
-            raise document.error(DOING, ("cameras", i, "name"), f"duplicate camera name {name!r}", "give it another name")
+            raise document.error(
+                DOING,
+                ("cameras", i, "name"),
+                f"duplicate camera name {name!r}",
+                "give it another name",
+            )
     if spec.log is not None and spec.actors:
-        raise document.error(DOING, ("actors",), "actors beside a recorded log", "remove actors; log.actors chooses the recorded traffic")
+        raise document.error(
+            DOING,
+            ("actors",),
+            "actors beside a recorded log",
+            "remove actors; log.actors chooses the recorded traffic",
+        )
 
 
-def _varied(document: Document, spec: ScenarioSpec, scene_id: str, fixed: tuple[str, ...]) -> Document:
-    """Return the document with the variations and the sample of this seed written into it, except for keys that an override fixes."""
+def _varied(
+    document: Document, spec: ScenarioSpec, scene_id: str, fixed: tuple[str, ...]
+) -> Document:
+    """Return the document with the variations and the sample of this seed written into it, except
+    for keys that an override fixes.
+    """
     chosen: dict[str, Any] = {}
     for key, rule in spec.variations.items():
         rng = stream(scene_id, spec.seed, f"scenario/variation/{key}")
@@ -112,19 +138,28 @@ def _varied(document: Document, spec: ScenarioSpec, scene_id: str, fixed: tuple[
 def _jitter(spec: ScenarioSpec, scene_id: str, fixed: tuple[str, ...]) -> ScenarioSpec:
     """Return the specification with road, ego and actors changed within the declared ranges."""
     ids = {str(i): actor.id for i, actor in enumerate(spec.actors)}
-    touched = {_by_id(k, ids) for k in (*fixed, *spec.variations, *(k for sample in spec.samples for k in sample))}
+    touched = {
+        _by_id(k, ids)
+        for k in (*fixed, *spec.variations, *(k for sample in spec.samples for k in sample))
+    }
 
     def walk(part: Any, loc: tuple[str | int, ...], name: str) -> Any:
         if isinstance(part, Part):
             pairs = ((k, getattr(part, k)) for k in type(part).model_fields)
             changed = {k: walk(v, (*loc, k), k) for k, v in pairs}
-            return part.model_copy(update={k: v for k, v in changed.items() if v is not getattr(part, k)})
+            return part.model_copy(
+                update={k: v for k, v in changed.items() if v is not getattr(part, k)}
+            )
         if isinstance(part, tuple) and part and isinstance(part[0], Part):
             # Actors are named by their ids, so that the order of the list does not matter.
             keys = [getattr(item, "id", i) for i, item in enumerate(part)]
             new = tuple(walk(item, (*loc, key), "") for item, key in zip(part, keys, strict=True))
             return part if all(a is b for a, b in zip(new, part, strict=True)) else new
-        if isinstance(part, bool) or not isinstance(part, int | float) or ".".join(map(str, loc)) in touched:
+        if (
+            isinstance(part, bool)
+            or not isinstance(part, int | float)
+            or ".".join(map(str, loc)) in touched
+        ):
             return part
         return _shake(part, loc, name, spec.jitter, scene_id, spec.seed)
 
@@ -134,16 +169,24 @@ def _jitter(spec: ScenarioSpec, scene_id: str, fixed: tuple[str, ...]) -> Scenar
 
 
 def differences(written: ScenarioSpec, drawn: ScenarioSpec) -> dict[str, tuple[Any, Any]]:
-    """Return every key whose value the scene seed has changed, dotted, with the value as written (None: absent) and as drawn."""
+    """Return every key whose value the scene seed has changed, dotted, with the value as written
+    (None: absent) and as drawn.
+    """
     before, after = _flat(written, ()), _flat(drawn, ())
-    return {key: (before.get(key), value) for key, value in after.items() if before.get(key) != value}
+    return {
+        key: (before.get(key), value) for key, value in after.items() if before.get(key) != value
+    }
 
 
 def _flat(part: Any, loc: tuple[str | int, ...]) -> dict[str, Any]:
     """Return dotted keys and plain values of a specification; actors go by their ids."""
     if isinstance(part, Part):
-        names = set(type(part).model_fields) - ({"jitter", "variations", "samples"} if not loc else set())
-        pairs: list[tuple[str | int, Any]] = [(name, getattr(part, name)) for name in type(part).model_fields if name in names]
+        names = set(type(part).model_fields) - (
+            {"jitter", "variations", "samples"} if not loc else set()
+        )
+        pairs: list[tuple[str | int, Any]] = [
+            (name, getattr(part, name)) for name in type(part).model_fields if name in names
+        ]
     elif isinstance(part, tuple) and part and isinstance(part[0], Part):
         pairs = [(getattr(item, "id", i), item) for i, item in enumerate(part)]
     else:
@@ -158,8 +201,11 @@ def _by_id(key: str, ids: dict[str, str]) -> str:
     return f"actors.{ids[item]}.{tail}" if head == "actors" and item in ids else key
 
 
-def _shake(value: float, loc: tuple[str | int, ...], name: str, j: JitterSpec, scene_id: str, seed: int) -> float:
-    # One factor bends the whole road, so that transitions still end with the curvature of the arc after them.
+def _shake(
+    value: float, loc: tuple[str | int, ...], name: str, j: JitterSpec, scene_id: str, seed: int
+) -> float:
+    # One factor bends the whole road, so that transitions still end with the curvature of the arc
+    # after them.
     key = "curvature" if name in _CURVATURES else dotted(loc)
     u = float(stream(scene_id, seed, f"scenario/jitter/{key}").uniform(-1.0, 1.0))
     if name in _TIMES:

@@ -1,4 +1,6 @@
-"""simrun: what a user's own code imports. Every name is loaded on first use, so that a type costs no rasteriser and no torch."""
+"""simrun: what a user's own code imports. Every name is loaded on first use, so that a type costs
+no rasteriser and no torch.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,15 @@ if TYPE_CHECKING:
     from alpasim_plugin.runs.cell import make_renderer
     from alpasim_plugin.runs.notebook import open_run
     from alpasim_plugin.runs.rollout import run_rollout
-    from evaluators import aggregate, paired, reduce_rollout, resolve_evaluators, rollout_values, score, series
+    from evaluators import (
+        aggregate,
+        paired,
+        reduce_rollout,
+        resolve_evaluators,
+        rollout_values,
+        score,
+        series,
+    )
     from policies import check_policy, make_policy
     from policies.base import plan_times
     from scenarios.load import load_scenario
@@ -39,17 +49,38 @@ HOMES = {
     "alpasim_plugin.alpasim.server.driver_service": ["serve_policy"],
     "alpasim_plugin.core.errors": ["InputError", "SimrunError"],
     "alpasim_plugin.core.types": [
-        "CameraSpec", "EgoState", "Frame", "MetricInfo", "MetricSeries", "Observation", "Plan", "RenderRequest", "RolloutLog", "Route",
-        "Scenario", "Scene", "SensorSpec", "Trajectory", "U8",
+        "CameraSpec",
+        "EgoState",
+        "Frame",
+        "MetricInfo",
+        "MetricSeries",
+        "Observation",
+        "Plan",
+        "RenderRequest",
+        "RolloutLog",
+        "Route",
+        "Scenario",
+        "Scene",
+        "SensorSpec",
+        "Trajectory",
+        "U8",
     ],
     "alpasim_plugin.runs.notebook": ["open_run"],
     "alpasim_plugin.runs.cell": ["make_renderer"],
     "alpasim_plugin.runs.rollout": ["run_rollout"],
-    "evaluators": ["aggregate", "paired", "reduce_rollout", "resolve_evaluators", "rollout_values", "score", "series"],
+    "evaluators": [
+        "aggregate",
+        "paired",
+        "reduce_rollout",
+        "resolve_evaluators",
+        "rollout_values",
+        "score",
+        "series",
+    ],
     "policies": ["check_policy", "make_policy"],
     "policies.base": ["plan_times"],
     "scenarios.load": ["load_scenario"],
-}  # fmt: skip
+}
 
 __all__ = [
     "U8",
@@ -85,6 +116,6 @@ __all__ = [
     "score",
     "series",
     "serve_policy",
-]  # fmt: skip
+]
 
 __getattr__ = lazy_names(__name__, {name: home for home, names in HOMES.items() for name in names})

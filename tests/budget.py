@@ -132,7 +132,9 @@ def summary(rooms: dict[str, Size]) -> dict[str, int]:
 def grown(now: dict[str, int]) -> list[str]:
     """Return a line for every number that is above its record."""
     record = json.loads(RECORD.read_text())["limits"]
-    return [f"{name}: {now[name]}, record {record[name]}" for name in record if now[name] > record[name]]
+    return [
+        f"{name}: {now[name]}, record {record[name]}" for name in record if now[name] > record[name]
+    ]
 
 
 def main() -> None:
@@ -153,7 +155,8 @@ def main() -> None:
         return
     print(
         f"{'room':28}{'modules':>9}{'lines':>8}{'nodes':>9}{'statements':>12}{'/stmt':>7}"
-        f"{'median':>8}{'used once':>11}" + (f"  nodes against {arguments.against}" if before else "")
+        f"{'median':>8}{'used once':>11}"
+        + (f"  nodes against {arguments.against}" if before else "")
     )
     for room, row in rows.items():
         print(

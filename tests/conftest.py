@@ -1,7 +1,8 @@
 """Fixtures shared by all tests.
 
-Hypothesis draws few examples of each property by default, the same ones in every run. The full numbers, which stand beside the properties
-(`tests.examples`), are drawn with ``SIMRUN_HYPOTHESIS=nightly pytest -n auto --dist loadfile``.
+Hypothesis draws few examples of each property by default, the same ones in every run. The full
+numbers, which stand beside the properties (`tests.examples`), are drawn with
+``SIMRUN_HYPOTHESIS=nightly pytest -n auto --dist loadfile``.
 """
 
 from __future__ import annotations
@@ -16,14 +17,20 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from tests.durations import kept_seconds, pytest_addoption, pytest_runtest_logreport, pytest_terminal_summary  # noqa: F401 - hooks
+from tests.durations import (
+    kept_seconds,
+)
 from tests.examples import PROFILE, examples
 from tests.report.browser import Browser, find_chromium
 
-settings.register_profile(PROFILE, derandomize=PROFILE == "quick", deadline=None, max_examples=examples(100))
+settings.register_profile(
+    PROFILE, derandomize=PROFILE == "quick", deadline=None, max_examples=examples(100)
+)
 settings.load_profile(PROFILE)
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # one worker a core: threads of several workers on the same cores wait for each other
+if (
+    "PYTEST_XDIST_WORKER" in os.environ
+):  # one worker a core: threads of several workers on the same cores wait for each other
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 REPO = Path(__file__).resolve().parents[1]
@@ -32,16 +39,19 @@ REPO = Path(__file__).resolve().parents[1]
 def pytest_configure(config: pytest.Config) -> None:
     """Keep what tests fit out of the user's cache; workers inherit the folder."""
     if hasattr(config.option, "loadscopereorder"):
-        config.option.loadscopereorder = False  # files are handed out in the order below, not those of most tests first
+        config.option.loadscopereorder = (
+            False  # files are handed out in the order below, not those of most tests first
+        )
     if "SIMRUN_CACHE" not in os.environ:
         folder = tempfile.mkdtemp(prefix="simrun-tests-")
         os.environ["SIMRUN_CACHE"] = folder
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
 
 
-# A kernel's first call compiles it, for half a minute, and leaves it on disk for every later process. The files that compile the three
-# groups of kernels come first, one a worker, so that no two processes compile the same ones; then what took longest when it was last
-# measured, so that no worker is left alone with it at the end.
+# A kernel's first call compiles it, for half a minute, and leaves it on disk for every later
+# process. The files that compile the three groups of kernels come first, one a worker, so that no
+# two processes compile the same ones; then what took longest when it was last measured, so that no
+# worker is left alone with it at the end.
 FIRST = (
     "tests/gaussians/test_rasterize_hard_cases.py",
     "tests/fixers/test_draw.py",
@@ -62,7 +72,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def no_waiting_for_the_disk() -> Iterator[None]:
-    """Let no write of this process wait until it is on the disk: thousands do, and no test cuts the power."""
+    """Let no write of this process wait until it is on the disk: thousands do, and no test cuts the
+    power.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda handle: None)
         yield
@@ -70,7 +82,9 @@ def no_waiting_for_the_disk() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def same_threads() -> Iterator[None]:
-    """Leave torch's number of threads as it was: two workers with two threads each wait for one another most of the time."""
+    """Leave torch's number of threads as it was: two workers with two threads each wait for one
+    another most of the time.
+    """
     torch = sys.modules.get("torch")
     before = torch.get_num_threads() if torch else 0
     yield
@@ -90,7 +104,9 @@ def find_shared_data() -> Path | None:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Give the data folder or skip: its files have licences that keep them out of this repository."""
+    """Give the data folder or skip: its files have licences that keep them out of this
+    repository.
+    """
     folder = find_shared_data()
     if folder is None:
         pytest.skip("third-party data sets absent (set SIMRUN_SHARED_DATA to their folder)")
@@ -120,6 +136,8 @@ def browser() -> Iterator[Browser]:
     """Give an installed Chromium; the test skips where there is none."""
     executable = find_chromium()
     if executable is None:
-        pytest.skip("no Chromium on this machine (looked for chromium, chromium-browser, google-chrome)")
+        pytest.skip(
+            "no Chromium on this machine (looked for chromium, chromium-browser, google-chrome)"
+        )
     with Browser(executable) as opened:
         yield opened

@@ -1,7 +1,8 @@
-"""How long each file of tests takes: ``pytest --durations-file FILE`` writes it and says what became slower than `tests/durations.json`.
+"""How long each file of tests takes: ``pytest --durations-file FILE`` writes it and says what
+became slower than `tests/durations.json`.
 
-Nothing fails for it. ``pytest --durations-file tests/durations.json`` keeps a new standard, which holds for one machine and one number of
-workers: CI's.
+Nothing fails for it. ``pytest --durations-file tests/durations.json`` keeps a new standard, which
+holds for one machine and one number of workers: CI's.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ seconds: defaultdict[str, float] = defaultdict(float)  # by file, set-up and tea
 
 
 def slower(before: Mapping[str, float], now: Mapping[str, float]) -> list[str]:
-    """Return a line for each file that became slower and for each new one that takes long, the worst first."""
+    """Return a line for each file that became slower and for each new one that takes long, the
+    worst first.
+    """
     worse = []
     for file, took in now.items():
         was = before.get(file, 0.0)
@@ -34,14 +37,20 @@ def kept_seconds() -> dict[str, float]:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--durations-file", type=Path, help="write the seconds that each file of tests took here, and compare them")
+    parser.addoption(
+        "--durations-file",
+        type=Path,
+        help="write the seconds that each file of tests took here, and compare them",
+    )
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     seconds[report.nodeid.partition("::")[0]] += report.duration
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter, config: pytest.Config
+) -> None:
     file: Path | None = config.getoption("--durations-file")
     if file is None:
         return

@@ -1,6 +1,7 @@
 """How much of a property is tried in every run, and how much in the nightly one.
 
-Hypothesis draws few examples by default and all of them with ``SIMRUN_HYPOTHESIS=nightly``; further cases of one rule are marked ``slow``.
+Hypothesis draws few examples by default and all of them with ``SIMRUN_HYPOTHESIS=nightly``; further
+cases of one rule are marked ``slow``.
 """
 
 from __future__ import annotations
@@ -22,10 +23,18 @@ def examples(full: int) -> int:
 
 
 def first_of(cases: Sequence[Any], count: int = 1) -> list[Any]:
-    """Return the cases of a test with one parameter, all but the first ``count`` of them marked ``slow``."""
-    return [case if k < count else pytest.param(case, marks=pytest.mark.slow) for k, case in enumerate(cases)]
+    """Return the cases of a test with one parameter, all but the first ``count`` of them marked
+    ``slow``.
+    """
+    return [
+        case if k < count else pytest.param(case, marks=pytest.mark.slow)
+        for k, case in enumerate(cases)
+    ]
 
 
 def first_rows_of(cases: Sequence[tuple[Any, ...]], count: int = 1) -> list[Any]:
     """Do the same for a test with several parameters, whose cases are tuples of their values."""
-    return [case if k < count else pytest.param(*case, marks=pytest.mark.slow) for k, case in enumerate(cases)]
+    return [
+        case if k < count else pytest.param(*case, marks=pytest.mark.slow)
+        for k, case in enumerate(cases)
+    ]

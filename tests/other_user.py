@@ -1,4 +1,6 @@
-"""Run a command as another user, in a file system of its own: without rights to the source, with a read-only root, or with a small disk."""
+"""Run a command as another user, in a file system of its own: without rights to the source, with a
+read-only root, or with a small disk.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ import pytest
 
 NOBODY = 65534
 TOOLS = ("unshare", "setpriv", "mount")
-# The interpreter may lie in a folder that only root may enter: it is mounted again below an empty folder that all may.
+# The interpreter may lie in a folder that only root may enter: it is mounted again below an empty
+# folder that all may.
 SHOW = """
 mount -t tmpfs -o mode=755 none /mnt && mkdir /mnt/keep && mount --bind "{prefix}" /mnt/keep
 mount -t tmpfs -o mode=755 none "{closed}" && mkdir -p "{prefix}" && mount --move /mnt/keep "{prefix}"
@@ -26,10 +29,19 @@ def can_become_nobody() -> bool:
     """Tell whether this process may change its user and mount, in a file system of its own."""
     if os.getuid() != 0 or any(shutil.which(tool) is None for tool in TOOLS):
         return False
-    return subprocess.run(["unshare", "-m", "mount", "-t", "tmpfs", "none", "/mnt"], capture_output=True, check=False).returncode == 0
+    return (
+        subprocess.run(
+            ["unshare", "-m", "mount", "-t", "tmpfs", "none", "/mnt"],
+            capture_output=True,
+            check=False,
+        ).returncode
+        == 0
+    )
 
 
-as_root = pytest.mark.skipif(not can_become_nobody(), reason="needs root that may mount, to become another user")
+as_root = pytest.mark.skipif(
+    not can_become_nobody(), reason="needs root that may mount, to become another user"
+)
 
 
 @contextmanager
@@ -46,11 +58,18 @@ def shared_folder() -> Iterator[Path]:
 def _closed() -> Path | None:
     """Return the first folder on the way to the interpreter that other users may not enter."""
     prefix = Path(sys.base_prefix)
-    return next((one for one in reversed((prefix, *prefix.parents)) if not one.stat().st_mode & 0o001), None)
+    return next(
+        (one for one in reversed((prefix, *prefix.parents)) if not one.stat().st_mode & 0o001), None
+    )
 
 
 def run_as_nobody(
-    command: Sequence[str], *, cwd: Path | str = "/", mounts: str = "", timeout: float = 240, **variables: str
+    command: Sequence[str],
+    *,
+    cwd: Path | str = "/",
+    mounts: str = "",
+    timeout: float = 240,
+    **variables: str,
 ) -> subprocess.CompletedProcess[str]:
     """Run a command as the user "nobody".
 
@@ -67,4 +86,6 @@ def run_as_nobody(
     script = f'set -e\n{show}{mounts}cd "{cwd}"\n{become}'
     environment = {"PATH": os.environ["PATH"], "LANG": "C.UTF-8", **variables}
     whole = ["unshare", "-m", "sh", "-c", script, "sh", *command]
-    return subprocess.run(whole, env=environment, capture_output=True, text=True, check=False, timeout=timeout)
+    return subprocess.run(
+        whole, env=environment, capture_output=True, text=True, check=False, timeout=timeout
+    )

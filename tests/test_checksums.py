@@ -1,4 +1,6 @@
-"""A file that is not the one that was written is noticed, and a copy of it is not taken for another one."""
+"""A file that is not the one that was written is noticed, and a copy of it is not taken for another
+one.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,9 @@ def test_missing_cut_and_changed_files_are_told_apart(tmp_path: Path) -> None:
     assert problem_of(path, facts["a"]) == "not a file"
 
 
-def test_content_that_rots_under_the_same_size_and_time_is_found_when_everything_is_read(tmp_path: Path) -> None:
+def test_content_that_rots_under_the_same_size_and_time_is_found_when_everything_is_read(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "a"
     path.write_bytes(b"0123456789")
     facts = checksums_of(tmp_path, ["a"])["a"]
@@ -80,7 +84,9 @@ def test_content_that_rots_under_the_same_size_and_time_is_found_when_everything
     assert problem_of(path, facts, full=True) == "not the content that was written"
 
 
-def test_a_copy_is_read_once_and_then_taken_by_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_copy_is_read_once_and_then_taken_by_its_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "a").write_bytes(b"0123456789")
     facts = checksums_of(tmp_path, ["a"])["a"]
     copy = tmp_path / "copy"
@@ -88,6 +94,8 @@ def test_a_copy_is_read_once_and_then_taken_by_its_time(tmp_path: Path, monkeypa
     os.utime(copy, ns=(0, facts["mtime_ns"] + 5 * 10**9))
     read_in_full: list[Path] = []
     digest = checksums.sha256_of
-    monkeypatch.setattr(checksums, "sha256_of", lambda path: (read_in_full.append(path), digest(path))[1])
+    monkeypatch.setattr(
+        checksums, "sha256_of", lambda path: (read_in_full.append(path), digest(path))[1]
+    )
     assert [problem_of(copy, facts) for _ in range(3)] == [None, None, None]
     assert read_in_full == [copy]

@@ -15,8 +15,13 @@ import pytest
 @pytest.fixture
 def steps(repo: Path) -> list[tuple[str, str]]:
     """Give the instructions with their arguments, continued lines joined."""
-    text = re.sub(r"^\s*#.*\n", "", (repo / "Dockerfile").read_text(), flags=re.M).replace("\\\n", " ")
-    return [(word, rest.strip()) for word, _, rest in (line.partition(" ") for line in text.splitlines() if line.strip())]
+    text = re.sub(r"^\s*#.*\n", "", (repo / "Dockerfile").read_text(), flags=re.M).replace(
+        "\\\n", " "
+    )
+    return [
+        (word, rest.strip())
+        for word, _, rest in (line.partition(" ") for line in text.splitlines() if line.strip())
+    ]
 
 
 def test_the_base_is_an_argument_with_a_fixed_version(steps: list[tuple[str, str]]) -> None:
@@ -31,13 +36,26 @@ def test_it_does_not_run_as_root(steps: list[tuple[str, str]]) -> None:
     user = dict(steps[last:])["USER"]
     assert user.isdigit(), "a number can be checked by whoever runs it"
     assert int(user) > 0
-    assert words.index("USER") > max(i for i, word in enumerate(words) if word in ("RUN", "COPY")), "what is installed stays root's"
+    assert words.index("USER") > max(
+        i for i, word in enumerate(words) if word in ("RUN", "COPY")
+    ), "what is installed stays root's"
     assert words.index("USER") < words.index("ENTRYPOINT")
 
 
 def test_commands_are_lists_and_layers_keep_no_package_lists(steps: list[tuple[str, str]]) -> None:
     for word, rest in steps:
-        assert word in {"ARG", "FROM", "SHELL", "RUN", "ENV", "WORKDIR", "COPY", "USER", "ENTRYPOINT", "CMD"}, f"{word}: not needed here"
+        assert word in {
+            "ARG",
+            "FROM",
+            "SHELL",
+            "RUN",
+            "ENV",
+            "WORKDIR",
+            "COPY",
+            "USER",
+            "ENTRYPOINT",
+            "CMD",
+        }, f"{word}: not needed here"
         if word in ("ENTRYPOINT", "CMD", "SHELL"):
             assert isinstance(json.loads(rest), list)
         if "apt-get install" in rest:
@@ -47,21 +65,38 @@ def test_commands_are_lists_and_layers_keep_no_package_lists(steps: list[tuple[s
 
 
 def test_what_it_copies_is_there_and_is_sent(repo: Path, steps: list[tuple[str, str]]) -> None:
-    sent = {line[1:] for line in (repo / ".dockerignore").read_text().splitlines() if line.startswith("!")}
-    copied = {name for word, rest in steps if word == "COPY" and "--from" not in rest for name in rest.split()[:-1]}
+    sent = {
+        line[1:]
+        for line in (repo / ".dockerignore").read_text().splitlines()
+        if line.startswith("!")
+    }
+    copied = {
+        name
+        for word, rest in steps
+        if word == "COPY" and "--from" not in rest
+        for name in rest.split()[:-1]
+    }
     assert copied == sent
     assert all((repo / name).exists() for name in copied)
     project = tomllib.loads((repo / "pyproject.toml").read_text())
-    packages = {pattern.rstrip("*") for pattern in project["tool"]["setuptools"]["packages"]["find"]["include"]}
+    packages = {
+        pattern.rstrip("*")
+        for pattern in project["tool"]["setuptools"]["packages"]["find"]["include"]
+    }
     assert packages <= copied, "a package that the wheel needs is not copied"
     torch = next(one for one in project["project"]["dependencies"] if one.startswith("torch"))
-    assert any(f'"{torch}"' in rest for _, rest in steps), "the range of torch differs from the project's"
+    assert any(f'"{torch}"' in rest for _, rest in steps), (
+        "the range of torch differs from the project's"
+    )
 
 
 def engine() -> str | None:
     """Return a container engine that answers."""
     for name in ("docker", "podman"):
-        if shutil.which(name) and subprocess.run([name, "info"], capture_output=True, check=False).returncode == 0:
+        if (
+            shutil.which(name)
+            and subprocess.run([name, "info"], capture_output=True, check=False).returncode == 0
+        ):
             return name
     return None
 
@@ -73,8 +108,24 @@ def test_the_image_builds_and_drives(repo: Path, tmp_path: Path) -> None:
     if found is None:
         pytest.skip("no container engine answers")
     subprocess.run([found, "build", "-q", "-t", "simrun-test", str(repo)], check=True)
-    who = subprocess.run([found, "run", "--rm", "--entrypoint", "id", "simrun-test", "-u"], check=True, capture_output=True, text=True)
+    who = subprocess.run(
+        [found, "run", "--rm", "--entrypoint", "id", "simrun-test", "-u"],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
     assert who.stdout.strip() == "10001"
-    words = ["--renderer", "clean", "--policy", "pure-pursuit", "smoke/straight", "--set", "timing.duration_us=1200000", "--json"]
-    drive = subprocess.run([found, "run", "--rm", "simrun-test", *words], check=True, capture_output=True, text=True)
+    words = [
+        "--renderer",
+        "clean",
+        "--policy",
+        "pure-pursuit",
+        "smoke/straight",
+        "--set",
+        "timing.duration_us=1200000",
+        "--json",
+    ]
+    drive = subprocess.run(
+        [found, "run", "--rm", "simrun-test", *words], check=True, capture_output=True, text=True
+    )
     assert json.loads(drive.stdout)["exit_code"] == 0

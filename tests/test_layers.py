@@ -1,4 +1,6 @@
-"""Data flows one way (docs/architecture.md): a room imports what stands before it in `ROOMS`, never what stands after it."""
+"""Data flows one way (docs/architecture.md): a room imports what stands before it in `ROOMS`, never
+what stands after it.
+"""
 
 from __future__ import annotations
 
@@ -57,10 +59,19 @@ def name_of(path: Path) -> str:
 def modules() -> tuple[Module, ...]:
     found = []
     gc.disable()  # collections while a million nodes are made take as long as making them
-    for path in (p for package in PACKAGES for p in sorted((REPO / package).rglob("*.py")) if not p.name.endswith("_pb2.py")):
+    for path in (
+        p
+        for package in PACKAGES
+        for p in sorted((REPO / package).rglob("*.py"))
+        if not p.name.endswith("_pb2.py")
+    ):
         text = path.read_text()
         tree = ast.parse(text)
-        found.append(Module(path, name_of(path), len(text.splitlines()), tuple(ast.walk(tree)), tuple(tree.body)))
+        found.append(
+            Module(
+                path, name_of(path), len(text.splitlines()), tuple(ast.walk(tree)), tuple(tree.body)
+            )
+        )
     gc.enable()
     return tuple(found)
 
@@ -96,13 +107,26 @@ def upward_imports(module: Module) -> list[str]:
         return []
     allowed = may_import(room)
     found = {(name, room_of(name)) for name in imported(module.nodes)}
-    return [f"{module.name} imports {name}" for name, target in sorted(found, key=str) if target not in (None, room, *allowed)]
+    return [
+        f"{module.name} imports {name}"
+        for name, target in sorted(found, key=str)
+        if target not in (None, room, *allowed)
+    ]
 
 
 def test_every_module_lies_in_a_room() -> None:
-    faces = {"alpasim_plugin", "simrun", "configs", "configs.can", "configs.fixers", "configs.paper"}
+    faces = {
+        "alpasim_plugin",
+        "simrun",
+        "configs",
+        "configs.can",
+        "configs.fixers",
+        "configs.paper",
+    }
     assert {module.name for module in modules() if room_of(module.name) is None} - faces == set()
-    assert {room for room in ROOMS if not any(room_of(module.name) == room for module in modules())} <= set(PLUG_INS)
+    assert {
+        room for room in ROOMS if not any(room_of(module.name) == room for module in modules())
+    } <= set(PLUG_INS)
 
 
 def test_rooms_import_only_rooms_that_stand_before_them() -> None:
@@ -110,7 +134,9 @@ def test_rooms_import_only_rooms_that_stand_before_them() -> None:
 
 
 def test_no_room_imports_in_a_circle() -> None:
-    """Modules of one room may import one another, but not in a circle either, imports inside functions included."""
+    """Modules of one room may import one another, but not in a circle either, imports inside
+    functions included.
+    """
     arrows = {module.name: targets_of(module) for module in modules()}
     done: set[str] = set()
     path: list[str] = []
@@ -130,9 +156,13 @@ def test_no_room_imports_in_a_circle() -> None:
 
 
 def targets_of(module: Module) -> set[str]:
-    """Return the modules that a module imports when it runs: not what only type checkers import, nor a package for one of its modules."""
+    """Return the modules that a module imports when it runs: not what only type checkers import,
+    nor a package for one of its modules.
+    """
     names = {one.name for one in modules()}
-    guarded = {id(inner) for node in module.nodes if is_for_type_checkers(node) for inner in ast.walk(node)}
+    guarded = {
+        id(inner) for node in module.nodes if is_for_type_checkers(node) for inner in ast.walk(node)
+    }
     found: set[str] = set()
     for node in module.nodes:
         if id(node) in guarded:
@@ -151,7 +181,9 @@ def is_for_type_checkers(node: ast.AST) -> bool:
 
 @pytest.mark.parametrize("room", PLUG_INS)
 def test_the_core_does_not_name_a_plug_in_room(room: str) -> None:
-    """A string that names one of their modules is an import too: it would break where the room is not installed."""
+    """A string that names one of their modules is an import too: it would break where the room is
+    not installed.
+    """
     word = re.compile(re.escape(room) + r"\b")
     outside = [module for module in modules() if room_of(module.name) not in PLUG_INS]
     assert [module.name for module in outside if word.search(module.path.read_text())] == []
@@ -159,9 +191,23 @@ def test_the_core_does_not_name_a_plug_in_room(room: str) -> None:
 
 def test_evaluators_do_not_load_torch() -> None:
     own = [module for module in modules() if module.name.startswith("evaluators")]
-    top = {m.name: {alias.name for node in m.top if isinstance(node, ast.Import) for alias in node.names} for m in own}
-    assert [name for name, names in top.items() if any(one.split(".")[0] == "torch" for one in names)] == []
-    assert [m.name for m in own if any(isinstance(n, ast.ImportFrom) and (n.module or "").split(".")[0] == "torch" for n in m.top)] == []
+    top = {
+        m.name: {
+            alias.name for node in m.top if isinstance(node, ast.Import) for alias in node.names
+        }
+        for m in own
+    }
+    assert [
+        name for name, names in top.items() if any(one.split(".")[0] == "torch" for one in names)
+    ] == []
+    assert [
+        m.name
+        for m in own
+        if any(
+            isinstance(n, ast.ImportFrom) and (n.module or "").split(".")[0] == "torch"
+            for n in m.top
+        )
+    ] == []
 
 
 def test_modules_stay_readable_in_one_sitting() -> None:
@@ -172,9 +218,15 @@ def test_no_global_random_generator_is_used() -> None:
     wrong = []
     for module in modules():
         for node in module.nodes:
-            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Attribute) and node.value.attr == "random":
+            if (
+                isinstance(node, ast.Attribute)
+                and isinstance(node.value, ast.Attribute)
+                and node.value.attr == "random"
+            ):
                 if node.attr not in {"Generator", "Philox", "SeedSequence"}:
                     wrong.append(f"{module.path}:{node.lineno}: np.random.{node.attr}")
-            elif isinstance(node, ast.Import) and any(alias.name == "random" for alias in node.names):
+            elif isinstance(node, ast.Import) and any(
+                alias.name == "random" for alias in node.names
+            ):
                 wrong.append(f"{module.path}:{node.lineno}: import random")
     assert wrong == []

@@ -1,23 +1,27 @@
-"""3D rotary position embedding (RoPE) over (time, height, width), with NTK-scaled frequencies and rotate-half pairing.
+"""3D rotary position embedding (RoPE) over (time, height, width), with NTK-scaled frequencies and
+rotate-half pairing.
 
-Each head's channels are split ``h = w = 2 * (head_width // 6)``, ``t = rest``. An axis of width ``d`` has the frequencies ``theta **
-(-2k / d)`` for ``k < d / 2`` with ``theta = 10000 * ratio ** (d / (d - 2))``. The angles of a token are concatenated in the order t, h,
-w and repeated twice; channel ``j`` is rotated together with channel ``j + head_width / 2``.
+Each head's channels are split ``h = w = 2 * (head_width // 6)``, ``t = rest``. An axis of width
+``d`` has the frequencies ``theta ** (-2k / d)`` for ``k < d / 2`` with ``theta = 10000 * ratio **
+(d / (d - 2))``. The angles of a token are concatenated in the order t, h, w and repeated twice;
+channel ``j`` is rotated together with channel ``j + head_width / 2``.
 
-Source: Cosmos-Predict2 rotary embedding as released with OmniDreams. The released table has 128 latents; here positions are
-unbounded. Tables are computed on the CPU, also under a default device of ``meta``, and then moved. Angles are float64: at position 10,000
-float32 has an error of 6e-4 rad.
+Source: Cosmos-Predict2 rotary embedding as released with OmniDreams. The released table has 128
+    latents; here positions are
+unbounded. Tables are computed on the CPU, also under a default device of ``meta``, and then moved.
+Angles are float64: at position 10,000 float32 has an error of 6e-4 rad.
 
 Attention over latents: block-causal over a whole clip, over a cache, and over the text.
 
-Block-causal mask: a token attends to every token of its own block and of earlier blocks. A sliding window restricts this to the last
-``window - sink`` latents up to the end of the own block, plus the first ``sink`` latents of the rollout (attention sink); the own block
-is always visible, even when the window is smaller.
+Block-causal mask: a token attends to every token of its own block and of earlier blocks. A sliding
+window restricts this to the last ``window - sink`` latents up to the end of the own block, plus the
+first ``sink`` latents of the rollout (attention sink); the own block is always visible, even when
+the window is smaller.
 
 Select torch's attention kernel, for benchmarks; the networks work with any.
 
-No mask is built (`attention`), so every kernel applies: flash, cuDNN, memory-efficient, and `math` (plain matrix products that hold all
-scores), which is the reference of the others.
+No mask is built (`attention`), so every kernel applies: flash, cuDNN, memory-efficient, and `math`
+(plain matrix products that hold all scores), which is the reference of the others.
 """
 
 from __future__ import annotations
@@ -36,7 +40,9 @@ from alpasim_plugin.core.errors import InputError
 
 BASE = 10000.0
 RopeTable = tuple[Tensor, Tensor]  # cos, sin: (L, head_width / 2) float32
-Attend = Callable[[Tensor, Tensor, Tensor], Tensor]  # q, k, v (B, L, heads, head_width) -> (B, L, heads * head_width)
+Attend = Callable[
+    [Tensor, Tensor, Tensor], Tensor
+]  # q, k, v (B, L, heads, head_width) -> (B, L, heads * head_width)
 Kernel = Literal["auto", "flash", "cudnn", "efficient", "math"]
 BACKENDS = {
     "flash": SDPBackend.FLASH_ATTENTION,
@@ -54,7 +60,12 @@ def axis_widths(head_width: int) -> tuple[int, int, int]:
         (44, 42, 42)
     """
     if head_width < 2 or head_width % 2:
-        raise InputError("splitting a head for rotary positions", "head width", str(head_width), "use an even head width")
+        raise InputError(
+            "splitting a head for rotary positions",
+            "head width",
+            str(head_width),
+            "use an even head width",
+        )
     spatial = 2 * (head_width // 6)
     return head_width - 2 * spatial, spatial, spatial
 
@@ -70,7 +81,8 @@ def frequencies(width: int, ratio: float) -> Tensor:
         ``(width / 2,)`` float64, radians per position.
     """
     exponent = torch.arange(0, width, 2, dtype=torch.float64, device="cpu") / max(width, 1)
-    # With two channels the only exponent is zero, so the base (whose NTK power is singular) has no effect.
+    # With two channels the only exponent is zero, so the base (whose NTK power is singular) has no
+    # effect.
     theta = BASE * ratio ** (width / (width - 2)) if width > 2 else BASE
     return torch.pow(torch.tensor(theta, dtype=torch.float64, device="cpu"), -exponent)
 
@@ -88,7 +100,9 @@ class Rope3D:
         height_ratio, width_ratio, time_ratio = ratios
         pairs = zip(widths, (time_ratio, height_ratio, width_ratio), strict=True)
         self.head_width, self.ratios = head_width, ratios
-        self.freq_t, self.freq_h, self.freq_w = (frequencies(width, ratio) for width, ratio in pairs)
+        self.freq_t, self.freq_h, self.freq_w = (
+            frequencies(width, ratio) for width, ratio in pairs
+        )
 
     def angles(self, start: int, frames: int, rows: int, columns: int) -> Tensor:
         """Return the angle of every token and channel.
@@ -98,13 +112,18 @@ class Rope3D:
             frames, rows, columns: Token grid of the block.
 
         Returns:
-            ``(frames, rows, columns, head_width)`` float64 radians, the second half repeating the first.
+            ``(frames, rows, columns, head_width)`` float64 radians, the second half repeating the
+            first.
         """
         half = self._half(start, frames, rows, columns)
         return torch.cat([half, half], dim=-1)
 
-    def table(self, start: int, frames: int, rows: int, columns: int, device: torch.device | str = "cpu") -> RopeTable:
-        """Return ``cos`` and ``sin`` of a block's tokens in (t, h, w) order, each ``(frames * rows * columns, head_width / 2)`` float32."""
+    def table(
+        self, start: int, frames: int, rows: int, columns: int, device: torch.device | str = "cpu"
+    ) -> RopeTable:
+        """Return ``cos`` and ``sin`` of a block's tokens in (t, h, w) order, each ``(frames * rows
+        * columns, head_width / 2)`` float32.
+        """
         half = self._half(start, frames, rows, columns).reshape(-1, self.head_width // 2)
         return half.cos().float().to(device), half.sin().float().to(device)
 
@@ -113,17 +132,30 @@ class Rope3D:
 
         Bit-identical to a new table, with less arithmetic and less data moved to the device.
         """
-        angle = torch.arange(start, start + frames, dtype=torch.float64, device="cpu")[:, None] * self.freq_t
+        angle = (
+            torch.arange(start, start + frames, dtype=torch.float64, device="cpu")[:, None]
+            * self.freq_t
+        )
         for kept, new in zip(table, (angle.cos(), angle.sin()), strict=True):
             columns = kept.view(frames, -1, self.head_width // 2)[..., : len(self.freq_t)]
             columns.copy_(new.float().to(kept.device)[:, None].expand(columns.shape))
 
     def _half(self, start: int, frames: int, rows: int, columns: int) -> Tensor:
-        t = torch.arange(start, start + frames, dtype=torch.float64, device="cpu")[:, None] * self.freq_t
+        t = (
+            torch.arange(start, start + frames, dtype=torch.float64, device="cpu")[:, None]
+            * self.freq_t
+        )
         h = torch.arange(rows, dtype=torch.float64, device="cpu")[:, None] * self.freq_h
         w = torch.arange(columns, dtype=torch.float64, device="cpu")[:, None] * self.freq_w
         shape = (frames, rows, columns, -1)
-        return torch.cat([t[:, None, None].expand(shape), h[None, :, None].expand(shape), w[None, None].expand(shape)], dim=-1)
+        return torch.cat(
+            [
+                t[:, None, None].expand(shape),
+                h[None, :, None].expand(shape),
+                w[None, None].expand(shape),
+            ],
+            dim=-1,
+        )
 
 
 def rotate(x: Tensor, table: RopeTable) -> Tensor:
@@ -171,7 +203,13 @@ def visible_latents(start: int, end: int, window: int | None, sink: int) -> list
 
 
 def block_causal_attention(
-    q: Tensor, k: Tensor, v: Tensor, tokens: int, block_latents: int, window: int | None = None, sink: int = 0
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    tokens: int,
+    block_latents: int,
+    window: int | None = None,
+    sink: int = 0,
 ) -> Tensor:
     """Attend block by block without building a mask.
 
@@ -190,9 +228,14 @@ def block_causal_attention(
         end = min(start + block_latents, frames)
         first = 0 if window is None else max(0, min(start, end - (window - sink)))
         keys, values = (part[:, first * tokens : end * tokens] for part in (k, v))
-        kept = min(sink, first) if window is not None else 0  # sink latents outside the contiguous range
+        kept = (
+            min(sink, first) if window is not None else 0
+        )  # sink latents outside the contiguous range
         if kept:
-            keys, values = (torch.cat([part[:, : kept * tokens], run], dim=1) for part, run in ((k, keys), (v, values)))
+            keys, values = (
+                torch.cat([part[:, : kept * tokens], run], dim=1)
+                for part, run in ((k, keys), (v, values))
+            )
         out.append(attend(q[:, start * tokens : end * tokens], keys, values))
     return torch.cat(out, dim=1)
 
@@ -220,9 +263,11 @@ class SelfAttention(nn.Module):
         del self.q_proj, self.k_proj, self.v_proj
 
     def project(self, x: Tensor, added: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Map tokens ``(B, L, width)`` to normed queries and keys, and values, each ``(B, L, heads, head_width)``.
+        """Map tokens ``(B, L, width)`` to normed queries and keys, and values, each ``(B, L, heads,
+        head_width)``.
 
-        ``added (B, L, width)`` is added to the tokens; once the projections are fused it is ``(B, L, 3 * width)``, already projected.
+        ``added (B, L, width)`` is added to the tokens; once the projections are fused it is ``(B,
+        L, 3 * width)``, already projected.
         """
         if self.qkv_proj is None:
             x = x if added is None else x + added
@@ -233,7 +278,9 @@ class SelfAttention(nn.Module):
         q, k, v = (part.unflatten(-1, (-1, self.head_width)) for part in parts)
         return self.q_norm(q), self.k_norm(k), v
 
-    def forward(self, x: Tensor, table: RopeTable, attention: Attend, added: Tensor | None = None) -> Tensor:
+    def forward(
+        self, x: Tensor, table: RopeTable, attention: Attend, added: Tensor | None = None
+    ) -> Tensor:
         """Apply self-attention.
 
         Args:
@@ -261,14 +308,20 @@ class CrossAttention(nn.Module):
         self.k_norm = RMSNorm(head_width)
 
     def keys_values(self, context: Tensor) -> tuple[Tensor, Tensor]:
-        """Map the context ``(B, tokens, context_width)`` to keys and values ``(B, tokens, heads, head_width)``; once per prompt."""
-        k, v = (part.unflatten(-1, (-1, self.head_width)) for part in (self.k_proj(context), self.v_proj(context)))
+        """Map the context ``(B, tokens, context_width)`` to keys and values ``(B, tokens, heads,
+        head_width)``; once per prompt.
+        """
+        k, v = (
+            part.unflatten(-1, (-1, self.head_width))
+            for part in (self.k_proj(context), self.v_proj(context))
+        )
         return self.k_norm(k), v
 
     def forward(self, x: Tensor, keys_values: tuple[Tensor, Tensor]) -> Tensor:
         """Attend from ``x (B, T, N, width)`` to the text.
 
-        With a single text token the softmax is 1, so the output is that token's value for every query.
+        With a single text token the softmax is 1, so the output is that token's value for every
+        query.
         """
         k, v = (part.expand(x.shape[0], *part.shape[1:]) for part in keys_values)
         if k.shape[1] == 1:
@@ -281,7 +334,10 @@ class CrossAttention(nn.Module):
 
 @contextmanager
 def attention_kernel(
-    name: Kernel, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32, head_width: int = 64
+    name: Kernel,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
+    head_width: int = 64,
 ) -> Iterator[None]:
     """Run attention with one kernel and no other; ``auto`` leaves the choice to torch.
 
@@ -293,7 +349,12 @@ def attention_kernel(
         InputError: The kernel is unknown or does not support these inputs.
     """
     if name not in get_args(Kernel):
-        raise InputError("choosing an attention kernel", name, "no such kernel", f"take one of {', '.join(get_args(Kernel))}")
+        raise InputError(
+            "choosing an attention kernel",
+            name,
+            "no such kernel",
+            f"take one of {', '.join(get_args(Kernel))}",
+        )
     if name == "auto":
         yield
         return
@@ -303,5 +364,7 @@ def attention_kernel(
             F.scaled_dot_product_attention(x, x, x)
         except RuntimeError as error:
             found = f"{str(error).splitlines()[0]} ({device}, {dtype}, head width {head_width})"
-            raise InputError("choosing an attention kernel", name, found, "use auto, or another precision") from error
+            raise InputError(
+                "choosing an attention kernel", name, found, "use auto, or another precision"
+            ) from error
         yield

@@ -1,14 +1,16 @@
-"""Adaptive layer norm (adaLN) with low-rank modulation, and its exact folding into the weights for one fixed time step.
+"""Adaptive layer norm (adaLN) with low-rank modulation, and its exact folding into the weights for
+one fixed time step.
 
-A sub-layer ``f`` (self-attention, cross-attention, MLP) acts as ``x + gate * f(LN(x) * (1 + scale) + shift)`` where ``(shift, scale,
-gate) = B A SiLU(e) + lora`` depends on time only. For one fixed time step the three vectors are constants: with ``W`` the first and
-``V`` the last linear of ``f``,
+A sub-layer ``f`` (self-attention, cross-attention, MLP) acts as ``x + gate * f(LN(x) * (1 + scale)
++ shift)`` where ``(shift, scale, gate) = B A SiLU(e) + lora`` depends on time only. For one fixed
+time step the three vectors are constants: with ``W`` the first and ``V`` the last linear of ``f``,
 
     W (n * (1 + scale) + shift) = (W diag(1 + scale)) n + W shift         and         gate * (V y) = (diag(gate) V) y,
 
 so they are folded into the weights and a plain pre-norm transformer remains.
 
-The transformer block and the final layer, with adaLN modulation or with the modulation folded into the weights.
+The transformer block and the final layer, with adaLN modulation or with the modulation folded into
+the weights.
 """
 
 from __future__ import annotations
@@ -30,7 +32,9 @@ KeysValues = tuple[Tensor, Tensor]
 
 
 class LowRankModulation(nn.Sequential):
-    """Compute shift, scale (and gate) from the time embedding; keys ``1.weight`` and ``2.weight``."""
+    """Compute shift, scale (and gate) from the time embedding; keys ``1.weight`` and
+    ``2.weight``.
+    """
 
     def __init__(self, width: int, rank: int, parts: int) -> None:
         super().__init__(nn.SiLU(), Float32Linear(width, rank), Float32Linear(rank, parts * width))
@@ -48,7 +52,8 @@ class LowRankModulation(nn.Sequential):
 
 
 def residual(x: Tensor, f: Callable[[Tensor], Tensor], modulation: Modulation | None) -> Tensor:
-    """Apply one modulated sub-layer with a residual connection; modulation None: it is folded into ``f``.
+    """Apply one modulated sub-layer with a residual connection; modulation None: it is folded into
+    ``f``.
 
     Args:
         x: ``(B, T, N, width)``.
@@ -62,16 +67,24 @@ def residual(x: Tensor, f: Callable[[Tensor], Tensor], modulation: Modulation | 
 
 
 def fold_input(linear: nn.Linear, shift: Tensor, scale: Tensor) -> nn.Linear:
-    """Return ``n -> W (n * (1 + scale) + shift) + b`` as one linear; sums in float64, stored in the weight's dtype."""
+    """Return ``n -> W (n * (1 + scale) + shift) + b`` as one linear; sums in float64, stored in the
+    weight's dtype.
+    """
     weight, bias = _wide(linear)
-    return _linear(weight * (1 + scale.double().flatten()), bias + weight @ shift.double().flatten(), linear.weight)
+    return _linear(
+        weight * (1 + scale.double().flatten()),
+        bias + weight @ shift.double().flatten(),
+        linear.weight,
+    )
 
 
 def fold_output(linear: nn.Linear, gate: Tensor) -> nn.Linear:
     """Return ``y -> gate * (V y + b)`` as one linear."""
     weight, bias = _wide(linear)
     gain = gate.double().flatten()
-    return _linear(gain[:, None] * weight, gain * bias if linear.bias is not None else None, linear.weight)
+    return _linear(
+        gain[:, None] * weight, gain * bias if linear.bias is not None else None, linear.weight
+    )
 
 
 def stack_rows(linears: list[nn.Linear]) -> nn.Linear:
@@ -82,7 +95,9 @@ def stack_rows(linears: list[nn.Linear]) -> nn.Linear:
 
 def _wide(linear: nn.Linear) -> tuple[Tensor, Tensor]:
     weight = linear.weight.detach().double()
-    bias = weight.new_zeros(weight.shape[0]) if linear.bias is None else linear.bias.detach().double()
+    bias = (
+        weight.new_zeros(weight.shape[0]) if linear.bias is None else linear.bias.detach().double()
+    )
     return weight, bias
 
 
@@ -109,20 +124,36 @@ class Mlp(nn.Module):
 
 
 class Block(nn.Module):
-    """Self-attention, cross-attention, MLP, in this order, each ``x + gate * f(LN(x) * (1 + scale) + shift)``."""
+    """Self-attention, cross-attention, MLP, in this order, each ``x + gate * f(LN(x) * (1 + scale)
+    + shift)``.
+    """
 
     def __init__(self, sizes: DiTSizes) -> None:
         super().__init__()
         self.self_attn = SelfAttention(sizes.width, sizes.head_width)
         self.cross_attn = CrossAttention(sizes.width, sizes.context_width, sizes.head_width)
         self.mlp = Mlp(sizes.width, sizes.mlp_width)
-        self.opacity_embed = PatchLinear(sizes.opacity_channels, sizes.width) if sizes.opacity_channels else None
-        self.adaln_modulation_self_attn: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
-        self.adaln_modulation_cross_attn: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
-        self.adaln_modulation_mlp: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
+        self.opacity_embed = (
+            PatchLinear(sizes.opacity_channels, sizes.width) if sizes.opacity_channels else None
+        )
+        self.adaln_modulation_self_attn: LowRankModulation | None = LowRankModulation(
+            sizes.width, sizes.adaln_rank, 3
+        )
+        self.adaln_modulation_cross_attn: LowRankModulation | None = LowRankModulation(
+            sizes.width, sizes.adaln_rank, 3
+        )
+        self.adaln_modulation_mlp: LowRankModulation | None = LowRankModulation(
+            sizes.width, sizes.adaln_rank, 3
+        )
 
     def forward(
-        self, x: Tensor, time: TimeSignal | None, text: KeysValues, table: RopeTable, attention: Attend, opacity: Tensor | None = None
+        self,
+        x: Tensor,
+        time: TimeSignal | None,
+        text: KeysValues,
+        table: RopeTable,
+        attention: Attend,
+        opacity: Tensor | None = None,
     ) -> Tensor:
         """Apply the block.
 
@@ -132,19 +163,38 @@ class Block(nn.Module):
             text: Cross-attention keys and values of this block.
             table: Rotation of the block's tokens.
             attention: Self-attention with the cached past.
-            opacity: ``(B, opacity_channels, T, H, W)`` for a block that embeds it: added to the modulated input of self-attention.
+            opacity: ``(B, opacity_channels, T, H, W)`` for a block that embeds it: added to the
+                modulated input of self-attention.
         """
-        seen = None if self.opacity_embed is None or opacity is None else self.opacity_embed.embed(opacity)
-        x = residual(x, lambda n: self.self_attn(n, table, attention, seen), _modulation(self.adaln_modulation_self_attn, time))
-        x = residual(x, lambda n: self.cross_attn(n, text), _modulation(self.adaln_modulation_cross_attn, time))
+        seen = (
+            None
+            if self.opacity_embed is None or opacity is None
+            else self.opacity_embed.embed(opacity)
+        )
+        x = residual(
+            x,
+            lambda n: self.self_attn(n, table, attention, seen),
+            _modulation(self.adaln_modulation_self_attn, time),
+        )
+        x = residual(
+            x,
+            lambda n: self.cross_attn(n, text),
+            _modulation(self.adaln_modulation_cross_attn, time),
+        )
         return residual(x, self.mlp, _modulation(self.adaln_modulation_mlp, time))
 
     def fold(self, time: TimeSignal) -> None:
-        """Fold the modulation of one time step into the weights, in place; queries, keys and values become one linear."""
-        attn, cross, mlp = self.self_attn, self.cross_attn, self.mlp
+        """Fold the modulation of one time step into the weights, in place; queries, keys and values
+        become one linear.
+        """
+        attn = self.self_attn
+        cross = self.cross_attn
+        mlp = self.mlp
         shift, scale, gate = _require(self.adaln_modulation_self_attn, time)
         qkv = stack_rows([attn.q_proj, attn.k_proj, attn.v_proj])
-        if self.opacity_embed is not None:  # added after scale and shift, so it passes the projections as they are
+        if (
+            self.opacity_embed is not None
+        ):  # added after scale and shift, so it passes the projections as they are
             self.opacity_embed.follow(qkv.weight)
         attn.fuse(fold_input(qkv, shift, scale))
         attn.output_proj = fold_output(attn.output_proj, gate)
@@ -154,7 +204,9 @@ class Block(nn.Module):
         shift, scale, gate = _require(self.adaln_modulation_mlp, time)
         mlp.layer1 = fold_input(mlp.layer1, shift, scale)
         mlp.layer2 = fold_output(mlp.layer2, gate)
-        self.adaln_modulation_self_attn = self.adaln_modulation_cross_attn = self.adaln_modulation_mlp = None
+        self.adaln_modulation_self_attn = self.adaln_modulation_cross_attn = (
+            self.adaln_modulation_mlp
+        ) = None
 
 
 class FinalLayer(nn.Module):
@@ -163,10 +215,14 @@ class FinalLayer(nn.Module):
     def __init__(self, sizes: DiTSizes) -> None:
         super().__init__()
         self.linear = nn.Linear(sizes.width, sizes.latent_channels * PATCH * PATCH, bias=False)
-        self.adaln_modulation: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 2)
+        self.adaln_modulation: LowRankModulation | None = LowRankModulation(
+            sizes.width, sizes.adaln_rank, 2
+        )
 
     def forward(self, x: Tensor, time: TimeSignal | None) -> Tensor:
-        """Map ``(B, T, N, width)`` to ``(B, T, N, 4 * channels)``, ordered (row, column, channel)."""
+        """Map ``(B, T, N, width)`` to ``(B, T, N, 4 * channels)``, ordered (row, column,
+        channel).
+        """
         if self.adaln_modulation is None:
             return cast(Tensor, self.linear(layer_norm(x)))
         assert time is not None, "a network that is not folded needs its time signal"

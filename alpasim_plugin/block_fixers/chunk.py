@@ -1,4 +1,6 @@
-"""Fix whole blocks of true frames: the loop advances block by block, with one policy query at the end of each."""
+"""Fix whole blocks of true frames: the loop advances block by block, with one policy query at the
+end of each.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,13 @@ class ChunkRenderer(Renderer):
         first: One that is made already.
     """
 
-    def __init__(self, runner: BlockRunner, make_fixer: Callable[[], Fixer], settings: FixerSettings, first: Fixer | None = None) -> None:
+    def __init__(
+        self,
+        runner: BlockRunner,
+        make_fixer: Callable[[], Fixer],
+        settings: FixerSettings,
+        first: Fixer | None = None,
+    ) -> None:
         self.runner, self.fixer = runner, first or make_fixer()
         self.block = self.fixer.blocks
         self.frames = self.blocks = 0
@@ -36,7 +44,11 @@ class ChunkRenderer(Renderer):
         """Return the fixer's label and the counts so far."""
         fixer = self.fixer
         counts = {"frames": self.frames, "blocks": self.blocks}
-        return {"label": fixer.label, "trained": fixer.trained, "mode": "chunk"} | counts | {"chosen": dict(fixer.chosen)}
+        return (
+            {"label": fixer.label, "trained": fixer.trained, "mode": "chunk"}
+            | counts
+            | {"chosen": dict(fixer.chosen)}
+        )
 
     def render(self, request: RenderRequest) -> Frame:
         """Render a block of one frame; see `render_batch`."""
@@ -55,10 +67,15 @@ class ChunkRenderer(Renderer):
             counts[request.camera.name] = counts.get(request.camera.name, 0) + 1
         if set(counts.values()) != {due}:
             raise RendererError(
-                "rendering a block", f"block {self.blocks}", f"frames by camera: {counts}; the block has {due}", "request whole blocks"
+                "rendering a block",
+                f"block {self.blocks}",
+                f"frames by camera: {counts}; the block has {due}",
+                "request whole blocks",
             )
         self.runner.reset_times()
-        fixed = self.runner.fix(self.fixer, self.fixer.step, [self.runner.render(request) for request in requests])
+        fixed = self.runner.fix(
+            self.fixer, self.fixer.step, [self.runner.render(request) for request in requests]
+        )
         self.blocks += 1
         self.frames += len(fixed)
         return fixed

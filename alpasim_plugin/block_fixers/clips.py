@@ -1,6 +1,8 @@
-"""Valid clip sizes of video autoencoders (1 + 4k frames, sides in multiples of 8), and padding to them.
+"""Valid clip sizes of video autoencoders (1 + 4k frames, sides in multiples of 8), and padding to
+them.
 
-Padding is explicit: `pad_clip` repeats the last frame and the right and bottom edges, and returns the size to crop to after decoding.
+Padding is explicit: `pad_clip` repeats the last frame and the right and bottom edges, and returns
+the size to crop to after decoding.
 """
 
 from __future__ import annotations
@@ -61,7 +63,8 @@ def pad_clip(video: Tensor, group: int = GROUP, side: int = SIDE) -> tuple[Tenso
     Args:
         video: ``(B, C, T, H, W)``, T at least 1.
         group: Frames of a latent after the first.
-        side: Pixels that height and width must be a multiple of (16 for a network that works on 2x2 latents).
+        side: Pixels that height and width must be a multiple of (16 for a network that works on 2x2
+            latents).
 
     Returns:
         The padded clip and the size to crop to (`crop_clip`).
@@ -78,7 +81,9 @@ def crop_clip(video: Tensor, size: ClipSize) -> Tensor:
     return video[:, :, : size.frames, : size.height, : size.width]
 
 
-def check_frames(video: Tensor, doing: str, first: bool, group: int = GROUP, side: int = SIDE, channels: int = 3) -> None:
+def check_frames(
+    video: Tensor, doing: str, first: bool, group: int = GROUP, side: int = SIDE, channels: int = 3
+) -> None:
     """Refuse clips of an invalid size.
 
     Args:
@@ -95,7 +100,9 @@ def check_frames(video: Tensor, doing: str, first: bool, group: int = GROUP, sid
     shape = list(video.shape)
     if video.ndim != 5 or shape[1] != channels or not video.is_floating_point():
         do = f"give (B, {channels}, T, H, W) with values in [-1, 1]"
-        raise InputError(doing, f"a tensor {shape} of {video.dtype}", "not a floating-point video", do)
+        raise InputError(
+            doing, f"a tensor {shape} of {video.dtype}", "not a floating-point video", do
+        )
     frames, height, width = shape[2:]
     if height < side or width < side or height % side or width % side:
         raise InputError(
@@ -141,7 +148,9 @@ class Clip:
 
 
 def to_clip(views: Views, frames_due: int, device: torch.device | str = "cpu") -> Clip:
-    """Convert views to tensors: ``x / 127.5 - 1``, the last frame repeated up to ``frames_due``, edges padded to multiples of 16."""
+    """Convert views to tensors: ``x / 127.5 - 1``, the last frame repeated up to ``frames_due``,
+    edges padded to multiples of 16.
+    """
 
     def video(images: U8 | F32) -> Tensor:
         x = torch.from_numpy(images).to(device).float()
@@ -160,7 +169,9 @@ def to_clip(views: Views, frames_due: int, device: torch.device | str = "cpu") -
 
 
 def to_images(video: Tensor, size: ClipSize) -> U8:
-    """Crop ``(B, 3, T, H, W)`` in [-1, 1] and round it to images ``(B, T, H, W, 3)``; values are clipped to the range."""
+    """Crop ``(B, 3, T, H, W)`` in [-1, 1] and round it to images ``(B, T, H, W, 3)``; values are
+    clipped to the range.
+    """
     levels = crop_clip(video, size).float().clamp(-1, 1).add_(1).mul_(HALF).round_()
     images: U8 = levels.to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous().cpu().numpy()
     return images

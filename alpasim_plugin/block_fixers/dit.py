@@ -1,11 +1,15 @@
-"""The causal one-step generator: a diffusion transformer (DiT) over latents with block-causal attention.
+"""The causal one-step generator: a diffusion transformer (DiT) over latents with block-causal
+attention.
 
-One set of weights, two entry points. ``net(...)`` takes a whole clip with a block-causal mask (training, reference); ``net.step(...)``
-takes one block and a KV cache (streaming). They agree where the window covers the history.
+One set of weights, two entry points. ``net(...)`` takes a whole clip with a block-causal mask
+(training, reference); ``net.step(...)`` takes one block and a KV cache (streaming). They agree
+where the window covers the history.
 
-Conventions: ``x`` and ``hdmap`` are ``(B, C, T, H, W)`` normalised latents, time steps run from 0 to 1000, the output is the velocity
-``noise - clean`` (source minus target) in the shape and dtype of ``x``. Keys, shapes and order of operations are those of OmniDreams
-single view (the causal student of Cosmos-Predict2.5), so its checkpoints load; docs/block-fixers.md lists them.
+Conventions: ``x`` and ``hdmap`` are ``(B, C, T, H, W)`` normalised latents, time steps run from 0
+    to 1000, the output is the velocity
+``noise - clean`` (source minus target) in the shape and dtype of ``x``. Keys, shapes and order of
+operations are those of OmniDreams single view (the causal student of Cosmos-Predict2.5), so its
+checkpoints load; docs/block-fixers.md lists them.
 """
 
 from __future__ import annotations
@@ -22,19 +26,32 @@ from torch import Tensor, nn
 from alpasim_plugin.block_fixers.attention import Attend, Rope3D, RopeTable, block_causal_attention
 from alpasim_plugin.block_fixers.blocks import Block, FinalLayer, KeysValues, TimeSignal
 from alpasim_plugin.block_fixers.kv_cache import BlockCache, GraphCache, RollingCache
-from alpasim_plugin.block_fixers.layers import PatchEmbed, RMSNorm, TimeMap, embed_latents, sinusoid, unpatchify
+from alpasim_plugin.block_fixers.layers import (
+    PatchEmbed,
+    RMSNorm,
+    TimeMap,
+    embed_latents,
+    sinusoid,
+    unpatchify,
+)
 from alpasim_plugin.block_fixers.sizes import MASK_CHANNELS, DiTSizes, read_sizes
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network import checkpoints
 
-RELEASED_ROPE_RATIOS = (3.0, 3.0, 1.0)  # height, width, time, as all released single-view experiments set them
+RELEASED_ROPE_RATIOS = (
+    3.0,
+    3.0,
+    1.0,
+)  # height, width, time, as all released single-view experiments set them
 FLOAT32_KEYS = ("t_embedder.", "t_embedding_norm.", "adaln_modulation")
 __all__ = ["CosmosCausalDiT", "DiTSizes", "TextContext"]
 
 
 @dataclass(frozen=True)
 class TextContext:
-    """Cross-attention keys and values of a prompt: computed once by `CosmosCausalDiT.encode_text`, passed in place of the text."""
+    """Cross-attention keys and values of a prompt: computed once by `CosmosCausalDiT.encode_text`,
+    passed in place of the text.
+    """
 
     keys_values: tuple[KeysValues, ...]  # per block: k, v (B or 1, tokens, heads, head_width)
 
@@ -45,7 +62,8 @@ class CosmosCausalDiT(nn.Module):
     Args:
         sizes: All sizes; `DiTSizes()` is OmniDreams single view.
         rope_ratios: NTK stretch of the rotary positions: height, width, time.
-        time_rounding: ``torch.bfloat16`` rounds time steps as the original training code does; float32 does not round.
+        time_rounding: ``torch.bfloat16`` rounds time steps as the original training code does;
+            float32 does not round.
 
     Attributes:
         folded_t: The only valid time step of a network from `folded`.
@@ -65,7 +83,9 @@ class CosmosCausalDiT(nn.Module):
         self.additional_patch_embedding = PatchEmbed(sizes.map_channels, sizes.width)
         self.t_embedder = nn.ModuleList([nn.Identity(), TimeMap(sizes.width)])
         self.t_embedding_norm = RMSNorm(sizes.width)
-        self.crossattn_proj = nn.Sequential(nn.Linear(sizes.text_width, sizes.context_width), nn.GELU())
+        self.crossattn_proj = nn.Sequential(
+            nn.Linear(sizes.text_width, sizes.context_width), nn.GELU()
+        )
         self.blocks = nn.ModuleList(Block(sizes) for _ in range(sizes.blocks))
         self.final_layer = FinalLayer(sizes)
 
@@ -82,15 +102,17 @@ class CosmosCausalDiT(nn.Module):
         """Build a network with sizes read from the tensors, and copy them.
 
         Args:
-            sd: Tensors under the original's keys (docs/block-fixers.md), with or without the prefix ``net.`` and an outer
-                ``model`` or ``state_dict``.
+            sd: Tensors under the original's keys (docs/block-fixers.md), with or without the prefix
+                ``net.`` and an outer ``model`` or ``state_dict``.
             rope_ratios: Height, width, time; not stored in checkpoints.
-            dtype: Precision of the weights; half-precision tensors are widened by the default. Time embedding and modulation stay float32.
+            dtype: Precision of the weights; half-precision tensors are widened by the default. Time
+                embedding and modulation stay float32.
             time_rounding: See the class.
             source: Name for error messages.
 
         Raises:
-            InputError: Missing, unexpected, mis-shaped or transposed, non-floating or non-finite tensors, all listed.
+            InputError: Missing, unexpected, mis-shaped or transposed, non-floating or non-finite
+                tensors, all listed.
         """
         tensors = checkpoints.clean(checkpoints.unwrap(sd, source))
         sizes = read_sizes({key: tuple(value.shape) for key, value in tensors.items()}, source)
@@ -133,24 +155,34 @@ class CosmosCausalDiT(nn.Module):
             x: ``(B, C, T, H, W)`` noised latents, H and W even.
             t: ``(B, T)`` time steps, 0 to 1000, or ``(B, 1)``, or one number for all.
             text: ``(B or 1, tokens, text_width)`` features, or a `TextContext`.
-            hdmap: ``(B, condition_channels, T, H, W)`` latents of the semantic map; a network that embeds opacity takes its channels after
-                the map's.
+            hdmap: ``(B, condition_channels, T, H, W)`` latents of the semantic map; a network that
+                embeds opacity takes its channels after the map's.
             condition_mask: ``(B, 1, T, H, W)``, 1 where the latent is given; None is 0 everywhere.
-            block_latents: Latents of a causal block (the last may be shorter); None for bidirectional attention, as in the teacher.
+            block_latents: Latents of a causal block (the last may be shorter); None for
+                bidirectional attention, as in the teacher.
             padding_mask: ``(B, 1, h, w)`` at any resolution; None is 0 everywhere.
-            window, sink: Sliding window and attention sink in latents, as in a cache; None for the whole past, as in training.
+            window, sink: Sliding window and attention sink in latents, as in a cache; None for the
+                whole past, as in training.
             start: Absolute latent index of the first frame.
 
         Returns:
             ``(B, C, T, H, W)`` velocity.
         """
         self._check(x, t, text, hdmap, block_latents)
-        frames, rows, columns = x.shape[2], x.shape[3] // 2, x.shape[4] // 2
+        frames = x.shape[2]
+        rows = x.shape[3] // 2
+        columns = x.shape[4] // 2
         table = self.rope.table(start, frames, rows, columns, x.device)
         attention = functools.partial(
-            block_causal_attention, tokens=rows * columns, block_latents=block_latents or frames, window=window, sink=sink
+            block_causal_attention,
+            tokens=rows * columns,
+            block_latents=block_latents or frames,
+            window=window,
+            sink=sink,
         )
-        return self._run(x, t, text, hdmap, condition_mask, padding_mask, table, lambda layer: attention)
+        return self._run(
+            x, t, text, hdmap, condition_mask, padding_mask, table, lambda layer: attention
+        )
 
     def step(
         self,
@@ -166,11 +198,13 @@ class CosmosCausalDiT(nn.Module):
     ) -> Tensor:
         """Predict the velocity of one block from its cached past.
 
-        A block may take several forwards (denoising steps, then the cache write): all but the last with ``write=False``. They use the same
-        cache slots, and the last one's keys and values are kept.
+        A block may take several forwards (denoising steps, then the cache write): all but the last
+        with ``write=False``. They use the same cache slots, and the last one's keys and values are
+        kept.
 
         Args:
-            x_block, t_block, text, hdmap_block, condition_mask, padding_mask: As in `forward`, for the T latents of the block.
+            x_block, t_block, text, hdmap_block, condition_mask, padding_mask: As in `forward`, for
+                the T latents of the block.
             cache: From `new_cache`; one per rollout.
             write: Keep this forward's keys and values and advance to the next block.
 
@@ -185,44 +219,79 @@ class CosmosCausalDiT(nn.Module):
             def attention(layer: int) -> Attend:
                 return functools.partial(cache.attend, layer)
 
-            v = self._run(x_block, t_block, text, hdmap_block, condition_mask, padding_mask, table, attention)
+            v = self._run(
+                x_block, t_block, text, hdmap_block, condition_mask, padding_mask, table, attention
+            )
         if write:
             cache.commit()
         return v
 
     def new_cache(
-        self, batch: int, height: int, width: int, window: int | None = 6, sink: int = 0, *, keeps_graph: bool = False
+        self,
+        batch: int,
+        height: int,
+        width: int,
+        window: int | None = 6,
+        sink: int = 0,
+        *,
+        keeps_graph: bool = False,
     ) -> BlockCache:
         """Make an empty cache.
 
         Args:
             batch: Sequences (or camera views) side by side.
             height, width: Latent size, even.
-            window: Latents that a token attends to, own block and sink included; None (all) needs ``keeps_graph``.
+            window: Latents that a token attends to, own block and sink included; None (all) needs
+                ``keeps_graph``.
             sink: First latents of the rollout that stay visible (attention sink).
-            keeps_graph: Use a growing list with gradients (training) instead of a fixed rolling buffer (inference).
+            keeps_graph: Use a growing list with gradients (training) instead of a fixed rolling
+                buffer (inference).
         """
         if keeps_graph:
             return GraphCache(self.rope, batch, height, width, window, sink, self.device)
         if window is None:
             do = "give the number of latents to hold, or keeps_graph=True"
-            raise InputError("making a rolling cache", "window", "None: a fixed buffer needs a length", do)
-        return RollingCache(self.rope, self.sizes.blocks, self.sizes.heads, batch, height, width, window, sink, self.device, self.dtype)
+            raise InputError(
+                "making a rolling cache", "window", "None: a fixed buffer needs a length", do
+            )
+        return RollingCache(
+            self.rope,
+            self.sizes.blocks,
+            self.sizes.heads,
+            batch,
+            height,
+            width,
+            window,
+            sink,
+            self.device,
+            self.dtype,
+        )
 
     def encode_text(self, text: Tensor) -> TextContext:
-        """Project a prompt ``(B or 1, tokens, text_width)`` to the cross-attention keys and values of every block."""
+        """Project a prompt ``(B or 1, tokens, text_width)`` to the cross-attention keys and values
+        of every block.
+        """
         self._check_text(text)
         context = self.crossattn_proj(text.to(self.dtype))
-        return TextContext(tuple(cast(Block, block).cross_attn.keys_values(context) for block in self.blocks))
+        return TextContext(
+            tuple(cast(Block, block).cross_attn.keys_values(context) for block in self.blocks)
+        )
 
     def folded(self, t: float) -> Self:
-        """Return a copy for one time step, with shift, scale and gate folded into the neighbouring linears.
+        """Return a copy for one time step, with shift, scale and gate folded into the neighbouring
+        linears.
 
-        Exact (see `adaln`): the result is a plain pre-norm transformer without modulation. It takes the same caches. Later changes of
+        Exact (see `adaln`): the result is a plain pre-norm transformer without modulation. It takes
+            the same caches. Later changes of
         these weights do not reach the copy.
         """
         if self.folded_t is not None:
-            raise InputError("folding a time step", f"t={t}", f"already folded for t={self.folded_t}", "fold the original network")
+            raise InputError(
+                "folding a time step",
+                f"t={t}",
+                f"already folded for t={self.folded_t}",
+                "fold the original network",
+            )
         net = copy.deepcopy(self).requires_grad_(False)
         with torch.no_grad():
             time = self._time(t)
@@ -246,56 +315,119 @@ class CosmosCausalDiT(nn.Module):
     ) -> Tensor:
         time = self._time(t)
         text = text if isinstance(text, TextContext) else self.encode_text(text)
-        tokens = embed_latents(self.x_embedder.linear, x.to(self.dtype), condition_mask, padding_mask)
+        tokens = embed_latents(
+            self.x_embedder.linear, x.to(self.dtype), condition_mask, padding_mask
+        )
         condition = hdmap.to(self.dtype)
-        tokens = tokens + self.additional_patch_embedding.linear.embed(condition[:, : self.sizes.map_channels])
+        tokens = tokens + self.additional_patch_embedding.linear.embed(
+            condition[:, : self.sizes.map_channels]
+        )
         opacity = condition[:, self.sizes.map_channels :] if self.sizes.opacity_channels else None
         for layer, block in enumerate(self.blocks):
             tokens = block(tokens, time, text.keys_values[layer], table, attention(layer), opacity)
         return unpatchify(self.final_layer(tokens, time), x.shape[3], x.shape[4]).to(x.dtype)
 
     def _time(self, t: Tensor | float) -> TimeSignal | None:
-        """Return emb ``(b, T, width)`` and lora ``(b, T, 3 * width)``; None when folded (after checking ``t``)."""
+        """Return emb ``(b, T, width)`` and lora ``(b, T, 3 * width)``; None when folded (after
+        checking ``t``).
+        """
         if self.folded_t is not None:
-            same = t == self.folded_t if not isinstance(t, Tensor) else t.is_meta or bool((t == self.folded_t).all())
+            same = (
+                t == self.folded_t
+                if not isinstance(t, Tensor)
+                else t.is_meta or bool((t == self.folded_t).all())
+            )
             if not same:
                 found = f"t={t if not isinstance(t, Tensor) else t.flatten()[:4].tolist()}"
                 do = f"pass t={self.folded_t}, or use the network that is not folded"
-                raise InputError("running a folded network", f"folded for t={self.folded_t}", found, do)
+                raise InputError(
+                    "running a folded network", f"folded for t={self.folded_t}", found, do
+                )
             return None
         steps = t if isinstance(t, Tensor) else torch.full((1, 1), float(t), device=self.device)
         s = sinusoid(steps, self.sizes.width, self.time_rounding)
         return self.t_embedding_norm(s), self.t_embedder[1](s)
 
-    def _check(self, x: Tensor, t: Tensor | float, text: Tensor | TextContext, hdmap: Tensor, block_latents: int | None) -> None:
+    def _check(
+        self,
+        x: Tensor,
+        t: Tensor | float,
+        text: Tensor | TextContext,
+        hdmap: Tensor,
+        block_latents: int | None,
+    ) -> None:
         doing = "running a causal network"
         sizes = self.sizes
-        if x.ndim != 5 or x.shape[1] != sizes.latent_channels or x.shape[2] < 1 or x.shape[3] % 2 or x.shape[4] % 2 or 0 in x.shape:
+        if (
+            x.ndim != 5
+            or x.shape[1] != sizes.latent_channels
+            or x.shape[2] < 1
+            or x.shape[3] % 2
+            or x.shape[4] % 2
+            or 0 in x.shape
+        ):
             do = f"give (batch, {sizes.latent_channels}, latents, height, width) with even height and width (pixels in multiples of 16)"
             raise InputError(doing, "x", f"shape {list(x.shape)}", do)
         expected = [x.shape[0], sizes.condition_channels, *x.shape[2:]]
         if list(hdmap.shape) != expected:
-            raise InputError(doing, "hdmap", f"shape {list(hdmap.shape)}", f"give {expected}, the map at the latents of x")
-        if isinstance(t, Tensor) and (t.ndim != 2 or t.shape[0] not in (1, x.shape[0]) or t.shape[1] not in (1, x.shape[2])):
+            raise InputError(
+                doing,
+                "hdmap",
+                f"shape {list(hdmap.shape)}",
+                f"give {expected}, the map at the latents of x",
+            )
+        if isinstance(t, Tensor) and (
+            t.ndim != 2 or t.shape[0] not in (1, x.shape[0]) or t.shape[1] not in (1, x.shape[2])
+        ):
             do = f"give one step per latent, [{x.shape[0]}, {x.shape[2]}], or one number"
             raise InputError(doing, "t", f"shape {list(t.shape)}", do)
         if block_latents is not None and block_latents < 1:
-            raise InputError(doing, "block_latents", str(block_latents), "give at least one latent a block, or None for no causality")
+            raise InputError(
+                doing,
+                "block_latents",
+                str(block_latents),
+                "give at least one latent a block, or None for no causality",
+            )
         if isinstance(text, Tensor):
             self._check_text(text, x.shape[0])
 
     def _check_text(self, text: Tensor, batch: int | None = None) -> None:
         alone = batch is None or (text.ndim == 3 and text.shape[0] in (1, batch))
-        if not alone or text.ndim != 3 or text.shape[2] != self.sizes.text_width or text.shape[1] < 1:
+        if (
+            not alone
+            or text.ndim != 3
+            or text.shape[2] != self.sizes.text_width
+            or text.shape[1] < 1
+        ):
             do = f"give (batch or 1, tokens, {self.sizes.text_width})"
             raise InputError("projecting text features", "text", f"shape {list(text.shape)}", do)
 
     def _check_cache(self, x: Tensor, cache: BlockCache) -> None:
-        made: tuple[object, ...] = (cache.batch, cache.height, cache.width, cache.rope.head_width, cache.rope.ratios)
-        expected: tuple[object, ...] = (x.shape[0], x.shape[3], x.shape[4], self.sizes.head_width, self.rope_ratios)
+        made: tuple[object, ...] = (
+            cache.batch,
+            cache.height,
+            cache.width,
+            cache.rope.head_width,
+            cache.rope.ratios,
+        )
+        expected: tuple[object, ...] = (
+            x.shape[0],
+            x.shape[3],
+            x.shape[4],
+            self.sizes.head_width,
+            self.rope_ratios,
+        )
         if isinstance(cache, RollingCache):
-            made, expected = (*made, *cache.layout), (*expected, self.sizes.blocks, self.sizes.heads, self.dtype)
+            made, expected = (
+                (*made, *cache.layout),
+                (*expected, self.sizes.blocks, self.sizes.heads, self.dtype),
+            )
         if made != expected:
             do = "make the cache with this network's new_cache for this batch and latent size"
             names = "batch, height, width, head width, rope ratios, layers, heads, dtype"
-            raise InputError("running one block with a cache", names, f"cache {made}, block and network {expected}", do)
+            raise InputError(
+                "running one block with a cache",
+                names,
+                f"cache {made}, block and network {expected}",
+                do,
+            )

@@ -1,4 +1,6 @@
-"""The factory of the block generators: what is known of one without loading its networks, and how a session is made."""
+"""The factory of the block generators: what is known of one without loading its networks, and how a
+session is made.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ if TYPE_CHECKING:
     from alpasim_plugin.block_fixers.onefixer import OneFixer
 
 
-def _session(settings: OneFixerSettings, scene_id: str, seed: int, device: str, threads: int | None) -> OneFixer:
+def _session(
+    settings: OneFixerSettings, scene_id: str, seed: int, device: str, threads: int | None
+) -> OneFixer:
     from alpasim_plugin.block_fixers.onefixer import OneFixer  # loads torch
 
     return OneFixer(settings, scene_id, seed, device, threads)

@@ -1,11 +1,12 @@
 """Capture a function of tensors once and replay it: CUDA graphs, one per shape of the arguments.
 
-A captured function uses fixed addresses. Arguments are copied into static buffers, the graph runs, results are copied out; so the caller's
-tensors are not written to, and results stay valid after the next call. Other tensors that the function uses (weights, a rolling cache)
-must keep their address. Python code in the function runs at capture only: open and close cache blocks around the call.
+A captured function uses fixed addresses. Arguments are copied into static buffers, the graph runs,
+results are copied out; so the caller's tensors are not written to, and results stay valid after the
+next call. Other tensors that the function uses (weights, a rolling cache) must keep their address.
+Python code in the function runs at capture only: open and close cache blocks around the call.
 
-There is no silent fallback. A call runs eagerly while its shape is new (`warmups`) or when `limit` shapes have been recorded; `counts`
-holds how often. A function that cannot be captured is an error.
+There is no silent fallback. A call runs eagerly while its shape is new (`warmups`) or when `limit`
+shapes have been recorded; `counts` holds how often. A function that cannot be captured is an error.
 """
 
 from __future__ import annotations
@@ -52,10 +53,12 @@ class CudaRecorder:
         self._pool: Any = None  # torch's handle of a memory pool
 
     def record(self, function: Callable[[], Any]) -> Recording:
-        """Run ``function`` once on a side stream, so that libraries allocate their workspaces, then capture it.
+        """Run ``function`` once on a side stream, so that libraries allocate their workspaces, then
+        capture it.
 
         Raises:
-            InfrastructureError: It cannot be captured, for example because it synchronises with the device.
+            InfrastructureError: It cannot be captured, for example because it synchronises with the
+                device.
         """
         try:
             with torch.cuda.device(self._device):
@@ -70,7 +73,9 @@ class CudaRecorder:
         except RuntimeError as error:
             found = str(error).splitlines()[0]
             do = "run without graphs (for a fixer: --set fixer.graphs=off) and report this"
-            raise InfrastructureError("recording a CUDA graph", str(self._device), found, do) from error
+            raise InfrastructureError(
+                "recording a CUDA graph", str(self._device), found, do
+            ) from error
         self._pool = self._pool or graph.pool()
         return Recording(outputs, graph.replay)
 
@@ -85,16 +90,21 @@ class GraphedFunction:
     """Call a function through captured graphs.
 
     Args:
-        function: Takes and returns tensors, bare or in tuples, lists, dictionaries; does not write to its arguments.
+        function: Takes and returns tensors, bare or in tuples, lists, dictionaries; does not write
+            to its arguments.
         recorder: Captures it, such as `CudaRecorder`.
-        warmups: Eager calls of a shape before it is recorded, in which kernels are selected and caches filled.
+        warmups: Eager calls of a shape before it is recorded, in which kernels are selected and
+            caches filled.
         limit: Maximum number of shapes recorded; each keeps its buffers.
 
     Attributes:
-        counts: Calls so far that ran ``eager``, ``recorded`` (and replayed) or ``replayed``, those ``beyond limit`` and ``unrecorded``.
+        counts: Calls so far that ran ``eager``, ``recorded`` (and replayed) or ``replayed``, those
+            ``beyond limit`` and ``unrecorded``.
     """
 
-    def __init__(self, function: Function, recorder: Recorder, warmups: int = 2, limit: int = 4) -> None:
+    def __init__(
+        self, function: Function, recorder: Recorder, warmups: int = 2, limit: int = 4
+    ) -> None:
         self._function, self._recorder = function, recorder
         self.warmups, self.limit = warmups, limit
         self.counts: Counter[str] = Counter()
@@ -117,8 +127,12 @@ class GraphedFunction:
                 self.counts["beyond limit" if full else "eager"] += 1
                 return self._function(*args)
             # The copy keeps strides: kernel selection may depend on them.
-            inputs = tree_map_only(Tensor, lambda x: x.clone(memory_format=torch.preserve_format), args)
-            entry = self._entries[what] = _Entry(inputs, self._recorder.record(lambda: self._function(*inputs)))
+            inputs = tree_map_only(
+                Tensor, lambda x: x.clone(memory_format=torch.preserve_format), args
+            )
+            entry = self._entries[what] = _Entry(
+                inputs, self._recorder.record(lambda: self._function(*inputs))
+            )
             self.counts["recorded"] += 1
         else:
             self.counts["replayed"] += 1
@@ -126,7 +140,9 @@ class GraphedFunction:
                 if isinstance(kept, Tensor):
                     kept.copy_(new)
         entry.recording.replay()
-        return tree_map_only(Tensor, lambda x: x.clone(memory_format=torch.preserve_format), entry.recording.outputs)
+        return tree_map_only(
+            Tensor, lambda x: x.clone(memory_format=torch.preserve_format), entry.recording.outputs
+        )
 
     def eagerly(self, *args: Any) -> Any:
         """Run the function eagerly; counted as ``unrecorded``."""
@@ -136,5 +152,7 @@ class GraphedFunction:
     @staticmethod
     def _signature(args: Any, key: Hashable) -> Hashable:
         leaves, structure = tree_flatten(args)
-        shapes = tuple((x.shape, x.stride(), x.dtype, x.device) if isinstance(x, Tensor) else x for x in leaves)
+        shapes = tuple(
+            (x.shape, x.stride(), x.dtype, x.device) if isinstance(x, Tensor) else x for x in leaves
+        )
         return key, str(structure), shapes

@@ -1,14 +1,15 @@
 """KV caches: a fixed rolling buffer for inference and a list with gradients for training.
 
-Both have the same visibility rule (see `attention`): the window includes the sink and the own block. Keys are stored after the rotary
-embedding at their absolute positions.
+Both have the same visibility rule (see `attention`): the window includes the sink and the own
+block. Keys are stored after the rotary embedding at their absolute positions.
 
-`RollingCache` allocates once. Latent ``i`` is in slot ``i`` if it is a sink, else in slot ``sink + (i - sink) % (window - sink)``, so the
-newest latents overwrite the oldest without moves. Attention is invariant to the order of keys, so the buffer is used unsorted.
-`GraphCache` keeps the tensors of every block with their gradients and grows. It is the reference implementation of the rolling cache.
+`RollingCache` allocates once. Latent ``i`` is in slot ``i`` if it is a sink, else in slot ``sink +
+(i - sink) % (window - sink)``, so the newest latents overwrite the oldest without moves. Attention
+is invariant to the order of keys, so the buffer is used unsorted. `GraphCache` keeps the tensors of
+every block with their gradients and grows. It is the reference implementation of the rolling cache.
 
-A block is a series of forwards at one position: `begin` opens or reopens it, `attend` serves one layer, `commit` keeps the keys and values
-of the last forward and advances.
+A block is a series of forwards at one position: `begin` opens or reopens it, `attend` serves one
+layer, `commit` keeps the keys and values of the last forward and advances.
 """
 
 from __future__ import annotations
@@ -36,20 +37,40 @@ class BlockCache(ABC):
 
     keeps_graph: bool = False
 
-    def __init__(self, rope: Rope3D, batch: int, height: int, width: int, window: int | None, sink: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        rope: Rope3D,
+        batch: int,
+        height: int,
+        width: int,
+        window: int | None,
+        sink: int,
+        device: torch.device,
+    ) -> None:
         doing = "making a cache for a causal network"
         if batch < 1 or height < 2 or width < 2 or height % 2 or width % 2:
             found = f"batch {batch}, latent size {height} x {width}"
-            raise InputError(doing, "batch, height, width", found, "give a positive batch and even latent sizes (pixels / 8)")
+            raise InputError(
+                doing,
+                "batch, height, width",
+                found,
+                "give a positive batch and even latent sizes (pixels / 8)",
+            )
         if sink < 0 or (window is not None and (window < 1 or sink > window)):
             found = f"window {window}, sink {sink}"
-            raise InputError(doing, "window and sink, in latents", found, "use window >= 1 and 0 <= sink <= window")
+            raise InputError(
+                doing,
+                "window and sink, in latents",
+                found,
+                "use window >= 1 and 0 <= sink <= window",
+            )
         self.rope, self.batch, self.height, self.width = rope, batch, height, width
         self.window, self.sink, self.device = window, sink, device
         self.rows, self.columns = height // 2, width // 2
         self.tokens = self.rows * self.columns
         self.position = 0  # absolute index of the open block's first latent
-        self.filled = 0  # latents committed since reset; differs from position in a rollout that does not start at 0
+        # latents committed since reset; differs from position in a rollout that does not start at 0
+        self.filled = 0
         self.open_latents = 0  # length of the open block; 0 between blocks
         self._tables: dict[int, tuple[int, RopeTable]] = {}
 
@@ -58,15 +79,22 @@ class BlockCache(ABC):
         self.position, self.filled, self.open_latents = position, 0, 0
 
     def begin(self, latents: int) -> RopeTable:
-        """Open or reopen the block at the current position, and return the rotary table of its tokens.
+        """Open or reopen the block at the current position, and return the rotary table of its
+        tokens.
 
         In a rolling cache the returned tensors keep their storage for all blocks of one length.
         """
         self.open_latents = latents
         at, table = self._tables.get(latents, (-1, None))
-        with torch.inference_mode(False):  # tensors created in inference mode cannot be written to outside of it
-            if table is None or (at != self.position and self.keeps_graph):  # the backward pass of earlier blocks needs their tables
-                table = self.rope.table(self.position, latents, self.rows, self.columns, self.device)
+        with torch.inference_mode(
+            False
+        ):  # tensors created in inference mode cannot be written to outside of it
+            if table is None or (
+                at != self.position and self.keeps_graph
+            ):  # the backward pass of earlier blocks needs their tables
+                table = self.rope.table(
+                    self.position, latents, self.rows, self.columns, self.device
+                )
             elif at != self.position:
                 self.rope.move(table, self.position, latents)
         self._tables[latents] = (self.position, table)
@@ -80,14 +108,18 @@ class BlockCache(ABC):
         """
         if not self.open_latents:
             do = "run the block first, with write=False if it is not final"
-            raise InputError("keeping a block in a cache", f"latent {self.position}", "no forward to keep", do)
+            raise InputError(
+                "keeping a block in a cache", f"latent {self.position}", "no forward to keep", do
+            )
         self.position += self.open_latents
         self.filled += self.open_latents
         self.open_latents = 0
 
     @abstractmethod
     def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        """Attend from the open block to itself and the visible past; see `attention.attend` for shapes."""
+        """Attend from the open block to itself and the visible past; see `attention.attend` for
+        shapes.
+        """
 
 
 class RollingCache(BlockCache):
@@ -116,7 +148,9 @@ class RollingCache(BlockCache):
         with torch.inference_mode(False):
             self.keys = torch.zeros(shape, device=device, dtype=dtype)
             self.values = torch.zeros(shape, device=device, dtype=dtype)
-            self._rows = torch.zeros(0, dtype=torch.long, device=device)  # buffer rows of the open block's tokens
+            self._rows = torch.zeros(
+                0, dtype=torch.long, device=device
+            )  # buffer rows of the open block's tokens
         self._source: Tensor | None = None  # the block's tokens in those rows; None for all
         self._chosen = (0, 0)  # filled latents and block length that the rows belong to
         self._fits = True
@@ -128,20 +162,32 @@ class RollingCache(BlockCache):
 
     @property
     def visible(self) -> tuple[int, int, bool]:
-        """Visible latents, visible sinks, and whether the block fits in the window; constant once the window is full."""
-        return min(self.size, self.filled + self.open_latents), min(self.sink, self.filled), self._fits
+        """Visible latents, visible sinks, and whether the block fits in the window; constant once
+        the window is full.
+        """
+        return (
+            min(self.size, self.filled + self.open_latents),
+            min(self.sink, self.filled),
+            self._fits,
+        )
 
     def begin(self, latents: int) -> RopeTable:
         """Open the block and choose the slots of its latents.
 
         Raises:
-            InputError: The block is reopened with fewer latents after its first forward overwrote the oldest latents.
+            InputError: The block is reopened with fewer latents after its first forward overwrote
+                the oldest latents.
         """
         overwritten = self.filled + self.open_latents > self.size
         if 0 < latents < self.open_latents and overwritten:
             found = f"{latents} latents after a forward with {self.open_latents} at latent {self.position}"
             do = "repeat a block with its first length (its forwards share slots), or write it, or reset the cache"
-            raise InputError("opening a block of a rolling cache", f"window {self.window}, sink {self.sink}", found, do)
+            raise InputError(
+                "opening a block of a rolling cache",
+                f"window {self.window}, sink {self.sink}",
+                found,
+                do,
+            )
         table = super().begin(latents)
         if self._chosen == (self.filled, latents):  # reopened: no transfer to the device
             return table
@@ -155,7 +201,11 @@ class RollingCache(BlockCache):
         slots = [i if i < self.sink else self.sink + (i - self.sink) % ring for i in kept]
         with torch.inference_mode(False):
             self._rows = self._keep_in_place(self._rows, slots)
-            self._source = None if self._fits else self._keep_in_place(self._source, [i - self.filled for i in kept])
+            self._source = (
+                None
+                if self._fits
+                else self._keep_in_place(self._source, [i - self.filled for i in kept])
+            )
         return table
 
     def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
@@ -168,7 +218,11 @@ class RollingCache(BlockCache):
             end = self.visible[0] * self.tokens
             return attend(q, keys[:, :end], values[:, :end])
         past = self.visible[1] * self.tokens
-        return attend(q, torch.cat([keys[:, :past], own_k], dim=1), torch.cat([values[:, :past], own_v], dim=1))
+        return attend(
+            q,
+            torch.cat([keys[:, :past], own_k], dim=1),
+            torch.cat([values[:, :past], own_v], dim=1),
+        )
 
     def _keep_in_place(self, old: Tensor | None, latents: list[int]) -> Tensor:
         """Return the rows of these latents, in the old tensor's storage if the shape is equal."""
@@ -185,9 +239,20 @@ class GraphCache(BlockCache):
 
     keeps_graph = True
 
-    def __init__(self, rope: Rope3D, batch: int, height: int, width: int, window: int | None, sink: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        rope: Rope3D,
+        batch: int,
+        height: int,
+        width: int,
+        window: int | None,
+        sink: int,
+        device: torch.device,
+    ) -> None:
         super().__init__(rope, batch, height, width, window, sink, device)
-        self._kept: dict[int, list[tuple[Tensor, Tensor]]] = {}  # layer -> per latent k, v: (B, tokens, heads, head_width)
+        self._kept: dict[
+            int, list[tuple[Tensor, Tensor]]
+        ] = {}  # layer -> per latent k, v: (B, tokens, heads, head_width)
         self._open: dict[int, tuple[Tensor, Tensor]] = {}
 
     def reset(self, position: int = 0) -> None:
@@ -199,13 +264,25 @@ class GraphCache(BlockCache):
         """Attend to the concatenation of the visible past and the block."""
         self._open[layer] = (k, v)
         kept = self._kept.get(layer, [])
-        visible = [i for i in visible_latents(self.filled, self.filled + self.open_latents, self.window, self.sink) if i < self.filled]
-        return attend(q, torch.cat([*(kept[i][0] for i in visible), k], dim=1), torch.cat([*(kept[i][1] for i in visible), v], dim=1))
+        visible = [
+            i
+            for i in visible_latents(
+                self.filled, self.filled + self.open_latents, self.window, self.sink
+            )
+            if i < self.filled
+        ]
+        return attend(
+            q,
+            torch.cat([*(kept[i][0] for i in visible), k], dim=1),
+            torch.cat([*(kept[i][1] for i in visible), v], dim=1),
+        )
 
     def commit(self) -> None:
         """Keep the tensors of the last forward."""
         for layer, (k, v) in self._open.items():
-            pairs = zip(torch.split(k, self.tokens, dim=1), torch.split(v, self.tokens, dim=1), strict=True)
+            pairs = zip(
+                torch.split(k, self.tokens, dim=1), torch.split(v, self.tokens, dim=1), strict=True
+            )
             self._kept.setdefault(layer, []).extend(pairs)
         self._open = {}
         super().commit()
@@ -218,8 +295,17 @@ class GraphCache(BlockCache):
         """
         if self.open_latents:
             do = "commit the block first, or reset the cache"
-            raise InputError("forking a cache", f"latent {self.position}", "an open block with forwards that were not committed", do)
-        copy = GraphCache(self.rope, self.batch, self.height, self.width, self.window, self.sink, self.device)
+            raise InputError(
+                "forking a cache",
+                f"latent {self.position}",
+                "an open block with forwards that were not committed",
+                do,
+            )
+        copy = GraphCache(
+            self.rope, self.batch, self.height, self.width, self.window, self.sink, self.device
+        )
         copy.position, copy.filled = self.position, self.filled
-        copy._kept = {layer: [(k.detach(), v.detach()) for k, v in kept] for layer, kept in self._kept.items()}
+        copy._kept = {
+            layer: [(k.detach(), v.detach()) for k, v in kept] for layer, kept in self._kept.items()
+        }
         return copy

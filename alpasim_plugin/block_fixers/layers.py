@@ -1,13 +1,16 @@
 """Small layers shared by the transformer's parts: float32 islands, RMS norm, patch order.
 
-Three places stay in float32 whatever the network's precision: the time embedding, the modulation made from it, and the rotary
-positions. `Float32Linear` keeps the first two there even under autocast or after ``net.to(torch.bfloat16)``.
+Three places stay in float32 whatever the network's precision: the time embedding, the modulation
+made from it, and the rotary positions. `Float32Linear` keeps the first two there even under
+autocast or after ``net.to(torch.bfloat16)``.
 
 Embeddings of the transformer: patch tokens, semantic-map tokens and time.
 
-Source: OmniDreams single view (causal HD-map network). Channel order at the input is latent, condition mask, padding mask; the map has
-its own patch embedding and is added to the tokens. The time sinusoid is cosine first; its RMS norm feeds the modulation layers
-directly, while the two-layer map of the raw sinusoid is the additive term that all modulation layers share.
+Source: OmniDreams single view (causal HD-map network). Channel order at the input is latent,
+    condition mask, padding mask; the map has
+its own patch embedding and is added to the tokens. The time sinusoid is cosine first; its RMS norm
+feeds the modulation layers directly, while the two-layer map of the raw sinusoid is the additive
+term that all modulation layers share.
 """
 
 from __future__ import annotations
@@ -34,7 +37,11 @@ class Float32Linear(nn.Linear):
     def forward(self, input: Tensor) -> Tensor:
         """Map ``(..., inputs)`` to ``(..., outputs)`` float32."""
         kind = input.device.type
-        with torch.autocast(kind, enabled=False) if torch.amp.is_autocast_available(kind) else nullcontext():
+        with (
+            torch.autocast(kind, enabled=False)
+            if torch.amp.is_autocast_available(kind)
+            else nullcontext()
+        ):
             return F.linear(input.float(), self.weight.float())
 
 
@@ -51,7 +58,9 @@ class RMSNorm(nn.Module):
 
 
 def layer_norm(x: Tensor) -> Tensor:
-    """Normalise the last axis to zero mean and unit variance; the network's layer norms have no parameters."""
+    """Normalise the last axis to zero mean and unit variance; the network's layer norms have no
+    parameters.
+    """
     return F.layer_norm(x, (x.shape[-1],), eps=NORM_EPS)
 
 
@@ -66,11 +75,14 @@ def patchify(video: Tensor) -> Tensor:
     """
     b, c, t, h, w = video.shape
     grid = video.reshape(b, c, t, h // PATCH, PATCH, w // PATCH, PATCH)
-    return grid.permute(0, 2, 3, 5, 1, 4, 6).reshape(b, t, (h // PATCH) * (w // PATCH), c * PATCH * PATCH)
+    return grid.permute(0, 2, 3, 5, 1, 4, 6).reshape(
+        b, t, (h // PATCH) * (w // PATCH), c * PATCH * PATCH
+    )
 
 
 def unpatchify(tokens: Tensor, height: int, width: int) -> Tensor:
-    """Join 2x2 patches, channel fastest: the order of the output layer, which differs from the input's.
+    """Join 2x2 patches, channel fastest: the order of the output layer, which differs from the
+    input's.
 
     Args:
         tokens: ``(B, T, H/2 * W/2, 4 * C)`` with the last axis ordered (row, column, channel).
@@ -80,7 +92,9 @@ def unpatchify(tokens: Tensor, height: int, width: int) -> Tensor:
         ``(B, C, T, H, W)``.
     """
     b, t, _, depth = tokens.shape
-    grid = tokens.reshape(b, t, height // PATCH, width // PATCH, PATCH, PATCH, depth // (PATCH * PATCH))
+    grid = tokens.reshape(
+        b, t, height // PATCH, width // PATCH, PATCH, PATCH, depth // (PATCH * PATCH)
+    )
     return grid.permute(0, 6, 1, 2, 4, 3, 5).reshape(b, -1, t, height, width)
 
 
@@ -91,12 +105,18 @@ class PatchLinear(nn.Linear):
         super().__init__(channels * PATCH * PATCH, width, bias=False)
 
     def follow(self, weight: Tensor) -> None:
-        """Become the embedding followed by a linear with this weight ``(outputs, width)``, in place; product in float64."""
-        self.weight = nn.Parameter((weight.double() @ self.weight.double()).to(self.weight.dtype), requires_grad=False)
+        """Become the embedding followed by a linear with this weight ``(outputs, width)``, in
+        place; product in float64.
+        """
+        self.weight = nn.Parameter(
+            (weight.double() @ self.weight.double()).to(self.weight.dtype), requires_grad=False
+        )
         self.out_features = len(weight)
 
     def embed(self, video: Tensor, first_channel: int = 0) -> Tensor:
-        """Embed ``video (B, C, T, H, W)`` as the channels from ``first_channel`` on; return ``(B, T, N, width)``."""
+        """Embed ``video (B, C, T, H, W)`` as the channels from ``first_channel`` on; return ``(B,
+        T, N, width)``.
+        """
         patches = patchify(video)
         start = first_channel * PATCH * PATCH
         return F.linear(patches, self.weight[:, start : start + patches.shape[-1]])
@@ -108,21 +128,25 @@ def sinusoid(t: Tensor, width: int, rounding: torch.dtype = torch.float32) -> Te
     Args:
         t: ``(...)`` time steps, 0 to 1000.
         width: Channels, even.
-        rounding: Precision in which the original training code holds time: with ``torch.bfloat16``, the step, its scaled value and the
-            result are each rounded (937.5 becomes 936).
+        rounding: Precision in which the original training code holds time: with ``torch.bfloat16``,
+            the step, its scaled value and the result are each rounded (937.5 becomes 936).
 
     Returns:
         ``(..., width)`` float32.
     """
     scaled = (t.to(rounding) * TIME_SCALE).float()
     half = width // 2
-    frequency = torch.exp(-math.log(MAX_PERIOD) * torch.arange(half, device=t.device, dtype=torch.float32) / half)
+    frequency = torch.exp(
+        -math.log(MAX_PERIOD) * torch.arange(half, device=t.device, dtype=torch.float32) / half
+    )
     angle = scaled[..., None] * frequency
     return torch.cat([angle.cos(), angle.sin()], dim=-1).to(rounding).float()
 
 
 class TimeMap(nn.Module):
-    """Map the sinusoid to the modulation term shared by every block: ``Linear(SiLU(Linear(s)))``, no biases, float32."""
+    """Map the sinusoid to the modulation term shared by every block: ``Linear(SiLU(Linear(s)))``,
+    no biases, float32.
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -150,7 +174,9 @@ class PatchEmbed(nn.Module):
         return layer
 
 
-def embed_latents(embed: PatchLinear, x: Tensor, condition_mask: Tensor | None, padding_mask: Tensor | None) -> Tensor:
+def embed_latents(
+    embed: PatchLinear, x: Tensor, condition_mask: Tensor | None, padding_mask: Tensor | None
+) -> Tensor:
     """Embed latents together with their masks.
 
     Without a mask it is zero, so its columns of the embedding are skipped.
@@ -158,8 +184,10 @@ def embed_latents(embed: PatchLinear, x: Tensor, condition_mask: Tensor | None, 
     Args:
         embed: Embedding of C + 2 channels.
         x: ``(B, C, T, H, W)``.
-        condition_mask: ``(B, 1, T, H, W)`` or anything that broadcasts to it, 1 where the latent is given.
-        padding_mask: ``(B, 1, h, w)`` at any resolution; resized to the latent's by nearest neighbour.
+        condition_mask: ``(B, 1, T, H, W)`` or anything that broadcasts to it, 1 where the latent is
+            given.
+        padding_mask: ``(B, 1, h, w)`` at any resolution; resized to the latent's by nearest
+            neighbour.
 
     Returns:
         ``(B, T, N, width)``.

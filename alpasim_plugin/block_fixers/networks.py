@@ -1,7 +1,8 @@
 """Cast a trained network to another precision for inference.
 
-In bf16 and fp16 the token stream and the linear layers have that type; the time embedding, the modulation, the rotary angles and the
-arithmetic inside norms stay float32. Cast last: fold at float32 and cast the folded network, so that each weight is rounded once.
+In bf16 and fp16 the token stream and the linear layers have that type; the time embedding, the
+modulation, the rotary angles and the arithmetic inside norms stay float32. Cast last: fold at
+float32 and cast the folded network, so that each weight is rounded once.
 
 The networks of a fixer, from weights or untrained, loaded once per process.
 """
@@ -37,7 +38,11 @@ from alpasim_plugin.fixers.network.machine_probe import require_device
 from alpasim_plugin.fixers.settings import FixerSettings
 
 Precision = Literal["fp32", "bf16", "fp16"]
-DTYPES: Mapping[Precision, torch.dtype] = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
+DTYPES: Mapping[Precision, torch.dtype] = {
+    "fp32": torch.float32,
+    "bf16": torch.bfloat16,
+    "fp16": torch.float16,
+}
 Net = TypeVar("Net", bound=nn.Module)
 DOING = "loading the networks of a fixer"
 TAEHV_WIDTHS = (256, 128, 64, 64)
@@ -61,7 +66,8 @@ def at_precision(net: CosmosCausalDiT, precision: Precision) -> CosmosCausalDiT:
 
 
 def codec_at_precision(codec: Net, precision: Precision) -> Net:
-    """Return a frozen copy of a video autoencoder or decoder at another precision; its constants stay float32.
+    """Return a frozen copy of a video autoencoder or decoder at another precision; its constants
+    stay float32.
 
     Raises:
         InputError: A weight that overflows the precision, named.
@@ -86,7 +92,9 @@ def _cast(net: Net, dtype: torch.dtype, stays: Callable[[str], bool]) -> Net:
     cast: dict[int, object] = {}
     for key, value in net.named_parameters():
         kept = torch.float32 if stays(key) else dtype
-        cast[id(value)] = nn.Parameter(checkpoints.convert(key, value.detach(), kept, "network"), requires_grad=False)
+        cast[id(value)] = nn.Parameter(
+            checkpoints.convert(key, value.detach(), kept, "network"), requires_grad=False
+        )
     return copy.deepcopy(net, cast)
 
 
@@ -109,7 +117,8 @@ class Networks:
 
 
 def load_networks(settings: LatentFixerSettings, device: str = "cpu") -> Networks:
-    """Build the networks that the settings name, or return them if this process has built them before.
+    """Build the networks that the settings name, or return them if this process has built them
+    before.
 
     Raises:
         InputError: Weights that are missing or do not fit.
@@ -117,10 +126,17 @@ def load_networks(settings: LatentFixerSettings, device: str = "cpu") -> Network
     """
     require_device(device, DOING)
     loop = FixerSettings(name="")  # settings of the loop do not change the networks
-    return _load(settings.model_copy(update={key: getattr(loop, key) for key in ("mode", "tolerance_m", "tolerance_deg")}), device)
+    return _load(
+        settings.model_copy(
+            update={key: getattr(loop, key) for key in ("mode", "tolerance_m", "tolerance_deg")}
+        ),
+        device,
+    )
 
 
-def streaming_dit(weights: Mapping[str, Tensor], settings: LatentFixerSettings, source: str) -> CosmosCausalDiT:
+def streaming_dit(
+    weights: Mapping[str, Tensor], settings: LatentFixerSettings, source: str
+) -> CosmosCausalDiT:
     """Build a transformer for streaming inference.
 
     Args:
@@ -129,19 +145,26 @@ def streaming_dit(weights: Mapping[str, Tensor], settings: LatentFixerSettings, 
         source: Where the weights come from, for errors.
 
     Raises:
-        InputError: Weights that do not fit together, or that take another condition than the settings give.
+        InputError: Weights that do not fit together, or that take another condition than the
+            settings give.
     """
     net = CosmosCausalDiT.from_state_dict(weights, settings.rope_ratios, source=source)
     expected = condition_sizes(settings)
     found = {key: getattr(net.sizes, key) for key in expected}
     if found != expected:
-        do = "set fixer.render_input and fixer.opacity_input as in its training; its bundle has them"
-        raise InputError(DOING, source, f"{_listed(found)}, streaming gives {_listed(expected)}", do)
+        do = (
+            "set fixer.render_input and fixer.opacity_input as in its training; its bundle has them"
+        )
+        raise InputError(
+            DOING, source, f"{_listed(found)}, streaming gives {_listed(expected)}", do
+        )
     return net
 
 
 def condition_sizes(settings: LatentFixerSettings) -> dict[str, int]:
-    """Return the sizes of the condition that a transformer is given; models without a map take the render, or nothing, in its place."""
+    """Return the sizes of the condition that a transformer is given; models without a map take the
+    render, or nothing, in its place.
+    """
     if not isinstance(settings, OneFixerSettings):
         return {"map_channels": LATENT, "opacity_channels": 0}
     return {
@@ -155,7 +178,12 @@ def _listed(sizes: Mapping[str, int]) -> str:
 
 
 def decode(
-    networks: Networks, settings: LatentFixerSettings, z: Tensor, render: Tensor, opacity: Tensor | None, state: State | None = None
+    networks: Networks,
+    settings: LatentFixerSettings,
+    z: Tensor,
+    render: Tensor,
+    opacity: Tensor | None,
+    state: State | None = None,
 ) -> tuple[Tensor, State]:
     """Decode latents as the settings say.
 
@@ -172,7 +200,9 @@ def decode(
     """
     if not settings.shows_render:
         return networks.decoder.decode_next(z, state, clamp=False)
-    assert isinstance(networks.decoder, TinyVAE), "settings allow no other decoder to see the render"
+    assert isinstance(networks.decoder, TinyVAE), (
+        "settings allow no other decoder to see the render"
+    )
     return networks.decoder.decode_next(z, state, render=render, opacity=opacity, clamp=False)
 
 
@@ -186,26 +216,44 @@ def build_networks(parts: Parts, dit_device: str, codec_device: str) -> Networks
     settings, precision = parts.settings, parts.settings.precision
     plain = parts.dit().to(dit_device)
     with torch.no_grad():
-        text = text_at_precision(plain.encode_text(parts.prompt(plain.sizes).to(dit_device)), precision)
+        text = text_at_precision(
+            plain.encode_text(parts.prompt(plain.sizes).to(dit_device)), precision
+        )
     times = settings.network_times
     fold = settings.fold and len(times) == 1
     # Folded at float32 and cast after that, so that every weight is rounded once.
     dit = at_precision(plain.folded(times[0]) if fold else plain, precision)
-    finalise = at_precision(plain.folded(CONTEXT_STEP), precision) if fold and settings.finalises else dit
+    finalise = (
+        at_precision(plain.folded(CONTEXT_STEP), precision) if fold and settings.finalises else dit
+    )
     vae = codec_at_precision(parts.vae(), settings.codec_precision).to(codec_device)
     own = settings.decoder.kind != "taehv"
-    decoder = vae if own else codec_at_precision(parts.decoder(), settings.codec_precision).to(codec_device)
+    decoder = (
+        vae
+        if own
+        else codec_at_precision(parts.decoder(), settings.codec_precision).to(codec_device)
+    )
     return Networks(dit, finalise, vae, decoder, text, parts.trained, parts.note)
 
 
 class Parts:
-    """The parts of a fixer with their weights: from the bundle, from a file of their own, or initialised as ``untrained`` says."""
+    """The parts of a fixer with their weights: from the bundle, from a file of their own, or
+    initialised as ``untrained`` says.
+    """
 
     def __init__(self, settings: LatentFixerSettings) -> None:
         self.settings, self.weights = settings, settings.weights
-        self.bundle = read_bundle(self.weights.bundle, settings) if self.weights.bundle is not None else None
+        self.bundle = (
+            read_bundle(self.weights.bundle, settings) if self.weights.bundle is not None else None
+        )
         self.trained = self.bundle.trained if self.bundle else self.weights.dit is not None
-        self.note = self.bundle.note if self.bundle else f"weights of {Path(self.weights.dit).name}" if self.weights.dit else ""
+        self.note = (
+            self.bundle.note
+            if self.bundle
+            else f"weights of {Path(self.weights.dit).name}"
+            if self.weights.dit
+            else ""
+        )
         self.note = self.note or f"untrained ({settings.untrained})"
         self.seed = derive_seed("fixer", 0, settings.name)
 
@@ -215,7 +263,11 @@ class Parts:
             found = self.bundle.parts.get(part)
             return None if found is None else (found, f"{self.weights.bundle} ({part})")
         path: str | None = getattr(self.weights, part)
-        return None if path is None else (load_weights(path, sha256=getattr(self.weights.sha256, part)), path)
+        return (
+            None
+            if path is None
+            else (load_weights(path, sha256=getattr(self.weights.sha256, part)), path)
+        )
 
     def dit(self) -> CosmosCausalDiT:
         """Build the transformer."""
@@ -224,25 +276,37 @@ class Parts:
         if given is None:
             self.allow_untrained("dit")
             sizes = DiTSizes(**settings.dit.model_dump(), **condition_sizes(settings))
-            given = initial_weights(sizes, self.seed, zero_velocity=settings.untrained == "identity"), "initial weights"
+            given = (
+                initial_weights(sizes, self.seed, zero_velocity=settings.untrained == "identity"),
+                "initial weights",
+            )
         return streaming_dit(given[0], settings, given[1])
 
     def prompt(self, sizes: DiTSizes) -> Tensor:
-        """Return the prompt's features ``(1, tokens, text_width)``; a zero token for untrained weights."""
+        """Return the prompt's features ``(1, tokens, text_width)``; a zero token for untrained
+        weights.
+        """
         given, name = self.tensors("prompt"), self.prompt_name
         if name is not None:
             return self.named_prompt(name, sizes)
         if given is None:
             if self.trained and self.bundle is None:
-                self.refuse("prompt", "its transformer needs the features of the prompt that it was trained with")
+                self.refuse(
+                    "prompt",
+                    "its transformer needs the features of the prompt that it was trained with",
+                )
             return torch.zeros(1, 1, sizes.text_width)
         text = given[0].get("text")
         if text is None and given[0]:
             found = f"its weights learned several prompts: {', '.join(sorted(given[0]))}"
-            raise InputError(DOING, given[1], found, f"choose one: --set fixer.prompt={min(given[0])}")
+            raise InputError(
+                DOING, given[1], found, f"choose one: --set fixer.prompt={min(given[0])}"
+            )
         if text is None or text.ndim != 2 or text.shape[1] != sizes.text_width:
             found = "no tensor 'text'" if text is None else f"text is {list(text.shape)}"
-            raise InputError(DOING, given[1], found, f"give 'text' of shape [tokens, {sizes.text_width}]")
+            raise InputError(
+                DOING, given[1], found, f"give 'text' of shape [tokens, {sizes.text_width}]"
+            )
         return text.float()[None]
 
     @property
@@ -257,15 +321,32 @@ class Parts:
             InputError: The weights have learned none, or none of that name.
         """
         given = self.tensors("prompt")
-        known = {} if given is None else {key: value for key, value in given[0].items() if key != "text"}
+        known = (
+            {}
+            if given is None
+            else {key: value for key, value in given[0].items() if key != "text"}
+        )
         if name not in known:
             source = self.settings.name if given is None else given[1]
-            found = f"its weights learned the prompts {', '.join(sorted(known))}" if known else "its weights learned no prompts"
-            do = "choose one of these" if known else "leave fixer.prompt out, or give a bundle of 'simrun train fixer --recipe appearance'"
+            found = (
+                f"its weights learned the prompts {', '.join(sorted(known))}"
+                if known
+                else "its weights learned no prompts"
+            )
+            do = (
+                "choose one of these"
+                if known
+                else "leave fixer.prompt out, or give a bundle of 'simrun train fixer --recipe appearance'"
+            )
             raise InputError("choosing a prompt", f"{source}, fixer.prompt={name}", found, do)
         text = known[name]
         if text.ndim != 2 or text.shape[1] != sizes.text_width:
-            raise InputError(DOING, f"prompt {name}", f"shape {list(text.shape)}", f"give [tokens, {sizes.text_width}]")
+            raise InputError(
+                DOING,
+                f"prompt {name}",
+                f"shape {list(text.shape)}",
+                f"give [tokens, {sizes.text_width}]",
+            )
         return text.float()[None]
 
     def vae(self) -> Codec:
@@ -295,7 +376,12 @@ class Parts:
 
     def refuse(self, part: str, found: str) -> None:
         """Raise the error for weights that are missing."""
-        raise InputError(DOING, f"{self.settings.name}, weights.{part}", found, weights_to_give(part, self.settings.trained_by))
+        raise InputError(
+            DOING,
+            f"{self.settings.name}, weights.{part}",
+            found,
+            weights_to_give(part, self.settings.trained_by),
+        )
 
 
 def load_tiny_vae(path: str | Path) -> TinyVAE:

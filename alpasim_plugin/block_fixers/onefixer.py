@@ -1,9 +1,12 @@
-"""Noise for the transparent parts of a render: one random stream per scene, seed, camera, draw and latent.
+"""Noise for the transparent parts of a render: one random stream per scene, seed, camera, draw and
+latent.
 
-OneFixer as a streaming session: one causal flow step per block, a history per rollout and camera, every frame guarded.
+OneFixer as a streaming session: one causal flow step per block, a history per rollout and camera,
+every frame guarded.
 
-Frames are grouped into views (`views`), run through the networks (`pipeline`), checked (`guard`) and returned as frames. The session holds
-the history: the pipeline's state, and the last frame of every camera.
+Frames are grouped into views (`views`), run through the networks (`pipeline`), checked (`guard`)
+and returned as frames. The session holds the history: the pipeline's state, and the last frame of
+every camera.
 """
 
 from __future__ import annotations
@@ -18,7 +21,13 @@ from torch import Tensor
 
 from alpasim_plugin.block_fixers.clips import SIDE, TOKEN_PX, crop_clip, to_clip, to_images
 from alpasim_plugin.block_fixers.networks import LATENT, load_networks
-from alpasim_plugin.block_fixers.pipeline import TIMED, BlockPipeline, PipelineState, StageClock, no_clock
+from alpasim_plugin.block_fixers.pipeline import (
+    TIMED,
+    BlockPipeline,
+    PipelineState,
+    StageClock,
+    no_clock,
+)
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer
@@ -30,7 +39,14 @@ from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import DOING, Views, group_views
 
 
-def latent_noise(scene_id: str, seed: int, cameras: Sequence[str], draws: int, latents: range, shape: tuple[int, int, int]) -> list[Tensor]:
+def latent_noise(
+    scene_id: str,
+    seed: int,
+    cameras: Sequence[str],
+    draws: int,
+    latents: range,
+    shape: tuple[int, int, int],
+) -> list[Tensor]:
     """Draw standard normal latents.
 
     Args:
@@ -45,9 +61,14 @@ def latent_noise(scene_id: str, seed: int, cameras: Sequence[str], draws: int, l
     """
 
     def one(draw: int, camera: str, index: int) -> np.ndarray:
-        return stream(scene_id, seed, f"fixer/{camera}/{draw}", index).standard_normal(shape, np.float32)
+        return stream(scene_id, seed, f"fixer/{camera}/{draw}", index).standard_normal(
+            shape, np.float32
+        )
 
-    views = [[np.stack([one(draw, camera, i) for i in latents], axis=1) for camera in cameras] for draw in range(draws)]
+    views = [
+        [np.stack([one(draw, camera, i) for i in latents], axis=1) for camera in cameras]
+        for draw in range(draws)
+    ]
     return [torch.from_numpy(np.stack(view)) for view in views]
 
 
@@ -59,7 +80,9 @@ class ViewsHistory:
     shape: tuple[int, int]  # height and width of their images
     state: PipelineState
     last_t_us: tuple[int, ...] = ()  # per camera; empty before the first block
-    last_fixed: U8 | None = None  # (B, H, W, 3) as decoded, also if the guard returned the raw frame
+    last_fixed: U8 | None = (
+        None  # (B, H, W, 3) as decoded, also if the guard returned the raw frame
+    )
     last_raw: U8 | None = None  # (B, H, W, 3)
 
 
@@ -80,24 +103,43 @@ class OneFixer(Fixer):
         settings: Sizes, weights, window, steps, precision.
         scene_id, seed: Key of the noise, with the camera and the latent's index.
         device: ``cpu`` or ``cuda``.
-        threads: Torch threads that this process may use; as many are used as pay. None leaves their number.
+        threads: Torch threads that this process may use; as many are used as pay. None leaves their
+            number.
 
     Raises:
         InputError: Settings of another fixer, or weights that are missing or do not fit.
     """
 
-    def __init__(self, settings: FixerSettings, scene_id: str, seed: int = 0, device: str = "cpu", threads: int | None = None) -> None:
+    def __init__(
+        self,
+        settings: FixerSettings,
+        scene_id: str,
+        seed: int = 0,
+        device: str = "cpu",
+        threads: int | None = None,
+    ) -> None:
         if not isinstance(settings, OneFixerSettings):
             found = f"settings of type {type(settings).__name__}"
-            raise InputError("making a fixer", settings.name, found, "take them from fixer_settings(name)")
+            raise InputError(
+                "making a fixer", settings.name, found, "take them from fixer_settings(name)"
+            )
         self.chosen: dict[str, Any] = take_threads(threads)
-        self.chosen["precision"] = {"name": settings.precision, "codec": settings.codec_precision, "why": "as set"}
+        self.chosen["precision"] = {
+            "name": settings.precision,
+            "codec": settings.codec_precision,
+            "why": "as set",
+        }
         self.settings, self.scene_id, self.seed = settings, scene_id, seed
         self.networks = load_networks(settings, device)
-        # On an accelerator timing a stage waits for the device and prevents recordings; there the block is timed as a whole.
+        # On an accelerator timing a stage waits for the device and prevents recordings; there the
+        # block is timed as a whole.
         self._clock = StageClock(device) if self.networks.device.type == "cpu" else None
         self.pipeline = BlockPipeline(self.networks, settings, self._clock or no_clock)
-        self.blocks = BlockRule(1, 1) if settings.history == "none" else BlockRule.of_latents(settings.block_latents)
+        self.blocks = (
+            BlockRule(1, 1)
+            if settings.history == "none"
+            else BlockRule.of_latents(settings.block_latents)
+        )
         self.trained = self.networks.trained
         at = f"@{len(settings.steps)}" if len(settings.steps) > 1 else ""
         prompt = "" if settings.prompt is None else f", prompt {settings.prompt}"
@@ -106,8 +148,12 @@ class OneFixer(Fixer):
 
     @property
     def stage_ms(self) -> dict[str, float]:  # type: ignore[override]  # computed when it is read
-        """Total wall time by stage since the session was made, milliseconds; empty where stages are not timed."""
-        return {} if self._clock is None else {name: self._clock.ms.get(name, 0.0) for name in TIMED}
+        """Total wall time by stage since the session was made, milliseconds; empty where stages are
+        not timed.
+        """
+        return (
+            {} if self._clock is None else {name: self._clock.ms.get(name, 0.0) for name in TIMED}
+        )
 
     def reset(self, seed: int) -> None:
         """Drop the history and use the noise of another seed."""
@@ -120,23 +166,30 @@ class OneFixer(Fixer):
         """Fix the block in progress; the history stays as it was.
 
         Args:
-            block: Frames of the rollout's cameras, at most as many per camera as ``blocks`` says. The cameras stay the same.
-            maps: Semantic maps of the same frames, or empty; ignored unless the settings say ``uses_map``.
+            block: Frames of the rollout's cameras, at most as many per camera as ``blocks`` says.
+                The cameras stay the same.
+            maps: Semantic maps of the same frames, or empty; ignored unless the settings say
+                ``uses_map``.
 
         Returns:
             As many frames, same order, times and cameras. Opacity and depth remain the render's.
 
         Raises:
-            InputError: A block that does not continue the rollout, or is not one (see `views.group_views`).
+            InputError: A block that does not continue the rollout, or is not one (see
+                `views.group_views`).
             RendererError: An opacity that is not a number or outside [0, 1].
         """
         views = self._views(block, maps)
         if not self._is_pending(views):
-            self._pending = tuple(self._fix(view, history) for view, history in zip(views, self._history, strict=True))
+            self._pending = tuple(
+                self._fix(view, history) for view, history in zip(views, self._history, strict=True)
+            )
         return self._frames(block)
 
     def step(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
-        """Fix a block and add it to the history. A block equal to the last preview's is not computed again. See `preview`."""
+        """Fix a block and add it to the history. A block equal to the last preview's is not
+        computed again. See `preview`.
+        """
         fixed = self.preview(block, maps)
         self._history = tuple(self._keep(block) for block in self._pending)
         self._pending = ()
@@ -144,42 +197,65 @@ class OneFixer(Fixer):
         return fixed
 
     def _views(self, block: Sequence[Frame], maps: Sequence[U8]) -> tuple[Views, ...]:
-        """Group a block and check that it continues the rollout; a rollout's first block starts its history."""
-        views = group_views(block, maps if self.settings.uses_map else (), self.blocks.frames(self._done))
-        given, known = ([(part.cameras, part.shape) for part in parts] for parts in (views, self._history))
+        """Group a block and check that it continues the rollout; a rollout's first block starts its
+        history.
+        """
+        views = group_views(
+            block, maps if self.settings.uses_map else (), self.blocks.frames(self._done)
+        )
+        given, known = (
+            [(part.cameras, part.shape) for part in parts] for parts in (views, self._history)
+        )
         if given != known and not self._done:
             self._history, self._pending = tuple(self._open(view) for view in views), ()
         elif given != known:
             do = "give the same cameras at the same sizes in every block, or reset"
-            raise InputError(DOING, f"block {self._done}", f"cameras and sizes {given} after {known}", do)
+            raise InputError(
+                DOING, f"block {self._done}", f"cameras and sizes {given} after {known}", do
+            )
         for view, history in zip(views, self._history, strict=True) if self._done else ():
             for camera, times, last in zip(view.cameras, view.t_us, history.last_t_us, strict=True):
                 if times[0] <= last:
                     found = f"a frame at {times[0]} us after one at {last} us"
-                    raise InputError(DOING, f"camera {camera!r}, block {self._done}", found, "give frames in the order of time, or reset")
+                    raise InputError(
+                        DOING,
+                        f"camera {camera!r}, block {self._done}",
+                        found,
+                        "give frames in the order of time, or reset",
+                    )
         return views
 
     def _open(self, view: Views) -> ViewsHistory:
         height, width = (side + -side % TOKEN_PX for side in view.shape)
-        return ViewsHistory(view.cameras, view.shape, self.pipeline.start(len(view.cameras), height, width))
+        return ViewsHistory(
+            view.cameras, view.shape, self.pipeline.start(len(view.cameras), height, width)
+        )
 
     def _is_pending(self, views: Sequence[Views]) -> bool:
         pending = [block.views for block in self._pending]
-        return len(pending) == len(views) and all(view.equals(before) for view, before in zip(views, pending, strict=True))
+        return len(pending) == len(views) and all(
+            view.equals(before) for view, before in zip(views, pending, strict=True)
+        )
 
     def _fix(self, view: Views, history: ViewsHistory) -> PendingBlock:
         clip = to_clip(view, self.blocks.frames(self._done), self.networks.device)
         shape = (LATENT, clip.rgb.shape[3] // SIDE, clip.rgb.shape[4] // SIDE)
         first = self._done if self.settings.history == "none" else history.state.latent
         latents = range(first, first + self.settings.block_latents)
-        drawn = latent_noise(self.scene_id, self.seed, view.cameras, self.pipeline.draws, latents, shape)
+        drawn = latent_noise(
+            self.scene_id, self.seed, view.cameras, self.pipeline.draws, latents, shape
+        )
         noise = [eps.to(self.networks.device) for eps in drawn]
         video, state = self.pipeline.run(history.state, clip.rgb, clip.alpha, clip.maps, noise)
         video = crop_clip(video, view.size)
         images = to_images(video, view.size)
         events = []
         for b in range(len(view.cameras)):
-            before = None if history.last_fixed is None or history.last_raw is None else (history.last_fixed[b], history.last_raw[b])
+            before = (
+                None
+                if history.last_fixed is None or history.last_raw is None
+                else (history.last_fixed[b], history.last_raw[b])
+            )
             events.append(tuple(guard.check_frames(video[b], images[b], view.rgb[b], before)))
         return PendingBlock(view, images, tuple(events), state)
 
@@ -189,8 +265,19 @@ class OneFixer(Fixer):
         if self.settings.history == "none":
             state = self._open(view).state
         else:
-            state = self.pipeline.drop_history(block.state) if has_nan else self.pipeline.keep(block.state)
-        return ViewsHistory(view.cameras, view.shape, state, tuple(times[-1] for times in view.t_us), block.images[:, -1], view.rgb[:, -1])
+            state = (
+                self.pipeline.drop_history(block.state)
+                if has_nan
+                else self.pipeline.keep(block.state)
+            )
+        return ViewsHistory(
+            view.cameras,
+            view.shape,
+            state,
+            tuple(times[-1] for times in view.t_us),
+            block.images[:, -1],
+            view.rgb[:, -1],
+        )
 
     def _frames(self, block: Sequence[Frame]) -> tuple[Frame, ...]:
         out = list(block)
@@ -198,5 +285,9 @@ class OneFixer(Fixer):
             for b, mine in enumerate(pending.views.index):
                 for t, i in enumerate(mine):
                     event = pending.events[b][t]
-                    out[i] = replace(block[i], events=(*block[i].events, event)) if event else replace(block[i], rgb=pending.images[b, t])
+                    out[i] = (
+                        replace(block[i], events=(*block[i].events, event))
+                        if event
+                        else replace(block[i], rgb=pending.images[b, t])
+                    )
         return tuple(out)

@@ -1,14 +1,17 @@
 """The noise schedule: time steps of a sampler and their noise levels.
 
-With shift 5, ``sigma(u) = 5 u / (1 + 4 u)`` for ``u`` in (0, 1], tabulated at 1000 points; the network takes ``1000 sigma``. A *named*
-step, as in "1000, 750, 500, 250", is ``1000 u``, before the shift. The cache write at 128 is after the shift: it is the network's time
-input, and its noise level is that of the nearest entry in the table (0.12993).
+With shift 5, ``sigma(u) = 5 u / (1 + 4 u)`` for ``u`` in (0, 1], tabulated at 1000 points; the
+network takes ``1000 sigma``. A *named* step, as in "1000, 750, 500, 250", is ``1000 u``, before the
+shift. The cache write at 128 is after the shift: it is the network's time input, and its noise
+level is that of the nearest entry in the table (0.12993).
 
 Source: OmniDreams' flow-matching scheduler and self-forcing sampler.
 
-Sampling: from the latents of a render to clean latents (paper, Eq. 1 and 2), and the extension to several steps.
+Sampling: from the latents of a render to clean latents (paper, Eq. 1 and 2), and the extension to
+    several steps.
 
-Noise is an argument. All functions take normalised latents ``(B, C, T, H, W)`` and are differentiable.
+Noise is an argument. All functions take normalised latents ``(B, C, T, H, W)`` and are
+differentiable.
 """
 
 from __future__ import annotations
@@ -33,7 +36,8 @@ OPACITY_CHANNELS = 16  # of `opacity_values`: 4 frames, 2 rows, 2 columns of a l
 
 
 def context_level(t: float = CONTEXT_STEP) -> NoiseLevel:
-    """Return the noise level of the cache write: time input ``t``, sigma of the table's nearest entry.
+    """Return the noise level of the cache write: time input ``t``, sigma of the table's nearest
+    entry.
 
     Example:
         >>> round(context_level().sigma, 5)
@@ -44,7 +48,9 @@ def context_level(t: float = CONTEXT_STEP) -> NoiseLevel:
 
 
 class BlockNet(Protocol):
-    """The network interface of the sampler; `CosmosCausalDiT` and its folded copies implement it."""
+    """The network interface of the sampler; `CosmosCausalDiT` and its folded copies implement
+    it.
+    """
 
     def step(
         self,
@@ -63,10 +69,12 @@ class BlockNet(Protocol):
 def opacity_mask(opacity: Tensor, first: bool = True, nan_as: float | None = None) -> Tensor:
     """Max-pool a renderer's opacity to latent size: the mask ``m`` of Eq. 1.
 
-    A latent covers 4 frames of 8 x 8 pixels. The first frame of a rollout is repeated three times, since the first latent covers it alone.
+    A latent covers 4 frames of 8 x 8 pixels. The first frame of a rollout is repeated three times,
+    since the first latent covers it alone.
 
     Args:
-        opacity: ``(B, 1, frames, H, W)``, 0 to 1; ``1 + 4 n`` frames if ``first``, else ``4 n``; H and W in multiples of 8.
+        opacity: ``(B, 1, frames, H, W)``, 0 to 1; ``1 + 4 n`` frames if ``first``, else ``4 n``; H
+            and W in multiples of 8.
         first: Whether the rollout starts here.
         nan_as: Value that replaces NaN; None refuses NaN.
 
@@ -80,7 +88,8 @@ def opacity_mask(opacity: Tensor, first: bool = True, nan_as: float | None = Non
 
 
 def opacity_values(opacity: Tensor, first: bool = True) -> Tensor:
-    """Average a renderer's opacity over 4 x 4 pixels, as channels of its latents: the input of a network that sees the opacity.
+    """Average a renderer's opacity over 4 x 4 pixels, as channels of its latents: the input of a
+    network that sees the opacity.
 
     Args:
         opacity, first: As for `opacity_mask`.
@@ -94,14 +103,23 @@ def opacity_values(opacity: Tensor, first: bool = True) -> Tensor:
     cells = F.avg_pool3d(_checked_opacity(opacity, first, None), (1, 4, 4))
     b, _, frames, rows, columns = cells.shape
     split = cells.view(b, frames // 4, 4, rows // 2, 2, columns // 2, 2)
-    return split.permute(0, 2, 4, 6, 1, 3, 5).flatten(1, 3)  # (B, frame row column, latents, H / 8, W / 8)
+    return split.permute(0, 2, 4, 6, 1, 3, 5).flatten(
+        1, 3
+    )  # (B, frame row column, latents, H / 8, W / 8)
 
 
 def _checked_opacity(opacity: Tensor, first: bool, nan_as: float | None) -> Tensor:
     """Return opacity in [0, 1], four frames a latent."""
     doing = "pooling opacity to latents"
     frames = opacity.shape[2] if opacity.ndim == 5 else 0
-    if opacity.ndim != 5 or opacity.shape[1] != 1 or frames < 1 or (frames - first) % 4 or opacity.shape[3] % 8 or opacity.shape[4] % 8:
+    if (
+        opacity.ndim != 5
+        or opacity.shape[1] != 1
+        or frames < 1
+        or (frames - first) % 4
+        or opacity.shape[3] % 8
+        or opacity.shape[4] % 8
+    ):
         do = f"give (B, 1, {'1 + 4 n' if first else '4 n'} frames, H, W) with H and W in multiples of 8"
         raise InputError(doing, "opacity", f"shape {list(opacity.shape)}", do)
     if not opacity.is_meta:
@@ -124,7 +142,12 @@ def _without_nan(opacity: Tensor, nan_as: float | None, doing: str) -> Tensor:
         opacity = opacity.masked_fill(unknown, nan_as if nan_as is not None else 0.0)
     low, high = float(opacity.min()), float(opacity.max())
     if low < -SLACK or high > 1 + SLACK:
-        raise InputError(doing, "opacity", f"values from {low:.4g} to {high:.4g}", "give accumulated alpha between 0 and 1")
+        raise InputError(
+            doing,
+            "opacity",
+            f"values from {low:.4g} to {high:.4g}",
+            "give accumulated alpha between 0 and 1",
+        )
     return opacity
 
 
@@ -143,13 +166,17 @@ def mixed_source(z_r: Tensor, m: Tensor, eps: Tensor) -> Tensor:
 
 
 def flow_step(z_t: Tensor, v: Tensor, t: Tensor | float = 1.0) -> Tensor:
-    """Predict the clean latents in one Euler step along the velocity (Eq. 2): ``z_0 = z_t - t v``; in float32 or wider."""
+    """Predict the clean latents in one Euler step along the velocity (Eq. 2): ``z_0 = z_t - t v``;
+    in float32 or wider.
+    """
     wide = torch.promote_types(z_t.dtype, torch.float32)
     return (z_t.to(wide) - t * v.to(wide)).to(z_t.dtype)
 
 
 def sources_needed(schedule: Sequence[NoiseLevel], history: History) -> int:
-    """Return the number of noise tensors for one block: one per step, and one for the cache write."""
+    """Return the number of noise tensors for one block: one per step, and one for the cache
+    write.
+    """
     return len(schedule) + (history == "finalise")
 
 
@@ -167,23 +194,27 @@ def sample_block(
 ) -> Tensor:
     """Sample one block of clean latents and write its keys and values into the cache.
 
-    Each step predicts the clean latents; between steps they are noised again to the next level with a *fresh* source (stochastic, not
-    Euler). The cache keeps the keys and values of the block's last forward: either an extra one over the clean latents, slightly noised at
-    t = 128 (``finalise``), or the last denoising step itself (``last-forward``, one forward less). With ``none`` nothing is kept.
+    Each step predicts the clean latents; between steps they are noised again to the next level with
+    a *fresh* source (stochastic, not Euler). The cache keeps the keys and values of the block's
+    last forward: either an extra one over the clean latents, slightly noised at t = 128
+    (``finalise``), or the last denoising step itself (``last-forward``, one forward less). With
+    ``none`` nothing is kept.
 
     Args:
         net: The network; a folded copy if ``schedule`` has its one step.
-        sources: As many as `sources_needed`: ``z_1`` at the start (Eq. 1, or noise), one for each renoising between steps (mixed again
-            with fresh noise, or noise), then the noise of the cache write. Each ``(B, C, T, H, W)``.
+        sources: As many as `sources_needed`: ``z_1`` at the start (Eq. 1, or noise), one for each
+            renoising between steps (mixed again with fresh noise, or noise), then the noise of the
+            cache write. Each ``(B, C, T, H, W)``.
         text: Prompt, best as a `TextContext`.
         hdmap: ``(B, map_channels, T, H, W)``.
         cache: KV cache of this rollout.
         schedule: Noise levels, the first with sigma 1; see `schedule.steps`.
         history: What the cache keeps.
-        given: ``(B, C, n, H, W)`` known clean latents of the first n of the block: they replace the input of every forward, the cache
-            write included, and the prediction.
+        given: ``(B, C, n, H, W)`` known clean latents of the first n of the block: they replace the
+            input of every forward, the cache write included, and the prediction.
         finalise_net: Network for the cache write, when ``net`` is folded for another time step.
-        commit: False leaves the block open: run it again (for example with its true poses), or keep it with ``cache.commit()``.
+        commit: False leaves the block open: run it again (for example with its true poses), or keep
+            it with ``cache.commit()``.
 
     Returns:
         ``(B, C, T, H, W)`` clean latents.
@@ -193,13 +224,23 @@ def sample_block(
     """
     if len(sources) != sources_needed(schedule, history) or not schedule:
         found = f"{len(sources)} sources for {len(schedule)} steps with history {history!r}"
-        do = f"give {sources_needed(schedule, history)}: one per step" + (", one for the cache write" if history == "finalise" else "")
+        do = f"give {sources_needed(schedule, history)}: one per step" + (
+            ", one for the cache write" if history == "finalise" else ""
+        )
         raise InputError("sampling a block of latents", "sources", found, do)
     fixed, mask = _given(given, sources[0])
     z = sources[0]
     for i, level in enumerate(schedule):
         last = i == len(schedule) - 1
-        v = net.step(fixed(z), level.t, text, hdmap, cache, commit and last and history == "last-forward", mask)
+        v = net.step(
+            fixed(z),
+            level.t,
+            text,
+            hdmap,
+            cache,
+            commit and last and history == "last-forward",
+            mask,
+        )
         z_0 = fixed(flow_step(z, v, level.sigma))
         if not last:
             z = interpolant(z_0, sources[i + 1], schedule[i + 1].sigma)
@@ -231,7 +272,9 @@ def finalise(
 
 
 def _given(given: Tensor | None, like: Tensor) -> tuple[Callable[[Tensor], Tensor], Tensor | None]:
-    """Return a function that overwrites the first latents of a block with known ones, and the condition mask."""
+    """Return a function that overwrites the first latents of a block with known ones, and the
+    condition mask.
+    """
     if given is None:
         return lambda z: z, None
     n = given.shape[2]

@@ -1,4 +1,6 @@
-"""The block generators before they are loaded: settings, kind of bundle, factory, and the appearances that learned prompts ask for."""
+"""The block generators before they are loaded: settings, kind of bundle, factory, and the
+appearances that learned prompts ask for.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from alpasim_plugin.fixers.network import schedule
-from alpasim_plugin.fixers.settings import BundleKind, Part, Positive, Unit, WeightedSettings, check_steps, counted_steps
+from alpasim_plugin.fixers.settings import (
+    BundleKind,
+    Part,
+    Positive,
+    Unit,
+    WeightedSettings,
+    check_steps,
+    counted_steps,
+)
 
 if TYPE_CHECKING:
     pass
@@ -32,8 +42,13 @@ class DiTSettings(Part):
 class CodecSettings(Part):
     """The video autoencoder."""
 
-    kind: Literal["tiny", "wan"] = Field(description="tiny: TinyVAE. wan: the Wan 2.1 autoencoder at any width.")
-    base: Positive = Field(default=96, description="Width of an untrained wan autoencoder: 96 as published, 24 for LightVAE.")
+    kind: Literal["tiny", "wan"] = Field(
+        description="tiny: TinyVAE. wan: the Wan 2.1 autoencoder at any width."
+    )
+    base: Positive = Field(
+        default=96,
+        description="Width of an untrained wan autoencoder: 96 as published, 24 for LightVAE.",
+    )
     widths: tuple[Positive, Positive, Positive, Positive, Positive] = Field(
         default=(64, 96, 96, 64, 48),
         description="Channels of an untrained tiny autoencoder: encoder at 1/4 and 1/8, decoder at 1/8, 1/4 and per frame.",
@@ -48,20 +63,35 @@ class DecoderSettings(Part):
         description="latent: the autoencoder's decoder. render: the same, and it also sees the render's frames (tiny only). "
         "taehv: the tiny Wan decoder.",
     )
-    scaled: bool = Field(default=False, description="taehv: weights expect de-normalised latents (LightTAE).")
+    scaled: bool = Field(
+        default=False, description="taehv: weights expect de-normalised latents (LightTAE)."
+    )
 
 
 class LatentFixerSettings(WeightedSettings):
     """Any fixer with an autoencoder and a transformer on its latents."""
 
     dit: DiTSettings = Field(description="Sizes of the transformer where no weights say them.")
-    rope_ratios: tuple[float, float, float] = Field(default=(3.0, 3.0, 1.0), description="NTK stretch: height, width, time.")
+    rope_ratios: tuple[float, float, float] = Field(
+        default=(3.0, 3.0, 1.0), description="NTK stretch: height, width, time."
+    )
     vae: CodecSettings = Field(description="The video autoencoder.")
-    decoder: DecoderSettings = Field(default=DecoderSettings(), description="From latents to frames.")
-    trained_by: str | None = Field(default=None, description="Command that trains the weights, for the error where there are none.")
-    precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the transformer.")
-    codec_precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the autoencoder.")
-    fold: bool = Field(default=True, description="Fold the modulation into the linears where there is one step.")
+    decoder: DecoderSettings = Field(
+        default=DecoderSettings(), description="From latents to frames."
+    )
+    trained_by: str | None = Field(
+        default=None,
+        description="Command that trains the weights, for the error where there are none.",
+    )
+    precision: Literal["fp32", "bf16", "fp16"] = Field(
+        default="fp32", description="Of the transformer."
+    )
+    codec_precision: Literal["fp32", "bf16", "fp16"] = Field(
+        default="fp32", description="Of the autoencoder."
+    )
+    fold: bool = Field(
+        default=True, description="Fold the modulation into the linears where there is one step."
+    )
 
     @property
     def needed_weights(self) -> tuple[str, ...]:
@@ -86,16 +116,28 @@ class LatentFixerSettings(WeightedSettings):
     @model_validator(mode="after")
     def _decodable(self) -> Self:
         if self.decoder.kind == "render" and self.vae.kind != "tiny":
-            raise ValueError(f"decoder.kind 'render' with vae.kind {self.vae.kind!r} | only the tiny autoencoder can see the render")
+            raise ValueError(
+                f"decoder.kind 'render' with vae.kind {self.vae.kind!r} | only the tiny autoencoder can see the render"
+            )
         if self.decoder.kind == "taehv" and self.vae.kind != "wan":
-            raise ValueError(f"decoder.kind 'taehv' with vae.kind {self.vae.kind!r} | it decodes Wan latents: use vae.kind wan")
+            raise ValueError(
+                f"decoder.kind 'taehv' with vae.kind {self.vae.kind!r} | it decodes Wan latents: use vae.kind wan"
+            )
         return self
 
 
 def latent_kind(name: str, must_match: tuple[str, ...], may_differ: tuple[str, ...]) -> BundleKind:
-    """Return a kind of bundle with a transformer on latents; `BundleKind` explains the arguments."""
+    """Return a kind of bundle with a transformer on latents; `BundleKind` explains the
+    arguments.
+    """
     latent = ("rope_ratios", "vae.kind", "decoder.kind", "decoder.scaled")
-    return BundleKind(name, frozenset({"dit", "vae"}), frozenset({"decoder", "prompt"}), (*latent, *must_match), may_differ)
+    return BundleKind(
+        name,
+        frozenset({"dit", "vae"}),
+        frozenset({"decoder", "prompt"}),
+        (*latent, *must_match),
+        may_differ,
+    )
 
 
 class OneFixerSettings(LatentFixerSettings):
@@ -106,9 +148,18 @@ class OneFixerSettings(LatentFixerSettings):
         must_match=("block_latents", "render_input", "opacity_input"),
         may_differ=("steps", "history", "window", "sink", "holes", "uses_map", "no_map"),
     )
-    window: Positive = Field(default=6, description="Attention window in latents, the block itself and the sink included.")
-    sink: int = Field(default=0, ge=0, description="Attention sink: first latents of the rollout that stay in the window.")
-    steps: tuple[float, ...] = Field(default=(1000.0,), min_length=1, description="Named time steps, falling from 1000.")
+    window: Positive = Field(
+        default=6,
+        description="Attention window in latents, the block itself and the sink included.",
+    )
+    sink: int = Field(
+        default=0,
+        ge=0,
+        description="Attention sink: first latents of the rollout that stay in the window.",
+    )
+    steps: tuple[float, ...] = Field(
+        default=(1000.0,), min_length=1, description="Named time steps, falling from 1000."
+    )
     history: Literal["finalise", "last-forward", "none"] = Field(
         default="last-forward",
         description="Keys and values cached of a block: those of an extra forward (finalise) or of the last step. none: no history, "
@@ -120,14 +171,24 @@ class OneFixerSettings(LatentFixerSettings):
         "render_input.",
     )
     no_map: Literal["nothing", "black"] = Field(
-        default="nothing", description="In the map's place where there is none: nothing is added to the tokens, or a black map is encoded."
+        default="nothing",
+        description="In the map's place where there is none: nothing is added to the tokens, or a black map is encoded.",
     )
-    render_input: bool = Field(default=False, description="Whether the render's latents are a condition beside the map's.")
-    opacity_input: bool = Field(default=False, description="Whether every block of the transformer embeds the opacity (ArtiFixer).")
+    render_input: bool = Field(
+        default=False, description="Whether the render's latents are a condition beside the map's."
+    )
+    opacity_input: bool = Field(
+        default=False,
+        description="Whether every block of the transformer embeds the opacity (ArtiFixer).",
+    )
     prompt: str | None = Field(
-        default=None, description="Name of a prompt that its weights learned, such as night; recipe appearance has clear, night, fog, snow."
+        default=None,
+        description="Name of a prompt that its weights learned, such as night; recipe appearance has clear, night, fog, snow.",
     )
-    graphs: Literal["auto", "off"] = Field(default="auto", description="auto: on a GPU, blocks are recorded as CUDA graphs and replayed.")
+    graphs: Literal["auto", "off"] = Field(
+        default="auto",
+        description="auto: on a GPU, blocks are recorded as CUDA graphs and replayed.",
+    )
 
     @property
     def network_times(self) -> tuple[float, ...]:
@@ -136,7 +197,9 @@ class OneFixerSettings(LatentFixerSettings):
 
     @property
     def shows_render(self) -> bool:
-        """Whether the decoder sees the render; in another appearance than the render's, its detail would show the clear day through."""
+        """Whether the decoder sees the render; in another appearance than the render's, its detail
+        would show the clear day through.
+        """
         return super().shows_render and self.keeps_appearance
 
     @property
@@ -164,9 +227,15 @@ class OneFixerSettings(LatentFixerSettings):
     def _consistent(self) -> OneFixerSettings:
         check_steps(self.steps)
         if self.sink > self.window:
-            raise ValueError(f"sink {self.sink} in a window of {self.window} | the window includes the sink: make it larger")
+            raise ValueError(
+                f"sink {self.sink} in a window of {self.window} | the window includes the sink: make it larger"
+            )
         if self.history == "none" and self.block_latents != 1:
-            raise ValueError(f"block_latents {self.block_latents} without history | frames are fixed one by one: set block_latents 1")
+            raise ValueError(
+                f"block_latents {self.block_latents} without history | frames are fixed one by one: set block_latents 1"
+            )
         if self.holes == "everywhere" and not self.render_input:
-            raise ValueError("holes 'everywhere' without render_input | the network would see nothing of the render: set render_input true")
+            raise ValueError(
+                "holes 'everywhere' without render_input | the network would see nothing of the render: set render_input true"
+            )
         return self

@@ -1,4 +1,5 @@
-"""Sizes of the causal transformer, the checkpoint keys and shapes that follow, and reading sizes from a checkpoint.
+"""Sizes of the causal transformer, the checkpoint keys and shapes that follow, and reading sizes
+from a checkpoint.
 
 Initial weights for training: truncated normal linears, unit gains, zero last modulation.
 """
@@ -29,7 +30,8 @@ CUT = 3.0  # standard deviations
 class DiTSizes:
     """Every size of a `CosmosCausalDiT`; the defaults are OmniDreams single view (2B).
 
-    ``opacity_channels`` above 0 gives every block an embedding of the render's opacity (ArtiFixer), which OmniDreams does not have.
+    ``opacity_channels`` above 0 gives every block an embedding of the render's opacity (ArtiFixer),
+    which OmniDreams does not have.
     """
 
     width: int = 2048
@@ -60,7 +62,11 @@ class DiTSizes:
 
     def shapes(self) -> dict[str, Shape]:
         """Return the shape of every tensor of a checkpoint, by key."""
-        d, a, x, f, hd = self.width, self.adaln_rank, self.context_width, self.mlp_width, self.head_width
+        d = self.width
+        a = self.adaln_rank
+        x = self.context_width
+        f = self.mlp_width
+        hd = self.head_width
         out: dict[str, Shape] = {
             "x_embedder.proj.1.weight": (d, (self.latent_channels + MASK_CHANNELS) * AREA),
             "additional_patch_embedding.proj.1.weight": (d, self.map_channels * AREA),
@@ -77,7 +83,9 @@ class DiTSizes:
             for name, context in zip(ATTENTIONS, (d, x), strict=True):
                 for part, columns in (("q", d), ("k", context), ("v", context), ("output", d)):
                     out[f"blocks.{i}.{name}.{part}_proj.weight"] = (d, columns)
-                out[f"blocks.{i}.{name}.q_norm.weight"] = out[f"blocks.{i}.{name}.k_norm.weight"] = (hd,)
+                out[f"blocks.{i}.{name}.q_norm.weight"] = out[
+                    f"blocks.{i}.{name}.k_norm.weight"
+                ] = (hd,)
             if self.opacity_channels:
                 out[f"blocks.{i}.opacity_embed.weight"] = (d, self.opacity_channels * AREA)
             out[f"blocks.{i}.mlp.layer1.weight"] = (f, d)
@@ -91,8 +99,8 @@ class DiTSizes:
 def read_sizes(shapes: Mapping[str, Shape], source: str) -> DiTSizes:
     """Read all sizes from the tensors of a checkpoint and check every key against them.
 
-    Each size is the majority vote of the tensors that depend on it, so that a single wrong tensor is reported, not all others. A
-    transposed square matrix cannot be detected.
+    Each size is the majority vote of the tensors that depend on it, so that a single wrong tensor
+    is reported, not all others. A transposed square matrix cannot be detected.
 
     Args:
         shapes: Shape of every tensor by key, already cleaned (see `checkpoints.clean`).
@@ -108,7 +116,9 @@ def read_sizes(shapes: Mapping[str, Shape], source: str) -> DiTSizes:
     names = set(DiTSizes(blocks=depth, opacity_channels=bool(embeds)).shapes())
     missing, extra = sorted(names - set(shapes)), sorted(set(shapes) - names)
     if missing or extra:
-        raise _refusal(source, len(shapes), [listed("missing", missing), listed("unexpected", extra)])
+        raise _refusal(
+            source, len(shapes), [listed("missing", missing), listed("unexpected", extra)]
+        )
     sizes = _vote_sizes(shapes, depth, source)
     wrong = []
     for key, expected in sizes.shapes().items():
@@ -128,12 +138,23 @@ def _vote_sizes(shapes: Mapping[str, Shape], depth: int, source: str) -> DiTSize
         return Counter(values).most_common(1)[0][0]
 
     def other_side(keys: Iterable[str], known: int) -> list[int]:
-        """Return the second side of matrices of which one side is known; transposition does not matter."""
+        """Return the second side of matrices of which one side is known; transposition does not
+        matter.
+        """
         return [math.prod(shapes[key]) // known for key in keys]
 
-    squares = [f"blocks.{i}.self_attn.{part}_proj.weight" for i in blocks for part in ("q", "k", "v", "output")]
+    squares = [
+        f"blocks.{i}.self_attn.{part}_proj.weight"
+        for i in blocks
+        for part in ("q", "k", "v", "output")
+    ]
     width = mode(n for key in ("t_embedding_norm.weight", *squares) for n in shapes[key])
-    gains = [f"blocks.{i}.{name}.{part}_norm.weight" for i in blocks for name in ATTENTIONS for part in "qk"]
+    gains = [
+        f"blocks.{i}.{name}.{part}_norm.weight"
+        for i in blocks
+        for name in ATTENTIONS
+        for part in "qk"
+    ]
     head_width = mode(n for key in gains for n in shapes[key])
     if width < 2 or head_width < 2 or width % head_width or head_width % 2:
         found = f"width {width} (self_attn) with head width {head_width} (q_norm, k_norm): no whole number of even heads"
@@ -148,7 +169,9 @@ def _vote_sizes(shapes: Mapping[str, Shape], depth: int, source: str) -> DiTSize
         width=width,
         blocks=depth,
         head_width=head_width,
-        mlp_width=mode(other_side([f"blocks.{i}.mlp.layer{n}.weight" for i in blocks for n in (1, 2)], width)),
+        mlp_width=mode(
+            other_side([f"blocks.{i}.mlp.layer{n}.weight" for i in blocks for n in (1, 2)], width)
+        ),
         adaln_rank=mode(other_side([*ranks, "final_layer.adaln_modulation.1.weight"], width)),
         text_width=mode(other_side(["crossattn_proj.0.weight"], context_width)),
         context_width=context_width,
@@ -172,13 +195,15 @@ def _refusal(source: str, count: int, parts: list[str]) -> InputError:
 def initial_weights(sizes: DiTSizes, seed: int, zero_velocity: bool = False) -> dict[str, Tensor]:
     """Draw a state dict.
 
-    Every linear is truncated normal with deviation ``1 / sqrt(inputs)``, cut at three deviations; norm gains are one, the bias and the
-    final layer's second modulation are zero (the original's initialisation), and so are the embeddings of the opacity (ArtiFixer's).
+    Every linear is truncated normal with deviation ``1 / sqrt(inputs)``, cut at three deviations;
+    norm gains are one, the bias and the final layer's second modulation are zero (the original's
+    initialisation), and so are the embeddings of the opacity (ArtiFixer's).
 
     Args:
         sizes: The network.
         seed: Of the draw, for example from `alpasim_plugin.core.seeding.derive_seed`.
-        zero_velocity: Also zero the output layer: the predicted velocity is then zero, and one step returns its source unchanged.
+        zero_velocity: Also zero the output layer: the predicted velocity is then zero, and one step
+            returns its source unchanged.
 
     Returns:
         Float32 tensors by key, for `CosmosCausalDiT.from_state_dict`.
@@ -189,7 +214,11 @@ def initial_weights(sizes: DiTSizes, seed: int, zero_velocity: bool = False) -> 
         tensor = torch.zeros(shape)
         if key.endswith("norm.weight"):
             tensor.fill_(1.0)
-        elif len(shape) == 2 and key != "final_layer.adaln_modulation.2.weight" and not key.endswith("opacity_embed.weight"):
+        elif (
+            len(shape) == 2
+            and key != "final_layer.adaln_modulation.2.weight"
+            and not key.endswith("opacity_embed.weight")
+        ):
             std = 1 / math.sqrt(shape[1])
             nn.init.trunc_normal_(tensor, std=std, a=-CUT * std, b=CUT * std, generator=generator)
         out[key] = tensor

@@ -1,10 +1,14 @@
-"""Differences between a predicted render request and the true one: whether a frame rendered ahead of time may be shown.
+"""Differences between a predicted render request and the true one: whether a frame rendered ahead
+of time may be shown.
 
-Speculative rendering: frames are returned one by one from blocks that were fixed along predicted poses.
+Speculative rendering: frames are returned one by one from blocks that were fixed along predicted
+poses.
 
-At a block's first frame the rest of the block is predicted from the plan in force, rendered and fixed as a draft. A later frame is taken
-from the draft if the true poses are within tolerance of the predicted ones; otherwise a new draft is made from the true frames so far and
-a new forecast. The block's last frame completes the block of true poses, which enters the fixer's history; its last frame is shown.
+At a block's first frame the rest of the block is predicted from the plan in force, rendered and
+fixed as a draft. A later frame is taken from the draft if the true poses are within tolerance of
+the predicted ones; otherwise a new draft is made from the true frames so far and a new forecast.
+The block's last frame completes the block of true poses, which enters the fixer's history; its last
+frame is shown.
 """
 
 from __future__ import annotations
@@ -22,9 +26,12 @@ from alpasim_plugin.core.types import F64, Frame, RenderRequest
 from alpasim_plugin.fixers.loop import BlockRunner, ConditionedFrame
 from alpasim_plugin.fixers.settings import FixerSettings
 
-NEAR_M = 10.0  # beyond this distance an actor's displacement counts in proportion to its size in the image
+# beyond this distance an actor's displacement counts in proportion to its size in the image
+NEAR_M = 10.0
 ARM_M = 2.5  # an actor's rotation counts as the displacement of a point this far from its centre
-BEHIND_M = 10.0  # an actor whose centre lies further than this behind the camera is not in the image
+BEHIND_M = (
+    10.0  # an actor whose centre lies further than this behind the camera is not in the image
+)
 
 
 @dataclass(frozen=True)
@@ -33,7 +40,9 @@ class Deviation:
 
     camera_m: float  # displacement of the camera, the larger of shutter start and end
     camera_deg: float  # its rotation
-    actor_m: float  # largest displacement of an actor in view, scaled to a distance of `NEAR_M`; infinite if one appeared or left
+    # largest displacement of an actor in view, scaled to a distance of `NEAR_M`; infinite if one
+    # appeared or left
+    actor_m: float
 
     def within(self, tolerance_m: float, tolerance_deg: float) -> bool:
         """Return whether camera and actors are within tolerance."""
@@ -58,7 +67,9 @@ def same_view(predicted: RenderRequest, true: RenderRequest) -> bool:
 
 
 def rotation_rad(a: F64, b: F64) -> float:
-    """Return the angle between the rotations of two transforms ``(4, 4)``, exact to rounding for small angles too."""
+    """Return the angle between the rotations of two transforms ``(4, 4)``, exact to rounding for
+    small angles too.
+    """
     chord = float(np.linalg.norm(a[:3, :3] - b[:3, :3]))
     return 2.0 * math.asin(min(1.0, chord / math.sqrt(8.0)))
 
@@ -91,19 +102,29 @@ class SpeculationStats:
     drafts: int = 0
     redrafts: int = 0  # drafts made in the middle of a block
     forecasts: list[Deviation] = field(default_factory=list)  # of predicted frames
-    shown: list[Deviation] = field(default_factory=list)  # between the pose of the frame shown and the true one
+    shown: list[Deviation] = field(
+        default_factory=list
+    )  # between the pose of the frame shown and the true one
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the counts and, in metres and degrees, the errors of the forecasts and of the frames shown."""
-        counts = {name: getattr(self, name) for name in ("frames", "blocks", "predicted", "hits", "exact", "drafts", "redrafts")}
-        return counts | {"forecast_error": _percentiles(self.forecasts), "shown_error": _percentiles(self.shown)}
+        """Return the counts and, in metres and degrees, the errors of the forecasts and of the
+        frames shown.
+        """
+        counts = {
+            name: getattr(self, name)
+            for name in ("frames", "blocks", "predicted", "hits", "exact", "drafts", "redrafts")
+        }
+        return counts | {
+            "forecast_error": _percentiles(self.forecasts),
+            "shown_error": _percentiles(self.shown),
+        }
 
 
 class SpeculativeRenderer(Renderer):
     """A renderer session whose frames are fixed block by block and returned one by one.
 
-    Cameras with the same frame times are one group and go through the fixer together, as views of one batch; every group has its own
-    fixer.
+    Cameras with the same frame times are one group and go through the fixer together, as views of
+    one batch; every group has its own fixer.
 
     Args:
         runner: Renders and calls the fixer.
@@ -112,13 +133,25 @@ class SpeculativeRenderer(Renderer):
         first: One that is made already.
     """
 
-    def __init__(self, runner: BlockRunner, make_fixer: Callable[[], Fixer], settings: FixerSettings, first: Fixer | None = None) -> None:
+    def __init__(
+        self,
+        runner: BlockRunner,
+        make_fixer: Callable[[], Fixer],
+        settings: FixerSettings,
+        first: Fixer | None = None,
+    ) -> None:
         self.runner, self.settings = runner, settings
         self._make = make_fixer
         self._spare: Fixer | None = first or make_fixer()
-        self.label, self.trained, blocks = self._spare.label, self._spare.trained, self._spare.blocks
+        self.label, self.trained, blocks = (
+            self._spare.label,
+            self._spare.trained,
+            self._spare.blocks,
+        )
         self.chosen = dict(self._spare.chosen)
-        self.lookahead = max(1, max(blocks.first, blocks.then) - 1)  # at least the next frame, which tells cameras of other rates apart
+        self.lookahead = max(
+            1, max(blocks.first, blocks.then) - 1
+        )  # at least the next frame, which tells cameras of other rates apart
         self._groups: dict[tuple[int, ...], _CameraGroup] = {}
         self._group_of: dict[str, _CameraGroup] = {}
         self.stats = SpeculationStats()
@@ -130,7 +163,12 @@ class SpeculativeRenderer(Renderer):
 
     def facts(self) -> dict[str, Any]:
         """Return the fixer's label and the counts so far."""
-        return {"label": self.label, "trained": self.trained, "mode": "speculative", "chosen": self.chosen} | self.stats.as_dict()
+        return {
+            "label": self.label,
+            "trained": self.trained,
+            "mode": "speculative",
+            "chosen": self.chosen,
+        } | self.stats.as_dict()
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame; see `render_batch`."""
@@ -175,8 +213,12 @@ class _CameraGroup:
     cameras: list[str] = field(default_factory=list)
     done: int = 0  # complete blocks
     last_us: int | None = None
-    true: list[list[ConditionedFrame]] = field(default_factory=list)  # instants of the block so far, a frame per camera each
-    draft: list[list[tuple[ConditionedFrame, Frame]]] = field(default_factory=list)  # instants of the block, each per camera
+    true: list[list[ConditionedFrame]] = field(
+        default_factory=list
+    )  # instants of the block so far, a frame per camera each
+    draft: list[list[tuple[ConditionedFrame, Frame]]] = field(
+        default_factory=list
+    )  # instants of the block, each per camera
 
     def emit(self, requests: Sequence[RenderRequest]) -> dict[str, Frame]:
         """Return the frames of one instant by camera."""
@@ -184,10 +226,17 @@ class _CameraGroup:
         self._check(requests)
         place = len(self.true)
         predicted = self.draft[place] if place < len(self.draft) else None
-        self.true.append([self._true_frame(request, predicted, i) for i, request in enumerate(requests)])
+        self.true.append(
+            [self._true_frame(request, predicted, i) for i, request in enumerate(requests)]
+        )
         exact = [Deviation(0.0, 0.0, 0.0)] * len(requests)
-        forecasts = [deviation(item.request, now) for (item, _), now in zip(predicted or (), requests, strict=predicted is not None)]
-        hit = bool(forecasts) and all(d.within(self.settings.tolerance_m, self.settings.tolerance_deg) for d in forecasts)
+        forecasts = [
+            deviation(item.request, now)
+            for (item, _), now in zip(predicted or (), requests, strict=predicted is not None)
+        ]
+        hit = bool(forecasts) and all(
+            d.within(self.settings.tolerance_m, self.settings.tolerance_deg) for d in forecasts
+        )
         self._count(len(requests), forecasts, hit, predicted)
         if place + 1 == self.fixer.blocks.frames(self.done):
             frames, shown = self._complete(), exact
@@ -197,9 +246,14 @@ class _CameraGroup:
             frames, shown = self._make_draft(requests), exact
         self.stats.shown += shown
         missed: Sequence[Deviation | None] = forecasts or [None] * len(frames)
-        return {frame.camera: _measured(frame, off, miss) for frame, off, miss in zip(frames, shown, missed, strict=True)}
+        return {
+            frame.camera: _measured(frame, off, miss)
+            for frame, off, miss in zip(frames, shown, missed, strict=True)
+        }
 
-    def _true_frame(self, request: RenderRequest, predicted: list[tuple[ConditionedFrame, Frame]] | None, i: int) -> ConditionedFrame:
+    def _true_frame(
+        self, request: RenderRequest, predicted: list[tuple[ConditionedFrame, Frame]] | None, i: int
+    ) -> ConditionedFrame:
         if predicted is not None and same_view(predicted[i][0].request, request):
             return predicted[i][0]
         return self.runner.render(request)
@@ -213,31 +267,55 @@ class _CameraGroup:
         return fixed[-1]
 
     def _make_draft(self, requests: Sequence[RenderRequest]) -> list[Frame]:
-        """Fix the true frames so far with the predicted rest of the block and return the newest true ones."""
+        """Fix the true frames so far with the predicted rest of the block and return the newest
+        true ones.
+        """
         left = self.fixer.blocks.frames(self.done) - len(self.true)
         coming = min(left, *(len(request.ahead) for request in requests))
-        block = [*self.true, *([self.runner.render(request.ahead[k]) for request in requests] for k in range(coming))]
+        block = [
+            *self.true,
+            *(
+                [self.runner.render(request.ahead[k]) for request in requests]
+                for k in range(coming)
+            ),
+        ]
         fixed = self._fix(self.fixer.preview, block)
-        self.draft = [list(zip(items, frames, strict=True)) for items, frames in zip(block, fixed, strict=True)]
+        self.draft = [
+            list(zip(items, frames, strict=True))
+            for items, frames in zip(block, fixed, strict=True)
+        ]
         self.stats.drafts += 1
         self.stats.redrafts += len(self.true) > 1
         return fixed[len(self.true) - 1]
 
-    def _fix(self, call: Callable[..., Sequence[Frame]], block: Sequence[Sequence[ConditionedFrame]]) -> list[list[Frame]]:
+    def _fix(
+        self, call: Callable[..., Sequence[Frame]], block: Sequence[Sequence[ConditionedFrame]]
+    ) -> list[list[Frame]]:
         flat = self.runner.fix(self.fixer, call, [item for items in block for item in items])
         n = len(self.cameras)
         return [flat[i : i + n] for i in range(0, len(flat), n)]
 
-    def _count(self, n: int, off: Sequence[Deviation], hit: bool, predicted: list[tuple[ConditionedFrame, Frame]] | None) -> None:
+    def _count(
+        self,
+        n: int,
+        off: Sequence[Deviation],
+        hit: bool,
+        predicted: list[tuple[ConditionedFrame, Frame]] | None,
+    ) -> None:
         self.stats.frames += n
         self.stats.predicted += len(off)
         self.stats.hits += n if hit else 0
         self.stats.forecasts += off
         if predicted is not None:
-            self.stats.exact += sum(item is before for item, (before, _) in zip(self.true[-1], predicted, strict=True))
+            self.stats.exact += sum(
+                item is before for item, (before, _) in zip(self.true[-1], predicted, strict=True)
+            )
 
     def _check(self, requests: Sequence[RenderRequest]) -> None:
-        names, t_us = sorted(request.camera.name for request in requests), {request.t_us for request in requests}
+        names, t_us = (
+            sorted(request.camera.name for request in requests),
+            {request.t_us for request in requests},
+        )
         if names != sorted(self.cameras) or len(t_us) > 1:
             raise RendererError(
                 "rendering for a fixer",
@@ -248,24 +326,39 @@ class _CameraGroup:
         now = next(iter(t_us))
         if self.last_us is not None and now <= self.last_us:
             raise RendererError(
-                "rendering for a fixer", f"{now} us", f"the last frame was of {self.last_us} us", "make a new renderer for every rollout"
+                "rendering for a fixer",
+                f"{now} us",
+                f"the last frame was of {self.last_us} us",
+                "make a new renderer for every rollout",
             )
         self.last_us = now
 
 
 def _measured(frame: Frame, shown: Deviation, forecast: Deviation | None) -> Frame:
     """Add the pose errors of the frame shown and of the forecast to its facts."""
-    facts = {"pose_error_m": shown.camera_m, "pose_error_deg": shown.camera_deg, "actor_error_m": shown.actor_m}
+    facts = {
+        "pose_error_m": shown.camera_m,
+        "pose_error_deg": shown.camera_deg,
+        "actor_error_m": shown.actor_m,
+    }
     if forecast is not None:
         facts |= {"forecast_error_m": forecast.camera_m, "forecast_error_deg": forecast.camera_deg}
-    return replace(frame, facts={**frame.facts, **{name: round(value, 6) for name, value in facts.items()}})
+    return replace(
+        frame, facts={**frame.facts, **{name: round(value, 6) for name, value in facts.items()}}
+    )
 
 
 def _percentiles(errors: Sequence[Deviation]) -> dict[str, dict[str, float] | None]:
-    """Return median, 95th percentile and maximum of each kind of error; None where no value is finite."""
+    """Return median, 95th percentile and maximum of each kind of error; None where no value is
+    finite.
+    """
     out: dict[str, dict[str, float] | None] = {}
     for name in ("camera_m", "camera_deg", "actor_m"):
         values = [value for error in errors if math.isfinite(value := getattr(error, name))]
-        p50, p95, top = (round(float(v), 6) for v in np.percentile(values, (50, 95, 100))) if values else (0.0, 0.0, 0.0)
+        p50, p95, top = (
+            (round(float(v), 6) for v in np.percentile(values, (50, 95, 100)))
+            if values
+            else (0.0, 0.0, 0.0)
+        )
         out[name] = {"p50": p50, "p95": p95, "max": top} if values else None
     return out

@@ -1,7 +1,9 @@
-"""Stand-in weights for measuring: random, of the real sizes, with corrections as large as a trained fixer's.
+"""Stand-in weights for measuring: random, of the real sizes, with corrections as large as a trained
+fixer's.
 
-An identity shows no error of a reduced precision, for its transformer's output is multiplied by zero. With these weights every layer
-contributes, and latents change by a quarter of their standard deviation.
+An identity shows no error of a reduced precision, for its transformer's output is multiplied by
+zero. With these weights every layer contributes, and latents change by a quarter of their standard
+deviation.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ NOTE = "random weights, small corrections"
 
 
 def save_stand_in(path: str | Path, settings: OneFixerSettings, seed: int = 0) -> None:
-    """Write a bundle with stand-in weights for the tiny autoencoder and a transformer, both of the settings' sizes.
+    """Write a bundle with stand-in weights for the tiny autoencoder and a transformer, both of the
+    settings' sizes.
 
     Args:
         path: A ``.safetensors`` file.
@@ -37,14 +40,20 @@ def save_stand_in(path: str | Path, settings: OneFixerSettings, seed: int = 0) -
     for name in (name for name in dit if name.endswith("opacity_embed.weight")):
         draw = stream("fixer-stand-in", seed, name).standard_normal(tuple(dit[name].shape))
         dit[name] = torch.from_numpy(draw).float() / dit[name].shape[1] ** 0.5
-    dit["final_layer.linear.weight"] *= VELOCITY  # its input is normalised, so this is the spread of its output
+    dit["final_layer.linear.weight"] *= (
+        VELOCITY  # its input is normalised, so this is the spread of its output
+    )
     last = dit["final_layer.adaln_modulation.2.weight"]
     draw = stream("fixer-stand-in", seed, "modulation").standard_normal(tuple(last.shape))
-    dit["final_layer.adaln_modulation.2.weight"] = torch.from_numpy(draw).float() * (MODULATION / last.shape[1] ** 0.5)
+    dit["final_layer.adaln_modulation.2.weight"] = torch.from_numpy(draw).float() * (
+        MODULATION / last.shape[1] ** 0.5
+    )
     vae = TinyVAE.random(TinySizes(*settings.vae.widths), key)
     with torch.no_grad():
         for name, head in (("encoder", vae.encoder.head), ("decoder", vae.decoder.head)):
             weight = head.weight
-            noise = stream("fixer-stand-in", seed, f"vae.{name}").standard_normal(tuple(weight.shape))
+            noise = stream("fixer-stand-in", seed, f"vae.{name}").standard_normal(
+                tuple(weight.shape)
+            )
             weight.copy_(torch.from_numpy(noise).float() * (CORRECTION / weight[0].numel() ** 0.5))
     save_bundle(path, {"dit": dit, "vae": vae.state_dict()}, settings, trained=False, note=NOTE)

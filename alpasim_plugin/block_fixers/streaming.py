@@ -1,14 +1,18 @@
 """Streaming state of causal networks: explicit, immutable, passed in and returned.
 
-A causal layer sees one or two past frames; in a stream they come from the previous call. `StreamingState` serves the layers of one pass in
-their fixed order: each layer takes its cached frames and leaves those for the next pass. A `State` is a tuple of tensors that are never
-written to, so a copy is a reference: a stream can be forked, or rolled back to before a speculative block.
+A causal layer sees one or two past frames; in a stream they come from the previous call.
+`StreamingState` serves the layers of one pass in their fixed order: each layer takes its cached
+frames and leaves those for the next pass. A `State` is a tuple of tensors that are never written
+to, so a copy is a reference: a stream can be forked, or rolled back to before a speculative block.
 
-Per-frame layers on videos ``(B, T, H, W, C)``, and the loop over a mix of per-frame and causal layers.
+Per-frame layers on videos ``(B, T, H, W, C)``, and the loop over a mix of per-frame and causal
+layers.
 
-Channels last: norms and 1x1 convolutions act on contiguous vectors, a frame is a contiguous slice, and a CPU's 2D convolutions are fast.
+Channels last: norms and 1x1 convolutions act on contiguous vectors, a frame is a contiguous slice,
+and a CPU's 2D convolutions are fast.
 
-Whole-clip and streaming interface of the video codecs, over their pure step functions `encode_next` and `decode_next`.
+Whole-clip and streaming interface of the video codecs, over their pure step functions `encode_next`
+and `decode_next`.
 """
 
 from __future__ import annotations
@@ -59,7 +63,8 @@ class StreamingState:
             frames: Past frames that the layer sees.
 
         Returns:
-            ``(B, k + T, ...)`` with ``0 <= k <= frames``; no padding is added at the start of a video.
+            ``(B, k + T, ...)`` with ``0 <= k <= frames``; no padding is added at the start of a
+            video.
 
         Raises:
             InputError: Batch or frame size changed in the middle of a stream.
@@ -74,13 +79,21 @@ class StreamingState:
             )
         joined = torch.cat([past, x], dim=1) if past.shape[1] else x
         kept = joined[:, max(0, joined.shape[1] - frames) :]
-        self._new.append((kept.detach() if self._detach else kept).clone())  # a view would keep the memory of the whole pass
+        self._new.append(
+            (kept.detach() if self._detach else kept).clone()
+        )  # a view would keep the memory of the whole pass
         return joined
 
     def shift(self, x: Tensor) -> Tensor:
-        """Return every frame's predecessor, same shape; a zero frame before the first one of the video."""
+        """Return every frame's predecessor, same shape; a zero frame before the first one of the
+        video.
+        """
         joined = self.extend(x, 1)
-        return joined[:, :-1] if joined.shape[1] > x.shape[1] else torch.cat([torch.zeros_like(x[:, :1]), x[:, :-1]], dim=1)
+        return (
+            joined[:, :-1]
+            if joined.shape[1] > x.shape[1]
+            else torch.cat([torch.zeros_like(x[:, :1]), x[:, :-1]], dim=1)
+        )
 
 
 class Stream:
@@ -105,11 +118,14 @@ class Stream:
         return Stream(self._step, self.state)
 
 
-def in_passes(step: Step, x: Tensor, state: State | None, ends: Sequence[int]) -> tuple[Tensor, State]:
-    """Apply a pure step to consecutive parts of ``x (B, C, T, H, W)`` along time and join the results.
+def in_passes(
+    step: Step, x: Tensor, state: State | None, ends: Sequence[int]
+) -> tuple[Tensor, State]:
+    """Apply a pure step to consecutive parts of ``x (B, C, T, H, W)`` along time and join the
+    results.
 
-    One latent a pass bounds memory and makes the result bit-identical for any division of a video into calls: the order of
-    summation is the same.
+    One latent a pass bounds memory and makes the result bit-identical for any division of a video
+    into calls: the order of summation is the same.
 
     Args:
         step: ``step(part, state) -> (y, state)``.
@@ -156,20 +172,32 @@ def split_last(x: Tensor, parts: int) -> Tensor:
 
 
 def channels_to_frames(x: Tensor, parts: int) -> Tensor:
-    """Rearrange ``parts`` groups of channels as consecutive frames: ``(B, T, H, W, parts * C)`` to ``(B, parts * T, H, W, C)``."""
+    """Rearrange ``parts`` groups of channels as consecutive frames: ``(B, T, H, W, parts * C)`` to
+    ``(B, parts * T, H, W, C)``.
+    """
     return split_last(x, parts).movedim(-2, 2).flatten(1, 2)
 
 
-def conv_frames(x: Tensor, weight: Tensor, bias: Tensor | None, stride: int = 1, padding: int = 0) -> Tensor:
+def conv_frames(
+    x: Tensor, weight: Tensor, bias: Tensor | None, stride: int = 1, padding: int = 0
+) -> Tensor:
     """Convolve every frame of ``(B, T, H, W, C)`` with a 2D kernel ``(O, C, kh, kw)``."""
     b, t = x.shape[:2]
-    out = F.conv2d(x.flatten(0, 1).permute(0, 3, 1, 2), weight.contiguous(memory_format=torch.channels_last), bias, stride, padding)
+    out = F.conv2d(
+        x.flatten(0, 1).permute(0, 3, 1, 2),
+        weight.contiguous(memory_format=torch.channels_last),
+        bias,
+        stride,
+        padding,
+    )
     out = out.permute(0, 2, 3, 1)
     return out.reshape(b, t, *out.shape[1:])
 
 
 class Float32Buffers(nn.Module):
-    """A module whose buffers stay float32 when the network changes precision (``net.to(torch.bfloat16)``)."""
+    """A module whose buffers stay float32 when the network changes precision
+    (``net.to(torch.bfloat16)``).
+    """
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         before = dict(self._buffers)
@@ -227,7 +255,8 @@ class PointwiseConv(nn.Module):
 class StreamingDecoder(nn.Module, ABC):
     """Decode clips and streams of latents.
 
-    ``latents_per_pass`` (1; None for all) is the number of latents processed at once, which bounds memory; results differ by rounding only.
+    ``latents_per_pass`` (1; None for all) is the number of latents processed at once, which bounds
+    memory; results differ by rounding only.
     """
 
     latents_per_pass: int | None = 1
@@ -239,7 +268,9 @@ class StreamingDecoder(nn.Module, ABC):
 
     @abstractmethod
     def decode_next(self, *args: Any, **options: Any) -> tuple[Tensor, State]:
-        """Decode the next latents of a stream; a pure function ``(latents, state, **options) -> (frames, state)``."""
+        """Decode the next latents of a stream; a pure function ``(latents, state, **options) ->
+        (frames, state)``.
+        """
 
     def decode(self, z: Tensor, **options: Any) -> Tensor:
         """Decode a whole clip.
@@ -257,7 +288,9 @@ class StreamingDecoder(nn.Module, ABC):
         return self.decode_next(z, None, **options)[0]
 
     def decoder_stream(self, *, detach: bool = True) -> Stream:
-        """Start a stream: ``push(latents, ...) -> frames`` as `decode_next`; its ``state`` is all it holds."""
+        """Start a stream: ``push(latents, ...) -> frames`` as `decode_next`; its ``state`` is all
+        it holds.
+        """
         return Stream(partial(self.decode_next, detach=detach))
 
 
@@ -266,13 +299,16 @@ class StreamingCodec(StreamingDecoder):
 
     @abstractmethod
     def encode_next(self, *args: Any, **options: Any) -> tuple[Tensor, State]:
-        """Encode the next frames of a stream; a pure function ``(frames, state, detach=False) -> (latents, state)``."""
+        """Encode the next frames of a stream; a pure function ``(frames, state, detach=False) ->
+        (latents, state)``.
+        """
 
     def encode(self, video: Tensor) -> Tensor:
         """Encode a whole clip.
 
         Args:
-            video: ``(B, 3, 1 + 4k, H, W)`` in [-1, 1], H and W multiples of 8 (`clips.pad_clip` pads any clip).
+            video: ``(B, 3, 1 + 4k, H, W)`` in [-1, 1], H and W multiples of 8 (`clips.pad_clip`
+                pads any clip).
 
         Returns:
             ``(B, 16, 1 + k, H/8, W/8)``, normalised means; nothing is sampled.
@@ -283,5 +319,7 @@ class StreamingCodec(StreamingDecoder):
         return self.encode_next(video, None)[0]
 
     def encoder_stream(self, *, detach: bool = True) -> Stream:
-        """Start a stream: ``push(frames) -> latents`` as `encode_next`; its ``state`` is all it holds."""
+        """Start a stream: ``push(frames) -> latents`` as `encode_next`; its ``state`` is all it
+        holds.
+        """
         return Stream(partial(self.encode_next, detach=detach))

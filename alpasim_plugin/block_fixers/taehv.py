@@ -1,10 +1,12 @@
 """The tiny decoder for Wan latents (TAEHV, LightTAE): 2D convolutions with one past frame.
 
-Three stages, each: three memory blocks, spatial upsampling by 2, temporal upsampling by 1, 2 and 2. A latent becomes 4 frames, and the
-first three frames of a video are dropped so that the first latent is 1 frame, as in the Wan autoencoder.
+Three stages, each: three memory blocks, spatial upsampling by 2, temporal upsampling by 1, 2 and 2.
+A latent becomes 4 frames, and the first three frames of a video are dropped so that the first
+latent is 1 frame, as in the Wan autoencoder.
 
-Two families of weights share the graph. TAEHV's own Wan weights take the normalised latent; LightTAE's take the de-normalised one
-(``scaled=True``). The tensors do not show which; the wrong choice gives a washed-out image, so the caller must state it.
+Two families of weights share the graph. TAEHV's own Wan weights take the normalised latent;
+LightTAE's take the de-normalised one (``scaled=True``). The tensors do not show which; the wrong
+choice gives a washed-out image, so the caller must state it.
 
 Source: madebyollin/taehv ``taehv.py``; ModelTC/LightX2V ``vae_tiny.py`` for the scaling.
 """
@@ -19,7 +21,13 @@ import torch
 from torch import Tensor, nn
 
 from alpasim_plugin.block_fixers.clips import GROUP, check_latents, pass_ends
-from alpasim_plugin.block_fixers.codec_weights import WAN_MEAN, WAN_STD, LatentStats, fill_random, load_checked
+from alpasim_plugin.block_fixers.codec_weights import (
+    WAN_MEAN,
+    WAN_STD,
+    LatentStats,
+    fill_random,
+    load_checked,
+)
 from alpasim_plugin.block_fixers.streaming import (
     FrameConv,
     PointwiseConv,
@@ -72,7 +80,9 @@ class MemBlock(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         convs = [FrameConv(inputs, width) for inputs in (2 * width, width, width)]
-        self.conv = nn.ModuleList([convs[0], nn.ReLU(inplace=True), convs[1], nn.ReLU(inplace=True), convs[2]])
+        self.conv = nn.ModuleList(
+            [convs[0], nn.ReLU(inplace=True), convs[1], nn.ReLU(inplace=True), convs[2]]
+        )
 
     def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
         """Map ``(B, T, H, W, C)`` to the same shape; the first frame's predecessor is zero."""
@@ -85,14 +95,19 @@ def decoder_layers(latent: int, widths: Sequence[int]) -> nn.ModuleList:
     layers: list[nn.Module] = [SoftClamp(), FrameConv(latent, widths[0]), nn.ReLU(inplace=True)]
     for inputs, outputs, growth in zip(widths[:-1], widths[1:], GROWTH, strict=True):
         layers += [MemBlock(inputs) for _ in range(3)]
-        # The original repeats pixels at the first of these positions. Temporal upsampling is pointwise, so repeating after it is equal
-        # at a quarter of the cost.
-        layers += [nn.Identity(), TemporalUpsample(inputs, growth), UpsampleConv(inputs, outputs, bias=False)]
+        # The original repeats pixels at the first of these positions. Temporal upsampling is
+        # pointwise, so repeating after it is equal at a quarter of the cost.
+        layers += [
+            nn.Identity(),
+            TemporalUpsample(inputs, growth),
+            UpsampleConv(inputs, outputs, bias=False),
+        ]
     return nn.ModuleList([*layers, nn.ReLU(inplace=True), FrameConv(widths[-1], COLOURS)])
 
 
 class TinyDecoder(StreamingDecoder):
-    """Decode normalised Wan latents with a small network; weights are frozen, gradients with respect to the input flow.
+    """Decode normalised Wan latents with a small network; weights are frozen, gradients with
+    respect to the input flow.
 
     Args:
         latent: Channels of the latent.
@@ -124,23 +139,34 @@ class TinyDecoder(StreamingDecoder):
         std: Sequence[float] = WAN_STD,
         source: str = "a state dict",
     ) -> Self:
-        """Build the decoder that ``sd`` holds, at whatever widths it has (256, 128, 64, 64 as published).
+        """Build the decoder that ``sd`` holds, at whatever widths it has (256, 128, 64, 64 as
+        published).
 
         Args:
-            sd: Original keys, alone or under ``model`` or ``state_dict``; ``encoder.*`` is ignored. Of a temporal upsampling layer
-                with more rows than needed, the last ones are used.
+            sd: Original keys, alone or under ``model`` or ``state_dict``; ``encoder.*`` is ignored.
+                Of a temporal upsampling layer with more rows than needed, the last ones are used.
             scaled: True for LightTAE, whose weights expect ``z * std + mean``.
             dtype: Precision of the network.
             mean, std: Latent statistics, used when ``scaled``.
             source: Where ``sd`` comes from, for messages.
 
         Raises:
-            InputError: Missing, unexpected, mis-shaped or transposed keys, or statistics of another length than the latent.
+            InputError: Missing, unexpected, mis-shaped or transposed keys, or statistics of another
+                length than the latent.
         """
-        tensors = {key: value for key, value in unwrap(sd, source).items() if not key.startswith("encoder.")}
+        tensors = {
+            key: value
+            for key, value in unwrap(sd, source).items()
+            if not key.startswith("encoder.")
+        }
         latent, widths = _read_widths(tensors, source)
         if scaled and len(mean) != latent:
-            raise InputError(DOING, source, f"{latent} latent channels, {len(mean)} latent means", "pass mean= and std=, a value a channel")
+            raise InputError(
+                DOING,
+                source,
+                f"{latent} latent channels, {len(mean)} latent means",
+                "pass mean= and std=, a value a channel",
+            )
         with torch.device("meta"):
             net = cls(latent, widths, scaled)
         load_checked(net, _last_rows(tensors, widths), dtype, DOING, source, DO)
@@ -148,7 +174,9 @@ class TinyDecoder(StreamingDecoder):
         return net
 
     @classmethod
-    def random(cls, latent: int, widths: Sequence[int], scaled: bool = False, seed: int = 0) -> Self:
+    def random(
+        cls, latent: int, widths: Sequence[int], scaled: bool = False, seed: int = 0
+    ) -> Self:
         """Build an untrained decoder, for tests and timing."""
         with torch.device("meta"):
             net = cls(latent, widths, scaled)
@@ -156,7 +184,9 @@ class TinyDecoder(StreamingDecoder):
         net.stats = LatentStats() if scaled else None
         return net
 
-    def decode_next(self, z: Tensor, state: State | None, *, clamp: bool = True, detach: bool = False) -> tuple[Tensor, State]:
+    def decode_next(
+        self, z: Tensor, state: State | None, *, clamp: bool = True, detach: bool = False
+    ) -> tuple[Tensor, State]:
         """Decode the next latents of a stream; a pure function.
 
         Args:
@@ -166,18 +196,28 @@ class TinyDecoder(StreamingDecoder):
             detach: Whether to cut gradients after every pass.
 
         Returns:
-            Frames ``(B, 3, n, 8h, 8w)``, n = 4m, or 1 + 4 (m - 1) at the start; and the state for the next call.
+            Frames ``(B, 3, n, 8h, 8w)``, n = 4m, or 1 + 4 (m - 1) at the start; and the state for
+            the next call.
 
         Raises:
             InputError: Another shape.
         """
         check_latents(z, "decoding latents with the tiny decoder", self.latent)
-        video, state = in_passes(partial(self._pass, detach=detach), z.to(self.dtype), state, pass_ends(z.shape[2], self.latents_per_pass))
+        video, state = in_passes(
+            partial(self._pass, detach=detach),
+            z.to(self.dtype),
+            state,
+            pass_ends(z.shape[2], self.latents_per_pass),
+        )
         return (video.clamp(0, 1) if clamp else video) * 2 - 1, state
 
     def _pass(self, z: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
         streaming = StreamingState(state, detach)
-        frames = run_layers(self.decoder, channels_last(z if self.stats is None else self.stats.denormalise(z)), streaming)
+        frames = run_layers(
+            self.decoder,
+            channels_last(z if self.stats is None else self.stats.denormalise(z)),
+            streaming,
+        )
         return channels_first(frames[:, DROPPED if streaming.first else 0 :]), streaming.state
 
     forward = StreamingDecoder.decode
@@ -189,7 +229,9 @@ def _read_widths(tensors: Mapping[str, Tensor], source: str) -> tuple[int, tuple
     stem, last = "decoder.1.weight", f"decoder.{FIRST + STAGE * len(GROWTH) + 1}.weight"
     missing = [key for key in (stem, *first_convs, last) if key not in tensors]
     if missing:
-        raise InputError(DOING, f"{source} ({len(tensors)} tensors)", f"missing: {', '.join(missing)}", DO)
+        raise InputError(
+            DOING, f"{source} ({len(tensors)} tensors)", f"missing: {', '.join(missing)}", DO
+        )
     widths = [tensors[key].numel() for key in first_convs]
     latent = _other_side(tensors[stem], widths[0], stem, source)
     return latent, (*widths, _other_side(tensors[last], COLOURS, last, source))
@@ -198,7 +240,12 @@ def _read_widths(tensors: Mapping[str, Tensor], source: str) -> tuple[int, tuple
 def _other_side(kernel: Tensor, known: int, key: str, source: str) -> int:
     sides = list(kernel.shape[:2])
     if kernel.ndim != 4 or known not in sides:
-        raise InputError(DOING, source, f"wrong shape: {key} is {list(kernel.shape)}, where one side should be {known}", DO)
+        raise InputError(
+            DOING,
+            source,
+            f"wrong shape: {key} is {list(kernel.shape)}, where one side should be {known}",
+            DO,
+        )
     return int(sides[1] if sides[0] == known else sides[0])
 
 

@@ -1,21 +1,25 @@
-"""A causal video autoencoder for CPUs: 4x8x8 compression to 16 channels, as the Wan autoencoder, at a small part of its work.
+"""A causal video autoencoder for CPUs: 4x8x8 compression to 16 channels, as the Wan autoencoder, at
+a small part of its work.
 
-Cost: 2D convolutions only, with one past frame; none above a quarter of the resolution (space-to-depth); the encoder and half of the
+Cost: 2D convolutions only, with one past frame; none above a quarter of the resolution
+    (space-to-depth); the encoder and half of the
 decoder run once per latent, not once per frame; channels last throughout.
 
-The networks predict residuals of a fixed transform (`CosineTransform`). The latent is 16 cosine components of each 4x8x8 group plus the
-encoder's correction; the image is their synthesis plus the decoder's correction. Untrained, both corrections are zero and the round trip is
-a blurred copy.
+The networks predict residuals of a fixed transform (`CosineTransform`). The latent is 16 cosine
+components of each 4x8x8 group plus the encoder's correction; the image is their synthesis plus the
+decoder's correction. Untrained, both corrections are zero and the round trip is a blurred copy.
 
-The decoder can be conditioned on the render. With P the projection on the components, s the synthesised image, r the render and a its
-opacity, it starts from
+The decoder can be conditioned on the render. With P the projection on the components, s the
+synthesised image, r the render and a its opacity, it starts from
 
     s + g (1 - P) a (r - s),
 
-the decoded image with the detail of the render where the render is opaque; the gate g (one value a pixel, 1 when untrained) and an
-additive correction are learned. If the latent encodes the render, untrained decoding returns an opaque render exactly.
+the decoded image with the detail of the render where the render is opaque; the gate g (one value a
+pixel, 1 when untrained) and an additive correction are learned. If the latent encodes the render,
+untrained decoding returns an opaque render exactly.
 
-Frames: 1 + 4k, as Wan's. The first latent's group is the first frame four times; decoding it gives one frame.
+Frames: 1 + 4k, as Wan's. The first latent's group is the first frame four times; decoding it gives
+    one frame.
 """
 
 from __future__ import annotations
@@ -28,7 +32,14 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from alpasim_plugin.block_fixers.clips import GROUP, SIDE, check_frames, check_latents, group_ends, pass_ends
+from alpasim_plugin.block_fixers.clips import (
+    GROUP,
+    SIDE,
+    check_frames,
+    check_latents,
+    group_ends,
+    pass_ends,
+)
 from alpasim_plugin.block_fixers.codec_weights import LatentStats, fill_random, load_checked
 from alpasim_plugin.block_fixers.streaming import (
     State,
@@ -61,7 +72,8 @@ DO = "give a file that TinyVAE.save wrote (keys encoder.*, decoder.*, stats.*)"
 
 
 class TinyVAE(StreamingCodec):
-    """Encode video to latents of about unit variance and back, on a CPU in a few milliseconds a frame.
+    """Encode video to latents of about unit variance and back, on a CPU in a few milliseconds a
+    frame.
 
     Example:
         >>> vae = TinyVAE.random()
@@ -82,7 +94,9 @@ class TinyVAE(StreamingCodec):
 
     @classmethod
     def random(cls, sizes: TinySizes = TinySizes(), seed: int = 0) -> Self:
-        """Build an untrained, trainable network whose round trip is the cosine transform's blurred copy."""
+        """Build an untrained, trainable network whose round trip is the cosine transform's blurred
+        copy.
+        """
         with torch.device("meta"):  # layers would draw initial values from the global generator
             vae = cls(sizes)
         for name, part in (("encoder", vae.encoder), ("decoder", vae.decoder)):
@@ -92,7 +106,13 @@ class TinyVAE(StreamingCodec):
         return vae
 
     @classmethod
-    def from_state_dict(cls, sd: Mapping[str, Tensor], *, dtype: torch.dtype = torch.float32, source: str = "a state dict") -> Self:
+    def from_state_dict(
+        cls,
+        sd: Mapping[str, Tensor],
+        *,
+        dtype: torch.dtype = torch.float32,
+        source: str = "a state dict",
+    ) -> Self:
         """Build the network that ``sd`` holds, at whatever widths it has, frozen.
 
         Raises:
@@ -120,8 +140,12 @@ class TinyVAE(StreamingCodec):
         """Write a safetensors file atomically."""
         write_safetensors(path, self.state_dict(), metadata)
 
-    def encode_next(self, frames: Tensor, state: State | None, *, detach: bool = False) -> tuple[Tensor, State]:
-        """Encode the next frames of a stream; a pure function, with the same rules as `WanVAE.encode_next`."""
+    def encode_next(
+        self, frames: Tensor, state: State | None, *, detach: bool = False
+    ) -> tuple[Tensor, State]:
+        """Encode the next frames of a stream; a pure function, with the same rules as
+        `WanVAE.encode_next`.
+        """
         check_frames(frames, "encoding video frames with the tiny VAE", first=state is None)
         ends = group_ends(frames.shape[2], state is None, self.latents_per_pass)
         return in_passes(partial(self._encode_pass, detach=detach), frames.float(), state, ends)
@@ -136,18 +160,21 @@ class TinyVAE(StreamingCodec):
         clamp: bool = True,
         detach: bool = False,
     ) -> tuple[Tensor, State]:
-        """Decode the next latents of a stream; a pure function, with the same rules as `WanVAE.decode_next`.
+        """Decode the next latents of a stream; a pure function, with the same rules as
+        `WanVAE.decode_next`.
 
         Args:
             z: ``(B, 16, m, h, w)``, any m.
             state: What the call before returned, None at the start of the video.
             render: ``(B, 3, n, 8h, 8w)`` in [-1, 1]: frames whose detail the decoder uses, or None.
-            opacity: ``(B, 1, n, 8h, 8w)``, 0 to 1: coverage of the render; None is opaque everywhere.
+            opacity: ``(B, 1, n, 8h, 8w)``, 0 to 1: coverage of the render; None is opaque
+                everywhere.
             clamp: Whether to cut the result to [-1, 1].
             detach: Whether to cut gradients after every pass.
 
         Returns:
-            Frames ``(B, 3, n, 8h, 8w)``, n = 4m, or 1 + 4 (m - 1) at the start; and the state for the next call.
+            Frames ``(B, 3, n, 8h, 8w)``, n = 4m, or 1 + 4 (m - 1) at the start; and the state for
+            the next call.
 
         Raises:
             InputError: Another shape, or an opacity without a render.
@@ -156,25 +183,41 @@ class TinyVAE(StreamingCodec):
         b, _, m, h, w = z.shape
         frames = GROUP * m - (DROPPED if state is None else 0)
         _check_condition(render, opacity, (b, frames, h * SIDE, w * SIDE))
-        latent_ends, frame_ends = pass_ends(m, self.latents_per_pass), group_ends(frames, state is None, self.latents_per_pass)
-        parts, start, first = [], 0, 0
+        latent_ends, frame_ends = (
+            pass_ends(m, self.latents_per_pass),
+            group_ends(frames, state is None, self.latents_per_pass),
+        )
+        parts = []
+        start = 0
+        first = 0
         for end, last in zip(latent_ends, frame_ends, strict=True):
-            condition = [None if x is None else x[:, :, first:last].float() for x in (render, opacity)]
-            part, state = self._decode_pass(z[:, :, start:end].float(), condition[0], condition[1], state, detach)
+            condition = [
+                None if x is None else x[:, :, first:last].float() for x in (render, opacity)
+            ]
+            part, state = self._decode_pass(
+                z[:, :, start:end].float(), condition[0], condition[1], state, detach
+            )
             parts.append(part)
             start, first = end, last
         assert state is not None
         video = torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]
         return video.clamp(-1, 1) if clamp else video, state
 
-    def _encode_pass(self, frames: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
+    def _encode_pass(
+        self, frames: Tensor, state: State | None, detach: bool
+    ) -> tuple[Tensor, State]:
         streaming = StreamingState(state, detach)
         grid = to_grid(_whole_groups(frames, streaming.first))
         mu = self.transform.analyse(grid) + self.encoder.next(grid.to(self.dtype), streaming)
         return self.stats.normalise(channels_first(mu)).to(self.dtype), streaming.state
 
     def _decode_pass(
-        self, z: Tensor, render: Tensor | None, opacity: Tensor | None, state: State | None, detach: bool
+        self,
+        z: Tensor,
+        render: Tensor | None,
+        opacity: Tensor | None,
+        state: State | None,
+        detach: bool,
     ) -> tuple[Tensor, State]:
         streaming = StreamingState(state, detach)
         mu = channels_last(self.stats.denormalise(z))
@@ -194,11 +237,16 @@ class TinyVAE(StreamingCodec):
         else:
             cover = to_grid(_whole_groups(opacity, streaming.first))
             shown, difference = _per_pixel(shown, cover), _per_pixel(shown - grid, cover)
-        condition = as_frames(shown.to(self.dtype)), None if cover is None else as_frames(cover.to(self.dtype))
+        condition = (
+            as_frames(shown.to(self.dtype)),
+            None if cover is None else as_frames(cover.to(self.dtype)),
+        )
         correction, gate = self.decoder.next(mu.to(self.dtype), condition, streaming)
         assert gate is not None
         detail = split_last(as_frames(self.transform.residue(difference)), CELL)
-        image = torch.addcmul(split_last(frames + correction, CELL), detail, gate.float()[..., None])
+        image = torch.addcmul(
+            split_last(frames + correction, CELL), detail, gate.float()[..., None]
+        )
         return from_grid(image.flatten(-2)).to(self.dtype), streaming.state
 
 
@@ -212,11 +260,19 @@ def _per_pixel(colours: Tensor, factor: Tensor) -> Tensor:
 
 
 def _whole_groups(frames: Tensor, first: bool) -> Tensor:
-    """Repeat the video's first frame three times before it, so that the first latent has a group of four frames."""
-    return torch.cat([frames[:, :, :1].expand(-1, -1, DROPPED, -1, -1), frames], dim=2) if first else frames
+    """Repeat the video's first frame three times before it, so that the first latent has a group of
+    four frames.
+    """
+    return (
+        torch.cat([frames[:, :, :1].expand(-1, -1, DROPPED, -1, -1), frames], dim=2)
+        if first
+        else frames
+    )
 
 
-def _check_condition(render: Tensor | None, opacity: Tensor | None, expected: tuple[int, int, int, int]) -> None:
+def _check_condition(
+    render: Tensor | None, opacity: Tensor | None, expected: tuple[int, int, int, int]
+) -> None:
     b, *size = expected
     for name, given, channels in (("render", render, COLOURS), ("opacity", opacity, 1)):
         if given is not None and tuple(given.shape) != (b, channels, *size):
@@ -227,4 +283,9 @@ def _check_condition(render: Tensor | None, opacity: Tensor | None, expected: tu
                 f"give the {name} of exactly the frames that come out",
             )
     if render is None and opacity is not None:
-        raise InputError("decoding latents with the tiny VAE", "an opacity", "no render with it", "give both, or the render alone")
+        raise InputError(
+            "decoding latents with the tiny VAE",
+            "an opacity",
+            "no render with it",
+            "give both, or the render alone",
+        )

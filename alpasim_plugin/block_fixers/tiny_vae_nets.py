@@ -1,13 +1,18 @@
-"""The fixed transform of the tiny autoencoder: frames as quarter-resolution grids, and 16 DCT components of 4x8x8 pixel groups.
+"""The fixed transform of the tiny autoencoder: frames as quarter-resolution grids, and 16 DCT
+components of 4x8x8 pixel groups.
 
-A group is 4 frames of one 8x8 pixel square. Its orthonormal discrete cosine transform over colour, time, row and column has 768 components;
-the 16 kept ones are those with the most energy in driving video at 256x144 (eleven clips of eight cameras, 10 and 30 frames per second).
-They hold 71 % of the energy beside the mean. Keeping them is an orthogonal projection: analysis after synthesis changes nothing.
+A group is 4 frames of one 8x8 pixel square. Its orthonormal discrete cosine transform over colour,
+time, row and column has 768 components; the 16 kept ones are those with the most energy in driving
+video at 256x144 (eleven clips of eight cameras, 10 and 30 frames per second). They hold 71 % of the
+energy beside the mean. Keeping them is an orthogonal projection: analysis after synthesis changes
+nothing.
 
-The learned parts of the tiny autoencoder: residual corrections of the latent (encoder) and of the image (decoder).
+The learned parts of the tiny autoencoder: residual corrections of the latent (encoder) and of the
+image (decoder).
 
-Layout ``(B, T, H, W, C)`` as everywhere inside the codecs. The last layer of both parts is initialised to zero, so an untrained network
-adds nothing. Attribute names (``fold``, ``grow``, ``see_colour``, ...) are keys of the shipped weights.
+Layout ``(B, T, H, W, C)`` as everywhere inside the codecs. The last layer of both parts is
+initialised to zero, so an untrained network adds nothing. Attribute names (``fold``, ``grow``,
+``see_colour``, ...) are keys of the shipped weights.
 """
 
 from __future__ import annotations
@@ -37,11 +42,23 @@ QUARTER = 4  # side of a grid cell, pixels
 CELL = QUARTER * QUARTER  # pixels of a cell
 # (colour, time, row, column) frequency and standard deviation over driving video in [-1, 1]
 COMPONENTS: tuple[tuple[tuple[int, int, int, int], float], ...] = (
-    ((0, 0, 0, 0), 8.0), ((0, 0, 1, 0), 2.0), ((1, 0, 0, 0), 1.8), ((0, 0, 0, 1), 1.2),
-    ((0, 0, 2, 0), 1.1), ((0, 1, 0, 0), 1.0), ((0, 0, 1, 1), 0.7), ((0, 0, 3, 0), 0.65),
-    ((0, 1, 0, 1), 0.6), ((0, 0, 0, 2), 0.55), ((0, 2, 0, 0), 0.55), ((0, 1, 1, 0), 0.5),
-    ((0, 0, 2, 1), 0.5), ((2, 0, 0, 0), 0.4), ((0, 0, 4, 0), 0.45), ((0, 2, 0, 1), 0.45),
-)  # fmt: skip
+    ((0, 0, 0, 0), 8.0),
+    ((0, 0, 1, 0), 2.0),
+    ((1, 0, 0, 0), 1.8),
+    ((0, 0, 0, 1), 1.2),
+    ((0, 0, 2, 0), 1.1),
+    ((0, 1, 0, 0), 1.0),
+    ((0, 0, 1, 1), 0.7),
+    ((0, 0, 3, 0), 0.65),
+    ((0, 1, 0, 1), 0.6),
+    ((0, 0, 0, 2), 0.55),
+    ((0, 2, 0, 0), 0.55),
+    ((0, 1, 1, 0), 0.5),
+    ((0, 0, 2, 1), 0.5),
+    ((2, 0, 0, 0), 0.4),
+    ((0, 0, 4, 0), 0.45),
+    ((0, 2, 0, 1), 0.45),
+)
 BLACK_OFFSET = -6.8  # mean of the first component: driving video is darker than mid-grey
 SLOPE = 0.1  # of the leaky ReLU
 LATENT = len(COMPONENTS)
@@ -50,24 +67,33 @@ DROPPED = GROUP - 1  # padding frames of the first group
 
 
 def to_grid(video: Tensor) -> Tensor:
-    """Map frames ``(B, C, 4t, H, W)`` to ``(B, t, H/4, W/4, 4 * 16 * C)``, channels ordered (frame, row, column, colour)."""
+    """Map frames ``(B, C, 4t, H, W)`` to ``(B, t, H/4, W/4, 4 * 16 * C)``, channels ordered (frame,
+    row, column, colour).
+    """
     b, c, frames, height, width = video.shape
-    cells = video.reshape(b, c, frames // GROUP, GROUP, height // QUARTER, QUARTER, width // QUARTER, QUARTER)
-    return cells.permute(0, 2, 4, 6, 3, 5, 7, 1).reshape(b, frames // GROUP, height // QUARTER, width // QUARTER, GROUP * CELL * c)
+    cells = video.reshape(
+        b, c, frames // GROUP, GROUP, height // QUARTER, QUARTER, width // QUARTER, QUARTER
+    )
+    return cells.permute(0, 2, 4, 6, 3, 5, 7, 1).reshape(
+        b, frames // GROUP, height // QUARTER, width // QUARTER, GROUP * CELL * c
+    )
 
 
 def from_grid(grid: Tensor) -> Tensor:
     """Rearrange single frames ``(B, T, H/4, W/4, 16 * C)`` out as ``(B, C, T, H, W)``."""
     b, frames, rows, columns, depth = grid.shape
     cells = grid.reshape(b, frames, rows, columns, QUARTER, QUARTER, depth // CELL)
-    return cells.permute(0, 6, 1, 2, 4, 3, 5).reshape(b, depth // CELL, frames, rows * QUARTER, columns * QUARTER)
+    return cells.permute(0, 6, 1, 2, 4, 3, 5).reshape(
+        b, depth // CELL, frames, rows * QUARTER, columns * QUARTER
+    )
 
 
 class CosineTransform(Float32Buffers):
-    """Analyse grids of 4 frames into the 16 components of every 8x8 square, and synthesise them back.
+    """Analyse grids of 4 frames into the 16 components of every 8x8 square, and synthesise them
+    back.
 
-    Both directions use the same fixed orthonormal kernel, computed in code and not stored in weights. Everything here
-    is float32: half precision has an error of one grey level.
+    Both directions use the same fixed orthonormal kernel, computed in code and not stored in
+    weights. Everything here is float32: half precision has an error of one grey level.
     """
 
     kernel: Tensor
@@ -76,8 +102,12 @@ class CosineTransform(Float32Buffers):
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("kernel", _kernel().contiguous(memory_format=torch.channels_last), persistent=False)
-        self.register_buffer("mean", torch.tensor([BLACK_OFFSET] + [0.0] * (len(COMPONENTS) - 1)), persistent=False)
+        self.register_buffer(
+            "kernel", _kernel().contiguous(memory_format=torch.channels_last), persistent=False
+        )
+        self.register_buffer(
+            "mean", torch.tensor([BLACK_OFFSET] + [0.0] * (len(COMPONENTS) - 1)), persistent=False
+        )
         self.register_buffer("std", torch.tensor([std for _, std in COMPONENTS]), persistent=False)
 
     def analyse(self, grid: Tensor) -> Tensor:
@@ -89,7 +119,9 @@ class CosineTransform(Float32Buffers):
         return self._sum(components * self.std + self.mean)
 
     def residue(self, grid: Tensor) -> Tensor:
-        """Return the residual of the projection on the components, ``(B, t, H/4, W/4, 192)``: detail that the latent lacks."""
+        """Return the residual of the projection on the components, ``(B, t, H/4, W/4, 192)``:
+        detail that the latent lacks.
+        """
         return grid - self._sum(self._coefficients(grid))
 
     def _coefficients(self, grid: Tensor) -> Tensor:
@@ -97,16 +129,24 @@ class CosineTransform(Float32Buffers):
 
     def _sum(self, coefficients: Tensor) -> Tensor:
         b, t, rows, columns, _ = coefficients.shape
-        squares = F.linear(coefficients, self.kernel.permute(2, 3, 1, 0).flatten(0, 2)).view(b, t, rows, columns, 2, 2, -1)
+        squares = F.linear(coefficients, self.kernel.permute(2, 3, 1, 0).flatten(0, 2)).view(
+            b, t, rows, columns, 2, 2, -1
+        )
         return squares.permute(0, 1, 2, 4, 3, 5, 6).reshape(b, t, 2 * rows, 2 * columns, -1)
 
 
 def _kernel() -> Tensor:
-    """Return ``(16, 192, 2, 2)``: components by grid channels (frame, row, column, colour) and 2x2 cells."""
-    colour, time, space = _cosines(COLOURS), _cosines(GROUP), _cosines(SIDE)
+    """Return ``(16, 192, 2, 2)``: components by grid channels (frame, row, column, colour) and 2x2
+    cells.
+    """
+    colour = _cosines(COLOURS)
+    time = _cosines(GROUP)
+    space = _cosines(SIDE)
     rows = []
     for (c, t, y, x), _ in COMPONENTS:
-        block = torch.einsum("t,y,x,c->tyxc", time[t], space[y], space[x], colour[c])  # (4, 8, 8, 3)
+        block = torch.einsum(
+            "t,y,x,c->tyxc", time[t], space[y], space[x], colour[c]
+        )  # (4, 8, 8, 3)
         cells = block.reshape(GROUP, 2, QUARTER, 2, QUARTER, COLOURS).permute(0, 2, 4, 5, 1, 3)
         rows.append(cells.reshape(GROUP * CELL * COLOURS, 2, 2))
     return torch.stack(rows).float()
@@ -115,7 +155,8 @@ def _kernel() -> Tensor:
 def _cosines(n: int) -> Tensor:
     """Return the orthonormal DCT-II matrix ``(n, n)``, one frequency a row, float64.
 
-    On the CPU also under another default device: arithmetic on ``meta`` would load torch's compiler, which takes seconds.
+    On the CPU also under another default device: arithmetic on ``meta`` would load torch's
+    compiler, which takes seconds.
     """
     index = torch.arange(n, dtype=torch.float64, device="cpu")
     k, i = index[:, None], index[None]
@@ -131,7 +172,8 @@ class TinySizes:
     Args:
         encoder_quarter, encoder_eighth: Encoder, once per latent.
         decoder_eighth, decoder_quarter: Decoder, once per latent.
-        decoder_frame: Decoder at a quarter of the resolution, once per frame: most of the cost. Multiples of 16 use SIMD fully.
+        decoder_frame: Decoder at a quarter of the resolution, once per frame: most of the cost.
+            Multiples of 16 use SIMD fully.
     """
 
     encoder_quarter: int = 64
@@ -148,17 +190,24 @@ class TinySizes:
             InputError: One of the biases is missing.
         """
         keys = {
-            "encoder_quarter": "encoder.stem.bias", "encoder_eighth": "encoder.fold.bias", "decoder_eighth": "decoder.stem.bias",
-            "decoder_quarter": "decoder.quarter.bias", "decoder_frame": "decoder.mix.last.bias",
-        }  # fmt: skip
+            "encoder_quarter": "encoder.stem.bias",
+            "encoder_eighth": "encoder.fold.bias",
+            "decoder_eighth": "decoder.stem.bias",
+            "decoder_quarter": "decoder.quarter.bias",
+            "decoder_frame": "decoder.mix.last.bias",
+        }
         missing = [key for key in keys.values() if key not in tensors]
         if missing:
-            raise InputError(doing, f"{source} ({len(tensors)} tensors)", f"missing: {', '.join(missing)}", do)
+            raise InputError(
+                doing, f"{source} ({len(tensors)} tensors)", f"missing: {', '.join(missing)}", do
+            )
         return cls(**{field.name: tensors[keys[field.name]].numel() for field in fields(cls)})
 
 
 def activation() -> nn.LeakyReLU:
-    """Return the activation layer, in place; leaky, since units that die under a plain ReLU do not recover in a network this small."""
+    """Return the activation layer, in place; leaky, since units that die under a plain ReLU do not
+    recover in a network this small.
+    """
     return nn.LeakyReLU(SLOPE, inplace=True)
 
 
@@ -172,7 +221,9 @@ class TemporalResidualBlock(nn.Module):
 
     def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
         """Map ``(B, T, H, W, C)`` to the same shape; the first frame's predecessor is zero."""
-        out: Tensor = self.last(F.leaky_relu_(self.first(torch.cat([x, streaming.shift(x)], dim=-1)), SLOPE))
+        out: Tensor = self.last(
+            F.leaky_relu_(self.first(torch.cat([x, streaming.shift(x)], dim=-1)), SLOPE)
+        )
         return F.leaky_relu_(out.add_(x), SLOPE)
 
 
@@ -216,7 +267,11 @@ class TinyVAEEncoder(nn.Module):
 
     def next(self, grid: Tensor, streaming: StreamingState) -> Tensor:
         """Map ``(B, t, H/4, W/4, 192)`` to ``(B, t, H/8, W/8, 16)``."""
-        return run_layers((self.stem, activation(), self.near, self.fold, activation(), *self.far, self.head), grid, streaming)
+        return run_layers(
+            (self.stem, activation(), self.near, self.fold, activation(), *self.far, self.head),
+            grid,
+            streaming,
+        )
 
 
 class TinyVAEDecoder(nn.Module):
@@ -224,7 +279,9 @@ class TinyVAEDecoder(nn.Module):
 
     def __init__(self, sizes: TinySizes) -> None:
         super().__init__()
-        eighth, quarter, frame = sizes.decoder_eighth, sizes.decoder_quarter, sizes.decoder_frame
+        eighth = sizes.decoder_eighth
+        quarter = sizes.decoder_quarter
+        frame = sizes.decoder_frame
         self.stem = FrameConv(LATENT, eighth)
         self.far = nn.ModuleList([TemporalResidualBlock(eighth), TemporalResidualBlock(eighth)])
         self.quarter = Upsample(eighth, quarter)
@@ -235,27 +292,45 @@ class TinyVAEDecoder(nn.Module):
         self.mix = TemporalResidualBlock(frame)
         self.head = FrameConv(frame, PIXELS + CELL)
 
-    def next(self, z: Tensor, condition: tuple[Tensor, Tensor | None] | None, streaming: StreamingState) -> tuple[Tensor, Tensor | None]:
+    def next(
+        self, z: Tensor, condition: tuple[Tensor, Tensor | None] | None, streaming: StreamingState
+    ) -> tuple[Tensor, Tensor | None]:
         """Map latents to corrections.
 
         Args:
             z: ``(B, t, H/8, W/8, 16)``.
-            condition: Colours of the render times its opacity ``(B, T, H/4, W/4, 48)``, and the opacity ``(B, T, H/4, W/4, 16)`` or
-                None for opaque; None without a render.
+            condition: Colours of the render times its opacity ``(B, T, H/4, W/4, 48)``, and the
+                opacity ``(B, T, H/4, W/4, 16)`` or None for opaque; None without a render.
             streaming: Cached frames.
 
         Returns:
-            Correction of the frames ``(B, T, H/4, W/4, 48)``, and the gate of the render's detail ``(B, T, H/4, W/4, 16)`` with a render;
-            T is 4t, or 4t - 3 at the start of a video.
+            Correction of the frames ``(B, T, H/4, W/4, 48)``, and the gate of the render's detail
+            ``(B, T, H/4, W/4, 16)`` with a render; T is 4t, or 4t - 3 at the start of a video.
         """
-        latent_rate = (self.stem, activation(), *self.far, self.quarter, activation(), self.near, self.grow)
-        x = channels_to_frames(run_layers(latent_rate, z, streaming), GROUP)[:, DROPPED if streaming.first else 0 :]
+        latent_rate = (
+            self.stem,
+            activation(),
+            *self.far,
+            self.quarter,
+            activation(),
+            self.near,
+            self.grow,
+        )
+        x = channels_to_frames(run_layers(latent_rate, z, streaming), GROUP)[
+            :, DROPPED if streaming.first else 0 :
+        ]
         if condition is not None:
-            covered = self.see_opacity.weight.sum(1) if condition[1] is None else self.see_opacity(condition[1])
+            covered = (
+                self.see_opacity.weight.sum(1)
+                if condition[1] is None
+                else self.see_opacity(condition[1])
+            )
             x = x + self.see_colour(condition[0]) + covered
         x = self.mix.next(F.leaky_relu_(x, SLOPE), streaming)
         if condition is None:
             assert self.head.bias is not None
-            return conv_frames(x, self.head.weight[:PIXELS], self.head.bias[:PIXELS], padding=1), None
+            return conv_frames(
+                x, self.head.weight[:PIXELS], self.head.bias[:PIXELS], padding=1
+            ), None
         out = self.head(x)
         return out[..., :PIXELS], 2 * torch.sigmoid(out[..., PIXELS:])

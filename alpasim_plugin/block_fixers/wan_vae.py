@@ -1,7 +1,8 @@
 """The Wan 2.1 causal video autoencoder: 4x8x8 compression to 16 channels, whole clips or streams.
 
-Frame accounting: the first latent holds 1 frame and every later one 4: 1 + 4k frames and 1 + k latents belong together. An encoder stream
-takes the first frame, alone or with groups of 4 after it, and groups of 4 afterwards; a decoder stream takes any number of latents.
+Frame accounting: the first latent holds 1 frame and every later one 4: 1 + 4k frames and 1 + k
+latents belong together. An encoder stream takes the first frame, alone or with groups of 4 after
+it, and groups of 4 afterwards; a decoder stream takes any number of latents.
 """
 
 from __future__ import annotations
@@ -14,7 +15,13 @@ import torch
 from torch import Tensor, nn
 
 from alpasim_plugin.block_fixers.clips import check_frames, check_latents, group_ends, pass_ends
-from alpasim_plugin.block_fixers.codec_weights import WAN_MEAN, WAN_STD, LatentStats, fill_random, load_checked
+from alpasim_plugin.block_fixers.codec_weights import (
+    WAN_MEAN,
+    WAN_STD,
+    LatentStats,
+    fill_random,
+    load_checked,
+)
 from alpasim_plugin.block_fixers.streaming import (
     PointwiseConv,
     State,
@@ -49,12 +56,16 @@ def residual_blocks(inputs: int, outputs: int, count: int) -> list[nn.Module]:
 
 
 class Coder(nn.Module):
-    """Common part of encoder and decoder: a middle (residual, attention, residual) and a head (norm, SiLU, convolution)."""
+    """Common part of encoder and decoder: a middle (residual, attention, residual) and a head
+    (norm, SiLU, convolution).
+    """
 
     def __init__(self, stem: tuple[int, int], middle: int, head: tuple[int, int]) -> None:
         super().__init__()
         self.conv1 = CausalConv(*stem)
-        self.middle = nn.ModuleList([ResidualBlock(middle, middle), FrameAttention(middle), ResidualBlock(middle, middle)])
+        self.middle = nn.ModuleList(
+            [ResidualBlock(middle, middle), FrameAttention(middle), ResidualBlock(middle, middle)]
+        )
         self.head = nn.ModuleList([ChannelNorm(head[0]), nn.SiLU(), CausalConv(*head)])
 
 
@@ -65,7 +76,9 @@ class Encoder(Coder):
         last = layout.encoder[-1]
         super().__init__((layout.colours, layout.stem), last, (last, 2 * layout.latent))
         blocks: list[nn.Module] = []
-        for stage, (inputs, outputs) in enumerate(zip((layout.stem, *layout.encoder[:-1]), layout.encoder, strict=True)):
+        for stage, (inputs, outputs) in enumerate(
+            zip((layout.stem, *layout.encoder[:-1]), layout.encoder, strict=True)
+        ):
             blocks += residual_blocks(inputs, outputs, layout.blocks)
             if stage < len(ENCODER_TIME):
                 blocks.append(Downsample(outputs, ENCODER_TIME[stage]))
@@ -83,7 +96,9 @@ class Decoder(Coder):
         first = layout.decoder_in[0]
         super().__init__((layout.latent, first), first, (layout.decoder_out[-1], layout.colours))
         blocks: list[nn.Module] = []
-        for stage, (inputs, outputs) in enumerate(zip(layout.decoder_in, layout.decoder_out, strict=True)):
+        for stage, (inputs, outputs) in enumerate(
+            zip(layout.decoder_in, layout.decoder_out, strict=True)
+        ):
             blocks += residual_blocks(inputs, outputs, layout.blocks + 1)
             if stage < len(DECODER_TIME):
                 blocks.append(Upsample(outputs, layout.decoder_in[stage + 1], DECODER_TIME[stage]))
@@ -106,7 +121,9 @@ class WanVAE(StreamingCodec):
         ((1, 16, 2, 2, 3), (1, 3, 5, 16, 24))
     """
 
-    def __init__(self, layout: WanLayout, mean: Sequence[float] = WAN_MEAN, std: Sequence[float] = WAN_STD) -> None:
+    def __init__(
+        self, layout: WanLayout, mean: Sequence[float] = WAN_MEAN, std: Sequence[float] = WAN_STD
+    ) -> None:
         super().__init__()
         self.layout = layout
         self.encoder = Encoder(layout)
@@ -126,16 +143,19 @@ class WanVAE(StreamingCodec):
         std: Sequence[float] = WAN_STD,
         source: str = "a state dict",
     ) -> Self:
-        """Build the network that ``sd`` holds, at whatever width it has (96 as published, 24 for LightVAE).
+        """Build the network that ``sd`` holds, at whatever width it has (96 as published, 24 for
+        LightVAE).
 
         Args:
-            sd: Original keys, alone or under ``model`` or ``state_dict``; any floating precision, also mixed.
+            sd: Original keys, alone or under ``model`` or ``state_dict``; any floating precision,
+                also mixed.
             dtype: Precision of the network.
             mean, std: Latent statistics, one value a channel.
             source: Where ``sd`` comes from, for messages.
 
         Raises:
-            InputError: Missing, unexpected, mis-shaped or transposed keys, or statistics of another length than the latent.
+            InputError: Missing, unexpected, mis-shaped or transposed keys, or statistics of another
+                length than the latent.
         """
         tensors = unwrap(sd, source)
         layout = read_layout(tensors, source)
@@ -157,11 +177,14 @@ class WanVAE(StreamingCodec):
         vae.stats = LatentStats(WAN_MEAN, WAN_STD)
         return vae
 
-    def encode_next(self, frames: Tensor, state: State | None, *, detach: bool = False) -> tuple[Tensor, State]:
+    def encode_next(
+        self, frames: Tensor, state: State | None, *, detach: bool = False
+    ) -> tuple[Tensor, State]:
         """Encode the next frames of a stream; a pure function.
 
         Args:
-            frames: ``(B, 3, n, H, W)``: n = 1 + 4k if ``state`` is None (the video starts here), else 4k.
+            frames: ``(B, 3, n, H, W)``: n = 1 + 4k if ``state`` is None (the video starts here),
+                else 4k.
             state: State after the previous call.
             detach: Whether to cut gradients after every pass.
 
@@ -171,35 +194,51 @@ class WanVAE(StreamingCodec):
         Raises:
             InputError: An invalid number of frames or size.
         """
-        check_frames(frames, "encoding video frames", first=state is None, channels=self.layout.colours)
+        check_frames(
+            frames, "encoding video frames", first=state is None, channels=self.layout.colours
+        )
         ends = group_ends(frames.shape[2], state is None, self.latents_per_pass)
-        return in_passes(partial(self._encode_pass, detach=detach), frames.to(self.dtype), state, ends)
+        return in_passes(
+            partial(self._encode_pass, detach=detach), frames.to(self.dtype), state, ends
+        )
 
-    def decode_next(self, z: Tensor, state: State | None, *, clamp: bool = True, detach: bool = False) -> tuple[Tensor, State]:
+    def decode_next(
+        self, z: Tensor, state: State | None, *, clamp: bool = True, detach: bool = False
+    ) -> tuple[Tensor, State]:
         """Decode the next latents of a stream; a pure function.
 
         Args:
             z: ``(B, 16, m, h, w)``, any m.
             state: State after the previous call, None at the start of the video.
             clamp: Whether to cut the result to [-1, 1].
-            detach: Whether to cut gradients after every pass (one latent a pass is a truncation distance of 1).
+            detach: Whether to cut gradients after every pass (one latent a pass is a truncation
+                distance of 1).
 
         Returns:
-            Frames ``(B, 3, n, 8h, 8w)``, n = 4m, or 1 + 4 (m - 1) at the start; and the state for the next call.
+            Frames ``(B, 3, n, 8h, 8w)``, n = 4m, or 1 + 4 (m - 1) at the start; and the state for
+            the next call.
 
         Raises:
             InputError: Another shape.
         """
         check_latents(z, "decoding video latents", self.layout.latent)
         ends = pass_ends(z.shape[2], self.latents_per_pass)
-        video, state = in_passes(partial(self._decode_pass, detach=detach), z.to(self.dtype), state, ends)
+        video, state = in_passes(
+            partial(self._decode_pass, detach=detach), z.to(self.dtype), state, ends
+        )
         return video.clamp(-1, 1) if clamp else video, state
 
-    def _encode_pass(self, frames: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
+    def _encode_pass(
+        self, frames: Tensor, state: State | None, detach: bool
+    ) -> tuple[Tensor, State]:
         streaming = StreamingState(state, detach)
         moments = self.conv1(self.encoder.next(channels_last(frames), streaming))
-        return self.stats.normalise(channels_first(moments[..., : self.layout.latent])), streaming.state
+        return self.stats.normalise(
+            channels_first(moments[..., : self.layout.latent])
+        ), streaming.state
 
     def _decode_pass(self, z: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
         streaming = StreamingState(state, detach)
-        return channels_first(self.decoder.next(self.conv2(channels_last(self.stats.denormalise(z))), streaming)), streaming.state
+        return channels_first(
+            self.decoder.next(self.conv2(channels_last(self.stats.denormalise(z))), streaming)
+        ), streaming.state

@@ -1,13 +1,15 @@
 """Sizes of a Wan 2.1 autoencoder, read from its tensors.
 
-The graph is fixed: four stages, one residual block more per stage in the decoder than in the encoder, time halved after the second and
-third encoder stage. The widths of the stages vary (96, 192, 384, 384 in the published network, a quarter of that in LightVAE)
-and so may the number of blocks (2).
+The graph is fixed: four stages, one residual block more per stage in the decoder than in the
+encoder, time halved after the second and third encoder stage. The widths of the stages vary (96,
+192, 384, 384 in the published network, a quarter of that in LightVAE) and so may the number of
+blocks (2).
 
 Layers of the Wan 2.1 video autoencoder, with its parameter names and shapes.
 
-Inside, a video is ``(B, T, H, W, C)``. Every layer is causal in time. The first frame of a video is special in the two layers that change
-the frame rate: it passes unchanged, and later frames are processed in groups.
+Inside, a video is ``(B, T, H, W, C)``. Every layer is causal in time. The first frame of a video is
+special in the two layers that change the frame rate: it passes unchanged, and later frames are
+processed in groups.
 
 Source: Wan 2.1 ``wan/modules/vae.py`` (graph, keys, cache rules).
 """
@@ -72,8 +74,12 @@ class WanLayout:
             >>> WanLayout.of_base(96).encoder
             (96, 192, 384, 384)
         """
-        one, two, four = base, 2 * base, 4 * base
-        return cls(3, latent, one, (one, two, four, four), (four, two, two, one), (four, four, two, one))
+        one = base
+        two = 2 * base
+        four = 4 * base
+        return cls(
+            3, latent, one, (one, two, four, four), (four, two, two, one), (four, four, two, one)
+        )
 
 
 def read_layout(sd: Mapping[str, Tensor], source: str = "a state dict") -> WanLayout:
@@ -82,9 +88,18 @@ def read_layout(sd: Mapping[str, Tensor], source: str = "a state dict") -> WanLa
     Raises:
         InputError: A key that gives a width is missing.
     """
-    halvings = [int(key.split(".")[2]) for key in sd if key.startswith("encoder.downsamples.") and ".resample." in key]
+    halvings = [
+        int(key.split(".")[2])
+        for key in sd
+        if key.startswith("encoder.downsamples.") and ".resample." in key
+    ]
     if not halvings:
-        raise InputError(DOING, f"{source} ({len(sd)} tensors)", "missing: encoder.downsamples.2.resample.1.weight", DO)
+        raise InputError(
+            DOING,
+            f"{source} ({len(sd)} tensors)",
+            "missing: encoder.downsamples.2.resample.1.weight",
+            DO,
+        )
     blocks = min(halvings)
     encoder_starts = [stage * (blocks + 1) for stage in range(STAGES)]
     decoder_starts = [stage * (blocks + 2) for stage in range(STAGES)]
@@ -92,9 +107,16 @@ def read_layout(sd: Mapping[str, Tensor], source: str = "a state dict") -> WanLa
         colours=_length(sd, source, "decoder.head.2.bias"),
         latent=_length(sd, source, "conv2.bias"),
         stem=_length(sd, source, "encoder.conv1.bias"),
-        encoder=tuple(_length(sd, source, f"encoder.downsamples.{i}.residual.3.gamma") for i in encoder_starts),
-        decoder_in=tuple(_length(sd, source, f"decoder.upsamples.{i}.residual.0.gamma") for i in decoder_starts),
-        decoder_out=tuple(_length(sd, source, f"decoder.upsamples.{i + blocks}.residual.3.gamma") for i in decoder_starts),
+        encoder=tuple(
+            _length(sd, source, f"encoder.downsamples.{i}.residual.3.gamma") for i in encoder_starts
+        ),
+        decoder_in=tuple(
+            _length(sd, source, f"decoder.upsamples.{i}.residual.0.gamma") for i in decoder_starts
+        ),
+        decoder_out=tuple(
+            _length(sd, source, f"decoder.upsamples.{i + blocks}.residual.3.gamma")
+            for i in decoder_starts
+        ),
         blocks=blocks,
     )
 
@@ -108,8 +130,9 @@ def _length(sd: Mapping[str, Tensor], source: str, key: str) -> int:
 def causal_conv(joined: Tensor, weight: Tensor, bias: Tensor, frames: int) -> Tensor:
     """Convolve the last ``frames`` of ``joined`` in space and time.
 
-    On an accelerator one 3D convolution (`causal_conv3d`). On a CPU the three temporal taps are 2D convolutions that are summed: up to six
-    times faster on the small frames of the inner stages. Taps that would only see frames before the video are skipped.
+    On an accelerator one 3D convolution (`causal_conv3d`). On a CPU the three temporal taps are 2D
+    convolutions that are summed: up to six times faster on the small frames of the inner stages.
+    Taps that would only see frames before the video are skipped.
 
     Args:
         joined: ``(B, k + frames, H, W, C)`` with k <= 2 past frames; missing ones are zero.
@@ -134,11 +157,17 @@ def causal_conv(joined: Tensor, weight: Tensor, bias: Tensor, frames: int) -> Te
 
 
 def causal_conv3d(joined: Tensor, weight: Tensor, bias: Tensor, frames: int) -> Tensor:
-    """Compute `causal_conv` as one 3D convolution: the path on an accelerator, and the reference of the CPU path."""
+    """Compute `causal_conv` as one 3D convolution: the path on an accelerator, and the reference of
+    the CPU path.
+    """
     pad = weight.shape[-1] // 2
     missing = frames + TAPS - 1 - joined.shape[1]
-    padded = F.pad(joined, (0, 0, 0, 0, 0, 0, missing, 0)) if missing else joined  # a pad of zero frames would still copy
-    return F.conv3d(padded.permute(0, 4, 1, 2, 3), weight, bias, padding=(0, pad, pad)).permute(0, 2, 3, 4, 1)
+    padded = (
+        F.pad(joined, (0, 0, 0, 0, 0, 0, missing, 0)) if missing else joined
+    )  # a pad of zero frames would still copy
+    return F.conv3d(padded.permute(0, 4, 1, 2, 3), weight, bias, padding=(0, pad, pad)).permute(
+        0, 2, 3, 4, 1
+    )
 
 
 class CausalConv(nn.Module):
@@ -155,7 +184,9 @@ class CausalConv(nn.Module):
 
 
 class TemporalDownsampleConv(nn.Module):
-    """3x1x1 convolution with stride 2 in time: each output sees two frames and their predecessor."""
+    """3x1x1 convolution with stride 2 in time: each output sees two frames and their
+    predecessor.
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -163,11 +194,17 @@ class TemporalDownsampleConv(nn.Module):
         self.bias = nn.Parameter(torch.zeros(width))
 
     def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
-        """Halve the frames of ``(B, T, H, W, C)``; the first frame of a video passes unchanged and is the predecessor of the second."""
+        """Halve the frames of ``(B, T, H, W, C)``; the first frame of a video passes unchanged and
+        is the predecessor of the second.
+        """
         joined = streaming.extend(x, 1)
         taps = self.weight.flatten(2).unbind(2)
         inputs = [joined[:, back : joined.shape[1] - (TAPS - 1) + back : 2] for back in range(TAPS)]
-        out = F.linear(inputs[0], taps[0], self.bias) + F.linear(inputs[1], taps[1]) + F.linear(inputs[2], taps[2])
+        out = (
+            F.linear(inputs[0], taps[0], self.bias)
+            + F.linear(inputs[1], taps[1])
+            + F.linear(inputs[2], taps[2])
+        )
         return torch.cat([x[:, :1], out], dim=1) if streaming.first else out
 
 
@@ -188,11 +225,15 @@ class ChannelNorm(nn.Module):
         return self.reference(x) if x.device.type == "cpu" else self.fused(x)
 
     def fused(self, x: Tensor) -> Tensor:
-        """Normalise with torch's fused RMS norm: one pass over memory instead of six, the path on an accelerator."""
+        """Normalise with torch's fused RMS norm: one pass over memory instead of six, the path on
+        an accelerator.
+        """
         return F.rms_norm(x, (x.shape[-1],), self.gamma.flatten().to(x.dtype), SQUARE_FLOOR)
 
     def reference(self, x: Tensor) -> Tensor:
-        """Normalise with elementary operations: the path on a CPU, where torch's version is not fused."""
+        """Normalise with elementary operations: the path on a CPU, where torch's version is not
+        fused.
+        """
         wide = x.float()
         length: Tensor = torch.linalg.vector_norm(wide, dim=-1, keepdim=True).clamp_min(1e-12)
         gain = self.gamma.flatten().float() * math.sqrt(x.shape[-1])
@@ -200,18 +241,27 @@ class ChannelNorm(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """Norm, SiLU, convolution, twice, added to the input (through a 1x1x1 convolution if the width changes)."""
+    """Norm, SiLU, convolution, twice, added to the input (through a 1x1x1 convolution if the width
+    changes).
+    """
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
         # Position 5 is a dropout in the checkpoint's numbering.
         self.residual = nn.ModuleList(
             [
-                ChannelNorm(inputs), nn.SiLU(), CausalConv(inputs, outputs),
-                ChannelNorm(outputs), nn.SiLU(), nn.Identity(), CausalConv(outputs, outputs),
+                ChannelNorm(inputs),
+                nn.SiLU(),
+                CausalConv(inputs, outputs),
+                ChannelNorm(outputs),
+                nn.SiLU(),
+                nn.Identity(),
+                CausalConv(outputs, outputs),
             ]
-        )  # fmt: skip
-        self.shortcut = PointwiseConv(inputs, outputs, axes=3) if inputs != outputs else nn.Identity()
+        )
+        self.shortcut = (
+            PointwiseConv(inputs, outputs, axes=3) if inputs != outputs else nn.Identity()
+        )
 
     def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
         """Map ``(B, T, H, W, inputs)`` to ``(B, T, H, W, outputs)``."""
@@ -241,11 +291,15 @@ class Downsample(nn.Module):
 
     def __init__(self, width: int, time: bool) -> None:
         super().__init__()
-        self.resample = nn.ModuleList([nn.Identity(), DownsampleConv(width, width)])  # position 0 is the padding
+        self.resample = nn.ModuleList(
+            [nn.Identity(), DownsampleConv(width, width)]
+        )  # position 0 is the padding
         self.time_conv = TemporalDownsampleConv(width) if time else None
 
     def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
-        """Map ``(B, T, H, W, C)`` to ``(B, T', H/2, W/2, C)``: T' = T, or T/2 not counting a first frame."""
+        """Map ``(B, T, H, W, C)`` to ``(B, T', H/2, W/2, C)``: T' = T, or T/2 not counting a first
+        frame.
+        """
         x = run_layers(self.resample, x, streaming)
         return x if self.time_conv is None else self.time_conv.next(x, streaming)
 
@@ -253,23 +307,30 @@ class Downsample(nn.Module):
 class Upsample(nn.Module):
     """Upsample by 2 in space, after upsampling by 2 in time with ``time``, and change the channels.
 
-    Temporal upsampling is a causal convolution to twice the channels, whose halves become consecutive frames. The first latent of a video
-    skips it; the padding of that convolution is zero and follows the first latent.
+    Temporal upsampling is a causal convolution to twice the channels, whose halves become
+    consecutive frames. The first latent of a video skips it; the padding of that convolution is
+    zero and follows the first latent.
     """
 
     def __init__(self, inputs: int, outputs: int, time: bool) -> None:
         super().__init__()
-        self.resample = nn.ModuleList([nn.Identity(), UpsampleConv(inputs, outputs)])  # position 0 is the repetition of pixels
+        self.resample = nn.ModuleList(
+            [nn.Identity(), UpsampleConv(inputs, outputs)]
+        )  # position 0 is the repetition of pixels
         self.time_conv = CausalConv(inputs, 2 * inputs, side=1) if time else None
 
     def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
-        """Map ``(B, T, H, W, inputs)`` to ``(B, T', 2H, 2W, outputs)``: T' = T, or 2T not counting a first latent."""
+        """Map ``(B, T, H, W, inputs)`` to ``(B, T', 2H, 2W, outputs)``: T' = T, or 2T not counting
+        a first latent.
+        """
         if self.time_conv is not None:
             first = 1 if streaming.first else 0
             alone, rest = x[:, :first], x[:, first:]
             if rest.shape[1]:
                 rest = channels_to_frames(self.time_conv.next(rest, streaming), 2)
             else:
-                streaming.extend(rest, TAPS - 1)  # only the first latent: cache an empty history, so that the slot exists
+                streaming.extend(
+                    rest, TAPS - 1
+                )  # only the first latent: cache an empty history, so that the slot exists
             x = torch.cat([alone, rest], dim=1)
         return run_layers(self.resample, x, streaming)

@@ -1,6 +1,8 @@
-"""Reference implementation of the streaming fixer: a whole clip at once in float32, nothing streamed, cached, folded or reused.
+"""Reference implementation of the streaming fixer: a whole clip at once in float32, nothing
+streamed, cached, folded or reused.
 
-Every block sees all blocks before it in one forward pass under the block-causal mask, so the cost grows with the square of the clip.
+Every block sees all blocks before it in one forward pass under the block-causal mask, so the cost
+grows with the square of the clip.
 """
 
 from __future__ import annotations
@@ -16,7 +18,13 @@ from alpasim_plugin.block_fixers.clips import on_grid, to_clip, to_images
 from alpasim_plugin.block_fixers.networks import LATENT, Networks, decode, load_networks
 from alpasim_plugin.block_fixers.onefixer import latent_noise
 from alpasim_plugin.block_fixers.pipeline import condition_of, map_video, opacity_input
-from alpasim_plugin.block_fixers.sampling import context_level, flow_step, mixed_source, opacity_mask, sources_needed
+from alpasim_plugin.block_fixers.sampling import (
+    context_level,
+    flow_step,
+    mixed_source,
+    opacity_mask,
+    sources_needed,
+)
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.interfaces import BlockRule
 from alpasim_plugin.core.types import F32, I64, U8, Frame
@@ -45,13 +53,24 @@ class Clip:
     @classmethod
     def of(cls, frames: Sequence[Frame], maps: Sequence[U8]) -> Clip:
         """Stack frames of one camera and their maps; a frame without opacity counts as opaque."""
-        alpha = [np.ones(frame.rgb.shape[:2], np.float32) if frame.alpha is None else frame.alpha for frame in frames]
+        alpha = [
+            np.ones(frame.rgb.shape[:2], np.float32) if frame.alpha is None else frame.alpha
+            for frame in frames
+        ]
         times = np.array([frame.t_us for frame in frames], dtype=np.int64)
-        return cls(frames[0].camera, times, np.stack([frame.rgb for frame in frames]), np.stack(alpha), np.stack(maps))
+        return cls(
+            frames[0].camera,
+            times,
+            np.stack([frame.rgb for frame in frames]),
+            np.stack(alpha),
+            np.stack(maps),
+        )
 
     def first(self, count: int) -> Clip:
         """Return the first frames."""
-        return Clip(self.camera, self.t_us[:count], self.rgb[:count], self.alpha[:count], self.maps[:count])
+        return Clip(
+            self.camera, self.t_us[:count], self.rgb[:count], self.alpha[:count], self.maps[:count]
+        )
 
     def frames(self) -> list[Frame]:
         """Return the frames."""
@@ -59,8 +78,12 @@ class Clip:
         return [Frame(int(t_us), self.camera, rgb, alpha) for t_us, rgb, alpha in rows]
 
     def blocks(self, rule: Callable[[int], int]) -> Iterator[tuple[list[Frame], list[U8]]]:
-        """Yield whole blocks of frames with their maps; frames at the end that fill no block are left out."""
-        frames, start, index = self.frames(), 0, 0
+        """Yield whole blocks of frames with their maps; frames at the end that fill no block are
+        left out.
+        """
+        frames = self.frames()
+        start = 0
+        index = 0
         while start + rule(index) <= len(frames):
             end = start + rule(index)
             yield frames[start:end], list(self.maps[start:end])
@@ -68,7 +91,12 @@ class Clip:
 
 
 def refine_latents(
-    networks: Networks, settings: OneFixerSettings, z_render: Tensor, mask: Tensor, condition: Tensor, noise: Sequence[Tensor]
+    networks: Networks,
+    settings: OneFixerSettings,
+    z_render: Tensor,
+    mask: Tensor,
+    condition: Tensor,
+    noise: Sequence[Tensor],
 ) -> Tensor:
     """Fix the latents of a whole clip.
 
@@ -84,16 +112,26 @@ def refine_latents(
         ``(B, 16, T, h, w)`` clean latents.
     """
     schedule, n = from_names(settings.steps), settings.block_latents
-    clean, past, past_t = z_render[:, :, :0], z_render[:, :, :0], torch.zeros(1, 0)
+    clean = z_render[:, :, :0]
+    past = z_render[:, :, :0]
+    past_t = torch.zeros(1, 0)
     for start in range(0, z_render.shape[2], n):
         own = slice(start, start + n)
-        sources = [mixed_source(z_render[:, :, own], mask[:, :, own], eps[:, :, own]) for eps in noise]  # Eq. 1
+        sources = [
+            mixed_source(z_render[:, :, own], mask[:, :, own], eps[:, :, own]) for eps in noise
+        ]  # Eq. 1
         x = sources[0]
         for i, level in enumerate(schedule):
             given = torch.cat([past, x], dim=2)
             t = torch.cat([past_t, torch.full((1, x.shape[2]), level.t)], dim=1)
             v = networks.dit(
-                given, t, networks.text, condition[:, :, : start + n], block_latents=n, window=settings.window, sink=settings.sink
+                given,
+                t,
+                networks.text,
+                condition[:, :, : start + n],
+                block_latents=n,
+                window=settings.window,
+                sink=settings.sink,
             )
             z_0 = flow_step(x, v[:, :, start:], level.sigma)  # Eq. 2
             if i + 1 < len(schedule):
@@ -108,7 +146,12 @@ def refine_latents(
 
 @torch.inference_mode()
 def refine_clip(
-    networks: Networks, settings: OneFixerSettings, rgb: Tensor, alpha: Tensor | None, sdmap: Tensor | None, noise: Sequence[Tensor]
+    networks: Networks,
+    settings: OneFixerSettings,
+    rgb: Tensor,
+    alpha: Tensor | None,
+    sdmap: Tensor | None,
+    noise: Sequence[Tensor],
 ) -> Tensor:
     """Fix a whole clip; arguments as `BlockPipeline.run`, for all frames.
 
@@ -118,9 +161,15 @@ def refine_clip(
     z_render = networks.vae.encode(rgb)
     shown = map_video(settings, rgb, sdmap)
     z_map = torch.zeros_like(z_render) if shown is None else networks.vae.encode(shown)
-    mask = torch.ones_like(z_render[:, :1]) if alpha is None or settings.holes == "render" else opacity_mask(alpha, first=True)
+    mask = (
+        torch.ones_like(z_render[:, :1])
+        if alpha is None or settings.holes == "render"
+        else opacity_mask(alpha, first=True)
+    )
     mask = torch.zeros_like(mask) if settings.holes == "everywhere" else mask
-    condition = condition_of(settings, z_map, z_render, opacity_input(settings, rgb, alpha, first=True))
+    condition = condition_of(
+        settings, z_map, z_render, opacity_input(settings, rgb, alpha, first=True)
+    )
     clean = refine_latents(networks, settings, z_render, mask, condition, noise)
     return decode(networks, settings, clean, rgb, alpha)[0]
 
@@ -136,7 +185,9 @@ def whole_clip(settings: OneFixerSettings, clip: Clip, scene_id: str, seed: int)
     Returns:
         ``(T, H, W, 3)`` uint8.
     """
-    exact = settings.model_copy(update={"precision": "fp32", "codec_precision": "fp32", "fold": False})
+    exact = settings.model_copy(
+        update={"precision": "fp32", "codec_precision": "fp32", "fold": False}
+    )
     networks = load_networks(exact)
     rule, frames = BlockRule.of_latents(settings.block_latents), clip.frames()
     due = rule.first + -(-max(0, len(frames) - rule.first) // rule.then) * rule.then

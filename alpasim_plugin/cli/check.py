@@ -31,14 +31,19 @@ process writes it.
 
 def check(
     run: Run,
-    repair: Annotated[bool, Flag("Run or score damaged rollouts again, and make the tables again.")] = False,
-    workers: Annotated[int | None, Flag("Repair: worker processes; by default one per core.", min=1)] = None,
+    repair: Annotated[
+        bool, Flag("Run or score damaged rollouts again, and make the tables again.")
+    ] = False,
+    workers: Annotated[
+        int | None, Flag("Repair: worker processes; by default one per core.", min=1)
+    ] = None,
     wait: Annotated[bool, Flag("Repair: wait for a process that writes the folder.")] = False,
     as_json: Json = False,
 ) -> None:
     """Read every file of a run folder, compare it with its digest, and say what is damaged.
 
-    Nothing is written without `--repair`, so a read-only folder can be checked. With it, damaged rollouts alone are run or scored again.
+    Nothing is written without `--repair`, so a read-only folder can be checked. With it, damaged
+    rollouts alone are run or scored again.
     """
     before = inspect_run(run, full=True)
     after = before
@@ -48,18 +53,30 @@ def check(
     rows = rows_of(before, after, repair)
     code = 0 if after.whole else NOT_REPAIRED if repair else DAMAGED
     if as_json:
-        counts = {"rollouts": len(before.cells), "unfinished": len(before.unfinished), "tables_only": before.tables_only}
-        print(json.dumps({"run": str(run), "whole": after.whole, "exit_code": code, **counts, "damage": rows}))
+        counts = {
+            "rollouts": len(before.cells),
+            "unfinished": len(before.unfinished),
+            "tables_only": before.tables_only,
+        }
+        print(
+            json.dumps(
+                {"run": str(run), "whole": after.whole, "exit_code": code, **counts, "damage": rows}
+            )
+        )
     else:
         _print(before, rows, repair, after.whole)
     raise typer.Exit(code)
 
 
 def rows_of(before: Inspection, after: Inspection, repaired: bool) -> list[dict[str, Any]]:
-    """Return one row for each damaged file and unfinished rollout: ``cell``, ``file``, ``wrong``, ``done`` (None without a repair)."""
+    """Return one row for each damaged file and unfinished rollout: ``cell``, ``file``, ``wrong``,
+    ``done`` (None without a repair).
+    """
     wrong = [(one.cell, one.file, one.problem) for one in before.damage]
     wrong += [(cell, MANIFEST, "never finished") for cell in before.unfinished]
-    still = {(one.cell, one.file) for one in after.damage} | {(cell, MANIFEST) for cell in after.unfinished}
+    still = {(one.cell, one.file) for one in after.damage} | {
+        (cell, MANIFEST) for cell in after.unfinished
+    }
     driven = {cell for cell, file, _ in wrong if cell and file not in DERIVED}
 
     def done(cell: str, file: str) -> str | None:
@@ -71,20 +88,38 @@ def rows_of(before: Inspection, after: Inspection, repaired: bool) -> list[dict[
             return "written again" if file != RUN_INFO else "restored"
         return "run again" if cell in driven else "scored again"
 
-    return [{"cell": cell, "file": file, "wrong": text, "done": done(cell, file)} for cell, file, text in wrong]
+    return [
+        {"cell": cell, "file": file, "wrong": text, "done": done(cell, file)}
+        for cell, file, text in wrong
+    ]
 
 
 def _print(found: Inspection, rows: list[dict[str, Any]], repaired: bool, whole: bool) -> None:
     if rows:
         lines = [("cell", "file", "what is wrong", "what was done")]
-        lines += [(row["cell"] or "(the run)", row["file"], row["wrong"], row["done"] or "-") for row in rows]
+        lines += [
+            (row["cell"] or "(the run)", row["file"], row["wrong"], row["done"] or "-")
+            for row in rows
+        ]
         cells = [[terminal(text) for text in line] for line in lines]
         widths = [max(len(line[i]) for line in cells) for i in range(len(cells[0]))]
         for line in cells:
-            print("  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip())
+            print(
+                "  ".join(
+                    text.ljust(width) for text, width in zip(line, widths, strict=True)
+                ).rstrip()
+            )
     if found.tables_only:
         print("the folder has no rollouts, only tables; those were read")
-    state = "whole" if not rows else "made whole" if whole else "repaired in part" if repaired else "damaged"
+    state = (
+        "whole"
+        if not rows
+        else "made whole"
+        if whole
+        else "repaired in part"
+        if repaired
+        else "damaged"
+    )
     print(f"{len(found.cells)} rollouts, {len(rows)} findings: {state}")
     if rows and not repaired:
         print(f"repair with  simrun check {found.root} --repair")

@@ -1,4 +1,6 @@
-"""``simrun check-policy``: the conformance test of a policy. ``simrun check-driver``: the pre-flight check of an AlpaSim driver."""
+"""``simrun check-policy``: the conformance test of a policy. ``simrun check-driver``: the
+pre-flight check of an AlpaSim driver.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,15 @@ import numpy as np
 import typer
 
 from alpasim_plugin.alpasim.client.driver import AlpasimPolicy
-from alpasim_plugin.alpasim.client.preflight import LIMIT_S, DriveTimes, Finding, findings, outside_view, resident_mib, tolerances
+from alpasim_plugin.alpasim.client.preflight import (
+    LIMIT_S,
+    DriveTimes,
+    Finding,
+    findings,
+    outside_view,
+    resident_mib,
+    tolerances,
+)
 from alpasim_plugin.cli.options import Json, Overrides
 from alpasim_plugin.core.errors import InfrastructureError, PolicyError, SimrunError
 from alpasim_plugin.core.flags import Flag, Positional
@@ -28,7 +38,9 @@ from scenarios.suite import LIBRARY, expand
 
 BROKEN = 1
 ATTEMPTS = 2  # at a scene in which the driver is lost
-KNOWN = LIBRARY / "suites" / "known_drivers.json"  # which shipped scenes known drivers passed; docs/scripts/known_drivers.py records it
+KNOWN = (
+    LIBRARY / "suites" / "known_drivers.json"
+)  # which shipped scenes known drivers passed; docs/scripts/known_drivers.py records it
 
 CHECK_POLICY_EPILOG = """
 Examples:
@@ -43,20 +55,38 @@ Exit codes: 0 every check passed; 1 the policy breaks its contract, or could not
 
 def check_policy(
     policy: Annotated[str, Positional("A policy's name, package.module:Class, or file.py:Class.")],
-    scenario: Annotated[str | None, Flag("Scenario whose cameras it gets; by default one camera ahead.")] = None,
+    scenario: Annotated[
+        str | None, Flag("Scenario whose cameras it gets; by default one camera ahead.")
+    ] = None,
     latency_limit_ms: Annotated[float, Flag("Longest median time of a plan.", min=0.0)] = 100.0,
     as_json: Json = False,
 ) -> None:
-    """Call a policy in fixed situations and name every breach of its contract: shapes, frames, units, time, determinism.
+    """Call a policy in fixed situations and name every breach of its contract: shapes, frames,
+    units, time, determinism.
 
     Nothing is rendered or scored; it takes seconds. Run it before the first drive.
     """
     with parts_print_to_stderr():
-        report = run_checks(policy, None if scenario is None else load_scenario(scenario), latency_limit_ms)
+        report = run_checks(
+            policy, None if scenario is None else load_scenario(scenario), latency_limit_ms
+        )
     if as_json:
-        checks = [{"check": check.name, "ok": check.ok, "found": check.sentence} for check in report.checks]
+        checks = [
+            {"check": check.name, "ok": check.ok, "found": check.sentence}
+            for check in report.checks
+        ]
         latency_ms = dict(zip(("p50", "max"), report.latency_ms, strict=True))
-        print(json.dumps({"policy": policy, "ok": report.ok, "checks": checks, "notes": report.notes, "latency_ms": latency_ms}))
+        print(
+            json.dumps(
+                {
+                    "policy": policy,
+                    "ok": report.ok,
+                    "checks": checks,
+                    "notes": report.notes,
+                    "latency_ms": latency_ms,
+                }
+            )
+        )
     else:
         print(report)
     raise typer.Exit(0 if report.ok else BROKEN)
@@ -74,14 +104,21 @@ Examples:
 
 
 def check_driver(
-    address: Annotated[str, Positional("The driver, with options as after alpasim://.", metavar="HOST:PORT")],
-    scenario: Annotated[str, Flag("What it drives through: a scenario, or a suite for a score of its ability.")] = "smoke/curve",
+    address: Annotated[
+        str, Positional("The driver, with options as after alpasim://.", metavar="HOST:PORT")
+    ],
+    scenario: Annotated[
+        str, Flag("What it drives through: a scenario, or a suite for a score of its ability.")
+    ] = "smoke/curve",
     renderer: Annotated[str, Flag("Renderer of its frames.")] = "clean",
     overrides: Overrides = (),
-    limit_ms: Annotated[float, Flag("Longest drive call; the challenge allows 100.", min=0.1)] = LIMIT_S * 1000,
+    limit_ms: Annotated[
+        float, Flag("Longest drive call; the challenge allows 100.", min=0.1)
+    ] = LIMIT_S * 1000,
     as_json: Json = False,
 ) -> None:
-    """Check a driver before it is submitted: rollouts in AlpaSim's order of calls, its times, its plans, and what it must tolerate.
+    """Check a driver before it is submitted: rollouts in AlpaSim's order of calls, its times, its
+    plans, and what it must tolerate.
 
     Exit codes: 0 nothing failed; 1 a check failed; 4 the driver cannot be reached.
     """
@@ -103,14 +140,21 @@ def check_driver(
         drives.append(rehearse(scene, policy, renderer, times))
     assert policy is not None, "a scenario stands for one scene at least"
     failed = next((one.failed for one in drives if one.failed is not None), None)
-    found = [*findings(times, failed, sum(one.warmup for one in drives), limit_ms / 1000), *over_scenes(drives)]
+    found = [
+        *findings(times, failed, sum(one.warmup for one in drives), limit_ms / 1000),
+        *over_scenes(drives),
+    ]
     found += [*tolerances(policy.service, scene.scene_id), *outside_view()]
     changed = [key for key in overrides if not key.startswith("cameras")]
     other = f"behind {renderer}" if renderer != "clean" else f"with {changed[0]}" if changed else ""
     ability = ability_over(drives, other)
     worst = 1 if any(one.result == "failed" for one in found) else 0
     if as_json:
-        facts = {"driver": policy.facts()["driver"], "checks": [one.__dict__ for one in found], "ability": ability}
+        facts = {
+            "driver": policy.facts()["driver"],
+            "checks": [one.__dict__ for one in found],
+            "ability": ability,
+        }
         print(json.dumps({**facts, "scenes": [one.facts() for one in drives], "exit_code": worst}))
     else:
         print(f"driver  {policy.facts()['driver']}")
@@ -143,18 +187,29 @@ class Drive:
     def facts(self) -> dict[str, Any]:
         """Return what JSON says of it."""
         ended = None if self.outcomes is None else in_words(self.outcomes)
-        return {"scene": self.scene, "ended": ended, "lost": self.lost, "resident_mib": self.resident_mib}
+        return {
+            "scene": self.scene,
+            "ended": ended,
+            "lost": self.lost,
+            "resident_mib": self.resident_mib,
+        }
 
 
 def rehearse(scene: Scenario, policy: AlpasimPolicy, renderer: str, times: DriveTimes) -> Drive:
-    """Drive a scene and name its outcomes; where the driver is lost, wait until it is there again and begin anew."""
+    """Drive a scene and name its outcomes; where the driver is lost, wait until it is there again
+    and begin anew.
+    """
     out = Drive(scene.scene_id, scene.warmup_us // scene.rates.policy_us + 1)
     times.watch(policy.service)
     for _ in range(ATTEMPTS):
         try:
             log = run_rollout(scene, make_renderer(renderer, scene), policy).log()
             values = reduce_rollout(score(log, scene.scene, preset="paper"), "paper").as_dict()
-            out.outcomes = tuple(name for name in OUTCOMES if values.get(name, {}).get("valid") and values[name]["value"] >= 0.5)
+            out.outcomes = tuple(
+                name
+                for name in OUTCOMES
+                if values.get(name, {}).get("valid") and values[name]["value"] >= 0.5
+            )
             out.failed = None
         except PolicyError as error:
             out.outcomes, out.failed = (POLICY_FAULT,), error
@@ -188,31 +243,63 @@ def over_scenes(drives: Sequence[Drive]) -> list[Finding]:
 
 
 def ability_over(drives: Sequence[Drive], other: str = "") -> dict[str, Any]:
-    """Return the ability of the driver on the scale of the known ones, with its interval, in numbers and in words.
+    """Return the ability of the driver on the scale of the known ones, with its interval, in
+    numbers and in words.
 
     Args:
         drives: What it drove.
-        other: What makes the scenes others than the known drivers drove, and their difficulties unknown.
+        other: What makes the scenes others than the known drivers drove, and their difficulties
+            unknown.
     """
     known = json.loads(KNOWN.read_text())["passed"]
     scenes, names = list(known), sorted({driver for ends in known.values() for driver in ends})
-    scale = calibrate(np.array([[known[scene].get(name, np.nan) for scene in scenes] for name in names], dtype=np.float64))
-    drove = [(scenes.index(one.scene), not one.outcomes) for one in drives if one.outcomes is not None and one.scene in known]
-    out: dict[str, Any] = {"n_scenes": len(drove), "n_passed": sum(ok for _, ok in drove), "estimate": None, "ci95": [None, None]}
-    out["known"] = {name: round(float(value), 2) for name, value in zip(names, scale.ability, strict=True)}
+    scale = calibrate(
+        np.array(
+            [[known[scene].get(name, np.nan) for scene in scenes] for name in names],
+            dtype=np.float64,
+        )
+    )
+    drove = [
+        (scenes.index(one.scene), not one.outcomes)
+        for one in drives
+        if one.outcomes is not None and one.scene in known
+    ]
+    out: dict[str, Any] = {
+        "n_scenes": len(drove),
+        "n_passed": sum(ok for _, ok in drove),
+        "estimate": None,
+        "ci95": [None, None],
+    }
+    out["known"] = {
+        name: round(float(value), 2) for name, value in zip(names, scale.ability, strict=True)
+    }
     if other or not drove:
         return {**out, "text": f"no score: no known driver drove these scenes {other}".rstrip()}
     at = [index for index, _ in drove]
     one = ability_of(out["n_passed"], scale.difficulty[at], scale.spread[at])
     out |= {"estimate": one.estimate, "ci95": [one.low, one.high], "reason": one.reason}
-    share = [None if a is None else float(chances(a, scale.difficulty, scale.spread).mean()) for a in (one.estimate, one.low, one.high)]
-    out |= {"expected_share": share[0], "expected_share_ci95": share[1:], "n_known_scenes": len(scenes)}
+    share = [
+        None if a is None else float(chances(a, scale.difficulty, scale.spread).mean())
+        for a in (one.estimate, one.low, one.high)
+    ]
+    out |= {
+        "expected_share": share[0],
+        "expected_share_ci95": share[1:],
+        "n_known_scenes": len(scenes),
+    }
     if one.estimate is None:
-        side, bound, part = ("above", one.low, share[1]) if one.low is not None else ("below", one.high, share[2])
+        side, bound, part = (
+            ("above", one.low, share[1]) if one.low is not None else ("below", one.high, share[2])
+        )
         text = f"no score, {one.reason}; {side} {bound:+.2f} logits with 95 %, that is {part:.0%} of all {len(scenes)} known scenes"
     else:
         text = f"{one.estimate:+.2f} logits [{one.low:+.2f}, {one.high:+.2f}]: passes {out['n_passed']} of {len(drove)} known scenes, "
         text += f"would pass {share[0]:.0%} [{share[1]:.0%}, {share[2]:.0%}] of all {len(scenes)}"
     others = ", ".join(f"{name} {value:+.2f}" for name, value in out["known"].items())
     left = len(drives) - len(drove)
-    return {**out, "text": text + (f"; {left} scenes without a known difficulty or an outcome" if left else "") + f" ({others})"}
+    return {
+        **out,
+        "text": text
+        + (f"; {left} scenes without a known difficulty or an outcome" if left else "")
+        + f" ({others})",
+    }

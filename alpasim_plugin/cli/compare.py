@@ -1,4 +1,6 @@
-"""``simrun compare``: paired differences within a run or between two runs. ``simrun aggregate``: the numbers of several runs as of one."""
+"""``simrun compare``: paired differences within a run or between two runs. ``simrun aggregate``:
+the numbers of several runs as of one.
+"""
 
 from __future__ import annotations
 
@@ -43,15 +45,24 @@ SHOWN, NAMED = 10, 3  # lines about missing pairs; cells named in each
 
 
 def compare(
-    runs: Annotated[tuple[Path, ...], Positional("One run folder, or two: the second is compared with the first.")],
-    baseline: Annotated[str | None, Flag("RENDERER, POLICY or RENDERER/POLICY to compare with (of the first run).")] = None,
+    runs: Annotated[
+        tuple[Path, ...],
+        Positional("One run folder, or two: the second is compared with the first."),
+    ],
+    baseline: Annotated[
+        str | None, Flag("RENDERER, POLICY or RENDERER/POLICY to compare with (of the first run).")
+    ] = None,
     gate: Annotated[str | None, Flag("Take the margins from this gate file.")] = None,
     every: Every = False,
     as_json: Json = False,
 ) -> None:
-    """Print paired differences on shared scene-seed cells, with verdicts; cells without a pair are listed."""
+    """Print paired differences on shared scene-seed cells, with verdicts; cells without a pair are
+    listed.
+    """
     if len(runs) > 2:
-        raise InputError("comparing runs", f"{len(runs)} folders", "more than two", "name one run, or two")
+        raise InputError(
+            "comparing runs", f"{len(runs)} folders", "more than two", "name one run, or two"
+        )
     for run in runs:
         use_run(run, warn)
         if note := stopping_note(run):
@@ -85,15 +96,25 @@ def compare(
 def _print(result: Comparison, only: Sequence[str] | None) -> None:
     for note in result.notes:
         print(f"note: {note}")
-    for variant, entries in (*result.paired.items(), *result.with_base.items(), *result.arms.items()):
-        mine = [row for row in pair_rows({"paired": {variant: entries}}, result.metrics) if only is None or row.metric in only]
+    for variant, entries in (
+        *result.paired.items(),
+        *result.with_base.items(),
+        *result.arms.items(),
+    ):
+        mine = [
+            row
+            for row in pair_rows({"paired": {variant: entries}}, result.metrics)
+            if only is None or row.metric in only
+        ]
         baseline = next((str(entry["baseline"]) for entry in entries.values()), "nothing")
         print(f"\n{variant} minus {baseline}")
         for line in [*_table(mine, entries, result.metrics), *_missing(entries)]:
             print(line)
 
 
-def _table(rows: Sequence[PairRow], entries: Mapping[str, Mapping[str, Any]], known: MetricTable) -> list[str]:
+def _table(
+    rows: Sequence[PairRow], entries: Mapping[str, Mapping[str, Any]], known: MetricTable
+) -> list[str]:
     """Return one line per metric; lines are not wrapped."""
     lines = [("metric", "difference", "95 %", "p", "margin", "pairs", "verdict")]
     for row in rows:
@@ -103,16 +124,35 @@ def _table(rows: Sequence[PairRow], entries: Mapping[str, Mapping[str, Any]], kn
         verdict += " (better)" if entry["difference"] == "better" else ""
         scale = 100.0 if known.shown(row.metric).in_percent else 1.0
         pairs = f"{entry['n_cells']} in {plural(int(entry['n_scenes']), 'scene')}"
-        lines.append((row.metric, row.diff.text, row.interval.text, row.p_value.text, f"{scale * entry['margin']:g}", pairs, verdict))
+        lines.append(
+            (
+                row.metric,
+                row.diff.text,
+                row.interval.text,
+                row.p_value.text,
+                f"{scale * entry['margin']:g}",
+                pairs,
+                verdict,
+            )
+        )
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     padded = (zip(line, widths, strict=True) for line in lines)
-    return ["  " + "  ".join(cell.ljust(width) for cell, width in line).replace("\u00a0", " ").rstrip() for line in padded]
+    return [
+        "  " + "  ".join(cell.ljust(width) for cell, width in line).replace("\u00a0", " ").rstrip()
+        for line in padded
+    ]
 
 
 def _missing(entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """List missing pairs: metrics without any, cells without any, and metrics that lack some cells."""
+    """List missing pairs: metrics without any, cells without any, and metrics that lack some
+    cells.
+    """
     paired = {metric: entry for metric, entry in entries.items() if entry["n_cells"]}
-    lines = [f"  no pair: {metric}: {entry.get('reason')}" for metric, entry in entries.items() if metric not in paired]
+    lines = [
+        f"  no pair: {metric}: {entry.get('reason')}"
+        for metric, entry in entries.items()
+        if metric not in paired
+    ]
     lacking: dict[tuple[str, str], list[str]] = {}  # (cell, reason) -> metrics
     for metric, entry in paired.items():
         for cell in entry["missing"]:
@@ -125,9 +165,15 @@ def _missing(entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
         else:
             partly.setdefault((", ".join(metrics), why), []).append(name)
     for (metrics_text, why), names in partly.items():
-        where = "; ".join(names[:NAMED]) + (f"; {len(names) - NAMED} more" if len(names) > NAMED else "")
+        where = "; ".join(names[:NAMED]) + (
+            f"; {len(names) - NAMED} more" if len(names) > NAMED else ""
+        )
         lines.append(f"  no pair: {metrics_text} in {plural(len(names), 'cell')} ({where}): {why}")
-    return lines if len(lines) <= SHOWN else [*lines[:SHOWN], f"  {len(lines) - SHOWN} more lines: --json lists all"]
+    return (
+        lines
+        if len(lines) <= SHOWN
+        else [*lines[:SHOWN], f"  {len(lines) - SHOWN} more lines: --json lists all"]
+    )
 
 
 AGGREGATE_EPILOG = """
@@ -143,12 +189,18 @@ Examples:
 
 def aggregate(
     runs: Annotated[tuple[Path, ...], Positional("Finished run folders.")],
-    baseline: Annotated[str | None, Flag("Renderer to compare against; by default the first run's.")] = None,
-    out: Annotated[Path | None, Flag("Also write the numbers as JSON, in the form of summary.json.")] = None,
+    baseline: Annotated[
+        str | None, Flag("Renderer to compare against; by default the first run's.")
+    ] = None,
+    out: Annotated[
+        Path | None, Flag("Also write the numbers as JSON, in the form of summary.json.")
+    ] = None,
     every: Every = False,
     as_json: Json = False,
 ) -> None:
-    """Print means, intervals and verdicts over the rollouts of several runs; tables of millions of rows are streamed."""
+    """Print means, intervals and verdicts over the rollouts of several runs; tables of millions of
+    rows are streamed.
+    """
     found = aggregate_runs(runs, baseline)
     if out is not None:
         write_json(out, found)
@@ -159,11 +211,15 @@ def aggregate(
     Console().print(render_table(found, headline_only=not every, known=known))
     for row in pair_rows(found, known):
         if every or known.shown(row.metric).is_headline:
-            numbers = f"{row.diff.text}, 95 % {row.interval.text}, p {row.p_value.text}".replace("\u00a0", " ")
+            numbers = f"{row.diff.text}, 95 % {row.interval.text}, p {row.p_value.text}".replace(
+                "\u00a0", " "
+            )
             print(f"{row.variant} minus {row.baseline}: {row.metric} {numbers}: {row.verdict}")
     failures = found["failures"]
     if failures["n_failed"]:
         causes = ", ".join(f"{name} {n}" for name, n in failures["by_class"].items())
-        print(f"{failures['n_failed']} of {failures['n_rollouts']} rollouts failed ({causes}); they are in no average")
+        print(
+            f"{failures['n_failed']} of {failures['n_rollouts']} rollouts failed ({causes}); they are in no average"
+        )
     if out is not None:
         print(f"numbers  {out}")

@@ -1,4 +1,6 @@
-"""``simrun decide``: drive scenes in random order until a question is decided. ``simrun gate --until-decided`` uses its parts."""
+"""``simrun decide``: drive scenes in random order until a question is decided. ``simrun gate
+--until-decided`` uses its parts.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,17 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from alpasim_plugin.cli.options import Care, Json, Only, Quiet, RunFolder, What, Where, check_preset, split_policies
+from alpasim_plugin.cli.options import (
+    Care,
+    Json,
+    Only,
+    Quiet,
+    RunFolder,
+    What,
+    Where,
+    check_preset,
+    split_policies,
+)
 from alpasim_plugin.cli.progress import Lines, Silent, report_line
 from alpasim_plugin.cli.run import planned
 from alpasim_plugin.core.errors import InputError
@@ -24,13 +36,26 @@ from evaluators.opening import read_run
 from evaluators.report.numbers import plural
 from evaluators.report.verdict import metric_lines, verdict_line
 from evaluators.statistics.arms import Arm, arms_of, base_named, usual_base
-from evaluators.statistics.baselines import StoredSide, check_made_alike, read_baseline, rows_of_run, stored_side
+from evaluators.statistics.baselines import (
+    StoredSide,
+    check_made_alike,
+    read_baseline,
+    rows_of_run,
+    stored_side,
+)
 from evaluators.statistics.gate import GateSpec, load_gate
 from evaluators.statistics.sequential import control as variance
 from evaluators.statistics.sequential.asymptotic import FIRST_LOOK
 from evaluators.statistics.sequential.control import Control
 from evaluators.statistics.sequential.decision import State
-from evaluators.statistics.sequential.question import Method, MetricQuestion, Order, Population, Question, metric_question
+from evaluators.statistics.sequential.question import (
+    Method,
+    MetricQuestion,
+    Order,
+    Population,
+    Question,
+    metric_question,
+)
 
 DOING = "planning a decision"
 AUTO = "auto:"
@@ -60,7 +85,9 @@ Exit codes: 0 non-inferior (or better), 1 worse (or not better), 2 bad input or 
 
 
 Alpha = Annotated[float, Flag("Chance of a wrong decision, over all looks.", min=1e-6, max=0.5)]
-Asked = Annotated[Population, Flag("The population that the scenes were drawn from, or the suite itself.")]
+Asked = Annotated[
+    Population, Flag("The population that the scenes were drawn from, or the suite itself.")
+]
 Stored = Annotated[Path | None, Flag("Compare with this stored baseline, or this earlier run.")]
 
 
@@ -72,47 +99,100 @@ def decide(
     care: Care,
     metric: Annotated[
         tuple[str, ...],
-        Flag("What is asked about; repeatable or comma-separated. Default: the gate's.", metavar="NAME[=MARGIN]"),
+        Flag(
+            "What is asked about; repeatable or comma-separated. Default: the gate's.",
+            metavar="NAME[=MARGIN]",
+        ),
     ] = (),
-    gate: Annotated[str, Flag("Gate whose margins are asked about where no --metric is named.")] = "default",
-    ask: Annotated[Literal["non-inferior", "better"], Flag("At most MARGIN worse, or at least MARGIN better?")] = "non-inferior",
-    expect: Annotated[float | None, Flag("Expected difference, which makes the decision fast. Default: that nothing changes.")] = None,
+    gate: Annotated[
+        str, Flag("Gate whose margins are asked about where no --metric is named.")
+    ] = "default",
+    ask: Annotated[
+        Literal["non-inferior", "better"], Flag("At most MARGIN worse, or at least MARGIN better?")
+    ] = "non-inferior",
+    expect: Annotated[
+        float | None,
+        Flag("Expected difference, which makes the decision fast. Default: that nothing changes."),
+    ] = None,
     alpha: Alpha = 0.05,
-    method: Annotated[Method | None, Flag("Default: betting where differences are bounded.")] = None,
+    method: Annotated[
+        Method | None, Flag("Default: betting where differences are bounded.")
+    ] = None,
     population: Asked = "scenes",
-    control: Annotated[tuple[str, ...], Flag("With --population suite: take out known variance. Repeatable.", metavar="family|RUN")] = (),
-    first_look: Annotated[int, Flag("Scenes before the first look of asymptotic metrics.", min=5)] = FIRST_LOOK,
-    min_scenes: Annotated[int | None, Flag("Scenes before any decision. Default: the gate's, else 2.", min=2)] = None,
+    control: Annotated[
+        tuple[str, ...],
+        Flag("With --population suite: take out known variance. Repeatable.", metavar="family|RUN"),
+    ] = (),
+    first_look: Annotated[
+        int, Flag("Scenes before the first look of asymptotic metrics.", min=5)
+    ] = FIRST_LOOK,
+    min_scenes: Annotated[
+        int | None, Flag("Scenes before any decision. Default: the gate's, else 2.", min=2)
+    ] = None,
     baseline_file: Stored = None,
     out: RunFolder = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Drive scenes in random order until it is decided whether a renderer, or a policy, is worse than another.
+    """Drive scenes in random order until it is decided whether a renderer, or a policy, is worse
+    than another.
 
-    `--renderer` or `--policy` names the baseline and the one in question; with `--baseline-file` the latter alone. `--seeds auto:N` takes
-    up to N seeds of a scene, chosen by cost against variance. An interrupted decision continues when the same command is given again, and
-    decides the same.
+    `--renderer` or `--policy` names the baseline and the one in question; with `--baseline-file`
+    the latter alone. `--seeds auto:N` takes up to N seeds of a scene, chosen by cost against
+    variance. An interrupted decision continues when the same command is given again, and decides
+    the same.
     """
     check_preset(options.preset)
     spec = None if metric else load_gate(gate)[0]
     if spec is not None and (ask != "non-inferior" or expect is not None):
-        raise InputError(DOING, f"--ask {ask}" if ask != "non-inferior" else "--expect", "no metric is named", "name it with --metric")
+        raise InputError(
+            DOING,
+            f"--ask {ask}" if ask != "non-inferior" else "--expect",
+            "no metric is named",
+            "name it with --metric",
+        )
     asked = questions_of(metric, ask, expect, method) if spec is None else questions_of_gate(spec)
     least = min_scenes or (2 if spec is None else spec.min_scenes)
-    population = population_of(population, design.max_missing, f"--max-missing {design.max_missing:g}")
+    population = population_of(
+        population, design.max_missing, f"--max-missing {design.max_missing:g}"
+    )
     question = Question(asked, alpha, population, first_look, least)
     is_auto = what.seeds.startswith(AUTO)
     if is_auto and population == "suite":
         found = "the suite's mean is over the same seeds in every scene"
         raise InputError(DOING, f"--seeds {what.seeds}", found, "give a number of seeds")
     how = where.arguments() | care.arguments()
-    plan = plan_of(replace(what, seeds=what.seeds.removeprefix(AUTO)), options, stored=baseline_file is not None)
-    stored = None if baseline_file is None else side_of_baseline(baseline_file, plan, options.baseline, design.max_missing)
+    plan = plan_of(
+        replace(what, seeds=what.seeds.removeprefix(AUTO)),
+        options,
+        stored=baseline_file is not None,
+    )
+    stored = (
+        None
+        if baseline_file is None
+        else side_of_baseline(baseline_file, plan, options.baseline, design.max_missing)
+    )
     controls = controls_of(control, plan, question, design.order, stored)
-    decided = decide_into(plan, question, replace(design, auto_seeds=is_auto), controls, out, quiet or as_json, stored, **how)
+    decided = decide_into(
+        plan,
+        question,
+        replace(design, auto_seeds=is_auto),
+        controls,
+        out,
+        quiet or as_json,
+        stored,
+        **how,
+    )
     if as_json:
-        print(json.dumps({"out": str(decided.run.root), "exit_code": decided.outcome.exit_code, "decision": decided.record}))
+        print(
+            json.dumps(
+                {
+                    "out": str(decided.run.root),
+                    "exit_code": decided.outcome.exit_code,
+                    "decision": decided.record,
+                }
+            )
+        )
     else:
         print_end(decided)
         print(report_line(decided.run.root))
@@ -152,7 +232,8 @@ def plan_of(what: What, options: RunOptions, stored: bool = False) -> RunPlan:
     """Plan all cells that may be driven.
 
     Args:
-        what: Scenes, and two renderers, two policies, or two of both with a baseline that names both.
+        what: Scenes, and two renderers, two policies, or two of both with a baseline that names
+            both.
         options: Of the run.
         stored: The baseline was driven earlier: one arm is driven.
 
@@ -163,42 +244,78 @@ def plan_of(what: What, options: RunOptions, stored: bool = False) -> RunPlan:
     what_is_asked = f"--renderer {what.renderer} --policy {what.policy}"
     if stored:
         if len(renderers) * len(policies) != 1:
-            found = f"{len(renderers)} renderers and {len(policies)} policies beside a stored baseline"
-            raise InputError(DOING, what_is_asked, found, "name the arm in question; the baseline is not driven again")
+            found = (
+                f"{len(renderers)} renderers and {len(policies)} policies beside a stored baseline"
+            )
+            raise InputError(
+                DOING,
+                what_is_asked,
+                found,
+                "name the arm in question; the baseline is not driven again",
+            )
         return planned(what, renderers, policies, replace(options, baseline=None))
     if sorted((len(renderers), len(policies))) not in ([1, 2], [2, 2]):
         found = f"{len(renderers)} renderers and {len(policies)} policies"
-        raise InputError(DOING, what_is_asked, found, "name two renderers or two policies: the baseline and the one in question")
+        raise InputError(
+            DOING,
+            what_is_asked,
+            found,
+            "name two renderers or two policies: the baseline and the one in question",
+        )
     plan = planned(what, renderers, policies, options)
-    arms = arms_of((renderer.name, policy.name) for policy in plan.policies for renderer in plan.renderers)
-    base = usual_base(arms) if options.baseline is None else base_named(options.baseline, arms, DOING, "the plan")
+    arms = arms_of(
+        (renderer.name, policy.name) for policy in plan.policies for renderer in plan.renderers
+    )
+    base = (
+        usual_base(arms)
+        if options.baseline is None
+        else base_named(options.baseline, arms, DOING, "the plan")
+    )
     if len(arms) == 4:
         if base.renderer is None or base.policy is None:
             found = f"baseline {base.name} leaves open which of four arms is in question"
             raise InputError(
-                DOING, what_is_asked, found, f"name one arm, as --baseline {arms[0].name}: the one in question shares nothing with it"
+                DOING,
+                what_is_asked,
+                found,
+                f"name one arm, as --baseline {arms[0].name}: the one in question shares nothing with it",
             )
-        arms = [arm for arm in arms if arm == base.of(arm) or (base.renderer != arm.renderer and base.policy != arm.policy)]
+        arms = [
+            arm
+            for arm in arms
+            if arm == base.of(arm) or (base.renderer != arm.renderer and base.policy != arm.policy)
+        ]
     kept = {(arm.renderer, arm.policy) for arm in arms}
     cells = tuple(cell for cell in plan.cells if (cell.renderer.name, cell.policy.name) in kept)
     return replace(plan, cells=cells, options=replace(plan.options, baseline=base.name))
 
 
-def side_of_baseline(path: Path, plan: RunPlan, baseline: str | None, max_missing: float) -> StoredSide:
-    """Read a stored baseline, or an earlier run's folder, and check it against what is about to be driven.
+def side_of_baseline(
+    path: Path, plan: RunPlan, baseline: str | None, max_missing: float
+) -> StoredSide:
+    """Read a stored baseline, or an earlier run's folder, and check it against what is about to be
+    driven.
 
     Args:
         path: The baseline's file or folder.
         plan: What may be driven, of one renderer.
-        baseline: RENDERER, POLICY or RENDERER/POLICY whose rollouts are taken; None: the arm that is driven.
+        baseline: RENDERER, POLICY or RENDERER/POLICY whose rollouts are taken; None: the arm that
+            is driven.
         max_missing: Share of the plan's scenes and seeds that it may lack.
 
     Raises:
-        InputError: It was made with another preset, other weights or other scenes, or lacks rollouts that may be driven.
+        InputError: It was made with another preset, other weights or other scenes, or lacks
+            rollouts that may be driven.
     """
     stored = read_baseline(path)
     weights = {file: sha for part in plan.parts for file, sha in part.files.items()}
-    check_made_alike(stored, plan.options.preset, {name: one.content_hash for name, one in plan.scenarios.items()}, weights, path)
+    check_made_alike(
+        stored,
+        plan.options.preset,
+        {name: one.content_hash for name, one in plan.scenarios.items()},
+        weights,
+        path,
+    )
     planned = {(cell.scene, cell.seed) for cell in plan.cells}
     there = arms_of((str(row["renderer"]), str(row["policy"])) for row in stored.rows)
     driven = Arm(plan.renderers[0].name, plan.policies[0].name)
@@ -206,7 +323,9 @@ def side_of_baseline(path: Path, plan: RunPlan, baseline: str | None, max_missin
     return stored_side(stored.rows, arm.renderer, arm.policy, planned, max_missing, path)
 
 
-def questions_of(metrics: Sequence[str], asked: Any, expected: float | None, method: Method | None) -> tuple[MetricQuestion, ...]:
+def questions_of(
+    metrics: Sequence[str], asked: Any, expected: float | None, method: Method | None
+) -> tuple[MetricQuestion, ...]:
     """Read ``--metric NAME[=MARGIN]``, repeatable or comma-separated.
 
     Raises:
@@ -218,7 +337,12 @@ def questions_of(metrics: Sequence[str], asked: Any, expected: float | None, met
         try:
             value = float(margin) if margin else None
         except ValueError:
-            raise InputError(DOING, f"--metric {text}", f"margin {margin!r} is no number", "write NAME=MARGIN, as progress=0.05") from None
+            raise InputError(
+                DOING,
+                f"--metric {text}",
+                f"margin {margin!r} is no number",
+                "write NAME=MARGIN, as progress=0.05",
+            ) from None
         found.append(metric_question(name, value, asked, expected, method=method))
     names = [one.metric for one in found]
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -239,12 +363,21 @@ def questions_of_gate(spec: GateSpec) -> tuple[MetricQuestion, ...]:
         if rule.margin is not None
     )
     if not any(one.binding for one in found):
-        raise InputError(DOING, "the gate", "no margin of it must be decided", "give it a metric with a margin, or judge a run without")
+        raise InputError(
+            DOING,
+            "the gate",
+            "no margin of it must be decided",
+            "give it a metric with a margin, or judge a run without",
+        )
     return found
 
 
 def controls_of(
-    texts: Sequence[str], plan: RunPlan, question: Question, order: Order, stored: StoredSide | None = None
+    texts: Sequence[str],
+    plan: RunPlan,
+    question: Question,
+    order: Order,
+    stored: StoredSide | None = None,
 ) -> dict[str, Control]:
     """Read ``--control``: ``family``, or run folders.
 
@@ -256,26 +389,43 @@ def controls_of(
         stored: The baseline's side, where it was driven earlier.
 
     Raises:
-        InputError: Controls for the population ``scenes``, families that the order takes out already, or one that cannot be had.
+        InputError: Controls for the population ``scenes``, families that the order takes out
+            already, or one that cannot be had.
     """
     if not texts:
         return {}
     if question.population != "suite":
         found = "the mean of a control over a population of scenes is not known"
-        raise InputError(DOING, f"--control {texts[0]}", found, "ask about the suite itself with --population suite, or leave it out")
+        raise InputError(
+            DOING,
+            f"--control {texts[0]}",
+            found,
+            "ask about the suite itself with --population suite, or leave it out",
+        )
     if "family" in texts and order == "stratified":
         found = "with --order stratified, families are taken out by the order"
         raise InputError(DOING, "--control family", found, "leave out one of the two")
     base, asked = arms_asked(plan, stored is not None)
     if base.policy != asked.policy and any(text != "family" for text in texts):
-        raise InputError(DOING, "--control RUN", "two policies are compared", "take --control family: an earlier run is of two renderers")
-    scenes, baseline, candidate = list(plan.scenarios), base.renderer if stored is None else stored.renderer, asked.renderer
+        raise InputError(
+            DOING,
+            "--control RUN",
+            "two policies are compared",
+            "take --control family: an earlier run is of two renderers",
+        )
+    scenes = list(plan.scenarios)
+    baseline = base.renderer if stored is None else stored.renderer
+    candidate = asked.renderer
     paths = {cell.scene: cell.ref.path for cell in plan.cells}
     out: dict[str, Control] = {}
     for text in texts:
         rows = None if text == "family" else rows_of_run(read_run(Path(text)))
         for one in question.metrics:
-            made = variance.of_families(paths) if rows is None else variance.of_rows(rows, one.metric, scenes, candidate, baseline, text)
+            made = (
+                variance.of_families(paths)
+                if rows is None
+                else variance.of_rows(rows, one.metric, scenes, candidate, baseline, text)
+            )
             out[one.metric] = variance.join(out[one.metric], made) if one.metric in out else made
     return out
 
@@ -303,18 +453,34 @@ def decide_into(
         how: Further arguments of `execute_decision`.
 
     Raises:
-        InputError: The scenes are fewer than a decision takes, whatever they show: nothing is driven.
+        InputError: The scenes are fewer than a decision takes, whatever they show: nothing is
+            driven.
     """
     scenes, least = len(plan.scenarios), question.min_scenes
     if scenes < least:
         do_this = "name more scenes, or drive these and judge all of them: simrun --renderer A,B SCENARIO..., then simrun gate RUN"
-        raise InputError(DOING, plural(scenes, "scene"), f"nothing is decided on fewer than {least} (min_scenes)", do_this)
+        raise InputError(
+            DOING,
+            plural(scenes, "scene"),
+            f"nothing is decided on fewer than {least} (min_scenes)",
+            do_this,
+        )
     plan = replace(plan, question=key_of(question, design, controls, stored))
-    folder = root or Path("runs", f"decide-{slug(next(iter(plan.scenarios)))}-{plan.command_key}")  # by the command alone
+    folder = root or Path(
+        "runs", f"decide-{slug(next(iter(plan.scenarios)))}-{plan.command_key}"
+    )  # by the command alone
     progress = SilentLooks() if quiet else LookLines()
     try:
         return execute_decision(
-            plan, question, design, folder, command=["simrun", *sys.argv[1:]], progress=progress, controls=controls, stored=stored, **how
+            plan,
+            question,
+            design,
+            folder,
+            command=["simrun", *sys.argv[1:]],
+            progress=progress,
+            controls=controls,
+            stored=stored,
+            **how,
         )
     except Stopped as stop:
         stop.kept = f"finished rollouts are kept in {folder}; the same command continues and decides the same"

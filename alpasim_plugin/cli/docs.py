@@ -12,7 +12,10 @@ from alpasim_plugin.cli.options import Json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Positional
 
-FOLDERS = (Path(__file__).resolve().parents[2] / "docs", Path(sys.prefix, "share", "simrun", "docs"))  # of a checkout, of the wheel
+FOLDERS = (
+    Path(__file__).resolve().parents[2] / "docs",
+    Path(sys.prefix, "share", "simrun", "docs"),
+)  # of a checkout, of the wheel
 EPILOG = """
 Examples:
 
@@ -23,24 +26,41 @@ Examples:
 
 
 def docs(
-    page: Annotated[str | None, Positional("A page, such as `policies` or `ci`; without it all are listed.")] = None,
+    page: Annotated[
+        str | None, Positional("A page, such as `policies` or `ci`; without it all are listed.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Read a page of the documentation in the terminal, or list all."""
     folder = next((one for one in FOLDERS if (one / "index.md").is_file()), None)
     if folder is None:
         found = "this installation has no pages"
-        raise InputError("reading the documentation", str(FOLDERS[1]), found, "install the wheel with pip, or use a checkout")
+        raise InputError(
+            "reading the documentation",
+            str(FOLDERS[1]),
+            found,
+            "install the wheel with pip, or use a checkout",
+        )
     pages = {path.stem: path for path in sorted(folder.glob("*.md"))}
     if page is None:
-        titles = {name: path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ") for name, path in pages.items()}
-        print(json.dumps(titles) if as_json else "\n".join(f"{name:<24}{title}" for name, title in titles.items()))
+        titles = {
+            name: path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+            for name, path in pages.items()
+        }
+        print(
+            json.dumps(titles)
+            if as_json
+            else "\n".join(f"{name:<24}{title}" for name, title in titles.items())
+        )
         return
     name = Path(page).stem
     if name not in pages:
         near = difflib.get_close_matches(name, pages, 1) or ["index"]
         raise InputError(
-            "reading the documentation", page, f"no such page among {len(pages)}", f"did you mean {near[0]!r}? simrun docs lists all"
+            "reading the documentation",
+            page,
+            f"no such page among {len(pages)}",
+            f"did you mean {near[0]!r}? simrun docs lists all",
         )
     text = pages[name].read_text(encoding="utf-8")
     if as_json:

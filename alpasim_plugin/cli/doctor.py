@@ -39,9 +39,19 @@ def doctor(
     rows = []
     for name, check in checks.items():
         try:
-            rows.append({"check": name, "ok": True, "needed": name in needed, "found": check(), "do": ""})
+            rows.append(
+                {"check": name, "ok": True, "needed": name in needed, "found": check(), "do": ""}
+            )
         except SimrunError as error:
-            rows.append({"check": name, "ok": False, "needed": name in needed, "found": error.found, "do": error.do_this})
+            rows.append(
+                {
+                    "check": name,
+                    "ok": False,
+                    "needed": name in needed,
+                    "found": error.found,
+                    "do": error.do_this,
+                }
+            )
     broken = [row for row in rows if row["needed"] and not row["ok"]]
     if as_json:
         print(json.dumps({"hardware": hardware(), "versions": versions(), "checks": rows}))
@@ -50,7 +60,10 @@ def doctor(
             print(f"{key:>32}  {value}")
         for row in rows:
             mark = "ok" if row["ok"] else "BROKEN" if row["needed"] else "absent"
-            print(f"{row['check']:>32}  {mark}: {row['found']}" + (f" -> {row['do']}" if row["do"] else ""))
+            print(
+                f"{row['check']:>32}  {mark}: {row['found']}"
+                + (f" -> {row['do']}" if row["do"] else "")
+            )
     raise typer.Exit(4 if broken else 0)
 
 
@@ -74,10 +87,15 @@ def _fixer() -> str:
     from alpasim_plugin.fixers import make_fixer
 
     fixer = make_fixer("onefixer", scene_id="doctor", threads=1)
-    grey = [Frame(i, "front", np.full((32, 48, 3), 40 * i, dtype=np.uint8)) for i in range(fixer.blocks.first)]
+    grey = [
+        Frame(i, "front", np.full((32, 48, 3), 40 * i, dtype=np.uint8))
+        for i in range(fixer.blocks.first)
+    ]
     fixed = fixer.step(grey, [frame.rgb for frame in grey])
     refused = sum(bool(frame.events) for frame in fixed)
-    return f"{fixer.label}: {len(fixed)} of {len(grey)} frames fixed, {refused} refused by its guard"
+    return (
+        f"{fixer.label}: {len(fixed)} of {len(grey)} frames fixed, {refused} refused by its guard"
+    )
 
 
 def _video() -> str:
@@ -104,7 +122,9 @@ def _writable(place: places.Place) -> str:
     """
     trouble = places.trouble_of(place)
     if trouble:
-        raise InfrastructureError("choosing folders", str(place), f"{place}: {trouble}", places.DO_THIS)
+        raise InfrastructureError(
+            "choosing folders", str(place), f"{place}: {trouble}", places.DO_THIS
+        )
     return str(place)
 
 

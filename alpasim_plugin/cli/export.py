@@ -1,4 +1,6 @@
-"""``simrun export``: runs and rollouts for other people's tools: AlpaSim's evaluation, Foxglove, Rerun."""
+"""``simrun export``: runs and rollouts for other people's tools: AlpaSim's evaluation, Foxglove,
+Rerun.
+"""
 
 from __future__ import annotations
 
@@ -49,38 +51,67 @@ Exit codes: 0 written; 2 no such run or rollout, several cells where one was nee
 
 def export(
     items: Annotated[
-        tuple[str, ...], Positional("A run folder, the folder of a rollout, or scenarios (--alpasim).", metavar="RUN|ROLLOUT|SCENARIO...")
+        tuple[str, ...],
+        Positional(
+            "A run folder, the folder of a rollout, or scenarios (--alpasim).",
+            metavar="RUN|ROLLOUT|SCENARIO...",
+        ),
     ],
     wanted: Wanted,
-    alpasim: Annotated[Path | None, Flag("Write AlpaSim run folders; new or empty.", metavar="DIR")] = None,
-    mcap: Annotated[Path | None, Flag("Write a recording for Foxglove; extra [mcap].", metavar="FILE")] = None,
-    rrd: Annotated[Path | None, Flag("Write a recording for Rerun; extra [rerun].", metavar="FILE")] = None,
+    alpasim: Annotated[
+        Path | None, Flag("Write AlpaSim run folders; new or empty.", metavar="DIR")
+    ] = None,
+    mcap: Annotated[
+        Path | None, Flag("Write a recording for Foxglove; extra [mcap].", metavar="FILE")
+    ] = None,
+    rrd: Annotated[
+        Path | None, Flag("Write a recording for Rerun; extra [rerun].", metavar="FILE")
+    ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a run for other tools: AlpaSim run folders and scenes, or one scene, policy and seed as a recording for Foxglove or Rerun.
+    """Write a run for other tools: AlpaSim run folders and scenes, or one scene, policy and seed as
+    a recording for Foxglove or Rerun.
 
-    With `--alpasim`, one run folder for each renderer and policy: logs, `_complete` marks, metadata and settings, so that `alpasim-eval`,
-    `alpasim-aggregation` and `alpasim-reeval` take them as they are, and `simrun score --preset alpasim` gives the same numbers.
+    With `--alpasim`, one run folder for each renderer and policy: logs, `_complete` marks, metadata
+    and settings, so that `alpasim-eval`, `alpasim-aggregation` and `alpasim-reeval` take them as
+    they are, and `simrun score --preset alpasim` gives the same numbers.
 
-    With `--mcap` or `--rrd`, camera frames, boxes, map, driven path, plans and metrics behind every renderer on one time line.
+    With `--mcap` or `--rrd`, camera frames, boxes, map, driven path, plans and metrics behind every
+    renderer on one time line.
     """
     files = {name: path for name, path in (("mcap", mcap), ("rrd", rrd)) if path is not None}
     if (alpasim is None) == (not files):
         found = "nothing to write" if alpasim is None else "--alpasim beside --mcap or --rrd"
-        raise InputError(DOING, " ".join(items), found, "give --alpasim DIR, or --mcap FILE and --rrd FILE")
+        raise InputError(
+            DOING, " ".join(items), found, "give --alpasim DIR, or --mcap FILE and --rrd FILE"
+        )
     if alpasim is None:
         _print_recording(*export_recording(items, wanted, files, overwrite), as_json)
         return
     if not wanted.is_all:
-        raise InputError(DOING, "--alpasim", "--scene, --policy, --seed or --renderer beside it", "leave them out: a run is exported whole")
+        raise InputError(
+            DOING,
+            "--alpasim",
+            "--scene, --policy, --seed or --renderer beside it",
+            "leave them out: a run is exported whole",
+        )
     runs = [item for item in items if is_run(Path(item))]
     if runs and len(items) > 1:
-        raise InputError("exporting to AlpaSim", " ".join(items), "a run folder among several items", "export one run at a time")
+        raise InputError(
+            "exporting to AlpaSim",
+            " ".join(items),
+            "a run folder among several items",
+            "export one run at a time",
+        )
     if runs:
         use_run(Path(runs[0]), warn)
-        done = export_run(Path(runs[0]), alpasim, lambda text: None if quiet or as_json else print(text, file=sys.stderr, flush=True))
+        done = export_run(
+            Path(runs[0]),
+            alpasim,
+            lambda text: None if quiet or as_json else print(text, file=sys.stderr, flush=True),
+        )
     else:
         done = export_scenes(items, alpasim)
     _print(done, as_json)
@@ -98,14 +129,21 @@ def export_recording(
         overwrite: Replace files that are there.
 
     Returns:
-        The recording, and for each file ``format``, ``file``, ``bytes``, ``messages``, and ``channels`` with the messages of each.
+        The recording, and for each file ``format``, ``file``, ``bytes``, ``messages``, and
+        ``channels`` with the messages of each.
 
     Raises:
-        InputError: Not one run or rollout, several cells, a file that is there already, a damaged log, or a library is not installed.
+        InputError: Not one run or rollout, several cells, a file that is there already, a damaged
+            log, or a library is not installed.
         InfrastructureError: The disk refuses.
     """
     if len(items) > 1:
-        raise InputError(RECORDING, " ".join(items), "several items", "give one run folder, or the folder of one rollout")
+        raise InputError(
+            RECORDING,
+            " ".join(items),
+            "several items",
+            "give one run folder, or the folder of one rollout",
+        )
     for name, path in files.items():
         refuse_existing(path, overwrite, RECORDING, "")
         FORMATS[name][0]()  # the library, before anything is read
@@ -118,26 +156,49 @@ def export_recording(
     check_wanted(run, wanted)
     cells = cells_of(run, wanted)
     if len(cells) != 1:
-        some = "; ".join(cell.name for cell in cells[:NAMED]) + (f"; {len(cells) - NAMED} more" if len(cells) > NAMED else "")
-        found = f"{len(cells)} cells of scene, policy and seed: {some}" if cells else "no finished rollout that was asked for"
-        raise InputError(RECORDING, str(root), found, "choose one by --scene, --policy and --seed, or name a rollout's folder")
+        some = "; ".join(cell.name for cell in cells[:NAMED]) + (
+            f"; {len(cells) - NAMED} more" if len(cells) > NAMED else ""
+        )
+        found = (
+            f"{len(cells)} cells of scene, policy and seed: {some}"
+            if cells
+            else "no finished rollout that was asked for"
+        )
+        raise InputError(
+            RECORDING,
+            str(root),
+            found,
+            "choose one by --scene, --policy and --seed, or name a rollout's folder",
+        )
     recording = collect(run, cells[0], read_logs(run, cells[0]))
     written = []
     for name, path in files.items():
         counts = dict(FORMATS[name][1](recording, path))
-        facts = {"format": name, "file": str(path), "bytes": path.stat().st_size, "messages": sum(counts.values()), "channels": counts}
+        facts = {
+            "format": name,
+            "file": str(path),
+            "bytes": path.stat().st_size,
+            "messages": sum(counts.values()),
+            "channels": counts,
+        }
         written.append(facts)
     return recording, written
 
 
 def _print_recording(recording: Recording, files: Sequence[dict[str, Any]], as_json: bool) -> None:
     if as_json:
-        print(json.dumps({"recording": recording.name, "files": files, "notes": list(recording.notes)}))
+        print(
+            json.dumps(
+                {"recording": recording.name, "files": files, "notes": list(recording.notes)}
+            )
+        )
         return
     for note in recording.notes:
         print(f"note     {note}")
     for one in files:
-        print(f"{one['format']:<8} {one['file']}  {one['bytes'] / 1e6:.1f} MB, {one['messages']} messages: {recording.name}")
+        print(
+            f"{one['format']:<8} {one['file']}  {one['bytes'] / 1e6:.1f} MB, {one['messages']} messages: {recording.name}"
+        )
 
 
 def _print(done: Export, as_json: bool) -> None:

@@ -15,7 +15,14 @@ import numpy as np
 import scipy
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from alpasim_plugin.cli.options import Json, command_of
 from alpasim_plugin.core.errors import InputError
@@ -47,19 +54,29 @@ from alpasim_plugin.gaussians.sh import C0
 from alpasim_plugin.world.ground import height_at
 
 DOING = "importing a trained model"
-OPAQUE, MOST_POINTS = 0.3, 100_000  # Gaussians that count as surface; how many of them the ground is looked for in
+OPAQUE, MOST_POINTS = (
+    0.3,
+    100_000,
+)  # Gaussians that count as surface; how many of them the ground is looked for in
 SPREAD = 0.5  # of a Gaussian's middle around the surface, in its own mean size
-LEAST_CARRIED, NEAR_M, FEWEST = 0.5, 2.5, 5  # share of the way that must have so many points so near below it
+LEAST_CARRIED, NEAR_M, FEWEST = (
+    0.5,
+    2.5,
+    5,
+)  # share of the way that must have so many points so near below it
 
 BESIDE_M, CLEARLY_M = 15.0, 0.5  # of the way, where things stand on the ground; above it
 
 
-def import_splat(file: Path, poses: Path, out: Path, report: Report | None = None) -> dict[str, Any]:
+def import_splat(
+    file: Path, poses: Path, out: Path, report: Report | None = None
+) -> dict[str, Any]:
     """Make a scenario of a trained model.
 
     Args:
         file: PLY, compressed PLY, ``.splat``, ``.spz`` or SOG.
-        poses: ``transforms.json`` with its folder, a COLMAP model or another drive, in the model's frame; photographs need not be there.
+        poses: ``transforms.json`` with its folder, a COLMAP model or another drive, in the model's
+            frame; photographs need not be there.
         out: Becomes the scenario's folder.
         report: Called as the work goes on.
 
@@ -67,22 +84,39 @@ def import_splat(file: Path, poses: Path, out: Path, report: Report | None = Non
         What ``quality.json`` holds.
 
     Raises:
-        InputError: The model or the poses cannot be used, or do not lie in one frame; nothing is left behind then.
+        InputError: The model or the poses cannot be used, or do not lie in one frame; nothing is
+            left behind then.
     """
     tell = report or (lambda stage, done, all: None)
     with working_folders(out) as (found, work):
-        drive = read_source(poses.parent if poses.name == "transforms.json" else poses, found, tell, photographs=False)
+        drive = read_source(
+            poses.parent if poses.name == "transforms.json" else poses,
+            found,
+            tell,
+            photographs=False,
+        )
         has_photographs = all(one.file.is_file() for one in drive.pictures)
         drive = checked(drive, poses, has_photographs)
         tell("reading the model", 0, 1)
         cloud, kept = read_gaussians(file)
         if kept.n_kept == 0:
-            raise InputError(DOING, str(file), str(kept), "give a file with at least one drawable Gaussian")
+            raise InputError(
+                DOING, str(file), str(kept), "give a file with at least one drawable Gaussian"
+            )
         key = key_of(drive, None, file if file.is_file() else None)
         if out.exists():
             return finished(out, key)
-        note = f"the model is {file.name}: {kept}" if kept.n_kept < kept.n_input else f"the model is {file.name}: {kept.n_kept} Gaussians"
-        drive = replace(drive, scene_id=file.stem.split(".")[0], points=_surface(cloud), notes=(*drive.notes, note))
+        note = (
+            f"the model is {file.name}: {kept}"
+            if kept.n_kept < kept.n_input
+            else f"the model is {file.name}: {kept.n_kept} Gaussians"
+        )
+        drive = replace(
+            drive,
+            scene_id=file.stem.split(".")[0],
+            points=_surface(cloud),
+            notes=(*drive.notes, note),
+        )
         return _built(drive, cloud, file, work, key, has_photographs, tell)
 
 
@@ -92,11 +126,21 @@ def _surface(cloud: GaussianCloud) -> Points:
     chosen = stream("splat", 0, "surface").permutation(chosen)[:MOST_POINTS]
     spread = SPREAD * np.asarray(cloud.scales, dtype=np.float64)[chosen].mean(axis=1)
     rgb = np.clip(0.5 + C0 * np.asarray(cloud.sh, dtype=np.float64)[chosen, 0], 0, 1)
-    return Points(np.asarray(cloud.means, dtype=np.float64)[chosen], rgb, np.eye(3) * (spread**2 / 3)[:, None, None])
+    return Points(
+        np.asarray(cloud.means, dtype=np.float64)[chosen],
+        rgb,
+        np.eye(3) * (spread**2 / 3)[:, None, None],
+    )
 
 
 def _built(
-    drive: SourceDrive, cloud: GaussianCloud, file: Path, work: Path, key: str, has_photographs: bool, tell: Report
+    drive: SourceDrive,
+    cloud: GaussianCloud,
+    file: Path,
+    work: Path,
+    key: str,
+    has_photographs: bool,
+    tell: Report,
 ) -> dict[str, Any]:
     assert drive.points is not None
     placed = place(drive, drive.points)
@@ -104,20 +148,42 @@ def _built(
     share = 0.0 if placed.strip is None else _carried(placed)
     if share < LEAST_CARRIED:
         found = f"{100 * share:.0f} % of the way of the poses runs over Gaussians of the model"
-        raise InputError(DOING, str(file), found, "give the poses in the model's own frame and unit: those that it was trained with")
+        raise InputError(
+            DOING,
+            str(file),
+            found,
+            "give the poses in the model's own frame and unit: those that it was trained with",
+        )
     above, below = _stands(placed)
     if below > above:
         found = f"upside down: beside the way {below} of its surfaces lie below the road and {above} stand on it"
-        raise InputError(DOING, str(file), found, "turn the model over, or give the poses that it was trained with")
+        raise InputError(
+            DOING,
+            str(file),
+            found,
+            "turn the model over, or give the poses that it was trained with",
+        )
     model = Reconstruction(background, {}, Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
     begin(work, key)
     shown = shown_photographs(drive, placed) if has_photographs else []
     write_photographs(work, shown, tell)
-    views = {use: [one.view() for one in shown if one.use == use] for use in ("fitted", "held-out", "never-fitted")}
+    views = {
+        use: [one.view() for one in shown if one.use == use]
+        for use in ("fitted", "held-out", "never-fitted")
+    }
     if not has_photographs:
         views["fitted"] = _blank(drive, placed)
-    drive = replace(drive, notes=(*drive.notes, _said(has_photographs), "the sky is black: a model of Gaussians has none"))
-    return write_folder(work, drive, placed, corridor(placed.ego, placed.ground), model, shown, views, {}, tell)
+    drive = replace(
+        drive,
+        notes=(
+            *drive.notes,
+            _said(has_photographs),
+            "the sky is black: a model of Gaussians has none",
+        ),
+    )
+    return write_folder(
+        work, drive, placed, corridor(placed.ego, placed.ground), model, shown, views, {}, tell
+    )
 
 
 def _carried(placed: PlacedDrive) -> float:
@@ -147,7 +213,13 @@ def _blank(drive: SourceDrive, placed: PlacedDrive) -> list[PosedView]:
     for picture, pose in zip(drive.of(drive.front), placed.poses[drive.front], strict=True):
         lens = picture.lens.resized(320)
         blank: U8 = np.zeros((lens.height, lens.width, 3), np.uint8)
-        out.append(PosedView(PinholeCamera.from_pose(lens.width, lens.height, lens.straight_K(), pose), blank, picture.file.stem))
+        out.append(
+            PosedView(
+                PinholeCamera.from_pose(lens.width, lens.height, lens.straight_K(), pose),
+                blank,
+                picture.file.stem,
+            )
+        )
     return out
 
 
@@ -159,27 +231,41 @@ Examples:
 
 - `simrun import drive walk.mp4 -o walk --camera-height 1.4`: a video without poses (needs the extra `sfm`)
 """
-SPLAT_EPILOG = (
-    "Example: `simrun import splat street.ply --poses transforms.json -o street`: then `simrun --renderer 3dgs street/scenario.yaml`"
+SPLAT_EPILOG = "Example: `simrun import splat street.ply --poses transforms.json -o street`: then `simrun --renderer 3dgs street/scenario.yaml`"
+
+app = typer.Typer(
+    no_args_is_help=True, help="Make a scenario of a recorded drive, or of a trained model."
 )
 
-app = typer.Typer(no_args_is_help=True, help="Make a scenario of a recorded drive, or of a trained model.")
-
-Out = Annotated[Path, Flag("Folder of the scenario; the same command goes on where it stopped.", also="-o")]
+Out = Annotated[
+    Path, Flag("Folder of the scenario; the same command goes on where it stopped.", also="-o")
+]
 
 
 def drive(
-    folder: Annotated[Path, Positional("Folder of photographs with poses, or a video (docs/real-drives.md).", metavar="FOLDER")],
+    folder: Annotated[
+        Path,
+        Positional(
+            "Folder of photographs with poses, or a video (docs/real-drives.md).", metavar="FOLDER"
+        ),
+    ],
     out: Out,
     camera_height: Annotated[
-        float | None, Flag("Front camera above the ground, metres, where poses have no unit.", min=0.1, max=5.0)
+        float | None,
+        Flag("Front camera above the ground, metres, where poses have no unit.", min=0.1, max=5.0),
     ] = None,
     road: Annotated[
-        Path | None, Flag("OpenDRIVE map in the coordinates of the poses; by default the driven path is the road.", "--map")
+        Path | None,
+        Flag(
+            "OpenDRIVE map in the coordinates of the poses; by default the driven path is the road.",
+            "--map",
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Make a scenario of a recorded drive: photographs with poses become a street in which policies drive."""
+    """Make a scenario of a recorded drive: photographs with poses become a street in which policies
+    drive.
+    """
     began = time.perf_counter()
     with _progress(as_json) as tell:
         try:
@@ -191,8 +277,19 @@ def drive(
 
 
 def splat(
-    file: Annotated[Path, Positional("The model: .ply, compressed .ply, .splat, .spz, .sog, or a folder of SOG.", metavar="FILE")],
-    poses: Annotated[Path, Flag("How it was driven through, in its own frame: transforms.json, COLMAP model, KITTI folder.")],
+    file: Annotated[
+        Path,
+        Positional(
+            "The model: .ply, compressed .ply, .splat, .spz, .sog, or a folder of SOG.",
+            metavar="FILE",
+        ),
+    ],
+    poses: Annotated[
+        Path,
+        Flag(
+            "How it was driven through, in its own frame: transforms.json, COLMAP model, KITTI folder."
+        ),
+    ],
     out: Out,
     as_json: Json = False,
 ) -> None:
@@ -209,7 +306,15 @@ app.command("splat", epilog=SPLAT_EPILOG)(command_of(splat))
 
 def _finish(quality: Mapping[str, Any], out: Path, began: float, as_json: bool) -> None:
     if as_json:
-        print(json.dumps({"scenario": str(out / "scenario.yaml"), "seconds": round(time.perf_counter() - began, 1), **quality}))
+        print(
+            json.dumps(
+                {
+                    "scenario": str(out / "scenario.yaml"),
+                    "seconds": round(time.perf_counter() - began, 1),
+                    **quality,
+                }
+            )
+        )
         return
     for line in _told(quality, out):
         print(line)
@@ -228,14 +333,22 @@ def _told(quality: Mapping[str, Any], out: Path) -> Iterator[str]:
 
 @contextmanager
 def _progress(silent: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """Show a bar on a terminal; elsewhere a line a stage, and one every `LINE_EVERY_S`; nothing if ``silent``."""
+    """Show a bar on a terminal; elsewhere a line a stage, and one every `LINE_EVERY_S`; nothing if
+    ``silent``.
+    """
     if silent:
         yield lambda stage, done, whole: None
         return
     if not sys.stderr.isatty():
         yield _Lines()
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         tasks: dict[str, Any] = {}
 

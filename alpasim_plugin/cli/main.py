@@ -1,6 +1,8 @@
-"""Entry point of ``simrun``: verbs, the default verb ``run``, and the mapping of errors and signals to exit codes.
+"""Entry point of ``simrun``: verbs, the default verb ``run``, and the mapping of errors and signals
+to exit codes.
 
-Only light modules are imported here: until a verb's own are loaded, a signal ends the process without a traceback.
+Only light modules are imported here: until a verb's own are loaded, a signal ends the process
+without a traceback.
 """
 
 from __future__ import annotations
@@ -31,26 +33,47 @@ from alpasim_plugin.core.signals import Stopped, leave_at_once, stoppable
 if TYPE_CHECKING:
     import typer
 
-# Verb -> module of this package and its function, by the groups of the help page. Only the verb that was typed is imported: some need
-# torch, which takes seconds to load.
+# Verb -> module of this package and its function, by the groups of the help page. Only the verb
+# that was typed is imported: some need torch, which takes seconds to load.
 GROUPS: dict[str, dict[str, str]] = {
     "Bring in": {"import": "import_drive:app"},
-    "Drive": {"run": "run:run", "decide": "decide:decide", "fork": "fork:fork", "probe": "fork:probe", "refine": "refine:refine"},
+    "Drive": {
+        "run": "run:run",
+        "decide": "decide:decide",
+        "fork": "fork:fork",
+        "probe": "fork:probe",
+        "refine": "refine:refine",
+    },
     "Read results": {
-        "score": "score:score", "compare": "compare:compare", "aggregate": "compare:aggregate", "gate": "gate:gate",
-        "report": "view:report", "runs": "runs:runs",
+        "score": "score:score",
+        "compare": "compare:compare",
+        "aggregate": "compare:aggregate",
+        "gate": "gate:gate",
+        "report": "view:report",
+        "runs": "runs:runs",
     },
     "Look": {"why": "fork:why", "view": "view:view", "preview": "preview:preview"},
     "AlpaSim": {
-        "serve": "serve:serve", "serve-policy": "serve:serve_policy", "check-driver": "check_policy:check_driver",
+        "serve": "serve:serve",
+        "serve-policy": "serve:serve_policy",
+        "check-driver": "check_policy:check_driver",
         "export": "export:export",
     },
-    "Extend": {"list": "new:list_parts", "new": "new:new", "check-policy": "check_policy:check_policy"},
+    "Extend": {
+        "list": "new:list_parts",
+        "new": "new:new",
+        "check-policy": "check_policy:check_policy",
+    },
     "Check and read": {"check": "check:check", "doctor": "doctor:doctor", "docs": "docs:docs"},
-}  # fmt: skip
+}
 PLUGINS = "From installed packages"
 GROUP = "simrun.commands"
-OF_EXTRA = {"adapt": "lab", "train": "lab", "judge": "lab", "bench": "lab"}  # verbs that an optional package of ours brings
+OF_EXTRA = {
+    "adapt": "lab",
+    "train": "lab",
+    "judge": "lab",
+    "bench": "lab",
+}  # verbs that an optional package of ours brings
 OWN_OPTIONS = ("--help", "--version", "--install-completion", "--show-completion")
 PIPE_CLOSED = 141  # as shells count a process that SIGPIPE ended
 READING = "reading the command line"
@@ -65,12 +88,17 @@ simrun itself, 130, 143 or 129 stopped by SIGINT, SIGTERM or SIGHUP, 141 the rea
 
 @cache
 def verbs() -> dict[str, str]:
-    """Return every verb and its ``module:attribute``: ours, and those that installed packages register in the group `GROUP`.
+    """Return every verb and its ``module:attribute``: ours, and those that installed packages
+    register in the group `GROUP`.
 
     Raises:
         InputError: A package claims a name that is taken.
     """
-    own = {verb: f"alpasim_plugin.cli.{target}" for group in GROUPS.values() for verb, target in group.items()}
+    own = {
+        verb: f"alpasim_plugin.cli.{target}"
+        for group in GROUPS.values()
+        for verb, target in group.items()
+    }
     return own | installed_names(GROUP, own, "command")
 
 
@@ -84,7 +112,8 @@ def with_verb(args: list[str]) -> list[str]:
         ['list', 'renderers']
 
     Raises:
-        InputError: The first word is no file and resembles a verb, or is the verb of a package that is not installed.
+        InputError: The first word is no file and resembles a verb, or is the verb of a package that
+            is not installed.
     """
     if not args or args[0] in verbs() or args[0] in OWN_OPTIONS:
         return args
@@ -92,32 +121,47 @@ def with_verb(args: list[str]) -> list[str]:
         extra = OF_EXTRA[args[0]]
         do_this = f"install the extra that brings it: pip install 'alpasim-onefixer[{extra}]'"
         raise InputError(READING, f"simrun {args[0]}", "the verb is not installed", do_this)
-    near = [] if args[0].startswith("-") or Path(args[0]).exists() else difflib.get_close_matches(args[0], verbs(), 1, 0.7)
+    near = (
+        []
+        if args[0].startswith("-") or Path(args[0]).exists()
+        else difflib.get_close_matches(args[0], verbs(), 1, 0.7)
+    )
     if near:
         found = f"neither a verb nor a scenario; {near[0]} is one"
-        raise InputError(READING, args[0], found, f"type 'simrun {near[0]}', or 'simrun --help' for all verbs")
+        raise InputError(
+            READING, args[0], found, f"type 'simrun {near[0]}', or 'simrun --help' for all verbs"
+        )
     return ["run", *args]
 
 
 def make_app(verb: str | None) -> typer.Typer:
     """Return the command line with one verb, or with all verbs for the help page.
 
-    A verb is a `typer.Typer`, or a function whose parameters Typer or `alpasim_plugin.cli.options.command_of` understands. Its help is its
-    docstring; below it stands ``VERB_EPILOG`` or ``EPILOG`` of its module.
+    A verb is a `typer.Typer`, or a function whose parameters Typer or
+    `alpasim_plugin.cli.options.command_of` understands. Its help is its docstring; below it stands
+    ``VERB_EPILOG`` or ``EPILOG`` of its module.
     """
     import typer
 
-    app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", pretty_exceptions_enable=False, help=HELP)
+    app = typer.Typer(
+        no_args_is_help=True, rich_markup_mode="markdown", pretty_exceptions_enable=False, help=HELP
+    )
 
     @app.callback()
-    def own(version: bool = typer.Option(False, "--version", help="Print the version and leave.")) -> None:
+    def own(
+        version: bool = typer.Option(False, "--version", help="Print the version and leave."),
+    ) -> None:
         """Take the options that stand before a verb."""
 
     if verb in verbs():
         from alpasim_plugin.cli.options import command_of
 
         module_name, _, name = verbs()[verb].partition(":")
-        with arrow_without_pandas() if module_name.startswith(f"{__package__}.") else contextlib.nullcontext():
+        with (
+            arrow_without_pandas()
+            if module_name.startswith(f"{__package__}.")
+            else contextlib.nullcontext()
+        ):
             module = import_module(module_name)
         found = getattr(module, name)
         if isinstance(found, typer.Typer):
@@ -128,12 +172,15 @@ def make_app(verb: str | None) -> typer.Typer:
         return app
     panels = {listed: panel for panel, group in GROUPS.items() for listed in group}
     for listed in (*panels, *(name for name in verbs() if name not in panels)):
-        app.command(listed, help=first_line(verbs()[listed]), rich_help_panel=panels.get(listed, PLUGINS))(lambda: None)
+        app.command(
+            listed, help=first_line(verbs()[listed]), rich_help_panel=panels.get(listed, PLUGINS)
+        )(lambda: None)
     return app
 
 
 def first_line(target: str) -> str:
-    """Return the first line of a verb's help, read off its source: of a function's docstring, or of the ``help`` of a `typer.Typer`.
+    """Return the first line of a verb's help, read off its source: of a function's docstring, or of
+    the ``help`` of a `typer.Typer`.
 
     The module is not imported; where it has no source, the line says where the verb comes from.
     """
@@ -147,7 +194,11 @@ def first_line(target: str) -> str:
     for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
         if isinstance(node, ast.FunctionDef) and node.name == name:
             return (ast.get_docstring(node) or "").partition("\n")[0]
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name and isinstance(node.value, ast.Call):
+        if (
+            isinstance(node, ast.Assign)
+            and ast.unparse(node.targets[0]) == name
+            and isinstance(node.value, ast.Call)
+        ):
             for keyword in node.value.keywords:
                 if keyword.arg == "help" and isinstance(keyword.value, ast.Constant):
                     return str(keyword.value.value).partition("\n")[0]
@@ -168,25 +219,33 @@ def _run(args: list[str]) -> int:
     if not gc.isenabled():
         gc.freeze()
         gc.enable()
-    usage_error: Any = typer.BadParameter.__bases__[0]  # its module is another one in other versions of typer
+    usage_error: Any = typer.BadParameter.__bases__[
+        0
+    ]  # its module is another one in other versions of typer
     try:
         with stoppable(), command.make_context("simrun", list(args)) as context:
             command.invoke(context)
     except typer.Exit as leaving:
         return leaving.exit_code
     except usage_error as error:
-        if type(error).__name__ == "NoArgsIsHelpError":  # simrun alone, or a verb with verbs of its own
+        if (
+            type(error).__name__ == "NoArgsIsHelpError"
+        ):  # simrun alone, or a verb with verbs of its own
             print(error.ctx.get_help(), file=sys.stderr)
             return InputError.exit_code
         where = error.ctx.command_path if error.ctx else "simrun"
         raise InputError(
-            READING, where, error.format_message().replace("Value error, ", ""), f"'{where} --help' lists what it takes"
+            READING,
+            where,
+            error.format_message().replace("Value error, ", ""),
+            f"'{where} --help' lists what it takes",
         ) from error
     return 0
 
 
 def run_command(args: list[str]) -> int:
-    """Run one command line and return its exit code; errors are printed, as JSON on stdout with ``--json``.
+    """Run one command line and return its exit code; errors are printed, as JSON on stdout with
+    ``--json``.
 
     Nothing is raised: what is not one of our errors is an `InternalError`.
     """
@@ -197,7 +256,9 @@ def run_command(args: list[str]) -> int:
             sys.stdout.flush()  # here a full disk is still an error with a text
         return code
     except SystemExit as leaving:
-        if isinstance(leaving.__context__, BrokenPipeError):  # rich leaves with 1, which would read as a failed gate
+        if isinstance(
+            leaving.__context__, BrokenPipeError
+        ):  # rich leaves with 1, which would read as a failed gate
             return PIPE_CLOSED
         return leaving.code if isinstance(leaving.code, int) else 0 if leaving.code is None else 2
     except (SimrunError, Stopped) as error:
@@ -211,7 +272,9 @@ def run_command(args: list[str]) -> int:
         traceback.print_exception(failure)
     with contextlib.suppress(OSError):  # nobody can be told; the exit code still says it
         if "--json" in args:
-            print(json.dumps({"error": failure.as_dict(), "exit_code": failure.exit_code}), flush=True)
+            print(
+                json.dumps({"error": failure.as_dict(), "exit_code": failure.exit_code}), flush=True
+            )
         else:
             print(failure, file=sys.stderr, flush=True)
     _drop_unwritten_output()
@@ -222,16 +285,33 @@ def _unforeseen(error: Exception, args: list[str]) -> SimrunError:
     """Say in four parts what no part of the program has foreseen."""
     command = " ".join(["simrun", *args])
     if isinstance(error, MemoryError):
-        return InfrastructureError("running a command", command, f"out of memory: {error}", "use fewer --workers, or free memory")
+        return InfrastructureError(
+            "running a command",
+            command,
+            f"out of memory: {error}",
+            "use fewer --workers, or free memory",
+        )
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         where = error.filename or "where the output goes"
         return InfrastructureError(
-            "running a command", command, f"{error.strerror}: {where}", "free space, then give the same command again"
+            "running a command",
+            command,
+            f"{error.strerror}: {where}",
+            "free space, then give the same command again",
         )
     if isinstance(error, PermissionError) and error.filename:
-        return InputError("running a command", str(error.filename), str(error.strerror), "let this user read and write it, or name another")
-    if isinstance(error, OSError) and places.nothing_is_writable():  # of a library that needs a folder for itself
-        return InfrastructureError("running a command", command, f"no folder can be written: {error}", places.DO_THIS)
+        return InputError(
+            "running a command",
+            str(error.filename),
+            str(error.strerror),
+            "let this user read and write it, or name another",
+        )
+    if (
+        isinstance(error, OSError) and places.nothing_is_writable()
+    ):  # of a library that needs a folder for itself
+        return InfrastructureError(
+            "running a command", command, f"no folder can be written: {error}", places.DO_THIS
+        )
     failure = InternalError.of(error, command)
     failure.__cause__ = error
     return failure
@@ -248,7 +328,9 @@ def _reader_is_gone() -> bool:
 
 
 def _drop_unwritten_output() -> None:
-    """Drop what was printed and cannot be written, so that Python does not fail on it at its end."""
+    """Drop what was printed and cannot be written, so that Python does not fail on it at its
+    end.
+    """
     try:
         sys.stdout.flush()
     except (OSError, ValueError, AttributeError):
@@ -257,8 +339,12 @@ def _drop_unwritten_output() -> None:
 
 
 def _complete() -> None:
-    """Answer a Tab, for which a shell runs the program with the words so far in its environment; only the typed verb is imported."""
-    variable, joint = ("COMP_WORDS", "\n") if "COMP_WORDS" in os.environ else ("_TYPER_COMPLETE_ARGS", " ")
+    """Answer a Tab, for which a shell runs the program with the words so far in its environment;
+    only the typed verb is imported.
+    """
+    variable, joint = (
+        ("COMP_WORDS", "\n") if "COMP_WORDS" in os.environ else ("_TYPER_COMPLETE_ARGS", " ")
+    )
     text = os.environ.get(variable, "")
     number = int(os.environ.get("COMP_CWORD", "0")) or len(text.split()) - (not text.endswith(" "))
     first = [*text.split(), "", ""][1]
@@ -271,9 +357,15 @@ def _complete() -> None:
 
 
 def load_workers_early(args: Sequence[str]) -> None:
-    """Let what rollouts need be loaded beside this process, if it is about to have some driven by workers of this machine."""
+    """Let what rollouts need be loaded beside this process, if it is about to have some driven by
+    workers of this machine.
+    """
     is_run = bool(args) and (args[0] == "run" or args[0].startswith("-") or args[0] not in verbs())
-    if is_run and not re.search(r"--(help|version|dry-run|executor|workers[= ]1\b)", " ".join(args)) and (os.cpu_count() or 1) > 1:
+    if (
+        is_run
+        and not re.search(r"--(help|version|dry-run|executor|workers[= ]1\b)", " ".join(args))
+        and (os.cpu_count() or 1) > 1
+    ):
         from alpasim_plugin.runs.executors.local import load_early
 
         load_early()
@@ -282,7 +374,9 @@ def load_workers_early(args: Sequence[str]) -> None:
 def main() -> None:
     """Run the process's command line and exit with its code."""
     leave_at_once()
-    gc.disable()  # until a verb is imported: that stays, and the collector need not look through it again and again
+    # until a verb is imported: that stays, and the collector need not look through it again and
+    # again
+    gc.disable()
     if "_SIMRUN_COMPLETE" not in os.environ:
         with contextlib.suppress(SimrunError):  # it is raised again where errors are printed
             load_workers_early(sys.argv[1:])

@@ -1,4 +1,6 @@
-"""``simrun list``: names for the command line. ``simrun new``: write a part or a scenario that works, with its test, to begin from."""
+"""``simrun list``: names for the command line. ``simrun new``: write a part or a scenario that
+works, with its test, to begin from.
+"""
 
 from __future__ import annotations
 
@@ -22,14 +24,26 @@ from alpasim_plugin.core.parts.source import load
 
 LIST_PARTS_EPILOG = "Example: `simrun list scenarios`"
 
-Listed = Literal["renderers", "fixers", "policies", "controllers", "evaluators", "sources", "scenarios", "metrics", "presets"]
+Listed = Literal[
+    "renderers",
+    "fixers",
+    "policies",
+    "controllers",
+    "evaluators",
+    "sources",
+    "scenarios",
+    "metrics",
+    "presets",
+]
 
 
 def list_parts(
     kind: Annotated[Listed, Positional("What to list.")],
     as_json: Json = False,
 ) -> None:
-    """List renderers, fixers, policies, other parts, shipped scenarios, metrics or presets, one a line with one line of help."""
+    """List renderers, fixers, policies, other parts, shipped scenarios, metrics or presets, one a
+    line with one line of help.
+    """
     tables: dict[str, Callable[[], dict[str, str]]] = {
         "renderers": _renderers,
         "fixers": _fixers,
@@ -51,8 +65,12 @@ def list_parts(
 
 
 def _renderers() -> dict[str, str]:
-    """Return every renderer, and the fixers that a renderer may be named by: each stands for ``NAME+3dgs``."""
-    return names("renderer") | {name: f"3dgs, repaired by the fixer {name}: {text}" for name, text in names("fixer").items()}
+    """Return every renderer, and the fixers that a renderer may be named by: each stands for
+    ``NAME+3dgs``.
+    """
+    return names("renderer") | {
+        name: f"3dgs, repaired by the fixer {name}: {text}" for name, text in names("fixer").items()
+    }
 
 
 def _fixers() -> dict[str, str]:
@@ -62,7 +80,9 @@ def _fixers() -> dict[str, str]:
         spec = unidentified("fixer", name)
         factory = load(spec.target, "fixer")
         help_text = getattr(factory, "help", {}).get(name, help_text)
-        listed[name] = f"{help_text} [{note_of(spec, declaration_of(factory, spec.settings, Path()))}]"
+        listed[name] = (
+            f"{help_text} [{note_of(spec, declaration_of(factory, spec.settings, Path()))}]"
+        )
     return listed
 
 
@@ -112,7 +132,12 @@ def new(
 ) -> None:
     """Write a working policy, scenario, renderer, fixer or metric with a test, to begin from."""
     if not re.fullmatch("[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
-        raise InputError(DOING, f"name {name!r}", "not a name of a Python file", "use lower case, digits and underscores: my_policy")
+        raise InputError(
+            DOING,
+            f"name {name!r}",
+            "not a name of a Python file",
+            "use lower case, digits and underscores: my_policy",
+        )
     if not folder.is_dir():
         raise InputError(DOING, f"--folder {folder}", "no such folder", "make it first")
     words = {
@@ -124,10 +149,16 @@ def new(
     targets = {folder / words["file"]: f"{kind}.txt", folder / words["test"]: f"{kind}_test.txt"}
     for path in targets:
         if path.exists():
-            raise InputError(DOING, str(path), "it exists already", "choose another name or --folder")
+            raise InputError(
+                DOING, str(path), "it exists already", "choose another name or --folder"
+            )
     templates = files("alpasim_plugin.cli") / "templates"
     for path, template in targets.items():
-        write_text(path, Template((templates / template).read_text(encoding="utf-8")).substitute(words), DOING)
+        write_text(
+            path,
+            Template((templates / template).read_text(encoding="utf-8")).substitute(words),
+            DOING,
+        )
     command = TRY[kind].format(file=folder / words["file"], cls=words["Class"])
     if as_json:
         print(json.dumps({"files": [str(path) for path in targets], "try": command}))
@@ -135,5 +166,9 @@ def new(
     for path in targets:
         print(f"wrote    {path}")
     test = f"python -m pytest {folder / words['test']}"
-    print(f"test     {test}" if find_spec("pytest") else f"test     {test}   # after: pip install pytest")
+    print(
+        f"test     {test}"
+        if find_spec("pytest")
+        else f"test     {test}   # after: pip install pytest"
+    )
     print(f"next     {command}")

@@ -1,4 +1,6 @@
-"""The options of the command line, each stated once: as an annotated field of a job's dataclass, or as an annotated parameter of a verb."""
+"""The options of the command line, each stated once: as an annotated field of a job's dataclass, or
+as an annotated parameter of a verb.
+"""
 
 from __future__ import annotations
 
@@ -22,18 +24,30 @@ Run = Annotated[Path, Positional("A run folder.")]
 Json = Annotated[bool, Flag("Print one JSON document on stdout.", "--json")]
 Debug = Annotated[bool, Flag("Show tracebacks.")]
 Quiet = Annotated[bool, Flag("No progress, only the result.")]
-RunFolder = Annotated[Path | None, Flag("Run folder; by default one below runs/ named after the command.")]
-Overrides = Annotated[tuple[str, ...], Flag("Override a scenario key: key=value. Repeatable.", "--set")]
+RunFolder = Annotated[
+    Path | None, Flag("Run folder; by default one below runs/ named after the command.")
+]
+Overrides = Annotated[
+    tuple[str, ...], Flag("Override a scenario key: key=value. Repeatable.", "--set")
+]
 Overwrite = Annotated[bool, Flag("Replace files that exist.")]
 Every = Annotated[bool, Flag("Print every metric, not only the headline ones.", "--all")]
 Preset = Annotated[str, Flag("Evaluator preset.", names="preset")]
 Presets = Annotated[str, Flag("Evaluator presets, separated by commas.", names="preset")]
-Evaluators = Annotated[tuple[str, ...], Flag("A further evaluator, package.module:Class. Repeatable.", "--evaluator")]
+Evaluators = Annotated[
+    tuple[str, ...], Flag("A further evaluator, package.module:Class. Repeatable.", "--evaluator")
+]
 Device = Annotated[Literal["cpu", "cuda"], Flag("Where to compute.")]
 Seed = Annotated[int, Flag("Seed of the noise.", min=0)]
-Workers = Annotated[int | None, Flag("Worker processes; by default one per core. The result does not depend on them.", min=1)]
+Workers = Annotated[
+    int | None,
+    Flag("Worker processes; by default one per core. The result does not depend on them.", min=1),
+]
 Wait = Annotated[bool, Flag("Wait for a process that writes the run folder; otherwise refuse.")]
-Report = Annotated[bool, Flag("Write report.html now; `simrun report RUN` writes it later.", "--report/--no-report")]
+Report = Annotated[
+    bool,
+    Flag("Write report.html now; `simrun report RUN` writes it later.", "--report/--no-report"),
+]
 
 
 @dataclass(frozen=True)
@@ -42,21 +56,38 @@ class What:
 
     scenarios: Annotated[
         tuple[str, ...],
-        Positional("Scenario or suite YAML, a folder of them, a shipped name, or a recorded log.", names="scenario", required=True),
+        Positional(
+            "Scenario or suite YAML, a folder of them, a shipped name, or a recorded log.",
+            names="scenario",
+            required=True,
+        ),
     ] = ()
     renderer: Annotated[
         str,
-        Flag("Renderers, comma-separated: a name, `FIXER`, `FIXER+RENDERER`, or `package.module:Class`.", names="renderer"),
+        Flag(
+            "Renderers, comma-separated: a name, `FIXER`, `FIXER+RENDERER`, or `package.module:Class`.",
+            names="renderer",
+        ),
     ] = "3dgs"
     policy: Annotated[
         str,
-        Flag("Policies, comma-separated: a name, `package.module:Class`, `file.py:Class` or `exec:COMMAND`.", names="policy"),
+        Flag(
+            "Policies, comma-separated: a name, `package.module:Class`, `file.py:Class` or `exec:COMMAND`.",
+            names="policy",
+        ),
     ] = "lane-camera"
     seeds: Annotated[str, Flag("How many seeds (3 means 0,1,2), or a list such as 4,7.")] = "1"
     overrides: Annotated[
-        tuple[str, ...], Flag("Override a scenario key, key=value, or with [RENDERER:]fixer. a fixer's. Repeatable.", "--set")
+        tuple[str, ...],
+        Flag(
+            "Override a scenario key, key=value, or with [RENDERER:]fixer. a fixer's. Repeatable.",
+            "--set",
+        ),
     ] = ()
-    source: Annotated[str | None, Flag("Reader of the recorded log: a name, or package.module:Class.", names="source")] = None
+    source: Annotated[
+        str | None,
+        Flag("Reader of the recorded log: a name, or package.module:Class.", names="source"),
+    ] = None
 
     @property
     def renderers(self) -> list[str]:
@@ -67,7 +98,9 @@ class What:
 
     @property
     def of_fixer(self) -> tuple[str, ...]:
-        """Give the settings of fixers among the overrides, as `alpasim_plugin.runs.plan.RunOptions` has them."""
+        """Give the settings of fixers among the overrides, as `alpasim_plugin.runs.plan.RunOptions`
+        has them.
+        """
         return split_overrides(self.overrides)[1]
 
     @property
@@ -83,9 +116,16 @@ class Where:
     workers: Workers = None
     executor: Annotated[
         str,
-        Flag("`local`, `ray[:HOST:PORT]` or `slurm[:PARTITION]`; behind it what a worker needs: `ray?cores=2&gpus=0.5&memory=8` (GiB)."),
+        Flag(
+            "`local`, `ray[:HOST:PORT]` or `slurm[:PARTITION]`; behind it what a worker needs: `ray?cores=2&gpus=0.5&memory=8` (GiB)."
+        ),
     ] = "local"
-    store: Annotated[str | None, Flag("Also keep every rollout in a store: a folder, or `s3://BUCKET/PREFIX`.", metavar="URL")] = None
+    store: Annotated[
+        str | None,
+        Flag(
+            "Also keep every rollout in a store: a folder, or `s3://BUCKET/PREFIX`.", metavar="URL"
+        ),
+    ] = None
 
     def arguments(self) -> dict[str, Any]:
         """Return the arguments of the same meaning of `execute_run` and `execute_decision`.
@@ -95,25 +135,41 @@ class Where:
         """
         from alpasim_plugin.runs.executors.choice import parse_executor
 
-        return {"workers": self.workers, "executor": parse_executor(self.executor), "store": self.store}
+        return {
+            "workers": self.workers,
+            "executor": parse_executor(self.executor),
+            "store": self.store,
+        }
 
 
 @dataclass(frozen=True)
 class Care:
     """How a run is kept, checked and reported."""
 
-    certify: Annotated[Literal["one", "none"], Flag("Repeat one rollout and compare bit for bit.")] = "one"
+    certify: Annotated[
+        Literal["one", "none"], Flag("Repeat one rollout and compare bit for bit.")
+    ] = "one"
     report: Report = True
     wait: Wait = False
-    time_limit: Annotated[float | None, Flag("Seconds that a rollout may take; one that hangs is ended and reported.", min=0.001)] = None
+    time_limit: Annotated[
+        float | None,
+        Flag("Seconds that a rollout may take; one that hangs is ended and reported.", min=0.001),
+    ] = None
 
     def arguments(self) -> dict[str, Any]:
         """Return the arguments of the same meaning of `execute_run` and `execute_decision`."""
-        return {"certificate": self.certify, "report": self.report, "wait": self.wait, "limit_s": self.time_limit}
+        return {
+            "certificate": self.certify,
+            "report": self.report,
+            "wait": self.wait,
+            "limit_s": self.time_limit,
+        }
 
 
 class Only:
-    """Beside a dataclass of options in a verb's signature: the fields that the verb takes; the others keep their default."""
+    """Beside a dataclass of options in a verb's signature: the fields that the verb takes; the
+    others keep their default.
+    """
 
     def __init__(self, *names: str) -> None:
         self.names = names
@@ -122,8 +178,9 @@ class Only:
 def command_of(function: Callable[..., None]) -> Callable[..., None]:
     """Return the function that Typer is given for a verb.
 
-    A parameter that is a dataclass of flags is taken apart into one option for each flag, and put together again for the call. Annotations
-    of Typer's own are left as they are, and ``--debug`` is added where the verb does not have it.
+    A parameter that is a dataclass of flags is taken apart into one option for each flag, and put
+    together again for the call. Annotations of Typer's own are left as they are, and ``--debug`` is
+    added where the verb does not have it.
     """
     hints = get_type_hints(function, include_extras=True)
     parts: list[inspect.Parameter] = []
@@ -133,15 +190,22 @@ def command_of(function: Callable[..., None]) -> Callable[..., None]:
         if not is_dataclass(kind):
             parts.append(_option(parameter.name, hints[parameter.name], parameter.default))
             continue
-        made = _options_of(kind, next((fact.names for fact in facts if isinstance(fact, Only)), None))
+        made = _options_of(
+            kind, next((fact.names for fact in facts if isinstance(fact, Only)), None)
+        )
         groups[parameter.name] = kind, [part.name for part in made]
         parts += made
     has_debug = "debug" in hints
     if not has_debug:
-        parts.append(_option("debug", Debug, False))  # read from the command line by cli.main, before any option is parsed
+        parts.append(
+            _option("debug", Debug, False)
+        )  # read from the command line by cli.main, before any option is parsed
 
     def call(**given: Any) -> None:
-        values = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
+        values = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in given.items()
+        }
         values |= {part.name: () for part in parts if part.name in many and not values[part.name]}
         for name, (kind, names) in groups.items():
             values[name] = kind(**{field: values.pop(field) for field in names})
@@ -162,14 +226,19 @@ def _parted(hint: Any) -> tuple[Any, ...]:
 
 def _is_list(hint: Any) -> bool:
     kind = _parted(hint)[0]
-    return any(get_origin(one) is list for one in (get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)))
+    return any(
+        get_origin(one) is list
+        for one in (get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,))
+    )
 
 
 def _options_of(kind: Any, only: Sequence[str] | None) -> list[inspect.Parameter]:
     hints = get_type_hints(kind, include_extras=True)
     made = []
     for field in fields(kind):
-        has_flag = any(isinstance(fact, Flag | Positional) for fact in _parted(hints[field.name])[1:])
+        has_flag = any(
+            isinstance(fact, Flag | Positional) for fact in _parted(hints[field.name])[1:]
+        )
         if has_flag and (only is None or field.name in only):
             default = inspect.Parameter.empty if field.default is MISSING else field.default
             made.append(_option(field.name, hints[field.name], default))
@@ -183,7 +252,9 @@ def _option(name: str, hint: Any, default: Any) -> inspect.Parameter:
     if fact is not None:
         if get_origin(kind) is tuple:
             many: Any = GenericAlias(list, (get_args(kind)[0],))
-            is_required = default is inspect.Parameter.empty or (isinstance(fact, Positional) and fact.required)
+            is_required = default is inspect.Parameter.empty or (
+                isinstance(fact, Positional) and fact.required
+            )
             kind, default = (many, inspect.Parameter.empty) if is_required else (many | None, None)
         hint = Annotated[kind, _info(name, fact)]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hint)
@@ -195,12 +266,20 @@ def _info(name: str, fact: Flag | Positional) -> Any:
         return typer.Argument(help=fact.help, metavar=fact.metavar, autocompletion=offered)
     written = [fact.name or f"--{name.replace('_', '-')}", *([fact.also] if fact.also else [])]
     return typer.Option(
-        *written, help=fact.help, min=fact.min, max=fact.max, metavar=fact.metavar, envvar=fact.variable, autocompletion=offered
+        *written,
+        help=fact.help,
+        min=fact.min,
+        max=fact.max,
+        metavar=fact.metavar,
+        envvar=fact.variable,
+        autocompletion=offered,
     )
 
 
 def _names(kind: str) -> Callable[[str], list[str]]:
-    """Return what a Tab offers: names of one kind, the last of several behind commas; none with a colon, at which shells end words."""
+    """Return what a Tab offers: names of one kind, the last of several behind commas; none with a
+    colon, at which shells end words.
+    """
 
     def offer(incomplete: str) -> list[str]:
         from alpasim_plugin.core.parts import names
@@ -211,7 +290,9 @@ def _names(kind: str) -> Callable[[str], list[str]]:
         known = {"preset": lambda: [*PRESETS], "scenario": lambda: [*shipped_names(), *suites()]}
         known["renderer"] = lambda: [*names("renderer"), *names("fixer")]
         found = known[kind]() if kind in known else names(kind)  # type: ignore[arg-type]
-        return [before + comma + name for name in found if name.startswith(last) and ":" not in name]
+        return [
+            before + comma + name for name in found if name.startswith(last) and ":" not in name
+        ]
 
     return offer
 
@@ -228,7 +309,8 @@ def split_policies(text: str) -> list[str]:
 
 
 def split_overrides(overrides: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Separate the overrides of scenarios from those of fixers: ``fixer.KEY=VALUE``, or ``RENDERER:fixer.KEY=VALUE`` for one of them.
+    """Separate the overrides of scenarios from those of fixers: ``fixer.KEY=VALUE``, or
+    ``RENDERER:fixer.KEY=VALUE`` for one of them.
 
     Example:
         >>> split_overrides(["timing.warmup_us=400000", "fixer.mode=chunk", "difix:fixer.weights.bundle=d.safetensors"])
@@ -253,7 +335,12 @@ def fixer_overrides(texts: Sequence[str]) -> list[str]:
     """
     for text in texts:
         if not text.startswith(FIXER_PREFIX):
-            raise InputError("reading --set", f"--set {text}", "not a key of the fixer", f"write --set {FIXER_PREFIX}key=value")
+            raise InputError(
+                "reading --set",
+                f"--set {text}",
+                "not a key of the fixer",
+                f"write --set {FIXER_PREFIX}key=value",
+            )
     return [text.removeprefix(FIXER_PREFIX) for text in texts]
 
 
@@ -278,7 +365,12 @@ def parse_seeds(text: str) -> list[int]:
         SEEDS.check(len(values), "reading --seeds", "--seeds")
         return values
     found = "neither a count from 1 up nor a list of seeds from 0 to 2^63 - 1"
-    raise InputError("reading --seeds", f"--seeds {text}", found, "write a count such as 3, or a list such as 4,7")
+    raise InputError(
+        "reading --seeds",
+        f"--seeds {text}",
+        found,
+        "write a count such as 3, or a list such as 4,7",
+    )
 
 
 def check_preset(preset: str) -> None:
@@ -290,7 +382,12 @@ def check_preset(preset: str) -> None:
     from evaluators import PRESETS
 
     if preset not in PRESETS:
-        raise InputError("choosing a preset", f"--preset {preset}", "no such preset", f"known: {', '.join(PRESETS)}")
+        raise InputError(
+            "choosing a preset",
+            f"--preset {preset}",
+            "no such preset",
+            f"known: {', '.join(PRESETS)}",
+        )
 
 
 def refuse_existing(path: Path | None, overwrite: bool, doing: str, option: str) -> None:
@@ -300,4 +397,9 @@ def refuse_existing(path: Path | None, overwrite: bool, doing: str, option: str)
         InputError: It exists.
     """
     if path is not None and path.exists() and not overwrite:
-        raise InputError(doing, f"{option} {path}".strip(), "it exists already", "name another file, or pass --overwrite")
+        raise InputError(
+            doing,
+            f"{option} {path}".strip(),
+            "it exists already",
+            "name another file, or pass --overwrite",
+        )

@@ -62,12 +62,14 @@ class Preview:
 def draw_preview(scenario: Scenario, path: Path, renderer: str | None = None) -> Preview:
     """Draw a scenario into a PNG, or into an HTML page that holds it.
 
-    The drive and all road users are drawn as recorded or scripted; reactive ones go other ways once a policy drives.
+    The drive and all road users are drawn as recorded or scripted; reactive ones go other ways once
+    a policy drives.
 
     Args:
         scenario: What is drawn.
         path: ``.png`` or ``.html``.
-        renderer: What the camera frames are rendered by; None: clean, or 3dgs for an imported drive, of which nothing was built.
+        renderer: What the camera frames are rendered by; None: clean, or 3dgs for an imported
+            drive, of which nothing was built.
 
     Raises:
         InputError: Another suffix, or no such renderer.
@@ -77,9 +79,19 @@ def draw_preview(scenario: Scenario, path: Path, renderer: str | None = None) ->
     if path.suffix not in (".png", ".html"):
         raise InputError(DOING, str(path), f"suffix {path.suffix!r}", "name it .png or .html")
     times = [int(t) for t in np.linspace(scenario.start_us, scenario.end_us, MOMENTS)]
-    there = [actor for actor in scenario.actors if actor.track.t_us[0] <= scenario.end_us and actor.track.t_us[-1] >= scenario.start_us]
+    there = [
+        actor
+        for actor in scenario.actors
+        if actor.track.t_us[0] <= scenario.end_us and actor.track.t_us[-1] >= scenario.start_us
+    ]
     facts = _facts(scenario, there)
-    png = _figure(scenario, there, times, _camera_frames(scenario, times, renderer or ("3dgs" if scenario.model else "clean")), facts)
+    png = _figure(
+        scenario,
+        there,
+        times,
+        _camera_frames(scenario, times, renderer or ("3dgs" if scenario.model else "clean")),
+        facts,
+    )
     write_bytes(path, png if path.suffix == ".png" else _page(scenario, png, facts))
     return Preview(tuple(round((t - times[0]) * 1e-6, 3) for t in times), len(there), facts)
 
@@ -102,17 +114,32 @@ def _facts(scenario: Scenario, there: Sequence[Actor]) -> tuple[str, ...]:
     inside = (log.t_us >= scenario.start_us) & (log.t_us <= scenario.end_us)
     length_m = float(np.hypot(*np.diff(log.xyz[inside, :2], axis=0).T).sum())
     seconds = (scenario.end_us - scenario.start_us) * 1e-6
-    kinds = {label: sum(a.label == label for a in there) for label in dict.fromkeys(a.label for a in there)}
+    kinds = {
+        label: sum(a.label == label for a in there)
+        for label in dict.fromkeys(a.label for a in there)
+    }
     who = ", ".join(f"{n} {label}" for label, n in kinds.items()) or "nobody else"
     reacting = sum(actor.behaviour.kind != "replay" for actor in there)
     text = [
         f"{scenario.scene_id}: {seconds:.1f} s, {length_m:.0f} m at {length_m / seconds:.1f} m/s; {who}"
-        + (f"; {reacting} of them {'reacts' if reacting == 1 else 'react'} once the policy drives" if reacting else ""),
+        + (
+            f"; {reacting} of them {'reacts' if reacting == 1 else 'react'} once the policy drives"
+            if reacting
+            else ""
+        ),
         f"the policy drives from {scenario.warmup_us * 1e-6:.1f} s on; camera {scenario.cameras[0].name}, "
         f"{scenario.cameras[0].width}x{scenario.cameras[0].height}",
     ]
-    changes = [f"{key} {_short(old)} -> {_short(new)}" for key, (old, new) in scenario.varied.items()]
-    text += [f"scene seed {scenario.seed} varies {', '.join(changes[:6])}{' and more' if len(changes) > 6 else ''}"] if changes else []
+    changes = [
+        f"{key} {_short(old)} -> {_short(new)}" for key, (old, new) in scenario.varied.items()
+    ]
+    text += (
+        [
+            f"scene seed {scenario.seed} varies {', '.join(changes[:6])}{' and more' if len(changes) > 6 else ''}"
+        ]
+        if changes
+        else []
+    )
     background = background_note(scenario)
     return (*text, *([background] if background else []), *scenario.notes[:4])
 
@@ -122,7 +149,8 @@ def _short(value: Any) -> str:
 
 
 def window(low: F64, high: F64, height_per_width: float) -> tuple[F64, F64]:
-    """Return the corners ``(2,)`` of the smallest window of a shape that holds a box, about the box's middle.
+    """Return the corners ``(2,)`` of the smallest window of a shape that holds a box, about the
+    box's middle.
 
     Example:
         >>> [corner.tolist() for corner in window(np.array([0.0, 0.0]), np.array([10.0, 4.0]), 0.5)]
@@ -134,7 +162,13 @@ def window(low: F64, high: F64, height_per_width: float) -> tuple[F64, F64]:
     return middle - half, middle + half
 
 
-def _figure(scenario: Scenario, there: Sequence[Actor], times: Sequence[int], images: Sequence[U8], facts: Sequence[str]) -> bytes:
+def _figure(
+    scenario: Scenario,
+    there: Sequence[Actor],
+    times: Sequence[int],
+    images: Sequence[U8],
+    facts: Sequence[str],
+) -> bytes:
     content, log = scene_as_json(scenario), scenario.ego_log
     recorded = recorded_drive(content, scenario.scene_id)
     turn = chord_angle(recorded)
@@ -146,21 +180,39 @@ def _figure(scenario: Scenario, there: Sequence[Actor], times: Sequence[int], im
 
     driven = place(log.xyz[(log.t_us >= times[0]) & (log.t_us <= times[-1])])
     low, high = driven.min(axis=0) - MARGIN_M, driven.max(axis=0) + MARGIN_M
-    map_height = float(np.clip(WIDTH * (high[1] - low[1]) / (high[0] - low[0]), MIN_HEIGHT, MAX_HEIGHT))
+    map_height = float(
+        np.clip(WIDTH * (high[1] - low[1]) / (high[0] - low[0]), MIN_HEIGHT, MAX_HEIGHT)
+    )
     strip_height = WIDTH / len(images) * images[0].shape[0] / images[0].shape[1] + 0.3
     height = map_height + strip_height + 0.22 * len(facts) + 0.2
     with mpl.rc_context({"font.size": 9}):
         figure = Figure(figsize=(WIDTH, height), dpi=100)
         for row, line in enumerate(facts):
-            figure.text(0.01, 1 - (0.2 + 0.22 * row) / height, line[:190], va="center", weight="bold" if row == 0 else "normal")
+            figure.text(
+                0.01,
+                1 - (0.2 + 0.22 * row) / height,
+                line[:190],
+                va="center",
+                weight="bold" if row == 0 else "normal",
+            )
         axes = figure.add_axes((0.0, strip_height / height, 1.0, map_height / height))
-        _draw_road(axes, {kind: [place(line) for line in lines] for kind, lines in drawn_map(content).items()})
+        _draw_road(
+            axes,
+            {kind: [place(line) for line in lines] for kind, lines in drawn_map(content).items()},
+        )
         _draw_users(axes, scenario, there, times, place)
         (x0, y0), (x1, y1) = window(low, high, map_height / WIDTH)
         axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
         axes.set_axis_off()
         for k, (t_us, image) in enumerate(zip(times, images, strict=True)):
-            cell = figure.add_axes((k / len(images) + 0.002, 0.0, 1 / len(images) - 0.004, (strip_height - 0.28) / height))
+            cell = figure.add_axes(
+                (
+                    k / len(images) + 0.002,
+                    0.0,
+                    1 / len(images) - 0.004,
+                    (strip_height - 0.28) / height,
+                )
+            )
             cell.imshow(image)
             cell.set_title(f"{(t_us - times[0]) * 1e-6:.1f} s", fontsize=9, pad=2)
             cell.set_axis_off()
@@ -171,12 +223,16 @@ def _figure(scenario: Scenario, there: Sequence[Actor], times: Sequence[int], im
 
 def _draw_road(axes: Axes, lines: Mapping[str, Sequence[F64]]) -> None:
     axes.add_collection(PolyCollection(lines["lanes"], facecolor=ROAD, edgecolor="none", zorder=1))
-    axes.add_collection(PolyCollection(lines["crosswalks"], facecolor=CROSSWALK, edgecolor="none", zorder=2))
+    axes.add_collection(
+        PolyCollection(lines["crosswalks"], facecolor=CROSSWALK, edgecolor="none", zorder=2)
+    )
     axes.add_collection(LineCollection(lines["paint"], colors=PAINT, linewidths=1.0, zorder=2))
     axes.add_collection(LineCollection(lines["edges"], colors=EDGE, linewidths=1.1, zorder=2))
 
 
-def _draw_users(axes: Axes, scenario: Scenario, there: Sequence[Actor], times: Sequence[int], place: Flatten) -> None:
+def _draw_users(
+    axes: Axes, scenario: Scenario, there: Sequence[Actor], times: Sequence[int], place: Flatten
+) -> None:
     """Draw ways as lines and bodies at each moment, later ones darker; the ego last."""
     moments = list(zip(times, np.linspace(0.25, 0.95, len(times)).tolist(), strict=True))
 
@@ -193,18 +249,32 @@ def _draw_users(axes: Axes, scenario: Scenario, there: Sequence[Actor], times: S
         _draw_bodies(axes, actor.track, actor.box, 0.0, seen, place, OTHERS[k % len(OTHERS)])
     vehicle = scenario.vehicle
     draw_way(scenario.ego_log, EGO)
-    _draw_bodies(axes, scenario.ego_log, vehicle.box, vehicle.rear_axle_to_centre_m, moments, place, EGO)
+    _draw_bodies(
+        axes, scenario.ego_log, vehicle.box, vehicle.rear_axle_to_centre_m, moments, place, EGO
+    )
 
 
 def _draw_bodies(
-    axes: Axes, track: Trajectory, box: Box, ahead_m: float, moments: Sequence[tuple[int, float]], place: Flatten, colour: str
+    axes: Axes,
+    track: Trajectory,
+    box: Box,
+    ahead_m: float,
+    moments: Sequence[tuple[int, float]],
+    place: Flatten,
+    colour: str,
 ) -> None:
-    """Draw a body at moments (time, shade), with its centre so far ahead of the poses of its track."""
+    """Draw a body at moments (time, shade), with its centre so far ahead of the poses of its
+    track.
+    """
     for t_us, shade in moments:
         pose = interpolate(track, np.array([t_us]))[0]
         centre = pose[:2, 3] + pose[:2, 0] * ahead_m
         body = place(corners(centre, yaw_of(pose), box.length_m, box.width_m))
-        axes.add_collection(PolyCollection([body], facecolor=colour, edgecolor=colour, alpha=shade, linewidth=0.8, zorder=6))
+        axes.add_collection(
+            PolyCollection(
+                [body], facecolor=colour, edgecolor=colour, alpha=shade, linewidth=0.8, zorder=6
+            )
+        )
 
 
 def _page(scenario: Scenario, png: bytes, facts: Sequence[str]) -> bytes:
@@ -235,19 +305,31 @@ def preview(
     scenario: Annotated[str, Positional("Scenario YAML, a shipped name, or a recorded log.")],
     out: Annotated[Path | None, Flag("PNG or HTML; by default SCENE.png here.", also="-o")] = None,
     seed: Annotated[int | None, Flag("Scene seed; by default the file's.", min=0)] = None,
-    renderer: Annotated[str | None, Flag("What renders the camera frames; clean, or 3dgs for an imported drive.")] = None,
+    renderer: Annotated[
+        str | None, Flag("What renders the camera frames; clean, or 3dgs for an imported drive.")
+    ] = None,
     overrides: Overrides = (),
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
-    """Draw a scenario before it is driven: map, road users over time, and the camera along the recorded drive."""
+    """Draw a scenario before it is driven: map, road users over time, and the camera along the
+    recorded drive.
+    """
     loaded = load_scenario(scenario, seed, overrides)
     path = out or Path(f"{slug(loaded.scene_id)}.png")
     refuse_existing(path, overwrite, DOING, "")
     made = draw_preview(loaded, path, renderer)
     if as_json:
         print(
-            json.dumps({"preview": str(path), "scene": loaded.scene_id, "times_s": made.times_s, "actors": made.actors, "facts": made.text})
+            json.dumps(
+                {
+                    "preview": str(path),
+                    "scene": loaded.scene_id,
+                    "times_s": made.times_s,
+                    "actors": made.actors,
+                    "facts": made.text,
+                }
+            )
         )
         return
     for line in made.text:

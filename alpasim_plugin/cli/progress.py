@@ -8,7 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from evaluators.metrics.outcomes import NO_OUTCOME, event_words
 from evaluators.report.numbers import plural
@@ -36,7 +43,9 @@ class Silent:
 
 
 class Lines:
-    """One line per finished rollout on stderr, for pipes and CI logs; of a large run some `MAX_LINES` in all, and one per failure."""
+    """One line per finished rollout on stderr, for pipes and CI logs; of a large run some
+    `MAX_LINES` in all, and one per failure.
+    """
 
     def __init__(self) -> None:
         self._done, self._total, self._failed = 0, 0, 0
@@ -51,9 +60,17 @@ class Lines:
         self._done += 1
         has_failed = manifest["status"] != "ok"
         self._failed += has_failed
-        if has_failed or self._done == self._total or self._done % max(1, self._total // MAX_LINES) == 0:
+        if (
+            has_failed
+            or self._done == self._total
+            or self._done % max(1, self._total // MAX_LINES) == 0
+        ):
             failed = f", {self._failed} failed" if self._failed else ""
-            print(f"[{self._done}/{self._total}{failed}] {describe(manifest, reused)}", file=sys.stderr, flush=True)
+            print(
+                f"[{self._done}/{self._total}{failed}] {describe(manifest, reused)}",
+                file=sys.stderr,
+                flush=True,
+            )
 
     def noticed(self, text: str) -> None:
         """Print it."""
@@ -85,7 +102,9 @@ class Bar:
         """Advance the bar, and print failures above it."""
         if manifest["status"] != "ok":
             self._progress.console.print(describe(manifest, reused), highlight=False, markup=False)
-        self._progress.update(self._task, advance=1, description=f"{manifest['renderer']} {manifest['scene']}")
+        self._progress.update(
+            self._task, advance=1, description=f"{manifest['renderer']} {manifest['scene']}"
+        )
         if self._progress.finished:
             self._progress.stop()
 
@@ -100,9 +119,15 @@ def warn(text: str) -> None:
 
 
 def report_line(root: Path) -> str:
-    """Return the lines that say where a run's report is, or how to get it, and how to watch its drives."""
+    """Return the lines that say where a run's report is, or how to get it, and how to watch its
+    drives.
+    """
     page, run = root / "report.html", shlex.quote(str(root))
-    report = f"report   {shlex.quote(str(page))}" if page.exists() else f"report   not written; simrun report {run}"
+    report = (
+        f"report   {shlex.quote(str(page))}"
+        if page.exists()
+        else f"report   not written; simrun report {run}"
+    )
     return f"{report}\nwatch    simrun view {run}"
 
 
@@ -122,25 +147,53 @@ def headline(plan: RunPlan, root: Path, threads: Threads) -> str:
         plural(len(plan.seeds), "seed"),
     )
     cores = f"{plural(threads.workers, 'worker')} x {plural(threads.per_worker, 'thread')}"
-    line = f"{plural(len(plan.cells), 'rollout')} ({' x '.join(axes)}), {cores}".replace("\u00a0", " ") + f" -> {root}"
+    line = (
+        f"{plural(len(plan.cells), 'rollout')} ({' x '.join(axes)}), {cores}".replace("\u00a0", " ")
+        + f" -> {root}"
+    )
     return "\n".join([line, *fixer_labels(plan), *varied_lines(plan), *background_lines(plan)])
 
 
 def background_lines(plan: RunPlan) -> list[str]:
-    """Return what the planning has noted about scenes with a background file: where it stands, and what it replaces."""
-    return [f"{name}: {note}" for name, s in plan.scenarios.items() if s.background for note in s.notes if note.startswith("background ")]
+    """Return what the planning has noted about scenes with a background file: where it stands, and
+    what it replaces.
+    """
+    return [
+        f"{name}: {note}"
+        for name, s in plan.scenarios.items()
+        if s.background
+        for note in s.notes
+        if note.startswith("background ")
+    ]
 
 
 def varied_lines(plan: RunPlan) -> list[str]:
-    """Return one line per scene whose numbers are not those in its file: what the scene seed has made of them."""
+    """Return one line per scene whose numbers are not those in its file: what the scene seed has
+    made of them.
+    """
     lines = []
     for name, scenario in list(plan.scenarios.items()):
-        changes = [f"{key} {_value(old)} -> {_value(new)}" for key, (old, new) in scenario.varied.items()]
+        changes = [
+            f"{key} {_value(old)} -> {_value(new)}" for key, (old, new) in scenario.varied.items()
+        ]
         if changes:
-            more = f", and {len(changes) - SHOWN_CHANGES} more in run.json" if len(changes) > SHOWN_CHANGES else ""
-            lines.append(f"{name}: scene seed {scenario.seed} varies {', '.join(changes[:SHOWN_CHANGES])}{more}")
+            more = (
+                f", and {len(changes) - SHOWN_CHANGES} more in run.json"
+                if len(changes) > SHOWN_CHANGES
+                else ""
+            )
+            lines.append(
+                f"{name}: scene seed {scenario.seed} varies {', '.join(changes[:SHOWN_CHANGES])}{more}"
+            )
     hidden = len(lines) - SHOWN_SCENES
-    return lines if hidden <= 0 else [*lines[:SHOWN_SCENES], f"{plural(hidden, 'more scene')} with varied numbers: see run.json"]
+    return (
+        lines
+        if hidden <= 0
+        else [
+            *lines[:SHOWN_SCENES],
+            f"{plural(hidden, 'more scene')} with varied numbers: see run.json",
+        ]
+    )
 
 
 def _value(value: Any) -> str:
@@ -150,13 +203,25 @@ def _value(value: Any) -> str:
 def fixer_labels(plan: RunPlan) -> list[str]:
     """Return one line per fixer: label, with the origin of its weights, and mode."""
     named = [(spec.name, spec.fixer) for spec in plan.renderers if spec.fixer is not None]
-    return [", ".join(filter(None, (f"{name}: {fixer.label}", getattr(fixer.settings, "loop_mode", "")))) for name, fixer in named]
+    return [
+        ", ".join(
+            filter(None, (f"{name}: {fixer.label}", getattr(fixer.settings, "loop_mode", "")))
+        )
+        for name, fixer in named
+    ]
 
 
 def describe(manifest: dict[str, Any], reused: bool) -> str:
     """Return one line with a rollout's result."""
-    cell = f"{manifest['renderer']} {manifest['policy']} {manifest['scene']} seed {manifest['seed']}"
+    cell = (
+        f"{manifest['renderer']} {manifest['policy']} {manifest['scene']} seed {manifest['seed']}"
+    )
     if manifest["status"] != "ok":
         return f"{cell}: FAILED ({manifest['error']['failure_class']}) {manifest['error']['found']}"
-    events = ", ".join(dict.fromkeys(event_words(event["metric"]) for event in manifest.get("events", []))) or NO_OUTCOME
+    events = (
+        ", ".join(
+            dict.fromkeys(event_words(event["metric"]) for event in manifest.get("events", []))
+        )
+        or NO_OUTCOME
+    )
     return f"{cell}: {events}" + (" (reused)" if reused else f", {manifest['wall_s']:.1f} s")

@@ -38,30 +38,44 @@ Examples:
 
 
 def refine(
-    source: Annotated[Path, Positional("A video of any size, rate and length, or a folder of PNG.", metavar="IN")],
-    out: Annotated[Path, Flag("The refined video (MP4); a folder of PNG without a suffix.", also="-o")],
-    opacity: Annotated[Path | None, Flag("Grey, white where the input is reliable; in the input's form.")] = None,
-    sdmap: Annotated[Path | None, Flag("Semantic map (docs/semantic-map.md), in the input's form.")] = None,
+    source: Annotated[
+        Path, Positional("A video of any size, rate and length, or a folder of PNG.", metavar="IN")
+    ],
+    out: Annotated[
+        Path, Flag("The refined video (MP4); a folder of PNG without a suffix.", also="-o")
+    ],
+    opacity: Annotated[
+        Path | None, Flag("Grey, white where the input is reliable; in the input's form.")
+    ] = None,
+    sdmap: Annotated[
+        Path | None, Flag("Semantic map (docs/semantic-map.md), in the input's form.")
+    ] = None,
     fixer: Annotated[str, Flag("A fixer (`simrun list fixers`), or NAME@STEPS.")] = "onefixer",
-    overrides: Annotated[tuple[str, ...], Flag("Override a setting: fixer.key=value. Repeatable.", "--set")] = (),
+    overrides: Annotated[
+        tuple[str, ...], Flag("Override a setting: fixer.key=value. Repeatable.", "--set")
+    ] = (),
     seed: Annotated[int, Flag("Seed of the fixer's noise.", min=0)] = 0,
     device: Annotated[Literal["cpu", "cuda"], Flag("Where the fixer computes.")] = "cpu",
     threads: Annotated[int | None, Flag("Torch threads; by default one per core.", min=1)] = None,
     compare: Annotated[Path | None, Flag("Also write input and result side by side.")] = None,
-    anyway: Annotated[bool, Flag("Take whatever the fixer makes, however much it changes.")] = False,
+    anyway: Annotated[
+        bool, Flag("Take whatever the fixer makes, however much it changes.")
+    ] = False,
     overwrite: Overwrite = False,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Refine a video with a fixer, block by block, at any length in constant memory.
 
-    Frame times, size and colours are kept; sound is dropped. The result gets its name once complete: an interrupted command leaves
-    no file.
+    Frame times, size and colours are kept; sound is dropped. The result gets its name once
+    complete: an interrupted command leaves no file.
     """
     settings = fixer_settings(fixer, fixer_overrides(overrides))
 
     def session() -> Fixer:
-        made = make_fixer(fixer, settings, scene_id=SCENE, seed=seed, device=device, threads=threads)
+        made = make_fixer(
+            fixer, settings, scene_id=SCENE, seed=seed, device=device, threads=threads
+        )
         if not made.trained and not as_json:
             print(untrained_notice(made.label), file=sys.stderr)
         return made
@@ -75,7 +89,16 @@ def refine(
         stop.kept = "nothing was written; the same command starts again"
         raise
     if as_json:
-        print(json.dumps({"input": str(source), "output": str(out), "compare": compare and str(compare), **asdict(summary)}))
+        print(
+            json.dumps(
+                {
+                    "input": str(source),
+                    "output": str(out),
+                    "compare": compare and str(compare),
+                    **asdict(summary),
+                }
+            )
+        )
     else:
         print(describe(summary, out))
         for line in warnings(summary):
@@ -94,7 +117,9 @@ def warnings(summary: RefineSummary) -> list[str]:
         ]
     if summary.psnr_db is not None and summary.psnr_db < LARGE_CHANGE_DB:
         said = f"PSNR {summary.psnr_db:.1f} dB, mean {summary.mean_levels:.1f} grey levels"
-        return [f"warning: the fixer changed this video by much ({said}): compare with --compare before you use the result"]
+        return [
+            f"warning: the fixer changed this video by much ({said}): compare with --compare before you use the result"
+        ]
     return []
 
 
@@ -107,7 +132,9 @@ def describe(summary: RefineSummary, out: Path) -> str:
     """Return the summary as lines of text."""
     rate = "" if summary.fps is None else f" at {summary.fps:g} frames per second"
     psnr = "equal" if summary.psnr_db is None else f"PSNR {summary.psnr_db:.2f} dB"
-    events = ", ".join(f"{name} {count}" for name, count in sorted(summary.events.items())) or "none"
+    events = (
+        ", ".join(f"{name} {count}" for name, count in sorted(summary.events.items())) or "none"
+    )
     times = f"p50 {summary.ms_per_frame_p50:.1f}, p95 {summary.ms_per_frame_p95:.1f}, first block {summary.ms_per_frame_first:.1f}"
     lines = [
         f"     fixer  {summary.fixer}" + ("" if summary.trained else "   UNTRAINED"),
@@ -129,8 +156,16 @@ def frame_progress(silent: bool) -> Iterator[Callable[[int, int | None], None]]:
     """
     begin = last = time.perf_counter()
     terminal = sys.stderr.isatty()
-    columns = (TextColumn("refining"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[speed]}"), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=silent or not terminal) as bar:
+    columns = (
+        TextColumn("refining"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[speed]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(
+        *columns, console=Console(stderr=True), transient=True, disable=silent or not terminal
+    ) as bar:
         task = bar.add_task("refining", total=None, speed="")
 
         def show(done: int, claimed: int | None) -> None:
@@ -142,7 +177,11 @@ def frame_progress(silent: bool) -> Iterator[Callable[[int, int | None], None]]:
             if not silent and not terminal and now - last > LINE_EVERY_S:
                 last = now
                 of = "" if claimed is None else f"/{claimed}"
-                print(f"refined {done}{of} frames, {speed}{time_left(left_s)}", file=sys.stderr, flush=True)
+                print(
+                    f"refined {done}{of} frames, {speed}{time_left(left_s)}",
+                    file=sys.stderr,
+                    flush=True,
+                )
 
         yield show
 
@@ -156,4 +195,6 @@ def time_left(seconds: float | None) -> str:
     """
     if seconds is None:
         return ""
-    return f", about {seconds:.0f} s left" if seconds < 120 else f", about {seconds / 60:.0f} min left"
+    return (
+        f", about {seconds:.0f} s left" if seconds < 120 else f", about {seconds / 60:.0f} min left"
+    )

@@ -21,7 +21,12 @@ from alpasim_plugin.core.errors import EvaluatorError, InputError, four_parts
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.parts import PartSpec, digest
 from alpasim_plugin.core.parts.source import own_code_digest
-from alpasim_plugin.log.run_folder.manifests import find_contents, read_run_json, write_manifest, write_run_json
+from alpasim_plugin.log.run_folder.manifests import (
+    find_contents,
+    read_run_json,
+    write_manifest,
+    write_run_json,
+)
 from alpasim_plugin.log.run_folder.schema import AGGREGATE, CONTENTS, slug
 from alpasim_plugin.log.run_folder.writer import write_parquet, write_scene, writing
 from alpasim_plugin.runs.execute import Threads
@@ -71,7 +76,8 @@ def execute_score(
     report: bool = True,
     wait: bool = False,
 ) -> ScoreResult:
-    """Score logs and write run.json, the tables, the reports, and with preset ``alpasim`` its aggregation.
+    """Score logs and write run.json, the tables, the reports, and with preset ``alpasim`` its
+    aggregation.
 
     Args:
         logs: The logs.
@@ -90,12 +96,23 @@ def execute_score(
         InfrastructureError: Another process writes the folder.
     """
     began = time.perf_counter()
-    key = digest({"logs": sorted(_hash(log) for log in logs), "scenes": scenes.places, "preset": preset.as_dict()})[:12]
+    key = digest(
+        {
+            "logs": sorted(_hash(log) for log in logs),
+            "scenes": scenes.places,
+            "preset": preset.as_dict(),
+        }
+    )[:12]
     root = root or Path("runs", f"score-{slug(logs[0].resolve().parent.parent.name)}-{key}")
     with writing(root, wait, lambda text: print(text, file=sys.stderr, flush=True)):
         held = _held_key(root)
         if held not in (None, key):
-            raise InputError("scoring logs", f"folder {root}", f"it holds other results (key {held})", "choose another --out")
+            raise InputError(
+                "scoring logs",
+                f"folder {root}",
+                f"it holds other results (key {held})",
+                "choose another --out",
+            )
         (root / CONTENTS).unlink(missing_ok=True)  # from here on the folder is unfinished
         scores = score_logs(logs, scenes, preset, evaluators, root, on_done)
         aggregation: dict[str, Any] | None = None
@@ -106,14 +123,26 @@ def execute_score(
         for manifest in manifests:
             write_manifest(root / manifest["path"], manifest)
         _write_info(root, key, scores, scenes, preset, settings, command, table_of(evaluators))
-        code = exit_code(scores, settings is not None and settings.allow_aggregation_with_failed_rollouts, error)
-        more = {"pool": pool_of(manifests, Threads(1, 1), time.perf_counter() - began, None), "exit_code": code}
-        summary = finish_run(root, manifests, more | ({} if aggregation is None else {"alpasim": aggregation}), report)
+        code = exit_code(
+            scores, settings is not None and settings.allow_aggregation_with_failed_rollouts, error
+        )
+        more = {
+            "pool": pool_of(manifests, Threads(1, 1), time.perf_counter() - began, None),
+            "exit_code": code,
+        }
+        summary = finish_run(
+            root,
+            manifests,
+            more | ({} if aggregation is None else {"alpasim": aggregation}),
+            report,
+        )
     return ScoreResult(root, summary, code)
 
 
 def _held_key(root: Path) -> str | None:
-    """Return the key of the results that a folder holds; None for a new one, or where ``run.json`` is damaged: it is written again."""
+    """Return the key of the results that a folder holds; None for a new one, or where ``run.json``
+    is damaged: it is written again.
+    """
     contents = find_contents(root)
     try:
         return str(read_run_json(root)["key"])
@@ -130,24 +159,39 @@ def _aggregate(
     skipped = ""
     if failed and not settings.allow_aggregation_with_failed_rollouts:
         skipped = f"{len(failed)} of {len(scores)} rollouts failed, and allow_aggregation_with_failed_rollouts is false"
-    reduced, marks, error = _reduce([one.scored for one in good if one.scored is not None], preset, settings)
+    reduced, marks, error = _reduce(
+        [one.scored for one in good if one.scored is not None], preset, settings
+    )
     for i, one in enumerate(reduced):
         values = dict(one.reduction.values)
         if i in marks:
             facts = METRICS["scene_score"]
-            values["scene_score"] = RolloutValue(marks[i].score, True, "", facts.unit, facts.direction)
+            values["scene_score"] = RolloutValue(
+                marks[i].score, True, "", facts.unit, facts.direction
+            )
         good[i].manifest["metrics"] = {name: value.as_dict() for name, value in values.items()}
-        good[i].manifest["scene_score"] = None if i not in marks else {"failure_reason": marks[i].failure_reason}
+        good[i].manifest["scene_score"] = (
+            None if i not in marks else {"failure_reason": marks[i].failure_reason}
+        )
     written: list[str] = []
     if reduced and not skipped:
-        written = _write_aggregate(root / AGGREGATE, reduced, None if error else marks, failed, settings)
-    return {"folder": AGGREGATE, "files": written, "skipped": skipped, "error": error.as_dict() if error else None}, error
+        written = _write_aggregate(
+            root / AGGREGATE, reduced, None if error else marks, failed, settings
+        )
+    return {
+        "folder": AGGREGATE,
+        "files": written,
+        "skipped": skipped,
+        "error": error.as_dict() if error else None,
+    }, error
 
 
 def _reduce(
     scored: Sequence[ScoredRollout], preset: Preset, settings: EvalSettings
 ) -> tuple[Sequence[Any], dict[int, SceneScore], EvaluatorError | None]:
-    """Reduce rollouts to values, and score their scenes; an error of the scene score leaves the values."""
+    """Reduce rollouts to values, and score their scenes; an error of the scene score leaves the
+    values.
+    """
     if not scored:
         return [], {}, None
     try:
@@ -155,14 +199,22 @@ def _reduce(
     except EvaluatorError as error:
         return [], {}, error
     try:
-        kept = [(i, one) for i, one in enumerate(reduced) if settings.scene_score.enabled and not one.dropped]
+        kept = [
+            (i, one)
+            for i, one in enumerate(reduced)
+            if settings.scene_score.enabled and not one.dropped
+        ]
         return reduced, {i: scene_score(one.values, settings.scene_score) for i, one in kept}, None
     except EvaluatorError as error:
         return reduced if "scene score" in error.doing else [], {}, error
 
 
 def _write_aggregate(
-    folder: Path, reduced: Sequence[Any], marks: dict[int, SceneScore] | None, failed: Sequence[dict[str, Any]], settings: EvalSettings
+    folder: Path,
+    reduced: Sequence[Any],
+    marks: dict[int, SceneScore] | None,
+    failed: Sequence[dict[str, Any]],
+    settings: EvalSettings,
 ) -> list[str]:
     """Write AlpaSim's files and return their names; without ``marks`` no summary."""
     own, sweeps = [one.of for one in reduced], over_sweeps(reduced)
@@ -172,9 +224,17 @@ def _write_aggregate(
         return ["metrics_unprocessed.parquet", "metrics_results.parquet"]
     rows = []
     for one in failed:
-        ids = {"clipgt_id": one["scene"], "rollout_id": one["rollout"], "run_uuid": None, "run_name": own[0].run_name}
+        ids = {
+            "clipgt_id": one["scene"],
+            "rollout_id": one["rollout"],
+            "run_uuid": None,
+            "run_name": own[0].run_name,
+        }
         rows.append(ids | {"error": one["error"]["found"]})
-    write_json(folder / "results-summary.json", results_summary(reduced, marks, rows, sweeps, settings.scene_score))
+    write_json(
+        folder / "results-summary.json",
+        results_summary(reduced, marks, rows, sweeps, settings.scene_score),
+    )
     return ["metrics_unprocessed.parquet", "metrics_results.parquet", "results-summary.json"]
 
 
@@ -188,7 +248,11 @@ def _write_info(
     command: Sequence[str],
     metrics: MetricTable,
 ) -> None:
-    used = {one.manifest["scene"]: scenes.of(one.manifest["scene"]) for one in scores if one.scored is not None}
+    used = {
+        one.manifest["scene"]: scenes.of(one.manifest["scene"])
+        for one in scores
+        if one.scored is not None
+    }
     for scene in used.values():
         write_scene(root, scene)
 
@@ -200,14 +264,22 @@ def _write_info(
         {
             **{"schema_version": SCHEMA_VERSION, "kind": "score", "key": key},
             **origin_of(command),
-            "config": {"preset": preset.as_dict(), "settings": None if settings is None else settings.model_dump(mode="json")},
+            "config": {
+                "preset": preset.as_dict(),
+                "settings": None if settings is None else settings.model_dump(mode="json"),
+            },
             "preset": preset.name,
             "renderers": names("renderer"),
             "policies": names("policy"),
             "seeds": names("seed"),
             "logs": names("log"),
             "scenes": {
-                name: {"source": one.source, "content_hash": one.content_hash, "notes": list(one.notes)} for name, one in used.items()
+                name: {
+                    "source": one.source,
+                    "content_hash": one.content_hash,
+                    "notes": list(one.notes),
+                }
+                for name, one in used.items()
             },
             "code": {"scoring": own_code_digest(SCORING)[:12]},
             "metrics": metrics.as_dict(),
@@ -223,7 +295,9 @@ def _hash(path: Path) -> str:
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
-        raise InputError("scoring logs", str(path), f"cannot open: {error.strerror}", "check the path") from error
+        raise InputError(
+            "scoring logs", str(path), f"cannot open: {error.strerror}", "check the path"
+        ) from error
 
 
 EPILOG = """
@@ -240,13 +314,28 @@ Examples:
 
 
 def score(
-    logs: Annotated[tuple[str, ...], Positional("Logs (.asl, AlpaSim's or ours), folders of them, or patterns in quotes.")],
-    scene: Annotated[tuple[str, ...], Flag("The logs' scene: .usdz, scenario YAML, recorded log, or a folder of them. Repeatable.")],
+    logs: Annotated[
+        tuple[str, ...],
+        Positional("Logs (.asl, AlpaSim's or ours), folders of them, or patterns in quotes."),
+    ],
+    scene: Annotated[
+        tuple[str, ...],
+        Flag(
+            "The logs' scene: .usdz, scenario YAML, recorded log, or a folder of them. Repeatable."
+        ),
+    ],
     preset: Presets = presets.DEFAULT,
-    settings: Annotated[Path | None, Flag("AlpaSim's eval-config.yaml, with --preset alpasim.")] = None,
-    rails: Annotated[bool, Flag("Lanes by their rails, or their centres widened by 1.85 m.", "--rails/--no-rails")] = True,
+    settings: Annotated[
+        Path | None, Flag("AlpaSim's eval-config.yaml, with --preset alpasim.")
+    ] = None,
+    rails: Annotated[
+        bool,
+        Flag("Lanes by their rails, or their centres widened by 1.85 m.", "--rails/--no-rails"),
+    ] = True,
     evaluators: Evaluators = (),
-    out: Annotated[Path | None, Flag("Run folder; by default one below runs/ named by logs and preset.")] = None,
+    out: Annotated[
+        Path | None, Flag("Run folder; by default one below runs/ named by logs and preset.")
+    ] = None,
     report: Report = True,
     wait: Wait = False,
     as_json: Json = False,
@@ -254,12 +343,16 @@ def score(
 ) -> None:
     """Score rollout logs, AlpaSim's or ours, without rendering; the files are those of a run.
 
-    Rows name the log by its folder in the column `rollout`. With `--preset alpasim` AlpaSim's own aggregation and scene score are written
-    to `aggregate/` as well. Nothing in a log is ever unpickled.
+    Rows name the log by its folder in the column `rollout`. With `--preset alpasim` AlpaSim's own
+    aggregation and scene score are written to `aggregate/` as well. Nothing in a log is ever
+    unpickled.
     """
     names = list(dict.fromkeys(part.strip() for part in preset.split(",")))
     chosen = {name: find_preset(name) for name in names}
-    own = {name: _settings(one, settings if len(names) == 1 or one.aliases else None) for name, one in chosen.items()}
+    own = {
+        name: _settings(one, settings if len(names) == 1 or one.aliases else None)
+        for name, one in chosen.items()
+    }
     found = find_logs(logs)
     results: dict[str, ScoreResult] = {}
     for name, one in chosen.items():
@@ -277,9 +370,14 @@ def score(
             wait,
         )
     code = max(one.exit_code for one in results.values())
-    said = {name: {"out": str(one.root), "exit_code": one.exit_code, "summary": one.summary} for name, one in results.items()}
+    said = {
+        name: {"out": str(one.root), "exit_code": one.exit_code, "summary": one.summary}
+        for name, one in results.items()
+    }
     if as_json:
-        print(json.dumps(said[names[0]] if len(names) == 1 else {"exit_code": code, "presets": said}))
+        print(
+            json.dumps(said[names[0]] if len(names) == 1 else {"exit_code": code, "presets": said})
+        )
     for result in () if as_json else results.values():
         _print(result, len(names) == 1)
     if not as_json and (len(names) > 1 or any(one.protocol for one in chosen.values())):
@@ -295,7 +393,11 @@ def _teller(count: int, silent: bool) -> Callable[[dict[str, Any]], None]:
         nonlocal done
         done += 1
         if not silent:
-            print(f"[{done}/{count}] {manifest['rollout']}: {describe(manifest, reused=False)}", file=sys.stderr, flush=True)
+            print(
+                f"[{done}/{count}] {manifest['rollout']}: {describe(manifest, reused=False)}",
+                file=sys.stderr,
+                flush=True,
+            )
 
     return on_done
 
@@ -306,14 +408,23 @@ def _settings(preset: presets.Preset, path: Path | None) -> EvalSettings | None:
         return EvalSettings() if path is None else load_settings(path)
     if path is not None:
         raise InputError(
-            "reading evaluation settings", f"--settings {path}", f"--preset {preset.name}", "add --preset alpasim: the file is AlpaSim's"
+            "reading evaluation settings",
+            f"--settings {path}",
+            f"--preset {preset.name}",
+            "add --preset alpasim: the file is AlpaSim's",
         )
     return None
 
 
 def _print(result: ScoreResult, with_table: bool) -> None:
     if with_table:
-        Console().print(render_table(result.summary, headline_only=True, known=MetricTable.of_run(read_run_json(result.root))))
+        Console().print(
+            render_table(
+                result.summary,
+                headline_only=True,
+                known=MetricTable.of_run(read_run_json(result.root)),
+            )
+        )
     for cell in result.summary["failures"]["cells"][:5]:
         print(four_parts(cell["error"]), file=sys.stderr)
     aggregation = result.summary.get("alpasim") or {}

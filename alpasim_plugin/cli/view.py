@@ -1,4 +1,6 @@
-"""``simrun view``: replay rollouts in a browser. ``simrun report``: write a run's report again from its tables."""
+"""``simrun view``: replay rollouts in a browser. ``simrun report``: write a run's report again from
+its tables.
+"""
 
 from __future__ import annotations
 
@@ -44,17 +46,26 @@ Exit codes: 0 the page is written, or the server was stopped by a signal; 2 no s
 
 
 def view(
-    what: Annotated[Path, Positional("A run folder, or the folder of one of its rollouts.", metavar="RUN|ROLLOUT")],
+    what: Annotated[
+        Path,
+        Positional("A run folder, or the folder of one of its rollouts.", metavar="RUN|ROLLOUT"),
+    ],
     asked: Wanted,
-    out: Annotated[Path | None, Flag("The page; by default view.html in the run folder.", also="-o")] = None,
-    serve: Annotated[str | None, Flag("Serve a running run on this machine instead.", metavar="HOST:PORT")] = None,
+    out: Annotated[
+        Path | None, Flag("The page; by default view.html in the run folder.", also="-o")
+    ] = None,
+    serve: Annotated[
+        str | None, Flag("Serve a running run on this machine instead.", metavar="HOST:PORT")
+    ] = None,
     camera: Annotated[str | None, Flag("Keep this camera alone.")] = None,
     cells: Annotated[int | None, Flag("Most scene-policy-seed cells in the page.", min=1)] = None,
     max_mb: Annotated[float, Flag("Size of the page, megabytes.", min=1.0)] = DEFAULT_MB,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
-    """Replay rollouts in a browser: cameras side by side, a map from above, metrics over time, events; offline, or of a running run."""
+    """Replay rollouts in a browser: cameras side by side, a map from above, metrics over time,
+    events; offline, or of a running run.
+    """
     root, of_rollout = find_cell(what, DOING)
     wanted = narrowed(what, of_rollout, asked, DOING)
     options = Options(int(max_mb * MB), camera=camera)
@@ -69,26 +80,52 @@ def view(
     for line in so_far.damage:
         warn(f"warning: damaged: {line}")
     if not so_far.finished:
-        warn(f"note: the run is not finished: {len(so_far.run.rollouts)} of {so_far.planned} rollouts")
+        warn(
+            f"note: the run is not finished: {len(so_far.run.rollouts)} of {so_far.planned} rollouts"
+        )
     if not so_far.run.rollouts:
-        raise InputError(DOING, str(root), "no rollout has finished", "wait for the first, or watch with --serve 8000")
+        raise InputError(
+            DOING,
+            str(root),
+            "no rollout has finished",
+            "wait for the first, or watch with --serve 8000",
+        )
     path = out or root / PAGE
     refuse_existing(out, overwrite, DOING, "--out")
     made = write_page(so_far.run, path, wanted, options, cells)
     if as_json:
-        shown = [{"scene": cell.scene, "policy": cell.policy, "seed": cell.seed} for cell in made.shown]
-        print(json.dumps({"page": str(path), "bytes": made.size, "cells": shown, "of": len(made.known), "notes": list(made.notes)}))
+        shown = [
+            {"scene": cell.scene, "policy": cell.policy, "seed": cell.seed} for cell in made.shown
+        ]
+        print(
+            json.dumps(
+                {
+                    "page": str(path),
+                    "bytes": made.size,
+                    "cells": shown,
+                    "of": len(made.known),
+                    "notes": list(made.notes),
+                }
+            )
+        )
         return
     for note in made.notes:
         print(f"note     {note}")
-    print(f"page     {shlex.quote(str(path))}, {made.size / MB:.1f} MB, {len(made.shown)} of {len(made.known)} cells")
+    print(
+        f"page     {shlex.quote(str(path))}, {made.size / MB:.1f} MB, {len(made.shown)} of {len(made.known)} cells"
+    )
 
 
 def _serve(root: Path, address: str, wanted: Wanted, options: Options, as_json: bool) -> None:
     from evaluators.viewer.serve import RunServer, loopback  # a page needs no web server
 
     with RunServer(loopback(address), lambda: read_so_far(root), wanted, options) as server:
-        print(json.dumps({"serving": str(root), "at": server.url}) if as_json else f"watch    {server.url}   # Ctrl-C ends it", flush=True)
+        print(
+            json.dumps({"serving": str(root), "at": server.url})
+            if as_json
+            else f"watch    {server.url}   # Ctrl-C ends it",
+            flush=True,
+        )
         try:
             server.serve_forever()
         except Stopped:  # how a server ends
@@ -101,7 +138,8 @@ def is_run(what: Path) -> bool:
 
 
 def find_cell(what: Path, doing: str) -> tuple[Path, Wanted | None]:
-    """Return the run folder of a run or a rollout, and which rollouts to show if a rollout was named.
+    """Return the run folder of a run or a rollout, and which rollouts to show if a rollout was
+    named.
 
     Raises:
         InputError: Neither.
@@ -110,15 +148,25 @@ def find_cell(what: Path, doing: str) -> tuple[Path, Wanted | None]:
         return what, None
     if (what / MANIFEST).exists():
         manifest, _ = read_manifest(what)
-        root = next((folder for folder in what.resolve().parents if (folder / RUN_INFO).exists()), None)
+        root = next(
+            (folder for folder in what.resolve().parents if (folder / RUN_INFO).exists()), None
+        )
         if root is not None:
-            return root, Wanted((str(manifest["scene"]),), (str(manifest["policy"]),), (int(manifest["seed"]),))
+            return root, Wanted(
+                (str(manifest["scene"]),), (str(manifest["policy"]),), (int(manifest["seed"]),)
+            )
     found = "no run.json and no manifest.json" if what.exists() else "no such folder"
-    raise InputError(doing, str(what), found, "give a folder that simrun run wrote, or RUN/rollouts/RENDERER/POLICY/SCENE/SEED")
+    raise InputError(
+        doing,
+        str(what),
+        found,
+        "give a folder that simrun run wrote, or RUN/rollouts/RENDERER/POLICY/SCENE/SEED",
+    )
 
 
 def narrowed(what: Path, rollout: Wanted | None, asked: Wanted, doing: str) -> Wanted:
-    """Return which rollouts to show: all that was asked for of a run, of a rollout's cell the renderers that were.
+    """Return which rollouts to show: all that was asked for of a run, of a rollout's cell the
+    renderers that were.
 
     Raises:
         InputError: More than renderers is asked for beside a rollout.
@@ -126,7 +174,12 @@ def narrowed(what: Path, rollout: Wanted | None, asked: Wanted, doing: str) -> W
     if rollout is None:
         return asked
     if asked.scenes or asked.policies or asked.seeds:
-        raise InputError(doing, str(what), "--scene, --policy or --seed beside a rollout, which has one of each", "name its run folder")
+        raise InputError(
+            doing,
+            str(what),
+            "--scene, --policy or --seed beside a rollout, which has one of each",
+            "name its run folder",
+        )
     return Wanted(rollout.scenes, rollout.policies, rollout.seeds, asked.renderers)
 
 

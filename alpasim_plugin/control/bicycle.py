@@ -1,12 +1,14 @@
-"""Kinematic bicycle about the rear axle, integrated with the classical Runge-Kutta method of order 4.
+"""Kinematic bicycle about the rear axle, integrated with the classical Runge-Kutta method of order
+4.
 
-The reference point is the rig origin, on the ground under the rear axle, where a kinematic bicycle has no side slip
-(Rajamani, Vehicle Dynamics and Control, 2nd ed., section 2.2)::
+The reference point is the rig origin, on the ground under the rear axle, where a kinematic bicycle
+has no side slip (Rajamani, Vehicle Dynamics and Control, 2nd ed., section 2.2)::
 
     x' = v cos(yaw)    y' = v sin(yaw)    yaw' = v tan(steer) / wheelbase    v' = accel    steer' = rate
 
-The equations hold at standstill and in reverse without a special case: nothing is divided by the speed. Tyre slip is left out; the
-tracker keeps its commands where that is fair (`tracker.MAX_LATERAL_MPS2`).
+The equations hold at standstill and in reverse without a special case: nothing is divided by the
+speed. Tyre slip is left out; the tracker keeps its commands where that is fair
+(`tracker.MAX_LATERAL_MPS2`).
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ MAX_SUBSTEP_S = 0.01
 
 @dataclass(frozen=True)
 class BicycleState:
-    """Planar state of the rear axle; world metres and radians, ``speed_mps`` along the body, negative in reverse."""
+    """Planar state of the rear axle; world metres and radians, ``speed_mps`` along the body,
+    negative in reverse.
+    """
 
     x_m: float
     y_m: float
@@ -35,8 +39,9 @@ class BicycleState:
 class Command:
     """What the driver does with wheel and pedals.
 
-    ``drive_mps2`` pushes along the body (negative: reverse gear). ``brake_mps2`` >= 0 opposes the motion and can stop the vehicle
-    but never turn its motion round; at standstill it holds against any smaller drive.
+    ``drive_mps2`` pushes along the body (negative: reverse gear). ``brake_mps2`` >= 0 opposes the
+    motion and can stop the vehicle but never turn its motion round; at standstill it holds against
+    any smaller drive.
     """
 
     steer_rad: float
@@ -44,11 +49,18 @@ class Command:
     brake_mps2: float = 0.0
 
 
-def step(state: BicycleState, command: Command, dt_s: float, vehicle: Vehicle, max_substep_s: float = MAX_SUBSTEP_S) -> BicycleState:
+def step(
+    state: BicycleState,
+    command: Command,
+    dt_s: float,
+    vehicle: Vehicle,
+    max_substep_s: float = MAX_SUBSTEP_S,
+) -> BicycleState:
     """Advance the vehicle by ``dt_s`` under a held command.
 
-    The wheel turns towards the commanded angle at no more than ``vehicle.max_steer_rate_radps``; drive and brake are cut to the
-    vehicle's limits. The instant of stopping is found exactly, so that braking ends at a speed of exactly 0.
+    The wheel turns towards the commanded angle at no more than ``vehicle.max_steer_rate_radps``;
+    drive and brake are cut to the vehicle's limits. The instant of stopping is found exactly, so
+    that braking ends at a speed of exactly 0.
 
     Args:
         state: Where the vehicle is.
@@ -68,14 +80,23 @@ def step(state: BicycleState, command: Command, dt_s: float, vehicle: Vehicle, m
     values = (*vars(state).values(), *vars(command).values(), dt_s)
     if not all(map(math.isfinite, values)) or dt_s < 0:
         found = f"a value that is not finite, or dt_s = {dt_s} < 0"
-        raise InputError("advancing the vehicle", f"{state} under {command}", found, "give finite values and dt_s >= 0")
+        raise InputError(
+            "advancing the vehicle",
+            f"{state} under {command}",
+            found,
+            "give finite values and dt_s >= 0",
+        )
     target = _clip(command.steer_rad, vehicle.max_steer_rad)
     drive = _clip(command.drive_mps2, vehicle.max_accel_mps2)
     brake = min(max(command.brake_mps2, 0.0), vehicle.max_brake_mps2)
     turn = target - state.steer_rad
     slew_s = min(abs(turn) / vehicle.max_steer_rate_radps, dt_s)
-    # No step contains the instant at which the wheel arrives: the right-hand side is smooth inside each, which order 4 needs.
-    for span_s, rate in ((slew_s, math.copysign(vehicle.max_steer_rate_radps, turn)), (dt_s - slew_s, 0.0)):
+    # No step contains the instant at which the wheel arrives: the right-hand side is smooth inside
+    # each, which order 4 needs.
+    for span_s, rate in (
+        (slew_s, math.copysign(vehicle.max_steer_rate_radps, turn)),
+        (dt_s - slew_s, 0.0),
+    ):
         n = math.ceil(span_s / max_substep_s - 1e-9)
         for _ in range(n):
             state = _substep(state, rate, drive, brake, span_s / n, vehicle.wheelbase_m)
@@ -84,7 +105,9 @@ def step(state: BicycleState, command: Command, dt_s: float, vehicle: Vehicle, m
     return state
 
 
-def _substep(state: BicycleState, steer_rate: float, drive: float, brake: float, h: float, wheelbase: float) -> BicycleState:
+def _substep(
+    state: BicycleState, steer_rate: float, drive: float, brake: float, h: float, wheelbase: float
+) -> BicycleState:
     """Integrate one sub-step, cut at the instant of standstill where the brake brings one."""
     accel = _accel(state.speed_mps, drive, brake)
     if state.speed_mps * accel < 0:
@@ -96,15 +119,23 @@ def _substep(state: BicycleState, steer_rate: float, drive: float, brake: float,
 
 
 def _accel(speed: float, drive: float, brake: float) -> float:
-    """Return the net acceleration: the brake acts against the motion, and at standstill against the drive."""
+    """Return the net acceleration: the brake acts against the motion, and at standstill against the
+    drive.
+    """
     if speed != 0:
         return drive - math.copysign(brake, speed)
     return math.copysign(max(abs(drive) - brake, 0.0), drive)
 
 
-def _rk4(s: BicycleState, steer_rate: float, accel: float, h: float, wheelbase: float) -> BicycleState:
-    """Take one classical Runge-Kutta step; speed and steer are linear in time, so only x, y and yaw need the four stages."""
-    v0, v1, v2 = s.speed_mps, s.speed_mps + 0.5 * h * accel, s.speed_mps + h * accel
+def _rk4(
+    s: BicycleState, steer_rate: float, accel: float, h: float, wheelbase: float
+) -> BicycleState:
+    """Take one classical Runge-Kutta step; speed and steer are linear in time, so only x, y and yaw
+    need the four stages.
+    """
+    v0 = s.speed_mps
+    v1 = s.speed_mps + 0.5 * h * accel
+    v2 = s.speed_mps + h * accel
     w0 = v0 * math.tan(s.steer_rad) / wheelbase
     w1 = v1 * math.tan(s.steer_rad + 0.5 * h * steer_rate) / wheelbase
     w2 = v2 * math.tan(s.steer_rad + h * steer_rate) / wheelbase
@@ -114,7 +145,9 @@ def _rk4(s: BicycleState, steer_rate: float, accel: float, h: float, wheelbase: 
     cos, sin = math.cos, math.sin
     x = s.x_m + h / 6 * (v0 * cos(s.yaw_rad) + 2 * v1 * (cos(yaw_a) + cos(yaw_b)) + v2 * cos(yaw_c))
     y = s.y_m + h / 6 * (v0 * sin(s.yaw_rad) + 2 * v1 * (sin(yaw_a) + sin(yaw_b)) + v2 * sin(yaw_c))
-    return BicycleState(x, y, s.yaw_rad + h / 6 * (w0 + 4 * w1 + w2), v2, s.steer_rad + h * steer_rate)
+    return BicycleState(
+        x, y, s.yaw_rad + h / 6 * (w0 + 4 * w1 + w2), v2, s.steer_rad + h * steer_rate
+    )
 
 
 def _clip(value: float, limit: float) -> float:

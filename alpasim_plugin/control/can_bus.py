@@ -1,7 +1,9 @@
-"""One exchange with a control unit over a CAN bus: messages out, its commands in, and what happens when they do not come.
+"""One exchange with a control unit over a CAN bus: messages out, its commands in, and what happens
+when they do not come.
 
-A command that is missing at its deadline is replaced: the last one is held for `HOLD_US`, then the vehicle is braked by a ramp while the
-steering is held. Every such instant, and every frame that was refused, is counted by cause.
+A command that is missing at its deadline is replaced: the last one is held for `HOLD_US`, then the
+vehicle is braked by a ramp while the steering is held. Every such instant, and every frame that was
+refused, is counted by cause.
 """
 
 from __future__ import annotations
@@ -52,14 +54,28 @@ class Address:
         interface, colon, channel = place.partition(":")
         if not colon or interface not in INTERFACES:
             interface, channel = "virtual", place
-        options = {key: values[-1] for key, values in parse_qs(query, keep_blank_values=True).items()}
+        options = {
+            key: values[-1] for key, values in parse_qs(query, keep_blank_values=True).items()
+        }
         timeout = options.pop("timeout_ms", "100")
         unknown = sorted(set(options) - {"map", "dbc"})
         if not channel or unknown or not timeout.isdigit() or not 0 < int(timeout) <= 10_000:
-            found = f"option {unknown[0]!r}" if unknown else "no channel" if not channel else f"timeout_ms = {timeout!r}"
+            found = (
+                f"option {unknown[0]!r}"
+                if unknown
+                else "no channel"
+                if not channel
+                else f"timeout_ms = {timeout!r}"
+            )
             do_this = f"write can://[{'|'.join(INTERFACES)}:]CHANNEL[?map=NAME&dbc=FILE&timeout_ms=1..10000]"
             raise InputError(DOING, f"can://{text}", found, do_this)
-        return cls(interface, channel, options.get("map", "example"), options.get("dbc"), int(timeout) / 1000)
+        return cls(
+            interface,
+            channel,
+            options.get("map", "example"),
+            options.get("dbc"),
+            int(timeout) / 1000,
+        )
 
 
 def open_bus(address: Address) -> can.BusABC:
@@ -69,7 +85,9 @@ def open_bus(address: Address) -> can.BusABC:
         InputError: The interface or the channel does not work on this machine.
     """
     try:
-        return can.Bus(interface=address.interface, channel=address.channel, receive_own_messages=False)
+        return can.Bus(
+            interface=address.interface, channel=address.channel, receive_own_messages=False
+        )
     except Exception as error:  # every interface raises errors of its own
         found = f"{type(error).__name__}: {error}"
         do_this = f"use one that this machine has: {', '.join(INTERFACES)}"
@@ -100,9 +118,11 @@ class Exchange:
     """Sends what is due and waits for the commands of one instant.
 
     Attributes:
-        counts: Frames and instants by what happened to them: ``sent``, ``fresh``, ``held``, ``ramped``, ``late``, ``lost``, ``repeated``,
-            ``malformed``, ``out_of_range``, ``not_enabled``, ``other``.
-        latencies_s: From the last frame sent to the command that completed each fresh instant, wall time.
+        counts: Frames and instants by what happened to them: ``sent``, ``fresh``, ``held``,
+            ``ramped``, ``late``, ``lost``, ``repeated``, ``malformed``, ``out_of_range``,
+            ``not_enabled``, ``other``.
+        latencies_s: From the last frame sent to the command that completed each fresh instant, wall
+            time.
     """
 
     bus: can.BusABC
@@ -115,11 +135,18 @@ class Exchange:
     def __post_init__(self) -> None:
         parts = self.codec.map.steer, self.codec.map.accel
         if parts[0] is None or parts[1] is None:
-            raise InputError(DOING, f"a map for {self.codec.map.dbc}", "it has no steering or acceleration command", "use a map with both")
+            raise InputError(
+                DOING,
+                f"a map for {self.codec.map.dbc}",
+                "it has no steering or acceleration command",
+                "use a map with both",
+            )
         self._steer, self._accel = (_Command(part) for part in parts if part is not None)
         self._began_us: int | None = None
         self._own_ids = {self.codec.message(sent.message).frame_id for sent in self.codec.map.send}
-        self._by_id = {self.codec.message(one.part.message).frame_id: one for one in (self._steer, self._accel)}
+        self._by_id = {
+            self.codec.message(one.part.message).frame_id: one for one in (self._steer, self._accel)
+        }
 
     def step(self, t_us: int, quantities: Mapping[str, float]) -> Commands:
         """Send the messages that are due at an instant and return the commands that answer them.
@@ -148,25 +175,40 @@ class Exchange:
     def facts(self) -> dict[str, Any]:
         """Return counts, latency and rounding, for the rollout's manifest."""
         ms = np.array(self.latencies_s) * 1000
-        quantiles = {f"p{q}": round(float(np.percentile(ms, q)), 3) for q in (50, 95, 99)} if len(ms) else {}
+        quantiles = (
+            {f"p{q}": round(float(np.percentile(ms, q)), 3) for q in (50, 95, 99)}
+            if len(ms)
+            else {}
+        )
         rounding = {name: one.as_dict() for name, one in self.codec.rounding.items()}
         return {"frames": dict(self.counts), "latency_ms": quantiles, "rounding": rounding}
 
     def _drain(self, t_us: int) -> None:
-        """Take in what came after the last deadline: too late for its instant, yet the newest that is known."""
+        """Take in what came after the last deadline: too late for its instant, yet the newest that
+        is known.
+        """
         while (frame := self.bus.recv(0)) is not None:
             if self._take(frame, t_us) is not None:
                 self.counts["late"] += 1
 
     def _send(self, frame_id: int, data: bytes) -> None:
         try:
-            self.bus.send(can.Message(arbitration_id=frame_id, data=data, is_extended_id=frame_id > 0x7FF))
+            self.bus.send(
+                can.Message(arbitration_id=frame_id, data=data, is_extended_id=frame_id > 0x7FF)
+            )
         except can.CanError as error:
-            raise PolicyError("sending on a CAN bus", f"{self.bus.channel_info}", f"{error}", "check that the bus is up") from error
+            raise PolicyError(
+                "sending on a CAN bus",
+                f"{self.bus.channel_info}",
+                f"{error}",
+                "check that the bus is up",
+            ) from error
         self.counts["sent"] += 1
 
     def _take(self, frame: can.Message, t_us: int) -> _Command | None:
-        """Take in a frame; return the command that it renews, or None where it is refused or another's."""
+        """Take in a frame; return the command that it renews, or None where it is refused or
+        another's.
+        """
         if frame.arbitration_id in self._own_ids:
             return None  # multicast gives back what was sent
         one = self._by_id.get(frame.arbitration_id)
@@ -177,10 +219,19 @@ class Exchange:
             value, counter = self.codec.decode(one.part, bytes(frame.data))
         except BadFrame as error:
             text = str(error)
-            self.counts["not_enabled" if text.startswith("not enabled") else "out_of_range" if "outside" in text else "malformed"] += 1
+            self.counts[
+                "not_enabled"
+                if text.startswith("not enabled")
+                else "out_of_range"
+                if "outside" in text
+                else "malformed"
+            ] += 1
             return None
         if counter is not None and one.counter is not None and one.part.counter is not None:
-            size = 1 << self.codec.message(one.part.message).get_signal_by_name(one.part.counter).length
+            size = (
+                1
+                << self.codec.message(one.part.message).get_signal_by_name(one.part.counter).length
+            )
             ahead = (counter - one.counter) % size
             if ahead == 0:
                 self.counts["repeated"] += 1
@@ -193,10 +244,20 @@ class Exchange:
         """Return the newest commands, or what replaces them."""
         wheel = self._steer.value if self._steer.value is not None else 0.0
         self._began_us = t_us if self._began_us is None else self._began_us
-        never_us = self._began_us - HOLD_US  # without a first command there is nothing to hold: the ramp begins at once
-        age_us = t_us - min(one.t_us if one.value is not None else never_us for one in (self._steer, self._accel))
+        never_us = (
+            self._began_us - HOLD_US
+        )  # without a first command there is nothing to hold: the ramp begins at once
+        age_us = t_us - min(
+            one.t_us if one.value is not None else never_us for one in (self._steer, self._accel)
+        )
         held = self._accel.value if self._accel.value is not None else 0.0
-        mark: Mark = "fresh" if fresh else "held" if age_us <= HOLD_US and None not in (self._steer.value, self._accel.value) else "ramped"
+        mark: Mark = (
+            "fresh"
+            if fresh
+            else "held"
+            if age_us <= HOLD_US and None not in (self._steer.value, self._accel.value)
+            else "ramped"
+        )
         self.counts[mark] += 1
         if mark != "ramped":
             return Commands(wheel, held, mark)

@@ -1,9 +1,12 @@
-"""Between quantities and CAN frames: encoding with counters and checksums, decoding with every check that the database allows.
+"""Between quantities and CAN frames: encoding with counters and checksums, decoding with every
+check that the database allows.
 
-Which message and signal of a database carries which quantity stands in a map, one YAML file beside a DBC.
+Which message and signal of a database carries which quantity stands in a map, one YAML file beside
+a DBC.
 
-Checksums are those of the manufacturers, as opendbc documents them: Toyota's sum of identifier, length and data bytes; Tesla's sum of
-identifier and data bytes; and CRC-8 SAE J1850 over identifier and data. Nothing of a frame is trusted before all checks have passed.
+Checksums are those of the manufacturers, as opendbc documents them: Toyota's sum of identifier,
+length and data bytes; Tesla's sum of identifier and data bytes; and CRC-8 SAE J1850 over identifier
+and data. Nothing of a frame is trusted before all checks have passed.
 """
 
 from __future__ import annotations
@@ -22,10 +25,23 @@ MAP_DOING = "reading a CAN map"
 FOLDER = Path(__file__).resolve().parents[2] / "configs" / "can"
 
 Quantity = Literal[
-    "speed_kph", "speed_mps", "accel_mps2", "lateral_accel_mps2", "yaw_rate_degps", "steering_wheel_deg", "steering_wheel_rate_degps",
-    "wheel_fl_kph", "wheel_fr_kph", "wheel_rl_kph", "wheel_rr_kph",
-    "path_offset_m", "path_heading_rad", "path_curvature_1pm", "path_curvature_rate_1pm2", "path_length_m",
-]  # fmt: skip
+    "speed_kph",
+    "speed_mps",
+    "accel_mps2",
+    "lateral_accel_mps2",
+    "yaw_rate_degps",
+    "steering_wheel_deg",
+    "steering_wheel_rate_degps",
+    "wheel_fl_kph",
+    "wheel_fr_kph",
+    "wheel_rl_kph",
+    "wheel_rr_kph",
+    "path_offset_m",
+    "path_heading_rad",
+    "path_curvature_1pm",
+    "path_curvature_rate_1pm2",
+    "path_length_m",
+]
 ChecksumKind = Literal["crc8_j1850", "sum_toyota", "sum_tesla"]
 
 
@@ -41,7 +57,9 @@ class Checksum(_Part):
 
 
 class Content(_Part):
-    """What a signal carries: a quantity, or what is left of it after another signal of the message took its rounded part."""
+    """What a signal carries: a quantity, or what is left of it after another signal of the message
+    took its rounded part.
+    """
 
     quantity: Quantity
     scale: float = 1.0
@@ -59,11 +77,16 @@ class Sent(_Part):
 
     def contents(self) -> dict[str, Content]:
         """Give every signal's content."""
-        return {name: one if isinstance(one, Content) else Content(quantity=one) for name, one in self.signals.items()}
+        return {
+            name: one if isinstance(one, Content) else Content(quantity=one)
+            for name, one in self.signals.items()
+        }
 
 
 class Received(_Part):
-    """A command to the simulation: steering wheel angle in degrees, left positive after ``scale``, or acceleration in m/s^2."""
+    """A command to the simulation: steering wheel angle in degrees, left positive after ``scale``,
+    or acceleration in m/s^2.
+    """
 
     message: str
     signal: str
@@ -74,7 +97,9 @@ class Received(_Part):
 
 
 class CanMap(_Part):
-    """A whole map. Without ``steer`` and ``accel`` it can send and read recorded drives, but not drive."""
+    """A whole map. Without ``steer`` and ``accel`` it can send and read recorded drives, but not
+    drive.
+    """
 
     dbc: str
     steering_ratio: Annotated[float, Field(gt=0)]  # steering wheel angle over road-wheel angle
@@ -97,11 +122,18 @@ def load_map(name: str, dbc: str | None = None) -> tuple[CanMap, Path]:
     path = shipped if shipped.is_file() else Path(name)
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in FOLDER.glob("*.yaml")))
-        raise InputError(MAP_DOING, f"map={name}", "no such map or file", f"known: {known}; or name a YAML file")
+        raise InputError(
+            MAP_DOING, f"map={name}", "no such map or file", f"known: {known}; or name a YAML file"
+        )
     found: CanMap = validate(CanMap, load_yaml(path, MAP_DOING), MAP_DOING)
     database = Path(dbc) if dbc is not None else path.parent / found.dbc
     if not database.is_file():
-        raise InputError(MAP_DOING, f"database {database}", "no such file", f"name it with dbc=FILE; the map {name!r} is for {found.dbc}")
+        raise InputError(
+            MAP_DOING,
+            f"database {database}",
+            "no such file",
+            f"name it with dbc=FILE; the map {name!r} is for {found.dbc}",
+        )
     return found, database
 
 
@@ -125,17 +157,29 @@ class Rounding:
     saturated: int = 0
 
     def add(self, wanted: float, carried: float, cut: bool) -> None:
-        """Take in one value; one that was cut to the signal's range counts as saturated, not as rounded."""
+        """Take in one value; one that was cut to the signal's range counts as saturated, not as
+        rounded.
+        """
         if cut:
             self.saturated += 1
             return
         error = abs(wanted - carried)
-        self.count, self.worst, self.squares = self.count + 1, max(self.worst, error), self.squares + error * error
+        self.count, self.worst, self.squares = (
+            self.count + 1,
+            max(self.worst, error),
+            self.squares + error * error,
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return the numbers for a report."""
         rms = (self.squares / self.count) ** 0.5 if self.count else None
-        return {"resolution": self.resolution, "unit": self.unit, "worst": self.worst, "rms": rms, "saturated": self.saturated}
+        return {
+            "resolution": self.resolution,
+            "unit": self.unit,
+            "worst": self.worst,
+            "rms": rms,
+            "saturated": self.saturated,
+        }
 
 
 @dataclass
@@ -167,16 +211,27 @@ class Codec:
 
     def encode_command(self, received: Received, value: float) -> tuple[int, bytes]:
         """Return identifier and data of a command, as a control unit sends it."""
-        values = {received.signal: self._carried(received.message, received.signal, value * received.scale), **received.enabled}
+        values = {
+            received.signal: self._carried(
+                received.message, received.signal, value * received.scale
+            ),
+            **received.enabled,
+        }
         return self.pack(received.message, values, received.counter, received.checksum)
 
-    def pack(self, name: str, values: Mapping[str, float], counter: str | None, checksum: Checksum | None) -> tuple[int, bytes]:
-        """Return identifier and data of given signal values; signals that are not named are at their lowest raw value, 0 in most."""
+    def pack(
+        self, name: str, values: Mapping[str, float], counter: str | None, checksum: Checksum | None
+    ) -> tuple[int, bytes]:
+        """Return identifier and data of given signal values; signals that are not named are at
+        their lowest raw value, 0 in most.
+        """
         message = self.message(name)
         full = {signal.name: signal.offset for signal in message.signals} | dict(values)
         if counter is not None:
             length = message.get_signal_by_name(counter).length
-            full[counter] = self._counters[name] = (self._counters.get(name, -1) + 1) % (1 << length)
+            full[counter] = self._counters[name] = (self._counters.get(name, -1) + 1) % (
+                1 << length
+            )
         if checksum is not None:
             full[checksum.signal] = 0
         data = bytearray(message.encode(full, strict=False))
@@ -189,28 +244,39 @@ class Codec:
         """Return a command's value and counter.
 
         Raises:
-            BadFrame: Wrong length, wrong checksum, a value that the database does not allow, or a command that is not enabled.
+            BadFrame: Wrong length, wrong checksum, a value that the database does not allow, or a
+                command that is not enabled.
         """
         message = self.message(received.message)
         values = checked_values(message, data, received.checksum)
-        off = [f"{name} = {values[name]}" for name, wanted in received.enabled.items() if values[name] != wanted]
+        off = [
+            f"{name} = {values[name]}"
+            for name, wanted in received.enabled.items()
+            if values[name] != wanted
+        ]
         if off:
             raise BadFrame(f"not enabled: {', '.join(off)}")
         signal, value = message.get_signal_by_name(received.signal), float(values[received.signal])
         if not _inside(signal, value):
             low, high = _range(signal)
             raise BadFrame(f"{received.signal} = {value} outside [{low:g}, {high:g}]")
-        return value / received.scale, None if received.counter is None else int(values[received.counter])
+        return value / received.scale, None if received.counter is None else int(
+            values[received.counter]
+        )
 
     def _carried(self, message: str, name: str, wanted: float) -> float:
-        """Return the value that a signal can hold nearest to the wanted one, and keep account of the difference."""
+        """Return the value that a signal can hold nearest to the wanted one, and keep account of
+        the difference.
+        """
         signal = self.message(message).get_signal_by_name(name)
         low, high = _range(signal)
         held = min(max(wanted, low), high)
         raw = round((held - signal.offset) / signal.scale)
         first, last = _raw_range(signal)
         carried = float(min(max(raw, first), last) * signal.scale + signal.offset)
-        account = self.rounding.setdefault(f"{message}.{name}", Rounding(float(signal.scale), signal.unit or ""))
+        account = self.rounding.setdefault(
+            f"{message}.{name}", Rounding(float(signal.scale), signal.unit or "")
+        )
         account.add(wanted, carried, held != wanted)
         return carried
 
@@ -219,30 +285,48 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
     """Load a database and check that the map fits it.
 
     Raises:
-        InputError: cantools is missing, the file is not a database that it accepts, or the map names what the database lacks.
+        InputError: cantools is missing, the file is not a database that it accepts, or the map
+            names what the database lacks.
     """
     try:
         import cantools
     except ImportError as error:
-        raise InputError(DOING, str(database), "cantools is not installed", "install the extra [can], or pip install cantools") from error
+        raise InputError(
+            DOING,
+            str(database),
+            "cantools is not installed",
+            "install the extra [can], or pip install cantools",
+        ) from error
     try:
-        # Real databases have overlapping signals in messages that nobody uses here; the map's own messages are checked below.
+        # Real databases have overlapping signals in messages that nobody uses here; the map's own
+        # messages are checked below.
         loaded = cantools.database.load_file(database, strict=False)
     except Exception as error:  # the parser raises errors of many kinds
         found = f"{type(error).__name__}: {error}"
-        raise InputError(DOING, str(database), found, "repair the database, or remove the message that it names") from error
+        raise InputError(
+            DOING, str(database), found, "repair the database, or remove the message that it names"
+        ) from error
     codec = Codec(can_map, loaded)
-    parts: list[Sent | Received] = [*can_map.send, *(one for one in (can_map.steer, can_map.accel) if one is not None)]
+    parts: list[Sent | Received] = [
+        *can_map.send,
+        *(one for one in (can_map.steer, can_map.accel) if one is not None),
+    ]
     for part in parts:
         signals = list(part.signals) if isinstance(part, Sent) else [part.signal, *part.enabled]
-        signals += [name for name in (part.counter, part.checksum.signal if part.checksum else None) if name is not None]
+        signals += [
+            name
+            for name in (part.counter, part.checksum.signal if part.checksum else None)
+            if name is not None
+        ]
         try:
             message = codec.message(part.message)
             for name in signals:
                 message.get_signal_by_name(name)
         except KeyError as error:
             do_this = "name a database of the vehicle that the map is for"
-            raise InputError(DOING, str(database), f"no {error} of message {part.message}", do_this) from error
+            raise InputError(
+                DOING, str(database), f"no {error} of message {part.message}", do_this
+            ) from error
     return codec
 
 
@@ -299,11 +383,16 @@ def _raw_range(signal: Any) -> tuple[int, int]:
 def _range(signal: Any) -> tuple[float, float]:
     """Return the least and the greatest value of a signal.
 
-    The range that a database states counts where the bits can carry it. Databases written by hand often hold one that they cannot, such as
-    0 to 65535 for a yaw rate of 10 bits from -125 deg/s; then the bits decide.
+    The range that a database states counts where the bits can carry it. Databases written by hand
+    often hold one that they cannot, such as 0 to 65535 for a yaw rate of 10 bits from -125 deg/s;
+    then the bits decide.
     """
-    low, high = sorted(raw * float(signal.scale) + float(signal.offset) for raw in _raw_range(signal))
-    least, most, half = signal.minimum, signal.maximum, abs(float(signal.scale)) / 2
+    low, high = sorted(
+        raw * float(signal.scale) + float(signal.offset) for raw in _raw_range(signal)
+    )
+    least = signal.minimum
+    most = signal.maximum
+    half = abs(float(signal.scale)) / 2
     if least is None or most is None or not (low - half <= least < most <= high + half):
         return low, high
     return max(low, float(least)), min(high, float(most))

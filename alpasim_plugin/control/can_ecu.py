@@ -1,4 +1,5 @@
-"""An example control unit: keeps to the path that the bus carries, at the speed of its first message. A process, or a thread beside a test.
+"""An example control unit: keeps to the path that the bus carries, at the speed of its first
+message. A process, or a thread beside a test.
 
 python -m alpasim_plugin.control.can_ecu udp_multicast:239.74.163.2
 """
@@ -21,7 +22,9 @@ SPEED_GAIN = 0.5  # 1/s
 
 
 class LaneKeeper:
-    """Pure pursuit on the path cubic, and a proportional speed hold; answers the map's last message with one pair of commands."""
+    """Pure pursuit on the path cubic, and a proportional speed hold; answers the map's last message
+    with one pair of commands.
+    """
 
     def __init__(self, codec: Codec) -> None:
         self._codec, self._ratio = codec, codec.map.steering_ratio
@@ -39,27 +42,40 @@ class LaneKeeper:
         if one is None:
             return []
         try:
-            values = checked_values(self._codec.message(one.message), bytes(frame.data), one.checksum)
+            values = checked_values(
+                self._codec.message(one.message), bytes(frame.data), one.checksum
+            )
         except BadFrame:
             return []
         for name, content in one.contents().items():
             value = values[name] / content.scale
-            self._seen[content.quantity] = value + (self._seen[content.quantity] if content.rest_of is not None else 0.0)
+            self._seen[content.quantity] = value + (
+                self._seen[content.quantity] if content.rest_of is not None else 0.0
+            )
         if frame.arbitration_id != self._trigger or "speed_kph" not in self._seen:
             return []
         steer, accel = self._codec.map.steer, self._codec.map.accel
         assert steer is not None
         assert accel is not None
         wheel_deg, accel_mps2 = self.command(self._seen)
-        return [self._codec.encode_command(steer, wheel_deg), self._codec.encode_command(accel, accel_mps2)]
+        return [
+            self._codec.encode_command(steer, wheel_deg),
+            self._codec.encode_command(accel, accel_mps2),
+        ]
 
     def command(self, seen: Mapping[str, float]) -> tuple[float, float]:
         """Return steering wheel angle (deg, left positive) and acceleration (m/s^2)."""
         speed = seen["speed_kph"] / 3.6
         self._cruise_mps = speed if self._cruise_mps is None else self._cruise_mps
-        x = min(max(LOOKAHEAD_S * speed, LEAST_LOOKAHEAD_M), max(seen.get("path_length_m", 0.0), LEAST_LOOKAHEAD_M))
+        x = min(
+            max(LOOKAHEAD_S * speed, LEAST_LOOKAHEAD_M),
+            max(seen.get("path_length_m", 0.0), LEAST_LOOKAHEAD_M),
+        )
         y = seen.get("path_offset_m", 0.0) + seen.get("path_heading_rad", 0.0) * x
-        y += seen.get("path_curvature_1pm", 0.0) * x**2 / 2 + seen.get("path_curvature_rate_1pm2", 0.0) * x**3 / 6
+        y += (
+            seen.get("path_curvature_1pm", 0.0) * x**2 / 2
+            + seen.get("path_curvature_rate_1pm2", 0.0) * x**3 / 6
+        )
         steer = math.atan(2 * WHEELBASE_M * y / (x * x + y * y))
         return math.degrees(steer) * self._ratio, SPEED_GAIN * (self._cruise_mps - speed)
 
@@ -75,11 +91,16 @@ def serve(bus: can.BusABC, unit: LaneKeeper, stop: threading.Event) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the unit until Ctrl-C."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("address", help="as after can://, such as udp_multicast:239.74.163.2 or socketcan:vcan0?map=tesla&dbc=FILE")
+    parser.add_argument(
+        "address",
+        help="as after can://, such as udp_multicast:239.74.163.2 or socketcan:vcan0?map=tesla&dbc=FILE",
+    )
     address = Address.parse(parser.parse_args(arguments).address)
     unit = LaneKeeper(open_codec(*load_map(address.map, address.dbc)))
     with open_bus(address) as bus:
-        print(f"control unit on {address.interface}:{address.channel}, map {address.map}", flush=True)
+        print(
+            f"control unit on {address.interface}:{address.channel}, map {address.map}", flush=True
+        )
         try:
             serve(bus, unit, threading.Event())
         except KeyboardInterrupt:

@@ -1,7 +1,9 @@
-"""``--policy can://CHANNEL``: a control unit on a CAN bus drives the ego with steering wheel and acceleration commands.
+"""``--policy can://CHANNEL``: a control unit on a CAN bus drives the ego with steering wheel and
+acceleration commands.
 
-Between two queries the vehicle is simulated here at the bus's own rate: its messages go out, the unit's commands come in, and a kinematic
-bicycle moves on by one bus period. The plan is that motion, continued under the last commands, and the ego follows it exactly.
+Between two queries the vehicle is simulated here at the bus's own rate: its messages go out, the
+unit's commands come in, and a kinematic bicycle moves on by one bus period. The plan is that
+motion, continued under the last commands, and the ego follows it exactly.
 """
 
 from __future__ import annotations
@@ -17,7 +19,16 @@ from alpasim_plugin.control.can_codec import load_map, open_codec
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import transform_points, yaw_of
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.types import F64, EgoState, Observation, Plan, Route, Scenario, SensorSpec, Vehicle
+from alpasim_plugin.core.types import (
+    F64,
+    EgoState,
+    Observation,
+    Plan,
+    Route,
+    Scenario,
+    SensorSpec,
+    Vehicle,
+)
 
 PLAN_US, PLAN_STEP_US = 5_000_000, 100_000
 TRACK_M = 1.6  # between the wheels of an axle
@@ -47,7 +58,12 @@ class CanPolicy(Policy):
         self._step_us = min((sent.period_us for sent in can_map.send), default=PLAN_STEP_US)
         if self._period_us % self._step_us:
             found = f"the shortest message period is {self._step_us} us, the query period {self._period_us} us"
-            raise InputError("connecting a CAN bus", f"can://{address}", found, "choose a rates.policy_us that is a whole multiple")
+            raise InputError(
+                "connecting a CAN bus",
+                f"can://{address}",
+                found,
+                "choose a rates.policy_us that is a whole multiple",
+            )
         self._bus = open_bus(self._address)
         self._exchange = Exchange(self._bus, self._codec, self._address.timeout_s)
         self._predicted: tuple[int, BicycleState] | None = None
@@ -66,10 +82,18 @@ class CanPolicy(Policy):
         """
         now, start = observation.t_us, self._start(observation)
         path = observation.route_rig[np.isfinite(observation.route_rig).all(axis=1)]
-        states, state, commands = [start], start, Commands(0.0, 0.0, "held")
+        states = [start]
+        state = start
+        commands = Commands(0.0, 0.0, "held")
         for t_us in range(now, now + self._period_us, self._step_us):
-            commands = self._exchange.step(t_us, quantities(state, self._steer_rate, self._accel, path, self._ratio, self._vehicle))
-            before, state = state, step(state, self._command(commands), self._step_us * 1e-6, self._vehicle)
+            commands = self._exchange.step(
+                t_us,
+                quantities(state, self._steer_rate, self._accel, path, self._ratio, self._vehicle),
+            )
+            before, state = (
+                state,
+                step(state, self._command(commands), self._step_us * 1e-6, self._vehicle),
+            )
             self._steer_rate = (state.steer_rad - before.steer_rad) / (self._step_us * 1e-6)
             self._accel = (state.speed_mps - before.speed_mps) / (self._step_us * 1e-6)
             states.append(state)
@@ -80,7 +104,13 @@ class CanPolicy(Policy):
             states.append(state)
             times.append(times[-1] + PLAN_STEP_US)
         xy = np.array([[s.x_m, s.y_m] for s in states])
-        return Plan(now, np.array(times), xy, np.array([s.yaw_rad for s in states]), debug={"mark": commands.mark})
+        return Plan(
+            now,
+            np.array(times),
+            xy,
+            np.array([s.yaw_rad for s in states]),
+            debug={"mark": commands.mark},
+        )
 
     def close(self) -> None:
         """Close the bus."""
@@ -88,12 +118,16 @@ class CanPolicy(Policy):
 
     def facts(self) -> Mapping[str, Any]:
         """Return what happened on the bus, for the rollout's manifest."""
-        return {"bus": f"{self._address.interface}:{self._address.channel}", **self._exchange.facts()}
+        return {
+            "bus": f"{self._address.interface}:{self._address.channel}",
+            **self._exchange.facts(),
+        }
 
     def _start(self, observation: Observation) -> BicycleState:
         """Return the state now, in the rig frame.
 
-        A plan says poses only, so speed and wheel angle at the end of the last one are remembered here, and used where the ego is on it.
+        A plan says poses only, so speed and wheel angle at the end of the last one are remembered
+        here, and used where the ego is on it.
         """
         ego = observation.ego
         if self._predicted is not None and self._predicted[0] == ego.t_us:
@@ -111,7 +145,9 @@ class CanPolicy(Policy):
         return Command(steer, 0.0, -commands.accel_mps2)
 
 
-def quantities(state: BicycleState, steer_rate: float, accel: float, path: F64, ratio: float, vehicle: Vehicle) -> dict[str, float]:
+def quantities(
+    state: BicycleState, steer_rate: float, accel: float, path: F64, ratio: float, vehicle: Vehicle
+) -> dict[str, float]:
     """Return what the bus can carry about a motion: by the names of `can_map.Quantity`.
 
     Args:
@@ -124,9 +160,19 @@ def quantities(state: BicycleState, steer_rate: float, accel: float, path: F64, 
     """
     yaw_rate = state.speed_mps * float(np.tan(state.steer_rad)) / vehicle.wheelbase_m
     # Rear wheels roll on circles around the turning centre; the front ones are farther from it.
-    rear = {"l": state.speed_mps - yaw_rate * TRACK_M / 2, "r": state.speed_mps + yaw_rate * TRACK_M / 2}
-    front = {side: float(np.copysign(np.hypot(v, yaw_rate * vehicle.wheelbase_m), state.speed_mps)) for side, v in rear.items()}
-    wheels = {f"wheel_{axle}{side}_kph": v * 3.6 for axle, two in (("f", front), ("r", rear)) for side, v in two.items()}
+    rear = {
+        "l": state.speed_mps - yaw_rate * TRACK_M / 2,
+        "r": state.speed_mps + yaw_rate * TRACK_M / 2,
+    }
+    front = {
+        side: float(np.copysign(np.hypot(v, yaw_rate * vehicle.wheelbase_m), state.speed_mps))
+        for side, v in rear.items()
+    }
+    wheels = {
+        f"wheel_{axle}{side}_kph": v * 3.6
+        for axle, two in (("f", front), ("r", rear))
+        for side, v in two.items()
+    }
     offset, heading, curvature, rate, length = path_cubic(path, state)
     return wheels | {
         "speed_mps": state.speed_mps,
@@ -145,9 +191,11 @@ def quantities(state: BicycleState, steer_rate: float, accel: float, path: F64, 
 
 
 def path_cubic(path: F64, state: BicycleState) -> tuple[float, float, float, float, float]:
-    """Return offset (m), heading (rad), curvature (1/m), its rate (1/m^2) and reach (m) of the route ahead, seen from the vehicle.
+    """Return offset (m), heading (rad), curvature (1/m), its rate (1/m^2) and reach (m) of the
+    route ahead, seen from the vehicle.
 
-    A lane camera's usual form: y(x) = offset + heading x + curvature x^2 / 2 + rate x^3 / 6. All are 0 where there is no route ahead.
+    A lane camera's usual form: y(x) = offset + heading x + curvature x^2 / 2 + rate x^3 / 6. All
+    are 0 where there is no route ahead.
     """
     cos, sin = np.cos(state.yaw_rad), np.sin(state.yaw_rad)
     away = path[:, :2] - np.array([state.x_m, state.y_m])
@@ -168,4 +216,6 @@ def _steer_of(ego: EgoState, vehicle: Vehicle) -> float:
 
 def _in_world(state: BicycleState, T_world_rig: F64) -> BicycleState:
     x, y, _ = transform_points(T_world_rig, np.array([[state.x_m, state.y_m, 0.0]]))[0]
-    return BicycleState(float(x), float(y), state.yaw_rad + yaw_of(T_world_rig), state.speed_mps, state.steer_rad)
+    return BicycleState(
+        float(x), float(y), state.yaw_rad + yaw_of(T_world_rig), state.speed_mps, state.steer_rad
+    )

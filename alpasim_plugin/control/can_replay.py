@@ -1,8 +1,11 @@
-"""A recorded drive of comma2k19 as bus traffic: its raw frames with their times, sent again on any bus, or decoded.
+"""A recorded drive of comma2k19 as bus traffic: its raw frames with their times, sent again on any
+bus, or decoded.
 
-    python -m alpasim_plugin.control.can_replay COMMA2K19 'udp_multicast:239.74.163.2?map=toyota&dbc=_toyota_2017.dbc'
+    python -m alpasim_plugin.control.can_replay COMMA2K19
+    'udp_multicast:239.74.163.2?map=toyota&dbc=_toyota_2017.dbc'
 
-The recording holds frames of two buses and the echoes of what its device sent (buses from 128 on); one bus is replayed.
+The recording holds frames of two buses and the echoes of what its device sent (buses from 128 on);
+one bus is replayed.
 """
 
 from __future__ import annotations
@@ -33,16 +36,30 @@ class Recording:
 
     t_s: np.ndarray[Any, np.dtype[np.float64]]  # (N,) seconds from the first frame
     address: np.ndarray[Any, np.dtype[np.int64]]  # (N,)
-    data: np.ndarray[Any, np.dtype[np.bytes_]]  # (N,) up to 8 bytes; zero bytes at the end are cut off
+    data: np.ndarray[
+        Any, np.dtype[np.bytes_]
+    ]  # (N,) up to 8 bytes; zero bytes at the end are cut off
 
     def frames(self, codec: Codec) -> Iterator[tuple[float, can.Message]]:
-        """Yield every frame whose message the database knows, with its time; the data get the message's length back."""
-        for t, address, data in zip(self.t_s.tolist(), self.address.tolist(), self.data.tolist(), strict=True):
+        """Yield every frame whose message the database knows, with its time; the data get the
+        message's length back.
+        """
+        for t, address, data in zip(
+            self.t_s.tolist(), self.address.tolist(), self.data.tolist(), strict=True
+        ):
             try:
                 length = codec.database.get_message_by_frame_id(address).length
             except KeyError:
                 continue
-            yield t, can.Message(timestamp=t, arbitration_id=address, data=data.ljust(length, b"\0"), is_extended_id=False)
+            yield (
+                t,
+                can.Message(
+                    timestamp=t,
+                    arbitration_id=address,
+                    data=data.ljust(length, b"\0"),
+                    is_extended_id=False,
+                ),
+            )
 
 
 def read_recording(folder: Path, bus: int = 0) -> Recording:
@@ -57,20 +74,35 @@ def read_recording(folder: Path, bus: int = 0) -> Recording:
         check_regular(path, DOING)
         with parsing(DOING, path, do_this="fetch the segment again", what="a numpy array"):
             arrays[name] = np.load(path, allow_pickle=False)
-        if arrays[name].ndim != 1 or arrays[name].dtype.kind not in kind or len(arrays[name]) != len(arrays["t"]):
+        if (
+            arrays[name].ndim != 1
+            or arrays[name].dtype.kind not in kind
+            or len(arrays[name]) != len(arrays["t"])
+        ):
             found = f"{arrays[name].dtype} {arrays[name].shape}"
-            raise InputError(DOING, str(path), found, "give one value a frame in each of t, src, address, data")
+            raise InputError(
+                DOING, str(path), found, "give one value a frame in each of t, src, address, data"
+            )
     own = arrays["src"] == bus
     if not own.any() or bus >= ECHOES:
         buses = sorted(set(arrays["src"].tolist()))
-        raise InputError(DOING, str(folder), f"no frame of bus {bus}", f"choose among {buses}; those from {ECHOES} on are echoes")
+        raise InputError(
+            DOING,
+            str(folder),
+            f"no frame of bus {bus}",
+            f"choose among {buses}; those from {ECHOES} on are echoes",
+        )
     order = np.argsort(arrays["t"][own], kind="stable")
     t, address, data = (arrays[name][own][order] for name in ("t", "address", "data"))
     return Recording((t - t[0]).astype(np.float64), address.astype(np.int64), data)
 
 
-def decode(recording: Recording, codec: Codec) -> tuple[dict[str, tuple[list[float], list[float]]], Counter[str]]:
-    """Return the map's quantities, each as times (s) and values, and how many frames of each message passed and failed their checks."""
+def decode(
+    recording: Recording, codec: Codec
+) -> tuple[dict[str, tuple[list[float], list[float]]], Counter[str]]:
+    """Return the map's quantities, each as times (s) and values, and how many frames of each
+    message passed and failed their checks.
+    """
     parts = {codec.message(sent.message).frame_id: sent for sent in codec.map.send}
     out: dict[str, tuple[list[float], list[float]]] = {}
     counts: Counter[str] = Counter()
@@ -86,7 +118,9 @@ def decode(recording: Recording, codec: Codec) -> tuple[dict[str, tuple[list[flo
         counts[sent.message] += 1
         total: dict[str, float] = {}
         for name, content in sent.contents().items():
-            total[content.quantity] = total.get(content.quantity, 0.0) + values[name] / content.scale
+            total[content.quantity] = (
+                total.get(content.quantity, 0.0) + values[name] / content.scale
+            )
         for quantity, value in total.items():
             times, series = out.setdefault(quantity, ([], []))
             times.append(t)
@@ -102,7 +136,8 @@ def replay(
     clock: Callable[[], float] = time.perf_counter,
     sleep: Callable[[float], None] = time.sleep,
 ) -> tuple[int, float]:
-    """Send a recording with its own timing, and return the number of frames and the largest delay of one, s.
+    """Send a recording with its own timing, and return the number of frames and the largest delay
+    of one, s.
 
     Args:
         recording: From `read_recording`.
@@ -112,7 +147,9 @@ def replay(
         clock: Seconds that only grow.
         sleep: Waits for so many seconds.
     """
-    began, count, worst = clock(), 0, 0.0
+    began = clock()
+    count = 0
+    worst = 0.0
     for t, frame in recording.frames(codec):
         due = began + t / speed
         if (left := due - clock()) > 0:
@@ -127,8 +164,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Replay a segment and print what it carries."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("folder", type=Path, help="a comma2k19 segment")
-    parser.add_argument("address", help="as after can://, with a map for the recorded car: ...?map=toyota&dbc=FILE")
-    parser.add_argument("--speed", type=float, default=1.0, help="recorded seconds in a real second")
+    parser.add_argument(
+        "address", help="as after can://, with a map for the recorded car: ...?map=toyota&dbc=FILE"
+    )
+    parser.add_argument(
+        "--speed", type=float, default=1.0, help="recorded seconds in a real second"
+    )
     given = parser.parse_args(arguments)
     address = Address.parse(given.address)
     codec = open_codec(*load_map(address.map, address.dbc))
@@ -140,7 +181,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"{quantity:28} {min(values):10.3f} to {max(values):.3f}")
     with open_bus(address) as bus:
         sent, worst = replay(recording, codec, bus, given.speed)
-    print(f"sent {sent} frames in {recording.t_s[-1] / given.speed:.1f} s, at most {worst * 1000:.1f} ms late")
+    print(
+        f"sent {sent} frames in {recording.t_s[-1] / given.speed:.1f} s, at most {worst * 1000:.1f} ms late"
+    )
 
 
 if __name__ == "__main__":

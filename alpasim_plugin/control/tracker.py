@@ -1,11 +1,15 @@
-"""Follow a plan: exactly, or with a vehicle that has limits (preview steering, preview speed, kinematic bicycle).
+"""Follow a plan: exactly, or with a vehicle that has limits (preview steering, preview speed,
+kinematic bicycle).
 
-What all controllers share stands first: the checks on a plan, and the move from a world pose to the plane and back.
+What all controllers share stands first: the checks on a plan, and the move from a world pose to the
+plane and back.
 
-Steering minimises, over the next 20 nodes of the path, ``sum of lateral error^2 + rho * steer rate^2`` for the bicycle itself (not for a
-linear model of it), by Gauss-Newton. The nodes are spaced by path length, so the law has the same shape at every speed and needs no special
-case at standstill. With ``rho = v^4 / (L^2 w^6)`` the closed loop is a third-order Butterworth filter of bandwidth ``w`` (the
-linear-quadratic regulator of ``y''' = v^2 u / L``; Anderson and Moore, Optimal Control, 1990, section 6.1): no oscillation at any speed.
+Steering minimises, over the next 20 nodes of the path, ``sum of lateral error^2 + rho * steer
+rate^2`` for the bicycle itself (not for a linear model of it), by Gauss-Newton. The nodes are
+spaced by path length, so the law has the same shape at every speed and needs no special case at
+standstill. With ``rho = v^4 / (L^2 w^6)`` the closed loop is a third-order Butterworth filter of
+bandwidth ``w`` (the linear-quadratic regulator of ``y''' = v^2 u / L``; Anderson and Moore, Optimal
+Control, 1990, section 6.1): no oscillation at any speed.
 
 Speed is the constant acceleration that best meets the planned progress over the next 0.8 s.
 """
@@ -28,7 +32,9 @@ GENTLE_BRAKE_MPS2 = 2.0  # what a vehicle without a plan does
 
 
 def check_plan(plan: Trajectory) -> None:
-    """Raise PolicyError unless the plan has a pose, finite values, and strictly increasing times."""
+    """Raise PolicyError unless the plan has a pose, finite values, and strictly increasing
+    times.
+    """
     found = ""
     if len(plan) == 0 or plan.xyz.shape != (len(plan), 3) or plan.quat.shape != (len(plan), 4):
         found = f"shapes t {plan.t_us.shape}, xyz {plan.xyz.shape}, quat {plan.quat.shape}"
@@ -50,17 +56,23 @@ def check_interval(state: EgoState, to_us: int) -> float:
     """Return the seconds from the state to ``to_us``; raise InputError unless they are positive."""
     if to_us <= state.t_us:
         found = f"the target time {to_us} us is not later"
-        raise InputError("advancing the ego", f"a state at {state.t_us} us", found, "ask for a later time")
+        raise InputError(
+            "advancing the ego", f"a state at {state.t_us} us", found, "ask for a later time"
+        )
     return (to_us - state.t_us) * 1e-6
 
 
 def planar(state: EgoState) -> BicycleState:
     """Return the state of the rear axle in the world's xy plane."""
     pose = state.T_world_rig
-    return BicycleState(float(pose[0, 3]), float(pose[1, 3]), yaw_of(pose), state.speed_mps, state.steer_rad)
+    return BicycleState(
+        float(pose[0, 3]), float(pose[1, 3]), yaw_of(pose), state.speed_mps, state.steer_rad
+    )
 
 
-def spatial(now: BicycleState, t_us: int, z_m: float, accel_mps2: float, vehicle: Vehicle) -> EgoState:
+def spatial(
+    now: BicycleState, t_us: int, z_m: float, accel_mps2: float, vehicle: Vehicle
+) -> EgoState:
     """Return the ego state of a planar state: level, at height ``z_m``."""
     pose = se2(now.x_m, now.y_m, now.yaw_rad, z_m)
     yaw_rate = now.speed_mps * float(np.tan(now.steer_rad)) / vehicle.wheelbase_m
@@ -77,13 +89,17 @@ def coast_to_stop(state: EgoState, to_us: int, vehicle: Vehicle) -> EgoState:
 
 
 class PerfectController(Controller):
-    """Put the ego on the plan's interpolated pose at the given time; before the first and after the last pose, hold that pose."""
+    """Put the ego on the plan's interpolated pose at the given time; before the first and after the
+    last pose, hold that pose.
+    """
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
 
     def advance(self, state: EgoState, plan: Trajectory | None, to_us: int) -> EgoState:
-        """Return the state at ``to_us``; see `Controller.advance`. Speed and yaw rate are differences over the step."""
+        """Return the state at ``to_us``; see `Controller.advance`. Speed and yaw rate are
+        differences over the step.
+        """
         if plan is None:
             return coast_to_stop(state, to_us, self.vehicle)
         dt_s = check_interval(state, to_us)
@@ -96,7 +112,11 @@ class PerfectController(Controller):
         mean_yaw = yaw_of(state.T_world_rig) + turn / 2
         speed = float(moved @ np.array([np.cos(mean_yaw), np.sin(mean_yaw)])) / dt_s
         yaw_rate = turn / dt_s
-        steer = float(np.arctan(self.vehicle.wheelbase_m * yaw_rate / speed)) if abs(speed) > 0.5 else state.steer_rad
+        steer = (
+            float(np.arctan(self.vehicle.wheelbase_m * yaw_rate / speed))
+            if abs(speed) > 0.5
+            else state.steer_rad
+        )
         return EgoState(to_us, pose, speed, (speed - state.speed_mps) / dt_s, yaw_rate, steer)
 
 
@@ -106,7 +126,9 @@ _SEARCHED = np.arange(41.0)
 
 @dataclass(frozen=True)
 class ReferencePath:
-    """A plan in coordinates around ``origin``; arc length is signed: it falls where the plan drives backwards."""
+    """A plan in coordinates around ``origin``; arc length is signed: it falls where the plan drives
+    backwards.
+    """
 
     t_s: F64  # (T,) seconds after the state's time
     s_m: F64  # (T,) signed progress at t_s; 0 at the first pose
@@ -115,24 +137,36 @@ class ReferencePath:
 
     @cached_property
     def pieces(self) -> tuple[F64, F64, F64]:
-        """Give of each piece between two knots its span (P - 1,) of progress, its step (P - 1, 2) and its left normal (P - 1, 2)."""
+        """Give of each piece between two knots its span (P - 1,) of progress, its step (P - 1, 2)
+        and its left normal (P - 1, 2).
+        """
         step = self.path_xy[1:] - self.path_xy[:-1]
         tangent = step / np.linalg.norm(step, axis=1, keepdims=True)
-        return self.path_s[1:] - self.path_s[:-1], step, np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+        return (
+            self.path_s[1:] - self.path_s[:-1],
+            step,
+            np.stack([-tangent[:, 1], tangent[:, 0]], axis=1),
+        )
 
     def progress(self, t_s: F64) -> F64:
-        """Return the progress (K,) planned for times (K,); the first and last pose are held outside the plan."""
+        """Return the progress (K,) planned for times (K,); the first and last pose are held outside
+        the plan.
+        """
         return np.asarray(np.interp(t_s, self.t_s, self.s_m))
 
     def at(self, s_m: F64) -> tuple[F64, F64]:
-        """Return points (K, 2) and left normals (K, 2) of the path at progress (K,), straight beyond its ends."""
+        """Return points (K, 2) and left normals (K, 2) of the path at progress (K,), straight
+        beyond its ends.
+        """
         knots, (span, step, normal) = self.path_s, self.pieces
         i = np.minimum(np.maximum(np.searchsorted(knots, s_m, side="right") - 1, 0), len(span) - 1)
         point = self.path_xy[i] + ((s_m - knots[i]) / span[i])[:, None] * step[i]
         return point, normal[i]
 
     def project(self, xy: F64, near_s: float, window_m: float) -> float:
-        """Return the progress of the path point nearest to ``xy`` (2,), searched within ``window_m`` of ``near_s``."""
+        """Return the progress of the path point nearest to ``xy`` (2,), searched within
+        ``window_m`` of ``near_s``.
+        """
         reach = _SEARCHED * (window_m / 20) - window_m
         reach[-1] = window_m
         s = near_s + reach
@@ -146,9 +180,10 @@ class ReferencePath:
 def build_reference_path(plan: Trajectory, t_us: int, origin_xy: F64) -> ReferencePath:
     """Read a checked plan relative to a time and a place.
 
-    A step counts by its component along the pose's heading, so noise on a standing plan adds up to nothing instead of to a speed.
-    The path keeps only knots that lie ``MIN_SPACING_M`` further than every knot before; a plan that never gets that far is a point,
-    and its path is the straight line through it along its heading.
+    A step counts by its component along the pose's heading, so noise on a standing plan adds up to
+    nothing instead of to a speed. The path keeps only knots that lie ``MIN_SPACING_M`` further than
+    every knot before; a plan that never gets that far is a point, and its path is the straight line
+    through it along its heading.
     """
     xy = plan.xyz[:, :2] - origin_xy
     yaw = yaw_from_quat(plan.quat)
@@ -156,15 +191,22 @@ def build_reference_path(plan: Trajectory, t_us: int, origin_xy: F64) -> Referen
     mean = heading[:-1] + heading[1:]
     mean = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
     s = np.concatenate([[0.0], np.cumsum(np.sum((xy[1:] - xy[:-1]) * mean, axis=1))])
-    # Knots in the order of time while the plan drives one way; the way is the sign of the furthest excursion.
+    # Knots in the order of time while the plan drives one way; the way is the sign of the furthest
+    # excursion.
     sign = 1.0 if s[np.argmax(np.abs(s))] >= 0 else -1.0
     keep, places = [0], list(zip(s.tolist(), *xy.T.tolist(), strict=True))
     s_kept, x_kept, y_kept = places[0]
     for i, (s_i, x, y) in enumerate(places):
-        # Headings that contradict the motion can make progress where nothing moves: such a step has no direction.
-        if sign * (s_i - s_kept) >= MIN_SPACING_M and math.hypot(x - x_kept, y - y_kept) >= 0.5 * MIN_SPACING_M:
+        # Headings that contradict the motion can make progress where nothing moves: such a step has
+        # no direction.
+        if (
+            sign * (s_i - s_kept) >= MIN_SPACING_M
+            and math.hypot(x - x_kept, y - y_kept) >= 0.5 * MIN_SPACING_M
+        ):
             keep.append(i)
-            s_kept, x_kept, y_kept = s_i, x, y
+            s_kept = s_i
+            x_kept = x
+            y_kept = y
     path_s, path_xy = s[keep], xy[keep]
     if len(keep) == 1:
         path_s = np.array([s[0] - 1.0, s[0] + 1.0])
@@ -186,7 +228,9 @@ HOLD_SPEED_MPS = 0.5
 HOLD_MOVE_M = 0.3  # a plan that moves less than this in HOLD_S is a stop
 HOLD_S = 2.0
 
-_BEFORE = np.tril(np.ones((NODES, NODES)), -1)  # d steer at the start of step k / d change in step j
+_BEFORE = np.tril(
+    np.ones((NODES, NODES)), -1
+)  # d steer at the start of step k / d change in step j
 _MIDDLE = _BEFORE + 0.5 * np.eye(NODES)
 _UP_TO = np.tril(np.ones((NODES, NODES), dtype=bool))
 
@@ -194,8 +238,9 @@ _UP_TO = np.tril(np.ones((NODES, NODES), dtype=bool))
 class PlanTracker(Controller):
     """Drive a kinematic bicycle along the plan within the vehicle's limits.
 
-    A plan that ends is held at its last pose, so a short plan brakes. The vehicle reverses only for a plan that drives backwards by more
-    than half a metre; noise around a standing plan neither moves it nor turns the wheel.
+    A plan that ends is held at its last pose, so a short plan brakes. The vehicle reverses only for
+    a plan that drives backwards by more than half a metre; noise around a standing plan neither
+    moves it nor turns the wheel.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -215,11 +260,19 @@ class PlanTracker(Controller):
         for i in range(n):
             now = step(now, self.command(now, reference, i * dt_s / n), dt_s / n, self.vehicle)
         accel = (now.speed_mps - before.speed_mps) / dt_s
-        world = BicycleState(now.x_m + float(origin[0]), now.y_m + float(origin[1]), now.yaw_rad, now.speed_mps, now.steer_rad)
+        world = BicycleState(
+            now.x_m + float(origin[0]),
+            now.y_m + float(origin[1]),
+            now.yaw_rad,
+            now.speed_mps,
+            now.steer_rad,
+        )
         return spatial(world, to_us, float(state.T_world_rig[2, 3]), accel, self.vehicle)
 
     def command(self, now: BicycleState, reference: ReferencePath, t_s: float) -> Command:
-        """Return the command at ``t_s`` seconds after the reference's time for a vehicle in the reference's coordinates."""
+        """Return the command at ``t_s`` seconds after the reference's time for a vehicle in the
+        reference's coordinates.
+        """
         planned = reference.progress(np.concatenate([[t_s], t_s + PREVIEW_S, [t_s + HOLD_S]]))
         xy = np.array([now.x_m, now.y_m])
         s_now = reference.project(xy, float(planned[0]), 2.0 + abs(now.speed_mps) * 0.5)
@@ -231,21 +284,33 @@ class PlanTracker(Controller):
             return Command(now.steer_rad, 0.0, self.vehicle.max_brake_mps2 / 2)
         accel = _fit_acceleration(to_go[:-1], now.speed_mps)
         target = self.steer_target(now, reference, s_now, direction)
-        return Command(target, 0.0, abs(accel)) if direction * accel < 0 else Command(target, accel, 0.0)
+        return (
+            Command(target, 0.0, abs(accel))
+            if direction * accel < 0
+            else Command(target, accel, 0.0)
+        )
 
-    def steer_target(self, now: BicycleState, reference: ReferencePath, s_now: float, direction: float) -> float:
-        """Return the wheel angle to be reached ``CONTROL_S`` later: the first move of the optimal sequence."""
+    def steer_target(
+        self, now: BicycleState, reference: ReferencePath, s_now: float, direction: float
+    ) -> float:
+        """Return the wheel angle to be reached ``CONTROL_S`` later: the first move of the optimal
+        sequence.
+        """
         wheelbase = self.vehicle.wheelbase_m
         speed = max(abs(now.speed_mps), MIN_PREVIEW_MPS)
         ds = speed * NODE_S * direction
         target, normal = reference.at(s_now + ds * np.arange(1.0, NODES + 1))
-        weight = speed**2 / (wheelbase * BANDWIDTH_RADPS**3) / NODE_S  # sqrt(rho) per change of steer in one node
+        weight = (
+            speed**2 / (wheelbase * BANDWIDTH_RADPS**3) / NODE_S
+        )  # sqrt(rho) per change of steer in one node
         grip = math.atan(MAX_LATERAL_MPS2 * wheelbase / max(now.speed_mps**2, 1e-6))
         limit = min(grip, self.vehicle.max_steer_rad)
         change = np.zeros(NODES)
         start = now.steer_rad
         for _ in range(GAUSS_NEWTON_STEPS):
-            error, jacobian = _lateral_errors(now, start, change, ds, wheelbase, target, normal, self.vehicle.max_steer_rad)
+            error, jacobian = _lateral_errors(
+                now, start, change, ds, wheelbase, target, normal, self.vehicle.max_steer_rad
+            )
             hessian = jacobian.T @ jacobian
             hessian.reshape(-1)[:: NODES + 1] += weight**2
             change = change - np.linalg.solve(hessian, jacobian.T @ error + weight**2 * change)
@@ -254,11 +319,20 @@ class PlanTracker(Controller):
 
 
 def _lateral_errors(
-    now: BicycleState, start: float, change: F64, ds: float, wheelbase: float, target: F64, normal: F64, max_steer: float
+    now: BicycleState,
+    start: float,
+    change: F64,
+    ds: float,
+    wheelbase: float,
+    target: F64,
+    normal: F64,
+    max_steer: float,
 ) -> tuple[F64, F64]:
-    """Return the lateral errors (NODES,) of the bicycle under a steering sequence, and their derivative (NODES, NODES).
+    """Return the lateral errors (NODES,) of the bicycle under a steering sequence, and their
+    derivative (NODES, NODES).
 
-    Each node is one midpoint step of length ``ds``: turn by ``ds tan(steer) / L`` and move along the mean heading.
+    Each node is one midpoint step of length ``ds``: turn by ``ds tan(steer) / L`` and move along
+    the mean heading.
     """
     middle = np.minimum(np.maximum(start + _MIDDLE @ change, -max_steer), max_steer)
     turn = ds * np.tan(middle) / wheelbase
@@ -275,6 +349,8 @@ def _lateral_errors(
 
 
 def _fit_acceleration(to_go: F64, speed: float) -> float:
-    """Return the constant acceleration whose motion best meets the progress ``to_go`` (K,) at ``PREVIEW_S``."""
+    """Return the constant acceleration whose motion best meets the progress ``to_go`` (K,) at
+    ``PREVIEW_S``.
+    """
     basis = 0.5 * PREVIEW_S**2
     return float(basis @ (to_go - speed * PREVIEW_S) / (basis @ basis))

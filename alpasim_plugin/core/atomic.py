@@ -1,6 +1,8 @@
-"""Write files atomically: under a temporary name in the same folder, then renamed, so that a reader never sees an incomplete file.
+"""Write files atomically: under a temporary name in the same folder, then renamed, so that a reader
+never sees an incomplete file.
 
-A process that is killed leaves at most a hidden ``.NAME.PID.RANDOM.tmp`` behind; what stood at the path before is untouched.
+A process that is killed leaves at most a hidden ``.NAME.PID.RANDOM.tmp`` behind; what stood at the
+path before is untouched.
 """
 
 from __future__ import annotations
@@ -26,13 +28,19 @@ DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 DOING = "writing a result"
 
 
-def disk_error(path: Path, error: OSError, doing: str = DOING, do_this: str | None = None) -> InfrastructureError:
-    """Return a failed write as an error with four parts; the advice follows from the cause unless ``do_this`` is given."""
+def disk_error(
+    path: Path, error: OSError, doing: str = DOING, do_this: str | None = None
+) -> InfrastructureError:
+    """Return a failed write as an error with four parts; the advice follows from the cause unless
+    ``do_this`` is given.
+    """
     if do_this is None:
         full = "free disk space and run the same command again"
         missing = "check that the folder exists, or name another one"
         other = "make the folder writable, or name another one"
-        do_this = full if error.errno in DISK_FULL else missing if error.errno == errno.ENOENT else other
+        do_this = (
+            full if error.errno in DISK_FULL else missing if error.errno == errno.ENOENT else other
+        )
     return InfrastructureError(doing, str(path), error.strerror or str(error), do_this)
 
 
@@ -43,12 +51,14 @@ def temporary_path(path: Path) -> Path:
 
 @contextmanager
 def atomic_file(path: Path | str, doing: str = DOING, do_this: str | None = None) -> Iterator[Path]:
-    """Yield a temporary path to write; it is renamed to ``path`` when the block ends, and removed if the block raises.
+    """Yield a temporary path to write; it is renamed to ``path`` when the block ends, and removed
+    if the block raises.
 
     The folder must exist. The data are on the disk (fsync) before the rename.
 
     Raises:
-        InfrastructureError: The disk refuses; ``doing`` and ``do_this`` are the first and last part of the error.
+        InfrastructureError: The disk refuses; ``doing`` and ``do_this`` are the first and last part
+            of the error.
 
     Example:
         >>> with atomic_file("scene.png") as partial:     # doctest: +SKIP
@@ -64,14 +74,16 @@ def atomic_file(path: Path | str, doing: str = DOING, do_this: str | None = None
     except OSError as error:
         raise disk_error(path, error, doing, do_this) from error
     finally:
-        # A read-only folder refuses this as well, even for a file that is not there; the write's own error says so.
+        # A read-only folder refuses this as well, even for a file that is not there; the write's
+        # own error says so.
         with contextlib.suppress(OSError):
             partial.unlink()
 
 
 @contextmanager
 def atomic_folder(folder: Path, doing: str = DOING, do_this: str | None = None) -> Iterator[Path]:
-    """Yield a new empty folder; it replaces ``folder`` when the block ends, and is removed if the block raises.
+    """Yield a new empty folder; it replaces ``folder`` when the block ends, and is removed if the
+    block raises.
 
     Raises:
         InfrastructureError: The disk refuses.
@@ -94,7 +106,8 @@ def atomic_folder(folder: Path, doing: str = DOING, do_this: str | None = None) 
 
 @contextmanager
 def scratch_folder(path: Path, doing: str = DOING) -> Iterator[Path]:
-    """Yield a new empty folder with a temporary name beside ``path``; it is removed when the block ends.
+    """Yield a new empty folder with a temporary name beside ``path``; it is removed when the block
+    ends.
 
     Raises:
         InfrastructureError: The disk refuses to make it.
@@ -146,15 +159,22 @@ def write_array(path: Path, array: npt.NDArray[Any], doing: str = DOING) -> None
         np.save(file, array)
 
 
-def write_safetensors(path: Path | str, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
+def write_safetensors(
+    path: Path | str, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None
+) -> None:
     """Write tensors as safetensors atomically; see `atomic_file`."""
     from safetensors import SafetensorError
     from safetensors.torch import save_file
 
     with atomic_file(path, "writing network weights") as partial:
         try:
-            save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, partial, dict(metadata or {}))
-        except SafetensorError as error:  # the library reports a refused write as its own error, with the number in the text
+            save_file(
+                {name: value.detach().cpu().contiguous() for name, value in tensors.items()},
+                partial,
+                dict(metadata or {}),
+            )
+        # the library reports a refused write as its own error, with the number in the text
+        except SafetensorError as error:
             found = re.search(r"os error (\d+)", str(error))
             code = int(found[1]) if found else errno.EIO
             raise OSError(code, os.strerror(code)) from error

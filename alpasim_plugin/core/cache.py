@@ -1,4 +1,5 @@
-"""What is made once, by the first process that needs it, while the others wait: folders by their content, and measurements of a machine.
+"""What is made once, by the first process that needs it, while the others wait: folders by their
+content, and measurements of a machine.
 
 CACHE / KIND / KEY/        what was made; it appears atomically
              / KEY.lock     held by the process that makes it
@@ -22,7 +23,10 @@ from alpasim_plugin.core.lock import one_writer
 from alpasim_plugin.core.reading.files import read_json_object
 
 T = TypeVar("T")
-DOING, DO_THIS = "writing to the cache", "free disk space, or name a writable folder in SIMRUN_CACHE"
+DOING, DO_THIS = (
+    "writing to the cache",
+    "free disk space, or name a writable folder in SIMRUN_CACHE",
+)
 MEASURING = "measuring the machine"
 KEPT_S = 7 * 86400.0  # a folder of an earlier run, which nobody else removes
 
@@ -42,10 +46,19 @@ def cache_root() -> Path:
     return found
 
 
-def cached(kind: str, key: str, make: Callable[[Path], None], read: Callable[[Path], T], what: str, *, again: bool = False) -> T:
+def cached(
+    kind: str,
+    key: str,
+    make: Callable[[Path], None],
+    read: Callable[[Path], T],
+    what: str,
+    *,
+    again: bool = False,
+) -> T:
     """Return what ``read`` finds under a key, made first if it is not there.
 
-    Several processes may ask at once: one makes it, the others wait. A folder that ``read`` refuses is made anew, with a warning.
+    Several processes may ask at once: one makes it, the others wait. A folder that ``read`` refuses
+    is made anew, with a warning.
 
     Args:
         kind: Sub-folder of the cache.
@@ -65,8 +78,17 @@ def cached(kind: str, key: str, make: Callable[[Path], None], read: Callable[[Pa
         if found is not None:
             return found
     lock = folder.with_name(f"{key}.lock")
-    with one_writer(lock, DOING, what, wait=True, waiting=lambda text: print(text, file=sys.stderr, flush=True), do_this=DO_THIS):
-        for left_over in folder.parent.glob(f".{key}.*.tmp"):  # of a process that was killed while it made this entry
+    with one_writer(
+        lock,
+        DOING,
+        what,
+        wait=True,
+        waiting=lambda text: print(text, file=sys.stderr, flush=True),
+        do_this=DO_THIS,
+    ):
+        for left_over in folder.parent.glob(
+            f".{key}.*.tmp"
+        ):  # of a process that was killed while it made this entry
             shutil.rmtree(left_over)
         found = None if again or not folder.exists() else _readable(folder, read, what, warn=False)
         if found is None:
@@ -80,7 +102,11 @@ def _readable(folder: Path, read: Callable[[Path], T], what: str, warn: bool = T
         return read(folder)
     except InputError as error:
         if warn:
-            print(f"warning: {what} is damaged ({error.with_what}: {error.found}); making it again", file=sys.stderr, flush=True)
+            print(
+                f"warning: {what} is damaged ({error.with_what}: {error.found}); making it again",
+                file=sys.stderr,
+                flush=True,
+            )
         return None
 
 
@@ -93,7 +119,8 @@ def _make(folder: Path, make: Callable[[Path], None], what: str) -> None:
 
 
 def share_measurements(folder: Path | None) -> None:
-    """Share what this process measures from now on with the others that name the same folder; None: with nobody.
+    """Share what this process measures from now on with the others that name the same folder; None:
+    with nobody.
 
     Args:
         folder: Of the run, on a file system of this node.
@@ -121,7 +148,13 @@ def measured(name: str, measure: Callable[[], Mapping[str, Any]]) -> Mapping[str
 
 def _once(folder: Path, name: str, measure: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
     path = folder / f"{name}.json"
-    with one_writer(folder / f"{name}.lock", MEASURING, f"{name} of this machine", wait=True, waiting=lambda said: None):
+    with one_writer(
+        folder / f"{name}.lock",
+        MEASURING,
+        f"{name} of this machine",
+        wait=True,
+        waiting=lambda said: None,
+    ):
         if not path.exists():
             _forget(folder.parent)
             write_json(path, measure(), MEASURING)

@@ -1,8 +1,9 @@
 """Checksums of files, in files with a seal, so that damage is noticed before anything is trusted.
 
-A sealed JSON file ends with the SHA-256 of everything before it; it states size, time and SHA-256 of other files. A file
-with the stated size and time is taken as it is, since reading gigabytes before every command would cost more than it finds; any other is
-read in full. A copy has other times: they are set back once its content is found to be the same.
+A sealed JSON file ends with the SHA-256 of everything before it; it states size, time and SHA-256
+of other files. A file with the stated size and time is taken as it is, since reading gigabytes
+before every command would cost more than it finds; any other is read in full. A copy has other
+times: they are set back once its content is found to be the same.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ class FileFacts(TypedDict):
 
 
 def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file's content, in hexadecimal digits; OSError if it cannot be read."""
+    """Return the SHA-256 of a file's content, in hexadecimal digits; OSError if it cannot be
+    read.
+    """
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -50,7 +53,11 @@ def checksums_of(folder: Path, names: Iterable[str]) -> dict[str, FileFacts]:
         path = folder / name
         if path.is_file():
             state = path.stat()
-            found[name] = {"bytes": state.st_size, "mtime_ns": state.st_mtime_ns, "sha256": sha256_of(path)}
+            found[name] = {
+                "bytes": state.st_size,
+                "mtime_ns": state.st_mtime_ns,
+                "sha256": sha256_of(path),
+            }
     return found
 
 
@@ -88,7 +95,8 @@ def write_sealed(path: Path, value: Mapping[str, Any], doing: str) -> str:
 
     Raises:
         InfrastructureError: The disk refuses.
-        ValueError: NaN or infinity, which JSON does not have; an empty object, or one with the key of the seal.
+        ValueError: NaN or infinity, which JSON does not have; an empty object, or one with the key
+            of the seal.
     """
     if not value or SEAL in value:
         raise ValueError(f"a sealed object needs keys other than {SEAL!r}")
@@ -107,7 +115,12 @@ def read_sealed(path: Path, doing: str, do_this: str) -> tuple[dict[str, Any], s
     data = read_bytes(path, doing, do_this=do_this)
     tail = _TAIL.search(data, max(0, len(data) - TAIL_BYTES))
     if tail is None:
-        raise InputError(doing, str(path), "cut, or written by another program or version: its seal is missing", do_this)
+        raise InputError(
+            doing,
+            str(path),
+            "cut, or written by another program or version: its seal is missing",
+            do_this,
+        )
     seal = tail[1].decode()
     if hashlib.sha256(data[: tail.start()]).hexdigest() != seal:
         raise InputError(doing, str(path), "not the content that was written", do_this)

@@ -22,10 +22,12 @@ class Tick:
 
 @dataclass(frozen=True)
 class Clock:
-    """Ticks from ``start_us`` in whole control periods up to the last one that fits before ``end_us``.
+    """Ticks from ``start_us`` in whole control periods up to the last one that fits before
+    ``end_us``.
 
     Raises:
-        InputError: A period is not positive, does not divide as required, or not a single step fits.
+        InputError: A period is not positive, does not divide as required, or not a single step
+            fits.
 
     Example:
         >>> [t.t_us for t in Clock(0, 250_000, Rates()).ticks()]

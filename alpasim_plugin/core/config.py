@@ -1,4 +1,5 @@
-"""Configuration files: YAML with positions, ``extends``, dotted overrides, and pydantic validation with four-part errors.
+"""Configuration files: YAML with positions, ``extends``, dotted overrides, and pydantic validation
+with four-part errors.
 
 An error of a file says where in it, and the nearest valid key.
 """
@@ -31,12 +32,12 @@ MOST_READ = 64  # files of one document, through extends
 def load_yaml(path: str | Path, doing: str = "reading a configuration") -> Document:
     """Read a YAML file and everything that its ``extends:`` list names.
 
-    ``extends`` (a list of paths relative to the file, or one path) is merged first to last, then the file itself on top: mappings
-    key by key, everything else replaced as a whole.
+    ``extends`` (a list of paths relative to the file, or one path) is merged first to last, then
+    the file itself on top: mappings key by key, everything else replaced as a whole.
 
     Raises:
-        InputError: Missing or unreadable file, YAML syntax (with line and column), duplicate or non-text key, a bound exceeded,
-            or a cycle of ``extends``.
+        InputError: Missing or unreadable file, YAML syntax (with line and column), duplicate or
+            non-text key, a bound exceeded, or a cycle of ``extends``.
     """
     return _load(Path(path), doing, (), [])
 
@@ -51,11 +52,18 @@ def parse_scalar(text: str, doing: str, with_what: str) -> Any:
     return data
 
 
-def apply_overrides(document: Document, overrides: Sequence[str], doing: str = "applying overrides", origin: str = "--set") -> Document:
-    """Set dotted keys: ``road.lane_width_m=3.2``, ``actors.lead.speed_mps=8`` (list items by index or by their ``id``).
+def apply_overrides(
+    document: Document,
+    overrides: Sequence[str],
+    doing: str = "applying overrides",
+    origin: str = "--set",
+) -> Document:
+    """Set dotted keys: ``road.lane_width_m=3.2``, ``actors.lead.speed_mps=8`` (list items by index
+    or by their ``id``).
 
     Raises:
-        InputError: An override without ``=``, a path through a scalar, or a list item that does not exist.
+        InputError: An override without ``=``, a path through a scalar, or a list item that does not
+            exist.
     """
     if not overrides:
         return document
@@ -64,7 +72,9 @@ def apply_overrides(document: Document, overrides: Sequence[str], doing: str = "
         key, equals, value_text = text.partition("=")
         where = f"{origin} {text}"
         if not equals or not key.strip():
-            raise InputError(doing, where, "no KEY=VALUE", "write for example --set road.lane_width_m=3.2")
+            raise InputError(
+                doing, where, "no KEY=VALUE", "write for example --set road.lane_width_m=3.2"
+            )
         value = parse_scalar(value_text, doing, where)
         loc, before = _assign(data, key.strip(), value, where, doing)
         for old in _paths(before, loc):
@@ -74,10 +84,17 @@ def apply_overrides(document: Document, overrides: Sequence[str], doing: str = "
 
 
 def _load(path: Path, doing: str, chain: tuple[Path, ...], read: list[Path]) -> Document:
-    """Read a file and its bases; ``read`` counts every reading: files that name each other twice double at each step."""
+    """Read a file and its bases; ``read`` counts every reading: files that name each other twice
+    double at each step.
+    """
     resolved = path.resolve()
     if resolved in chain:
-        raise InputError(doing, str(path), f"extends itself through {' -> '.join(str(p) for p in chain)}", "break the cycle of extends")
+        raise InputError(
+            doing,
+            str(path),
+            f"extends itself through {' -> '.join(str(p) for p in chain)}",
+            "break the cycle of extends",
+        )
     read.append(resolved)
     if len(read) > MOST_READ:
         found = f"more than {MOST_READ} files to read, {len(set(read))} different ones"
@@ -86,7 +103,9 @@ def _load(path: Path, doing: str, chain: tuple[Path, ...], read: list[Path]) -> 
     try:
         text = raw.decode("utf-8")
     except UnicodeDecodeError as e:
-        raise InputError(doing, str(path), f"byte {e.start} is not UTF-8", "save the file as UTF-8 text") from e
+        raise InputError(
+            doing, str(path), f"byte {e.start} is not UTF-8", "save the file as UTF-8 text"
+        ) from e
     data, marks = parse(text, str(path), doing)
     sources: list[tuple[str, str]] = []
     if isinstance(data, dict) and "extends" in data:
@@ -95,13 +114,20 @@ def _load(path: Path, doing: str, chain: tuple[Path, ...], read: list[Path]) -> 
         marks = {k: m for k, m in marks.items() if k[:1] != ("extends",)}
         names = [names] if isinstance(names, str) else names
         if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
-            raise InputError(doing, str(at), f"extends: {names!r}", "give a list of paths, relative to this file")
+            raise InputError(
+                doing, str(at), f"extends: {names!r}", "give a list of paths, relative to this file"
+            )
         merged: Any = {}
         merged_marks: dict[Key, Mark] = {}
         for name in names:
             base_path = resolved.parent / name
             if not base_path.is_file():
-                raise InputError(doing, str(at), f"extends {name!r}, but {base_path} does not exist", "correct the path")
+                raise InputError(
+                    doing,
+                    str(at),
+                    f"extends {name!r}, but {base_path} does not exist",
+                    "correct the path",
+                )
             base = _load(base_path, doing, (*chain, resolved), read)
             merged, merged_marks = _merged(merged, merged_marks, base.data, base.marks)
             sources.extend(base.sources)
@@ -110,11 +136,17 @@ def _load(path: Path, doing: str, chain: tuple[Path, ...], read: list[Path]) -> 
     return Document(data, marks, str(path), tuple(sources))
 
 
-def _merged(a: Any, a_marks: Mapping[Key, Mark], b: Any, b_marks: Mapping[Key, Mark]) -> tuple[Any, dict[Key, Mark]]:
+def _merged(
+    a: Any, a_marks: Mapping[Key, Mark], b: Any, b_marks: Mapping[Key, Mark]
+) -> tuple[Any, dict[Key, Mark]]:
     """Merge b over a, with the positions of what is left of both."""
     replaced: set[Key] = set()
     data = _merge(a, b, (), replaced)
-    kept = {key: mark for key, mark in a_marks.items() if not any(key[:n] in replaced for n in range(len(key) + 1))}
+    kept = {
+        key: mark
+        for key, mark in a_marks.items()
+        if not any(key[:n] in replaced for n in range(len(key) + 1))
+    }
     return data, {**kept, **b_marks}
 
 
@@ -123,7 +155,10 @@ def _merge(a: Any, b: Any, loc: Key, replaced: set[Key]) -> Any:
     if not (isinstance(a, dict) and isinstance(b, dict)):
         replaced.add(loc)
         return b
-    return a | {key: _merge(a[key], value, (*loc, key), replaced) if key in a else value for key, value in b.items()}
+    return a | {
+        key: _merge(a[key], value, (*loc, key), replaced) if key in a else value
+        for key, value in b.items()
+    }
 
 
 def _copy(data: Any) -> Any:
@@ -146,7 +181,12 @@ def _assign(data: Any, key: str, value: Any, where: str, doing: str) -> tuple[Ke
         elif isinstance(node, list):
             step = _item(node, part, where, doing)
         else:
-            raise InputError(doing, where, f"{'.'.join(map(str, loc)) or 'the file'} holds a value, not keys", "shorten the path")
+            raise InputError(
+                doing,
+                where,
+                f"{'.'.join(map(str, loc)) or 'the file'} holds a value, not keys",
+                "shorten the path",
+            )
         loc.append(step)
         if last:
             before = node.get(step) if isinstance(node, dict) else node[int(step)]
@@ -159,7 +199,13 @@ def _assign(data: Any, key: str, value: Any, where: str, doing: str) -> tuple[Ke
 def _paths(value: Any, loc: Key) -> Iterator[Key]:
     """Yield the path of a value and of everything in it."""
     yield loc
-    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    inside = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     for key, child in inside:
         yield from _paths(child, (*loc, key))
 
@@ -182,7 +228,8 @@ def validate(model: type[M], document: Document, doing: str = "reading a configu
     """Validate a document strictly (no text for a number, no unknown key).
 
     Raises:
-        InputError: The first problem in file order, with its position and a hint; the others are listed after it.
+        InputError: The first problem in file order, with its position and a hint; the others are
+            listed after it.
     """
     _refuse_non_finite(document, document.data, (), doing)
     try:
@@ -211,7 +258,9 @@ def dotted(loc: Sequence[str | int]) -> str:
     return out or "the file"
 
 
-def _as_input_error(model: type[BaseModel], document: Document, error: ValidationError, doing: str) -> InputError:
+def _as_input_error(
+    model: type[BaseModel], document: Document, error: ValidationError, doing: str
+) -> InputError:
     items = error.errors(include_url=False)[:EXAMINED]
     placed = []
     for item in items:
@@ -221,7 +270,10 @@ def _as_input_error(model: type[BaseModel], document: Document, error: Validatio
             placed.append((document.mark(known), item, loc, known))
     # File order, so that the first problem shown is the first that a reader of the file meets.
     placed.sort(key=lambda p: (p[0].file, p[0].line, p[0].column))
-    texts = [(mark, *_explain(model, document, item, loc, known)) for mark, item, loc, known in placed[:EXPLAINED]]
+    texts = [
+        (mark, *_explain(model, document, item, loc, known))
+        for mark, item, loc, known in placed[:EXPLAINED]
+    ]
     mark, found, hint = texts[0]
     if len(placed) > 1:
         rest = "; ".join(f"{m}: {f}" for m, f, _ in texts[1:])
@@ -232,13 +284,18 @@ def _as_input_error(model: type[BaseModel], document: Document, error: Validatio
 def _follows_from_another(item: Any, items: Sequence[Any]) -> bool:
     """Say whether a problem is only the shadow of another one.
 
-    A list whose items are wrong counts as too short as well; a misspelt key leaves the right one missing.
+    A list whose items are wrong counts as too short as well; a misspelt key leaves the right one
+    missing.
     """
     loc = tuple(item["loc"])
     if item["type"] == "too_short":
         return any(len(o["loc"]) > len(loc) and tuple(o["loc"][: len(loc)]) == loc for o in items)
     if item["type"] == "missing":
-        extra = [str(o["loc"][-1]) for o in items if o["type"] == "extra_forbidden" and tuple(o["loc"][:-1]) == loc[:-1]]
+        extra = [
+            str(o["loc"][-1])
+            for o in items
+            if o["type"] == "extra_forbidden" and tuple(o["loc"][:-1]) == loc[:-1]
+        ]
         return bool(difflib.get_close_matches(str(loc[-1]), extra, n=1, cutoff=0.6))
     return False
 
@@ -257,8 +314,12 @@ def _in_document(data: Any, loc: Key) -> Key:
     return tuple(out)
 
 
-def _explain(model: type[BaseModel], document: Document, item: Any, loc: Key, known: Key) -> tuple[str, str]:
-    kind, ctx, value = item["type"], item.get("ctx", {}), item.get("input")
+def _explain(
+    model: type[BaseModel], document: Document, item: Any, loc: Key, known: Key
+) -> tuple[str, str]:
+    kind = item["type"]
+    ctx = item.get("ctx", {})
+    value = item.get("input")
     name = dotted(known)
     if kind == "extra_forbidden":
         keys = sorted({k for m in _models_at(model, loc[:-1]) for k in m.model_fields})
@@ -270,10 +331,17 @@ def _explain(model: type[BaseModel], document: Document, item: Any, loc: Key, kn
         return f"{name} has no {str(loc[-1])!r}", f"add {loc[-1]}: {_wanted(model, loc)}"
     if kind in ("union_tag_invalid", "literal_error", "enum"):
         given = str(ctx.get("tag", value))
-        options = [o.strip("' ") for o in str(ctx.get("expected_tags") or ctx.get("expected", "")).replace(" or ", ", ").split(",")]
+        options = [
+            o.strip("' ")
+            for o in str(ctx.get("expected_tags") or ctx.get("expected", ""))
+            .replace(" or ", ", ")
+            .split(",")
+        ]
         near = difflib.get_close_matches(given, options, n=1, cutoff=0.5)
         hint = f"did you mean {near[0]!r}? " if near else ""
-        key = f"{name}.{str(ctx['discriminator']).strip(chr(39))}" if "discriminator" in ctx else name
+        key = (
+            f"{name}.{str(ctx['discriminator']).strip(chr(39))}" if "discriminator" in ctx else name
+        )
         return f"{key} is {given!r}", f"{hint}valid: {', '.join(options)}"
     if kind == "union_tag_not_found":
         options = sorted({str(t) for m in _models_at(model, loc) for t in _tags(m)})
@@ -283,11 +351,20 @@ def _explain(model: type[BaseModel], document: Document, item: Any, loc: Key, kn
         found, _, hint = text.partition(" | ")
         return f"{name}: {found}", hint or "correct the value"
     if kind.endswith("_type") or kind.endswith("_parsing"):
-        return f"{name} = {_short(value)} ({_kind_of(value)})", f"{item['msg'].replace('Input should be', 'give')}"
+        return (
+            f"{name} = {_short(value)} ({_kind_of(value)})",
+            f"{item['msg'].replace('Input should be', 'give')}",
+        )
     if kind in ("too_short", "too_long"):
-        bound = f"at least {ctx['min_length']}" if kind == "too_short" else f"at most {ctx['max_length']}"
+        bound = (
+            f"at least {ctx['min_length']}"
+            if kind == "too_short"
+            else f"at most {ctx['max_length']}"
+        )
         return f"{name} = {_short(value)}", f"give {bound} item{'s' if bound[-2:] != ' 1' else ''}"
-    return f"{name} = {_short(value)}", item["msg"].replace("Input should be", "give a value").replace("Input should", "the value should")
+    return f"{name} = {_short(value)}", item["msg"].replace(
+        "Input should be", "give a value"
+    ).replace("Input should", "the value should")
 
 
 def _short(value: Any) -> str:
@@ -298,7 +375,14 @@ def _short(value: Any) -> str:
 
 
 def _kind_of(value: Any) -> str:
-    names = {dict: "keys", list: "a list", str: "text", bool: "true or false", int: "a whole number", float: "a number"}
+    names = {
+        dict: "keys",
+        list: "a list",
+        str: "text",
+        bool: "true or false",
+        int: "a whole number",
+        float: "a number",
+    }
     return names.get(type(value), "nothing")
 
 
@@ -316,7 +400,9 @@ def _tags(model: type[BaseModel]) -> list[Any]:
 
 
 def _models_at(model: type[BaseModel], loc: Key) -> list[type[BaseModel]]:
-    """Return the models that may stand at a pydantic location (several where a union is not decided by a tag)."""
+    """Return the models that may stand at a pydantic location (several where a union is not decided
+    by a tag).
+    """
     current: list[Any] = [model]
     for part in loc:
         current = [deeper for node in current for deeper in _step(node, part)]

@@ -1,7 +1,8 @@
 """Errors with four parts: doing what, with what, found what, do this.
 
-Every failure that a user can meet is a `SimrunError`. Its class sets the process exit code (docs/cli.md) and the failure class in
-``rollouts.parquet``, so the printed text, the table and the exit code agree.
+Every failure that a user can meet is a `SimrunError`. Its class sets the process exit code
+(docs/cli.md) and the failure class in ``rollouts.parquet``, so the printed text, the table and the
+exit code agree.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from alpasim_plugin.core.escape import shorten, terminal
 class SimrunError(Exception):
     """State what was attempted, with which object, what was found, and what the user can do.
 
-    A part is at most `alpasim_plugin.core.escape.MAX_PART` characters long, and nothing in it can act on a terminal.
+    A part is at most `alpasim_plugin.core.escape.MAX_PART` characters long, and nothing in it can
+    act on a terminal.
 
     Args:
         doing: The attempted action, as a verb phrase ("reading a scenario").
@@ -29,7 +31,9 @@ class SimrunError(Exception):
     failure_class: ClassVar[str] = "input"
 
     def __init__(self, doing: str, with_what: str, found: str, do_this: str) -> None:
-        doing, with_what, found, do_this = (shorten(terminal(str(part))) for part in (doing, with_what, found, do_this))
+        doing, with_what, found, do_this = (
+            shorten(terminal(str(part))) for part in (doing, with_what, found, do_this)
+        )
         super().__init__(doing, with_what, found, do_this)
         self.doing, self.with_what, self.found, self.do_this = doing, with_what, found, do_this
 
@@ -82,7 +86,9 @@ class PolicyError(SimrunError):
 
     @property
     def is_final(self) -> bool:
-        """Tell whether another try must end in the same way: yes, unless a file, memory or a package was missing."""
+        """Tell whether another try must end in the same way: yes, unless a file, memory or a
+        package was missing.
+        """
         return not isinstance(self.__cause__, OSError | MemoryError | ImportError)
 
 
@@ -94,7 +100,9 @@ class EvaluatorError(SimrunError):
 
 
 class InternalError(SimrunError):
-    """The program itself failed: an exception that nothing has foreseen, of ours or of a plug-in."""
+    """The program itself failed: an exception that nothing has foreseen, of ours or of a
+    plug-in.
+    """
 
     exit_code: ClassVar[int] = 70
     failure_class: ClassVar[str] = "internal"
@@ -109,5 +117,7 @@ class InternalError(SimrunError):
         """
         frames = traceback.extract_tb(error.__traceback__)
         where = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
-        do_this = "run the command with --debug and report the traceback to whoever maintains that file"
+        do_this = (
+            "run the command with --debug and report the traceback to whoever maintains that file"
+        )
         return cls("running a command", command, f"{type(error).__name__}: {error}{where}", do_this)

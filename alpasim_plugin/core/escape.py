@@ -1,4 +1,5 @@
-"""Text from scenes, logs and parts made harmless for the place where it is shown: terminal, Markdown, XML.
+"""Text from scenes, logs and parts made harmless for the place where it is shown: terminal,
+Markdown, XML.
 
 HTML is escaped by the report's template engine. None of these functions changes plain words.
 """
@@ -10,14 +11,19 @@ import re
 MAX_PART = 300  # characters of one part of an error
 
 # What a terminal acts upon: C0 and C1 controls, and the marks that turn the direction of text.
-_CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069]|[\ud800-\udfff]")
+_CONTROLS = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069]|[\ud800-\udfff]"
+)
 # What XML 1.0 has no way to write (section 2.2, production Char).
 _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-_MARKDOWN = re.compile(r"([\\`*\[\]|~#!]|(?<![^\W_])_|_(?![^\W_]))")  # an underscore inside a word means nothing
+_MARKDOWN = re.compile(
+    r"([\\`*\[\]|~#!]|(?<![^\W_])_|_(?![^\W_]))"
+)  # an underscore inside a word means nothing
 
 
 def shorten(text: str, most: int = MAX_PART) -> str:
-    """Return text of at most ``most`` characters: the beginning and the end, where the facts are, with how much lies between.
+    """Return text of at most ``most`` characters: the beginning and the end, where the facts are,
+    with how much lies between.
 
     Example:
         >>> shorten("a" * 50 + "b" * 50, 40)
@@ -31,17 +37,21 @@ def shorten(text: str, most: int = MAX_PART) -> str:
 
 
 def terminal(text: str) -> str:
-    r"""Return text on one line in which nothing makes a terminal act: line ends become spaces, other control characters escapes.
+    r"""Return text on one line in which nothing makes a terminal act: line ends become spaces,
+    other control characters escapes.
 
     Example:
         >>> terminal("red\x1b[31m")
         'red\\x1b[31m'
     """
-    return _CONTROLS.sub(lambda found: " " if found[0] in "\t\n\v\f\r\u2028\u2029" else _written(found[0]), text)
+    return _CONTROLS.sub(
+        lambda found: " " if found[0] in "\t\n\v\f\r\u2028\u2029" else _written(found[0]), text
+    )
 
 
 def markdown(text: str) -> str:
-    r"""Return text for a cell of a Markdown table: one line, with every character that Markdown or HTML reads escaped.
+    r"""Return text for a cell of a Markdown table: one line, with every character that Markdown or
+    HTML reads escaped.
 
     Example:
         >>> markdown("a|b <i>")
@@ -52,7 +62,8 @@ def markdown(text: str) -> str:
 
 
 def xml(text: str) -> str:
-    r"""Return text that an XML 1.0 document can hold, before the writer escapes its markup: other characters are written as escapes.
+    r"""Return text that an XML 1.0 document can hold, before the writer escapes its markup: other
+    characters are written as escapes.
 
     Example:
         >>> xml("a\x00b")

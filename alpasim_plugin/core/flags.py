@@ -1,4 +1,6 @@
-"""How a job's dataclass is given on the command line: its fields are annotated with `Flag`, from which the options are made."""
+"""How a job's dataclass is given on the command line: its fields are annotated with `Flag`, from
+which the options are made.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +9,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Flag:
-    """One option: a field ``look_every: Annotated[int, Flag("Scenes between looks.", min=1)] = 5`` is ``--look-every``.
+    """One option: a field ``look_every: Annotated[int, Flag("Scenes between looks.", min=1)] = 5``
+    is ``--look-every``.
 
     Attributes:
         help: One sentence.
-        name: Its name; by default the field's. ``--report/--no-report`` for both states of a field that is true or false.
+        name: Its name; by default the field's. ``--report/--no-report`` for both states of a field
+            that is true or false.
         also: A second name, ``-o``.
         min: Least value.
         max: Largest value.
@@ -32,7 +36,9 @@ class Flag:
 
 @dataclass(frozen=True)
 class Positional:
-    """One argument without a name of its own; ``required`` where the field has a default all the same. The others are those of `Flag`."""
+    """One argument without a name of its own; ``required`` where the field has a default all the
+    same. The others are those of `Flag`.
+    """
 
     help: str
     metavar: str | None = None

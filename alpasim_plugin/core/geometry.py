@@ -1,6 +1,8 @@
-"""Rigid motion and polylines: the small maths every stage shares, and motion read off recorded poses.
+"""Rigid motion and polylines: the small maths every stage shares, and motion read off recorded
+poses.
 
-Quaternions are ``wxyz``; ``T_a_b`` maps coordinates in b to coordinates in a; angles are radians, lengths metres.
+Quaternions are ``wxyz``; ``T_a_b`` maps coordinates in b to coordinates in a; angles are radians,
+lengths metres.
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ def quat_from_yaw(yaw_rad: npt.ArrayLike) -> F64:
 
 
 def yaw_from_quat(quat: npt.ArrayLike) -> F64:
-    """Return the heading ``(...)`` of ``(..., 4)`` quaternions: the angle of body x in the world's xy plane."""
+    """Return the heading ``(...)`` of ``(..., 4)`` quaternions: the angle of body x in the world's
+    xy plane.
+    """
     w, x, y, z = np.moveaxis(np.asarray(quat, dtype=np.float64), -1, 0)
     return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
@@ -43,18 +47,34 @@ def yaw_from_quat(quat: npt.ArrayLike) -> F64:
 def matrix_from_quat(quat: npt.ArrayLike) -> F64:
     """Return rotation matrices ``(..., 3, 3)`` of unit quaternions ``(..., 4)``."""
     q = np.asarray(quat, dtype=np.float64)
-    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    w = q[..., 0]
+    x = q[..., 1]
+    y = q[..., 2]
+    z = q[..., 3]
     m = np.empty((*q.shape[:-1], 3, 3))
-    m[..., 0, 0], m[..., 0, 1], m[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    m[..., 1, 0], m[..., 1, 1], m[..., 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    m[..., 2, 0], m[..., 2, 1], m[..., 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    m[..., 0, 0], m[..., 0, 1], m[..., 0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+    )
+    m[..., 1, 0], m[..., 1, 1], m[..., 1, 2] = (
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+    )
+    m[..., 2, 0], m[..., 2, 1], m[..., 2, 2] = (
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
     return m
 
 
 def quat_from_matrix(rotation: npt.ArrayLike) -> F64:
     """Return the unit quaternions ``(..., 4)`` with w >= 0 of rotation matrices ``(..., 3, 3)``.
 
-    Takes the largest of the four candidate components, so it is stable at 180 degrees (Shepperd 1978).
+    Takes the largest of the four candidate components, so it is stable at 180 degrees (Shepperd
+    1978).
     """
     r = np.asarray(rotation, dtype=np.float64)
     batch = r.shape[:-2]
@@ -73,8 +93,12 @@ def quat_from_matrix(rotation: npt.ArrayLike) -> F64:
     return np.asarray(quat.reshape(*batch, 4), dtype=np.float64)
 
 
-def _long_quat(largest: int, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any, i: Any) -> tuple[Any, Any, Any, Any]:
-    """Return the quaternion, not yet of unit length, of matrices given row by row, of whose candidates one is known to be the largest."""
+def _long_quat(
+    largest: int, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any, i: Any
+) -> tuple[Any, Any, Any, Any]:
+    """Return the quaternion, not yet of unit length, of matrices given row by row, of whose
+    candidates one is known to be the largest.
+    """
     if largest == 0:
         return 1 + (a + e + i), h - f, c - g, d - b
     if largest == 1:
@@ -84,21 +108,32 @@ def _long_quat(largest: int, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: 
     return d - b, g + c, h + f, 1 + i - a - e
 
 
-def _quat_of(a: float, b: float, c: float, d: float, e: float, f: float, g: float, h: float, i: float) -> tuple[float, float, float, float]:
-    """Return the quaternion of one matrix, given row by row: the arithmetic of `quat_from_matrix` without arrays, a tenth of its time."""
+def _quat_of(
+    a: float, b: float, c: float, d: float, e: float, f: float, g: float, h: float, i: float
+) -> tuple[float, float, float, float]:
+    """Return the quaternion of one matrix, given row by row: the arithmetic of `quat_from_matrix`
+    without arrays, a tenth of its time.
+    """
     trace = a + e + i
     candidates = (trace, a, e, i)
-    largest = candidates.index(max(candidates)) if trace == trace else 0  # NaN is the largest, as for arrays
+    largest = (
+        candidates.index(max(candidates)) if trace == trace else 0
+    )  # NaN is the largest, as for arrays
     w, x, y, z = _long_quat(largest, a, b, c, d, e, f, g, h, i)
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if norm == 0.0:
         return math.nan, math.nan, math.nan, math.nan
-    w, x, y, z = w / norm, x / norm, y / norm, z / norm
+    w = w / norm
+    x = x / norm
+    y = y / norm
+    z = z / norm
     return (-w, -x, -y, -z) if w < 0 else (w, x, y, z)
 
 
 def se3(xyz: npt.ArrayLike, quat: npt.ArrayLike) -> F64:
-    """Return ``(..., 4, 4)`` transforms from positions ``(..., 3)`` and quaternions ``(..., 4)``."""
+    """Return ``(..., 4, 4)`` transforms from positions ``(..., 3)`` and quaternions ``(...,
+    4)``.
+    """
     xyz_ = np.asarray(xyz, dtype=np.float64)
     out = np.zeros((*xyz_.shape[:-1], 4, 4))
     out[..., :3, :3] = matrix_from_quat(quat)
@@ -133,7 +168,9 @@ def yaw_of(transform: F64) -> float:
 
 
 def slerp(q0: F64, q1: F64, fraction: F64) -> F64:
-    """Interpolate unit quaternions ``(N, 4)`` on the shorter arc; falls back to normalised lerp below 1e-8 rad, where it is exact."""
+    """Interpolate unit quaternions ``(N, 4)`` on the shorter arc; falls back to normalised lerp
+    below 1e-8 rad, where it is exact.
+    """
     dot = np.sum(q0 * q1, axis=-1, keepdims=True)
     q1 = np.where(dot < 0, -q1, q1)
     angle = np.arccos(np.clip(np.abs(dot), 0.0, 1.0))
@@ -148,7 +185,8 @@ def slerp(q0: F64, q1: F64, fraction: F64) -> F64:
 
 
 def interpolate(trajectory: Trajectory, t_us: npt.ArrayLike) -> F64:
-    """Return poses ``(..., 4, 4)`` at times inside the trajectory: linear in position, slerp in rotation.
+    """Return poses ``(..., 4, 4)`` at times inside the trajectory: linear in position, slerp in
+    rotation.
 
     Raises:
         InputError: A time lies outside ``[t_us[0], t_us[-1]]``; poses are never extrapolated.
@@ -165,23 +203,34 @@ def interpolate(trajectory: Trajectory, t_us: npt.ArrayLike) -> F64:
     if len(trajectory) == 1:
         return np.broadcast_to(se3(trajectory.xyz[0], trajectory.quat[0]), (*t.shape, 4, 4)).copy()
     i = np.clip(np.searchsorted(trajectory.t_us, t, side="right") - 1, 0, len(trajectory) - 2)
-    # Differences in integers first: epoch microseconds do not fit a float's mantissa once squared or scaled.
+    # Differences in integers first: epoch microseconds do not fit a float's mantissa once squared
+    # or scaled.
     span = (trajectory.t_us[i + 1] - trajectory.t_us[i]).astype(np.float64)
     f = (t - trajectory.t_us[i]).astype(np.float64) / span
     xyz = trajectory.xyz[i] * (1 - f)[..., None] + trajectory.xyz[i + 1] * f[..., None]
-    quat = slerp(trajectory.quat[i].reshape(-1, 4), trajectory.quat[i + 1].reshape(-1, 4), f.reshape(-1))
+    quat = slerp(
+        trajectory.quat[i].reshape(-1, 4), trajectory.quat[i + 1].reshape(-1, 4), f.reshape(-1)
+    )
     return se3(xyz, quat.reshape(*t.shape, 4))
 
 
 def trajectory_from_poses(t_us: npt.ArrayLike, poses: npt.ArrayLike) -> Trajectory:
     """Build a trajectory from times ``(T,)`` and transforms ``(T, 4, 4)``."""
     matrices = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
-    return Trajectory(np.asarray(t_us, dtype=np.int64), matrices[:, :3, 3].copy(), quat_from_matrix(matrices[:, :3, :3]))
+    return Trajectory(
+        np.asarray(t_us, dtype=np.int64),
+        matrices[:, :3, 3].copy(),
+        quat_from_matrix(matrices[:, :3, :3]),
+    )
 
 
 def offset_trajectory(trajectory: Trajectory, T_body_other: F64) -> Trajectory:
-    """Return the trajectory of a frame fixed to the body: ``T_world_other = T_world_body @ T_body_other``."""
-    return trajectory_from_poses(trajectory.t_us, se3(trajectory.xyz, trajectory.quat) @ T_body_other)
+    """Return the trajectory of a frame fixed to the body: ``T_world_other = T_world_body @
+    T_body_other``.
+    """
+    return trajectory_from_poses(
+        trajectory.t_us, se3(trajectory.xyz, trajectory.quat) @ T_body_other
+    )
 
 
 def arc_lengths(line: F64) -> F64:
@@ -194,7 +243,9 @@ def arc_lengths(line: F64) -> F64:
 
 
 def resample(line: F64, s_m: npt.ArrayLike, along: F64 | None = None) -> F64:
-    """Return points ``(M, D)`` of a polyline ``(N, D)`` at arc lengths ``(M,)``, clamped to its ends; ``along`` are its `arc_lengths`."""
+    """Return points ``(M, D)`` of a polyline ``(N, D)`` at arc lengths ``(M,)``, clamped to its
+    ends; ``along`` are its `arc_lengths`.
+    """
     s = arc_lengths(line) if along is None else along
     rises = s[1:] > s[:-1]
     if not rises.all():
@@ -208,9 +259,11 @@ def resample(line: F64, s_m: npt.ArrayLike, along: F64 | None = None) -> F64:
 
 
 class CubicSpline:
-    """The cubic spline through points over a parameter, whose ends are not knots; through three points a parabola, through two a line.
+    """The cubic spline through points over a parameter, whose ends are not knots; through three
+    points a parabola, through two a line.
 
-    It is ``scipy.interpolate.CubicSpline`` to the last bit, without its checks; its module takes longer to load than a drive to begin.
+    It is ``scipy.interpolate.CubicSpline`` to the last bit, without its checks; its module takes
+    longer to load than a drive to begin.
 
     Args:
         at: ``(N,)`` increasing, N at least two.
@@ -224,25 +277,39 @@ class CubicSpline:
         if n == 2:
             tangent = np.concatenate([slope, slope])
         elif n == 3:
-            matrix = np.array([[1.0, 1.0, 0.0], [step[1], 2 * (step[0] + step[1]), step[0]], [0.0, 1.0, 1.0]])
-            right = np.stack([2 * slope[0], 3 * (step[0] * slope[1] + step[1] * slope[0]), 2 * slope[1]])
+            matrix = np.array(
+                [[1.0, 1.0, 0.0], [step[1], 2 * (step[0] + step[1]), step[0]], [0.0, 1.0, 1.0]]
+            )
+            right = np.stack(
+                [2 * slope[0], 3 * (step[0] * slope[1] + step[1] * slope[0]), 2 * slope[1]]
+            )
             tangent = scipy.linalg.solve(matrix, right)
         else:
             right = np.empty_like(points)
             right[1:-1] = 3 * (over[1:] * slope[:-1] + over[:-1] * slope[1:])
             first, last = at[2] - at[0], at[-1] - at[-3]
-            right[0] = ((step[0] + 2 * first) * step[1] * slope[0] + step[0] ** 2 * slope[1]) / first
-            right[-1] = (step[-1] ** 2 * slope[-2] + (2 * last + step[-1]) * step[-2] * slope[-1]) / last
+            right[0] = (
+                (step[0] + 2 * first) * step[1] * slope[0] + step[0] ** 2 * slope[1]
+            ) / first
+            right[-1] = (
+                step[-1] ** 2 * slope[-2] + (2 * last + step[-1]) * step[-2] * slope[-1]
+            ) / last
             diagonal = np.concatenate([[step[1]], 2 * (step[:-1] + step[1:]), [step[-2]]])
             below, above = np.concatenate([step[1:], [last]]), np.concatenate([[first], step[:-1]])
             tangent = solve_tridiagonal(below, diagonal, above, right)
         bend = (tangent[:-1] + tangent[1:] - 2 * slope) / over
         self._at = at
-        self._terms = np.stack([points[:-1], tangent[:-1], (slope - tangent[:-1]) / over - bend, bend / over])  # (4, N - 1, D)
+        self._terms = np.stack(
+            [points[:-1], tangent[:-1], (slope - tangent[:-1]) / over - bend, bend / over]
+        )  # (4, N - 1, D)
 
     def __call__(self, at: F64, derivative: int = 0) -> F64:
-        """Return points ``(M, D)``, or their first or second derivative, at ``(M,)``; outside, those of the outermost piece."""
-        i = np.minimum(np.maximum(np.searchsorted(self._at, at, side="right") - 1, 0), len(self._at) - 2)
+        """Return points ``(M, D)``, or their first or second derivative, at ``(M,)``; outside,
+        those of the outermost piece.
+        """
+        i = np.minimum(
+            np.maximum(np.searchsorted(self._at, at, side="right") - 1, 0), len(self._at) - 2
+        )
         along = (at - self._at[i])[:, None]
         terms, power = self._terms[derivative:, i], along
         total = terms[0] * float(math.factorial(derivative))
@@ -253,32 +320,50 @@ class CubicSpline:
 
 
 def solve_tridiagonal(below: F64, diagonal: F64, above: F64, right: F64) -> F64:
-    """Return X ``(N, D)`` of A X = right, A having the diagonals ``(N - 1,)``, ``(N,)``, ``(N - 1,)``; N at least two.
+    """Return X ``(N, D)`` of A X = right, A having the diagonals ``(N - 1,)``, ``(N,)``, ``(N -
+    1,)``; N at least two.
 
-    Elimination with exchange of neighbouring rows, operation by operation LAPACK's ``dgtsv``; ``scipy.linalg`` takes longer to load.
+    Elimination with exchange of neighbouring rows, operation by operation LAPACK's ``dgtsv``;
+    ``scipy.linalg`` takes longer to load.
     """
-    low, mid, up, rows = below.tolist(), diagonal.tolist(), above.tolist(), right.tolist()
+    low = below.tolist()
+    mid = diagonal.tolist()
+    up = above.tolist()
+    rows = right.tolist()
     for i in range(len(low)):
         if abs(mid[i]) >= abs(low[i]):
             factor, low[i] = low[i] / mid[i], 0.0
             mid[i + 1] -= factor * up[i]
         else:
-            factor, mid[i], up[i], mid[i + 1] = mid[i] / low[i], low[i], mid[i + 1], up[i] - mid[i] / low[i] * mid[i + 1]
+            factor, mid[i], up[i], mid[i + 1] = (
+                mid[i] / low[i],
+                low[i],
+                mid[i + 1],
+                up[i] - mid[i] / low[i] * mid[i + 1],
+            )
             rows[i], rows[i + 1] = rows[i + 1], rows[i]
             if i + 1 < len(up):
-                low[i], up[i + 1] = up[i + 1], -factor * up[i + 1]  # from here on the second diagonal above
+                low[i], up[i + 1] = (
+                    up[i + 1],
+                    -factor * up[i + 1],
+                )  # from here on the second diagonal above
         rows[i + 1] = [y - factor * x for x, y in zip(rows[i], rows[i + 1], strict=True)]
     low[-1:] = [0.0, 0.0]
     up.append(0.0)
     after = after_next = [0.0] * right.shape[1]
     for i in reversed(range(len(mid))):
-        solved = [(x - up[i] * y - low[i] * z) / mid[i] for x, y, z in zip(rows[i], after, after_next, strict=True)]
+        solved = [
+            (x - up[i] * y - low[i] * z) / mid[i]
+            for x, y, z in zip(rows[i], after, after_next, strict=True)
+        ]
         rows[i], after, after_next = solved, solved, after
     return np.array(rows)
 
 
 def project(line: F64, xy: F64) -> tuple[float, float]:
-    """Return (arc length, signed distance; left positive) of the point of a polyline ``(N, 2+)`` nearest to ``xy``."""
+    """Return (arc length, signed distance; left positive) of the point of a polyline ``(N, 2+)``
+    nearest to ``xy``.
+    """
     a, b = line[:-1, :2], line[1:, :2]
     d = b - a
     length2 = np.maximum(np.sum(d * d, axis=1), 1e-300)
@@ -291,11 +376,15 @@ def project(line: F64, xy: F64) -> tuple[float, float]:
     return float(s[i] + f[i] * np.sqrt(length2[i])), float(np.copysign(np.sqrt(distance2[i]), side))
 
 
-UNIT_CORNERS = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]])  # front-left, front-right, rear-right, rear-left
+UNIT_CORNERS = np.array(
+    [[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]]
+)  # front-left, front-right, rear-right, rear-left
 
 
 def rectangle_corners(xy: F64, yaw: F64, size: F64) -> F64:
-    """Return the corners ``(N, 4, 2)`` of boxes with centres ``(N, 2)``, headings ``(N,)`` and (length, width) ``(N, 2)``."""
+    """Return the corners ``(N, 4, 2)`` of boxes with centres ``(N, 2)``, headings ``(N,)`` and
+    (length, width) ``(N, 2)``.
+    """
     local = UNIT_CORNERS * size[:, None, :]  # (N, 4, 2)
     c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
     x, y = local[..., 0], local[..., 1]
@@ -303,7 +392,9 @@ def rectangle_corners(xy: F64, yaw: F64, size: F64) -> F64:
 
 
 def densify(line: F64, max_step_m: float = 2.0) -> F64:
-    """Insert points so that neighbours of a polyline ``(N, D)`` are at most ``max_step_m`` apart in plan view; its own vertices stay."""
+    """Insert points so that neighbours of a polyline ``(N, D)`` are at most ``max_step_m`` apart in
+    plan view; its own vertices stay.
+    """
     steps = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
     count = np.maximum(np.ceil(steps / max_step_m - 1e-9).astype(np.int64), 1)  # pieces per segment
     if count.size == 0 or int(count.max()) == 1:
@@ -316,14 +407,19 @@ def densify(line: F64, max_step_m: float = 2.0) -> F64:
 
 
 def centre_line(left: F64, right: F64, max_step_m: float = 2.0) -> F64:
-    """Return the line ``(N, 3)`` halfway between two edges ``(L, 3)`` and ``(R, 3)`` that need not have the same number of points.
+    """Return the line ``(N, 3)`` halfway between two edges ``(L, 3)`` and ``(R, 3)`` that need not
+    have the same number of points.
 
-    Points at equal shares of both edges' lengths are averaged, at every vertex of either edge and at most ``max_step_m`` apart.
+    Points at equal shares of both edges' lengths are averaged, at every vertex of either edge and
+    at most ``max_step_m`` apart.
     """
     share_left, share_right = _shares(left), _shares(right)
     shares = np.unique(np.round(np.concatenate([share_left, share_right]), 9))
     length = max(float(arc_lengths(left)[-1]), float(arc_lengths(right)[-1]))
-    at_left, at_right = resample(left, shares * arc_lengths(left)[-1]), resample(right, shares * arc_lengths(right)[-1])
+    at_left, at_right = (
+        resample(left, shares * arc_lengths(left)[-1]),
+        resample(right, shares * arc_lengths(right)[-1]),
+    )
     middle = (at_left + at_right) / 2
     steps = np.linalg.norm(np.diff(middle[:, :2], axis=0), axis=1)
     keep = np.concatenate([[True], steps > 1e-6 * max(length, 1.0)])
@@ -336,7 +432,9 @@ def _shares(line: F64) -> F64:
     return s / s[-1] if s[-1] > 0 else np.linspace(0.0, 1.0, len(s))
 
 
-DIFFERENCE_US = 100_000  # half window of the differences: long enough to bridge the noise of 200 Hz poses
+DIFFERENCE_US = (
+    100_000  # half window of the differences: long enough to bridge the noise of 200 Hz poses
+)
 
 
 def ego_state_from_log(ego_log: Trajectory, t_us: int, vehicle: Vehicle) -> EgoState:
@@ -344,11 +442,15 @@ def ego_state_from_log(ego_log: Trajectory, t_us: int, vehicle: Vehicle) -> EgoS
     return ego_states_from_log(ego_log, [t_us], vehicle)[0]
 
 
-def ego_states_from_log(ego_log: Trajectory, t_us: npt.ArrayLike, vehicle: Vehicle) -> list[EgoState]:
-    """Return the recorded state at each of ``(N,)`` times, motion by differences over at most +-0.1 s inside the log.
+def ego_states_from_log(
+    ego_log: Trajectory, t_us: npt.ArrayLike, vehicle: Vehicle
+) -> list[EgoState]:
+    """Return the recorded state at each of ``(N,)`` times, motion by differences over at most +-0.1
+    s inside the log.
 
-    Speed is the component of velocity along the rig's x axis (negative in reverse). The steering angle is the one with which a
-    kinematic bicycle makes the recorded yaw rate, limited to what the vehicle can do, so that the loop closes without a jump.
+    Speed is the component of velocity along the rig's x axis (negative in reverse). The steering
+    angle is the one with which a kinematic bicycle makes the recorded yaw rate, limited to what the
+    vehicle can do, so that the loop closes without a jump.
 
     Raises:
         InputError: A time lies outside the log.
@@ -358,17 +460,32 @@ def ego_states_from_log(ego_log: Trajectory, t_us: npt.ArrayLike, vehicle: Vehic
     after = np.minimum(t + DIFFERENCE_US, ego_log.t_us[-1])
     poses = interpolate(ego_log, np.stack([before, t, after], axis=-1))  # (N, 3, 4, 4)
     forward, xyz = poses[:, 1, :3, 0], poses[:, :, :3, 3]
-    # A window of no length, as in a log of one pose, has no motion; one that ends at t has no acceleration.
-    span_s, first_s, second_s = (np.where(us > 0, us, 1) * 1e-6 for us in (after - before, t - before, after - t))
+    # A window of no length, as in a log of one pose, has no motion; one that ends at t has no
+    # acceleration.
+    span_s, first_s, second_s = (
+        np.where(us > 0, us, 1) * 1e-6 for us in (after - before, t - before, after - t)
+    )
     speed = _along(xyz[:, 2] - xyz[:, 0], forward) / span_s
     yaw = np.arctan2(poses[:, :, 1, 0], poses[:, :, 0, 0])
     yaw_rate = wrap_angle(yaw[:, 2] - yaw[:, 0]) / span_s
-    v0, v1 = _along(xyz[:, 1] - xyz[:, 0], forward) / first_s, _along(xyz[:, 2] - xyz[:, 1], forward) / second_s
+    v0, v1 = (
+        _along(xyz[:, 1] - xyz[:, 0], forward) / first_s,
+        _along(xyz[:, 2] - xyz[:, 1], forward) / second_s,
+    )
     accel = np.where((before < t) & (t < after), 2.0 * (v1 - v0) / span_s, 0.0)
     turns = np.abs(speed) > 0.5
-    steer = np.where(turns, np.arctan(vehicle.wheelbase_m * yaw_rate / np.where(turns, speed, 1.0)), 0.0)
+    steer = np.where(
+        turns, np.arctan(vehicle.wheelbase_m * yaw_rate / np.where(turns, speed, 1.0)), 0.0
+    )
     steer = np.clip(steer, -vehicle.max_steer_rad, vehicle.max_steer_rad)
-    columns = (t.tolist(), poses[:, 1], speed.tolist(), accel.tolist(), yaw_rate.tolist(), steer.tolist())
+    columns = (
+        t.tolist(),
+        poses[:, 1],
+        speed.tolist(),
+        accel.tolist(),
+        yaw_rate.tolist(),
+        steer.tolist(),
+    )
     return [EgoState(*row) for row in zip(*columns, strict=True)]
 
 
@@ -378,7 +495,9 @@ def _along(move: F64, forward: F64) -> F64:
 
 
 def speeds(track: Trajectory) -> F64:
-    """Return the speed in the plane ``(T,)`` at every pose of a track, by central differences; one pose: 0."""
+    """Return the speed in the plane ``(T,)`` at every pose of a track, by central differences; one
+    pose: 0.
+    """
     if len(track) < 2:
         return np.zeros(len(track))
     t_s = (track.t_us - track.t_us[0]).astype(np.float64) * 1e-6

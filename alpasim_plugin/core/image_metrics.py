@@ -1,7 +1,9 @@
-"""What images are judged by: one definition of PSNR, SSIM and a black picture for every stage, table, report and training log.
+"""What images are judged by: one definition of PSNR, SSIM and a black picture for every stage,
+table, report and training log.
 
-SSIM follows Wang et al., IEEE TIP 2004, Eq. 13, in the convention of the 3DGS papers: Gaussian window 11x11 with sigma 1.5, biased moments,
-zeros beyond the border, per channel, then the mean over pixels and channels. Other conventions differ by up to 0.005 on one pair of images.
+SSIM follows Wang et al., IEEE TIP 2004, Eq. 13, in the convention of the 3DGS papers: Gaussian
+window 11x11 with sigma 1.5, biased moments, zeros beyond the border, per channel, then the mean
+over pixels and channels. Other conventions differ by up to 0.005 on one pair of images.
 """
 
 from __future__ import annotations
@@ -16,7 +18,9 @@ from alpasim_plugin.core.types import F32, U8
 CAP_DB = 100.0  # of identical images, whose ratio is infinite
 WINDOW_PX, SIGMA_PX = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2  # for values in 0 to 1
-BLACK_MAX = 10  # uint8 sRGB value, 0..255: an image is black when no channel of any pixel is above it; AlpaSim's img_is_black
+# uint8 sRGB value, 0..255: an image is black when no channel of any pixel is above it; AlpaSim's
+# img_is_black
+BLACK_MAX = 10
 
 Image = npt.NDArray[Any]
 
@@ -52,8 +56,12 @@ def ssim(image: Image, truth: Image, peak: float = 255.0) -> float:
     """
     a, b = (np.ascontiguousarray(x, dtype=np.float32) / np.float32(peak) for x in (image, truth))
     mu_a, mu_b = gaussian_blur(a), gaussian_blur(b)
-    both, square_a, square_b = mu_a * mu_b, mu_a * mu_a, mu_b * mu_b
-    var_a, var_b, cov = gaussian_blur(a * a) - square_a, gaussian_blur(b * b) - square_b, gaussian_blur(a * b) - both
+    both = mu_a * mu_b
+    square_a = mu_a * mu_a
+    square_b = mu_b * mu_b
+    var_a = gaussian_blur(a * a) - square_a
+    var_b = gaussian_blur(b * b) - square_b
+    cov = gaussian_blur(a * b) - both
     value = (2 * both + C1) * (2 * cov + C2) / ((square_a + square_b + C1) * (var_a + var_b + C2))
     return float(value.mean(dtype=np.float64))
 
@@ -63,11 +71,14 @@ def gaussian_blur(image: F32) -> F32:
     import cv2  # not for those who only ask whether a picture is black
 
     window = cv2.getGaussianKernel(WINDOW_PX, SIGMA_PX, cv2.CV_32F)
-    return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, window, window, borderType=cv2.BORDER_CONSTANT))
+    return np.asarray(
+        cv2.sepFilter2D(image, cv2.CV_32F, window, window, borderType=cv2.BORDER_CONSTANT)
+    )
 
 
 def is_black(rgb: U8) -> bool:
-    """Return whether every value of ``(H, W, 3)`` pixels is at most `BLACK_MAX`; an image without pixels is black.
+    """Return whether every value of ``(H, W, 3)`` pixels is at most `BLACK_MAX`; an image without
+    pixels is black.
 
     Example:
         >>> is_black(np.full((4, 4, 3), 10, np.uint8)), is_black(np.full((4, 4, 3), 11, np.uint8))
@@ -76,10 +87,14 @@ def is_black(rgb: U8) -> bool:
     return int(rgb.max(initial=0)) <= BLACK_MAX
 
 
-def grid_ratio(images: Image, truths: Image, side: int = 4, flat_levels: float = 3.0) -> float | None:
-    """Return how much stronger a picture's steps are across the borders of a grid than elsewhere, on surfaces that are flat in the truth.
+def grid_ratio(
+    images: Image, truths: Image, side: int = 4, flat_levels: float = 3.0
+) -> float | None:
+    """Return how much stronger a picture's steps are across the borders of a grid than elsewhere,
+    on surfaces that are flat in the truth.
 
-    A network that makes cells of pixels at a time may leave their grid in the picture; 1 is none. Both axes count alike.
+    A network that makes cells of pixels at a time may leave their grid in the picture; 1 is none.
+    Both axes count alike.
 
     Args:
         images: ``(..., H, W, 3)`` what a network made, 8 bits.
@@ -88,7 +103,8 @@ def grid_ratio(images: Image, truths: Image, side: int = 4, flat_levels: float =
         flat_levels: A step between neighbouring pixels of the truth up to which it counts as flat.
 
     Returns:
-        Mean step at borders over mean step elsewhere; None where nothing is flat, or the image does not change there.
+        Mean step at borders over mean step elsewhere; None where nothing is flat, or the image does
+        not change there.
 
     Example:
         >>> column = np.arange(64)
@@ -98,8 +114,12 @@ def grid_ratio(images: Image, truths: Image, side: int = 4, flat_levels: float =
     """
     border, elsewhere = np.zeros(2), np.zeros(2)  # sum of steps, their number
     for axis in (-3, -2):
-        step, flat = (np.abs(np.diff(x.astype(np.int16), axis=axis)).mean(axis=-1) for x in (images, truths))
-        at = np.arange(1, step.shape[axis + 1] + 1) % side == 0  # the step from pixel k to k + 1 crosses a border where side divides k + 1
+        step, flat = (
+            np.abs(np.diff(x.astype(np.int16), axis=axis)).mean(axis=-1) for x in (images, truths)
+        )
+        at = (
+            np.arange(1, step.shape[axis + 1] + 1) % side == 0
+        )  # the step from pixel k to k + 1 crosses a border where side divides k + 1
         at = at[:, None] if axis == -3 else at
         for total, chosen in ((border, at), (elsewhere, ~at)):
             counted = step[(flat <= flat_levels) & chosen]

@@ -1,7 +1,9 @@
-"""The interfaces of the replaceable parts. Required members are abstract; every other member is optional and has its default here.
+"""The interfaces of the replaceable parts. Required members are abstract; every other member is
+optional and has its default here.
 
-A part may inherit from its interface or only look like it: `complete` adds the defaults of the optional members that it
-does not define, so that the loop never has to ask whether a member is there. docs/extending.md shows one part of every kind.
+A part may inherit from its interface or only look like it: `complete` adds the defaults of the
+optional members that it does not define, so that the loop never has to ask whether a member is
+there. docs/extending.md shows one part of every kind.
 """
 
 from __future__ import annotations
@@ -54,7 +56,9 @@ class BlockRule:
 
     @classmethod
     def of_latents(cls, latents: int) -> BlockRule:
-        """Return the rule of a causal video autoencoder: the first latent holds one frame, every other one four."""
+        """Return the rule of a causal video autoencoder: the first latent holds one frame, every
+        other one four.
+        """
         return cls(1 + 4 * (latents - 1), 4 * latents)
 
     def frames(self, block: int) -> int:
@@ -64,16 +68,20 @@ class BlockRule:
 
 @dataclass(frozen=True)
 class Declaration:
-    """What a part declares about itself before it is built; see `alpasim_plugin.core.parts.resolve.declaration_of`.
+    """What a part declares about itself before it is built; see
+    `alpasim_plugin.core.parts.resolve.declaration_of`.
 
     Attributes:
-        files: Files that shape what the part does, such as weights, by a name. A name that is a dotted key of the settings says that this
-            setting is the file's path; the digest then holds the file's content instead of the path.
+        files: Files that shape what the part does, such as weights, by a name. A name that is a
+            dotted key of the settings says that this setting is the file's path; the digest then
+            holds the file's content instead of the path.
         trained: Whether the part's weights were learned; None where it has none.
         note: What the part is, for labels: "trained", "untrained (identity)".
-        is_remote: The part's behaviour is decided elsewhere, as a service's is: it has no digest, and its rollouts are never reused.
-        missing: What a user must still give before the part can be built, as an error says it; empty where nothing is missing. A run with
-            such a part is refused before its first rollout.
+        is_remote: The part's behaviour is decided elsewhere, as a service's is: it has no digest,
+            and its rollouts are never reused.
+        missing: What a user must still give before the part can be built, as an error says it;
+            empty where nothing is missing. A run with such a part is refused before its first
+            rollout.
     """
 
     files: Mapping[str, Path] = field(default_factory=dict)
@@ -87,20 +95,33 @@ class Declaration:
 class Renderer(Protocol):
     """One rollout's renderer session."""
 
-    lookahead: int = 0  # requests carry a forecast of so many of the camera's next frames in ``ahead``
-    block: BlockRule | None = None  # frames come in blocks of so many, and the policy is asked at each block's end; None: one by one
-    stage_ms: Mapping[str, float] = EMPTY  # parts of the last call's wall time that are stages of their own, such as {"fix": 12.0}
+    lookahead: int = (
+        0  # requests carry a forecast of so many of the camera's next frames in ``ahead``
+    )
+    block: BlockRule | None = (
+        # frames come in blocks of so many, and the policy is asked at each block's end; None: one
+        # by one
+        None
+    )
+    stage_ms: Mapping[str, float] = (
+        # parts of the last call's wall time that are stages of their own, such as {"fix": 12.0}
+        EMPTY
+    )
 
     @abstractmethod
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame."""
 
     def render_batch(self, requests: Sequence[RenderRequest]) -> Sequence[Frame]:
-        """Render all requests of an instant (of all cameras; of a whole block with ``block``). One by one unless overridden."""
+        """Render all requests of an instant (of all cameras; of a whole block with ``block``). One
+        by one unless overridden.
+        """
         return [self.render(request) for request in requests]
 
     def recorded(self) -> Sequence[RecordedFrame]:
-        """Return the frames of the recorded drive that the renderer's model was made from; none unless overridden."""
+        """Return the frames of the recorded drive that the renderer's model was made from; none
+        unless overridden.
+        """
         return ()
 
     def facts(self) -> Mapping[str, Any]:
@@ -110,18 +131,23 @@ class Renderer(Protocol):
 
 @runtime_checkable
 class Fixer(Protocol):
-    """One rollout's fixer session: repairs frames causally, from the past and the current block only.
+    """One rollout's fixer session: repairs frames causally, from the past and the current block
+    only.
 
-    A block holds frames of one or several cameras in any order, each camera with the same number of frames, at most as many as ``blocks``
-    says. ``maps`` are the semantic maps of the same frames in the same order, or empty. What comes out has the order, times and cameras of
-    what went in.
+    A block holds frames of one or several cameras in any order, each camera with the same number of
+    frames, at most as many as ``blocks`` says. ``maps`` are the semantic maps of the same frames in
+    the same order, or empty. What comes out has the order, times and cameras of what went in.
     """
 
     blocks: BlockRule = BlockRule(1, 1)  # frames of the first block and of each later one
     trained: bool = False  # whether the weights were learned
     label: str = ""  # what this is, for tables and reports: "onefixer, trained"
-    chosen: Mapping[str, Any] = EMPTY  # what was chosen by measuring the machine, with the measurements, for ``run.json``
-    stage_ms: Mapping[str, float] = EMPTY  # wall time by stage since the session was made: sums that only grow
+    chosen: Mapping[str, Any] = (
+        EMPTY  # what was chosen by measuring the machine, with the measurements, for ``run.json``
+    )
+    stage_ms: Mapping[str, float] = (
+        EMPTY  # wall time by stage since the session was made: sums that only grow
+    )
 
     @abstractmethod
     def reset(self, seed: int) -> None:
@@ -134,8 +160,9 @@ class Fixer(Protocol):
     def preview(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
         """Fix the block in progress and leave the history as it is; any number of times.
 
-        By default a copy of the session makes the step. Override it where a session is large, or where a step after an equal preview can
-        be had for nothing. It is called only for blocks of more than one frame.
+        By default a copy of the session makes the step. Override it where a session is large, or
+        where a step after an equal preview can be had for nothing. It is called only for blocks of
+        more than one frame.
         """
         return copy.deepcopy(self).step(block, maps)
 
@@ -145,7 +172,9 @@ class Policy(Protocol):
     """Plans from observations."""
 
     sensors: Sequence[SensorSpec]  # which cameras, at which rate; nothing else is rendered
-    controller: str = "bicycle"  # which controller moves the ego along its plans; declared on the class
+    controller: str = (
+        "bicycle"  # which controller moves the ego along its plans; declared on the class
+    )
 
     @abstractmethod
     def reset(self, seed: int, route: Route) -> None:
@@ -160,19 +189,26 @@ class Policy(Protocol):
         return
 
     def close(self) -> None:
-        """Give back what the policy holds, such as a session or a bus; called after a rollout, also after one that failed."""
+        """Give back what the policy holds, such as a session or a bus; called after a rollout, also
+        after one that failed.
+        """
         return
 
     def facts(self) -> Mapping[str, Any]:
-        """Return what the policy did beside its plans, such as what happened on its bus, for the rollout's manifest."""
+        """Return what the policy did beside its plans, such as what happened on its bus, for the
+        rollout's manifest.
+        """
         return {}
 
 
 @runtime_checkable
 class Controller(Protocol):
-    """Moves the ego along a plan. Pure, unless it is a remote one: the result depends on the arguments only."""
+    """Moves the ego along a plan. Pure, unless it is a remote one: the result depends on the
+    arguments only.
+    """
 
-    grounds: bool = False  # whether the poses that it returns stand on the ground; others are put on the scenario's
+    # whether the poses that it returns stand on the ground; others are put on the scenario's
+    grounds: bool = False
 
     @abstractmethod
     def advance(self, state: EgoState, plan: Trajectory | None, to_us: int) -> EgoState:
@@ -180,7 +216,8 @@ class Controller(Protocol):
 
         Args:
             state: The true state now.
-            plan: Absolute rig poses in the world with their times; None: there is no plan yet, brake gently to a stop.
+            plan: Absolute rig poses in the world with their times; None: there is no plan yet,
+                brake gently to a stop.
             to_us: When to arrive; later than ``state.t_us``.
 
         Raises:
@@ -189,7 +226,9 @@ class Controller(Protocol):
         """
 
     def close(self) -> None:
-        """Give back what the controller holds, such as a session; called after a rollout, also after one that failed."""
+        """Give back what the controller holds, such as a session; called after a rollout, also
+        after one that failed.
+        """
         return
 
 
@@ -197,7 +236,9 @@ class Controller(Protocol):
 class Evaluator(Protocol):
     """Pure: a log in, series out; never a renderer, a policy or a GPU."""
 
-    metrics: Mapping[str, MetricInfo] = EMPTY  # the metrics that it gives and that `evaluators.metrics.METRICS` does not hold
+    metrics: Mapping[str, MetricInfo] = (
+        EMPTY  # the metrics that it gives and that `evaluators.metrics.METRICS` does not hold
+    )
 
     @abstractmethod
     def __call__(self, rollout: RolloutLog, scene: Scene) -> Sequence[MetricSeries]:
@@ -220,7 +261,8 @@ class Source(Protocol):
 
         Args:
             path: File or folder.
-            ego: Which recorded vehicle becomes the ego, for formats that do not say it; None: the reader chooses.
+            ego: Which recorded vehicle becomes the ego, for formats that do not say it; None: the
+                reader chooses.
         """
 
 
@@ -231,12 +273,14 @@ def complete(part: T, interface: Any, what: str = "") -> T:
     """Return a part with the defaults of the optional members that it does not define.
 
     Args:
-        part: Any object with the interface's required members; it need not inherit from the interface.
+        part: Any object with the interface's required members; it need not inherit from the
+            interface.
         interface: Of this module.
         what: The part for messages.
 
     Raises:
-        InputError: A required member is missing; of a policy it is a `PolicyError`, since only the loop finds it out.
+        InputError: A required member is missing; of a policy it is a `PolicyError`, since only the
+            loop finds it out.
     """
     required, optional = _members(interface)
     missing = [name for name in required if not hasattr(part, name)]
@@ -256,7 +300,9 @@ def complete(part: T, interface: Any, what: str = "") -> T:
 
 
 def contract_error(kind: str) -> type[SimrunError]:
-    """Return the error of a part that does not have its kind's form: a policy is what is under test, so the fault is its own."""
+    """Return the error of a part that does not have its kind's form: a policy is what is under
+    test, so the fault is its own.
+    """
     return PolicyError if kind == "policy" else InputError
 
 
@@ -264,7 +310,15 @@ def _members(interface: Any) -> tuple[list[str], dict[str, Any]]:
     """Return the names of the required members, and the optional ones with their defaults."""
     own = vars(interface)
     required = [name for name in interface.__annotations__ if name not in own]
-    required += [name for name, member in own.items() if getattr(member, "__isabstractmethod__", False)]
+    required += [
+        name for name, member in own.items() if getattr(member, "__isabstractmethod__", False)
+    ]
     optional = {name: own[name] for name in interface.__annotations__ if name in own}
-    public = {name: member for name, member in own.items() if inspect.isfunction(member) and not name.startswith("_")}
-    return required, optional | {name: member for name, member in public.items() if name not in required}
+    public = {
+        name: member
+        for name, member in own.items()
+        if inspect.isfunction(member) and not name.startswith("_")
+    }
+    return required, optional | {
+        name: member for name, member in public.items() if name not in required
+    }

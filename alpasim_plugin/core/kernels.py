@@ -1,13 +1,16 @@
-"""Compiled kernels: those that lie in the package, the user's own cache, and numba's compiler, in this order.
+"""Compiled kernels: those that lie in the package, the user's own cache, and numba's compiler, in
+this order.
 
 MADE / compiled / PYTHON-NUMBA-LLVMLITE-TRIPLE-LEVEL /            what one version of the compiler made for one level of processors
                                            SUBJECT-DIGEST         empty: the folder has all that the subject's case calls
                                            KERNEL-DIGEST          one kernel for arguments of one kind: a pickle, as in numba's own cache
 
-A kernel is named by its arguments and by the code of its module with everything that it imports: where a constant was edited it is
-compiled anew, in the user's cache too, which numba names by the kernel's own file alone.
+A kernel is named by its arguments and by the code of its module with everything that it imports:
+where a constant was edited it is compiled anew, in the user's cache too, which numba names by the
+kernel's own file alone.
 
-``python -m alpasim_plugin.core.kernels`` fills the folder for the levels that this machine runs; the next wheel holds it.
+``python -m alpasim_plugin.core.kernels`` fills the folder for the levels that this machine runs;
+the next wheel holds it.
 """
 
 # Numba's interface is untyped.
@@ -33,27 +36,43 @@ from alpasim_plugin.core.parts.source import own_code_digest
 from alpasim_plugin.core.places import MADE
 
 COMPILED = MADE / "compiled"
-SUBJECTS = {  # subject -> tiny case, imported in the process that compiles; two at a time, in this order, leave no core idle for long
+# subject -> tiny case, imported in the process that compiles; two at a time, in this order, leave
+# no core idle for long
+SUBJECTS = {
     "map": "alpasim_plugin.fixers.pixel_network:draw_and_warp",
     "rasteriser": "alpasim_plugin.gaussians.sample_scene:rasterise",
     "network": "alpasim_plugin.fixers.pixel_network:gather_and_mix",
-    "gradient": "alpasim_plugin.gaussians.sample_scene:fit",  # last: it calls much of what the rasteriser has compiled by then
+    # last: it calls much of what the rasteriser has compiled by then
+    "gradient": "alpasim_plugin.gaussians.sample_scene:fit",
 }
-# Level, best first -> what a processor must have, and how the code differs from what the level's name alone gives.
+# Level, best first -> what a processor must have, and how the code differs from what the level's
+# name alone gives.
 V3 = frozenset({"avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"})
 LEVELS = {
-    "x86-64-v4": (V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}, "-prefer-256-bit"),
+    "x86-64-v4": (
+        V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"},
+        "-prefer-256-bit",
+    ),
     "x86-64-v3": (V3, ""),
     "generic": (frozenset({"neon"}), ""),  # 64-bit Arm
 }
-DECIDES = ("CPU_NAME", "CPU_FEATURES", "ENABLE_AVX", "OPT", "BOUNDSCHECK", "DEBUGINFO")  # numba's settings that change the code
+DECIDES = (
+    "CPU_NAME",
+    "CPU_FEATURES",
+    "ENABLE_AVX",
+    "OPT",
+    "BOUNDSCHECK",
+    "DEBUGINFO",
+)  # numba's settings that change the code
 
 _chosen: Path | None = None  # by `use`
 _filled: Path | None = None  # by `fill`
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Compile a function at its first call, unless it was compiled before: ``numba.njit`` with the cache of this module."""
+    """Compile a function at its first call, unless it was compiled before: ``numba.njit`` with the
+    cache of this module.
+    """
     import numba
 
     def decorate(function: Callable[..., Any]) -> Any:
@@ -70,17 +89,23 @@ class _Compiled:
 
     def __init__(self, cached: Any, function: Callable[..., Any]) -> None:
         self._cached, self._name_of_kernel = cached, function.__qualname__
-        self._code = _code(function.__module__)  # now: the file may be edited before the first call compiles what was imported
+        self._code = _code(
+            function.__module__
+        )  # now: the file may be edited before the first call compiles what was imported
         cached._cache_file._source_stamp = self._code
 
     def load_overload(self, sig, target_context):
-        """Return a kernel that was compiled for arguments of these types; None where there is none."""
+        """Return a kernel that was compiled for arguments of these types; None where there is
+        none.
+        """
         if _filled is not None:
             return None
         from numba.core.compiler import CompileResult
         from numba.core.runtime import rtsys
 
-        rtsys.initialize(target_context)  # what kernels call; numba would also load all that compiling takes, scipy.linalg too: 0.2 s
+        rtsys.initialize(
+            target_context
+        )  # what kernels call; numba would also load all that compiling takes, scipy.linalg too: 0.2 s
         folder = shipped()
         path = None if folder is None else folder / self._name(sig)
         if path is not None and path.exists():
@@ -89,7 +114,9 @@ class _Compiled:
             return self._cached._load_overload(sig, target_context)
 
     def save_overload(self, sig, data):
-        """Keep what was just compiled: in the user's cache, or in the folder that is being filled."""
+        """Keep what was just compiled: in the user's cache, or in the folder that is being
+        filled.
+        """
         if _filled is None:
             self._cached.save_overload(sig, data)
             return
@@ -110,7 +137,9 @@ def _code(module: str) -> str:
 
 
 def shipped() -> Path | None:
-    """Return the folder of the best level that this processor runs, and that the compiler in use made; None: there is none."""
+    """Return the folder of the best level that this processor runs, and that the compiler in use
+    made; None: there is none.
+    """
     return _chosen if _chosen is not None else _found()
 
 
@@ -118,7 +147,9 @@ def shipped() -> Path | None:
 def _found() -> Path | None:
     if not COMPILED.is_dir() or any(f"NUMBA_{name}" in os.environ for name in DECIDES):
         return None
-    return next((folder for level in levels_here() if (folder := COMPILED / target(level)).is_dir()), None)
+    return next(
+        (folder for level in levels_here() if (folder := COMPILED / target(level)).is_dir()), None
+    )
 
 
 def use(folder: Path) -> None:
@@ -165,7 +196,9 @@ def fills() -> bool:
 
 
 def fill(folder: Path) -> None:
-    """Compile the kernels of all subjects into a folder, for the processor that numba's settings name."""
+    """Compile the kernels of all subjects into a folder, for the processor that numba's settings
+    name.
+    """
     global _filled
     _filled = folder
     for subject in SUBJECTS:
@@ -184,7 +217,11 @@ def build(root: Path = COMPILED) -> list[Path]:
         folder = root / target(level)
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        settings = {"NUMBA_CPU_NAME": level, "NUMBA_CPU_FEATURES": LEVELS[level][1], "NUMBA_DISABLE_INTEL_SVML": "1"}
+        settings = {
+            "NUMBA_CPU_NAME": level,
+            "NUMBA_CPU_FEATURES": LEVELS[level][1],
+            "NUMBA_DISABLE_INTEL_SVML": "1",
+        }
         code = f"from pathlib import Path; from {__spec__.name} import fill; fill(Path({str(folder)!r}))"
         subprocess.run([sys.executable, "-P", "-c", code], check=True, env=os.environ | settings)
         made.append(folder)

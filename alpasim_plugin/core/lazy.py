@@ -1,4 +1,5 @@
-"""What is imported on demand: public names of a package, libraries that only one feature needs, and what installed packages register.
+"""What is imported on demand: public names of a package, libraries that only one feature needs, and
+what installed packages register.
 
 The working directory is no installed package, whatever it holds.
 """
@@ -24,7 +25,8 @@ def lazy_names(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
 
     Args:
         package: The module's ``__name__``.
-        homes: Public name -> module that defines it, relative to the package where it begins with a dot.
+        homes: Public name -> module that defines it, relative to the package where it begins with a
+            dot.
     """
 
     def get(name: str) -> Any:
@@ -48,11 +50,18 @@ def require_library(module: str, doing: str, with_what: str, do_this: str) -> An
     try:
         return import_module(module)
     except ImportError as error:
-        raise InputError(doing, with_what, f"the library {module.partition('.')[0]} cannot be imported: {error}", do_this) from error
+        raise InputError(
+            doing,
+            with_what,
+            f"the library {module.partition('.')[0]} cannot be imported: {error}",
+            do_this,
+        ) from error
 
 
 class _NoPandas:
-    """A finder by which pandas is not installed; nothing in its place in `sys.modules`, where libraries look for its classes."""
+    """A finder by which pandas is not installed; nothing in its place in `sys.modules`, where
+    libraries look for its classes.
+    """
 
     @staticmethod
     def find_spec(name: str, path: Any = None, target: Any = None) -> None:
@@ -62,7 +71,8 @@ class _NoPandas:
 
 @contextmanager
 def arrow_without_pandas() -> Iterator[None]:
-    """Let pyarrow not load pandas, where a block of imports loads pyarrow: 0.1 s, to recognise objects that nobody hands it.
+    """Let pyarrow not load pandas, where a block of imports loads pyarrow: 0.1 s, to recognise
+    objects that nobody hands it.
 
     Other people's code may: `arrow_with_pandas` comes before it.
     """
@@ -82,15 +92,18 @@ def arrow_with_pandas() -> None:
 
 
 def installed(group: str) -> Mapping[str, EntryPoint]:
-    """Return what the installed packages register in a group of entry points, by name; nothing of theirs is imported.
+    """Return what the installed packages register in a group of entry points, by name; nothing of
+    theirs is imported.
 
-    A folder that was received from somebody may hold a distribution's metadata, which make no installed package.
+    A folder that was received from somebody may hold a distribution's metadata, which make no
+    installed package.
     """
     return {point.name: point for point in _points(group, _search_path())}
 
 
 def installed_names(group: str, taken: Mapping[str, str], what: str) -> dict[str, str]:
-    """Return what installed packages register in a group: name to ``package.module:attribute``. Nothing of theirs is imported.
+    """Return what installed packages register in a group: name to ``package.module:attribute``.
+    Nothing of theirs is imported.
 
     Args:
         group: Entry-point group, ``simrun.policies``.
@@ -121,9 +134,11 @@ def _search_path() -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def _points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """Return the entry points of a group; of two distributions of one name the first on the path counts.
+    """Return the entry points of a group; of two distributions of one name the first on the path
+    counts.
 
-    Scanning the installed packages takes tens of milliseconds and changes only with the import path.
+    Scanning the installed packages takes tens of milliseconds and changes only with the import
+    path.
     """
     from importlib.metadata import distributions
 

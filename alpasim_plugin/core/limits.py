@@ -1,6 +1,8 @@
-"""One bound per quantity: its name, unit, range, and why. Schemas, readers and the command line take their limits from here.
+"""One bound per quantity: its name, unit, range, and why. Schemas, readers and the command line
+take their limits from here.
 
-docs/security.md shows this table; a test holds the two together. What a scene may cost as a whole is in `scenarios.budget`.
+docs/security.md shows this table; a test holds the two together. What a scene may cost as a whole
+is in `scenarios.budget`.
 """
 
 from __future__ import annotations
@@ -60,40 +62,86 @@ def number(value: float) -> str:
     return f"{value:.3g}"
 
 
-KIB, MIB, GIB = 1 << 10, 1 << 20, 1 << 30
+KIB = 1 << 10
+MIB = 1 << 20
+GIB = 1 << 30
 
 # Files
-FILE_BYTES = Bound("file size", "bytes", 0, 2 * GIB, "no scene, log or table that this machine could use is larger")
-SOURCE_BYTES = Bound("size of a source file", "bytes", 0, 256 * MIB, "maps, tracks and tables of recorded scenes are a few MiB")
-ARCHIVE_BYTES = Bound("size of a scene archive", "bytes", 0, 64 * GIB, "scenes carry checkpoints of several GB, which are not read")
-JSON_BYTES = Bound("JSON size", "bytes", 0, 64 * MIB, "parsed JSON takes about ten times its size in memory")
+FILE_BYTES = Bound(
+    "file size", "bytes", 0, 2 * GIB, "no scene, log or table that this machine could use is larger"
+)
+SOURCE_BYTES = Bound(
+    "size of a source file",
+    "bytes",
+    0,
+    256 * MIB,
+    "maps, tracks and tables of recorded scenes are a few MiB",
+)
+ARCHIVE_BYTES = Bound(
+    "size of a scene archive",
+    "bytes",
+    0,
+    64 * GIB,
+    "scenes carry checkpoints of several GB, which are not read",
+)
+JSON_BYTES = Bound(
+    "JSON size", "bytes", 0, 64 * MIB, "parsed JSON takes about ten times its size in memory"
+)
 YAML_BYTES = Bound("YAML size", "bytes", 0, MIB, "a scenario takes a few KiB")
-XML_ELEMENTS = Bound("elements of an XML document", "", 1, 2_000_000, "maps of towns have some 100,000")
-DEPTH = Bound("depth of nesting", "levels", 0, 64, "no format here nests deeper than a dozen levels")
+XML_ELEMENTS = Bound(
+    "elements of an XML document", "", 1, 2_000_000, "maps of towns have some 100,000"
+)
+DEPTH = Bound(
+    "depth of nesting", "levels", 0, 64, "no format here nests deeper than a dozen levels"
+)
 MEMBERS = Bound("members of an archive", "", 0, 100_000, "scenes hold a few hundred")
-UNPACKED_BYTES = Bound("unpacked size", "bytes", 0, 2 * GIB, "what is packed may not fill the memory")
-TABLE_ROWS = Bound("rows of a table", "", 0, 100_000_000, "a thousand rollouts have some millions of steps")
+UNPACKED_BYTES = Bound(
+    "unpacked size", "bytes", 0, 2 * GIB, "what is packed may not fill the memory"
+)
+TABLE_ROWS = Bound(
+    "rows of a table", "", 0, 100_000_000, "a thousand rollouts have some millions of steps"
+)
 TABLE_COLUMNS = Bound("columns of a table", "", 0, 4_096, "each metric has two")
 TABLE_BYTES = Bound("unpacked size of a table", "bytes", 0, 4 * GIB, "it must fit into the memory")
 LOG_BYTES = Bound("size of a rollout log", "bytes", 0, 64 * GIB, "it is read one entry at a time")
-ENTRY_BYTES = Bound("log entry", "bytes", 1, GIB, "a session request with whole maps takes megabytes")
+ENTRY_BYTES = Bound(
+    "log entry", "bytes", 1, GIB, "a session request with whole maps takes megabytes"
+)
 
-WEIGHT_BYTES = Bound("size of network weights", "bytes", 0, 32 * GIB, "a network of 14 billion weights in two bytes each")
-GAUSSIANS = Bound("Gaussians of a file", "", 0, 20_000_000, "each takes some 250 bytes while it is read")
+WEIGHT_BYTES = Bound(
+    "size of network weights",
+    "bytes",
+    0,
+    32 * GIB,
+    "a network of 14 billion weights in two bytes each",
+)
+GAUSSIANS = Bound(
+    "Gaussians of a file", "", 0, 20_000_000, "each takes some 250 bytes while it is read"
+)
 
 # Images
 IMAGE_SIDE_PX = Bound("image side", "px", 8, 8192, "no camera of a car is larger")
 PICTURE_SIDE_PX = Bound("side of a stored picture", "px", 1, 16_384, "no camera of a car is larger")
-PICTURE_PIXELS = Bound("pixels of a stored picture", "", 1, 1 << 26, "67 megapixels take 200 MB decoded")
+PICTURE_PIXELS = Bound(
+    "pixels of a stored picture", "", 1, 1 << 26, "67 megapixels take 200 MB decoded"
+)
 
 # Places and sizes
 COORDINATE_M = Bound("coordinate", "m", -10_000, 10_000, "no scene reaches farther from its drive")
-SEGMENT_M = Bound("length of a road element", "m", 0.1, 10_000, "longer roads are built of several elements")
+SEGMENT_M = Bound(
+    "length of a road element", "m", 0.1, 10_000, "longer roads are built of several elements"
+)
 ROAD_M = Bound("length of a road", "m", 0.1, 20_000, "a drive of ten minutes on a highway")
-MAP_ROAD_M = Bound("length of a road in a map", "m", 0, 200_000, "no road of a recorded map is longer")
+MAP_ROAD_M = Bound(
+    "length of a road in a map", "m", 0, 200_000, "no road of a recorded map is longer"
+)
 CURVATURE_PER_M = Bound("curvature", "1/m", -0.2, 0.2, "a car cannot turn on a radius below 5 m")
-MAP_CURVATURE_PER_M = Bound("curvature in a map", "1/m", -2, 2, "corners of junctions turn on half a metre")
-ASIDE_M = Bound("distance beside a reference line", "m", -1000, 1000, "no lane lies farther beside its road")
+MAP_CURVATURE_PER_M = Bound(
+    "curvature in a map", "1/m", -2, 2, "corners of junctions turn on half a metre"
+)
+ASIDE_M = Bound(
+    "distance beside a reference line", "m", -1000, 1000, "no lane lies farther beside its road"
+)
 BODY_M = Bound("side of a body", "m", 0.01, 200, "trains and buildings beside the road included")
 SIGN_M = Bound("side of a sign", "m", 0, 100, "gantries across a road")
 VEHICLE_M = Bound("side of the ego", "m", 0.3, 30, "from a wheelbarrow to a road train")
@@ -119,9 +167,17 @@ TREES_PER_100M = Bound("trees per 100 m", "", 0, 50, "a tree every two metres is
 POLES_M = Bound("spacing of poles", "m", 1, 1000, "lamp posts stand tens of metres apart")
 
 # Time
-TIME_US = Bound("time in a scenario", "us", 0, 600_000_000, "ten minutes: the expert drives the whole scene when it is loaded")
+TIME_US = Bound(
+    "time in a scenario",
+    "us",
+    0,
+    600_000_000,
+    "ten minutes: the expert drives the whole scene when it is loaded",
+)
 LOG_S = Bound("length of a recording", "s", 0, 7200, "recorded drives are minutes long")
-EPOCH_US = Bound("time stamp", "us", -(2**62), 2**62, "microseconds that int64 holds with room for sums")
+EPOCH_US = Bound(
+    "time stamp", "us", -(2**62), 2**62, "microseconds that int64 holds with room for sums"
+)
 MOMENT_S = Bound("moment", "s", -86_400, 86_400, "a day before or after the log's start")
 PERIOD_US = Bound("period", "us", 1_000, 10_000_000, "1 ms to 10 s")
 SHUTTER_US = Bound("exposure", "us", 0, 1_000_000, "a second")

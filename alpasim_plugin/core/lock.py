@@ -1,7 +1,8 @@
 """One writer at a time: a lock file that says who holds it and that a killed process does not keep.
 
-The system releases the lock (``flock``) when its holder ends, however it ends; the text in the file is for the message. Where the file
-system has no such locks, the text itself is the lock, and its holder is asked for: number, start and machine tell whether it still runs.
+The system releases the lock (``flock``) when its holder ends, however it ends; the text in the file
+is for the message. Where the file system has no such locks, the text itself is the lock, and its
+holder is asked for: number, start and machine tell whether it still runs.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ class Held:
     """A lock that this process holds.
 
     Attributes:
-        since_ns: When it was taken, by the clock of the file system; a left-over of an earlier holder is older.
+        since_ns: When it was taken, by the clock of the file system; a left-over of an earlier
+            holder is older.
     """
 
     path: Path
@@ -40,7 +42,12 @@ class Held:
 
 @contextmanager
 def one_writer(
-    path: Path, doing: str, what: str, wait: bool = False, waiting: Callable[[str], None] = print, do_this: str | None = None
+    path: Path,
+    doing: str,
+    what: str,
+    wait: bool = False,
+    waiting: Callable[[str], None] = print,
+    do_this: str | None = None,
 ) -> Iterator[Held]:
     """Hold a lock file during the block.
 
@@ -79,7 +86,8 @@ def one_writer(
 
 
 def holder_of(path: Path) -> ProcessName | None:
-    """Return the process that holds a lock file, or None; nothing is locked, and a holder that is gone holds nothing.
+    """Return the process that holds a lock file, or None; nothing is locked, and a holder that is
+    gone holds nothing.
 
     Where only another machine could tell whether the process still runs, it is taken to.
     """
@@ -95,7 +103,12 @@ def holder_of(path: Path) -> ProcessName | None:
 
 def _in_use(path: Path, doing: str, what: str, owner: ProcessName | None) -> InfrastructureError:
     if owner is None:
-        return InfrastructureError(doing, what, "another process is writing it", "wait for it (--wait), or name another folder")
+        return InfrastructureError(
+            doing,
+            what,
+            "another process is writing it",
+            "wait for it (--wait), or name another folder",
+        )
     if owner.life == "elsewhere":
         do_this = f"wait for it (--wait); if nothing runs there any more, remove {path}"
     else:
@@ -121,7 +134,8 @@ def _take(path: Path) -> tuple[Release | None, ProcessName | None]:
             return _take_by_text(path)
         raise
     owner = _owner(_text(handle))
-    # Some network file systems lock within one machine only: what another machine left there is not ours to take.
+    # Some network file systems lock within one machine only: what another machine left there is not
+    # ours to take.
     if owner is not None and owner.life == "elsewhere":
         os.close(handle)
         return None, owner
@@ -141,7 +155,9 @@ def _take(path: Path) -> tuple[Release | None, ProcessName | None]:
 
 
 def _take_by_text(path: Path) -> tuple[Release | None, ProcessName | None]:
-    """Try once without the help of the file system: whoever makes the file with its name in it holds the lock."""
+    """Try once without the help of the file system: whoever makes the file with its name in it
+    holds the lock.
+    """
     named, mine = _named(path), temporary_path(path)
     mine.write_bytes(_own_text())
     try:
@@ -166,7 +182,9 @@ def _named(path: Path) -> Path:
 
 
 def _put_aside(named: Path, text: bytes) -> bool:
-    """Remove the file of a holder that is gone; False if another process took the lock meanwhile, which keeps it."""
+    """Remove the file of a holder that is gone; False if another process took the lock meanwhile,
+    which keeps it.
+    """
     aside = temporary_path(named)
     try:
         named.rename(aside)
@@ -181,7 +199,10 @@ def _put_aside(named: Path, text: bytes) -> bool:
 
 
 def _own_text() -> bytes:
-    return json.dumps(this_process(datetime.now(UTC).isoformat(timespec="seconds")).as_dict()).encode() + b"\n"
+    return (
+        json.dumps(this_process(datetime.now(UTC).isoformat(timespec="seconds")).as_dict()).encode()
+        + b"\n"
+    )
 
 
 def _text(handle: int) -> bytes:
@@ -197,6 +218,8 @@ def _owner(text: bytes) -> ProcessName | None:
     """Read who holds the lock; None where nobody says so."""
     try:
         fields = json.loads(text)
-        return ProcessName(int(fields["pid"]), *(str(fields[key]) for key in ("host", "boot", "started", "since")))
+        return ProcessName(
+            int(fields["pid"]), *(str(fields[key]) for key in ("host", "boot", "started", "since"))
+        )
     except (ValueError, KeyError, TypeError):
         return None

@@ -11,7 +11,15 @@ import numpy.typing as npt
 
 F64 = npt.NDArray[np.float64]
 
-Paint = Literal["none", "solid_white", "dashed_white", "solid_yellow", "dashed_yellow", "double_yellow", "unknown"]
+Paint = Literal[
+    "none",
+    "solid_white",
+    "dashed_white",
+    "solid_yellow",
+    "dashed_yellow",
+    "double_yellow",
+    "unknown",
+]
 
 
 @dataclass(frozen=True)
@@ -84,7 +92,9 @@ class LaneMap:
     markings: tuple[Marking, ...] = ()
     poles: tuple[F64, ...] = ()  # each (N, 3) polyline
     signs: tuple[tuple[F64, Box], ...] = ()  # (T_world_sign (4, 4), size)
-    signals: tuple[Signal, ...] | None = None  # traffic lights with their states; None: not known, also where there is none
+    signals: tuple[Signal, ...] | None = (
+        None  # traffic lights with their states; None: not known, also where there is none
+    )
 
 
 @dataclass(frozen=True)

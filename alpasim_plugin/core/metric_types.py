@@ -6,14 +6,17 @@ import math
 from dataclasses import KW_ONLY, dataclass
 from typing import Literal
 
-RATE_MARGIN = 0.02  # how much more often a flag may be set where neither it nor a gate says otherwise
+RATE_MARGIN = (
+    0.02  # how much more often a flag may be set where neither it nor a gate says otherwise
+)
 Aggregation = Literal["mean", "median", "max", "min", "last"]
 Direction = Literal["lower", "higher", "none"]
 
 
 @dataclass(frozen=True)
 class MetricInfo:
-    """What one metric is: tables, charts, gates, headlines and pages take what they say about it from here.
+    """What one metric is: tables, charts, gates, headlines and pages take what they say about it
+    from here.
 
     Attributes:
         unit: Empty for flags and ratios.
@@ -23,17 +26,23 @@ class MetricInfo:
         is_flag: It is 0 or 1 per step; its mean over rollouts is a rate.
         derived: It exists per rollout only, computed in the reduction.
         is_headline: Reports lead with it.
-        is_primary: It is a run's one primary question, declared before a run by standing in its run.json; no other metric is.
+        is_primary: It is a run's one primary question, declared before a run by standing in its
+            run.json; no other metric is.
         is_share: It is a fraction that is printed in percent; flags are anyway.
         name: Given by the mapping that holds the metric.
         label: What sentences and charts call it; empty: its name.
-        margin: How much worse is accepted where no gate says otherwise, in its unit; None: 2 points for flags, nothing for the others.
-        limits: Least and greatest possible value, None where there is no bound; a flag or a share lies in [0, 1].
-        formula: How a step's value is computed, for docs/metrics.md, whose symbols it uses; empty: as ``help`` says.
+        margin: How much worse is accepted where no gate says otherwise, in its unit; None: 2 points
+            for flags, nothing for the others.
+        limits: Least and greatest possible value, None where there is no bound; a flag or a share
+            lies in [0, 1].
+        formula: How a step's value is computed, for docs/metrics.md, whose symbols it uses; empty:
+            as ``help`` says.
         invalid: When a step has no value, for docs/metrics.md.
         reference: Which point is measured, and in which frame, for docs/metrics.md.
-        curve: Place among the curves over time that a viewer shows first, from 1; 0: only when asked for.
-        event: Flag that counts what a distance does not: a scene's difference counts up to a cap, so it decides only together with it.
+        curve: Place among the curves over time that a viewer shows first, from 1; 0: only when
+            asked for.
+        event: Flag that counts what a distance does not: a scene's difference counts up to a cap,
+            so it decides only together with it.
     """
 
     unit: str

@@ -5,8 +5,9 @@ kernels  those in the wheel; $NUMBA_CACHE_DIR; beside their source; numba below 
 scratch  $SIMRUN_SCRATCH/simrun-USER-HOST; below the system's temporary folder, by a name that only this user's cache holds
 state    $SIMRUN_SLURM; simrun/slurm below $XDG_STATE_HOME or ~/.local/state
 
-Kernels, and the results of Slurm's jobs, are pickles, which run code when they are read. So a folder that nobody named must be this user's
-own, as must the folder that it is made in: ``sudo`` leaves the home of another user in the environment.
+Kernels, and the results of Slurm's jobs, are pickles, which run code when they are read. So a
+folder that nobody named must be this user's own, as must the folder that it is made in: ``sudo``
+leaves the home of another user in the environment.
 """
 
 from __future__ import annotations
@@ -28,8 +29,13 @@ if TYPE_CHECKING:
     from tempfile import TemporaryDirectory
 
 PACKAGE = Path(__file__).resolve().parents[1]
-MADE = PACKAGE / "made"  # compiled kernels and reconstructions that lie in a wheel, as in a cache; nothing is written there
-CACHE, KERNELS, SCRATCH, STATE = "SIMRUN_CACHE", "NUMBA_CACHE_DIR", "SIMRUN_SCRATCH", "SIMRUN_SLURM"
+MADE = (
+    PACKAGE / "made"
+)  # compiled kernels and reconstructions that lie in a wheel, as in a cache; nothing is written there
+CACHE = "SIMRUN_CACHE"
+KERNELS = "NUMBA_CACHE_DIR"
+SCRATCH = "SIMRUN_SCRATCH"
+STATE = "SIMRUN_SLURM"
 TEMPORARY = "simrun-cache-"  # then the process that made it
 SECRET = "scratch-name"  # file of the cache
 TEMPORARILY = "making a temporary folder"
@@ -52,14 +58,24 @@ class Place:
 
 
 def cache() -> Place:
-    """Return the folder of what is kept between runs; it need not exist, and one that was named may turn out not to be writable."""
-    return _named(CACHE) or _own_below("XDG_CACHE_HOME", ".cache") or Place(None, "no folder can be written")
+    """Return the folder of what is kept between runs; it need not exist, and one that was named may
+    turn out not to be writable.
+    """
+    return (
+        _named(CACHE)
+        or _own_below("XDG_CACHE_HOME", ".cache")
+        or Place(None, "no folder can be written")
+    )
 
 
 def kernels() -> Place:
     """Return the folder of compiled kernels, as `prepare` left it."""
     beside = Place(PACKAGE, "beside their source") if INTERPRETED not in _notes else None
-    return _named(KERNELS) or beside or Place(None, "no folder can be written: kernels are not compiled")
+    return (
+        _named(KERNELS)
+        or beside
+        or Place(None, "no folder can be written: kernels are not compiled")
+    )
 
 
 def scratch() -> Place:
@@ -73,32 +89,47 @@ def scratch() -> Place:
         return Place(Path(named, f"simrun-{os.getuid()}-{socket.gethostname()}"), SCRATCH)
     if kept is None:
         return Place(None, "no folder can be written")
-    return Place(_temporary_root() / f"simrun-{_secret(kept)}", "below the temporary folder, by a name that is kept in the cache")
+    return Place(
+        _temporary_root() / f"simrun-{_secret(kept)}",
+        "below the temporary folder, by a name that is kept in the cache",
+    )
 
 
 def state() -> Path:
-    """Return the folder that Slurm's jobs answer through, which must be on a file system that all nodes see."""
+    """Return the folder that Slurm's jobs answer through, which must be on a file system that all
+    nodes see.
+    """
     root = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
     return Path(os.environ.get(STATE) or Path(root, "simrun", "slurm"))
 
 
 def prepare() -> None:
-    """Choose cache and kernels for this process and those that it starts, in the environment; call it before numba is imported.
+    """Choose cache and kernels for this process and those that it starts, in the environment; call
+    it before numba is imported.
 
-    Where neither the home nor the source can be written, a private temporary folder is made. It goes with this process.
+    Where neither the home nor the source can be written, a private temporary folder is made. It
+    goes with this process.
     """
     if cache().path is None:
         _set(CACHE, _make_temporary(), "a private temporary folder, as no other can be written")
     named = os.environ.get(KERNELS)
     if named and not _is_usable(Path(named)):
-        print(f"warning: {KERNELS} names {named}, which cannot be written; another folder is used", file=sys.stderr, flush=True)
+        print(
+            f"warning: {KERNELS} names {named}, which cannot be written; another folder is used",
+            file=sys.stderr,
+            flush=True,
+        )
         del os.environ[KERNELS]
         named = None
     if named or os.access(PACKAGE, os.W_OK):
         return
     kept = cache().path
     folder = kept if kept is not None and _is_usable(kept) else _make_temporary()
-    _set(KERNELS, folder and folder / "numba", "below the cache" if folder == kept else "a private temporary folder")
+    _set(
+        KERNELS,
+        folder and folder / "numba",
+        "below the cache" if folder == kept else "a private temporary folder",
+    )
     if folder is None:
         _set(INTERPRETED, "1", "or the import of a kernel would fail")
     elif folder == _temporary:
@@ -111,13 +142,16 @@ def nothing_is_writable() -> bool:
 
 
 def require_kernels() -> None:
-    """Refuse to compute where kernels cannot be compiled: it would take a thousand times as long, and some cannot run.
+    """Refuse to compute where kernels cannot be compiled: it would take a thousand times as long,
+    and some cannot run.
 
     Raises:
         InfrastructureError: `prepare` found no folder for them.
     """
     if nothing_is_writable():
-        raise InfrastructureError("compiling kernels", "the cache of kernels", "no folder can be written", DO_THIS)
+        raise InfrastructureError(
+            "compiling kernels", "the cache of kernels", "no folder can be written", DO_THIS
+        )
 
 
 def temporary_folder(prefix: str) -> TemporaryDirectory[str]:
@@ -132,7 +166,9 @@ def temporary_folder(prefix: str) -> TemporaryDirectory[str]:
     try:
         return tempfile.TemporaryDirectory(prefix=prefix, dir=root)
     except OSError as error:
-        raise InfrastructureError(TEMPORARILY, str(root), error.strerror or str(error), DO_THIS) from error
+        raise InfrastructureError(
+            TEMPORARILY, str(root), error.strerror or str(error), DO_THIS
+        ) from error
 
 
 def _temporary_root() -> Path:
@@ -141,7 +177,9 @@ def _temporary_root() -> Path:
     try:
         return Path(tempfile.gettempdir())
     except FileNotFoundError as error:
-        raise InfrastructureError(TEMPORARILY, "TMPDIR, /tmp, /var/tmp", "none of them can be written", DO_THIS) from error
+        raise InfrastructureError(
+            TEMPORARILY, "TMPDIR, /tmp, /var/tmp", "none of them can be written", DO_THIS
+        ) from error
 
 
 def trouble_of(place: Place) -> str:
@@ -156,7 +194,9 @@ def trouble_of(place: Place) -> str:
 
 
 def is_private(path: Path) -> bool:
-    """Tell whether a path is a folder, not a link, that only this user can write; it is made where it is missing."""
+    """Tell whether a path is a folder, not a link, that only this user can write; it is made where
+    it is missing.
+    """
     try:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = path.lstat()
@@ -171,14 +211,22 @@ def _named(variable: str) -> Place | None:
 
 
 def _own_below(variable: str, default: str) -> Place | None:
-    """Return our folder below one of the user's standard folders, where this user may write it and owns what it lies in."""
+    """Return our folder below one of the user's standard folders, where this user may write it and
+    owns what it lies in.
+    """
     root = os.environ.get(variable, "")
-    folder = Path(root if os.path.isabs(root) else os.path.expanduser(f"~/{default}"), "simrun")  # the standard ignores relative paths
+    folder = Path(
+        root if os.path.isabs(root) else os.path.expanduser(f"~/{default}"), "simrun"
+    )  # the standard ignores relative paths
     if not folder.is_absolute() or not _is_usable(folder):
         return None
     found = _nearest(folder).stat()
     is_own = found.st_uid == os.getuid() and not found.st_mode & stat.S_IWOTH
-    return Place(folder, variable if os.path.isabs(root) else "below the home folder") if is_own else None
+    return (
+        Place(folder, variable if os.path.isabs(root) else "below the home folder")
+        if is_own
+        else None
+    )
 
 
 def _nearest(path: Path) -> Path:
@@ -205,7 +253,9 @@ def _set(variable: str, value: Path | str | None, why: str) -> None:
 
 
 def _make_temporary() -> Path | None:
-    """Make the private folder of this process, once, after those that killed processes have left."""
+    """Make the private folder of this process, once, after those that killed processes have
+    left.
+    """
     global _temporary
     if _temporary is None:
         import tempfile
@@ -248,5 +298,7 @@ def _secret(kept: Path) -> str:
     except OSError as error:
         raise disk_error(path, error, "choosing a scratch folder", DO_THIS) from error
     if not text.isalnum():
-        raise InfrastructureError("choosing a scratch folder", str(path), "not what simrun wrote", "remove the file")
+        raise InfrastructureError(
+            "choosing a scratch folder", str(path), "not what simrun wrote", "remove the file"
+        )
     return text

@@ -1,4 +1,5 @@
-"""What policies of others are met with: what is wrong with a plan or with sensors, in a sentence, and a scenario that says nothing.
+"""What policies of others are met with: what is wrong with a plan or with sensors, in a sentence,
+and a scenario that says nothing.
 
 A policy may return anything; nothing here assumes more than an object.
 """
@@ -26,17 +27,26 @@ from alpasim_plugin.core.types import (
 )
 
 ARRAYS = ("times_us", "xy", "yaw")
-UNITS = ((100.0, "centimetres"), (1000.0, "millimetres"), (0.001, "kilometres"), (3.28, "feet"), (3.6, "km/h taken for m/s"))
+UNITS = (
+    (100.0, "centimetres"),
+    (1000.0, "millimetres"),
+    (0.001, "kilometres"),
+    (3.28, "feet"),
+    (3.6, "km/h taken for m/s"),
+)
 
 
 def unit_guess(ratio: float) -> str:
-    """Name the unit in which lengths come out ``ratio`` times as large as in metres; empty where none fits.
+    """Name the unit in which lengths come out ``ratio`` times as large as in metres; empty where
+    none fits.
 
     Example:
         >>> unit_guess(97.0), unit_guess(1.1)
         ('centimetres', '')
     """
-    fits = [(abs(ratio / factor - 1.0), unit) for factor, unit in UNITS if 0.7 <= ratio / factor <= 1.3]
+    fits = [
+        (abs(ratio / factor - 1.0), unit) for factor, unit in UNITS if 0.7 <= ratio / factor <= 1.3
+    ]
     return min(fits)[1] if fits else ""
 
 
@@ -48,7 +58,8 @@ def sensors_problem(sensors: Any) -> str:
 
 
 def shape_problem(plan: Any, min_rows: int = 1) -> str:
-    """Say what keeps a plan from being read: another type, arrays of other shapes, values that are not finite; empty if nothing.
+    """Say what keeps a plan from being read: another type, arrays of other shapes, values that are
+    not finite; empty if nothing.
 
     Args:
         plan: What a policy's ``act`` returned.
@@ -85,7 +96,11 @@ def plan_problem(plan: Any, now_us: int) -> str:
     if int(plan.times_us[0]) != now_us:
         return f"times_us starts at {int(plan.times_us[0])} us, the observation is at {now_us} us"
     steps = np.diff(plan.times_us.astype(np.int64))
-    return f"times_us does not increase strictly after row {int(np.argmax(steps <= 0))}" if (steps <= 0).any() else ""
+    return (
+        f"times_us does not increase strictly after row {int(np.argmax(steps <= 0))}"
+        if (steps <= 0).any()
+        else ""
+    )
 
 
 def _samples_problem(samples: Any, n: int) -> str:
@@ -103,8 +118,11 @@ def _a(value: Any) -> str:
     return "nothing" if value is None else f"a {type(value).__name__}"
 
 
-def blank_scenario(scene_id: str, ego_log: Trajectory, cameras: Sequence[CameraSpec] = ()) -> Scenario:
-    """Return a scenario with a flat ground, an empty map and no actors; all of the drive is the rollout.
+def blank_scenario(
+    scene_id: str, ego_log: Trajectory, cameras: Sequence[CameraSpec] = ()
+) -> Scenario:
+    """Return a scenario with a flat ground, an empty map and no actors; all of the drive is the
+    rollout.
 
     Args:
         scene_id: Its id.

@@ -24,7 +24,8 @@ class ProcessName:
         pid: Its number.
         host: Name of the machine.
         boot: Changes whenever the machine starts; equal in all containers of a machine.
-        started: When the process started, in the system's own units; empty where the system does not say.
+        started: When the process started, in the system's own units; empty where the system does
+            not say.
         since: The same for people, ISO 8601, UTC.
     """
 
@@ -43,7 +44,9 @@ class ProcessName:
         """Tell whether the process still runs; ``elsewhere`` if only another machine could tell."""
         if self.boot != boot_id():
             return "gone" if self.host == socket.gethostname() else "elsewhere"
-        return "running" if is_running(self.pid) and started_of(self.pid) == self.started else "gone"
+        return (
+            "running" if is_running(self.pid) and started_of(self.pid) == self.started else "gone"
+        )
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}, since {self.since}"
@@ -56,7 +59,9 @@ def this_process(since: str) -> ProcessName:
 
 @cache
 def boot_id() -> str:
-    """Return a text that changes whenever the machine starts; empty where the system does not say."""
+    """Return a text that changes whenever the machine starts; empty where the system does not
+    say.
+    """
     linux = Path("/proc/sys/kernel/random/boot_id")
     if linux.exists():
         return linux.read_text().strip()
@@ -64,13 +69,20 @@ def boot_id() -> str:
 
 
 def started_of(pid: int) -> str:
-    """Return when a process started, in the system's own units; empty where there is none, or only what its parent has not yet fetched."""
+    """Return when a process started, in the system's own units; empty where there is none, or only
+    what its parent has not yet fetched.
+    """
     try:
-        # The name of the program, in parentheses, may hold spaces. Fields 3 and 22: state, and start in clock ticks after the machine's.
+        # The name of the program, in parentheses, may hold spaces. Fields 3 and 22: state, and
+        # start in clock ticks after the machine's.
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         return "" if fields[0] in ENDED else fields[19]
     except OSError:
-        state, _, start = ("", "", "") if sys.platform == "linux" else _said_by("ps", "-o", "stat=,lstart=", "-p", str(pid)).partition(" ")
+        state, _, start = (
+            ("", "", "")
+            if sys.platform == "linux"
+            else _said_by("ps", "-o", "stat=,lstart=", "-p", str(pid)).partition(" ")
+        )
         return "" if state[:1] in ENDED else start.strip()
 
 
@@ -93,7 +105,11 @@ def _said_by(*command: str) -> str:
 
 
 def resident_mb(key: str) -> float | None:
-    """Return an entry of ``/proc/self/status`` in 1e6 bytes, None where the system has no such file."""
+    """Return an entry of ``/proc/self/status`` in 1e6 bytes, None where the system has no such
+    file.
+    """
     status = Path("/proc/self/status")
     lines = status.read_text().splitlines() if status.exists() else []
-    return next((float(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith(f"{key}:")), None)
+    return next(
+        (float(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith(f"{key}:")), None
+    )

@@ -1,8 +1,9 @@
 """Random streams keyed by (scene, seed, component, step).
 
-The hashed key seeds a Philox counter-based generator. A stream depends on its key alone: not on call order, worker count or platform.
-The renderer's name is not part of the key of a shared component: all renderers get common random numbers, which reduces the variance of
-paired differences.
+The hashed key seeds a Philox counter-based generator. A stream depends on its key alone: not on
+call order, worker count or platform. The renderer's name is not part of the key of a shared
+component: all renderers get common random numbers, which reduces the variance of paired
+differences.
 """
 
 from __future__ import annotations

@@ -1,9 +1,12 @@
-"""Rolling shutters: a picture whose pixels are exposed at different times, as bands that are drawn at one instant each.
+"""Rolling shutters: a picture whose pixels are exposed at different times, as bands that are drawn
+at one instant each.
 
-A pixel that is exposed at the share s of the shutter is seen from the camera's pose at s, and shows the road users where they are at s:
-linear in position, slerp in rotation between the poses at shutter start and end. A band holds the pixels whose s lies in one of N equal
-parts, and is drawn at the middle of theirs. N follows the motion: what comes apart by so many pixels while the shutter is open needs as
-many bands, a vehicle that stands needs one. Who draws bands draws rows: with as many bands as rows each row has its own pose.
+A pixel that is exposed at the share s of the shutter is seen from the camera's pose at s, and shows
+the road users where they are at s: linear in position, slerp in rotation between the poses at
+shutter start and end. A band holds the pixels whose s lies in one of N equal parts, and is drawn at
+the middle of theirs. N follows the motion: what comes apart by so many pixels while the shutter is
+open needs as many bands, a vehicle that stands needs one. Who draws bands draws rows: with as many
+bands as rows each row has its own pose.
 """
 
 from __future__ import annotations
@@ -18,7 +21,8 @@ from alpasim_plugin.core.geometry import inverse, quat_from_matrix, se3, slerp, 
 from alpasim_plugin.core.types import F32, F64, Bool, RenderRequest
 
 Along = Literal["rows", "columns"]
-APART_PX = 1.0  # two neighbouring bands show a thing so far apart, so that none is off by more than half of it ...
+# two neighbouring bands show a thing so far apart, so that none is off by more than half of it ...
+APART_PX = 1.0
 NEAR_M = 8.0  # ... but what is nearer than this: the lowest rows of a street, and a car that passes
 USER_M = 2.5  # a road user's side is so much nearer than its middle
 MOST_BANDS = 64
@@ -51,21 +55,27 @@ class Band:
 
 
 def bands(request: RenderRequest, apart_px: float = APART_PX) -> list[Band]:
-    """Return the bands of a request's frame, in the order of their time; without an exposure one, at the shutter's end.
+    """Return the bands of a request's frame, in the order of their time; without an exposure one,
+    at the shutter's end.
 
     Args:
         request: With the poses at shutter start and end.
-        apart_px: What neighbouring bands may show a thing apart by; no more than `MOST_BANDS` are made however fast things move.
+        apart_px: What neighbouring bands may show a thing apart by; no more than `MOST_BANDS` are
+            made however fast things move.
     """
     height, width = request.camera.height, request.camera.width
     if request.exposure is None:
-        return [Band(slice(0, height), slice(0, width), None, request.T_world_camera[1], request.actors)]
+        return [
+            Band(slice(0, height), slice(0, width), None, request.T_world_camera[1], request.actors)
+        ]
     count = min(max(int(np.ceil(motion_px(request) / apart_px)), 1), MOST_BANDS)
     return list(bands_of(request, count))
 
 
 def bands_of(request: RenderRequest, count: int) -> Iterator[Band]:
-    """Yield the bands of a frame whose shutter is cut into ``count`` equal parts; those without a pixel are left out."""
+    """Yield the bands of a frame whose shutter is cut into ``count`` equal parts; those without a
+    pixel are left out.
+    """
     assert request.exposure is not None, "a frame without exposure is exposed at one instant"
     share = request.exposure.share
     height, width = request.camera.height, request.camera.width
@@ -83,7 +93,9 @@ def bands_of(request: RenderRequest, count: int) -> Iterator[Band]:
 
 
 def extent(used: Bool, size: int) -> slice:
-    """Return the part of an axis between the first and the last place in use; a single place stands for the whole axis."""
+    """Return the part of an axis between the first and the last place in use; a single place stands
+    for the whole axis.
+    """
     if len(used) == 1:
         return slice(0, size)
     at = np.flatnonzero(used)
@@ -93,25 +105,35 @@ def extent(used: Bool, size: int) -> slice:
 def at_share(request: RenderRequest, share: float) -> tuple[F64, dict[str, F64]]:
     """Return the camera's pose ``(4, 4)`` and the road users' boxes at a share of the shutter."""
     assert request.exposure is not None, "a frame without exposure is exposed at one instant"
-    start = [request.T_world_camera[0], *(request.exposure.actors_start[name] for name in request.actors)]
+    start = [
+        request.T_world_camera[0],
+        *(request.exposure.actors_start[name] for name in request.actors),
+    ]
     end = [request.T_world_camera[1], *request.actors.values()]
     T = between(np.array(start), np.array(end), share)
     return T[0], dict(zip(request.actors, T[1:], strict=True))
 
 
 def between(start: F64, end: F64, share: float) -> F64:
-    """Return the poses ``(N, 4, 4)`` at a share of the way between two: linear in position, slerp in rotation; the ends as given."""
+    """Return the poses ``(N, 4, 4)`` at a share of the way between two: linear in position, slerp
+    in rotation; the ends as given.
+    """
     if share <= 0.0 or share >= 1.0:
         return end if share >= 1.0 else start
-    turned = slerp(quat_from_matrix(start[:, :3, :3]), quat_from_matrix(end[:, :3, :3]), np.full(len(start), share))
+    turned = slerp(
+        quat_from_matrix(start[:, :3, :3]),
+        quat_from_matrix(end[:, :3, :3]),
+        np.full(len(start), share),
+    )
     return se3(start[:, :3, 3] + share * (end[:, :3, 3] - start[:, :3, 3]), turned)
 
 
 def motion_px(request: RenderRequest) -> float:
     """Return by how many pixels a thing in the picture moves while the shutter is open, at most.
 
-    Of the street that is what is `NEAR_M` away or at infinity, at the picture's edge; of the road users in view their near side. Pixels are
-    those of the picture's middle: at the edge of a wide pinhole they are smaller, but those of the lens that it stands for are not.
+    Of the street that is what is `NEAR_M` away or at infinity, at the picture's edge; of the road
+    users in view their near side. Pixels are those of the picture's middle: at the edge of a wide
+    pinhole they are smaller, but those of the lens that it stands for are not.
     """
     assert request.exposure is not None, "a frame without exposure is exposed at one instant"
     K, (start, end) = request.camera.K, request.T_world_camera
@@ -125,7 +147,9 @@ def motion_px(request: RenderRequest) -> float:
     if request.actors:
         first = np.array([request.exposure.actors_start[name][:3, 3] for name in request.actors])
         last = np.array([T[:3, 3] for T in request.actors.values()])
-        before, after = (transform_points(inverse(T), points) for T, points in ((start, first), (end, last)))
+        before, after = (
+            transform_points(inverse(T), points) for T, points in ((start, first), (end, last))
+        )
         near_m = np.maximum(np.linalg.norm(after, axis=1) - USER_M, NEAR_M)
         seen = after[:, 2] > -USER_M
         moves.append(np.where(seen, np.linalg.norm(after - before, axis=1) / near_m, 0.0))
@@ -138,7 +162,8 @@ def angle_between(a: F64, b: F64) -> F64:
 
 
 def rolling(width: int, height: int, along: Along, backwards: bool) -> F32:
-    """Return the shares of a picture exposed row by row (``along`` is ``rows``) or column by column, the first at shutter start.
+    """Return the shares of a picture exposed row by row (``along`` is ``rows``) or column by
+    column, the first at shutter start.
 
     Example:
         >>> rolling(4, 3, "rows", backwards=False).ravel().tolist()

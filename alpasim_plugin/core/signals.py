@@ -1,4 +1,6 @@
-"""Stop on SIGINT, SIGTERM and SIGHUP alike: what runs is unwound, the message says what is kept, the exit code names the signal."""
+"""Stop on SIGINT, SIGTERM and SIGHUP alike: what runs is unwound, the message says what is kept,
+the exit code names the signal.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +11,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
 NOTHING_KEPT = "the same command starts again"
 
 
 class Stopped(BaseException):
-    """A signal asks the process to stop. No library takes it for an error of its own, since it is no ``Exception``.
+    """A signal asks the process to stop. No library takes it for an error of its own, since it is
+    no ``Exception``.
 
     Attributes:
         kept: What is kept and how to go on; whoever knows sets it on the way up.
@@ -27,7 +32,9 @@ class Stopped(BaseException):
 
     @property
     def exit_code(self) -> int:
-        """Give the exit code of a process that a signal ended, as shells count it: 130, 143 or 129."""
+        """Give the exit code of a process that a signal ended, as shells count it: 130, 143 or
+        129.
+        """
         return 128 + self.number
 
     def __str__(self) -> str:
@@ -36,15 +43,21 @@ class Stopped(BaseException):
     def as_dict(self) -> dict[str, str]:
         """Return the four parts of an error, for ``--json``."""
         found = f"stopped by {signal.Signals(self.number).name}"
-        return {"doing": "running a command", "with": "simrun", "found": found, "do": self.kept or NOTHING_KEPT, "failure_class": "stopped"}
+        return {
+            "doing": "running a command",
+            "with": "simrun",
+            "found": found,
+            "do": self.kept or NOTHING_KEPT,
+            "failure_class": "stopped",
+        }
 
 
 @contextmanager
 def stoppable() -> Iterator[None]:
     """Raise `Stopped` in the block at the first signal; a second one ends the process at once.
 
-    A signal that the process was started to ignore (``nohup``) stays ignored. Outside the main thread, where Python has no handlers,
-    nothing changes.
+    A signal that the process was started to ignore (``nohup``) stays ignored. Outside the main
+    thread, where Python has no handlers, nothing changes.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -55,7 +68,11 @@ def stoppable() -> Iterator[None]:
             signal.signal(one, _leave)
         raise Stopped(number)
 
-    before = {number: signal.getsignal(number) for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN}
+    before = {
+        number: signal.getsignal(number)
+        for number in SIGNALS
+        if signal.getsignal(number) is not signal.SIG_IGN
+    }
     try:
         for number in before:
             signal.signal(number, stop)
@@ -66,7 +83,9 @@ def stoppable() -> Iterator[None]:
 
 
 def leave_at_once() -> None:
-    """Let the signals end the process without a traceback, while nothing is there to be unwound: during imports."""
+    """Let the signals end the process without a traceback, while nothing is there to be unwound:
+    during imports.
+    """
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _leave)

@@ -1,7 +1,8 @@
-"""Child processes: workers of our own, and a command of the user's, whose output is passed on. None outlives this process.
+"""Child processes: workers of our own, and a command of the user's, whose output is passed on. None
+outlives this process.
 
-Standard output belongs to the command: what parts print goes to standard error, so that ``--json`` stays one document. In a run it also
-goes to a file beside the rollout's log.
+Standard output belongs to the command: what parts print goes to standard error, so that ``--json``
+stays one document. In a run it also goes to a file beside the rollout's log.
 """
 
 from __future__ import annotations
@@ -28,7 +29,10 @@ from alpasim_plugin.core.errors import InputError
 
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 ORPHANED = 70  # exit code of a worker whose parent is gone (EX_SOFTWARE)
-SAFE_PATH, OURS = "PYTHONSAFEPATH", "simrun"  # variable that keeps Python from importing from the working directory; our value of it
+SAFE_PATH, OURS = (
+    "PYTHONSAFEPATH",
+    "simrun",
+)  # variable that keeps Python from importing from the working directory; our value of it
 SUPERVISOR = Path(__file__).with_name("supervisor.py")
 GRACE_S = 5.0  # between asking the command to end and ending it
 LAST_LINES = 20
@@ -38,10 +42,12 @@ DOING = "starting a command"
 
 @contextmanager
 def safe_path() -> Iterator[None]:
-    """Let Python processes that are started during the block import nothing from the working directory.
+    """Let Python processes that are started during the block import nothing from the working
+    directory.
 
-    ``python -c`` and ``python -m``, by which workers are started, would look for the standard library there first. The process that was
-    started calls `own_path_only`, so that a user's command that it starts is not concerned.
+    ``python -c`` and ``python -m``, by which workers are started, would look for the standard
+    library there first. The process that was started calls `own_path_only`, so that a user's
+    command that it starts is not concerned.
     """
     if SAFE_PATH in os.environ:
         yield
@@ -54,12 +60,16 @@ def safe_path() -> Iterator[None]:
 
 
 def own_path_only() -> None:
-    """Take the working directory off this worker's import path, unless the user's ``PYTHONPATH`` names it; undo `safe_path`."""
+    """Take the working directory off this worker's import path, unless the user's ``PYTHONPATH``
+    names it; undo `safe_path`.
+    """
     if os.environ.get(SAFE_PATH) == OURS:
         del os.environ[SAFE_PATH]
     given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     here = os.path.realpath(os.getcwd())
-    sys.path[:] = [folder for folder in sys.path if folder in given or os.path.realpath(folder) != here]
+    sys.path[:] = [
+        folder for folder in sys.path if folder in given or os.path.realpath(folder) != here
+    ]
 
 
 class _Process(SpawnProcess):
@@ -93,20 +103,25 @@ def _forget_safe_path() -> None:
 
 
 def spawn_context() -> SpawnContext:
-    """Return how worker processes are started: anew, by a Python that imports nothing from the working directory."""
+    """Return how worker processes are started: anew, by a Python that imports nothing from the
+    working directory.
+    """
     return _Context()
 
 
 def copy_context() -> ForkServerContext | None:
-    """Return how worker processes are started as copies of the process that `load_for_copies` has started; None: there is none."""
+    """Return how worker processes are started as copies of the process that `load_for_copies` has
+    started; None: there is none.
+    """
     return _CopyContext() if _model_pid() is not None else None
 
 
 def load_for_copies(modules: Sequence[str]) -> None:
-    """Start a process without threads of its own that loads modules, while this one goes on; it ends with this one.
+    """Start a process without threads of its own that loads modules, while this one goes on; it
+    ends with this one.
 
-    Call it once, at the start of a command: copies have the environment and the working directory of this moment. Only on Linux, where a
-    fork is safe with the libraries that are loaded.
+    Call it once, at the start of a command: copies have the environment and the working directory
+    of this moment. Only on Linux, where a fork is safe with the libraries that are loaded.
     """
     if sys.platform != "linux":
         return
@@ -130,11 +145,14 @@ def _end_model() -> None:
 
 
 def end_with_parent() -> None:
-    """End this worker process as soon as its parent is gone, by whatever signal; call it first, in the worker's main thread.
+    """End this worker process as soon as its parent is gone, by whatever signal; call it first, in
+    the worker's main thread.
 
-    A thread waits for the end of a pipe that only the parent holds open, which works on every system. Linux kills the worker as well, so
-    that one inside a long call that never returns to Python ends too. A parent that died before the request was made is noticed by the
-    change of the parent's number. A copy is killed with the process that it is a copy of, which ends with the parent.
+    A thread waits for the end of a pipe that only the parent holds open, which works on every
+    system. Linux kills the worker as well, so that one inside a long call that never returns to
+    Python ends too. A parent that died before the request was made is noticed by the change of the
+    parent's number. A copy is killed with the process that it is a copy of, which ends with the
+    parent.
     """
     parent = multiprocessing.parent_process()
     if parent is None:
@@ -155,7 +173,8 @@ def end_with_parent() -> None:
 
 
 class Child:
-    """A running command, in a process group of its own under a supervisor (`alpasim_plugin.core.supervisor`).
+    """A running command, in a process group of its own under a supervisor
+    (`alpasim_plugin.core.supervisor`).
 
     Args:
         command: Program and arguments; no shell reads them.
@@ -171,10 +190,19 @@ class Child:
     """
 
     def __init__(
-        self, command: Sequence[str], environment: Mapping[str, str], heard: Callable[[str], None], ended: Callable[[], None]
+        self,
+        command: Sequence[str],
+        environment: Mapping[str, str],
+        heard: Callable[[str], None],
+        ended: Callable[[], None],
     ) -> None:
         if sys.platform == "win32":
-            raise InputError(DOING, command[0], "Windows has no process groups to end it with", "use Linux, macOS or WSL")
+            raise InputError(
+                DOING,
+                command[0],
+                "Windows has no process groups to end it with",
+                "use Linux, macOS or WSL",
+            )
         self.last: deque[str] = deque(maxlen=LAST_LINES)
         self._heard, self._ended = heard, ended
         self._process = subprocess.Popen(
@@ -183,14 +211,17 @@ class Child:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             env={**os.environ, "PYTHONUNBUFFERED": "1", **environment},
-            start_new_session=True,  # Ctrl-C in a terminal is for simrun alone, which then ends the command
+            # Ctrl-C in a terminal is for simrun alone, which then ends the command
+            start_new_session=True,
         )
         self._pump = threading.Thread(target=self._listen, name="child-output", daemon=True)
         self._pump.start()
         _running.append(self)
 
     def end_within(self, seconds: float) -> int | None:
-        """Return the exit code (128 + N after signal N) if the command ends within a time; None if it still runs."""
+        """Return the exit code (128 + N after signal N) if the command ends within a time; None if
+        it still runs.
+        """
         try:
             code = self._process.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -284,7 +315,9 @@ class _Output(io.TextIOBase):
 
 @contextmanager
 def parts_print_to_stderr(file: Path | None = None) -> Iterator[None]:
-    """Send what is printed during the block to standard error, and to ``file``, which is made only if something is printed."""
+    """Send what is printed during the block to standard error, and to ``file``, which is made only
+    if something is printed.
+    """
     output = _Output(file)
     _open.append(output)
     try:

@@ -1,8 +1,10 @@
-"""Start a command and end it with whoever asked: ``python supervisor.py GRACE_S COMMAND...``; the standard library alone, run as a script.
+"""Start a command and end it with whoever asked: ``python supervisor.py GRACE_S COMMAND...``; the
+standard library alone, run as a script.
 
-Standard input is a pipe that only the asking process holds open. When it ends, by whatever signal that process died, the command and all
-that it started get SIGTERM (which a container's client hands on to its container), and SIGKILL after the grace time. The exit code is the
-command's; 128 + N where signal N ended it.
+Standard input is a pipe that only the asking process holds open. When it ends, by whatever signal
+that process died, the command and all that it started get SIGTERM (which a container's client hands
+on to its container), and SIGKILL after the grace time. The exit code is the command's; 128 + N
+where signal N ended it.
 """
 
 from __future__ import annotations
@@ -26,11 +28,15 @@ def main(grace_s: float, command: list[str]) -> int:
     bell, ring = os.pipe()
     for end in (bell, ring):
         os.set_blocking(end, False)
-    signal.signal(signal.SIGCHLD, lambda *_: None)  # with a handler, the signal's number is written to the pipe below
+    signal.signal(
+        signal.SIGCHLD, lambda *_: None
+    )  # with a handler, the signal's number is written to the pipe below
     signal.signal(signal.SIGTERM, lambda *_: None)
     signal.set_wakeup_fd(ring, warn_on_full_buffer=False)
     try:
-        child = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True, preexec_fn=_die_with_parent)
+        child = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, start_new_session=True, preexec_fn=_die_with_parent
+        )
     except OSError as error:
         print(f"{command[0]}: {error.strerror or error}", flush=True)
         return NOT_STARTED
@@ -55,7 +61,9 @@ def end_group(child: subprocess.Popen[bytes], grace_s: float) -> None:
 
 
 def _signal_group(group: int, number: int) -> None:
-    with suppress(ProcessLookupError, PermissionError):  # macOS answers EPERM for a group of ended processes
+    with suppress(
+        ProcessLookupError, PermissionError
+    ):  # macOS answers EPERM for a group of ended processes
         os.killpg(group, number)
 
 

@@ -1,8 +1,11 @@
-"""The only data that crosses from one stage to the next: frozen dataclasses with shapes, units and frames.
+"""The only data that crosses from one stage to the next: frozen dataclasses with shapes, units and
+frames.
 
-Conventions (docs/architecture.md): time is integer microseconds; world is ENU metres in float64 around a local origin; rig is x forward,
-y left, z up with its origin on the ground under the rear axle; cameras are OpenCV (x right, y down, z forward); a matrix ``T_a_b`` maps
-coordinates in b to coordinates in a; quaternions are ``wxyz``; images are HWC uint8 sRGB.
+Conventions (docs/architecture.md): time is integer microseconds; world is ENU metres in float64
+    around a local origin; rig is x forward,
+y left, z up with its origin on the ground under the rear axle; cameras are OpenCV (x right, y down,
+z forward); a matrix ``T_a_b`` maps coordinates in b to coordinates in a; quaternions are ``wxyz``;
+images are HWC uint8 sRGB.
 """
 
 from __future__ import annotations
@@ -33,7 +36,7 @@ U8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
 
 
-# --- motion ---------------------------------------------------------------------------------------------------------
+# --- motion
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,9 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Vehicle:
-    """The ego's body and chassis. The box centre lies at ``(rear_axle_to_centre_m, 0, box.height_m / 2)`` in the rig frame."""
+    """The ego's body and chassis. The box centre lies at ``(rear_axle_to_centre_m, 0, box.height_m
+    / 2)`` in the rig frame.
+    """
 
     box: Box = Box(4.855, 1.88, 1.6)
     rear_axle_to_centre_m: float = 1.4
@@ -73,7 +78,7 @@ class EgoState:
     steer_rad: float = 0.0  # road-wheel angle, left positive
 
 
-# --- actors ---------------------------------------------------------------------------------------------------------
+# --- actors
 
 
 @dataclass(frozen=True)
@@ -81,12 +86,16 @@ class Behaviour:
     """How an actor moves once the loop is closed."""
 
     kind: Literal["replay", "idm"] = "replay"
-    params: Mapping[str, float] = field(default_factory=dict)  # idm: desired_speed_mps, headway_s, min_gap_m, accel_mps2, brake_mps2
+    params: Mapping[str, float] = field(
+        default_factory=dict
+    )  # idm: desired_speed_mps, headway_s, min_gap_m, accel_mps2, brake_mps2
 
 
 @dataclass(frozen=True)
 class Actor:
-    """A road user or obstacle with its recorded or scripted track (pose of the box centre in the world)."""
+    """A road user or obstacle with its recorded or scripted track (pose of the box centre in the
+    world).
+    """
 
     actor_id: str
     label: str  # car | truck | bus | pedestrian | cyclist | motorcycle | other
@@ -96,12 +105,14 @@ class Actor:
     behaviour: Behaviour = Behaviour()
 
 
-# --- sensors --------------------------------------------------------------------------------------------------------
+# --- sensors
 
 
 @dataclass(frozen=True)
 class FTheta:
-    """Polynomials of an f-theta lens: theta = sum b_k r^k and r = sum a_k theta^k, pixels and radians."""
+    """Polynomials of an f-theta lens: theta = sum b_k r^k and r = sum a_k theta^k, pixels and
+    radians.
+    """
 
     pixel_to_angle: tuple[float, ...]
     angle_to_pixel: tuple[float, ...]
@@ -110,7 +121,9 @@ class FTheta:
 
 @dataclass(frozen=True)
 class CameraSpec:
-    """A camera on the rig. With ``ftheta`` set, ``K`` is the pinhole that is really rendered and ``ftheta`` the recorded lens."""
+    """A camera on the rig. With ``ftheta`` set, ``K`` is the pinhole that is really rendered and
+    ``ftheta`` the recorded lens.
+    """
 
     name: str
     width: int
@@ -123,7 +136,9 @@ class CameraSpec:
 
 @dataclass(frozen=True)
 class SensorSpec:
-    """What a policy asks for: a camera by name, every ``interval_us`` (0: the scenario's camera rate)."""
+    """What a policy asks for: a camera by name, every ``interval_us`` (0: the scenario's camera
+    rate).
+    """
 
     camera: str
     interval_us: int = 0
@@ -133,8 +148,11 @@ class SensorSpec:
 class Exposure:
     """When a rolling shutter exposes the pixels of a frame; see `core.shutter`."""
 
-    share: F32  # (H, W), (H, 1) or (1, W): 0 at shutter start, 1 at its end; NaN: nobody looks at that pixel
-    actors_start: Mapping[str, F64]  # T_world_box (4, 4) at shutter start, of the same actors as at its end
+    # (H, W), (H, 1) or (1, W): 0 at shutter start, 1 at its end; NaN: nobody looks at that pixel
+    share: F32
+    actors_start: Mapping[
+        str, F64
+    ]  # T_world_box (4, 4) at shutter start, of the same actors as at its end
 
 
 @dataclass(frozen=True)
@@ -145,31 +163,54 @@ class RenderRequest:
     camera: CameraSpec
     T_world_camera: F64  # (2, 4, 4): at shutter start and at shutter end
     actors: Mapping[str, F64]  # actor id -> T_world_box (4, 4), only actors present at t_us
-    ahead: Sequence[RenderRequest] = ()  # forecast of this camera's next requests; only for a renderer with `lookahead`
-    exposure: Exposure | None = None  # of a rolling shutter; None: all pixels are exposed at the shutter's end
+    ahead: Sequence[
+        RenderRequest
+    ] = ()  # forecast of this camera's next requests; only for a renderer with `lookahead`
+    exposure: Exposure | None = (
+        None  # of a rolling shutter; None: all pixels are exposed at the shutter's end
+    )
 
 
-# Facts of a frame that a fixer made of recorded ones: shares of the picture, 0 to 1, and both by cell (`fixers.trust`).
-RECORDED_SHARE, GUESSED_SHARE, TRUST_CELLS = "recorded_share", "guessed_share", "trust_cells"
+# Facts of a frame that a fixer made of recorded ones: shares of the picture, 0 to 1, and both by
+# cell (`fixers.trust`).
+RECORDED_SHARE = "recorded_share"
+GUESSED_SHARE = "guessed_share"
+TRUST_CELLS = "trust_cells"
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One camera frame. ``alpha`` and ``depth`` are None where a renderer cannot give them (remote, video)."""
+    """One camera frame. ``alpha`` and ``depth`` are None where a renderer cannot give them (remote,
+    video).
+    """
 
     t_us: int
     camera: str
     rgb: U8  # (H, W, 3) sRGB
-    alpha: F32 | None = None  # (H, W) opacity of what the renderer shows, 0..1: low where it has holes; sky counts as opaque
-    depth: F32 | None = None  # (H, W) metres along the optical axis; 0 where no surface is, or it is less than half opaque
+    alpha: F32 | None = (
+        # (H, W) opacity of what the renderer shows, 0..1: low where it has holes; sky counts as
+        # opaque
+        None
+    )
+    depth: F32 | None = (
+        # (H, W) metres along the optical axis; 0 where no surface is, or it is less than half
+        # opaque
+        None
+    )
     events: tuple[str, ...] = ()  # what a guard saw: "nan", "black", "frozen", ...
-    facts: Mapping[str, float | str] = field(default_factory=dict)  # about this frame, for the log, such as "pose_error_m"
-    references: tuple[U8, ...] = ()  # (H, W, 4) recorded frames, warped into the view, nearest first; the last channel: where they hold
+    facts: Mapping[str, float | str] = field(
+        default_factory=dict
+    )  # about this frame, for the log, such as "pose_error_m"
+    references: tuple[
+        U8, ...
+    ] = ()  # (H, W, 4) recorded frames, warped into the view, nearest first; the last channel: where they hold
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """A picture of the recorded drive in a file, undistorted, and where it was taken, as the reconstruction believes."""
+    """A picture of the recorded drive in a file, undistorted, and where it was taken, as the
+    reconstruction believes.
+    """
 
     t_us: int
     camera: str
@@ -178,8 +219,14 @@ class Photograph:
     K: F64  # (3, 3) pixels
     T_world_camera: F64  # (4, 4)
     path: str  # of the picture
-    use: Literal["fitted", "held-out", "never-fitted"] = "fitted"  # by the reconstruction; never-fitted: all of a further camera
-    exposure: tuple[float, float, float] = (1.0, 1.0, 1.0)  # gain of each channel, by which the reconstruction explains this picture
+    use: Literal["fitted", "held-out", "never-fitted"] = (
+        "fitted"  # by the reconstruction; never-fitted: all of a further camera
+    )
+    exposure: tuple[float, float, float] = (
+        1.0,
+        1.0,
+        1.0,
+    )  # gain of each channel, by which the reconstruction explains this picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,10 +238,12 @@ class RecordedFrame:
     K: F64  # (3, 3) pixels, of the picture
     T_world_camera: F64  # (4, 4), as the reconstruction believes
     actors: Mapping[str, F64]  # actor id -> T_world_box (4, 4) of those present
-    read: Callable[[], tuple[U8, F32]]  # (H, W, 3) sRGB; (H, W) metres, as the renderer sees it from there, 0 where it shows nothing or sky
+    read: Callable[
+        [], tuple[U8, F32]
+    ]  # (H, W, 3) sRGB; (H, W) metres, as the renderer sees it from there, 0 where it shows nothing or sky
 
 
-# --- policy ---------------------------------------------------------------------------------------------------------
+# --- policy
 
 
 @dataclass(frozen=True)
@@ -211,7 +260,9 @@ class Observation:
 
 @dataclass(frozen=True)
 class Plan:
-    """Future rig poses in the rig frame at ``t_us``; the first row is the pose at ``t_us`` itself."""
+    """Future rig poses in the rig frame at ``t_us``; the first row is the pose at ``t_us``
+    itself.
+    """
 
     t_us: int
     times_us: I64  # (T,) absolute, strictly increasing, times_us[0] == t_us
@@ -221,7 +272,7 @@ class Plan:
     debug: Mapping[str, Any] = field(default_factory=dict)
 
 
-# --- scene ----------------------------------------------------------------------------------------------------------
+# --- scene
 
 
 @dataclass(frozen=True)
@@ -249,24 +300,33 @@ class Environment:
 class Degradation:
     """How the renderer ``3dgs`` differs from the scene as built.
 
-    ``reconstruction``: an under-trained model fitted to the frames of the logged drive. ``cycle``: a model fitted to frames seen from
-    aside, rendered on the path (OneFixer, App. A). ``surrogate``: seeded stand-ins, nothing is fitted. ``none``: the scene as built.
+    ``reconstruction``: an under-trained model fitted to the frames of the logged drive. ``cycle``:
+        a model fitted to frames seen from
+    aside, rendered on the path (OneFixer, App. A). ``surrogate``: seeded stand-ins, nothing is
+    fitted. ``none``: the scene as built.
     """
 
     kind: Literal["reconstruction", "cycle", "surrogate", "none"] = "reconstruction"
     share: float = 0.15  # of the fit's schedule, 0..1; reconstruction and cycle
-    shift_m: float = 1.0  # sideways, left positive, of the views that the cycle's model is fitted to
+    shift_m: float = (
+        1.0  # sideways, left positive, of the views that the cycle's model is fitted to
+    )
     severity: float = 1.5  # scales all terms of the surrogate; 0 leaves the scene as built
-    onset_m: float = 0.1  # lateral distance from the logged path where the surrogate's error starts to grow
+    onset_m: float = (
+        0.1  # lateral distance from the logged path where the surrogate's error starts to grow
+    )
     full_m: float = 2.0  # lateral distance where it is full
-    views_per_s: float = 6.0  # of the log, that the model is fitted to; reconstruction and cycle, as are the next two
+    # of the log, that the model is fitted to; reconstruction and cycle, as are the next two
+    views_per_s: float = 6.0
     depth_error: float = 0.1  # spread of the distance of the points it starts from, as a share
     pose_error_m: float = 0.0  # spread of the poses that the views are believed to have
 
 
 @dataclass(frozen=True)
 class Latency:
-    """Delay from observation to the plan taking effect: none, a fixed time, or the measured one, of the fixer too if ``fixer``."""
+    """Delay from observation to the plan taking effect: none, a fixed time, or the measured one, of
+    the fixer too if ``fixer``.
+    """
 
     kind: Literal["none", "fixed", "measured"] = "none"
     fixed_us: int = 0
@@ -282,9 +342,12 @@ class BackgroundFile:
     keep_road: bool = False  # whether the built road is drawn with it
 
 
-Standing = Literal["known", "found", "unknown"]  # what stands there: all among the actors; found in a reconstruction; not looked for
+Standing = Literal[
+    "known", "found", "unknown"
+]  # what stands there: all among the actors; found in a reconstruction; not looked for
 
-STANDING_ID = "obstacle-"  # ids of actors found in a reconstruction begin so: it shows them, nobody draws them once more
+# ids of actors found in a reconstruction begin so: it shows them, nobody draws them once more
+STANDING_ID = "obstacle-"
 
 
 @dataclass(frozen=True)
@@ -295,7 +358,9 @@ class Scene:
     lane_map: LaneMap
     ego_log: Trajectory  # recorded rig poses (rear axle on the ground), world
     vehicle: Vehicle
-    alpasim_map: LaneMap | None = None  # the same road as AlpaSim's own loader reads it, where that differs
+    alpasim_map: LaneMap | None = (
+        None  # the same road as AlpaSim's own loader reads it, where that differs
+    )
     standing: Standing = "known"
 
 
@@ -321,24 +386,45 @@ class Scenario:
     environment: Environment
     degradation: Degradation
     background: BackgroundFile | None = None
-    world_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # what was subtracted from the source's coordinates, metres
+    world_origin: tuple[float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # what was subtracted from the source's coordinates, metres
     content_hash: str = ""
     notes: tuple[str, ...] = ()  # what the loader left out or assumed; goes to run.json
-    alpasim_map: LaneMap | None = None  # the same road as AlpaSim's own loader reads it, where that differs
+    alpasim_map: LaneMap | None = (
+        None  # the same road as AlpaSim's own loader reads it, where that differs
+    )
     source_part: str | None = None  # the source that read the log, as named; None: a built road
-    varied: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)  # key of the scenario file -> (as written, as drawn by the seed)
+    varied: Mapping[str, tuple[Any, Any]] = field(
+        default_factory=dict
+    )  # key of the scenario file -> (as written, as drawn by the seed)
     recording: tuple[Photograph, ...] = ()  # the drive's photographs, of an imported drive
-    model: str | None = None  # folder of the reconstruction fitted to them, which 3dgs shows; then nothing was built and `clean` is refused
+    model: str | None = (
+        # folder of the reconstruction fitted to them, which 3dgs shows; then nothing was built and
+        # `clean` is refused
+        None
+    )
     standing: Standing = "known"
-    stop_at_path_end: bool = True  # a rollout ends where the recorded path does, unless the recorded car stands there
+    stop_at_path_end: bool = (
+        True  # a rollout ends where the recorded path does, unless the recorded car stands there
+    )
 
     @property
     def scene(self) -> Scene:
         """Give the part that evaluators may see."""
-        return Scene(self.scene_id, self.lane_map, self.ego_log, self.vehicle, self.alpasim_map, self.standing)
+        return Scene(
+            self.scene_id,
+            self.lane_map,
+            self.ego_log,
+            self.vehicle,
+            self.alpasim_map,
+            self.standing,
+        )
 
 
-# --- log and scores -------------------------------------------------------------------------------------------------
+# --- log and scores
 
 
 @dataclass(frozen=True)
@@ -385,7 +471,9 @@ class RolloutLog:
 
 @dataclass(frozen=True)
 class MetricSeries:
-    """Values of one metric over a rollout; a value is never bare: it has validity and, where invalid, a reason."""
+    """Values of one metric over a rollout; a value is never bare: it has validity and, where
+    invalid, a reason.
+    """
 
     metric: MetricInfo
     t_us: I64  # (T,)

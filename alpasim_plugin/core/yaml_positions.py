@@ -1,9 +1,10 @@
 """YAML text to plain data in which every key remembers its file, line and column.
 
-The compiled parser reads the text, in linear time; its events are counted before a node is built, so that a small hostile file can fill
-neither the memory nor the stack. Scalars follow the YAML 1.2 core schema (``no`` is a word, ``1e-3`` a number, ``12:30`` a string), with
-``_`` allowed inside integers.
-Duplicate keys, merge keys and recursive aliases are refused; depth and the number of nodes after alias expansion are bounded.
+The compiled parser reads the text, in linear time; its events are counted before a node is built,
+so that a small hostile file can fill neither the memory nor the stack. Scalars follow the YAML 1.2
+core schema (``no`` is a word, ``1e-3`` a number, ``12:30`` a string), with ``_`` allowed inside
+integers. Duplicate keys, merge keys and recursive aliases are refused; depth and the number of
+nodes after alias expansion are bounded.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ Key = tuple[str | int, ...]
 
 @dataclass(frozen=True)
 class Mark:
-    """Where a key was written. Line and column count from 1; line 0 stands for a command-line override."""
+    """Where a key was written. Line and column count from 1; line 0 stands for a command-line
+    override.
+    """
 
     file: str
     line: int
@@ -45,7 +48,9 @@ class Document:
     data: Any
     marks: Mapping[Key, Mark]
     path: str
-    sources: tuple[tuple[str, str], ...] = ()  # (path, sha256) of every file that was merged, in order
+    sources: tuple[
+        tuple[str, str], ...
+    ] = ()  # (path, sha256) of every file that was merged, in order
     overrides: tuple[str, ...] = ()
 
     def mark(self, loc: Sequence[str | int]) -> Mark:
@@ -67,7 +72,9 @@ class Document:
 
 
 class _CoreLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # a base chosen at run time
-    """Safe loader with YAML 1.2 core scalars; compiled where PyYAML comes with it, as its wheels do."""
+    """Safe loader with YAML 1.2 core scalars; compiled where PyYAML comes with it, as its wheels
+    do.
+    """
 
 
 _CoreLoader.yaml_implicit_resolvers = {}
@@ -81,10 +88,14 @@ for _tag, _pattern, _first in (
         "-+0123456789.",
     ),
 ):
-    _CoreLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), list(_first))
+    _CoreLoader.add_implicit_resolver(
+        f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), list(_first)
+    )
 
 
-def parse(text: str, file: str, doing: str, *, override: bool = False) -> tuple[Any, dict[Key, Mark]]:
+def parse(
+    text: str, file: str, doing: str, *, override: bool = False
+) -> tuple[Any, dict[Key, Mark]]:
     """Return plain data and the position of every key path.
 
     Args:
@@ -105,19 +116,35 @@ def parse(text: str, file: str, doing: str, *, override: bool = False) -> tuple[
     except yaml.MarkedYAMLError as e:
         mark = e.problem_mark or e.context_mark
         at = file if mark is None or override else f"{file}:{mark.line + 1}:{mark.column + 1}"
-        if "nesting depth" in str(e.problem):  # libyaml 0.2.6 looks ahead of the events counted here and has a bound of its own
+        if "nesting depth" in str(
+            e.problem
+        ):  # libyaml 0.2.6 looks ahead of the events counted here and has a bound of its own
             raise InputError(doing, at, _TOO_DEEP, "flatten the file") from e
         found = " ".join(str(part) for part in (e.context, e.problem) if part)
-        raise InputError(doing, at, f"not valid YAML: {found}", "correct the syntax (indentation, colon, quote or bracket)") from e
+        raise InputError(
+            doing,
+            at,
+            f"not valid YAML: {found}",
+            "correct the syntax (indentation, colon, quote or bracket)",
+        ) from e
     except yaml.reader.ReaderError as e:
         line = text.count("\n", 0, e.position) + 1
-        at = file if override else f"{file}:{line}:{e.position - text.rfind(chr(10), 0, e.position)}"
-        raise InputError(doing, at, f"not valid YAML: the control character {e.character!r}", "save the file as plain UTF-8 text") from e
+        at = (
+            file if override else f"{file}:{line}:{e.position - text.rfind(chr(10), 0, e.position)}"
+        )
+        raise InputError(
+            doing,
+            at,
+            f"not valid YAML: the control character {e.character!r}",
+            "save the file as plain UTF-8 text",
+        ) from e
     return data, builder.marks
 
 
 def _check_events(text: str, file: str, doing: str) -> None:
-    """Refuse too many or too deeply nested values before nodes are built, which takes stack and memory."""
+    """Refuse too many or too deeply nested values before nodes are built, which takes stack and
+    memory.
+    """
     values = depth = 0
     for event in yaml.parse(text, Loader=_CoreLoader):
         if isinstance(event, yaml.CollectionEndEvent):
@@ -129,7 +156,14 @@ def _check_events(text: str, file: str, doing: str) -> None:
             found = _TOO_DEEP if depth > MAX_DEPTH + 1 else f"more than {MAX_NODES} values"
             mark = event.start_mark
             at = f"{file}:{mark.line + 1}:{mark.column + 1}" if mark is not None else file
-            raise InputError(doing, at, found, "flatten the file" if depth > MAX_DEPTH + 1 else "split the file or use a data file")
+            raise InputError(
+                doing,
+                at,
+                found,
+                "flatten the file"
+                if depth > MAX_DEPTH + 1
+                else "split the file or use a data file",
+            )
 
 
 class _Builder:
@@ -150,7 +184,11 @@ class _Builder:
     def build(self, node: yaml.Node, loc: Key, depth: int) -> Any:
         self.n_nodes += 1
         if self.n_nodes > MAX_NODES:
-            raise self.fail(node, f"more than {MAX_NODES} values once aliases are expanded", "remove nested aliases")
+            raise self.fail(
+                node,
+                f"more than {MAX_NODES} values once aliases are expanded",
+                "remove nested aliases",
+            )
         if depth > MAX_DEPTH:
             raise self.fail(node, _TOO_DEEP, "flatten the file")
         if id(node) in self.open:
@@ -162,7 +200,9 @@ class _Builder:
             raise self.fail(node, f"the tag {node.tag!r}", "use plain YAML values without tags")
         self.open.add(id(node))
         if isinstance(node, yaml.SequenceNode):
-            out: Any = [self.build(child, (*loc, i), depth + 1) for i, child in enumerate(node.value)]
+            out: Any = [
+                self.build(child, (*loc, i), depth + 1) for i, child in enumerate(node.value)
+            ]
         else:
             out = self.mapping(node, loc, depth)
         self.open.discard(id(node))
@@ -173,20 +213,32 @@ class _Builder:
         for key_node, value_node in node.value:
             key = self.scalar(key_node) if isinstance(key_node, yaml.ScalarNode) else None
             if key == "<<":
-                raise self.fail(key_node, "the merge key '<<'", "use extends: or write the keys out")
+                raise self.fail(
+                    key_node, "the merge key '<<'", "use extends: or write the keys out"
+                )
             if isinstance(key, bool) or not isinstance(key, str | int):
                 raise self.fail(key_node, "a key that is not text", "write keys as plain words")
             name = str(key)
             if name in out:
                 first = self.marks[(*loc, name)]
-                raise self.fail(key_node, f"duplicate key {name!r}, first at line {first.line}", "keep one of the two")
+                raise self.fail(
+                    key_node,
+                    f"duplicate key {name!r}, first at line {first.line}",
+                    "keep one of the two",
+                )
             self.marks[(*loc, name)] = self.position(key_node)
             out[name] = self.build(value_node, (*loc, name), depth + 1)
         return out
 
     def scalar(self, node: yaml.ScalarNode) -> Any:
         kind = node.tag.rsplit(":", 1)[-1]
-        if not node.tag.startswith("tag:yaml.org,2002:") or kind not in ("str", "int", "float", "bool", "null"):
+        if not node.tag.startswith("tag:yaml.org,2002:") or kind not in (
+            "str",
+            "int",
+            "float",
+            "bool",
+            "null",
+        ):
             raise self.fail(node, f"the tag {node.tag!r}", "use plain YAML values without tags")
         if kind == "str":
             return str(node.value)

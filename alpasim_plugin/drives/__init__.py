@@ -1,1 +1,3 @@
-"""Recorded drives become scenarios: readers of posed photographs, ground, corridor, obstacles, quality."""
+"""Recorded drives become scenarios: readers of posed photographs, ground, corridor, obstacles,
+quality.
+"""

@@ -1,4 +1,6 @@
-"""Import a drive: read it, place it, fit it, and write the folder that scenarios are loaded from. Read `import_drive` downwards."""
+"""Import a drive: read it, place it, fit it, and write the folder that scenarios are loaded from.
+Read `import_drive` downwards.
+"""
 
 from __future__ import annotations
 
@@ -36,10 +38,19 @@ from alpasim_plugin.gaussians.fit.views import PosedView
 from scenarios.drive import MODEL_FOLDER, TRANSFORMS_FILE, write_drive
 from scenarios.recorded import RecordedLog
 
-SCENARIO_FILE, KEY_FILE, FIT_FOLDER, POINTS_FILE = "scenario.yaml", "import.json", "fit", "points.ply"
-EVERY, EVERY_STILL = 8, 5  # one photograph of so many is held out; of those that were not taken along a road, which are fewer
+SCENARIO_FILE = "scenario.yaml"
+KEY_FILE = "import.json"
+FIT_FOLDER = "fit"
+POINTS_FILE = "points.ply"
+EVERY, EVERY_STILL = (
+    8,
+    5,
+)  # one photograph of so many is held out; of those that were not taken along a road, which are fewer
 FIT_PX = 608  # least longer side of fitted views; half of the photograph's where that is more
-RENDER_PX, SIDE_PX = 640, 16  # most of the longer side of the scenario's cameras; what their sides are multiples of, as fixers need
+RENDER_PX, SIDE_PX = (
+    640,
+    16,
+)  # most of the longer side of the scenario's cameras; what their sides are multiples of, as fixers need
 SEED = 0  # of the fit
 HELD_US = 150_000  # cameras and the sensor that tracks are not triggered at once
 SHORT_US = 2_000_000  # a shorter log is driven from its first pose on
@@ -76,22 +87,30 @@ class Shown:
 
 
 def import_drive(
-    folder: Path, out: Path, camera_height_m: float | None = None, lane_map: Path | None = None, report: Report | None = None
+    folder: Path,
+    out: Path,
+    camera_height_m: float | None = None,
+    lane_map: Path | None = None,
+    report: Report | None = None,
 ) -> dict[str, Any]:
     """Make a scenario of a recorded drive.
 
     Args:
         folder: The recording.
-        out: Becomes the scenario's folder, once everything is there; the same call goes on where an earlier one stopped.
-        camera_height_m: Of the front camera above the ground, for poses without a unit; None assumes one.
-        lane_map: OpenDRIVE map in the drive's coordinates; None makes a corridor of the driven path.
+        out: Becomes the scenario's folder, once everything is there; the same call goes on where an
+            earlier one stopped.
+        camera_height_m: Of the front camera above the ground, for poses without a unit; None
+            assumes one.
+        lane_map: OpenDRIVE map in the drive's coordinates; None makes a corridor of the driven
+            path.
         report: Called as the work goes on.
 
     Returns:
         What ``quality.json`` holds.
 
     Raises:
-        InputError: Anything wrong with the recording, or ``out`` is something else; nothing is left behind then.
+        InputError: Anything wrong with the recording, or ``out`` is something else; nothing is left
+            behind then.
         InfrastructureError: The disk refuses.
     """
     tell = report or (lambda stage, done, all: None)
@@ -105,9 +124,11 @@ def import_drive(
 
 @contextmanager
 def working_folders(out: Path) -> Iterator[tuple[Path, Path]]:
-    """Give the folders for poses that are found and for the unfinished scenario, which becomes ``out`` at the end.
+    """Give the folders for poses that are found and for the unfinished scenario, which becomes
+    ``out`` at the end.
 
-    After an `InputError`, which would come again, both are removed; after an interruption they are kept to go on from.
+    After an `InputError`, which would come again, both are removed; after an interruption they are
+    kept to go on from.
     """
     found, work = out.with_name(f".{out.name}.poses"), out.with_name(f".{out.name}.unfinished")
     try:
@@ -122,21 +143,42 @@ def working_folders(out: Path) -> Iterator[tuple[Path, Path]]:
 
 
 def _built(
-    drive: SourceDrive, folder: Path, work: Path, key: str, camera_height_m: float | None, map_file: Path | None, tell: Report
+    drive: SourceDrive,
+    folder: Path,
+    work: Path,
+    key: str,
+    camera_height_m: float | None,
+    map_file: Path | None,
+    tell: Report,
 ) -> dict[str, Any]:
     """Place, fit and measure a drive, and write all of it into a working folder."""
     tell("correcting poses", 0, 1)
     drive = with_corrected_poses(drive)
     points = _points(drive, folder, tell)
     placed = place(drive, points, camera_height_m)
-    roads, notes = given_map(map_file, drive, placed) if map_file else (corridor(placed.ego, placed.ground), (NO_MAP,))
+    roads, notes = (
+        given_map(map_file, drive, placed)
+        if map_file
+        else (corridor(placed.ego, placed.ground), (NO_MAP,))
+    )
     drive = replace(drive, notes=(*drive.notes, *notes))
     shown = shown_photographs(drive, placed)
     begin(work, key)
     write_photographs(work, shown, tell)
-    views = {use: [one.view() for one in shown if one.use == use] for use in ("fitted", "held-out", "never-fitted")}
+    views = {
+        use: [one.view() for one in shown if one.use == use]
+        for use in ("fitted", "held-out", "never-fitted")
+    }
     boxes = {actor.actor_id: actor.box for actor in placed.tracks}
-    model, exposures = fitted(views["fitted"], views["held-out"], placed.points, boxes, scene_id_of(drive), work / FIT_FOLDER, tell)
+    model, exposures = fitted(
+        views["fitted"],
+        views["held-out"],
+        placed.points,
+        boxes,
+        scene_id_of(drive),
+        work / FIT_FOLDER,
+        tell,
+    )
     quality = write_folder(work, drive, placed, roads, model, shown, views, exposures, tell)
     shutil.rmtree(work / FIT_FOLDER, ignore_errors=True)
     return quality
@@ -153,7 +195,8 @@ def write_folder(
     exposures: Mapping[str, tuple[float, float, float]],
     tell: Report,
 ) -> dict[str, Any]:
-    """Find what stands in a model, measure it, and write everything of an imported drive but its photographs.
+    """Find what stands in a model, measure it, and write everything of an imported drive but its
+    photographs.
 
     Args:
         work: The folder.
@@ -170,46 +213,82 @@ def write_folder(
     """
     scene_id = scene_id_of(drive)
     model.save(work / MODEL_FOLDER, {"scene_id": scene_id, "views": len(views["fitted"])})
-    standing = standing_obstacles(model.background, placed.points, placed.ground, placed.ego, Vehicle())
+    standing = standing_obstacles(
+        model.background, placed.points, placed.ground, placed.ego, Vehicle()
+    )
     log = _log(drive, placed, roads, scene_id)
-    write_points(work / POINTS_FILE, placed.points.xyz, np.rint(placed.points.rgb * 255).clip(0, 255).astype(np.uint8))
+    write_points(
+        work / POINTS_FILE,
+        placed.points.xyz,
+        np.rint(placed.points.rgb * 255).clip(0, 255).astype(np.uint8),
+    )
     _write_transforms(work, shown, exposures)
-    write_drive(work, log, [_from_start(one, int(placed.ego.t_us[0])) for one in placed.tracks], standing.obstacles)
-    quality = write_page(work, drive, placed, measure(model, views, exposures, placed, standing, tell))
+    write_drive(
+        work,
+        log,
+        [_from_start(one, int(placed.ego.t_us[0])) for one in placed.tracks],
+        standing.obstacles,
+    )
+    quality = write_page(
+        work, drive, placed, measure(model, views, exposures, placed, standing, tell)
+    )
     write_text(work / SCENARIO_FILE, _scenario_text(scene_id, log, drive.scene_id))
     return quality
 
 
 def key_of(drive: SourceDrive, camera_height_m: float | None, lane_map: Path | None) -> str:
-    """Return what identifies an import: the pictures by size and time of change, their poses and lenses, and the options."""
-    digest = hashlib.sha256(repr((drive.kind, camera_height_m, lane_map and read_bytes(lane_map, DOING))).encode())
+    """Return what identifies an import: the pictures by size and time of change, their poses and
+    lenses, and the options.
+    """
+    digest = hashlib.sha256(
+        repr((drive.kind, camera_height_m, lane_map and read_bytes(lane_map, DOING))).encode()
+    )
     for one in drive.pictures:
         status = one.file.stat() if one.file.is_file() else None
-        digest.update(f"{one.file}{status and (status.st_size, status.st_mtime_ns)}{one.camera}{one.t_us}".encode())
-        digest.update(one.T_world_camera.tobytes() + one.lens.K.tobytes() + one.lens.distortion.tobytes())
+        digest.update(
+            f"{one.file}{status and (status.st_size, status.st_mtime_ns)}{one.camera}{one.t_us}".encode()
+        )
+        digest.update(
+            one.T_world_camera.tobytes() + one.lens.K.tobytes() + one.lens.distortion.tobytes()
+        )
     return digest.hexdigest()
 
 
 def finished(out: Path, key: str) -> dict[str, Any]:
     """Return the quality of a finished import, or refuse another thing in its place."""
     if not (out / SCENARIO_FILE).is_file() or not (out / KEY_FILE).is_file():
-        raise InputError(DOING, str(out), "it exists and is no imported drive", "name a folder that does not exist yet")
+        raise InputError(
+            DOING,
+            str(out),
+            "it exists and is no imported drive",
+            "name a folder that does not exist yet",
+        )
     if read_json(out / KEY_FILE, DOING).get("key") != key:
-        raise InputError(DOING, str(out), "it holds another import", "name another folder, or remove this one first")
+        raise InputError(
+            DOING,
+            str(out),
+            "it holds another import",
+            "name another folder, or remove this one first",
+        )
     quality: dict[str, Any] = read_json(out / "quality.json", DOING)
     return quality
 
 
 def begin(work: Path, key: str) -> None:
     """Make the working folder, or keep that of the same import; another one's is removed."""
-    if work.exists() and (not (work / KEY_FILE).is_file() or json.loads((work / KEY_FILE).read_text()).get("key") != key):
+    if work.exists() and (
+        not (work / KEY_FILE).is_file()
+        or json.loads((work / KEY_FILE).read_text()).get("key") != key
+    ):
         shutil.rmtree(work)
     work.mkdir(parents=True, exist_ok=True)
     write_json(work / KEY_FILE, {"key": key})
 
 
 def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
-    """Return the drive's points, in its frame: given, or triangulated; and the road's own, which features miss."""
+    """Return the drive's points, in its frame: given, or triangulated; and the road's own, which
+    features miss.
+    """
     front = drive.of(drive.front)
     if drive.points is not None:
         return drive.points
@@ -220,7 +299,11 @@ def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
     if rough.strip is None:
         return points
     T = rough.T_world_source
-    return points.joined(road_points(front, rough.poses[drive.front], rough.strip).moved(np.asarray(np.linalg.inv(T), dtype=np.float64)))
+    return points.joined(
+        road_points(front, rough.poses[drive.front], rough.strip).moved(
+            np.asarray(np.linalg.inv(T), dtype=np.float64)
+        )
+    )
 
 
 def shown_photographs(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
@@ -232,18 +315,38 @@ def shown_photographs(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
         name = camera if camera != drive.front or "front" in camera else "front"
         for i, one in enumerate(drive.of(camera)):
             held = i % every == every // 2 and len(drive.of(camera)) >= EVERY
-            use = "never-fitted" if camera in drive.never_fitted else "held-out" if held else "fitted"
+            use = (
+                "never-fitted" if camera in drive.never_fitted else "held-out" if held else "fitted"
+            )
             ending = one.file.suffix.lower() if not one.lens.bends else ".png"
             picture = replace(one, t_us=int(one.t_us or 0) - first_us)
             there = _tracked_at(placed.tracks, int(one.t_us or 0))
-            out.append(Shown(picture, name, use, placed.poses[camera][i], f"photographs/{name}/{i:06d}{ending}", there))
+            out.append(
+                Shown(
+                    picture,
+                    name,
+                    use,
+                    placed.poses[camera][i],
+                    f"photographs/{name}/{i:06d}{ending}",
+                    there,
+                )
+            )
     return out
 
 
 def _tracked_at(tracks: Sequence[Actor], t_us: int) -> dict[str, F64]:
-    """Return where tracked road users are; just before and after what was tracked they stand where they were."""
-    near = [one for one in tracks if one.track.t_us[0] - HELD_US <= t_us <= one.track.t_us[-1] + HELD_US]
-    return {one.actor_id: interpolate(one.track, int(np.clip(t_us, one.track.t_us[0], one.track.t_us[-1]))) for one in near}
+    """Return where tracked road users are; just before and after what was tracked they stand where
+    they were.
+    """
+    near = [
+        one for one in tracks if one.track.t_us[0] - HELD_US <= t_us <= one.track.t_us[-1] + HELD_US
+    ]
+    return {
+        one.actor_id: interpolate(
+            one.track, int(np.clip(t_us, one.track.t_us[0], one.track.t_us[-1]))
+        )
+        for one in near
+    }
 
 
 def write_photographs(work: Path, shown: Sequence[Shown], tell: Report) -> None:
@@ -255,34 +358,66 @@ def write_photographs(work: Path, shown: Sequence[Shown], tell: Report) -> None:
             continue
         path.parent.mkdir(parents=True, exist_ok=True)
         bends = one.picture.lens.bends
-        data = cv2.imencode(".png", one.picture.rgb()[..., ::-1])[1].tobytes() if bends else read_bytes(one.picture.file, DOING)
+        data = (
+            cv2.imencode(".png", one.picture.rgb()[..., ::-1])[1].tobytes()
+            if bends
+            else read_bytes(one.picture.file, DOING)
+        )
         write_bytes(path, data, DOING)
 
 
-def _write_transforms(work: Path, shown: Sequence[Shown], exposures: Mapping[str, tuple[float, float, float]]) -> None:
+def _write_transforms(
+    work: Path, shown: Sequence[Shown], exposures: Mapping[str, tuple[float, float, float]]
+) -> None:
     frames = []
     for one in shown:
         lens, K = one.picture.lens, one.picture.lens.straight_K()
         frame = {
-            "file_path": one.file, "transform_matrix": one.T_world_camera.tolist(), "w": lens.width, "h": lens.height,
-            "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "t_us": one.picture.t_us, "camera": one.camera, "use": one.use,
-        }  # fmt: skip
+            "file_path": one.file,
+            "transform_matrix": one.T_world_camera.tolist(),
+            "w": lens.width,
+            "h": lens.height,
+            "fl_x": K[0, 0],
+            "fl_y": K[1, 1],
+            "cx": K[0, 2],
+            "cy": K[1, 2],
+            "t_us": one.picture.t_us,
+            "camera": one.camera,
+            "use": one.use,
+        }
         name = f"{one.camera}-{one.picture.file.stem}"
         frames.append(frame | ({"exposure": list(exposures[name])} if name in exposures else {}))
-    write_json(work / TRANSFORMS_FILE, {"axes": "opencv", "ply_file_path": POINTS_FILE, "frames": frames})
+    write_json(
+        work / TRANSFORMS_FILE, {"axes": "opencv", "ply_file_path": POINTS_FILE, "frames": frames}
+    )
 
 
 def _log(drive: SourceDrive, placed: PlacedDrive, roads: LaneMap, scene_id: str) -> RecordedLog:
     first_us = int(placed.ego.t_us[0])
     ego = replace(placed.ego, t_us=placed.ego.t_us - first_us)
     only_moved = drive.metric is not None and np.allclose(placed.T_world_source[:3, :3], np.eye(3))
-    origin = placed.T_world_source[:3, 3] if only_moved else np.zeros(3)  # a turned frame has no origin to subtract
+    origin = (
+        placed.T_world_source[:3, 3] if only_moved else np.zeros(3)
+    )  # a turned frame has no origin to subtract
     x, y, z = (-float(value) for value in origin)
-    cameras = [_camera(drive, placed, name) for name in drive.cameras if name not in drive.never_fitted and name in placed.mounts]
+    cameras = [
+        _camera(drive, placed, name)
+        for name in drive.cameras
+        if name not in drive.never_fitted and name in placed.mounts
+    ]
     return RecordedLog(
-        scene_id, "drive", roads, placed.ground, ego, Vehicle(), (), tuple(cameras), (x, y, z), "",
+        scene_id,
+        "drive",
+        roads,
+        placed.ground,
+        ego,
+        Vehicle(),
+        (),
+        tuple(cameras),
+        (x, y, z),
+        "",
         notes=(*drive.notes, *placed.notes),
-    )  # fmt: skip
+    )
 
 
 def _from_start(actor: Actor, first_us: int) -> Actor:
@@ -290,15 +425,25 @@ def _from_start(actor: Actor, first_us: int) -> Actor:
 
 
 def _camera(drive: SourceDrive, placed: PlacedDrive, name: str) -> CameraSpec:
-    """Return a camera of the rig at the size that it is rendered in: reduced, its height cut at the middle."""
+    """Return a camera of the rig at the size that it is rendered in: reduced, its height cut at the
+    middle.
+    """
     picture = drive.of(name)[0]
     lens = picture.lens
-    width = min(RENDER_PX * lens.width // max(lens.width, lens.height), lens.width) // SIDE_PX * SIDE_PX
+    width = (
+        min(RENDER_PX * lens.width // max(lens.width, lens.height), lens.width) // SIDE_PX * SIDE_PX
+    )
     scale = width / lens.width
     height = max(SIDE_PX, int(lens.height * scale) // SIDE_PX * SIDE_PX)
     K = np.diag([scale, scale, 1.0]) @ lens.straight_K()
     K[1, 2] -= (lens.height * scale - height) / 2
-    return CameraSpec(name if name != drive.front or "front" in name else "front", width, height, K, placed.mounts[name])
+    return CameraSpec(
+        name if name != drive.front or "front" in name else "front",
+        width,
+        height,
+        K,
+        placed.mounts[name],
+    )
 
 
 def scene_id_of(drive: SourceDrive) -> str:
@@ -345,12 +490,22 @@ def fitted(
     near = points.chosen(np.asarray(points.spread < np.percentile(points.spread, 90)))
     start = cloud_from_points(near.xyz, near.rgb)
     done = fit_drive(
-        views, start, kept=kept, boxes=boxes, scene_id=scene_id, folder=folder, seed=SEED,
+        views,
+        start,
+        kept=kept,
+        boxes=boxes,
+        scene_id=scene_id,
+        folder=folder,
+        seed=SEED,
         report=lambda stage, at, all, numbers: tell(_words(stage, numbers), at, all),
-    )  # fmt: skip
+    )
     return done.model, dict(done.exposures)
 
 
 def _words(stage: str, numbers: Mapping[str, float]) -> str:
     """Return a stage with how well held-out photographs are shown, where that was just measured."""
-    return f"{stage}, held-out photographs {numbers['held_out_db']:.1f} dB" if "held_out_db" in numbers else stage
+    return (
+        f"{stage}, held-out photographs {numbers['held_out_db']:.1f} dB"
+        if "held_out_db" in numbers
+        else stage
+    )

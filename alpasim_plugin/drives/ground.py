@@ -1,6 +1,8 @@
-"""The ground along a drive, from triangulated or measured points: a strip that bends with the road, robust to what stands on it.
+"""The ground along a drive, from triangulated or measured points: a strip that bends with the road,
+robust to what stands on it.
 
-Lengths are in units of the camera's height above the ground, which the points themselves give first, so that the fit needs no metre.
+Lengths are in units of the camera's height above the ground, which the points themselves give
+first, so that the fit needs no metre.
 """
 
 from __future__ import annotations
@@ -15,23 +17,52 @@ from alpasim_plugin.core.types import F64, Bool, HeightField
 from alpasim_plugin.drives.source import Points
 
 # In camera heights:
-STEP, AHEAD = 0.3, 25.0  # of the path's samples; how far the strip goes on before and beyond the path, straight on
-# Points beside the path by less than they lie below it are on what was driven over, for the most part; the wider cone is for few points.
+STEP, AHEAD = (
+    0.3,
+    25.0,
+)  # of the path's samples; how far the strip goes on before and beyond the path, straight on
+# Points beside the path by less than they lie below it are on what was driven over, for the most
+# part; the wider cone is for few points.
 CONES = (1.0, 1.6)
 STRIP = 1.6  # half the width of the strip that is fitted
-KNOTS, TILT_KNOTS, CROSS_KNOTS = 2.0, 8.0, 0.4  # distance of the knots of height, of cross slope, and of the road's cross section
-BEND, RISE = 0.03, 0.02  # usual second and first difference of the heights at knots, against the path
-TURN, CROSS = 0.02, 0.02  # usual difference of neighbouring cross slopes, and second difference of the cross section
+KNOTS, TILT_KNOTS, CROSS_KNOTS = (
+    2.0,
+    8.0,
+    0.4,
+)  # distance of the knots of height, of cross slope, and of the road's cross section
+BEND, RISE = (
+    0.03,
+    0.02,
+)  # usual second and first difference of the heights at knots, against the path
+TURN, CROSS = (
+    0.02,
+    0.02,
+)  # usual difference of neighbouring cross slopes, and second difference of the cross section
 NOISE = 0.015  # of a surface
-LOOSE, TIGHT, ROUNDS = 0.3, 0.06, 10  # where Tukey's weight ends, in the first round and in the last ones
-WHEELS, ASIDE_WEIGHT = 0.8, 0.02  # half the width of what is driven over, and what points beside it count: kerbs come and go
+LOOSE, TIGHT, ROUNDS = (
+    0.3,
+    0.06,
+    10,
+)  # where Tukey's weight ends, in the first round and in the last ones
+WHEELS, ASIDE_WEIGHT = (
+    0.8,
+    0.02,
+)  # half the width of what is driven over, and what points beside it count: kerbs come and go
 FEWEST, SECTION = 40, 3.0  # points that a strip needs; length of the sections that are judged
-CROSS_AT: F64 = np.asarray(np.arange(-4, 5) * CROSS_KNOTS, dtype=np.float64)  # offsets of the cross section's knots
-CELL_M, BESIDE_M, TILTED_M = 1.0, 60.0, 6.0  # of the height field; beyond TILTED_M beside the path it goes on level
+CROSS_AT: F64 = np.asarray(
+    np.arange(-4, 5) * CROSS_KNOTS, dtype=np.float64
+)  # offsets of the cross section's knots
+CELL_M, BESIDE_M, TILTED_M = (
+    1.0,
+    60.0,
+    6.0,
+)  # of the height field; beyond TILTED_M beside the path it goes on level
 
 
 class PathFrame:
-    """Places points beside a path: station along it, offset to its left, and its own height there."""
+    """Places points beside a path: station along it, offset to its left, and its own height
+    there.
+    """
 
     def __init__(self, path: F64, unit: float) -> None:
         line = _extended(path, AHEAD * unit, unit)
@@ -60,11 +91,14 @@ class GroundStrip:
     Attributes:
         frame: The path of the camera.
         height: Of the camera above it, the median along the path.
-        knots, below: ``(K,)`` stations, and how far the surface lies below the path there (negative).
+        knots, below: ``(K,)`` stations, and how far the surface lies below the path there
+            (negative).
         tilt_knots, tilt: ``(L,)`` stations, and the slope to the left there.
-        cross_knots, cross: ``(M,)`` offsets to the left, and the cross section there, the same along the whole drive: gutters and kerbs.
+        cross_knots, cross: ``(M,)`` offsets to the left, and the cross section there, the same
+            along the whole drive: gutters and kerbs.
         used: How many points carry it.
-        section_errors: ``(S,)`` medians of what the points of each section with enough of them say against it.
+        section_errors: ``(S,)`` medians of what the points of each section with enough of them say
+            against it.
     """
 
     frame: PathFrame
@@ -79,16 +113,23 @@ class GroundStrip:
     section_errors: F64
 
     def z(self, xy: F64, widest: float = np.inf) -> F64:
-        """Return the surface's height ``(N,)`` at points ``(N, 2+)``; beyond ``widest`` beside the path it goes on level."""
+        """Return the surface's height ``(N,)`` at points ``(N, 2+)``; beyond ``widest`` beside the
+        path it goes on level.
+        """
         s, left, z = self.frame.place(xy)
         return np.asarray(
-            z + np.interp(s, self.knots, self.below) + np.interp(s, self.tilt_knots, self.tilt) * np.clip(left, -widest, widest)
+            z
+            + np.interp(s, self.knots, self.below)
+            + np.interp(s, self.tilt_knots, self.tilt) * np.clip(left, -widest, widest)
         )
 
     def field(self) -> HeightField:
         """Return it as a height field, metres, around the whole path."""
         low = np.floor(self.frame.line[:, :2].min(axis=0) - BESIDE_M)
-        nx, ny = (int(n) + 2 for n in np.ceil((self.frame.line[:, :2].max(axis=0) + BESIDE_M - low) / CELL_M))
+        nx, ny = (
+            int(n) + 2
+            for n in np.ceil((self.frame.line[:, :2].max(axis=0) + BESIDE_M - low) / CELL_M)
+        )
         x, y = np.meshgrid(low[0] + CELL_M * np.arange(nx), low[1] + CELL_M * np.arange(ny))
         z = self.z(np.column_stack([x.ravel(), y.ravel()]), TILTED_M)
         return HeightField(float(low[0]), float(low[1]), CELL_M, z.reshape(ny, nx))
@@ -110,31 +151,57 @@ def fit_ground(points: Points, path: F64) -> GroundStrip | None:
     frame = PathFrame(path, height)
     s, left, z = frame.place(points.xyz)
     h = (points.xyz[:, 2] - z) / height
-    s, left, spread = s / height, left / height, points.rise_spread / height
-    near = (np.abs(left) < STRIP) & (h > -1.6) & (h < -0.5) & (s > frame.s[0] / height) & (s < frame.s[-1] / height)
+    s = s / height
+    left = left / height
+    spread = points.rise_spread / height
+    near = (
+        (np.abs(left) < STRIP)
+        & (h > -1.6)
+        & (h < -0.5)
+        & (s > frame.s[0] / height)
+        & (s < frame.s[-1] / height)
+    )
     if near.sum() < FEWEST:
         return None
     fitted = _Strip(frame.s / height)
-    weight = np.where(np.abs(left[near]) < WHEELS, 1.0, ASIDE_WEIGHT) / (spread[near] ** 2 + NOISE**2)
+    weight = np.where(np.abs(left[near]) < WHEELS, 1.0, ASIDE_WEIGHT) / (
+        spread[near] ** 2 + NOISE**2
+    )
     coefficients, kept = fitted.solve(s[near], left[near], h[near], weight)
-    errors = _section_errors(s[near], left[near], h[near] - fitted.value(s[near], left[near], coefficients), spread[near])
+    errors = _section_errors(
+        s[near], left[near], h[near] - fitted.value(s[near], left[near], coefficients), spread[near]
+    )
     offsets: F64 = np.asarray(CROSS_AT * height, dtype=np.float64)
-    below, tilt, cross = np.split(coefficients, np.cumsum([len(fitted.knots), len(fitted.tilt_knots)]))
+    below, tilt, cross = np.split(
+        coefficients, np.cumsum([len(fitted.knots), len(fitted.tilt_knots)])
+    )
     own = np.interp(PathFrame(path, height).place(path)[0] / height, fitted.knots, below)
     return GroundStrip(
-        frame, -float(np.median(own)) * height, fitted.knots * height, below * height, fitted.tilt_knots * height, tilt, offsets,
-        cross * height, int(kept.sum()), errors * height,
-    )  # fmt: skip
+        frame,
+        -float(np.median(own)) * height,
+        fitted.knots * height,
+        below * height,
+        fitted.tilt_knots * height,
+        tilt,
+        offsets,
+        cross * height,
+        int(kept.sum()),
+        errors * height,
+    )
 
 
 def _camera_height(points: Points, path: F64) -> float | None:
-    """Return the camera's height above what was driven over: where points inside a cone below the path crowd."""
+    """Return the camera's height above what was driven over: where points inside a cone below the
+    path crowd.
+    """
     unit = float(np.median(np.linalg.norm(np.diff(path, axis=0), axis=1))) or 1.0
     frame = PathFrame(path, 3 * unit)
     for _ in range(2):  # the path's samples should be as fine as the height that is found
         s, left, z = frame.place(points.xyz)
         below = z - points.xyz[:, 2]
-        good = (below > 0) & (points.rise_spread < 0.1 * below) & (s > frame.s[0]) & (s < frame.s[-1])
+        good = (
+            (below > 0) & (points.rise_spread < 0.1 * below) & (s > frame.s[0]) & (s < frame.s[-1])
+        )
         cones = [good & (np.abs(left) < cone * below) for cone in CONES]
         inside = next((cone for cone in cones if cone.sum() >= FEWEST), None)
         if inside is None:
@@ -149,28 +216,42 @@ def _camera_height(points: Points, path: F64) -> float | None:
 
 
 class _Strip:
-    """Height and cross slope along the way, and one cross section: piecewise linear, with a prior of smoothness."""
+    """Height and cross slope along the way, and one cross section: piecewise linear, with a prior
+    of smoothness.
+    """
 
     def __init__(self, stations: F64) -> None:
         span = stations[-1] - stations[0]
         self.knots = np.linspace(stations[0], stations[-1], max(3, round(span / KNOTS) + 1))
-        self.tilt_knots = np.linspace(stations[0], stations[-1], max(2, round(span / TILT_KNOTS) + 1))
+        self.tilt_knots = np.linspace(
+            stations[0], stations[-1], max(2, round(span / TILT_KNOTS) + 1)
+        )
         n, m = len(self.knots), len(self.tilt_knots)
         bend = scipy.sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(n - 2, n)) / BEND
         rise = scipy.sparse.diags([1.0, -1.0], [0, 1], shape=(n - 1, n)) / RISE
         turn = scipy.sparse.diags([1.0, -1.0], [0, 1], shape=(m - 1, m)) / TURN
         level = scipy.sparse.eye(m) / 0.1
-        prior = scipy.sparse.block_diag([scipy.sparse.vstack([bend, rise]), scipy.sparse.vstack([turn, level])]).tocsr()
+        prior = scipy.sparse.block_diag(
+            [scipy.sparse.vstack([bend, rise]), scipy.sparse.vstack([turn, level])]
+        ).tocsr()
         k = len(CROSS_AT)
         arched = scipy.sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(k - 2, k)) / CROSS
-        middle = scipy.sparse.csr_matrix(np.abs(CROSS_AT)[None] < CROSS_KNOTS / 2) / 1e-4  # the path's own height is that of the knots
-        cross = scipy.sparse.vstack([arched, middle, scipy.sparse.csr_matrix(CROSS_AT[None]) / 0.1])  # its slope is the tilt's
+        middle = (
+            scipy.sparse.csr_matrix(np.abs(CROSS_AT)[None] < CROSS_KNOTS / 2) / 1e-4
+        )  # the path's own height is that of the knots
+        cross = scipy.sparse.vstack(
+            [arched, middle, scipy.sparse.csr_matrix(CROSS_AT[None]) / 0.1]
+        )  # its slope is the tilt's
         prior = scipy.sparse.block_diag([prior, cross]).tocsr()
         self.prior = (prior.T @ prior).tocsc()
 
     def rows(self, s: F64, left: F64) -> scipy.sparse.csr_matrix:
         """Return the matrix that maps coefficients to heights at points."""
-        parts = [_hats(s, self.knots), scipy.sparse.diags(left) @ _hats(s, self.tilt_knots), _hats(left, CROSS_AT)]
+        parts = [
+            _hats(s, self.knots),
+            scipy.sparse.diags(left) @ _hats(s, self.tilt_knots),
+            _hats(left, CROSS_AT),
+        ]
         return scipy.sparse.hstack(parts).tocsr()
 
     def value(self, s: F64, left: F64, coefficients: F64) -> F64:
@@ -180,7 +261,9 @@ class _Strip:
     def solve(self, s: F64, left: F64, h: F64, weight: F64) -> tuple[F64, Bool]:
         """Return the coefficients, and which points carry them: Tukey's weights, ever tighter."""
         A = self.rows(s, left)
-        coefficients = np.concatenate([np.full(len(self.knots), -1.0), np.zeros(len(self.tilt_knots) + len(CROSS_AT))])
+        coefficients = np.concatenate(
+            [np.full(len(self.knots), -1.0), np.zeros(len(self.tilt_knots) + len(CROSS_AT))]
+        )
         robust = np.ones(len(h))
         for i in range(ROUNDS):
             end = max(TIGHT, LOOSE * 0.75**i)
@@ -188,21 +271,32 @@ class _Strip:
             slack = end + 2 / np.sqrt(weight)  # a far point is judged by its own spread
             robust = np.where(np.abs(error) < slack, (1 - (error / slack) ** 2) ** 2, 0.0)
             W = scipy.sparse.diags(weight * robust)
-            coefficients = np.asarray(scipy.sparse.linalg.spsolve((A.T @ W @ A + self.prior).tocsc(), A.T @ (weight * robust * h)))
+            coefficients = np.asarray(
+                scipy.sparse.linalg.spsolve(
+                    (A.T @ W @ A + self.prior).tocsc(), A.T @ (weight * robust * h)
+                )
+            )
         return coefficients, np.asarray(robust > 0.1)
 
 
 def _hats(s: F64, knots: F64) -> scipy.sparse.csr_matrix:
-    """Return the weights ``(N, K)`` of linear interpolation between knots, which are evenly spaced."""
+    """Return the weights ``(N, K)`` of linear interpolation between knots, which are evenly
+    spaced.
+    """
     u = np.clip((s - knots[0]) / (knots[1] - knots[0]), 0, len(knots) - 1 - 1e-9)
     low = u.astype(np.int64)
     rows = np.arange(len(s))
     values = np.concatenate([1 - (u - low), u - low])
-    return scipy.sparse.csr_matrix((values, (np.concatenate([rows, rows]), np.concatenate([low, low + 1]))), shape=(len(s), len(knots)))
+    return scipy.sparse.csr_matrix(
+        (values, (np.concatenate([rows, rows]), np.concatenate([low, low + 1]))),
+        shape=(len(s), len(knots)),
+    )
 
 
 def _section_errors(s: F64, left: F64, error: F64, spread: F64) -> F64:
-    """Return the median error of every section of the strip under the wheels that has eight good points."""
+    """Return the median error of every section of the strip under the wheels that has eight good
+    points.
+    """
     under = (np.abs(left) < WHEELS) & (spread < 0.03) & (np.abs(error) < LOOSE)
     section = np.floor(s / SECTION).astype(np.int64)
     groups = [error[under & (section == one)] for one in np.unique(section[under])]
@@ -210,13 +304,17 @@ def _section_errors(s: F64, left: F64, error: F64, spread: F64) -> F64:
 
 
 def _extended(path: F64, by: float, unit: float) -> F64:
-    """Return a path with a straight piece before and beyond it, level with its mean slope near the ends."""
+    """Return a path with a straight piece before and beyond it, level with its mean slope near the
+    ends.
+    """
     moved = np.concatenate([[True], np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1) > 1e-9])
     line = path[moved]
     s = arc_lengths(line[:, :2])
     ends = []
     for at, away in ((s[0], min(s[-1], s[0] + 3 * unit)), (s[-1], max(s[0], s[-1] - 3 * unit))):
-        here, there = (np.array([np.interp(x, s, line[:, axis]) for axis in range(3)]) for x in (at, away))
+        here, there = (
+            np.array([np.interp(x, s, line[:, axis]) for axis in range(3)]) for x in (at, away)
+        )
         direction = here - there
         ends.append(here + direction * by / max(float(np.linalg.norm(direction[:2])), 1e-9))
     return np.concatenate([[ends[0]], line, [ends[1]]])

@@ -1,8 +1,10 @@
-"""KITTI odometry folders: pictures of one or two rectified stereo pairs, poses of the left grey camera, projections.
+"""KITTI odometry folders: pictures of one or two rectified stereo pairs, poses of the left grey
+camera, projections.
 
-Read are the benchmark's own layout (``image_0`` to ``image_3``, named rows in ``calib.txt``, ``times.txt``, poses beside or in
-``../../poses/NN.txt``) and copies with ``image_l`` and ``image_r`` and a ``calib.txt`` of bare rows. Poses map the left camera to the
-world, metres, axes of OpenCV; a row of ``calib.txt`` is the projection K [I | t] of a camera, t against the left one.
+Read are the benchmark's own layout (``image_0`` to ``image_3``, named rows in ``calib.txt``,
+``times.txt``, poses beside or in ``../../poses/NN.txt``) and copies with ``image_l`` and
+``image_r`` and a ``calib.txt`` of bare rows. Poses map the left camera to the world, metres, axes
+of OpenCV; a row of ``calib.txt`` is the projection K [I | t] of a camera, t against the left one.
 """
 
 from __future__ import annotations
@@ -20,7 +22,11 @@ from alpasim_plugin.gaussians.fit.lens import Lens
 from alpasim_plugin.gaussians.fit.photographs import Picture, rigid_pose
 
 DOING = "reading a KITTI drive"
-PAIRS = (("image_2", "image_3"), ("image_0", "image_1"), ("image_l", "image_r"))  # the first that is there is read, left and right
+PAIRS = (
+    ("image_2", "image_3"),
+    ("image_0", "image_1"),
+    ("image_l", "image_r"),
+)  # the first that is there is read, left and right
 ROWS = {"image_l": 0, "image_r": 1, "image_0": 0, "image_1": 1, "image_2": 2, "image_3": 3}
 PERIOD_US = 100_000
 SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -35,7 +41,8 @@ def read_kitti(folder: Path) -> SourceDrive:
     """Read a drive: the left camera is driven by and fitted, the right one is kept for judging.
 
     Raises:
-        InputError: A file is missing or damaged, or a pose is no rigid motion; the message names it.
+        InputError: A file is missing or damaged, or a pose is no rigid motion; the message names
+            it.
     """
     left, right = next(pair for pair in PAIRS if (folder / pair[0]).is_dir())
     projections, poses = _projections(folder / "calib.txt"), _poses(folder)
@@ -44,38 +51,66 @@ def read_kitti(folder: Path) -> SourceDrive:
         if not (folder / name).is_dir():
             notes.append(f"no {name}: no second camera to judge the fit by")
             continue
-        files = sorted(path for path in (folder / name).iterdir() if path.suffix.lower() in SUFFIXES)
+        files = sorted(
+            path for path in (folder / name).iterdir() if path.suffix.lower() in SUFFIXES
+        )
         taken, note = _matched(folder, name, files, len(poses))
         notes += note
         K, T_left_camera = _camera(projections, name, folder / "calib.txt")
         times = _times(folder, len(poses))
         for i, path in enumerate(taken):
             lens = Lens(*check_image(read_bytes(path, DOING), path, DOING), K)
-            pictures.append(Picture(path, lens, poses[i] @ T_left_camera, f"{folder}, photograph {i}", times[i], side, {}))
+            pictures.append(
+                Picture(
+                    path,
+                    lens,
+                    poses[i] @ T_left_camera,
+                    f"{folder}, photograph {i}",
+                    times[i],
+                    side,
+                    {},
+                )
+            )
     if not (folder / "times.txt").is_file():
         notes.append("no times.txt: 10 photographs a second are assumed, as KITTI takes them")
     others = [name for name in ROWS if name not in (left, right) and (folder / name).is_dir()]
     if others:
         notes.append(f"not read: {', '.join(others)}")
     return SourceDrive(
-        "kitti", folder.resolve().name, tuple(pictures), "left", ("right",) if (folder / right).is_dir() else (),
-        metric="the poses, metres", notes=tuple(notes),
-    )  # fmt: skip
+        "kitti",
+        folder.resolve().name,
+        tuple(pictures),
+        "left",
+        ("right",) if (folder / right).is_dir() else (),
+        metric="the poses, metres",
+        notes=tuple(notes),
+    )
 
 
-def _matched(folder: Path, name: str, files: list[Path], poses: int) -> tuple[list[Path], list[str]]:
-    """Return the pictures that have poses; a few more of either are dropped and said, many are another drive's."""
+def _matched(
+    folder: Path, name: str, files: list[Path], poses: int
+) -> tuple[list[Path], list[str]]:
+    """Return the pictures that have poses; a few more of either are dropped and said, many are
+    another drive's.
+    """
     spare = len(files) - poses
     if not spare:
         return files, []
     if abs(spare) > max(2, poses // 10):
         do = "give the poses of these very photographs, one row each"
-        raise InputError(DOING, str(folder / name), f"{len(files)} photographs and {poses} poses", do)
+        raise InputError(
+            DOING, str(folder / name), f"{len(files)} photographs and {poses} poses", do
+        )
     if spare < 0:
-        return files, [f"{poses} poses for {len(files)} photographs in {name}: the last {-spare} poses were dropped"]
+        return files, [
+            f"{poses} poses for {len(files)} photographs in {name}: the last {-spare} poses were dropped"
+        ]
     names = ", ".join(path.name for path in files[poses:])
-    return files[:poses], [f"{poses} poses for {len(files)} photographs in {name}: the last was dropped ({names})" if spare == 1 else
-                           f"{poses} poses for {len(files)} photographs in {name}: the last {spare} were dropped ({names})"]  # fmt: skip
+    return files[:poses], [
+        f"{poses} poses for {len(files)} photographs in {name}: the last was dropped ({names})"
+        if spare == 1
+        else f"{poses} poses for {len(files)} photographs in {name}: the last {spare} were dropped ({names})"
+    ]
 
 
 def _rows(path: Path, width: int) -> list[list[float]]:
@@ -88,11 +123,18 @@ def _rows(path: Path, width: int) -> list[list[float]]:
         try:
             numbers = [float(word) for word in words]
         except ValueError as error:
-            raise InputError(DOING, f"{path}, line {i + 1}", str(error), f"give {width} numbers a line") from error
+            raise InputError(
+                DOING, f"{path}, line {i + 1}", str(error), f"give {width} numbers a line"
+            ) from error
         if len(numbers) == width:
             rows.append(numbers)
         elif len(words) not in (9, 12):  # calib.txt of raw drives also holds rotations
-            raise InputError(DOING, f"{path}, line {i + 1}", f"{len(numbers)} numbers", f"give {width} numbers a line")
+            raise InputError(
+                DOING,
+                f"{path}, line {i + 1}",
+                f"{len(numbers)} numbers",
+                f"give {width} numbers a line",
+            )
     return rows
 
 
@@ -101,32 +143,57 @@ def _poses(folder: Path) -> list[F64]:
     path = next((one for one in places if one.is_file()), None)
     if path is None:
         raise InputError(
-            DOING, str(folder), "no poses.txt", "put the poses of the left camera beside the pictures, one row of 12 numbers each"
+            DOING,
+            str(folder),
+            "no poses.txt",
+            "put the poses of the left camera beside the pictures, one row of 12 numbers each",
         )
     rows = _rows(path, 12)
     if len(rows) < 2:
-        raise InputError(DOING, str(path), f"{len(rows)} poses", "give a row of 12 numbers for each photograph")
-    return [rigid_pose(np.reshape(row, (3, 4)).tolist(), f"{path}, line {i + 1}", DOING) for i, row in enumerate(rows)]
+        raise InputError(
+            DOING, str(path), f"{len(rows)} poses", "give a row of 12 numbers for each photograph"
+        )
+    return [
+        rigid_pose(np.reshape(row, (3, 4)).tolist(), f"{path}, line {i + 1}", DOING)
+        for i, row in enumerate(rows)
+    ]
 
 
 def _projections(path: Path) -> list[F64]:
     rows = _rows(path, 12)
     if not rows:
-        raise InputError(DOING, str(path), "no row of 12 numbers", "give the cameras' projections, left and right")
+        raise InputError(
+            DOING,
+            str(path),
+            "no row of 12 numbers",
+            "give the cameras' projections, left and right",
+        )
     return [np.reshape(row, (3, 4)) for row in rows]
 
 
 def _camera(projections: list[F64], name: str, path: Path) -> tuple[F64, F64]:
     """Return a camera's intrinsics and its pose against the left grey camera."""
     if ROWS[name] >= len(projections):
-        raise InputError(DOING, str(path), f"{len(projections)} projections, none for {name}", "give a row of 12 numbers for each camera")
+        raise InputError(
+            DOING,
+            str(path),
+            f"{len(projections)} projections, none for {name}",
+            "give a row of 12 numbers for each camera",
+        )
     P = projections[ROWS[name]]
     K = P[:, :3].copy()
     if not np.isfinite(P).all() or min(K[0, 0], K[1, 1]) <= 0:
-        raise InputError(DOING, f"{path}, row {ROWS[name] + 1}", "no focal length", "give the projection of a rectified camera")
+        raise InputError(
+            DOING,
+            f"{path}, row {ROWS[name] + 1}",
+            "no focal length",
+            "give the projection of a rectified camera",
+        )
     T = np.eye(4)
     T[:3, 3] = -np.linalg.solve(K, P[:, 3])
-    return K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), T  # pixels are counted from their middle there
+    return K + np.array(
+        [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    ), T  # pixels are counted from their middle there
 
 
 def _times(folder: Path, count: int) -> list[int]:
@@ -135,6 +202,12 @@ def _times(folder: Path, count: int) -> list[int]:
         return [i * PERIOD_US for i in range(count)]
     seconds = np.array([float(word) for word in read_text(path, DOING).split()])
     if len(seconds) < count or not (np.diff(seconds) > 0).all() or not np.isfinite(seconds).all():
-        found = f"{len(seconds)} times for {count} poses" if len(seconds) < count else "times that do not increase"
-        raise InputError(DOING, str(path), found, "give the time of each photograph in seconds, in order")
+        found = (
+            f"{len(seconds)} times for {count} poses"
+            if len(seconds) < count
+            else "times that do not increase"
+        )
+        raise InputError(
+            DOING, str(path), found, "give the time of each photograph in seconds, in order"
+        )
     return [round(1e6 * float(one - seconds[0])) for one in seconds]

@@ -1,7 +1,9 @@
-"""What stands in a reconstruction and can be hit: upright boxes around opaque Gaussians between 0.3 and 2 m above the ground.
+"""What stands in a reconstruction and can be hit: upright boxes around opaque Gaussians between 0.3
+and 2 m above the ground.
 
-A splat has no bodies: without these a car drives through a parked one and nothing is measured. What the recorded car drove through is free
-by that fact; opaque Gaussians there are errors of the fit, are left out, and are counted.
+A splat has no bodies: without these a car drives through a parked one and nothing is measured. What
+the recorded car drove through is free by that fact; opaque Gaussians there are errors of the fit,
+are left out, and are counted.
 """
 
 from __future__ import annotations
@@ -12,7 +14,16 @@ import numpy as np
 import scipy
 
 from alpasim_plugin.core.geometry import matrix_from_quat
-from alpasim_plugin.core.types import F64, I64, STANDING_ID, Bool, Box, HeightField, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    F64,
+    I64,
+    STANDING_ID,
+    Bool,
+    Box,
+    HeightField,
+    Trajectory,
+    Vehicle,
+)
 from alpasim_plugin.drives.ground import PathFrame
 from alpasim_plugin.drives.source import Points
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -24,7 +35,9 @@ OPAQUE, LARGEST_M = 0.3, 0.6  # of a Gaussian that counts; larger ones are backg
 CELL_M, PIECE_M, REACH_M = 0.2, 1.0, 9.0  # of the grid, of a box along the path, and from the path
 LEAST_M2 = 0.06  # of opaque surface in a column of a cell: a wall has 0.34
 FEWEST = 3  # cells of something that stands
-GAP_M = 1.2  # a gap in something that no car fits into is closed: dark doors and windows leave some in parked cars
+# a gap in something that no car fits into is closed: dark doors and windows leave some in parked
+# cars
+GAP_M = 1.2
 SPARE_M = 0.1  # beside the recorded car that it drove through unhurt
 UNSEEN_M = 0.5  # uncertainty where no point is near
 NEAR_M = 1.0
@@ -38,12 +51,15 @@ class Standing:
     cleared: int
 
 
-def standing_obstacles(cloud: GaussianCloud, points: Points, ground: HeightField, ego: Trajectory, vehicle: Vehicle) -> Standing:
+def standing_obstacles(
+    cloud: GaussianCloud, points: Points, ground: HeightField, ego: Trajectory, vehicle: Vehicle
+) -> Standing:
     """Return what stands beside a driven path.
 
     Args:
         cloud: The reconstruction's background, world.
-        points: Triangulated or measured points, world; their spread near an obstacle is its uncertainty.
+        points: Triangulated or measured points, world; their spread near an obstacle is its
+            uncertainty.
         ground: Height field.
         ego: Recorded rig poses.
         vehicle: The recorded car, which hit nothing.
@@ -52,8 +68,16 @@ def standing_obstacles(cloud: GaussianCloud, points: Points, ground: HeightField
     frame = PathFrame(ego.xyz, 1.0)
     s, left, _ = frame.place(places)
     above = places[:, 2] - height_at(ground, places)
-    near = (above > LOW_M) & (above < HIGH_M) & (np.abs(left) < REACH_M) & (s > frame.s[0]) & (s < frame.s[-1])
-    places, area, above = places[near], area[near], above[near]
+    near = (
+        (above > LOW_M)
+        & (above < HIGH_M)
+        & (np.abs(left) < REACH_M)
+        & (s > frame.s[0])
+        & (s < frame.s[-1])
+    )
+    places = places[near]
+    area = area[near]
+    above = above[near]
     low = ego.xyz[:, :2].min(axis=0) - REACH_M - 30.0
     cells = np.floor((places[:, :2] - low) / CELL_M).astype(np.int64)
     if not len(cells):
@@ -80,22 +104,42 @@ def _disc(radius_m: float) -> Bool:
 
 
 def _samples(cloud: GaussianCloud) -> tuple[F64, F64]:
-    """Return points ``(N, 3)`` on the opaque Gaussians, their middles and their ends, and the surface ``(N,)`` that each stands for."""
+    """Return points ``(N, 3)`` on the opaque Gaussians, their middles and their ends, and the
+    surface ``(N,)`` that each stands for.
+    """
     scales = np.asarray(cloud.scales, dtype=np.float64)
     chosen = (np.asarray(cloud.opacities) > OPAQUE) & (scales.max(axis=1) < LARGEST_M)
     means, scales = np.asarray(cloud.means, dtype=np.float64)[chosen], scales[chosen]
     order = np.argsort(-scales, axis=1)[:, :2]
-    axes = np.take_along_axis(matrix_from_quat(np.asarray(cloud.quats, dtype=np.float64)[chosen]), order[:, None, :], axis=2)  # (N, 3, 2)
+    axes = np.take_along_axis(
+        matrix_from_quat(np.asarray(cloud.quats, dtype=np.float64)[chosen]),
+        order[:, None, :],
+        axis=2,
+    )  # (N, 3, 2)
     sizes = np.take_along_axis(scales, order, axis=1)
     ends = axes * sizes[:, None, :]
-    shown = [means, means + ends[:, :, 0], means - ends[:, :, 0], means + ends[:, :, 1], means - ends[:, :, 1]]
-    surface = np.pi * sizes[:, 0] * sizes[:, 1] * np.asarray(cloud.opacities, dtype=np.float64)[chosen] / len(shown)
+    shown = [
+        means,
+        means + ends[:, :, 0],
+        means - ends[:, :, 0],
+        means + ends[:, :, 1],
+        means - ends[:, :, 1],
+    ]
+    surface = (
+        np.pi
+        * sizes[:, 0]
+        * sizes[:, 1]
+        * np.asarray(cloud.opacities, dtype=np.float64)[chosen]
+        / len(shown)
+    )
     return np.concatenate(shown), np.tile(surface, len(shown))
 
 
 def _driven(grid: Bool, low: F64, ego: Trajectory, vehicle: Vehicle) -> Bool:
     """Return which cells the recorded car drove over."""
-    x, y = np.meshgrid(np.arange(grid.shape[0]) - 0.5, np.arange(grid.shape[1]) - 0.5, indexing="ij")
+    x, y = np.meshgrid(
+        np.arange(grid.shape[0]) - 0.5, np.arange(grid.shape[1]) - 0.5, indexing="ij"
+    )
     xy = low + np.column_stack([x.ravel(), y.ravel()]) * CELL_M
     frame = PathFrame(ego.xyz, 1.0)
     s, left, _ = frame.place(xy)
@@ -108,11 +152,17 @@ def _tops(places: F64, above: F64, low: F64, shape: tuple[int, ...]) -> F64:
     tops = np.zeros(shape)
     cells = np.floor((places[:, :2] - low) / CELL_M).astype(np.int64) + 1
     np.maximum.at(tops, (cells[:, 0], cells[:, 1]), above)
-    return np.where(tops > 0, tops, scipy.ndimage.grey_dilation(tops, footprint=_disc(GAP_M / 2)))  # of cells in gaps: their neighbours'
+    return np.where(
+        tops > 0, tops, scipy.ndimage.grey_dilation(tops, footprint=_disc(GAP_M / 2))
+    )  # of cells in gaps: their neighbours'
 
 
-def _boxes(at: F64, cells: I64, tops: F64, frame: PathFrame, ground: HeightField, points: Points) -> list[Obstacle]:
-    """Return boxes around cells ``(N, 2)`` that are connected within a piece of the path, along the path's own direction."""
+def _boxes(
+    at: F64, cells: I64, tops: F64, frame: PathFrame, ground: HeightField, points: Points
+) -> list[Obstacle]:
+    """Return boxes around cells ``(N, 2)`` that are connected within a piece of the path, along the
+    path's own direction.
+    """
     s, left, _ = frame.place(at)
     piece = np.floor(s / PIECE_M).astype(np.int64)
     label = np.zeros(len(cells), dtype=np.int64)
@@ -120,7 +170,9 @@ def _boxes(at: F64, cells: I64, tops: F64, frame: PathFrame, ground: HeightField
         mine = piece == number
         grid = np.zeros(cells.max(axis=0) + 1, dtype=bool)
         grid[cells[mine, 0], cells[mine, 1]] = True
-        label[mine] = scipy.ndimage.label(grid, structure=np.ones((3, 3)))[0][cells[mine, 0], cells[mine, 1]]
+        label[mine] = scipy.ndimage.label(grid, structure=np.ones((3, 3)))[0][
+            cells[mine, 0], cells[mine, 1]
+        ]
     tree = scipy.spatial.KDTree(points.xyz[:, :2]) if len(points) else None
     out: list[Obstacle] = []
     for one in np.unique(np.stack([label, piece, left > 0], axis=1).astype(np.int64), axis=0):
@@ -140,5 +192,13 @@ def _boxes(at: F64, cells: I64, tops: F64, frame: PathFrame, ground: HeightField
         uncertainty = round(float(np.hypot(CELL_M / 2, spread)), 2)
         box = Box(float(np.ptp(u)) + 2 * half, float(np.ptp(v)) + 2 * half, top)
         name = f"{STANDING_ID}{len(out) + 1:03d}-within-{uncertainty:g}m"
-        out.append(Obstacle(name, box, np.array([*middle, base + top / 2]), float(np.arctan2(along[1], along[0])), uncertainty))
+        out.append(
+            Obstacle(
+                name,
+                box,
+                np.array([*middle, base + top / 2]),
+                float(np.arctan2(along[1], along[0])),
+                uncertainty,
+            )
+        )
     return out

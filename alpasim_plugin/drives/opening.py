@@ -15,11 +15,22 @@ from alpasim_plugin.drives.kitti import is_kitti, read_kitti
 from alpasim_plugin.drives.points import agreeing
 from alpasim_plugin.drives.sfm import Report, is_unposed, read_unposed
 from alpasim_plugin.drives.source import DOING, Points, SourceDrive, timed
-from alpasim_plugin.gaussians.fit.photographs import AXES, FILE, Picture, present, read_pictures, read_points
+from alpasim_plugin.gaussians.fit.photographs import (
+    AXES,
+    FILE,
+    Picture,
+    present,
+    read_pictures,
+    read_points,
+)
 from alpasim_plugin.gaussians.sh import C0
 
 PERIOD_US = 100_000  # between photographs without times
-PAIRS, FEWEST, CLEARLY = 6, 40, 1.5  # pairs that the axes are tried on; matches that tell; by how much one must be better
+PAIRS, FEWEST, CLEARLY = (
+    6,
+    40,
+    1.5,
+)  # pairs that the axes are tried on; matches that tell; by how much one must be better
 FORMS = "transforms.json, a KITTI odometry folder, a DGP scene, a COLMAP model, a video, or a folder of photographs"
 
 
@@ -30,7 +41,8 @@ def read_source(folder: Path, work: Path, tell: Report, photographs: bool = True
         folder: A folder, or a video.
         work: Receives what structure from motion finds; only made where there are no poses.
         tell: Called as the work goes on.
-        photographs: Whether they must be there; poses and lenses alone are enough for a model that is trained already.
+        photographs: Whether they must be there; poses and lenses alone are enough for a model that
+            is trained already.
 
     Raises:
         InputError: There is nothing, no reader knows it, or it is damaged.
@@ -47,8 +59,14 @@ def read_source(folder: Path, work: Path, tell: Report, photographs: bool = True
         return read_colmap(folder, photographs=photographs)
     if is_unposed(folder):
         return read_unposed(folder, work, tell)
-    inside = ", ".join(sorted(path.name for path in folder.iterdir())[:5]) if folder.is_dir() else "a file"
-    raise InputError(DOING, str(folder), f"{inside or 'nothing'}: no known form of a drive", f"give {FORMS}")
+    inside = (
+        ", ".join(sorted(path.name for path in folder.iterdir())[:5])
+        if folder.is_dir()
+        else "a file"
+    )
+    raise InputError(
+        DOING, str(folder), f"{inside or 'nothing'}: no known form of a drive", f"give {FORMS}"
+    )
 
 
 def _transforms(folder: Path, photographs: bool) -> SourceDrive:
@@ -64,7 +82,9 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
     some = photographs or any(one.file.is_file() for one in listed)
     there, missing = present(folder, listed) if some else (listed, ())
     if missing:
-        notes.append(f"{len(missing)} of {len(listed)} listed photographs are missing and left out: {', '.join(missing[:4])}...")
+        notes.append(
+            f"{len(missing)} of {len(listed)} listed photographs are missing and left out: {', '.join(missing[:4])}..."
+        )
     names = list(dict.fromkeys(one.camera or "front" for one in there))
     front = next((name for name in names if "front" in name), names[0])
     pictures: list[Picture] = []
@@ -72,25 +92,48 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
         mine = [replace(one, camera=name) for one in there if (one.camera or "front") == name]
         if all(one.t_us is None for one in mine):
             mine.sort(key=lambda one: one.file.name)
-            notes.append(f"no times: photographs of {name} are taken by name, {1_000_000 // PERIOD_US} a second")
+            notes.append(
+                f"no times: photographs of {name} are taken by name, {1_000_000 // PERIOD_US} a second"
+            )
         elif any(one.t_us is None for one in mine):
             bad = next(one for one in mine if one.t_us is None)
-            raise InputError(DOING, bad.where, "no t_us, which other photographs have", "give every photograph its time, or none")
+            raise InputError(
+                DOING,
+                bad.where,
+                "no t_us, which other photographs have",
+                "give every photograph its time, or none",
+            )
         pictures += sorted(timed(mine, PERIOD_US), key=lambda one: int(one.t_us or 0))
-    kept = tuple(sorted({str(one.camera) for one in pictures if one.more.get("use") == "never-fitted"}))
+    kept = tuple(
+        sorted({str(one.camera) for one in pictures if one.more.get("use") == "never-fitted"})
+    )
     metric = "the file's word that its unit is the metre" if document.get("unit") == "m" else None
     points = document.get("ply_file_path")
     cloud = None if points is None else read_points(folder / str(points))
     given = (
         None
         if cloud is None
-        else Points(np.asarray(cloud.means, dtype=np.float64), np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1), np.zeros((len(cloud), 3, 3)))
+        else Points(
+            np.asarray(cloud.means, dtype=np.float64),
+            np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1),
+            np.zeros((len(cloud), 3, 3)),
+        )
     )
-    return SourceDrive("transforms", folder.resolve().name, tuple(pictures), front, kept, metric, points=given, notes=tuple(notes))
+    return SourceDrive(
+        "transforms",
+        folder.resolve().name,
+        tuple(pictures),
+        front,
+        kept,
+        metric,
+        points=given,
+        notes=tuple(notes),
+    )
 
 
 def recognised_axes(folder: Path) -> tuple[str, str]:
-    """Return the convention of axes of a ``transforms.json`` under which neighbouring photographs fit together, and a note.
+    """Return the convention of axes of a ``transforms.json`` under which neighbouring photographs
+    fit together, and a note.
 
     With the wrong one epipolar lines are mirrored, or points lie behind the cameras.
 
@@ -107,4 +150,7 @@ def recognised_axes(folder: Path) -> tuple[str, str]:
         found = f"no 'axes', and photographs fit together alike with {best} ({inliers[best]} matches) and {other} ({inliers[other]})"
         do = 'write "axes": "opencv" (y down, z forward) or "axes": "opengl" (y up, z back) into the file'
         raise InputError(DOING, str(folder / FILE), found, do)
-    return best, f"axes recognised as {best}: {inliers[best]} matches of neighbouring photographs fit, {inliers[other]} with {other}"
+    return (
+        best,
+        f"axes recognised as {best}: {inliers[best]} matches of neighbouring photographs fit, {inliers[other]} with {other}",
+    )

@@ -1,4 +1,6 @@
-"""Put a drive into the scenario's world: up, scale, ground, the rig's path and mounts, and a corridor where there is no map."""
+"""Put a drive into the scenario's world: up, scale, ground, the rig's path and mounts, and a
+corridor where there is no map.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,13 @@ import numpy as np
 import scipy
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, inverse, matrix_from_quat, se3, trajectory_from_poses
+from alpasim_plugin.core.geometry import (
+    arc_lengths,
+    inverse,
+    matrix_from_quat,
+    se3,
+    trajectory_from_poses,
+)
 from alpasim_plugin.core.types import F64, Actor, HeightField, Lane, LaneMap, Trajectory
 from alpasim_plugin.drives.ground import GroundStrip, fit_ground
 from alpasim_plugin.drives.source import DOING, Points, SourceDrive
@@ -22,7 +30,12 @@ from scenarios.recorded import SourceFiles
 CAMERA_HEIGHT_M = 1.5  # assumed where neither the files nor the user say it
 AHEAD_OF_AXLE_M = 1.6  # of the front camera, assumed: behind the windscreen of a car
 OFF_THE_MAP_M = 5.0  # from the nearest lane, on the median
-LANE_M, BEFORE_M, BEYOND_M, VERTEX_M = 3.5, 8.0, 15.0, 1.0  # of the corridor: width, how far it goes on, distance of vertices
+LANE_M, BEFORE_M, BEYOND_M, VERTEX_M = (
+    3.5,
+    8.0,
+    15.0,
+    1.0,
+)  # of the corridor: width, how far it goes on, distance of vertices
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +73,17 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
     Args:
         drive: As its files say it.
         points: In the drive's frame.
-        camera_height_m: Of the front camera above the ground; None: as the poses say, or assumed where they have no unit.
+        camera_height_m: Of the front camera above the ground; None: as the poses say, or assumed
+            where they have no unit.
     """
     T, strip, found_up = _levelled(drive, points)
     scale, scale_note = _scale(drive, strip, camera_height_m)
     T = np.diag([scale, scale, scale, 1.0]) @ T
     moved = points.moved(T)
-    poses = {name: np.array([_moved(T, one.T_world_camera) for one in drive.of(name)]) for name in drive.cameras}
+    poses = {
+        name: np.array([_moved(T, one.T_world_camera) for one in drive.of(name)])
+        for name in drive.cameras
+    }
     strip = fit_ground(moved, poses[drive.front][:, :3, 3])
     height = camera_height_m or CAMERA_HEIGHT_M
     field = strip.field() if strip else _below(poses[drive.front][:, :3, 3], height)
@@ -75,7 +92,9 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
     shift[:3, 3] = -first[0], -first[1], -float(height_at(field, first[None])[0])
     T, moved = shift @ T, moved.moved(shift)
     poses = {name: shift @ values for name, values in poses.items()}
-    field = HeightField(field.x0_m + shift[0, 3], field.y0_m + shift[1, 3], field.cell_m, field.z + shift[2, 3])
+    field = HeightField(
+        field.x0_m + shift[0, 3], field.y0_m + shift[1, 3], field.cell_m, field.z + shift[2, 3]
+    )
     strip = fit_ground(moved, poses[drive.front][:, :3, 3]) if strip else None
     ego, mounts, mount_notes = _rig(drive, T, poses, field)
     notes = [found_up, scale_note, *mount_notes]
@@ -85,16 +104,30 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
             "photographs (simrun bench real); a drive needs photographs taken along a road"
         )
     return PlacedDrive(
-        T, moved, field, strip, ego, mounts, poses, tuple(_moved_actor(T, one) for one in drive.tracks),
-        {"up": found_up, "scale": scale_note, "ground": _ground_facts(strip)}, tuple(notes),
-    )  # fmt: skip
+        T,
+        moved,
+        field,
+        strip,
+        ego,
+        mounts,
+        poses,
+        tuple(_moved_actor(T, one) for one in drive.tracks),
+        {"up": found_up, "scale": scale_note, "ground": _ground_facts(strip)},
+        tuple(notes),
+    )
 
 
 def _levelled(drive: SourceDrive, points: Points) -> tuple[F64, GroundStrip | None, str]:
-    """Return the transform that puts the drive's up along z (and, without a given up, its first heading along x), and the ground found."""
+    """Return the transform that puts the drive's up along z (and, without a given up, its first
+    heading along x), and the ground found.
+    """
     front = np.array([one.T_world_camera for one in drive.of(drive.front)])
     given = drive.up is not None
-    up = np.asarray(drive.up, dtype=np.float64) if drive.up is not None else -front[:, :3, 1].mean(axis=0)
+    up = (
+        np.asarray(drive.up, dtype=np.float64)
+        if drive.up is not None
+        else -front[:, :3, 1].mean(axis=0)
+    )
     T = _upright(up, None if given else front)
     strip = None
     for _ in range(1 if given else 3):
@@ -110,7 +143,9 @@ def _levelled(drive: SourceDrive, points: Points) -> tuple[F64, GroundStrip | No
 
 
 def _upright(up: F64, front: F64 | None) -> F64:
-    """Return a rotation ``(4, 4)`` that puts ``up`` along z; the first heading of cameras ``(N, 4, 4)`` along x, or the least turn."""
+    """Return a rotation ``(4, 4)`` that puts ``up`` along z; the first heading of cameras ``(N, 4,
+    4)`` along x, or the least turn.
+    """
     z = up / np.linalg.norm(up)
     forward = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     if front is not None:
@@ -136,15 +171,23 @@ def _normal(strip: GroundStrip) -> F64:
     return np.asarray(normal / np.linalg.norm(normal))
 
 
-def _scale(drive: SourceDrive, strip: GroundStrip | None, camera_height_m: float | None) -> tuple[float, str]:
+def _scale(
+    drive: SourceDrive, strip: GroundStrip | None, camera_height_m: float | None
+) -> tuple[float, str]:
     if drive.metric is not None:
         return 1.0, f"scale from {drive.metric}"
     wanted = camera_height_m or CAMERA_HEIGHT_M
     how = "as given" if camera_height_m else "assumed; `simrun import drive` takes --camera-height"
     if strip is not None:
-        return wanted / strip.height, f"scale from the camera's height above the ground, {wanted:g} m ({how})"
+        return (
+            wanted / strip.height,
+            f"scale from the camera's height above the ground, {wanted:g} m ({how})",
+        )
     reach = float(np.linalg.norm(drive.path - drive.path.mean(axis=0), axis=1).max())
-    return 4.0 / reach, "scale unknown: neither poses in metres nor a ground below the camera; the path reaches 4 m from its middle"
+    return (
+        4.0 / reach,
+        "scale unknown: neither poses in metres nor a ground below the camera; the path reaches 4 m from its middle",
+    )
 
 
 def _moved(T: F64, T_world_camera: F64) -> F64:
@@ -165,26 +208,35 @@ def _matrices(track: Trajectory) -> F64:
 
 
 def _below(path: F64, height: float) -> HeightField:
-    """Return the ground at a height below a path that saw none: the path's own heights, nearest first."""
+    """Return the ground at a height below a path that saw none: the path's own heights, nearest
+    first.
+    """
     corners = np.array([[dx, dy, 0.0] for dx in (-60.0, 60.0) for dy in (-60.0, 60.0)])
     around = np.concatenate([path, path[:1] + corners, path[-1:] + corners])
     around[:, 2] -= height
     return from_points(around, 2.0)
 
 
-def _rig(drive: SourceDrive, T: F64, poses: Mapping[str, F64], field: HeightField) -> tuple[Trajectory, dict[str, F64], list[str]]:
+def _rig(
+    drive: SourceDrive, T: F64, poses: Mapping[str, F64], field: HeightField
+) -> tuple[Trajectory, dict[str, F64], list[str]]:
     """Return the rig's poses and the cameras' mounts; the rig's origin stands on the ground."""
     if drive.ego is not None and drive.mounts is not None:
         rig = np.array([_moved(T, pose) for pose in _matrices(drive.ego)])
         above = float(np.median(rig[:, 2, 3] - height_at(field, rig[:, :3, 3])))
         lower = np.eye(4)
         lower[2, 3] = -above
-        mounts = {name: inverse(lower) @ mount for name, mount in drive.mounts.items() if name in poses}
+        mounts = {
+            name: inverse(lower) @ mount for name, mount in drive.mounts.items() if name in poses
+        }
         note = f"the rig's origin lies {above:.2f} m above the ground that was found, and was put on it"
         return trajectory_from_poses(drive.ego.t_us, rig @ lower), mounts, [note]
     front, pictures = poses[drive.front], drive.of(drive.front)
     mount = _front_mount(front, field)
-    ego = trajectory_from_poses(np.array([int(one.t_us or 0) for one in pictures]), np.array([pose @ inverse(mount) for pose in front]))
+    ego = trajectory_from_poses(
+        np.array([int(one.t_us or 0) for one in pictures]),
+        np.array([pose @ inverse(mount) for pose in front]),
+    )
     times = {one.t_us: i for i, one in enumerate(pictures)}
     mounts = {drive.front: mount}
     for name in drive.cameras[1:]:
@@ -192,20 +244,36 @@ def _rig(drive: SourceDrive, T: F64, poses: Mapping[str, F64], field: HeightFiel
         if common:
             i, j = common[len(common) // 2]
             mounts[name] = mount @ inverse(front[i]) @ poses[name][j]
-    return ego, mounts, [f"the front camera is taken to stand {AHEAD_OF_AXLE_M:g} m ahead of the rear axle"]
+    return (
+        ego,
+        mounts,
+        [f"the front camera is taken to stand {AHEAD_OF_AXLE_M:g} m ahead of the rear axle"],
+    )
 
 
 def _front_mount(front: F64, field: HeightField) -> F64:
-    """Return the front camera's pose on the rig: its mean direction against the road and the way it moves, its median height."""
+    """Return the front camera's pose on the rig: its mean direction against the road and the way it
+    moves, its median height.
+    """
     centres = front[:, :3, 3]
     step = np.gradient(centres, axis=0)
-    moving = np.linalg.norm(step[:, :2], axis=1) > 0.3 * np.median(np.linalg.norm(step[:, :2], axis=1))
+    moving = np.linalg.norm(step[:, :2], axis=1) > 0.3 * np.median(
+        np.linalg.norm(step[:, :2], axis=1)
+    )
     turns = []
     for pose, along in zip(front[moving], step[moving], strict=True):
         heading = along[:2] / np.linalg.norm(along[:2])
-        if heading @ pose[:2, 2] < 0:  # it looks back, or the drive goes backwards: the camera's own direction counts
+        if (
+            heading @ pose[:2, 2] < 0
+        ):  # it looks back, or the drive goes backwards: the camera's own direction counts
             heading = pose[:2, 2] / max(float(np.linalg.norm(pose[:2, 2])), 1e-9)
-        ahead = float(height_at(field, (pose[:2, 3] + heading)[None])[0] - height_at(field, (pose[:2, 3] - heading)[None])[0]) / 2
+        ahead = (
+            float(
+                height_at(field, (pose[:2, 3] + heading)[None])[0]
+                - height_at(field, (pose[:2, 3] - heading)[None])[0]
+            )
+            / 2
+        )
         x = np.array([*heading, ahead]) / np.sqrt(1 + ahead**2)
         y = np.cross([0.0, 0.0, 1.0], x)
         y /= np.linalg.norm(y)
@@ -221,18 +289,27 @@ def _ground_facts(strip: GroundStrip | None) -> dict[str, object] | None:
     if strip is None:
         return None
     errors = np.abs(strip.section_errors)
-    worst, usual = (round(float(value), 4) for value in (errors.max(), np.median(errors))) if len(errors) else (None, None)
+    worst, usual = (
+        (round(float(value), 4) for value in (errors.max(), np.median(errors)))
+        if len(errors)
+        else (None, None)
+    )
     return {
-        "points": strip.used, "camera_height_m": round(strip.height, 3), "sections": len(errors), "median_error_m": usual,
+        "points": strip.used,
+        "camera_height_m": round(strip.height, 3),
+        "sections": len(errors),
+        "median_error_m": usual,
         "worst_error_m": worst,
-    }  # fmt: skip
+    }
 
 
 NO_MAP = "no map: the road is the driven path, 3.5 m wide, without paint"
 
 
 def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
-    """Return the driven path as one lane of usual width, without paint: nothing says where lines were."""
+    """Return the driven path as one lane of usual width, without paint: nothing says where lines
+    were.
+    """
     xy = ego.xyz[:, :2]
     keep = [0]
     for i in range(1, len(xy)):
@@ -240,48 +317,76 @@ def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
             keep.append(i)
     line = xy[keep] if len(keep) > 1 else np.stack([xy[0], xy[0] + _heading(ego)])
     first, last = line[1] - line[0], line[-1] - line[-2]
-    line = np.concatenate([
-        [line[0] - first / np.linalg.norm(first) * BEFORE_M], line, [line[-1] + last / np.linalg.norm(last) * BEYOND_M]
-    ])  # fmt: skip
+    line = np.concatenate(
+        [
+            [line[0] - first / np.linalg.norm(first) * BEFORE_M],
+            line,
+            [line[-1] + last / np.linalg.norm(last) * BEYOND_M],
+        ]
+    )
     s = arc_lengths(line)
     at = np.linspace(0.0, s[-1], max(2, int(s[-1] / VERTEX_M) + 1))
     centre = np.stack([np.interp(at, s, line[:, axis]) for axis in range(2)], axis=1)
     along = np.gradient(centre, axis=0)
-    left = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    left = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(
+        np.linalg.norm(along, axis=1, keepdims=True), 1e-12
+    )
     edges = [centre + side * LANE_M / 2 * left for side in (0.0, 1.0, -1.0)]
     middle, one, other = (np.column_stack([edge, height_at(field, edge)]) for edge in edges)
-    return LaneMap({"corridor": Lane("corridor", middle, one, other, left_paint="none", right_paint="none")})
+    return LaneMap(
+        {"corridor": Lane("corridor", middle, one, other, left_paint="none", right_paint="none")}
+    )
 
 
 def _heading(ego: Trajectory) -> F64:
     return np.asarray(matrix_from_quat(ego.quat[0])[:2, 0])
 
 
-def given_map(path: Path, drive: SourceDrive, placed: PlacedDrive) -> tuple[LaneMap, tuple[str, ...]]:
-    """Read an OpenDRIVE map in the drive's own coordinates, lay it onto the ground that was found, and return it with notes.
+def given_map(
+    path: Path, drive: SourceDrive, placed: PlacedDrive
+) -> tuple[LaneMap, tuple[str, ...]]:
+    """Read an OpenDRIVE map in the drive's own coordinates, lay it onto the ground that was found,
+    and return it with notes.
 
     Raises:
-        InputError: The drive has no metres, the file is no map, or it lies elsewhere than the drive; then the offset is named.
+        InputError: The drive has no metres, the file is no map, or it lies elsewhere than the
+            drive; then the offset is named.
     """
     if drive.metric is None:
-        raise InputError(DOING, str(path), "a map in metres for poses without a unit", "give poses in metres, in the map's coordinates")
+        raise InputError(
+            DOING,
+            str(path),
+            "a map in metres for poses without a unit",
+            "give poses in metres, in the map's coordinates",
+        )
     files = SourceFiles(DOING)
     odr = parse_map(files, path, files.read_xml(path))
     lane_map, notes = lane_map_of(files, path, odr, placed.T_world_source)
-    centres = np.concatenate([lane.centre for lane in lane_map.lanes.values() if lane.kind == "vehicle"])
+    centres = np.concatenate(
+        [lane.centre for lane in lane_map.lanes.values() if lane.kind == "vehicle"]
+    )
     away, nearest = scipy.spatial.KDTree(centres[:, :2]).query(placed.ego.xyz[:, :2])
     if np.median(away) > OFF_THE_MAP_M:
-        dx, dy = np.linalg.inv(placed.T_world_source)[:2, :2] @ np.median(centres[nearest, :2] - placed.ego.xyz[:, :2], axis=0)
+        dx, dy = np.linalg.inv(placed.T_world_source)[:2, :2] @ np.median(
+            centres[nearest, :2] - placed.ego.xyz[:, :2], axis=0
+        )
         found = f"its nearest lane lies {np.median(away):.1f} m from the drive: {dx:+.1f} m in x and {dy:+.1f} m in y"
-        raise InputError(DOING, str(path), found, "give the map of this street, in the coordinates of the poses")
+        raise InputError(
+            DOING, str(path), found, "give the map of this street, in the coordinates of the poses"
+        )
 
     def laid(line: F64) -> F64:
         return np.column_stack([line[:, :2], height_at(placed.ground, line)])
 
-    lanes = {key: replace(
-        lane, centre=laid(lane.centre), left=None if lane.left is None else laid(lane.left),
-        right=None if lane.right is None else laid(lane.right),
-    ) for key, lane in lane_map.lanes.items()}  # fmt: skip
+    lanes = {
+        key: replace(
+            lane,
+            centre=laid(lane.centre),
+            left=None if lane.left is None else laid(lane.left),
+            right=None if lane.right is None else laid(lane.right),
+        )
+        for key, lane in lane_map.lanes.items()
+    }
     edges = tuple(laid(edge) for edge in lane_map.road_edges)
     return replace(lane_map, lanes=lanes, road_edges=edges), (
         f"the road is that of {path.name}, laid onto the ground that was found",

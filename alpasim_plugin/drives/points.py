@@ -1,7 +1,9 @@
-"""What photographs with known poses say of the world: points of surfaces, points of the road, and where the poses themselves are off.
+"""What photographs with known poses say of the world: points of surfaces, points of the road, and
+where the poses themselves are off.
 
-The road has too little contrast for features. The next photographs are warped onto a photograph by the plane of the road ahead; what is
-left is a shift of a few pixels, which optical flow finds on asphalt too; undoing the warp gives rays, and the rays give points.
+The road has too little contrast for features. The next photographs are warped onto a photograph by
+the plane of the road ahead; what is left is a shift of a few pixels, which optical flow finds on
+asphalt too; undoing the warp gives rays, and the rays give points.
 """
 
 from __future__ import annotations
@@ -21,11 +23,21 @@ from alpasim_plugin.drives.source import DOING, Points, SourceDrive
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.photographs import Picture, resized
 from alpasim_plugin.gaussians.fit.start import matches
-from alpasim_plugin.gaussians.fit.tracks import Tracks, corrected, follow, place, pose_arrays, residuals
+from alpasim_plugin.gaussians.fit.tracks import (
+    Tracks,
+    corrected,
+    follow,
+    place,
+    pose_arrays,
+    residuals,
+)
 from alpasim_plugin.gaussians.fit.views import PosedView
 
 WIDTH_PX = 1280  # following and matching need no more
-ERROR_PX, PIXEL_SPREAD = 1.2, 0.3  # of a point in each photograph that places it: largest, and usual
+ERROR_PX, PIXEL_SPREAD = (
+    1.2,
+    0.3,
+)  # of a point in each photograph that places it: largest, and usual
 FEWEST_VIEWS, LEAST_ANGLE_RAD = 3, np.radians(0.7)  # that place a point; between its outermost rays
 FEWEST_POINTS = 60
 
@@ -39,41 +51,56 @@ def small_view(picture: Picture) -> PosedView:
 def triangulated(pictures: Sequence[Picture], folder: str) -> Points:
     """Return the points that at least three photographs place alike.
 
-    Corners are followed from photograph to photograph; photographs too far apart for that are matched.
+    Corners are followed from photograph to photograph; photographs too far apart for that are
+    matched.
 
     Args:
         pictures: Of one camera, in order along the way.
         folder: For messages.
 
     Raises:
-        InputError: Fewer than `FEWEST_POINTS` points: the photographs do not overlap, or their poses are not theirs.
+        InputError: Fewer than `FEWEST_POINTS` points: the photographs do not overlap, or their
+            poses are not theirs.
     """
     views = [small_view(picture) for picture in pictures]
     points = placed(follow(views), views)
     if len(points) < 4 * FEWEST_POINTS:
         points = max(points, placed(_matched(views), views), key=len)
     if len(points) < FEWEST_POINTS:
-        found = f"{len(points)} points that {FEWEST_VIEWS} of {len(pictures)} photographs place alike"
+        found = (
+            f"{len(points)} points that {FEWEST_VIEWS} of {len(pictures)} photographs place alike"
+        )
         do = "give photographs that overlap, in order along the way, with their own poses and lens"
         raise InputError(DOING, folder, found, do)
     return points
 
 
 def placed(tracks: Tracks, views: Sequence[PosedView]) -> Points:
-    """Place tracks, and return the points that at least three views place alike, with how well each is known."""
+    """Place tracks, and return the points that at least three views place alike, with how well each
+    is known.
+    """
     if not tracks.count:
         return Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     cameras = [view.camera for view in views]
     first = place(tracks, cameras)
-    tracks = tracks.only(np.asarray(first.error_px < 3 * ERROR_PX))  # observations that do not fit are left out once
+    tracks = tracks.only(
+        np.asarray(first.error_px < 3 * ERROR_PX)
+    )  # observations that do not fit are left out once
     if not tracks.count:
         return Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     found = place(tracks, cameras)
     worst, count = np.zeros(tracks.count), np.bincount(tracks.point, minlength=tracks.count)
     np.maximum.at(worst, tracks.point, found.error_px)
-    good = (count >= FEWEST_VIEWS) & (worst < ERROR_PX) & (found.angle_rad > LEAST_ANGLE_RAD) & np.isfinite(found.xyz).all(axis=1)
+    good = (
+        (count >= FEWEST_VIEWS)
+        & (worst < ERROR_PX)
+        & (found.angle_rad > LEAST_ANGLE_RAD)
+        & np.isfinite(found.xyz).all(axis=1)
+    )
     begins = np.searchsorted(tracks.point, np.arange(tracks.count))
-    colours = np.array([_colour(views[tracks.view[i]], tracks.at[i]) for i in begins]).reshape(-1, 3)
+    colours = np.array([_colour(views[tracks.view[i]], tracks.at[i]) for i in begins]).reshape(
+        -1, 3
+    )
     return Points(found.xyz, colours, _covariance(found.xyz, tracks, cameras)).chosen(good)
 
 
@@ -91,26 +118,40 @@ def _covariance(xyz: F64, tracks: Tracks, cameras: Sequence[PinholeCamera]) -> F
 
 
 def _matched(views: Sequence[PosedView]) -> Tracks:
-    """Return tracks of features that were matched between near photographs; one that meets a photograph twice is left out."""
+    """Return tracks of features that were matched between near photographs; one that meets a
+    photograph twice is left out.
+    """
     found = matches(views)
     if not found:
         return Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), 0)
-    ends = np.array([[m.first, *m.at_first] for m in found] + [[m.second, *m.at_second] for m in found])
+    ends = np.array(
+        [[m.first, *m.at_first] for m in found] + [[m.second, *m.at_second] for m in found]
+    )
     seen, number = np.unique(ends, axis=0, return_inverse=True)
     number, n = number.ravel(), len(found)
-    graph = scipy.sparse.coo_matrix((np.ones(n), (number[:n], number[n:])), shape=(len(seen), len(seen)))
+    graph = scipy.sparse.coo_matrix(
+        (np.ones(n), (number[:n], number[n:])), shape=(len(seen), len(seen))
+    )
     _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
     view = seen[:, 0].astype(np.int64)
-    _, index, times = np.unique(np.stack([label, view], axis=1), axis=0, return_inverse=True, return_counts=True)
+    _, index, times = np.unique(
+        np.stack([label, view], axis=1), axis=0, return_inverse=True, return_counts=True
+    )
     twice = np.unique(label[times[index.ravel()] > 1])
     keep = ~np.isin(label, twice)
     order = np.argsort(label[keep], kind="stable")
     _, point = np.unique(label[keep][order], return_inverse=True)
-    return Tracks(view[keep][order], point.astype(np.int64), seen[keep][order, 1:], int(point.max(initial=-1)) + 1)
+    return Tracks(
+        view[keep][order],
+        point.astype(np.int64),
+        seen[keep][order, 1:],
+        int(point.max(initial=-1)) + 1,
+    )
 
 
 def agreeing(one: Picture, other: Picture, turns: Sequence[F64]) -> list[int]:
-    """Return for each turn of the camera's axes how many matches of two photographs lie before both, where both see them.
+    """Return for each turn of the camera's axes how many matches of two photographs lie before
+    both, where both see them.
 
     Args:
         one, other: Photographs.
@@ -126,7 +167,10 @@ def agreeing(one: Picture, other: Picture, turns: Sequence[F64]) -> list[int]:
     tracks = Tracks(np.tile([0, 1], n), np.repeat(np.arange(n), 2), at, n)
     counts = []
     for turn in turns:
-        turned = [PinholeCamera(c.width, c.height, c.K, inverse(turn) @ c.T_camera_world) for c in (view.camera for view in views)]
+        turned = [
+            PinholeCamera(c.width, c.height, c.K, inverse(turn) @ c.T_camera_world)
+            for c in (view.camera for view in views)
+        ]
         error = place(tracks, turned).error_px.reshape(-1, 2)
         counts.append(int((error < ERROR_PX).all(axis=1).sum()))
     return counts
@@ -134,7 +178,11 @@ def agreeing(one: Picture, other: Picture, turns: Sequence[F64]) -> list[int]:
 
 NEAR, FAR = 2.0, 9.0  # of the piece of road that is looked at, in camera heights
 ASIDE = (0.75, 1.5)  # to both sides: under the wheels, where there is least to see, and beside them
-CORNERS, CORNER_CONTRAST, APART_PX = (250, 60), 0.01, 6.0  # in each of the two; contrast is relative, and asphalt is faint
+CORNERS, CORNER_CONTRAST, APART_PX = (
+    (250, 60),
+    0.01,
+    6.0,
+)  # in each of the two; contrast is relative, and asphalt is faint
 NEXT = (1, 2, 3)  # photographs
 WINDOW_PX, BACK_PX = 21, 0.25  # of the flow; how near it must come back
 MOST_PX = 12.0  # more than this and the plane was no prediction
@@ -151,8 +199,14 @@ def road_points(pictures: Sequence[Picture], poses: F64, strip: GroundStrip) -> 
     Returns:
         Points in the strip's frame.
     """
-    views = [small_view(replace(picture, T_world_camera=pose)) for picture, pose in zip(pictures, poses, strict=True)]
-    shots = [(view.camera, np.asarray(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)) for view in views]
+    views = [
+        small_view(replace(picture, T_world_camera=pose))
+        for picture, pose in zip(pictures, poses, strict=True)
+    ]
+    shots = [
+        (view.camera, np.asarray(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8))
+        for view in views
+    ]
     rows = [np.zeros((0, 4))]
     count = 0
     for i in range(len(shots) - 1):
@@ -167,13 +221,21 @@ def road_points(pictures: Sequence[Picture], poses: F64, strip: GroundStrip) -> 
 
 
 def _tracked(i: int, shots: Sequence[tuple[PinholeCamera, U8]], strip: GroundStrip) -> F64:
-    """Return observations of the road seen in photograph ``i``: rows of track, view and pixel, sorted by track."""
+    """Return observations of the road seen in photograph ``i``: rows of track, view and pixel,
+    sorted by track.
+    """
     camera, image = shots[i]
     pieces = [_piece_ahead(strip, camera.centre_world, aside) for aside in ASIDE]
     masks = [_mask(camera, piece) for piece in pieces]
     masks[1] = masks[1] & ~masks[0]
-    corners = [cv2.goodFeaturesToTrack(image, n, CORNER_CONTRAST, APART_PX, mask=m) for n, m in zip(CORNERS, masks, strict=True) if m.any()]
-    at = np.concatenate([np.zeros((0, 2)), *(one.reshape(-1, 2) for one in corners if one is not None)]).astype(np.float32)
+    corners = [
+        cv2.goodFeaturesToTrack(image, n, CORNER_CONTRAST, APART_PX, mask=m)
+        for n, m in zip(CORNERS, masks, strict=True)
+        if m.any()
+    ]
+    at = np.concatenate(
+        [np.zeros((0, 2)), *(one.reshape(-1, 2) for one in corners if one is not None)]
+    ).astype(np.float32)
     if not len(at):
         return np.zeros((0, 4))
     normal, away = _plane(pieces[0], camera.T_camera_world)
@@ -181,12 +243,21 @@ def _tracked(i: int, shots: Sequence[tuple[PinholeCamera, U8]], strip: GroundStr
     for j in (i + k for k in NEXT if i + k < len(shots)):
         other, shown = shots[j]
         move = other.T_camera_world @ inverse(camera.T_camera_world)
-        H = other.K @ (move[:3, :3] + np.outer(move[:3, 3], normal) / away) @ np.linalg.inv(camera.K)
+        H = (
+            other.K
+            @ (move[:3, :3] + np.outer(move[:3, 3], normal) / away)
+            @ np.linalg.inv(camera.K)
+        )
         from_corner = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
         H = np.linalg.inv(from_corner) @ H @ from_corner  # OpenCV counts from pixel centres
-        warped = cv2.warpPerspective(shown, H, (camera.width, camera.height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        warped = cv2.warpPerspective(
+            shown, H, (camera.width, camera.height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        )
         inside = cv2.warpPerspective(
-            np.full_like(shown, 255), H, (camera.width, camera.height), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+            np.full_like(shown, 255),
+            H,
+            (camera.width, camera.height),
+            flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
         )
         moved, good = _flow(image, np.asarray(warped, dtype=np.uint8), at)
         cells = np.clip(np.rint(moved), 0, [camera.width - 1, camera.height - 1]).astype(np.int64)
@@ -205,14 +276,20 @@ def _rows(track: I64, view: int, at: F64) -> F64:
 def _flow(image: U8, warped: U8, at: F32) -> tuple[F32, Bool]:
     """Return where points moved to, and which came back to where they were."""
     options = {"winSize": (WINDOW_PX, WINDOW_PX), "maxLevel": 2}
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(image, warped, at, at.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **options)  # type: ignore[call-overload]
-    back, again, _ = cv2.calcOpticalFlowPyrLK(warped, image, moved, at.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **options)  # type: ignore[call-overload]
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        image, warped, at, at.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **options
+    )  # type: ignore[call-overload]
+    back, again, _ = cv2.calcOpticalFlowPyrLK(
+        warped, image, moved, at.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **options
+    )  # type: ignore[call-overload]
     good = (found.ravel() > 0) & (again.ravel() > 0) & (np.linalg.norm(back - at, axis=1) < BACK_PX)
     return moved, good & (np.linalg.norm(moved - at, axis=1) < MOST_PX)
 
 
 def _piece_ahead(strip: GroundStrip, centre: F64, aside: float) -> F64:
-    """Return corners ``(8, 3)`` of the piece of road ahead of a camera, on the strip, to ``aside`` camera heights beside the path."""
+    """Return corners ``(8, 3)`` of the piece of road ahead of a camera, on the strip, to ``aside``
+    camera heights beside the path.
+    """
     here = strip.frame.place(centre[None])[0][0]
     out = []
     for ahead in np.linspace(NEAR, FAR, 4) * strip.height:
@@ -225,7 +302,9 @@ def _piece_ahead(strip: GroundStrip, centre: F64, aside: float) -> F64:
 
 
 def _plane(piece: F64, T: F64) -> tuple[F64, float]:
-    """Return the plane of a piece of road in a camera's axes: unit normal and distance, ``normal . x = distance``."""
+    """Return the plane of a piece of road in a camera's axes: unit normal and distance, ``normal .
+    x = distance``.
+    """
     local = transform_points(T, piece)
     middle = local.mean(axis=0)
     normal = np.linalg.svd(local - middle)[2][2]
@@ -245,15 +324,25 @@ def _mask(camera: PinholeCamera, piece: F64) -> U8:
 
 CORRECTING_PX = 640  # corners are followed at a tenth of a pixel: more is not needed
 LEAST_GAIN = 0.9  # the error must fall below this share of what it was
-FARTHEST_M, FARTHEST_RAD = 0.5, 0.05  # of a correction; more is another fault than a recorder's noise
+FARTHEST_M, FARTHEST_RAD = (
+    0.5,
+    0.05,
+)  # of a correction; more is another fault than a recorder's noise
 
 
 def with_corrected_poses(drive: SourceDrive) -> SourceDrive:
-    """Return the drive with the front camera's poses adjusted to its photographs, and its other cameras moved along, as a rig is rigid.
+    """Return the drive with the front camera's poses adjusted to its photographs, and its other
+    cameras moved along, as a rig is rigid.
 
-    Poses in metres are held to what they were; a drive whose points or ego poses were measured apart keeps its own.
+    Poses in metres are held to what they were; a drive whose points or ego poses were measured
+    apart keeps its own.
     """
-    if drive.metric is None or drive.points is not None or drive.ego is not None or drive.kind in ("colmap", "sfm"):
+    if (
+        drive.metric is None
+        or drive.points is not None
+        or drive.ego is not None
+        or drive.kind in ("colmap", "sfm")
+    ):
         return drive
     front = drive.of(drive.front)
     found = corrected([_small(picture) for picture in front])
@@ -262,7 +351,10 @@ def with_corrected_poses(drive: SourceDrive) -> SourceDrive:
     poses = np.array([inverse(camera.T_camera_world) for camera in found.cameras])
     moves = [new @ inverse(old.T_world_camera) for new, old in zip(poses, front, strict=True)]
     turned = [np.arccos(np.clip((np.trace(move[:3, :3]) - 1) / 2, -1, 1)) for move in moves]
-    shifted = [float(np.linalg.norm(new[:3, 3] - old.T_world_camera[:3, 3])) for new, old in zip(poses, front, strict=True)]
+    shifted = [
+        float(np.linalg.norm(new[:3, 3] - old.T_world_camera[:3, 3]))
+        for new, old in zip(poses, front, strict=True)
+    ]
     if max(shifted) > FARTHEST_M or max(turned) > FARTHEST_RAD:
         return drive
     at = {picture.t_us: move for picture, move in zip(front, moves, strict=True)}
@@ -280,4 +372,6 @@ def _small(picture: Picture) -> PosedView:
 
 
 def _moved(picture: Picture, move: F64 | None) -> Picture:
-    return picture if move is None else replace(picture, T_world_camera=move @ picture.T_world_camera)
+    return (
+        picture if move is None else replace(picture, T_world_camera=move @ picture.T_world_camera)
+    )

@@ -1,4 +1,6 @@
-"""How good an imported drive is: photographs that the fit did not see, coverage on and beside the path, ground, what is missing."""
+"""How good an imported drive is: photographs that the fit did not see, coverage on and beside the
+path, ground, what is missing.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,10 @@ from scenarios.drive import Obstacle
 ASIDE_M = (0.0, 1.0, -1.0, 2.0, -2.0)  # to the left of the path
 OPAQUE = 0.5
 SHOWN, COVERED = 6, 8  # photographs of the page; views that coverage is measured on
-PLAN_PX, PLAN_M = 900, 70.0  # the view from above: its width, and how much of the world it shows at most across
+PLAN_PX, PLAN_M = (
+    900,
+    70.0,
+)  # the view from above: its width, and how much of the world it shows at most across
 PICTURES = "pictures"
 Report = Callable[[str, int, int], None]
 
@@ -38,7 +43,8 @@ class Measured:
 
     Attributes:
         rows: Use of the photographs to their comparisons.
-        coverage: Metres beside the path to the share of the lower half of the picture that the model covers.
+        coverage: Metres beside the path to the share of the lower half of the picture that the
+            model covers.
         plan: ``(H, W, 3)`` uint8, the drive from above.
         standing: Obstacles.
         fitted: How many photographs the model was fitted to.
@@ -59,7 +65,9 @@ def measure(
     standing: Standing,
     tell: Report,
 ) -> Measured:
-    """Render the model where photographs were taken that it did not see, in the exposure of those near by, and beside the path."""
+    """Render the model where photographs were taken that it did not see, in the exposure of those
+    near by, and beside the path.
+    """
     graph = model.graph()
     known = [view for view in views["fitted"] if view.name in exposures]
     centres = np.array([view.camera.centre_world for view in known]).reshape(-1, 3)
@@ -69,10 +77,17 @@ def measure(
         chosen = [views[use][i] for i in _spread(len(views[use]), 12)]
         if chosen:
             tell(f"measuring {use} photographs", 0, 1)
-            rows[use] = [_compared(graph, view, gain_between(centres, gains, view.camera.centre_world)) for view in chosen]
+            rows[use] = [
+                _compared(graph, view, gain_between(centres, gains, view.camera.centre_world))
+                for view in chosen
+            ]
     some = [views["fitted"][i] for i in _spread(len(views["fitted"]), COVERED)]
-    coverage = {aside: float(np.mean([_covered(graph, view, aside) for view in some])) for aside in ASIDE_M}
-    return Measured(rows, coverage, _plan(placed, standing.obstacles), standing, len(views["fitted"]))
+    coverage = {
+        aside: float(np.mean([_covered(graph, view, aside) for view in some])) for aside in ASIDE_M
+    }
+    return Measured(
+        rows, coverage, _plan(placed, standing.obstacles), standing, len(views["fitted"])
+    )
 
 
 def _compared(graph: SceneGraph, view: PosedView, gain: F32) -> Comparison:
@@ -83,15 +98,23 @@ def _compared(graph: SceneGraph, view: PosedView, gain: F32) -> Comparison:
 
 
 def _spread(count: int, most: int) -> list[int]:
-    return [int(i) for i in np.unique(np.linspace(0, count - 1, min(count, most)).round())] if count else []
+    return (
+        [int(i) for i in np.unique(np.linspace(0, count - 1, min(count, most)).round())]
+        if count
+        else []
+    )
 
 
 def _covered(graph: SceneGraph, view: PosedView, aside_m: float) -> float:
-    """Return the share of the picture's lower half that the model covers, seen from beside where a view was taken."""
+    """Return the share of the picture's lower half that the model covers, seen from beside where a
+    view was taken.
+    """
     shift = np.eye(4)
     pose = inverse(view.camera.T_camera_world)
     shift[:3, 3] = -aside_m * pose[:3, 0]  # the camera's own left
-    camera = type(view.camera).from_pose(view.camera.width, view.camera.height, view.camera.K, shift @ pose)
+    camera = type(view.camera).from_pose(
+        view.camera.width, view.camera.height, view.camera.K, shift @ pose
+    )
     alpha = graph.render(camera, {}).alpha
     return float((alpha[camera.height // 2 :] > OPAQUE).mean())
 
@@ -112,17 +135,30 @@ def _plan(placed: PlacedDrive, obstacles: Sequence[Obstacle]) -> U8:
     order = np.argsort(placed.points.xyz[:, 2])
     cells = at(placed.points.xyz[order]).astype(np.int64)
     inside = ((cells >= 0) & (cells < size)).all(axis=1)
-    image[cells[inside, 1], cells[inside, 0]] = np.rint(placed.points.rgb[order][inside] * 200).astype(np.uint8)
+    image[cells[inside, 1], cells[inside, 0]] = np.rint(
+        placed.points.rgb[order][inside] * 200
+    ).astype(np.uint8)
     cv2.polylines(image, [np.rint(at(path)).astype(np.int32)], False, (30, 90, 220), 2, cv2.LINE_AA)
     for one in obstacles:
-        c, s, half = np.cos(one.yaw_rad), np.sin(one.yaw_rad), np.array([one.box.length_m, one.box.width_m]) / 2
-        corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * half @ np.array([[c, s], [-s, c]]) + one.xyz[:2]
-        cv2.polylines(image, [np.rint(at(corners)).astype(np.int32)], True, (200, 40, 30), 2, cv2.LINE_AA)
+        c = np.cos(one.yaw_rad)
+        s = np.sin(one.yaw_rad)
+        half = np.array([one.box.length_m, one.box.width_m]) / 2
+        corners = (
+            np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * half @ np.array([[c, s], [-s, c]])
+            + one.xyz[:2]
+        )
+        cv2.polylines(
+            image, [np.rint(at(corners)).astype(np.int32)], True, (200, 40, 30), 2, cv2.LINE_AA
+        )
     return image
 
 
-def write_page(folder: Path, drive: SourceDrive, placed: PlacedDrive, measured: Measured) -> dict[str, Any]:
-    """Write ``quality.json``, ``quality.md`` and the pictures, and return what ``quality.json`` holds."""
+def write_page(
+    folder: Path, drive: SourceDrive, placed: PlacedDrive, measured: Measured
+) -> dict[str, Any]:
+    """Write ``quality.json``, ``quality.md`` and the pictures, and return what ``quality.json``
+    holds.
+    """
     (folder / PICTURES).mkdir(exist_ok=True)
     shown = []
     for use, rows in measured.rows.items():
@@ -136,8 +172,14 @@ def write_page(folder: Path, drive: SourceDrive, placed: PlacedDrive, measured: 
         "photographs": {use: len(rows) for use, rows in measured.rows.items()},
         "fitted": measured.fitted,
         "tracks": len(placed.tracks),
-        **{use: {"psnr_db": _mean(rows, "psnr_db"), "ssim": _mean(rows, "ssim")} for use, rows in measured.rows.items()},
-        "coverage": [{"aside_m": aside, "share": round(share, 4)} for aside, share in measured.coverage.items()],
+        **{
+            use: {"psnr_db": _mean(rows, "psnr_db"), "ssim": _mean(rows, "ssim")}
+            for use, rows in measured.rows.items()
+        },
+        "coverage": [
+            {"aside_m": aside, "share": round(share, 4)}
+            for aside, share in measured.coverage.items()
+        ],
         "obstacles": _obstacle_facts(measured.standing),
         **placed.facts,
         "T_world_source": placed.T_world_source.tolist(),
@@ -151,8 +193,10 @@ def write_page(folder: Path, drive: SourceDrive, placed: PlacedDrive, measured: 
 def _obstacle_facts(standing: Standing) -> dict[str, Any]:
     spread = [one.uncertainty_m for one in standing.obstacles]
     return {
-        "boxes": len(spread), "uncertainty_m": round(float(np.median(spread)), 2) if spread else None, "cleared_cells": standing.cleared,
-    }  # fmt: skip
+        "boxes": len(spread),
+        "uncertainty_m": round(float(np.median(spread)), 2) if spread else None,
+        "cleared_cells": standing.cleared,
+    }
 
 
 def _mean(rows: Sequence[Comparison], name: str) -> float:
@@ -163,7 +207,9 @@ def _write(path: Path, rgb: U8) -> None:
     write_bytes(path, cv2.imencode(path.suffix, np.ascontiguousarray(rgb[..., ::-1]))[1].tobytes())
 
 
-def _page(drive: SourceDrive, quality: Mapping[str, Any], shown: Sequence[tuple[str, Comparison, str]]) -> str:
+def _page(
+    drive: SourceDrive, quality: Mapping[str, Any], shown: Sequence[tuple[str, Comparison, str]]
+) -> str:
     lines = [f"# Quality of {drive.scene_id}", "", "## What is missing or assumed", ""]
     lines += [f"- {note}" for note in quality["notes"]]
     lines += ["- no tracks of other road users: nobody moves"] if not quality["tracks"] else []
@@ -175,26 +221,45 @@ def _page(drive: SourceDrive, quality: Mapping[str, Any], shown: Sequence[tuple[
         "|---|---|---|---|",
     ]
     for use, count in quality["photographs"].items():
-        lines.append(f"| {use} | {count} | {quality[use]['psnr_db']:.2f} | {quality[use]['ssim']:.3f} |")
-    lines += ["", "## Coverage of the lower half of the picture", "", "| metres to the left of the path | covered |", "|---|---|"]
+        lines.append(
+            f"| {use} | {count} | {quality[use]['psnr_db']:.2f} | {quality[use]['ssim']:.3f} |"
+        )
+    lines += [
+        "",
+        "## Coverage of the lower half of the picture",
+        "",
+        "| metres to the left of the path | covered |",
+        "|---|---|",
+    ]
     lines += [f"| {row['aside_m']:g} | {100 * row['share']:.1f} % |" for row in quality["coverage"]]
     ground = quality["ground"]
     if ground:
         errors = (
-            f"median {100 * ground['median_error_m']:.1f} cm, worst {100 * ground['worst_error_m']:.1f} cm" if ground["sections"] else "-"
+            f"median {100 * ground['median_error_m']:.1f} cm, worst {100 * ground['worst_error_m']:.1f} cm"
+            if ground["sections"]
+            else "-"
         )
         lines += [
             "",
             f"Ground: {ground['points']} points, camera {ground['camera_height_m']:.2f} m above it; against them by section: {errors}.",
         ]
     found = quality["obstacles"]
-    sides = f", whose sides are known to {found['uncertainty_m']} m (median)" if found["boxes"] else ""
+    sides = (
+        f", whose sides are known to {found['uncertainty_m']} m (median)" if found["boxes"] else ""
+    )
     lines += [
         "",
         f"Standing obstacles: {found['boxes']} boxes{sides}. On the driven path {found['cleared_cells']} cells of 0.2 m were opaque",
     ]
     lines += ["by mistake and were taken as free."]
-    lines += ["", "## From above", "", f"![from above]({PICTURES}/plan.png)", "", "## Photograph above, reconstruction below"]
+    lines += [
+        "",
+        "## From above",
+        "",
+        f"![from above]({PICTURES}/plan.png)",
+        "",
+        "## Photograph above, reconstruction below",
+    ]
     for use, row, name in shown:
         lines += ["", f"{use}, {row.name}: {row.psnr_db:.2f} dB", "", f"![{row.name}]({name})"]
     return "\n".join(lines) + "\n"

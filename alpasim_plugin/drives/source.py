@@ -1,4 +1,6 @@
-"""What a reader of a recorded drive returns, in the frame and the unit of its own files, and the checks that all of them pass."""
+"""What a reader of a recorded drive returns, in the frame and the unit of its own files, and the
+checks that all of them pass.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from alpasim_plugin.core.types import F64, Actor, Bool, Trajectory
 from alpasim_plugin.gaussians.fit.photographs import Picture, whole_photograph
 
 DOING = "importing a drive"
-JUMP = 12.0  # a step so many times the usual one is no driving: two units, or two drives in one file
+JUMP = (
+    12.0  # a step so many times the usual one is no driving: two units, or two drives in one file
+)
 LEAST_M = 1.0
 FEWEST, MOST = 8, 400  # photographs of a camera
 
@@ -38,7 +42,9 @@ class Points:
 
     def moved(self, T: F64) -> Points:
         """Return them in another frame; ``(4, 4)``, may scale."""
-        return Points(self.xyz @ T[:3, :3].T + T[:3, 3], self.rgb, T[:3, :3] @ self.covariance @ T[:3, :3].T)
+        return Points(
+            self.xyz @ T[:3, :3].T + T[:3, 3], self.rgb, T[:3, :3] @ self.covariance @ T[:3, :3].T
+        )
 
     def chosen(self, which: Bool) -> Points:
         """Return those that a mask ``(N,)`` chooses."""
@@ -46,7 +52,10 @@ class Points:
 
     def joined(self, other: Points) -> Points:
         """Return these and others of the same frame."""
-        mine, theirs = (self.xyz, self.rgb, self.covariance), (other.xyz, other.rgb, other.covariance)
+        mine, theirs = (
+            (self.xyz, self.rgb, self.covariance),
+            (other.xyz, other.rgb, other.covariance),
+        )
         return Points(*(np.concatenate(pair) for pair in zip(mine, theirs, strict=True)))
 
     @property
@@ -74,7 +83,8 @@ class SourceDrive:
         up: ``(3,)`` against gravity; None where the files do not say it.
         points: Of LiDAR or of structure from motion; None where there are none.
         ego: Rig poses, where the files have them.
-        mounts: Camera to its pose on the rig ``(4, 4)``, where the files have them; belongs to ``ego``.
+        mounts: Camera to its pose on the rig ``(4, 4)``, where the files have them; belongs to
+            ``ego``.
         tracks: Recorded road users.
         notes: What was assumed or left out.
     """
@@ -100,7 +110,14 @@ class SourceDrive:
     def cameras(self) -> list[str]:
         """Return the cameras, the front one first."""
         names = dict.fromkeys(str(picture.camera) for picture in self.pictures)
-        return sorted(names, key=lambda name: (name != self.front, name in self.never_fitted, list(names).index(name)))
+        return sorted(
+            names,
+            key=lambda name: (
+                name != self.front,
+                name in self.never_fitted,
+                list(names).index(name),
+            ),
+        )
 
     @property
     def path(self) -> F64:
@@ -109,37 +126,62 @@ class SourceDrive:
 
 
 def checked(drive: SourceDrive, folder: Path, photographs: bool = True) -> SourceDrive:
-    """Return a drive whose poses can be those of a moving camera, and, if ``photographs`` are needed, whose photographs are whole.
+    """Return a drive whose poses can be those of a moving camera, and, if ``photographs`` are
+    needed, whose photographs are whole.
 
     Raises:
-        InputError: A photograph is cut off, or of another size than its lens or its camera's others; too few; two units of length in one
-            file; a camera that stands or only turns.
+        InputError: A photograph is cut off, or of another size than its lens or its camera's
+            others; too few; two units of length in one file; a camera that stands or only turns.
     """
     pictures = drive.of(drive.front)
     if len(pictures) < 2 or (drive.kind != "dgp" and len(pictures) < FEWEST):
         found = f"{len(pictures)} photographs of the camera {drive.front!r}"
-        raise InputError(DOING, str(folder), found, f"give at least {FEWEST} photographs with poses along a drive")
+        raise InputError(
+            DOING,
+            str(folder),
+            found,
+            f"give at least {FEWEST} photographs with poses along a drive",
+        )
     if len(pictures) > MOST:
         found = f"{len(pictures)} photographs of the camera {drive.front!r}, at most {MOST}"
-        raise InputError(DOING, str(folder), found, "give a part of the drive, or every second photograph with its pose")
+        raise InputError(
+            DOING,
+            str(folder),
+            found,
+            "give a part of the drive, or every second photograph with its pose",
+        )
     for one in drive.pictures:
         if photographs:
             whole_photograph(one.file, one.lens, one.where)
         first = drive.of(str(one.camera))[0].lens
         if (one.lens.width, one.lens.height) != (first.width, first.height):
             found = f"{one.lens.width}x{one.lens.height} pixels, others of the camera {one.camera!r} have {first.width}x{first.height}"
-            raise InputError(DOING, f"{one.where}, {one.file}", found, "give the photographs as they were, each with its camera's name")
+            raise InputError(
+                DOING,
+                f"{one.where}, {one.file}",
+                found,
+                "give the photographs as they were, each with its camera's name",
+            )
     steps = np.linalg.norm(np.diff(drive.path, axis=0), axis=1)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     length = float(steps.sum())
     if length == 0 or (drive.metric and length < LEAST_M and len(pictures) >= FEWEST):
         found = f"the camera {drive.front!r} moves {length:.2f} m over {len(pictures)} photographs: it stands, or only turns"
-        raise InputError(DOING, str(folder), found, "give a part of the drive in which the car moves: depth comes from moving")
+        raise InputError(
+            DOING,
+            str(folder),
+            found,
+            "give a part of the drive in which the car moves: depth comes from moving",
+        )
     far = int(np.argmax(steps))
     if steps[far] > JUMP * usual and steps[far] > 0.2 * length:
         one = pictures[far + 1]
-        found = f"a step of {steps[far]:.4g} to {one.file.name}, where the usual step is {usual:.4g}"
-        raise InputError(DOING, one.where, found, "give all poses in one unit, metres, and one drive at a time")
+        found = (
+            f"a step of {steps[far]:.4g} to {one.file.name}, where the usual step is {usual:.4g}"
+        )
+        raise InputError(
+            DOING, one.where, found, "give all poses in one unit, metres, and one drive at a time"
+        )
     ratio = _unit_change(steps)
     if ratio is not None:
         one = pictures[ratio[0]]
@@ -149,9 +191,14 @@ def checked(drive: SourceDrive, folder: Path, photographs: bool = True) -> Sourc
 
 
 def _unit_change(steps: F64) -> tuple[int, float] | None:
-    """Return where steps become, at once and for good, more than 30 times longer or shorter, and the factor; None where they do not."""
+    """Return where steps become, at once and for good, more than 30 times longer or shorter, and
+    the factor; None where they do not.
+    """
     for at in range(3, len(steps) - 3):
-        before, after = float(np.median(steps[max(0, at - 5) : at])), float(np.median(steps[at : at + 5]))
+        before, after = (
+            float(np.median(steps[max(0, at - 5) : at])),
+            float(np.median(steps[at : at + 5])),
+        )
         if min(before, after) > 0 and max(before / after, after / before) > 30:
             return at + 1, max(before / after, after / before)
     return None
@@ -159,4 +206,7 @@ def _unit_change(steps: F64) -> tuple[int, float] | None:
 
 def timed(pictures: Sequence[Picture], period_us: int) -> tuple[Picture, ...]:
     """Return pictures without times as taken one after another."""
-    return tuple(replace(one, t_us=i * period_us) if one.t_us is None else one for i, one in enumerate(pictures))
+    return tuple(
+        replace(one, t_us=i * period_us) if one.t_us is None else one
+        for i, one in enumerate(pictures)
+    )

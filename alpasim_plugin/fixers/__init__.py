@@ -24,7 +24,8 @@ def make_fixer(
     """Make one rollout's fixer. Networks are loaded once per process and shared.
 
     Args:
-        name: A fixer as `alpasim_plugin.core.parts.resolve` takes it: ``onefixer``, ``onefixer@2``, ``package.module:Class``.
+        name: A fixer as `alpasim_plugin.core.parts.resolve` takes it: ``onefixer``, ``onefixer@2``,
+            ``package.module:Class``.
         settings: From `fixer_settings`; None for the settings that the name stands for.
         scene_id, seed: Key of the noise, with the camera and the index in the rollout.
         device: ``cpu`` or ``cuda``.
@@ -35,13 +36,18 @@ def make_fixer(
     """
     spec = unidentified("fixer", name)
     fixer: Fixer = build(
-        spec if settings is None else replace(spec, settings=settings), scene_id=scene_id, seed=seed, device=device, threads=threads
+        spec if settings is None else replace(spec, settings=settings),
+        scene_id=scene_id,
+        seed=seed,
+        device=device,
+        threads=threads,
     )
     return fixer
 
 
 def fixer_settings(name: str, overrides: Sequence[str] = ()) -> FixerSettings:
-    """Return the settings of ``NAME`` or ``NAME@STEPS`` with dotted overrides (``window=4``, ``decoder.kind=latent``) on top.
+    """Return the settings of ``NAME`` or ``NAME@STEPS`` with dotted overrides (``window=4``,
+    ``decoder.kind=latent``) on top.
 
     Raises:
         InputError: Unknown name or key (with the nearest), or a bad value, with its position.

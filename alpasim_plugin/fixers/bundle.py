@@ -1,9 +1,11 @@
-"""Weights of a fixer in one safetensors file: its networks, and the settings they were trained with.
+"""Weights of a fixer in one safetensors file: its networks, and the settings they were trained
+with.
 
-Keys carry their part. A bundle of the kind ``per-frame`` has ``generator.``; those of latent fixers (``block``, ``render-step``,
-``noise-window``) have ``dit.``, ``vae.``, ``decoder.`` (where it is not the autoencoder's) and ``prompt.text``, or ``prompt.NAME`` for
-each of several learned prompts. The header holds ``format``, ``kind``, ``trained``, ``note`` and ``settings``, the JSON of the settings
-that the weights were trained with. Only safetensors is read: a pickle is refused.
+Keys carry their part. A bundle of the kind ``per-frame`` has ``generator.``; those of latent fixers
+(``block``, ``render-step``, ``noise-window``) have ``dit.``, ``vae.``, ``decoder.`` (where it is
+not the autoencoder's) and ``prompt.text``, or ``prompt.NAME`` for each of several learned prompts.
+The header holds ``format``, ``kind``, ``trained``, ``note`` and ``settings``, the JSON of the
+settings that the weights were trained with. Only safetensors is read: a pickle is refused.
 """
 
 from __future__ import annotations
@@ -28,7 +30,10 @@ if TYPE_CHECKING:
 
 FORMAT = "simrun-fixer-1"
 DOING = "loading a fixer's weights"
-RENAMED = {"onefixer-tiny": "onefixer-dit-tiny", "onefixer-s": "onefixer-dit-s"}  # former names in the headers of older bundles
+RENAMED = {
+    "onefixer-tiny": "onefixer-dit-tiny",
+    "onefixer-s": "onefixer-dit-s",
+}  # former names in the headers of older bundles
 OLDEST_KIND = "block"  # of bundles whose header names none
 FILES = ("bundle", "dit", "vae", "decoder", "prompt")  # of `WeightsSettings`
 S = TypeVar("S", bound=WeightedSettings)
@@ -40,7 +45,8 @@ class FixerFactory(Generic[S]):
 
     Args:
         settings_model: Of its settings.
-        session: Makes one rollout's session from settings, scene id, seed, device and threads. It imports what loads torch.
+        session: Makes one rollout's session from settings, scene id, seed, device and threads. It
+            imports what loads torch.
         help: One line for every fixer that the factory makes, by its name.
     """
 
@@ -48,7 +54,14 @@ class FixerFactory(Generic[S]):
     session: Callable[[S, str, int, str, int | None], Fixer]
     help: Mapping[str, str] = field(default_factory=dict)
 
-    def __call__(self, settings: S, scene_id: str, seed: int = 0, device: str = "cpu", threads: int | None = None) -> Fixer:
+    def __call__(
+        self,
+        settings: S,
+        scene_id: str,
+        seed: int = 0,
+        device: str = "cpu",
+        threads: int | None = None,
+    ) -> Fixer:
         """Make one rollout's session."""
         return self.session(settings, scene_id, seed, device, threads)
 
@@ -58,20 +71,40 @@ class FixerFactory(Generic[S]):
         Raises:
             InputError: Weights that are named but not there.
         """
-        files = {f"weights.{part}": path for part in FILES if (path := settings.weights.path(part)) is not None}
+        files = {
+            f"weights.{part}": path
+            for part in FILES
+            if (path := settings.weights.path(part)) is not None
+        }
         for key, path in files.items():
             if not path.is_file():
                 do = f"correct --set fixer.{key}, or where it is written"
-                raise InputError("looking for a fixer's weights", f"{settings.name}: {key} = {path}", "no such file", do)
+                raise InputError(
+                    "looking for a fixer's weights",
+                    f"{settings.name}: {key} = {path}",
+                    "no such file",
+                    do,
+                )
         if "weights.bundle" in files:
             trained = read_metadata(files["weights.bundle"]).get("trained") == "true"
             return Declaration(files, trained, "trained" if trained else "untrained")
         trained = "weights.dit" in files
-        missing = next((part for part in settings.needed_weights if f"weights.{part}" not in files), None)
+        missing = next(
+            (part for part in settings.needed_weights if f"weights.{part}" not in files), None
+        )
         if settings.untrained == "refuse" and missing is not None:
             note = f"weights missing: {missing}" if files else "weights missing"
-            return Declaration(files, trained, note, missing=weights_to_give(missing, getattr(settings, "trained_by", None)))
-        return Declaration(files, trained, "weights of a checkpoint" if trained else f"untrained ({settings.untrained})")
+            return Declaration(
+                files,
+                trained,
+                note,
+                missing=weights_to_give(missing, getattr(settings, "trained_by", None)),
+            )
+        return Declaration(
+            files,
+            trained,
+            "weights of a checkpoint" if trained else f"untrained ({settings.untrained})",
+        )
 
 
 def weights_to_give(part: str, trained_by: str | None = None) -> str:
@@ -96,14 +129,20 @@ class Bundle:
 
 
 def save_bundle(
-    path: str | Path, parts: Mapping[str, Mapping[str, Tensor]], settings: WeightedSettings, *, trained: bool, note: str = ""
+    path: str | Path,
+    parts: Mapping[str, Mapping[str, Tensor]],
+    settings: WeightedSettings,
+    *,
+    trained: bool,
+    note: str = "",
 ) -> None:
     """Write a bundle atomically.
 
     Args:
         path: A ``.safetensors`` file.
-        parts: State dicts by part: ``generator``; or ``dit`` and ``vae``, and where there are any ``decoder`` and ``prompt`` (``text``,
-            or a name for each of several: tokens, text_width).
+        parts: State dicts by part: ``generator``; or ``dit`` and ``vae``, and where there are any
+            ``decoder`` and ``prompt`` (``text``, or a name for each of several: tokens,
+            text_width).
         settings: What the weights were trained with.
         trained: Whether they were learned.
         note: Description for labels.
@@ -118,7 +157,13 @@ def save_bundle(
         raise InputError("saving a fixer's weights", str(path), "; ".join(problems), do)
     tensors = {f"{part}.{key}": value for part, sd in parts.items() for key, value in sd.items()}
     plain = settings.model_dump(mode="json", exclude={"weights"})
-    header = {"format": FORMAT, "kind": kind.name, "trained": str(trained).lower(), "note": note, "settings": json.dumps(plain)}
+    header = {
+        "format": FORMAT,
+        "kind": kind.name,
+        "trained": str(trained).lower(),
+        "note": note,
+        "settings": json.dumps(plain),
+    }
     write_safetensors(path, tensors, header)
 
 
@@ -126,7 +171,8 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
     """Read a bundle for use with some settings.
 
     Raises:
-        InputError: Not a safetensors file, not a bundle, a digest that differs, or weights that were made for other settings.
+        InputError: Not a safetensors file, not a bundle, a digest that differs, or weights that
+            were made for other settings.
     """
     header, trained_with = _header(path)
     kind = settings.bundle_kind
@@ -134,14 +180,30 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
     if found_kind != kind.name:
         do = f"take a fixer of that kind: `simrun list fixers`, this bundle is for {trained_with['name']}"
         raise InputError(
-            DOING, f"{path} with the settings of {settings.name}", f"a bundle of the kind {found_kind!r}, not {kind.name!r}", do
+            DOING,
+            f"{path} with the settings of {settings.name}",
+            f"a bundle of the kind {found_kind!r}, not {kind.name!r}",
+            do,
         )
-    # A header written before a setting existed lacks it: its weights were trained at what is now the default.
+    # A header written before a setting existed lacks it: its weights were trained at what is now
+    # the default.
     trained_with = {**_defaults(settings), **trained_with}
-    differs = [(key, _at(trained_with, key), _at(settings.model_dump(mode="json"), key)) for key in (*kind.must_match, *kind.may_differ)]
-    wrong = [f"{key} is {used} for {due}" for key, due, used in differs if due != used and key in kind.must_match]
+    differs = [
+        (key, _at(trained_with, key), _at(settings.model_dump(mode="json"), key))
+        for key in (*kind.must_match, *kind.may_differ)
+    ]
+    wrong = [
+        f"{key} is {used} for {due}"
+        for key, due, used in differs
+        if due != used and key in kind.must_match
+    ]
     if wrong:
-        raise InputError(DOING, f"{path} with the settings of {settings.name}", "; ".join(wrong), "set these as the weights need them")
+        raise InputError(
+            DOING,
+            f"{path} with the settings of {settings.name}",
+            "; ".join(wrong),
+            "set these as the weights need them",
+        )
     from alpasim_plugin.fixers.network.checkpoints import load_weights  # loads torch
 
     parts = parts_of(load_weights(path, sha256=settings.weights.sha256.bundle))
@@ -150,13 +212,20 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
         do = f"write it with save_bundle (parts {', '.join(sorted(kind.needed | kind.optional))})"
         raise InputError(DOING, str(path), "; ".join(problems), do)
     trained = header.get("trained") == "true"
-    others = [f"{key} {used} instead of {due}" for key, due, used in differs if due != used and key in kind.may_differ]
-    note = ", ".join(text for text in ("" if trained else "untrained", header.get("note", ""), *others) if text)
+    others = [
+        f"{key} {used} instead of {due}"
+        for key, due, used in differs
+        if due != used and key in kind.may_differ
+    ]
+    note = ", ".join(
+        text for text in ("" if trained else "untrained", header.get("note", ""), *others) if text
+    )
     return Bundle(parts, trained, note or "trained")
 
 
 def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
-    """Return the fixer that a bundle is for and the overrides that make its settings those of the weights, the bundle included.
+    """Return the fixer that a bundle is for and the overrides that make its settings those of the
+    weights, the bundle included.
 
     Raises:
         InputError: Not a bundle.
@@ -164,8 +233,16 @@ def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
     _, trained_with = _header(path)
     name = trained_with.pop("name")
     if not isinstance(name, str):
-        raise InputError(DOING, f"{path}, settings in its header", f"name: {kind_of(name)}", "give a file that save_bundle wrote")
-    return RENAMED.get(name, name), (*_flat(trained_with), f"weights.bundle={json.dumps(str(Path(path).absolute()))}")
+        raise InputError(
+            DOING,
+            f"{path}, settings in its header",
+            f"name: {kind_of(name)}",
+            "give a file that save_bundle wrote",
+        )
+    return RENAMED.get(name, name), (
+        *_flat(trained_with),
+        f"weights.bundle={json.dumps(str(Path(path).absolute()))}",
+    )
 
 
 def parts_of(tensors: Mapping[str, Tensor]) -> dict[str, StateDict]:
@@ -195,14 +272,22 @@ def _header(path: str | Path) -> tuple[Mapping[str, str], dict[str, object]]:
 def _defaults(settings: WeightedSettings) -> dict[str, object]:
     """Return the settings that have a default, at it, as JSON has them."""
     fields = type(settings).model_fields.items()
-    return {key: field.get_default() for key, field in fields if isinstance(field.get_default(), str | bool | int | float)}
+    return {
+        key: field.get_default()
+        for key, field in fields
+        if isinstance(field.get_default(), str | bool | int | float)
+    }
 
 
 def _flat(data: Mapping[str, object], prefix: str = "") -> list[str]:
     """Return ``KEY=VALUE`` for every leaf of nested settings."""
     out: list[str] = []
     for key, value in data.items():
-        out += _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [f"{prefix}{key}={json.dumps(value)}"]
+        out += (
+            _flat(value, f"{prefix}{key}.")
+            if isinstance(value, Mapping)
+            else [f"{prefix}{key}={json.dumps(value)}"]
+        )
     return out
 
 

@@ -1,9 +1,12 @@
-"""Recorded frames carried into a view by two hypotheses of its depth: the render's own, and the ground.
+"""Recorded frames carried into a view by two hypotheses of its depth: the render's own, and the
+ground.
 
-A poor reconstruction has holes and mist above the road in front of the car, where a recorded frame shows the road itself. A rig stands on
-the ground, so the depth of the ground is known wherever a ray meets the plane z = 0 of the rig. Of the two depths of a pixel the one counts
-with which two recorded frames agree: plane-sweeping stereo (Collins, 1996, "A space-sweep approach to true multi-image matching") with two
-hypotheses a pixel. Where they agree equally well, or where only one frame is there, the ground is preferred.
+A poor reconstruction has holes and mist above the road in front of the car, where a recorded frame
+shows the road itself. A rig stands on the ground, so the depth of the ground is known wherever a
+ray meets the plane z = 0 of the rig. Of the two depths of a pixel the one counts with which two
+recorded frames agree: plane-sweeping stereo (Collins, 1996, "A space-sweep approach to true
+multi-image matching") with two hypotheses a pixel. Where they agree equally well, or where only one
+frame is there, the ground is preferred.
 """
 
 # Numba's decorators are untyped.
@@ -26,7 +29,8 @@ from alpasim_plugin.gaussians.raster.rasterize_cpu import run_on_threads
 I32 = npt.NDArray[np.int32]
 
 NEAREST_M, FARTHEST_M = 0.5, 120.0  # depths in which the road is taken for the plane below the rig
-FREE_SHARE = 0.4  # a surface nearer than this share of the ground's depth stands above the ground for certain
+# a surface nearer than this share of the ground's depth stands above the ground for certain
+FREE_SHARE = 0.4
 WINDOW_RAD = 0.075  # side of the window in which two recorded frames are compared
 PREFERENCE = 3  # grey levels by which the ground may agree less than the render's depth does
 GREY = np.array([[1 / 3, 1 / 3, 1 / 3, 0]], np.float32)
@@ -34,8 +38,11 @@ HIDING_M = 1e-3  # depth given to a recorded road user, whom the ground behind s
 UNSEEN = 30  # grey levels: the disagreement of a pixel that one of the two frames does not show
 
 
-def carry(pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64, threads: int = 1) -> tuple[U8, ...]:
-    """Carry recorded frames into a view, each as `warp` does, by the better of the two depths of every pixel.
+def carry(
+    pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64, threads: int = 1
+) -> tuple[U8, ...]:
+    """Carry recorded frames into a view, each as `warp` does, by the better of the two depths of
+    every pixel.
 
     Args:
         pictures: Recorded frames as of `with_users`, nearest first; the first two are compared.
@@ -55,19 +62,26 @@ def carry(pictures: Sequence[Picture], target: WarpTarget, T_world_rig: F64, thr
     K = target.K.copy()
     K[1, 2] -= lower.start
     view = replace(target, K=K, depth=depth[lower], actors={})
-    by_ground = _warp_all([_hidden_by_users(picture) for picture in pictures], view, FREE_SHARE, threads)
+    by_ground = _warp_all(
+        [_hidden_by_users(picture) for picture in pictures], view, FREE_SHARE, threads
+    )
     ground = view.depth > 0
     if len(pictures) > 1:
         size = window_px(K)
         own = [image[lower] for image in by_depth[:2]]
-        better = _disagreement(by_ground[0], by_ground[1], size) <= _disagreement(own[0], own[1], size) + PREFERENCE * size**2
+        better = (
+            _disagreement(by_ground[0], by_ground[1], size)
+            <= _disagreement(own[0], own[1], size) + PREFERENCE * size**2
+        )
         ground &= better | (target.depth[lower] <= 0)
     for image, on_ground in zip(by_depth, by_ground, strict=True):
         cv2.copyTo(on_ground, ground.view(np.uint8), image[lower])  # in place
     return tuple(by_depth)
 
 
-def _warp_all(pictures: Sequence[Picture], target: WarpTarget, free_share: float, threads: int) -> list[U8]:
+def _warp_all(
+    pictures: Sequence[Picture], target: WarpTarget, free_share: float, threads: int
+) -> list[U8]:
     out: dict[int, U8] = {}
     todo = iter(range(len(pictures)))  # shared: each thread takes the next
 
@@ -85,10 +99,12 @@ def window_px(K: F64) -> int:
 
 
 def ground_hypothesis(target: WarpTarget, T_world_rig: F64) -> F32:
-    """Return the depth of the ground ``(H, W)`` in metres along the optical axis, where a pixel of the view may show it; elsewhere 0.
+    """Return the depth of the ground ``(H, W)`` in metres along the optical axis, where a pixel of
+    the view may show it; elsewhere 0.
 
-    It may where the ray meets the ground between `NEAREST_M` and `FARTHEST_M`, and the render has a hole there or a surface that is not
-    nearer than `FREE_SHARE` of that, and the ray meets no actor's box. Arguments as of `carry`.
+    It may where the ray meets the ground between `NEAREST_M` and `FARTHEST_M`, and the render has a
+    hole there or a surface that is not nearer than `FREE_SHARE` of that, and the ray meets no
+    actor's box. Arguments as of `carry`.
     """
     # A pixel p at depth z lies at the height z (down . p) + height_m above the ground.
     down = T_world_rig[:3, 2] @ target.T_world_camera[:3, :3] @ np.linalg.inv(target.K)
@@ -106,7 +122,9 @@ def _ground(depth, down, height_m, out):
         for column in range(out.shape[1]):
             slope, surface = down[0] * (column + 0.5) + below, np.float64(depth[row, column])
             z = -height_m / slope if slope < 0 else 0.0
-            free = (z > NEAREST_M) & (z < FARTHEST_M) & ((surface <= 0) | (surface >= FREE_SHARE * z))
+            free = (
+                (z > NEAREST_M) & (z < FARTHEST_M) & ((surface <= 0) | (surface >= FREE_SHARE * z))
+            )
             out[row, column] = z if free else 0.0
 
 
@@ -119,12 +137,19 @@ def with_users(picture: Picture, boxes: Mapping[str, Box]) -> Picture:
 
 
 def _hidden_by_users(picture: Picture) -> Picture:
-    """Return a recorded frame whose road users hide all ground behind them, however near to it they stand."""
-    return picture if picture.users is None else replace(picture, depth=np.where(picture.users, np.float32(HIDING_M), picture.depth))
+    """Return a recorded frame whose road users hide all ground behind them, however near to it they
+    stand.
+    """
+    return (
+        picture
+        if picture.users is None
+        else replace(picture, depth=np.where(picture.users, np.float32(HIDING_M), picture.depth))
+    )
 
 
 def _disagreement(a: U8, b: U8, size: int) -> I32:
-    """Return by how many grey levels two warped frames differ, summed over the window around each pixel ``(H, W)``.
+    """Return by how many grey levels two warped frames differ, summed over the window around each
+    pixel ``(H, W)``.
 
     Whole numbers: their sum is the same in any order.
     """

@@ -1,8 +1,10 @@
-"""Two guards. Every fixed frame is checked, and a broken one is replaced by the raw frame, with an event that names the failure.
+"""Two guards. Every fixed frame is checked, and a broken one is replaced by the raw frame, with an
+event that names the failure.
 
-The harmlessness guard of the generator in pixels keeps the render where a change is not believable. A change is believable where the render
-is transparent, where it is small, where the map shows something (a lane line, a road user), or where the last output already showed nearby
-what the generator draws now. Elsewhere an opaque render is better evidence than a guess.
+The harmlessness guard of the generator in pixels keeps the render where a change is not believable.
+A change is believable where the render is transparent, where it is small, where the map shows
+something (a lane line, a road user), or where the last output already showed nearby what the
+generator draws now. Elsewhere an opaque render is better evidence than a guess.
 """
 
 from __future__ import annotations
@@ -20,14 +22,24 @@ from alpasim_plugin.core.image_metrics import is_black
 from alpasim_plugin.core.types import F32, U8
 
 Ramped = TypeVar("Ramped", Tensor, F32)
-NAN, RANGE, BLACK, FROZEN = "fixer-nan", "fixer-range", "fixer-black", "fixer-frozen"
+NAN = "fixer-nan"
+RANGE = "fixer-range"
+BLACK = "fixer-black"
+FROZEN = "fixer-frozen"
 LIMIT = 1.5  # a quarter of the range from black to white beyond either end
 SHARE = 0.01  # of a frame's values may lie beyond the limit; decoders overshoot at a few edges
-MOVED = 0.5  # grey levels of mean change in the raw frames above which an unchanged output counts as frozen
+# grey levels of mean change in the raw frames above which an unchanged output counts as frozen
+MOVED = 0.5
 CELL = 8  # pixels of the side of a cell; changes are judged by cells
 REACH = 2  # cells around, where the map or the last output may support a change
-OPAQUE = (0.9, 0.98)  # opacity of a cell: below the first the generator is free, above the second the render is fully trusted
-LARGE = (0.3, 0.5)  # mean change of a cell, of a range of 2: below the first it is never touched, above the second not believed
+OPAQUE = (
+    0.9,
+    0.98,
+)  # opacity of a cell: below the first the generator is free, above the second the render is fully trusted
+LARGE = (
+    0.3,
+    0.5,
+)  # mean change of a cell, of a range of 2: below the first it is never touched, above the second not believed
 AROUND = 2 * REACH + 1
 MAPPED = 0.02  # share of a cell's range that drawn map covers
 
@@ -41,7 +53,9 @@ def failures(video: Tensor) -> list[str]:
     Returns:
         T events, "" where a frame is fine.
     """
-    low, high = (x.float() for x in (video.amin((0, 2, 3)), video.amax((0, 2, 3))))  # NaN anywhere in a frame is the result
+    low, high = (
+        x.float() for x in (video.amin((0, 2, 3)), video.amax((0, 2, 3)))
+    )  # NaN anywhere in a frame is the result
     finite = (low.isfinite() & high.isfinite()).tolist()
     beyond = ((low < -LIMIT) | (high > LIMIT)).tolist()
     events = ["" if fine else NAN for fine in finite]
@@ -57,7 +71,9 @@ def black(fixed: U8, raw: U8) -> bool:
 
 
 def frozen(fixed: U8, before: U8, raw: U8, raw_before: U8) -> bool:
-    """Return whether an output repeats the previous one bit for bit although the raw frame changed."""
+    """Return whether an output repeats the previous one bit for bit although the raw frame
+    changed.
+    """
     if not np.array_equal(fixed, before):
         return False
     return float(np.abs(raw.astype(np.int16) - raw_before).mean()) > MOVED
@@ -85,7 +101,9 @@ def check_frames(video: Tensor, fixed: U8, raw: U8, before: tuple[U8, U8] | None
     return events
 
 
-def keep_render(out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, before: Tensor, recorded: Tensor) -> Tensor | None:
+def keep_render(
+    out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, before: Tensor, recorded: Tensor
+) -> Tensor | None:
     """Put the render back where the change is not believable; None where nothing is put back.
 
     Args:
@@ -94,19 +112,33 @@ def keep_render(out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, bef
         opacity: ``(B, H, W, 1)``.
         sdmap: Like ``out``; black where it shows nothing.
         before: The last output, like ``out``.
-        recorded: ``(B, H, W, 1)`` share of the references, which are evidence of their own: what they show stays.
+        recorded: ``(B, H, W, 1)`` share of the references, which are evidence of their own: what
+            they show stays.
     """
     if out.device.type == "cpu":
-        kept = [_keep_one(*images) for images in zip(*(x.numpy() for x in (out, render, opacity, sdmap, before, recorded)), strict=True)]
-        return None if all(one is None for one in kept) else torch.stack([o if k is None else k for o, k in zip(out, kept, strict=True)])
+        kept = [
+            _keep_one(*images)
+            for images in zip(
+                *(x.numpy() for x in (out, render, opacity, sdmap, before, recorded)), strict=True
+            )
+        ]
+        return (
+            None
+            if all(one is None for one in kept)
+            else torch.stack([o if k is None else k for o, k in zip(out, kept, strict=True)])
+        )
     share = render_share(out, render, opacity, sdmap, before)
     return None if share is None else torch.lerp(out, render, share * (1 - recorded))
 
 
-def render_share(out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, before: Tensor) -> Tensor | None:
-    """Return the weight of the render in the picture ``(B, H, W, 1)``, 0 nearly everywhere; None where it is 0 everywhere.
+def render_share(
+    out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, before: Tensor
+) -> Tensor | None:
+    """Return the weight of the render in the picture ``(B, H, W, 1)``, 0 nearly everywhere; None
+    where it is 0 everywhere.
 
-    It is what `keep_render` does on other devices than processors, and the reference of what it does there; arguments as there.
+    It is what `keep_render` does on other devices than processors, and the reference of what it
+    does there; arguments as there.
     """
     change = _cells((out - render).abs_()).mean(1, keepdim=True)
     if float(change.amax()) <= LARGE[0]:
@@ -117,10 +149,14 @@ def render_share(out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, be
     mapped = F.max_pool2d((_cells(sdmap).mean(1, keepdim=True) + 1) / 2, AROUND, 1, REACH) > MAPPED
     now, past = _cells(out), _cells(before)
     low, high = -F.max_pool2d(-past, AROUND, 1, REACH), F.max_pool2d(past, AROUND, 1, REACH)
-    beyond = torch.relu(now - high).amax(1, keepdim=True) + torch.relu(low - now).amax(1, keepdim=True)
+    beyond = torch.relu(now - high).amax(1, keepdim=True) + torch.relu(low - now).amax(
+        1, keepdim=True
+    )
     unseen = _ramp(beyond, *(limit / 2 for limit in LARGE))
     share = trusted * unseen * ~mapped
-    return F.interpolate(share, scale_factor=CELL, mode="bilinear", align_corners=False).permute(0, 2, 3, 1)
+    return F.interpolate(share, scale_factor=CELL, mode="bilinear", align_corners=False).permute(
+        0, 2, 3, 1
+    )
 
 
 def _cells(x: Tensor) -> Tensor:
@@ -130,8 +166,12 @@ def _cells(x: Tensor) -> Tensor:
     return rows.view(b, h // CELL, w // CELL, CELL, c).mean(3).permute(0, 3, 1, 2)
 
 
-def _keep_one(out: F32, render: F32, opacity: F32, sdmap: F32, before: F32, recorded: F32) -> Tensor | None:
-    """Do what `keep_render` does for one image, `render_share` by OpenCV, which pools images whose channels come last six times as fast."""
+def _keep_one(
+    out: F32, render: F32, opacity: F32, sdmap: F32, before: F32, recorded: F32
+) -> Tensor | None:
+    """Do what `keep_render` does for one image, `render_share` by OpenCV, which pools images whose
+    channels come last six times as fast.
+    """
     height, width, _ = out.shape
     around = np.ones((AROUND, AROUND), np.uint8)
 
@@ -154,10 +194,15 @@ def _keep_one(out: F32, render: F32, opacity: F32, sdmap: F32, before: F32, reco
         return None
     now, past = means(out[pixels]), means(before[pixels])
     above, below = now - cv2.dilate(past, around), cv2.erode(past, around) - now
-    near *= _ramp(np.maximum(above.max(axis=-1), 0) + np.maximum(below.max(axis=-1), 0), *(limit / 2 for limit in LARGE))
+    near *= _ramp(
+        np.maximum(above.max(axis=-1), 0) + np.maximum(below.max(axis=-1), 0),
+        *(limit / 2 for limit in LARGE),
+    )
     if not near.any():
         return None
-    weight = np.asarray(cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR))[pixels, :, None] * (1 - recorded[pixels])
+    weight = np.asarray(cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR))[
+        pixels, :, None
+    ] * (1 - recorded[pixels])
     kept = out.copy()
     kept[pixels] += weight * (render[pixels] - out[pixels])
     return torch.from_numpy(kept)

@@ -1,4 +1,6 @@
-"""Fixers that are known without loading a network: the one that fixes nothing, and the factory of the per-frame generators."""
+"""Fixers that are known without loading a network: the one that fixes nothing, and the factory of
+the per-frame generators.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,14 @@ class IdentityFixer(Fixer):
     settings_model = FixerSettings
     note = "no network"
 
-    def __init__(self, settings: FixerSettings, scene_id: str = "", seed: int = 0, device: str = "cpu", threads: int | None = None) -> None:
+    def __init__(
+        self,
+        settings: FixerSettings,
+        scene_id: str = "",
+        seed: int = 0,
+        device: str = "cpu",
+        threads: int | None = None,
+    ) -> None:
         self.settings = settings
         self.label = f"{settings.name}, no network"
         self.blocks = BlockRule.of_latents(settings.block_latents)
@@ -50,7 +59,9 @@ class IdentityFixer(Fixer):
         return out
 
 
-def _session(settings: PixelFixerSettings, scene_id: str, seed: int, device: str, threads: int | None) -> PixelFixer:
+def _session(
+    settings: PixelFixerSettings, scene_id: str, seed: int, device: str, threads: int | None
+) -> PixelFixer:
     from alpasim_plugin.fixers.pixel_fixer import PixelFixer  # loads torch
 
     return PixelFixer(settings, scene_id, seed, device, threads)

@@ -1,7 +1,8 @@
-"""Compose a renderer and a fixer into a renderer: render frames with their semantic maps and run the fixer over them, checked and timed.
+"""Compose a renderer and a fixer into a renderer: render frames with their semantic maps and run
+the fixer over them, checked and timed.
 
-A fixer of single frames fixes each frame as it is rendered. How the loop calls a fixer of blocks is a mode, which the package that holds it
-registers in the entry-point group ``simrun.fixer_modes``.
+A fixer of single frames fixes each frame as it is rendered. How the loop calls a fixer of blocks is
+a mode, which the package that holds it registers in the entry-point group ``simrun.fixer_modes``.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ class BlockRunner:
         render_base: The base renderer; its frames are checked.
         scene_map: The scene's map, or None where the fixer uses none.
         actors: The scenario's, for the sizes of their boxes.
-        references: Warps recorded frames into each view; None where the fixer reads none, or the renderer declares none.
+        references: Warps recorded frames into each view; None where the fixer reads none, or the
+            renderer declares none.
         threads: Threads of the map rasteriser.
         stage_ms: Time since `reset_times` by stage, without the base renderer's.
     """
@@ -72,7 +74,13 @@ class BlockRunner:
             return ConditionedFrame(request, frame, None)
         with self._timed("map"):
             boxes = actor_boxes(request.actors, self.actors)
-            image = draw_map(self.scene_map, request.camera, request.T_world_camera[-1], boxes, threads=self.threads)
+            image = draw_map(
+                self.scene_map,
+                request.camera,
+                request.T_world_camera[-1],
+                boxes,
+                threads=self.threads,
+            )
         return ConditionedFrame(request, frame, image)
 
     def fix(self, fixer: Fixer, call: Call, block: Sequence[ConditionedFrame]) -> list[Frame]:
@@ -84,9 +92,13 @@ class BlockRunner:
             block: Frames with their maps.
 
         Raises:
-            FixerError: The fixer raised, or its frames have another number, time, camera, size or type.
+            FixerError: The fixer raised, or its frames have another number, time, camera, size or
+                type.
         """
-        frames, maps = [item.frame for item in block], [item.map for item in block if item.map is not None]
+        frames, maps = (
+            [item.frame for item in block],
+            [item.map for item in block if item.map is not None],
+        )
         name = f"{type(fixer).__name__}, {len(frames)} frames of {frames[0].t_us} to {frames[-1].t_us} us"
         before = dict(fixer.stage_ms)
         with self._timed("fix"):
@@ -95,11 +107,21 @@ class BlockRunner:
             except SimrunError:
                 raise
             except Exception as error:
-                raise FixerError(DOING, name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest") from error
+                raise FixerError(
+                    DOING,
+                    name,
+                    f"{type(error).__name__}: {error}",
+                    "see the traceback in the rollout's manifest",
+                ) from error
         self._add_fixer_stages(before, fixer.stage_ms)
         problem = _problem(frames, fixed)
         if problem:
-            raise FixerError(DOING, name, problem, "fix the fixer: as many frames out as in, with the same times, cameras and sizes")
+            raise FixerError(
+                DOING,
+                name,
+                problem,
+                "fix the fixer: as many frames out as in, with the same times, cameras and sizes",
+            )
         return [replace(frame, references=()) for frame in fixed]
 
     @contextmanager
@@ -109,7 +131,9 @@ class BlockRunner:
         self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + 1e3 * (time.perf_counter() - began)
 
     def _add_fixer_stages(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
-        """Add what a fixer timed itself (running sums) as ``fix: STAGE``, and the rest of its call as ``fix``."""
+        """Add what a fixer timed itself (running sums) as ``fix: STAGE``, and the rest of its call
+        as ``fix``.
+        """
         for stage, total_ms in after.items():
             part_ms = total_ms - before.get(stage, 0.0)
             name = f"fix: {stage}"
@@ -129,7 +153,8 @@ def _problem(given: Sequence[Frame], fixed: Sequence[Frame]) -> str:
 
 
 class PerFrameRenderer(Renderer):
-    """A renderer session whose frames are fixed at once, at every camera's own rate; the cameras of an instant are one batch.
+    """A renderer session whose frames are fixed at once, at every camera's own rate; the cameras of
+    an instant are one batch.
 
     Args:
         runner: Renders and calls the fixer.
@@ -148,7 +173,13 @@ class PerFrameRenderer(Renderer):
     def facts(self) -> dict[str, Any]:
         """Return the fixer's label and the number of frames so far."""
         fixer = self.fixer
-        return {"label": fixer.label, "trained": fixer.trained, "mode": "frame", "frames": self.frames, "chosen": dict(fixer.chosen)}
+        return {
+            "label": fixer.label,
+            "trained": fixer.trained,
+            "mode": "frame",
+            "frames": self.frames,
+            "chosen": dict(fixer.chosen),
+        }
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame; see `render_batch`."""
@@ -161,7 +192,9 @@ class PerFrameRenderer(Renderer):
             FixerError: The fixer broke its contract.
         """
         self.runner.reset_times()
-        fixed = self.runner.fix(self.fixer, self.fixer.step, [self.runner.render(request) for request in requests])
+        fixed = self.runner.fix(
+            self.fixer, self.fixer.step, [self.runner.render(request) for request in requests]
+        )
         self.frames += len(fixed)
         return fixed
 
@@ -176,12 +209,14 @@ def fixed_renderer(
 ) -> Renderer:
     """Return one rollout's renderer whose frames are fixed.
 
-    A fixer of single frames fixes each as it is rendered. Others work in blocks (5 frames first, then 8), but the poses of a block's later
-    frames are not known when its first frame falls due: ``settings.mode`` names what is done about it.
+    A fixer of single frames fixes each as it is rendered. Others work in blocks (5 frames first,
+    then 8), but the poses of a block's later frames are not known when its first frame falls due:
+    ``settings.mode`` names what is done about it.
 
     Args:
         render: The base renderer of the same rollout; its frames are checked.
-        make_fixer: Makes a fixer without history; called once, and again for every further group of cameras with other frame times.
+        make_fixer: Makes a fixer without history; called once, and again for every further group of
+            cameras with other frame times.
         settings: Mode, tolerances, and whether the fixer wants semantic maps.
         scenario: Its map and its actors' boxes are what the semantic map shows.
         threads: Threads of the map rasteriser; None leaves numba's number.
@@ -207,6 +242,8 @@ def fixed_renderer(
     if settings.mode not in modes:
         found = f"no installed package has this mode (entry points {MODES}); known: {', '.join(modes) or 'none'}"
         do = "install simrun with its block fixers, or take a fixer of single frames, such as onefixer"
-        raise InputError("running a fixer of blocks", f"{settings.name}, fixer.mode={settings.mode}", found, do)
+        raise InputError(
+            "running a fixer of blocks", f"{settings.name}, fixer.mode={settings.mode}", found, do
+        )
     renderer: Renderer = modes[settings.mode].load()(runner, make, settings, first)
     return renderer

@@ -1,4 +1,6 @@
-"""The control without a network: the nearest recorded frame, warped into the view, and the render where that does not hold."""
+"""The control without a network: the nearest recorded frame, warped into the view, and the render
+where that does not hold.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,12 @@ from alpasim_plugin.fixers.warp import VALID
 class NearestSettings(FrameByFrameSettings):
     """Which recorded frames are looked at."""
 
-    references: int = Field(default=1, ge=1, le=8, description="Recorded frames; a nearer one is shown before a farther one.")
+    references: int = Field(
+        default=1,
+        ge=1,
+        le=8,
+        description="Recorded frames; a nearer one is shown before a farther one.",
+    )
 
 
 class NearestFixer(Fixer):
@@ -32,7 +39,12 @@ class NearestFixer(Fixer):
     blocks = BlockRule(1, 1)
 
     def __init__(
-        self, settings: NearestSettings, scene_id: str = "", seed: int = 0, device: str = "cpu", threads: int | None = None
+        self,
+        settings: NearestSettings,
+        scene_id: str = "",
+        seed: int = 0,
+        device: str = "cpu",
+        threads: int | None = None,
     ) -> None:
         self.settings, self.label = settings, f"{settings.name}, no network"
 

@@ -1,7 +1,9 @@
-"""The generator in pixels as a streaming session: one frame in, one frame out, a history per camera, every frame guarded.
+"""The generator in pixels as a streaming session: one frame in, one frame out, a history per
+camera, every frame guarded.
 
-`fix_frame` is one frame through the network, tensors in and tensors out: source (Eq. 1), flow steps (Eq. 2), the harmlessness guard. Its
-state goes in and comes out, and nothing else is remembered. Several cameras are a batch.
+`fix_frame` is one frame through the network, tensors in and tensors out: source (Eq. 1), flow steps
+(Eq. 2), the harmlessness guard. Its state goes in and comes out, and nothing else is remembered.
+Several cameras are a batch.
 """
 
 from __future__ import annotations
@@ -21,7 +23,13 @@ from alpasim_plugin.core.types import F32, I64, U8, Frame
 from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.guard import keep_render
 from alpasim_plugin.fixers.network.machine_probe import take_threads
-from alpasim_plugin.fixers.network.pixel_generator import GRID_PX, PixelState, content_key, pixel_noise, sparse_source
+from alpasim_plugin.fixers.network.pixel_generator import (
+    GRID_PX,
+    PixelState,
+    content_key,
+    pixel_noise,
+    sparse_source,
+)
 from alpasim_plugin.fixers.network.schedule import from_names, interpolant
 from alpasim_plugin.fixers.pixel_network import LoadedGenerator, load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
@@ -59,14 +67,21 @@ def fix_frame(
         source: Returns the source z_1 (Eq. 1) of a flow step by its number, ``(B, H, W, 3)``.
 
     Returns:
-        ``(B, H, W, 3)``, not clipped to [-1, 1], and the state after the frame, whose last output is this one.
+        ``(B, H, W, 3)``, not clipped to [-1, 1], and the state after the frame, whose last output
+        is this one.
     """
     render = inputs.render
     images = render, inputs.opacity, inputs.sdmap, state
     out, after = generator.step(*images, source(0), inputs.references, scale=inputs.scale)
     for index, level in enumerate(from_names(settings.steps)[1:], start=1):
         t = render.new_full((len(render),), level.sigma)
-        out, after = generator.step(*images, interpolant(out, source(index), level.sigma), inputs.references, t, inputs.scale)
+        out, after = generator.step(
+            *images,
+            interpolant(out, source(index), level.sigma),
+            inputs.references,
+            t,
+            inputs.scale,
+        )
     if settings.keep_render:
         kept = keep_render(out, render, inputs.opacity, inputs.sdmap, state.output, after.recorded)
         if kept is not None:
@@ -86,13 +101,16 @@ class CameraHistory:
 
 
 class PixelFixer(Fixer):
-    """Repair the frames of one rollout one by one. A step may hold other cameras than the step before; each has its own history.
+    """Repair the frames of one rollout one by one. A step may hold other cameras than the step
+    before; each has its own history.
 
     Args:
         settings: Weights, steps, precision, guard.
-        scene_id, seed: Key of the noise, with camera, frame (its index or its content, see `PixelFixerSettings.noise`) and pixel.
+        scene_id, seed: Key of the noise, with camera, frame (its index or its content, see
+            `PixelFixerSettings.noise`) and pixel.
         device: ``cpu`` or ``cuda``.
-        threads: Torch threads that this process may use; as many are used as pay. None leaves their number.
+        threads: Torch threads that this process may use; as many are used as pay. None leaves their
+            number.
 
     Raises:
         InputError: Settings of another fixer, or weights that are missing or do not fit.
@@ -100,10 +118,19 @@ class PixelFixer(Fixer):
 
     blocks = BlockRule(1, 1)
 
-    def __init__(self, settings: FixerSettings, scene_id: str, seed: int = 0, device: str = "cpu", threads: int | None = None) -> None:
+    def __init__(
+        self,
+        settings: FixerSettings,
+        scene_id: str,
+        seed: int = 0,
+        device: str = "cpu",
+        threads: int | None = None,
+    ) -> None:
         if not isinstance(settings, PixelFixerSettings):
             found = f"settings of type {type(settings).__name__}"
-            raise InputError("making a fixer", settings.name, found, "take them from fixer_settings(name)")
+            raise InputError(
+                "making a fixer", settings.name, found, "take them from fixer_settings(name)"
+            )
         self.chosen: dict[str, Any] = take_threads(threads)
         self.settings, self.scene_id = settings, scene_id
         self.generator = load_generator(settings, device)
@@ -123,20 +150,25 @@ class PixelFixer(Fixer):
 
         Args:
             block: One frame per camera.
-            maps: Semantic maps of the same frames, or empty: nothing is drawn; ignored unless the settings say ``uses_map``.
+            maps: Semantic maps of the same frames, or empty: nothing is drawn; ignored unless the
+                settings say ``uses_map``.
 
         Returns:
             As many frames, same order, times and cameras. Opacity and depth remain the render's.
 
         Raises:
-            InputError: Frames that do not continue the rollout, or are none (see `views.group_views`).
+            InputError: Frames that do not continue the rollout, or are none (see
+                `views.group_views`).
             RendererError: An opacity that is not a number or outside [0, 1].
         """
         out, self._history = self._advance(block, maps, self._history)
         return out
 
-    def advance(self, frame: Frame, sdmap: U8 | None, past: CameraHistory | None) -> tuple[Frame, CameraHistory]:
-        """Fix one frame of one camera from a given past; the session's own histories are neither read nor changed.
+    def advance(
+        self, frame: Frame, sdmap: U8 | None, past: CameraHistory | None
+    ) -> tuple[Frame, CameraHistory]:
+        """Fix one frame of one camera from a given past; the session's own histories are neither
+        read nor changed.
 
         A past is never written to: histories can be forked, kept and continued in any order.
 
@@ -168,16 +200,25 @@ class PixelFixer(Fixer):
                 if event:  # the render is returned, and nothing of the network's
                     out[index[0]] = replace(frame, events=(*frame.events, event))
                 else:
-                    out[index[0]] = replace(frame, rgb=made.fixed, facts={**frame.facts, **_trust(made)})
+                    out[index[0]] = replace(
+                        frame, rgb=made.fixed, facts={**frame.facts, **_trust(made)}
+                    )
                 after[camera] = made
         return tuple(out), after
 
-    def _fix(self, view: Views, histories: Mapping[str, CameraHistory]) -> list[tuple[str, tuple[int, ...], CameraHistory, str]]:
-        """Return per camera its name, the places of its frames in the block, its history after the frame, and the guard's event."""
+    def _fix(
+        self, view: Views, histories: Mapping[str, CameraHistory]
+    ) -> list[tuple[str, tuple[int, ...], CameraHistory, str]]:
+        """Return per camera its name, the places of its frames in the block, its history after the
+        frame, and the guard's event.
+        """
         start, device = self.generator.step.start, self.generator.device
         inputs = to_inputs(view, device, self.settings.scale_of(*view.shape))
         pasts = [histories.get(camera) for camera in view.cameras]
-        states = [start(inputs.render[b : b + 1], inputs.scale) if past is None else past.state for b, past in enumerate(pasts)]
+        states = [
+            start(inputs.render[b : b + 1], inputs.scale) if past is None else past.state
+            for b, past in enumerate(pasts)
+        ]
         counts = [0 if past is None else past.frames for past in pasts]
         height, width = view.shape
 
@@ -187,12 +228,24 @@ class PixelFixer(Fixer):
                 return inputs.render
 
             def noise(b: int, pixels: I64) -> F32:
-                frame = counts[b] if self.settings.noise == "rollout" else content_key(view.t_us[b][0], view.rgb[b, 0])
+                frame = (
+                    counts[b]
+                    if self.settings.noise == "rollout"
+                    else content_key(view.t_us[b][0], view.rgb[b, 0])
+                )
                 return pixel_noise(self.scene_id, self.seed, view.cameras[b], draw, frame, pixels)
 
-            return sparse_source(inputs.render, torch.zeros_like(inputs.opacity) if everywhere else inputs.opacity, noise)
+            return sparse_source(
+                inputs.render,
+                torch.zeros_like(inputs.opacity) if everywhere else inputs.opacity,
+                noise,
+            )
 
-        joined = PixelState(*(torch.cat(parts) for parts in zip(*states, strict=True))) if len(states) > 1 else states[0]
+        joined = (
+            PixelState(*(torch.cat(parts) for parts in zip(*states, strict=True)))
+            if len(states) > 1
+            else states[0]
+        )
         video, after = fix_frame(self.generator, self.settings, inputs, joined, source)
         shown = after.output[:, :height, :width].cpu().numpy()
         images = np.stack([cv2.convertScaleAbs(one, alpha=HALF, beta=HALF) for one in shown])
@@ -200,16 +253,30 @@ class PixelFixer(Fixer):
         for b, (camera, past) in enumerate(zip(view.cameras, pasts, strict=True)):
             before = None if past is None else (past.fixed, past.raw)
             raw = view.rgb[b, 0]
-            event = guard.check_frames(video[b, :height, :width].permute(2, 0, 1)[:, None], images[b : b + 1], raw[None], before)[0]
+            event = guard.check_frames(
+                video[b, :height, :width].permute(2, 0, 1)[:, None],
+                images[b : b + 1],
+                raw[None],
+                before,
+            )[0]
             state = PixelState(*(part[b : b + 1] for part in after))
             if event == guard.NAN:  # it would stay in the state for ever
                 state = start(inputs.render[b : b + 1], inputs.scale)
-            found.append((camera, view.index[b], CameraHistory(state, counts[b] + 1, view.t_us[b][0], raw, images[b]), event))
+            found.append(
+                (
+                    camera,
+                    view.index[b],
+                    CameraHistory(state, counts[b] + 1, view.t_us[b][0], raw, images[b]),
+                    event,
+                )
+            )
         return found
 
 
 def _trust(made: CameraHistory) -> dict[str, float | str]:
-    """Return where a camera's last picture comes from, without the padding below and to the right of it."""
+    """Return where a camera's last picture comes from, without the padding below and to the right
+    of it.
+    """
     height, width = made.fixed.shape[:2]
     parts = (made.state.output, made.state.render, made.state.recorded)
     output, render, recorded = (part[0, :height, :width].cpu().float().numpy() for part in parts)
@@ -217,7 +284,9 @@ def _trust(made: CameraHistory) -> dict[str, float | str]:
 
 
 def to_inputs(view: Views, device: torch.device | str = "cpu", scale: int = 1) -> PixelInputs:
-    """Convert one frame of views to tensors: ``x / 127.5 - 1``, edges repeated up to multiples of 16 ``scale``."""
+    """Convert one frame of views to tensors: ``x / 127.5 - 1``, edges repeated up to multiples of
+    16 ``scale``.
+    """
     height, width = view.shape
     right, below = -width % (GRID_PX * scale), -height % (GRID_PX * scale)
 
@@ -227,8 +296,16 @@ def to_inputs(view: Views, device: torch.device | str = "cpu", scale: int = 1) -
         return torch.from_numpy(x).to(device)
 
     render = image(view.rgb[:, 0]).float().div_(HALF).sub_(1)
-    opacity = torch.ones_like(render[..., :1]) if view.alpha is None else image(view.alpha[:, 0, ..., None])
-    sdmap = torch.full_like(render, -1.0) if view.maps is None else image(view.maps[:, 0]).float().div_(HALF).sub_(1)
+    opacity = (
+        torch.ones_like(render[..., :1])
+        if view.alpha is None
+        else image(view.alpha[:, 0, ..., None])
+    )
+    sdmap = (
+        torch.full_like(render, -1.0)
+        if view.maps is None
+        else image(view.maps[:, 0]).float().div_(HALF).sub_(1)
+    )
     references = None
     if view.references is not None:
         padded = view.references[:, 0]

@@ -1,4 +1,6 @@
-"""The per-frame generator in pixels before it is loaded: its settings, its kind of bundle, and its factory."""
+"""The per-frame generator in pixels before it is loaded: its settings, its kind of bundle, and its
+factory.
+"""
 
 from __future__ import annotations
 
@@ -24,18 +26,33 @@ from alpasim_plugin.fixers.settings import (
 class PixelSizesSettings(Part):
     """Sizes of a generator in pixels where they are not read off weights."""
 
-    widths: tuple[Positive, Positive, Positive] = Field(default=(48, 64, 160), description="Channels at 1/4, 1/8 and 1/16.")
+    widths: tuple[Positive, Positive, Positive] = Field(
+        default=(48, 64, 160), description="Channels at 1/4, 1/8 and 1/16."
+    )
     blocks: tuple[int, int, int, int, int] = Field(
-        default=(0, 1, 1, 1, 1), description="Residual blocks at 1/4, 1/8, 1/16, and on the way back at 1/8 and 1/4."
+        default=(0, 1, 1, 1, 1),
+        description="Residual blocks at 1/4, 1/8, 1/16, and on the way back at 1/8 and 1/4.",
     )
     detail: Positive = Field(default=16, description="Channels of the detail path at 1/2.")
     hidden: int = Field(default=16, ge=0, description="Recurrent channels at 1/4.")
-    memory: int = Field(default=0, ge=0, description="Past frames, every fourth, that are attended to at 1/16; 0: none.")
-    blend: int = Field(default=0, ge=0, description="Channels of the head that blends references with the picture; 0: none are read.")
+    memory: int = Field(
+        default=0,
+        ge=0,
+        description="Past frames, every fourth, that are attended to at 1/16; 0: none.",
+    )
+    blend: int = Field(
+        default=0,
+        ge=0,
+        description="Channels of the head that blends references with the picture; 0: none are read.",
+    )
 
 
 USUAL_PX = 256 * 144  # of most pictures of the training
-PER_FRAME = BundleKind("per-frame", frozenset({"generator"}), may_differ=("steps", "holes", "uses_map", "references", "recording", "scale"))
+PER_FRAME = BundleKind(
+    "per-frame",
+    frozenset({"generator"}),
+    may_differ=("steps", "holes", "uses_map", "references", "recording", "scale"),
+)
 
 
 class FrameByFrameSettings(FixerSettings):
@@ -56,19 +73,29 @@ class PixelFixerSettings(FrameByFrameSettings, WeightedSettings):
     """A causal generator in pixels, one frame at a time."""
 
     bundle_kind: ClassVar[BundleKind] = PER_FRAME
-    uses_map: bool = Field(default=True, description="Whether the semantic map is drawn and given to the fixer.")
-    generator: PixelSizesSettings = Field(default=PixelSizesSettings(), description="Sizes where no weights say them.")
-    weights: WeightsSettings = Field(default=WeightsSettings(), description="File with weights: `bundle` alone.")
-    steps: tuple[float, ...] = Field(default=(1000.0,), min_length=1, description="Named time steps, falling from 1000.")
+    uses_map: bool = Field(
+        default=True, description="Whether the semantic map is drawn and given to the fixer."
+    )
+    generator: PixelSizesSettings = Field(
+        default=PixelSizesSettings(), description="Sizes where no weights say them."
+    )
+    weights: WeightsSettings = Field(
+        default=WeightsSettings(), description="File with weights: `bundle` alone."
+    )
+    steps: tuple[float, ...] = Field(
+        default=(1000.0,), min_length=1, description="Named time steps, falling from 1000."
+    )
     holes: Literal["noise", "render", "everywhere"] = Field(
         default="noise",
         description="Source of a frame: noise where the render is transparent (Eq. 1), the render alone, or noise everywhere.",
     )
     noise: Literal["rollout", "content"] = Field(
-        default="rollout", description="Key of a frame's noise: its index in the rollout, or its time and content, as in `simrun serve`."
+        default="rollout",
+        description="Key of a frame's noise: its index in the rollout, or its time and content, as in `simrun serve`.",
     )
     keep_render: bool = Field(
-        default=True, description="Keep the render where it is opaque, the change is large, and neither map nor history supports it."
+        default=True,
+        description="Keep the render where it is opaque, the change is large, and neither map nor history supports it.",
     )
     scale: Literal["auto"] | Positive = Field(
         default="auto",
@@ -76,7 +103,8 @@ class PixelFixerSettings(FrameByFrameSettings, WeightedSettings):
         "auto: the largest that leaves as many pixels as 256x144 has, the usual size of the training.",
     )
     precision: Literal["auto", "fp32", "bf16"] = Field(
-        default="auto", description="Of the network. auto: bf16 on a GPU and where a probe finds it at least 1.5 times as fast, else fp32."
+        default="auto",
+        description="Of the network. auto: bf16 on a GPU and where a probe finds it at least 1.5 times as fast, else fp32.",
     )
 
     def scale_of(self, height: int, width: int) -> int:
@@ -86,7 +114,9 @@ class PixelFixerSettings(FrameByFrameSettings, WeightedSettings):
             >>> [PixelFixerSettings(name="onefixer").scale_of(*size) for size in ((144, 256), (270, 480), (288, 512), (1080, 1920))]
             [1, 1, 2, 7]
         """
-        return max(1, math.isqrt(height * width // USUAL_PX)) if self.scale == "auto" else self.scale
+        return (
+            max(1, math.isqrt(height * width // USUAL_PX)) if self.scale == "auto" else self.scale
+        )
 
     @property
     def unit(self) -> Unit:
@@ -108,7 +138,13 @@ class PixelFixerSettings(FrameByFrameSettings, WeightedSettings):
     @model_validator(mode="after")
     def _consistent(self) -> PixelFixerSettings:
         check_steps(self.steps)
-        parts = [key for key in ("dit", "vae", "decoder", "prompt") if getattr(self.weights, key) is not None]
+        parts = [
+            key
+            for key in ("dit", "vae", "decoder", "prompt")
+            if getattr(self.weights, key) is not None
+        ]
         if parts:
-            raise ValueError(f"weights.{parts[0]} | a generator in pixels has one file: give weights.bundle")
+            raise ValueError(
+                f"weights.{parts[0]} | a generator in pixels has one file: give weights.bundle"
+            )
         return self

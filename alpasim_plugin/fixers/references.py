@@ -1,11 +1,14 @@
-"""Recorded frames as references of a fixer: which of them a frame is given. `fixers.ground` carries them into its view.
+"""Recorded frames as references of a fixer: which of them a frame is given. `fixers.ground` carries
+them into its view.
 
-Whoever has a reconstruction has the photographs it was fitted to. A reference is such a photograph, carried into the view by the render's
-own depth and by the poses that the reconstruction believes; pixels of a road user move with its box. Both are as wrong as the
-reconstruction is, so each reference comes with a validity mask, and the fixer learns how much of it to use.
+Whoever has a reconstruction has the photographs it was fitted to. A reference is such a photograph,
+carried into the view by the render's own depth and by the poses that the reconstruction believes;
+pixels of a road user move with its box. Both are as wrong as the reconstruction is, so each
+reference comes with a validity mask, and the fixer learns how much of it to use.
 
-A recording is known in full before a rollout begins: frames that were recorded after the present time are references as well, unless
-``past`` asks for earlier ones alone. Nothing of the rollout's own future is looked at.
+A recording is known in full before a rollout begins: frames that were recorded after the present
+time are references as well, unless ``past`` asks for earlier ones alone. Nothing of the rollout's
+own future is looked at.
 """
 
 from __future__ import annotations
@@ -18,15 +21,31 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import se3
 from alpasim_plugin.core.shutter import bands
-from alpasim_plugin.core.types import F64, I64, U8, Actor, Frame, RecordedFrame, RenderRequest, Trajectory
+from alpasim_plugin.core.types import (
+    F64,
+    I64,
+    U8,
+    Actor,
+    Frame,
+    RecordedFrame,
+    RenderRequest,
+    Trajectory,
+)
 from alpasim_plugin.fixers.ground import carry, window_px, with_users
 from alpasim_plugin.fixers.warp import Picture, WarpTarget
 
 KEPT_FRAMES = 24  # decoded recorded frames that a session keeps
-SECOND_M, TURN_M = 0.5, 10.0  # a second apart counts as so many metres, and so does a view that is turned by a radian
+SECOND_M, TURN_M = (
+    0.5,
+    10.0,
+)  # a second apart counts as so many metres, and so does a view that is turned by a radian
 FARTHEST_M = 25.0  # a recorded frame from farther away is no reference
-STAY = 0.75  # the distance of a frame that the last picture had counts as this share of it, so that references do not flicker
-SPAN_S = 6.0  # a recorded frame from longer before or after is no reference: light, and what stands about, has changed
+# the distance of a frame that the last picture had counts as this share of it, so that references
+# do not flicker
+STAY = 0.75
+# a recorded frame from longer before or after is no reference: light, and what stands about, has
+# changed
+SPAN_S = 6.0
 
 
 class ReferenceIndex:
@@ -42,10 +61,18 @@ class ReferenceIndex:
         self._centres, self._axes = T[:, :3, 3], T[:, :3, 2]
         self._t_us: I64 = np.array([frame.t_us for frame in recorded], dtype=np.int64)
 
-    def choose(self, T_world_camera: F64, t_us: int, count: int, last: Sequence[int] = (), past: bool = False) -> tuple[int, ...]:
+    def choose(
+        self,
+        T_world_camera: F64,
+        t_us: int,
+        count: int,
+        last: Sequence[int] = (),
+        past: bool = False,
+    ) -> tuple[int, ...]:
         """Return the nearest recorded frames, nearest first.
 
-        The distance is that of the cameras' centres, plus `SECOND_M` a second and `TURN_M` a radian between the optical axes.
+        The distance is that of the cameras' centres, plus `SECOND_M` a second and `TURN_M` a radian
+        between the optical axes.
 
         Args:
             T_world_camera: ``(4, 4)`` of the view.
@@ -77,8 +104,9 @@ class ReferenceSession:
         ego_log: Of the rig; the ground of a view is that of the pose nearest to its camera.
         count: References of a frame, at most.
         which: ``all`` of the recording, or only what was recorded before the frame's time.
-        hysteresis: Whether a camera keeps its references a little longer than they are nearest. Without it the references of a view do not
-            depend on what came before, as a server of several drives needs.
+        hysteresis: Whether a camera keeps its references a little longer than they are nearest.
+            Without it the references of a view do not depend on what came before, as a server of
+            several drives needs.
         threads: Threads that carry them.
     """
 
@@ -92,7 +120,12 @@ class ReferenceSession:
         hysteresis: bool = True,
         threads: int = 1,
     ) -> None:
-        self.index, self.count, self.past, self.hysteresis = ReferenceIndex(recorded), count, which == "past", hysteresis
+        self.index, self.count, self.past, self.hysteresis = (
+            ReferenceIndex(recorded),
+            count,
+            which == "past",
+            hysteresis,
+        )
         self.threads = threads
         self._boxes, self._ego_log = {actor.actor_id: actor.box for actor in actors}, ego_log
         self._last: dict[str, tuple[int, ...]] = {}
@@ -116,14 +149,23 @@ class ReferenceSession:
         T_world_rig = se3(self._ego_log.xyz[at], self._ego_log.quat[at])
         pictures = [self._picture(i) for i in chosen]
         out = tuple(np.zeros((*frame.depth.shape, 4), np.uint8) for _ in pictures)
-        around = window_px(request.camera.K)  # what `carry` decides of a pixel depends on those around it
+        around = window_px(
+            request.camera.K
+        )  # what `carry` decides of a pixel depends on those around it
         for band in bands(request):
-            top, end = max(band.rows.start - around, 0), min(band.rows.stop + around, len(frame.depth))
+            top, end = (
+                max(band.rows.start - around, 0),
+                min(band.rows.stop + around, len(frame.depth)),
+            )
             K = request.camera.K.copy()
             K[1, 2] -= top
-            target = WarpTarget(K, band.T_world_camera, frame.depth[top:end], band.actors, self._boxes)
+            target = WarpTarget(
+                K, band.T_world_camera, frame.depth[top:end], band.actors, self._boxes
+            )
             own = slice(band.rows.start - top, band.rows.stop - top), band.columns
-            for whole, part in zip(out, carry(pictures, target, T_world_rig, self.threads), strict=True):
+            for whole, part in zip(
+                out, carry(pictures, target, T_world_rig, self.threads), strict=True
+            ):
                 band.put(whole, part[own])
         return out
 

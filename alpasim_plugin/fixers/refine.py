@@ -14,12 +14,16 @@ from alpasim_plugin.core.image_metrics import decibels
 from alpasim_plugin.core.interfaces import Fixer
 from alpasim_plugin.core.types import U8, Frame
 
-UNLIKE = "unlike"  # event of frames that passed through since the fixer does not know this kind of video
+UNLIKE = (
+    "unlike"  # event of frames that passed through since the fixer does not know this kind of video
+)
 
 
 @dataclass(frozen=True)
 class FixedBlock:
-    """One block: input, output, the fixer's time, and the least PSNR of what was refused, where something was."""
+    """One block: input, output, the fixer's time, and the least PSNR of what was refused, where
+    something was.
+    """
 
     given: tuple[Frame, ...]
     fixed: tuple[Frame, ...]
@@ -29,31 +33,38 @@ class FixedBlock:
 
 @dataclass(frozen=True)
 class ChangeLimit:
-    """How much a fixer may change a frame that was given as reliable, before it is taken not to know this kind of video.
+    """How much a fixer may change a frame that was given as reliable, before it is taken not to
+    know this kind of video.
 
-    A fixer trained on one kind of picture damages others, and says nothing of it. What it should repair is marked by a low opacity; a whole
-    video without opacity is declared reliable, so a frame that comes out very different is damage.
+    A fixer trained on one kind of picture damages others, and says nothing of it. What it should
+    repair is marked by a low opacity; a whole video without opacity is declared reliable, so a
+    frame that comes out very different is damage.
 
     Attributes:
-        least_psnr_db: A frame changed by more than this passes through unrefined, as do all after it.
+        least_psnr_db: A frame changed by more than this passes through unrefined, as do all after
+            it.
     """
 
     least_psnr_db: float = 32.0
 
 
-def refine_frames(frames: Iterable[tuple[Frame, U8 | None]], fixer: Fixer, limit: ChangeLimit | None = None) -> Iterator[FixedBlock]:
+def refine_frames(
+    frames: Iterable[tuple[Frame, U8 | None]], fixer: Fixer, limit: ChangeLimit | None = None
+) -> Iterator[FixedBlock]:
     """Fix a stream block by block; the last block may be shorter.
 
     Args:
         frames: Frames of one camera, oldest first, each with its semantic map, or all with None.
         fixer: A session at the start of a rollout.
-        limit: From the first frame that the fixer changes by more on, the frames pass through as they are, with the event `UNLIKE`; None:
-            whatever the fixer makes is taken.
+        limit: From the first frame that the fixer changes by more on, the frames pass through as
+            they are, with the event `UNLIKE`; None: whatever the fixer makes is taken.
 
     Yields:
         Blocks as they are done; only one is held at a time.
     """
-    stream, index, is_unlike = iter(frames), 0, False
+    stream = iter(frames)
+    index = 0
+    is_unlike = False
     while pairs := list(islice(stream, fixer.blocks.frames(index))):
         given = tuple(frame for frame, _ in pairs)
         maps = tuple(image for _, image in pairs if image is not None)
@@ -64,7 +75,11 @@ def refine_frames(frames: Iterable[tuple[Frame, U8 | None]], fixer: Fixer, limit
             worst = min(_psnr_db(*pair) for pair in zip(given, fixed, strict=True))
             is_unlike = worst < limit.least_psnr_db
             refused_psnr_db = worst if is_unlike else None
-        fixed = tuple(replace(frame, events=(*frame.events, UNLIKE)) for frame in given) if is_unlike else fixed
+        fixed = (
+            tuple(replace(frame, events=(*frame.events, UNLIKE)) for frame in given)
+            if is_unlike
+            else fixed
+        )
         yield FixedBlock(given, fixed, took_s, refused_psnr_db)
         index += 1
 
@@ -77,7 +92,8 @@ def _psnr_db(given: Frame, fixed: Frame) -> float:
 
 @dataclass
 class Difference:
-    """Accumulated difference of two streams of images: mean and largest in grey levels, and PSNR over all values.
+    """Accumulated difference of two streams of images: mean and largest in grey levels, and PSNR
+    over all values.
 
     Example:
         >>> difference = Difference()
@@ -124,7 +140,9 @@ class StreamStats:
     def add(self, block: FixedBlock) -> None:
         """Add one block."""
         self.frames += len(block.given)
-        self.refused_psnr_db = block.refused_psnr_db if self.refused_psnr_db is None else self.refused_psnr_db
+        self.refused_psnr_db = (
+            block.refused_psnr_db if self.refused_psnr_db is None else self.refused_psnr_db
+        )
         self.ms_per_frame.append(block.seconds * 1e3 / len(block.given))
         for given, fixed in zip(block.given, block.fixed, strict=True):
             self.difference.add(given.rgb, fixed.rgb)

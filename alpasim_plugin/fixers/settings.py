@@ -50,18 +50,36 @@ class FixerSettings(Part):
     """Settings of any fixer, read by the closed loop."""
 
     name: str = Field(description="Name in tables and reports.")
-    block_latents: Positive = Field(default=2, description="Latents of a block: 2 are 8 frames, 5 at the start of a rollout.")
+    block_latents: Positive = Field(
+        default=2, description="Latents of a block: 2 are 8 frames, 5 at the start of a rollout."
+    )
     mode: Literal["chunk", "speculative"] = Field(
         default="speculative",
         description="chunk: the plan is committed for a block. speculative: a block is fixed along the predicted poses, and again where "
         "the true poses differ.",
     )
-    tolerance_m: float = Field(default=0.02, ge=0, description="Speculative: largest camera displacement from the predicted pose.")
-    tolerance_deg: float = Field(default=0.1, ge=0, description="Speculative: largest camera rotation from the predicted pose.")
-    uses_map: bool = Field(default=False, description="Whether the semantic map is drawn and given to the fixer.")
-    references: int = Field(default=0, ge=0, le=8, description="Recorded frames that are warped into each view, at most; 0: none.")
+    tolerance_m: float = Field(
+        default=0.02,
+        ge=0,
+        description="Speculative: largest camera displacement from the predicted pose.",
+    )
+    tolerance_deg: float = Field(
+        default=0.1,
+        ge=0,
+        description="Speculative: largest camera rotation from the predicted pose.",
+    )
+    uses_map: bool = Field(
+        default=False, description="Whether the semantic map is drawn and given to the fixer."
+    )
+    references: int = Field(
+        default=0,
+        ge=0,
+        le=8,
+        description="Recorded frames that are warped into each view, at most; 0: none.",
+    )
     recording: Literal["all", "past"] = Field(
-        default="all", description="Which recorded frames may be references: all of the recording, or those from before the frame's time."
+        default="all",
+        description="Which recorded frames may be references: all of the recording, or those from before the frame's time.",
     )
 
     @property
@@ -76,12 +94,16 @@ class FixerSettings(Part):
 
     @property
     def keeps_appearance(self) -> bool:
-        """Whether the output is meant to look like the render; a fixer asked for another appearance changes every pixel."""
+        """Whether the output is meant to look like the render; a fixer asked for another appearance
+        changes every pixel.
+        """
         return True
 
     @property
     def unit(self) -> Unit | None:
-        """What the fixer makes at a time and what that costs, for tables; None where it does not say."""
+        """What the fixer makes at a time and what that costs, for tables; None where it does not
+        say.
+        """
         return None
 
     @classmethod
@@ -101,25 +123,40 @@ class DigestSettings(Part):
 
 
 class WeightsSettings(Part):
-    """Files with weights; relative paths start at the folder of the file that names them, or at the working folder."""
+    """Files with weights; relative paths start at the folder of the file that names them, or at the
+    working folder.
+    """
 
-    bundle: str | None = Field(default=None, description="One safetensors file with everything (docs/fixers.md).")
+    bundle: str | None = Field(
+        default=None, description="One safetensors file with everything (docs/fixers.md)."
+    )
     dit: str | None = Field(default=None, description="The transformer alone.")
     vae: str | None = Field(default=None, description="The autoencoder alone.")
     decoder: str | None = Field(default=None, description="The tiny Wan decoder.")
-    prompt: str | None = Field(default=None, description="Safetensors with 'text' (tokens, text_width), or with a prompt under each name.")
-    sha256: DigestSettings = Field(default=DigestSettings(), description="Expected digests by the keys above.")
+    prompt: str | None = Field(
+        default=None,
+        description="Safetensors with 'text' (tokens, text_width), or with a prompt under each name.",
+    )
+    sha256: DigestSettings = Field(
+        default=DigestSettings(), description="Expected digests by the keys above."
+    )
 
     def path(self, part: str) -> Path | None:
-        """Return where a part's weights lie: ``bundle``, ``dit``, ``vae``, ``decoder`` or ``prompt``; None where it has no file."""
+        """Return where a part's weights lie: ``bundle``, ``dit``, ``vae``, ``decoder`` or
+        ``prompt``; None where it has no file.
+        """
         path: str | None = getattr(self, part)
         return None if path is None else Path(path)
 
     @model_validator(mode="after")
     def _one_source(self) -> WeightsSettings:
-        parts = [key for key in ("dit", "vae", "decoder", "prompt") if getattr(self, key) is not None]
+        parts = [
+            key for key in ("dit", "vae", "decoder", "prompt") if getattr(self, key) is not None
+        ]
         if self.bundle is not None and parts:
-            raise ValueError(f"a bundle and {', '.join(parts)} | give the bundle alone, or the parts")
+            raise ValueError(
+                f"a bundle and {', '.join(parts)} | give the bundle alone, or the parts"
+            )
         return self
 
 
@@ -144,7 +181,9 @@ class BundleKind:
         """Return what is missing and what does not belong."""
         found = set(parts)
         unknown = sorted(found - self.needed - self.optional)
-        return [f"no {part}.*" for part in sorted(self.needed - found)] + [f"unknown part {part}.*" for part in unknown]
+        return [f"no {part}.*" for part in sorted(self.needed - found)] + [
+            f"unknown part {part}.*" for part in unknown
+        ]
 
 
 class WeightedSettings(FixerSettings):
@@ -153,7 +192,8 @@ class WeightedSettings(FixerSettings):
     bundle_kind: ClassVar[BundleKind]
     weights: WeightsSettings = Field(default=WeightsSettings(), description="Files with weights.")
     untrained: Literal["identity", "random", "refuse"] = Field(
-        default="refuse", description="Initialisation without weights: returns the render (identity), random, or an error (refuse)."
+        default="refuse",
+        description="Initialisation without weights: returns the render (identity), random, or an error (refuse).",
     )
 
     @property
@@ -166,7 +206,9 @@ def counted_steps(value: Any) -> Any:
     """Take a count of steps for the schedule's own, as ``NAME@STEPS`` gives it."""
     if isinstance(value, int) and not isinstance(value, bool):
         return schedule.names(value)
-    return tuple(value) if isinstance(value, list) else value  # strict validation takes no list for a tuple after this step
+    return (
+        tuple(value) if isinstance(value, list) else value
+    )  # strict validation takes no list for a tuple after this step
 
 
 def check_steps(steps: tuple[float, ...]) -> None:
@@ -176,7 +218,9 @@ def check_steps(steps: tuple[float, ...]) -> None:
         ValueError: With what to write, as pydantic's validators report it.
     """
     if any(b >= a for a, b in pairwise(steps)) or steps[0] != 1000 or steps[-1] <= 0:
-        raise ValueError(f"steps = {list(steps)} | give named steps falling from 1000, such as [1000] or [1000, 500]")
+        raise ValueError(
+            f"steps = {list(steps)} | give named steps falling from 1000, such as [1000] or [1000, 500]"
+        )
 
 
 def check_no_blocks(settings: FixerSettings) -> None:
@@ -187,14 +231,17 @@ def check_no_blocks(settings: FixerSettings) -> None:
     """
     for key in ("block_latents", "mode", "tolerance_m", "tolerance_deg"):
         if getattr(settings, key) != FixerSettings.model_fields[key].default:
-            raise ValueError(f"{key} = {getattr(settings, key)} | one frame at a time has no blocks: leave it out, or take a onefixer-dit")
+            raise ValueError(
+                f"{key} = {getattr(settings, key)} | one frame at a time has no blocks: leave it out, or take a onefixer-dit"
+            )
 
 
 S = TypeVar("S", bound=FixerSettings)
 
 
 def load_settings(name: str, model: type[S], overrides: Sequence[str] = ()) -> S:
-    """Read ``configs/fixers/NAME.yaml`` (a fixer without a file has its model's defaults) and apply overrides.
+    """Read ``configs/fixers/NAME.yaml`` (a fixer without a file has its model's defaults) and apply
+    overrides.
 
     Args:
         name: The fixer.
@@ -202,15 +249,23 @@ def load_settings(name: str, model: type[S], overrides: Sequence[str] = ()) -> S
         overrides: ``window=4``, ``decoder.kind=latent``.
 
     Raises:
-        InputError: An unknown key with the nearest known one, or a bad value, with file, line and column.
+        InputError: An unknown key with the nearest known one, or a bad value, with file, line and
+            column.
     """
     path = Path(str(resources.files("configs.fixers"))) / f"{name}.yaml"
-    document = load_yaml(path, DOING) if path.is_file() else Document({"name": name}, {}, f"the defaults of {name}")
-    return validate(model, _absolute(_override(_without_shipped(document, overrides), overrides)), DOING)
+    document = (
+        load_yaml(path, DOING)
+        if path.is_file()
+        else Document({"name": name}, {}, f"the defaults of {name}")
+    )
+    return validate(
+        model, _absolute(_override(_without_shipped(document, overrides), overrides)), DOING
+    )
 
 
 def _without_shipped(document: Document, overrides: Sequence[str]) -> Document:
-    """Let parts named in overrides take the place of the bundle that the file names; sizes are what its weights are, so they stay.
+    """Let parts named in overrides take the place of the bundle that the file names; sizes are what
+    its weights are, so they stay.
 
     Raises:
         InputError: Other sizes for weights that have theirs.
@@ -231,17 +286,29 @@ def _without_shipped(document: Document, overrides: Sequence[str]) -> Document:
 
 
 def _override(document: Document, overrides: Sequence[str]) -> Document:
-    """Apply overrides under the prefix that users write, ``--set fixer.KEY=VALUE``, so that messages show it."""
-    nested = Document({"fixer": document.data}, {("fixer", *loc): mark for loc, mark in document.marks.items()}, document.path)
+    """Apply overrides under the prefix that users write, ``--set fixer.KEY=VALUE``, so that
+    messages show it.
+    """
+    nested = Document(
+        {"fixer": document.data},
+        {("fixer", *loc): mark for loc, mark in document.marks.items()},
+        document.path,
+    )
     done = apply_overrides(nested, [f"fixer.{text}" for text in overrides], DOING)
     marks = {loc[1:]: mark for loc, mark in done.marks.items()}
     return Document(done.data["fixer"], marks, document.path, document.sources, tuple(overrides))
 
 
 def _absolute(document: Document) -> Document:
-    """Resolve relative paths of weights against the file, or the working folder, that they were written in."""
+    """Resolve relative paths of weights against the file, or the working folder, that they were
+    written in.
+    """
     weights = document.data.get("weights")
     if not isinstance(weights, dict):
         return document
-    paths = {key: str(document.folder_of(("weights", key)) / value) for key, value in weights.items() if isinstance(value, str)}
+    paths = {
+        key: str(document.folder_of(("weights", key)) / value)
+        for key, value in weights.items()
+        if isinstance(value, str)
+    }
     return replace(document, data={**document.data, "weights": {**weights, **paths}})

@@ -1,4 +1,6 @@
-"""Where a fixed picture comes from, as facts of its frame: recorded frames, the render, or the fixer itself."""
+"""Where a fixed picture comes from, as facts of its frame: recorded frames, the render, or the
+fixer itself.
+"""
 
 # Numba's decorators are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
@@ -11,7 +13,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.core.types import F32, GUESSED_SHARE, RECORDED_SHARE, TRUST_CELLS, U8
 
-MADE_UP = 0.25  # a pixel that differs from the render by so much, of a range of 2, is the fixer's own altogether
+# a pixel that differs from the render by so much, of a range of 2, is the fixer's own altogether
+MADE_UP = 0.25
 CELL_PX, MOST_COLUMNS = 16, 32  # side of a cell; a picture wider than 512 pixels has larger ones
 LEVELS = 15  # a share is a hexadecimal digit
 
@@ -24,23 +27,34 @@ def trust(output: F32, render: F32, recorded: F32) -> dict[str, float | str]:
         recorded: ``(H, W)`` share of the references in each pixel.
 
     Returns:
-        `RECORDED_SHARE` and `GUESSED_SHARE`: means over the picture. `TRUST_CELLS`: both by cell, as `trust_cells` reads it. Sums are
-        in double precision and in one order: those of torch depend in their last bits on the number of threads, and facts must not.
+        `RECORDED_SHARE` and `GUESSED_SHARE`: means over the picture. `TRUST_CELLS`: both by cell,
+        as `trust_cells` reads it. Sums are in double precision and in one order: those of torch
+        depend in their last bits on the number of threads, and facts must not.
     """
     height, width = recorded.shape
     side = max(CELL_PX, -(-width // MOST_COLUMNS))
     sums = np.zeros((-(-height // side), -(-width // side), 2))
     _add_shares(*(np.ascontiguousarray(x) for x in (output, render, recorded)), side, sums)
-    pixels = np.outer(*(np.diff(np.arange(0, length, side), append=length) for length in (height, width)))
+    pixels = np.outer(
+        *(np.diff(np.arange(0, length, side), append=length) for length in (height, width))
+    )
     digits = np.rint(sums / pixels[..., None] * LEVELS).astype(np.uint8)
-    recorded_share, guessed_share = (float(share) for share in sums.sum(axis=(0, 1)) / recorded.size)
+    recorded_share, guessed_share = (
+        float(share) for share in sums.sum(axis=(0, 1)) / recorded.size
+    )
     text = digits.tobytes().hex()[1::2]  # of a byte's two digits the second: it is at most fifteen
-    return {RECORDED_SHARE: recorded_share, GUESSED_SHARE: guessed_share, TRUST_CELLS: f"{sums.shape[1]}x{sums.shape[0]}:{text}"}
+    return {
+        RECORDED_SHARE: recorded_share,
+        GUESSED_SHARE: guessed_share,
+        TRUST_CELLS: f"{sums.shape[1]}x{sums.shape[0]}:{text}",
+    }
 
 
 @njit(cache=True, nogil=True)
 def _add_shares(output, render, recorded, side, sums):
-    """Add the recorded and the made-up share of every pixel to its cell, in double precision and row by row."""
+    """Add the recorded and the made-up share of every pixel to its cell, in double precision and
+    row by row.
+    """
     scale = np.float32(1 / (3 * MADE_UP))
     height, width = recorded.shape
     for row in range(height):
@@ -56,7 +70,8 @@ def _add_shares(output, render, recorded, side, sums):
 
 
 def trust_cells(text: str) -> U8:
-    """Return the shares of every cell of a picture ``(rows, columns, 2)``, recorded and guessed, in fifteenths.
+    """Return the shares of every cell of a picture ``(rows, columns, 2)``, recorded and guessed, in
+    fifteenths.
 
     Args:
         text: ``COLUMNSxROWS:`` and two hexadecimal digits a cell, row by row from the top.
@@ -75,5 +90,8 @@ def trust_cells(text: str) -> U8:
     except ValueError as error:
         found = f"{text[:40]!r}"
         raise InputError(
-            "reading where a picture comes from", TRUST_CELLS, found, "run the rollout again: its frames.jsonl is damaged"
+            "reading where a picture comes from",
+            TRUST_CELLS,
+            found,
+            "run the rollout again: its frames.jsonl is damaged",
         ) from error

@@ -29,7 +29,11 @@ class Views:
     rgb: U8  # (B, T, H, W, 3)
     alpha: F32 | None  # (B, T, H, W), 0 to 1; None where every pixel is opaque
     maps: U8 | None  # (B, T, H, W, 3)
-    references: U8 | None = None  # (B, T, K, H, W, 4) recorded frames, 0 where a frame has fewer than others; None: no frame has any
+    references: U8 | None = (
+        # (B, T, K, H, W, 4) recorded frames, 0 where a frame has fewer than others; None: no frame
+        # has any
+        None
+    )
 
     @property
     def size(self) -> ClipSize:
@@ -43,7 +47,9 @@ class Views:
 
     def equals(self, other: Views | None) -> bool:
         """Return whether two blocks are equal bit for bit."""
-        return other is not None and all(_same(getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+        return other is not None and all(
+            _same(getattr(self, field.name), getattr(other, field.name)) for field in fields(self)
+        )
 
 
 class Past(Protocol):
@@ -72,15 +78,22 @@ def group_views(block: Sequence[Frame], maps: Sequence[U8], frames_due: int) -> 
         One batch of views per image size; pixels are copied.
 
     Raises:
-        InputError: No frame, too many, cameras with different numbers of frames, two frames at one time, sizes that change within a camera,
-            or maps that do not belong to the frames.
+        InputError: No frame, too many, cameras with different numbers of frames, two frames at one
+            time, sizes that change within a camera, or maps that do not belong to the frames.
         RendererError: An opacity that is not a number or outside [0, 1].
     """
     if not block:
         raise InputError(DOING, "the block", "no frames", "give at least one frame per camera")
     if maps and len(maps) != len(block):
-        raise InputError(DOING, "semantic maps", f"{len(maps)} for {len(block)} frames", "give one per frame in the same order, or none")
-    order = sorted(range(len(block)), key=lambda i: (block[i].rgb.shape, block[i].camera, block[i].t_us))
+        raise InputError(
+            DOING,
+            "semantic maps",
+            f"{len(maps)} for {len(block)} frames",
+            "give one per frame in the same order, or none",
+        )
+    order = sorted(
+        range(len(block)), key=lambda i: (block[i].rgb.shape, block[i].camera, block[i].t_us)
+    )
     index: dict[str, list[int]] = {}
     for i in order:
         index.setdefault(block[i].camera, []).append(i)
@@ -104,46 +117,83 @@ def check_continues(view: Views, pasts: Mapping[str, Past]) -> None:
             continue
         if past.raw.shape[:2] != view.shape:
             found = f"{view.shape} (height, width) after {past.raw.shape[:2]}"
-            raise InputError(DOING, f"camera {camera!r}", found, "keep a camera's image size for the whole rollout, or reset")
+            raise InputError(
+                DOING,
+                f"camera {camera!r}",
+                found,
+                "keep a camera's image size for the whole rollout, or reset",
+            )
         if times[0] <= past.t_us:
             found = f"a frame at {times[0]} us after one at {past.t_us} us"
-            raise InputError(DOING, f"camera {camera!r}", found, "give frames in the order of time, or reset")
+            raise InputError(
+                DOING, f"camera {camera!r}", found, "give frames in the order of time, or reset"
+            )
 
 
 def _check_view(camera: str, frames: Sequence[Frame], maps: Sequence[U8]) -> None:
     times = [frame.t_us for frame in frames]
     shape = frames[0].rgb.shape
     if len(set(times)) < len(times):
-        raise InputError(DOING, f"camera {camera!r}", f"two frames at one time: {times}", "give every frame once")
+        raise InputError(
+            DOING, f"camera {camera!r}", f"two frames at one time: {times}", "give every frame once"
+        )
     for frame in frames:
         what = f"camera {camera!r} at {frame.t_us} us"
-        if frame.rgb.ndim != 3 or frame.rgb.shape[2] != 3 or 0 in frame.rgb.shape or frame.rgb.dtype != np.uint8:
-            raise InputError(DOING, what, f"rgb is {frame.rgb.dtype} {frame.rgb.shape}", "give (height, width, 3) uint8")
+        if (
+            frame.rgb.ndim != 3
+            or frame.rgb.shape[2] != 3
+            or 0 in frame.rgb.shape
+            or frame.rgb.dtype != np.uint8
+        ):
+            raise InputError(
+                DOING,
+                what,
+                f"rgb is {frame.rgb.dtype} {frame.rgb.shape}",
+                "give (height, width, 3) uint8",
+            )
         if frame.rgb.shape != shape:
             do = "keep a camera's image size for the whole rollout"
-            raise InputError(DOING, what, f"rgb of {frame.rgb.shape[:2]} after {shape[:2]} (height, width)", do)
+            raise InputError(
+                DOING, what, f"rgb of {frame.rgb.shape[:2]} after {shape[:2]} (height, width)", do
+            )
         if frame.alpha is not None:
             _check_alpha(what, frame.alpha, shape[:2])
         for image in frame.references:
             if image.shape != (*shape[:2], 4) or image.dtype != np.uint8:
                 found = f"a reference of {image.dtype} {image.shape}"
-                raise InputError(DOING, what, found, f"give uint8 {(*shape[:2], 4)}, the size of the frame")
+                raise InputError(
+                    DOING, what, found, f"give uint8 {(*shape[:2], 4)}, the size of the frame"
+                )
     for t_us, image in zip(times, maps, strict=False):
         if image.shape != shape or image.dtype != np.uint8:
             found = f"{image.dtype} {image.shape}"
-            raise InputError(DOING, f"map of camera {camera!r} at {t_us} us", found, f"give uint8 {shape}, the size of the frame")
+            raise InputError(
+                DOING,
+                f"map of camera {camera!r} at {t_us} us",
+                found,
+                f"give uint8 {shape}, the size of the frame",
+            )
 
 
 def _check_alpha(what: str, alpha: F32, shape: tuple[int, ...]) -> None:
     if alpha.shape != shape:
-        raise InputError(DOING, what, f"alpha of {alpha.shape} with rgb of {shape} (height, width)", "give both at one size")
+        raise InputError(
+            DOING,
+            what,
+            f"alpha of {alpha.shape} with rgb of {shape} (height, width)",
+            "give both at one size",
+        )
     low, high = float(alpha.min()), float(alpha.max())
     if not (low >= -SLACK and high <= 1 + SLACK):  # also refuses NaN, which min and max propagate
         found = f"opacity with {int(np.isnan(alpha).sum())} NaN, values from {np.nanmin(alpha):.4g} to {np.nanmax(alpha):.4g}"
-        raise RendererError(DOING, what, found, "repair the renderer: its opacity is accumulated alpha, 0 to 1")
+        raise RendererError(
+            DOING, what, found, "repair the renderer: its opacity is accumulated alpha, 0 to 1"
+        )
 
 
-def _stack(block: Sequence[Frame], maps: Sequence[U8], cameras: Sequence[str], index: dict[str, list[int]]) -> Views:
+def _stack(
+    block: Sequence[Frame], maps: Sequence[U8], cameras: Sequence[str], index: dict[str, list[int]]
+) -> Views:
     names = tuple(sorted(cameras))
     order = tuple(tuple(index[name]) for name in names)
     shape = block[order[0][0]].rgb.shape
@@ -152,7 +202,10 @@ def _stack(block: Sequence[Frame], maps: Sequence[U8], cameras: Sequence[str], i
     frames = [block[i] for i in flat]
     alpha = None
     if any(frame.alpha is not None and frame.alpha.min() < 1 for frame in frames):
-        alphas = [np.ones(shape[:2], np.float32) if frame.alpha is None else frame.alpha for frame in frames]
+        alphas = [
+            np.ones(shape[:2], np.float32) if frame.alpha is None else frame.alpha
+            for frame in frames
+        ]
         alpha = np.stack(alphas, dtype=np.float32).clip(0, 1).reshape(*lead, *shape[:2])
     return Views(
         names,

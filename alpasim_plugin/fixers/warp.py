@@ -1,4 +1,6 @@
-"""Carry a recorded frame into another view by that view's depth: a compiled kernel, and the plain arithmetic that it is held to."""
+"""Carry a recorded frame into another view by that view's depth: a compiled kernel, and the plain
+arithmetic that it is held to.
+"""
 
 # Numba's decorators are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
@@ -19,12 +21,21 @@ from alpasim_plugin.core.types import F32, F64, I64, U8, Bool, Box
 from alpasim_plugin.gaussians.raster import simd as v
 
 INFINITY_M = 1e5  # how far a pixel without depth is: nothing moves by parallax there
-NEAREST_M = 0.3  # a point that is nearer to the recorded camera, or behind it, is not in its picture
-SLACK, SLACK_M = 0.12, 0.4  # two depths agree within this share and this length: reconstructions are no better
+NEAREST_M = (
+    0.3  # a point that is nearer to the recorded camera, or behind it, is not in its picture
+)
+SLACK, SLACK_M = (
+    0.12,
+    0.4,
+)  # two depths agree within this share and this length: reconstructions are no better
 AROUND_M = (0.25, 0.25, 0.2)  # a point this far outside of a box still moves with it
-PARALLEL = 1e-300  # stands for the slope of a ray along a wall, so that it meets that wall's plane nowhere near
+# stands for the slope of a ray along a wall, so that it meets that wall's plane nowhere near
+PARALLEL = 1e-300
 SOLE_M = 0.05  # but not the ground below: a box's lowest layer of this height stays where it is
-VALID, INCONSISTENT = 255, 128  # last channel of a reference: validity: the depths agree; they do not
+VALID, INCONSISTENT = (
+    255,
+    128,
+)  # last channel of a reference: validity: the depths agree; they do not
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +45,8 @@ class WarpTarget:
     Attributes:
         K: ``(3, 3)`` pixels.
         T_world_camera: ``(4, 4)``.
-        depth: ``(H, W)`` metres along the optical axis; 0 where nothing is, which counts as infinitely far.
+        depth: ``(H, W)`` metres along the optical axis; 0 where nothing is, which counts as
+            infinitely far.
         actors: ``T_world_box`` of the actors present.
         boxes: Sizes of actors; one that has none counts as absent.
     """
@@ -47,13 +59,17 @@ class WarpTarget:
 
     @cached_property
     def placed(self) -> PlacedBoxes:
-        """The boxes of the actors present, as the view sees them; found once for all recorded frames that are carried into it."""
+        """The boxes of the actors present, as the view sees them; found once for all recorded
+        frames that are carried into it.
+        """
         return place_boxes(self.depth.shape, self.K, self.T_world_camera, self.actors, self.boxes)
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A recorded frame in memory: see `RecordedFrame`; ``users`` are the pixels of its road users ``(H, W)``, None where there are none."""
+    """A recorded frame in memory: see `RecordedFrame`; ``users`` are the pixels of its road users
+    ``(H, W)``, None where there are none.
+    """
 
     K: F64
     T_world_camera: F64
@@ -64,8 +80,15 @@ class Picture:
 
     @cached_property
     def bordered(self) -> U8:
-        """Four bytes a pixel ``(H + 4, W + 4, 4)``, the outermost pixels twice more on each side: what `_look_up` reads."""
-        return np.asarray(cv2.copyMakeBorder(cv2.cvtColor(self.rgb, cv2.COLOR_RGB2RGBA), 2, 2, 2, 2, cv2.BORDER_REPLICATE), np.uint8)
+        """Four bytes a pixel ``(H + 4, W + 4, 4)``, the outermost pixels twice more on each side:
+        what `_look_up` reads.
+        """
+        return np.asarray(
+            cv2.copyMakeBorder(
+                cv2.cvtColor(self.rgb, cv2.COLOR_RGB2RGBA), 2, 2, 2, 2, cv2.BORDER_REPLICATE
+            ),
+            np.uint8,
+        )
 
 
 class Lookup(NamedTuple):
@@ -77,10 +100,11 @@ class Lookup(NamedTuple):
         K_then, T_then_world: Of the recorded camera; the second maps the world to it.
         depth_then: ``(H', W')`` of the recorded frame.
         T_box_world: ``(A, 4, 4)`` the world to each actor's box, at the view's time.
-        T_then_box: ``(A, 4, 4)`` each box to the world, when the frame was recorded; NaN where the actor was absent.
+        T_then_box: ``(A, 4, 4)`` each box to the world, when the frame was recorded; NaN where the
+            actor was absent.
         sizes: ``(A, 3)`` length, width and height, metres.
-        free_share: A recorded surface that is at least this share of a point's distance away does not hide the point. Infinite: only one
-            that agrees with the point does not.
+        free_share: A recorded surface that is at least this share of a point's distance away does
+            not hide the point. Infinite: only one that agrees with the point does not.
         seen: Where the view sees the boxes; None: not yet known.
     """
 
@@ -100,8 +124,8 @@ class Lookup(NamedTuple):
 def warp(picture: Picture, target: WarpTarget, free_share: float = np.inf) -> U8:
     """Carry a recorded frame into a view by the view's depth.
 
-    A pixel's surface point is moved with the box it lies in, from where the actor is now to where it was when the frame was recorded, and
-    looked up there, between pixels bicubically.
+    A pixel's surface point is moved with the box it lies in, from where the actor is now to where
+    it was when the frame was recorded, and looked up there, between pixels bicubically.
 
     Args:
         picture: The recorded frame.
@@ -109,14 +133,18 @@ def warp(picture: Picture, target: WarpTarget, free_share: float = np.inf) -> U8
         free_share: See `Lookup`.
 
     Returns:
-        ``(H, W, 4)`` uint8: colour, and `VALID` where the recorded frame's own depth agrees with the point, `INCONSISTENT` where it does
-        not (something stands in between, or one of the depths is wrong), 0 where the point lies outside of the recorded frame or belongs to
-        an actor that was not there.
+        ``(H, W, 4)`` uint8: colour, and `VALID` where the recorded frame's own depth agrees with
+        the point, `INCONSISTENT` where it does not (something stands in between, or one of the
+        depths is wrong), 0 where the point lies outside of the recorded frame or belongs to an
+        actor that was not there.
     """
     now, T_box_world, sizes, seen = target.placed
     absent = np.full((4, 4), np.nan)
     T_then_box = np.array([picture.actors.get(name, absent) for name in now]).reshape(-1, 4, 4)
-    view, then = (target.depth, target.K, target.T_world_camera), (picture.K, inverse(picture.T_world_camera), picture.depth)
+    view, then = (
+        (target.depth, target.K, target.T_world_camera),
+        (picture.K, inverse(picture.T_world_camera), picture.depth),
+    )
     lookup = Lookup(*view, *then, T_box_world, T_then_box, sizes, free_share, seen)
     x, y, held = warp_coordinates(lookup)
     out = np.empty((*held.shape, 4), np.uint8)
@@ -126,9 +154,15 @@ def warp(picture: Picture, target: WarpTarget, free_share: float = np.inf) -> U8
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _weights(t):
-    """Return the weights of four pixels in a row, ``t`` behind the second (Keys, 1981, with the slope -3/4 that OpenCV has)."""
-    one, before, after = np.float32(1.0), t + np.float32(1.0), np.float32(1.0) - t
-    first = ((np.float32(-0.75) * before + np.float32(3.75)) * before - np.float32(6.0)) * before + np.float32(3.0)
+    """Return the weights of four pixels in a row, ``t`` behind the second (Keys, 1981, with the
+    slope -3/4 that OpenCV has).
+    """
+    one = np.float32(1.0)
+    before = t + np.float32(1.0)
+    after = np.float32(1.0) - t
+    first = (
+        (np.float32(-0.75) * before + np.float32(3.75)) * before - np.float32(6.0)
+    ) * before + np.float32(3.0)
     second = (np.float32(1.25) * t - np.float32(2.25)) * t * t + one
     third = (np.float32(1.25) * after - np.float32(2.25)) * after * after + one
     return first, second, third, one - first - second - third
@@ -136,7 +170,9 @@ def _weights(t):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _look_up(bordered, x, y, held, out):
-    """Write what lies at ``x`` and ``y``, to rounding as ``cv2.remap`` does: four rows of four pixels, a row as one vector."""
+    """Write what lies at ``x`` and ``y``, to rounding as ``cv2.remap`` does: four rows of four
+    pixels, a row as one vector.
+    """
     height, width = x.shape
     flat, step = bordered.reshape(-1), 4 * bordered.shape[1]
     w, place = np.empty((8, width), np.float32), np.empty(width, np.int64)
@@ -153,7 +189,10 @@ def _look_up(bordered, x, y, held, out):
             rows = v.fma(v.load_bytes(flat, at + step), v.splat(w[5, i]), rows)
             rows = v.fma(v.load_bytes(flat, at + 2 * step), v.splat(w[6, i]), rows)
             v.store(sums, 0, v.fma(v.load_bytes(flat, at + 3 * step), v.splat(w[7, i]), rows))
-            a, b, c, d = w[0, i], w[1, i], w[2, i], w[3, i]
+            a = w[0, i]
+            b = w[1, i]
+            c = w[2, i]
+            d = w[3, i]
             # All four are computed before one is written, so that they become one vector.
             red = a * sums[0] + b * sums[4] + c * sums[8] + d * sums[12]
             green = a * sums[1] + b * sums[5] + c * sums[9] + d * sums[13]
@@ -162,7 +201,9 @@ def _look_up(bordered, x, y, held, out):
             line[4 * i], line[4 * i + 1], line[4 * i + 2], line[4 * i + 3] = red, green, blue, rest
         into = out[row].reshape(-1)
         for i in range(len(line)):
-            into[i] = np.uint8(np.int32(np.rint(min(max(line[i], np.float32(0.0)), np.float32(255.0)))))
+            into[i] = np.uint8(
+                np.int32(np.rint(min(max(line[i], np.float32(0.0)), np.float32(255.0))))
+            )
         for i in range(width):
             out[row, i, 3] = held[row, i]
 
@@ -176,24 +217,53 @@ class PlacedBoxes(NamedTuple):
     seen: SeenBoxes
 
 
-def place_boxes(shape: tuple[int, ...], K: F64, T_world_camera: F64, actors: Mapping[str, F64], boxes: Mapping[str, Box]) -> PlacedBoxes:
-    """Return the boxes of the actors present as a camera of ``shape`` rows and columns sees them."""
+def place_boxes(
+    shape: tuple[int, ...],
+    K: F64,
+    T_world_camera: F64,
+    actors: Mapping[str, F64],
+    boxes: Mapping[str, Box],
+) -> PlacedBoxes:
+    """Return the boxes of the actors present as a camera of ``shape`` rows and columns sees
+    them.
+    """
     names = [name for name in sorted(actors) if name in boxes]
     T_box_world = inverse(np.array([actors[name] for name in names]).reshape(-1, 4, 4))
-    sizes = np.array([[boxes[n].length_m, boxes[n].width_m, boxes[n].height_m] for n in names]).reshape(-1, 3)
-    return PlacedBoxes(names, T_box_world, sizes, _seen_boxes(K, T_world_camera, T_box_world, sizes, shape))
+    sizes = np.array(
+        [[boxes[n].length_m, boxes[n].width_m, boxes[n].height_m] for n in names]
+    ).reshape(-1, 3)
+    return PlacedBoxes(
+        names, T_box_world, sizes, _seen_boxes(K, T_world_camera, T_box_world, sizes, shape)
+    )
 
 
 def warp_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
-    """Return where every pixel of a view is to be looked up in a recorded frame, and how well that holds.
+    """Return where every pixel of a view is to be looked up in a recorded frame, and how well that
+    holds.
 
     Returns:
-        Column and row ``(H, W)``, counted from the centre of the first pixel, and `VALID`, `INCONSISTENT` or 0 ``(H, W)``.
+        Column and row ``(H, W)``, counted from the centre of the first pixel, and `VALID`,
+        `INCONSISTENT` or 0 ``(H, W)``.
     """
-    depth, K, T_world_camera, K_then, T_then_world, depth_then, T_box_world, T_then_box, sizes, free_share, seen = lookup
+    (
+        depth,
+        K,
+        T_world_camera,
+        K_then,
+        T_then_world,
+        depth_then,
+        T_box_world,
+        T_then_box,
+        sizes,
+        free_share,
+        seen,
+    ) = lookup
     height, width = depth.shape
-    x, y, held = np.empty((height, width), np.float32), np.empty((height, width), np.float32), np.empty((height, width), np.uint8)
-    # A pixel p at depth z lies at z A p + b in the recorded frame's homogeneous pixels; A p is linear along a row.
+    x = np.empty((height, width), np.float32)
+    y = np.empty((height, width), np.float32)
+    held = np.empty((height, width), np.uint8)
+    # A pixel p at depth z lies at z A p + b in the recorded frame's homogeneous pixels; A p is
+    # linear along a row.
     ray = T_world_camera[:3, :3] @ np.linalg.inv(K)
     project = K_then @ T_then_world[:3]
     A, b = project[:, :3] @ ray, project[:, :3] @ T_world_camera[:3, 3] + project[:, 3]
@@ -205,20 +275,36 @@ def warp_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
     for i in reversed(shown):  # of two boxes the first counts
         part = slice(*seen.pixels[i, :2]), slice(*seen.pixels[i, 2:])
         images = x[part], y[part], held[part]
-        _coordinates_on_box(lines[part], then, seen.ray[i], seen.eye[i], seen.walls[i], to_then[i], seen.pixels[i], free_share, *images)
+        _coordinates_on_box(
+            lines[part],
+            then,
+            seen.ray[i],
+            seen.eye[i],
+            seen.walls[i],
+            to_then[i],
+            seen.pixels[i],
+            free_share,
+            *images,
+        )
     return x, y, held
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _coordinates(depth, depth_then, A, b, free_share, x, y, held):
-    """Fill ``x``, ``y`` and ``held`` as if nothing moved; the loop of `plain_coordinates`, whose rows are vectors."""
+    """Fill ``x``, ``y`` and ``held`` as if nothing moved; the loop of `plain_coordinates`, whose
+    rows are vectors.
+    """
     height, width = depth.shape
     rows_then, columns_then = depth_then.shape
     surfaces = depth_then.reshape(-1)
-    place, distance, seen = np.empty(width, np.uint32), np.empty(width, np.float64), np.empty(width, np.bool_)
+    place = np.empty(width, np.uint32)
+    distance = np.empty(width, np.float64)
+    seen = np.empty(width, np.bool_)
     for row in range(height):
         v0 = row + 0.5
-        ax, ay, az = A[0, 1] * v0 + A[0, 2], A[1, 1] * v0 + A[1, 2], A[2, 1] * v0 + A[2, 2]
+        ax = A[0, 1] * v0 + A[0, 2]
+        ay = A[1, 1] * v0 + A[1, 2]
+        az = A[2, 1] * v0 + A[2, 2]
         for column in range(width):
             u0 = column + 0.5
             z = np.float64(depth[row, column])
@@ -229,14 +315,22 @@ def _coordinates(depth, depth_then, A, b, free_share, x, y, held):
             there = (rz > NEAREST_M) & (u >= 0) & (u < columns_then) & (v >= 0) & (v < rows_then)
             u, v = u if there else 0.5, v if there else 0.5
             x[row, column], y[row, column] = np.float32(u - 0.5), np.float32(v - 0.5)
-            place[column], distance[column], seen[column] = np.uint32(np.int32(v) * columns_then + np.int32(u)), rz, there
+            place[column], distance[column], seen[column] = (
+                np.uint32(np.int32(v) * columns_then + np.int32(u)),
+                rz,
+                there,
+            )
         for column in range(width):
-            held[row, column] = _held(surfaces[place[column]], distance[column], free_share) if seen[column] else 0
+            held[row, column] = (
+                _held(surfaces[place[column]], distance[column], free_share) if seen[column] else 0
+            )
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _held(surface, rz, free_share):
-    """Return how well it holds that a point at depth ``rz`` of the recorded camera is shown by its pixel of depth ``surface``."""
+    """Return how well it holds that a point at depth ``rz`` of the recorded camera is shown by its
+    pixel of depth ``surface``.
+    """
     there = np.float64(surface) if surface > 0 else INFINITY_M
     far = (there > INFINITY_M / 2) & (rz > INFINITY_M / 2)
     agrees = far | (there >= free_share * rz) | (abs(there - rz) < SLACK * rz + SLACK_M)
@@ -244,10 +338,14 @@ def _held(surface, rz, free_share):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _coordinates_on_box(depth, depth_then, ray, eye, walls, project, pixels, free_share, x, y, held):
-    """Fill in what moves with one box in the part of the picture that it may be seen in; see `SeenBoxes`.
+def _coordinates_on_box(
+    depth, depth_then, ray, eye, walls, project, pixels, free_share, x, y, held
+):
+    """Fill in what moves with one box in the part of the picture that it may be seen in; see
+    `SeenBoxes`.
 
-    ``project`` maps the box's axes to the recorded frame's homogeneous pixels; it is not finite where the actor was absent.
+    ``project`` maps the box's axes to the recorded frame's homogeneous pixels; it is not finite
+    where the actor was absent.
     """
     rows_then, columns_then = depth_then.shape
     low, high = walls
@@ -290,16 +388,24 @@ class SeenBoxes(NamedTuple):
     pixels: I64  # (A, 4) first row, last, first column, last; the last ones are not included
 
 
-def _seen_boxes(K: F64, T_world_camera: F64, T_box_world: F64, sizes: F64, shape: tuple[int, ...]) -> SeenBoxes:
+def _seen_boxes(
+    K: F64, T_world_camera: F64, T_box_world: F64, sizes: F64, shape: tuple[int, ...]
+) -> SeenBoxes:
     if not len(sizes):
-        return SeenBoxes(np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 2, 3)), np.empty((0, 4), np.int64))
+        return SeenBoxes(
+            np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 2, 3)), np.empty((0, 4), np.int64)
+        )
     T_box_camera = T_box_world @ T_world_camera
     walls = _walls(sizes)
-    corners = walls[:, [[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], [0, 1, 2]]  # (A, 8, 3)
+    corners = walls[
+        :, [[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], [0, 1, 2]
+    ]  # (A, 8, 3)
     project = K @ inverse(T_box_camera)[:, :3]
     shown = corners @ np.swapaxes(project[..., :3], 1, 2) + project[:, None, :, 3]
     behind = (shown[..., 2] <= 0).all(axis=1, keepdims=True)
-    around = (shown[..., 2] <= NEAREST_M).any(axis=1, keepdims=True)  # some corners lie behind the camera, and the box may reach anywhere
+    around = (shown[..., 2] <= NEAREST_M).any(
+        axis=1, keepdims=True
+    )  # some corners lie behind the camera, and the box may reach anywhere
     with np.errstate(divide="ignore", invalid="ignore"):
         u_v = shown[..., :2] / shown[..., 2:]
     whole = np.array(shape[::-1])
@@ -311,19 +417,27 @@ def _seen_boxes(K: F64, T_world_camera: F64, T_box_world: F64, sizes: F64, shape
 
 
 def _walls(sizes: F64) -> F64:
-    """Return the least and the greatest coordinates ``(..., 2, 3)`` of what moves with boxes ``(..., 3)``."""
-    walls = sizes[..., None, :] / 2 * np.array([[-1.0], [1.0]]) + np.array([np.negative(AROUND_M), AROUND_M])
+    """Return the least and the greatest coordinates ``(..., 2, 3)`` of what moves with boxes
+    ``(..., 3)``.
+    """
+    walls = sizes[..., None, :] / 2 * np.array([[-1.0], [1.0]]) + np.array(
+        [np.negative(AROUND_M), AROUND_M]
+    )
     walls[..., 0, 2] = SOLE_M - sizes[..., 2] / 2
     return np.asarray(walls)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_box(ray, eye, walls, pixels, out):
-    """Add the pixels that show one box to the part of a picture that it may be seen in, by the slab method (Kay and Kajiya, 1986)."""
+    """Add the pixels that show one box to the part of a picture that it may be seen in, by the slab
+    method (Kay and Kajiya, 1986).
+    """
     for row in range(out.shape[0]):
         v = pixels[0] + row + 0.5
         for column in range(out.shape[1]):
-            u, near, far = pixels[2] + column + 0.5, 0.0, np.inf
+            u = pixels[2] + column + 0.5
+            near = 0.0
+            far = np.inf
             for axis in range(3):
                 along = ray[axis, 0] * u + ray[axis, 1] * v + ray[axis, 2]
                 along = along if along != 0.0 else PARALLEL
@@ -332,27 +446,52 @@ def _add_box(ray, eye, walls, pixels, out):
             out[row, column] |= near < far
 
 
-def plain_on_boxes(shape: tuple[int, int], K: F64, T_world_camera: F64, T_box_world: F64, sizes: F64) -> Bool:
-    """Return the same as `on_boxes` of `PlacedBoxes`, array by array: the reference of its kernel."""
+def plain_on_boxes(
+    shape: tuple[int, int], K: F64, T_world_camera: F64, T_box_world: F64, sizes: F64
+) -> Bool:
+    """Return the same as `on_boxes` of `PlacedBoxes`, array by array: the reference of its
+    kernel.
+    """
     rays = plain_points(np.ones(shape), K, T_world_camera) - T_world_camera[:3, 3]
     out: Bool = np.zeros(shape, dtype=bool)
     for T_box, size in zip(T_box_world, sizes, strict=True):
         with np.errstate(divide="ignore"):
-            hits = (_walls(size) - _moved(T_box, T_world_camera[:3, 3]))[:, None, None] / (rays @ T_box[:3, :3].T)
+            hits = (_walls(size) - _moved(T_box, T_world_camera[:3, 3]))[:, None, None] / (
+                rays @ T_box[:3, :3].T
+            )
         out |= np.maximum(hits.min(axis=0).max(axis=-1), 0) < hits.max(axis=0).min(axis=-1)
     return out
 
 
 def plain_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
     """Return the same as `warp_coordinates`, array by array: the reference of its kernel."""
-    depth, K, T_world_camera, K_then, T_then_world, depth_then, T_box_world, T_then_box, sizes, free_share, _ = lookup
+    (
+        depth,
+        K,
+        T_world_camera,
+        K_then,
+        T_then_world,
+        depth_then,
+        T_box_world,
+        T_then_box,
+        sizes,
+        free_share,
+        _,
+    ) = lookup
     height, width = depth.shape
     points = plain_points(np.where(depth > 0, depth, INFINITY_M), K, T_world_camera)
-    out, there, free = points.copy(), np.ones((height, width), dtype=bool), np.ones((height, width), dtype=bool)
+    out = points.copy()
+    there = np.ones((height, width), dtype=bool)
+    free = np.ones((height, width), dtype=bool)
     for T_box, T_then, size in zip(T_box_world, T_then_box, sizes, strict=True):
         q = _moved(T_box, points)
         low, high = _walls(size)
-        inside = free & (np.abs(q[..., :2]) < high[:2]).all(-1) & (q[..., 2] >= low[2]) & (q[..., 2] < high[2])
+        inside = (
+            free
+            & (np.abs(q[..., :2]) < high[:2]).all(-1)
+            & (q[..., 2] >= low[2])
+            & (q[..., 2] < high[2])
+        )
         out[inside] = _moved(T_then, q[inside])
         there[inside] = bool(np.isfinite(T_then).all())
         free &= ~inside
@@ -368,7 +507,11 @@ def plain_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
     far = (then > INFINITY_M / 2) & (rz > INFINITY_M / 2)
     agrees = far | (then >= free_share * rz) | (np.abs(then - rz) < SLACK * rz + SLACK_M)
     held = np.where(seen, np.where(agrees, VALID, INCONSISTENT), 0).astype(np.uint8)
-    return np.where(seen, x - 0.5, 0).astype(np.float32), np.where(seen, y - 0.5, 0).astype(np.float32), held
+    return (
+        np.where(seen, x - 0.5, 0).astype(np.float32),
+        np.where(seen, y - 0.5, 0).astype(np.float32),
+        held,
+    )
 
 
 def plain_points(depth: F64 | F32, K: F64, T_world_camera: F64) -> F64:
@@ -376,7 +519,10 @@ def plain_points(depth: F64 | F32, K: F64, T_world_camera: F64) -> F64:
     height, width = depth.shape
     v, u = np.mgrid[:height, :width] + 0.5
     z = depth.astype(np.float64)
-    return _moved(T_world_camera, np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], axis=-1))
+    return _moved(
+        T_world_camera,
+        np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], axis=-1),
+    )
 
 
 def _moved(T: F64, points: F64) -> F64:

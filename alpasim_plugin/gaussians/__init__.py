@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from alpasim_plugin.gaussians.raster.prepared import PreparedCloud as PreparedCloud
     from alpasim_plugin.gaussians.raster.prepared import prepare as prepare
     from alpasim_plugin.gaussians.raster.rasterize import rasterize as rasterize
-    from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared as rasterize_prepared
+    from alpasim_plugin.gaussians.raster.rasterize_cpu import (
+        rasterize_prepared as rasterize_prepared,
+    )
 
 __all__ = [
     "CleanReport",

@@ -16,7 +16,8 @@ from alpasim_plugin.gaussians.constants import SLOPE_MARGIN
 
 @dataclass(frozen=True, eq=False)
 class PinholeCamera:
-    """A pinhole camera in OpenCV axes: x right, y down, z forward; the centre of pixel (row i, column j) is (j + 0.5, i + 0.5).
+    """A pinhole camera in OpenCV axes: x right, y down, z forward; the centre of pixel (row i,
+    column j) is (j + 0.5, i + 0.5).
 
     Attributes:
         width: Pixels.
@@ -26,7 +27,8 @@ class PinholeCamera:
         whole: `slope_limits` of the picture that this is a window of; None: it is a whole picture.
 
     Raises:
-        InputError: A size below 1, intrinsics with skew or without positive focal lengths, or a transform that is not rigid.
+        InputError: A size below 1, intrinsics with skew or without positive focal lengths, or a
+            transform that is not rigid.
     """
 
     width: int
@@ -37,11 +39,24 @@ class PinholeCamera:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "K", np.asarray(self.K, dtype=np.float64))
-        object.__setattr__(self, "T_camera_world", np.asarray(self.T_camera_world, dtype=np.float64))
+        object.__setattr__(
+            self, "T_camera_world", np.asarray(self.T_camera_world, dtype=np.float64)
+        )
         if self.width < 1 or self.height < 1:
-            raise InputError("building a camera", f"{self.width} x {self.height} pixels", "no pixel", "give at least one")
+            raise InputError(
+                "building a camera",
+                f"{self.width} x {self.height} pixels",
+                "no pixel",
+                "give at least one",
+            )
         k = self.K
-        upper = k.shape == (3, 3) and np.isfinite(k).all() and k[0, 1] == 0 and k[1, 0] == 0 and np.array_equal(k[2], [0, 0, 1])
+        upper = (
+            k.shape == (3, 3)
+            and np.isfinite(k).all()
+            and k[0, 1] == 0
+            and k[1, 0] == 0
+            and np.array_equal(k[2], [0, 0, 1])
+        )
         if not upper or k[0, 0] <= 0 or k[1, 1] <= 0:
             raise InputError(
                 "building a camera",
@@ -52,20 +67,35 @@ class PinholeCamera:
         require_rigid(self.T_camera_world, "building a camera")
 
     @classmethod
-    def from_pose(cls, width: int, height: int, K: npt.ArrayLike, T_world_camera: F64) -> PinholeCamera:
+    def from_pose(
+        cls, width: int, height: int, K: npt.ArrayLike, T_world_camera: F64
+    ) -> PinholeCamera:
         """Build a camera from its pose, the transform that maps camera points to the world."""
         require_rigid(T_world_camera, "building a camera")
-        return cls(width, height, np.asarray(K, dtype=np.float64), inverse(np.asarray(T_world_camera, dtype=np.float64)))
+        return cls(
+            width,
+            height,
+            np.asarray(K, dtype=np.float64),
+            inverse(np.asarray(T_world_camera, dtype=np.float64)),
+        )
 
     @classmethod
-    def from_hfov(cls, width: int, height: int, hfov_rad: float, T_world_camera: F64 | None = None) -> PinholeCamera:
-        """Build a camera with square pixels and a centred principal point from its horizontal field of view."""
+    def from_hfov(
+        cls, width: int, height: int, hfov_rad: float, T_world_camera: F64 | None = None
+    ) -> PinholeCamera:
+        """Build a camera with square pixels and a centred principal point from its horizontal field
+        of view.
+        """
         f = width / (2 * np.tan(hfov_rad / 2))
         K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
-        return cls.from_pose(width, height, K, np.eye(4) if T_world_camera is None else T_world_camera)
+        return cls.from_pose(
+            width, height, K, np.eye(4) if T_world_camera is None else T_world_camera
+        )
 
     def window(self, rows: slice, columns: slice) -> PinholeCamera:
-        """Return the camera of a part of the picture: its pixels show what those of the whole do."""
+        """Return the camera of a part of the picture: its pixels show what those of the whole
+        do.
+        """
         K = self.K.copy()
         K[:2, 2] -= columns.start, rows.start
         size = columns.stop - columns.start, rows.stop - rows.start
@@ -97,9 +127,11 @@ class PinholeCamera:
         return np.asarray(-self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3])
 
     def slope_limits(self) -> tuple[float, float, float, float]:
-        """Return the bounds (x low, x high, y low, y high) of x/z and y/z inside the covariance's Jacobian.
+        """Return the bounds (x low, x high, y low, y high) of x/z and y/z inside the covariance's
+        Jacobian.
 
-        They lie 30 % of the half view outside the image's edges, so that splats just out of view do not become streaks.
+        They lie 30 % of the half view outside the image's edges, so that splats just out of view do
+        not become streaks.
         """
         if self.whole is not None:
             return self.whole

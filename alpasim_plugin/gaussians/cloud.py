@@ -1,4 +1,6 @@
-"""Hold a set of 3D Gaussians, as a file states them or cleaned for drawing; clean, move and join such sets."""
+"""Hold a set of 3D Gaussians, as a file states them or cleaned for drawing; clean, move and join
+such sets.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ class CleanReport:
     Attributes:
         n_input: Gaussians offered.
         n_kept: Gaussians that remain.
-        dropped: Cause to count; each dropped Gaussian is counted once, under the first cause that applies in the order listed.
+        dropped: Cause to count; each dropped Gaussian is counted once, under the first cause that
+            applies in the order listed.
         repaired: Cause to count of Gaussians kept with a changed value.
     """
 
@@ -54,13 +57,16 @@ class GaussianCloud:
 
     Attributes:
         means: ``(N, 3)`` centres, metres; float64 keeps UTM-sized coordinates exact.
-        quats: ``(N, 4)`` wxyz, Gaussian axes to the cloud's frame; need not be unit, must not be zero.
+        quats: ``(N, 4)`` wxyz, Gaussian axes to the cloud's frame; need not be unit, must not be
+            zero.
         scales: ``(N, 3)`` standard deviations along the Gaussian's axes, metres, linear.
         opacities: ``(N,)`` linear, 0..1.
-        sh: ``(N, K, 3)`` colour coefficients, K = (degree + 1)^2 in 1, 4, 9, 16; RGB = 0.5 + sum_k Y_k(view direction) sh_k.
+        sh: ``(N, K, 3)`` colour coefficients, K = (degree + 1)^2 in 1, 4, 9, 16; RGB = 0.5 + sum_k
+            Y_k(view direction) sh_k.
 
     Raises:
-        InputError: Shapes disagree or K is not a full degree. Values are not inspected here: see `cleaned`.
+        InputError: Shapes disagree or K is not a full degree. Values are not inspected here: see
+            `cleaned`.
     """
 
     means: FloatArray
@@ -74,14 +80,20 @@ class GaussianCloud:
             value = np.asarray(getattr(self, name))
             if value.dtype not in (np.float32, np.float64):
                 value = value.astype(np.float64)
-            # A view that cannot be written through: what is prepared for rendering stays true to the cloud.
+            # A view that cannot be written through: what is prepared for rendering stays true to
+            # the cloud.
             value = value.view()
             value.flags.writeable = False
             object.__setattr__(self, name, value)
         n = self.means.shape[0] if self.means.ndim else -1
         wanted = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
         found = {name: getattr(self, name).shape for name in wanted}
-        sh_ok = self.sh.ndim == 3 and self.sh.shape[0] == n and self.sh.shape[1] in SH_SIZES and self.sh.shape[2] == 3
+        sh_ok = (
+            self.sh.ndim == 3
+            and self.sh.shape[0] == n
+            and self.sh.shape[1] in SH_SIZES
+            and self.sh.shape[2] == 3
+        )
         if n < 0 or found != wanted or not sh_ok:
             raise InputError(
                 "building a Gaussian cloud",
@@ -102,20 +114,35 @@ class GaussianCloud:
     @classmethod
     def empty(cls, sh_size: int = 1) -> GaussianCloud:
         """Return a cloud of no Gaussians."""
-        return cls(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, sh_size, 3)))
+        return cls(
+            np.zeros((0, 3)),
+            np.zeros((0, 4)),
+            np.zeros((0, 3)),
+            np.zeros(0),
+            np.zeros((0, sh_size, 3)),
+        )
 
     @classmethod
     def cleaned(
-        cls, means: npt.ArrayLike, quats: npt.ArrayLike, scales: npt.ArrayLike, opacities: npt.ArrayLike, sh: npt.ArrayLike
+        cls,
+        means: npt.ArrayLike,
+        quats: npt.ArrayLike,
+        scales: npt.ArrayLike,
+        opacities: npt.ArrayLike,
+        sh: npt.ArrayLike,
     ) -> tuple[GaussianCloud, CleanReport]:
-        """Build a cloud from untrusted arrays: drop what cannot be drawn, repair what can, count both.
+        """Build a cloud from untrusted arrays: drop what cannot be drawn, repair what can, count
+        both.
 
-        Dropped: a mean, opacity or colour coefficient that is not finite, a NaN or negative scale, a scale whose logarithm exceeds 20
-        (infinite ones included), a quaternion of length zero or not finite. Repaired: scales below ``exp(-20)`` m are raised to it (they
-        draw as a dot either way), opacities outside [0, 1] are clipped. Quaternions are normalised in float64.
+        Dropped: a mean, opacity or colour coefficient that is not finite, a NaN or negative scale,
+            a scale whose logarithm exceeds 20
+        (infinite ones included), a quaternion of length zero or not finite. Repaired: scales below
+        ``exp(-20)`` m are raised to it (they draw as a dot either way), opacities outside [0, 1]
+        are clipped. Quaternions are normalised in float64.
 
         Returns:
-            The cloud, float64 means and quaternions, other arrays in the type given; and the report.
+            The cloud, float64 means and quaternions, other arrays in the type given; and the
+            report.
 
         Raises:
             InputError: Shapes disagree.
@@ -125,10 +152,17 @@ class GaussianCloud:
             >>> len(cloud), report.dropped["non-finite mean"]
             (0, 1)
         """
-        raw = cls(np.asarray(means), np.asarray(quats), np.asarray(scales), np.asarray(opacities), np.asarray(sh))
+        raw = cls(
+            np.asarray(means),
+            np.asarray(quats),
+            np.asarray(scales),
+            np.asarray(opacities),
+            np.asarray(sh),
+        )
         n = len(raw)
         q = raw.quats.astype(np.float64)
-        # Scaling by the largest component first keeps tiny quaternions of float32 files from underflowing in the square.
+        # Scaling by the largest component first keeps tiny quaternions of float32 files from
+        # underflowing in the square.
         largest = np.max(np.abs(q), axis=1, initial=0.0, keepdims=True)
         with np.errstate(invalid="ignore", divide="ignore"):
             unit = q / largest
@@ -151,7 +185,9 @@ class GaussianCloud:
         scales_kept, opacities_kept = raw.scales[keep], raw.opacities[keep]
         repaired = {
             "scale raised to exp(-20) m": int(np.count_nonzero(np.any(scales_kept < low, axis=1))),
-            "opacity clipped to [0, 1]": int(np.count_nonzero((opacities_kept < 0) | (opacities_kept > 1))),
+            "opacity clipped to [0, 1]": int(
+                np.count_nonzero((opacities_kept < 0) | (opacities_kept > 1))
+            ),
         }
         cloud = cls(
             raw.means[keep].astype(np.float64),
@@ -163,11 +199,22 @@ class GaussianCloud:
         return cloud, CleanReport(n, len(cloud), dropped, repaired)
 
     def _drawable(self) -> bool:
-        """Return whether every Gaussian can be drawn: whole arrays, as numpy is slow along an axis of three."""
+        """Return whether every Gaussian can be drawn: whole arrays, as numpy is slow along an axis
+        of three.
+        """
         scales, opacities, (w, x, y, z) = self.scales, self.opacities, self.quats.T
-        within = not len(self) or (scales.min() >= 0 and scales.max() <= LARGEST_SCALE_M and opacities.min() >= 0 and opacities.max() <= 1)
+        within = not len(self) or (
+            scales.min() >= 0
+            and scales.max() <= LARGEST_SCALE_M
+            and opacities.min() >= 0
+            and opacities.max() <= 1
+        )
         turns = bool((w != 0).all()) or bool(((w != 0) | (x != 0) | (y != 0) | (z != 0)).all())
-        return bool(within) and turns and all(np.isfinite(array).all() for array in (self.means, self.quats, self.sh))
+        return (
+            bool(within)
+            and turns
+            and all(np.isfinite(array).all() for array in (self.means, self.quats, self.sh))
+        )
 
     def require_drawable(self, doing: str) -> None:
         """Raise where any Gaussian could not be drawn.
@@ -179,8 +226,11 @@ class GaussianCloud:
             return
         checks = {
             "non-finite mean": np.isfinite(self.means).all(axis=1),
-            "zero or non-finite quaternion": np.isfinite(self.quats).all(axis=1) & (np.abs(self.quats).max(axis=1, initial=0.0) > 0),
-            "negative, non-finite or overflowing scale": np.all((self.scales >= 0) & (self.scales <= LARGEST_SCALE_M), axis=1),
+            "zero or non-finite quaternion": np.isfinite(self.quats).all(axis=1)
+            & (np.abs(self.quats).max(axis=1, initial=0.0) > 0),
+            "negative, non-finite or overflowing scale": np.all(
+                (self.scales >= 0) & (self.scales <= LARGEST_SCALE_M), axis=1
+            ),
             "opacity outside 0..1": (self.opacities >= 0) & (self.opacities <= 1),
             "non-finite colour": np.isfinite(self.sh).all(axis=(1, 2)),
         }
@@ -199,15 +249,18 @@ class GaussianCloud:
 
     def part(self, i: slice | npt.NDArray[np.integer | np.bool_]) -> GaussianCloud:
         """Return the Gaussians of an index, or a view of those of a slice."""
-        return GaussianCloud(self.means[i], self.quats[i], self.scales[i], self.opacities[i], self.sh[i])
+        return GaussianCloud(
+            self.means[i], self.quats[i], self.scales[i], self.opacities[i], self.sh[i]
+        )
 
     def transformed(self, T: F64, rotate_colour: bool = True) -> GaussianCloud:
         """Return the cloud moved by a rigid transform, colours turning with the object.
 
         Args:
             T: ``(4, 4)`` rigid transform applied to the cloud.
-            rotate_colour: Turn the spherical harmonics too. False keeps them in the old axes, as checkpoints of Street Gaussians,
-                drivestudio and MTGS expect (they evaluate world directions for moving objects).
+            rotate_colour: Turn the spherical harmonics too. False keeps them in the old axes, as
+                checkpoints of Street Gaussians, drivestudio and MTGS expect (they evaluate world
+                directions for moving objects).
 
         Raises:
             InputError: ``T`` is not rigid.
@@ -231,7 +284,9 @@ class GaussianCloud:
 
     @staticmethod
     def concatenate(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
-        """Join clouds in the order given (which decides equal depths); lower degrees are padded with zero coefficients."""
+        """Join clouds in the order given (which decides equal depths); lower degrees are padded
+        with zero coefficients.
+        """
         if not clouds:
             return GaussianCloud.empty()
         size = max(cloud.sh.shape[1] for cloud in clouds)
@@ -246,7 +301,9 @@ class GaussianCloud:
 
 
 def quat_multiply(a: F64, b: F64) -> F64:
-    """Return the Hamilton product of wxyz quaternions ``(..., 4)``: the rotation b followed by a."""
+    """Return the Hamilton product of wxyz quaternions ``(..., 4)``: the rotation b followed by
+    a.
+    """
     aw, ax, ay, az = np.moveaxis(a, -1, 0)
     bw, bx, by, bz = np.moveaxis(b, -1, 0)
     return np.stack(
@@ -261,7 +318,9 @@ def quat_multiply(a: F64, b: F64) -> F64:
 
 
 def require_rigid(T: npt.ArrayLike, doing: str) -> None:
-    """Raise `InputError` unless ``T`` is a finite ``(4, 4)`` rigid transform (rotation to 1e-5, no reflection, no scale)."""
+    """Raise `InputError` unless ``T`` is a finite ``(4, 4)`` rigid transform (rotation to 1e-5, no
+    reflection, no scale).
+    """
     m = np.asarray(T, dtype=np.float64)
     fault = None
     if m.shape == (4, 4) and _clearly_rigid(m):
@@ -271,19 +330,39 @@ def require_rigid(T: npt.ArrayLike, doing: str) -> None:
     elif not np.isfinite(m).all():
         fault = "a value that is not finite"
     elif np.abs(m[:3, :3] @ m[:3, :3].T - np.eye(3)).max() > 1e-5 or np.linalg.det(m[:3, :3]) < 0:
-        fault = f"an upper-left block that is no rotation (determinant {np.linalg.det(m[:3, :3]):.6g})"
+        fault = (
+            f"an upper-left block that is no rotation (determinant {np.linalg.det(m[:3, :3]):.6g})"
+        )
     elif np.abs(m[3] - [0, 0, 0, 1]).max() > 1e-9:
         fault = f"last row {m[3].tolist()}"
     if fault:
-        raise InputError(doing, "a transform", fault, "give a (4, 4) rotation and translation, metres, column vectors")
+        raise InputError(
+            doing,
+            "a transform",
+            fault,
+            "give a (4, 4) rotation and translation, metres, column vectors",
+        )
 
 
 def _clearly_rigid(T: F64) -> bool:
-    """Return whether ``(4, 4)`` passes `require_rigid` beyond rounding: numbers one by one, a tenth of the time of arrays so small."""
+    """Return whether ``(4, 4)`` passes `require_rigid` beyond rounding: numbers one by one, a tenth
+    of the time of arrays so small.
+    """
     (a, b, c, x), (d, e, f, y), (g, h, i, z), last = T.tolist()
-    products = a * a + b * b + c * c - 1, d * d + e * e + f * f - 1, g * g + h * h + i * i - 1, a * d + b * e + c * f, a * g + b * h + c * i
+    products = (
+        a * a + b * b + c * c - 1,
+        d * d + e * e + f * f - 1,
+        g * g + h * h + i * i - 1,
+        a * d + b * e + c * f,
+        a * g + b * h + c * i,
+    )
     near = all(-9e-6 < value < 9e-6 for value in (*products, d * g + e * h + f * i))
-    return near and last == [0, 0, 0, 1] and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0 and isfinite(x + y + z)
+    return (
+        near
+        and last == [0, 0, 0, 1]
+        and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
+        and isfinite(x + y + z)
+    )
 
 
 def all_rigid(T: F64) -> bool:
@@ -328,7 +407,8 @@ def logit(p: FloatArray) -> F64:
 
 
 def build_cloud(arrays: GaussianArrays) -> tuple[GaussianCloud, CleanReport]:
-    """Clean decoded columns into a cloud; bands of harmonics above what can be drawn are left out and counted as repaired.
+    """Clean decoded columns into a cloud; bands of harmonics above what can be drawn are left out
+    and counted as repaired.
 
     Raises:
         InputError: Shapes disagree.

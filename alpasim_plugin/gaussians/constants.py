@@ -1,7 +1,9 @@
-"""Constants of the splatting rule, shared by every backend, and the columns of the arrays that the CPU kernels share.
+"""Constants of the splatting rule, shared by every backend, and the columns of the arrays that the
+CPU kernels share.
 
-Values are those of gsplat 1.6. Thresholds that decide what is drawn are the *float32* neighbours of their decimal value, also in float64
-code: whether a second saturated layer is drawn hangs on ``(1 - 0.99)**2 <= 1e-4``, which is true in float32 and false in float64.
+Values are those of gsplat 1.6. Thresholds that decide what is drawn are the *float32* neighbours of
+their decimal value, also in float64 code: whether a second saturated layer is drawn hangs on ``(1 -
+0.99)**2 <= 1e-4``, which is true in float32 and false in float64.
 """
 
 from __future__ import annotations
@@ -17,19 +19,31 @@ ALPHA_MAX = float(np.float32(0.99))
 ALPHA_MIN = float(np.float32(1.0 / 255.0))
 TRANSMITTANCE_STOP = float(np.float32(1.0e-4))
 EXTENT_MAX_SIGMA = 3.33  # sqrt(2 ln 255) = 3.3290: outside, even an opaque splat is below ALPHA_MIN
-SLOPE_MARGIN = 0.3  # the Jacobian's slopes are clamped at this share of the half view beyond the image edge
+SLOPE_MARGIN = (
+    0.3  # the Jacobian's slopes are clamped at this share of the half view beyond the image edge
+)
 LOG_SCALE_LIMIT = 20.0
 
 
 # A camera's numbers, one float32 array.
-CAM_FX, CAM_FY, CAM_CX, CAM_CY = 0, 1, 2, 3
-CAM_SLOPE_LOW_X, CAM_SLOPE_HIGH_X, CAM_SLOPE_LOW_Y, CAM_SLOPE_HIGH_Y = 4, 5, 6, 7
+CAM_FX = 0
+CAM_FY = 1
+CAM_CX = 2
+CAM_CY = 3
+CAM_SLOPE_LOW_X = 4
+CAM_SLOPE_HIGH_X = 5
+CAM_SLOPE_LOW_Y = 6
+CAM_SLOPE_HIGH_Y = 7
 CAM_WIDTH, CAM_HEIGHT = 8, 9
 CAM_LOD = 10
 
-# A node's pose, one float64 array: rotation node to camera, camera centre in the node, rotation from the node to the axes of its colours,
-# and the depth range.
-POSE_ROTATION, POSE_CENTRE, POSE_COLOUR, POSE_NEAR, POSE_FAR = 0, 9, 12, 21, 22
+# A node's pose, one float64 array: rotation node to camera, camera centre in the node, rotation
+# from the node to the axes of its colours, and the depth range.
+POSE_ROTATION = 0
+POSE_CENTRE = 9
+POSE_COLOUR = 12
+POSE_NEAR = 21
+POSE_FAR = 22
 POSE_SIZE = 23
 
 # One group of sixteen prepared Gaussians: columns of sixteen lanes each.
@@ -44,23 +58,39 @@ BUNDLE = 256
 SPHERE_SIZE = 5
 
 # One prepared cloud among those of a frame, one int64 row: addresses of its arrays, and numbers.
-PART_MEANS, PART_GEOMETRY, PART_SH, PART_INDEX, PART_SPHERES, PART_SPHERE = 0, 1, 2, 3, 4, 5
-PART_GROUPS, PART_SH_SIZE, PART_INPUT = 6, 7, 8
+PART_MEANS = 0
+PART_GEOMETRY = 1
+PART_SH = 2
+PART_INDEX = 3
+PART_SPHERES = 4
+PART_SPHERE = 5
+PART_GROUPS = 6
+PART_SH_SIZE = 7
+PART_INPUT = 8
 PART_SIZE = 9
 
-# One visible splat: sixteen float32, one cache line. With d = pixel - (u, v) the exponent is s^2 + t^2 where s = L11 dx + L12 dy and
-# t = L22 dy: a sum of squares, which keeps its precision for needles where the usual quadratic form cancels.
+# One visible splat: sixteen float32, one cache line. With d = pixel - (u, v) the exponent is s^2 +
+# t^2 where s = L11 dx + L12 dy and t = L22 dy: a sum of squares, which keeps its precision for
+# needles where the usual quadratic form cancels.
 U, V = 0, 1
-L11, L12, L22 = 2, 3, 4
+L11 = 2
+L12 = 3
+L22 = 4
 PEAK = 5
-R, G, B = 6, 7, 8
+R = 6
+G = 7
+B = 8
 Z = 9
 RADIUS_X, RADIUS_Y = 10, 11  # half sizes of the box around the drawn ellipse, pixels
 TOP_Y = 12  # dy of the ellipse's rightmost point
 SLOPE = 13  # dx of the ellipse's middle line per dy
 HALF_WIDTH = 14  # half the ellipse's width at dy = 0
-BLOCK_REACH = 15  # s^2 + t^2 of a 4 x 4 block's centre beyond which no pixel of the block is touched
+BLOCK_REACH = (
+    15  # s^2 + t^2 of a 4 x 4 block's centre beyond which no pixel of the block is touched
+)
 RECORD = 16
 
 TILE = 16  # pixels; a tile is 4 x 4 blocks of 4 x 4 pixels
-EXPONENT_SCALE = math.sqrt(math.log2(math.e) / 16.0)  # turns (q^2 / 2) log2(e) / 8 into a plain sum of squares
+EXPONENT_SCALE = math.sqrt(
+    math.log2(math.e) / 16.0
+)  # turns (q^2 / 2) log2(e) / 8 into a plain sum of squares

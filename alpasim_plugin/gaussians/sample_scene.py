@@ -1,4 +1,6 @@
-"""A random scene with the statistics of a street, for tests and measurements of the rasterisers, and tiny cases that compile kernels."""
+"""A random scene with the statistics of a street, for tests and measurements of the rasterisers,
+and tiny cases that compile kernels.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +13,11 @@ from alpasim_plugin.gaussians.cloud import GaussianCloud
 
 
 def driving_like_scene(n: int, seed: int = 0, sh_degree: int = 3) -> GaussianCloud:
-    """Return n Gaussians around a straight road, world axes ENU with the road along x, seen well from (0, 0, 1.6) towards +x.
+    """Return n Gaussians around a straight road, world axes ENU with the road along x, seen well
+    from (0, 0, 1.6) towards +x.
 
-    30 % road, 35 % facades, 12 % vehicles, 18 % foliage, 5 % far shell at 300 m; sizes scale with n^-1/2, so that the covered share of an
-    image does not depend on n.
+    30 % road, 35 % facades, 12 % vehicles, 18 % foliage, 5 % far shell at 300 m; sizes scale with
+    n^-1/2, so that the covered share of an image does not depend on n.
     """
     rng = stream("raster-bench", seed, "scene")
     size = np.sqrt(100_000 / n)
@@ -31,14 +34,23 @@ def driving_like_scene(n: int, seed: int = 0, sh_degree: int = 3) -> GaussianClo
     def ahead(count: int, reach_m: float) -> F64:
         return np.asarray(-8.0 + (reach_m + 8.0) * rng.uniform(0, 1, count) ** 1.5)
 
-    road_means = np.stack([ahead(road, 120), rng.uniform(-9, 9, road), rng.normal(0, 0.01, road)], axis=1)
+    road_means = np.stack(
+        [ahead(road, 120), rng.uniform(-9, 9, road), rng.normal(0, 0.01, road)], axis=1
+    )
     side = rng.choice([-1.0, 1.0], facade)
-    facade_means = np.stack([ahead(facade, 140), side * (12 + rng.normal(0, 0.1, facade)), rng.uniform(0, 14, facade)], axis=1)
+    facade_means = np.stack(
+        [ahead(facade, 140), side * (12 + rng.normal(0, 0.1, facade)), rng.uniform(0, 14, facade)],
+        axis=1,
+    )
     box = rng.integers(0, 24, vehicle)
-    car_at = np.stack([np.linspace(4, 110, 24), np.tile([-5.5, -2.0, 2.0, 5.5], 6), np.full(24, 0.8)], axis=1)
+    car_at = np.stack(
+        [np.linspace(4, 110, 24), np.tile([-5.5, -2.0, 2.0, 5.5], 6), np.full(24, 0.8)], axis=1
+    )
     vehicle_means = car_at[box] + rng.uniform(-1, 1, (vehicle, 3)) * [2.2, 0.9, 0.75]
     tree = rng.integers(0, 30, foliage)
-    tree_at = np.stack([np.linspace(0, 130, 30), np.tile([-9.5, 9.5], 15), np.full(30, 4.5)], axis=1)
+    tree_at = np.stack(
+        [np.linspace(0, 130, 30), np.tile([-9.5, 9.5], 15), np.full(30, 4.5)], axis=1
+    )
     foliage_means = tree_at[tree] + rng.normal(0, [1.4, 1.2, 1.4], (foliage, 3))
     direction = rng.normal(size=(far, 3))
     direction[:, 0] = 2 * np.abs(direction[:, 0])
@@ -75,10 +87,16 @@ def driving_like_scene(n: int, seed: int = 0, sh_degree: int = 3) -> GaussianClo
 
 
 def driving_camera(width: int, height: int, yaw_rad: float = 0.0) -> PinholeCamera:
-    """Return a camera at (0, 0, 1.6), looking along +x turned left by the yaw, horizontal field of view 65 degrees."""
+    """Return a camera at (0, 0, 1.6), looking along +x turned left by the yaw, horizontal field of
+    view 65 degrees.
+    """
     T_world_camera = np.eye(4)
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-    T_world_camera[:3, :3] = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    T_world_camera[:3, :3] = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ [
+        [0, 0, 1],
+        [-1, 0, 0],
+        [0, -1, 0],
+    ]
     T_world_camera[:3, 3] = [0, 0, 1.6]
     return PinholeCamera.from_hfov(width, height, np.deg2rad(65), T_world_camera)
 
@@ -91,7 +109,9 @@ def rasterise() -> None:
     from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_cpu
     from alpasim_plugin.gaussians.scene.log_views import LogView, LogViews
 
-    drawn = rasterize_cpu(_cloud(), _camera(), np.zeros((SIDE_PX, SIDE_PX, 3), np.float32), threads=1)
+    drawn = rasterize_cpu(
+        _cloud(), _camera(), np.zeros((SIDE_PX, SIDE_PX, 3), np.float32), threads=1
+    )
     LogViews([LogView(_camera(), drawn.depth, drawn.alpha)]).see(np.zeros((1, 3)), np.ones(1))
 
 

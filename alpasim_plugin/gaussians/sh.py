@@ -1,6 +1,8 @@
-"""Evaluate and rotate real spherical harmonics up to degree 3, in the order and with the signs of 3DGS files.
+"""Evaluate and rotate real spherical harmonics up to degree 3, in the order and with the signs of
+3DGS files.
 
-The basis (order k = 0 | -1, 0, 1 | -2..2 | -3..3) is orthonormal over the unit sphere; its constants are square roots of rationals over pi.
+The basis (order k = 0 | -1, 0, 1 | -2..2 | -3..3) is orthonormal over the unit sphere; its
+constants are square roots of rationals over pi.
 """
 
 from __future__ import annotations
@@ -18,12 +20,22 @@ SH_SIZES = (1, 4, 9, 16)  # (degree + 1)^2
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
-C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+C3 = (
+    0.5900435899266435,
+    2.890611442640554,
+    0.4570457994644658,
+    0.3731763325901154,
+    1.445305721320277,
+)
 
 
 def sh_terms(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
-    """Return the basis functions of degrees 1 to 3, fifteen of them, at a unit direction: numbers, arrays or tensors alike."""
-    xx, yy, zz = x * x, y * y, z * z
+    """Return the basis functions of degrees 1 to 3, fifteen of them, at a unit direction: numbers,
+    arrays or tensors alike.
+    """
+    xx = x * x
+    yy = y * y
+    zz = z * z
     return (
         -C1 * y,
         C1 * z,
@@ -56,7 +68,9 @@ def sh_basis(directions: npt.ArrayLike, size: int = 16) -> F64:
 
 
 def sh_colours(sh: npt.NDArray[np.floating], directions: npt.ArrayLike) -> F64:
-    """Return RGB ``(N, 3)`` of coefficients ``(N, K, 3)`` seen along unit directions ``(N, 3)``: clamped at 0 below, not above."""
+    """Return RGB ``(N, 3)`` of coefficients ``(N, K, 3)`` seen along unit directions ``(N, 3)``:
+    clamped at 0 below, not above.
+    """
     basis = sh_basis(directions, sh.shape[1])
     return np.asarray(np.maximum(0.5 + np.einsum("nk,nkc->nc", basis, sh.astype(np.float64)), 0.0))
 
@@ -68,21 +82,27 @@ def dc_from_rgb(rgb: npt.ArrayLike) -> F64:
 
 @lru_cache(maxsize=1)
 def _sample_directions() -> tuple[F64, tuple[F64, ...]]:
-    """Return 64 spread directions (a Fibonacci sphere) and, per degree, the pseudo-inverse of the basis there."""
+    """Return 64 spread directions (a Fibonacci sphere) and, per degree, the pseudo-inverse of the
+    basis there.
+    """
     i = np.arange(64) + 0.5
     z = 1 - 2 * i / 64
     phi = np.pi * (1 + np.sqrt(5)) * i
     r = np.sqrt(1 - z * z)
     directions = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
     basis = sh_basis(directions)
-    return directions, tuple(np.asarray(np.linalg.pinv(basis[:, d * d : (d + 1) ** 2]), np.float64) for d in range(4))
+    return directions, tuple(
+        np.asarray(np.linalg.pinv(basis[:, d * d : (d + 1) ** 2]), np.float64) for d in range(4)
+    )
 
 
 def sh_rotation(rotation: F64, degree: int) -> F64:
-    """Return the real Wigner matrix ``(2l+1, 2l+1)`` that turns the coefficients of one degree with an object.
+    """Return the real Wigner matrix ``(2l+1, 2l+1)`` that turns the coefficients of one degree with
+    an object.
 
-    If an object turns by R its colour seen along d is the old colour along R^T d. The basis of one degree spans a space closed under
-    rotation, so the matrix is found exactly (to rounding) by matching both sides at more directions than there are unknowns.
+    If an object turns by R its colour seen along d is the old colour along R^T d. The basis of one
+    degree spans a space closed under rotation, so the matrix is found exactly (to rounding) by
+    matching both sides at more directions than there are unknowns.
     """
     directions, inverses = _sample_directions()
     turned = sh_basis(directions @ rotation)[:, degree * degree : (degree + 1) ** 2]
@@ -90,9 +110,13 @@ def sh_rotation(rotation: F64, degree: int) -> F64:
 
 
 def rotate_sh(sh: npt.NDArray[np.floating], rotation: F64) -> npt.NDArray[np.floating]:
-    """Return coefficients ``(N, K, 3)`` of the same objects after turning them by ``rotation`` ``(3, 3)``; type kept."""
+    """Return coefficients ``(N, K, 3)`` of the same objects after turning them by ``rotation``
+    ``(3, 3)``; type kept.
+    """
     out = sh.copy()
     for degree in range(1, SH_SIZES.index(sh.shape[1]) + 1):
         band = slice(degree * degree, (degree + 1) ** 2)
-        out[:, band] = np.einsum("jk,nkc->njc", sh_rotation(rotation, degree), sh[:, band].astype(np.float64)).astype(sh.dtype)
+        out[:, band] = np.einsum(
+            "jk,nkc->njc", sh_rotation(rotation, degree), sh[:, band].astype(np.float64)
+        ).astype(sh.dtype)
     return out

@@ -1,4 +1,5 @@
-"""Gymnasium environments over the closed loop: ``import alpasim_plugin.gym`` registers ``simrun/Drive-v0`` and ``simrun/Plan-v0``.
+"""Gymnasium environments over the closed loop: ``import alpasim_plugin.gym`` registers
+``simrun/Drive-v0`` and ``simrun/Plan-v0``.
 
 Needs the extra ``gym``. See docs/gym.md.
 """
@@ -11,7 +12,10 @@ try:
     import gymnasium
 except ImportError as error:
     raise InputError(
-        "importing alpasim_plugin.gym", "library gymnasium", f"it cannot be imported: {error}", "install the extra [gym], or gymnasium>=1.0"
+        "importing alpasim_plugin.gym",
+        "library gymnasium",
+        f"it cannot be imported: {error}",
+        "install the extra [gym], or gymnasium>=1.0",
     ) from error
 
 from alpasim_plugin.gym.env import DriveEnv
@@ -23,4 +27,6 @@ DRIVE, PLAN = "simrun/Drive-v0", "simrun/Plan-v0"
 
 for _id, _actions in ((DRIVE, "controls"), (PLAN, "trajectory")):
     if _id not in gymnasium.registry:
-        gymnasium.register(_id, entry_point="alpasim_plugin.gym.env:DriveEnv", kwargs={"actions": _actions})
+        gymnasium.register(
+            _id, entry_point="alpasim_plugin.gym.env:DriveEnv", kwargs={"actions": _actions}
+        )

@@ -20,7 +20,17 @@ from alpasim_plugin.core.interfaces import Controller
 from alpasim_plugin.core.places import temporary_folder
 from alpasim_plugin.core.plan_check import plan_problem
 from alpasim_plugin.core.seeding import derive_seed
-from alpasim_plugin.core.types import F64, U8, EgoState, Observation, Plan, Scenario, SensorSpec, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    F64,
+    U8,
+    EgoState,
+    Observation,
+    Plan,
+    Scenario,
+    SensorSpec,
+    Trajectory,
+    Vehicle,
+)
 from alpasim_plugin.gym.reward import Instant, Reward, Scorer
 from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME
 from alpasim_plugin.runs.cell import make_renderer
@@ -32,7 +42,10 @@ from scenarios.load import load_scenario
 if TYPE_CHECKING:
     from tempfile import TemporaryDirectory
 
-PREDICTED_US, PREDICTED_STEP_US = 2_000_000, 100_000  # of the plan that stands in the log for a held command
+PREDICTED_US, PREDICTED_STEP_US = (
+    2_000_000,
+    100_000,
+)  # of the plan that stands in the log for a held command
 FORWARD_M, BACKWARD_M, ASIDE_M = 200.0, 50.0, 100.0  # bounds of a trajectory, rig frame
 DOING = "making an environment"
 ROUTE_POINTS, ROUTE_M = 20, 200.0  # rows of the route, and the bound of its coordinates
@@ -57,7 +70,8 @@ class Actions(ABC):
 
 
 class Controls(Actions):
-    """``(2,)`` in -1..1: steering angle of the wheels as a share of the vehicle's limit, left positive; throttle above 0, brake below.
+    """``(2,)`` in -1..1: steering angle of the wheels as a share of the vehicle's limit, left
+    positive; throttle above 0, brake below.
 
     The vehicle's own limits apply, its steering rate too. The brake ends at a standstill.
     """
@@ -70,8 +84,13 @@ class Controls(Actions):
     def plan(self, action: F64, observation: Observation) -> Plan:
         """Hold the command, and return where it leads in two seconds."""
         steer, pedal = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
-        drive, brake = max(pedal, 0.0) * self._vehicle.max_accel_mps2, max(-pedal, 0.0) * self._vehicle.max_brake_mps2
-        self.controller.command = Command(float(steer) * self._vehicle.max_steer_rad, float(drive), float(brake))
+        drive, brake = (
+            max(pedal, 0.0) * self._vehicle.max_accel_mps2,
+            max(-pedal, 0.0) * self._vehicle.max_brake_mps2,
+        )
+        self.controller.command = Command(
+            float(steer) * self._vehicle.max_steer_rad, float(drive), float(brake)
+        )
         times = observation.t_us + np.arange(0, PREDICTED_US + 1, PREDICTED_STEP_US, dtype=np.int64)
         step_s = PREDICTED_STEP_US * 1e-6
         state = replace(planar(observation.ego), x_m=0.0, y_m=0.0, yaw_rad=0.0)
@@ -98,7 +117,8 @@ class HeldCommand(Controller):
 
 
 class Trajectories(Actions):
-    """``(T, 3)``: x, y (metres) and yaw (radians) in the rig frame, at equal steps after now, the first step ahead.
+    """``(T, 3)``: x, y (metres) and yaw (radians) in the rig frame, at equal steps after now, the
+    first step ahead.
 
     The tracking controller of runs follows it, as it follows a policy's plan.
     """
@@ -121,18 +141,22 @@ Actions_ = Literal["controls", "trajectory"]
 
 
 class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gymnasium is an extra
-    """Drive a scenario; an episode is a rollout, with the loop, the renderer and the evaluators of a run.
+    """Drive a scenario; an episode is a rollout, with the loop, the renderer and the evaluators of
+    a run.
 
-    Observation, a dictionary: ``camera`` ``(H, W, 3)`` uint8 sRGB; ``speed`` ``(1,)`` float32 m/s; ``route`` ``(20, 3)`` float32, x and y
-    in the rig frame (metres) and 1, or zeros after the route's end. Actions: `Controls` or `Trajectories`. Reward: `Reward`. An episode
-    terminates with a collision or off the road, or where the recorded path ends, and is truncated when its time is up. ``info`` then holds
-    ``ended`` and ``metrics``, the scores of the whole rollout as ``simrun score`` would give them.
+    Observation, a dictionary: ``camera`` ``(H, W, 3)`` uint8 sRGB; ``speed`` ``(1,)`` float32 m/s;
+    ``route`` ``(20, 3)`` float32, x and y in the rig frame (metres) and 1, or zeros after the
+    route's end. Actions: `Controls` or `Trajectories`. Reward: `Reward`. An episode terminates with
+    a collision or off the road, or where the recorded path ends, and is truncated when its time is
+    up. ``info`` then holds ``ended`` and ``metrics``, the scores of the whole rollout as ``simrun
+    score`` would give them.
 
     Args:
         scenario: File, recorded log, or shipped name.
         actions: ``controls`` or ``trajectory``.
         renderer: As `make_renderer` takes it.
-        camera: Which camera; None: the scenario's first. An empty name: none, and nothing is rendered.
+        camera: Which camera; None: the scenario's first. An empty name: none, and nothing is
+            rendered.
         scene_seeds: Each episode drives the scene of one of these seeds.
         overrides: ``key=value`` for the scenario, such as ``cameras=[{width: 64, height: 36}]``.
         preset: Evaluator preset: ``paper`` or ``strict``.
@@ -163,20 +187,39 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
     ) -> None:
         self._scenarios = [load_scenario(scenario, seed, tuple(overrides)) for seed in scene_seeds]
         _check(self._scenarios, actions, preset, horizon_us, step_us)
-        self._preset, self._reward, self._renderer, self.render_mode = preset, reward, renderer, render_mode
+        self._preset, self._reward, self._renderer, self.render_mode = (
+            preset,
+            reward,
+            renderer,
+            render_mode,
+        )
         self._scenario = self._scenarios[0]
         known = [one.name for one in self._scenario.cameras]
         name = camera if camera is not None else known[0] if known else ""
         if name and name not in known:
-            raise InputError(DOING, f"camera {name!r}", f"the scenario has {known}", "name one of them, or camera='' for none")
+            raise InputError(
+                DOING,
+                f"camera {name!r}",
+                f"the scenario has {known}",
+                "name one of them, or camera='' for none",
+            )
         self._sensors = (SensorSpec(name),) if name else ()
         if not name:
             self.metadata = self.metadata | {"render_modes": []}
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise InputError(DOING, f"render_mode={render_mode!r}", f"it has {self.metadata['render_modes']}", "rgb_array needs a camera")
+            raise InputError(
+                DOING,
+                f"render_mode={render_mode!r}",
+                f"it has {self.metadata['render_modes']}",
+                "rgb_array needs a camera",
+            )
         self._camera = next((one for one in self._scenario.cameras if one.name == name), None)
         vehicle = self._scenario.vehicle
-        self._actions: Actions = Controls(vehicle) if actions == "controls" else Trajectories(vehicle, horizon_us, step_us)
+        self._actions: Actions = (
+            Controls(vehicle)
+            if actions == "controls"
+            else Trajectories(vehicle, horizon_us, step_us)
+        )
         self.action_space = self._actions.space
         self.observation_space = self._space()
         self._driving: Generator[Observation, Plan, None] | None = None
@@ -195,34 +238,55 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
     def observation(self) -> Observation:
         """Give the observation as policies get it: with times, poses and camera models."""
         if self._observation is None:
-            raise InputError("observing", "an environment", "no episode has begun", "call reset() first")
+            raise InputError(
+                "observing", "an environment", "no episode has begun", "call reset() first"
+            )
         return self._observation
 
-    def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode; its scene and its rollout seed follow from the seed of the last `reset` that had one.
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode; its scene and its rollout seed follow from the seed of the last `reset`
+        that had one.
 
         Args:
             seed: Of the episodes from here on.
-            options: ``scene_seed``: index into ``scene_seeds``; ``seed``: the rollout seed of this episode.
+            options: ``scene_seed``: index into ``scene_seeds``; ``seed``: the rollout seed of this
+                episode.
         """
         super().reset(seed=seed)
         self.close()
         wanted = dict(options or {})
-        drawn_scene = int(self.np_random.integers(len(self._scenarios)))  # drawn in any case, so that options change one episode only
+        drawn_scene = int(
+            self.np_random.integers(len(self._scenarios))
+        )  # drawn in any case, so that options change one episode only
         drawn_seed = int(self.np_random.integers(ROLLOUT_SEEDS))
         self._scenario = self._scenarios[int(wanted.get("scene_seed", drawn_scene))]
-        rollout_seed = int(wanted.get("seed", derive_seed(self._scenario.scene_id, drawn_seed, "gym") % ROLLOUT_SEEDS))
+        rollout_seed = int(
+            wanted.get(
+                "seed", derive_seed(self._scenario.scene_id, drawn_seed, "gym") % ROLLOUT_SEEDS
+            )
+        )
         self._folder = temporary_folder("simrun-gym-")
         self._recorder = _Watching(self._scenario, rollout_seed, Path(self._folder.name))
         session = make_renderer(self._renderer, self._scenario, rollout_seed, threads=1)
-        self._loop = Loop(self._scenario, session, self._sensors, self._actions.controller, self._recorder)
+        self._loop = Loop(
+            self._scenario, session, self._sensors, self._actions.controller, self._recorder
+        )
         self._judge = Scorer(self._scenario, self._preset, self._reward)
         self._driving = self._loop.drive()
         self._observation = next(self._driving)
-        while self._observation.t_us < self._scenario.start_us + self._scenario.warmup_us:  # the recording is forced: nothing to decide
+        while (
+            self._observation.t_us < self._scenario.start_us + self._scenario.warmup_us
+        ):  # the recording is forced: nothing to decide
             self._observation = self._driving.send(self._recorded())
         *_, facts = self._judge.judge(self._recorder.taken())
-        return self._seen(), {"seed": rollout_seed, "scene": self._scenario.scene_id, "t_us": self._observation.t_us, **facts}
+        return self._seen(), {
+            "seed": rollout_seed,
+            "scene": self._scenario.scene_id,
+            "t_us": self._observation.t_us,
+            **facts,
+        }
 
     def step(self, action: Any) -> tuple[dict[str, Any], SupportsFloat, bool, bool, dict[str, Any]]:
         """Act for one policy period.
@@ -230,12 +294,19 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         Raises:
             InputError: No episode runs, or the action is none.
         """
-        if self._driving is None or self._judge is None or self._recorder is None or self._loop is None:
+        if (
+            self._driving is None
+            or self._judge is None
+            or self._recorder is None
+            or self._loop is None
+        ):
             raise InputError("stepping", "an environment", "no episode runs", "call reset() first")
         plan = self._actions.plan(np.asarray(action), self.observation)
         problem = plan_problem(plan, self.observation.t_us)
         if problem:
-            raise InputError("stepping", "an action", problem, "give finite numbers within the action space")
+            raise InputError(
+                "stepping", "an action", problem, "give finite numbers within the action space"
+            )
         over = False
         try:
             self._observation = self._driving.send(plan)
@@ -245,8 +316,13 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         terminated = bool(ended) or (over and self._loop.path_end.passed)
         info: dict[str, Any] = {"t_us": self._loop.state.ego.t_us, **facts}
         if over or terminated:
-            info |= {"ended": ended or ("path_end" if terminated else "time"), "metrics": self._finish()}
-            self._observation = self._loop.state.observe({} if self._camera is None else {self._camera.name: self._camera})
+            info |= {
+                "ended": ended or ("path_end" if terminated else "time"),
+                "metrics": self._finish(),
+            }
+            self._observation = self._loop.state.observe(
+                {} if self._camera is None else {self._camera.name: self._camera}
+            )
         return self._seen(), worth, terminated, over and not terminated, info
 
     def render(self) -> U8 | None:
@@ -260,14 +336,18 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         """End the episode, if one runs."""
         if self._recorder is not None and self._driving is not None:
             self._driving.close()
-            self._recorder.__exit__(GeneratorExit, GeneratorExit(), None)  # the log of an episode that was left is not kept
+            self._recorder.__exit__(
+                GeneratorExit, GeneratorExit(), None
+            )  # the log of an episode that was left is not kept
         self._driving = self._recorder = None
         if self._folder is not None:
             self._folder.cleanup()
             self._folder = None
 
     def _finish(self) -> dict[str, float | None]:
-        """Close the log and return the scores of the whole rollout; None where a metric is not valid."""
+        """Close the log and return the scores of the whole rollout; None where a metric is not
+        valid.
+        """
         assert self._recorder is not None
         assert self._driving is not None
         assert self._loop is not None
@@ -276,13 +356,18 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         folder = self._recorder.folder
         scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, self._scenario, self._preset)
         self._driving = None
-        return {name: entry["value"] if entry["valid"] else None for name, entry in scored.metrics.items()}
+        return {
+            name: entry["value"] if entry["valid"] else None
+            for name, entry in scored.metrics.items()
+        }
 
     def _recorded(self) -> Plan:
         """Return a plan for the warm-up, in which none is driven: straight on."""
         observation = self.observation
         times = observation.t_us + np.arange(0, 2_000_001, 100_000, dtype=np.int64)
-        xy = np.column_stack([observation.ego.speed_mps * (times - times[0]) * 1e-6, np.zeros(len(times))])
+        xy = np.column_stack(
+            [observation.ego.speed_mps * (times - times[0]) * 1e-6, np.zeros(len(times))]
+        )
         return Plan(observation.t_us, times, xy, np.zeros(len(times)))
 
     def _space(self) -> Dict:
@@ -296,7 +381,11 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
 
     def _seen(self) -> dict[str, Any]:
         observation = self.observation
-        seen = {"speed": np.array([np.clip(observation.ego.speed_mps, -SPEED_MPS, SPEED_MPS)], np.float32)}
+        seen = {
+            "speed": np.array(
+                [np.clip(observation.ego.speed_mps, -SPEED_MPS, SPEED_MPS)], np.float32
+            )
+        }
         seen["route"] = _route(observation.route_rig)
         if self._camera is not None:
             seen["camera"] = np.array(observation.frames[self._camera.name].rgb)
@@ -328,14 +417,22 @@ def _route(route_rig: F64) -> np.ndarray[Any, np.dtype[np.float32]]:
     return out
 
 
-def _check(scenarios: Sequence[Scenario], actions: str, preset: str, horizon_us: int, step_us: int) -> None:
+def _check(
+    scenarios: Sequence[Scenario], actions: str, preset: str, horizon_us: int, step_us: int
+) -> None:
     latencies = {one.latency.kind for one in scenarios}
     problems = {
         "scene_seeds": "" if scenarios else "none",
-        "latency": "measured, so that a step depends on how long the learner thinks" if "measured" in latencies else "",
+        "latency": "measured, so that a step depends on how long the learner thinks"
+        if "measured" in latencies
+        else "",
         "actions": "" if actions in ("controls", "trajectory") else f"{actions!r}",
-        "preset": "" if preset in ("paper", "strict") else f"{preset!r}, which scores whole rollouts only",
-        "horizon_us and step_us": "" if 0 < step_us <= horizon_us and horizon_us % step_us == 0 else f"{horizon_us} and {step_us}",
+        "preset": ""
+        if preset in ("paper", "strict")
+        else f"{preset!r}, which scores whole rollouts only",
+        "horizon_us and step_us": ""
+        if 0 < step_us <= horizon_us and horizon_us % step_us == 0
+        else f"{horizon_us} and {step_us}",
     }
     for name, found in problems.items():
         if found:

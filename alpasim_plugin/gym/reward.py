@@ -16,7 +16,11 @@ from evaluators import resolve_evaluators
 from evaluators.metrics.presets import preset as find_preset
 from evaluators.metrics.score import check_rollout, run_evaluator
 
-USED = ("collision", "offroad", "route")  # evaluators whose values at an instant need no more of the drive than the instant before
+USED = (
+    "collision",
+    "offroad",
+    "route",
+)  # evaluators whose values at an instant need no more of the drive than the instant before
 DOING = "rewarding a step"
 
 Instant = tuple[EgoState, Mapping[str, F64]]  # the ego, and T_world_box (4, 4) of the others by id
@@ -26,8 +30,9 @@ Instant = tuple[EgoState, Mapping[str, F64]]  # the ego, and T_world_box (4, 4) 
 class Reward:
     """What a step is worth, in terms of the metrics of docs/metrics.md.
 
-    ``progress_per_m`` for each metre gained along the recorded path, minus ``lateral_per_m_s`` for each metre beside it and second, minus
-    ``collision`` or ``offroad`` once, at the end of the episode that it makes.
+    ``progress_per_m`` for each metre gained along the recorded path, minus ``lateral_per_m_s`` for
+    each metre beside it and second, minus ``collision`` or ``offroad`` once, at the end of the
+    episode that it makes.
     """
 
     progress_per_m: float = 0.1
@@ -63,7 +68,8 @@ class Scorer:
             instants: Every control instant since then, in order.
 
         Returns:
-            The reward; ``collision``, ``offroad`` or an empty text; the metrics at the last instant.
+            The reward; ``collision``, ``offroad`` or an empty text; the metrics at the last
+            instant.
 
         Raises:
             EvaluatorError: A metric that is needed has no value.
@@ -73,7 +79,10 @@ class Scorer:
         is_first, self._before = self._before is None, instants[-1]
         lateral_m = float(self._value(found["lateral_distance_m"])[-1])
         share, length_m = self._value(found["progress"]), self._value(found["gt_dist_traveled_m"])
-        flags = {name: bool((self._value(found[name])[0 if is_first else 1 :] > 0.5).any()) for name in ("collision_any", "offroad")}
+        flags = {
+            name: bool((self._value(found[name])[0 if is_first else 1 :] > 0.5).any())
+            for name in ("collision_any", "offroad")
+        }
         gained_m = 0.0 if is_first else float((share[-1] - share[0]) * length_m[-1])
         seconds = (window[-1][0].t_us - window[0][0].t_us) * 1e-6
         weights = self._reward
@@ -85,25 +94,37 @@ class Scorer:
     def _value(self, series: MetricSeries) -> F64:
         if not series.valid.all():
             do_this = "choose a scene with a road and a recorded drive that moves"
-            raise EvaluatorError(DOING, f"scene {self._scenario.scene_id!r}, {series.name}", series.reason, do_this)
+            raise EvaluatorError(
+                DOING, f"scene {self._scenario.scene_id!r}, {series.name}", series.reason, do_this
+            )
         return series.value
 
     def _score(self, window: Sequence[Instant]) -> dict[str, MetricSeries]:
         rollout = self._as_log(window)
         check_rollout(rollout)
         scene = self._scenario.scene
-        return {one.name: one for name, evaluator in self._evaluators for one in run_evaluator(name, evaluator, rollout, scene)}
+        return {
+            one.name: one
+            for name, evaluator in self._evaluators
+            for one in run_evaluator(name, evaluator, rollout, scene)
+        }
 
     def _as_log(self, window: Sequence[Instant]) -> RolloutLog:
-        """Return the window as a log of its own; it has no plans and no images, which these evaluators do not read."""
+        """Return the window as a log of its own; it has no plans and no images, which these
+        evaluators do not read.
+        """
         scenario = self._scenario
         to_box = T_rig_box(scenario.vehicle)
         times = np.array([ego.t_us for ego, _ in window], dtype=np.int64)
-        ego = trajectory_from_poses(times, np.array([one.T_world_rig @ to_box for one, _ in window]))
+        ego = trajectory_from_poses(
+            times, np.array([one.T_world_rig @ to_box for one, _ in window])
+        )
         actors = {}
         for actor_id in dict.fromkeys(name for _, others in window for name in others):
             there = [i for i, (_, others) in enumerate(window) if actor_id in others]
-            track = trajectory_from_poses(times[there], np.array([window[i][1][actor_id] for i in there]))
+            track = trajectory_from_poses(
+                times[there], np.array([window[i][1][actor_id] for i in there])
+            )
             kind = self._kinds[actor_id]
             actors[actor_id] = Actor(actor_id, kind.label, kind.box, track, kind.is_static)
         start_us, log = scenario.start_us, scenario.ego_log

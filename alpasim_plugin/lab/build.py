@@ -1,6 +1,8 @@
-"""Build the wheel of ``alpasim-onefixer-lab`` from this checkout: ``python -m alpasim_plugin.lab.build DIST``.
+"""Build the wheel of ``alpasim-onefixer-lab`` from this checkout: ``python -m
+alpasim_plugin.lab.build DIST``.
 
-It holds the laboratory's folder alone; installed beside the core's wheel, it brings its verbs and fixers.
+It holds the laboratory's folder alone; installed beside the core's wheel, it brings its verbs and
+fixers.
 """
 
 from __future__ import annotations
@@ -27,7 +29,12 @@ namespaces = true
 def stage(target: Path) -> None:
     """Write the distribution's source tree into a folder."""
     for path in sorted(HERE.rglob("*")):
-        if path.is_file() and path.name != PROJECT and path.suffix != ".pyc" and not any(one.endswith(".egg-info") for one in path.parts):
+        if (
+            path.is_file()
+            and path.name != PROJECT
+            and path.suffix != ".pyc"
+            and not any(one.endswith(".egg-info") for one in path.parts)
+        ):
             copy(path, target / "alpasim_plugin" / "lab" / path.relative_to(HERE))
     text = (HERE / PROJECT).read_text()
     assert IN_CHECKOUT in text, "the packages of a checkout are no longer where they were"
@@ -42,7 +49,10 @@ def build(dist: Path) -> Path:
     """
     with tempfile.TemporaryDirectory() as scratch:
         stage(Path(scratch))
-        subprocess.run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(dist), scratch], check=True)
+        subprocess.run(
+            [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(dist), scratch],
+            check=True,
+        )
     return sorted(dist.glob("alpasim_onefixer_lab-*.whl"))[-1]
 
 

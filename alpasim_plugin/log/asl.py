@@ -1,7 +1,7 @@
 """Frame ASL logs: a 4-byte big-endian length before each serialised ``LogEntry``, and nothing else.
 
-The format has no header, index or checksum. A log whose writer was killed ends inside an entry: the reader gives everything before it
-and a `TruncatedTail`. Damage anywhere else is an error.
+The format has no header, index or checksum. A log whose writer was killed ends inside an entry: the
+reader gives everything before it and a `TruncatedTail`. Damage anywhere else is an error.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ from alpasim_plugin.core.reading.files import open_regular
 from alpasim_plugin.log.wire import logging_pb2
 
 _LENGTH = struct.Struct(">I")
-_COPY_AGAIN = "copy the log again from where it was written; nothing after this point can be trusted"
+_COPY_AGAIN = (
+    "copy the log again from where it was written; nothing after this point can be trusted"
+)
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,11 @@ class TruncatedTail:
     present: int
 
     def __str__(self) -> str:
-        size = "its length is cut too" if self.announced is None else f"{self.present} of {self.announced} bytes"
+        size = (
+            "its length is cut too"
+            if self.announced is None
+            else f"{self.present} of {self.announced} bytes"
+        )
         return f"{self.path}: last entry cut at byte {self.offset} ({size}); {self.entries} whole entries read"
 
 
@@ -79,7 +85,9 @@ class AslReader:
                 yield self._parse(body, index, stream.tell() - len(body))
                 index += 1
         if index == 0 and self.truncated is None:
-            raise InputError("reading a rollout log", str(self.path), "an empty file", "run the rollout again")
+            raise InputError(
+                "reading a rollout log", str(self.path), "an empty file", "run the rollout again"
+            )
 
     def _next(self, stream: BinaryIO, index: int) -> bytes | None:
         """Return the bytes of the next entry, or None at the end; notes an unfinished one."""
@@ -97,7 +105,9 @@ class AslReader:
         if len(body) == announced:
             return body
         if not _may_begin_entry(body, announced):
-            raise self._damaged(index, offset, f"a length of {announced} bytes that does not fit what follows")
+            raise self._damaged(
+                index, offset, f"a length of {announced} bytes that does not fit what follows"
+            )
         self.truncated = TruncatedTail(self.path, index, offset, announced, len(body))
         return None
 
@@ -106,18 +116,25 @@ class AslReader:
         try:
             entry.ParseFromString(body)
         except DecodeError as error:
-            raise self._damaged(index, offset, f"{len(body)} bytes that are no log entry") from error
+            raise self._damaged(
+                index, offset, f"{len(body)} bytes that are no log entry"
+            ) from error
         return entry
 
     def _damaged(self, index: int, offset: int, found: str) -> InputError:
-        return InputError("reading a rollout log", f"{self.path}, entry {index} at byte {offset}", found, _COPY_AGAIN)
+        return InputError(
+            "reading a rollout log",
+            f"{self.path}, entry {index} at byte {offset}",
+            found,
+            _COPY_AGAIN,
+        )
 
 
 class AslFile:
     """Write entries to ``PATH.part`` and give the file its name only when it is finished.
 
-    As a context manager it finishes on success; on an exception the ``.part`` file stays for inspection, readable up to its last
-    whole entry, and the next attempt replaces it.
+    As a context manager it finishes on success; on an exception the ``.part`` file stays for
+    inspection, readable up to its last whole entry, and the next attempt replaces it.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -136,7 +153,12 @@ class AslFile:
             InfrastructureError: The disk refuses, or the file is already finished.
         """
         if self._stream is None:
-            raise InfrastructureError("writing a rollout log", str(self.path), "the log is already finished", "open a new log")
+            raise InfrastructureError(
+                "writing a rollout log",
+                str(self.path),
+                "the log is already finished",
+                "open a new log",
+            )
         body = entry.SerializeToString()
         try:
             self._stream.write(_LENGTH.pack(len(body)))
@@ -165,7 +187,8 @@ class AslFile:
     def abandon(self) -> None:
         """Close without renaming."""
         if self._stream is not None:
-            # The caller is already dealing with a failure; that the last buffer of a full disk is lost too adds nothing to it.
+            # The caller is already dealing with a failure; that the last buffer of a full disk is
+            # lost too adds nothing to it.
             with contextlib.suppress(OSError):
                 self._stream.close()
             self._stream = None
@@ -173,7 +196,12 @@ class AslFile:
     def __enter__(self) -> AslFile:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         if kind is None:
             self.finish()
         else:
@@ -186,8 +214,8 @@ class AslFile:
 def _may_begin_entry(head: bytes, announced: int) -> bool:
     """Tell whether `head` can be the beginning of an entry of `announced` bytes.
 
-    An entry is one length-delimited field, so its own inner length must reach exactly to its end. This tells a cut file from a length
-    field that was overwritten.
+    An entry is one length-delimited field, so its own inner length must reach exactly to its end.
+    This tells a cut file from a length field that was overwritten.
     """
     tag, at = _varint(head, 0)
     if at is None:
@@ -249,7 +277,8 @@ def copy_log(source: Path, target: Path, *stages: Stage) -> int:
     Args:
         source: A finished log.
         target: The file to write; its folder exists.
-        stages: Each makes the entries to write of an entry; the next one receives them. Without any, the copy is equal.
+        stages: Each makes the entries to write of an entry; the next one receives them. Without
+            any, the copy is equal.
 
     Raises:
         InputError: The source is damaged, or ends inside an entry.
@@ -264,7 +293,9 @@ def copy_log(source: Path, target: Path, *stages: Stage) -> int:
             for made in entries:
                 out.write(made)
         if reader.truncated is not None:
-            raise InputError("copying a rollout log", str(source), str(reader.truncated), "run the rollout again")
+            raise InputError(
+                "copying a rollout log", str(source), str(reader.truncated), "run the rollout again"
+            )
     return out.entries
 
 

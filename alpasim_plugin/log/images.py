@@ -24,24 +24,46 @@ def encode_image(rgb: U8, encoding: ImageEncoding = "png", quality: int = 95) ->
         InputError: Not an HWC uint8 image.
     """
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3 or 0 in rgb.shape:
-        raise InputError("encoding a camera image", f"array {rgb.shape} {rgb.dtype}", "not (H, W, 3) uint8", "give an sRGB image as uint8")
+        raise InputError(
+            "encoding a camera image",
+            f"array {rgb.shape} {rgb.dtype}",
+            "not (H, W, 3) uint8",
+            "give an sRGB image as uint8",
+        )
     options = {
-        # A log is written while the loop runs. One filter for all rows, and no search for repetitions, which rendered pictures hardly have,
-        # take less than half of the time of libpng's own choices at its lowest level. Of filters that are as fast, averages leave least.
+        # A log is written while the loop runs. One filter for all rows, and no search for
+        # repetitions, which rendered pictures hardly have, take less than half of the time of
+        # libpng's own choices at its lowest level. Of filters that are as fast, averages leave
+        # least.
         "png": [*COMPRESSION, *STRATEGY, *FILTER],
-        "jpeg": [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444],
+        "jpeg": [
+            cv2.IMWRITE_JPEG_QUALITY,
+            quality,
+            cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+            cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+        ],
     }[encoding]
-    done, data = cv2.imencode({"png": ".png", "jpeg": ".jpg"}[encoding], cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
+    done, data = cv2.imencode(
+        {"png": ".png", "jpeg": ".jpg"}[encoding], cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options
+    )
     if not done:
-        raise InputError("encoding a camera image", f"array {rgb.shape} as {encoding}", "the encoder refused", "use a smaller image")
+        raise InputError(
+            "encoding a camera image",
+            f"array {rgb.shape} as {encoding}",
+            "the encoder refused",
+            "use a smaller image",
+        )
     return data.tobytes()
 
 
 def decode_image(data: bytes, what: str = "a camera image") -> U8:
-    """Decode PNG or JPEG to ``(H, W, 3)`` uint8 sRGB. The size is the image's own, never the requested one.
+    """Decode PNG or JPEG to ``(H, W, 3)`` uint8 sRGB. The size is the image's own, never the
+    requested one.
 
     Raises:
         InputError: Not a whole image.
     """
-    bgr = images.decode_image(data, what, "decoding a camera image", "store PNG or JPEG images in the log")
+    bgr = images.decode_image(
+        data, what, "decoding a camera image", "store PNG or JPEG images in the log"
+    )
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))

@@ -1,6 +1,7 @@
 """Read an ASL log of any writer into a `RolloutLog`.
 
-Reads what AlpaSim's evaluation reads and ignores the rest. Nothing is ever unpickled: the driver's unstructured debug bytes stay unread.
+Reads what AlpaSim's evaluation reads and ignores the rest. Nothing is ever unpickled: the driver's
+unstructured debug bytes stay unread.
 """
 
 from __future__ import annotations
@@ -16,7 +17,14 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import BODY_M
 from alpasim_plugin.core.types import Actor, Box, LoggedImage, LoggedPlan, RolloutLog, Trajectory
 from alpasim_plugin.log.asl import AslReader
-from alpasim_plugin.log.schema import EGO, increasing_times, read_camera, read_poses, read_trajectory, read_transform
+from alpasim_plugin.log.schema import (
+    EGO,
+    increasing_times,
+    read_camera,
+    read_poses,
+    read_trajectory,
+    read_transform,
+)
 from alpasim_plugin.log.wire import common_pb2, egodriver_pb2, logging_pb2
 
 
@@ -32,7 +40,13 @@ class _Collected:
     static_ids: set[str] = field(default_factory=set)
     counts: Counter[str] = field(default_factory=Counter)
     info: dict[str, Any] = field(
-        default_factory=lambda: {"empty_plans": 0, "terminated": False, "cameras": (), "other_cameras": (), "seed": 0}
+        default_factory=lambda: {
+            "empty_plans": 0,
+            "terminated": False,
+            "cameras": (),
+            "other_cameras": (),
+            "seed": 0,
+        }
     )
 
 
@@ -44,13 +58,15 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
         images: Keep the encoded camera images; False saves their memory.
 
     Returns:
-        The rollout. ``warnings`` lists a truncated last entry and entries of unknown kind; ``info`` holds ``entries`` (count by kind),
-        ``n_steps``, ``empty_plans`` and ``unanswered`` (drive requests without a plan), ``terminated`` (the driver ended the
-        rollout), ``cameras`` (`CameraSpec` of the pinhole cameras), ``other_cameras`` (names of the rest), ``versions``, and
-        ``undefined_actors`` (poses of ids that the header does not define are left out).
+        The rollout. ``warnings`` lists a truncated last entry and entries of unknown kind; ``info``
+        holds ``entries`` (count by kind), ``n_steps``, ``empty_plans`` and ``unanswered`` (drive
+        requests without a plan), ``terminated`` (the driver ended the rollout), ``cameras``
+        (`CameraSpec` of the pinhole cameras), ``other_cameras`` (names of the rest), ``versions``,
+        and ``undefined_actors`` (poses of ids that the header does not define are left out).
 
     Raises:
-        InputError: Missing, empty or damaged file, no metadata first, no ego poses, times that do not increase, or a bad quaternion.
+        InputError: Missing, empty or damaged file, no metadata first, no ego poses, times that do
+            not increase, or a bad quaternion.
     """
     path = Path(path)
     reader = AslReader(path)
@@ -59,22 +75,32 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
         kind = entry.WhichOneof("log_entry") or "unknown"
         got.counts[kind] += 1
         if got.metadata is None and kind != "rollout_metadata":
-            raise _bad(path, f"first entry is {kind}", "give a whole log: rollout_metadata comes first")
+            raise _bad(
+                path, f"first entry is {kind}", "give a whole log: rollout_metadata comes first"
+            )
         handler = _HANDLERS.get(kind)
         if handler is not None:
             handler(got, getattr(entry, kind), str(path))
         elif kind == "driver_camera_image" and images:
             image = entry.driver_camera_image.camera_image
-            got.images.append(LoggedImage(image.logical_id, image.frame_start_us, image.frame_end_us, image.image_bytes))
+            got.images.append(
+                LoggedImage(
+                    image.logical_id, image.frame_start_us, image.frame_end_us, image.image_bytes
+                )
+            )
     warnings = [str(reader.truncated)] if reader.truncated else []
     if got.counts["unknown"]:
-        warnings.append(f"{path}: {got.counts['unknown']} entries of a kind that this version does not know were skipped")
+        warnings.append(
+            f"{path}: {got.counts['unknown']} entries of a kind that this version does not know were skipped"
+        )
     return _assemble(path, got, tuple(warnings))
 
 
 def _metadata(got: _Collected, message: logging_pb2.RolloutMetadata, where: str) -> None:
     if got.metadata is not None:
-        raise InputError("reading a rollout log", where, "a second rollout_metadata", "give one rollout a file")
+        raise InputError(
+            "reading a rollout log", where, "a second rollout_metadata", "give one rollout a file"
+        )
     got.metadata = message
 
 
@@ -90,7 +116,12 @@ def _driver_request(got: _Collected, message: egodriver_pb2.DriveRequest, where:
 def _driver_return(got: _Collected, message: egodriver_pb2.DriveResponse, where: str) -> None:
     """Pair first in, first out; a response without poses is a driver that is not ready yet."""
     if not got.requests:
-        raise InputError("reading a rollout log", where, "a driver_return without a driver_request", "give a whole log")
+        raise InputError(
+            "reading a rollout log",
+            where,
+            "a driver_return without a driver_request",
+            "give a whole log",
+        )
     request = got.requests.pop(0)
     if message.terminate_session:
         got.info["terminated"] = True
@@ -98,11 +129,23 @@ def _driver_return(got: _Collected, message: egodriver_pb2.DriveResponse, where:
         got.info["empty_plans"] += 1
         return
     what = f"{where}, plan at {request.time_now_us} us"
-    samples = tuple(read_trajectory(sample, f"{what}, sample {i}") for i, sample in enumerate(message.debug_info.sampled_trajectories))
-    got.plans.append(LoggedPlan(request.time_now_us, request.time_query_us, read_trajectory(message.trajectory, what), samples))
+    samples = tuple(
+        read_trajectory(sample, f"{what}, sample {i}")
+        for i, sample in enumerate(message.debug_info.sampled_trajectories)
+    )
+    got.plans.append(
+        LoggedPlan(
+            request.time_now_us,
+            request.time_query_us,
+            read_trajectory(message.trajectory, what),
+            samples,
+        )
+    )
 
 
-def _driver_session(got: _Collected, message: egodriver_pb2.DriveSessionRequest, where: str) -> None:
+def _driver_session(
+    got: _Collected, message: egodriver_pb2.DriveSessionRequest, where: str
+) -> None:
     got.info["seed"] = message.random_seed
 
 
@@ -135,16 +178,30 @@ def _assemble(path: Path, got: _Collected, warnings: tuple[str, ...]) -> Rollout
     definitions = metadata.actor_definitions.actor_aabb
     if not definitions or definitions[0].actor_id != EGO:
         first = definitions[0].actor_id if definitions else "nothing"
-        raise _bad(path, f"actor definitions begin with {first}", f"define {EGO} first: its size is read from there")
+        raise _bad(
+            path,
+            f"actor definitions begin with {first}",
+            f"define {EGO} first: its size is read from there",
+        )
     if EGO not in got.poses:
-        raise _bad(path, f"no actor_poses of {EGO}", "run the rollout again; nothing can be scored without them")
+        raise _bad(
+            path,
+            f"no actor_poses of {EGO}",
+            "run the rollout again; nothing can be scored without them",
+        )
     actors = {}
     for definition in definitions[1:]:
         poses = got.poses.get(definition.actor_id)
         if poses:
             i = definition.actor_id
             track = _track(poses, f"{path}, poses of actor {i!r}")
-            actors[i] = Actor(i, definition.actor_label, _box(definition.aabb, path, i), track, is_static=i in got.static_ids)
+            actors[i] = Actor(
+                i,
+                definition.actor_label,
+                _box(definition.aabb, path, i),
+                track,
+                is_static=i in got.static_ids,
+            )
     defined = {d.actor_id for d in definitions}
     seed = got.info.pop("seed")
     info = {
@@ -152,19 +209,26 @@ def _assemble(path: Path, got: _Collected, warnings: tuple[str, ...]) -> Rollout
         "n_steps": session.n_sim_steps,
         "unanswered": len(got.requests),
         "undefined_actors": tuple(sorted(set(got.poses) - defined)),
-        "versions": {f.name.removesuffix("_version"): v.version_id for f, v in metadata.version_ids.ListFields()},
+        "versions": {
+            f.name.removesuffix("_version"): v.version_id
+            for f, v in metadata.version_ids.ListFields()
+        },
         **got.info,
     }
     return RolloutLog(
         scene_id=session.scene_id,
         session_uuid=session.session_uuid,
         ego_box=_box(definitions[0].aabb, path, EGO),
-        T_rig_box=read_transform(metadata.transform_ego_coords_rig_to_aabb, f"{path}, offset from rig to box"),
+        T_rig_box=read_transform(
+            metadata.transform_ego_coords_rig_to_aabb, f"{path}, offset from rig to box"
+        ),
         ego=_track(got.poses[EGO], f"{path}, poses of {EGO}"),
         actors=actors,
         plans=tuple(got.plans),
         images=tuple(sorted(got.images, key=lambda image: image.end_us)),
-        ego_log=read_trajectory(metadata.ego_rig_recorded_ground_truth_trajectory, f"{path}, recorded ego poses"),
+        ego_log=read_trajectory(
+            metadata.ego_rig_recorded_ground_truth_trajectory, f"{path}, recorded ego poses"
+        ),
         start_us=session.start_timestamp_us,
         render_start_us=session.render_start_timestamp_us,
         force_gt_us=metadata.force_gt_duration,
@@ -182,8 +246,15 @@ def _track(poses: list[tuple[int, common_pb2.Pose]], what: str) -> Trajectory:
 
 
 def _box(aabb: common_pb2.AABB, path: Path, actor: str) -> Box:
-    """Return a box; sizes are float32 on the wire and shown with its seven digits, so that 4.855 stays 4.855."""
-    box = Box(*(float(np.format_float_positional(np.float32(v))) for v in (aabb.size_x, aabb.size_y, aabb.size_z)))
+    """Return a box; sizes are float32 on the wire and shown with its seven digits, so that 4.855
+    stays 4.855.
+    """
+    box = Box(
+        *(
+            float(np.format_float_positional(np.float32(v)))
+            for v in (aabb.size_x, aabb.size_y, aabb.size_z)
+        )
+    )
     for side in (box.length_m, box.width_m):
         BODY_M.check(side, "reading a rollout log", f"{path}, box of actor {actor!r}")
     return box

@@ -1,7 +1,7 @@
 """Translate between our types and the messages of a rollout log.
 
-Poses are float32 on the wire: metres keep 1 mm up to about 8 km from the local origin, so a log must use a local origin. Times are
-integer microseconds in 64 bits and exact.
+Poses are float32 on the wire: metres keep 1 mm up to about 8 km from the local origin, so a log
+must use a local origin. Times are integer microseconds in 64 bits and exact.
 """
 
 from __future__ import annotations
@@ -17,7 +17,17 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import matrix_from_quat, quat_from_matrix, se3
-from alpasim_plugin.core.types import F64, Actor, Box, CameraSpec, EgoState, RenderRequest, Scenario, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    F64,
+    Actor,
+    Box,
+    CameraSpec,
+    EgoState,
+    RenderRequest,
+    Scenario,
+    Trajectory,
+    Vehicle,
+)
 from alpasim_plugin.log.images import ImageEncoding
 from alpasim_plugin.log.wire import common_pb2, egodriver_pb2, sensorsim_pb2, traffic_pb2
 
@@ -25,9 +35,13 @@ SEED_BITS, DIGEST_BITS = 64, 58
 EGO = "EGO"
 QUAT_NORM_TOLERANCE = 1e-4  # on |q|^2, as AlpaSim's reader checks it
 MAX_LOCAL_M = 1e5  # float32 steps are 7.8 mm there
-# One PoseAtTime as an element of Trajectory.poses: protobuf tags and lengths (bytes) before each number.
+# One PoseAtTime as an element of Trajectory.poses: protobuf tags and lengths (bytes) before each
+# number.
 _TAGS = {
-    "head": ("x", b"\x0a\x32\x0a\x27\x0a\x0f\x0d"),  # PoseAtTime of 50 bytes, pose of 39, vec of 15, x
+    "head": (
+        "x",
+        b"\x0a\x32\x0a\x27\x0a\x0f\x0d",
+    ),  # PoseAtTime of 50 bytes, pose of 39, vec of 15, x
     "tag_y": ("y", b"\x15"),
     "tag_z": ("z", b"\x1d"),
     "tag_qw": ("qw", b"\x12\x14\x0d"),  # quat of 20 bytes, w
@@ -51,8 +65,9 @@ for _name, (_, _tag) in _TAGS.items():
 def session_uuid(seed: int, identity: str) -> str:
     """Return the session id of a rollout, a UUID of version 8 (RFC 9562, section 5.8).
 
-    AlpaSim pairs the rollouts of different scenes by the rank of their ids, so an id begins with the seed: rollouts of one seed have the
-    same rank in every scene. The rest is a digest, so that ids differ between renderers, policies and scenes.
+    AlpaSim pairs the rollouts of different scenes by the rank of their ids, so an id begins with
+    the seed: rollouts of one seed have the same rank in every scene. The rest is a digest, so that
+    ids differ between renderers, policies and scenes.
 
     Args:
         seed: The rollout's seed, 0 to 2^64 - 1.
@@ -63,9 +78,21 @@ def session_uuid(seed: int, identity: str) -> str:
         ('00000000-0000-8000-8b2a-5e044b286ef7', '00000000-0000-8000-ab2a-5e044b286ef7')
     """
     digest = int.from_bytes(hashlib.sha256(identity.encode()).digest()) >> (256 - DIGEST_BITS)
-    # Layout: 48 bits, version 8, 12 bits, variant 0b10, 62 bits; the seed's 64 bits come first among the free ones.
-    high, middle, low = seed >> 16, (seed >> 4) & 0xFFF, seed & 0xF
-    return str(uuid.UUID(int=(high << 80) | (8 << 76) | (middle << 64) | (0b10 << 62) | (low << DIGEST_BITS) | digest))
+    # Layout: 48 bits, version 8, 12 bits, variant 0b10, 62 bits; the seed's 64 bits come first
+    # among the free ones.
+    high = seed >> 16
+    middle = (seed >> 4) & 0xFFF
+    low = seed & 0xF
+    return str(
+        uuid.UUID(
+            int=(high << 80)
+            | (8 << 76)
+            | (middle << 64)
+            | (0b10 << 62)
+            | (low << DIGEST_BITS)
+            | digest
+        )
+    )
 
 
 @dataclass(frozen=True)
@@ -83,8 +110,9 @@ class RolloutHeader:
         control_us: Control period.
         n_steps: Number of control steps.
         seed: Rollout seed.
-        versions: Version text by service (``runtime``, ``egodriver``, ``sensorsim``, ``controller``, ``physics``, ``traffic``,
-            ``video_model``); services not named are logged as skipped.
+        versions: Version text by service (``runtime``, ``egodriver``, ``sensorsim``,
+            ``controller``, ``physics``, ``traffic``, ``video_model``); services not named are
+            logged as skipped.
     """
 
     scene_id: str
@@ -106,7 +134,11 @@ class RolloutHeader:
 
 
 def header_from_scenario(
-    scenario: Scenario, session_uuid: str, seed: int, n_steps: int, versions: Mapping[str, str] | None = None
+    scenario: Scenario,
+    session_uuid: str,
+    seed: int,
+    n_steps: int,
+    versions: Mapping[str, str] | None = None,
 ) -> RolloutHeader:
     """Return the header of a rollout of `scenario`."""
     return RolloutHeader(
@@ -131,7 +163,7 @@ def T_rig_box(vehicle: Vehicle) -> F64:
     return out
 
 
-# --- to the wire ----------------------------------------------------------------------------------------------------
+# --- to the wire
 
 
 def wire_poses(xyz: F64, quat: F64, what: str) -> list[common_pb2.Pose]:
@@ -143,16 +175,22 @@ def wire_poses(xyz: F64, quat: F64, what: str) -> list[common_pb2.Pose]:
         what: Whose poses, for the error.
 
     Raises:
-        InputError: A value is not finite, a quaternion is zero, or a coordinate is too large for float32.
+        InputError: A value is not finite, a quaternion is zero, or a coordinate is too large for
+            float32.
     """
     rows = _checked_rows(xyz, quat, what).tolist()
     return [
-        common_pb2.Pose(vec=common_pb2.Vec3(x=x, y=y, z=z), quat=common_pb2.Quat(w=w, x=qx, y=qy, z=qz)) for x, y, z, w, qx, qy, qz in rows
+        common_pb2.Pose(
+            vec=common_pb2.Vec3(x=x, y=y, z=z), quat=common_pb2.Quat(w=w, x=qx, y=qy, z=qz)
+        )
+        for x, y, z, w, qx, qy, qz in rows
     ]
 
 
 def _checked_rows(xyz: F64, quat: F64, what: str) -> F64:
-    """Return ``(N, 7)``: positions and unit quaternions that float32 can hold; raises as `wire_poses` says."""
+    """Return ``(N, 7)``: positions and unit quaternions that float32 can hold; raises as
+    `wire_poses` says.
+    """
     norm = np.linalg.norm(quat, axis=-1, keepdims=True)
     near, long = np.abs(xyz) < MAX_LOCAL_M, (norm > 0) & (norm < np.inf)  # neither is true of NaN
     if not (near.all() and long.all()):
@@ -167,43 +205,65 @@ def _checked_rows(xyz: F64, quat: F64, what: str) -> F64:
 
 
 def wire_pose(transform: F64, what: str) -> common_pb2.Pose:
-    """Return the message of one ``(4, 4)`` transform; see `wire_poses`, whose arithmetic it does without arrays."""
+    """Return the message of one ``(4, 4)`` transform; see `wire_poses`, whose arithmetic it does
+    without arrays.
+    """
     (x, y, z), quat = transform[:3, 3].tolist(), quat_from_matrix(transform[:3, :3])
     w, qx, qy, qz = quat.tolist()
     norm = math.sqrt(w * w + qx * qx + qy * qy + qz * qz)
-    if not (abs(x) < MAX_LOCAL_M and abs(y) < MAX_LOCAL_M and abs(z) < MAX_LOCAL_M and 0.0 < norm < math.inf):
+    if not (
+        abs(x) < MAX_LOCAL_M
+        and abs(y) < MAX_LOCAL_M
+        and abs(z) < MAX_LOCAL_M
+        and 0.0 < norm < math.inf
+    ):
         return wire_poses(transform[None, :3, 3], quat[None], what)[0]  # which says what is wrong
-    return common_pb2.Pose(vec=common_pb2.Vec3(x=x, y=y, z=z), quat=common_pb2.Quat(w=w / norm, x=qx / norm, y=qy / norm, z=qz / norm))
+    return common_pb2.Pose(
+        vec=common_pb2.Vec3(x=x, y=y, z=z),
+        quat=common_pb2.Quat(w=w / norm, x=qx / norm, y=qy / norm, z=qz / norm),
+    )
 
 
 def wire_trajectory(trajectory: Trajectory, what: str) -> common_pb2.Trajectory:
     """Return the message of a trajectory; see `wire_poses`."""
-    message: common_pb2.Trajectory = common_pb2.Trajectory.FromString(wire_bytes([trajectory], what)[0])
+    message: common_pb2.Trajectory = common_pb2.Trajectory.FromString(
+        wire_bytes([trajectory], what)[0]
+    )
     return message
 
 
 def wire_bytes(trajectories: Sequence[Trajectory], what: str) -> list[bytes]:
     """Return the messages of trajectories, serialised; see `wire_poses`.
 
-    The poses are laid out by array operations, to be parsed once: twenty times faster than building a message a pose, and plans with
-    their alternatives are most of what a log holds. A message that takes them parses them in place: one given to a constructor is copied.
+    The poses are laid out by array operations, to be parsed once: twenty times faster than building
+    a message a pose, and plans with their alternatives are most of what a log holds. A message that
+    takes them parses them in place: one given to a constructor is copied.
     """
-    xyz, quat, t_us = (np.concatenate([getattr(one, name) for one in trajectories]) for name in ("xyz", "quat", "t_us"))
+    xyz, quat, t_us = (
+        np.concatenate([getattr(one, name) for one in trajectories])
+        for name in ("xyz", "quat", "t_us")
+    )
     rows = _checked_rows(xyz, quat, what)
     table = np.repeat(_BLANK, len(rows))
     for i, name in enumerate(("x", "y", "z", "qw", "qx", "qy", "qz")):
         table[name] = rows[:, i]
     table["t_us"] = t_us
     ends = list(accumulate(map(len, trajectories)))
-    return [table[end - len(one) : end].tobytes() for one, end in zip(trajectories, ends, strict=True)]
+    return [
+        table[end - len(one) : end].tobytes() for one, end in zip(trajectories, ends, strict=True)
+    ]
 
 
 def wire_dynamics(state: EgoState) -> common_pb2.DynamicState:
-    """Return speeds and accelerations in the rig frame, for planar motion without side slip at the rear axle."""
+    """Return speeds and accelerations in the rig frame, for planar motion without side slip at the
+    rear axle.
+    """
     return common_pb2.DynamicState(
         angular_velocity=common_pb2.Vec3(z=state.yaw_rate_radps),
         linear_velocity=common_pb2.Vec3(x=state.speed_mps),
-        linear_acceleration=common_pb2.Vec3(x=state.accel_mps2, y=state.speed_mps * state.yaw_rate_radps),
+        linear_acceleration=common_pb2.Vec3(
+            x=state.accel_mps2, y=state.speed_mps * state.yaw_rate_radps
+        ),
         angular_acceleration=common_pb2.Vec3(),
     )
 
@@ -213,7 +273,9 @@ def wire_box(box: Box) -> common_pb2.AABB:
     return common_pb2.AABB(size_x=box.length_m, size_y=box.width_m, size_z=box.height_m)
 
 
-def wire_camera(camera: CameraSpec, name: str | None = None) -> sensorsim_pb2.AvailableCamerasReturn.AvailableCamera:
+def wire_camera(
+    camera: CameraSpec, name: str | None = None
+) -> sensorsim_pb2.AvailableCamerasReturn.AvailableCamera:
     """Return a camera with the pinhole that is really rendered, under its own name or another."""
     return sensorsim_pb2.AvailableCamerasReturn.AvailableCamera(
         intrinsics=wire_intrinsics(camera, name),
@@ -223,7 +285,9 @@ def wire_camera(camera: CameraSpec, name: str | None = None) -> sensorsim_pb2.Av
 
 
 def wire_intrinsics(camera: CameraSpec, name: str | None = None) -> sensorsim_pb2.CameraSpec:
-    """Return the intrinsics of a camera; all twelve distortion coefficients are stated, as zeros."""
+    """Return the intrinsics of a camera; all twelve distortion coefficients are stated, as
+    zeros.
+    """
     return sensorsim_pb2.CameraSpec(
         opencv_pinhole_param=sensorsim_pb2.OpenCVPinholeCameraParam(
             principal_point_x=camera.K[0, 2],
@@ -237,14 +301,18 @@ def wire_intrinsics(camera: CameraSpec, name: str | None = None) -> sensorsim_pb
         logical_id=name or camera.name,
         resolution_h=camera.height,
         resolution_w=camera.width,
-        shutter_type=sensorsim_pb2.ROLLING_TOP_TO_BOTTOM if camera.shutter_us else sensorsim_pb2.GLOBAL,
+        shutter_type=sensorsim_pb2.ROLLING_TOP_TO_BOTTOM
+        if camera.shutter_us
+        else sensorsim_pb2.GLOBAL,
     )
 
 
 def wire_render_request(
     scene_id: str, request: RenderRequest, encoding: ImageEncoding, name: str | None = None
 ) -> sensorsim_pb2.RGBRenderRequest:
-    """Return the message of one frame to render, of the request's camera under its own name or another."""
+    """Return the message of one frame to render, of the request's camera under its own name or
+    another.
+    """
     camera = request.camera
     start, end = (wire_pose(T, f"pose of camera {camera.name!r}") for T in request.T_world_camera)
     objects = []
@@ -254,7 +322,8 @@ def wire_render_request(
         poses = wire_poses(stack[:, :3, 3], quat_from_matrix(stack[:, :3, :3]), f"actors {ids}")
         pair = sensorsim_pb2.PosePair
         objects = [
-            sensorsim_pb2.DynamicObject(track_id=i, pose_pair=pair(start_pose=p, end_pose=p)) for i, p in zip(ids, poses, strict=True)
+            sensorsim_pb2.DynamicObject(track_id=i, pose_pair=pair(start_pose=p, end_pose=p))
+            for i, p in zip(ids, poses, strict=True)
         ]
     return sensorsim_pb2.RGBRenderRequest(
         scene_id=scene_id,
@@ -270,17 +339,27 @@ def wire_render_request(
     )
 
 
-def wire_image(session_uuid: str, camera: str, start_us: int, end_us: int, data: bytes) -> egodriver_pb2.RolloutCameraImage:
+def wire_image(
+    session_uuid: str, camera: str, start_us: int, end_us: int, data: bytes
+) -> egodriver_pb2.RolloutCameraImage:
     """Return the message of one encoded frame; ``end_us`` is its time stamp."""
-    image = egodriver_pb2.RolloutCameraImage.CameraImage(frame_start_us=start_us, frame_end_us=end_us, image_bytes=data, logical_id=camera)
+    image = egodriver_pb2.RolloutCameraImage.CameraImage(
+        frame_start_us=start_us, frame_end_us=end_us, image_bytes=data, logical_id=camera
+    )
     return egodriver_pb2.RolloutCameraImage(session_uuid=session_uuid, camera_image=image)
 
 
 def wire_traffic_session(header: RolloutHeader) -> traffic_pb2.TrafficSessionRequest:
-    """Return the message that opens a session of road users: the ego first, then every track, and when the service takes over."""
+    """Return the message that opens a session of road users: the ego first, then every track, and
+    when the service takes over.
+    """
     xyz, quat = rigid_product(header.ego_log.xyz, header.ego_log.quat, header.T_rig_box)
     ego = wire_trajectory(Trajectory(header.ego_log.t_us, xyz, quat), "the recorded ego")
-    objects = [traffic_pb2.ObjectTrajectory(aabb=wire_box(header.vehicle.box), trajectory=ego, object_id=EGO, is_static=False)]
+    objects = [
+        traffic_pb2.ObjectTrajectory(
+            aabb=wire_box(header.vehicle.box), trajectory=ego, object_id=EGO, is_static=False
+        )
+    ]
     objects += [
         traffic_pb2.ObjectTrajectory(
             aabb=wire_box(a.box),
@@ -300,14 +379,15 @@ def wire_traffic_session(header: RolloutHeader) -> traffic_pb2.TrafficSessionReq
     )
 
 
-# --- from the wire --------------------------------------------------------------------------------------------------
+# --- from the wire
 
 
 def read_poses(poses: Iterable[common_pb2.Pose], what: str) -> tuple[F64, F64]:
     """Return positions ``(N, 3)`` and unit quaternions ``(N, 4)``, widened to float64.
 
     Raises:
-        InputError: A value is not finite, or a squared quaternion norm is off 1 by more than 1e-4 (an unset quaternion is all zero).
+        InputError: A value is not finite, or a squared quaternion norm is off 1 by more than 1e-4
+            (an unset quaternion is all zero).
     """
     # Each attribute access makes a Python object, so vec and quat are fetched once a pose.
     rows = [(v.x, v.y, v.z, q.w, q.x, q.y, q.z) for v, q in ((p.vec, p.quat) for p in poses)]
@@ -370,11 +450,19 @@ def read_camera(camera: sensorsim_pb2.AvailableCamerasReturn.AvailableCamera) ->
     p = spec.opencv_pinhole_param
     if any((*p.radial_coeffs, *p.tangential_coeffs, *p.thin_prism_coeffs)):
         return None
-    matrix = np.array([[p.focal_length_x, 0.0, p.principal_point_x], [0.0, p.focal_length_y, p.principal_point_y], [0.0, 0.0, 1.0]])
+    matrix = np.array(
+        [
+            [p.focal_length_x, 0.0, p.principal_point_x],
+            [0.0, p.focal_length_y, p.principal_point_y],
+            [0.0, 0.0, 1.0],
+        ]
+    )
     mounting = read_transform(camera.rig_to_camera, f"mounting of camera {camera.logical_id!r}")
     return CameraSpec(camera.logical_id, spec.resolution_w, spec.resolution_h, matrix, mounting)
 
 
 def rigid_product(xyz: F64, quat: F64, T_body_other: F64) -> tuple[F64, F64]:
-    """Return poses ``(N, 3)``, ``(N, 4)`` of a frame that is shifted, not turned, in the body: exact in rotation."""
+    """Return poses ``(N, 3)``, ``(N, 4)`` of a frame that is shifted, not turned, in the body:
+    exact in rotation.
+    """
     return xyz + matrix_from_quat(quat) @ T_body_other[:3, 3], quat

@@ -15,17 +15,20 @@ from alpasim_plugin.core.reading import read_json_lines
 from alpasim_plugin.log.asl import AslReader
 from alpasim_plugin.log.schema import EGO
 
-# In the order in which the loop makes them at one instant: where the ego got to, where the others are, what the cameras saw, what the
-# policy answered. Scores come last of all: they are made from the finished log.
+# In the order in which the loop makes them at one instant: where the ego got to, where the others
+# are, what the cameras saw, what the policy answered. Scores come last of all: they are made from
+# the finished log.
 COMPONENTS = ("ego", "actors", "frames", "plans", "scores")
 
 Fact = str | int | float | bool | None
 
 
 def write_facts(path: Path | str, rows: Iterable[Mapping[str, Fact]]) -> None:
-    """Write one JSON object a line, such as ``{"t_us": 100000, "camera": "front", "alpha_mean": 0.98, "render_ms": 12.1}``.
+    """Write one JSON object a line, such as ``{"t_us": 100000, "camera": "front", "alpha_mean":
+    0.98, "render_ms": 12.1}``.
 
-    The file appears under its name only once complete. NaN and infinities are refused: a fact that is missing is left out.
+    The file appears under its name only once complete. NaN and infinities are refused: a fact that
+    is missing is left out.
 
     Raises:
         InputError: A value that JSON cannot hold.
@@ -33,10 +36,18 @@ def write_facts(path: Path | str, rows: Iterable[Mapping[str, Fact]]) -> None:
     """
     path = Path(path)
     try:
-        with atomic_file(path, "writing facts of a rollout") as partial, partial.open("w", encoding="utf-8") as stream:
+        with (
+            atomic_file(path, "writing facts of a rollout") as partial,
+            partial.open("w", encoding="utf-8") as stream,
+        ):
             stream.writelines(json.dumps(dict(row), allow_nan=False) + "\n" for row in rows)
     except (TypeError, ValueError) as error:
-        raise InputError("writing facts of a rollout", str(path), str(error), "give finite numbers, text or booleans") from error
+        raise InputError(
+            "writing facts of a rollout",
+            str(path),
+            str(error),
+            "give finite numbers, text or booleans",
+        ) from error
 
 
 def read_facts(path: Path | str) -> list[dict[str, Fact]]:
@@ -45,11 +56,15 @@ def read_facts(path: Path | str) -> list[dict[str, Fact]]:
     Raises:
         InputError: Missing file, or a line that is no JSON object.
     """
-    rows: list[dict[str, Fact]] = read_json_lines(path, "reading facts of a rollout", do_this="run the rollout again")
+    rows: list[dict[str, Fact]] = read_json_lines(
+        path, "reading facts of a rollout", do_this="run the rollout again"
+    )
     return rows
 
 
-Key = tuple[int, str]  # time in microseconds, and which part of the component: a camera, a metric, ...
+Key = tuple[
+    int, str
+]  # time in microseconds, and which part of the component: a camera, a metric, ...
 Trace = Mapping[str, Mapping[Key, str]]  # component -> key -> SHA-256
 
 
@@ -64,7 +79,12 @@ class Difference:
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for JSON."""
-        return {"component": self.component, "t_us": self.t_us, "step": self.step, "what": self.what}
+        return {
+            "component": self.component,
+            "t_us": self.t_us,
+            "step": self.step,
+            "what": self.what,
+        }
 
     def __str__(self) -> str:
         at = f"step {self.step}" if self.step is not None else "before the first frame"
@@ -74,12 +94,14 @@ class Difference:
 def trace_log(path: Path, facts: Iterable[Mapping[str, Fact]] = ()) -> dict[str, dict[Key, str]]:
     """Read the components of a rollout out of its log.
 
-    Names of sessions and services are not part of any component: rollouts of different names can be equal.
+    Names of sessions and services are not part of any component: rollouts of different names can be
+    equal.
 
     Args:
         path: The ``.asl`` file.
-        facts: Rows of the frame facts beside it: they hold the digest of the pixels before the log's image compression. Times that were
-            measured (names ending in ``_ms``) are left out.
+        facts: Rows of the frame facts beside it: they hold the digest of the pixels before the
+            log's image compression. Times that were measured (names ending in ``_ms``) are left
+            out.
 
     Raises:
         InputError: The log is missing or damaged.
@@ -90,24 +112,40 @@ def trace_log(path: Path, facts: Iterable[Mapping[str, Fact]] = ()) -> dict[str,
         kind = entry.WhichOneof("log_entry")
         if kind == "actor_poses":
             poses = entry.actor_poses
-            parts["ego"][poses.timestamp_us, "pose"] = _joined(p.SerializeToString() for p in poses.actor_poses if p.actor_id == EGO)
-            parts["actors"][poses.timestamp_us, "poses"] = _joined(p.SerializeToString() for p in poses.actor_poses if p.actor_id != EGO)
+            parts["ego"][poses.timestamp_us, "pose"] = _joined(
+                p.SerializeToString() for p in poses.actor_poses if p.actor_id == EGO
+            )
+            parts["actors"][poses.timestamp_us, "poses"] = _joined(
+                p.SerializeToString() for p in poses.actor_poses if p.actor_id != EGO
+            )
         elif kind == "controller_return":
             states = entry.controller_return.states
-            parts["ego"][states[-1].timestamp_us, "motion"] = _joined(state.SerializeToString() for state in states)
+            parts["ego"][states[-1].timestamp_us, "motion"] = _joined(
+                state.SerializeToString() for state in states
+            )
         elif kind == "driver_camera_image":
             image = entry.driver_camera_image.camera_image
-            parts["frames"][image.frame_end_us, f"camera {image.logical_id} as logged"] = sha256(image.image_bytes)
+            parts["frames"][image.frame_end_us, f"camera {image.logical_id} as logged"] = sha256(
+                image.image_bytes
+            )
         elif kind == "driver_request":
             asked_us = entry.driver_request.time_now_us
         elif kind == "driver_return":
             parts["plans"][asked_us, "plan"] = sha256(entry.driver_return.SerializeToString())
     for fact in facts:
-        text = json.dumps({name: value for name, value in fact.items() if not name.endswith("_ms")}, sort_keys=True)
+        text = json.dumps(
+            {name: value for name, value in fact.items() if not name.endswith("_ms")},
+            sort_keys=True,
+        )
         t_us, camera = fact.get("t_us"), fact.get("camera")
         if not isinstance(t_us, int) or not isinstance(camera, str):
             found = f"frame facts of camera {camera!r} at t_us {t_us!r}"
-            raise InputError("comparing rollouts", str(path), found, "run the rollout again: its facts are damaged")
+            raise InputError(
+                "comparing rollouts",
+                str(path),
+                found,
+                "run the rollout again: its facts are damaged",
+            )
         parts["frames"][t_us, f"camera {camera}"] = sha256(text.encode())
     return parts
 
@@ -118,32 +156,52 @@ def digests(trace: Trace) -> dict[str, str]:
 
 
 def first_difference(
-    one: Trace, other: Trace, start_us: int, control_us: int, until_us: Mapping[str, int] | None = None
+    one: Trace,
+    other: Trace,
+    start_us: int,
+    control_us: int,
+    until_us: Mapping[str, int] | None = None,
 ) -> Difference | None:
-    """Return the earliest difference, or None; what only one of the two has is a difference as well.
+    """Return the earliest difference, or None; what only one of the two has is a difference as
+    well.
 
-    At equal times the component that the loop makes first is named; scores are named only where nothing else differs.
+    At equal times the component that the loop makes first is named; scores are named only where
+    nothing else differs.
 
     Args:
         one: A rollout.
         other: Another one.
         start_us: Time of the first frame, from which steps are counted.
         control_us: Length of a step.
-        until_us: Component -> first time that is not compared; components without one are left out. None compares everything.
+        until_us: Component -> first time that is not compared; components without one are left out.
+            None compares everything.
     """
     found: list[tuple[bool, int, int, str]] = []  # scores?, time, rank, which part
     for rank, name in enumerate(COMPONENTS):
         if until_us is not None and name not in until_us:
             continue
         a, b = one.get(name, {}), other.get(name, {})
-        keys = [key for key in {**a, **b} if a.get(key) != b.get(key) and (until_us is None or key[0] < until_us[name])]
+        keys = [
+            key
+            for key in {**a, **b}
+            if a.get(key) != b.get(key) and (until_us is None or key[0] < until_us[name])
+        ]
         if keys:
             t_us, what = min(keys)
-            found.append((name == "scores", t_us, rank, what if (t_us, what) in a and (t_us, what) in b else f"{what}, in one only"))
+            found.append(
+                (
+                    name == "scores",
+                    t_us,
+                    rank,
+                    what if (t_us, what) in a and (t_us, what) in b else f"{what}, in one only",
+                )
+            )
     if not found:
         return None
     _, t_us, rank, what = min(found)
-    return Difference(COMPONENTS[rank], t_us, (t_us - start_us) // control_us if t_us >= start_us else None, what)
+    return Difference(
+        COMPONENTS[rank], t_us, (t_us - start_us) // control_us if t_us >= start_us else None, what
+    )
 
 
 def sha256(data: bytes) -> str:

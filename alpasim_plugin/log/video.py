@@ -1,4 +1,6 @@
-"""Write and read camera frames as MP4 (H.264, yuv420p): small, playable anywhere, exactly timed, but lossy."""
+"""Write and read camera frames as MP4 (H.264, yuv420p): small, playable anywhere, exactly timed,
+but lossy.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,15 @@ from alpasim_plugin.core.types import I64, U8
 UNSPECIFIED = 2  # of ITU-T H.273: matrix, primaries and transfer that a video does not state
 GIVE = "give a whole video file (MP4, MOV, MKV, WebM, AVI, ...)"
 BT601, BT709 = 5, 1  # matrices of ITU-T H.273
-WRITABLE = {UNSPECIFIED: BT601, BT709: BT709, 4: 4, BT601: BT601, 6: BT601, 7: 7, 9: 9}  # stated matrix -> the one to convert with
+WRITABLE = {
+    UNSPECIFIED: BT601,
+    BT709: BT709,
+    4: 4,
+    BT601: BT601,
+    6: BT601,
+    7: 7,
+    9: 9,
+}  # stated matrix -> the one to convert with
 WRITING = "writing a video"
 _MAX_DENOMINATOR = 1001  # covers whole rates and the 1001 family (29.97 = 30000/1001)
 
@@ -38,18 +48,24 @@ def load_av(doing: str) -> Any:
         import av
         import av.video.reformatter
     except ImportError as missing:
-        raise InfrastructureError(doing, "PyAV", f"it does not load ({missing})", 'pip install "av>=14"') from missing
+        raise InfrastructureError(
+            doing, "PyAV", f"it does not load ({missing})", 'pip install "av>=14"'
+        ) from missing
     return av
 
 
 def exact_conversion(av: Any) -> Any:
-    """Return the scaler's settings for colour conversion. Its faster ones darken pictures by a grey level; these are exact to a tenth."""
+    """Return the scaler's settings for colour conversion. Its faster ones darken pictures by a grey
+    level; these are exact to a tenth.
+    """
     flags = av.video.reformatter.Interpolation
     return flags.BILINEAR | flags.ACCURATE_RND | flags.FULL_CHR_H_INP | flags.FULL_CHR_H_INT
 
 
 class TimedFrame(NamedTuple):
-    """One picture ``(H, W, 3)`` uint8 sRGB, shown from ``time`` for ``duration``, both in units of the video's ``time_base``."""
+    """One picture ``(H, W, 3)`` uint8 sRGB, shown from ``time`` for ``duration``, both in units of
+    the video's ``time_base``.
+    """
 
     image: U8
     time: int
@@ -58,7 +74,8 @@ class TimedFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class VideoFormat:
-    """What a video states about itself; pictures are upright, so width and height are those after the rotation in its metadata.
+    """What a video states about itself; pictures are upright, so width and height are those after
+    the rotation in its metadata.
 
     Attributes:
         width, height: Pixels.
@@ -83,14 +100,16 @@ class VideoFormat:
 class VideoReader:
     """Iterate once over the frames of a video file; use it in a ``with`` statement.
 
-    Times strictly increase: a frame without one follows its predecessor by one frame of the average rate.
+    Times strictly increase: a frame without one follows its predecessor by one frame of the average
+    rate.
 
     Args:
         path: The file.
         doing: For messages.
 
     Raises:
-        InputError: Missing or unreadable file, no video in it, no frames, damage, a changing picture size, times that go back.
+        InputError: Missing or unreadable file, no video in it, no frames, damage, a changing
+            picture size, times that go back.
 
     Example:
         >>> with VideoReader("drive.mp4") as video:                           # doctest: +SKIP
@@ -114,17 +133,29 @@ class VideoReader:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self._container.close()
 
     def __iter__(self) -> Iterator[TimedFrame]:
-        step = 1 if self.format.rate is None else max(1, round(1 / (self.format.rate * self.format.time_base)))
+        step = (
+            1
+            if self.format.rate is None
+            else max(1, round(1 / (self.format.rate * self.format.time_base)))
+        )
         last: int | None = None
         for index, frame in enumerate(self._all()):
             time = frame.pts if frame.pts is not None else 0 if last is None else last + step
             if last is not None and time <= last:
                 found = f"frame {index} at {float(time * self.format.time_base):.6f} s, not after the one before"
-                raise self._refusal(found, "rewrite its time stamps, for example with ffmpeg -i IN -vf setpts=N/FR/TB OUT")
+                raise self._refusal(
+                    found,
+                    "rewrite its time stamps, for example with ffmpeg -i IN -vf setpts=N/FR/TB OUT",
+                )
             image = self._upright(frame)
             if image.shape[:2] != (self.format.height, self.format.width):
                 found = f"frame {index} is {image.shape[1]}x{image.shape[0]}, the first is {self.format.width}x{self.format.height}"
@@ -159,9 +190,16 @@ class VideoReader:
         )
 
     def _check_end(self, count: int, reached: int) -> None:
-        """Refuse a file that was cut short: fewer frames than it claims, and an end well before the one it claims."""
+        """Refuse a file that was cut short: fewer frames than it claims, and an end well before the
+        one it claims.
+        """
         claimed, length = self.format.frames, self._stream.duration
-        if claimed and count < claimed and length and reached < (self._stream.start_time or 0) + length:
+        if (
+            claimed
+            and count < claimed
+            and length
+            and reached < (self._stream.start_time or 0) + length
+        ):
             raise self._refusal(f"it stops after frame {count} of {claimed}")
 
     def _all(self) -> Iterator[Any]:
@@ -180,7 +218,9 @@ class VideoReader:
 
     def _upright(self, frame: Any) -> U8:
         # By the matrix that the frame states; BT.601 where it states none.
-        image: U8 = frame.to_ndarray(format="rgb24", interpolation=exact_conversion(self._av), threads=1)
+        image: U8 = frame.to_ndarray(
+            format="rgb24", interpolation=exact_conversion(self._av), threads=1
+        )
         turns = round(frame.rotation / 90) % 4  # counter-clockwise
         return np.ascontiguousarray(np.rot90(image, turns)) if turns else image
 
@@ -191,14 +231,16 @@ class VideoReader:
 class VideoWriter:
     """Take frames one by one; use it in a ``with`` statement.
 
-    The file appears under its name once the block ends well; until then, and for good if it fails, there is only a temporary file, which is
-    removed. Odd sizes are padded by repeating the last row or column, as yuv420p needs even ones.
+    The file appears under its name once the block ends well; until then, and for good if it fails,
+    there is only a temporary file, which is removed. Odd sizes are padded by repeating the last row
+    or column, as yuv420p needs even ones.
 
     Args:
         path: The file.
         time_base: Seconds of one tick of the frames' times.
         rate: Frames per second, for players that ask; times are what counts.
-        colour: Matrix, primaries and transfer that the pictures follow (ITU-T H.273); they are stated in the file.
+        colour: Matrix, primaries and transfer that the pictures follow (ITU-T H.273); they are
+            stated in the file.
         pixel_aspect: Width of a pixel over its height.
         crf: Quality of the encoder, 0 (lossless in yuv) to 51.
 
@@ -230,15 +272,24 @@ class VideoWriter:
             self._container = self._av.open(str(self._partial), mode="w", format="mp4")
         except (OSError, self._av.FFmpegError) as error:
             raise self._failure(error) from error
-        self._stream = self._container.add_stream("libx264", rate=rate, options={"crf": str(crf), "preset": "veryfast"})
+        self._stream = self._container.add_stream(
+            "libx264", rate=rate, options={"crf": str(crf), "preset": "veryfast"}
+        )
         self._stream.pix_fmt = "yuv420p"
         self._stream.time_base = self._stream.codec_context.time_base = time_base
-        self._stream.thread_count = 1  # the thread budget counts workers and networks, not encoder threads
+        self._stream.thread_count = (
+            1  # the thread budget counts workers and networks, not encoder threads
+        )
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         try:
             if error is None and self.count:
                 self._container.mux(self._stream.encode())
@@ -256,14 +307,28 @@ class VideoWriter:
     def write(self, image: U8, time: int, duration: int = 1) -> None:
         """Append one frame ``(H, W, 3)`` uint8 sRGB, shown from ``time`` for ``duration`` ticks."""
         self._size = self._size or image.shape
-        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.shape != self._size:
+        if (
+            image.dtype != np.uint8
+            or image.ndim != 3
+            or image.shape[2] != 3
+            or image.shape != self._size
+        ):
             found = f"frame {self.count}: {image.shape} {image.dtype}, the first is {self._size}"
-            raise InputError(WRITING, str(self.path), found, "give frames (H, W, 3) uint8 of one size")
-        even = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), mode="edge")
+            raise InputError(
+                WRITING, str(self.path), found, "give frames (H, W, 3) uint8 of one size"
+            )
+        even = np.pad(
+            image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), mode="edge"
+        )
         if self.count == 0:
             self._state_format(*even.shape[:2])
         rgb = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
-        frame = rgb.reformat(format="yuv420p", dst_colorspace=self._matrix, interpolation=exact_conversion(self._av), threads=1)
+        frame = rgb.reformat(
+            format="yuv420p",
+            dst_colorspace=self._matrix,
+            interpolation=exact_conversion(self._av),
+            threads=1,
+        )
         frame.pts, frame.time_base, frame.duration = time, self._time_base, duration
         try:
             self._container.mux(self._stream.encode(frame))
@@ -281,11 +346,15 @@ class VideoWriter:
             codec.sample_aspect_ratio = self._pixel_aspect
 
     def _failure(self, error: Exception) -> InfrastructureError:
-        return InfrastructureError(WRITING, str(self.path), str(error), "check that the folder exists and has room")
+        return InfrastructureError(
+            WRITING, str(self.path), str(error), "check that the folder exists and has room"
+        )
 
 
 class Video(NamedTuple):
-    """Decoded frames ``(N, H, W, 3)`` uint8 sRGB, their times ``(N,)`` in microseconds, and the frame rate."""
+    """Decoded frames ``(N, H, W, 3)`` uint8 sRGB, their times ``(N,)`` in microseconds, and the
+    frame rate.
+    """
 
     frames: U8
     t_us: I64
@@ -295,8 +364,8 @@ class Video(NamedTuple):
 def write_mp4(path: Path | str, frames: Iterable[U8], fps: float | Fraction, crf: int = 18) -> int:
     """Write frames ``(H, W, 3)`` uint8 sRGB, frame i at exactly i / fps seconds.
 
-    Odd sizes are padded by repeating the last row or column, as yuv420p needs even ones. The file appears under its name only once
-    complete.
+    Odd sizes are padded by repeating the last row or column, as yuv420p needs even ones. The file
+    appears under its name only once complete.
 
     Args:
         path: The file.
@@ -314,7 +383,9 @@ def write_mp4(path: Path | str, frames: Iterable[U8], fps: float | Fraction, crf
     path = Path(path)
     rate = Fraction(fps).limit_denominator(_MAX_DENOMINATOR)
     if rate <= 0:
-        raise InputError("writing a video", str(path), f"{fps} frames per second", "give a positive rate")
+        raise InputError(
+            "writing a video", str(path), f"{fps} frames per second", "give a positive rate"
+        )
     with VideoWriter(path, 1 / rate, rate, crf=crf) as video:
         for index, image in enumerate(frames):
             video.write(image, index)
@@ -328,7 +399,9 @@ def read_mp4(path: Path | str) -> Video:
         InputError: Missing file, no video or frame rate in it, or damage.
     """
     with VideoReader(path) as video:
-        decoded, rate, base = list(video), video.format.rate, video.format.time_base
+        decoded = list(video)
+        rate = video.format.rate
+        base = video.format.time_base
     if rate is None:
         raise InputError("reading a video", str(path), "no frame rate", "give a whole MP4 file")
     t_us = np.array([round(frame.time * base * 1_000_000) for frame in decoded], dtype=np.int64)

@@ -11,7 +11,13 @@ import numpy as np
 
 from alpasim_plugin import __version__
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate, inverse, quat_from_matrix, se3, trajectory_from_poses
+from alpasim_plugin.core.geometry import (
+    interpolate,
+    inverse,
+    quat_from_matrix,
+    se3,
+    trajectory_from_poses,
+)
 from alpasim_plugin.core.types import F64, CameraSpec, EgoState, Frame, RenderRequest, Trajectory
 from alpasim_plugin.log.asl import AslFile
 from alpasim_plugin.log.images import ImageEncoding, encode_image
@@ -29,7 +35,14 @@ from alpasim_plugin.log.schema import (
     wire_traffic_session,
     wire_trajectory,
 )
-from alpasim_plugin.log.wire import api_version, common_pb2, controller_pb2, egodriver_pb2, logging_pb2, sensorsim_pb2
+from alpasim_plugin.log.wire import (
+    api_version,
+    common_pb2,
+    controller_pb2,
+    egodriver_pb2,
+    logging_pb2,
+    sensorsim_pb2,
+)
 
 _SERVICES = ("runtime", "egodriver", "sensorsim", "physics", "traffic", "controller", "video_model")
 
@@ -37,9 +50,10 @@ _SERVICES = ("runtime", "egodriver", "sensorsim", "physics", "traffic", "control
 class AslWriter:
     """Append the entries of one rollout, in the order AlpaSim's runtime writes them.
 
-    ``begin`` first; then for every step ``render_request``, ``camera_image``, ``ego_trajectory``, ``route``, ``driver_request``,
-    ``driver_return``, ``controller_request``, ``controller_return`` and the ``actor_poses`` of the next instant; last ``finish``.
-    Only ``begin``, ``actor_poses`` and the driver pair are needed for scoring. Until ``finish`` the file is called ``PATH.part``.
+    ``begin`` first; then for every step ``render_request``, ``camera_image``, ``ego_trajectory``,
+    ``route``, ``driver_request``, ``driver_return``, ``controller_request``, ``controller_return``
+    and the ``actor_poses`` of the next instant; last ``finish``. Only ``begin``, ``actor_poses``
+    and the driver pair are needed for scoring. Until ``finish`` the file is called ``PATH.part``.
 
     Example:
         >>> with AslWriter("rollout.asl", header) as log:  # doctest: +SKIP
@@ -68,21 +82,30 @@ class AslWriter:
         self._T_rig_box = header.T_rig_box
         self._file = AslFile(path)
 
-    # --- start ------------------------------------------------------------------------------------------------------
+    # --- start
 
-    def begin(self, cameras: Sequence[CameraSpec], context: Mapping[str, F64] | None = None) -> None:
+    def begin(
+        self, cameras: Sequence[CameraSpec], context: Mapping[str, F64] | None = None
+    ) -> None:
         """Write everything that precedes the first step.
 
         Args:
             cameras: Cameras the policy receives.
-            context: ``T_world_box`` of the actors present at the first recorded ego pose. AlpaSim logs the poses of that instant too
-                when it lies before the first frame; None takes them from the recorded tracks.
+            context: ``T_world_box`` of the actors present at the first recorded ego pose. AlpaSim
+                logs the poses of that instant too when it lies before the first frame; None takes
+                them from the recorded tracks.
         """
         header = self.header
         listed = [wire_camera(camera) for camera in cameras]
         self._write(rollout_metadata=self._metadata())
-        self._write(available_cameras_request=sensorsim_pb2.AvailableCamerasRequest(scene_id=header.scene_id))
-        self._write(available_cameras_return=sensorsim_pb2.AvailableCamerasReturn(available_cameras=listed))
+        self._write(
+            available_cameras_request=sensorsim_pb2.AvailableCamerasRequest(
+                scene_id=header.scene_id
+            )
+        )
+        self._write(
+            available_cameras_return=sensorsim_pb2.AvailableCamerasReturn(available_cameras=listed)
+        )
         request = egodriver_pb2.DriveSessionRequest
         vehicle = request.RolloutSpec.VehicleDefinition(available_cameras=listed)
         self._write(
@@ -99,10 +122,11 @@ class AslWriter:
             present = self._recorded(first_us) if context is None else context
             self.actor_poses(first_us, se3(header.ego_log.xyz[0], header.ego_log.quat[0]), present)
 
-    # --- each step --------------------------------------------------------------------------------------------------
+    # --- each step
 
     def actor_poses(self, t_us: int, T_world_rig: F64, actors: Mapping[str, F64]) -> None:
-        """Write ground-truth poses at one instant: the ego's rig pose, and ``T_world_box`` of the actors present.
+        """Write ground-truth poses at one instant: the ego's rig pose, and ``T_world_box`` of the
+        actors present.
 
         Raises:
             InputError: An actor that the header does not define, or a pose that is not finite.
@@ -117,31 +141,49 @@ class AslWriter:
             )
         ids = sorted(actors)
         poses = np.stack([*(actors[i] for i in ids), T_world_rig @ self._T_rig_box])
-        messages = wire_poses(poses[:, :3, 3], quat_from_matrix(poses[:, :3, :3]), f"actors {[*ids, EGO]} at {t_us} us")
+        messages = wire_poses(
+            poses[:, :3, 3],
+            quat_from_matrix(poses[:, :3, :3]),
+            f"actors {[*ids, EGO]} at {t_us} us",
+        )
         pose = logging_pb2.ActorPoses.ActorPose
-        entries = [pose(actor_id=i, actor_pose=m) for i, m in zip([*ids, EGO], messages, strict=True)]
+        entries = [
+            pose(actor_id=i, actor_pose=m) for i, m in zip([*ids, EGO], messages, strict=True)
+        ]
         self._write(actor_poses=logging_pb2.ActorPoses(timestamp_us=t_us, actor_poses=entries))
 
-    def render_request(self, requests: Sequence[RenderRequest], encoding: ImageEncoding = "png") -> None:
+    def render_request(
+        self, requests: Sequence[RenderRequest], encoding: ImageEncoding = "png"
+    ) -> None:
         """Write the render requests of one instant, bundled as AlpaSim sends them by default."""
         items = [
             sensorsim_pb2.BatchRGBRenderRequestItem(
-                camera_name=r.camera.name, request=wire_render_request(self.header.scene_id, r, encoding)
+                camera_name=r.camera.name,
+                request=wire_render_request(self.header.scene_id, r, encoding),
             )
             for r in requests
         ]
         self._write(batch_render_request=sensorsim_pb2.BatchRGBRenderRequest(items=items))
 
-    def camera_image(self, frame: Frame, encoding: ImageEncoding = "png", shutter_us: int = 0, quality: int = 95) -> None:
+    def camera_image(
+        self, frame: Frame, encoding: ImageEncoding = "png", shutter_us: int = 0, quality: int = 95
+    ) -> None:
         """Write one frame as the driver received it."""
-        self.encoded_image(frame.camera, frame.t_us - shutter_us, frame.t_us, encode_image(frame.rgb, encoding, quality))
+        self.encoded_image(
+            frame.camera,
+            frame.t_us - shutter_us,
+            frame.t_us,
+            encode_image(frame.rgb, encoding, quality),
+        )
 
     def encoded_image(self, camera: str, start_us: int, end_us: int, data: bytes) -> None:
         """Write one frame that is already encoded; ``end_us`` is its time stamp."""
         self._write(driver_camera_image=wire_image(self._uuid, camera, start_us, end_us, data))
 
     def ego_trajectory(self, states: Sequence[EgoState]) -> None:
-        """Write the ego states the driver learned since the last call; the first call carries the recorded context."""
+        """Write the ego states the driver learned since the last call; the first call carries the
+        recorded context.
+        """
         poses = np.stack([s.T_world_rig for s in states])
         trajectory = trajectory_from_poses([s.t_us for s in states], poses)
         self._write(
@@ -153,26 +195,41 @@ class AslWriter:
         )
 
     def route(self, t_us: int, route_rig: F64) -> None:
-        """Write the route ahead, ``(N, 3)`` in the rig frame; rows of NaN stand for its missing end."""
+        """Write the route ahead, ``(N, 3)`` in the rig frame; rows of NaN stand for its missing
+        end.
+        """
         points = [common_pb2.Vec3(x=x, y=y, z=z) for x, y, z in np.asarray(route_rig).tolist()]
         route = egodriver_pb2.Route(waypoints=points, timestamp_us=t_us)
         self._write(route_request=egodriver_pb2.RouteRequest(session_uuid=self._uuid, route=route))
 
     def driver_request(self, now_us: int, query_us: int) -> None:
-        """Write the query to the driver at ``now_us`` for a plan through ``query_us`` (one control step later)."""
-        self._write(driver_request=egodriver_pb2.DriveRequest(session_uuid=self._uuid, time_now_us=now_us, time_query_us=query_us))
+        """Write the query to the driver at ``now_us`` for a plan through ``query_us`` (one control
+        step later).
+        """
+        self._write(
+            driver_request=egodriver_pb2.DriveRequest(
+                session_uuid=self._uuid, time_now_us=now_us, time_query_us=query_us
+            )
+        )
 
-    def driver_return(self, plan: Trajectory, samples: Sequence[Trajectory] = (), terminate: bool = False) -> None:
+    def driver_return(
+        self, plan: Trajectory, samples: Sequence[Trajectory] = (), terminate: bool = False
+    ) -> None:
         """Write the driver's plan.
 
         Args:
-            plan: Absolute rig poses in the world, the first at the time of the request; empty where the driver gave none.
+            plan: Absolute rig poses in the world, the first at the time of the request; empty where
+                the driver gave none.
             samples: Alternatives it considered, the same way; they feed minADE.
             terminate: The driver ends the rollout.
         """
         message = egodriver_pb2.DriveResponse
         entry = logging_pb2.LogEntry(
-            driver_return=message(trajectory=common_pb2.Trajectory(), debug_info=message.DebugInfo(), terminate_session=terminate)
+            driver_return=message(
+                trajectory=common_pb2.Trajectory(),
+                debug_info=message.DebugInfo(),
+                terminate_session=terminate,
+            )
         )
         first, *others = wire_bytes([plan, *samples], "the driver's plan and its samples")
         entry.driver_return.trajectory.MergeFromString(first)
@@ -180,8 +237,11 @@ class AslWriter:
             entry.driver_return.debug_info.sampled_trajectories.add().MergeFromString(other)
         self._file.write(entry)
 
-    def controller_request(self, state: EgoState, plan: Trajectory, to_us: int, forced: bool = False) -> None:
-        """Write the request to the vehicle model: from `state`, along `plan` (absolute rig poses, world), to ``to_us``.
+    def controller_request(
+        self, state: EgoState, plan: Trajectory, to_us: int, forced: bool = False
+    ) -> None:
+        """Write the request to the vehicle model: from `state`, along `plan` (absolute rig poses,
+        world), to ``to_us``.
 
         Args:
             state: True state now.
@@ -196,7 +256,9 @@ class AslWriter:
             controller_request=controller_pb2.RunControllerAndVehicleModelRequest(
                 session_uuid=self._uuid,
                 state=common_pb2.StateAtTime(
-                    timestamp_us=state.t_us, pose=wire_pose(state.T_world_rig, "ego state"), state=wire_dynamics(state)
+                    timestamp_us=state.t_us,
+                    pose=wire_pose(state.T_world_rig, "ego state"),
+                    state=wire_dynamics(state),
                 ),
                 planned_trajectory_in_rig=common_pb2.Trajectory(),
                 future_time_us=to_us,
@@ -204,11 +266,15 @@ class AslWriter:
                 pose_reporting_interval_us=self.header.control_us,
             )
         )
-        entry.controller_request.planned_trajectory_in_rig.MergeFromString(wire_bytes([plan], "the active plan")[0])
+        entry.controller_request.planned_trajectory_in_rig.MergeFromString(
+            wire_bytes([plan], "the active plan")[0]
+        )
         self._file.write(entry)
 
     def controller_return(self, state: EgoState) -> None:
-        """Write the state the vehicle model reached; estimated equals true, as no pose error is modelled."""
+        """Write the state the vehicle model reached; estimated equals true, as no pose error is
+        modelled.
+        """
         pose, dynamics = wire_pose(state.T_world_rig, "ego state"), wire_dynamics(state)
         reached = controller_pb2.RunControllerAndVehicleModelResponse.PropagatedState(
             timestamp_us=state.t_us,
@@ -217,9 +283,11 @@ class AslWriter:
             dynamic_state=dynamics,
             dynamic_state_estimated=dynamics,
         )
-        self._write(controller_return=controller_pb2.RunControllerAndVehicleModelResponse(states=[reached]))
+        self._write(
+            controller_return=controller_pb2.RunControllerAndVehicleModelResponse(states=[reached])
+        )
 
-    # --- end --------------------------------------------------------------------------------------------------------
+    # --- end
 
     def finish(self) -> None:
         """Flush the log and give it its name."""
@@ -232,10 +300,15 @@ class AslWriter:
     def __enter__(self) -> AslWriter:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         self._file.__exit__(kind, error, traceback)
 
-    # --- messages ---------------------------------------------------------------------------------------------------
+    # --- messages
 
     def _write(self, **entry: Any) -> None:
         self._file.write(logging_pb2.LogEntry(**entry))
@@ -244,7 +317,10 @@ class AslWriter:
         header, message = self.header, logging_pb2.RolloutMetadata
         box = message.ActorDefinitions.ActorAABB
         actors = [box(actor_id=EGO, aabb=wire_box(header.vehicle.box))]
-        actors += [box(actor_id=a.actor_id, aabb=wire_box(a.box), actor_label=a.label) for a in header.actors]
+        actors += [
+            box(actor_id=a.actor_id, aabb=wire_box(a.box), actor_label=a.label)
+            for a in header.actors
+        ]
         return message(
             session_metadata=message.SessionMetadata(
                 session_uuid=self._uuid,
@@ -257,17 +333,29 @@ class AslWriter:
             ),
             actor_definitions=message.ActorDefinitions(actor_aabb=actors),
             force_gt_duration=header.force_gt_us,
-            version_ids=message.VersionIds(**{f"{name}_version": self._version(name) for name in _SERVICES}),
+            version_ids=message.VersionIds(
+                **{f"{name}_version": self._version(name) for name in _SERVICES}
+            ),
             transform_ego_coords_rig_to_aabb=wire_pose(self._T_rig_box, "offset from rig to box"),
-            ego_rig_recorded_ground_truth_trajectory=wire_trajectory(header.ego_log, "the recorded ego poses"),
+            ego_rig_recorded_ground_truth_trajectory=wire_trajectory(
+                header.ego_log, "the recorded ego poses"
+            ),
         )
 
     def _version(self, service: str) -> common_pb2.VersionId:
         given = self.header.versions.get(service, __version__ if service == "runtime" else "<skip>")
         git_hash = "<skip>" if given == "<skip>" else ""
-        return common_pb2.VersionId(version_id=given, git_hash=git_hash, grpc_api_version=api_version())
+        return common_pb2.VersionId(
+            version_id=given, git_hash=git_hash, grpc_api_version=api_version()
+        )
 
     def _recorded(self, t_us: int) -> dict[str, F64]:
-        """Return ``T_world_box`` of the actors whose tracks have a pose exactly at an instant or around it."""
+        """Return ``T_world_box`` of the actors whose tracks have a pose exactly at an instant or
+        around it.
+        """
         tracks = ((a.actor_id, a.track) for a in self.header.actors if len(a.track))
-        return {i: interpolate(track, t_us) for i, track in tracks if track.t_us[0] <= t_us <= track.t_us[-1]}
+        return {
+            i: interpolate(track, t_us)
+            for i, track in tracks
+            if track.t_us[0] <= t_us <= track.t_us[-1]
+        }

@@ -7,7 +7,9 @@ from alpasim_plugin.core.parts import build, unidentified
 from alpasim_plugin.core.types import Scenario
 
 
-def make_renderer(name: str, scenario: Scenario, seed: int = 0, device: str = "cpu", threads: int | None = None) -> Renderer:
+def make_renderer(
+    name: str, scenario: Scenario, seed: int = 0, device: str = "cpu", threads: int | None = None
+) -> Renderer:
     """Make one rollout's renderer.
 
     Scenes are built once per process and shared between renderers.
@@ -15,7 +17,8 @@ def make_renderer(name: str, scenario: Scenario, seed: int = 0, device: str = "c
     Args:
         name: A renderer as `alpasim_plugin.core.parts.resolve` takes it.
         scenario: What is rendered.
-        seed: The rollout's seed: what wanders from frame to frame depends on it, the scene does not.
+        seed: The rollout's seed: what wanders from frame to frame depends on it, the scene does
+            not.
         device: ``cpu`` or ``cuda``.
         threads: Threads of the CPU rasteriser; None leaves numba's number.
 
@@ -23,5 +26,7 @@ def make_renderer(name: str, scenario: Scenario, seed: int = 0, device: str = "c
         InputError: Unknown name or device.
         RendererError: The device does not work.
     """
-    renderer: Renderer = build(unidentified("renderer", name), scenario=scenario, seed=seed, device=device, threads=threads)
+    renderer: Renderer = build(
+        unidentified("renderer", name), scenario=scenario, seed=seed, device=device, threads=threads
+    )
     return renderer

@@ -1,6 +1,8 @@
-"""The background file of a scenario: read, placed, and refused where nothing of it could be seen on the drive.
+"""The background file of a scenario: read, placed, and refused where nothing of it could be seen on
+the drive.
 
-`Coverage` says whether a Gaussian file stands where the drive is: its bounds, the share of the path near it, a place where it might belong.
+`Coverage` says whether a Gaussian file stands where the drive is: its bounds, the share of the path
+near it, a place where it might belong.
 """
 
 from __future__ import annotations
@@ -15,7 +17,11 @@ from alpasim_plugin.core.types import F64, BackgroundFile, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
 from alpasim_plugin.gaussians.files import read_gaussians
 
-NEAR_M, BELOW_M, ABOVE_M = 10.0, 5.0, 15.0  # a Gaussian is near a point of the path: in plan view, and in height
+NEAR_M, BELOW_M, ABOVE_M = (
+    10.0,
+    5.0,
+    15.0,
+)  # a Gaussian is near a point of the path: in plan view, and in height
 FEWEST = 20  # Gaussians near a point of the path for it to count as covered
 STEP_M = 2.0
 VISIBLE = 0.05  # opacity
@@ -27,7 +33,8 @@ class Coverage:
     """Where a model stands.
 
     Attributes:
-        low, high: ``(3,)`` bounds of its bulk (1st to 99th percentile of what is not transparent), metres, world.
+        low, high: ``(3,)`` bounds of its bulk (1st to 99th percentile of what is not transparent),
+            metres, world.
         covered: Share of the path with Gaussians near it, 0..1.
     """
 
@@ -36,7 +43,10 @@ class Coverage:
     covered: float
 
     def __str__(self) -> str:
-        spans = (f"{axis} {low:.1f} to {high:.1f}" for axis, low, high in zip("xyz", self.low, self.high, strict=True))
+        spans = (
+            f"{axis} {low:.1f} to {high:.1f}"
+            for axis, low, high in zip("xyz", self.low, self.high, strict=True)
+        )
         return f"it spans {', '.join(spans)} m and covers {100 * self.covered:.0f} % of the route"
 
 
@@ -59,8 +69,9 @@ def coverage_of(cloud: GaussianCloud, path: F64) -> Coverage:
 def suggested_transform(cloud: GaussianCloud, path: F64) -> F64:
     """Guess where a file belongs: ``(4, 4)`` from its frame to the world, without scale.
 
-    The axis of least spread is taken as vertical, its dense end as the ground; the longer horizontal axis is laid along the path, the
-    middle on the path's middle, the ground at its height. A start to correct by eye: a file does not say which end of it is the front.
+    The axis of least spread is taken as vertical, its dense end as the ground; the longer
+    horizontal axis is laid along the path, the middle on the path's middle, the ground at its
+    height. A start to correct by eye: a file does not say which end of it is the front.
     """
     points = _bulk(cloud)
     low, middle, high = np.percentile(points, (5.0, 50.0, 95.0), axis=0)
@@ -68,7 +79,9 @@ def suggested_transform(cloud: GaussianCloud, path: F64) -> F64:
     sign = 1.0 if middle[vertical] - low[vertical] <= high[vertical] - middle[vertical] else -1.0
     up = sign * np.eye(3)[vertical]
     one = np.eye(3)[(vertical + 1) % 3]
-    R_flat_file = np.stack([one, np.cross(up, one), up])  # (3, 3): its rows are the flat frame's axes in the file
+    R_flat_file = np.stack(
+        [one, np.cross(up, one), up]
+    )  # (3, 3): its rows are the flat frame's axes in the file
     flat = points @ R_flat_file.T
     turn = _heading(path[:, :2]) - _heading(flat[:, :2])
     c, s = np.cos(turn), np.sin(turn)
@@ -120,16 +133,23 @@ def read_background(background: BackgroundFile, path: F64) -> tuple[GaussianClou
         The Gaussians in the file's frame, and their coverage once placed.
 
     Raises:
-        InputError: It cannot be read, no Gaussian of it can be drawn, or it covers next to nothing of the path; then the error suggests a
-            transform.
+        InputError: It cannot be read, no Gaussian of it can be drawn, or it covers next to nothing
+            of the path; then the error suggests a transform.
     """
     cloud, report = read_gaussians(background.path)
     if report.n_kept == 0:
-        raise InputError("loading a background", background.path, str(report), "give a file with at least one drawable Gaussian")
+        raise InputError(
+            "loading a background",
+            background.path,
+            str(report),
+            "give a file with at least one drawable Gaussian",
+        )
     coverage = coverage_of(placed_cloud(cloud, background.T_world_file), path)
     if coverage.covered < LEAST:
         low, high = path.min(axis=0), path.max(axis=0)
-        drive = ", ".join(f"{axis} {a:.1f} to {b:.1f}" for axis, a, b in zip("xyz", low, high, strict=True))
+        drive = ", ".join(
+            f"{axis} {a:.1f} to {b:.1f}" for axis, a, b in zip("xyz", low, high, strict=True)
+        )
         found = f"{coverage}, which runs through {drive} m: nothing of it would be seen"
         raise InputError("placing a background", background.path, found, _advice(cloud, path))
     return cloud, coverage
@@ -144,7 +164,11 @@ def background_note(scenario: Scenario) -> str:
     if scenario.background is None:
         return ""
     _, coverage = read_background(scenario.background, scenario.ego_log.xyz)
-    road = "the built road is drawn with it" if scenario.background.keep_road else "it replaces the built road, markings and houses"
+    road = (
+        "the built road is drawn with it"
+        if scenario.background.keep_road
+        else "it replaces the built road, markings and houses"
+    )
     return f"background {scenario.background.path}: {coverage}; {road}"
 
 

@@ -1,7 +1,8 @@
-"""Renderers with one deliberate fault each: known-bad input that metrics, guards and gates must detect.
+"""Renderers with one deliberate fault each: known-bad input that metrics, guards and gates must
+detect.
 
-Each renders the clean scene and corrupts the frame, or renders it from a wrong place; what else a frame carries (time, alpha, depth) stays
-as a fault in a real pipeline would leave it.
+Each renders the clean scene and corrupts the frame, or renders it from a wrong place; what else a
+frame carries (time, alpha, depth) stays as a fault in a real pipeline would leave it.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ class BrokenRenderer(Renderer):
 
 
 class ShiftedRenderer(Renderer):
-    """Render the clean scene from a camera that stands beside its place, as a wrong extrinsic calibration or map offset would."""
+    """Render the clean scene from a camera that stands beside its place, as a wrong extrinsic
+    calibration or map offset would.
+    """
 
     def __init__(self, clean: CleanRenderer, right_m: float) -> None:
         self.clean, self.right_m = clean, right_m
@@ -51,14 +54,18 @@ class ShiftedRenderer(Renderer):
 
 
 class StaleRenderer(Renderer):
-    """Show an earlier picture of the same camera under the new time: the newest one that is ``age_us`` old, or always the first one."""
+    """Show an earlier picture of the same camera under the new time: the newest one that is
+    ``age_us`` old, or always the first one.
+    """
 
     def __init__(self, clean: CleanRenderer, age_us: int | None) -> None:
         self.clean, self.age_us = clean, age_us
         self._past: dict[str, deque[tuple[int, U8]]] = {}
 
     def render(self, request: RenderRequest) -> Frame:
-        """Render one frame and swap its picture for an older one; before there is one that old, for the first."""
+        """Render one frame and swap its picture for an older one; before there is one that old, for
+        the first.
+        """
         frame = self.clean.render(request)
         past = self._past.setdefault(request.camera.name, deque())
         if self.age_us is not None or not past:
@@ -83,11 +90,15 @@ def blurred(rgb: U8) -> U8:
     return np.asarray(cv2.GaussianBlur(rgb, (0, 0), BLUR_SHARE * rgb.shape[1]), dtype=np.uint8)
 
 
-def _corrupted(scenario: Scenario, seed: int, device: str, threads: int | None, *, corrupt: Corruption) -> Renderer:
+def _corrupted(
+    scenario: Scenario, seed: int, device: str, threads: int | None, *, corrupt: Corruption
+) -> Renderer:
     return BrokenRenderer(CleanRenderer(scenario, seed, device, threads), corrupt)
 
 
-def _stale(scenario: Scenario, seed: int, device: str, threads: int | None, *, age_us: int | None) -> Renderer:
+def _stale(
+    scenario: Scenario, seed: int, device: str, threads: int | None, *, age_us: int | None
+) -> Renderer:
     return StaleRenderer(CleanRenderer(scenario, seed, device, threads), age_us)
 
 

@@ -1,7 +1,9 @@
-"""Render Gaussian scenes: ``clean``, the scene as built, and the surrogate of a bad reconstruction of it.
+"""Render Gaussian scenes: ``clean``, the scene as built, and the surrogate of a bad reconstruction
+of it.
 
-A frame is drawn at the shutter's end, unless its request says when its pixels are exposed (`renderers.rolling`). Runs of this project do
-not say so, and no policy here uses more than the pose at the frame's time; a request of AlpaSim does.
+A frame is drawn at the shutter's end, unless its request says when its pixels are exposed
+(`renderers.rolling`). Runs of this project do not say so, and no policy here uses more than the
+pose at the frame's time; a request of AlpaSim does.
 """
 
 from __future__ import annotations
@@ -68,13 +70,17 @@ class CleanRenderer(Renderer):
         complete = self.scenario.background is None
 
         def draw(camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
-            return self.scene.render(camera, actors, self.threads, self.backend, sky_in_alpha=complete)
+            return self.scene.render(
+                camera, actors, self.threads, self.backend, sky_in_alpha=complete
+            )
 
         return self._frame(request, draw_request(request, draw, self.backend))
 
     def _frame(self, request: RenderRequest, out: RasterOutput) -> Frame:
         self.stats = out.stats
-        return Frame(request.t_us, request.camera.name, out.to_uint8(), out.alpha, out.surface_depth())
+        return Frame(
+            request.t_us, request.camera.name, out.to_uint8(), out.alpha, out.surface_depth()
+        )
 
 
 class SurrogateRenderer(CleanRenderer):
@@ -82,10 +88,14 @@ class SurrogateRenderer(CleanRenderer):
 
     def __init__(self, scenario: Scenario, seed: int, device: str, threads: int | None) -> None:
         super().__init__(scenario, seed, device, threads)
-        self.surrogate, self.sky, self.ghosts, self._graphs = reconstruction_of(scenario, self.scene)
+        self.surrogate, self.sky, self.ghosts, self._graphs = reconstruction_of(
+            scenario, self.scene
+        )
 
     def render(self, request: RenderRequest) -> Frame:
-        """Render one frame; how bad it is follows the rig's lateral distance from the logged path."""
+        """Render one frame; how bad it is follows the rig's lateral distance from the logged
+        path.
+        """
         w = self.surrogate.weight(request.T_world_camera[1] @ inverse(request.camera.T_rig_camera))
         graph = self._graph(w)
         gain = self.surrogate.gain(request.t_us, self.seed, w)
@@ -95,22 +105,33 @@ class SurrogateRenderer(CleanRenderer):
             for actor_id, pose in actors.items():
                 poses[actor_id] = self.surrogate.pose(actor_id, pose, request.t_us, self.seed, w)
                 if actor_id + GHOST in graph.actors:
-                    poses[actor_id + GHOST] = self.surrogate.ghost_pose(actor_id, pose, request.t_us, self.seed, w)
+                    poses[actor_id + GHOST] = self.surrogate.ghost_pose(
+                        actor_id, pose, request.t_us, self.seed, w
+                    )
             out = graph.render(camera, poses, self.threads, self.backend)
-            return replace(out, rgb=np.clip(out.rgb * gain, 0.0, 1.0), alpha=np.maximum(out.alpha, self.sky.share(camera)))
+            return replace(
+                out,
+                rgb=np.clip(out.rgb * gain, 0.0, 1.0),
+                alpha=np.maximum(out.alpha, self.sky.share(camera)),
+            )
 
         return self._frame(request, draw_request(request, draw, self.backend))
 
     def recorded(self) -> Sequence[RecordedFrame]:
-        """Return the scene as built, as its cameras saw it along the log; depth is the built scene's too."""
+        """Return the scene as built, as its cameras saw it along the log; depth is the built
+        scene's too.
+        """
         return built_recording(self.scenario, self.scene, self.scene.render, None)
 
     def _graph(self, w: float) -> SceneGraph:
         if w not in self._graphs:
-            self._graphs[w] = self.scene.changed(partial(self._change, w), self.ghosts, SOFT_CELL_PX)
+            self._graphs[w] = self.scene.changed(
+                partial(self._change, w), self.ghosts, SOFT_CELL_PX
+            )
         return self._graphs[w]
 
-    # A bound method of the first renderer stays in the shared graphs; it uses only the surrogate, which is shared as well.
+    # A bound method of the first renderer stays in the shared graphs; it uses only the surrogate,
+    # which is shared as well.
     def _change(self, w: float, node: SceneNode, level: int) -> GaussianCloud:
         change = self.surrogate.actor if node.kind == "actor" else self.surrogate.background
         return change(node, level, node.levels[level].cloud, w)
@@ -123,7 +144,9 @@ def backend_of(device: str) -> Backend:
         InputError: Neither ``cpu`` nor ``cuda``.
     """
     if device not in ("cpu", "cuda"):
-        raise InputError("choosing a rasteriser", f"device {device!r}", "no such device", "use cpu or cuda")
+        raise InputError(
+            "choosing a rasteriser", f"device {device!r}", "no such device", "use cpu or cuda"
+        )
     return "cpu" if device == "cpu" else "gsplat"
 
 
@@ -132,8 +155,12 @@ def scene_of(scenario: Scenario) -> SceneGraph:
     return in_memory(f"scene:{scene_key(scenario)}", partial(_build, scenario))
 
 
-def reconstruction_of(scenario: Scenario, scene: SceneGraph) -> tuple[Surrogate, SkyMask, list[SceneNode], dict[float, SceneGraph]]:
-    """Return the surrogate, its sky, the ghosts of moving actors, and graphs by weight as they are made, shared by a process."""
+def reconstruction_of(
+    scenario: Scenario, scene: SceneGraph
+) -> tuple[Surrogate, SkyMask, list[SceneNode], dict[float, SceneGraph]]:
+    """Return the surrogate, its sky, the ghosts of moving actors, and graphs by weight as they are
+    made, shared by a process.
+    """
     key = f"surrogate:{scene_key(scenario)}:{scenario.degradation!r}"
     moving = [a.actor_id for a in scenario.actors if not a.is_static]
     ghosts = [SceneNode(i + GHOST, "actor", scene.actors[i].levels[1:]) for i in moving]
@@ -146,7 +173,9 @@ def reconstruction_of(scenario: Scenario, scene: SceneGraph) -> tuple[Surrogate,
 
 
 def log_views(scenario: Scenario, scene: SceneGraph) -> list[LogView]:
-    """Render small depth images from the scenario's cameras along the log: what a reconstruction could have learned from."""
+    """Render small depth images from the scenario's cameras along the log: what a reconstruction
+    could have learned from.
+    """
     cameras = scenario.cameras
     times = log_times(scenario, LOG_VIEW_SPACING_M, max(1, LOG_VIEWS // max(1, len(cameras))))
     views = []
@@ -160,14 +189,33 @@ def log_views(scenario: Scenario, scene: SceneGraph) -> list[LogView]:
 
 
 def scene_key(scenario: Scenario) -> str:
-    """Return what a scene's look depends on, as a digest: the source's content, the seed and what is built."""
+    """Return what a scene's look depends on, as a digest: the source's content, the seed and what
+    is built.
+    """
     digest = hashlib.blake2b(digest_size=16)
-    for part in (scenario.scene_id, scenario.seed, scenario.content_hash, scenario.environment, scenario.background, scenario.vehicle.box):
+    for part in (
+        scenario.scene_id,
+        scenario.seed,
+        scenario.content_hash,
+        scenario.environment,
+        scenario.background,
+        scenario.vehicle.box,
+    ):
         digest.update(repr(part).encode())
-    digest.update(repr([(c.name, c.width, c.height, c.K.tolist(), c.T_rig_camera.tolist()) for c in scenario.cameras]).encode())
+    digest.update(
+        repr(
+            [
+                (c.name, c.width, c.height, c.K.tolist(), c.T_rig_camera.tolist())
+                for c in scenario.cameras
+            ]
+        ).encode()
+    )
     digest.update(scenario.ego_log.xyz.tobytes())
     for actor in scenario.actors:
-        digest.update(f"{actor.actor_id}{actor.label}{actor.box}{actor.is_static}".encode() + actor.track.xyz.tobytes())
+        digest.update(
+            f"{actor.actor_id}{actor.label}{actor.box}{actor.is_static}".encode()
+            + actor.track.xyz.tobytes()
+        )
     if not scenario.content_hash:
         for lane in scenario.lane_map.lanes.values():
             digest.update(lane.lane_id.encode() + lane.centre.tobytes())
@@ -189,7 +237,9 @@ def _build(scenario: Scenario) -> SceneGraph:
 
 
 def in_memory(key: str, make: Callable[[], T]) -> T:
-    """Return what is kept under a key in this process, made if it is not there; the least recently used goes first."""
+    """Return what is kept under a key in this process, made if it is not there; the least recently
+    used goes first.
+    """
     if key not in _cache:
         _cache[key] = make()
         while len(_cache) > 3 * CACHED_SCENES:  # a scene, its reconstruction and its recording

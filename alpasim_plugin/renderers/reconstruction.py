@@ -1,12 +1,14 @@
-"""The renderer ``3dgs``: a model fitted to the logged drive and kept in the cache, or the scenario's degradation instead.
+"""The renderer ``3dgs``: a model fitted to the logged drive and kept in the cache, or the
+scenario's degradation instead.
 
 background.ply, actors/*.ply, sky.png, reconstruction.json      what `Reconstruction.save` writes
 sky_views.npz       cameras of the views and, bit by bit, where they show sky
 hashes.json         file name to SHA-256; written last
 
-An imported drive has the reconstruction that was fitted to its photographs, shown as it is. Its sky is a layer of its own: where the model
-is transparent above the horizon a frame is opaque, because it shows the sky and no hole, and its depth is 0, because the sky has none.
-Colours get the exposure that the recording's camera had near by: frames look as the drive's own.
+An imported drive has the reconstruction that was fitted to its photographs, shown as it is. Its sky
+is a layer of its own: where the model is transparent above the horizon a frame is opaque, because
+it shows the sky and no hole, and its depth is 0, because the sky has none. Colours get the exposure
+that the recording's camera had near by: frames look as the drive's own.
 """
 
 from __future__ import annotations
@@ -22,7 +24,17 @@ from alpasim_plugin.core.cache import cached
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.places import MADE
-from alpasim_plugin.core.types import F32, F64, STANDING_ID, Bool, Frame, Photograph, RecordedFrame, RenderRequest, Scenario
+from alpasim_plugin.core.types import (
+    F32,
+    F64,
+    STANDING_ID,
+    Bool,
+    Frame,
+    Photograph,
+    RecordedFrame,
+    RenderRequest,
+    Scenario,
+)
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.lens import gain_between
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
@@ -30,9 +42,27 @@ from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.build_actors import build_actor
 from alpasim_plugin.gaussians.scene.builder import LIGHT, lit
 from alpasim_plugin.gaussians.scene.log_views import SkyMask, SkyView
-from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneNode, nodes_by_tile, tile_numbers
-from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, backend_of, in_memory, scene_key, scene_of
-from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe, read_model, recipe_of, reconstruction_key
+from alpasim_plugin.gaussians.scene.scene_graph import (
+    Level,
+    SceneGraph,
+    SceneNode,
+    nodes_by_tile,
+    tile_numbers,
+)
+from alpasim_plugin.renderers.gaussian import (
+    CleanRenderer,
+    SurrogateRenderer,
+    backend_of,
+    in_memory,
+    scene_key,
+    scene_of,
+)
+from alpasim_plugin.renderers.reconstruction_key import (
+    ReconstructionRecipe,
+    read_model,
+    recipe_of,
+    reconstruction_key,
+)
 from alpasim_plugin.renderers.recorded import built_recording, photograph_recording
 from alpasim_plugin.renderers.rolling import camera_at, draw_request
 
@@ -50,7 +80,8 @@ class Model:
 
 
 class ReconstructionRenderer(Renderer):
-    """Render a reconstruction of the scenario's logged drive; it is fitted first if it is not in the cache.
+    """Render a reconstruction of the scenario's logged drive; it is fitted first if it is not in
+    the cache.
 
     Attributes:
         stats: Counts of the last frame: ``visible`` Gaussians, ``nodes`` drawn and ``nodes_total``.
@@ -67,21 +98,36 @@ class ReconstructionRenderer(Renderer):
 
         def draw(camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
             out = self.model.graph.render(camera, actors, self.threads, self.backend)
-            return replace(out, alpha=np.maximum(out.alpha, self.model.sky.share(camera)), depth=out.surface_depth())
+            return replace(
+                out,
+                alpha=np.maximum(out.alpha, self.model.sky.share(camera)),
+                depth=out.surface_depth(),
+            )
 
         out = draw_request(request, draw, self.backend)
         self.stats = out.stats
         return Frame(request.t_us, request.camera.name, out.to_uint8(), out.alpha, out.depth)
 
     def recorded(self) -> Sequence[RecordedFrame]:
-        """Return what the scenario's cameras saw along the log, at the believed poses; the drives of a process share what was read."""
+        """Return what the scenario's cameras saw along the log, at the believed poses; the drives
+        of a process share what was read.
+        """
         recipe = recipe_of(self.scenario)
         key = f"recording:{reconstruction_key(self.scenario, recipe)}"
-        return in_memory(key, lambda: built_recording(self.scenario, scene_of(self.scenario), self.model.graph.render, recipe))
+        return in_memory(
+            key,
+            lambda: built_recording(
+                self.scenario, scene_of(self.scenario), self.model.graph.render, recipe
+            ),
+        )
 
 
-def reconstruction_renderer(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:
-    """Make the renderer ``3dgs``: the model of an imported drive, and otherwise what the scenario's degradation names."""
+def reconstruction_renderer(
+    scenario: Scenario, seed: int, device: str, threads: int | None
+) -> Renderer:
+    """Make the renderer ``3dgs``: the model of an imported drive, and otherwise what the scenario's
+    degradation names.
+    """
     if scenario.model is not None:
         return ImportedRenderer(scenario, device, threads)
     amount = scenario.degradation
@@ -101,24 +147,38 @@ def model_of(scenario: Scenario, threads: int | None = None) -> Model:
     """
     recipe = recipe_of(scenario)
     key = reconstruction_key(scenario, recipe)
-    return in_memory(f"reconstruction:{key}", lambda: scene_from(scenario, *ensure(scenario, recipe, threads)))
+    return in_memory(
+        f"reconstruction:{key}", lambda: scene_from(scenario, *ensure(scenario, recipe, threads))
+    )
 
 
 def ensure(
-    scenario: Scenario, recipe: ReconstructionRecipe, threads: int | None = None, *, again: bool = False
+    scenario: Scenario,
+    recipe: ReconstructionRecipe,
+    threads: int | None = None,
+    *,
+    again: bool = False,
 ) -> tuple[Reconstruction, list[SkyView]]:
-    """Return a reconstruction and its sky views from wheel or cache; it is fitted first if neither has it, or if ``again``."""
+    """Return a reconstruction and its sky views from wheel or cache; it is fitted first if neither
+    has it, or if ``again``.
+    """
     key = reconstruction_key(scenario, recipe)
     if not again and (MADE / KIND / key).is_dir():
         return read_model(MADE / KIND / key)
-    from alpasim_plugin.renderers.reconstruction_build import build  # needs torch, which a cached reconstruction does not
+    from alpasim_plugin.renderers.reconstruction_build import (
+        build,
+    )  # needs torch, which a cached reconstruction does not
 
     what = f"reconstruction of {scenario.scene_id} ({scenario.degradation.kind})"
-    return cached(KIND, key, partial(build, scenario, recipe, threads), read_model, what, again=again)
+    return cached(
+        KIND, key, partial(build, scenario, recipe, threads), read_model, what, again=again
+    )
 
 
 def scene_from(scenario: Scenario, model: Reconstruction, sky_views: Sequence[SkyView]) -> Model:
-    """Join a reconstruction's parts; actors that it lacks are spliced in from the scene as built (paper, App. A)."""
+    """Join a reconstruction's parts; actors that it lacks are spliced in from the scene as built
+    (paper, App. A).
+    """
     tile = tile_numbers(model.background.means[:, :2], TILE_M, 1_000_003)
     background = nodes_by_tile("fit", [(0.0, model.background, tile)])
     light = np.array(LIGHT[scenario.environment.sky])
@@ -158,28 +218,50 @@ class ImportedRenderer(Renderer):
         return Frame(request.t_us, request.camera.name, shown.to_uint8(), out.alpha, out.depth)
 
     def recorded(self) -> Sequence[RecordedFrame]:
-        """Return the photographs that the model was fitted to, with the depth that the model has there."""
-        return photograph_recording(self.scenario, lambda camera, actors: self._drawn(camera, actors).depth)
+        """Return the photographs that the model was fitted to, with the depth that the model has
+        there.
+        """
+        return photograph_recording(
+            self.scenario, lambda camera, actors: self._drawn(camera, actors).depth
+        )
 
     def _drawn(self, camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
         """Render with the sky as an opaque layer without depth."""
         known = {name: T for name, T in actors.items() if name in self.graph.actors}
         out = self.graph.render(camera, known, self.threads, self.backend)
         sky = (out.alpha < OPAQUE) & above_horizon(camera)
-        return replace(out, alpha=np.where(sky, np.float32(1), out.alpha), depth=np.where(sky, np.float32(0), out.depth))
+        return replace(
+            out,
+            alpha=np.where(sky, np.float32(1), out.alpha),
+            depth=np.where(sky, np.float32(0), out.depth),
+        )
 
 
 def graph_of(scenario: Scenario) -> SceneGraph:
-    """Return the model of an imported drive as a scene, read once per process; road users that it lacks are drawn as built ones are."""
+    """Return the model of an imported drive as a scene, read once per process; road users that it
+    lacks are drawn as built ones are.
+    """
     if scenario.model is None:
         raise InputError(
-            "showing an imported drive", scenario.scene_id, "no model", "import the drive again: simrun import drive FOLDER -o OUT"
+            "showing an imported drive",
+            scenario.scene_id,
+            "no model",
+            "import the drive again: simrun import drive FOLDER -o OUT",
         )
     folder = Path(scenario.model)
 
     def read() -> SceneGraph:
         model = Reconstruction.load(folder)
-        background = nodes_by_tile("fit", [(0.0, model.background, tile_numbers(model.background.means[:, :2], TILE_M, 1_000_003))])
+        background = nodes_by_tile(
+            "fit",
+            [
+                (
+                    0.0,
+                    model.background,
+                    tile_numbers(model.background.means[:, :2], TILE_M, 1_000_003),
+                )
+            ],
+        )
         actors = [
             SceneNode(a.actor_id, "actor", (Level(0.0, model.actors[a.actor_id]),))
             if a.actor_id in model.actors
@@ -196,7 +278,9 @@ def above_horizon(camera: PinholeCamera) -> Bool:
     """Return which pixels ``(H, W)`` look up, towards +z of the world."""
     v, u = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
     up = camera.T_camera_world[:3, 2]
-    return np.asarray((u - camera.cx) / camera.fx * up[0] + (v - camera.cy) / camera.fy * up[1] + up[2] > 0)
+    return np.asarray(
+        (u - camera.cx) / camera.fx * up[0] + (v - camera.cy) / camera.fy * up[1] + up[2] > 0
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,10 +302,16 @@ class Exposures:
         """Take those of the fitted photographs: others were not explained by the fit."""
         fitted = [one for one in recording if one.use == "fitted"]
         centres = np.array([one.T_world_camera[:3, 3] for one in fitted]).reshape(-1, 3)
-        return cls(tuple(one.camera for one in fitted), centres, np.array([one.exposure for one in fitted]).reshape(-1, 3))
+        return cls(
+            tuple(one.camera for one in fitted),
+            centres,
+            np.array([one.exposure for one in fitted]).reshape(-1, 3),
+        )
 
     def near(self, camera: str, place: F64) -> F32:
-        """Return the gain ``(3,)`` at a place: of the two nearest photographs of that camera, or of all where it took none."""
+        """Return the gain ``(3,)`` at a place: of the two nearest photographs of that camera, or of
+        all where it took none.
+        """
         mine = np.array([name == camera for name in self.cameras], dtype=bool)
         rows = np.flatnonzero(mine) if mine.any() else np.arange(len(self.cameras))
         return gain_between(self.centres[rows], self.gains[rows], place)

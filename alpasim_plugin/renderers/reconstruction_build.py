@@ -1,6 +1,8 @@
-"""Fit the model behind the renderer ``3dgs`` to what the scenario's cameras saw along the log, or beside it.
+"""Fit the model behind the renderer ``3dgs`` to what the scenario's cameras saw along the log, or
+beside it.
 
-The fit starts from poses that drift and from the depth of a few views, wrong by patches, as matching images gives both.
+The fit starts from poses that drift and from the depth of a few views, wrong by patches, as
+matching images gives both.
 """
 
 from __future__ import annotations
@@ -30,26 +32,47 @@ from alpasim_plugin.renderers.recorded import pose_errors
 FEWEST_GAUSSIANS = 40  # an actor with fewer was hardly seen: the scene's own is spliced in
 
 
-def build(scenario: Scenario, recipe: ReconstructionRecipe, threads: int | None, folder: Path) -> None:
+def build(
+    scenario: Scenario, recipe: ReconstructionRecipe, threads: int | None, folder: Path
+) -> None:
     """Fit a reconstruction and write it into an empty folder.
 
-    Points inside the boxes of actors never start a background Gaussian. Without ``fit_actors`` nothing explains the actors' pixels, as in
-    the second fit of the cycle render (paper, App. A, stage 2), where they are smeared over the background or lost.
+    Points inside the boxes of actors never start a background Gaussian. Without ``fit_actors``
+    nothing explains the actors' pixels, as in the second fit of the cycle render (paper, App. A,
+    stage 2), where they are smeared over the background or lost.
 
     Raises:
         InputError: The scenario has no camera, or its views show nothing.
     """
     if not scenario.cameras:
-        raise InputError("fitting a reconstruction", f"scene {scenario.scene_id!r}", "no camera", "give the scenario a camera")
+        raise InputError(
+            "fitting a reconstruction",
+            f"scene {scenario.scene_id!r}",
+            "no camera",
+            "give the scenario a camera",
+        )
     splat = recipe.splat
-    views = logged_views(scenario, scene_of(scenario), splat.views, splat.width, aside_m=recipe.aside_m, threads=threads)
-    model, sky_views = reconstruct(views, {a.actor_id: a.box for a in scenario.actors}, recipe, scenario.scene_id, threads)
+    views = logged_views(
+        scenario,
+        scene_of(scenario),
+        splat.views,
+        splat.width,
+        aside_m=recipe.aside_m,
+        threads=threads,
+    )
+    model, sky_views = reconstruct(
+        views, {a.actor_id: a.box for a in scenario.actors}, recipe, scenario.scene_id, threads
+    )
     facts = {"scene_id": scenario.scene_id, "recipe": asdict(recipe), "views": len(views)}
     write_model(folder, model, sky_views, facts)
 
 
 def reconstruct(
-    views: Sequence[PosedView], boxes: Mapping[str, Box], recipe: ReconstructionRecipe, scene_id: str, threads: int | None
+    views: Sequence[PosedView],
+    boxes: Mapping[str, Box],
+    recipe: ReconstructionRecipe,
+    scene_id: str,
+    threads: int | None,
 ) -> tuple[Reconstruction, list[SkyView]]:
     """Fit a model to views as a recipe says: from misplaced poses and rough depth.
 
@@ -72,14 +95,18 @@ def reconstruct(
     start = Start(start.background, start.actors if recipe.fit_actors else {})
     with _one_torch_thread():
         fitted = fit(believed, start, splat, scene_id=scene_id, threads=threads)
-    actors = {name: cloud for name, cloud in fitted.actors.items() if len(cloud) >= FEWEST_GAUSSIANS}
+    actors = {
+        name: cloud for name, cloud in fitted.actors.items() if len(cloud) >= FEWEST_GAUSSIANS
+    }
     sky_views = [SkyView(v.camera, v.sky.astype(np.float32)) for v in believed if v.sky is not None]
     return Reconstruction(fitted.background, actors, fitted.sky), sky_views
 
 
 @contextmanager
 def _one_torch_thread() -> Iterator[None]:
-    """Let torch sum in one order, so that the model is the same on any number of cores; its share of a fit is too small to divide."""
+    """Let torch sum in one order, so that the model is the same on any number of cores; its share
+    of a fit is too small to divide.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -92,28 +119,42 @@ PATCH_SHARE = 0.075  # of the image's width: neighbours within a patch are wrong
 LEAST, MOST = 0.5, 2.0  # a depth is never wrong by more than these factors
 
 
-def misplaced(views: Sequence[PosedView], spread_m: float, scene_id: str, seed: int) -> list[PosedView]:
-    """Return the views with the poses that registration believes: moved and turned by smooth errors of normal spread.
+def misplaced(
+    views: Sequence[PosedView], spread_m: float, scene_id: str, seed: int
+) -> list[PosedView]:
+    """Return the views with the poses that registration believes: moved and turned by smooth errors
+    of normal spread.
 
     Args:
         views: In order of time.
-        spread_m: Along each axis of the camera; directions turn by `TURN_RAD_PER_M` of it about each axis. 0 changes nothing.
+        spread_m: Along each axis of the camera; directions turn by `TURN_RAD_PER_M` of it about
+            each axis. 0 changes nothing.
         scene_id, seed: Key of the random stream.
     """
     if spread_m == 0:
         return list(views)
-    errors = pose_errors(scene_id, seed, spread_m, len(views), np.arange(len(views), dtype=np.float64))
+    errors = pose_errors(
+        scene_id, seed, spread_m, len(views), np.arange(len(views), dtype=np.float64)
+    )
     return [
-        replace(view, camera=replace(view.camera, T_camera_world=error @ view.camera.T_camera_world))
+        replace(
+            view, camera=replace(view.camera, T_camera_world=error @ view.camera.T_camera_world)
+        )
         for view, error in zip(views, errors, strict=True)
     ]
 
 
-def rough_start(views: Sequence[PosedView], boxes: Mapping[str, Box], recipe: ReconstructionRecipe, scene_id: str) -> Start:
+def rough_start(
+    views: Sequence[PosedView],
+    boxes: Mapping[str, Box],
+    recipe: ReconstructionRecipe,
+    scene_id: str,
+) -> Start:
     """Return the Gaussians to begin with.
 
-    Points that are wrong along the ray of the view they come from look right from there and wrong from aside: that, and not only blur, is
-    what a short fit leaves of a scene beside the logged path.
+    Points that are wrong along the ray of the view they come from look right from there and wrong
+    from aside: that, and not only blur, is what a short fit leaves of a scene beside the logged
+    path.
 
     Args:
         views: With depth.
@@ -126,16 +167,27 @@ def rough_start(views: Sequence[PosedView], boxes: Mapping[str, Box], recipe: Re
     """
     splat = recipe.splat
     chosen = [
-        replace(view, depth=view.depth * _factors(view, recipe.range_error, stream(scene_id, splat.seed, "reconstruction.range", i)))
+        replace(
+            view,
+            depth=view.depth
+            * _factors(
+                view, recipe.range_error, stream(scene_id, splat.seed, "reconstruction.range", i)
+            ),
+        )
         for i, view in enumerate(views)
         if view.depth is not None and i % recipe.depth_every == 0
     ]
     start = start_from_depth(chosen, boxes, splat.points, scene_id, splat.seed)
-    return Start(_sized(start.background, recipe), {name: _sized(cloud, recipe) for name, cloud in start.actors.items()})
+    return Start(
+        _sized(start.background, recipe),
+        {name: _sized(cloud, recipe) for name, cloud in start.actors.items()},
+    )
 
 
 def _factors(view: PosedView, spread: float, rng: np.random.Generator) -> F32:
-    """Return by what the depth of every pixel ``(H, W)`` is multiplied: smooth over a patch, of this spread about one."""
+    """Return by what the depth of every pixel ``(H, W)`` is multiplied: smooth over a patch, of
+    this spread about one.
+    """
     height, width = view.rgb.shape[:2]
     cell = max(2.0, PATCH_SHARE * width)
     coarse = rng.standard_normal((int(height / cell) + 2, int(width / cell) + 2)).astype(np.float32)
@@ -144,4 +196,8 @@ def _factors(view: PosedView, spread: float, rng: np.random.Generator) -> F32:
 
 
 def _sized(cloud: GaussianCloud, recipe: ReconstructionRecipe) -> GaussianCloud:
-    return replace(cloud, scales=cloud.scales * recipe.size, opacities=np.full_like(cloud.opacities, recipe.opacity))
+    return replace(
+        cloud,
+        scales=cloud.scales * recipe.size,
+        opacities=np.full_like(cloud.opacities, recipe.opacity),
+    )

@@ -1,4 +1,6 @@
-"""Say how a scenario's reconstruction is fitted, name it by its content (scene, recipe, version of the code), and keep its files."""
+"""Say how a scenario's reconstruction is fitted, name it by its content (scene, recipe, version of
+the code), and keep its files.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,10 @@ if TYPE_CHECKING:
 
 # By second of the log and camera, so that a longer drive is fitted no worse.
 POINTS_PER_S, FULL_STEPS_PER_S = 2_400, 50.0
-FEWEST_VIEWS, MOST_VIEWS, MOST_POINTS, MOST_STEPS = 12, 180, 72_000, 1500
+FEWEST_VIEWS = 12
+MOST_VIEWS = 180
+MOST_POINTS = 72_000
+MOST_STEPS = 1500
 
 
 @dataclass(frozen=True)
@@ -39,9 +44,11 @@ class ReconstructionRecipe:
         fit_actors: Fit actors as rigid nodes; otherwise all are spliced in from the scene as built.
         depth_every: Every such view gives points to start from.
         range_error: Spread of these points' distance from their view, as a share of it.
-        size: Of the Gaussians at the start, in distances to their neighbours: below one, the ground shows through until they have grown.
+        size: Of the Gaussians at the start, in distances to their neighbours: below one, the ground
+            shows through until they have grown.
         opacity: Of the Gaussians at the start.
-        pose_error_m: Spread of the views' believed places, metres; their directions err in proportion.
+        pose_error_m: Spread of the views' believed places, metres; their directions err in
+            proportion.
     """
 
     splat: SplatRecipe
@@ -55,48 +62,83 @@ class ReconstructionRecipe:
 
 
 def recipe_of(scenario: Scenario) -> ReconstructionRecipe:
-    """Return the recipe of a scenario's degradation, which is fitted to what its cameras saw along the log.
+    """Return the recipe of a scenario's degradation, which is fitted to what its cameras saw along
+    the log.
 
     Raises:
         InputError: The degradation is not one that fits a model.
     """
     t_us = scenario.ego_log.t_us
-    return recipe_for(scenario.degradation, (t_us[-1] - t_us[0]) * 1e-6 * max(1, len(scenario.cameras)))
+    return recipe_for(
+        scenario.degradation, (t_us[-1] - t_us[0]) * 1e-6 * max(1, len(scenario.cameras))
+    )
 
 
 def recipe_for(amount: Degradation, watched_s: float) -> ReconstructionRecipe:
     """Return the recipe of a degradation of what a camera watched for so many seconds.
 
-    Few points, small views, no densification: a model that some seconds of one core can fit. Rates are higher than those of a whole fit,
-    as a schedule of hundreds of steps needs.
+    Few points, small views, no densification: a model that some seconds of one core can fit. Rates
+    are higher than those of a whole fit, as a schedule of hundreds of steps needs.
 
     Raises:
         InputError: The degradation is not one that fits a model.
     """
     if amount.kind not in ("reconstruction", "cycle"):
-        raise InputError("fitting a reconstruction", f"degradation kind {amount.kind!r}", "nothing to fit", "say reconstruction or cycle")
+        raise InputError(
+            "fitting a reconstruction",
+            f"degradation kind {amount.kind!r}",
+            "nothing to fit",
+            "say reconstruction or cycle",
+        )
     points = min(MOST_POINTS, max(POINTS_PER_S, round(POINTS_PER_S * watched_s)))
     splat = SplatRecipe(
         steps=max(1, round(amount.share * min(MOST_STEPS, FULL_STEPS_PER_S * watched_s))),
         views=min(MOST_VIEWS, max(FEWEST_VIEWS, round(amount.views_per_s * watched_s))),
-        width=160, points=points, cap=points, hold_out_every=0, sh_degree=1, lr_means=4e-4, lr_means_end=4e-5, lr_scales=1e-2,
-        lr_quaternions=2e-3, lr_opacities=0.05, lr_colour=5e-3, densify_every=0,
-    )  # fmt: skip
+        width=160,
+        points=points,
+        cap=points,
+        hold_out_every=0,
+        sh_degree=1,
+        lr_means=4e-4,
+        lr_means_end=4e-5,
+        lr_scales=1e-2,
+        lr_quaternions=2e-3,
+        lr_opacities=0.05,
+        lr_colour=5e-3,
+        densify_every=0,
+    )
     on_path = amount.kind == "reconstruction"
     aside_m = 0.0 if on_path else amount.shift_m
-    return ReconstructionRecipe(splat, aside_m, on_path, range_error=amount.depth_error, pose_error_m=amount.pose_error_m)
+    return ReconstructionRecipe(
+        splat, aside_m, on_path, range_error=amount.depth_error, pose_error_m=amount.pose_error_m
+    )
 
 
-BUILD = "alpasim_plugin.renderers.reconstruction_build"  # what it imports decides, with the scene and the recipe, what the model is
+# what it imports decides, with the scene and the recipe, what the model is
+BUILD = "alpasim_plugin.renderers.reconstruction_build"
 
-# What neither the frames of the logged drive nor the fit depend on. The source's hash is left out because everything it stands for is here,
-# the path of a background file because its bytes are.
+# What neither the frames of the logged drive nor the fit depend on. The source's hash is left out
+# because everything it stands for is here, the path of a background file because its bytes are.
 _NO_MATTER = frozenset(
     {
-        "source", "rates", "start_us", "end_us", "warmup_us", "latency", "degradation", "world_origin", "content_hash", "notes",
-        "alpasim_map", "behaviour", "path", "source_part", "stop_at_path_end", "varied",
+        "source",
+        "rates",
+        "start_us",
+        "end_us",
+        "warmup_us",
+        "latency",
+        "degradation",
+        "world_origin",
+        "content_hash",
+        "notes",
+        "alpasim_map",
+        "behaviour",
+        "path",
+        "source_part",
+        "stop_at_path_end",
+        "varied",
     }
-)  # fmt: skip
+)
 
 
 class Sink(Protocol):
@@ -111,7 +153,8 @@ def reconstruction_key(scenario: Scenario, recipe: object) -> str:
     """Return 32 hexadecimal digits that two reconstructions share only if they are the same.
 
     Args:
-        scenario: The scene; how long it is driven, its rates and how actors behave in a loop do not matter, its log and tracks do.
+        scenario: The scene; how long it is driven, its rates and how actors behave in a loop do not
+            matter, its log and tracks do.
         recipe: Numbers, texts, arrays, and mappings, sequences and dataclasses of them.
 
     Raises:
@@ -132,14 +175,17 @@ def is_reconstructed(scenario: Scenario) -> bool:
 
 
 def model_key(scenario: Scenario) -> str | None:
-    """Return the key of what the renderer ``3dgs`` shows of a scenario; None where nothing is fitted."""
+    """Return the key of what the renderer ``3dgs`` shows of a scenario; None where nothing is
+    fitted.
+    """
     if not is_reconstructed(scenario):
         return None
     return reconstruction_key(scenario, recipe_of(scenario))
 
 
 def feed(sink: Sink, value: Any, skip: frozenset[str] = frozenset()) -> None:
-    """Feed a value to a hash, every part with its type and length in front, so that different values give different bytes.
+    """Feed a value to a hash, every part with its type and length in front, so that different
+    values give different bytes.
 
     Args:
         sink: The hash.
@@ -181,7 +227,9 @@ HASHES, SKY_VIEWS = "hashes.json", "sky_views.npz"
 DOING, DO_THIS = "reading a reconstruction", "remove its folder; it is made again when it is needed"
 
 
-def write_model(folder: Path, model: Reconstruction, sky_views: Sequence[SkyView], facts: Mapping[str, Any]) -> None:
+def write_model(
+    folder: Path, model: Reconstruction, sky_views: Sequence[SkyView], facts: Mapping[str, Any]
+) -> None:
     """Write a reconstruction and its sky views into an existing, empty folder.
 
     Raises:
@@ -191,7 +239,9 @@ def write_model(folder: Path, model: Reconstruction, sky_views: Sequence[SkyView
     bits = [np.packbits(view.sky > 0.5) for view in sky_views]
     np.savez_compressed(
         folder / SKY_VIEWS,
-        size=np.array([[v.camera.width, v.camera.height] for v in sky_views], dtype=np.int64).reshape(-1, 2),
+        size=np.array(
+            [[v.camera.width, v.camera.height] for v in sky_views], dtype=np.int64
+        ).reshape(-1, 2),
         K=np.array([v.camera.K for v in sky_views]).reshape(-1, 3, 3),
         T_camera_world=np.array([v.camera.T_camera_world for v in sky_views]).reshape(-1, 4, 4),
         sky=np.concatenate(bits) if bits else np.zeros(0, np.uint8),
@@ -200,18 +250,25 @@ def write_model(folder: Path, model: Reconstruction, sky_views: Sequence[SkyView
 
 
 def read_model(folder: Path) -> tuple[Reconstruction, list[SkyView]]:
-    """Read what `write_model` wrote: exactly the files that it lists, each with the hash it was written with.
+    """Read what `write_model` wrote: exactly the files that it lists, each with the hash it was
+    written with.
 
     Raises:
         InputError: A file is missing or is another one than was written.
     """
-    from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction  # it loads the rasteriser, which a key needs not
+    from alpasim_plugin.gaussians.fit.reconstruction import (
+        Reconstruction,
+    )  # it loads the rasteriser, which a key needs not
 
     hashes = read_json_as(dict[str, str], folder / HASHES, DOING, do_this=DO_THIS)
     there = set(_files(folder)) - {HASHES}
     odd = sorted(there ^ set(hashes))
     if odd or not hashes:  # a list that names other files than are there checks nothing
-        found = f"{odd[0]} is {'not listed' if odd[0] in there else 'missing'}" if odd else "it lists no file"
+        found = (
+            f"{odd[0]} is {'not listed' if odd[0] in there else 'missing'}"
+            if odd
+            else "it lists no file"
+        )
         raise _damaged(folder / HASHES, found)
     for name, expected in hashes.items():
         try:
@@ -228,20 +285,27 @@ def _read_sky_views(path: Path) -> list[SkyView]:
 
     try:
         with np.load(path, allow_pickle=False) as file:
-            sizes, Ks, Ts, bits = file["size"], file["K"], file["T_camera_world"], file["sky"]
+            sizes = file["size"]
+            Ks = file["K"]
+            Ts = file["T_camera_world"]
+            bits = file["sky"]
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise _damaged(path, str(error)) from error
     views, first = [], 0
     for (width, height), K, T in zip(sizes.tolist(), Ks, Ts, strict=True):
         length = -(-width * height // 8)
-        sky = np.unpackbits(bits[first : first + length], count=width * height).reshape(height, width)
+        sky = np.unpackbits(bits[first : first + length], count=width * height).reshape(
+            height, width
+        )
         views.append(SkyView(PinholeCamera(width, height, K, T), sky.astype(np.float32)))
         first += length
     return views
 
 
 def _files(folder: Path) -> list[str]:
-    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    return sorted(
+        path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
+    )
 
 
 def _damaged(path: Path, found: str) -> InputError:

@@ -1,8 +1,10 @@
-"""The frames of the recorded drive that a renderer declares, for a fixer to look at; each is read when it is first needed.
+"""The frames of the recorded drive that a renderer declares, for a fixer to look at; each is read
+when it is first needed.
 
-Of an imported drive they are the photographs that its model was fitted to. A scene that was built has no photographs: its recording is what
-its cameras would have taken along the log, the built scene itself, twice a second. The poses are those that the reconstruction believes,
-with the errors of its registration, so a recorded frame is no better placed than a user's own.
+Of an imported drive they are the photographs that its model was fitted to. A scene that was built
+has no photographs: its recording is what its cameras would have taken along the log, the built
+scene itself, twice a second. The poses are those that the reconstruction believes, with the errors
+of its registration, so a recorded frame is no better placed than a user's own.
 """
 
 from __future__ import annotations
@@ -27,19 +29,32 @@ from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe
 
 DOING = "reading a recorded photograph"
 SIDE_PX = 16
-INTERVAL_US, FIRST_US = 500_000, 50_000  # from the log's start; between the frames of a camera at 10 Hz, of which none is a recorded one
-POSE_KNOT_VIEWS = 4  # the error of poses is drawn every so many views and interpolated: registration drifts, it does not jump
-KEPT_BYTES = 50_000_000  # of rendered pictures and depths that a built scene's recording keeps: 48 of 512x288, three of 1920x1080
+INTERVAL_US, FIRST_US = (
+    500_000,
+    50_000,
+)  # from the log's start; between the frames of a camera at 10 Hz, of which none is a recorded one
+# the error of poses is drawn every so many views and interpolated: registration drifts, it does not
+# jump
+POSE_KNOT_VIEWS = 4
+# of rendered pictures and depths that a built scene's recording keeps: 48 of 512x288, three of
+# 1920x1080
+KEPT_BYTES = 50_000_000
 TURN_RAD_PER_M = 0.044  # of the error's directions: a quarter degree with 0.1 m
 
 BYTES_PER_PX = 7  # three of colour, four of depth
-Model = Callable[[PinholeCamera, Mapping[str, F64]], RasterOutput]  # renders a view of the reconstruction
-DepthFrom = Callable[[PinholeCamera, Mapping[str, F64]], F32]  # camera, actor poses -> depth (H, W) metres, 0 where there is none
+Model = Callable[
+    [PinholeCamera, Mapping[str, F64]], RasterOutput
+]  # renders a view of the reconstruction
+DepthFrom = Callable[
+    [PinholeCamera, Mapping[str, F64]], F32
+]  # camera, actor poses -> depth (H, W) metres, 0 where there is none
 
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """One recorded frame of a built scene: where it was taken, and where the reconstruction believes that it was."""
+    """One recorded frame of a built scene: where it was taken, and where the reconstruction
+    believes that it was.
+    """
 
     scene: SceneGraph
     model: Model
@@ -49,20 +64,26 @@ class _Shot:
 
     def read(self) -> tuple[U8, F32]:
         """Return the built scene's picture, and the model's depth from the believed pose."""
-        return self.scene.render(self.true, self.actors, 1).to_uint8(), self.model(self.believed, self.actors).surface_depth()
+        return self.scene.render(self.true, self.actors, 1).to_uint8(), self.model(
+            self.believed, self.actors
+        ).surface_depth()
 
 
 Read = Callable[[_Shot], tuple[U8, F32]]
 
 
-def built_recording(scenario: Scenario, scene: SceneGraph, model: Model, recipe: ReconstructionRecipe | None) -> tuple[RecordedFrame, ...]:
-    """Return the recording of a built scene; a frame is rendered when it is first read, and kept as a file would be.
+def built_recording(
+    scenario: Scenario, scene: SceneGraph, model: Model, recipe: ReconstructionRecipe | None
+) -> tuple[RecordedFrame, ...]:
+    """Return the recording of a built scene; a frame is rendered when it is first read, and kept as
+    a file would be.
 
     Args:
         scenario: Its log, cameras and actors.
         scene: The scene as built.
         model: The reconstruction.
-        recipe: How that was fitted: how far aside its views lie, and how wrong their poses are; None: on the log, without error.
+        recipe: How that was fitted: how far aside its views lie, and how wrong their poses are;
+            None: on the log, without error.
     """
     log = scenario.ego_log
     times = range(int(log.t_us[0]) + FIRST_US, int(log.t_us[-1]), INTERVAL_US)
@@ -70,29 +91,47 @@ def built_recording(scenario: Scenario, scene: SceneGraph, model: Model, recipe:
     if recipe:
         last_view = max(recipe.splat.views - 1, 1)
         at = (np.array(times) - log.t_us[0]) / (log.t_us[-1] - log.t_us[0]) * last_view
-        errors = pose_errors(scenario.scene_id, recipe.splat.seed, recipe.pose_error_m, recipe.splat.views, at)
+        errors = pose_errors(
+            scenario.scene_id, recipe.splat.seed, recipe.pose_error_m, recipe.splat.views, at
+        )
     aside = np.eye(4)
     aside[1, 3] = recipe.aside_m if recipe else 0.0
     largest = max(spec.width * spec.height for spec in scenario.cameras) if scenario.cameras else 1
     read = lru_cache(maxsize=max(1, KEPT_BYTES // (largest * BYTES_PER_PX)))(_Shot.read)
     return tuple(
-        _frame(scenario, scene, model, read, spec, t_us, interpolate(log, t_us) @ aside @ spec.T_rig_camera, error)
+        _frame(
+            scenario,
+            scene,
+            model,
+            read,
+            spec,
+            t_us,
+            interpolate(log, t_us) @ aside @ spec.T_rig_camera,
+            error,
+        )
         for t_us, error in zip(times, errors, strict=True)
         for spec in scenario.cameras
     )
 
 
 def pose_errors(scene_id: str, seed: int, spread_m: float, views: int, at: F64) -> F64:
-    """Return by what registration misplaces views: ``(N, 4, 4)``, from the true camera to the believed one.
+    """Return by what registration misplaces views: ``(N, 4, 4)``, from the true camera to the
+    believed one.
 
     Args:
         scene_id, seed: Key of the random stream.
-        spread_m: Along each axis of the camera; directions turn by `TURN_RAD_PER_M` of it about each axis.
+        spread_m: Along each axis of the camera; directions turn by `TURN_RAD_PER_M` of it about
+            each axis.
         views: How many were registered.
         at: ``(N,)`` places in the order of the views, between 0 and ``views - 1``.
     """
-    knots = stream(scene_id, seed, "reconstruction.poses").standard_normal((views // POSE_KNOT_VIEWS + 2, 6))
-    errors = spread_m * np.stack([np.interp(at / POSE_KNOT_VIEWS, np.arange(len(knots)), column) for column in knots.T], axis=1)  # (N, 6)
+    knots = stream(scene_id, seed, "reconstruction.poses").standard_normal(
+        (views // POSE_KNOT_VIEWS + 2, 6)
+    )
+    errors = spread_m * np.stack(
+        [np.interp(at / POSE_KNOT_VIEWS, np.arange(len(knots)), column) for column in knots.T],
+        axis=1,
+    )  # (N, 6)
     out = np.broadcast_to(np.eye(4), (len(at), 4, 4)).copy()
     out[:, :3, :3] = [cv2.Rodrigues(TURN_RAD_PER_M * error[3:])[0] for error in errors]
     out[:, :3, 3] = errors[:, :3]
@@ -100,25 +139,41 @@ def pose_errors(scene_id: str, seed: int, spread_m: float, views: int, at: F64) 
 
 
 def _frame(
-    scenario: Scenario, scene: SceneGraph, model: Model, read: Read, spec: CameraSpec, t_us: int, T_world_camera: F64, error: F64
+    scenario: Scenario,
+    scene: SceneGraph,
+    model: Model,
+    read: Read,
+    spec: CameraSpec,
+    t_us: int,
+    T_world_camera: F64,
+    error: F64,
 ) -> RecordedFrame:
     true = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_camera)
     T_world_believed = inverse(error @ true.T_camera_world)
     believed = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_believed)
     actors = dict(log_actors(scenario, t_us))
-    return RecordedFrame(t_us, spec.name, spec.K, T_world_believed, actors, partial(read, _Shot(scene, model, true, believed, actors)))
+    return RecordedFrame(
+        t_us,
+        spec.name,
+        spec.K,
+        T_world_believed,
+        actors,
+        partial(read, _Shot(scene, model, true, believed, actors)),
+    )
 
 
 def photograph_recording(scenario: Scenario, depth_from: DepthFrom) -> tuple[RecordedFrame, ...]:
-    """Return the photographs that the model was fitted to; those held out or of another camera stay unseen, so that they can judge.
+    """Return the photographs that the model was fitted to; those held out or of another camera stay
+    unseen, so that they can judge.
 
     Args:
         scenario: Of an imported drive.
         depth_from: What the renderer sees from a camera.
 
     Returns:
-        In order of time, each at the size at which the scenario renders its camera, where that is smaller, with its field of view. Reading
-        one raises `InputError` where its file is missing or damaged.
+        In order of time, each at the size at which the scenario renders its camera, where that is
+        smaller, with its field of view. Reading one raises `InputError` where its file is missing
+        or damaged.
     """
     widths = {camera.name: camera.width for camera in scenario.cameras}
     frames = []
@@ -126,7 +181,9 @@ def photograph_recording(scenario: Scenario, depth_from: DepthFrom) -> tuple[Rec
         camera = photograph_camera(one, widths.get(one.camera, one.width))
         actors = log_actors(scenario, one.t_us)
         read = partial(_read, one, camera, partial(depth_from, camera, actors))
-        frames.append(RecordedFrame(one.t_us, one.camera, camera.K, one.T_world_camera, actors, read))
+        frames.append(
+            RecordedFrame(one.t_us, one.camera, camera.K, one.T_world_camera, actors, read)
+        )
     return tuple(frames)
 
 
@@ -134,11 +191,16 @@ def photograph_camera(one: Photograph, width: int) -> PinholeCamera:
     """Return a photograph's camera with so many pixels across, never more than it has."""
     w = min(width, one.width)
     h = max(1, round(one.height * w / one.width))
-    return PinholeCamera.from_pose(w, h, np.diag([w / one.width, h / one.height, 1.0]) @ one.K, one.T_world_camera)
+    return PinholeCamera.from_pose(
+        w, h, np.diag([w / one.width, h / one.height, 1.0]) @ one.K, one.T_world_camera
+    )
 
 
-def posed_photograph(one: Photograph, width: int, height: int | None = None) -> tuple[PinholeCamera, U8]:
-    """Read a photograph at sides that are multiples of 16, as fixers need; its height is cut at the middle.
+def posed_photograph(
+    one: Photograph, width: int, height: int | None = None
+) -> tuple[PinholeCamera, U8]:
+    """Read a photograph at sides that are multiples of 16, as fixers need; its height is cut at the
+    middle.
 
     Args:
         one: The photograph.
@@ -164,13 +226,20 @@ def photograph_picture(one: Photograph, camera: PinholeCamera) -> U8:
     """
     rgb = np.asarray(read_image(Path(one.path), DOING)[..., ::-1], np.uint8)
     size = camera.width, camera.height
-    small = rgb if size == (one.width, one.height) else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    small = (
+        rgb
+        if size == (one.width, one.height)
+        else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    )
     return np.ascontiguousarray(small, dtype=np.uint8)
 
 
 def of_use(scenario: Scenario, use: str) -> Sequence[Photograph]:
     """Return the drive's photographs of one use, in order of time."""
-    return sorted((one for one in scenario.recording if one.use == use), key=lambda one: (one.t_us, one.camera))
+    return sorted(
+        (one for one in scenario.recording if one.use == use),
+        key=lambda one: (one.t_us, one.camera),
+    )
 
 
 def _read(one: Photograph, camera: PinholeCamera, depth: Callable[[], F32]) -> tuple[U8, F32]:

@@ -1,4 +1,6 @@
-"""Draw a frame of a rolling shutter: each of its bands from the pose, and with the road users, of the band's instant."""
+"""Draw a frame of a rolling shutter: each of its bands from the pose, and with the road users, of
+the band's instant.
+"""
 
 from __future__ import annotations
 
@@ -21,12 +23,13 @@ def draw_request(request: RenderRequest, draw: Draw, backend: Backend) -> Raster
     Args:
         request: What to draw.
         draw: Draws a camera's picture with the road users at their boxes.
-        backend: Of ``draw``. It is given the window of each band, but gsplat the whole picture: its limits of slopes
-            (`PinholeCamera.slope_limits`) are its own, and would follow the window.
+        backend: Of ``draw``. It is given the window of each band, but gsplat the whole picture: its
+            limits of slopes (`PinholeCamera.slope_limits`) are its own, and would follow the
+            window.
 
     Returns:
-        The picture; a pixel that nobody looks at is black and opaque. Depth is along the axis of the pose at the pixel's time. ``stats``
-        are the largest of any band.
+        The picture; a pixel that nobody looks at is black and opaque. Depth is along the axis of
+        the pose at the pixel's time. ``stats`` are the largest of any band.
     """
     spec = request.camera
     if request.exposure is None:
@@ -45,7 +48,9 @@ def draw_request(request: RenderRequest, draw: Draw, backend: Backend) -> Raster
 
 
 def plain_draw_request(request: RenderRequest, draw: Draw) -> RasterOutput:
-    """Return the same as `draw_request`, by the definition: for each time of exposure the whole picture, of which its pixels are taken."""
+    """Return the same as `draw_request`, by the definition: for each time of exposure the whole
+    picture, of which its pixels are taken.
+    """
     assert request.exposure is not None, "a frame without exposure has no reference but itself"
     spec = request.camera
     share = np.broadcast_to(request.exposure.share, (spec.height, spec.width))
@@ -67,4 +72,6 @@ def camera_at(request: RenderRequest, T_world_camera: F64) -> PinholeCamera:
 
 def _blank(height: int, width: int) -> RasterOutput:
     shape = height, width
-    return RasterOutput(np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32), np.zeros(shape, np.float32))
+    return RasterOutput(
+        np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32), np.zeros(shape, np.float32)
+    )

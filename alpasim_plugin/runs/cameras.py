@@ -11,7 +11,15 @@ import numpy as np
 from alpasim_plugin.core.clock import Clock, Tick
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule
-from alpasim_plugin.core.types import F64, I64, CameraSpec, RenderRequest, Scenario, SensorSpec, Trajectory
+from alpasim_plugin.core.types import (
+    F64,
+    I64,
+    CameraSpec,
+    RenderRequest,
+    Scenario,
+    SensorSpec,
+    Trajectory,
+)
 from alpasim_plugin.runs.loop_state import Forecaster, PredictedRequests, drawn, shutter_poses
 
 IN_BLOCKS = "setting up a loop in whole blocks of frames"
@@ -21,8 +29,9 @@ IN_BLOCKS = "setting up a loop in whole blocks of frames"
 class Cadence:
     """The instants at which the policy is queried.
 
-    With ``whole_blocks`` all frames since the last query are rendered together at the next query. Otherwise a frame is rendered at its own
-    instant, and only if it is the camera's newest at the next query.
+    With ``whole_blocks`` all frames since the last query are rendered together at the next query.
+    Otherwise a frame is rendered at its own instant, and only if it is the camera's newest at the
+    next query.
     """
 
     query_times_us: I64  # (Q,) increasing
@@ -43,12 +52,16 @@ class Cadence:
         return query is not None and (self.whole_blocks or query - t_us < period_us)
 
 
-def make_cadence(clock: Clock, scenario: Scenario, sensors: Sequence[SensorSpec], block: BlockRule | None = None) -> Cadence:
-    """Return the cadence of a rollout: the policy's own period, or with ``block`` one query at the end of each block of frames.
+def make_cadence(
+    clock: Clock, scenario: Scenario, sensors: Sequence[SensorSpec], block: BlockRule | None = None
+) -> Cadence:
+    """Return the cadence of a rollout: the policy's own period, or with ``block`` one query at the
+    end of each block of frames.
 
-    ``block`` is AlpaSim's rule for video models: the control step is one block, and a plan is committed for the whole next block. The
-    warm-up must cover the first block, since there is no query before its end. A policy without cameras has no blocks and keeps its own
-    period. There is no query at the last instant, because no control step follows it.
+    ``block`` is AlpaSim's rule for video models: the control step is one block, and a plan is
+    committed for the whole next block. The warm-up must cover the first block, since there is no
+    query before its end. A policy without cameras has no blocks and keeps its own period. There is
+    no query at the last instant, because no control step follows it.
 
     Args:
         clock: Ticks of the rollout.
@@ -57,11 +70,17 @@ def make_cadence(clock: Clock, scenario: Scenario, sensors: Sequence[SensorSpec]
         block: Frames of the first block and of each later one.
 
     Raises:
-        InputError: Cameras of different periods, a warm-up shorter than the first block, or a scenario in which no block ends.
+        InputError: Cameras of different periods, a warm-up shorter than the first block, or a
+            scenario in which no block ends.
     """
     end_us = clock.start_us + clock.n_steps * clock.rates.control_us
     if block is None or not sensors:
-        return Cadence(np.array([tick.t_us for tick in clock.ticks() if tick.policy_due and not tick.is_last], dtype=np.int64))
+        return Cadence(
+            np.array(
+                [tick.t_us for tick in clock.ticks() if tick.policy_due and not tick.is_last],
+                dtype=np.int64,
+            )
+        )
     first, then = block.first, block.then
     periods = {sensor.interval_us or scenario.rates.camera_us for sensor in sensors}
     if len(periods) > 1:
@@ -103,7 +122,8 @@ class CameraRig:
         lookahead: How many of a camera's next frames a request predicts.
 
     Raises:
-        InputError: The scenario lacks a camera of the policy, or a period is no multiple of the control period.
+        InputError: The scenario lacks a camera of the policy, or a period is no multiple of the
+            control period.
     """
 
     def __init__(
@@ -144,24 +164,38 @@ class CameraRig:
         """Give the cameras in use by name."""
         return {camera.name: camera for camera, _ in self._due}
 
-    def requests(self, tick: Tick, history: Trajectory, actors: Mapping[str, F64]) -> list[RenderRequest]:
-        """Return the requests to render now. Shutter-start poses come from the history, the shutter ends now.
+    def requests(
+        self, tick: Tick, history: Trajectory, actors: Mapping[str, F64]
+    ) -> list[RenderRequest]:
+        """Return the requests to render now. Shutter-start poses come from the history, the shutter
+        ends now.
 
-        In a cadence of whole blocks the requests of a block are returned together when its last frame is due.
+        In a cadence of whole blocks the requests of a block are returned together when its last
+        frame is due.
         """
         shown = drawn(actors)
         forecast = self._forecaster.now() if self._forecaster and self._lookahead else None
         for camera, period in self._due:
             if self._is_due(tick.t_us, period):
-                ahead = PredictedRequests(forecast, camera, self._next_us(tick.t_us, period)) if forecast else ()
-                self._held.append(RenderRequest(tick.t_us, camera, shutter_poses(history, camera, tick.t_us), shown, ahead))
+                ahead = (
+                    PredictedRequests(forecast, camera, self._next_us(tick.t_us, period))
+                    if forecast
+                    else ()
+                )
+                self._held.append(
+                    RenderRequest(
+                        tick.t_us, camera, shutter_poses(history, camera, tick.t_us), shown, ahead
+                    )
+                )
         if self._cadence.whole_blocks and not self._cadence.queries_at(tick.t_us):
             return []
         ready, self._held = self._held, []
         return ready
 
     def _is_due(self, t_us: int, period: int) -> bool:
-        return (t_us - self._clock.start_us) % period == 0 and self._cadence.needs_frame(t_us, period)
+        return (t_us - self._clock.start_us) % period == 0 and self._cadence.needs_frame(
+            t_us, period
+        )
 
     def _next_us(self, t_us: int, period: int) -> tuple[int, ...]:
         end_us = self._clock.start_us + self._clock.n_steps * self._clock.rates.control_us

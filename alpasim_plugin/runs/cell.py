@@ -21,8 +21,22 @@ from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_ren
 from alpasim_plugin.core.places import require_kernels
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
-from alpasim_plugin.log.run_folder.manifests import RepairAction, RolloutState, inspect_rollout, write_manifest
-from alpasim_plugin.log.run_folder.schema import DERIVED, DRIVEN, FRAMES_NAME, LOG_NAME, MANIFEST, OUTPUT_NAME, VIDEO_NAME, WHY_NAME
+from alpasim_plugin.log.run_folder.manifests import (
+    RepairAction,
+    RolloutState,
+    inspect_rollout,
+    write_manifest,
+)
+from alpasim_plugin.log.run_folder.schema import (
+    DERIVED,
+    DRIVEN,
+    FRAMES_NAME,
+    LOG_NAME,
+    MANIFEST,
+    OUTPUT_NAME,
+    VIDEO_NAME,
+    WHY_NAME,
+)
 from alpasim_plugin.log.run_folder.writer import write_steps
 from alpasim_plugin.runs.guards import checked_frames
 from alpasim_plugin.runs.plan import Cell, RunOptions
@@ -57,7 +71,9 @@ class RolloutParts:
 
 def remote_actors(scenario: Scenario, address: str, seed: int) -> RemoteActors:
     """Connect a rollout's road users to a traffic service."""
-    from alpasim_plugin.alpasim.client.world_services import RemoteActors  # gRPC is loaded where a service is called
+    from alpasim_plugin.alpasim.client.world_services import (
+        RemoteActors,
+    )  # gRPC is loaded where a service is called
 
     return RemoteActors(scenario, address, seed)
 
@@ -72,7 +88,10 @@ def build_parts(cell: Cell, options: RunOptions, scenario: Scenario, threads: in
         make_renderer(cell.renderer, scenario, cell.seed, options.device, threads),
         build(cell.policy, scenario=scenario),
         cell.rollout_key,
-        {"sensorsim": name if fixer is None else f"{name} ({fixer.label})", "egodriver": cell.policy.name},
+        {
+            "sensorsim": name if fixer is None else f"{name} ({fixer.label})",
+            "egodriver": cell.policy.name,
+        },
         build(cell.controller, vehicle=scenario.vehicle, scene_id=scenario.scene_id),
         remote_actors(scenario, options.traffic, cell.seed) if options.traffic else None,
     )
@@ -86,9 +105,11 @@ def run_cell(
     builder: PartsBuilder = build_parts,
     load: Callable[[ScenarioRef], Scenario] | None = None,
 ) -> dict[str, Any]:
-    """Run and score one cell and return its manifest. The manifest is written last: a folder without one is unfinished.
+    """Run and score one cell and return its manifest. The manifest is written last: a folder
+    without one is unfinished.
 
-    A failure is a result too: the manifest then has ``status: failed``, the error and the traceback.
+    A failure is a result too: the manifest then has ``status: failed``, the error and the
+    traceback.
 
     Args:
         cell: The rollout.
@@ -100,11 +121,22 @@ def run_cell(
     """
     folder = root / cell.folder
     began = time.perf_counter()
-    cv2.setNumThreads(1)  # OpenCV's pool is outside the thread budget, and frames are too small to gain from it
-    manifest = _begun(cell) | {"preset": options.preset, "stops_at_path_end": cell.stops_at_path_end, "video": options.video}
+    cv2.setNumThreads(
+        1
+    )  # OpenCV's pool is outside the thread budget, and frames are too small to gain from it
+    manifest = _begun(cell) | {
+        "preset": options.preset,
+        "stops_at_path_end": cell.stops_at_path_end,
+        "video": options.video,
+    }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (MANIFEST, *DRIVEN, *DERIVED, WHY_NAME):  # the manifest first: without it nothing is trusted
+        for name in (
+            MANIFEST,
+            *DRIVEN,
+            *DERIVED,
+            WHY_NAME,
+        ):  # the manifest first: without it nothing is trusted
             (folder / name).unlink(missing_ok=True)
         scenario = replace((load or _scenario)(cell.ref), stop_at_path_end=cell.stops_at_path_end)
         with parts_print_to_stderr(folder / OUTPUT_NAME):
@@ -112,7 +144,10 @@ def run_cell(
             recorder = _drive(parts, cell, options, scenario, folder)
         manifest |= recorder.facts() | _facts_of(parts, has_fixer=cell.renderer.fixer is not None)
         manifest |= _score(folder, cell, options, scenario)
-        recorder.save_pictures(video=options.video == "all" or (options.video == "failures" and bool(manifest["events"])))
+        recorder.save_pictures(
+            video=options.video == "all"
+            or (options.video == "failures" and bool(manifest["events"]))
+        )
         manifest["status"] = "ok"
     except Exception as error:
         manifest |= _failure(error, folder)
@@ -124,24 +159,52 @@ def run_cell(
 
 def _begun(cell: Cell) -> dict[str, Any]:
     """Return what the manifest of a rollout begins with."""
-    return {**cell.names, "path": cell.folder.as_posix(), "rollout_key": cell.rollout_key, "score_key": cell.score_key}
+    return {
+        **cell.names,
+        "path": cell.folder.as_posix(),
+        "rollout_key": cell.rollout_key,
+        "score_key": cell.score_key,
+    }
 
 
-def _drive(parts: RolloutParts, cell: Cell, options: RunOptions, scenario: Scenario, folder: Path) -> Recorder:
+def _drive(
+    parts: RolloutParts, cell: Cell, options: RunOptions, scenario: Scenario, folder: Path
+) -> Recorder:
     """Drive a rollout and close its parts, however it ends."""
-    recorder = Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names)
-    held: list[Policy | Controller | RemoteActors] = [complete(parts.policy, Policy), complete(parts.controller, Controller)]
+    recorder = Recorder(
+        scenario,
+        cell.seed,
+        folder,
+        parts.session,
+        options.images,
+        options.video != "none",
+        parts.names,
+    )
+    held: list[Policy | Controller | RemoteActors] = [
+        complete(parts.policy, Policy),
+        complete(parts.controller, Controller),
+    ]
     if parts.actors is not None:
         held.append(parts.actors)
     with recorder, ExitStack() as stack:
         for part in held:
             stack.enter_context(_closing(part))
-        run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller, parts.actors)
+        run_rollout(
+            scenario,
+            parts.renderer,
+            parts.policy,
+            cell.seed,
+            recorder,
+            parts.controller,
+            parts.actors,
+        )
     return recorder
 
 
 def _facts_of(parts: RolloutParts, has_fixer: bool) -> dict[str, Any]:
-    """Return what renderer and policy say of the rollout; a renderer with a fixer speaks for the fixer."""
+    """Return what renderer and policy say of the rollout; a renderer with a fixer speaks for the
+    fixer.
+    """
     rendered = dict(complete(parts.renderer, Renderer).facts())
     driven = dict(complete(parts.policy, Policy).facts())
     facts: dict[str, Any] = {"fixer": rendered if has_fixer else {}}
@@ -171,7 +234,9 @@ def _failure(error: Exception, folder: Path) -> dict[str, Any]:
 
 
 def _log_traceback(error: Exception, folder: Path) -> None:
-    """Add the traceback of what failed first to the log of the rollout, which the terminal names."""
+    """Add the traceback of what failed first to the log of the rollout, which the terminal
+    names.
+    """
     cause = error
     while isinstance(cause.__cause__, Exception):
         cause = cause.__cause__
@@ -188,8 +253,12 @@ def failed_manifest(cell: Cell, error: SimrunError) -> dict[str, Any]:
     return _begun(cell) | {"status": "failed", "error": error.as_dict(), "wall_s": None}
 
 
-def rescore_cell(cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any]) -> dict[str, Any]:
-    """Score a finished rollout again from its log: another preset, changed evaluators, or a damaged table; return the new manifest."""
+def rescore_cell(
+    cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any]
+) -> dict[str, Any]:
+    """Score a finished rollout again from its log: another preset, changed evaluators, or a damaged
+    table; return the new manifest.
+    """
     folder = root / cell.folder
     manifest = manifest | _score(folder, cell, options, _scenario(cell.ref))
     manifest |= {"score_key": cell.score_key, "preset": options.preset}
@@ -208,9 +277,10 @@ def find_rollout_state(
 ) -> tuple[RepairAction, RolloutState]:
     """Return what a cell needs, and the rollout as it is found on disk.
 
-    A rollout with another content key is driven again; so are those with a part that has no digest unless ``reuse_undigested`` is set, and
-    failed ones, except where the policy is at fault: the same policy would fail again (``retry`` drives these too).
-    One that was driven without the ``video`` that is asked for now is driven again as well. See
+    A rollout with another content key is driven again; so are those with a part that has no digest
+    unless ``reuse_undigested`` is set, and failed ones, except where the policy is at fault: the
+    same policy would fail again (``retry`` drives these too). One that was driven without the
+    ``video`` that is asked for now is driven again as well. See
     `alpasim_plugin.log.run_folder.manifests.inspect_rollout` for ``full`` and ``known``.
     """
     state = inspect_rollout(root, cell.folder.as_posix(), full, known)
@@ -223,8 +293,14 @@ def find_rollout_state(
         return "drive", state
     if manifest["status"] != "ok":
         return "none", state
-    if manifest.get("passed_path_end") and manifest.get("stops_at_path_end") != cell.stops_at_path_end:
-        return "drive", state  # the only rollouts that differ between presets that stop there and those that drive on
+    if (
+        manifest.get("passed_path_end")
+        and manifest.get("stops_at_path_end") != cell.stops_at_path_end
+    ):
+        return (
+            "drive",
+            state,
+        )  # the only rollouts that differ between presets that stop there and those that drive on
     wants_video = video == "all" or (video == "failures" and bool(manifest.get("events")))
     if wants_video and VIDEO_NAME not in manifest["files"] and manifest.get("video") != video:
         return "drive", state
@@ -234,9 +310,16 @@ def find_rollout_state(
 
 
 def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> dict[str, Any]:
-    scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset, cell.evaluators)
+    scored = score_log(
+        folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset, cell.evaluators
+    )
     write_steps(folder, [cell.names | row for row in scored.steps])
-    return {"metrics": scored.metrics, "events": scored.events, "contacts": scored.contacts, "censored": scored.censored}
+    return {
+        "metrics": scored.metrics,
+        "events": scored.events,
+        "contacts": scored.contacts,
+        "censored": scored.censored,
+    }
 
 
 @contextmanager
@@ -245,7 +328,9 @@ def _closing(part: Policy | Controller | RemoteActors) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        with suppress(SimrunError):  # what failed first is the rollout's failure; a service that is gone cannot be closed either
+        with suppress(
+            SimrunError
+        ):  # what failed first is the rollout's failure; a service that is gone cannot be closed either
             part.close()
         raise
     part.close()
@@ -267,7 +352,8 @@ def make_renderer(
     """Build one rollout's renderer.
 
     Args:
-        name: A renderer, or a fixer over one, as `alpasim_plugin.core.parts.resolve_renderer` takes it; or its resolved spec.
+        name: A renderer, or a fixer over one, as `alpasim_plugin.core.parts.resolve_renderer` takes
+            it; or its resolved spec.
         scenario: What is rendered.
         seed: The rollout's seed, for temporal noise and the fixer's noise.
         device: ``cpu`` or ``cuda``.
@@ -295,4 +381,11 @@ def make_renderer(
         return checked_frames(base, [request])[0]
 
     recorded = base.recorded() if settings.references else ()
-    return fixed_renderer(render, lambda: build(fixer, scene_id=scenario.scene_id, **session), settings, scenario, threads, recorded)
+    return fixed_renderer(
+        render,
+        lambda: build(fixer, scene_id=scenario.scene_id, **session),
+        settings,
+        scenario,
+        threads,
+        recorded,
+    )

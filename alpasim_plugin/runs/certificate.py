@@ -1,4 +1,6 @@
-"""The determinism certificate of a run: one rollout is repeated and compared with the first, component by component, bit for bit."""
+"""The determinism certificate of a run: one rollout is repeated and compared with the first,
+component by component, bit for bit.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ Certify = Literal["none", "one"]
 
 @dataclass
 class Repeat:
-    """A rollout that is driven twice, the second time beside other rollouts where there are workers.
+    """A rollout that is driven twice, the second time beside other rollouts where there are
+    workers.
 
     Attributes:
         cell: Which; None: none.
@@ -48,19 +51,27 @@ def repeating(plan: RunPlan, root: Path, mode: Certify) -> Iterator[Repeat]:
 
 
 def foreseen(plan: RunPlan, mode: Certify) -> Cell | None:
-    """Return which rollout of a plan may be repeated beside the others; None: none, or one of services, which may take one at a time."""
+    """Return which rollout of a plan may be repeated beside the others; None: none, or one of
+    services, which may take one at a time.
+    """
     cell = None if mode == "none" else chosen_of(plan, plan.cells)
     return None if cell is None or cell.undigested else cell
 
 
 def chosen_of(plan: RunPlan, cells: Iterable[Cell]) -> Cell | None:
-    """Return which of some rollouts is repeated; None where none can be: the shortest, of several that with the smallest content key."""
+    """Return which of some rollouts is repeated; None where none can be: the shortest, of several
+    that with the smallest content key.
+    """
 
     def order(cell: Cell) -> tuple[int, str]:
         scenario = plan.scenarios[cell.scene]
         return scenario.end_us - scenario.start_us, cell.rollout_key
 
-    return min((cell for cell in cells if plan.scenarios[cell.scene].latency.kind != "measured"), key=order, default=None)
+    return min(
+        (cell for cell in cells if plan.scenarios[cell.scene].latency.kind != "measured"),
+        key=order,
+        default=None,
+    )
 
 
 def certify(
@@ -82,20 +93,28 @@ def certify(
         manifests: One per cell, in the plan's order.
         threads: Threads of a repeat in this process; results must not depend on them.
         mode: "none" makes no repeat.
-        before: The folder's earlier certificate; it is kept if it certifies the same rollout and the same log.
-        repeat: What was repeated beside the others. Where it is another rollout, the repeat runs now, in this process.
+        before: The folder's earlier certificate; it is kept if it certifies the same rollout and
+            the same log.
+        repeat: What was repeated beside the others. Where it is another rollout, the repeat runs
+            now, in this process.
 
     Returns:
-        ``status`` (equal, different, skipped), ``reason`` where skipped, ``error`` (its four parts) where the repeat failed, ``cell``,
-        ``path``, ``rollout_key``, ``score_key``, ``steps``, ``log_sha256`` and ``digests`` (component -> SHA-256 of the first rollout),
-        ``repeated`` (those of the repeat), ``first_difference`` (component, t_us, step, what) or None, and ``wall_s``.
+        ``status`` (equal, different, skipped), ``reason`` where skipped, ``error`` (its four parts)
+        where the repeat failed, ``cell``, ``path``, ``rollout_key``, ``score_key``, ``steps``,
+        ``log_sha256`` and ``digests`` (component -> SHA-256 of the first rollout), ``repeated``
+        (those of the repeat), ``first_difference`` (component, t_us, step, what) or None, and
+        ``wall_s``.
     """
     if mode == "none":
         return {"status": "skipped", "reason": "switched off with --certify none"}
     done = [(cell, m) for cell, m in zip(plan.cells, manifests, strict=True) if m["status"] == "ok"]
     cell = chosen_of(plan, (cell for cell, _ in done))
     if cell is None:
-        why = "latency 'measured' depends on the machine: no rollout can be repeated" if done else "no rollout finished"
+        why = (
+            "latency 'measured' depends on the machine: no rollout can be repeated"
+            if done
+            else "no rollout finished"
+        )
         return {"status": "skipped", "reason": why}
     manifest = next(m for one, m in done if one is cell)
     log_sha256 = sha256((root / cell.folder / LOG_NAME).read_bytes())
@@ -107,16 +126,25 @@ def certify(
         "steps": manifest["steps"],
         "log_sha256": log_sha256,
     }
-    if before and before.get("status") == "equal" and all(before.get(key) == value for key, value in facts.items()):
+    if (
+        before
+        and before.get("status") == "equal"
+        and all(before.get(key) == value for key, value in facts.items())
+    ):
         return dict(before)
     began = time.perf_counter()
     try:
         with repeating(plan, root, mode) as late:
-            again = repeat if repeat is not None and repeat.cell is cell and repeat.manifest is not None else late
+            again = (
+                repeat
+                if repeat is not None and repeat.cell is cell and repeat.manifest is not None
+                else late
+            )
             took_s = 0.0 if again.manifest is None else again.manifest["wall_s"]
             again.manifest = again.manifest or run_cell(cell, plan.options, late.root, threads)
             found = _compared(plan, cell, root, manifest, again.root, again.manifest, log_sha256)
-    except SimrunError as error:  # the run is driven and scored: its tables and reports must not be lost with the repeat
+    # the run is driven and scored: its tables and reports must not be lost with the repeat
+    except SimrunError as error:
         found = _skipped(error.as_dict())
         took_s = 0.0
     return facts | found | {"wall_s": round(took_s + time.perf_counter() - began, 3)}
@@ -139,27 +167,59 @@ def certificate_line(certificate: Mapping[str, Any]) -> str:
 
 
 def _compared(
-    plan: RunPlan, cell: Cell, root: Path, manifest: Mapping[str, Any], again_root: Path, again: Mapping[str, Any], log_sha256: str
+    plan: RunPlan,
+    cell: Cell,
+    root: Path,
+    manifest: Mapping[str, Any],
+    again_root: Path,
+    again: Mapping[str, Any],
+    log_sha256: str,
 ) -> dict[str, Any]:
     if again["status"] != "ok":
         return _not_repeated(again["error"])
-    one, other = rollout_trace(root / cell.folder, manifest), rollout_trace(again_root / cell.folder, again)
+    one, other = (
+        rollout_trace(root / cell.folder, manifest),
+        rollout_trace(again_root / cell.folder, again),
+    )
     same_bytes = sha256((again_root / cell.folder / LOG_NAME).read_bytes()) == log_sha256
     scenario = plan.scenarios[cell.scene]
     difference = first_difference(one, other, scenario.start_us, scenario.rates.control_us)
     first = None if difference is None else difference.as_dict()
     if first is None and not same_bytes:
-        first = {"component": "log", "t_us": None, "step": None, "what": "an entry that belongs to no component"}
+        first = {
+            "component": "log",
+            "t_us": None,
+            "step": None,
+            "what": "an entry that belongs to no component",
+        }
     status = "equal" if first is None else "different"
-    return {"status": status, "digests": digests(one), "repeated": digests(other), "first_difference": first}
+    return {
+        "status": status,
+        "digests": digests(one),
+        "repeated": digests(other),
+        "first_difference": first,
+    }
 
 
 def _not_repeated(error: Mapping[str, str]) -> dict[str, Any]:
-    """Return the certificate of a repeat that ended with an error; one of the machine or of a service says nothing about the rollout."""
+    """Return the certificate of a repeat that ended with an error; one of the machine or of a
+    service says nothing about the rollout.
+    """
     if error["failure_class"] == InfrastructureError.failure_class:
         return _skipped(error)
-    first = {"component": "run", "t_us": None, "step": None, "what": f"the repeat failed: {error['found']}"}
-    return {"status": "different", "digests": {}, "repeated": {}, "first_difference": first, "error": dict(error)}
+    first = {
+        "component": "run",
+        "t_us": None,
+        "step": None,
+        "what": f"the repeat failed: {error['found']}",
+    }
+    return {
+        "status": "different",
+        "digests": {},
+        "repeated": {},
+        "first_difference": first,
+        "error": dict(error),
+    }
 
 
 def _skipped(error: Mapping[str, str]) -> dict[str, Any]:
@@ -183,7 +243,9 @@ def rollout_trace(folder: Path, manifest: Mapping[str, Any]) -> dict[str, dict[K
         InputError: A file is missing or damaged.
     """
     trace = log_trace(folder)
-    table = pq.read_table(folder / STEPS_NAME, columns=["t_us", "metric", "value", "valid", "reason"])
+    table = pq.read_table(
+        folder / STEPS_NAME, columns=["t_us", "metric", "value", "valid", "reason"]
+    )
     values: dict[Key, list[str]] = defaultdict(list)
     columns: list[list[Any]] = [table[name].to_pylist() for name in table.column_names]
     for t_us, metric, *rest in zip(*columns, strict=True):

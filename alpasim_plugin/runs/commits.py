@@ -1,7 +1,9 @@
-"""A finished rollout on its way from a node to the run folder: its manifest and its files, and the store that keeps them: bytes by key.
+"""A finished rollout on its way from a node to the run folder: its manifest and its files, and the
+store that keeps them: bytes by key.
 
-A store is a folder, or an object store through fsspec. A key appears whole or not at all, and can be made to appear only once. Nothing here
-lists keys: that would be slow with a million of them, and some stores show new keys late in lists.
+A store is a folder, or an object store through fsspec. A key appears whole or not at all, and can
+be made to appear only once. Nothing here lists keys: that would be slow with a million of them, and
+some stores show new keys late in lists.
 """
 
 from __future__ import annotations
@@ -49,7 +51,8 @@ class Objects(Protocol):
     def create(self, key: str, data: bytes) -> bool:
         """Write a key, whole or not at all, unless it is there; return whether this call made it.
 
-        A store may say False to the one that made it, if its first answer was lost: read the key to know what is there.
+        A store may say False to the one that made it, if its first answer was lost: read the key to
+        know what is there.
         """
         ...
 
@@ -62,16 +65,25 @@ def open_objects(url: str) -> Objects:
     """
     if "://" not in url or url.startswith("file://"):
         return FolderObjects(Path(url.removeprefix("file://")))
-    fsspec = require_library("fsspec", DOING, f"--store {url}", "pip install 'alpasim-onefixer[s3]'")
+    fsspec = require_library(
+        "fsspec", DOING, f"--store {url}", "pip install 'alpasim-onefixer[s3]'"
+    )
     try:
         system, root = fsspec.core.url_to_fs(url, use_listings_cache=False)
     except (ValueError, ImportError) as error:
-        raise InputError(DOING, f"--store {url}", str(error), "write a path or s3://BUCKET/PREFIX; s3 needs the extra [s3]") from error
+        raise InputError(
+            DOING,
+            f"--store {url}",
+            str(error),
+            "write a path or s3://BUCKET/PREFIX; s3 needs the extra [s3]",
+        ) from error
     return RemoteObjects(system, root, url)
 
 
 class FolderObjects:
-    """Keys as files of a folder, also on NFS: a new name is linked, which only one process can do."""
+    """Keys as files of a folder, also on NFS: a new name is linked, which only one process can
+    do.
+    """
 
     def __init__(self, root: Path) -> None:
         self._root = root.absolute()
@@ -115,7 +127,12 @@ class RemoteObjects:
     """
 
     def __init__(self, system: Any, root: str, url: str, patience_s: float = PATIENCE_S) -> None:
-        self._system, self._root, self._url, self._patience_s = system, root.rstrip("/"), url, patience_s
+        self._system, self._root, self._url, self._patience_s = (
+            system,
+            root.rstrip("/"),
+            url,
+            patience_s,
+        )
 
     def read(self, key: str) -> bytes | None:
         """See `Objects`."""
@@ -154,14 +171,22 @@ class RemoteObjects:
         while True:
             try:
                 return ask()
-            except (PermissionError, FileNotFoundError) as error:  # no right, no bucket: asking again would not help
+            except (
+                PermissionError,
+                FileNotFoundError,
+            ) as error:  # no right, no bucket: asking again would not help
                 do_this = "check the address, the bucket and the credentials, on the nodes too"
-                raise InfrastructureError(DOING, f"{self._url}/{key}", f"{type(error).__name__}: {error}", do_this) from error
-            except Exception as error:  # libraries of object stores have families of errors for a network that is down
+                raise InfrastructureError(
+                    DOING, f"{self._url}/{key}", f"{type(error).__name__}: {error}", do_this
+                ) from error
+            # libraries of object stores have families of errors for a network that is down
+            except Exception as error:
                 if time.monotonic() + wait_s > until_s:
                     found = f"no answer for {self._patience_s:g} s: {type(error).__name__}: {error}"
                     do_this = "give the same command again when the store is back; finished rollouts are kept"
-                    raise InfrastructureError(DOING, f"{self._url}/{key}", found, do_this) from error
+                    raise InfrastructureError(
+                        DOING, f"{self._url}/{key}", found, do_this
+                    ) from error
             time.sleep(wait_s)
             wait_s = min(2 * wait_s, LONGEST_WAIT_S)
 
@@ -190,7 +215,9 @@ def pack(folder: Path, node: str) -> RolloutResult:
         OSError: A file cannot be read.
     """
     manifest, _ = read_manifest(folder)
-    names = list(manifest["files"]) or [OUTPUT_NAME]  # of a failed rollout only what its parts printed
+    names = list(manifest["files"]) or [
+        OUTPUT_NAME
+    ]  # of a failed rollout only what its parts printed
     files = {name: (folder / name).read_bytes() for name in names if (folder / name).exists()}
     return RolloutResult({"node": node, **manifest}, files)
 
@@ -205,7 +232,12 @@ def unpack(result: RolloutResult, root: Path) -> dict[str, Any]:
     for name, facts in result.manifest["files"].items():
         if hashlib.sha256(result.files[name]).hexdigest() != facts["sha256"]:
             where = f"{result.manifest['path']}/{name} from {result.manifest['node']}"
-            raise InfrastructureError("receiving a rollout", where, "not the content that the node wrote", "give the same command again")
+            raise InfrastructureError(
+                "receiving a rollout",
+                where,
+                "not the content that the node wrote",
+                "give the same command again",
+            )
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name in (MANIFEST, *NAMES):  # the manifest first: without it nothing is trusted
@@ -234,7 +266,8 @@ class Commits:
         """Return a committed rollout; None where there is none.
 
         Raises:
-            InfrastructureError: A file is missing or not what was committed, or the store does not answer.
+            InfrastructureError: A file is missing or not what was committed, or the store does not
+                answer.
         """
         stated = self._objects.read(_name(key))
         return None if stated is None else self._result(key, json.loads(stated))
@@ -252,11 +285,18 @@ class Commits:
         if there == data:  # the answer to our own commit was lost
             return result
         if there is None:
-            raise InfrastructureError("committing a rollout", f"{self.url}/{_name(key)}", "it exists, and cannot be read", "try again")
+            raise InfrastructureError(
+                "committing a rollout",
+                f"{self.url}/{_name(key)}",
+                "it exists, and cannot be read",
+                "try again",
+            )
         return self._result(key, json.loads(there))
 
     def publish(self, root: Path, names: Sequence[str]) -> None:
-        """Copy files of a finished run folder to the store; ``latest`` names them when all are there."""
+        """Copy files of a finished run folder to the store; ``latest`` names them when all are
+        there.
+        """
         attempt = f"tables/{os.urandom(8).hex()}"
         for name in names:
             self._objects.write(f"{attempt}/{name}", (root / name).read_bytes())
@@ -281,7 +321,8 @@ def _name(key: str) -> str:
 
 @dataclass
 class Index:
-    """Which keys are committed, so that a restarted driver need not ask for each. Written by drivers, also by several at once.
+    """Which keys are committed, so that a restarted driver need not ask for each. Written by
+    drivers, also by several at once.
 
     A key that is committed but in no part is found by the worker that is about to drive it.
     """
@@ -293,7 +334,9 @@ class Index:
     _written_s: float = field(default_factory=time.monotonic)
 
     def load(self) -> None:
-        """Read the parts that are there and were not read yet: one question a part, and one more."""
+        """Read the parts that are there and were not read yet: one question a part, and one
+        more.
+        """
         while (part := self.objects.read(_part(self._parts))) is not None:
             self.keys |= set(json.loads(part))
             self._parts += 1
@@ -302,7 +345,9 @@ class Index:
         """Take in committed keys, and write a part when it is due."""
         self._new += [key for key in keys if key not in self.keys]
         self.keys |= set(self._new)
-        if len(self._new) >= PART_KEYS or (self._new and time.monotonic() - self._written_s >= PART_S):
+        if len(self._new) >= PART_KEYS or (
+            self._new and time.monotonic() - self._written_s >= PART_S
+        ):
             self.flush()
 
     def flush(self) -> None:
@@ -346,14 +391,18 @@ class KnownCommits:
 
 
 def commit_key(cell: Cell, options: RunOptions, fresh: str = "") -> str:
-    """Return the name of a rollout in a store: a digest of everything that decides its log and its pictures.
+    """Return the name of a rollout in a store: a digest of everything that decides its log and its
+    pictures.
 
     Args:
         cell: The rollout.
         options: Of the run.
-        fresh: Makes the key of a rollout with a part that has no digest another one, so that it is driven again; empty: it may be reused.
+        fresh: Makes the key of a rollout with a part that has no digest another one, so that it is
+            driven again; empty: it may be reused.
     """
-    return digest([cell.rollout_key, options.video, cell.stops_at_path_end, fresh if cell.undigested else ""])
+    return digest(
+        [cell.rollout_key, options.video, cell.stops_at_path_end, fresh if cell.undigested else ""]
+    )
 
 
 def run_stored_cell(
@@ -365,7 +414,8 @@ def run_stored_cell(
     fresh: str = "",
     load: Callable[[ScenarioRef], Scenario] | None = None,
 ) -> dict[str, Any]:
-    """Take a cell from the store, or run and commit it; return its manifest. Failed rollouts are not committed.
+    """Take a cell from the store, or run and commit it; return its manifest. Failed rollouts are
+    not committed.
 
     Args:
         cell, options, root, threads, load: As for `alpasim_plugin.runs.cell.run_cell`.

@@ -1,7 +1,9 @@
-"""Drive scenes in random or stratified order until a question is decided, into an ordinary run folder.
+"""Drive scenes in random or stratified order until a question is decided, into an ordinary run
+folder.
 
-Scenes are driven in batches. After each, the state follows from the scenes so far and their order alone (`statistics.sequential`), and so
-does what is driven next: never from workers, times or interruptions. The same command therefore reaches the same decision after any kill.
+Scenes are driven in batches. After each, the state follows from the scenes so far and their order
+alone (`statistics.sequential`), and so does what is driven next: never from workers, times or
+interruptions. The same command therefore reaches the same decision after any kill.
 """
 
 from __future__ import annotations
@@ -26,14 +28,26 @@ from alpasim_plugin.runs.certificate import Certify, certify
 from alpasim_plugin.runs.execute import HowToRun, execute, thread_budget
 from alpasim_plugin.runs.executors.choice import LOCAL, Executor, kept_open
 from alpasim_plugin.runs.plan import Cell, RunPlan, part_of
-from alpasim_plugin.runs.run import Progress, RunResult, claim, finish_run, on_done, publish, write_run_info
+from alpasim_plugin.runs.run import (
+    Progress,
+    RunResult,
+    claim,
+    finish_run,
+    on_done,
+    publish,
+    write_run_info,
+)
 from alpasim_plugin.runs.summary import pool_of
 from evaluators.statistics.arms import Arm, arms_of, as_policy, short_name, usual_base
 from evaluators.statistics.baselines import StoredSide
 from evaluators.statistics.gate import failures_of
 from evaluators.statistics.sequential.control import Control, adjusted_draws
 from evaluators.statistics.sequential.decision import State, look_as_dict, outcome_of, state_after
-from evaluators.statistics.sequential.differences import SceneDifferences, next_seeds, scene_differences
+from evaluators.statistics.sequential.differences import (
+    SceneDifferences,
+    next_seeds,
+    scene_differences,
+)
 from evaluators.statistics.sequential.draws import Strata, families_of
 from evaluators.statistics.sequential.question import (
     OPPOSITE,
@@ -63,24 +77,38 @@ class Design:
     """How scenes are drawn.
 
     Attributes:
-        order: ``random``, or ``stratified``: every batch holds the families of scenes in proportion (`sequential.draws`).
+        order: ``random``, or ``stratified``: every batch holds the families of scenes in proportion
+            (`sequential.draws`).
         order_seed: Key of the order.
         look_every: Scenes between looks.
         budget: Most rollouts; None: as many as the plan has.
-        auto_seeds: Choose the seeds of a scene by cost against variance; otherwise all of the plan are driven.
+        auto_seeds: Choose the seeds of a scene by cost against variance; otherwise all of the plan
+            are driven.
         scene_cost: What a new scene costs, in pairs of rollouts.
         max_failed: Share of rollouts that may fail.
         max_missing: Share of pairs of a metric that may lack.
     """
 
-    order: Annotated[Order, Flag("With --population suite, stratified: between looks every family of scenes in proportion.")] = "random"
+    order: Annotated[
+        Order,
+        Flag(
+            "With --population suite, stratified: between looks every family of scenes in proportion."
+        ),
+    ] = "random"
     order_seed: Annotated[int, Flag("Key of the order of scenes.", min=0)] = 0
     look_every: Annotated[int, Flag("Scenes between looks.", min=1)] = 5
-    budget: Annotated[int | None, Flag("Most rollouts; then undecided. Default: all of the suite.", min=2)] = None
+    budget: Annotated[
+        int | None, Flag("Most rollouts; then undecided. Default: all of the suite.", min=2)
+    ] = None
     auto_seeds: bool = False
-    scene_cost: Annotated[float, Flag("What a new scene costs (a reconstruction, say), in pairs of rollouts.", min=0.0)] = 0.0
+    scene_cost: Annotated[
+        float,
+        Flag("What a new scene costs (a reconstruction, say), in pairs of rollouts.", min=0.0),
+    ] = 0.0
     max_failed: float = 0.0
-    max_missing: Annotated[float, Flag("Share of pairs that may lack a value.", min=0.0, max=0.99)] = 0.0
+    max_missing: Annotated[
+        float, Flag("Share of pairs that may lack a value.", min=0.0, max=0.99)
+    ] = 0.0
 
 
 @dataclass(frozen=True)
@@ -93,14 +121,21 @@ class Decided:
     outcome: Outcome
 
 
-def key_of(question: Question, design: Design, controls: Mapping[str, Control], stored: StoredSide | None = None) -> str:
+def key_of(
+    question: Question,
+    design: Design,
+    controls: Mapping[str, Control],
+    stored: StoredSide | None = None,
+) -> str:
     """Return the digest of what decides which rollouts are driven, besides the plan."""
     asked = [asdict(question), asdict(design), {name: one.digest for name, one in controls.items()}]
     return digest(asked if stored is None else [*asked, stored.digest])
 
 
 def drawing_order(scenes: Sequence[str], order_seed: int) -> list[str]:
-    """Return scenes in random order; it depends on their names and the seed, not on how they were listed."""
+    """Return scenes in random order; it depends on their names and the seed, not on how they were
+    listed.
+    """
     names = sorted(scenes)
     return [names[i] for i in stream("decide", order_seed, "decide/order").permutation(len(names))]
 
@@ -121,9 +156,17 @@ def strata_of(plan: RunPlan, question: Question, design: Design, most: int) -> S
         return None
     if question.population != "suite":
         found = "the shares of families in a population of scenes are not known"
-        raise InputError(DOING, f"--order {design.order}", found, "ask about the suite itself with --population suite, or leave it out")
+        raise InputError(
+            DOING,
+            f"--order {design.order}",
+            found,
+            "ask about the suite itself with --population suite, or leave it out",
+        )
     sizes = [min(design.look_every, most - begun) for begun in range(0, most, design.look_every)]
-    return Strata(families_of({cell.scene: cell.ref.path for cell in plan.cells}, f"--order {design.order}"), tuple(sizes))
+    return Strata(
+        families_of({cell.scene: cell.ref.path for cell in plan.cells}, f"--order {design.order}"),
+        tuple(sizes),
+    )
 
 
 def execute_decision(
@@ -147,8 +190,8 @@ def execute_decision(
     """Drive scenes of a plan until the question is decided or the ceiling is reached.
 
     Args:
-        plan: All cells that may be driven, of two arms: the baseline of ``plan.options`` and another (of one, with ``stored``). Its
-            ``question`` is `key_of` the question.
+        plan: All cells that may be driven, of two arms: the baseline of ``plan.options`` and
+            another (of one, with ``stored``). Its ``question`` is `key_of` the question.
         question: What is to be decided.
         design: How scenes are drawn.
         root: The run folder; one process writes it at a time.
@@ -156,7 +199,8 @@ def execute_decision(
         command: For ``run.json``.
         progress: Shows rollouts and looks.
         controls: METRIC -> what takes out variance; for the population ``suite`` only.
-        stored: The baseline's rollouts where they were driven earlier; the plan then has the renderer in question alone.
+        stored: The baseline's rollouts where they were driven earlier; the plan then has the
+            renderer in question alone.
         certificate: Whether to repeat a rollout.
         report: Write ``report.html``.
         wait: Wait for a process that writes the folder; otherwise refuse.
@@ -164,28 +208,43 @@ def execute_decision(
         executor, store: As for a run; the decision does not depend on them.
 
     Raises:
-        InputError: The folder holds another run, or the question cannot be asked in this order of scenes.
+        InputError: The folder holds another run, or the question cannot be asked in this order of
+            scenes.
         InfrastructureError: Another process writes the folder.
     """
     drawing = _Drawing(plan, question, design, controls, stored)
-    threads = thread_budget(workers, design.look_every * drawing.per_seed * len(plan.seeds), executor)
+    threads = thread_budget(
+        workers, design.look_every * drawing.per_seed * len(plan.seeds), executor
+    )
     how = HowToRun(threads, limit_s=limit_s, executor=executor, store=store)
     with writing(root, wait, progress.noticed), kept_open(executor):
         contents = find_contents(root)
         held = claim(root, plan, command, threads, False, contents, progress.noticed)
-        write_run_json(root, read_run_json(root) | {"kind": KIND})  # so that nothing takes all scenes of the plan for wanted
+        write_run_json(
+            root, read_run_json(root) | {"kind": KIND}
+        )  # so that nothing takes all scenes of the plan for wanted
         progress.started(plan, root, threads)
         began = time.perf_counter()
         known = contents.rollouts if contents else ()
         try:
             while cells := drawing.next_cells():
-                drawing.add(cells, execute(part_of(plan, cells), root, how, on_done(progress), progress.noticed, known))
+                drawing.add(
+                    cells,
+                    execute(
+                        part_of(plan, cells), root, how, on_done(progress), progress.noticed, known
+                    ),
+                )
                 progress.looked(drawing.state, drawing.rollouts, drawing.ceiling)
                 write_decision(root, drawing.record())
             driven = part_of(plan, drawing.cells)
             manifests = [drawing.manifests[cell.folder.as_posix()] for cell in driven.cells]
-            pool = {**how.stated, **pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))}
-            repeat = certify(driven, root, manifests, how.cores_here, certificate, held.get("determinism"))
+            pool = {
+                **how.stated,
+                **pool_of(manifests, threads, time.perf_counter() - began, held.get("pool")),
+            }
+            repeat = certify(
+                driven, root, manifests, how.cores_here, certificate, held.get("determinism")
+            )
         finally:
             end_children()
         write_run_info(root, driven, command, threads)  # again, with the scenes that were driven
@@ -198,7 +257,9 @@ def execute_decision(
 
 
 def arms_asked(plan: RunPlan, stored: bool = False) -> tuple[Arm, Arm]:
-    """Return the baseline's arm and the one in question of a plan that has two arms, or of a stored baseline one: then both are it."""
+    """Return the baseline's arm and the one in question of a plan that has two arms, or of a stored
+    baseline one: then both are it.
+    """
     arms = arms_of((cell.renderer.name, cell.policy.name) for cell in plan.cells)
     if stored:
         return arms[0], arms[0]
@@ -208,16 +269,29 @@ def arms_asked(plan: RunPlan, stored: bool = False) -> tuple[Arm, Arm]:
 
 
 def _side(rows: Sequence[Mapping[str, Any]], arm: Arm) -> RendererRows:
-    return RendererRows.of([row for row in rows if (row["renderer"], row["policy"]) == (arm.renderer, arm.policy)])
+    return RendererRows.of(
+        [row for row in rows if (row["renderer"], row["policy"]) == (arm.renderer, arm.policy)]
+    )
 
 
 class _Drawing:
     """The scenes driven so far, what follows from them, and which come next."""
 
     def __init__(
-        self, plan: RunPlan, question: Question, design: Design, controls: Mapping[str, Control], stored: StoredSide | None
+        self,
+        plan: RunPlan,
+        question: Question,
+        design: Design,
+        controls: Mapping[str, Control],
+        stored: StoredSide | None,
     ) -> None:
-        self.plan, self.question, self.design, self.controls, self.stored = plan, question, design, controls, stored
+        self.plan, self.question, self.design, self.controls, self.stored = (
+            plan,
+            question,
+            design,
+            controls,
+            stored,
+        )
         self.base, self.asked = arms_asked(plan, stored is not None)
         self.baseline = stored.name if stored is not None else short_name(self.base, self.asked)
         self.candidate = short_name(self.asked, self.base)
@@ -257,7 +331,9 @@ class _Drawing:
         return [cell for cell in self.plan.cells if cell.folder.as_posix() in self.manifests]
 
     def next_cells(self) -> list[Cell]:
-        """Return the cells of the next batch; none where the decision has ended, and then ``stopped`` says why."""
+        """Return the cells of the next batch; none where the decision has ended, and then
+        ``stopped`` says why.
+        """
         if self.stopped:
             return []
         left = self.order[len(self._chosen) :]
@@ -276,12 +352,19 @@ class _Drawing:
 
     def add(self, cells: Sequence[Cell], manifests: Sequence[dict[str, Any]]) -> None:
         """Take in a batch and look."""
-        self.manifests |= {cell.folder.as_posix(): manifest for cell, manifest in zip(cells, manifests, strict=True)}
+        self.manifests |= {
+            cell.folder.as_posix(): manifest
+            for cell, manifest in zip(cells, manifests, strict=True)
+        }
         rows = rollout_rows(list(self.manifests.values()))
         candidate = _side(rows, self.asked)
         self.failed = outcome_of_failures(failures_of(rows), self.design.max_failed)
         driven = {(cell.scene, cell.seed) for cell in self.cells}
-        there = _side(rows, self.base) if self.stored is None else RendererRows.of(self.stored.of_cells(driven))
+        there = (
+            _side(rows, self.base)
+            if self.stored is None
+            else RendererRows.of(self.stored.of_cells(driven))
+        )
         base = as_policy(there, self.asked.policy)
         values, adjusted = {}, {}
         for one in self.question.metrics:
@@ -289,7 +372,9 @@ class _Drawing:
             self.differences[one.metric] = found
             values[one.metric] = found.harm(one.direction)
             if self.question.population == "suite":
-                adjusted[one.metric] = adjusted_draws(values[one.metric], one, self.order, self.controls.get(one.metric), self.strata)
+                adjusted[one.metric] = adjusted_draws(
+                    values[one.metric], one, self.order, self.controls.get(one.metric), self.strata
+                )
         self.state = state_after(self.question, values, self.horizon, adjusted, len(self.order))
         self.looks.append(look_as_dict(self.state, self.rollouts, self._chosen[self.scenes[-1]]))
         self.stopped = self._reason_to_stop()
@@ -300,7 +385,9 @@ class _Drawing:
         return [
             one.metric
             for one in self.question.metrics
-            if one.binding and self.differences[one.metric].missing > self.design.max_missing * self.differences[one.metric].pairs.sum()
+            if one.binding
+            and self.differences[one.metric].missing
+            > self.design.max_missing * self.differences[one.metric].pairs.sum()
         ]
 
     @property
@@ -316,7 +403,11 @@ class _Drawing:
         """Return ``decision.json``."""
         outcome, asked = self.outcome, self.question.metrics[0].asked
         words = {"pass": asked, "regression": OPPOSITE[asked]}
-        chosen_by = "cost against variance of earlier scenes" if self.design.auto_seeds else "all that were asked for"
+        chosen_by = (
+            "cost against variance of earlier scenes"
+            if self.design.auto_seeds
+            else "all that were asked for"
+        )
         return {
             "schema_version": SCHEMA_VERSION,
             "question": question_as_dict(self.question),
@@ -326,10 +417,18 @@ class _Drawing:
             "order_seed": self.design.order_seed,
             "look_every": self.design.look_every,
             "ceiling": {"scenes": len(self.order), "rollouts": self.ceiling},
-            "seeds": {"most": len(self.plan.seeds), "chosen_by": chosen_by, "scene_cost": self.design.scene_cost},
+            "seeds": {
+                "most": len(self.plan.seeds),
+                "chosen_by": chosen_by,
+                "scene_cost": self.design.scene_cost,
+            },
             "controls": {name: one.facts for name, one in self.controls.items()},
             "drawn": {"order": self.design.order}
-            | ({} if self.strata is None else {"families": dict(Counter(self.strata.family_of.values()))}),
+            | (
+                {}
+                if self.strata is None
+                else {"families": dict(Counter(self.strata.family_of.values()))}
+            ),
             "order": self.scenes,
             "looks": self.looks,
             "verdict": words.get(outcome.cause, "undecided"),
@@ -356,7 +455,14 @@ class _Drawing:
             return min(2, most)
         log_bar, scenes = -math.log(self.question.alpha), len(self.order)
         wanted = [
-            next_seeds(self.differences[one.metric], one.distance, log_bar, self.design.scene_cost, scenes, most)
+            next_seeds(
+                self.differences[one.metric],
+                one.distance,
+                log_bar,
+                self.design.scene_cost,
+                scenes,
+                most,
+            )
             for one, now in zip(self.question.metrics, self.state.metrics, strict=True)
             if one.binding and now.answer == "undecided"
         ]

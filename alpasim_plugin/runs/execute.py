@@ -1,7 +1,9 @@
-"""Run the cells of a plan: in this process for one worker, in spawned processes for more, or on the nodes of a cluster.
+"""Run the cells of a plan: in this process for one worker, in spawned processes for more, or on the
+nodes of a cluster.
 
-A cell's result does not depend on where or when it runs: every random stream is keyed by (scene, seed, component, step) and the
-rasteriser is bit-equal for any number of threads. Workers may therefore run cells in any order.
+A cell's result does not depend on where or when it runs: every random stream is keyed by (scene,
+seed, component, step) and the rasteriser is bit-equal for any number of threads. Workers may
+therefore run cells in any order.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ GAUSSIANS = ("clean", "3dgs")  # base renderers that draw Gaussians themselves
 
 
 def compile_for(todo: Sequence[Cell], scenarios: Mapping[str, Scenario], workers: int) -> None:
-    """Compile what rollouts need that several workers are about to drive; nothing where that was done before.
+    """Compile what rollouts need that several workers are about to drive; nothing where that was
+    done before.
 
     Args:
         todo: The rollouts.
@@ -52,7 +55,11 @@ def compile_for(todo: Sequence[Cell], scenarios: Mapping[str, Scenario], workers
         return
     for subject, got in run_in_processes(compile_kernels, cold, min(workers, len(cold)), 1):
         if isinstance(got, Lost):
-            print(f"warning: compiling {subject} kernels: {got.found}; the rollouts compile them", file=sys.stderr, flush=True)
+            print(
+                f"warning: compiling {subject} kernels: {got.found}; the rollouts compile them",
+                file=sys.stderr,
+                flush=True,
+            )
 
 
 def is_cold(subject: str) -> bool:
@@ -74,16 +81,26 @@ def needed(todo: Iterable[Cell], scenarios: Mapping[str, Scenario]) -> list[str]
 
 
 def compile_kernels(subject: str) -> None:
-    """Compile the kernels of a subject on a tiny case, unless that was done; wait where another process is about to."""
+    """Compile the kernels of a subject on a tiny case, unless that was done; wait where another
+    process is about to.
+    """
 
     def make(folder: Path) -> None:
         kernels.call(subject)
 
-    cached(KERNELS, _key(subject), make, lambda folder: folder, f"compiling {subject} kernels, once on this machine")
+    cached(
+        KERNELS,
+        _key(subject),
+        make,
+        lambda folder: folder,
+        f"compiling {subject} kernels, once on this machine",
+    )
 
 
 def _key(subject: str) -> str:
-    """Name what is compiled as numba does: by the code, numba's version, its folder, the processor."""
+    """Name what is compiled as numba does: by the code, numba's version, its folder, the
+    processor.
+    """
     facts = repr((version("numba"), os.environ.get("NUMBA_CACHE_DIR"), hardware()["cpu"]))
     return f"{kernels.subject_name(subject)}-{hashlib.blake2b(facts.encode(), digest_size=8).hexdigest()}"
 
@@ -99,18 +116,24 @@ class Threads:
     per_worker: int
 
 
-def thread_budget(workers: int | None, n_cells: int, executor: Executor = LOCAL, repeats: bool = False) -> Threads:
-    """Divide the cores that this process may use among the workers; those of other nodes have the cores that the executor asks for.
+def thread_budget(
+    workers: int | None, n_cells: int, executor: Executor = LOCAL, repeats: bool = False
+) -> Threads:
+    """Divide the cores that this process may use among the workers; those of other nodes have the
+    cores that the executor asks for.
 
     Args:
-        workers: Number of workers; None is one per core. Never more than cells. On other nodes it is the most, and None is no bound.
+        workers: Number of workers; None is one per core. Never more than cells. On other nodes it
+            is the most, and None is no bound.
         n_cells: Number of cells to run.
         executor: Where rollouts run.
         repeats: A worker of this machine drives one of them again.
     """
     if not executor.is_local:
         return Threads(max(1, min(workers or n_cells, n_cells)), executor.resources.cores)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     chosen = max(1, min(workers or cores, max(n_cells, 1) + repeats))
     return Threads(chosen, max(1, cores // chosen))
 
@@ -122,11 +145,14 @@ class HowToRun:
     Attributes:
         threads: Workers, and threads of each.
         reuse_undigested: Also reuse rollouts with parts that have no digest.
-        full: Read every file of a finished rollout before it is reused, even if size and time are as written.
+        full: Read every file of a finished rollout before it is reused, even if size and time are
+            as written.
         retry: Drive again also what failed by the policy's own fault.
-        limit_s: Seconds that one rollout may take; a worker that exceeds them is killed. None: no limit.
+        limit_s: Seconds that one rollout may take; a worker that exceeds them is killed. None: no
+            limit.
         executor: Where rollouts run.
-        store: URL of a store in which rollouts are looked up and committed; None: the run folder alone.
+        store: URL of a store in which rollouts are looked up and committed; None: the run folder
+            alone.
         run: Token by which the processes of the run know each other.
     """
 
@@ -141,8 +167,14 @@ class HowToRun:
 
     @property
     def stated(self) -> dict[str, Any]:
-        """Give what ``run.json`` says of executor and store; nothing for a run on this machine alone."""
-        return {} if self.executor.is_local and self.store is None else {"executor": str(self.executor), "store": self.store}
+        """Give what ``run.json`` says of executor and store; nothing for a run on this machine
+        alone.
+        """
+        return (
+            {}
+            if self.executor.is_local and self.store is None
+            else {"executor": str(self.executor), "store": self.store}
+        )
 
     @property
     def cores_here(self) -> int:
@@ -162,8 +194,9 @@ def execute(
 ) -> list[dict[str, Any]]:
     """Run every unfinished cell and return all manifests in the plan's order.
 
-    Whole rollouts are reused; those scored with another preset, or whose table is damaged, are scored again from their logs; damaged
-    ones are driven again. On SIGINT, SIGTERM or SIGHUP the workers are stopped; finished rollouts stay on disk.
+    Whole rollouts are reused; those scored with another preset, or whose table is damaged, are
+    scored again from their logs; damaged ones are driven again. On SIGINT, SIGTERM or SIGHUP the
+    workers are stopped; finished rollouts stay on disk.
 
     Args:
         plan: The run.
@@ -177,10 +210,22 @@ def execute(
     share_measurements(measured_folder(how.run))
     manifests: dict[Path, dict[str, Any]] = {}
     todo: list[Cell] = []
-    store = None if how.store is None else KnownCommits(opened(how.store), plan.options, how.reuse_undigested)
+    store = (
+        None
+        if how.store is None
+        else KnownCommits(opened(how.store), plan.options, how.reuse_undigested)
+    )
     for cell in plan.cells:
         folder = cell.folder.as_posix()
-        action, state = find_rollout_state(cell, root, how.reuse_undigested, how.full, folder in known, how.retry, plan.options.video)
+        action, state = find_rollout_state(
+            cell,
+            root,
+            how.reuse_undigested,
+            how.full,
+            folder in known,
+            how.retry,
+            plan.options.video,
+        )
         if state.damage:
             doing = "driving again" if action == "drive" else "scoring again"
             notify(f"damaged: {'; '.join(map(str, state.damage))}; {doing}")
@@ -191,7 +236,11 @@ def execute(
                 continue
             manifest = _scored(cell, plan.options, root, unpack(stored, root))
         else:
-            manifest = state.manifest if action == "none" else rescore_cell(cell, plan.options, root, state.manifest)
+            manifest = (
+                state.manifest
+                if action == "none"
+                else rescore_cell(cell, plan.options, root, state.manifest)
+            )
         manifests[cell.folder] = manifest
         on_done(manifest, True)
     if how.executor.is_local:
@@ -209,8 +258,12 @@ def execute(
     return [manifests[cell.folder] for cell in plan.cells]
 
 
-def _scored(cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any]) -> dict[str, Any]:
-    """Score a rollout that comes from a store, or from an earlier driver, again if its scores are another preset's."""
+def _scored(
+    cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any]
+) -> dict[str, Any]:
+    """Score a rollout that comes from a store, or from an earlier driver, again if its scores are
+    another preset's.
+    """
     if manifest["status"] != "ok" or manifest["score_key"] == cell.score_key:
         return manifest
     return rescore_cell(cell, options, root, manifest)
@@ -219,7 +272,14 @@ def _scored(cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any
 Done = Iterator[tuple[Cell, dict[str, Any]]]
 
 
-def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, store: KnownCommits | None, repeat: Repeat | None) -> Done:
+def _run_local(
+    todo: Sequence[Cell],
+    plan: RunPlan,
+    root: Path,
+    how: HowToRun,
+    store: KnownCommits | None,
+    repeat: Repeat | None,
+) -> Done:
     """Run cells in this process, or in workers that write the run folder themselves."""
     if how.threads.workers > 1 or how.limit_s is not None:
         compile_for(todo, plan.scenarios, how.threads.workers)
@@ -227,18 +287,30 @@ def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, s
     drive: Callable[..., dict[str, Any]] = partial(run_cell, options=plan.options, threads=threads)
     work: Callable[..., dict[str, Any]] = drive
     if how.store is not None and store is not None:
-        work = partial(run_stored_cell, options=plan.options, threads=threads, store=how.store, fresh=store.fresh)
+        work = partial(
+            run_stored_cell,
+            options=plan.options,
+            threads=threads,
+            store=how.store,
+            fresh=store.fresh,
+        )
     jobs = [_Job(cell, root, work) for cell in todo]
     if how.threads.workers > 1:
         if repeat is not None and repeat.cell is not None and repeat.cell in todo:
             jobs.append(_Job(repeat.cell, repeat.root, drive))
-        jobs.sort(key=lambda job: job.cell.renderer.fixer is None)  # what takes longest comes first, so that all workers end together
+        jobs.sort(
+            key=lambda job: job.cell.renderer.fixer is None
+        )  # what takes longest comes first, so that all workers end together
 
-    def known(job: _Job) -> dict[str, Any] | None:  # a worker may have died after writing its rollout
+    def known(
+        job: _Job,
+    ) -> dict[str, Any] | None:  # a worker may have died after writing its rollout
         action, state = find_rollout_state(job.cell, job.root, reuse_undigested=True)
         return state.manifest if action == "none" else None
 
-    for job, got in run_or_retry(partial(_of_run, how.run), jobs, how.threads.workers, threads, how.limit_s, known):
+    for job, got in run_or_retry(
+        partial(_of_run, how.run), jobs, how.threads.workers, threads, how.limit_s, known
+    ):
         if repeat is not None and job.root is repeat.root:
             repeat.manifest = None if isinstance(got, Lost) else got
         else:
@@ -261,24 +333,39 @@ def _of_run(run: str, job: _Job) -> dict[str, Any]:
 
 
 def _run_elsewhere(
-    todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, store: KnownCommits | None, notify: Callable[[str], None]
+    todo: Sequence[Cell],
+    plan: RunPlan,
+    root: Path,
+    how: HowToRun,
+    store: KnownCommits | None,
+    notify: Callable[[str], None],
 ) -> Done:
     """Run cells on other nodes; only this process writes the run folder."""
     if not todo:
         return
-    from alpasim_plugin.runs.executors.job import rollout_work  # a run on this machine needs none of it
+    from alpasim_plugin.runs.executors.job import (
+        rollout_work,
+    )  # a run on this machine needs none of it
 
-    work, contents = rollout_work(plan, how.run, todo, how.threads.per_worker, how.store, store.fresh if store else "")
+    work, contents = rollout_work(
+        plan, how.run, todo, how.threads.per_worker, how.store, store.fresh if store else ""
+    )
     workers = min(how.threads.workers, len(todo))
-    assignment = assignment_as_here(work, contents, targets_of(plan.parts), how.executor.resources, workers, notify)
+    assignment = assignment_as_here(
+        work, contents, targets_of(plan.parts), how.executor.resources, workers, notify
+    )
     with opened_backend(how.executor, assignment, root) as backend:
         for cell, got in run_jobs(backend, todo, notify, how.limit_s):
             yield cell, _lost(cell, root, got) if isinstance(got, Lost) else unpack(got, root)
 
 
 def _lost(cell: Cell, root: Path, lost: Lost) -> dict[str, Any]:
-    """Write the manifest of a rollout whose workers died, or that was ended since it took too long."""
-    error = InfrastructureError("running a rollout in a worker process", cell.folder.as_posix(), lost.found, lost.do_this)
+    """Write the manifest of a rollout whose workers died, or that was ended since it took too
+    long.
+    """
+    error = InfrastructureError(
+        "running a rollout in a worker process", cell.folder.as_posix(), lost.found, lost.do_this
+    )
     manifest = failed_manifest(cell, error)
     write_manifest(root / cell.folder, manifest)
     return manifest

@@ -1,11 +1,13 @@
-"""A finished run as AlpaSim run folders, one for each renderer and policy, with its scenes: what AlpaSim's own evaluation takes as it is.
+"""A finished run as AlpaSim run folders, one for each renderer and policy, with its scenes: what
+AlpaSim's own evaluation takes as it is.
 
     OUT/RENDERER/POLICY/rollouts/SCENE/SESSION/{rollout.asl, _complete}
     OUT/RENDERER/POLICY/{run_metadata.yaml, eval-config.yaml, wizard-config.yaml}
     OUT/scenes/SCENE.usdz
 
-The logs are copied entry by entry. What differs: the main camera is called as AlpaSim's image check expects it, the session ids of runs of
-older versions are replaced by ones that sort as their seeds, and a rollout of a policy without cameras gets frames of the main one.
+The logs are copied entry by entry. What differs: the main camera is called as AlpaSim's image check
+expects it, the session ids of runs of older versions are replaced by ones that sort as their seeds,
+and a rollout of a policy without cameras gets frames of the main one.
 """
 
 from __future__ import annotations
@@ -28,7 +30,14 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, se3
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.parts import resolve_renderer
-from alpasim_plugin.core.types import F64, CameraSpec, RenderRequest, RolloutLog, Scenario, Trajectory
+from alpasim_plugin.core.types import (
+    F64,
+    CameraSpec,
+    RenderRequest,
+    RolloutLog,
+    Scenario,
+    Trajectory,
+)
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.asl import Renaming, Stage, copy_log
 from alpasim_plugin.log.images import encode_image
@@ -48,12 +57,15 @@ from scenarios.load import find, load_scenario
 from scenarios.suite import ScenarioRef, expand
 from scenarios.usdz_write import alpasim_cameras, rig_box, write_usdz
 
-RUN_METADATA, EVAL_CONFIG, WIZARD_CONFIG = "run_metadata.yaml", "eval-config.yaml", "wizard-config.yaml"
+RUN_METADATA = "run_metadata.yaml"
+EVAL_CONFIG = "eval-config.yaml"
+WIZARD_CONFIG = "wizard-config.yaml"
 SCENES = "scenes"
 OF_SCENES = "exporting scenes"
 DOING = "exporting to AlpaSim"
 COMPLETE, FAILED = "_complete", "failed_rollouts.json"
-PLAN_US = 5_000_000  # AlpaSim's longest minADE horizon; one shorter sample loses all four metrics of its rollout
+# AlpaSim's longest minADE horizon; one shorter sample loses all four metrics of its rollout
+PLAN_US = 5_000_000
 
 
 def write_configs(folder: Path, final: Path, name: str, identity: str) -> None:
@@ -61,22 +73,31 @@ def write_configs(folder: Path, final: Path, name: str, identity: str) -> None:
 
     Args:
         folder: Where to write now.
-        final: The export's own folder when it is done; ``alpasim-reeval`` looks for the scenes below it, by its absolute path.
+        final: The export's own folder when it is done; ``alpasim-reeval`` looks for the scenes
+            below it, by its absolute path.
         name: The run's name in AlpaSim's tables.
         identity: What determines the run; equal runs have equal ids.
     """
     metadata = {"run_uuid": str(uuid.uuid5(uuid.NAMESPACE_URL, identity)), "run_name": name}
     wizard = {
-        "services": {"runtime": {"image": "none"}},  # alpasim-reeval needs the key; only its Slurm mode uses the image
+        "services": {
+            "runtime": {"image": "none"}
+        },  # alpasim-reeval needs the key; only its Slurm mode uses the image
         "scenes": {"scene_cache": str(final.absolute()), "sceneset_path": SCENES},
         "wizard": {"sqshcaches": []},
     }
-    for file, content in ((RUN_METADATA, metadata), (EVAL_CONFIG, eval_config()), (WIZARD_CONFIG, wizard)):
+    for file, content in (
+        (RUN_METADATA, metadata),
+        (EVAL_CONFIG, eval_config()),
+        (WIZARD_CONFIG, wizard),
+    ):
         write_text(folder / file, yaml.safe_dump(content, sort_keys=False))
 
 
 def eval_config() -> dict[str, Any]:
-    """Return AlpaSim's evaluation settings: its defaults, no video, and no unpickling of what a driver sent."""
+    """Return AlpaSim's evaluation settings: its defaults, no video, and no unpickling of what a
+    driver sent.
+    """
     own = EvalSettings().model_dump(mode="json", exclude={"run_in_runtime", "vec_map", "video"})
     return own | {
         "vec_map": {
@@ -93,7 +114,11 @@ def eval_config() -> dict[str, Any]:
             "render_every_nth_frame": 1,
             "generate_combined_video": False,
             "combined_video_speed_factor": 0.33,
-            "map_video": {"map_radius_m": 20, "ego_loc": "BOTTOM_CENTER", "rotate_map_to_ego": True},
+            "map_video": {
+                "map_radius_m": 20,
+                "ego_loc": "BOTTOM_CENTER",
+                "rotate_map_to_ego": True,
+            },
         },
     }
 
@@ -112,19 +137,26 @@ def scenes_of(info: Mapping[str, Any]) -> dict[str, tuple[ScenarioRef, Scenario]
         given = stated.get("ref") or {}
         if "path" not in given:
             raise InputError(
-                OF_SCENES, f"scene {scene_id!r}", "run.json has no path of its scenario", "export a folder that simrun run wrote"
+                OF_SCENES,
+                f"scene {scene_id!r}",
+                "run.json has no path of its scenario",
+                "export a folder that simrun run wrote",
             )
         ref = ref_of(given)
         scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
         if scenario.content_hash != stated["content_hash"]:
             found = f"{ref.path} is not what was driven: its content has changed"
-            raise InputError(OF_SCENES, f"scene {scene_id!r}", found, "run again, or restore the scenario")
+            raise InputError(
+                OF_SCENES, f"scene {scene_id!r}", found, "run again, or restore the scenario"
+            )
         out[scene_id] = (ref, scenario)
     return out
 
 
 def write_scene(path: Path, ref: ScenarioRef, scenario: Scenario) -> None:
-    """Write a scenario as an AlpaSim scene; one that was read from an AlpaSim scene is a copy of it, with its own id and vehicle."""
+    """Write a scenario as an AlpaSim scene; one that was read from an AlpaSim scene is a copy of
+    it, with its own id and vehicle.
+    """
     if scenario.source == "usdz":
         _copy(path, _archive_of(ref), scenario)
     else:
@@ -151,7 +183,9 @@ def _copy(path: Path, source: Path, scenario: Scenario) -> None:
             if info.filename == "metadata.yaml":
                 metadata = yaml.safe_load(data)
                 if metadata["scene_id"] != scenario.scene_id:
-                    data = yaml.safe_dump(metadata | {"scene_id": scenario.scene_id}, sort_keys=False).encode()
+                    data = yaml.safe_dump(
+                        metadata | {"scene_id": scenario.scene_id}, sort_keys=False
+                    ).encode()
             elif info.filename == "rig_trajectories.json":
                 data = _with_vehicle(data, scenario)
             new.writestr(info, data)
@@ -161,7 +195,11 @@ def _with_vehicle(data: bytes, scenario: Scenario) -> bytes:
     rigs = json.loads(data)
     wanted, (rig,) = rig_box(scenario.vehicle), rigs["rig_trajectories"]
     held = rig.get("rig_bbox") or {}
-    same = all(abs(a - b) < 1e-6 for key in ("dim",) for a, b in zip(held.get(key, [0.0] * 3), wanted[key], strict=True))
+    same = all(
+        abs(a - b) < 1e-6
+        for key in ("dim",)
+        for a, b in zip(held.get(key, [0.0] * 3), wanted[key], strict=True)
+    )
     if held and same and abs(held["centroid"][0] - wanted["centroid"][0]) < 1e-6:
         return data
     rig["rig_bbox"] = wanted
@@ -210,7 +248,12 @@ def export_scenes(places: Sequence[str], out: Path) -> Export:
     for ref in refs:
         scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
         if scenario.scene_id in loaded:
-            raise InputError(DOING, ref.path, f"a second scene with the id {scenario.scene_id!r}", "name every scene once")
+            raise InputError(
+                DOING,
+                ref.path,
+                f"a second scene with the id {scenario.scene_id!r}",
+                "name every scene once",
+            )
         loaded[scenario.scene_id] = (ref, scenario)
     with atomic_folder(out, DOING) as partial:
         return Export(out, (), _write_scenes(partial, loaded))
@@ -225,13 +268,19 @@ def export_run(root: Path, out: Path, say: Callable[[str], None]) -> Export:
         say: Called with a line for each rollout.
 
     Raises:
-        InputError: It is no finished run, it has only scores, a log is damaged, a scenario has changed, or ``out`` is not empty.
+        InputError: It is no finished run, it has only scores, a log is damaged, a scenario has
+            changed, or ``out`` is not empty.
     """
     _check_free(out)
     contents = read_contents(root)
     info = contents.run
     if info.get("kind") == "score":
-        raise InputError(DOING, str(root), "scores of logs, without the logs", "export the run folder that holds them")
+        raise InputError(
+            DOING,
+            str(root),
+            "scores of logs, without the logs",
+            "export the run folder that holds them",
+        )
     manifests = [read_manifest(root / cell)[0] for cell in contents.rollouts]
     loaded = scenes_of(info)
     runs: dict[tuple[str, str], ExportedRun] = {}
@@ -242,7 +291,9 @@ def export_run(root: Path, out: Path, say: Callable[[str], None]) -> Export:
             if manifest["status"] != "ok":
                 run.failed += 1
                 continue
-            _export_rollout(root, partial / run.folder, manifest, loaded[manifest["scene"]][1], info, run)
+            _export_rollout(
+                root, partial / run.folder, manifest, loaded[manifest["scene"]][1], info, run
+            )
             run.rollouts += 1
             say(f"{run.folder}/{manifest['scene']}/{manifest['seed']}")
         for run in runs.values():
@@ -252,18 +303,30 @@ def export_run(root: Path, out: Path, say: Callable[[str], None]) -> Export:
 
 
 def _export_rollout(
-    root: Path, folder: Path, manifest: Mapping[str, Any], scenario: Scenario, info: Mapping[str, Any], run: ExportedRun
+    root: Path,
+    folder: Path,
+    manifest: Mapping[str, Any],
+    scenario: Scenario,
+    info: Mapping[str, Any],
+    run: ExportedRun,
 ) -> None:
     """Copy one log, renamed and with images, and mark it complete."""
     source = root / manifest["path"] / LOG_NAME
     check_vouched(source)
     rollout = read_asl(source)
     uuid = session_uuid(int(manifest["seed"]), str(manifest["rollout_key"]))
-    cameras = {camera.name: name for name, camera in alpasim_cameras(scenario.cameras).items() if name != camera.name}
+    cameras = {
+        camera.name: name
+        for name, camera in alpasim_cameras(scenario.cameras).items()
+        if name != camera.name
+    }
     stages: list[Stage] = []
     if not rollout.images:
         stages.append(_added(rollout, manifest, scenario, info))
-        _note(run, "the log holds no camera image: frames of the main camera were rendered along the drive")
+        _note(
+            run,
+            "the log holds no camera image: frames of the main camera were rendered along the drive",
+        )
     stages.append(Renaming(uuid, cameras))
     target = folder / "rollouts" / manifest["scene"] / uuid
     target.mkdir(parents=True)
@@ -272,15 +335,25 @@ def _export_rollout(
     _note_plans(rollout, run)
 
 
-def _added(rollout: RolloutLog, manifest: Mapping[str, Any], scenario: Scenario, info: Mapping[str, Any]) -> AddedFrames:
+def _added(
+    rollout: RolloutLog, manifest: Mapping[str, Any], scenario: Scenario, info: Mapping[str, Any]
+) -> AddedFrames:
     options = options_of(info)
     spec = resolve_renderer(manifest["renderer"], options.fixer)
     (main,) = list(alpasim_cameras(scenario.cameras).values())[:1] or (None,)
     if main is None:
-        raise InputError(DOING, manifest["path"], "no camera in the scenario, and no image in the log", "add a camera to the scenario")
+        raise InputError(
+            DOING,
+            manifest["path"],
+            "no camera in the scenario, and no image in the log",
+            "add a camera to the scenario",
+        )
     threads = thread_budget(1, 1).per_worker
     return AddedFrames(
-        rollout, main, scenario.rates.camera_us, lambda: make_renderer(spec, scenario, int(manifest["seed"]), options.device, threads)
+        rollout,
+        main,
+        scenario.rates.camera_us,
+        lambda: make_renderer(spec, scenario, int(manifest["seed"]), options.device, threads),
     )
 
 
@@ -291,26 +364,47 @@ def _note_plans(rollout: RolloutLog, run: ExportedRun) -> None:
         _note(run, "no minADE: the policy gives no sampled plans")
     elif min(int(sample.t_us[-1]) - now for now, sample in samples) < PLAN_US:
         shortest = min(int(sample.t_us[-1]) - now for now, sample in samples) * 1e-6
-        _note(run, f"no minADE where a sampled plan ends before 5 s: the shortest reaches {shortest:g} s")
+        _note(
+            run,
+            f"no minADE where a sampled plan ends before 5 s: the shortest reaches {shortest:g} s",
+        )
 
 
 def _note(run: ExportedRun, text: str) -> None:
     run.notes = (*run.notes, text) if text not in run.notes else run.notes
 
 
-def _finish(folder: Path, out: Path, run: ExportedRun, info: Mapping[str, Any], manifests: Sequence[Mapping[str, Any]]) -> None:
+def _finish(
+    folder: Path,
+    out: Path,
+    run: ExportedRun,
+    info: Mapping[str, Any],
+    manifests: Sequence[Mapping[str, Any]],
+) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     name = f"{run.renderer} {run.policy}"
     write_configs(folder, out, name, f"{info.get('content')}/{run.renderer}/{run.policy}")
-    failed = [m for m in manifests if m["status"] != "ok" and (m["renderer"], m["policy"]) == (run.renderer, run.policy)]
+    failed = [
+        m
+        for m in manifests
+        if m["status"] != "ok" and (m["renderer"], m["policy"]) == (run.renderer, run.policy)
+    ]
     if failed:
         rows = [
-            {"run_name": name, "clipgt_id": m["scene"], "rollout_id": f"seed-{m['seed']}", "error": m["error"]["found"]} for m in failed
+            {
+                "run_name": name,
+                "clipgt_id": m["scene"],
+                "rollout_id": f"seed-{m['seed']}",
+                "error": m["error"]["found"],
+            }
+            for m in failed
         ]
         write_json(folder / FAILED, rows)
 
 
-def _write_scenes(partial: Path, loaded: Mapping[str, tuple[ScenarioRef, Scenario]]) -> tuple[str, ...]:
+def _write_scenes(
+    partial: Path, loaded: Mapping[str, tuple[ScenarioRef, Scenario]]
+) -> tuple[str, ...]:
     (partial / SCENES).mkdir(parents=True, exist_ok=True)
     for scene_id, (ref, scenario) in loaded.items():
         write_scene(partial / SCENES / f"{slug(scene_id)}.usdz", ref, scenario)
@@ -319,7 +413,12 @@ def _write_scenes(partial: Path, loaded: Mapping[str, tuple[ScenarioRef, Scenari
 
 def _check_free(out: Path) -> None:
     if out.exists() and (not out.is_dir() or any(os.scandir(out))):
-        raise InputError(DOING, f"--alpasim {out}", "it is there and not empty", "name a new folder, or remove it first")
+        raise InputError(
+            DOING,
+            f"--alpasim {out}",
+            "it is there and not empty",
+            "name a new folder, or remove it first",
+        )
 
 
 class AddedFrames:
@@ -335,7 +434,13 @@ class AddedFrames:
         frames: How many were added.
     """
 
-    def __init__(self, rollout: RolloutLog, camera: CameraSpec, interval_us: int, make_renderer: Callable[[], Renderer]) -> None:
+    def __init__(
+        self,
+        rollout: RolloutLog,
+        camera: CameraSpec,
+        interval_us: int,
+        make_renderer: Callable[[], Renderer],
+    ) -> None:
         self._rollout, self._camera, self._make = rollout, camera, make_renderer
         self._requests = logged_requests(rollout, camera, interval_us)
         self._index = {request.t_us: i for i, request in enumerate(self._requests)}
@@ -350,15 +455,21 @@ class AddedFrames:
         if kind == "available_cameras_return":
             entry.available_cameras_return.available_cameras.append(wire_camera(self._camera))
         elif kind == "driver_session_request":
-            entry.driver_session_request.rollout_spec.vehicle.available_cameras.append(wire_camera(self._camera))
+            entry.driver_session_request.rollout_spec.vehicle.available_cameras.append(
+                wire_camera(self._camera)
+            )
         elif kind == "actor_poses" and int(entry.actor_poses.timestamp_us) in self._index:
             return [entry, *self._render(self._index[int(entry.actor_poses.timestamp_us)])]
         return [entry]
 
     def _render(self, i: int) -> list[logging_pb2.LogEntry]:
-        """Return the entries of the frames that are ready: those of a whole block, for a renderer that works in blocks."""
+        """Return the entries of the frames that are ready: those of a whole block, for a renderer
+        that works in blocks.
+        """
         renderer = self._renderer = self._renderer or self._make()
-        self._waiting.append(replace(self._requests[i], ahead=self._requests[i + 1 : i + 1 + renderer.lookahead]))
+        self._waiting.append(
+            replace(self._requests[i], ahead=self._requests[i + 1 : i + 1 + renderer.lookahead])
+        )
         if renderer.block is not None and len(self._waiting) < renderer.block.frames(self._blocks):
             return []
         requests, self._waiting = self._waiting, []
@@ -366,19 +477,38 @@ class AddedFrames:
         out = []
         for request, frame in zip(requests, checked_frames(renderer, requests), strict=True):
             one = wire_render_request(self._rollout.scene_id, request, "jpeg")
-            item = sensorsim_pb2.BatchRGBRenderRequestItem(camera_name=self._camera.name, request=one)
-            out.append(logging_pb2.LogEntry(batch_render_request=sensorsim_pb2.BatchRGBRenderRequest(items=[item])))
-            image, start_us = encode_image(frame.rgb, "jpeg"), request.t_us - self._camera.shutter_us
-            own = wire_image(self._rollout.session_uuid, self._camera.name, start_us, request.t_us, image)
+            item = sensorsim_pb2.BatchRGBRenderRequestItem(
+                camera_name=self._camera.name, request=one
+            )
+            out.append(
+                logging_pb2.LogEntry(
+                    batch_render_request=sensorsim_pb2.BatchRGBRenderRequest(items=[item])
+                )
+            )
+            image, start_us = (
+                encode_image(frame.rgb, "jpeg"),
+                request.t_us - self._camera.shutter_us,
+            )
+            own = wire_image(
+                self._rollout.session_uuid, self._camera.name, start_us, request.t_us, image
+            )
             out.append(logging_pb2.LogEntry(driver_camera_image=own))
         self.frames += len(requests)
         return out
 
 
-def logged_requests(rollout: RolloutLog, camera: CameraSpec, interval_us: int) -> list[RenderRequest]:
-    """Return the requests for a camera along a log's poses, one every ``interval_us`` from its render start."""
+def logged_requests(
+    rollout: RolloutLog, camera: CameraSpec, interval_us: int
+) -> list[RenderRequest]:
+    """Return the requests for a camera along a log's poses, one every ``interval_us`` from its
+    render start.
+    """
     rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
-    due = [int(t) for t in rig.t_us if t >= rollout.render_start_us and (t - rollout.render_start_us) % interval_us == 0]
+    due = [
+        int(t)
+        for t in rig.t_us
+        if t >= rollout.render_start_us and (t - rollout.render_start_us) % interval_us == 0
+    ]
     actors: dict[int, dict[str, F64]] = {t: {} for t in due}
     for name, actor in rollout.actors.items():
         poses = se3(actor.track.xyz, actor.track.quat)

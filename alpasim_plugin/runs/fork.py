@@ -1,11 +1,13 @@
 """Continue a logged rollout from an instant on with another renderer, policy or seed.
 
-Up to that instant the rollout is replayed with its own parts and compared with its log, component by component, bit for bit. The replay
-restores the whole state: the ego's speed and steering, reactive actors, the policy's memory, the renderer's history. A log alone does not
-hold it (its poses are float32, and it has no policy state). If the replay differs from the log, an error names the component and the step.
+Up to that instant the rollout is replayed with its own parts and compared with its log, component
+by component, bit for bit. The replay restores the whole state: the ego's speed and steering,
+reactive actors, the policy's memory, the renderer's history. A log alone does not hold it (its
+poses are float32, and it has no policy state). If the replay differs from the log, an error names
+the component and the step.
 
-The new parts get the same inputs before the instant, so that they have the same history: a renderer renders every request, a policy gets
-every query. Their outputs before the instant are discarded.
+The new parts get the same inputs before the instant, so that they have the same history: a renderer
+renders every request, a policy gets every query. Their outputs before the instant are discarded.
 """
 
 from __future__ import annotations
@@ -21,7 +23,17 @@ from typing import Any, Literal
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.interfaces import Controller, Policy, Renderer
 from alpasim_plugin.core.parts import digest, resolve, resolve_renderer
-from alpasim_plugin.core.types import EgoState, Frame, Observation, Plan, RenderRequest, Route, Scenario, SensorSpec, Trajectory
+from alpasim_plugin.core.types import (
+    EgoState,
+    Frame,
+    Observation,
+    Plan,
+    RenderRequest,
+    Route,
+    Scenario,
+    SensorSpec,
+    Trajectory,
+)
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifest, write_run_json
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, MANIFEST, RUN_INFO
 from alpasim_plugin.log.run_folder.writer import writing
@@ -62,7 +74,9 @@ class SwitchedRenderer(Renderer):
         return self.render_batch([request])[0]
 
     def render_batch(self, requests: Sequence[RenderRequest]) -> Sequence[Frame]:
-        """Render the frames of an instant or of a block; the end of a block decides which part renders it."""
+        """Render the frames of an instant or of a block; the end of a block decides which part
+        renders it.
+        """
         early = max(request.t_us for request in requests) < self.at_us
         used = self.first if early else self.then
         frames = used.render_batch(requests)
@@ -87,7 +101,9 @@ class SwitchedPolicy(Policy):
         camera_us: The scenario's camera period.
     """
 
-    def __init__(self, first: Policy, then: Policy, at_us: int, then_seed: int, camera_us: int) -> None:
+    def __init__(
+        self, first: Policy, then: Policy, at_us: int, then_seed: int, camera_us: int
+    ) -> None:
         self.first, self.then, self.at_us, self.then_seed = first, then, at_us, then_seed
         self.sensors: Sequence[SensorSpec] = merge_sensors(first.sensors, then.sensors, camera_us)
 
@@ -107,7 +123,9 @@ class SwitchedPolicy(Policy):
 
 
 class SwitchedController(Controller):
-    """Drive with ``first`` before ``at_us`` and with ``then`` from it on; the first call of ``then`` gives it the state to begin with."""
+    """Drive with ``first`` before ``at_us`` and with ``then`` from it on; the first call of
+    ``then`` gives it the state to begin with.
+    """
 
     def __init__(self, first: Controller, then: Controller, at_us: int) -> None:
         self.first, self.then, self.at_us = first, then, at_us
@@ -124,7 +142,9 @@ class SwitchedController(Controller):
         return (self.first if state.t_us < self.at_us else self.then).advance(state, plan, to_us)
 
 
-def merge_sensors(first: Sequence[SensorSpec], then: Sequence[SensorSpec], camera_us: int) -> tuple[SensorSpec, ...]:
+def merge_sensors(
+    first: Sequence[SensorSpec], then: Sequence[SensorSpec], camera_us: int
+) -> tuple[SensorSpec, ...]:
     """Return the cameras of two policies; a camera of both has the shorter of its periods.
 
     Args:
@@ -152,23 +172,45 @@ class Change:
     @property
     def label(self) -> str:
         """Name the continuation in tables, in the column of renderers."""
-        parts = [self.renderer or "", self.policy or "", f"seed {self.seed}" if self.seed is not None else ""]
+        parts = [
+            self.renderer or "",
+            self.policy or "",
+            f"seed {self.seed}" if self.seed is not None else "",
+        ]
         return f"{', '.join(part for part in parts if part) or UNCHANGED} from {self.after_us * 1e-6:g} s"
 
     def apply(self, cell: Cell, fixer: Sequence[str]) -> Cell:
         """Return the cell with the replaced parts; ``fixer`` are the run's fixer settings."""
-        renderer = cell.renderer if self.renderer is None else resolve_renderer(self.renderer, fixer)
+        renderer = (
+            cell.renderer if self.renderer is None else resolve_renderer(self.renderer, fixer)
+        )
         policy = cell.policy if self.policy is None else resolve("policy", self.policy)
-        controller = cell.controller if self.policy is None else resolve("controller", policy.controller)
-        return replace(cell, renderer=renderer, policy=policy, controller=controller, seed=cell.seed if self.seed is None else self.seed)
+        controller = (
+            cell.controller if self.policy is None else resolve("controller", policy.controller)
+        )
+        return replace(
+            cell,
+            renderer=renderer,
+            policy=policy,
+            controller=controller,
+            seed=cell.seed if self.seed is None else self.seed,
+        )
 
 
-def fork_rollout(past: LoggedRollout, change: Change, root: Path, video: Literal["none", "all"], command: Sequence[str]) -> RunResult:
-    """Continue a rollout and write a run folder with the original and the continuation side by side.
+def fork_rollout(
+    past: LoggedRollout,
+    change: Change,
+    root: Path,
+    video: Literal["none", "all"],
+    command: Sequence[str],
+) -> RunResult:
+    """Continue a rollout and write a run folder with the original and the continuation side by
+    side.
 
-    In the tables the continuation is a renderer of its own (`Change.label`), paired with the original: same policy name, scene and seed.
-    ``fork`` in ``run.json`` and in the manifest holds the change, the result of the replay and, for an empty change, whether the
-    continuation equals the log.
+    In the tables the continuation is a renderer of its own (`Change.label`), paired with the
+    original: same policy name, scene and seed. ``fork`` in ``run.json`` and in the manifest holds
+    the change, the result of the replay and, for an empty change, whether the continuation equals
+    the log.
 
     Args:
         past: The logged rollout.
@@ -178,7 +220,8 @@ def fork_rollout(past: LoggedRollout, change: Change, root: Path, video: Literal
         command: For ``run.json``.
 
     Raises:
-        InputError: The instant lies outside the rollout, its latency is measured, or ``root`` holds a run.
+        InputError: The instant lies outside the rollout, its latency is measured, or ``root`` holds
+            a run.
         InfrastructureError: The replay is not equal to the log up to the instant, or a part failed.
     """
     _check(past, change, root)
@@ -186,23 +229,55 @@ def fork_rollout(past: LoggedRollout, change: Change, root: Path, video: Literal
         return _fork(past, change, root, video, command)
 
 
-def _fork(past: LoggedRollout, change: Change, root: Path, video: Literal["none", "all"], command: Sequence[str]) -> RunResult:
+def _fork(
+    past: LoggedRollout,
+    change: Change,
+    root: Path,
+    video: Literal["none", "all"],
+    command: Sequence[str],
+) -> RunResult:
     _check(past, change, root)  # once more: another process may have been first
     began = time.perf_counter()
     options = replace(past.options, video=video, baseline=past.cell.renderer.name)
     then = change.apply(past.cell, options.fixer)
     original = _copied(past, root)
-    key = digest([past.cell.rollout_key, asdict(change), then.renderer.digest, then.policy.digest, then.controller.digest])
+    key = digest(
+        [
+            past.cell.rollout_key,
+            asdict(change),
+            then.renderer.digest,
+            then.policy.digest,
+            then.controller.digest,
+        ]
+    )
     label = replace(then.renderer, name=change.label)
-    fork = replace(past.cell, renderer=label, rollout_key=key, score_key=score_key(key, options.preset, past.cell.evaluators))
+    fork = replace(
+        past.cell,
+        renderer=label,
+        rollout_key=key,
+        score_key=score_key(key, options.preset, past.cell.evaluators),
+    )
     threads = thread_budget(1, 1)
     at_us = past.scenario.start_us + change.after_us
-    manifest = run_cell(fork, options, root, threads.per_worker, partial(_parts, past.cell, then, change))
+    manifest = run_cell(
+        fork, options, root, threads.per_worker, partial(_parts, past.cell, then, change)
+    )
     if manifest["status"] == "ok":
-        manifest["fork"] = asdict(change) | {"of": past.name} | _compare_with_log(past, change, at_us, root / fork.folder)
+        manifest["fork"] = (
+            asdict(change)
+            | {"of": past.name}
+            | _compare_with_log(past, change, at_us, root / fork.folder)
+        )
         write_manifest(root / fork.folder, manifest)
     cells, renderers = (past.cell, fork), (past.cell.renderer, fork.renderer)
-    plan = RunPlan(cells, {past.cell.scene: past.scenario}, renderers, (past.cell.policy,), (past.cell.seed,), options)
+    plan = RunPlan(
+        cells,
+        {past.cell.scene: past.scenario},
+        renderers,
+        (past.cell.policy,),
+        (past.cell.seed,),
+        options,
+    )
     write_run_info(root, plan, command, threads)
     write_run_json(root, read_run_json(root) | {"kind": "fork", "fork": manifest.get("fork")})
     pool = pool_of([original, manifest], threads, time.perf_counter() - began, None)
@@ -215,7 +290,12 @@ def _check(past: LoggedRollout, change: Change, root: Path) -> None:
     length_us = int(past.manifest["steps"]) * scenario.rates.control_us
     if not 0 <= change.after_us < length_us:
         found = f"the rollout lasts {length_us * 1e-6:g} s"
-        raise InputError(DOING, f"--at {change.after_us * 1e-6:g}", found, "choose an instant within it, in seconds after the first frame")
+        raise InputError(
+            DOING,
+            f"--at {change.after_us * 1e-6:g}",
+            found,
+            "choose an instant within it, in seconds after the first frame",
+        )
     past.check_repeatable(DOING)
     if (root / RUN_INFO).exists():
         raise InputError(DOING, f"--out {root}", "it holds a run already", "choose another --out")
@@ -230,8 +310,18 @@ def _copied(past: LoggedRollout, root: Path) -> dict[str, Any]:
     return manifest
 
 
-def _parts(own: Cell, then: Cell, change: Change, fork: Cell, options: RunOptions, scenario: Scenario, threads: int) -> RolloutParts:
-    """Build the original's parts and those that replace them, switched at the instant; an unchanged part is one object."""
+def _parts(
+    own: Cell,
+    then: Cell,
+    change: Change,
+    fork: Cell,
+    options: RunOptions,
+    scenario: Scenario,
+    threads: int,
+) -> RolloutParts:
+    """Build the original's parts and those that replace them, switched at the instant; an unchanged
+    part is one object.
+    """
     at_us = scenario.start_us + change.after_us
     before = build_parts(own, options, scenario, threads)
     after = before if then == own else build_parts(then, options, scenario, threads)
@@ -239,7 +329,9 @@ def _parts(own: Cell, then: Cell, change: Change, fork: Cell, options: RunOption
     same_policy = (then.policy, then.seed) == (own.policy, own.seed)
     next_policy = before.policy if same_policy else after.policy
     return RolloutParts(
-        SwitchedRenderer(before.renderer, before.renderer if same_renderer else after.renderer, at_us),
+        SwitchedRenderer(
+            before.renderer, before.renderer if same_renderer else after.renderer, at_us
+        ),
         SwitchedPolicy(before.policy, next_policy, at_us, then.seed, scenario.rates.camera_us),
         own.rollout_key if then == own else fork.rollout_key,
         before.names if then == own else after.names,
@@ -247,17 +339,25 @@ def _parts(own: Cell, then: Cell, change: Change, fork: Cell, options: RunOption
     )
 
 
-def _compare_with_log(past: LoggedRollout, change: Change, at_us: int, folder: Path) -> dict[str, Any]:
+def _compare_with_log(
+    past: LoggedRollout, change: Change, at_us: int, folder: Path
+) -> dict[str, Any]:
     """Compare the replay with the log up to the instant; for an empty change also the continuation.
 
     Raises:
         InfrastructureError: They differ before the instant.
     """
     one, other = log_trace(past.folder), log_trace(folder)
-    # Another policy may have more cameras; their frames before the instant have no logged counterpart.
-    other["frames"] = {key: value for key, value in other["frames"].items() if key in one["frames"] or key[0] >= at_us}
+    # Another policy may have more cameras; their frames before the instant have no logged
+    # counterpart.
+    other["frames"] = {
+        key: value
+        for key, value in other["frames"].items()
+        if key in one["frames"] or key[0] >= at_us
+    }
     where = (past.scenario.start_us, past.scenario.rates.control_us)
-    # The pose at the instant follows from the original parts; its frames and its plan come from the new ones.
+    # The pose at the instant follows from the original parts; its frames and its plan come from the
+    # new ones.
     until = {"ego": at_us + 1, "actors": at_us + 1, "frames": at_us, "plans": at_us}
     difference = first_difference(one, other, *where, until)
     if difference is not None:
@@ -273,8 +373,13 @@ def _compare_with_log(past: LoggedRollout, change: Change, at_us: int, folder: P
     return {"replay": "equal"}
 
 
-def _continuation(one: Trace, other: Trace, past: LoggedRollout, folder: Path, where: tuple[int, int]) -> Mapping[str, Any] | str:
+def _continuation(
+    one: Trace, other: Trace, past: LoggedRollout, folder: Path, where: tuple[int, int]
+) -> Mapping[str, Any] | str:
     difference = first_difference(one, other, *where)
-    if difference is None and (past.folder / LOG_NAME).read_bytes() != (folder / LOG_NAME).read_bytes():
+    if (
+        difference is None
+        and (past.folder / LOG_NAME).read_bytes() != (folder / LOG_NAME).read_bytes()
+    ):
         difference = Difference("log", where[0], None, "an entry that belongs to no component")
     return "equal" if difference is None else difference.as_dict()

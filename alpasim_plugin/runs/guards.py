@@ -15,16 +15,21 @@ from alpasim_plugin.core.interfaces import Policy, Renderer
 from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
 from alpasim_plugin.core.types import Frame, Observation, Plan, RenderRequest, Route, SensorSpec
 
-LIBRARIES = ("site-packages", sysconfig.get_paths()["stdlib"])  # in the paths of files that are nobody's own
+LIBRARIES = (
+    "site-packages",
+    sysconfig.get_paths()["stdlib"],
+)  # in the paths of files that are nobody's own
 CHECK = "simrun check-policy finds all faults of a policy"
 TRACEBACK = "see the traceback in output.log of the rollout"
 
 
 def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> list[Frame]:
-    """Render and check the frames of one instant, or of one block; an all-black frame passes but carries the event ``black``.
+    """Render and check the frames of one instant, or of one block; an all-black frame passes but
+    carries the event ``black``.
 
     Raises:
-        RendererError: The renderer raised, or its frames do not match the requests in number, size, type, time or camera.
+        RendererError: The renderer raised, or its frames do not match the requests in number, size,
+            type, time or camera.
     """
     if not requests:
         return []
@@ -37,9 +42,15 @@ def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> lis
         raise RendererError("rendering a frame", name, raised(error), TRACEBACK) from error
     if len(frames) != len(requests):
         raise RendererError(
-            "rendering a frame", name, f"{len(frames)} frames for {len(requests)} requests", "return one frame for each request"
+            "rendering a frame",
+            name,
+            f"{len(frames)} frames for {len(requests)} requests",
+            "return one frame for each request",
         )
-    return [_checked(type(renderer).__name__, frame, request) for frame, request in zip(frames, requests, strict=True)]
+    return [
+        _checked(type(renderer).__name__, frame, request)
+        for frame, request in zip(frames, requests, strict=True)
+    ]
 
 
 def _checked(renderer: str, frame: Frame, request: RenderRequest) -> Frame:
@@ -54,15 +65,26 @@ def _checked(renderer: str, frame: Frame, request: RenderRequest) -> Frame:
             problems.append(f"{label} has shape {plane.shape} or is not finite")
     if problems:
         name = f"{renderer}, camera {request.camera.name!r} at {request.t_us} us"
-        raise RendererError("rendering a frame", name, "; ".join(problems), "fix the renderer; its contract is types.Frame")
+        raise RendererError(
+            "rendering a frame",
+            name,
+            "; ".join(problems),
+            "fix the renderer; its contract is types.Frame",
+        )
     if "black" not in frame.events and is_black(frame.rgb):
         return replace(frame, events=(*frame.events, "black"))
     return frame
 
 
 def raised(error: Exception) -> str:
-    """Name an error of a foreign part with the line of that part at which it was raised, or from which a library was called."""
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__)[1:] if not any(part in frame.filename for part in LIBRARIES)]
+    """Name an error of a foreign part with the line of that part at which it was raised, or from
+    which a library was called.
+    """
+    frames = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)[1:]
+        if not any(part in frame.filename for part in LIBRARIES)
+    ]
     where = f" at {frames[-1].filename}:{frames[-1].lineno}, in {frames[-1].name}" if frames else ""
     return f"{type(error).__name__}: {error}{where}"
 
@@ -90,14 +112,17 @@ def reset_policy(policy: Policy, seed: int, route: Route) -> None:
     except SimrunError:
         raise
     except Exception as error:  # whatever a foreign policy raises
-        raise PolicyError("resetting a policy", type(policy).__name__, raised(error), TRACEBACK) from error
+        raise PolicyError(
+            "resetting a policy", type(policy).__name__, raised(error), TRACEBACK
+        ) from error
 
 
 def checked_plan(policy: Policy, observation: Observation) -> Plan:
     """Query the policy and check its plan.
 
     Raises:
-        PolicyError: The policy raised, or its plan is empty, not finite, not ordered in time or does not start now.
+        PolicyError: The policy raised, or its plan is empty, not finite, not ordered in time or
+            does not start now.
     """
     name = f"{type(policy).__name__} at {observation.t_us} us"
     try:

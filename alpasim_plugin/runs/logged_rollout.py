@@ -14,7 +14,14 @@ from alpasim_plugin.core.parts import overrides_of, resolve_renderer
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import inspect_rollout, read_run_json
 from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS, ROLLOUTS_TABLE, RUN_INFO, cell_name
-from alpasim_plugin.runs.plan import Cell, RunOptions, make_plan, options_of, ref_of, refuse_commands
+from alpasim_plugin.runs.plan import (
+    Cell,
+    RunOptions,
+    make_plan,
+    options_of,
+    ref_of,
+    refuse_commands,
+)
 
 DOING = "finding a logged rollout"
 
@@ -61,7 +68,8 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRo
 
     Args:
         root: Run folder.
-        name: ``RENDERER/POLICY/SCENE/SEED`` as in the tables, or the rollout's folder below the run folder.
+        name: ``RENDERER/POLICY/SCENE/SEED`` as in the tables, or the rollout's folder below the run
+            folder.
         scenario: Path of its scenario; by default the path in ``run.json``.
 
     Raises:
@@ -72,25 +80,42 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRo
     state = inspect_rollout(root, row["path"], full=True, known=True)
     if state.damage or state.manifest is None:
         do_this = f"simrun check {shlex.quote(str(root))} --repair runs it again"
-        raise InputError(DOING, name, "; ".join(f"{one.file}: {one.problem}" for one in state.damage), do_this)
+        raise InputError(
+            DOING, name, "; ".join(f"{one.file}: {one.problem}" for one in state.damage), do_this
+        )
     manifest = state.manifest
     if manifest.get("fork"):
-        raise InputError(DOING, name, "it is the continuation of another rollout", f"name that rollout: {manifest['fork']['of']}")
+        raise InputError(
+            DOING,
+            name,
+            "it is the continuation of another rollout",
+            f"name that rollout: {manifest['fork']['of']}",
+        )
     stated: Mapping[str, Any] = (info["scenes"].get(row["scene"]) or {}).get("ref") or {}
     where = scenario or stated.get("path")
     if where is None:
-        raise InputError(DOING, f"{root / RUN_INFO}", "it has no path of the scenario", "name it with --scenario PATH")
+        raise InputError(
+            DOING,
+            f"{root / RUN_INFO}",
+            "it has no path of the scenario",
+            "name it with --scenario PATH",
+        )
     ref = ref_of({**stated, "path": where})
     options = replace(options_of(info), baseline=None, video="none")
     refuse_commands([row["policy"]], DOING, str(root))
-    # Fixer settings may belong to another renderer of the run; a plan refuses settings without a fixer.
+    # Fixer settings may belong to another renderer of the run; a plan refuses settings without a
+    # fixer.
     has_fixer = resolve_renderer(row["renderer"], options.fixer).fixer is not None
     own = replace(options, fixer=overrides_of(row["renderer"], options.fixer) if has_fixer else ())
     plan = make_plan([ref], [row["renderer"]], [row["policy"]], [int(row["seed"])], own)
     (cell,) = plan.cells
     loaded = plan.scenarios.get(row["scene"])
     if loaded is None or cell.rollout_key != manifest["rollout_key"]:
-        what = f"scenario {ref.path} now has the scene id {cell.scene!r}" if loaded is None else "content key differs"
+        what = (
+            f"scenario {ref.path} now has the scene id {cell.scene!r}"
+            if loaded is None
+            else "content key differs"
+        )
         raise InputError(
             DOING,
             name,
@@ -102,14 +127,25 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRo
 
 def _row(root: Path, name: str) -> dict[str, Any]:
     path = root / ROLLOUTS
-    rows = ROLLOUTS_TABLE.read(path, DOING, "name a folder written by simrun run", (*KEYS, "status", "path", "failure")).to_pylist()
+    rows = ROLLOUTS_TABLE.read(
+        path, DOING, "name a folder written by simrun run", (*KEYS, "status", "path", "failure")
+    ).to_pylist()
     by_name = {cell_name(*(row[key] for key in KEYS)): row for row in rows}
     wanted = name.strip("/")
-    row = by_name.get(wanted) or next((r for r in rows if wanted in (r["path"], r["path"].removeprefix("rollouts/"))), None)
+    row = by_name.get(wanted) or next(
+        (r for r in rows if wanted in (r["path"], r["path"].removeprefix("rollouts/"))), None
+    )
     if row is None:
         near = difflib.get_close_matches(wanted, by_name, 3, 0.0)
         do_this = f"did you mean {' or '.join(near)}?" if near else "name a run that has rollouts"
-        raise InputError(DOING, f"--cell {name}", f"the run has no such rollout among its {len(rows)}", do_this)
+        raise InputError(
+            DOING, f"--cell {name}", f"the run has no such rollout among its {len(rows)}", do_this
+        )
     if row["status"] != "ok":
-        raise InputError(DOING, f"--cell {name}", f"it did not finish: {row['failure']}", "name a finished rollout")
+        raise InputError(
+            DOING,
+            f"--cell {name}",
+            f"it did not finish: {row['failure']}",
+            "name a finished rollout",
+        )
     return dict(row)

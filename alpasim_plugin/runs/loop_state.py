@@ -1,8 +1,10 @@
-"""The state of one rollout between ticks: the ego and its history, the active plan, the end of the path, and a forecast from it.
+"""The state of one rollout between ticks: the ego and its history, the active plan, the end of the
+path, and a forecast from it.
 
-Predicted poses of cameras and road users are for `RenderRequest.ahead`. The controller moves the predicted ego along the active plan and
-along plans that become active after their latency. During the warm-up the prediction is the log itself. A forecast queries no policy and
-leaves the state of the loop unchanged.
+Predicted poses of cameras and road users are for `RenderRequest.ahead`. The controller moves the
+predicted ego along the active plan and along plans that become active after their latency. During
+the warm-up the prediction is the log itself. A forecast queries no policy and leaves the state of
+the loop unchanged.
 """
 
 from __future__ import annotations
@@ -48,7 +50,9 @@ SPEED_SPAN_US = 500_000
 
 
 def drawn(actors: Mapping[str, F64]) -> Mapping[str, F64]:
-    """Return the poses of the actors that are drawn: what stands in a reconstruction is in its pictures already."""
+    """Return the poses of the actors that are drawn: what stands in a reconstruction is in its
+    pictures already.
+    """
     return {name: T for name, T in actors.items() if not name.startswith(STANDING_ID)}
 
 
@@ -56,11 +60,13 @@ def drawn(actors: Mapping[str, F64]) -> Mapping[str, F64]:
 class PlanQueue:
     """Plans in order of the time they become effective.
 
-    ``none`` applies a plan at its query, ``fixed`` after a constant delay, ``measured`` after the wall time of the query. With
-    ``measured`` a run depends on the machine and is not repeatable; run.json records this.
+    ``none`` applies a plan at its query, ``fixed`` after a constant delay, ``measured`` after the
+    wall time of the query. With ``measured`` a run depends on the machine and is not repeatable;
+    run.json records this.
 
-    With ``latency.fixer`` the fixer is a queue of its own: the frames of an instant are done after those before them, so a fixer slower
-    than the camera falls behind, and a query waits until its frames are done.
+    With ``latency.fixer`` the fixer is a queue of its own: the frames of an instant are done after
+    those before them, so a fixer slower than the camera falls behind, and a query waits until its
+    frames are done.
     """
 
     latency: Latency
@@ -76,7 +82,9 @@ class PlanQueue:
     def submit(self, plan_world: Trajectory, query_us: int, wall_us: int) -> None:
         """Add the plan of the query at ``query_us``, which took ``wall_us`` of wall time."""
         measured_us = max(self._fixed_us - query_us, 0) + wall_us
-        delay = {"none": 0, "fixed": self.latency.fixed_us, "measured": measured_us}[self.latency.kind]
+        delay = {"none": 0, "fixed": self.latency.fixed_us, "measured": measured_us}[
+            self.latency.kind
+        ]
         self._pending.append((query_us + delay, plan_world))
 
     def copy(self) -> PlanQueue:
@@ -84,7 +92,9 @@ class PlanQueue:
         return replace(self, _pending=list(self._pending))
 
     def active(self, t_us: int) -> Trajectory | None:
-        """Return the active plan at ``t_us``: among those due, that of the newest query. None before the first."""
+        """Return the active plan at ``t_us``: among those due, that of the newest query. None
+        before the first.
+        """
         while self._pending and self._pending[0][0] <= t_us:
             self._active = self._pending.pop(0)[1]
         # A later, faster query overtakes an earlier, slower one.
@@ -98,8 +108,9 @@ class PlanQueue:
 class PathEnd:
     """Tells when the ego has passed the end of the recorded path.
 
-    Beyond that end nothing is known: no recorded drive to compare with, often no map. If the recorded car stands there, what lies beyond
-    is why it stopped (a queue, a red light), and running into it must be seen: such a path has no end here.
+    Beyond that end nothing is known: no recorded drive to compare with, often no map. If the
+    recorded car stands there, what lies beyond is why it stopped (a queue, a red light), and
+    running into it must be seen: such a path has no end here.
 
     Args:
         log: The recorded rig poses.
@@ -118,13 +129,18 @@ class PathEnd:
         goes = seconds > 0 and float(np.hypot(*(self._path[-1] - there))) / seconds > STANDS_MPS
         self._has_end = goes and self._length_m > DIRECTION_M
         s = arc_lengths(self._path)
-        inside = [float(np.interp(self._length_m - DIRECTION_M, s, self._path[:, axis])) for axis in (0, 1)]
+        inside = [
+            float(np.interp(self._length_m - DIRECTION_M, s, self._path[:, axis]))
+            for axis in (0, 1)
+        ]
         self._ahead = self._path[-1] - np.array(inside)
         self._stops = stops
         self.passed = False
 
     def ends_rollout(self, at: F64) -> bool:
-        """Note where the ego's rear axle is, ``(2,)``, metres, world; return whether the rollout ends here."""
+        """Note where the ego's rear axle is, ``(2,)``, metres, world; return whether the rollout
+        ends here.
+        """
         if self._has_end and not self.passed and (at - self._path[-1]) @ self._ahead > 0.0:
             self.passed = project(self._path, at)[0] >= self._length_m * (1 - 1e-12)
         return self.passed and self._stops
@@ -134,7 +150,8 @@ class PathEnd:
 class LoopState:
     """The ego's true state, its history, and the newest frame of each camera.
 
-    The history is stored in arrays allocated once for the whole rollout: an observation is a view of them, not a copy.
+    The history is stored in arrays allocated once for the whole rollout: an observation is a view
+    of them, not a copy.
     """
 
     scenario: Scenario
@@ -147,7 +164,9 @@ class LoopState:
 
     @classmethod
     def at_start(cls, scenario: Scenario, n_steps: int) -> LoopState:
-        """Return the state at the first frame; the history begins with the recorded context before it."""
+        """Return the state at the first frame; the history begins with the recorded context before
+        it.
+        """
         log = scenario.ego_log
         context = int(np.searchsorted(log.t_us, scenario.start_us))
         size = context + n_steps + 1
@@ -182,14 +201,21 @@ class LoopState:
         c, s = np.cos(yaw0), np.sin(yaw0)
         turn = np.array([[c, s], [-s, c]])
 
-        all_xy, all_yaw = [plan.xy, *(sample[:, :2] for sample in plan.samples)], [plan.yaw, *(sample[:, 2] for sample in plan.samples)]
+        all_xy, all_yaw = (
+            [plan.xy, *(sample[:, :2] for sample in plan.samples)],
+            [plan.yaw, *(sample[:, 2] for sample in plan.samples)],
+        )
         xyz = np.full((len(all_xy), len(plan.times_us), 3), origin[2])
         for row, xy in zip(xyz, all_xy, strict=True):
             row[:, :2] = xy @ turn + origin[:2]
-        return [Trajectory(plan.times_us, *pose) for pose in zip(xyz, quat_from_yaw(wrap_angle(np.stack(all_yaw) + yaw0)), strict=True)]
+        return [
+            Trajectory(plan.times_us, *pose)
+            for pose in zip(xyz, quat_from_yaw(wrap_angle(np.stack(all_yaw) + yaw0)), strict=True)
+        ]
 
     def advance(self, controller: Controller, plan: Trajectory | None, to_us: int) -> bool:
-        """Move the ego to ``to_us``: along the log in the warm-up, then by the vehicle model, projected onto the ground.
+        """Move the ego to ``to_us``: along the log in the warm-up, then by the vehicle model,
+        projected onto the ground.
 
         Returns:
             Whether the log was forced.
@@ -206,19 +232,27 @@ class LoopState:
         self._filled = n + 1
 
 
-def advance_ego(scenario: Scenario, controller: Controller, ego: EgoState, plan: Trajectory | None, to_us: int) -> tuple[EgoState, bool]:
-    """Return the ego at ``to_us`` and whether the log was forced, as it is until the end of the warm-up."""
+def advance_ego(
+    scenario: Scenario, controller: Controller, ego: EgoState, plan: Trajectory | None, to_us: int
+) -> tuple[EgoState, bool]:
+    """Return the ego at ``to_us`` and whether the log was forced, as it is until the end of the
+    warm-up.
+    """
     if to_us <= scenario.start_us + scenario.warmup_us:
         return ego_state_from_log(scenario.ego_log, to_us, scenario.vehicle), True
     moved = controller.advance(ego, plan, to_us)
     if controller.grounds:
         return moved, False
     x, y = float(moved.T_world_rig[0, 3]), float(moved.T_world_rig[1, 3])
-    return replace(moved, T_world_rig=ground_pose(scenario.ground, x, y, yaw_of(moved.T_world_rig))), False
+    return replace(
+        moved, T_world_rig=ground_pose(scenario.ground, x, y, yaw_of(moved.T_world_rig))
+    ), False
 
 
 def shutter_poses(history: Trajectory, camera: CameraSpec, t_us: int) -> F64:
-    """Return ``T_world_camera`` ``(2, 4, 4)`` at shutter start and end, from rig poses of which the last is at ``t_us``."""
+    """Return ``T_world_camera`` ``(2, 4, 4)`` at shutter start and end, from rig poses of which the
+    last is at ``t_us``.
+    """
     start_us = max(t_us - camera.shutter_us, int(history.t_us[0]))
     return np.asarray(interpolate(history, np.array([start_us, t_us])) @ camera.T_rig_camera)
 
@@ -226,13 +260,22 @@ def shutter_poses(history: Trajectory, camera: CameraSpec, t_us: int) -> F64:
 class Forecaster:
     """Makes forecasts of a running loop."""
 
-    def __init__(self, scenario: Scenario, controller: Controller, plans: PlanQueue, actors: Actors, state: LoopState) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        controller: Controller,
+        plans: PlanQueue,
+        actors: Actors,
+        state: LoopState,
+    ) -> None:
         self._parts = scenario, controller, plans, actors, state
 
     def now(self) -> Forecast:
         """Return the forecast from the present instant. It is computed when read."""
         scenario, controller, plans, actors, state = self._parts
-        return Forecast(scenario, controller, plans.copy(), actors.forecast(), state.history, state.ego)
+        return Forecast(
+            scenario, controller, plans.copy(), actors.forecast(), state.history, state.ego
+        )
 
 
 @dataclass
@@ -250,19 +293,27 @@ class Forecast:
         """Return the predicted render request at a future control instant."""
         self._extend(t_us)
         upto = int(np.searchsorted(self.history.t_us, t_us, side="right"))
-        past = Trajectory(self.history.t_us[:upto], self.history.xyz[:upto], self.history.quat[:upto])
-        return RenderRequest(t_us, camera, shutter_poses(past, camera, t_us), drawn(self.actors.at(t_us)))
+        past = Trajectory(
+            self.history.t_us[:upto], self.history.xyz[:upto], self.history.quat[:upto]
+        )
+        return RenderRequest(
+            t_us, camera, shutter_poses(past, camera, t_us), drawn(self.actors.at(t_us))
+        )
 
     def _extend(self, to_us: int) -> None:
         states = []
         while self.ego.t_us < to_us:
             next_us = self.ego.t_us + self.scenario.rates.control_us
-            self.ego, _ = advance_ego(self.scenario, self.controller, self.ego, self.plans.active(self.ego.t_us), next_us)
+            self.ego, _ = advance_ego(
+                self.scenario, self.controller, self.ego, self.plans.active(self.ego.t_us), next_us
+            )
             states.append(self.ego)
         if states:
             past, poses = self.history, np.stack([state.T_world_rig for state in states])
             self.history = Trajectory(
-                np.concatenate([past.t_us, np.array([state.t_us for state in states], dtype=np.int64)]),
+                np.concatenate(
+                    [past.t_us, np.array([state.t_us for state in states], dtype=np.int64)]
+                ),
                 np.concatenate([past.xyz, poses[:, :3, 3]]),
                 np.concatenate([past.quat, quat_from_matrix(poses[:, :3, :3])]),
             )

@@ -1,4 +1,6 @@
-"""The plan of a run: its cells, renderer x policy x scene x seed, with resolved parts and content keys."""
+"""The plan of a run: its cells, renderer x policy x scene x seed, with resolved parts and content
+keys.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,10 @@ from scenarios.load import code_digest_of, load_scenario
 from scenarios.suite import ScenarioRef
 
 DOING = "planning a run"
-LOOP, SCORING = "alpasim_plugin.runs.rollout", "alpasim_plugin.runs.scoring"  # modules whose code, with its imports, decides
+LOOP, SCORING = (
+    "alpasim_plugin.runs.rollout",
+    "alpasim_plugin.runs.scoring",
+)  # modules whose code, with its imports, decides
 
 
 @dataclass(frozen=True)
@@ -28,25 +33,49 @@ class RunOptions:
     """Everything except the cells that determines a run's results."""
 
     preset: Annotated[str, Flag("Evaluator preset.", names="preset")] = DEFAULT
-    images: Annotated[Literal["none", "jpeg", "png"], Flag("Camera frames in rollout.asl.")] = "jpeg"
+    images: Annotated[Literal["none", "jpeg", "png"], Flag("Camera frames in rollout.asl.")] = (
+        "jpeg"
+    )
     video: Annotated[Literal["none", "failures", "all"], Flag("Write front.mp4.")] = "none"
     device: Annotated[Literal["cpu", "cuda"], Flag("Where renderers compute.")] = "cpu"
-    baseline: Annotated[str | None, Flag("RENDERER, POLICY or RENDERER/POLICY to compare with.", names="renderer")] = None
+    baseline: Annotated[
+        str | None, Flag("RENDERER, POLICY or RENDERER/POLICY to compare with.", names="renderer")
+    ] = None
     fixer: tuple[str, ...] = ()  # KEY=VALUE of the fixers' settings
-    controller: Annotated[str | None, Flag("Controller that tracks the plans; by default the policy's.", names="controller")] = None
-    evaluators: Annotated[tuple[str, ...], Flag("A further evaluator, package.module:Class. Repeatable.", "--evaluator")] = ()
-    traffic: Annotated[str | None, Flag("AlpaSim's traffic service moves the other road users.", metavar="HOST:PORT")] = None
+    controller: Annotated[
+        str | None,
+        Flag("Controller that tracks the plans; by default the policy's.", names="controller"),
+    ] = None
+    evaluators: Annotated[
+        tuple[str, ...],
+        Flag("A further evaluator, package.module:Class. Repeatable.", "--evaluator"),
+    ] = ()
+    traffic: Annotated[
+        str | None,
+        Flag("AlpaSim's traffic service moves the other road users.", metavar="HOST:PORT"),
+    ] = None
 
 
 def options_of(info: Mapping[str, Any]) -> RunOptions:
     """Return the options of an earlier run, as its ``run.json`` states them."""
-    stated = {f.name: info["config"][f.name] for f in fields(RunOptions) if f.name in info["config"]}
-    return RunOptions(**stated | {key: tuple(stated.get(key) or ()) for key in ("fixer", "evaluators")})
+    stated = {
+        f.name: info["config"][f.name] for f in fields(RunOptions) if f.name in info["config"]
+    }
+    return RunOptions(
+        **stated | {key: tuple(stated.get(key) or ()) for key in ("fixer", "evaluators")}
+    )
 
 
 def ref_of(stated: Mapping[str, Any]) -> ScenarioRef:
-    """Return how a scenario was named when it was driven, as ``run.json`` states it in a scene's ``ref``."""
-    return ScenarioRef(stated["path"], stated.get("seed"), tuple(stated.get("overrides") or ()), stated.get("source"))
+    """Return how a scenario was named when it was driven, as ``run.json`` states it in a scene's
+    ``ref``.
+    """
+    return ScenarioRef(
+        stated["path"],
+        stated.get("seed"),
+        tuple(stated.get("overrides") or ()),
+        stated.get("source"),
+    )
 
 
 @dataclass(frozen=True)
@@ -62,8 +91,11 @@ class Cell:
     evaluators: tuple[PartSpec, ...]
     rollout_key: str  # digest of everything that determines the log
     score_key: str  # digest of rollout_key and of everything that determines the scores
-    stops_at_path_end: bool = True  # as scenario and preset say; not in the key, since it matters only to a rollout that passes it
-    undigested: tuple[str, ...] = ()  # parts without a digest (remote services): the rollout is reused on request only
+    # as scenario and preset say; not in the key, since it matters only to a rollout that passes it
+    stops_at_path_end: bool = True
+    undigested: tuple[
+        str, ...
+    ] = ()  # parts without a digest (remote services): the rollout is reused on request only
 
     @property
     def folder(self) -> Path:
@@ -73,7 +105,12 @@ class Cell:
     @property
     def names(self) -> dict[str, str | int]:
         """Give the columns that identify the cell in tables."""
-        return {"renderer": self.renderer.name, "policy": self.policy.name, "scene": self.scene, "seed": self.seed}
+        return {
+            "renderer": self.renderer.name,
+            "policy": self.policy.name,
+            "scene": self.scene,
+            "seed": self.seed,
+        }
 
 
 @dataclass(frozen=True)
@@ -82,7 +119,8 @@ class RunPlan:
 
     Attributes:
         asked: The scenarios as the command named them: files, folders, suites; in no key.
-        question: Digest of a question that decides which of the cells are driven; empty where all are.
+        question: Digest of a question that decides which of the cells are driven; empty where all
+            are.
         whole: The plan that this is a part of, whose keys it bears; see `part_of`.
     """
 
@@ -98,15 +136,24 @@ class RunPlan:
 
     @property
     def command_key(self) -> str:
-        """Give a short digest of the command: names, paths and options, not the content of the parts."""
+        """Give a short digest of the command: names, paths and options, not the content of the
+        parts.
+        """
         if self.whole is not None:
             return self.whole.command_key
-        named = [[*cell.names.values(), cell.ref.path, cell.ref.seed, cell.ref.overrides] for cell in self.cells]
-        return digest([named, asdict(self.options), *([self.question] if self.question else [])])[:12]
+        named = [
+            [*cell.names.values(), cell.ref.path, cell.ref.seed, cell.ref.overrides]
+            for cell in self.cells
+        ]
+        return digest([named, asdict(self.options), *([self.question] if self.question else [])])[
+            :12
+        ]
 
     @property
     def content(self) -> str:
-        """Give a short digest of everything that determines the results; it changes with any part."""
+        """Give a short digest of everything that determines the results; it changes with any
+        part.
+        """
         if self.whole is not None:
             return self.whole.content
         return digest([[cell.score_key for cell in self.cells], asdict(self.options)])[:12]
@@ -114,7 +161,11 @@ class RunPlan:
     @property
     def parts(self) -> tuple[PartSpec, ...]:
         """Give every part that the run builds, each once."""
-        found = [part for cell in self.cells for part in (cell.renderer.base, cell.renderer.fixer, cell.policy, cell.controller)]
+        found = [
+            part
+            for cell in self.cells
+            for part in (cell.renderer.base, cell.renderer.fixer, cell.policy, cell.controller)
+        ]
         found += [part for cell in self.cells[:1] for part in cell.evaluators]
         return tuple({(part.kind, part.name): part for part in found if part is not None}.values())
 
@@ -131,20 +182,29 @@ def make_plan(
     seeds: Sequence[int],
     options: RunOptions,
 ) -> RunPlan:
-    """Load every scenario, resolve every part, and list the cells, scene by scene so that workers reuse a loaded scene.
+    """Load every scenario, resolve every part, and list the cells, scene by scene so that workers
+    reuse a loaded scene.
 
     Raises:
-        InputError: A scenario or a part is invalid, two scenarios share an id, or a name is given twice.
+        InputError: A scenario or a part is invalid, two scenarios share an id, or a name is given
+            twice.
     """
     for what, values in (("renderer", renderers), ("policy", policies), ("seed", seeds)):
         _check_named_once(what, values)
     rendering = tuple(resolve_renderer(name, options.fixer) for name in renderers)
     same = [str(spec) for spec in rendering]
     if len(set(same)) != len(same):
-        raise InputError(DOING, f"renderers {list(renderers)}", f"they resolve to {same}", "name every renderer once")
+        raise InputError(
+            DOING,
+            f"renderers {list(renderers)}",
+            f"they resolve to {same}",
+            "name every renderer once",
+        )
     _check_fixer_settings(options.fixer, renderers, rendering)
     driving = tuple(resolve("policy", name) for name in policies)
-    moving = {spec.name: resolve("controller", options.controller or spec.controller) for spec in driving}
+    moving = {
+        spec.name: resolve("controller", options.controller or spec.controller) for spec in driving
+    }
     scoring = resolve_evaluators(options.evaluators)
     loaded = _load(refs)
     scenarios = {scenario.scene_id: scenario for _, scenario in loaded}
@@ -163,19 +223,30 @@ def _check_named_once(what: str, values: Sequence[object]) -> None:
     twice = sorted({str(value) for value in values if list(values).count(value) > 1})
     if not values or twice:
         found = f"{', '.join(twice)} twice" if twice else "none"
-        raise InputError(DOING, f"{what}s {', '.join(map(str, values)) or '(none)'}", found, f"name every {what} once")
+        raise InputError(
+            DOING,
+            f"{what}s {', '.join(map(str, values)) or '(none)'}",
+            found,
+            f"name every {what} once",
+        )
 
 
-def _check_fixer_settings(settings: Sequence[str], names: Sequence[str], renderers: Sequence[RendererSpec]) -> None:
+def _check_fixer_settings(
+    settings: Sequence[str], names: Sequence[str], renderers: Sequence[RendererSpec]
+) -> None:
     """Refuse settings of fixers that no renderer has."""
     fixed = {spec.name for spec in renderers if spec.fixer is not None}
     labels = {label for text in settings if (label := text.partition("=")[0].rpartition(":")[0])}
     if unknown := sorted(labels - fixed):
         found = f"no fixer of that name among the renderers {list(names)}"
-        raise InputError(DOING, f"--set {unknown[0]}:fixer...", found, "write the name as --renderer has it")
+        raise InputError(
+            DOING, f"--set {unknown[0]}:fixer...", found, "write the name as --renderer has it"
+        )
     if settings and not fixed:
         found = f"no fixer among the renderers {list(names)}"
-        raise InputError(DOING, f"--set fixer.{settings[0]}", found, "leave it out, or name a fixer")
+        raise InputError(
+            DOING, f"--set fixer.{settings[0]}", found, "leave it out, or name a fixer"
+        )
 
 
 def _load(refs: Sequence[ScenarioRef]) -> list[tuple[ScenarioRef, Scenario]]:
@@ -188,7 +259,10 @@ def _load(refs: Sequence[ScenarioRef]) -> list[tuple[ScenarioRef, Scenario]]:
             found = f"both have the scene id {scenario.scene_id!r}"
             raise InputError(DOING, both, found, "give one of them another id, or name it once")
         note = background_note(scenario)
-        loaded[scenario.scene_id] = ref, replace(scenario, notes=(*scenario.notes, note)) if note else scenario
+        loaded[scenario.scene_id] = (
+            ref,
+            replace(scenario, notes=(*scenario.notes, note)) if note else scenario,
+        )
     return list(loaded.values())
 
 
@@ -197,7 +271,9 @@ def part_of(plan: RunPlan, cells: Sequence[Cell]) -> RunPlan:
     scenes, seeds = {cell.scene for cell in cells}, {cell.seed for cell in cells}
     scenarios = {name: scenario for name, scenario in plan.scenarios.items() if name in scenes}
     kept = tuple(seed for seed in plan.seeds if seed in seeds)
-    return replace(plan, cells=tuple(cells), scenarios=scenarios, seeds=kept, whole=plan.whole or plan)
+    return replace(
+        plan, cells=tuple(cells), scenarios=scenarios, seeds=kept, whole=plan.whole or plan
+    )
 
 
 def refuse_commands(policies: Sequence[str], doing: str, where: str) -> None:
@@ -214,12 +290,18 @@ def refuse_commands(policies: Sequence[str], doing: str, where: str) -> None:
     for name in policies:
         if name.startswith(COMMAND):
             do_this = "give simrun run the same command again: it drives what is missing or damaged"
-            raise InputError(doing, where, f"its policy is a command, {name}; no command is run because a file names it", do_this)
+            raise InputError(
+                doing,
+                where,
+                f"its policy is a command, {name}; no command is run because a file names it",
+                do_this,
+            )
 
 
 @dataclass(frozen=True)
 class _Code:
-    """What the keys of all cells of a plan share; to read it for each cell would cost milliseconds a rollout.
+    """What the keys of all cells of a plan share; to read it for each cell would cost milliseconds
+    a rollout.
 
     Attributes:
         loop: Digest of the loop's code.
@@ -232,7 +314,9 @@ class _Code:
     sources: Mapping[str, str | None]
 
     @classmethod
-    def of(cls, scenarios: Iterable[Scenario], preset_name: str, evaluators: Sequence[PartSpec]) -> _Code:
+    def of(
+        cls, scenarios: Iterable[Scenario], preset_name: str, evaluators: Sequence[PartSpec]
+    ) -> _Code:
         by_source: dict[str | None, str | None] = {}
         sources = {}
         for scenario in scenarios:
@@ -261,18 +345,40 @@ def _cell(
     }
     if options.traffic is not None:
         content[f"traffic service {options.traffic}"] = None
-    rollout_key = digest([code.loop, scenario.content_hash, content, seed, options.images, options.device])
+    rollout_key = digest(
+        [code.loop, scenario.content_hash, content, seed, options.images, options.device]
+    )
     undigested = tuple(what for what, known in content.items() if known is None)
     stops = scenario.stop_at_path_end and preset(options.preset).stop_at_path_end
     scored = digest([rollout_key, *code.scoring])
-    return Cell(renderer, policy, controller, scenario.scene_id, seed, ref, evaluators, rollout_key, scored, stops, undigested)
+    return Cell(
+        renderer,
+        policy,
+        controller,
+        scenario.scene_id,
+        seed,
+        ref,
+        evaluators,
+        rollout_key,
+        scored,
+        stops,
+        undigested,
+    )
 
 
 def score_key(rollout_key: str, preset_name: str, evaluators: Sequence[PartSpec]) -> str:
-    """Return the content key of a rollout's scores; it changes with the preset and the code of the evaluators and of the reduction."""
+    """Return the content key of a rollout's scores; it changes with the preset and the code of the
+    evaluators and of the reduction.
+    """
     return digest([rollout_key, *scoring_content(preset_name, evaluators)])
 
 
 def scoring_content(preset_name: str, evaluators: Sequence[PartSpec]) -> tuple[Any, ...]:
-    """Return what a `score_key` covers besides the rollout: the preset, the code of the scoring, the digest of every evaluator."""
-    return preset(preset_name).as_dict(), own_code_digest(SCORING), [(spec.name, spec.digest) for spec in evaluators]
+    """Return what a `score_key` covers besides the rollout: the preset, the code of the scoring,
+    the digest of every evaluator.
+    """
+    return (
+        preset(preset_name).as_dict(),
+        own_code_digest(SCORING),
+        [(spec.name, spec.digest) for spec in evaluators],
+    )

@@ -1,7 +1,9 @@
-"""Query one policy at the same poses behind several renderers: the effect of the renderer alone on the plans.
+"""Query one policy at the same poses behind several renderers: the effect of the renderer alone on
+the plans.
 
-The logged rollout is replayed with its own parts and compared with its log. Every renderer under test renders every request. Each has a
-policy instance of its own, which sees its frames and is queried at the same instants. Only the plans of the logged renderer's policy drive.
+The logged rollout is replayed with its own parts and compared with its log. Every renderer under
+test renders every request. Each has a policy instance of its own, which sees its frames and is
+queried at the same instants. Only the plans of the logged renderer's policy drive.
 """
 
 from __future__ import annotations
@@ -22,7 +24,16 @@ from alpasim_plugin.core.geometry import quat_from_yaw
 from alpasim_plugin.core.interfaces import Policy, Renderer
 from alpasim_plugin.core.parts import resolve_renderer
 from alpasim_plugin.core.places import temporary_folder
-from alpasim_plugin.core.types import F64, Frame, Observation, Plan, RenderRequest, Route, SensorSpec, Trajectory
+from alpasim_plugin.core.types import (
+    F64,
+    Frame,
+    Observation,
+    Plan,
+    RenderRequest,
+    Route,
+    SensorSpec,
+    Trajectory,
+)
 from alpasim_plugin.log import encode_image
 from alpasim_plugin.log.run_folder.schema import PROBE_JSON, PROBE_PLOT, PROBE_TABLE, probe_folder
 from alpasim_plugin.log.run_folder.writer import write_table
@@ -39,8 +50,17 @@ from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, plan_gap
 HORIZONS_S = (1.0, 3.0)
 DOING = "probing renderers along a logged rollout"
 SCHEMA = pa.schema(
-    [("reference", pa.string()), ("renderer", pa.string()), ("t_us", pa.int64()), ("after_us", pa.int64())]
-    + [(f"{what}_{h:g}s_{unit}", pa.float64()) for h in HORIZONS_S for what, unit in (("gap", "m"), ("turn", "rad"))]
+    [
+        ("reference", pa.string()),
+        ("renderer", pa.string()),
+        ("t_us", pa.int64()),
+        ("after_us", pa.int64()),
+    ]
+    + [
+        (f"{what}_{h:g}s_{unit}", pa.float64())
+        for h in HORIZONS_S
+        for what, unit in (("gap", "m"), ("turn", "rad"))
+    ]
     + [("levels", pa.float64())]
 )
 
@@ -90,10 +110,17 @@ class _MultiRenderer(Renderer):
     def __init__(self, renderers: Mapping[str, Renderer], driver: str) -> None:
         self.renderers, self.driver = renderers, driver
         self.block = renderers[driver].block
-        other = next((name for name, renderer in renderers.items() if renderer.block != self.block), None)
+        other = next(
+            (name for name, renderer in renderers.items() if renderer.block != self.block), None
+        )
         if other is not None:
             found = f"{other!r} renders {renderers[other].block or 'frames one by one'}, {driver!r} {self.block or 'frames one by one'}"
-            raise InputError(DOING, f"--renderers {','.join(renderers)}", found, "choose the mode 'speculative' for both")
+            raise InputError(
+                DOING,
+                f"--renderers {','.join(renderers)}",
+                found,
+                "choose the mode 'speculative' for both",
+            )
         self.lookahead = max(renderer.lookahead for renderer in renderers.values())
         self.latest: dict[str, dict[str, Frame]] = {name: {} for name in renderers}
 
@@ -111,7 +138,9 @@ class _MultiRenderer(Renderer):
 
 @dataclass
 class _MultiPolicy(Policy):
-    """Queries one policy per renderer, each with its renderer's frames, and returns the driving renderer's plan."""
+    """Queries one policy per renderer, each with its renderer's frames, and returns the driving
+    renderer's plan.
+    """
 
     policies: Mapping[str, Policy]
     renderer: _MultiRenderer
@@ -126,8 +155,15 @@ class _MultiPolicy(Policy):
 
     def act(self, observation: Observation) -> Plan:
         latest = self.renderer.latest
-        plans = {name: checked_plan(policy, replace(observation, frames=dict(latest[name]))) for name, policy in self.policies.items()}
-        frames = {name: latest[name][self.sensors[0].camera] for name in self.policies} if self.sensors else {}
+        plans = {
+            name: checked_plan(policy, replace(observation, frames=dict(latest[name])))
+            for name, policy in self.policies.items()
+        }
+        frames = (
+            {name: latest[name][self.sensors[0].camera] for name in self.policies}
+            if self.sensors
+            else {}
+        )
         self.queries.append(PolicyQuery(observation.t_us, plans, frames, observation))
         return plans[self.renderer.driver]
 
@@ -137,22 +173,32 @@ def probe_rollout(past: LoggedRollout, renderers: Sequence[str]) -> Probe:
 
     Args:
         past: The logged rollout, which is replayed.
-        renderers: Which to compare; the first is the reference. The logged renderer need not be among them.
+        renderers: Which to compare; the first is the reference. The logged renderer need not be
+            among them.
 
     Raises:
-        InputError: Fewer than two renderers, a policy without cameras, measured latency, or renderers with different blocks.
+        InputError: Fewer than two renderers, a policy without cameras, measured latency, or
+            renderers with different blocks.
         InfrastructureError: The replay is not equal to the log.
         RendererError: A renderer failed.
         PolicyError: The policy failed with one of them.
     """
     if len(set(renderers)) < 2 or len(set(renderers)) < len(renderers):
-        raise InputError(DOING, f"--renderers {','.join(renderers)}", "fewer than two, or one of them twice", "name two renderers")
+        raise InputError(
+            DOING,
+            f"--renderers {','.join(renderers)}",
+            "fewer than two, or one of them twice",
+            "name two renderers",
+        )
     queries = replay(past, renderers, must_see=True)
     return Probe(queries, tuple(compare(queries, renderers[0], name) for name in renderers[1:]))
 
 
-def replay(past: LoggedRollout, renderers: Sequence[str] = (), must_see: bool = False) -> tuple[PolicyQuery, ...]:
-    """Drive a logged rollout again and return its queries, with what these renderers beside its own show at its poses.
+def replay(
+    past: LoggedRollout, renderers: Sequence[str] = (), must_see: bool = False
+) -> tuple[PolicyQuery, ...]:
+    """Drive a logged rollout again and return its queries, with what these renderers beside its own
+    show at its poses.
 
     Raises:
         As `probe_rollout`.
@@ -160,18 +206,39 @@ def replay(past: LoggedRollout, renderers: Sequence[str] = (), must_see: bool = 
     past.check_repeatable(DOING)
     own, threads = past.cell, thread_budget(1, 1).per_worker
     specs = {own.renderer.name: own.renderer} | {
-        name: resolve_renderer(name, past.options.fixer) for name in renderers if name != own.renderer.name
+        name: resolve_renderer(name, past.options.fixer)
+        for name in renderers
+        if name != own.renderer.name
     }
-    parts = {name: build_parts(replace(own, renderer=spec), past.options, past.scenario, threads) for name, spec in specs.items()}
+    parts = {
+        name: build_parts(replace(own, renderer=spec), past.options, past.scenario, threads)
+        for name, spec in specs.items()
+    }
     renderer = _MultiRenderer({name: p.renderer for name, p in parts.items()}, own.renderer.name)
     policy = _MultiPolicy({name: p.policy for name, p in parts.items()}, renderer)
     if must_see and not policy.sensors:
-        raise InputError(DOING, past.name, f"the policy {own.policy.name!r} has no camera", "probe a rollout of a policy with cameras")
+        raise InputError(
+            DOING,
+            past.name,
+            f"the policy {own.policy.name!r} has no camera",
+            "probe a rollout of a policy with cameras",
+        )
     with temporary_folder("simrun-probe-") as folder:
-        with Recorder(past.scenario, own.seed, Path(folder), own.rollout_key, past.options.images) as recorder:
-            run_rollout(past.scenario, renderer, policy, own.seed, recorder, parts[own.renderer.name].controller)
+        with Recorder(
+            past.scenario, own.seed, Path(folder), own.rollout_key, past.options.images
+        ) as recorder:
+            run_rollout(
+                past.scenario,
+                renderer,
+                policy,
+                own.seed,
+                recorder,
+                parts[own.renderer.name].controller,
+            )
         one, other = log_trace(past.folder), log_trace(Path(folder))
-    difference = first_difference(one, other, past.scenario.start_us, past.scenario.rates.control_us)
+    difference = first_difference(
+        one, other, past.scenario.start_us, past.scenario.rates.control_us
+    )
     if difference is not None:
         raise InfrastructureError(
             DOING,
@@ -184,14 +251,25 @@ def replay(past: LoggedRollout, renderers: Sequence[str] = (), must_see: bool = 
 
 def compare(queries: Sequence[PolicyQuery], reference: str, renderer: str) -> Pair:
     """Compare the plans of two renderers over all queries."""
-    n, first, first_gap = len(queries), None, None
-    gap, turn, levels = np.full((n, len(HORIZONS_S)), np.nan), np.full((n, len(HORIZONS_S)), np.nan), np.zeros(n)
+    n = len(queries)
+    first = None
+    first_gap = None
+    gap = np.full((n, len(HORIZONS_S)), np.nan)
+    turn = np.full((n, len(HORIZONS_S)), np.nan)
+    levels = np.zeros(n)
     for row, query in enumerate(queries):
         # Plans as rig poses in the frame of the query, which all renderers share.
         plans = [query.plans[name] for name in (reference, renderer)]
-        a, b = (Trajectory(p.times_us, np.column_stack([p.xy, np.zeros(len(p.times_us))]), quat_from_yaw(p.yaw)) for p in plans)
+        a, b = (
+            Trajectory(
+                p.times_us, np.column_stack([p.xy, np.zeros(len(p.times_us))]), quat_from_yaw(p.yaw)
+            )
+            for p in plans
+        )
         end_us = min(query.t_us + HORIZON_US, int(a.t_us[-1]), int(b.t_us[-1]))
-        distances, turns = plan_gap(a, b, [*(query.t_us + round(h * 1e6) for h in HORIZONS_S), end_us])
+        distances, turns = plan_gap(
+            a, b, [*(query.t_us + round(h * 1e6) for h in HORIZONS_S), end_us]
+        )
         gap[row], turn[row] = distances[:-1], turns[:-1]
         if first is None and distances[-1] > DIVERGED_M:
             first, first_gap = row, float(distances[-1])
@@ -202,32 +280,54 @@ def compare(queries: Sequence[PolicyQuery], reference: str, renderer: str) -> Pa
 
 def summarise(pair: Pair, queries: Sequence[PolicyQuery], start_us: int) -> dict[str, Any]:
     """Return the numbers of a pair for JSON, without the frames."""
-    out: dict[str, Any] = {"reference": pair.reference, "renderer": pair.renderer, "queries": len(queries)}
+    out: dict[str, Any] = {
+        "reference": pair.reference,
+        "renderer": pair.renderer,
+        "queries": len(queries),
+    }
     for j, horizon in enumerate(HORIZONS_S):
         known = pair.gap_m[np.isfinite(pair.gap_m[:, j]), j]
         turns = np.abs(pair.turn_rad[np.isfinite(pair.turn_rad[:, j]), j])
         stats = {"median": 50, "p95": 95, "max": 100}
-        out[f"gap_{horizon:g}s_m"] = {k: round(float(np.percentile(known, q)), 4) for k, q in stats.items()} if len(known) else None
-        out[f"turn_{horizon:g}s_rad"] = {k: round(float(np.percentile(turns, q)), 5) for k, q in stats.items()} if len(turns) else None
+        out[f"gap_{horizon:g}s_m"] = (
+            {k: round(float(np.percentile(known, q)), 4) for k, q in stats.items()}
+            if len(known)
+            else None
+        )
+        out[f"turn_{horizon:g}s_rad"] = (
+            {k: round(float(np.percentile(turns, q)), 5) for k, q in stats.items()}
+            if len(turns)
+            else None
+        )
     out["levels_mean"] = round(float(np.mean(pair.levels)), 3) if len(pair.levels) else None
     out["first_divergence"] = None
     if pair.first is not None and pair.first_gap_m is not None:
         t_us = queries[pair.first].t_us
-        out["first_divergence"] = {"t_us": t_us, "after_us": t_us - start_us, "gap_m": round(pair.first_gap_m, 4)}
+        out["first_divergence"] = {
+            "t_us": t_us,
+            "after_us": t_us - start_us,
+            "gap_m": round(pair.first_gap_m, 4),
+        }
     return out
 
 
-def write_probe(probe: Probe, past: LoggedRollout, renderers: tuple[str, ...], out: Path | None = None) -> Path:
-    """Write ``probe.parquet``, ``probe.json``, ``probe.png`` and the frames of each first divergence; return the folder.
+def write_probe(
+    probe: Probe, past: LoggedRollout, renderers: tuple[str, ...], out: Path | None = None
+) -> Path:
+    """Write ``probe.parquet``, ``probe.json``, ``probe.png`` and the frames of each first
+    divergence; return the folder.
 
     Args:
         probe: The probe.
         past: The rollout it went along.
         renderers: The renderers compared.
-        out: Folder; by default one below ``probes/`` in the rollout's run folder, where the report looks.
+        out: Folder; by default one below ``probes/`` in the rollout's run folder, where the report
+            looks.
     """
     cell = past.cell
-    folder = out or past.root / probe_folder(cell.renderer.name, cell.policy.name, cell.scene, cell.seed, renderers)
+    folder = out or past.root / probe_folder(
+        cell.renderer.name, cell.policy.name, cell.scene, cell.seed, renderers
+    )
     folder.mkdir(parents=True, exist_ok=True)
     start_us = past.scenario.start_us
     pairs, rows = [], []
@@ -235,18 +335,35 @@ def write_probe(probe: Probe, past: LoggedRollout, renderers: tuple[str, ...], o
         entry = summarise(pair, probe.queries, start_us)
         if pair.first is not None:
             frames = probe.queries[pair.first].frames
-            names = {name: f"first-{number}-{side}.jpg" for side, name in enumerate((pair.reference, pair.renderer))}
+            names = {
+                name: f"first-{number}-{side}.jpg"
+                for side, name in enumerate((pair.reference, pair.renderer))
+            }
             for name, file in names.items():
                 write_bytes(folder / file, encode_image(frames[name].rgb, "jpeg", 85))
             entry["first_divergence"]["frames"] = names
         pairs.append(entry)
         for i, query in enumerate(probe.queries):
-            row = {"reference": pair.reference, "renderer": pair.renderer, "t_us": query.t_us, "after_us": query.t_us - start_us}
+            row = {
+                "reference": pair.reference,
+                "renderer": pair.renderer,
+                "t_us": query.t_us,
+                "after_us": query.t_us - start_us,
+            }
             for j, h in enumerate(HORIZONS_S):
-                row |= {f"gap_{h:g}s_m": _number(pair.gap_m[i, j]), f"turn_{h:g}s_rad": _number(pair.turn_rad[i, j])}
+                row |= {
+                    f"gap_{h:g}s_m": _number(pair.gap_m[i, j]),
+                    f"turn_{h:g}s_rad": _number(pair.turn_rad[i, j]),
+                }
             rows.append(row | {"levels": float(pair.levels[i])})
     write_table(folder / PROBE_TABLE, rows, SCHEMA)
-    about = {"along": past.name, "renderers": list(renderers), "threshold_m": DIVERGED_M, "horizon_s": HORIZON_US * 1e-6, "pairs": pairs}
+    about = {
+        "along": past.name,
+        "renderers": list(renderers),
+        "threshold_m": DIVERGED_M,
+        "horizon_s": HORIZON_US * 1e-6,
+        "pairs": pairs,
+    }
     write_json(folder / PROBE_JSON, about)
     _plot(folder / PROBE_PLOT, probe, past)
     return folder
@@ -270,7 +387,9 @@ def _plot(path: Path, probe: Probe, past: LoggedRollout) -> None:
         below.plot(seconds, pair.levels, color=f"C{k}", label=pair.renderer)
         if pair.first is not None:
             above.axvline(seconds[pair.first], color=f"C{k}", linewidth=0.8, alpha=0.6)
-    above.axhline(DIVERGED_M, color="0.5", linestyle=":", linewidth=1.0, label=f"diverged: {DIVERGED_M} m")
+    above.axhline(
+        DIVERGED_M, color="0.5", linestyle=":", linewidth=1.0, label=f"diverged: {DIVERGED_M} m"
+    )
     above.set_ylabel("distance of plans, m")
     middle.set_ylabel("heading difference, degrees")
     below.set_ylabel("image difference, 8-bit levels")
@@ -284,6 +403,7 @@ def _plot(path: Path, probe: Probe, past: LoggedRollout) -> None:
     above.legend(fontsize=8, loc="upper left")
     reference = probe.pairs[0].reference
     above.set_title(
-        f"{past.cell.policy.name} along {past.cell.scene}, seed {past.cell.seed}: compared with {reference} (grey: warm-up)", fontsize=10
+        f"{past.cell.policy.name} along {past.cell.scene}, seed {past.cell.seed}: compared with {reference} (grey: warm-up)",
+        fontsize=10,
     )
     figure.savefig(path, dpi=110)

@@ -1,4 +1,6 @@
-"""What a run folder says of its making: versions, machine and source, and what was chosen by measuring it."""
+"""What a run folder says of its making: versions, machine and source, and what was chosen by
+measuring it.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +17,30 @@ from typing import Any, TypedDict
 
 from alpasim_plugin import __version__
 
-PACKAGES = ("numpy", "scipy", "numba", "torch", "shapely", "opencv-contrib-python-headless", "pyarrow", "av")
+PACKAGES = (
+    "numpy",
+    "scipy",
+    "numba",
+    "torch",
+    "shapely",
+    "opencv-contrib-python-headless",
+    "pyarrow",
+    "av",
+)
 VARIABLE = "SIMRUN_COMMIT"
 PATIENCE_S = 5.0
-# The repository may be a stranger's: nothing that its configuration names may run, and nothing may be fetched.
-GIT = ("git", "--no-optional-locks", "-c", "core.fsmonitor=false", "-c", "log.showSignature=false", "-c", "core.hooksPath=/dev/null")
+# The repository may be a stranger's: nothing that its configuration names may run, and nothing may
+# be fetched.
+GIT = (
+    "git",
+    "--no-optional-locks",
+    "-c",
+    "core.fsmonitor=false",
+    "-c",
+    "log.showSignature=false",
+    "-c",
+    "core.hooksPath=/dev/null",
+)
 STATUS = ("--porcelain=v2", "--branch", "--untracked-files=no", "--ignore-submodules=dirty")
 ALONE = {"GIT_ALLOW_PROTOCOL": "none", "GIT_NO_LAZY_FETCH": "1"}
 _COMMIT = re.compile(r"[0-9a-f]{7,64}")
@@ -27,7 +48,9 @@ COUNTS = ("predicted", "hits", "exact", "drafts", "redrafts")
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the libraries that affect results, or "not installed"."""
+    """Return the versions of Python and of the libraries that affect results, or "not
+    installed".
+    """
     found = {"alpasim-onefixer": __version__, "python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -40,7 +63,9 @@ def versions() -> dict[str, str]:
 def hardware() -> dict[str, Any]:
     """Return the processor, the cores that this process may use, memory and operating system."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else None
+    memory = (
+        os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else None
+    )
     return {
         "cpu": _cpu_name(),
         "cores": cores,
@@ -66,8 +91,8 @@ class Project(TypedDict):
         commit: Full hash of the commit; None where there is none.
         committed_at: When it was made, ISO 8601.
         branch: None where no branch is checked out.
-        dirty: Whether a file that git follows differs from the commit; files that it does not follow do not count, nor do changes in
-            submodules.
+        dirty: Whether a file that git follows differs from the commit; files that it does not
+            follow do not count, nor do changes in submodules.
         reason: Why there is no commit, else empty.
     """
 
@@ -79,13 +104,15 @@ class Project(TypedDict):
 
 
 def project(folder: Path | None = None) -> Project:
-    """Return the commit of the repository that holds a folder, or what ``SIMRUN_COMMIT`` says where the repository is elsewhere.
+    """Return the commit of the repository that holds a folder, or what ``SIMRUN_COMMIT`` says where
+    the repository is elsewhere.
 
     Args:
         folder: The working directory by default.
 
     Returns:
-        Without a repository, or without git, ``commit`` is None and ``reason`` says why: a run needs neither.
+        Without a repository, or without git, ``commit`` is None and ``reason`` says why: a run
+        needs neither.
     """
     stated = os.environ.get(VARIABLE, "").strip().lower()
     if stated:
@@ -95,7 +122,13 @@ def project(folder: Path | None = None) -> Project:
     try:
         last = _git(folder, "log", "-1", "--format=%H %cI")
         state = _git(
-            folder, *_no_filters(folder), "status", "--porcelain=v2", "--branch", "--untracked-files=no", "--ignore-submodules=dirty"
+            folder,
+            *_no_filters(folder),
+            "status",
+            "--porcelain=v2",
+            "--branch",
+            "--untracked-files=no",
+            "--ignore-submodules=dirty",
         )
     except FileNotFoundError:
         return _without("git is not installed")
@@ -106,11 +139,22 @@ def project(folder: Path | None = None) -> Project:
         return _without(said[0] if said else f"git ended with {error.returncode}")
     commit, _, committed_at = last.strip().partition(" ")
     lines = state.splitlines()
-    branch = next((line.removeprefix("# branch.head ") for line in lines if line.startswith("# branch.head ")), "(detached)")
+    branch = next(
+        (
+            line.removeprefix("# branch.head ")
+            for line in lines
+            if line.startswith("# branch.head ")
+        ),
+        "(detached)",
+    )
     dirty = any(not line.startswith("#") for line in lines)
     return {
-        "commit": commit, "committed_at": committed_at, "branch": None if branch == "(detached)" else branch, "dirty": dirty, "reason": "",
-    }  # fmt: skip
+        "commit": commit,
+        "committed_at": committed_at,
+        "branch": None if branch == "(detached)" else branch,
+        "dirty": dirty,
+        "reason": "",
+    }
 
 
 def _without(reason: str) -> Project:
@@ -124,12 +168,19 @@ def _git(folder: Path | None, *words: str) -> str:
 
 
 def _no_filters(folder: Path | None) -> list[str]:
-    """Return the words that switch off what a repository's configuration runs on files: a filter's file then counts as it lies there.
+    """Return the words that switch off what a repository's configuration runs on files: a filter's
+    file then counts as it lies there.
 
     Raises:
         subprocess.CalledProcessError: A filter's name cannot be said on a command line.
     """
-    words = ["config", "--name-only", "-z", "--get-regexp", r"^filter\..*\.(clean|process|required)$"]
+    words = [
+        "config",
+        "--name-only",
+        "-z",
+        "--get-regexp",
+        r"^filter\..*\.(clean|process|required)$",
+    ]
     try:
         names = _git(folder, *words).split("\0")[:-1]
     except subprocess.CalledProcessError as error:
@@ -137,16 +188,23 @@ def _no_filters(folder: Path | None) -> list[str]:
             raise
         return []  # none is configured
     if any("=" in name for name in names):
-        raise subprocess.CalledProcessError(1, words, stderr="a filter of its configuration has '=' in its name")
-    return [word for name in names for word in ("-c", f"{name}={'false' if name.endswith('.required') else ''}")]
+        raise subprocess.CalledProcessError(
+            1, words, stderr="a filter of its configuration has '=' in its name"
+        )
+    return [
+        word
+        for name in names
+        for word in ("-c", f"{name}={'false' if name.endswith('.required') else ''}")
+    ]
 
 
 def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return for each renderer with a fixer: ``label``, ``trained``, ``mode``, ``rollouts`` and ``frames``; ``blocks`` unless the
-    mode is ``frame``.
+    """Return for each renderer with a fixer: ``label``, ``trained``, ``mode``, ``rollouts`` and
+    ``frames``; ``blocks`` unless the mode is ``frame``.
 
-    In speculative mode also the counts of `block_fixers.speculation.SpeculationStats` over rollouts, ``hit_rate`` (the share of
-    predicted frames within tolerance), and the largest ``forecast_error`` and ``shown_error``.
+    In speculative mode also the counts of `block_fixers.speculation.SpeculationStats` over
+    rollouts, ``hit_rate`` (the share of predicted frames within tolerance), and the largest
+    ``forecast_error`` and ``shown_error``.
 
     Args:
         manifests: Of finished rollouts of one policy.
@@ -156,21 +214,32 @@ def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
         facts = [m["fixer"] for m in manifests if m["renderer"] == name and m.get("fixer")]
         if not facts:
             continue
-        entry = {key: facts[0][key] for key in ("label", "trained", "mode")} | {"rollouts": len(facts)}
-        entry |= {key: sum(one[key] for one in facts) for key in ("frames", "blocks") if key in facts[0]}
+        entry = {key: facts[0][key] for key in ("label", "trained", "mode")} | {
+            "rollouts": len(facts)
+        }
+        entry |= {
+            key: sum(one[key] for one in facts) for key in ("frames", "blocks") if key in facts[0]
+        }
         if entry["mode"] == "speculative":
             entry |= {key: sum(one[key] for one in facts) for key in COUNTS}
-            entry["hit_rate"] = round(entry["hits"] / entry["predicted"], 4) if entry["predicted"] else None
-            entry |= {key: _largest(one[key] for one in facts) for key in ("forecast_error", "shown_error")}
+            entry["hit_rate"] = (
+                round(entry["hits"] / entry["predicted"], 4) if entry["predicted"] else None
+            )
+            entry |= {
+                key: _largest(one[key] for one in facts)
+                for key in ("forecast_error", "shown_error")
+            }
         out[name] = entry
     return out
 
 
 def chosen(manifests: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Return for each renderer with a fixer what was chosen by measuring the machines, for ``run.json``.
+    """Return for each renderer with a fixer what was chosen by measuring the machines, for
+    ``run.json``.
 
-    One entry for each node (``node``; null: the machine that the command ran on) and choice, with what was measured and the number of
-    rollouts. A node has several entries only where the run was continued, or its processes share no temporary folder.
+    One entry for each node (``node``; null: the machine that the command ran on) and choice, with
+    what was measured and the number of rollouts. A node has several entries only where the run was
+    continued, or its processes share no temporary folder.
     """
     out: dict[str, list[dict[str, Any]]] = {}
     for manifest in manifests:
@@ -178,7 +247,9 @@ def chosen(manifests: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]
         if not facts:
             continue
         node, entries = manifest.get("node"), out.setdefault(manifest["renderer"], [])
-        same = [entry for entry in entries if (entry["node"], _picked(entry)) == (node, _picked(facts))]
+        same = [
+            entry for entry in entries if (entry["node"], _picked(entry)) == (node, _picked(facts))
+        ]
         if same:
             same[0]["rollouts"] += 1
         else:
@@ -187,11 +258,15 @@ def chosen(manifests: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]
 
 
 def _picked(facts: Mapping[str, Any]) -> tuple[Any, Any]:
-    return facts["precision"]["name"] if "precision" in facts else None, facts["threads"]["number"] if "threads" in facts else None
+    return facts["precision"]["name"] if "precision" in facts else None, facts["threads"][
+        "number"
+    ] if "threads" in facts else None
 
 
 def _largest(spreads: Iterable[dict[str, dict[str, float] | None]]) -> dict[str, float | None]:
-    """Return the largest value of each kind of error over rollouts; None where there is no finite one."""
+    """Return the largest value of each kind of error over rollouts; None where there is no finite
+    one.
+    """
     found: dict[str, list[float]] = {}
     for spread in spreads:
         for name, values in spread.items():

@@ -1,4 +1,6 @@
-"""Writes the files of one rollout: the log, per-frame facts, a strip of frames and on request a video; collects stage times."""
+"""Writes the files of one rollout: the log, per-frame facts, a strip of frames and on request a
+video; collects stage times.
+"""
 
 from __future__ import annotations
 
@@ -34,14 +36,24 @@ from alpasim_plugin.core.types import (
     Trajectory,
     Vehicle,
 )
-from alpasim_plugin.log import AslWriter, encode_image, header_from_scenario, read_asl, write_facts, write_mp4
+from alpasim_plugin.log import (
+    AslWriter,
+    encode_image,
+    header_from_scenario,
+    read_asl,
+    write_facts,
+    write_mp4,
+)
 from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME, STRIP_NAME, VIDEO_NAME
 from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.runs.loop_state import PathEnd
 
 REACH_S = 1.0
 MOVING_MPS = 1.0  # below, a plan's speed says nothing about its unit
-SLACK, SLACK_M = 2.0, 5.0  # a plan may ask for more than the vehicle gives: only what is far beyond counts
+SLACK, SLACK_M = (
+    2.0,
+    5.0,
+)  # a plan may ask for more than the vehicle gives: only what is far beyond counts
 WARN_SHARE, MIN_PLANS = 0.2, 5
 NO_PLAN = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
 
@@ -53,34 +65,45 @@ class StageTimes:
         self.durations_s: dict[str, list[float]] = defaultdict(list)
 
     @contextmanager
-    def measure(self, stage: str, shares: int = 1, within: Callable[[], Mapping[str, float]] | None = None) -> Iterator[None]:
+    def measure(
+        self, stage: str, shares: int = 1, within: Callable[[], Mapping[str, float]] | None = None
+    ) -> Iterator[None]:
         """Time one pass through a stage; a stage that raises is timed as well.
 
         Args:
             stage: Its name.
             shares: Number of equal passes it counts as (frames of a block); 0 records nothing.
-            within: Called after the pass; returns the parts of it, in milliseconds, that belong to other stages.
+            within: Called after the pass; returns the parts of it, in milliseconds, that belong to
+                other stages.
         """
         began = time.perf_counter()
         try:
             yield
         finally:
             parts = dict(within()) if within is not None and shares else {}
-            parts[stage] = parts.get(stage, 0.0) + 1e3 * (time.perf_counter() - began) - sum(parts.values())
+            parts[stage] = (
+                parts.get(stage, 0.0) + 1e3 * (time.perf_counter() - began) - sum(parts.values())
+            )
             for name, part_ms in parts.items():
                 self.durations_s[name] += [1e-3 * part_ms / shares] * shares if shares else []
 
     def as_ms(self) -> dict[str, list[float]]:
         """Return all durations in milliseconds, rounded to a microsecond."""
-        return {stage: [round(1e3 * d, 3) for d in durations] for stage, durations in self.durations_s.items() if durations}
+        return {
+            stage: [round(1e3 * d, 3) for d in durations]
+            for stage, durations in self.durations_s.items()
+            if durations
+        }
 
 
 class PlanMotion:
-    """Counts the plans of one rollout that reach much further, or much less far, than the vehicle can drive.
+    """Counts the plans of one rollout that reach much further, or much less far, than the vehicle
+    can drive.
 
-    A plan's reach is its straight-line advance ``d`` in the first second (or up to its end). At speed ``v`` the vehicle drives at most
-    ``v t + a t^2 / 2`` with full throttle, and at least its braking distance. A plan is beyond the vehicle if ``d`` is more than twice the
-    former and 5 m, and below it if ``d`` is less than a tenth of the latter.
+    A plan's reach is its straight-line advance ``d`` in the first second (or up to its end). At
+    speed ``v`` the vehicle drives at most ``v t + a t^2 / 2`` with full throttle, and at least its
+    braking distance. A plan is beyond the vehicle if ``d`` is more than twice the former and 5 m,
+    and below it if ``d`` is less than a tenth of the latter.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -95,8 +118,14 @@ class PlanMotion:
         if reach_s <= 0.0:
             return  # one pose: the ego is to stand
         self._plans += 1
-        advance_m = float(np.hypot(*(np.interp(reach_s, t_s, plan.xy[:, axis]) - plan.xy[0, axis] for axis in (0, 1))))
-        speed, accel, brake = abs(ego.speed_mps), self._vehicle.max_accel_mps2, self._vehicle.max_brake_mps2
+        advance_m = float(
+            np.hypot(
+                *(np.interp(reach_s, t_s, plan.xy[:, axis]) - plan.xy[0, axis] for axis in (0, 1))
+            )
+        )
+        speed = abs(ego.speed_mps)
+        accel = self._vehicle.max_accel_mps2
+        brake = self._vehicle.max_brake_mps2
         most_m = speed * reach_s + 0.5 * accel * reach_s**2
         braking_s = min(reach_s, speed / brake)
         least_m = speed * braking_s - 0.5 * brake * braking_s**2
@@ -106,40 +135,60 @@ class PlanMotion:
             self._ratios.append(advance_m / (speed * reach_s))
 
     def facts(self) -> dict[str, Any]:
-        """Return ``plans``, ``beyond``, ``below``, and ``speed_ratio``: median of plan speed over the ego's (None if it never moved)."""
+        """Return ``plans``, ``beyond``, ``below``, and ``speed_ratio``: median of plan speed over
+        the ego's (None if it never moved).
+        """
         ratio = round(float(np.median(self._ratios)), 4) if self._ratios else None
-        return {"plans": self._plans, "beyond": self._beyond, "below": self._below, "speed_ratio": ratio}
+        return {
+            "plans": self._plans,
+            "beyond": self._beyond,
+            "below": self._below,
+            "speed_ratio": ratio,
+        }
 
 
 def plan_table(manifests: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return for each renderer the counts of `PlanMotion` over rollouts, and ``warning``: a sentence where plans and vehicle do not fit.
+    """Return for each renderer the counts of `PlanMotion` over rollouts, and ``warning``: a
+    sentence where plans and vehicle do not fit.
 
     Args:
         manifests: Of finished rollouts of one policy; those of scored logs have no plans counted.
     """
     out: dict[str, Any] = {}
     for name in dict.fromkeys(m["renderer"] for m in manifests):
-        facts = [m["plan_motion"] for m in manifests if m["renderer"] == name and m.get("plan_motion")]
+        facts = [
+            m["plan_motion"] for m in manifests if m["renderer"] == name and m.get("plan_motion")
+        ]
         if not facts:
             continue
         ratios = [one["speed_ratio"] for one in facts if one["speed_ratio"] is not None]
-        entry: dict[str, Any] = {key: sum(one[key] for one in facts) for key in ("plans", "beyond", "below")}
+        entry: dict[str, Any] = {
+            key: sum(one[key] for one in facts) for key in ("plans", "beyond", "below")
+        }
         entry["speed_ratio"] = round(float(np.median(ratios)), 4) if ratios else None
         out[name] = entry | {"warning": _warning(entry)}
     return out
 
 
 def _warning(entry: Mapping[str, Any]) -> str:
-    plans, beyond, below, ratio = (entry[key] for key in ("plans", "beyond", "below", "speed_ratio"))
+    plans, beyond, below, ratio = (
+        entry[key] for key in ("plans", "beyond", "below", "speed_ratio")
+    )
     found = max(beyond, below)
     if plans < MIN_PLANS or found < WARN_SHARE * plans:
         return ""
-    how = "further than the vehicle can drive in that time" if beyond >= below else "less far than its braking distance"
+    how = (
+        "further than the vehicle can drive in that time"
+        if beyond >= below
+        else "less far than its braking distance"
+    )
     said = f"{found} of {plans} plans reach {how}"
     if ratio is None:
         return said
     unit = unit_guess(ratio)
-    return f"{said}; their speed is {ratio:.3g} times the ego's{f', as if in {unit}' if unit else ''}"
+    return (
+        f"{said}; their speed is {ratio:.3g} times the ego's{f', as if in {unit}' if unit else ''}"
+    )
 
 
 class Recorder:
@@ -152,7 +201,8 @@ class Recorder:
         session: Identifies the rollout in the log; equal rollouts have equal ids.
         images: Encoding of camera frames in the log.
         keep_frames: Keep every frame for a video, not only those of the strip.
-        versions: Names of services for the log's header, such as ``{"sensorsim": "3dgs", "egodriver": "lane-camera"}``.
+        versions: Names of services for the log's header, such as ``{"sensorsim": "3dgs",
+            "egodriver": "lane-camera"}``.
     """
 
     def __init__(
@@ -183,7 +233,12 @@ class Recorder:
     def __enter__(self) -> Recorder:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         if error is not None and self._writer is not None:
             self._writer.abandon()
 
@@ -192,27 +247,33 @@ class Recorder:
         return self._times.measure(name)
 
     def rendering(self, renderer: Renderer, frames: int) -> AbstractContextManager[None]:
-        """Time the rendering of ``frames`` frames; stages that the renderer reports are timed under their own names."""
+        """Time the rendering of ``frames`` frames; stages that the renderer reports are timed under
+        their own names.
+        """
         if self._only_watched:
             return nullcontext()
         self._first_call = self._first_call or frames
         return self._times.measure("render", frames, lambda: renderer.stage_ms)
 
     def watch(self, scenario: Scenario) -> tuple[SensorSpec, ...]:
-        """Return the camera to render for a policy without one: the scenario's first if a video is kept, else none.
+        """Return the camera to render for a policy without one: the scenario's first if a video is
+        kept, else none.
 
-        Its frames go into the pictures alone: neither the log nor times nor scores depend on whether somebody watches.
+        Its frames go into the pictures alone: neither the log nor times nor scores depend on
+        whether somebody watches.
         """
         self._only_watched = self._keep_frames and bool(scenario.cameras)
         return (SensorSpec(scenario.cameras[0].name),) if self._only_watched else ()
 
-    # --- in the loop's order ----------------------------------------------------------------------------------------
+    # --- in the loop's order
 
     def start(self, clock: Clock, cameras: Mapping[str, CameraSpec]) -> None:
         """Open the log and write its header."""
         if cameras:
             self._pictures = Pictures(clock, next(iter(cameras)), self._keep_frames)
-        header = header_from_scenario(self._scenario, self._session, self._seed, clock.n_steps, self._versions)
+        header = header_from_scenario(
+            self._scenario, self._session, self._seed, clock.n_steps, self._versions
+        )
         self._writer = AslWriter(self.folder / LOG_NAME, header)
         self._writer.begin([] if self._only_watched else list(cameras.values()))
 
@@ -235,7 +296,9 @@ class Recorder:
                 {
                     "t_us": frame.t_us,
                     "camera": frame.camera,
-                    "opacity_mean": None if frame.alpha is None else round(float(frame.alpha.mean()), 5),
+                    "opacity_mean": None
+                    if frame.alpha is None
+                    else round(float(frame.alpha.mean()), 5),
                     "rgb_sha256": hashlib.sha256(frame.rgb.tobytes()).hexdigest()[:16],
                     "events": " ".join(frame.events),
                 }
@@ -249,7 +312,9 @@ class Recorder:
         with self.stage("log"):
             log, history = self._scenario.ego_log, observation.history.t_us
             unlogged = history[(history > self._last_query_us) & (history < clock.start_us)]
-            context = ego_states_from_log(log, unlogged, self._scenario.vehicle) if len(unlogged) else []
+            context = (
+                ego_states_from_log(log, unlogged, self._scenario.vehicle) if len(unlogged) else []
+            )
             self._log.ego_trajectory([*context, observation.ego])
             self._last_query_us = observation.t_us
             self._log.route(observation.t_us, observation.route_rig)
@@ -260,10 +325,14 @@ class Recorder:
         with self.stage("log"):
             self._log.driver_return(plan, samples)
 
-    def control_step(self, before: EgoState, plan: Trajectory | None, after: EgoState, forced: bool) -> None:
+    def control_step(
+        self, before: EgoState, plan: Trajectory | None, after: EgoState, forced: bool
+    ) -> None:
         """Log one control step."""
         with self.stage("log"):
-            self._log.controller_request(before, plan if plan is not None else NO_PLAN, after.t_us, forced)
+            self._log.controller_request(
+                before, plan if plan is not None else NO_PLAN, after.t_us, forced
+            )
             self._log.controller_return(after)
             self._steps += 1
 
@@ -274,7 +343,7 @@ class Recorder:
             self._log.finish()
             write_facts(self.folder / FRAMES_NAME, self._frames)
 
-    # --- after the rollout ------------------------------------------------------------------------------------------
+    # --- after the rollout
 
     def log(self, images: bool = True) -> RolloutLog:
         """Read the finished log back."""
@@ -295,7 +364,9 @@ class Recorder:
             "plan_motion": self.plan_motion.facts(),
             "stage_ms": self._times.as_ms(),
             "session_uuid": self._session,
-            "strip_t_us": [] if self._pictures is None else [t_us for t_us, _ in self._pictures.strip()],
+            "strip_t_us": []
+            if self._pictures is None
+            else [t_us for t_us, _ in self._pictures.strip()],
         }
 
     def save_pictures(self, video: bool) -> None:
@@ -324,7 +395,10 @@ class Pictures:
 
     def __init__(self, clock: Clock, camera: str, all_frames: bool) -> None:
         self._camera, self._all, self._period_us = camera, all_frames, clock.rates.camera_us
-        self._strip_us = [clock.start_us + round(fraction * clock.n_steps) * clock.rates.control_us for fraction in STRIP_FRACTIONS]
+        self._strip_us = [
+            clock.start_us + round(fraction * clock.n_steps) * clock.rates.control_us
+            for fraction in STRIP_FRACTIONS
+        ]
         self._kept: list[tuple[int, U8]] = []
 
     def add(self, frame: Frame) -> None:
@@ -336,7 +410,9 @@ class Pictures:
         """Write the strip, and the video if requested; nothing for a rollout without frames."""
         strip = [rgb for _, rgb in self.strip()]
         if strip:
-            write_bytes(folder / STRIP_NAME, encode_image(np.concatenate(strip, axis=1), "jpeg", 90))
+            write_bytes(
+                folder / STRIP_NAME, encode_image(np.concatenate(strip, axis=1), "jpeg", 90)
+            )
         if video and self._kept:
             write_mp4(folder / VIDEO_NAME, [rgb for _, rgb in self._kept], 1e6 / self._period_us)
 

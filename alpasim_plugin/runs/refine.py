@@ -1,7 +1,9 @@
-"""Refine a video file or a folder of pictures: read, fix block by block, write; optionally with opacity and semantic map.
+"""Refine a video file or a folder of pictures: read, fix block by block, write; optionally with
+opacity and semantic map.
 
-Only the current block is held in memory. The result is renamed to its final name when it is complete. A folder of PNG pictures may stand
-in the place of a video: no codec between a frame and what is made of it.
+Only the current block is held in memory. The result is renamed to its final name when it is
+complete. A folder of PNG pictures may stand in the place of a video: no codec between a frame and
+what is made of it.
 """
 
 from __future__ import annotations
@@ -42,22 +44,32 @@ class PictureFolderReader:
         doing: For messages.
 
     Raises:
-        InputError: No such folder, no picture in it, a picture that cannot be read or is not of 8 bits, or a changing size.
+        InputError: No such folder, no picture in it, a picture that cannot be read or is not of 8
+            bits, or a changing size.
     """
 
     def __init__(self, path: Path | str, doing: str = "reading a folder of pictures") -> None:
         self.path, self._doing = Path(path), doing
         self.names = tuple(sorted(file.name for file in self.path.glob("*.png")))
         if not self.names:
-            raise self._refusal("no .png files", "give a folder of pictures named in order, such as 000000.png")
+            raise self._refusal(
+                "no .png files", "give a folder of pictures named in order, such as 000000.png"
+            )
         height, width = self._read(self.names[0]).shape[:2]
         unstated = (UNSPECIFIED, UNSPECIFIED, UNSPECIFIED)
-        self.format = VideoFormat(width, height, None, PERIOD, len(self.names), Fraction(1), unstated, False)
+        self.format = VideoFormat(
+            width, height, None, PERIOD, len(self.names), Fraction(1), unstated, False
+        )
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         return None
 
     def __iter__(self) -> Iterator[TimedFrame]:
@@ -73,10 +85,17 @@ class PictureFolderReader:
         if image is None:
             raise self._refusal(f"{name} is no readable picture", "give complete PNG files")
         if image.dtype != np.uint8:
-            raise self._refusal(f"{name} has {8 * image.dtype.itemsize} bits a channel", "give pictures of 8 bits")
-        kind = {2: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB}.get(image.ndim if image.ndim == 2 or image.shape[2] == 3 else 0)
+            raise self._refusal(
+                f"{name} has {8 * image.dtype.itemsize} bits a channel", "give pictures of 8 bits"
+            )
+        kind = {2: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB}.get(
+            image.ndim if image.ndim == 2 or image.shape[2] == 3 else 0
+        )
         if kind is None:
-            raise self._refusal(f"{name} has {image.shape[2]} channels", "give grey or colour pictures without transparency")
+            raise self._refusal(
+                f"{name} has {image.shape[2]} channels",
+                "give grey or colour pictures without transparency",
+            )
         return np.asarray(cv2.cvtColor(image, kind), dtype=np.uint8)
 
     def _refusal(self, found: str, do: str) -> InputError:
@@ -84,7 +103,8 @@ class PictureFolderReader:
 
 
 class PictureFolderWriter:
-    """Take frames one by one; the folder appears once the ``with`` block ends well. Like `log.video.VideoWriter`.
+    """Take frames one by one; the folder appears once the ``with`` block ends well. Like
+    `log.video.VideoWriter`.
 
     Args:
         path: The folder; replaced if it exists.
@@ -103,7 +123,12 @@ class PictureFolderWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         if error is None and not self.count:
             error = InputError(WRITING, str(self.path), "no frames", "give at least one frame")
             self._folder.__exit__(type(error), error, None)
@@ -116,7 +141,9 @@ class PictureFolderWriter:
         name = f"{self.count:06d}.png" if self._names is None else self._names[self.count]
         done, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
         if not done:
-            raise InfrastructureError(WRITING, f"{self.path}/{name}", "the encoder refused", "check the picture's size")
+            raise InfrastructureError(
+                WRITING, f"{self.path}/{name}", "the encoder refused", "check the picture's size"
+            )
         write_bytes(self._partial / name, png.tobytes())
         self.count += 1
 
@@ -167,14 +194,15 @@ class RefineSummary:
         trained: Whether its weights were learned.
         frames, width, height: Of the video; odd sizes are padded by one row or column in the file.
         fps: Average frame rate, None where the source states none.
-        ms_per_frame_p50, ms_per_frame_p95: Fixer only, over blocks; without the first block where there are more.
+        ms_per_frame_p50, ms_per_frame_p95: Fixer only, over blocks; without the first block where
+            there are more.
         ms_per_frame_first: Of the first block.
         wall_s: Total time, files included.
         psnr_db: Result against source, None where they are equal; before the file's compression.
         mean_levels, max_levels: Their absolute difference in grey levels.
         events: Number of frames that a guard replaced by the unrefined ones, by event.
-        refused_psnr_db: Where the fixer changed a frame beyond the limit, that frame's PSNR against the source; from there on the source's
-            frames were written as they are.
+        refused_psnr_db: Where the fixer changed a frame beyond the limit, that frame's PSNR against
+            the source; from there on the source's frames were written as they are.
         audio_left_out: Whether the source has sound; the result has none.
     """
 
@@ -207,8 +235,10 @@ def refine_video(
     Args:
         files: The files to read and write.
         make_fixer: Creates the fixer's session; called after the files are checked.
-        on_frames: Called after every block with the frames done and the number that the container states.
-        limit: How much the fixer may change a frame; beyond it this and all later frames pass through as they are.
+        on_frames: Called after every block with the frames done and the number that the container
+            states.
+        limit: How much the fixer may change a frame; beyond it this and all later frames pass
+            through as they are.
 
     Raises:
         InputError: Files that cannot be read or do not match, or results that exist already.
@@ -220,7 +250,9 @@ def refine_video(
     with ExitStack() as stack:
         readers: dict[str, Reader] = {}
         for role, path in files.inputs.items():
-            readers[role] = PictureFolderReader(path, DOING) if path.is_dir() else VideoReader(path, DOING)
+            readers[role] = (
+                PictureFolderReader(path, DOING) if path.is_dir() else VideoReader(path, DOING)
+            )
             stack.enter_context(readers[role])
         check_formats(readers)
         source = readers["input"].format
@@ -234,7 +266,9 @@ def refine_video(
             for timed, given, fixed in zip(timing, block.given, block.fixed, strict=True):
                 writers["output"].write(fixed.rgb, timed.time, timed.duration)
                 if "compare" in writers:
-                    writers["compare"].write(np.concatenate([given.rgb, fixed.rgb], axis=1), timed.time, timed.duration)
+                    writers["compare"].write(
+                        np.concatenate([given.rgb, fixed.rgb], axis=1), timed.time, timed.duration
+                    )
             timing.clear()
             stats.add(block)
             if on_frames is not None:
@@ -275,7 +309,12 @@ def check_names(files: RefineFiles) -> None:
     for role, path in files.results.items():
         taken = resolved.get(path.resolve())
         if taken is not None:
-            raise InputError(DOING, str(path), f"the {role} would be written over the {taken}", "give the result a name of its own")
+            raise InputError(
+                DOING,
+                str(path),
+                f"the {role} would be written over the {taken}",
+                "give the result a name of its own",
+            )
         resolved[path.resolve()] = role
         if not path.parent.is_dir():
             raise InputError(DOING, str(path), f"no folder {path.parent}", "make it first")
@@ -283,20 +322,39 @@ def check_names(files: RefineFiles) -> None:
             do = "results are MP4 files or folders of PNG: name it .mp4, or without a suffix"
             raise InputError(DOING, str(path), f"suffix {path.suffix!r} of the {role}", do)
         if path.is_dir() and (path.suffix or any(file.suffix != ".png" for file in path.iterdir())):
-            raise InputError(DOING, str(path), f"the {role} is a folder with other things than pictures", "name a new folder or file")
+            raise InputError(
+                DOING,
+                str(path),
+                f"the {role} is a folder with other things than pictures",
+                "name a new folder or file",
+            )
         if path.exists() and not files.overwrite:
-            raise InputError(DOING, str(path), f"the {role} exists already", "choose another name, or pass --overwrite")
+            raise InputError(
+                DOING,
+                str(path),
+                f"the {role} exists already",
+                "choose another name, or pass --overwrite",
+            )
 
 
 def _writer(path: Path, source: Reader) -> Writer:
     if not path.suffix:
-        return PictureFolderWriter(path, source.names if isinstance(source, PictureFolderReader) else None)
+        return PictureFolderWriter(
+            path, source.names if isinstance(source, PictureFolderReader) else None
+        )
     stated = source.format
-    return VideoWriter(path, stated.time_base, stated.rate or 1 / stated.time_base, stated.colour, stated.pixel_aspect)
+    return VideoWriter(
+        path,
+        stated.time_base,
+        stated.rate or 1 / stated.time_base,
+        stated.colour,
+        stated.pixel_aspect,
+    )
 
 
 def check_formats(readers: Mapping[str, Reader]) -> None:
-    """Refuse opacity and maps of another form, size, frame rate or stated number of frames than the source's.
+    """Refuse opacity and maps of another form, size, frame rate or stated number of frames than the
+    source's.
 
     Raises:
         InputError: With both values.
@@ -306,12 +364,16 @@ def check_formats(readers: Mapping[str, Reader]) -> None:
         mine = reader.format
         if type(reader) is not type(readers["input"]):
             found = f"the {role} is a {_form(reader)}, the input a {_form(readers['input'])}"
-            raise InputError(DOING, str(reader.path), found, "give both as videos, or both as folders of PNG")
+            raise InputError(
+                DOING, str(reader.path), found, "give both as videos, or both as folders of PNG"
+            )
         if (mine.width, mine.height) != (source.width, source.height):
             found = f"the {role} is {mine.width}x{mine.height}, the input {source.width}x{source.height}"
             raise InputError(DOING, str(reader.path), found, "give both at one size")
         if mine.frames and source.frames and mine.frames != source.frames:
-            raise _lengths_differ(role, reader.path, f"{mine.frames} frames, the input {source.frames}")
+            raise _lengths_differ(
+                role, reader.path, f"{mine.frames} frames, the input {source.frames}"
+            )
         several = (source.frames or 2) > 1  # a single frame has no rate
         if several and mine.rate and source.rate and abs(mine.rate / source.rate - 1) > SAME_RATE:
             found = f"the {role} has {float(mine.rate):.3f} frames per second, the input {float(source.rate):.3f}"
@@ -322,7 +384,9 @@ def _form(reader: Reader) -> str:
     return "folder" if isinstance(reader, PictureFolderReader) else "video"
 
 
-def _joined(readers: Mapping[str, Reader], timing: list[TimedFrame]) -> Iterator[tuple[Frame, U8 | None]]:
+def _joined(
+    readers: Mapping[str, Reader], timing: list[TimedFrame]
+) -> Iterator[tuple[Frame, U8 | None]]:
     """Yield the source's frames with opacity and map, and append their times to ``timing``."""
     roles = list(readers)
     starts: list[Fraction] = []
@@ -330,24 +394,46 @@ def _joined(readers: Mapping[str, Reader], timing: list[TimedFrame]) -> Iterator
         ended = [role for role, timed in zip(roles, row, strict=True) if timed is None]
         if ended:
             going = [role for role in roles if role not in ended]
-            raise _lengths_differ(ended[0], readers[ended[0]].path, f"{index} frames, the {going[0]} more")
-        times = [timed.time * reader.format.time_base for timed, reader in zip(row, readers.values(), strict=True)]
+            raise _lengths_differ(
+                ended[0], readers[ended[0]].path, f"{index} frames, the {going[0]} more"
+            )
+        times = [
+            timed.time * reader.format.time_base
+            for timed, reader in zip(row, readers.values(), strict=True)
+        ]
         starts = starts or times
-        _check_times(index, dict(zip(roles, [t - start for t, start in zip(times, starts, strict=True)], strict=True)), readers)
+        _check_times(
+            index,
+            dict(
+                zip(roles, [t - start for t, start in zip(times, starts, strict=True)], strict=True)
+            ),
+            readers,
+        )
         given = dict(zip(roles, row, strict=True))
         timed = given["input"]
         timing.append(timed)
-        alpha = _alpha(given["opacity"].image, index, readers["opacity"].path) if "opacity" in given else None
+        alpha = (
+            _alpha(given["opacity"].image, index, readers["opacity"].path)
+            if "opacity" in given
+            else None
+        )
         sdmap = given["sdmap"].image if "sdmap" in given else None
         yield Frame(round(times[0] * 1_000_000), CAMERA, timed.image, alpha), sdmap
 
 
-def _check_times(index: int, times_s: Mapping[str, Fraction], readers: Mapping[str, Reader]) -> None:
+def _check_times(
+    index: int, times_s: Mapping[str, Fraction], readers: Mapping[str, Reader]
+) -> None:
     rate = readers["input"].format.rate
     for role, time_s in times_s.items():
         if rate and abs(time_s - times_s["input"]) > 1 / (2 * rate):
             found = f"frame {index} of the {role} comes {float(time_s):.3f} s after its first, the input's {float(times_s['input']):.3f} s"
-            raise InputError(DOING, str(readers[role].path), found, "give videos of the same frames at the same times")
+            raise InputError(
+                DOING,
+                str(readers[role].path),
+                found,
+                "give videos of the same frames at the same times",
+            )
 
 
 def _alpha(image: U8, index: int, path: Path) -> F32:
@@ -359,4 +445,6 @@ def _alpha(image: U8, index: int, path: Path) -> F32:
 
 
 def _lengths_differ(role: str, path: Path, counts: str) -> InputError:
-    return InputError(DOING, str(path), f"the {role} has {counts}", "give videos of the same frames")
+    return InputError(
+        DOING, str(path), f"the {role} has {counts}", "give videos of the same frames"
+    )

@@ -25,13 +25,15 @@ from evaluators.viewer.pictures import smaller
 
 
 def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | None:
-    """Write ``summary.md``, ``junit.xml``, ``flips.html`` and ``report.html`` of a run folder and return the path of the last.
+    """Write ``summary.md``, ``junit.xml``, ``flips.html`` and ``report.html`` of a run folder and
+    return the path of the last.
 
     Args:
         root: A run folder whose tables are written.
-        flips: Find cells whose outcome differs from their baseline's first; not for scored logs of others.
-        page: Write ``report.html`` and the flips that it shows and links to. Otherwise those of an earlier command are removed, and None is
-            returned.
+        flips: Find cells whose outcome differs from their baseline's first; not for scored logs of
+            others.
+        page: Write ``report.html`` and the flips that it shows and links to. Otherwise those of an
+            earlier command are removed, and None is returned.
     """
     run = read_run(root)
     replays: Mapping[FlipKey, str] = {}
@@ -52,7 +54,9 @@ MAX_CAUSES = 12  # a run must not wait for its pages; `simrun why` writes any ot
 
 
 def write_causes(run: Run) -> None:
-    """Write the page of a cause for the first drives that failed, one a scene and arm; those of `simrun why` are kept."""
+    """Write the page of a cause for the first drives that failed, one a scene and arm; those of
+    `simrun why` are kept.
+    """
     told = read_json(run.folder / FLIPS_NAME)["cells"]
     failed = {one.cell[:3]: one for one in reversed(run.rollouts) if one.ok and outcomes_of(one)}
     for rollout in list(failed.values())[::-1][:MAX_CAUSES]:
@@ -68,10 +72,11 @@ PICTURE_WIDTH = 560
 
 
 def write_flips(run_dir: Path | Run) -> Path:
-    """Find the first plan divergence of every flipped cell of a run folder and write ``flips.json``.
+    """Find the first plan divergence of every flipped cell of a run folder and write
+    ``flips.json``.
 
-    A probe of the same cell and renderers is used where it exists: it renders both at identical poses. Otherwise the two logs are compared;
-    their poses are equal until the plans diverge.
+    A probe of the same cell and renderers is used where it exists: it renders both at identical
+    poses. Otherwise the two logs are compared; their poses are equal until the plans diverge.
 
     Raises:
         InputError: The run folder is not complete enough to be read.
@@ -81,21 +86,42 @@ def write_flips(run_dir: Path | Run) -> Path:
     flips, compared = find_flips(run)
     cells = []
     for number, flip in enumerate(flips[:MAX_FLIPS]):
-        key = {"renderer": flip.other.renderer, "policy": flip.other.policy, "scene": flip.other.scene, "seed": flip.other.seed}
-        cells.append(key | {"baseline": flip.base.renderer, "against": flip.base.variant} | _divergence(root, flip, f"flips/{number:03d}"))
-    about = {"threshold_m": DIVERGED_M, "horizon_s": HORIZON_US * 1e-6, "n_flips": len(flips), "n_pairs": compared}
+        key = {
+            "renderer": flip.other.renderer,
+            "policy": flip.other.policy,
+            "scene": flip.other.scene,
+            "seed": flip.other.seed,
+        }
+        cells.append(
+            key
+            | {"baseline": flip.base.renderer, "against": flip.base.variant}
+            | _divergence(root, flip, f"flips/{number:03d}")
+        )
+    about = {
+        "threshold_m": DIVERGED_M,
+        "horizon_s": HORIZON_US * 1e-6,
+        "n_flips": len(flips),
+        "n_pairs": compared,
+    }
     write_json(root / FLIPS_NAME, about | {"cells": cells})
     return root / FLIPS_NAME
 
 
 def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
-    probe = find_probe(root, flip.base, flip.other.renderer) if flip.base.policy == flip.other.policy else None
+    probe = (
+        find_probe(root, flip.base, flip.other.renderer)
+        if flip.base.policy == flip.other.policy
+        else None
+    )
     if probe is not None:
         return dict(probe) | {"source": "probe"}
     if not (flip.base.ok and flip.other.ok):
         return {"t_us": None, "reason": "the policy broke off one of the drives"}
     try:
-        logs = {name: read_log(root / r.path / LOG_NAME) for name, r in zip(flip.sides, (flip.base, flip.other), strict=True)}
+        logs = {
+            name: read_log(root / r.path / LOG_NAME)
+            for name, r in zip(flip.sides, (flip.base, flip.other), strict=True)
+        }
     except SimrunError as error:
         return {"t_us": None, "reason": f"a log could not be read: {error.found}"}
     one, other = logs.values()
@@ -104,28 +130,51 @@ def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
     found = first_divergence(one.plans, other.plans)
     if found is None:
         return {"t_us": None, "reason": f"the plans never diverge by more than {DIVERGED_M} m"}
-    divergence: dict[str, Any] = {"t_us": found.t_us, "after_us": found.t_us - one.render_start_us, "gap_m": round(found.gap_m, 4)}
-    frames = {side: _picture(root, log, found.t_us, f"{name}-{i}.jpg") for i, (side, log) in enumerate(logs.items())}
+    divergence: dict[str, Any] = {
+        "t_us": found.t_us,
+        "after_us": found.t_us - one.render_start_us,
+        "gap_m": round(found.gap_m, 4),
+    }
+    frames = {
+        side: _picture(root, log, found.t_us, f"{name}-{i}.jpg")
+        for i, (side, log) in enumerate(logs.items())
+    }
     if None in frames.values():
-        divergence["frames_reason"] = "a log without camera images (--images none, or a policy without cameras)"
-    return divergence | {"source": "logs", "ahead_us": found.ahead_us, "frames": {side: path for side, path in frames.items() if path}}
+        divergence["frames_reason"] = (
+            "a log without camera images (--images none, or a policy without cameras)"
+        )
+    return divergence | {
+        "source": "logs",
+        "ahead_us": found.ahead_us,
+        "frames": {side: path for side, path in frames.items() if path},
+    }
 
 
 def find_probe(root: Path, driven: Rollout, other: str) -> Mapping[str, Any] | None:
-    """Return the first divergence that a probe along a rollout found between its renderer and another; None without such a probe."""
+    """Return the first divergence that a probe along a rollout found between its renderer and
+    another; None without such a probe.
+    """
     for path in sorted((root / probe_folder(*driven.cell)).glob(f"*/{PROBE_JSON}")):
         for pair in read_json(path)["pairs"]:
             if pair["reference"] == driven.renderer and pair["renderer"] == other:
                 first = pair["first_divergence"]
                 if first is None:
-                    return {"t_us": None, "reason": "a probe at identical poses found no divergence"}
-                frames = {r: (path.parent / name).relative_to(root).as_posix() for r, name in first["frames"].items()}
+                    return {
+                        "t_us": None,
+                        "reason": "a probe at identical poses found no divergence",
+                    }
+                frames = {
+                    r: (path.parent / name).relative_to(root).as_posix()
+                    for r, name in first["frames"].items()
+                }
                 return dict(first) | {"frames": frames}
     return None
 
 
 def _picture(root: Path, log: RolloutLog, t_us: int, name: str) -> str | None:
-    """Save the first camera's newest frame at a query and return its path; None where the log has none."""
+    """Save the first camera's newest frame at a query and return its path; None where the log has
+    none.
+    """
     if not log.images:
         return None
     camera = log.images[0].camera

@@ -1,4 +1,6 @@
-"""One closed-loop rollout: scenario -> world -> renderer -> policy -> vehicle -> log, once per tick."""
+"""One closed-loop rollout: scenario -> world -> renderer -> policy -> vehicle -> log, once per
+tick.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,9 @@ def run_rollout(
 ) -> Recorder:
     """Drive one scenario once and return its recorder.
 
-    Until ``start_us + warmup_us`` the logged ego pose is forced while renderer and policy run; then the loop is closed. It ends at
-    ``end_us``, or, if the scenario says so, where the ego passes the end of the recorded path (`alpasim_plugin.runs.loop_state`).
+    Until ``start_us + warmup_us`` the logged ego pose is forced while renderer and policy run; then
+    the loop is closed. It ends at ``end_us``, or, if the scenario says so, where the ego passes the
+    end of the recorded path (`alpasim_plugin.runs.loop_state`).
 
     Args:
         scenario: The scenario.
@@ -46,7 +49,9 @@ def run_rollout(
     """
     recorder = recorder or Recorder(scenario, seed)
     policy = complete(policy, Policy)
-    controller = complete(controller or make_controller(policy.controller, scenario.vehicle), Controller)
+    controller = complete(
+        controller or make_controller(policy.controller, scenario.vehicle), Controller
+    )
     loop = Loop(scenario, renderer, checked_sensors(policy), controller, recorder, actors)
     reset_policy(policy, seed, scenario.route)
     driving = loop.drive()
@@ -62,7 +67,8 @@ def run_rollout(
 
 
 class Loop:
-    """The closed loop of one rollout, which stops wherever a plan is needed: for a policy (`run_rollout`), or for whoever steps it.
+    """The closed loop of one rollout, which stops wherever a plan is needed: for a policy
+    (`run_rollout`), or for whoever steps it.
 
     Args:
         scenario: The scenario.
@@ -88,24 +94,42 @@ class Loop:
         actors: Actors | None = None,
     ) -> None:
         self._clock = clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
-        self._renderer, self._controller, self._recorder = complete(renderer, Renderer), controller, recorder
+        self._renderer, self._controller, self._recorder = (
+            complete(renderer, Renderer),
+            controller,
+            recorder,
+        )
         self._world = actors or make_actors(scenario)
         self._plans = PlanQueue(scenario.latency)
         self.state = LoopState.at_start(scenario, clock.n_steps)
         self.actors: Mapping[str, F64] = {}
-        self._watched = () if sensors else recorder.watch(scenario)  # what a policy without cameras does can be seen all the same
+        self._watched = (
+            () if sensors else recorder.watch(scenario)
+        )  # what a policy without cameras does can be seen all the same
         self._cadence = make_cadence(clock, scenario, sensors, self._renderer.block)
         self.path_end = PathEnd(scenario.ego_log, scenario.stop_at_path_end)
         forecaster = Forecaster(scenario, controller, self._plans, self._world, self.state)
-        self._rig = CameraRig(scenario, sensors or self._watched, clock, self._cadence, forecaster, self._renderer.lookahead)
+        self._rig = CameraRig(
+            scenario,
+            sensors or self._watched,
+            clock,
+            self._cadence,
+            forecaster,
+            self._renderer.lookahead,
+        )
 
     def drive(self) -> Generator[Observation, Plan, None]:
-        """Yield an observation at every policy query and take the plan for it; end with the rollout.
+        """Yield an observation at every policy query and take the plan for it; end with the
+        rollout.
 
         Raises:
             RendererError: The renderer raised, or a frame does not match its request.
         """
-        clock, renderer, recorder, plans, state = self._clock, self._renderer, self._recorder, self._plans, self.state
+        clock = self._clock
+        renderer = self._renderer
+        recorder = self._recorder
+        plans = self._plans
+        state = self.state
         recorder.start(clock, self._rig.specs)
         seen = {} if self._watched else self._rig.specs
         for tick in clock.ticks():

@@ -59,7 +59,9 @@ class Progress(Protocol):
         ...
 
     def noticed(self, text: str) -> None:
-        """Say in one line what was found damaged and what is done about it, or who is waited for."""
+        """Say in one line what was found damaged and what is done about it, or who is waited
+        for.
+        """
         ...
 
 
@@ -129,17 +131,22 @@ def execute_run(
         certificate: Whether to repeat a rollout.
         report: Write ``report.html``; otherwise `write_reports` makes it later.
         wait: Wait for a process that writes the folder; otherwise refuse.
-        full: Read every file of a finished rollout before it is reused, even if size and time are as written.
+        full: Read every file of a finished rollout before it is reused, even if size and time are
+            as written.
         limit_s: Seconds that one rollout may take.
         retry: Drive again also what failed by the policy's own fault.
         executor: Where rollouts run; the results do not depend on it.
-        store: URL of a store in which rollouts are looked up and committed, and to which the tables go.
+        store: URL of a store in which rollouts are looked up and committed, and to which the tables
+            go.
 
     Raises:
         InputError: The folder holds the run of another command and ``resume`` is not set.
-        InfrastructureError: Another process writes the folder, or it is read-only and the run is not finished.
+        InfrastructureError: Another process writes the folder, or it is read-only and the run is
+            not finished.
     """
-    threads = thread_budget(workers, len(plan.cells), executor, foreseen(plan, certificate) is not None)
+    threads = thread_budget(
+        workers, len(plan.cells), executor, foreseen(plan, certificate) is not None
+    )
     if root.exists() and not os.access(root, os.W_OK):
         return _finished_already(plan, root)
     with writing(root, wait, progress.noticed):
@@ -153,9 +160,22 @@ def execute_run(
         try:
             with repeating(plan, root, certificate) as repeat:
                 known = contents.rollouts if contents else ()
-                manifests = execute(plan, root, how, on_done(progress), progress.noticed, known, repeat)
-                pool = {**how.stated, **pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))}
-                determinism = certify(plan, root, manifests, how.cores_here, certificate, held.get("determinism"), repeat)
+                manifests = execute(
+                    plan, root, how, on_done(progress), progress.noticed, known, repeat
+                )
+                pool = {
+                    **how.stated,
+                    **pool_of(manifests, threads, time.perf_counter() - began, held.get("pool")),
+                }
+                determinism = certify(
+                    plan,
+                    root,
+                    manifests,
+                    how.cores_here,
+                    certificate,
+                    held.get("determinism"),
+                    repeat,
+                )
         finally:
             end_children()
         summary = finish_run(root, manifests, {"pool": pool, "determinism": determinism}, report)
@@ -169,21 +189,40 @@ def _load_ending() -> None:
         import_module(module)
 
 
-def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[str, Any], report: bool = True) -> dict[str, Any]:
-    """Write the tables, the reports and the contents of a run whose rollouts are done; return the summary.
+def finish_run(
+    root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[str, Any], report: bool = True
+) -> dict[str, Any]:
+    """Write the tables, the reports and the contents of a run whose rollouts are done; return the
+    summary.
 
     Args:
         root: The run folder.
         manifests: One per rollout, in the order of the tables.
-        more: What the rollouts do not tell; kept in ``run.json``, so that the tables can be made again.
+        more: What the rollouts do not tell; kept in ``run.json``, so that the tables can be made
+            again.
         report: Write ``report.html``.
     """
     info = read_run_json(root)
-    outcome = {"n_rollouts": len(manifests), "n_failed": sum(m["status"] != "ok" for m in manifests)}  # for lists of many runs
+    outcome = {
+        "n_rollouts": len(manifests),
+        "n_failed": sum(m["status"] != "ok" for m in manifests),
+    }  # for lists of many runs
     write_run_json(root, info | dict(more) | {"outcome": outcome, "chosen": chosen(manifests)})
     baseline, bases = info["config"].get("baseline"), info.get("bases") or {}
-    paths = {scene: str((facts.get("ref") or {}).get("path") or scene) for scene, facts in (info.get("scenes") or {}).items()}
-    summary = write_summary(root, manifests, info["preset"], baseline, more, bases, MetricTable.of_run(info), grouped(paths))
+    paths = {
+        scene: str((facts.get("ref") or {}).get("path") or scene)
+        for scene, facts in (info.get("scenes") or {}).items()
+    }
+    summary = write_summary(
+        root,
+        manifests,
+        info["preset"],
+        baseline,
+        more,
+        bases,
+        MetricTable.of_run(info),
+        grouped(paths),
+    )
     from alpasim_plugin.runs.reports import write_reports  # `_load_ending` has loaded it
 
     write_reports(root, flips=info.get("kind") != "score", page=report)
@@ -192,7 +231,9 @@ def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[st
 
 
 def publish(root: Path, store: str | None) -> None:
-    """Copy the description, tables and reports of a finished run folder to its store, if it has one."""
+    """Copy the description, tables and reports of a finished run folder to its store, if it has
+    one.
+    """
     if store is None:
         return
     pages = [name for name in REPORTS if (root / name).exists()]
@@ -206,9 +247,19 @@ def _finished_already(plan: RunPlan, root: Path) -> RunResult:
         InfrastructureError: It is not finished, or damaged.
     """
     contents = find_contents(root)
-    left = [cell for cell in plan.cells if find_rollout_state(cell, root, reuse_undigested=True)[0] != "none"]
-    problems = [f"{len(left)} of {len(plan.cells)} rollouts are missing or out of date"] if left else []
-    if contents is None or contents.run.get("content") != plan.content or damaged_files(root, contents):
+    left = [
+        cell
+        for cell in plan.cells
+        if find_rollout_state(cell, root, reuse_undigested=True)[0] != "none"
+    ]
+    problems = (
+        [f"{len(left)} of {len(plan.cells)} rollouts are missing or out of date"] if left else []
+    )
+    if (
+        contents is None
+        or contents.run.get("content") != plan.content
+        or damaged_files(root, contents)
+    ):
         problems.append("its tables are missing or those of another run")
     if problems:
         found = f"it is read-only, and {' and '.join(problems)}"
@@ -227,7 +278,8 @@ def claim(
     contents: Contents | None,
     noticed: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Write run.json and the scene files, or check that the folder holds this run; changed parts are written again.
+    """Write run.json and the scene files, or check that the folder holds this run; changed parts
+    are written again.
 
     Returns:
         What ``run.json`` said before; empty for a new folder.
@@ -254,8 +306,12 @@ def claim(
     return held
 
 
-def _held(root: Path, contents: Contents | None, noticed: Callable[[str], None]) -> tuple[dict[str, Any], bool]:
-    """Return what ``run.json`` says, empty for a new folder, and whether it is lost and its copy in the contents stands for it."""
+def _held(
+    root: Path, contents: Contents | None, noticed: Callable[[str], None]
+) -> tuple[dict[str, Any], bool]:
+    """Return what ``run.json`` says, empty for a new folder, and whether it is lost and its copy in
+    the contents stands for it.
+    """
     if contents is None and not (root / RUN_INFO).exists():
         return {}, False
     try:
@@ -282,12 +338,16 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
         | origin_of(command)
         | {
             "asked": list(plan.asked),
-            "config": asdict(plan.options) | {"workers": threads.workers, "threads_per_worker": threads.per_worker},
+            "config": asdict(plan.options)
+            | {"workers": threads.workers, "threads_per_worker": threads.per_worker},
             "preset": plan.options.preset,
             "renderers": [spec.name for spec in plan.renderers],
             "policies": [spec.name for spec in plan.policies],
             "seeds": list(plan.seeds),
-            "scenes": {name: _scene_facts(scenario, refs[name]) for name, scenario in plan.scenarios.items()},
+            "scenes": {
+                name: _scene_facts(scenario, refs[name])
+                for name, scenario in plan.scenarios.items()
+            },
             "bases": {spec.name: spec.base.name for spec in fixed},
             "fixers": {spec.name: spec.fixer.as_dict() for spec in fixed if spec.fixer is not None},
             "parts": {f"{part.kind} {part.name}": part.as_dict() for part in parts},
@@ -296,13 +356,17 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
             "weights": {file: sha for part in parts for file, sha in part.files.items()},
             "hardware": hardware(),
             "versions": versions(),
-            "left_out": sorted({note for scenario in plan.scenarios.values() for note in scenario.notes}),
+            "left_out": sorted(
+                {note for scenario in plan.scenarios.values() for note in scenario.notes}
+            ),
         },
     )
 
 
 def origin_of(command: Sequence[str]) -> dict[str, Any]:
-    """Return what ``run.json`` says of how a run folder came about: command, version, time, the user's project."""
+    """Return what ``run.json`` says of how a run folder came about: command, version, time, the
+    user's project.
+    """
     return {
         "command": list(command),
         "version": __version__,
@@ -312,7 +376,12 @@ def origin_of(command: Sequence[str]) -> dict[str, Any]:
 
 
 def _scene_facts(scenario: Scenario, ref: ScenarioRef) -> dict[str, Any]:
-    where = {"path": str(Path(ref.path).absolute()), "seed": ref.seed, "overrides": ref.overrides, "source": ref.source}
+    where = {
+        "path": str(Path(ref.path).absolute()),
+        "seed": ref.seed,
+        "overrides": ref.overrides,
+        "source": ref.source,
+    }
     return {
         "source": scenario.source,
         "ref": where,

@@ -44,7 +44,8 @@ class LogScore:
 
 
 def find_logs(items: Sequence[str]) -> list[Path]:
-    """Return the logs of files, folders (searched to any depth for ``*.asl``) and glob patterns, each once, sorted per item.
+    """Return the logs of files, folders (searched to any depth for ``*.asl``) and glob patterns,
+    each once, sorted per item.
 
     Raises:
         InputError: An item names no log.
@@ -55,10 +56,21 @@ def find_logs(items: Sequence[str]) -> list[Path]:
         paths = [path] if path.is_file() else sorted(path.rglob("*.asl")) if path.is_dir() else []
         if not paths and glob.has_magic(item):
             hits = [Path(hit) for hit in sorted(glob.glob(item, recursive=True))]
-            paths = [log for hit in hits for log in ([hit] if hit.is_file() else sorted(hit.rglob("*.asl")))]
+            paths = [
+                log
+                for hit in hits
+                for log in ([hit] if hit.is_file() else sorted(hit.rglob("*.asl")))
+            ]
         if not paths:
-            what = "a folder without .asl logs" if path.is_dir() else "no such file, folder or match"
-            raise InputError("finding logs", item, what, "give rollout.asl files, folders that hold them, or a pattern in quotes")
+            what = (
+                "a folder without .asl logs" if path.is_dir() else "no such file, folder or match"
+            )
+            raise InputError(
+                "finding logs",
+                item,
+                what,
+                "give rollout.asl files, folders that hold them, or a pattern in quotes",
+            )
         for log in paths:
             found.setdefault(log.resolve(), log)
     return list(found.values())
@@ -74,10 +86,12 @@ def score_logs(
 ) -> list[LogScore]:
     """Score every log against its scene and write its steps.
 
-    A log that cannot be read, is incomplete or cannot be scored becomes a failed row; the others are still scored.
+    A log that cannot be read, is incomplete or cannot be scored becomes a failed row; the others
+    are still scored.
 
     Raises:
-        InputError: A log of a scene that is not among the given ones, or a scene that cannot be read.
+        InputError: A log of a scene that is not among the given ones, or a scene that cannot be
+            read.
     """
     out: list[LogScore] = []
     taken: set[str] = set()
@@ -102,15 +116,23 @@ def _score(
 ) -> LogScore:
     name = log.resolve().parent.name
     manifest: dict[str, Any] = {
-        "renderer": UNKNOWN, "policy": UNKNOWN, "scene": UNKNOWN, "seed": 0, "rollout": name, "log": str(log), "preset": preset.name,
+        "renderer": UNKNOWN,
+        "policy": UNKNOWN,
+        "scene": UNKNOWN,
+        "seed": 0,
+        "rollout": name,
+        "log": str(log),
+        "preset": preset.name,
         "reused": True,  # nothing was rendered, so these rows have no speed
-    }  # fmt: skip
+    }
     try:
         check_vouched(log)
         rollout = read_asl(log)
     except InputError as error:
         return _failed(manifest, error, root, taken)
-    session = rollout.session_uuid or name  # as in AlpaSim; a second log with that id gets its folder's name with it
+    session = (
+        rollout.session_uuid or name
+    )  # as in AlpaSim; a second log with that id gets its folder's name with it
     session = session if session not in names else f"{session} ({name})"
     names.add(session)
     versions = rollout.info["versions"]
@@ -125,23 +147,35 @@ def _score(
         "steps": _steps(rollout),
         "warnings": list(rollout.warnings),
     }
-    known = scenes.of(rollout.scene_id)  # a wrong --scene is an error of the command, not of the log
+    known = scenes.of(
+        rollout.scene_id
+    )  # a wrong --scene is an error of the command, not of the log
     try:
         check_complete(log, rollout)
         series = tuple(score(rollout, known.scene, preset, evaluators))
-        one = tabulate(rollout, series, reduce_rollout(series, preset), contacts=contacts_of(rollout, preset))
+        one = tabulate(
+            rollout, series, reduce_rollout(series, preset), contacts=contacts_of(rollout, preset)
+        )
     except SimrunError as error:
         return _failed(manifest, error, root, taken)
-    manifest |= {"status": "ok", "metrics": one.metrics, "events": one.events, "censored": one.censored}
+    manifest |= {
+        "status": "ok",
+        "metrics": one.metrics,
+        "events": one.events,
+        "censored": one.censored,
+    }
     manifest |= {"contacts": one.contacts, "path": _folder(manifest, taken)}
     keys = {key: manifest[key] for key in ("renderer", "policy", "scene", "seed", "rollout")}
     write_steps(root / manifest["path"], [keys | row for row in one.steps], of_logs=True)
     run_uuid, run_name = run_names(log)
-    return LogScore(manifest, ScoredRollout(rollout.scene_id, manifest["rollout"], series, run_uuid, run_name))
+    return LogScore(
+        manifest, ScoredRollout(rollout.scene_id, manifest["rollout"], series, run_uuid, run_name)
+    )
 
 
 def check_vouched(log: Path) -> None:
-    """Refuse a log of a run folder that is not the one its manifest vouches for; logs without a manifest beside them pass.
+    """Refuse a log of a run folder that is not the one its manifest vouches for; logs without a
+    manifest beside them pass.
 
     Raises:
         InputError: The log is damaged, or another one.
@@ -154,16 +188,21 @@ def check_vouched(log: Path) -> None:
     except InputError as error:
         problem = f"its {MANIFEST} is damaged: {error.found}"
     if problem is not None:
-        run = next((folder for folder in log.resolve().parents if (folder / RUN_INFO).exists()), None)
-        do_this = "run the rollout again" if run is None else f"simrun check {run} --repair runs it again"
+        run = next(
+            (folder for folder in log.resolve().parents if (folder / RUN_INFO).exists()), None
+        )
+        do_this = (
+            "run the rollout again" if run is None else f"simrun check {run} --repair runs it again"
+        )
         raise InputError("reading a rollout log", str(log), problem, do_this)
 
 
 def check_complete(log: Path, rollout: RolloutLog) -> None:
     """Refuse the log of a rollout that did not finish.
 
-    A finished rollout has the number of control steps in its header after the first policy time, or covers the recording. A rollout that
-    the driver terminated is finished, and one whose last pose is the first beyond the end of the recorded path: ours end there.
+    A finished rollout has the number of control steps in its header after the first policy time, or
+    covers the recording. A rollout that the driver terminated is finished, and one whose last pose
+    is the first beyond the end of the recorded path: ours end there.
 
     Raises:
         InfrastructureError: The log ends earlier.
@@ -176,9 +215,11 @@ def check_complete(log: Path, rollout: RolloutLog) -> None:
     if done < steps and not _ends_with_the_path(rollout):
         cut = f"; {rollout.warnings[0]}" if rollout.warnings else ""
         raise InfrastructureError(
-            "scoring a log", str(log), f"the rollout ended after {done} of {steps} control steps{cut}",
+            "scoring a log",
+            str(log),
+            f"the rollout ended after {done} of {steps} control steps{cut}",
             "run this rollout again",
-        )  # fmt: skip
+        )
 
 
 def _ends_with_the_path(rollout: RolloutLog) -> bool:
@@ -189,14 +230,17 @@ def _ends_with_the_path(rollout: RolloutLog) -> bool:
 
 
 def _steps(rollout: RolloutLog) -> int:
-    """Return how many control steps were driven: since the first policy time, which is the second logged pose."""
+    """Return how many control steps were driven: since the first policy time, which is the second
+    logged pose.
+    """
     if len(rollout.ego) < 2 or rollout.control_us <= 0:
         return 0
     return (int(rollout.ego.t_us[-1]) - int(rollout.ego.t_us[1])) // rollout.control_us
 
 
 def run_names(log: Path) -> tuple[str | None, str | None]:
-    """Return uuid and name of the run that a log belongs to, of the ``run_metadata.yaml`` in the nearest folder above it.
+    """Return uuid and name of the run that a log belongs to, of the ``run_metadata.yaml`` in the
+    nearest folder above it.
 
     Raises:
         InputError: The file is invalid.
@@ -205,7 +249,10 @@ def run_names(log: Path) -> tuple[str | None, str | None]:
         path = folder / "run_metadata.yaml"
         if path.is_file():
             data = load_yaml(path, "reading the names of a run").data
-            uuid, name = (data.get(key) if isinstance(data, dict) else None for key in ("run_uuid", "run_name"))
+            uuid, name = (
+                data.get(key) if isinstance(data, dict) else None
+                for key in ("run_uuid", "run_name")
+            )
             return None if uuid is None else str(uuid), None if name is None else str(name)
     return None, None
 
@@ -216,8 +263,12 @@ def _failed(manifest: dict[str, Any], error: SimrunError, root: Path, taken: set
 
 
 def _folder(manifest: dict[str, Any], taken: set[str]) -> str:
-    """Return the folder of a log's results, relative to the run folder; logs with the same names get numbers."""
-    base = rollout_folder(*(str(manifest[key]) for key in ("renderer", "policy", "scene", "rollout"))).as_posix()
+    """Return the folder of a log's results, relative to the run folder; logs with the same names
+    get numbers.
+    """
+    base = rollout_folder(
+        *(str(manifest[key]) for key in ("renderer", "policy", "scene", "rollout"))
+    ).as_posix()
     path, n = base, 2
     while path in taken:
         path, n = f"{base}-{n}", n + 1
@@ -229,9 +280,15 @@ def _named(*versions: str | None) -> str:
     return next((text for text in versions if text and text != SKIPPED), UNKNOWN)
 
 
-def exit_code(scores: Sequence[LogScore], failures_allowed: bool, aggregate_error: EvaluatorError | None) -> int:
-    """Return the process exit code: 2 for a log that cannot be read, 5 for one that cannot be scored, 4 for a rollout cut short."""
-    classes = {one.manifest["error"]["failure_class"] for one in scores if one.manifest["status"] != "ok"}
+def exit_code(
+    scores: Sequence[LogScore], failures_allowed: bool, aggregate_error: EvaluatorError | None
+) -> int:
+    """Return the process exit code: 2 for a log that cannot be read, 5 for one that cannot be
+    scored, 4 for a rollout cut short.
+    """
+    classes = {
+        one.manifest["error"]["failure_class"] for one in scores if one.manifest["status"] != "ok"
+    }
     if "input" in classes:
         return 2
     if "evaluator" in classes or aggregate_error is not None:
@@ -240,7 +297,9 @@ def exit_code(scores: Sequence[LogScore], failures_allowed: bool, aggregate_erro
 
 
 FINDING = "finding the scene of a log"
-_SEEDED = re.compile(r"(?P<own>.+)-seed(?P<seed>\d+)")  # a seed other than the file's is part of the id
+_SEEDED = re.compile(
+    r"(?P<own>.+)-seed(?P<seed>\d+)"
+)  # a seed other than the file's is part of the id
 MOST_SEEDED = 256
 
 
@@ -261,7 +320,9 @@ class KnownScenes:
         self._others: list[str] = []
         self._read: dict[str, LoggedScene] = {}
         self._own: dict[str, str] = {}  # file -> id of its scene
-        self._seeded: list[str] = []  # of other seeds, oldest first: whoever asks may name any number of them
+        self._seeded: list[
+            str
+        ] = []  # of other seeds, oldest first: whoever asks may name any number of them
         for place in self.places:
             for path in _scene_files(place):
                 if Path(path).suffix == ".usdz":
@@ -282,9 +343,11 @@ class KnownScenes:
         if scene_id not in self._read:
             known = sorted({*self._archives, *self._read})
             raise InputError(
-                FINDING, f"scene {scene_id!r}", f"not among the {len(known)} scenes of {', '.join(self.places)}: {', '.join(known[:5])}",
+                FINDING,
+                f"scene {scene_id!r}",
+                f"not among the {len(known)} scenes of {', '.join(self.places)}: {', '.join(known[:5])}",
                 "name the log's scene with --scene, or a folder that holds it",
-            )  # fmt: skip
+            )
         return self._read[scene_id]
 
     def _search(self, scene_id: str) -> None:
@@ -309,7 +372,12 @@ class KnownScenes:
         scene_id = usdz_scene_id(path)
         before = self._archives.get(scene_id)
         if before is not None and before.resolve() != path.resolve():
-            raise InputError(FINDING, f"{before} and {path}", f"both have the id {scene_id!r}", "remove one of them")
+            raise InputError(
+                FINDING,
+                f"{before} and {path}",
+                f"both have the id {scene_id!r}",
+                "remove one of them",
+            )
         self._archives[scene_id] = path
 
 
@@ -324,21 +392,33 @@ def _scene_files(place: str) -> list[str]:
 
 def _from_archive(path: Path, rails: bool) -> LoggedScene:
     record = read_usdz(path, rails, needs_map=False)
-    scene = Scene(record.scene_id, record.lane_map, record.ego_log, record.vehicle, record.alpasim_map)
-    return LoggedScene(scene, record.source, record.content_hash, record.notes, record.actors, record.world_origin)
+    scene = Scene(
+        record.scene_id, record.lane_map, record.ego_log, record.vehicle, record.alpasim_map
+    )
+    return LoggedScene(
+        scene, record.source, record.content_hash, record.notes, record.actors, record.world_origin
+    )
 
 
 def _from_scenario(one: Scenario) -> LoggedScene:
     return LoggedScene(
-        one.scene, one.source, one.content_hash, one.notes, one.actors, one.world_origin, one.start_us, one.end_us, one.warmup_us
+        one.scene,
+        one.source,
+        one.content_hash,
+        one.notes,
+        one.actors,
+        one.world_origin,
+        one.start_us,
+        one.end_us,
+        one.warmup_us,
     )
 
 
 def scenario_finder(places: Sequence[str]) -> Callable[[str], Scenario]:
     """Return what finds a scenario by its scene id among files, folders and shipped names.
 
-    Without places, and only then, every id gets a straight road, of which nothing is true but the id: a policy under test takes no more
-    from its scenario than cameras and vehicle.
+    Without places, and only then, every id gets a straight road, of which nothing is true but the
+    id: a policy under test takes no more from its scenario than cameras and vehicle.
 
     Raises (when called):
         InputError: None of the places has the id.
@@ -357,7 +437,12 @@ def scenario_finder(places: Sequence[str]) -> Callable[[str], Scenario]:
                 found[scenario.scene_id] = scenario
         if scene_id not in found:
             shown = ", ".join(sorted(found)[:5])
-            raise InputError(FINDING, f"scene {scene_id!r}", f"not among the {len(found)} scenes given: {shown}", "name it with --scenes")
+            raise InputError(
+                FINDING,
+                f"scene {scene_id!r}",
+                f"not among the {len(found)} scenes given: {shown}",
+                "name it with --scenes",
+            )
         return found[scene_id]
 
     return find

@@ -11,13 +11,22 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, yaw_from_quat
 from alpasim_plugin.core.parts import PartSpec
-from alpasim_plugin.core.types import F64, GUESSED_SHARE, I64, RECORDED_SHARE, MetricSeries, RolloutLog, Scenario
+from alpasim_plugin.core.types import (
+    F64,
+    GUESSED_SHARE,
+    I64,
+    RECORDED_SHARE,
+    MetricSeries,
+    RolloutLog,
+    Scenario,
+)
 from alpasim_plugin.log import read_asl, read_facts
 from evaluators import ContactEvent, Preset, Reduction, contact_events, reduce_rollout, score
 from evaluators import preset as find_preset
 from evaluators.metrics.route import lateral_bias
 
-# Of a speculative fixer: distance of the camera pose of the shown frame, and of the forecast pose, from the true pose.
+# Of a speculative fixer: distance of the camera pose of the shown frame, and of the forecast pose,
+# from the true pose.
 FIXER_FACTS = ("pose_error_m", "forecast_error_m", RECORDED_SHARE, GUESSED_SHARE)
 
 
@@ -27,12 +36,22 @@ class TabulatedScores:
 
     steps: list[dict[str, Any]]  # rows of steps.parquet without the rollout's key
     metrics: dict[str, dict[str, Any]]  # metric -> value, valid, reason, unit, direction
-    events: list[dict[str, Any]]  # when outcomes began: metric, t_us, t_s (after the first frame), x_m, y_m
+    events: list[
+        dict[str, Any]
+    ]  # when outcomes began: metric, t_us, t_s (after the first frame), x_m, y_m
     censored: dict[str, Any]  # number of steps that each rule removed
-    contacts: list[dict[str, Any]]  # contact onsets, if contact is searched between steps: actor_id, t_s, side, x_m, y_m (rig frame)
+    contacts: list[
+        dict[str, Any]
+    ]  # contact onsets, if contact is searched between steps: actor_id, t_s, side, x_m, y_m (rig frame)
 
 
-def score_log(log: Path, frames: Path, scenario: Scenario, preset: str, evaluators: Sequence[PartSpec] | None = None) -> TabulatedScores:
+def score_log(
+    log: Path,
+    frames: Path,
+    scenario: Scenario,
+    preset: str,
+    evaluators: Sequence[PartSpec] | None = None,
+) -> TabulatedScores:
     """Read a log and score it; the scores depend on the written log alone.
 
     Raises:
@@ -40,7 +59,13 @@ def score_log(log: Path, frames: Path, scenario: Scenario, preset: str, evaluato
     """
     rollout = read_asl(log)
     series = score(rollout, scenario.scene, preset, evaluators)
-    return tabulate(rollout, series, reduce_rollout(series, preset), read_facts(frames), contacts_of(rollout, preset))
+    return tabulate(
+        rollout,
+        series,
+        reduce_rollout(series, preset),
+        read_facts(frames),
+        contacts_of(rollout, preset),
+    )
 
 
 def tabulate(
@@ -63,25 +88,57 @@ def tabulate(
     drawn = [] if any(one.name == "lateral_bias_m" for one in series) else [lateral_bias(rollout)]
     rows = []
     for one in (*series, *drawn):
-        for t, value, valid in zip(one.t_us.tolist(), one.value.tolist(), one.valid.tolist(), strict=True):
-            number = None if np.isnan(value) else value  # an infinite one stays, as in AlpaSim's tables
-            rows.append({"t_us": t, "metric": one.name, "value": number, "valid": valid, "reason": "" if valid else one.reason})
+        for t, value, valid in zip(
+            one.t_us.tolist(), one.value.tolist(), one.valid.tolist(), strict=True
+        ):
+            number = (
+                None if np.isnan(value) else value
+            )  # an infinite one stays, as in AlpaSim's tables
+            rows.append(
+                {
+                    "t_us": t,
+                    "metric": one.name,
+                    "value": number,
+                    "valid": valid,
+                    "reason": "" if valid else one.reason,
+                }
+            )
     rows += _state_rows(rollout)
-    rows += [_row(int(f["t_us"] or 0), "opacity_mean", f["opacity_mean"], "the renderer gives no opacity") for f in frames]
-    rows += [_row(int(f["t_us"] or 0), name, f[name]) for name in FIXER_FACTS for f in frames if name in f]
+    rows += [
+        _row(
+            int(f["t_us"] or 0), "opacity_mean", f["opacity_mean"], "the renderer gives no opacity"
+        )
+        for f in frames
+    ]
+    rows += [
+        _row(int(f["t_us"] or 0), name, f[name])
+        for name in FIXER_FACTS
+        for f in frames
+        if name in f
+    ]
     begun = [one.as_dict() for one in contacts]
-    return TabulatedScores(rows, reduction.as_dict(), _placed(rollout, reduction), reduction.ledger.as_dict(), begun)
+    return TabulatedScores(
+        rows, reduction.as_dict(), _placed(rollout, reduction), reduction.ledger.as_dict(), begun
+    )
 
 
 def contacts_of(rollout: RolloutLog, preset: str | Preset) -> tuple[ContactEvent, ...]:
-    """Return the contact onsets of the ego if the preset searches contact between steps; else none."""
+    """Return the contact onsets of the ego if the preset searches contact between steps; else
+    none.
+    """
     chosen = find_preset(preset)
     return contact_events(rollout, chosen) if chosen.contact == "between_steps" else ()
 
 
 def _row(t_us: int, metric: str, value: Any, why_missing: str = "") -> dict[str, Any]:
     missing = value is None
-    return {"t_us": t_us, "metric": metric, "value": value, "valid": not missing, "reason": why_missing if missing else ""}
+    return {
+        "t_us": t_us,
+        "metric": metric,
+        "value": value,
+        "valid": not missing,
+        "reason": why_missing if missing else "",
+    }
 
 
 def _state_rows(rollout: RolloutLog) -> list[dict[str, Any]]:
@@ -93,7 +150,11 @@ def _state_rows(rollout: RolloutLog) -> list[dict[str, Any]]:
         "ego_yaw_rad": yaw_from_quat(rig.quat),
         "ego_speed_mps": _speeds(rig.t_us, rig.xyz),
     }
-    return [_row(t, name, float(v)) for name, values in state.items() for t, v in zip(rig.t_us.tolist(), values, strict=True)]
+    return [
+        _row(t, name, float(v))
+        for name, values in state.items()
+        for t, v in zip(rig.t_us.tolist(), values, strict=True)
+    ]
 
 
 def _speeds(t_us: I64, xyz: F64) -> F64:
@@ -109,5 +170,8 @@ def _placed(rollout: RolloutLog, reduction: Reduction) -> list[dict[str, Any]]:
     for event in reduction.events:
         at = rollout.ego.xyz[int(np.searchsorted(rollout.ego.t_us, event["t_us"]))]
         after_s = round((int(event["t_us"]) - rollout.render_start_us) * 1e-6, 3)
-        placed.append(dict(event) | {"t_s": after_s, "x_m": round(float(at[0]), 3), "y_m": round(float(at[1]), 3)})
+        placed.append(
+            dict(event)
+            | {"t_s": after_s, "x_m": round(float(at[0]), 3), "y_m": round(float(at[1]), 3)}
+        )
     return sorted(placed, key=lambda event: (event["t_us"], event["metric"]))

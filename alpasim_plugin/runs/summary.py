@@ -1,4 +1,6 @@
-"""``summary.json`` of a run folder, and of several as one: numbers, failures and times, made from manifests and tables."""
+"""``summary.json`` of a run folder, and of several as one: numbers, failures and times, made from
+manifests and tables.
+"""
 
 from __future__ import annotations
 
@@ -42,10 +44,11 @@ def write_summary(
         root: The run folder; the manifests' rollouts are below it.
         manifests: One per rollout, in the order of the tables.
         preset: Evaluator preset of the scores.
-        baseline: RENDERER, POLICY or RENDERER/POLICY that the others are compared with; None is the first.
+        baseline: RENDERER, POLICY or RENDERER/POLICY that the others are compared with; None is the
+            first.
         more: What the manifests do not tell, for the summary.
-        bases: Renderer with a fixer -> the renderer below it; where the run has both and it is not the
-            baseline, the two are paired too.
+        bases: Renderer with a fixer -> the renderer below it; where the run has both and it is not
+            the baseline, the two are paired too.
         known: What the metrics are.
         family_of: SCENE -> its family.
     """
@@ -81,21 +84,35 @@ def _speeds(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def speed(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return time per camera frame, all-in and by stage, over rollouts of one renderer.
 
-    A frame's time is the sum of all stages of the loop between two frames; the time of a block is divided evenly among its frames.
-    The frames of each rollout's first call are kept apart: that call may compile or fill caches.
+    A frame's time is the sum of all stages of the loop between two frames; the time of a block is
+    divided evenly among its frames. The frames of each rollout's first call are kept apart: that
+    call may compile or fill caches.
     """
     stages: dict[str, list[float]] = {}
     first, per_frame = [], []
     for manifest in manifests:
-        frames, opening = max(int(manifest["frames"]), 1), max(int(manifest.get("first_call_frames", 1)), 1)
+        frames, opening = (
+            max(int(manifest["frames"]), 1),
+            max(int(manifest.get("first_call_frames", 1)), 1),
+        )
         total = np.zeros(frames)
         for stage, durations in manifest["stage_ms"].items():
             total += resample_durations(durations, frames)
-            stages.setdefault(stage, []).extend(durations[opening if len(durations) == frames else 1 :])
+            stages.setdefault(stage, []).extend(
+                durations[opening if len(durations) == frames else 1 :]
+            )
         first.append(float(total[:opening].sum()))
         per_frame.extend(total[opening:].tolist())
     if not per_frame:
-        nothing = dict.fromkeys(("ms_per_frame_p50", "ms_per_frame_p95", "ms_per_frame_mean", "frames_per_s", "first_frame_ms"))
+        nothing = dict.fromkeys(
+            (
+                "ms_per_frame_p50",
+                "ms_per_frame_p95",
+                "ms_per_frame_mean",
+                "frames_per_s",
+                "first_frame_ms",
+            )
+        )
         return nothing | {"stages": {}}
     all_ms = sum(sum(d) for d in stages.values())
     return {
@@ -109,7 +126,9 @@ def speed(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _stage(durations: Sequence[float], all_ms: float, frames: int) -> dict[str, float]:
-    """Return percentiles of the passes that took place (a frame from a draft has none through the fixer), share and mean per frame."""
+    """Return percentiles of the passes that took place (a frame from a draft has none through the
+    fixer), share and mean per frame.
+    """
     passes, total = [d for d in durations if d > 0.0], sum(durations)
     return {
         "p50_ms": round(float(np.percentile(passes, 50)), 3),
@@ -127,11 +146,20 @@ def resample_durations(durations: Sequence[float], frames: int) -> F64:
         (array([1., 1., 2., 2.]), array([2., 6.]))
     """
     done = np.concatenate([[0.0], np.cumsum(durations)])
-    return np.diff(np.interp(np.linspace(0, len(durations), frames + 1), np.arange(len(done)), done))
+    return np.diff(
+        np.interp(np.linspace(0, len(durations), frames + 1), np.arange(len(done)), done)
+    )
 
 
-def pool_of(manifests: Sequence[dict[str, Any]], threads: Threads, wall_s: float, before: Mapping[str, Any] | None) -> Mapping[str, Any]:
-    """Return the throughput of all workers together, start-up included; a run that only reused rollouts keeps its earlier figures."""
+def pool_of(
+    manifests: Sequence[dict[str, Any]],
+    threads: Threads,
+    wall_s: float,
+    before: Mapping[str, Any] | None,
+) -> Mapping[str, Any]:
+    """Return the throughput of all workers together, start-up included; a run that only reused
+    rollouts keeps its earlier figures.
+    """
     fresh = [m for m in manifests if not m.get("reused")]
     if not fresh and before:
         return before
@@ -149,27 +177,39 @@ def _failures(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
     failed = [m for m in manifests if m["status"] != "ok"]
     by_class = dict(Counter(m["error"]["failure_class"] for m in failed))
     cells = [{k: m[k] for k in (*KEYS, "path", "error")} for m in failed]
-    return {"n_failed": len(failed), "n_rollouts": len(manifests), "by_class": by_class, "cells": cells}
+    return {
+        "n_failed": len(failed),
+        "n_rollouts": len(manifests),
+        "by_class": by_class,
+        "cells": cells,
+    }
 
 
 def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[str, Any]:
-    """Return the numbers of all rollouts of some runs, such as the parts of a night, in the form of ``summary.json``.
+    """Return the numbers of all rollouts of some runs, such as the parts of a night, in the form of
+    ``summary.json``.
 
-    A cell (renderer, policy, scene, seed) that several runs hold counts once, with the mean of its repeats, as in a single run.
+    A cell (renderer, policy, scene, seed) that several runs hold counts once, with the mean of its
+    repeats, as in a single run.
 
     Args:
         runs: Finished run folders.
-        baseline: RENDERER, POLICY or RENDERER/POLICY that the others are compared with; None is the first run's.
+        baseline: RENDERER, POLICY or RENDERER/POLICY that the others are compared with; None is the
+            first run's.
 
     Returns:
-        ``runs``, ``preset``, ``metrics``, ``paired``, ``paired_with_base``, ``paired_arms``, ``failures`` (docs/statistics.md).
+        ``runs``, ``preset``, ``metrics``, ``paired``, ``paired_with_base``, ``paired_arms``,
+        ``failures`` (docs/statistics.md).
 
     Raises:
-        InputError: A run is not finished or its tables are damaged; presets differ, or a scene or a metric is another one in another run; a
-            folder
-            is named twice; no run has the baseline.
+        InputError: A run is not finished or its tables are damaged; presets differ, or a scene or a
+            metric is another one in another run; a folder is named twice; no run has the baseline.
     """
-    twice = [run for i, run in enumerate(runs) if run.resolve() in {other.resolve() for other in runs[:i]}]
+    twice = [
+        run
+        for i, run in enumerate(runs)
+        if run.resolve() in {other.resolve() for other in runs[:i]}
+    ]
     if twice:
         raise InputError(DOING, str(twice[0]), "named twice", "name every run once")
     infos = {run: _info_of(run) for run in runs}
@@ -180,13 +220,19 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[st
     if baseline is not None:
         base_named(baseline, arms, DOING, "the runs together")
     known = _joined(infos, table.metrics)
-    bases = {name: base for info in infos.values() for name, base in (info.get("bases") or {}).items()}
+    bases = {
+        name: base for info in infos.values() for name, base in (info.get("bases") or {}).items()
+    }
     by_class = table.failures()
     return {
         "runs": [str(run) for run in runs],
         "preset": first["preset"],
         **numbers(table, baseline or first["config"].get("baseline"), bases, known),
-        "failures": {"n_failed": sum(by_class.values()), "n_rollouts": table.n_rollouts, "by_class": by_class},
+        "failures": {
+            "n_failed": sum(by_class.values()),
+            "n_rollouts": table.n_rollouts,
+            "by_class": by_class,
+        },
     }
 
 
@@ -211,9 +257,15 @@ def _info_of(run: Path) -> dict[str, Any]:
     """
     info = read_run_json(run)
     contents = find_contents(run)
-    damaged = None if contents is None else next((one for one in damaged_files(run, contents) if one.file == ROLLOUTS), None)
+    damaged = (
+        None
+        if contents is None
+        else next((one for one in damaged_files(run, contents) if one.file == ROLLOUTS), None)
+    )
     if contents is None or damaged is not None:
-        raise InputError(DOING, str(run), "the run is not finished" if damaged is None else str(damaged), AGAIN)
+        raise InputError(
+            DOING, str(run), "the run is not finished" if damaged is None else str(damaged), AGAIN
+        )
     ROLLOUTS_TABLE.check(run / ROLLOUTS, DOING, AGAIN, MetricTable.of_run(info).rates)
     return info
 
@@ -229,11 +281,19 @@ def _check_alike(infos: Mapping[Path, Mapping[str, Any]]) -> None:
     for run, info in infos.items():
         if info["preset"] != kind:
             found = f"presets {kind!r} and {info['preset']!r}"
-            raise InputError(DOING, f"{first} and {run}", found, "give the command of one run again with --preset")
+            raise InputError(
+                DOING,
+                f"{first} and {run}",
+                found,
+                "give the command of one run again with --preset",
+            )
         for scene, facts in info["scenes"].items():
             content = str(facts.get("content_hash") or "")
             other, where = seen.setdefault(scene, (content, run))
             if other != content:
                 raise InputError(
-                    DOING, f"{where} and {run}", f"scene {scene} with another content", "aggregate runs of the same scene files"
+                    DOING,
+                    f"{where} and {run}",
+                    f"scene {scene} with another content",
+                    "aggregate runs of the same scene files",
                 )

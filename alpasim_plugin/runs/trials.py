@@ -1,4 +1,6 @@
-"""Trials of a policy along a logged drive: what its plans depend on, and which single change of what it sees or answers mends them."""
+"""Trials of a policy along a logged drive: what its plans depend on, and which single change of
+what it sees or answers mends them.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +15,23 @@ import numpy as np
 from alpasim_plugin.core.errors import PolicyError
 from alpasim_plugin.core.geometry import arc_lengths, yaw_of
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.types import F64, U8, CameraSpec, Observation, Plan, Route, SensorSpec, Trajectory
+from alpasim_plugin.core.types import (
+    F64,
+    U8,
+    CameraSpec,
+    Observation,
+    Plan,
+    Route,
+    SensorSpec,
+    Trajectory,
+)
 from alpasim_plugin.runs.guards import checked_plan, reset_policy
 
-AHEAD_S = (0.5, 1.0, 1.5)  # where plans are compared with the recording: what is driven of a plan is its beginning
+AHEAD_S = (
+    0.5,
+    1.0,
+    1.5,
+)  # where plans are compared with the recording: what is driven of a plan is its beginning
 CHANGED_M = 0.05  # plans further apart than this, 2 s ahead, are not the same
 CAP_M = 10.0  # of one distance: a plan that is far off is wrong, not infinitely wrong
 WORSE = 1.2  # a change that makes the error this much larger is not driven
@@ -72,29 +87,43 @@ def pictures(change: Callable[[U8, CameraSpec], U8]) -> See:
 
     def see(observation: Observation) -> Observation:
         cameras = observation.cameras
-        frames = {name: replace(f, rgb=change(f.rgb, cameras[name])) for name, f in observation.frames.items()}
+        frames = {
+            name: replace(f, rgb=change(f.rgb, cameras[name]))
+            for name, f in observation.frames.items()
+        }
         return replace(observation, frames=frames)
 
     return see
 
 
 def warped(zoom: float = 1.0, right_rad: float = 0.0, down_rad: float = 0.0) -> See:
-    """Return the change that shows pictures as a camera of ``zoom`` times the focal length would, turned by small angles."""
+    """Return the change that shows pictures as a camera of ``zoom`` times the focal length would,
+    turned by small angles.
+    """
 
     def change(rgb: U8, camera: CameraSpec) -> U8:
         K = camera.K
         cx, cy = K[0, 2], K[1, 2]
         shift = K[0, 0] * np.tan(right_rad), K[1, 1] * np.tan(down_rad)
-        matrix = np.array([[zoom, 0.0, cx * (1 - zoom) - shift[0]], [0.0, zoom, cy * (1 - zoom) - shift[1]]])
+        matrix = np.array(
+            [[zoom, 0.0, cx * (1 - zoom) - shift[0]], [0.0, zoom, cy * (1 - zoom) - shift[1]]]
+        )
         size = (rgb.shape[1], rgb.shape[0])
-        return np.asarray(cv2.warpAffine(rgb, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
+        return np.asarray(
+            cv2.warpAffine(
+                rgb, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            ),
+            dtype=np.uint8,
+        )
 
     return pictures(change)
 
 
 def brightness(factor: float) -> See:
     """Return the change that multiplies the pictures' brightness."""
-    return pictures(lambda rgb, _: np.clip(rgb.astype(np.float32) * factor, 0, 255).astype(np.uint8))
+    return pictures(
+        lambda rgb, _: np.clip(rgb.astype(np.float32) * factor, 0, 255).astype(np.uint8)
+    )
 
 
 def speed(factor: float) -> See:
@@ -108,7 +137,9 @@ def route(change: Callable[[F64], F64]) -> See:
 
 
 def moved(change: Callable[[F64, F64, Observation], tuple[F64, F64]]) -> Answer:
-    """Return the change of a plan's ``xy`` ``(T, 2)`` and ``yaw`` ``(T,)``; samples are left out."""
+    """Return the change of a plan's ``xy`` ``(T, 2)`` and ``yaw`` ``(T,)``; samples are left
+    out.
+    """
 
     def answer(plan: Plan, observation: Observation) -> Plan:
         xy, yaw = change(plan.xy.copy(), plan.yaw.copy(), observation)
@@ -144,40 +175,101 @@ def trials(camera_x_m: float) -> Iterator[Trial]:
         camera_x_m: Where the camera is on the rig, for plans that count from it.
     """
     mirrored = moved(lambda p, a, _: (p * MIRROR, -a))
-    yield Trial("plan mirrored", "its plan has the wrong sign: left and right are exchanged", answer=mirrored)
-    for factor, unit in ((3.6, "km/h for m/s"), (1 / 3.6, "m/s for km/h"), (1 / 0.3048, "feet for metres"), (0.3048, "metres for feet")):
+    yield Trial(
+        "plan mirrored",
+        "its plan has the wrong sign: left and right are exchanged",
+        answer=mirrored,
+    )
+    for factor, unit in (
+        (3.6, "km/h for m/s"),
+        (1 / 3.6, "m/s for km/h"),
+        (1 / 0.3048, "feet for metres"),
+        (0.3048, "metres for feet"),
+    ):
         what = f"its plan has the wrong unit ({unit}): it goes {1 / factor:.2g} times as far as it should"
-        yield Trial(f"plan scaled by {factor:.3g}", what, answer=moved(lambda p, a, _, k=factor: (p * k, a)))  # type: ignore[misc]
+        yield Trial(
+            f"plan scaled by {factor:.3g}", what, answer=moved(lambda p, a, _, k=factor: (p * k, a))
+        )  # type: ignore[misc]
     for factor in (0.5, 2.0):
         what = f"the time step of its plan is wrong: poses come after {1 / factor:g} times as long as they should"
-        yield Trial(f"plan in {factor:g} times the time", what, answer=lambda p, _, k=factor: later(p, k))  # type: ignore[misc]
+        yield Trial(
+            f"plan in {factor:g} times the time", what, answer=lambda p, _, k=factor: later(p, k)
+        )  # type: ignore[misc]
     world = moved(lambda p, a, o: _turned(p, a, -yaw_of(o.ego.T_world_rig)))
-    yield Trial("plan turned into the rig", "its plan has the world's axes, not the rig's", answer=world)
-    yield Trial("x and y of the plan exchanged", "it exchanges x and y", answer=moved(lambda p, a, _: (p[:, ::-1].copy(), np.pi / 2 - a)))
+    yield Trial(
+        "plan turned into the rig", "its plan has the world's axes, not the rig's", answer=world
+    )
+    yield Trial(
+        "x and y of the plan exchanged",
+        "it exchanges x and y",
+        answer=moved(lambda p, a, _: (p[:, ::-1].copy(), np.pi / 2 - a)),
+    )
     if abs(camera_x_m) > 0.3:
         shift = moved(lambda p, a, _: (p + np.array([camera_x_m, 0.0]), a))
-        yield Trial("plan counted from the camera", "its plan counts from the camera, not from the rear axle", answer=shift)
-    yield _seen("colours exchanged", "it exchanges red and blue of the picture", pictures(lambda rgb, _: rgb[..., ::-1].copy()))
-    yield _seen("picture mirrored", "it reads the picture mirrored", pictures(lambda rgb, _: rgb[:, ::-1].copy()))
-    yield _seen("picture upside down", "it reads the picture upside down", pictures(lambda rgb, _: rgb[::-1].copy()))
+        yield Trial(
+            "plan counted from the camera",
+            "its plan counts from the camera, not from the rear axle",
+            answer=shift,
+        )
+    yield _seen(
+        "colours exchanged",
+        "it exchanges red and blue of the picture",
+        pictures(lambda rgb, _: rgb[..., ::-1].copy()),
+    )
+    yield _seen(
+        "picture mirrored",
+        "it reads the picture mirrored",
+        pictures(lambda rgb, _: rgb[:, ::-1].copy()),
+    )
+    yield _seen(
+        "picture upside down",
+        "it reads the picture upside down",
+        pictures(lambda rgb, _: rgb[::-1].copy()),
+    )
     for zoom in (0.5, 0.67, 0.8, 1.25, 1.5, 2.0):
-        yield _seen(f"focal length x {zoom:g}", f"it takes the focal length for {zoom:g} times what it is", warped(zoom))
+        yield _seen(
+            f"focal length x {zoom:g}",
+            f"it takes the focal length for {zoom:g} times what it is",
+            warped(zoom),
+        )
     for degrees in (-6.0, -3.0, 3.0, 6.0):
         side, slope = ("right", "down") if degrees > 0 else ("left", "up")
         by, rad = f"{abs(degrees):g} degrees", np.deg2rad(degrees)
-        yield _seen(f"camera turned {side} {by}", f"it takes the camera to look {by} further {side} than it does", warped(right_rad=rad))
-        yield _seen(f"camera turned {slope} {by}", f"it takes the camera to look {by} further {slope} than it does", warped(down_rad=rad))
+        yield _seen(
+            f"camera turned {side} {by}",
+            f"it takes the camera to look {by} further {side} than it does",
+            warped(right_rad=rad),
+        )
+        yield _seen(
+            f"camera turned {slope} {by}",
+            f"it takes the camera to look {by} further {slope} than it does",
+            warped(down_rad=rad),
+        )
     for factor in (0.5, 2.0):
-        yield _seen(f"brightness x {factor:g}", f"it expects pictures of {factor:g} times the brightness", brightness(factor))
+        yield _seen(
+            f"brightness x {factor:g}",
+            f"it expects pictures of {factor:g} times the brightness",
+            brightness(factor),
+        )
     for factor in (3.6, 1 / 3.6):
-        yield Trial(f"speed x {factor:.3g}", f"it takes its speed for {1 / factor:.2g} times what it is (unit)", speed(factor))
-    yield Trial("route mirrored", "it reads the route with the wrong sign", route(lambda xyz: xyz * [1.0, -1.0, 1.0]))
+        yield Trial(
+            f"speed x {factor:.3g}",
+            f"it takes its speed for {1 / factor:.2g} times what it is (unit)",
+            speed(factor),
+        )
+    yield Trial(
+        "route mirrored",
+        "it reads the route with the wrong sign",
+        route(lambda xyz: xyz * [1.0, -1.0, 1.0]),
+    )
 
 
-# --- along the logged drive -----------------------------------------------------------------------------------------
+# --- along the logged drive
 
 
-def plans_over(policy: Policy, observations: Sequence[Observation], seed: int, its_route: Route) -> list[Plan]:
+def plans_over(
+    policy: Policy, observations: Sequence[Observation], seed: int, its_route: Route
+) -> list[Plan]:
     """Query a policy along observations that it does not influence.
 
     Raises:
@@ -188,18 +280,28 @@ def plans_over(policy: Policy, observations: Sequence[Observation], seed: int, i
 
 
 def ahead(plan: Plan, seconds: Sequence[float] = AHEAD_S) -> F64:
-    """Return where a plan is after some seconds ``(S, 2)``, metres, rig frame; beyond its end its last pose."""
+    """Return where a plan is after some seconds ``(S, 2)``, metres, rig frame; beyond its end its
+    last pose.
+    """
     at = plan.t_us + np.asarray(seconds) * 1e6
     return np.stack([np.interp(at, plan.times_us, plan.xy[:, k]) for k in (0, 1)], axis=1)
 
 
 def apart_m(one: Sequence[Plan], other: Sequence[Plan]) -> F64:
     """Return the distance of plans 2 s ahead ``(Q,)``, metres."""
-    return np.array([float(np.hypot(*(ahead(a, [2.0]) - ahead(b, [2.0]))[0])) for a, b in zip(one, other, strict=True)])
+    return np.array(
+        [
+            float(np.hypot(*(ahead(a, [2.0]) - ahead(b, [2.0]))[0]))
+            for a, b in zip(one, other, strict=True)
+        ]
+    )
 
 
-def error_m(plans: Sequence[Plan], observations: Sequence[Observation], recorded: Trajectory) -> float:
-    """Return the mean distance of plans from the recorded drive, from the place of it that is nearest to the ego on, metres.
+def error_m(
+    plans: Sequence[Plan], observations: Sequence[Observation], recorded: Trajectory
+) -> float:
+    """Return the mean distance of plans from the recorded drive, from the place of it that is
+    nearest to the ego on, metres.
 
     Args:
         plans: As the policy gave them.
@@ -274,7 +376,8 @@ class Findings:
         tried: All trials, the best first.
         depends: On which inputs the plans depend.
         pulses: When plans react to a disturbed picture.
-        repeatable: Whether the policy gives the same plans for the same observations; without it nothing else can be told.
+        repeatable: Whether the policy gives the same plans for the same observations; without it
+            nothing else can be told.
         left_out: How many trials there was no time for.
     """
 
@@ -286,7 +389,9 @@ class Findings:
     left_out: int = 0
 
     def promising(self, at_most: int) -> list[Tried]:
-        """Return the trials worth a drive, the best first: they change the plans, and not for much worse."""
+        """Return the trials worth a drive, the best first: they change the plans, and not for much
+        worse.
+        """
         moving = [one for one in self.tried if one.error_m is not None and one.moved_m > CHANGED_M]
         return [one for one in moving if (one.error_m or 0.0) < WORSE * self.own_error_m][:at_most]
 
@@ -302,7 +407,11 @@ INPUTS: Sequence[tuple[str, See]] = (
 
 
 def investigate(
-    make: Callable[[], Policy], given: Sequence[Plan], observations: Sequence[Observation], recorded: Trajectory, **reset: Any
+    make: Callable[[], Policy],
+    given: Sequence[Plan],
+    observations: Sequence[Observation],
+    recorded: Trajectory,
+    **reset: Any,
 ) -> Findings:
     """Try all changes along a logged drive, without driving.
 
@@ -322,10 +431,18 @@ def investigate(
     def with_change(see: See) -> list[Plan]:
         return plans_over(make(), [see(one) for one in observations], **reset)
 
-    depends = tuple(found for what, see in INPUTS if (found := _dependence(what, lambda see=see: with_change(see), given)))  # type: ignore[misc]
+    depends = tuple(
+        found
+        for what, see in INPUTS
+        if (found := _dependence(what, lambda see=see: with_change(see), given))
+    )  # type: ignore[misc]
     pulses = tuple(_pulses(make, given, observations, **reset)) if observations[0].frames else ()
-    mount_x_m = max((float(c.T_rig_camera[0, 3]) for c in observations[0].cameras.values()), default=0.0)
-    all_trials, tried, seen_m = list(trials(mount_x_m)), [], 0.0
+    mount_x_m = max(
+        (float(c.T_rig_camera[0, 3]) for c in observations[0].cameras.values()), default=0.0
+    )
+    all_trials = list(trials(mount_x_m))
+    tried = []
+    seen_m = 0.0
     for trial in all_trials:
         if time.monotonic() - began > MOST_S:
             break
@@ -338,18 +455,28 @@ def investigate(
         tried.append(Tried(trial, error_m(plans, observations, recorded), moved_m=moved_m))
         seen_m = max(seen_m, moved_m) if trial.of_pictures else seen_m
     tried.sort(key=lambda one: np.inf if one.error_m is None else one.error_m)
-    depends = tuple(replace(one, apart_m=max(one.apart_m, seen_m)) if "pictures" in one.what else one for one in depends)
+    depends = tuple(
+        replace(one, apart_m=max(one.apart_m, seen_m)) if "pictures" in one.what else one
+        for one in depends
+    )
     return Findings(own, tuple(tried), depends, pulses, True, len(all_trials) - len(tried))
 
 
-def _dependence(what: str, plans: Callable[[], list[Plan]], given: Sequence[Plan]) -> Dependence | None:
+def _dependence(
+    what: str, plans: Callable[[], list[Plan]], given: Sequence[Plan]
+) -> Dependence | None:
     try:
         return Dependence(what, float(apart_m(given, plans()).max()))
     except PolicyError:  # it refuses such an input, so it looks at it
         return Dependence(f"{what}: refused", np.inf)
 
 
-def _pulses(make: Callable[[], Policy], given: Sequence[Plan], observations: Sequence[Observation], **reset: Any) -> Iterator[Pulse]:
+def _pulses(
+    make: Callable[[], Policy],
+    given: Sequence[Plan],
+    observations: Sequence[Observation],
+    **reset: Any,
+) -> Iterator[Pulse]:
     """Disturb one picture at a time and see when the plans change."""
     for k in sorted({int(share * len(observations)) for share in PULSES}):
         shown = [NEGATIVE(one) if i == k else one for i, one in enumerate(observations)]

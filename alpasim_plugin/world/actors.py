@@ -1,7 +1,9 @@
-"""Road users while a scene is driven: replay of tracks, and drivers that react once the loop is closed.
+"""Road users while a scene is driven: replay of tracks, and drivers that react once the loop is
+closed.
 
-Replayed actors exist exactly during their track. Reactive ones follow their track until the loop closes, then drive along the same
-line, on along the lanes where it ends, and leave the scene at the end of the map.
+Replayed actors exist exactly during their track. Reactive ones follow their track until the loop
+closes, then drive along the same line, on along the lanes where it ends, and leave the scene at the
+end of the map.
 """
 
 from __future__ import annotations
@@ -13,7 +15,17 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, se2, se3, slerp, wrap_angle, yaw_of
-from alpasim_plugin.core.types import F64, I64, Actor, Bool, EgoState, HeightField, LaneMap, Scenario, Vehicle
+from alpasim_plugin.core.types import (
+    F64,
+    I64,
+    Actor,
+    Bool,
+    EgoState,
+    HeightField,
+    LaneMap,
+    Scenario,
+    Vehicle,
+)
 from alpasim_plugin.world.ground import ground_pose
 from alpasim_plugin.world.idm import (
     NO_BODIES,
@@ -48,15 +60,25 @@ class Actors:
         actors: Road users with their tracks.
         vehicle: Ego body, which reactive drivers see.
         closed_us: Time at which reactive drivers stop following their tracks.
-        lane_map: Map along which reactive drivers go on where their track ends; None: they leave the scene there.
+        lane_map: Map along which reactive drivers go on where their track ends; None: they leave
+            the scene there.
         ground: Height field that carries reactive drivers; None keeps the heights of their line.
     """
 
     def __init__(
-        self, actors: Sequence[Actor], vehicle: Vehicle, closed_us: int, lane_map: LaneMap | None = None, ground: HeightField | None = None
+        self,
+        actors: Sequence[Actor],
+        vehicle: Vehicle,
+        closed_us: int,
+        lane_map: LaneMap | None = None,
+        ground: HeightField | None = None,
     ) -> None:
         self.vehicle, self.closed_us = vehicle, closed_us
-        index = LaneIndex(lane_map) if lane_map is not None and any(a.behaviour.kind == "idm" for a in actors) else None
+        index = (
+            LaneIndex(lane_map)
+            if lane_map is not None and any(a.behaviour.kind == "idm" for a in actors)
+            else None
+        )
         self.drivers = [_Driver(a, index, ground) for a in actors if a.behaviour.kind == "idm"]
         self.replay = _Replay([a for a in actors if a.behaviour.kind != "idm"])
         self.standing = _Standing([a for a in actors if a.behaviour.kind != "idm" and a.is_static])
@@ -72,13 +94,19 @@ class Actors:
     def step(self, t_us: int, ego: EgoState) -> Mapping[str, F64]:
         """Advance to ``t_us`` and return ``T_world_box`` ``(4, 4)`` of every actor present.
 
-        Reactive drivers take one acceleration from the positions at the last call and hold it over the step.
+        Reactive drivers take one acceleration from the positions at the last call and hold it over
+        the step.
 
         Raises:
             InputError: Time does not increase.
         """
         if self.t_us is not None and t_us <= self.t_us:
-            raise InputError("moving the actors", f"t = {t_us} us", f"the last time was {self.t_us} us", "step forwards, or reset first")
+            raise InputError(
+                "moving the actors",
+                f"t = {t_us} us",
+                f"the last time was {self.t_us} us",
+                "step forwards, or reset first",
+            )
         poses = self.replay.at(t_us, self.replay.cursor)
         if self.drivers:
             if self.t_us is not None and t_us > self.closed_us:
@@ -91,9 +119,15 @@ class Actors:
         return poses
 
     def forecast(self) -> ActorForecast:
-        """Return a forecast from the present instant, which does not change as the actors move on."""
-        reactive = [(d, None if d.motion is None else replace(d.motion)) for d in self.drivers if d.present]
-        return ActorForecast(self.replay, self.replay.cursor.copy(), tuple(reactive), self.t_us, self.closed_us)
+        """Return a forecast from the present instant, which does not change as the actors move
+        on.
+        """
+        reactive = [
+            (d, None if d.motion is None else replace(d.motion)) for d in self.drivers if d.present
+        ]
+        return ActorForecast(
+            self.replay, self.replay.cursor.copy(), tuple(reactive), self.t_us, self.closed_us
+        )
 
     def _advance(self, from_us: int, to_us: int, ego: EgoState, poses: Mapping[str, F64]) -> None:
         n = max(1, int(np.ceil((to_us - from_us) * 1e-6 / MAX_STEP_S)))
@@ -125,10 +159,16 @@ class ActorForecast:
     closed_us: int
 
     def at(self, t_us: int) -> dict[str, F64]:
-        """Return ``T_world_box`` ``(4, 4)`` of every actor expected at ``t_us``, not earlier than the instant of the forecast."""
+        """Return ``T_world_box`` ``(4, 4)`` of every actor expected at ``t_us``, not earlier than
+        the instant of the forecast.
+        """
         poses = self.replay.at(t_us, self.cursor.copy())
         for driver, motion in self.reactive:
-            pose = driver.pose(t_us, t_us, None) if motion is None else self._moved(driver, motion, t_us)
+            pose = (
+                driver.pose(t_us, t_us, None)
+                if motion is None
+                else self._moved(driver, motion, t_us)
+            )
             if pose is not None:
                 poses[driver.actor.actor_id] = pose
         return poses
@@ -137,7 +177,11 @@ class ActorForecast:
         assert self.t_us is not None
         assert driver.path is not None
         s_m = motion.s_m + motion.speed_mps * (t_us - self.t_us) * 1e-6
-        return None if s_m > driver.path.length_m else driver.pose(t_us, self.closed_us, replace(motion, s_m=s_m))
+        return (
+            None
+            if s_m > driver.path.length_m
+            else driver.pose(t_us, self.closed_us, replace(motion, s_m=s_m))
+        )
 
 
 def make_actors(scenario: Scenario) -> Actors:
@@ -154,7 +198,9 @@ def _ego_bodies(ego: EgoState, vehicle: Vehicle) -> Bodies:
 
 
 class _Replay:
-    """Tracks that do not react, advanced together: one cursor per actor, one batch of interpolations a step."""
+    """Tracks that do not react, advanced together: one cursor per actor, one batch of
+    interpolations a step.
+    """
 
     def __init__(self, actors: Sequence[Actor]) -> None:
         self.actors = list(actors)
@@ -173,7 +219,9 @@ class _Replay:
         self.cursor = self.begin.copy()
 
     def at(self, t_us: int, cursor: I64) -> dict[str, F64]:
-        """Return the poses at ``t_us``, not earlier than where the cursors (one per actor) stand, and move those there."""
+        """Return the poses at ``t_us``, not earlier than where the cursors (one per actor) stand,
+        and move those there.
+        """
         rows = np.flatnonzero((self.first <= t_us) & (t_us <= self.last))
         if len(rows) == 0:
             return {}
@@ -201,7 +249,12 @@ class _Replay:
         j = np.minimum(i + 1, self.end[rows])
         dt_s = np.maximum(self.t[j] - self.t[i], 1).astype(np.float64) * 1e-6
         velocity = (self.xyz[j, :2] - self.xyz[i, :2]) / dt_s[:, None]
-        return bodies_from(T[:, :2, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0]), [self.actors[k].box for k in rows], velocity)
+        return bodies_from(
+            T[:, :2, 3],
+            np.arctan2(T[:, 1, 0], T[:, 0, 0]),
+            [self.actors[k].box for k in rows],
+            velocity,
+        )
 
 
 class _Standing:
@@ -210,7 +263,10 @@ class _Standing:
     def __init__(self, actors: Sequence[Actor]) -> None:
         poses = np.array([se3(a.track.xyz[0], a.track.quat[0]) for a in actors]).reshape(-1, 4, 4)
         self.bodies = bodies_from(
-            poses[:, :2, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0]), [a.box for a in actors], np.zeros((len(actors), 2))
+            poses[:, :2, 3],
+            np.arctan2(poses[:, 1, 0], poses[:, 0, 0]),
+            [a.box for a in actors],
+            np.zeros((len(actors), 2)),
         )
         self.first = np.array([int(a.track.t_us[0]) for a in actors], dtype=np.int64)
         self.last = np.array([int(a.track.t_us[-1]) for a in actors], dtype=np.int64)
@@ -282,12 +338,20 @@ class _Driver:
         if not self.knows_standing:
             self.standing, self.knows_standing = standing.on(path), True
         front, half = m.s_m + self.actor.box.length_m / 2, self.actor.box.width_m / 2
-        # Twice the wanted gap behind a standing leader: beyond it the interaction is below a quarter of the own acceleration.
+        # Twice the wanted gap behind a standing leader: beyond it the interaction is below a
+        # quarter of the own acceleration.
         horizon_m = 20.0 + 2.0 * wanted_gap_m(m.speed_mps, m.speed_mps, self.params)
         leaders = [find_leader(path, front, half, everybody, horizon_m, own_row=own_row)]
         if self.standing is not None:
-            leaders.append(nearest_ahead(self.standing.only(present[self.standing.index]), front, half, horizon_m))
-        m.accel_mps2 = min(idm_acceleration(m.speed_mps, o.gap_m, m.speed_mps - o.speed_mps, self.params) for o in leaders)
+            leaders.append(
+                nearest_ahead(
+                    self.standing.only(present[self.standing.index]), front, half, horizon_m
+                )
+            )
+        m.accel_mps2 = min(
+            idm_acceleration(m.speed_mps, o.gap_m, m.speed_mps - o.speed_mps, self.params)
+            for o in leaders
+        )
 
     def advance(self, dt_s: float) -> None:
         path, m = self._driving()
@@ -296,10 +360,14 @@ class _Driver:
             self.present, self.motion = False, None
 
     def pose(self, t_us: int, closed_us: int, motion: _Motion | None) -> F64 | None:
-        """Return the pose of the box centre for a state of motion (None: on the track), or None where the actor is not in the scene."""
+        """Return the pose of the box centre for a state of motion (None: on the track), or None
+        where the actor is not in the scene.
+        """
         if motion is None:
             first, last = int(self.actor.track.t_us[0]), int(self.actor.track.t_us[-1])
-            on_track = first <= t_us <= last and self.present and (t_us <= closed_us or self.path is None)
+            on_track = (
+                first <= t_us <= last and self.present and (t_us <= closed_us or self.path is None)
+            )
             return interpolate(self.actor.track, t_us) if on_track else None
         assert self.path is not None
         xyz, yaw = self.path.at(motion.s_m, motion.offset_m)
@@ -310,7 +378,9 @@ class _Driver:
 
 
 def _driving_line(actor: Actor, index: LaneIndex | None) -> Path | None:
-    """Return the line of a track, thinned where it stands and extended along the lanes; None for a track that goes nowhere."""
+    """Return the line of a track, thinned where it stands and extended along the lanes; None for a
+    track that goes nowhere.
+    """
     xyz = actor.track.xyz
     keep = [0]
     for i in range(1, len(xyz)):
@@ -326,8 +396,13 @@ def _driving_line(actor: Actor, index: LaneIndex | None) -> Path | None:
 
 
 def _lanes_ahead(index: LaneIndex, end: F64, heading: float) -> F64 | None:
-    """Return the way on from the end of a track: the lane there that runs the same way, and what follows it."""
-    turns = {lane: abs(float(wrap_angle(index.heading_rad(lane, end) - heading))) for lane in index.containing(end[:2])}
+    """Return the way on from the end of a track: the lane there that runs the same way, and what
+    follows it.
+    """
+    turns = {
+        lane: abs(float(wrap_angle(index.heading_rad(lane, end) - heading)))
+        for lane in index.containing(end[:2])
+    }
     lane = min(turns, key=lambda one: turns[one], default=None)
     if lane is None or turns[lane] >= MAX_TURN_RAD:
         return None

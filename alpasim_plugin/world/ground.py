@@ -1,4 +1,6 @@
-"""Ground height under the scene: a regular grid, bilinear in between, constant beyond its border."""
+"""Ground height under the scene: a regular grid, bilinear in between, constant beyond its
+border.
+"""
 
 from __future__ import annotations
 
@@ -21,32 +23,52 @@ def flat(z: float = 0.0) -> HeightField:
 def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> HeightField:
     """Fit a height field to scattered ground points.
 
-    Points are averaged per cell (position and height, so a plane stays a plane), the averages are joined by a Delaunay triangulation
-    that is read at the grid nodes, and nodes outside the convex hull take the nearest average.
+    Points are averaged per cell (position and height, so a plane stays a plane), the averages are
+    joined by a Delaunay triangulation that is read at the grid nodes, and nodes outside the convex
+    hull take the nearest average.
 
     Args:
         points: ``(N, 3)`` metres, world; order does not matter.
         cell_m: Grid step in metres.
-        drive: ``(T, 3)`` positions of the ego; points more than `SIGHT_M` outside the rectangle around them are left out, so that a large
-            map costs no more than what is seen of it.
+        drive: ``(T, 3)`` positions of the ego; points more than `SIGHT_M` outside the rectangle
+            around them are left out, so that a large map costs no more than what is seen of it.
 
     Raises:
-        InputError: There is no point, a coordinate is not finite, or the grid would have more than `MAX_NODES` nodes.
+        InputError: There is no point, a coordinate is not finite, or the grid would have more than
+            `MAX_NODES` nodes.
     """
     xyz = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     if len(xyz) == 0 or not np.isfinite(xyz).all() or cell_m <= 0:
-        bad = "no points" if len(xyz) == 0 else f"{int((~np.isfinite(xyz)).any(axis=1).sum())} points that are not finite"
+        bad = (
+            "no points"
+            if len(xyz) == 0
+            else f"{int((~np.isfinite(xyz)).any(axis=1).sum())} points that are not finite"
+        )
         with_what = f"{len(xyz)} points, cell {cell_m} m"
-        raise InputError("fitting a ground height field", with_what, bad, "give finite ground points and a cell > 0")
+        raise InputError(
+            "fitting a ground height field",
+            with_what,
+            bad,
+            "give finite ground points and a cell > 0",
+        )
     if drive is not None:
-        near = np.all((xyz[:, :2] >= drive[:, :2].min(axis=0) - SIGHT_M) & (xyz[:, :2] <= drive[:, :2].max(axis=0) + SIGHT_M), axis=1)
+        near = np.all(
+            (xyz[:, :2] >= drive[:, :2].min(axis=0) - SIGHT_M)
+            & (xyz[:, :2] <= drive[:, :2].max(axis=0) + SIGHT_M),
+            axis=1,
+        )
         xyz = xyz[near] if near.any() else np.asarray(drive, dtype=np.float64)
     low = np.floor(xyz[:, :2].min(axis=0) / cell_m) * cell_m
     nx, ny = (int(n) + 2 for n in np.floor((xyz[:, :2].max(axis=0) - low) / cell_m))
     if nx * ny > MAX_NODES:
         found = f"a grid of {nx} x {ny} nodes, more than {MAX_NODES}"
         with_what = f"{len(xyz)} points, cell {cell_m} m"
-        raise InputError("fitting a ground height field", with_what, found, "check the extent, or use a larger cell")
+        raise InputError(
+            "fitting a ground height field",
+            with_what,
+            found,
+            "check the extent, or use a larger cell",
+        )
     means = _cell_means(xyz, low, cell_m, nx)
     xs, ys = low[0] + cell_m * np.arange(nx), low[1] + cell_m * np.arange(ny)
     nodes = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)  # (Ny * Nx, 2)
@@ -60,7 +82,9 @@ def _cell_means(xyz: F64, low: F64, cell_m: float, nx: int) -> F64:
     _, inverse, count = np.unique(ij[:, 1] * nx + ij[:, 0], return_inverse=True, return_counts=True)
     # Sums of differences to one point: UTM-sized coordinates keep their last digits.
     rest = xyz - xyz[0]
-    sums = np.stack([np.bincount(inverse, weights=rest[:, d], minlength=len(count)) for d in range(3)], axis=1)
+    sums = np.stack(
+        [np.bincount(inverse, weights=rest[:, d], minlength=len(count)) for d in range(3)], axis=1
+    )
     return np.asarray(sums / count[:, None] + xyz[0])
 
 
@@ -79,7 +103,10 @@ def height_at(field: HeightField, xy: F64) -> F64:
     ny, nx = field.z.shape
     u = np.minimum(np.maximum((at[:, 0] - field.x0_m) / field.cell_m, 0), nx - 1)
     v = np.minimum(np.maximum((at[:, 1] - field.y0_m) / field.cell_m, 0), ny - 1)
-    i, j = np.minimum(u.astype(np.int64), max(nx - 2, 0)), np.minimum(v.astype(np.int64), max(ny - 2, 0))
+    i, j = (
+        np.minimum(u.astype(np.int64), max(nx - 2, 0)),
+        np.minimum(v.astype(np.int64), max(ny - 2, 0)),
+    )
     i1, j1 = np.minimum(i + 1, nx - 1), np.minimum(j + 1, ny - 1)
     fu, fv = u - i, v - j
     low = field.z[j, i] * (1 - fu) + field.z[j, i1] * fu
@@ -90,11 +117,15 @@ def height_at(field: HeightField, xy: F64) -> F64:
 def ground_pose(field: HeightField, x: float, y: float, yaw: float) -> F64:
     """Return ``T_world_rig (4, 4)`` standing on the ground with exactly this heading.
 
-    Pitch and roll follow the surface: slopes are central differences over `SLOPE_SPAN_M` along and across the heading, about what four
-    wheels feel, so a step in the grid does not kick the body.
+    Pitch and roll follow the surface: slopes are central differences over `SLOPE_SPAN_M` along and
+    across the heading, about what four wheels feel, so a step in the grid does not kick the body.
     """
-    c, s, h = np.cos(yaw), np.sin(yaw), SLOPE_SPAN_M
-    offsets = np.array([[0.0, 0.0], [c * h, s * h], [-c * h, -s * h], [-s * h, c * h], [s * h, -c * h]])
+    c = np.cos(yaw)
+    s = np.sin(yaw)
+    h = SLOPE_SPAN_M
+    offsets = np.array(
+        [[0.0, 0.0], [c * h, s * h], [-c * h, -s * h], [-s * h, c * h], [s * h, -c * h]]
+    )
     z = height_at(field, np.array([x, y]) + offsets)
     along, across = (z[1] - z[2]) / (2 * h), (z[3] - z[4]) / (2 * h)
     ex = np.array([c, s, along]) / np.sqrt(1 + along * along)

@@ -1,10 +1,12 @@
-"""The Intelligent Driver Model and the choice of the leader it follows, for one driver and for all drivers on one line at once.
+"""The Intelligent Driver Model and the choice of the leader it follows, for one driver and for all
+drivers on one line at once.
 
-`find_leader` is the plain version for one driver. `find_leaders` places every body on the line a single time, not once for every driver;
-where a line passes the same body twice (a loop, a crossing with itself) the plain version decides, since there the place of a body depends
-on who asks.
+`find_leader` is the plain version for one driver. `find_leaders` places every body on the line a
+single time, not once for every driver; where a line passes the same body twice (a loop, a crossing
+with itself) the plain version decides, since there the place of a body depends on who asks.
 
-Source: M. Treiber, A. Hennecke, D. Helbing, "Congested traffic states in empirical observations and microscopic simulations",
+Source: M. Treiber, A. Hennecke, D. Helbing, "Congested traffic states in empirical observations and
+    microscopic simulations",
 Physical Review E 62 (2000), equations 2 and 3.
 """
 
@@ -42,18 +44,26 @@ class IdmParams:
         for key, value in params.items():
             if key not in known or not value > 0:
                 found = f"{value} is not positive" if key in known else "no such parameter"
-                raise InputError("reading a driver's behaviour", f"idm parameter {key!r}", found, f"use positive {', '.join(known)}")
+                raise InputError(
+                    "reading a driver's behaviour",
+                    f"idm parameter {key!r}",
+                    found,
+                    f"use positive {', '.join(known)}",
+                )
         return IdmParams(**{k: float(v) for k, v in params.items()})
 
 
 def wanted_gap_m(speed_mps: float, closing_mps: float, p: IdmParams) -> float:
     """Return the gap that the driver wants at a speed and a closing speed (equation 3)."""
-    dynamic = speed_mps * p.headway_s + speed_mps * closing_mps / (2.0 * float(np.sqrt(p.accel_mps2 * p.brake_mps2)))
+    dynamic = speed_mps * p.headway_s + speed_mps * closing_mps / (
+        2.0 * float(np.sqrt(p.accel_mps2 * p.brake_mps2))
+    )
     return p.min_gap_m + max(0.0, dynamic)
 
 
 def idm_acceleration(speed_mps: float, gap_m: float, closing_mps: float, p: IdmParams) -> float:
-    """Return the acceleration behind a leader (``gap_m`` infinite: free road), within ``[-hard_brake, accel]``.
+    """Return the acceleration behind a leader (``gap_m`` infinite: free road), within
+    ``[-hard_brake, accel]``.
 
     Args:
         speed_mps: Own speed, >= 0.
@@ -67,12 +77,18 @@ def idm_acceleration(speed_mps: float, gap_m: float, closing_mps: float, p: IdmP
     """
     v0 = max(p.desired_speed_mps, 0.1)
     free = 1.0 - (speed_mps / v0) ** 4
-    interaction = 0.0 if np.isinf(gap_m) else (wanted_gap_m(speed_mps, closing_mps, p) / max(gap_m, 0.01)) ** 2
+    interaction = (
+        0.0
+        if np.isinf(gap_m)
+        else (wanted_gap_m(speed_mps, closing_mps, p) / max(gap_m, 0.01)) ** 2
+    )
     return float(np.clip(p.accel_mps2 * (free - interaction), -p.hard_brake_mps2, p.accel_mps2))
 
 
 def moved_on(s_m: float, speed_mps: float, accel_mps2: float, dt_s: float) -> tuple[float, float]:
-    """Return place (m) and speed (m/s) after a step at a held acceleration; a car that brakes stops, it does not reverse."""
+    """Return place (m) and speed (m/s) after a step at a held acceleration; a car that brakes
+    stops, it does not reverse.
+    """
     a = max(accel_mps2, -speed_mps / dt_s)
     return s_m + (speed_mps * dt_s + 0.5 * a * dt_s * dt_s), max(0.0, speed_mps + a * dt_s)
 
@@ -122,50 +138,90 @@ class Spans:
         return Spans(*(column[keep] for column in vars(self).values()))
 
 
-def spans(path: Path, from_s_m: float, bodies: Bodies, horizon_m: float = 120.0, window: bool = True) -> Spans | None:
-    """Return where bodies lie on a path, from 15 m behind ``from_s_m`` to ``horizon_m`` ahead; None where there is none.
+def spans(
+    path: Path, from_s_m: float, bodies: Bodies, horizon_m: float = 120.0, window: bool = True
+) -> Spans | None:
+    """Return where bodies lie on a path, from 15 m behind ``from_s_m`` to ``horizon_m`` ahead; None
+    where there is none.
 
     Without ``window`` the whole path is searched, for static bodies that are queried repeatedly.
     """
     if len(bodies.xy) == 0:
         return None
     start, _ = path.at(from_s_m)
-    near = np.flatnonzero(np.hypot(*(bodies.xy - start[:2]).T) < horizon_m + bodies.half_length_m + 5.0)
+    near = np.flatnonzero(
+        np.hypot(*(bodies.xy - start[:2]).T) < horizon_m + bodies.half_length_m + 5.0
+    )
     if len(near) == 0:
         return None
     c, s = np.cos(bodies.yaw[near])[:, None], np.sin(bodies.yaw[near])[:, None]
     ax = _OUTLINE[:, 0] * bodies.half_length_m[near, None]  # (m, 6)
     ay = _OUTLINE[:, 1] * bodies.half_width_m[near, None]
-    outline = np.stack([bodies.xy[near, 0:1] + c * ax - s * ay, bodies.xy[near, 1:2] + s * ax + c * ay], axis=-1)
-    along, across = path.project(outline.reshape(-1, 2), (from_s_m - 15.0, from_s_m + horizon_m) if window else None)
+    outline = np.stack(
+        [bodies.xy[near, 0:1] + c * ax - s * ay, bodies.xy[near, 1:2] + s * ax + c * ay], axis=-1
+    )
+    along, across = path.project(
+        outline.reshape(-1, 2), (from_s_m - 15.0, from_s_m + horizon_m) if window else None
+    )
     along, across = along.reshape(-1, 6), across.reshape(-1, 6)
     rear = along.min(axis=1)
     _, yaw = path.at(rear)
     speed = bodies.velocity[near, 0] * np.cos(yaw) + bodies.velocity[near, 1] * np.sin(yaw)
-    return Spans(near, rear, along.max(axis=1), across.min(axis=1), across.max(axis=1), np.maximum(speed, 0.0))
+    return Spans(
+        near,
+        rear,
+        along.max(axis=1),
+        across.min(axis=1),
+        across.max(axis=1),
+        np.maximum(speed, 0.0),
+    )
 
 
 def find_leader(
-    path: Path, front_s_m: float, half_width_m: float, bodies: Bodies, horizon_m: float = 120.0, margin_m: float = 0.2, own_row: int = -1
+    path: Path,
+    front_s_m: float,
+    half_width_m: float,
+    bodies: Bodies,
+    horizon_m: float = 120.0,
+    margin_m: float = 0.2,
+    own_row: int = -1,
 ) -> Leader:
-    """Return the nearest body that reaches into the corridor of a path ahead of the own front bumper.
+    """Return the nearest body that reaches into the corridor of a path ahead of the own front
+    bumper.
 
     ``own_row`` is the driver's own row in ``bodies``, which is left out.
 
-    A body counts when its outline overlaps ``+-(half_width_m + margin_m)`` across the path and its rear end is not more than 2 m
-    behind the own front bumper, so that touching bodies still count.
+    A body counts when its outline overlaps ``+-(half_width_m + margin_m)`` across the path and its
+    rear end is not more than 2 m behind the own front bumper, so that touching bodies still count.
     """
-    return nearest_ahead(spans(path, front_s_m, bodies, horizon_m), front_s_m, half_width_m, horizon_m, margin_m, own_row)
+    return nearest_ahead(
+        spans(path, front_s_m, bodies, horizon_m),
+        front_s_m,
+        half_width_m,
+        horizon_m,
+        margin_m,
+        own_row,
+    )
 
 
 def nearest_ahead(
-    span: Spans | None, front_s_m: float, half_width_m: float, horizon_m: float = 120.0, margin_m: float = 0.2, own_row: int = -1
+    span: Spans | None,
+    front_s_m: float,
+    half_width_m: float,
+    horizon_m: float = 120.0,
+    margin_m: float = 0.2,
+    own_row: int = -1,
 ) -> Leader:
     """Return the leader among bodies whose place on the path is known (see `find_leader`)."""
     if span is None:
         return NO_LEADER
     reach = half_width_m + margin_m
-    ahead = (span.low < reach) & (span.high > -reach) & (span.rear > front_s_m - 2.0) & (span.rear < front_s_m + horizon_m)
+    ahead = (
+        (span.low < reach)
+        & (span.high > -reach)
+        & (span.rear > front_s_m - 2.0)
+        & (span.rear < front_s_m + horizon_m)
+    )
     ahead &= span.index != own_row
     if not ahead.any():
         return NO_LEADER
@@ -177,23 +233,42 @@ NO_BODIES = Bodies(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), np.z
 
 
 def bodies_from(xy: F64, yaw: F64, boxes: Sequence[Box], velocity: F64) -> Bodies:
-    """Build `Bodies` from centres ``(M, 2)``, headings ``(M,)``, boxes and velocities ``(M, 2)``."""
+    """Build `Bodies` from centres ``(M, 2)``, headings ``(M,)``, boxes and velocities ``(M,
+    2)``.
+    """
     half = np.array([[b.length_m / 2, b.width_m / 2] for b in boxes]).reshape(-1, 2)
-    return Bodies(np.asarray(xy).reshape(-1, 2), np.asarray(yaw).reshape(-1), half[:, 0], half[:, 1], np.asarray(velocity).reshape(-1, 2))
+    return Bodies(
+        np.asarray(xy).reshape(-1, 2),
+        np.asarray(yaw).reshape(-1),
+        half[:, 0],
+        half[:, 1],
+        np.asarray(velocity).reshape(-1, 2),
+    )
 
 
 def concatenate(parts: Sequence[Bodies]) -> Bodies:
     """Stack several groups of bodies."""
     if not parts:
         return NO_BODIES
-    return Bodies(*(np.concatenate(columns) for columns in zip(*(vars(part).values() for part in parts), strict=True)))
+    return Bodies(
+        *(
+            np.concatenate(columns)
+            for columns in zip(*(vars(part).values() for part in parts), strict=True)
+        )
+    )
 
 
 COARSE_M = 4.0  # the line is looked at this often to find which bodies are near it
 
 
 def find_leaders(
-    path: Path, front_s_m: F64, half_width_m: F64, bodies: Bodies, own_row: I64, horizon_m: float = 120.0, margin_m: float = 0.2
+    path: Path,
+    front_s_m: F64,
+    half_width_m: F64,
+    bodies: Bodies,
+    own_row: I64,
+    horizon_m: float = 120.0,
+    margin_m: float = 0.2,
 ) -> list[Leader]:
     """Return for each of ``(K,)`` drivers on a path what `find_leader` returns for it.
 
@@ -209,31 +284,53 @@ def find_leaders(
     touching, twice = near_line(path, bodies, float(half_width_m.max()) + margin_m, horizon_m)
     if twice:
         drivers = zip(front_s_m.tolist(), half_width_m.tolist(), own_row.tolist(), strict=True)
-        return [find_leader(path, front, half, bodies, horizon_m, margin_m, row) for front, half, row in drivers]
-    placed = spans(path, path.length_m / 2, bodies.only(touching), np.inf, window=False) if len(touching) else None
+        return [
+            find_leader(path, front, half, bodies, horizon_m, margin_m, row)
+            for front, half, row in drivers
+        ]
+    placed = (
+        spans(path, path.length_m / 2, bodies.only(touching), np.inf, window=False)
+        if len(touching)
+        else None
+    )
     if placed is None:
         return [NO_LEADER] * len(front_s_m)
     index, reach = touching[placed.index], (half_width_m + margin_m)[:, None]
     ahead = (placed.low < reach) & (placed.high > -reach) & (index != own_row[:, None])  # (K, m)
-    ahead &= (placed.rear > front_s_m[:, None] - 2.0) & (placed.rear < front_s_m[:, None] + horizon_m)
+    ahead &= (placed.rear > front_s_m[:, None] - 2.0) & (
+        placed.rear < front_s_m[:, None] + horizon_m
+    )
     first = np.argmin(np.where(ahead, placed.rear, np.inf), axis=1)
     leaders = []
-    for k, front, any_ahead in zip(first, front_s_m.tolist(), ahead.any(axis=1).tolist(), strict=True):
-        leaders.append(Leader(float(placed.rear[k] - front), float(placed.speed[k]), int(index[k])) if any_ahead else NO_LEADER)
+    for k, front, any_ahead in zip(
+        first, front_s_m.tolist(), ahead.any(axis=1).tolist(), strict=True
+    ):
+        leaders.append(
+            Leader(float(placed.rear[k] - front), float(placed.speed[k]), int(index[k]))
+            if any_ahead
+            else NO_LEADER
+        )
     return leaders
 
 
 def near_line(path: Path, bodies: Bodies, reach_m: float, horizon_m: float) -> tuple[I64, bool]:
-    """Return the rows of bodies that may reach into a corridor along a path, and whether the path passes one of them twice.
+    """Return the rows of bodies that may reach into a corridor along a path, and whether the path
+    passes one of them twice.
 
-    A body that touches the corridor has its centre within its half diagonal and the corridor's reach of the line; the tangents at the
-    line's ends belong to it.
+    A body that touches the corridor has its centre within its half diagonal and the corridor's
+    reach of the line; the tangents at the line's ends belong to it.
     """
     s = np.arange(-horizon_m, path.length_m + horizon_m + COARSE_M, COARSE_M)
     xyz, yaw = path.at(s)
     beyond = s - np.clip(s, 0.0, path.length_m)
     x, y = xyz[:, 0] + beyond * np.cos(yaw), xyz[:, 1] + beyond * np.sin(yaw)
-    within = 2.0 * np.hypot(bodies.half_length_m, bodies.half_width_m) + reach_m + 0.5 * COARSE_M + 1.0
-    touches: Bool = (bodies.xy[:, 0, None] - x) ** 2 + (bodies.xy[:, 1, None] - y) ** 2 <= within[:, None] ** 2  # (M, S)
-    runs = touches[:, 0].astype(np.int64) + np.count_nonzero(touches[:, 1:] & ~touches[:, :-1], axis=1)
+    within = (
+        2.0 * np.hypot(bodies.half_length_m, bodies.half_width_m) + reach_m + 0.5 * COARSE_M + 1.0
+    )
+    touches: Bool = (bodies.xy[:, 0, None] - x) ** 2 + (bodies.xy[:, 1, None] - y) ** 2 <= within[
+        :, None
+    ] ** 2  # (M, S)
+    runs = touches[:, 0].astype(np.int64) + np.count_nonzero(
+        touches[:, 1:] & ~touches[:, :-1], axis=1
+    )
     return np.flatnonzero(runs), bool((runs > 1).any())

@@ -1,7 +1,9 @@
-"""Which lines of a map are painted on the road: one rule, which the built world, the semantic map and the learned metrics share.
+"""Which lines of a map are painted on the road: one rule, which the built world, the semantic map
+and the learned metrics share.
 
-Paint is what the map says: its marking lines, and the edges of lanes whose paint it knows. Unknown paint is nothing: a line that nobody has
-seen is not drawn. Where the road itself is built, its paint is a choice, and `with_default_paint` makes it before anything is drawn.
+Paint is what the map says: its marking lines, and the edges of lanes whose paint it knows. Unknown
+paint is nothing: a line that nobody has seen is not drawn. Where the road itself is built, its
+paint is a choice, and `with_default_paint` makes it before anything is drawn.
 """
 
 from __future__ import annotations
@@ -33,11 +35,19 @@ class _Edge:
 
 
 class _Edges:
-    """All edges of a map, with samples along them; ends are left out, for there other lanes begin."""
+    """All edges of a map, with samples along them; ends are left out, for there other lanes
+    begin.
+    """
 
     def __init__(self, lane_map: LaneMap) -> None:
-        self.all = [edge for edge in _edges_of(lane_map) if len(edge.line) > 1 and arc_lengths(edge.line)[-1] > SHORTEST_M]
-        owner, points, headings = [np.zeros(0, np.int64)], [np.zeros((0, 2))], [np.zeros((0, 2))]
+        self.all = [
+            edge
+            for edge in _edges_of(lane_map)
+            if len(edge.line) > 1 and arc_lengths(edge.line)[-1] > SHORTEST_M
+        ]
+        owner = [np.zeros(0, np.int64)]
+        points = [np.zeros((0, 2))]
+        headings = [np.zeros((0, 2))]
         for i, edge in enumerate(self.all):
             length = float(arc_lengths(edge.line)[-1])
             n = max(3, int(length / SAMPLE_M))
@@ -49,14 +59,22 @@ class _Edges:
         self.owner: I64 = np.concatenate(owner)
         self.headings: F64 = np.concatenate(headings)
         samples = shapely.points(np.concatenate(points))
-        of, near = shapely.STRtree(samples).query(samples, predicate="dwithin", distance=SAME_EDGE_M)
+        of, near = shapely.STRtree(samples).query(
+            samples, predicate="dwithin", distance=SAME_EDGE_M
+        )
         order = np.argsort(of, kind="stable")
         self.near = np.split(near[order], np.searchsorted(of[order], np.arange(1, len(samples))))
 
     def beside(self, i: int) -> list[list[tuple[int, float]]]:
-        """Return for every sample of edge ``i`` the other edges there, each with the cosine between the two headings."""
+        """Return for every sample of edge ``i`` the other edges there, each with the cosine between
+        the two headings.
+        """
         return [
-            [(int(self.owner[j]), float(self.headings[k] @ self.headings[j])) for j in self.near[k] if self.owner[j] != i]
+            [
+                (int(self.owner[j]), float(self.headings[k] @ self.headings[j]))
+                for j in self.near[k]
+                if self.owner[j] != i
+            ]
             for k in np.flatnonzero(self.owner == i)
         ]
 
@@ -65,8 +83,9 @@ def painted_lines(lane_map: LaneMap) -> list[tuple[F64, Paint]]:
     """Return what is painted along lanes, each place once.
 
     Returns:
-        Lines ``(N, 3)``, metres, world, with their paint, which is neither ``none`` nor ``unknown``: marking lines first, then lane edges;
-        an edge along which an earlier line runs is left out.
+        Lines ``(N, 3)``, metres, world, with their paint, which is neither ``none`` nor
+        ``unknown``: marking lines first, then lane edges; an edge along which an earlier line runs
+        is left out.
     """
     edges = _Edges(lane_map)
     taken: set[int] = set()
@@ -74,7 +93,9 @@ def painted_lines(lane_map: LaneMap) -> list[tuple[F64, Paint]]:
         if edge.paint in ("none", "unknown"):
             continue
         samples = edges.beside(i)
-        covered = np.mean([any(j in taken and abs(cosine) > ALONG for j, cosine in here) for here in samples])
+        covered = np.mean(
+            [any(j in taken and abs(cosine) > ALONG for j, cosine in here) for here in samples]
+        )
         if covered <= COVERED:
             taken.add(i)
     return [(edges.all[i].line, edges.all[i].paint) for i in sorted(taken)]
@@ -83,12 +104,16 @@ def painted_lines(lane_map: LaneMap) -> list[tuple[F64, Paint]]:
 def with_default_paint(lane_map: LaneMap) -> LaneMap:
     """Return a map whose unknown paint is chosen, for a road that is built from it.
 
-    An edge shared by two lanes of one direction is a dashed white line, one between opposing lanes a double yellow one, an outer edge a
-    solid white line; inside intersections nothing is painted. In maps with marking lines of their own, lane edges of unknown paint stay
-    as they are, and unknown marking lines are solid white.
+    An edge shared by two lanes of one direction is a dashed white line, one between opposing lanes
+    a double yellow one, an outer edge a solid white line; inside intersections nothing is painted.
+    In maps with marking lines of their own, lane edges of unknown paint stay as they are, and
+    unknown marking lines are solid white.
     """
     if lane_map.markings:
-        markings = tuple(replace(m, paint="solid_white") if m.paint == "unknown" else m for m in lane_map.markings)
+        markings = tuple(
+            replace(m, paint="solid_white") if m.paint == "unknown" else m
+            for m in lane_map.markings
+        )
         return replace(lane_map, markings=markings)
     edges = _Edges(lane_map)
     chosen: dict[tuple[str, int], Paint] = {}
@@ -100,10 +125,18 @@ def with_default_paint(lane_map: LaneMap) -> LaneMap:
 
 
 def _default(edges: _Edges, i: int) -> Paint:
-    """Return the paint of an unknown edge: that of a known one along it, else what its neighbours suggest."""
+    """Return the paint of an unknown edge: that of a known one along it, else what its neighbours
+    suggest.
+    """
     samples = edges.beside(i)
-    for paint in ("none", *dict.fromkeys(edge.paint for edge in edges.all if edge.paint not in ("none", "unknown"))):
-        known = [any(edges.all[j].paint == paint and abs(cosine) > ALONG for j, cosine in here) for here in samples]
+    for paint in (
+        "none",
+        *dict.fromkeys(edge.paint for edge in edges.all if edge.paint not in ("none", "unknown")),
+    ):
+        known = [
+            any(edges.all[j].paint == paint and abs(cosine) > ALONG for j, cosine in here)
+            for here in samples
+        ]
         if np.mean(known) > COVERED:
             return paint
     beside = [(edges.all[j], cosine) for here in samples for j, cosine in here]
@@ -117,7 +150,10 @@ def _default(edges: _Edges, i: int) -> Paint:
 def _edges_of(lane_map: LaneMap) -> list[_Edge]:
     out = [_Edge("", 0, marking.xyz, marking.paint, False) for marking in lane_map.markings]
     for lane in (lane_map.lanes[k] for k in sorted(lane_map.lanes)):
-        for side, line, paint in ((1, lane.left, lane.left_paint), (-1, lane.right, lane.right_paint)):
+        for side, line, paint in (
+            (1, lane.left, lane.left_paint),
+            (-1, lane.right, lane.right_paint),
+        ):
             if line is not None and lane.kind != "parking":
                 out.append(_Edge(lane.lane_id, side, line, paint, lane.is_intersection))
     return out
@@ -125,4 +161,6 @@ def _edges_of(lane_map: LaneMap) -> list[_Edge]:
 
 def _repainted(lane: Lane, chosen: dict[tuple[str, int], Paint]) -> Lane:
     left = chosen.get((lane.lane_id, 1), lane.left_paint)
-    return replace(lane, left_paint=left, right_paint=chosen.get((lane.lane_id, -1), lane.right_paint))
+    return replace(
+        lane, left_paint=left, right_paint=chosen.get((lane.lane_id, -1), lane.right_paint)
+    )

@@ -1,4 +1,6 @@
-"""Curves of roads (clothoids, Hermite turns), and drivable lines with arc length, heading, curvature and fast projection onto them."""
+"""Curves of roads (clothoids, Hermite turns), and drivable lines with arc length, heading,
+curvature and fast projection onto them.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +18,26 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
 def smoothstep(x: npt.ArrayLike) -> F64:
-    """Return the quintic blend 0..1 whose first and second derivatives vanish at both ends; clamped outside [0, 1]."""
+    """Return the quintic blend 0..1 whose first and second derivatives vanish at both ends; clamped
+    outside [0, 1].
+    """
     t = np.clip(np.asarray(x, dtype=np.float64), 0.0, 1.0)
     return np.asarray(t * t * t * (10.0 + t * (6.0 * t - 15.0)))
 
 
 def sample_clothoid(
-    start: tuple[float, float, float], length_m: float, start_curvature_per_m: float, end_curvature_per_m: float, step_m: float = 1.0
+    start: tuple[float, float, float],
+    length_m: float,
+    start_curvature_per_m: float,
+    end_curvature_per_m: float,
+    step_m: float = 1.0,
 ) -> F64:
-    """Sample a curve whose curvature is linear in arc length (straight and arc are its special cases).
+    """Sample a curve whose curvature is linear in arc length (straight and arc are its special
+    cases).
 
-    The heading is exact; positions integrate ``(cos, sin)`` of it with 8-point Gauss-Legendre quadrature between stations, which at
-    steps of 1 m is exact to rounding for any drivable curvature (compared with Fresnel integrals in the tests).
+    The heading is exact; positions integrate ``(cos, sin)`` of it with 8-point Gauss-Legendre
+    quadrature between stations, which at steps of 1 m is exact to rounding for any drivable
+    curvature (compared with Fresnel integrals in the tests).
 
     Args:
         start: x, y in metres and heading in radians.
@@ -43,7 +53,12 @@ def sample_clothoid(
         InputError: A length or step that is not positive.
     """
     if not (length_m > 0 and step_m > 0):
-        raise InputError("sampling a clothoid", f"length {length_m} m, step {step_m} m", "not positive", "give lengths > 0")
+        raise InputError(
+            "sampling a clothoid",
+            f"length {length_m} m, step {step_m} m",
+            "not positive",
+            "give lengths > 0",
+        )
     n = max(1, int(np.ceil(length_m / step_m - 1e-9)))
     s = np.linspace(0.0, length_m, n + 1)
     rate = (end_curvature_per_m - start_curvature_per_m) / length_m
@@ -61,10 +76,11 @@ def sample_clothoid(
 
 
 def connect(p0: F64, yaw0: float, p1: F64, yaw1: float, step_m: float = 0.5) -> F64:
-    """Join two poses by a quintic Hermite curve with zero curvature at both ends, and straights where a turn is longer on one side.
+    """Join two poses by a quintic Hermite curve with zero curvature at both ends, and straights
+    where a turn is longer on one side.
 
-    The common tangent length is the one, out of a fixed set, with the smallest peak curvature: turning lanes come out as wide as the
-    junction allows.
+    The common tangent length is the one, out of a fixed set, with the smallest peak curvature:
+    turning lanes come out as wide as the junction allows.
 
     Returns:
         ``(N, 3)``: x, y, heading; first and last points are ``p0`` and ``p1`` exactly.
@@ -73,14 +89,19 @@ def connect(p0: F64, yaw0: float, p1: F64, yaw1: float, step_m: float = 0.5) -> 
     q0 = p0[:2] + before * np.array([np.cos(yaw0), np.sin(yaw0)])
     q1 = p1[:2] - after * np.array([np.cos(yaw1), np.sin(yaw1)])
     turn = _turn(q0, yaw0, q1, yaw1, step_m)
-    head, tail = _straight(p0, q0, yaw0, step_m)[:-1], _straight(q1, p1, float(turn[-1, 2]), step_m)[1:]
+    head, tail = (
+        _straight(p0, q0, yaw0, step_m)[:-1],
+        _straight(q1, p1, float(turn[-1, 2]), step_m)[1:],
+    )
     curve = np.concatenate([head, turn, tail])
     curve[0, :2], curve[-1, :2] = p0[:2], p1[:2]
     return curve
 
 
 def _leads(p0: F64, yaw0: float, p1: F64, yaw1: float) -> tuple[float, float]:
-    """Return the straights before and after a turn that make what is left of it as long on one side as on the other."""
+    """Return the straights before and after a turn that make what is left of it as long on one side
+    as on the other.
+    """
     d0, d1 = np.array([np.cos(yaw0), np.sin(yaw0)]), np.array([np.cos(yaw1), np.sin(yaw1)])
     cross = float(d0[0] * d1[1] - d0[1] * d1[0])
     if abs(cross) < 0.1:
@@ -120,8 +141,12 @@ def _turn(p0: F64, yaw0: float, p1: F64, yaw1: float, step_m: float) -> F64:
     return np.column_stack([xy, yaw])
 
 
-def _quintic(p0: F64, yaw0: float, p1: F64, yaw1: float, tangent_m: float, t: F64) -> tuple[F64, F64, F64]:
-    """Return position, first and second derivative ``(N, 2)`` by t of the Hermite quintic with zero second derivatives at its ends."""
+def _quintic(
+    p0: F64, yaw0: float, p1: F64, yaw1: float, tangent_m: float, t: F64
+) -> tuple[F64, F64, F64]:
+    """Return position, first and second derivative ``(N, 2)`` by t of the Hermite quintic with zero
+    second derivatives at its ends.
+    """
     blend = smoothstep(t)[:, None]
     d_blend = (30 * t**2 * (1 - t) ** 2)[:, None]
     dd_blend = (60 * t * (1 - t) * (1 - 2 * t))[:, None]
@@ -143,14 +168,18 @@ def _quintic(p0: F64, yaw0: float, p1: F64, yaw1: float, tangent_m: float, t: F6
 
 
 def offset_line(curve: F64, offset_m: npt.ArrayLike, z_m: float = 0.0) -> F64:
-    """Return ``(N, 3)`` points beside a curve ``(N, 3+)`` of x, y, heading, at signed distances (left positive) along its normals."""
+    """Return ``(N, 3)`` points beside a curve ``(N, 3+)`` of x, y, heading, at signed distances
+    (left positive) along its normals.
+    """
     d = np.broadcast_to(np.asarray(offset_m, dtype=np.float64), (len(curve),))
     x = curve[:, 0] - d * np.sin(curve[:, 2])
     y = curve[:, 1] + d * np.cos(curve[:, 2])
     return np.column_stack([x, y, np.full(len(curve), z_m)])
 
 
-FEW_DISTANCES = 200_000  # above it, a tree over the stations is quicker than all distances, and takes no memory
+FEW_DISTANCES = (
+    200_000  # above it, a tree over the stations is quicker than all distances, and takes no memory
+)
 
 
 @dataclass(frozen=True)
@@ -168,7 +197,9 @@ class Path:
         return float(self.s[-1])
 
     def at(self, s_m: npt.ArrayLike, offset_m: npt.ArrayLike = 0.0) -> tuple[F64, F64]:
-        """Return points ``(..., 3)`` and headings ``(...)`` at arc lengths, moved left by ``offset_m``; clamped to the ends."""
+        """Return points ``(..., 3)`` and headings ``(...)`` at arc lengths, moved left by
+        ``offset_m``; clamped to the ends.
+        """
         s = np.asarray(s_m, dtype=np.float64)
         yaw = np.interp(s, self.s, self.yaw)
         d = np.asarray(offset_m, dtype=np.float64)
@@ -184,8 +215,8 @@ class Path:
     def project(self, xy: F64, window_m: tuple[float, float] | None = None) -> tuple[F64, F64]:
         """Return arc length and signed distance (left positive) of points ``(M, 2)``.
 
-        ``window_m`` limits the search to a range of arc lengths. Points beyond an end are projected onto the tangent there, so their
-        arc length is negative or larger than the length.
+        ``window_m`` limits the search to a range of arc lengths. Points beyond an end are projected
+        onto the tangent there, so their arc length is negative or larger than the length.
         """
         lo, hi = 0, len(self.s)
         if window_m is not None:
@@ -196,19 +227,22 @@ class Path:
         rest = xy[:, :2] - self.xyz[i, :2]
         c, s = np.cos(self.yaw[i]), np.sin(self.yaw[i])
         along, across = c * rest[:, 0] + s * rest[:, 1], c * rest[:, 1] - s * rest[:, 0]
-        # On the circle of curvature k through the nearest station; a straight tangent beyond the ends.
+        # On the circle of curvature k through the nearest station; a straight tangent beyond the
+        # ends.
         beyond = ((i == 0) & (along < 0)) | ((i == len(self.s) - 1) & (along > 0))
         k = np.where(beyond | (np.abs(self.curvature[i]) < 1e-9), 1e-9, self.curvature[i])
         radial = 1.0 - k * across
-        distance = (k * across * (2.0 - k * across) - (k * along) ** 2) / (k * (1.0 + np.hypot(k * along, radial)))
+        distance = (k * across * (2.0 - k * across) - (k * along) ** 2) / (
+            k * (1.0 + np.hypot(k * along, radial))
+        )
         return self.s[i] + np.arctan2(k * along, radial) / k, np.where(beyond, across, distance)
 
 
 def nearest(xy: F64, stations: F64) -> I64:
     """Return for each of ``(M, 2)`` points the first of the nearest of ``(N, 2)`` stations.
 
-    All distances are compared where they are few; a tree finds them where they are many, and its answer is compared with the neighbours,
-    since of two equally near stations it may name either.
+    All distances are compared where they are few; a tree finds them where they are many, and its
+    answer is compared with the neighbours, since of two equally near stations it may name either.
     """
     n = len(stations)
     if len(xy) * n <= FEW_DISTANCES:
@@ -230,9 +264,16 @@ def polyline_path(xyz: F64, doing: str = "building a path") -> Path:
     line = np.asarray(xyz, dtype=np.float64)
     if line.shape[1] == 2:
         line = np.column_stack([line, np.zeros(len(line))])
-    line = line[np.concatenate([[True], np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1) > 1e-4])]
+    line = line[
+        np.concatenate([[True], np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1) > 1e-4])
+    ]
     if len(line) < 2:
-        raise InputError(doing, f"a line of {len(xyz)} points", "fewer than two distinct points", "give a longer line")
+        raise InputError(
+            doing,
+            f"a line of {len(xyz)} points",
+            "fewer than two distinct points",
+            "give a longer line",
+        )
     s = arc_lengths(line)
     d = np.gradient(line[:, :2], s, axis=0)
     yaw = np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
@@ -240,11 +281,18 @@ def polyline_path(xyz: F64, doing: str = "building a path") -> Path:
 
 
 def smooth_path(xyz: F64, step_m: float = 0.25) -> Path:
-    """Build a path through the points by a cubic spline over arc length, resampled every ``step_m``."""
+    """Build a path through the points by a cubic spline over arc length, resampled every
+    ``step_m``.
+    """
     coarse = polyline_path(xyz)
     spline = CubicSpline(coarse.s, coarse.xyz)
     fine = np.linspace(0.0, coarse.length_m, max(2, int(np.ceil(coarse.length_m / step_m)) + 1))
     d, dd = spline(fine, 1), spline(fine, 2)
     speed2 = d[:, 0] ** 2 + d[:, 1] ** 2
     line = spline(fine)
-    return Path(arc_lengths(line), line, np.unwrap(np.arctan2(d[:, 1], d[:, 0])), (d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed2**1.5)
+    return Path(
+        arc_lengths(line),
+        line,
+        np.unwrap(np.arctan2(d[:, 1], d[:, 0])),
+        (d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed2**1.5,
+    )

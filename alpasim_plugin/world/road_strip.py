@@ -1,7 +1,8 @@
-"""What a procedural road is made of, and lanes side by side along one reference curve, with shared edges and exact joints.
+"""What a procedural road is made of, and lanes side by side along one reference curve, with shared
+edges and exact joints.
 
-The cross-section and the elements follow one another along the ego's way. A taper is a strip in which the rightmost forward lane ends or a
-new one opens.
+The cross-section and the elements follow one another along the ego's way. A taper is a strip in
+which the rightmost forward lane ends or a new one opens.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ Turn = Literal["left", "straight", "right"]
 
 @dataclass(frozen=True)
 class Profile:
-    """Cross-section of the main road; driving is on the right. The reference line is the middle between the two directions."""
+    """Cross-section of the main road; driving is on the right. The reference line is the middle
+    between the two directions.
+    """
 
     forward: int = 1  # lanes in the ego's direction
     backward: int = 1  # oncoming lanes; 0 makes the road one-way
@@ -49,13 +52,17 @@ class Profile:
         return self.median_m / 2 + n * self.lane_width_m + self.strip_m
 
     def left_extent_m(self) -> float:
-        """Distance from the reference line to the left road edge; on a one-way road the strip lies left of the reference line."""
+        """Distance from the reference line to the left road edge; on a one-way road the strip lies
+        left of the reference line.
+        """
         return self.median_m / 2 + self.backward * self.lane_width_m + self.strip_m
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A stretch whose curvature is linear in arc length: straight, arc or clothoid. Left curvature is positive."""
+    """A stretch whose curvature is linear in arc length: straight, arc or clothoid. Left curvature
+    is positive.
+    """
 
     length_m: float
     start_curvature_per_m: float = 0.0
@@ -64,7 +71,9 @@ class Curve:
 
 @dataclass(frozen=True)
 class LaneTaper:
-    """A straight stretch in which the rightmost forward lane ends (``merge``) or a new one opens (``split``)."""
+    """A straight stretch in which the rightmost forward lane ends (``merge``) or a new one opens
+    (``split``).
+    """
 
     kind: Literal["merge", "split"]
     length_m: float
@@ -90,8 +99,8 @@ Element = Curve | LaneTaper | Intersection
 class Stretch:
     """The main road's lanes in one element; index 0 is next to the centre line.
 
-    ``forward_next[k]`` is the index that a car in forward lane k has in the next element, or None where that lane does not go on along
-    the main road.
+    ``forward_next[k]`` is the index that a car in forward lane k has in the next element, or None
+    where that lane does not go on along the main road.
     """
 
     forward: tuple[str | None, ...]
@@ -128,8 +137,18 @@ class MapDraft:
 
     def finish(self) -> LaneMap:
         """Freeze the map."""
-        edges, areas, crosswalks = tuple(self.road_edges), tuple(self.drivable_areas), tuple(self.crosswalks)
-        return LaneMap(dict(self.lanes), edges, areas, crosswalks, tuple(self.stop_lines), tuple(self.markings), signals=())
+        edges = tuple(self.road_edges)
+        areas = tuple(self.drivable_areas)
+        crosswalks = tuple(self.crosswalks)
+        return LaneMap(
+            dict(self.lanes),
+            edges,
+            areas,
+            crosswalks,
+            tuple(self.stop_lines),
+            tuple(self.markings),
+            signals=(),
+        )
 
 
 @dataclass(frozen=True)
@@ -145,18 +164,22 @@ class Strip:
         return {name: line[-1 if at_end else 0] for name, line in self.lines.items()}
 
 
-def build_strip(draft: MapDraft, name: str, curve: F64, profile: Profile, joint: Joint | None = None) -> Strip:
+def build_strip(
+    draft: MapDraft, name: str, curve: F64, profile: Profile, joint: Joint | None = None
+) -> Strip:
     """Add the lanes of one stretch of road to the draft.
 
-    Line names: ``f0``.. boundaries of the forward lanes from the centre out, ``fc0``.. their centres, ``b0``/``bc0`` the same for the
-    oncoming lanes, ``right`` and ``left`` the road edges. All lines run in reference order and have one point per station.
+    Line names: ``f0``.. boundaries of the forward lanes from the centre out, ``fc0``.. their
+    centres, ``b0``/``bc0`` the same for the oncoming lanes, ``right`` and ``left`` the road edges.
+    All lines run in reference order and have one point per station.
 
     Args:
         draft: Map that receives the lanes.
         name: Prefix of the lane ids.
         curve: ``(N, 4)`` x, y, heading, curvature of the reference line.
         profile: Cross-section.
-        joint: End points of the strip before, copied into the first row so that consecutive lanes share their end points exactly.
+        joint: End points of the strip before, copied into the first row so that consecutive lanes
+            share their end points exactly.
 
     Raises:
         InputError: The curve is tighter than the road is wide.
@@ -169,7 +192,9 @@ def build_strip(draft: MapDraft, name: str, curve: F64, profile: Profile, joint:
                 line[0] = joint[key]
     forward = tuple(draft.add(_lane(name, "f", k, lines, profile)) for k in range(profile.forward))
     turned = reverse(lines)
-    backward = tuple(draft.add(_lane(name, "b", k, turned, profile)) for k in range(profile.backward))
+    backward = tuple(
+        draft.add(_lane(name, "b", k, turned, profile)) for k in range(profile.backward)
+    )
     add_sides(draft, name, lines, profile)
     return Strip(forward, backward, lines)
 
@@ -179,18 +204,25 @@ def make_lines(curve: F64, profile: Profile) -> dict[str, F64]:
     w, half = profile.lane_width_m, profile.median_m / 2
     lines = {f"f{j}": offset_line(curve, -half - j * w) for j in range(profile.forward + 1)}
     lines |= {f"fc{k}": offset_line(curve, -half - (k + 0.5) * w) for k in range(profile.forward)}
-    # Without a median both directions share one array, so that neighbours cannot drift apart by rounding.
+    # Without a median both directions share one array, so that neighbours cannot drift apart by
+    # rounding.
     lines["b0"] = lines["f0"] if half == 0 else offset_line(curve, half)
     lines |= {f"b{j}": offset_line(curve, half + j * w) for j in range(1, profile.backward + 1)}
     lines |= {f"bc{k}": offset_line(curve, half + (k + 0.5) * w) for k in range(profile.backward)}
     strip = profile.strip_m > 0
-    lines["right"] = offset_line(curve, -profile.right_extent_m()) if strip else lines[f"f{profile.forward}"]
-    lines["left"] = offset_line(curve, profile.left_extent_m()) if strip else lines[f"b{profile.backward}"]
+    lines["right"] = (
+        offset_line(curve, -profile.right_extent_m()) if strip else lines[f"f{profile.forward}"]
+    )
+    lines["left"] = (
+        offset_line(curve, profile.left_extent_m()) if strip else lines[f"b{profile.backward}"]
+    )
     return lines
 
 
 def reverse(lines: dict[str, F64]) -> dict[str, F64]:
-    """Return the oncoming lanes' lines in their own driving direction; neighbours go on sharing one array."""
+    """Return the oncoming lanes' lines in their own driving direction; neighbours go on sharing one
+    array.
+    """
     return {key: line[::-1].copy() for key, line in lines.items() if key.startswith("b")}
 
 
@@ -199,15 +231,33 @@ def add_sides(draft: MapDraft, name: str, lines: dict[str, F64], profile: Profil
     outer_right, outer_left = lines[f"f{profile.forward}"], lines[f"b{profile.backward}"]
     if profile.strip_m > 0:
         # The strip beside oncoming lanes runs in their direction, its left edge next to the lane.
-        left_strip = (outer_left[::-1], lines["left"][::-1]) if profile.backward > 0 else (lines["left"], outer_left)
+        left_strip = (
+            (outer_left[::-1], lines["left"][::-1])
+            if profile.backward > 0
+            else (lines["left"], outer_left)
+        )
         for side, (left, right) in (("r", (outer_right, lines["right"])), ("l", left_strip)):
             kind, limit = profile.strip_kind, profile.speed_limit_mps
             lane_id, centre = f"{name}_{kind}_{side}", 0.5 * (left + right)
-            draft.add(Lane(lane_id, centre, left, right, kind, left_paint="none", right_paint="none", speed_limit_mps=limit))
+            draft.add(
+                Lane(
+                    lane_id,
+                    centre,
+                    left,
+                    right,
+                    kind,
+                    left_paint="none",
+                    right_paint="none",
+                    speed_limit_mps=limit,
+                )
+            )
     draft.road_edges += [lines["left"], lines["right"]]
     if profile.median_m > 0 and profile.backward > 0:
         draft.road_edges += [lines["f0"], lines["b0"]]
-        draft.drivable_areas += [_ring(lines["f0"], lines["right"]), _ring(lines["left"], lines["b0"])]
+        draft.drivable_areas += [
+            _ring(lines["f0"], lines["right"]),
+            _ring(lines["left"], lines["b0"]),
+        ]
     else:
         draft.drivable_areas.append(_ring(lines["left"], lines["right"]))
 
@@ -221,8 +271,12 @@ def inner_paint(profile: Profile) -> Paint:
     return "solid_yellow" if profile.backward == 0 or profile.median_m > 0 else profile.centre_paint
 
 
-def _lane(name: str, side: Literal["f", "b"], k: int, lines: dict[str, F64], profile: Profile) -> Lane:
-    """Make the k-th lane from the centre of one direction; ``lines`` run in its driving direction."""
+def _lane(
+    name: str, side: Literal["f", "b"], k: int, lines: dict[str, F64], profile: Profile
+) -> Lane:
+    """Make the k-th lane from the centre of one direction; ``lines`` run in its driving
+    direction.
+    """
     outermost = k + 1 == (profile.forward if side == "f" else profile.backward)
     return Lane(
         f"{name}_{side}{k}",
@@ -238,7 +292,13 @@ def _lane(name: str, side: Literal["f", "b"], k: int, lines: dict[str, F64], pro
 
 
 def _check_width(name: str, curve: F64, profile: Profile) -> None:
-    tight = float(np.max(np.maximum(curve[:, 3] * profile.left_extent_m(), -curve[:, 3] * profile.right_extent_m())))
+    tight = float(
+        np.max(
+            np.maximum(
+                curve[:, 3] * profile.left_extent_m(), -curve[:, 3] * profile.right_extent_m()
+            )
+        )
+    )
     if tight > 0.9:
         raise InputError(
             "building a road",
@@ -249,11 +309,14 @@ def _check_width(name: str, curve: F64, profile: Profile) -> None:
         )
 
 
-def build_taper(draft: MapDraft, name: str, curve: F64, profile: Profile, kind: str, joint: Joint | None) -> tuple[Strip, str]:
-    """Add a straight stretch with one slanting lane beside (and running into, or out of) the outermost straight one.
+def build_taper(
+    draft: MapDraft, name: str, curve: F64, profile: Profile, kind: str, joint: Joint | None
+) -> tuple[Strip, str]:
+    """Add a straight stretch with one slanting lane beside (and running into, or out of) the
+    outermost straight one.
 
-    The slanting lane keeps its full width and overlaps its neighbour, as merging lanes do in surveyed maps: its edges meet the
-    neighbour's edges exactly at the narrow end.
+    The slanting lane keeps its full width and overlaps its neighbour, as merging lanes do in
+    surveyed maps: its edges meet the neighbour's edges exactly at the narrow end.
 
     Args:
         draft: Map that receives the lanes.
@@ -266,22 +329,40 @@ def build_taper(draft: MapDraft, name: str, curve: F64, profile: Profile, kind: 
     Returns:
         The strip with its lines at the far end, and the id of the slanting lane.
     """
-    n, w, half = profile.forward, profile.lane_width_m, profile.median_m / 2
+    n = profile.forward
+    w = profile.lane_width_m
+    half = profile.median_m / 2
     s = np.hypot(curve[:, 0] - curve[0, 0], curve[:, 1] - curve[0, 1])
     share = smoothstep(s / s[-1])
-    out = (1.0 - share) if kind == "merge" else share  # 1 where the extra lane stands fully beside the others
-    left, centre, right = (offset_line(curve, -half - (n - 1 + shift + out) * w) for shift in (0.0, 0.5, 1.0))
-    edge = offset_line(curve, -half - (n + out) * w - profile.strip_m) if profile.strip_m > 0 else right
+    out = (
+        (1.0 - share) if kind == "merge" else share
+    )  # 1 where the extra lane stands fully beside the others
+    left, centre, right = (
+        offset_line(curve, -half - (n - 1 + shift + out) * w) for shift in (0.0, 0.5, 1.0)
+    )
+    edge = (
+        offset_line(curve, -half - (n + out) * w - profile.strip_m)
+        if profile.strip_m > 0
+        else right
+    )
     lines = make_lines(curve, profile)
     if joint is not None:
         extra = n if kind == "merge" else n - 1
         for key, line in lines.items():
             if key in joint and key != "right":
                 line[0] = joint[key]
-        left[0], centre[0], right[0] = joint[f"f{extra}"], joint[f"fc{extra}"], joint[f"f{extra + 1}"]
+        left[0], centre[0], right[0] = (
+            joint[f"f{extra}"],
+            joint[f"fc{extra}"],
+            joint[f"f{extra + 1}"],
+        )
         edge[0] = joint["right"]
     if kind == "merge":  # the narrow end: meet the neighbour exactly
-        left[-1], centre[-1], right[-1] = lines[f"f{n - 1}"][-1], lines[f"fc{n - 1}"][-1], lines[f"f{n}"][-1]
+        left[-1], centre[-1], right[-1] = (
+            lines[f"f{n - 1}"][-1],
+            lines[f"fc{n - 1}"][-1],
+            lines[f"f{n}"][-1],
+        )
     inner = replace(profile, shoulder_m=0.0, parking_m=0.0)
     scratch = MapDraft()
     strip = build_strip(scratch, name, curve, inner)
@@ -289,9 +370,16 @@ def build_taper(draft: MapDraft, name: str, curve: F64, profile: Profile, kind: 
     for lane_id in (*strip.forward, *strip.backward):
         draft.add(_with_lines(scratch.lanes[lane_id], lane_id, name, lines, turned, n))
     slant = draft.add(
-        Lane(f"{name}_{kind}", centre, left, right, left_paint="none", right_paint=profile.edge_paint,
-             speed_limit_mps=profile.speed_limit_mps)
-    )  # fmt: skip
+        Lane(
+            f"{name}_{kind}",
+            centre,
+            left,
+            right,
+            left_paint="none",
+            right_paint=profile.edge_paint,
+            speed_limit_mps=profile.speed_limit_mps,
+        )
+    )
     add_sides(draft, name, {**lines, f"f{n}": right, "right": edge}, profile)
     end_lines = {**lines, "right": edge}
     if kind == "split":
@@ -299,10 +387,18 @@ def build_taper(draft: MapDraft, name: str, curve: F64, profile: Profile, kind: 
     return Strip(strip.forward, strip.backward, end_lines), slant
 
 
-def _with_lines(lane: Lane, lane_id: str, name: str, lines: dict[str, F64], turned: dict[str, F64], n: int) -> Lane:
+def _with_lines(
+    lane: Lane, lane_id: str, name: str, lines: dict[str, F64], turned: dict[str, F64], n: int
+) -> Lane:
     """Put the shared line arrays into a lane, and dashed paint where the slanting lane crosses."""
     k = int(lane_id.removeprefix(f"{name}_")[1:])
     if lane_id.startswith(f"{name}_f"):
         paint = "dashed_white" if k == n - 1 else lane.right_paint
-        return replace(lane, centre=lines[f"fc{k}"], left=lines[f"f{k}"], right=lines[f"f{k + 1}"], right_paint=paint)
+        return replace(
+            lane,
+            centre=lines[f"fc{k}"],
+            left=lines[f"f{k}"],
+            right=lines[f"f{k + 1}"],
+            right_paint=paint,
+        )
     return replace(lane, centre=turned[f"bc{k}"], left=turned[f"b{k}"], right=turned[f"b{k + 1}"])

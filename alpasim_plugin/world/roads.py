@@ -1,4 +1,5 @@
-"""Procedural roads: a list of elements becomes a lane map and the order of lanes along the main road.
+"""Procedural roads: a list of elements becomes a lane map and the order of lanes along the main
+road.
 
 Junctions have arms, turning lanes, kerbs, crosswalks and stop lines.
 """
@@ -35,13 +36,17 @@ CROSSWALK_M = (1.0, 4.0)  # from the junction's border, outwards
 
 @dataclass(frozen=True)
 class Arm:
-    """One road at the junction, seen from its middle outwards: ``out`` lanes leave, ``into`` lanes arrive; index 0 at the centre line."""
+    """One road at the junction, seen from its middle outwards: ``out`` lanes leave, ``into`` lanes
+    arrive; index 0 at the centre line.
+    """
 
     name: str  # entry | left | straight | right
     heading_rad: float  # outwards
     profile: Profile  # seen outwards: forward lanes leave the junction
     joint: Joint  # points on the junction's border, named as seen outwards
-    out: tuple[str | None, ...]  # None where the lane does not exist yet (the exit arm's strip comes later)
+    out: tuple[
+        str | None, ...
+    ]  # None where the lane does not exist yet (the exit arm's strip comes later)
     into: tuple[str, ...]
 
 
@@ -53,15 +58,25 @@ class Junction:
     joint: Joint  # of the exit arm
     forward: tuple[str | None, ...]  # connectors of the main road by entry lane index
     forward_next: tuple[int | None, ...]
-    backward: tuple[str | None, ...]  # connectors of the oncoming direction by lane index at the entry arm
-    exits: tuple[tuple[str, int], ...]  # connector id, exit lane index: to be linked once the exit strip exists
+    backward: tuple[
+        str | None, ...
+    ]  # connectors of the oncoming direction by lane index at the entry arm
+    exits: tuple[
+        tuple[str, int], ...
+    ]  # connector id, exit lane index: to be linked once the exit strip exists
     entries: tuple[tuple[int, str], ...]  # incoming lane index of the exit arm, connector id
 
 
 def build_intersection(
-    draft: MapDraft, name: str, pose: tuple[float, float, float], element: Intersection, profile: Profile, entry_joint: Joint,
-    entry_forward: tuple[str, ...], entry_backward: tuple[str, ...],
-) -> Junction:  # fmt: skip
+    draft: MapDraft,
+    name: str,
+    pose: tuple[float, float, float],
+    element: Intersection,
+    profile: Profile,
+    entry_joint: Joint,
+    entry_forward: tuple[str, ...],
+    entry_backward: tuple[str, ...],
+) -> Junction:
     """Add a junction at the end of a strip.
 
     Raises:
@@ -69,10 +84,22 @@ def build_intersection(
     """
     if element.turn not in element.arms:
         raise InputError(
-            "building an intersection", name, f"turn: {element.turn}, but the arms are {', '.join(element.arms)}", "add that arm"
+            "building an intersection",
+            name,
+            f"turn: {element.turn}, but the arms are {', '.join(element.arms)}",
+            "add that arm",
         )
-    side = replace(profile, forward=element.cross_lanes, backward=element.cross_lanes, median_m=0.0, parking_m=0.0)
-    reach = max(profile.right_extent_m(), profile.left_extent_m(), side.right_extent_m()) + element.corner_radius_m
+    side = replace(
+        profile,
+        forward=element.cross_lanes,
+        backward=element.cross_lanes,
+        median_m=0.0,
+        parking_m=0.0,
+    )
+    reach = (
+        max(profile.right_extent_m(), profile.left_extent_m(), side.right_extent_m())
+        + element.corner_radius_m
+    )
     x, y, yaw = pose
     centre = np.array([x + reach * np.cos(yaw), y + reach * np.sin(yaw)])
     back = replace(profile, forward=profile.backward, backward=profile.forward)
@@ -88,15 +115,32 @@ def build_intersection(
             exit_pose = start
             stub = sample_clothoid(start, 1.0, 0.0, 0.0)
             joint = {key: line[0] for key, line in make_lines(stub, profile).items()}
-            arms.append(Arm(turn, heading, profile, joint, (None,) * profile.forward, tuple(f"?{k}" for k in range(profile.backward))))
+            arms.append(
+                Arm(
+                    turn,
+                    heading,
+                    profile,
+                    joint,
+                    (None,) * profile.forward,
+                    tuple(f"?{k}" for k in range(profile.backward)),
+                )
+            )
         else:
             curve = sample_clothoid(start, element.arm_length_m, 0.0, 0.0)
             strip = build_strip(draft, f"{name}_{turn}", curve, side)
-            arms.append(Arm(turn, heading, side, strip.joint(at_end=False), strip.forward, strip.backward))
+            arms.append(
+                Arm(turn, heading, side, strip.joint(at_end=False), strip.forward, strip.backward)
+            )
     return _connect_all(draft, name, element, arms, exit_pose)
 
 
-def _connect_all(draft: MapDraft, name: str, element: Intersection, arms: list[Arm], exit_pose: tuple[float, float, float]) -> Junction:
+def _connect_all(
+    draft: MapDraft,
+    name: str,
+    element: Intersection,
+    arms: list[Arm],
+    exit_pose: tuple[float, float, float],
+) -> Junction:
     forward: dict[int, str] = {}
     forward_next: dict[int, int] = {}
     backward: dict[int, str] = {}
@@ -136,7 +180,9 @@ def _connect_all(draft: MapDraft, name: str, element: Intersection, arms: list[A
 
 
 def _movements(a: Arm, b: Arm) -> list[tuple[int, int]]:
-    """Return (incoming index at a, outgoing index at b): straight lane by lane, left from and to the inner, right the outer lane."""
+    """Return (incoming index at a, outgoing index at b): straight lane by lane, left from and to
+    the inner, right the outer lane.
+    """
     n_in, n_out = len(a.into), len(b.out)
     if n_in == 0 or n_out == 0:
         return []
@@ -152,18 +198,29 @@ def _connector(name: str, a: Arm, b: Arm, i: int, j: int) -> Lane:
     centre = connect(begin, yaw0, end, yaw1)
     t = np.linspace(0.0, 1.0, len(centre))
     width = (1 - t) * a.profile.lane_width_m + t * b.profile.lane_width_m
-    left, mid, right = offset_line(centre, width / 2), offset_line(centre, 0.0), offset_line(centre, -width / 2)
-    # An arriving lane drives against the arm's outward direction: its left edge is the one nearer to the centre line.
+    left = offset_line(centre, width / 2)
+    mid = offset_line(centre, 0.0)
+    right = offset_line(centre, -width / 2)
+    # An arriving lane drives against the arm's outward direction: its left edge is the one nearer
+    # to the centre line.
     left[0], mid[0], right[0] = a.joint[f"b{i}"], begin, a.joint[f"b{i + 1}"]
     left[-1], mid[-1], right[-1] = b.joint[f"f{j}"], end, b.joint[f"f{j + 1}"]
     return Lane(
-        f"{name}_{a.name}{i}_{b.name}{j}", mid, left, right, is_intersection=True, left_paint="none", right_paint="none",
+        f"{name}_{a.name}{i}_{b.name}{j}",
+        mid,
+        left,
+        right,
+        is_intersection=True,
+        left_paint="none",
+        right_paint="none",
         speed_limit_mps=a.profile.speed_limit_mps,
-    )  # fmt: skip
+    )
 
 
 def _kerbs(draft: MapDraft, arms: list[Arm]) -> None:
-    """Join each arm's left border to the right border of the next arm counter-clockwise, and close the drivable ring."""
+    """Join each arm's left border to the right border of the next arm counter-clockwise, and close
+    the drivable ring.
+    """
     ring: list[F64] = []
     for a, b in zip(arms, arms[1:] + arms[:1], strict=True):
         curve = connect(a.joint["left"], a.heading_rad + np.pi, b.joint["right"], b.heading_rad)
@@ -177,11 +234,18 @@ def _kerbs(draft: MapDraft, arms: list[Arm]) -> None:
 def _paint(draft: MapDraft, element: Intersection, arms: list[Arm], guided: list[str]) -> None:
     for arm in arms:
         outward = np.array([np.cos(arm.heading_rad), np.sin(arm.heading_rad), 0.0])
-        left, right, middle = arm.joint["left"], arm.joint["right"], arm.joint["b0"]
+        left = arm.joint["left"]
+        right = arm.joint["right"]
+        middle = arm.joint["b0"]
         stop_m = 1.0
         if element.crosswalks:
             near, far = CROSSWALK_M
-            corners = (right + near * outward, right + far * outward, left + far * outward, left + near * outward)
+            corners = (
+                right + near * outward,
+                right + far * outward,
+                left + far * outward,
+                left + near * outward,
+            )
             draft.crosswalks.append(np.stack([*corners, corners[0]]))
             stop_m = far + 1.0
         if arm.into:
@@ -192,7 +256,10 @@ def _paint(draft: MapDraft, element: Intersection, arms: list[Arm], guided: list
             lane = draft.lanes[lane_id]
             assert lane.left is not None
             assert lane.right is not None
-            draft.markings += [Marking(lane.left, "dashed_white"), Marking(lane.right, "dashed_white")]
+            draft.markings += [
+                Marking(lane.left, "dashed_white"),
+                Marking(lane.right, "dashed_white"),
+            ]
 
 
 def _outward(joint: Joint) -> Joint:
@@ -210,7 +277,8 @@ class Road:
     stretches: tuple[Stretch, ...]  # in the ego's direction
 
     def forward_chain(self, lane: int, stretch: int = 0) -> list[tuple[str, int]]:
-        """Return (lane id, index) of every stretch from one on for a car in forward lane ``lane`` that changes only where its lane ends.
+        """Return (lane id, index) of every stretch from one on for a car in forward lane ``lane``
+        that changes only where its lane ends.
 
         The chain stops where the lane does not go on.
         """
@@ -224,7 +292,9 @@ class Road:
         return out
 
     def backward_chain(self, lane: int) -> list[str]:
-        """Return the oncoming lane ids in *their* driving direction, from the far end of the main road."""
+        """Return the oncoming lane ids in *their* driving direction, from the far end of the main
+        road.
+        """
         out: list[str] = []
         for stretch in reversed(self.stretches):
             if lane >= len(stretch.backward) or stretch.backward[lane] is None:
@@ -243,12 +313,17 @@ class _Tip:
     joint: Joint | None = None
     strip: Strip | None = None
     junction: Junction | None = None
-    forward: tuple[str | None, ...] = ()  # lane ids by index in the next element that will be linked to it
+    forward: tuple[
+        str | None, ...
+    ] = ()  # lane ids by index in the next element that will be linked to it
     backward: tuple[str | None, ...] = ()
 
 
 def build_road(
-    elements: Sequence[Element], profile: Profile, start: tuple[float, float, float] = (0.0, 0.0, 0.0), step_m: float = 1.0
+    elements: Sequence[Element],
+    profile: Profile,
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    step_m: float = 1.0,
 ) -> Road:
     """Build a road from its elements.
 
@@ -259,11 +334,19 @@ def build_road(
         step_m: Distance between stations.
 
     Raises:
-        InputError: No element, an element where it cannot stand, or a curve tighter than the road is wide.
+        InputError: No element, an element where it cannot stand, or a curve tighter than the road
+            is wide.
     """
     if not elements or not isinstance(elements[0], Curve):
-        raise InputError("building a road", f"{len(elements)} elements", "the first is not a straight, arc or clothoid", "start with one")
-    draft, tip, stretches = MapDraft(), _Tip(start, profile), []
+        raise InputError(
+            "building a road",
+            f"{len(elements)} elements",
+            "the first is not a straight, arc or clothoid",
+            "start with one",
+        )
+    draft = MapDraft()
+    tip = _Tip(start, profile)
+    stretches = []
     for i, element in enumerate(elements):
         name = f"s{i}"
         if isinstance(element, Curve):
@@ -273,12 +356,23 @@ def build_road(
         else:
             stretches.append(_grow_intersection(draft, name, tip, element))
     if tip.junction is not None:
-        raise InputError("building a road", f"element {len(elements) - 1}", "an intersection ends the road", "add a straight after it")
+        raise InputError(
+            "building a road",
+            f"element {len(elements) - 1}",
+            "an intersection ends the road",
+            "add a straight after it",
+        )
     return Road(draft.finish(), tuple(stretches))
 
 
 def _grow_curve(draft: MapDraft, name: str, tip: _Tip, element: Curve, step_m: float) -> Stretch:
-    curve = sample_clothoid(tip.pose, element.length_m, element.start_curvature_per_m, element.end_curvature_per_m, step_m)
+    curve = sample_clothoid(
+        tip.pose,
+        element.length_m,
+        element.start_curvature_per_m,
+        element.end_curvature_per_m,
+        step_m,
+    )
     strip = build_strip(draft, name, curve, tip.profile, tip.joint)
     _link(draft, tip, strip)
     indices = tuple(range(len(strip.forward)))
@@ -286,21 +380,29 @@ def _grow_curve(draft: MapDraft, name: str, tip: _Tip, element: Curve, step_m: f
     return Stretch(strip.forward, indices, strip.backward)
 
 
-def _grow_taper(draft: MapDraft, name: str, tip: _Tip, element: LaneTaper, step_m: float) -> Stretch:
+def _grow_taper(
+    draft: MapDraft, name: str, tip: _Tip, element: LaneTaper, step_m: float
+) -> Stretch:
     before = tip.profile.forward
     narrow = replace(tip.profile, forward=before - 1 if element.kind == "merge" else before)
     if narrow.forward < 1 or tip.junction is not None:
         raise InputError(
-            "building a road", f"{name} ({element.kind})", f"{before} forward lanes before it" if narrow.forward < 1 else "follows an "
-            "intersection", "a merge needs two forward lanes and a straight, arc or clothoid before it",
-        )  # fmt: skip
+            "building a road",
+            f"{name} ({element.kind})",
+            f"{before} forward lanes before it"
+            if narrow.forward < 1
+            else "follows an intersection",
+            "a merge needs two forward lanes and a straight, arc or clothoid before it",
+        )
     curve = sample_clothoid(tip.pose, element.length_m, 0.0, 0.0, step_m)
     strip, slant = build_taper(draft, name, curve, narrow, element.kind, tip.joint)
     _link(draft, tip, strip)
     n, forward = narrow.forward, (*strip.forward, slant)
     if element.kind == "merge":
         draft.link(tip.forward[n], slant)
-        _move(tip, curve, strip, forward)  # the slanting lane's successor is the last straight lane's
+        _move(
+            tip, curve, strip, forward
+        )  # the slanting lane's successor is the last straight lane's
         tip.profile = narrow
         return Stretch(forward, (*range(n), n - 1), strip.backward)
     draft.link(tip.forward[n - 1], slant)
@@ -311,10 +413,24 @@ def _grow_taper(draft: MapDraft, name: str, tip: _Tip, element: LaneTaper, step_
 
 def _grow_intersection(draft: MapDraft, name: str, tip: _Tip, element: Intersection) -> Stretch:
     if tip.joint is None or tip.junction is not None or tip.strip is None:
-        raise InputError("building a road", name, "two intersections without a road between them", "put a straight between them")
+        raise InputError(
+            "building a road",
+            name,
+            "two intersections without a road between them",
+            "put a straight between them",
+        )
     n = tip.profile.forward
     forward = tuple(str(f) for f in tip.forward[:n])
-    junction = build_intersection(draft, name, tip.pose, element, tip.profile, tip.joint, forward, tuple(str(b) for b in tip.backward))
+    junction = build_intersection(
+        draft,
+        name,
+        tip.pose,
+        element,
+        tip.profile,
+        tip.joint,
+        forward,
+        tuple(str(b) for b in tip.backward),
+    )
     tip.pose, tip.joint, tip.junction, tip.strip = junction.pose, junction.joint, junction, None
     tip.forward, tip.backward = (), ()
     return Stretch(junction.forward, junction.forward_next, junction.backward)
@@ -332,7 +448,9 @@ def _link(draft: MapDraft, tip: _Tip, strip: Strip) -> None:
     for k, before in enumerate(tip.forward):
         if k < len(strip.forward):
             draft.link(before, strip.forward[k])
-        elif before is not None and before.endswith("_merge"):  # a lane that ends runs into the outermost one
+        elif before is not None and before.endswith(
+            "_merge"
+        ):  # a lane that ends runs into the outermost one
             draft.link(before, strip.forward[-1])
     for before, after in zip(tip.backward, strip.backward, strict=False):
         draft.link(after, before)

@@ -1,6 +1,8 @@
-"""Spatial queries on a lane map, and where the ego should go: the recorded path, named by lanes and carried on past its end.
+"""Spatial queries on a lane map, and where the ego should go: the recorded path, named by lanes and
+carried on past its end.
 
-`LaneIndex` answers which lanes are at a point, where they head and what follows them; routes are made with it.
+`LaneIndex` answers which lanes are at a point, where they head and what follows them; routes are
+made with it.
 """
 
 from __future__ import annotations
@@ -40,8 +42,9 @@ class LanePath:
 class LaneIndex:
     """Index of one `LaneMap`: an STRtree over lane polygons and KD-trees over centre vertices.
 
-    Points are ``(2,)`` or ``(3,)``, metres, world. Distances are taken in 3-D where the point has a height, so that a bridge does not
-    answer for the road below it, and in plan view where it has none. Answers are in the map's own order of lanes.
+    Points are ``(2,)`` or ``(3,)``, metres, world. Distances are taken in 3-D where the point has a
+    height, so that a bridge does not answer for the road below it, and in plan view where it has
+    none. Answers are in the map's own order of lanes.
 
     Example:
         >>> from alpasim_plugin.core.types import Lane
@@ -57,8 +60,12 @@ class LaneIndex:
         self._tree = shapely.STRtree(self.polygons)
         dense = [densify(lane_map.lanes[i].centre, VERTEX_STEP_M) for i in self.ids]
         self._vertices = np.concatenate(dense) if dense else np.zeros((0, 3))
-        self._owner: I64 = np.repeat(np.arange(len(dense)), [len(d) for d in dense]).astype(np.int64)
-        self._kd = {dim: scipy.spatial.KDTree(self._vertices[:, :dim]) for dim in (2, 3)} if dense else {}
+        self._owner: I64 = np.repeat(np.arange(len(dense)), [len(d) for d in dense]).astype(
+            np.int64
+        )
+        self._kd = (
+            {dim: scipy.spatial.KDTree(self._vertices[:, :dim]) for dim in (2, 3)} if dense else {}
+        )
 
     def containing(self, point: F64) -> tuple[str, ...]:
         """Return the lanes whose polygon holds the point in plan view, its border included."""
@@ -87,12 +94,19 @@ class LaneIndex:
             InputError: The map has no lanes.
         """
         if not self._kd:
-            raise InputError("finding the nearest lane", "a lane map", "it has no lanes", "use a map with at least one lane")
+            raise InputError(
+                "finding the nearest lane",
+                "a lane map",
+                "it has no lanes",
+                "use a map with at least one lane",
+            )
         distance, vertex = self._kd[len(point)].query(np.asarray(point, dtype=np.float64))
         return self.ids[int(self._owner[int(vertex)])], float(distance)
 
     def heading_rad(self, lane_id: str, point: F64) -> float:
-        """Return the driving direction of a lane at the place nearest to the point, in plan view."""
+        """Return the driving direction of a lane at the place nearest to the point, in plan
+        view.
+        """
         step, _, offset = _on_segments(self.lane_map.lanes[lane_id].centre, np.asarray(point)[:2])
         i = int(np.argmin(np.sum(offset * offset, axis=1)))
         return float(np.arctan2(step[i, 1], step[i, 0]))
@@ -102,10 +116,11 @@ class LaneIndex:
         return tuple(s for s in self.lane_map.lanes[lane_id].successors if s in self.lane_map.lanes)
 
     def straightest_successor(self, lane_id: str) -> str | None:
-        """Return the follower whose own course turns least from this lane's end to its own end, or None at a dead end.
+        """Return the follower whose own course turns least from this lane's end to its own end, or
+        None at a dead end.
 
-        The whole turn over the follower is compared and not its first segment: at an intersection all branches leave in the same
-        direction and part only later.
+        The whole turn over the follower is compared and not its first segment: at an intersection
+        all branches leave in the same direction and part only later.
         """
         here = _end_heading(self.lane_map.lanes[lane_id].centre, last=True)
 
@@ -123,16 +138,21 @@ class LaneIndex:
         Args:
             lane_id: Where to begin.
             distance_m: Length in plan view; the path is shorter where the map ends.
-            start: Point whose projection on the first lane begins the path; None: the lane's first point.
+            start: Point whose projection on the first lane begins the path; None: the lane's first
+                point.
         """
         line = self.lane_map.lanes[lane_id].centre
         begin = 0.0 if start is None else project(line, np.asarray(start, dtype=np.float64))[0]
-        ids, parts, left = [lane_id], [_from(line, begin)], distance_m
+        ids = [lane_id]
+        parts = [_from(line, begin)]
+        left = distance_m
         left -= float(arc_lengths(parts[0])[-1])
         current: str | None = lane_id
         while left > 0:
             current = self.straightest_successor(ids[-1])
-            if current is None or (current in ids and arc_lengths(self.lane_map.lanes[current].centre)[-1] <= 0):
+            if current is None or (
+                current in ids and arc_lengths(self.lane_map.lanes[current].centre)[-1] <= 0
+            ):
                 break
             ids.append(current)
             parts.append(self.lane_map.lanes[current].centre)
@@ -154,35 +174,46 @@ def _from(line: F64, begin_m: float) -> F64:
 
 
 def _end_heading(line: F64, last: bool) -> float:
-    """Return the heading over the first or last metre of a polyline, so that a tiny end segment does not decide."""
+    """Return the heading over the first or last metre of a polyline, so that a tiny end segment
+    does not decide.
+    """
     s = arc_lengths(line)
     span = min(1.0, float(s[-1]))
     a, b = resample(line, [s[-1] - span, s[-1]] if last else [0.0, span])
     return float(np.arctan2(b[1] - a[1], b[0] - a[0]))
 
 
-MIN_STEP_M = 0.2  # recorded points closer than this to the last kept one are dropped: a car at rest only adds noise
+# recorded points closer than this to the last kept one are dropped: a car at rest only adds noise
+MIN_STEP_M = 0.2
 SAMPLE_M = 1.0  # the recorded path is matched to lanes this often
 EXTENSION_M = 120.0  # enough for the 80 m that a policy sees, beyond the end of the log
 BLEND_M = 20.0  # the lateral offset at the end of the log fades out over this length
-MATCH_RADIUS_M = 4.0  # a point outside every lane is matched to lanes with a centre vertex this near
+MATCH_RADIUS_M = (
+    4.0  # a point outside every lane is matched to lanes with a centre vertex this near
+)
 MAX_HEADING_ERROR_RAD = np.pi / 3
 HEADING_WEIGHT_M = 3.0
 
 
-def route_from_log(lane_map: LaneMap, ego_log: Trajectory, extension_m: float = EXTENSION_M) -> Route:
+def route_from_log(
+    lane_map: LaneMap, ego_log: Trajectory, extension_m: float = EXTENSION_M
+) -> Route:
     """Make the route of a recorded drive.
 
-    The polyline is the recorded path itself, thinned to `MIN_STEP_M`, so that following it reproduces the human; past its end it goes on
-    along lane centres, at each fork with the smallest heading change, and the offset from the centre fades out over `BLEND_M`. Where
-    the log ends outside every lane, or the map ends, the route ends too. ``lane_ids`` are the lanes of both parts in driving order.
+    The polyline is the recorded path itself, thinned to `MIN_STEP_M`, so that following it
+    reproduces the human; past its end it goes on along lane centres, at each fork with the smallest
+    heading change, and the offset from the centre fades out over `BLEND_M`. Where the log ends
+    outside every lane, or the map ends, the route ends too. ``lane_ids`` are the lanes of both
+    parts in driving order.
 
     Raises:
         InputError: The log has no pose, or a position that is not finite.
     """
     if len(ego_log) == 0 or not np.isfinite(ego_log.xyz).all():
         found = "no poses" if len(ego_log) == 0 else "positions that are not finite"
-        raise InputError("making a route", "the recorded drive", found, "use a log with at least one finite pose")
+        raise InputError(
+            "making a route", "the recorded drive", found, "use a log with at least one finite pose"
+        )
     driven = _thin(ego_log.xyz)
     index = LaneIndex(lane_map)
     if len(driven) < 2:
@@ -195,7 +226,10 @@ def route_from_log(lane_map: LaneMap, ego_log: Trajectory, extension_m: float = 
         return Route(driven, ids)
     end = driven[-1]
     ahead = index.path_ahead(ids[-1], extension_m, start=end)
-    if len(ahead.xyz) < 2 or abs(float(wrap_angle(index.heading_rad(ids[-1], end) - heading))) > MAX_HEADING_ERROR_RAD:
+    if (
+        len(ahead.xyz) < 2
+        or abs(float(wrap_angle(index.heading_rad(ids[-1], end) - heading))) > MAX_HEADING_ERROR_RAD
+    ):
         return Route(driven, ids)
     s = arc_lengths(ahead.xyz)
     fade = np.clip(1 - s / BLEND_M, 0.0, 1.0)
@@ -207,18 +241,26 @@ def route_from_log(lane_map: LaneMap, ego_log: Trajectory, extension_m: float = 
 
 
 def match_lanes(index: LaneIndex, path: F64, first_heading_rad: float) -> tuple[str, ...]:
-    """Name the lanes along a path ``(N, 3)`` in driving order, consistently over places where lanes overlap.
+    """Name the lanes along a path ``(N, 3)`` in driving order, consistently over places where lanes
+    overlap.
 
-    Lanes overlap in intersections, so single points are ambiguous. A shortest path over all samples (Viterbi) weighs how far each
-    sample is from a lane's centre and heading against how plausible the change of lane is: staying is free, a successor nearly, a
-    neighbour costs more, a jump most. Samples in no lane's reach name no lane.
+    Lanes overlap in intersections, so single points are ambiguous. A shortest path over all samples
+    (Viterbi) weighs how far each sample is from a lane's centre and heading against how plausible
+    the change of lane is: staying is free, a successor nearly, a neighbour costs more, a jump most.
+    Samples in no lane's reach name no lane.
     """
     total = float(arc_lengths(path)[-1])
-    at = np.linspace(0.0, total, max(int(np.ceil(total / SAMPLE_M)), 1) + 1) if total > 0 else np.zeros(1)
+    at = (
+        np.linspace(0.0, total, max(int(np.ceil(total / SAMPLE_M)), 1) + 1)
+        if total > 0
+        else np.zeros(1)
+    )
     points, headings = path[:1], np.array([first_heading_rad])
     if total > 0:
         points = resample(path, at)
-        ahead = resample(path, np.minimum(at + SAMPLE_M / 2, total)) - resample(path, np.maximum(at - SAMPLE_M / 2, 0.0))
+        ahead = resample(path, np.minimum(at + SAMPLE_M / 2, total)) - resample(
+            path, np.maximum(at - SAMPLE_M / 2, 0.0)
+        )
         headings = np.arctan2(ahead[:, 1], ahead[:, 0])
     inside = index.containing_many(points)
     layers: list[dict[str, tuple[float, str | None]]] = []
@@ -245,8 +287,12 @@ def match_lanes(index: LaneIndex, path: F64, first_heading_rad: float) -> tuple[
     return tuple(reversed(chain))
 
 
-def _local_costs(index: LaneIndex, point: F64, heading_rad: float, inside: tuple[str, ...]) -> dict[str, float]:
-    """Return the cost of each lane that a sample may be in: offset from the centre in metres plus heading error."""
+def _local_costs(
+    index: LaneIndex, point: F64, heading_rad: float, inside: tuple[str, ...]
+) -> dict[str, float]:
+    """Return the cost of each lane that a sample may be in: offset from the centre in metres plus
+    heading error.
+    """
     candidates = inside or index.within(point, MATCH_RADIUS_M)
     costs: dict[str, float] = {}
     for lane_id in candidates:
@@ -267,10 +313,12 @@ def _change_cost(index: LaneIndex, old: str, new: str) -> float:
 
 
 def route_in_rig(route: Route, T_world_rig: F64, n: int = 20, spacing_m: float = 80 / 19) -> F64:
-    """Return the route ahead ``(n, 3)`` in the rig frame, z = 0, with NaN rows after the route's end.
+    """Return the route ahead ``(n, 3)`` in the rig frame, z = 0, with NaN rows after the route's
+    end.
 
-    The first point is the ego's projection on the route. Where the route passes the same place twice, the pass that runs in the
-    ego's direction counts: one radian of heading error weighs as much as `HEADING_WEIGHT_M` of distance.
+    The first point is the ego's projection on the route. Where the route passes the same place
+    twice, the pass that runs in the ego's direction counts: one radian of heading error weighs as
+    much as `HEADING_WEIGHT_M` of distance.
     """
     out = np.full((n, 3), np.nan)
     line = route.xyz
@@ -286,7 +334,9 @@ def route_in_rig(route: Route, T_world_rig: F64, n: int = 20, spacing_m: float =
 
 
 def _project_ahead(line: F64, along: F64, xy: F64, yaw: float) -> float:
-    """Return the arc length of the point of the route that is nearest in place and direction; ``along`` are those of its points."""
+    """Return the arc length of the point of the route that is nearest in place and direction;
+    ``along`` are those of its points.
+    """
     step, share, offset = _on_segments(line, xy)
     distance = np.linalg.norm(offset, axis=1)
     error = np.abs(wrap_angle(np.arctan2(step[:, 1], step[:, 0]) - yaw))
@@ -295,7 +345,9 @@ def _project_ahead(line: F64, along: F64, xy: F64, yaw: float) -> float:
 
 
 def _on_segments(line: F64, xy: F64) -> tuple[F64, F64, F64]:
-    """Return the segments ``(S, 2)`` of a polyline, the share of each at which it is nearest to a point, and the offsets there."""
+    """Return the segments ``(S, 2)`` of a polyline, the share of each at which it is nearest to a
+    point, and the offsets there.
+    """
     start, step = line[:-1, :2], line[1:, :2] - line[:-1, :2]
     length2 = np.maximum(np.sum(step * step, axis=1), 1e-300)
     share = np.minimum(np.maximum(np.sum((xy - start) * step, axis=1) / length2, 0.0), 1.0)

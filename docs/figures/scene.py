@@ -1,4 +1,5 @@
-"""Measure the scenes and their surrogate degradation: PSNR by lateral offset, time a frame, Gaussians; draw docs/img/degradation.png.
+"""Measure the scenes and their surrogate degradation: PSNR by lateral offset, time a frame,
+Gaussians; draw docs/img/degradation.png.
 
 python docs/figures/scene.py [--speed] [SCENARIO ...]
 """
@@ -24,7 +25,13 @@ from scenarios.load import load_scenario
 SURROGATE = ("degradation.kind=surrogate",)
 OFFSETS_M = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)
 SHOWN_M = (0.0, 1.0, 3.0)
-SHIPPED = ("smoke/straight", "smoke/curve", "urban/residential_parked", "highway/free_flow", "real/us101")
+SHIPPED = (
+    "smoke/straight",
+    "smoke/curve",
+    "urban/residential_parked",
+    "highway/free_flow",
+    "real/us101",
+)
 OUT = Path(__file__).resolve().parents[1] / "img" / "degradation.png"
 
 
@@ -32,17 +39,23 @@ def main() -> None:
     """Run the requested measurements."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("scenarios", nargs="*", default=list(SHIPPED))
-    parser.add_argument("--speed", action="store_true", help="measure time per frame instead of drawing the figure")
+    parser.add_argument(
+        "--speed", action="store_true", help="measure time per frame instead of drawing the figure"
+    )
     arguments = parser.parse_args()
     if arguments.speed:
-        print("scenario | size | renderer | visible | 2 threads, ms: median, p95 | 1 thread, ms: median, p95")
+        print(
+            "scenario | size | renderer | visible | 2 threads, ms: median, p95 | 1 thread, ms: median, p95"
+        )
         for name in arguments.scenarios:
             speed(name)
     else:
         figure(arguments.scenarios)
 
 
-def requests(scenario: Scenario, size: tuple[int, int], lateral_m: float, n: int) -> list[RenderRequest]:
+def requests(
+    scenario: Scenario, size: tuple[int, int], lateral_m: float, n: int
+) -> list[RenderRequest]:
     """Return n requests along the log, moved to the left by ``lateral_m``."""
     camera = scenario.cameras[0]
     K = camera.K.copy()
@@ -54,7 +67,11 @@ def requests(scenario: Scenario, size: tuple[int, int], lateral_m: float, n: int
         pose: F64 = interpolate(scenario.ego_log, t_us)
         pose[:3, 3] += lateral_m * pose[:3, 1]
         T = pose @ camera.T_rig_camera
-        actors = {a.actor_id: interpolate(a.track, t_us) for a in scenario.actors if a.track.t_us[0] <= t_us <= a.track.t_us[-1]}
+        actors = {
+            a.actor_id: interpolate(a.track, t_us)
+            for a in scenario.actors
+            if a.track.t_us[0] <= t_us <= a.track.t_us[-1]
+        }
         out.append(RenderRequest(int(t_us), camera, np.stack([T, T]), actors))
     return out
 
@@ -63,7 +80,9 @@ def degradation_curve(scenario: Scenario, clean: Renderer, bad: Renderer, n: int
     """Return the mean PSNR at each offset, both sides of the path."""
     means = []
     for offset in OFFSETS_M:
-        views = [r for sign in (1.0, -1.0) for r in requests(scenario, (256, 144), sign * offset, n)]
+        views = [
+            r for sign in (1.0, -1.0) for r in requests(scenario, (256, 144), sign * offset, n)
+        ]
         means.append(np.mean([psnr_db(clean.render(r).rgb, bad.render(r).rgb) for r in views]))
     return np.array(means)
 
@@ -74,17 +93,30 @@ def figure(names: list[str]) -> None:
     for name in names:
         scenario = load_scenario(name, overrides=SURROGATE)
         clean, bad = make_renderer("clean", scenario), make_renderer("3dgs", scenario)
-        curves[Path(name).stem if "/" not in name or Path(name).exists() else name] = degradation_curve(scenario, clean, bad)
-        print(name, " ".join(f"{m:g} m: {v:.1f} dB" for m, v in zip(OFFSETS_M, curves[next(reversed(curves))], strict=True)))
+        curves[Path(name).stem if "/" not in name or Path(name).exists() else name] = (
+            degradation_curve(scenario, clean, bad)
+        )
+        print(
+            name,
+            " ".join(
+                f"{m:g} m: {v:.1f} dB"
+                for m, v in zip(OFFSETS_M, curves[next(reversed(curves))], strict=True)
+            ),
+        )
     scenario = load_scenario(names[0], overrides=SURROGATE)
     clean, bad = make_renderer("clean", scenario), make_renderer("3dgs", scenario)
     views = [requests(scenario, (480, 272), m, 6)[1] for m in SHOWN_M]
-    columns = [np.concatenate([renderer.render(r).rgb for r in views], axis=1) for renderer in (clean, bad)]
+    columns = [
+        np.concatenate([renderer.render(r).rgb for r in views], axis=1) for renderer in (clean, bad)
+    ]
     fig = plt.figure(figsize=(11, 7.2))
     grid = fig.add_gridspec(2, 1, height_ratios=(1.18, 1.0), hspace=0.16)
     top = fig.add_subplot(grid[0])
     top.imshow(np.concatenate(columns, axis=0))
-    top.set_xticks([480 * (i + 0.5) for i in range(len(SHOWN_M))], [f"{m:g} m beside the logged path" for m in SHOWN_M])
+    top.set_xticks(
+        [480 * (i + 0.5) for i in range(len(SHOWN_M))],
+        [f"{m:g} m beside the logged path" for m in SHOWN_M],
+    )
     top.set_yticks([136, 408], ["clean", "3dgs"])
     top.tick_params(length=0)
     top.xaxis.tick_top()
@@ -118,7 +150,10 @@ def speed(name: str, n: int = 24) -> None:
                     times.append((time.perf_counter() - start) * 1e3)
                     visible.append(getattr(renderer, "stats", {}).get("visible", 0))
                 cells.append(f"{np.median(times):.1f}, {np.percentile(times, 95):.1f}")
-            print(f"{name} | {size[0]}x{size[1]} | {kind} | {min(visible)}..{max(visible)} | {' | '.join(cells)}", flush=True)
+            print(
+                f"{name} | {size[0]}x{size[1]} | {kind} | {min(visible)}..{max(visible)} | {' | '.join(cells)}",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

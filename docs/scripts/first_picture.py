@@ -1,4 +1,5 @@
-"""Make docs/img/drive.gif of a run: one scene behind three renderers, with the plan in force drawn into each picture.
+"""Make docs/img/drive.gif of a run: one scene behind three renderers, with the plan in force drawn
+into each picture.
 
 simrun --renderer clean,3dgs,onefixer --policy lane-camera --out RUN suites/first
 python docs/scripts/first_picture.py RUN hard-hard_brake
@@ -20,12 +21,20 @@ from alpasim_plugin.log import decode_image, read_asl
 from evaluators.metrics.outcomes import event_words, first_failure
 
 COLOURS = {"clean": (11, 107, 179), "3dgs": (194, 84, 10), "onefixer": (0, 128, 106)}
-SIZE, GAP_PX, FRAMES, MS, PALETTE = (320, 180), 6, slice(1, 57, 2), 200, 96
+SIZE = (320, 180)
+GAP_PX = 6
+FRAMES = slice(1, 57, 2)
+MS = 200
+PALETTE = 96
 
 
 def frames(folder: Path, name: str) -> list[U8]:
-    """Return the frames of a rollout ``(H, W, 3)``, with its plans, its name and, from then on, its first failure."""
-    log, colour, out = read_asl(folder / "rollout.asl"), COLOURS[name], []
+    """Return the frames of a rollout ``(H, W, 3)``, with its plans, its name and, from then on, its
+    first failure.
+    """
+    log = read_asl(folder / "rollout.asl")
+    colour = COLOURS[name]
+    out = []
     failure = first_failure(json.loads((folder / "manifest.json").read_text()))
     camera = log.info["cameras"][0]
     scale = SIZE[0] / camera.width
@@ -44,19 +53,38 @@ def frames(folder: Path, name: str) -> list[U8]:
         cv2.putText(rgb, name, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.48, colour, 1, cv2.LINE_AA)
         if failure is not None and image.end_us >= failure["t_us"]:
             cv2.rectangle(rgb, (0, SIZE[1] - 24), SIZE, (255, 255, 255), -1)
-            cv2.putText(rgb, event_words(failure["metric"]), (6, SIZE[1] - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.48, colour, 1, cv2.LINE_AA)
+            cv2.putText(
+                rgb,
+                event_words(failure["metric"]),
+                (6, SIZE[1] - 8),
+                cv2.FONT_HERSHEY_SIMPLEX,
+                0.48,
+                colour,
+                1,
+                cv2.LINE_AA,
+            )
         out.append(rgb)
     return out
 
 
 def main(run: Path, scene: str) -> None:
     """Write the picture."""
-    panels = [frames(run / "rollouts" / name / "lane-camera" / scene / "0", name) for name in COLOURS]
+    panels = [
+        frames(run / "rollouts" / name / "lane-camera" / scene / "0", name) for name in COLOURS
+    ]
     gap = np.full((SIZE[1], GAP_PX, 3), 255, np.uint8)
-    rows = [np.concatenate([one, gap, two, gap, three], axis=1) for one, two, three in zip(*panels, strict=False)]
-    pictures = [Image.fromarray(row).convert("P", palette=Image.Palette.ADAPTIVE, colors=PALETTE) for row in rows]
+    rows = [
+        np.concatenate([one, gap, two, gap, three], axis=1)
+        for one, two, three in zip(*panels, strict=False)
+    ]
+    pictures = [
+        Image.fromarray(row).convert("P", palette=Image.Palette.ADAPTIVE, colors=PALETTE)
+        for row in rows
+    ]
     out = Path(__file__).parents[1] / "img" / "drive.gif"
-    pictures[0].save(out, save_all=True, append_images=pictures[1:], duration=MS, loop=0, optimize=True)
+    pictures[0].save(
+        out, save_all=True, append_images=pictures[1:], duration=MS, loop=0, optimize=True
+    )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,11 @@
-"""Time blocks of ``onefixer-dit-tiny`` for several widths of its autoencoder: ``python docs/scripts/fixer_widths.py [THREADS]``.
+"""Time blocks of ``onefixer-dit-tiny`` for several widths of its autoencoder: ``python
+docs/scripts/fixer_widths.py [THREADS]``.
 
-Random frames of 256x144 with holes and semantic maps, chunk by chunk. Random weights stand in for the shipped ones, whose sizes are fixed;
-the history is kept from the last forward (`finalise`, as shipped, adds a forward a block). Prints milliseconds a frame: the median of
-blocks 3 to 10, in two rounds. Needs free cores: with two threads on busy ones it measures how long they wait for each other.
+Random frames of 256x144 with holes and semantic maps, chunk by chunk. Random weights stand in for
+the shipped ones, whose sizes are fixed; the history is kept from the last forward (`finalise`, as
+shipped, adds a forward a block). Prints milliseconds a frame: the median of blocks 3 to 10, in two
+rounds. Needs free cores: with two threads on busy ones it measures how long they wait for each
+other.
 """
 
 import sys
@@ -24,7 +27,9 @@ def ms_a_frame(widths: str, threads: int) -> float:
     """Return the median time a frame of one fixer's blocks after the second."""
     settings = fixer_settings("onefixer-dit-tiny", [f"vae.widths=[{widths}]", *UNTRAINED])
     fixer = make_fixer("onefixer-dit-tiny", settings, scene_id="widths", threads=threads)
-    rng, t_us, spent = stream("widths", 0, "frames"), 0, []
+    rng = stream("widths", 0, "frames")
+    t_us = 0
+    spent = []
     for block in range(BLOCKS):
         n = fixer.blocks.frames(block)
         images = rng.integers(0, 256, (2, n, *SIZE, 3), dtype=np.uint8)

@@ -1,10 +1,12 @@
-"""Write the headline about driving into README.md and docs/results.md, from one record: docs/experiments/fixer-closed-loop.md.
+"""Write the headline about driving into README.md and docs/results.md, from one record:
+docs/experiments/fixer-closed-loop.md.
 
     python docs/scripts/headline.py [--check]
 
-The record holds the tables that ``docs/scripts/closed_loop.py`` makes. A sentence says how long the drives are, of which sets and how many
-families, and gives the difference with scenes and with families as the unit. With ``--check`` nothing is written, and the exit code is 1
-where a page differs. The record need not be repeated for that: what it says is on the page.
+The record holds the tables that ``docs/scripts/closed_loop.py`` makes. A sentence says how long the
+drives are, of which sets and how many families, and gives the difference with scenes and with
+families as the unit. With ``--check`` nothing is written, and the exit code is 1 where a page
+differs. The record need not be repeated for that: what it says is on the page.
 """
 
 from __future__ import annotations
@@ -22,11 +24,16 @@ from evaluators.statistics.families import family_bounds
 RECORD = DOCS / "experiments" / "fixer-closed-loop.md"
 DRAWN_S = 19.8  # length of the test sets' drives
 SETS = "the two frozen test sets"
-POLICY, BASELINE, TRUE = "learned", "3dgs", "clean"
+POLICY = "learned"
+BASELINE = "3dgs"
+TRUE = "clean"
 FIXED, BARE = "onefixer", "onefixer[references=0]"
 OTHER = "not in this record"  # the block generator's cell
 EVENT, DISTANCE = "offroad_or_collision_at_fault", "lateral_distance_m"
-SAFER, KEEPS = "| Does it make driving safer? ", "| Does it keep the car on its path? "  # rows of docs/results.md
+SAFER, KEEPS = (
+    "| Does it make driving safer? ",
+    "| Does it keep the car on its path? ",
+)  # rows of docs/results.md
 
 
 @dataclass(frozen=True)
@@ -60,24 +67,37 @@ class Record:
     def over_families(self, renderer: str) -> tuple[float, float]:
         """Return the bounds of the difference in points with families as the unit.
 
-        The tables hold a family's sum and not its scenes, which is all that the variance of sums of residuals asks for.
+        The tables hold a family's sum and not its scenes, which is all that the variance of sums of
+        residuals asks for.
         """
         means, family = [], []
         for k, (name, cells) in enumerate(self.events.items()):
             here, there = cells[renderer], cells[BASELINE]
             n = here[1] // self.seeds
-            assert here[1] == there[1] == n * self.seeds, f"{name}: {here[1]} and {there[1]} rollouts of {self.seeds} seeds"
+            assert here[1] == there[1] == n * self.seeds, (
+                f"{name}: {here[1]} and {there[1]} rollouts of {self.seeds} seeds"
+            )
             means += [(here[0] - there[0]) / here[1]] * n
             family += [k] * n
         low, high = family_bounds(np.array(means), np.array(family))
         return 100.0 * low, 100.0 * high
 
     def without(self, renderer: str) -> tuple[str, float]:
-        """Return the family that moves the difference most, and the difference in points without it."""
+        """Return the family that moves the difference most, and the difference in points without
+        it.
+        """
 
         def rest(left_out: str | None) -> float:
-            pairs = [(cells[renderer], cells[BASELINE]) for name, cells in self.events.items() if name != left_out]
-            return 100.0 * sum(here[0] - there[0] for here, there in pairs) / sum(here[1] for here, _ in pairs)
+            pairs = [
+                (cells[renderer], cells[BASELINE])
+                for name, cells in self.events.items()
+                if name != left_out
+            ]
+            return (
+                100.0
+                * sum(here[0] - there[0] for here, there in pairs)
+                / sum(here[1] for here, _ in pairs)
+            )
 
         name = max(self.events, key=lambda one: abs(rest(one) - rest(None)))
         return name, rest(name)
@@ -88,7 +108,9 @@ def read_record(text: str) -> Record:
     made = re.search(r"<!-- begin closed-loop -->\n(.*?)<!-- end closed-loop -->", text, re.S)
     assert made, "the record has no tables"
     length, rest = made[1].split("\n", 1)
-    part = re.search(rf"\*\*{POLICY}\*\*: (\d+) scenes x (\d+) seeds\n(.*?)(?=\n\*\*|\Z)", rest, re.S)
+    part = re.search(
+        rf"\*\*{POLICY}\*\*: (\d+) scenes x (\d+) seeds\n(.*?)(?=\n\*\*|\Z)", rest, re.S
+    )
     assert part, f"the record has no policy {POLICY}"
     tables: dict[str, dict[str, dict[str, str]]] = {}
     rows: dict[str, dict[str, str]] = {}
@@ -103,8 +125,17 @@ def read_record(text: str) -> Record:
         elif not cells[0].startswith("-"):
             rows[re.sub(r"`(\w+)`.*", r"\1", cells[0])] = dict(zip(columns, cells[1:], strict=True))
     counts = tables["left the road or at fault, rollouts"]
-    events = {name: {key: _counted(cell) for key, cell in cells.items()} for name, cells in counts.items()}
-    return Record(_length(length), int(part[1]), int(part[2]), tables["metric"], tables[f"minus {BASELINE}"], events)
+    events = {
+        name: {key: _counted(cell) for key, cell in cells.items()} for name, cells in counts.items()
+    }
+    return Record(
+        _length(length),
+        int(part[1]),
+        int(part[2]),
+        tables["metric"],
+        tables[f"minus {BASELINE}"],
+        events,
+    )
 
 
 def _counted(cell: str) -> tuple[int, int]:
@@ -113,11 +144,17 @@ def _counted(cell: str) -> tuple[int, int]:
 
 
 def _length(line: str) -> str:
-    """Return the length of the drives in words, from the record's first line: ``8 s each; `scene` 9 s.``."""
+    """Return the length of the drives in words, from the record's first line: ``8 s each; `scene` 9
+    s.``.
+    """
     found = re.match(r"([\d.]+) s each", line)
     assert found, f"the record does not say how long its drives are: {line!r}"
     seconds = float(found[1])
-    return f"{seconds:g} s each" if seconds >= np.floor(DRAWN_S) else f"each cut to its first {seconds:g} of {DRAWN_S:g} s"
+    return (
+        f"{seconds:g} s each"
+        if seconds >= np.floor(DRAWN_S)
+        else f"each cut to its first {seconds:g} of {DRAWN_S:g} s"
+    )
 
 
 def sentence(record: Record, renderer: str = FIXED) -> str:
@@ -161,7 +198,10 @@ def written(record: Record) -> dict[Path, str]:
     for begins, row in rows(record).items():
         text, found = re.subn(rf"^{re.escape(begins)}.*$", lambda _, row=row: row, text, flags=re.M)
         assert found == 1, f"{results} has {found} rows that begin with {begins!r}"
-    return {readme: replace(readme.read_text(encoding="utf-8"), "headline", sentence(record)), results: text}
+    return {
+        readme: replace(readme.read_text(encoding="utf-8"), "headline", sentence(record)),
+        results: text,
+    }
 
 
 def main() -> None:

@@ -1,9 +1,11 @@
 """Does a fixer paint lines that are not there when its map is wrong?
 
-python docs/scripts/invented_paint.py data/pairs --split val --fixer "onefixer[references=0],onefixer" --frames 31
+python docs/scripts/invented_paint.py data/pairs --split val --fixer
+"onefixer[references=0],onefixer" --frames 31
 
-Every clip is fixed with its own map, with none, and with the map of the next clip, which is another street's. Prints for each: painted
-pixels a frame that no paint of the truth explains; their share of all painted pixels; and the share of the truth's paint that is shown
+Every clip is fixed with its own map, with none, and with the map of the next clip, which is another
+street's. Prints for each: painted pixels a frame that no paint of the truth explains; their share
+of all painted pixels; and the share of the truth's paint that is shown
 (`alpasim_plugin.lab.bench.lane_paint`). The road is the plane below the rig around the driven path.
 """
 
@@ -23,7 +25,9 @@ from alpasim_plugin.lab.bench.quality import QualityClip
 
 
 def roads_of(clip: QualityClip) -> list[Road]:
-    """Return the road of each frame: level at the rig's height, beside the path from the first frame to 40 m past the last."""
+    """Return the road of each frame: level at the rig's height, beside the path from the first
+    frame to 40 m past the last.
+    """
     recorded = clip.recorded
     if recorded is None:
         raise SystemExit(f"{clip.name} has no poses: it was made without references")
@@ -34,7 +38,13 @@ def roads_of(clip: QualityClip) -> list[Road]:
     roads = []
     for i, T in enumerate(rigs):
         ground = HeightField(float(T[0, 3]), float(T[1, 3]), 1.0, np.full((2, 2), T[2, 3]))
-        roads.append(road_of(PinholeCamera(width, height, recorded.K, inverse(recorded.T_world_camera[i])), ground, path))
+        roads.append(
+            road_of(
+                PinholeCamera(width, height, recorded.K, inverse(recorded.T_world_camera[i])),
+                ground,
+                path,
+            )
+        )
     return roads
 
 
@@ -53,17 +63,29 @@ def main() -> None:
     frames = sum(len(clip.t_us) for clip in clips)
     rows: dict[tuple[str, str], PaintCounts] = {}
     for i, clip in enumerate(clips):
-        others = [other for other in (*clips[i + 1 :], *clips[:i]) if other.sdmap.shape == clip.sdmap.shape]
-        maps = {"its own": clip.sdmap, "none": np.zeros_like(clip.sdmap), "another street's": others[0].sdmap}
+        others = [
+            other
+            for other in (*clips[i + 1 :], *clips[:i])
+            if other.sdmap.shape == clip.sdmap.shape
+        ]
+        maps = {
+            "its own": clip.sdmap,
+            "none": np.zeros_like(clip.sdmap),
+            "another street's": others[0].sdmap,
+        }
         for word, sdmap in maps.items():
             made = videos(replace(clip, sdmap=sdmap), names)
             for name, video in zip(("3dgs", *names), made, strict=True):
                 found = counts(video, np.asarray(clip.truth), roads[i])
                 rows[word, name] = rows.get((word, name), PaintCounts()) + found
-    print("| map | renderer | invented paint, pixels a frame | share of its paint | recall |\n|---|---|---:|---:|---:|")
+    print(
+        "| map | renderer | invented paint, pixels a frame | share of its paint | recall |\n|---|---|---:|---:|---:|"
+    )
     for (word, name), found in rows.items():
         invented = found.made - found.made_true
-        print(f"| {word} | {name} | {invented / frames:.1f} | {invented / found.made:.1%} | {found.recall:.3f} |")
+        print(
+            f"| {word} | {name} | {invented / frames:.1f} | {invented / found.made:.1%} | {found.recall:.3f} |"
+        )
 
 
 if __name__ == "__main__":

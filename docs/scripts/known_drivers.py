@@ -1,9 +1,12 @@
-"""Record which shipped scenes known drivers pass: the scale on which `simrun check-driver` places a driver.
+"""Record which shipped scenes known drivers pass: the scale on which `simrun check-driver` places a
+driver.
 
-    python docs/scripts/known_drivers.py OUT.json [--policy pure-pursuit,learned,tests/runs/seeded_bugs.py:Latency] [SCENE...]
+    python docs/scripts/known_drivers.py OUT.json [--policy
+    pure-pursuit,learned,tests/runs/seeded_bugs.py:Latency] [SCENE...]
 
-Scenes are driven as `simrun check-driver` drives them: behind `clean`, with AlpaSim's time line, seed 0, preset `paper`. OUT.json is
-scenarios/suites/known_drivers.json; what it has is kept, so a second call continues the first. A scene is passed without any outcome.
+Scenes are driven as `simrun check-driver` drives them: behind `clean`, with AlpaSim's time line,
+seed 0, preset `paper`. OUT.json is scenarios/suites/known_drivers.json; what it has is kept, so a
+second call continues the first. A scene is passed without any outcome.
 """
 
 from __future__ import annotations
@@ -27,11 +30,20 @@ def passes(scene: str, policy: str) -> tuple[str, bool]:
     (ref,) = expand(scene, ("timing.timeline=alpasim",))
     scenario = load_scenario(ref.path, ref.seed, ref.overrides)
     try:
-        recorder = run_rollout(scenario, make_renderer("clean", scenario, threads=1), make_policy(policy, scenario), seed=0)
+        recorder = run_rollout(
+            scenario,
+            make_renderer("clean", scenario, threads=1),
+            make_policy(policy, scenario),
+            seed=0,
+        )
     except PolicyError:
         return scenario.scene_id, False
-    values = reduce_rollout(score(recorder.log(), scenario.scene, preset="paper"), "paper").as_dict()
-    return scenario.scene_id, not any(values.get(name, {}).get("valid") and values[name]["value"] >= 0.5 for name in OUTCOMES)
+    values = reduce_rollout(
+        score(recorder.log(), scenario.scene, preset="paper"), "paper"
+    ).as_dict()
+    return scenario.scene_id, not any(
+        values.get(name, {}).get("valid") and values[name]["value"] >= 0.5 for name in OUTCOMES
+    )
 
 
 if __name__ == "__main__":
@@ -42,7 +54,9 @@ if __name__ == "__main__":
     asked = parser.parse_intermixed_args()  # scenes may stand after an option
     known = json.loads(asked.out.read_text()) if asked.out.exists() else {"passed": {}}
     for policy in asked.policy.split(","):
-        for scene in asked.scenes or [f"{Path(ref.path).parent.name}/{Path(ref.path).stem}" for ref in expand("suites/all")]:
+        for scene in asked.scenes or [
+            f"{Path(ref.path).parent.name}/{Path(ref.path).stem}" for ref in expand("suites/all")
+        ]:
             name = policy.rpartition(":")[2]
             scene_id = load_scenario(scene).scene_id
             if name not in known["passed"].get(scene_id, {}):

@@ -1,4 +1,5 @@
-"""Drive shipped scenes with blind and broken drivers, and with those that they are made from: what tells them apart, and how soon.
+"""Drive shipped scenes with blind and broken drivers, and with those that they are made from: what
+tells them apart, and how soon.
 
 python -m docs.scripts.power drive --policy pure-pursuit,lane-camera OUT.json SCENE...
 python -m docs.scripts.power drive --policy bugs OUT.json SCENE...    # those of tests/runs/seeded_bugs.py and what they are made from
@@ -29,9 +30,21 @@ from tests.runs import seeded_bugs
 SUITES = ("first", "smoke", "gate_self_test", "urban", "highway", "hard")
 BLIND, NOTHING = "pure-pursuit", in_words(())
 SOUND = {"LaneCamera": "lane-camera", "Learned": "learned"}  # class -> name of a shipped policy
-CLASSES = [one for one in vars(seeded_bugs).values() if isinstance(one, type) and one.__module__ == seeded_bugs.__name__]
-BASES = {one.__name__: one.__bases__[0].__name__ for one in CLASSES} | {BLIND: "LaneCamera", "MyPolicy": "LaneCamera"}
-MARGIN, ALPHA, CEILING, RUNS = 0.05, 0.05, 100, 1000  # of the default gate; most scenes, and simulated comparisons
+CLASSES = [
+    one
+    for one in vars(seeded_bugs).values()
+    if isinstance(one, type) and one.__module__ == seeded_bugs.__name__
+]
+BASES = {one.__name__: one.__bases__[0].__name__ for one in CLASSES} | {
+    BLIND: "LaneCamera",
+    "MyPolicy": "LaneCamera",
+}
+MARGIN, ALPHA, CEILING, RUNS = (
+    0.05,
+    0.05,
+    100,
+    1000,
+)  # of the default gate; most scenes, and simulated comparisons
 
 
 def outcome(scene: str, policy: str) -> str:
@@ -43,8 +56,14 @@ def outcome(scene: str, policy: str) -> str:
         recorder = run_rollout(scenario, make_renderer("clean", scenario, threads=1), made, seed=0)
     except PolicyError:
         return in_words([POLICY_FAULT])
-    values = reduce_rollout(score(recorder.log(), scenario.scene, preset="paper"), "paper").as_dict()
-    return in_words(name for name in OUTCOMES if values.get(name, {}).get("valid") and values[name]["value"] >= 0.5)
+    values = reduce_rollout(
+        score(recorder.log(), scenario.scene, preset="paper"), "paper"
+    ).as_dict()
+    return in_words(
+        name
+        for name in OUTCOMES
+        if values.get(name, {}).get("valid") and values[name]["value"] >= 0.5
+    )
 
 
 def drive(policies: list[str], out: Path, scenes: list[str]) -> None:
@@ -71,33 +90,70 @@ def read(files: list[Path]) -> dict[str, dict[str, str]]:
 def table(known: dict[str, dict[str, str]]) -> None:
     """Print a row a scene in which the blind driver fails, and a row a suite."""
     policies = list(dict.fromkeys(policy for ends in known.values() for policy in ends))
-    print("| scene | " + " | ".join(f"`{one}`" for one in policies) + " |\n|---" + "|---" * len(policies) + "|")
+    print(
+        "| scene | "
+        + " | ".join(f"`{one}`" for one in policies)
+        + " |\n|---"
+        + "|---" * len(policies)
+        + "|"
+    )
     for scene, ends in known.items():
         if ends.get(BLIND, NOTHING) != NOTHING:
-            print(f"| `{scene}` | " + " | ".join(ends.get(one, "not driven") for one in policies) + " |")
+            print(
+                f"| `{scene}` | "
+                + " | ".join(ends.get(one, "not driven") for one in policies)
+                + " |"
+            )
     print(f"\n| suite | scenes | `{BLIND}` fails in |\n|---|---|---|")
     for suite in SUITES:
         names = [scene_name(ref.path) for ref in load_suite(f"suites/{suite}")]
-        print(f"| `suites/{suite}` | {len(names)} | {sum(known[name][BLIND] != NOTHING for name in names)} |")
+        print(
+            f"| `suites/{suite}` | {len(names)} | {sum(known[name][BLIND] != NOTHING for name in names)} |"
+        )
 
 
 def rollouts(known: dict[str, dict[str, str]]) -> None:
-    """Print how many rollouts show that a broken driver fails more often than the one that it is made from, in scenes like these."""
-    print("| driver | fails in | made from | fails in | fixed design | until decided, median | decided |\n|---" + "|---" * 6 + "|")
+    """Print how many rollouts show that a broken driver fails more often than the one that it is
+    made from, in scenes like these.
+    """
+    print(
+        "| driver | fails in | made from | fails in | fixed design | until decided, median | decided |\n|---"
+        + "|---" * 6
+        + "|"
+    )
     for name, base in BASES.items():
         sound = SOUND.get(base, base)
-        pairs = np.array([[ends[one] != NOTHING for one in (name, sound)] for ends in known.values() if {name, sound} <= {*ends}], float)
+        pairs = np.array(
+            [
+                [ends[one] != NOTHING for one in (name, sound)]
+                for ends in known.values()
+                if {name, sound} <= {*ends}
+            ],
+            float,
+        )
         if name in BASES.values() or not len(pairs):
             continue
         delta, n = pairs[:, 0] - pairs[:, 1], len(pairs)
-        needed = more_scenes(delta.mean(), delta.std(), 0, MARGIN, None) if delta.mean() > MARGIN else None
+        needed = (
+            more_scenes(delta.mean(), delta.std(), 0, MARGIN, None)
+            if delta.mean() > MARGIN
+            else None
+        )
         draws = independent(np.random.default_rng(0).choice(delta, (RUNS, CEILING)), -1.0, 1.0)
-        capital = betting.log_capital(draws, MARGIN, betting.bet_sizes(draws, MARGIN, Plan(MARGIN, CEILING, ALPHA)))
+        capital = betting.log_capital(
+            draws, MARGIN, betting.bet_sizes(draws, MARGIN, Plan(MARGIN, CEILING, ALPHA))
+        )
         is_shown = capital >= -np.log(ALPHA)
         at = 2 * (1 + is_shown.argmax(axis=1)[is_shown.any(axis=1)])
         fails = [f"{int(side.sum())} of {n}" for side in pairs.T]
-        found = f"{np.median(at):.0f} | {100 * len(at) / RUNS:.0f} %" if 2 * len(at) > RUNS else f"not found | {100 * len(at) / RUNS:.0f} %"
-        print(f"| `{name}` | {fails[0]} | `{sound}` | {fails[1]} | {2 * needed if needed else 'not found'} | {found} |")
+        found = (
+            f"{np.median(at):.0f} | {100 * len(at) / RUNS:.0f} %"
+            if 2 * len(at) > RUNS
+            else f"not found | {100 * len(at) / RUNS:.0f} %"
+        )
+        print(
+            f"| `{name}` | {fails[0]} | `{sound}` | {fails[1]} | {2 * needed if needed else 'not found'} | {found} |"
+        )
 
 
 def scene_name(path: str) -> str:
@@ -115,6 +171,16 @@ if __name__ == "__main__":
     if asked.what == "drive":
         broken = [*SOUND.values(), *(f"{seeded_bugs.__name__}:{one.__name__}" for one in CLASSES)]
         asked_for = broken if asked.policy == "bugs" else asked.policy.split(",")
-        drive(asked_for, asked.out, [scene_name(ref.path) for item in asked.scenes or ["suites/all"] for ref in expand(item)])
+        drive(
+            asked_for,
+            asked.out,
+            [
+                scene_name(ref.path)
+                for item in asked.scenes or ["suites/all"]
+                for ref in expand(item)
+            ],
+        )
     else:
-        {"table": table, "rollouts": rollouts}[asked.what](read([asked.out, *map(Path, asked.scenes)]))
+        {"table": table, "rollouts": rollouts}[asked.what](
+            read([asked.out, *map(Path, asked.scenes)])
+        )

@@ -2,8 +2,9 @@
 
     python docs/scripts/results.py DATA [RUNS]
 
-DATA is the folder of third-party data sets (av2, commonroad, cosmos-drive-dreams); RUNS (default: runs/results) keeps the run folders, so a
-second call continues an interrupted first one. Pictures go to docs/img/, tables between the page's markers.
+DATA is the folder of third-party data sets (av2, commonroad, cosmos-drive-dreams); RUNS (default:
+runs/results) keeps the run folders, so a second call continues an interrupted first one. Pictures
+go to docs/img/, tables between the page's markers.
 """
 
 from __future__ import annotations
@@ -22,7 +23,14 @@ import pyarrow.parquet as pq
 from evaluators import aggregate, paired
 
 DOCS = Path(__file__).resolve().parents[1]
-SHOWN = ("collision_at_fault", "collision_any", "offroad", "route_distance_m", "progress", "min_distance_to_obstacle_m")
+SHOWN = (
+    "collision_at_fault",
+    "collision_any",
+    "offroad",
+    "route_distance_m",
+    "progress",
+    "min_distance_to_obstacle_m",
+)
 STRIP_PICK = (0, 1, 2)  # three of the strip's four frames
 
 
@@ -52,9 +60,19 @@ def picture(run: Path, scene: str, to: Path) -> None:
     """Write three frames of each renderer, clean above 3dgs, the same times in a column."""
     rows = []
     for renderer in ("clean", "3dgs"):
-        strip = cv2.imread(str(run / "rollouts" / renderer / "lane-camera" / scene / "0" / "strip.jpg"))
+        strip = cv2.imread(
+            str(run / "rollouts" / renderer / "lane-camera" / scene / "0" / "strip.jpg")
+        )
         frames = np.array_split(strip, 4, axis=1)
-        rows.append(np.concatenate([cv2.resize(frames[i], (512, 288), interpolation=cv2.INTER_CUBIC) for i in STRIP_PICK], axis=1))
+        rows.append(
+            np.concatenate(
+                [
+                    cv2.resize(frames[i], (512, 288), interpolation=cv2.INTER_CUBIC)
+                    for i in STRIP_PICK
+                ],
+                axis=1,
+            )
+        )
     to.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(to), np.concatenate(rows, axis=0), [cv2.IMWRITE_JPEG_QUALITY, 82])
 
@@ -66,14 +84,21 @@ def number(entry: dict[str, Any], rate: bool) -> str:
     scale, digits = (100.0, 1) if rate else (1.0, 3)
     half = "" if entry["ci95"] is None else f" ± {scale * entry['ci95']:.{digits}f}"
     low_high = entry["ci95_clustered"]
-    clustered = "" if low_high is None else f" [{scale * low_high[0]:.{digits}f}, {scale * low_high[1]:.{digits}f}]"
+    clustered = (
+        ""
+        if low_high is None
+        else f" [{scale * low_high[0]:.{digits}f}, {scale * low_high[1]:.{digits}f}]"
+    )
     return f"{scale * entry['mean']:.{digits}f}{half}{clustered}"
 
 
 def table(summary: dict[str, Any]) -> str:
     """Return metrics x renderers, and the paired difference of the last renderer from the first."""
     names = list(summary["metrics"])
-    lines = ["| metric | " + " | ".join(names) + " | paired difference, 95 % over scenes | p |", "|---" * (len(names) + 3) + "|"]
+    lines = [
+        "| metric | " + " | ".join(names) + " | paired difference, 95 % over scenes | p |",
+        "|---" * (len(names) + 3) + "|",
+    ]
     for metric in SHOWN:
         entries = [summary["metrics"][name][metric] for name in names]
         rate = entries[0]["unit"] == ""
@@ -82,7 +107,11 @@ def table(summary: dict[str, Any]) -> str:
         diff = p = "-"
         if pair and pair["diff"] is not None:
             scale, digits = (100.0, 1) if rate else (1.0, 3)
-            bounds = "" if pair["ci95"] is None else f" [{scale * pair['ci95'][0]:+.{digits}f}, {scale * pair['ci95'][1]:+.{digits}f}]"
+            bounds = (
+                ""
+                if pair["ci95"] is None
+                else f" [{scale * pair['ci95'][0]:+.{digits}f}, {scale * pair['ci95'][1]:+.{digits}f}]"
+            )
             diff = f"{scale * pair['diff']:+.{digits}f}{bounds}"
             p = "-" if pair["p_value"] is None else f"{pair['p_value']:.3f}"
         unit = " (%)" if rate else f" ({entries[0]['unit']})" if entries[0]["unit"] else ""
@@ -100,7 +129,15 @@ def scene_table(run: Path) -> str:
     """Return one row per scene and renderer, averaged over seeds."""
     rows = pq.read_table(run / "rollouts.parquet").to_pylist()
     keys = list(dict.fromkeys((row["scene"], row["renderer"]) for row in rows))
-    head = ("scene", "renderer", "at fault", "any contact", "off-road", "route distance (m)", "progress (%)")
+    head = (
+        "scene",
+        "renderer",
+        "at fault",
+        "any contact",
+        "off-road",
+        "route distance (m)",
+        "progress (%)",
+    )
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for scene, renderer in keys:
         mine = [row for row in rows if (row["scene"], row["renderer"]) == (scene, renderer)]
@@ -123,11 +160,18 @@ def scene_table(run: Path) -> str:
 def speed_table(summaries: dict[str, dict[str, Any]]) -> str:
     """Return time per camera frame by run and renderer."""
     stages = ("render", "policy", "control", "actors", "log")
-    lines = ["| run | renderer | ms a frame, mean | p95 | frames/s | " + " | ".join(f"{s} p50" for s in stages) + " | pool frames/s |"]
+    lines = [
+        "| run | renderer | ms a frame, mean | p95 | frames/s | "
+        + " | ".join(f"{s} p50" for s in stages)
+        + " | pool frames/s |"
+    ]
     lines.append("|---" * (6 + len(stages)) + "|")
     for name, summary in summaries.items():
         for renderer, speed in summary["speed"].items():
-            cells = [f"{speed['stages'][s]['p50_ms']:.2f}" if s in speed["stages"] else "-" for s in stages]
+            cells = [
+                f"{speed['stages'][s]['p50_ms']:.2f}" if s in speed["stages"] else "-"
+                for s in stages
+            ]
             pool = summary["pool"]["frames_per_s_total"]
             lines.append(
                 f"| {name} | {renderer} | {speed['ms_per_frame_mean']} | {speed['ms_per_frame_p95']} | {speed['frames_per_s']} | "
@@ -152,10 +196,28 @@ def main() -> None:
     given = inputs(data)
     both = ("--renderer", "clean,3dgs", "--policy", "lane-camera", "--seeds", "3")
     real = simrun(runs / "real", *both, *given.values())
-    simrun(runs / "replay", "--renderer", "clean", "--policy", "log-replay", *list(given.values())[1:])
-    suites = {name: simrun(runs / name, *both, f"suites/{name}") for name in ("smoke", "urban", "highway", "hard")}
-    one = simrun(runs / "one", "--renderer", "clean,3dgs", "--policy", "lane-camera", "--workers", "1", "suites/smoke")
-    scenes = list(dict.fromkeys(row["scene"] for row in pq.read_table(runs / "real" / "rollouts.parquet").to_pylist()))
+    simrun(
+        runs / "replay", "--renderer", "clean", "--policy", "log-replay", *list(given.values())[1:]
+    )
+    suites = {
+        name: simrun(runs / name, *both, f"suites/{name}")
+        for name in ("smoke", "urban", "highway", "hard")
+    }
+    one = simrun(
+        runs / "one",
+        "--renderer",
+        "clean,3dgs",
+        "--policy",
+        "lane-camera",
+        "--workers",
+        "1",
+        "suites/smoke",
+    )
+    scenes = list(
+        dict.fromkeys(
+            row["scene"] for row in pq.read_table(runs / "real" / "rollouts.parquet").to_pylist()
+        )
+    )
     for name, scene in zip(given, scenes, strict=True):
         picture(runs / "real", scene, DOCS / "img" / f"drive-{name}.jpg")
     page = DOCS / "experiments" / "clean-and-3dgs.md"
@@ -163,9 +225,14 @@ def main() -> None:
     text = replace(text, "real", table(real) + "\n\n" + scene_table(runs / "real"))
     text = replace(text, "replay", scene_table(runs / "replay"))
     together = pooled([runs / name for name in suites])
-    suites_text = [f"**{name}**\n\n{table(summary)}" for name, summary in {"all four together": together, **suites}.items()]
+    suites_text = [
+        f"**{name}**\n\n{table(summary)}"
+        for name, summary in {"all four together": together, **suites}.items()
+    ]
     text = replace(text, "suites", "\n\n".join(suites_text))
-    text = replace(text, "speed", speed_table({"one rollout at a time": one, "pooled": suites["smoke"]}))
+    text = replace(
+        text, "speed", speed_table({"one rollout at a time": one, "pooled": suites["smoke"]})
+    )
     page.write_text(text)
 
 

@@ -1,8 +1,10 @@
-"""Time what `simrun gate` and `simrun compare` compute of a run: from rows in memory, the readable reference, and from columns.
+"""Time what `simrun gate` and `simrun compare` compute of a run: from rows in memory, the readable
+reference, and from columns.
 
     python docs/scripts/rows_and_columns.py RUN [--turns 3]
 
-Both ways take turns in one process; the least processor time of each counts. Peak memory is that of a fresh process each.
+Both ways take turns in one process; the least processor time of each counts. Peak memory is that of
+a fresh process each.
 """
 
 from __future__ import annotations
@@ -70,13 +72,23 @@ def main() -> None:
     parser.add_argument("--turns", type=int, default=3)
     given = parser.parse_args()
     n = table_of_run(read_run(given.run)).n_rollouts
-    print(f"| {n} rollouts | by rows s | by columns s | ratio | by rows GB | by columns GB |\n| --- | --- | --- | --- | --- | --- |")
+    print(
+        f"| {n} rollouts | by rows s | by columns s | ratio | by rows GB | by columns GB |\n| --- | --- | --- | --- | --- | --- |"
+    )
     for name, ways in WAYS.items():
         assert ways[0](given.run) == ways[1](given.run), name
-        least = [min(times) for times in zip(*([seconds(way, given.run) for way in ways] for _ in range(given.turns)), strict=True)]
+        least = [
+            min(times)
+            for times in zip(
+                *([seconds(way, given.run) for way in ways] for _ in range(given.turns)),
+                strict=True,
+            )
+        ]
         with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
             peaks = [pool.apply(peak_gb, (way, given.run)) for way in ways]
-        print(f"| {name} | {least[0]:.2f} | {least[1]:.2f} | {least[0] / least[1]:.1f} | {peaks[0]:.2f} | {peaks[1]:.2f} |")
+        print(
+            f"| {name} | {least[0]:.2f} | {least[1]:.2f} | {least[0] / least[1]:.1f} | {peaks[0]:.2f} | {peaks[1]:.2f} |"
+        )
 
 
 if __name__ == "__main__":

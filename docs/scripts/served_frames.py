@@ -1,4 +1,5 @@
-"""Measure what `simrun serve` does to a frame: rolling shutters, batches of cameras, and the truth gate of the map.
+"""Measure what `simrun serve` does to a frame: rolling shutters, batches of cameras, and the truth
+gate of the map.
 
 python docs/scripts/served_frames.py shutter SCENARIO WIDTH HEIGHT [--turn DEG_S]    bands against rows: time and error
 python docs/scripts/served_frames.py batch                                          cameras one by one and in one pass
@@ -22,10 +23,23 @@ from alpasim_plugin.alpasim.server import map_gate
 from alpasim_plugin.core.geometry import interpolate, se2
 from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.shutter import bands, bands_of, rolling
-from alpasim_plugin.core.types import F64, CameraSpec, Degradation, Exposure, Frame, RenderRequest, Scenario
+from alpasim_plugin.core.types import (
+    F64,
+    CameraSpec,
+    Degradation,
+    Exposure,
+    Frame,
+    RenderRequest,
+    Scenario,
+)
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
-from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, PreparedMap, actor_boxes, prepare_map
+from alpasim_plugin.fixers.semantic_map.prepare import (
+    ActorBox,
+    PreparedMap,
+    actor_boxes,
+    prepare_map,
+)
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.log.asl import AslReader
 from alpasim_plugin.log.images import decode_image
@@ -58,8 +72,14 @@ def sized(scenario: Scenario, width: int, height: int) -> CameraSpec:
 
 
 def boxes_at(scenario: Scenario, t_us: int, before_us: int = 0) -> dict[str, F64]:
-    """Return the road users that are there at a time and ``before_us`` earlier, as they were then."""
-    present = [a for a in scenario.actors if a.track.t_us[0] <= t_us - before_us and t_us <= a.track.t_us[-1]]
+    """Return the road users that are there at a time and ``before_us`` earlier, as they were
+    then.
+    """
+    present = [
+        a
+        for a in scenario.actors
+        if a.track.t_us[0] <= t_us - before_us and t_us <= a.track.t_us[-1]
+    ]
     return {a.actor_id: interpolate(a.track, t_us - before_us) for a in present}
 
 
@@ -96,7 +116,9 @@ def shutter(name: str, width: int, height: int, turn_deg_s: float) -> None:
 
 
 def batch() -> None:
-    """Print how long some cameras take one by one and together, and how far the pictures lie apart."""
+    """Print how long some cameras take one by one and together, and how far the pictures lie
+    apart.
+    """
     for precision in ("fp32", "bf16"):
         for cameras in (2, 4):
             for height, width in ((90, 160), (144, 256), (320, 576), (540, 960)):
@@ -106,19 +128,39 @@ def batch() -> None:
 
 def batch_row(precision: str, cameras: int, height: int, width: int, references: int) -> str:
     """Return a row of the table of `batch`."""
-    fixer = make_fixer("onefixer", fixer_settings("onefixer", ["noise=content", f"precision={precision}"]), scene_id="x", threads=1)
+    fixer = make_fixer(
+        "onefixer",
+        fixer_settings("onefixer", ["noise=content", f"precision={precision}"]),
+        scene_id="x",
+        threads=1,
+    )
     rng = np.random.default_rng(0)
     block = []
     for i in range(cameras):
         coarse = rng.integers(0, 256, (height // 8 + 1, width // 8 + 1, 3), dtype=np.uint8)
         rgb = np.ascontiguousarray(coarse.repeat(8, 0).repeat(8, 1)[:height, :width])
         valid = np.full((height, width, 1), 255, np.uint8)
-        beside = tuple(np.concatenate([np.roll(rgb, k + 1, 1), valid], axis=2) for k in range(references))
-        block.append(Frame(0, f"c{i}", rgb, np.minimum(2 * rng.random((height, width), dtype=np.float32), 1), references=beside))
+        beside = tuple(
+            np.concatenate([np.roll(rgb, k + 1, 1), valid], axis=2) for k in range(references)
+        )
+        block.append(
+            Frame(
+                0,
+                f"c{i}",
+                rgb,
+                np.minimum(2 * rng.random((height, width), dtype=np.float32), 1),
+                references=beside,
+            )
+        )
     maps = [np.zeros((height, width, 3), np.uint8)] * cameras
-    pasts, alone, together, apart = [None] * cameras, [], [], 0
+    pasts = [None] * cameras
+    alone = []
+    together = []
+    apart = 0
     for step in range(16):  # a shape is recorded after eight
-        block = [replace(frame, t_us=1000 * (step + 1), rgb=np.roll(frame.rgb, 3, 1)) for frame in block]
+        block = [
+            replace(frame, t_us=1000 * (step + 1), rgb=np.roll(frame.rgb, 3, 1)) for frame in block
+        ]
         began = time.perf_counter()
         single = []
         for i, frame in enumerate(block):
@@ -128,30 +170,57 @@ def batch_row(precision: str, cameras: int, height: int, width: int, references:
         began = time.perf_counter()
         joint = fixer.step(block, maps)
         together.append(time.perf_counter() - began)
-        apart = max(apart, *(int(np.abs(a.rgb.astype(int) - b.rgb).max()) for a, b in zip(single, joint, strict=True)))
+        apart = max(
+            apart,
+            *(
+                int(np.abs(a.rgb.astype(int) - b.rgb).max())
+                for a, b in zip(single, joint, strict=True)
+            ),
+        )
     times = [1000 * min(took[10:]) for took in (alone, together)]
     return f"| {precision} | {cameras} | {width} x {height} | {references} | {times[0]:.0f} | {times[1]:.0f} | {apart} |"
 
 
 def truth(run: Path, ports: list[str]) -> None:
-    """Ask services at ``ports`` for what AlpaSim's runtime asked in the first drive of each scene; the first one has the truth."""
+    """Ask services at ``ports`` for what AlpaSim's runtime asked in the first drive of each scene;
+    the first one has the truth.
+    """
     with ExitStack() as stack:
         clients = [stack.enter_context(RendererClient(f"127.0.0.1:{port}")) for port in ports]
         for scene in sorted((run / "rollouts").iterdir()):
             log = AslReader(min(scene.rglob("rollout.asl")))
-            calls = [e.batch_render_request for e in log if e.WhichOneof("log_entry") == "batch_render_request"]
+            calls = [
+                e.batch_render_request
+                for e in log
+                if e.WhichOneof("log_entry") == "batch_render_request"
+            ]
             found = []
             for call in calls:
                 for item in call.items:
                     item.request.image_format = sensorsim_pb2.PNG
-                right, *shown = (client.render([item.request for item in call.items]) for client in clients)
-                found.append([[psnr_db(decode_image(one[name]), decode_image(right[name])) for name in right] for one in shown])
+                right, *shown = (
+                    client.render([item.request for item in call.items]) for client in clients
+                )
+                found.append(
+                    [
+                        [
+                            psnr_db(decode_image(one[name]), decode_image(right[name]))
+                            for name in right
+                        ]
+                        for one in shown
+                    ]
+                )
             gains = np.array(found).mean(axis=2)
-            print(f"| {scene.name} | {len(calls)} | {' | '.join(f'{mean:.2f}' for mean in gains.mean(axis=0))} |", flush=True)
+            print(
+                f"| {scene.name} | {len(calls)} | {' | '.join(f'{mean:.2f}' for mean in gains.mean(axis=0))} |",
+                flush=True,
+            )
 
 
 def gate(names: list[str]) -> None:
-    """Print shares of frames in which the map is contradicted, by renderer and by what is wrong with the map."""
+    """Print shares of frames in which the map is contradicted, by renderer and by what is wrong
+    with the map.
+    """
     counts: dict[tuple[str, str], list[str]] = {}
     for renderer, case, found in gate_cases(names):
         counts.setdefault((renderer, case), []).append(found)
@@ -161,12 +230,16 @@ def gate(names: list[str]) -> None:
 
 
 def gate_cases(names: list[str]) -> Iterator[tuple[str, str, str]]:
-    """Yield renderer, what is wrong with the map, and ``on``, ``off`` or ``unsure``: its lines are found nowhere."""
+    """Yield renderer, what is wrong with the map, and ``on``, ``off`` or ``unsure``: its lines are
+    found nowhere.
+    """
     other: Placed | None = None
     for name in names:
         scenario = load_scenario(name)
         spec, scene_map = sized(scenario, 480, 270), prepare_map(scenario.lane_map)
-        surrogate = SurrogateRenderer(replace(scenario, degradation=Degradation(kind="surrogate")), 0, "cpu", 1)
+        surrogate = SurrogateRenderer(
+            replace(scenario, degradation=Degradation(kind="surrogate")), 0, "cpu", 1
+        )
         renderers = {"clean": CleanRenderer(scenario, 0, "cpu", 1), "3dgs": surrogate}
         for share in (0.15, 0.5, 0.85):
             t_us = int(scenario.start_us + share * (scenario.ego_log.t_us[-1] - scenario.start_us))
@@ -174,7 +247,13 @@ def gate_cases(names: list[str]) -> Iterator[tuple[str, str, str]]:
             boxes = list(actor_boxes(users, scenario.actors))
             for aside_m in (0.0, 1.0):
 
-                def seen(left_m: float, yaw_deg: float = 0.0, rig: F64 = rig, aside_m: float = aside_m, spec: CameraSpec = spec) -> F64:
+                def seen(
+                    left_m: float,
+                    yaw_deg: float = 0.0,
+                    rig: F64 = rig,
+                    aside_m: float = aside_m,
+                    spec: CameraSpec = spec,
+                ) -> F64:
                     return rig @ se2(0, aside_m + left_m, np.deg2rad(yaw_deg)) @ spec.T_rig_camera
 
                 maps: dict[str, Placed] = {
@@ -193,8 +272,17 @@ def gate_cases(names: list[str]) -> Iterator[tuple[str, str, str]]:
         clear_cache()
 
 
-def verdict(scene_map: PreparedMap, spec: CameraSpec, T: F64, boxes: list[ActorBox], rgb: np.ndarray, beside_m: float) -> str:
-    """Return what the gate says of a map; the picture was taken ``beside_m`` to the left of the recorded path."""
+def verdict(
+    scene_map: PreparedMap,
+    spec: CameraSpec,
+    T: F64,
+    boxes: list[ActorBox],
+    rgb: np.ndarray,
+    beside_m: float,
+) -> str:
+    """Return what the gate says of a map; the picture was taken ``beside_m`` to the left of the
+    recorded path.
+    """
     if map_gate.contradiction(scene_map, spec, T, boxes, rgb, beside_m, 1):
         return "off"
     lines = map_gate.line_pixels(draw_map(scene_map, spec, T, threads=1))
@@ -203,7 +291,9 @@ def verdict(scene_map: PreparedMap, spec: CameraSpec, T: F64, boxes: list[ActorB
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=["shutter", "batch", "gate", "truth"])
     parser.add_argument("rest", nargs="*")
     parser.add_argument("--turn", type=float, default=0.0)

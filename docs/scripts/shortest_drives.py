@@ -1,4 +1,5 @@
-"""Scenes of the record docs/experiments/scale.md: `python docs/scripts/shortest_drives.py FOLDER` writes FOLDER/suite500.yaml.
+"""Scenes of the record docs/experiments/scale.md: `python docs/scripts/shortest_drives.py FOLDER`
+writes FOLDER/suite500.yaml.
 
 Five hundred scenes of a straight street, one for each scene seed.
 """

@@ -1,4 +1,6 @@
-"""What AlpaSim does with scored rollouts: its settings file, the scene score, and the table over repeated sweeps."""
+"""What AlpaSim does with scored rollouts: its settings file, the scene score, and the table over
+repeated sweeps.
+"""
 
 from evaluators.alpasim.results import (
     ReducedRollout,

@@ -1,9 +1,12 @@
-"""What AlpaSim makes of scored rollouts: values of a whole run, means over sweeps, the scene score, and its result files.
+"""What AlpaSim makes of scored rollouts: values of a whole run, means over sweeps, the scene score,
+and its result files.
 
-Which metrics exist depends on all rollouts of a run. Rollouts of different scenes are paired by rank: the first in the order of their names
-of every scene make one sweep, the second ones the next. A metric is averaged over the scenes of a sweep, then mean and sample standard
-deviation are taken over sweeps. That spread is neither a scene-to-scene spread nor a confidence interval; `evaluators.statistics` gives
-those. A rollout's score is 0 after a fault, else how much of the recorded path was driven.
+Which metrics exist depends on all rollouts of a run. Rollouts of different scenes are paired by
+rank: the first in the order of their names of every scene make one sweep, the second ones the next.
+A metric is averaged over the scenes of a sweep, then mean and sample standard deviation are taken
+over sweeps. That spread is neither a scene-to-scene spread nor a confidence interval;
+`evaluators.statistics` gives those. A rollout's score is 0 after a fault, else how much of the
+recorded path was driven.
 """
 
 from __future__ import annotations
@@ -58,22 +61,28 @@ class ReducedRollout:
 def reduce_run(rollouts: Sequence[ScoredRollout], preset: Preset) -> list[ReducedRollout]:
     """Reduce all rollouts of a run.
 
-    Off-road follows AlpaSim: where no rollout of the run has it, it counts as 0 when events are combined and is itself left out; where
-    only some have it, events combined with it are unknown for the others unless the other part fired.
+    Off-road follows AlpaSim: where no rollout of the run has it, it counts as 0 when events are
+    combined and is itself left out; where only some have it, events combined with it are unknown
+    for the others unless the other part fired.
 
     Raises:
-        EvaluatorError: No rollout has a camera image: AlpaSim's aggregation needs the black-image test in at least one.
+        EvaluatorError: No rollout has a camera image: AlpaSim's aggregation needs the black-image
+            test in at least one.
     """
     names = {one.name: one.metric for rollout in rollouts for one in rollout.series}
     if rollouts and "img_is_black" not in names:
         raise EvaluatorError(
-            "aggregating as AlpaSim does", f"{len(rollouts)} rollouts", f"no image of camera {preset.image_camera!r} in any log",
+            "aggregating as AlpaSim does",
+            f"{len(rollouts)} rollouts",
+            f"no image of camera {preset.image_camera!r} in any log",
             "log that camera, or name another one in scorers.image.camera_logical_id",
-        )  # fmt: skip
+        )
     return [_reduce(rollout, names, preset) for rollout in rollouts]
 
 
-def _reduce(rollout: ScoredRollout, names: Mapping[str, MetricInfo], preset: Preset) -> ReducedRollout:
+def _reduce(
+    rollout: ScoredRollout, names: Mapping[str, MetricInfo], preset: Preset
+) -> ReducedRollout:
     own = {one.name for one in rollout.series}
     line = next(one.t_us for one in rollout.series if one.name == "eval_relevant")
     added = []
@@ -87,7 +96,12 @@ def _reduce(rollout: ScoredRollout, names: Mapping[str, MetricInfo], preset: Pre
     for name, metric in names.items():
         if name not in own:
             facts = values.get(name) or RolloutValue(None, False, "", metric.unit, metric.direction)
-            values[name] = replace(facts, value=None, valid=False, reason=reduction.ledger.dropped or "not scored in this rollout")
+            values[name] = replace(
+                facts,
+                value=None,
+                valid=False,
+                reason=reduction.ledger.dropped or "not scored in this rollout",
+            )
     return ReducedRollout(rollout, replace(reduction, values=values))
 
 
@@ -98,19 +112,25 @@ INCIDENTS = {
 
 
 def over_sweeps(rollouts: Sequence[ReducedRollout]) -> dict[str, float | int | None]:
-    """Return one row: every metric, ``n_clips`` and the distances between incidents in km, each with ``_std``, and ``n_rollouts``.
+    """Return one row: every metric, ``n_clips`` and the distances between incidents in km, each
+    with ``_std``, and ``n_rollouts``.
 
-    ``n_clips`` is the mean number of scenes of a sweep: a fraction where rollouts were dropped. A distance is inf in a sweep without
-    incident. None where no sweep has a value, or a spread has fewer than two.
+    ``n_clips`` is the mean number of scenes of a sweep: a fraction where rollouts were dropped. A
+    distance is inf in a sweep without incident. None where no sweep has a value, or a spread has
+    fewer than two.
 
     Raises:
         InputError: Two rollouts of a scene have the same name.
     """
     ranks = _ranks(rollouts)
-    kept = [(rank, one.values) for rank, one in zip(ranks, rollouts, strict=True) if not one.dropped]
+    kept = [
+        (rank, one.values) for rank, one in zip(ranks, rollouts, strict=True) if not one.dropped
+    ]
     if not kept:
         return {}
-    sweeps = [[values for rank, values in kept if rank == r] for r in sorted({rank for rank, _ in kept})]
+    sweeps = [
+        [values for rank, values in kept if rank == r] for r in sorted({rank for rank, _ in kept})
+    ]
     rows = [_sweep(sweep) for sweep in sweeps]
     out: dict[str, float | int | None] = {}
     spread: dict[str, float | int | None] = {}
@@ -131,17 +151,24 @@ def _ranks(rollouts: Sequence[ReducedRollout]) -> list[int]:
         twice = next((name for name in own if own.count(name) > 1), None)
         if twice is not None:
             raise InputError(
-                "aggregating as AlpaSim does", f"scene {scene!r}", f"two rollouts named {twice!r}",
+                "aggregating as AlpaSim does",
+                f"scene {scene!r}",
+                f"two rollouts named {twice!r}",
                 "score the runs apart, or rename the folder of one log",
-            )  # fmt: skip
+            )
         own.sort()
     return [names[one.of.scene].index(one.of.rollout) for one in rollouts]
 
 
 def _sweep(rows: Sequence[dict[str, float | None]]) -> dict[str, float | None]:
     names = dict.fromkeys(name for row in rows for name in row)
-    columns = {name: np.array([row[name] for row in rows if row.get(name) is not None], dtype=np.float64) for name in names}
-    out: dict[str, float | None] = {name: float(np.mean(column)) if len(column) else None for name, column in columns.items()}
+    columns = {
+        name: np.array([row[name] for row in rows if row.get(name) is not None], dtype=np.float64)
+        for name in names
+    }
+    out: dict[str, float | None] = {
+        name: float(np.mean(column)) if len(column) else None for name, column in columns.items()
+    }
     out["n_clips"] = float(len(rows))
     for name, event in INCIDENTS.items():
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -168,7 +195,8 @@ class SceneScore:
 
 
 def scene_score(values: Mapping[str, float | None], settings: SceneScoreSettings) -> SceneScore:
-    """Score a rollout: ``min(clip(progress, 0, 1) / saturation, 1)``, 1 on recordings shorter than the least distance, 0 after a fault.
+    """Score a rollout: ``min(clip(progress, 0, 1) / saturation, 1)``, 1 on recordings shorter than
+    the least distance, 0 after a fault.
 
     Args:
         values: Rollout values by metric.
@@ -178,18 +206,27 @@ def scene_score(values: Mapping[str, float | None], settings: SceneScoreSettings
         EvaluatorError: A metric that is needed is missing or not finite; AlpaSim stops there too.
     """
     found: dict[str, float] = {}
-    faults = LATER_FAULTS if LATER_FAULTS[-1] in values else FAULTS  # only a preset that has the rule has the metric
+    faults = (
+        LATER_FAULTS if LATER_FAULTS[-1] in values else FAULTS
+    )  # only a preset that has the rule has the metric
     needed = ("progress_clipped_rel", "gt_dist_traveled_m", *faults)
     for name in needed:
         value = values.get(name)
         if name not in values or value is None or not np.isfinite(value):
-            what = f"missing metric {name!r}" if name not in values else f"metric {name!r} is {value}"
+            what = (
+                f"missing metric {name!r}" if name not in values else f"metric {name!r} is {value}"
+            )
             raise EvaluatorError(
-                "computing the scene score", f"metrics {', '.join(needed)}", what,
+                "computing the scene score",
+                f"metrics {', '.join(needed)}",
+                what,
                 "give the scene a map with road edges, or set scene_score.enabled: false in --settings",
-            )  # fmt: skip
+            )
         found[name] = float(value)
-    progress = min(min(max(found["progress_clipped_rel"], 0.0), 1.0) / settings.progress_saturation_threshold, 1.0)
+    progress = min(
+        min(max(found["progress_clipped_rel"], 0.0), 1.0) / settings.progress_saturation_threshold,
+        1.0,
+    )
     if found["gt_dist_traveled_m"] < settings.min_gt_distance_for_full_score_m:
         progress = 1.0
     reason = next((name for name in faults if found[name] != 0.0), None)
@@ -198,9 +235,14 @@ def scene_score(values: Mapping[str, float | None], settings: SceneScoreSettings
 
 SCHEMA_VERSION = 1
 SCORE_METRICS = (
-    "progress_clipped_rel", "progress_rel", "progress_score", "collision_at_fault", "offroad", "dist_to_gt_trajectory",
+    "progress_clipped_rel",
+    "progress_rel",
+    "progress_score",
+    "collision_at_fault",
+    "offroad",
+    "dist_to_gt_trajectory",
     "gt_dist_traveled_m",
-)  # fmt: skip
+)
 LATER_SCORE_METRICS = (*SCORE_METRICS, "lateral_dist_to_gt_trajectory", "left_corridor_laterally")
 
 
@@ -211,9 +253,15 @@ def combined_run_uuid(rollouts: Sequence[ScoredRollout]) -> str:
 
 
 def metrics_unprocessed_table(rollouts: Sequence[ScoredRollout]) -> pa.Table:
-    """Return every step of every metric, long; a metric without values has one row without a time."""
-    columns: dict[str, list[Any]] = {name: [] for name in ("name", "timestamps_us", "values", "valid", "time_aggregation")}
-    ids: dict[str, list[Any]] = {name: [] for name in ("clipgt_id", "rollout_id", "run_uuid", "run_name")}
+    """Return every step of every metric, long; a metric without values has one row without a
+    time.
+    """
+    columns: dict[str, list[Any]] = {
+        name: [] for name in ("name", "timestamps_us", "values", "valid", "time_aggregation")
+    }
+    ids: dict[str, list[Any]] = {
+        name: [] for name in ("clipgt_id", "rollout_id", "run_uuid", "run_name")
+    }
     for rollout in rollouts:
         for one in rollout.series:
             n = max(len(one.t_us), 1)
@@ -222,17 +270,33 @@ def metrics_unprocessed_table(rollouts: Sequence[ScoredRollout]) -> pa.Table:
             columns["values"] += one.value.tolist() or [None]
             columns["valid"] += one.valid.tolist() or [None]
             columns["time_aggregation"] += [one.metric.aggregation] * n
-            for name, value in zip(ids, (rollout.scene, rollout.rollout, rollout.run_uuid, rollout.run_name), strict=True):
+            for name, value in zip(
+                ids,
+                (rollout.scene, rollout.rollout, rollout.run_uuid, rollout.run_name),
+                strict=True,
+            ):
                 ids[name] += [value] * n
     types = [pa.string(), pa.int64(), pa.float64(), pa.bool_(), pa.string(), *[pa.string()] * 4]
     data = {**columns, **ids}
-    return pa.table({name: pa.array(values, type=kind) for (name, values), kind in zip(data.items(), types, strict=True)})
+    return pa.table(
+        {
+            name: pa.array(values, type=kind)
+            for (name, values), kind in zip(data.items(), types, strict=True)
+        }
+    )
 
 
-def metrics_results_table(row: Mapping[str, float | int | None], rollouts: Sequence[ScoredRollout]) -> pa.Table:
+def metrics_results_table(
+    row: Mapping[str, float | int | None], rollouts: Sequence[ScoredRollout]
+) -> pa.Table:
     """Return the one-row table over sweeps."""
-    columns: dict[str, pa.Array] = {"run_uuid": pa.array([combined_run_uuid(rollouts)], pa.string())}
-    columns |= {name: pa.array([value], pa.int64() if name == "n_rollouts" else pa.float64()) for name, value in row.items()}
+    columns: dict[str, pa.Array] = {
+        "run_uuid": pa.array([combined_run_uuid(rollouts)], pa.string())
+    }
+    columns |= {
+        name: pa.array([value], pa.int64() if name == "n_rollouts" else pa.float64())
+        for name, value in row.items()
+    }
     columns["run_name"] = pa.array([rollouts[0].run_name if rollouts else None], pa.string())
     return pa.table(columns)
 
@@ -244,12 +308,14 @@ def results_summary(
     sweeps: Mapping[str, float | int | None],
     settings: SceneScoreSettings,
 ) -> dict[str, Any]:
-    """Return ``results-summary.json``: one entry per counted rollout, failed ones after them, then the row over sweeps.
+    """Return ``results-summary.json``: one entry per counted rollout, failed ones after them, then
+    the row over sweeps.
 
     Args:
         rollouts: All reduced rollouts; dropped ones have no entry.
         scores: Scene score by index into ``rollouts``; empty where the score is off.
-        failed: ``clipgt_id``, ``rollout_id``, ``run_uuid``, ``run_name`` and ``error`` of rollouts that failed.
+        failed: ``clipgt_id``, ``rollout_id``, ``run_uuid``, ``run_name`` and ``error`` of rollouts
+            that failed.
         sweeps: What `over_sweeps` gave.
         settings: Of the scene score.
     """
@@ -258,17 +324,31 @@ def results_summary(
     shown = LATER_SCORE_METRICS if later else SCORE_METRICS
     counted = [(i, one) for i, one in enumerate(rollouts) if not one.dropped]
     entries = [
-        _entry(one, scores.get(i), run_uuid, shown) for i, one in sorted(counted, key=lambda item: (item[1].of.scene, item[1].of.rollout))
+        _entry(one, scores.get(i), run_uuid, shown)
+        for i, one in sorted(counted, key=lambda item: (item[1].of.scene, item[1].of.rollout))
     ]
     for failure in failed:
         ids = {key: failure.get(key) for key in ("run_uuid", "run_name", "clipgt_id", "rollout_id")}
         error = failure.get("error")
-        entry = ids | {"status": "fail", "passed": False, "failure_reason": error, "metrics": ids | {"error": error}}
+        entry = ids | {
+            "status": "fail",
+            "passed": False,
+            "failure_reason": error,
+            "metrics": ids | {"error": error},
+        }
         if settings.enabled:
-            entry |= {"score": 0.0, "score_metrics": {name: 0.0 if name == "progress_score" else None for name in shown}}
+            entry |= {
+                "score": 0.0,
+                "score_metrics": {
+                    name: 0.0 if name == "progress_score" else None for name in shown
+                },
+            }
         entries.append(entry)
     name = rollouts[0].of.run_name if rollouts else None
-    saturation, least = settings.progress_saturation_threshold, settings.min_gt_distance_for_full_score_m
+    saturation, least = (
+        settings.progress_saturation_threshold,
+        settings.min_gt_distance_for_full_score_m,
+    )
     overall: dict[str, Any] = {key: _number(value) for key, value in sweeps.items()}
     out: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
@@ -288,8 +368,15 @@ def results_summary(
     return out
 
 
-def _entry(one: ReducedRollout, score: SceneScore | None, run_uuid: str, shown: Sequence[str]) -> dict[str, Any]:
-    ids = {"run_uuid": run_uuid, "run_name": one.of.run_name, "clipgt_id": one.of.scene, "rollout_id": one.of.rollout}
+def _entry(
+    one: ReducedRollout, score: SceneScore | None, run_uuid: str, shown: Sequence[str]
+) -> dict[str, Any]:
+    ids = {
+        "run_uuid": run_uuid,
+        "run_name": one.of.run_name,
+        "clipgt_id": one.of.scene,
+        "rollout_id": one.of.rollout,
+    }
     values = {name: _number(value) for name, value in one.values.items()}
     status = "unscored" if score is None else "pass" if score.passed else "fail"
     own = {} if score is None else {"progress_score": score.progress_score}
@@ -298,7 +385,9 @@ def _entry(one: ReducedRollout, score: SceneScore | None, run_uuid: str, shown: 
         "passed": None if score is None else score.passed,
         "score": None if score is None else score.score,
         "failure_reason": None if score is None else score.failure_reason,
-        "score_metrics": None if score is None else {name: (values | own).get(name) for name in shown},
+        "score_metrics": None
+        if score is None
+        else {name: (values | own).get(name) for name in shown},
         "metrics": values | ids,
     }
 

@@ -23,7 +23,9 @@ class _Part(BaseModel):
 class MinAde(_Part):
     """Scorer of plan samples."""
 
-    time_deltas: tuple[Annotated[float, Field(gt=0)], ...] = Field(default=(0.5, 1.0, 2.5, 5.0), min_length=1)
+    time_deltas: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        default=(0.5, 1.0, 2.5, 5.0), min_length=1
+    )
     incl_z: bool = False
     target: Literal["GT", "SELF"] = "GT"
 
@@ -79,7 +81,9 @@ class Modifiers(_Part):
 
 
 class EvalSettings(_Part):
-    """The settings file. Sections that change no number (video, vec_map, processes) are accepted and not used."""
+    """The settings file. Sections that change no number (video, vec_map, processes) are accepted
+    and not used.
+    """
 
     aggregation_modifiers: Modifiers = Modifiers()
     allow_aggregation_with_failed_rollouts: bool = False
@@ -88,7 +92,9 @@ class EvalSettings(_Part):
     vehicle: VehicleShape = VehicleShape()
     enabled: bool = True
     num_processes: int = 1
-    parse_unstructured_debug_info: bool = False  # accepted; a driver's pickled bytes are never opened here
+    parse_unstructured_debug_info: bool = (
+        False  # accepted; a driver's pickled bytes are never opened here
+    )
     run_in_runtime: bool = True
     vec_map: dict[str, Any] = {}
     video: dict[str, Any] = {}
@@ -115,6 +121,7 @@ def load_settings(path: str | Path) -> EvalSettings:
     """Read a settings file.
 
     Raises:
-        InputError: Missing or broken file, unknown key, or a value out of range, with line and column.
+        InputError: Missing or broken file, unknown key, or a value out of range, with line and
+            column.
     """
     return validate(EvalSettings, load_yaml(path, DOING), DOING)

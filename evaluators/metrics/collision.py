@@ -1,7 +1,9 @@
-"""Contact with other actors: flags by side, the least gap, and where contact is searched between steps, time and place.
+"""Contact with other actors: flags by side, the least gap, and where contact is searched between
+steps, time and place.
 
-At fault is front or lateral. By the paper's protocol only logged instants are looked at (`evaluators.metrics.contact`); preset ``strict``
-searches the motion between them as well (`evaluators.metrics.contact`), and a row then says what happened since the row before.
+At fault is front or lateral. By the paper's protocol only logged instants are looked at
+(`evaluators.metrics.contact`); preset ``strict`` searches the motion between them as well
+(`evaluators.metrics.contact`), and a row then says what happened since the row before.
 """
 
 from __future__ import annotations
@@ -12,7 +14,15 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.types import F64, I64, STANDING_ID, Bool, MetricSeries, RolloutLog, Scene
-from evaluators.metrics.contact import FRONT, LATERAL, REAR, SweptContacts, find_contacts, find_swept, last_per_step
+from evaluators.metrics.contact import (
+    FRONT,
+    LATERAL,
+    REAR,
+    SweptContacts,
+    find_contacts,
+    find_swept,
+    last_per_step,
+)
 from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.presets import preset as find_preset
@@ -34,7 +44,9 @@ class ContactEvent:
     y_m: float  # rig frame, left
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the fields by name, for a manifest; micrometres and tenths of microseconds are rounded away."""
+        """Return the fields by name, for a manifest; micrometres and tenths of microseconds are
+        rounded away.
+        """
         return {
             "actor_id": self.actor_id,
             "t_s": round(self.t_s, 6),
@@ -44,7 +56,9 @@ class ContactEvent:
         }
 
 
-def contact_events(rollout: RolloutLog, preset: str | Preset = "strict") -> tuple[ContactEvent, ...]:
+def contact_events(
+    rollout: RolloutLog, preset: str | Preset = "strict"
+) -> tuple[ContactEvent, ...]:
     """Return the beginning of every contact at or between steps, in order of time.
 
     Args:
@@ -61,16 +75,23 @@ def contact_events(rollout: RolloutLog, preset: str | Preset = "strict") -> tupl
     begun = find_swept(ego, actors, rollout.ego.t_us, at_steps, handover_us(rollout)).onsets
     places = in_rig(begun.xy, rollout)
     return tuple(
-        ContactEvent(actors.ids[begun.actor[k]], float(begun.t_s[k]), SIDES[int(begun.side[k])], float(places[k, 0]), float(places[k, 1]))
+        ContactEvent(
+            actors.ids[begun.actor[k]],
+            float(begun.t_s[k]),
+            SIDES[int(begun.side[k])],
+            float(places[k, 0]),
+            float(places[k, 1]),
+        )
         for k in np.argsort(begun.t_s, kind="stable")
     )
 
 
 def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
-    """Give the ``collision_*`` flags and ``min_distance_to_obstacle_m`` per step, and ``contact_*`` where motion is searched too.
+    """Give the ``collision_*`` flags and ``min_distance_to_obstacle_m`` per step, and ``contact_*``
+    where motion is searched too.
 
-    In a recorded drive whose standing obstacles were found in its reconstruction, contact with them is also reported apart; where they were
-    not looked for, only contact is known, not its absence.
+    In a recorded drive whose standing obstacles were found in its reconstruction, contact with them
+    is also reported apart; where they were not looked for, only contact is known, not its absence.
     """
     origin = origin_of(rollout.ego, preset)
     t_us = rollout.ego.t_us
@@ -78,37 +99,63 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
     contacts, gap_m = find_contacts(ego, actors, t_us)
     if preset.hits == "last":
         contacts = last_per_step(contacts, ego, actors, t_us)
-    step, side, actor = contacts.step, contacts.side, contacts.actor
+    step = contacts.step
+    side = contacts.side
+    actor = contacts.actor
     first: list[MetricSeries] = []
     if preset.contact == "between_steps":
         swept = find_swept(ego, actors, t_us, contacts, handover_us(rollout))
-        step, side, actor, first = swept.step, swept.side, swept.actor, _first_contacts(rollout, swept)
+        step = swept.step
+        side = swept.side
+        actor = swept.actor
+        first = _first_contacts(rollout, swept)
         gap_m[step] = 0.0
     touched = np.zeros((3, len(t_us)), dtype=np.bool_)
     touched[side, step] = True
-    front, rear, lateral = touched[FRONT], touched[REAR], touched[LATERAL]
+    front = touched[FRONT]
+    rear = touched[REAR]
+    lateral = touched[LATERAL]
     there = np.isfinite(gap_m)
 
     def flag(name: str, fired: Bool) -> MetricSeries:
         return series(name, t_us, fired, fired | (scene.standing != "unknown"), NOT_LOOKED_FOR)
 
-    gap_known, why = (there, "no other actor is present") if scene.standing != "unknown" else (there & (gap_m == 0), NOT_LOOKED_FOR)
+    gap_known, why = (
+        (there, "no other actor is present")
+        if scene.standing != "unknown"
+        else (there & (gap_m == 0), NOT_LOOKED_FOR)
+    )
     return [
         flag("collision_any", front | rear | lateral),
         *([] if preset.hits == "last" else [flag("collision_at_fault", front | lateral)]),
         flag("collision_front", front),
         flag("collision_lateral", lateral),
         flag("collision_rear", rear),
-        *([flag("collision_standing", _standing(actors, actor, step, len(t_us)))] if scene.standing != "known" else []),
-        series("min_distance_to_obstacle_m", t_us, gap_m, gap_known, why, keep_values=not preset.honour_valid),
+        *(
+            [flag("collision_standing", _standing(actors, actor, step, len(t_us)))]
+            if scene.standing != "known"
+            else []
+        ),
+        series(
+            "min_distance_to_obstacle_m",
+            t_us,
+            gap_m,
+            gap_known,
+            why,
+            keep_values=not preset.honour_valid,
+        ),
         *first,
     ]
 
 
 def _standing(actors: ActorTable, actor: I64, step: I64, count: int) -> Bool:
-    """Return at which steps something touches the ego that was found standing in a reconstruction."""
+    """Return at which steps something touches the ego that was found standing in a
+    reconstruction.
+    """
     touched = np.zeros(count, dtype=np.bool_)
-    touched[[k for k, one in zip(step, actor, strict=True) if actors.ids[one].startswith(STANDING_ID)]] = True
+    touched[
+        [k for k, one in zip(step, actor, strict=True) if actors.ids[one].startswith(STANDING_ID)]
+    ] = True
     return touched
 
 
@@ -123,7 +170,11 @@ def _first_contacts(rollout: RolloutLog, swept: SweptContacts) -> list[MetricSer
     touched[step] = True
     x_m, y_m = in_rig(began.xy[begin], rollout).T
     out = []
-    for name, values in (("contact_time_s", began.t_s[begin]), ("contact_x_m", x_m), ("contact_y_m", y_m)):
+    for name, values in (
+        ("contact_time_s", began.t_s[begin]),
+        ("contact_x_m", x_m),
+        ("contact_y_m", y_m),
+    ):
         full = np.full(len(t_us), np.nan)
         full[step] = values
         out.append(series(name, t_us, full, touched, NO_CONTACT))

@@ -1,14 +1,19 @@
-"""Contact with other actors, at logged instants and between them: which actor, which side of the ego, when and where; and the least gap.
+"""Contact with other actors, at logged instants and between them: which actor, which side of the
+ego, when and where; and the least gap.
 
-**At steps** (paper, appendix "Collision"): the plan-view polygons of ego and actors are intersected; an actor that touches the front-bumper
-segment is a front contact, else one that touches the rear-bumper segment a rear contact, else a lateral one. Touching counts as contact.
-All pairs of a rollout are handled at once: centre distances rule out nearly all of them, shapely's exact predicates decide the rest.
+**At steps** (paper, appendix "Collision"): the plan-view polygons of ego and actors are
+intersected; an actor that touches the front-bumper segment is a front contact, else one that
+touches the rear-bumper segment a rear contact, else a lateral one. Touching counts as contact. All
+pairs of a rollout are handled at once: centre distances rule out nearly all of them, shapely's
+exact predicates decide the rest.
 
-**Between steps** a body's centre moves straight and its heading turns at a constant rate the shorter way. Which actors can come near is
-found by an R-tree over x, y and t of stretches of their tracks; the rest is solved by `evaluators.metrics.sweep`, for all pairs at once. A
-contact has one side from its beginning to its end: the one that its normal leaves the ego through, front, rear or lateral. At a corner that
-is the side nearer to the normal's direction; a tie is front before rear before lateral. Contact that is there from the start, or from an
-actor's first logged time, has no first touch; its normal is the shortest way out of the overlap.
+**Between steps** a body's centre moves straight and its heading turns at a constant rate the
+shorter way. Which actors can come near is found by an R-tree over x, y and t of stretches of their
+tracks; the rest is solved by `evaluators.metrics.sweep`, for all pairs at once. A contact has one
+side from its beginning to its end: the one that its normal leaves the ego through, front, rear or
+lateral. At a corner that is the side nearer to the normal's direction; a tie is front before rear
+before lateral. Contact that is there from the start, or from an actor's first logged time, has no
+first touch; its normal is the shortest way out of the overlap.
 """
 
 from __future__ import annotations
@@ -24,8 +29,11 @@ from alpasim_plugin.core.types import F64, I64, Bool
 from evaluators.metrics.footprint import ActorTable, Footprints
 from evaluators.metrics.sweep import Motions, first_contact, gaps
 
-FRONT, REAR, LATERAL = 0, 1, 2
-# Slack of the distance filter: far above rounding, far below any size, so that the filter never rules out a touching pair.
+FRONT = 0
+REAR = 1
+LATERAL = 2
+# Slack of the distance filter: far above rounding, far below any size, so that the filter never
+# rules out a touching pair.
 _SLACK_M = 1e-6
 
 
@@ -47,7 +55,8 @@ def find_contacts(ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[Conta
         t_us: ``(T,)`` times.
 
     Returns:
-        The contacts, and ``(T,)`` metres from the ego to the nearest actor: 0 on touch, inf where no actor is present.
+        The contacts, and ``(T,)`` metres from the ego to the nearest actor: 0 on touch, inf where
+        no actor is present.
     """
     gap_m = np.full(len(t_us), np.inf)
     none = np.zeros(0, dtype=np.int64)
@@ -57,40 +66,57 @@ def find_contacts(ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[Conta
     centre_m = there.centre_distance_m(ego.xy)  # (A, T)
     at_least = centre_m - ego.radius_m[None] - actors.radius_m[:, None]
     at_most = centre_m - ego.inner_radius_m[None] - actors.inner_radius_m[:, None]
-    # The nearest footprint is among those that could be as near as the surest one; every touching one is among them too.
+    # The nearest footprint is among those that could be as near as the surest one; every touching
+    # one is among them too.
     candidate = there.present & (at_least <= np.maximum(at_most.min(axis=0), 0.0)[None] + _SLACK_M)
     step, actor = np.nonzero(candidate.T)
     ego_shapes = ego.shapes()
     boxes = there.footprints(actor, step).shapes()
     distance_m = shapely.distance(ego_shapes[step], boxes)
     np.minimum.at(gap_m, step, distance_m)
-    # Distance 0 and "intersects" may differ by rounding; the predicate is exact and decides, and the gap follows it.
+    # Distance 0 and "intersects" may differ by rounding; the predicate is exact and decides, and
+    # the gap follows it.
     touch = shapely.intersects(ego_shapes[step], boxes)
     gap_m[step[touch]] = 0.0
-    step, actor, boxes = step[touch], actor[touch], boxes[touch]
+    step = step[touch]
+    actor = actor[touch]
+    boxes = boxes[touch]
     front, rear = ego.take(step).bumpers()
-    side = np.where(shapely.intersects(boxes, front), FRONT, np.where(shapely.intersects(boxes, rear), REAR, LATERAL))
+    side = np.where(
+        shapely.intersects(boxes, front),
+        FRONT,
+        np.where(shapely.intersects(boxes, rear), REAR, LATERAL),
+    )
     return Contacts(step, actor, side.astype(np.int64)), gap_m
 
 
 def last_per_step(contacts: Contacts, ego: Footprints, actors: ActorTable, t_us: I64) -> Contacts:
     """Keep of each step's contacts the one that the spatial index names last.
 
-    AlpaSim builds an STRtree of the ego and all present actors at every step, in the log's order, and the last result decides. The
-    order depends on the tree's layout, so the tree is built the same way here, for the steps with more than one contact.
+    AlpaSim builds an STRtree of the ego and all present actors at every step, in the log's order,
+    and the last result decides. The order depends on the tree's layout, so the tree is built the
+    same way here, for the steps with more than one contact.
     """
     keep = np.ones(len(contacts.step), dtype=np.bool_)
     there = actors.at(t_us)
     for step in np.flatnonzero(np.bincount(contacts.step, minlength=len(t_us)) > 1):
         present = np.flatnonzero(there.present[:, step])
-        shapes = np.concatenate([ego.take(np.array([step])).shapes(), there.footprints(present, np.full(len(present), step)).shapes()])
-        order = [i for i in shapely.STRtree(shapes).query(shapes[0], predicate="intersects") if i != 0]
+        shapes = np.concatenate(
+            [
+                ego.take(np.array([step])).shapes(),
+                there.footprints(present, np.full(len(present), step)).shapes(),
+            ]
+        )
+        order = [
+            i for i in shapely.STRtree(shapes).query(shapes[0], predicate="intersects") if i != 0
+        ]
         rows = np.flatnonzero(contacts.step == step)
         keep[rows[contacts.actor[rows] != present[order[-1] - 1]]] = False
     return Contacts(contacts.step[keep], contacts.actor[keep], contacts.side[keep])
 
 
-PLACE_M = 1e-6  # where two bodies touch is read off their overlap when the ego is this much larger on every side
+# where two bodies touch is read off their overlap when the ego is this much larger on every side
+PLACE_M = 1e-6
 _STRETCH = 16  # logged poses per box of the tree: few boxes, and little of the road in each
 _SLACK_M = 1e-6
 _SLACK_S = 1e-9  # far below the microsecond of the logs, far above the rounding of seconds
@@ -108,7 +134,9 @@ class ContactOnsets:
 
 @dataclass(frozen=True)
 class SweptContacts:
-    """Rows in which an actor touches the ego: at the row's time, or at any time since the row before."""
+    """Rows in which an actor touches the ego: at the row's time, or at any time since the row
+    before.
+    """
 
     step: I64  # (M,)
     actor: I64  # (M,)
@@ -132,7 +160,9 @@ class _Found:
     xy: F64  # (M, 2)
 
 
-def find_swept(ego: Footprints, actors: ActorTable, t_us: I64, at_steps: Contacts, handover_us: int) -> SweptContacts:
+def find_swept(
+    ego: Footprints, actors: ActorTable, t_us: I64, at_steps: Contacts, handover_us: int
+) -> SweptContacts:
     """Find all contacts at and between steps.
 
     Args:
@@ -140,12 +170,15 @@ def find_swept(ego: Footprints, actors: ActorTable, t_us: I64, at_steps: Contact
         actors: All other actors.
         t_us: ``(T,)`` times.
         at_steps: What touches at the times themselves; decided by exact predicates.
-        handover_us: When the policy takes over. A contact before it belongs to the row before it, although the next row is the policy's.
+        handover_us: When the policy takes over. A contact before it belongs to the row before it,
+            although the next row is the policy's.
     """
     touch = np.zeros((len(actors), len(t_us)), dtype=np.bool_)
     touch[at_steps.actor, at_steps.step] = True
     found = _between(ego, actors, t_us, touch)
-    forced = (found.t_s < (handover_us - t_us[0]) * 1e-6) & (t_us[np.minimum(found.interval + 1, len(t_us) - 1)] >= handover_us)
+    forced = (found.t_s < (handover_us - t_us[0]) * 1e-6) & (
+        t_us[np.minimum(found.interval + 1, len(t_us) - 1)] >= handover_us
+    )
     row = np.where(forced, found.interval, found.interval + 1)
     began = np.zeros_like(touch)
     began[found.actor, np.minimum(found.interval + 1, len(t_us) - 1)] = True
@@ -155,20 +188,28 @@ def find_swept(ego: Footprints, actors: ActorTable, t_us: I64, at_steps: Contact
     onsets, order = _onsets(found, at_steps, fresh, ego, actors, t_us)
     place_of = np.empty(len(order), dtype=np.int64)
     place_of[order] = np.arange(len(order))
-    # Rows with contact at their own time follow the latest beginning of that actor; the others are the beginning's own row.
+    # Rows with contact at their own time follow the latest beginning of that actor; the others are
+    # the beginning's own row.
     span = (t_us[-1] - t_us[0]) * 1e-6 + 1.0
     keys = onsets.actor * span + onsets.t_s
     at = at_steps.actor * span + (t_us[at_steps.step] - t_us[0]) * 1e-6
     latest = np.searchsorted(keys, at + _SLACK_S, side="right") - 1
     alone = np.flatnonzero(~touch[found.actor, row])
-    step, actor = np.concatenate([at_steps.step, row[alone]]), np.concatenate([at_steps.actor, found.actor[alone]])
+    step, actor = (
+        np.concatenate([at_steps.step, row[alone]]),
+        np.concatenate([at_steps.actor, found.actor[alone]]),
+    )
     begin = np.concatenate([latest, place_of[alone]])
     rank = np.lexsort((actor, step))
     return SweptContacts(step[rank], actor[rank], begin[rank], onsets)
 
 
-def _onsets(found: _Found, at_steps: Contacts, fresh: I64, ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[ContactOnsets, I64]:
-    """Join contacts found between steps with those that are there at once; also return how they were sorted (found ones first)."""
+def _onsets(
+    found: _Found, at_steps: Contacts, fresh: I64, ego: Footprints, actors: ActorTable, t_us: I64
+) -> tuple[ContactOnsets, I64]:
+    """Join contacts found between steps with those that are there at once; also return how they
+    were sorted (found ones first).
+    """
     step, actor = at_steps.step[fresh], at_steps.actor[fresh]
     boxes = actors.boxes(actor, t_us[step])
     still = np.zeros((len(fresh), 2))
@@ -180,7 +221,9 @@ def _onsets(found: _Found, at_steps: Contacts, fresh: I64, ego: Footprints, acto
     t_s = np.concatenate([found.t_s, (t_us[step] - t_us[0]) * 1e-6])
     side = np.concatenate([found.side, at_once])
     order = np.lexsort((t_s, who))
-    return ContactOnsets(who[order], t_s[order], side[order], np.concatenate([found.xy, xy])[order]), order
+    return ContactOnsets(
+        who[order], t_s[order], side[order], np.concatenate([found.xy, xy])[order]
+    ), order
 
 
 def _between(ego: Footprints, actors: ActorTable, t_us: I64, touch: Bool) -> _Found:
@@ -203,18 +246,25 @@ def _between(ego: Footprints, actors: ActorTable, t_us: I64, touch: Bool) -> _Fo
 
 
 def near_in_time(ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[I64, I64]:
-    """Return pairs ``(M,)`` of actor and interval (from step i to i + 1) in which the two could touch, by stretches of their paths."""
+    """Return pairs ``(M,)`` of actor and interval (from step i to i + 1) in which the two could
+    touch, by stretches of their paths.
+    """
     none = np.zeros(0, dtype=np.int64)
     if len(t_us) < 2 or not len(actors):
         return none, none
-    boxes = [_stretches(actors.path_of(a), actors.times_of(a) - t_us[0], float(actors.radius_m[a])) for a in range(len(actors))]
+    boxes = [
+        _stretches(actors.path_of(a), actors.times_of(a) - t_us[0], float(actors.radius_m[a]))
+        for a in range(len(actors))
+    ]
     owner = np.repeat(np.arange(len(actors)), [len(low) for low, _ in boxes])
     low, high = (np.concatenate([one[k] for one in boxes]) for k in (0, 1))
     tree = index.Index((np.arange(len(owner)), low, high), properties=index.Property(dimension=3))
     ego_low, ego_high = _stretches(ego.xy, t_us - t_us[0], float(ego.radius_m.max()) + _SLACK_M)
     ids, counts = tree.intersection_v(ego_low, ego_high)
     stretch = np.repeat(np.arange(len(ego_low)), counts.astype(np.int64))
-    met = np.unique(np.stack([owner[ids], stretch], axis=1), axis=0)  # an actor may meet a stretch with several of its own
+    met = np.unique(
+        np.stack([owner[ids], stretch], axis=1), axis=0
+    )  # an actor may meet a stretch with several of its own
     actor = np.repeat(met[:, 0], _STRETCH)
     interval = (met[:, 1:] * _STRETCH + np.arange(_STRETCH)).reshape(-1)
     inside = interval < len(t_us) - 1
@@ -222,7 +272,9 @@ def near_in_time(ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[I64, I
 
 
 def _stretches(path: F64, t: I64, radius_m: float) -> tuple[F64, F64]:
-    """Return the corners ``(N, 3)`` of boxes in x, y, t around stretches of a path ``(P, 2)``; neighbours share a pose."""
+    """Return the corners ``(N, 3)`` of boxes in x, y, t around stretches of a path ``(P, 2)``;
+    neighbours share a pose.
+    """
     starts = np.arange(0, max(len(path) - 1, 1), _STRETCH)
     ends = np.minimum(starts + _STRETCH, len(path) - 1)
     low = np.minimum(np.minimum.reduceat(path, starts), path[ends]) - radius_m
@@ -231,16 +283,26 @@ def _stretches(path: F64, t: I64, radius_m: float) -> tuple[F64, F64]:
 
 
 def _pieces(actors: ActorTable, actor: I64, begin: I64, end: I64) -> tuple[I64, I64, I64]:
-    """Cut intervals ``(M,)`` at the actor's logged times and to its presence; return (row of the interval, start, end) in order."""
-    pair, start, stop = [], [], []
+    """Cut intervals ``(M,)`` at the actor's logged times and to its presence; return (row of the
+    interval, start, end) in order.
+    """
+    pair = []
+    start = []
+    stop = []
     for a in np.unique(actor):
         mine = np.flatnonzero(actor == a)
         logged = actors.times_of(int(a))
         first, last = np.maximum(begin[mine], logged[0]), np.minimum(end[mine], logged[-1])
-        # An interval that only meets the presence at one of its own ends is decided there, at the step.
+        # An interval that only meets the presence at one of its own ends is decided there, at the
+        # step.
         inside = (first < last) | ((first == last) & (first > begin[mine]) & (first < end[mine]))
-        mine, first, last = mine[inside], first[inside], last[inside]
-        low, high = np.searchsorted(logged, first, side="right"), np.searchsorted(logged, last, side="left")
+        mine = mine[inside]
+        first = first[inside]
+        last = last[inside]
+        low, high = (
+            np.searchsorted(logged, first, side="right"),
+            np.searchsorted(logged, last, side="left"),
+        )
         n = np.maximum(high - low, 0) + 1
         row = np.repeat(np.arange(len(mine)), n)
         k = np.arange(len(row)) - np.repeat(np.cumsum(n) - n, n)
@@ -252,14 +314,23 @@ def _pieces(actors: ActorTable, actor: I64, begin: I64, end: I64) -> tuple[I64, 
     return np.concatenate(pair or none), np.concatenate(start or none), np.concatenate(stop or none)
 
 
-def _motions(ego: Footprints, actors: ActorTable, t_us: I64, actor: I64, interval: I64, t0: I64, t1: I64) -> Motions:
-    """Return the relative motion of ego and actors over pieces ``(M,)`` from t0 to t1 within an interval."""
+def _motions(
+    ego: Footprints, actors: ActorTable, t_us: I64, actor: I64, interval: I64, t0: I64, t1: I64
+) -> Motions:
+    """Return the relative motion of ego and actors over pieces ``(M,)`` from t0 to t1 within an
+    interval.
+    """
     span = (t_us[interval + 1] - t_us[interval]).astype(np.float64)
     turn = wrap_angle(ego.yaw[interval + 1] - ego.yaw[interval])
     ego_at = []
     for t in (t0, t1):
         f = (t - t_us[interval]) / span
-        ego_at.append((ego.xy[interval] * (1 - f)[:, None] + ego.xy[interval + 1] * f[:, None], ego.yaw[interval] + f * turn))
+        ego_at.append(
+            (
+                ego.xy[interval] * (1 - f)[:, None] + ego.xy[interval + 1] * f[:, None],
+                ego.yaw[interval] + f * turn,
+            )
+        )
     first, last = actors.boxes(actor, t0), actors.boxes(actor, t1)
     start = first.xy - ego_at[0][0]
     return Motions(
@@ -272,7 +343,9 @@ def _motions(ego: Footprints, actors: ActorTable, t_us: I64, actor: I64, interva
 
 
 def _place(pairs: Motions, tau: F64) -> tuple[I64, F64]:
-    """Return side ``(M,)`` and place ``(M, 2)`` of touching pairs: the middle of what they share, in the ego's box frame."""
+    """Return side ``(M,)`` and place ``(M, 2)`` of touching pairs: the middle of what they share,
+    in the ego's box frame.
+    """
     at = pairs.start + tau[:, None] * pairs.shift
     yaw = pairs.yaw + tau[:, None] * pairs.turn
     c, s = np.cos(yaw[:, 0]), np.sin(yaw[:, 0])
@@ -290,8 +363,12 @@ def _sides(pairs: Motions, tau: F64) -> I64:
     """Return the side ``(M,)`` of the ego that the normal of touching pairs leaves through."""
     gap = gaps(pairs, tau)  # (M, 8)
     turned = pairs.yaw[:, 1] - pairs.yaw[:, 0] + tau * (pairs.turn[:, 1] - pairs.turn[:, 0])
-    c, s, one, zero = np.cos(turned), np.sin(turned), np.ones(len(tau)), np.zeros(len(tau))
-    # Forward and left part of the directions that `gaps` looks along, ego's first; odd columns look the other way.
+    c = np.cos(turned)
+    s = np.sin(turned)
+    one = np.ones(len(tau))
+    zero = np.zeros(len(tau))
+    # Forward and left part of the directions that `gaps` looks along, ego's first; odd columns look
+    # the other way.
     forward = np.repeat(np.stack([one, zero, c, -s], axis=1), 2, axis=1) * np.tile([1.0, -1.0], 4)
     left = np.repeat(np.stack([zero, one, s, c], axis=1), 2, axis=1)
     normal = gap >= gap.max(axis=1, keepdims=True) - PLACE_M

@@ -1,7 +1,9 @@
-"""Plan-view footprints: the ego's and all actors' rectangles at any set of times, as arrays; and rows of different lengths in one array.
+"""Plan-view footprints: the ego's and all actors' rectangles at any set of times, as arrays; and
+rows of different lengths in one array.
 
-Corners run front-left, front-right, rear-right, rear-left; the front bumper is the side between the first two, the rear bumper the one
-between the last two. All coordinates are metres relative to an origin near the drive, so that UTM-sized worlds cost no precision.
+Corners run front-left, front-right, rear-right, rear-left; the front bumper is the side between the
+first two, the rear bumper the one between the last two. All coordinates are metres relative to an
+origin near the drive, so that UTM-sized worlds cost no precision.
 """
 
 from __future__ import annotations
@@ -19,13 +21,16 @@ from evaluators.metrics.presets import Preset
 
 
 def pairs_of(flags: Bool) -> tuple[I64, I64]:
-    """Return the rows and columns of the set flags ``(N, M)``, in order; several times as fast as `numpy.nonzero` where few are set."""
+    """Return the rows and columns of the set flags ``(N, M)``, in order; several times as fast as
+    `numpy.nonzero` where few are set.
+    """
     row, column = np.divmod(np.flatnonzero(flags), flags.shape[1])
     return np.asarray(row), np.asarray(column)
 
 
 def spans(first: I64, last: I64) -> tuple[I64, I64]:
-    """Return for spans ``(N,)`` of an array, each from ``first`` to before ``last``, the span and the place of all their members.
+    """Return for spans ``(N,)`` of an array, each from ``first`` to before ``last``, the span and
+    the place of all their members.
 
     >>> [one.tolist() for one in spans(np.array([5, 0]), np.array([7, 3]))]
     [[0, 0, 1, 1, 1], [5, 6, 0, 1, 2]]
@@ -39,7 +44,9 @@ Geometries = npt.NDArray[Any]  # of shapely geometries
 
 
 def origin_of(track: Trajectory, preset: Preset) -> F64:
-    """Return the point ``(3,)`` that geometry is relative to: whole metres near the start of a track; zero for float32 presets."""
+    """Return the point ``(3,)`` that geometry is relative to: whole metres near the start of a
+    track; zero for float32 presets.
+    """
     return np.zeros(3) if preset.float32 else np.asarray(np.round(track.xyz[0]))
 
 
@@ -49,11 +56,17 @@ def held(values: F64, preset: Preset) -> F64:
 
 
 def _corners_float32(xy: F64, yaw: F64, size: F64) -> F64:
-    """Return corners rounded to float32 after each step, the centre first, as AlpaSim does: half a millimetre 8 km from the origin."""
+    """Return corners rounded to float32 after each step, the centre first, as AlpaSim does: half a
+    millimetre 8 km from the origin.
+    """
     x, y = (xy.astype(np.float32)[:, [d]] for d in (0, 1))  # (N, 1)
     c, s = np.cos(yaw.astype(np.float32))[:, None], np.sin(yaw.astype(np.float32))[:, None]
-    along, across = ((UNIT_CORNERS[:, d] * size[:, [d]]).astype(np.float32) for d in (0, 1))  # (N, 4)
-    return np.stack([(x + along * c) - across * s, (y + along * s) + across * c], axis=-1).astype(np.float64)
+    along, across = (
+        (UNIT_CORNERS[:, d] * size[:, [d]]).astype(np.float32) for d in (0, 1)
+    )  # (N, 4)
+    return np.stack([(x + along * c) - across * s, (y + along * s) + across * c], axis=-1).astype(
+        np.float64
+    )
 
 
 @dataclass(frozen=True)
@@ -78,7 +91,9 @@ class Footprints:
 
     def take(self, index: I64) -> Footprints:
         """Return the boxes at some rows."""
-        return Footprints(self.xy[index], self.yaw[index], self.size[index], self.roundness, self.float32)
+        return Footprints(
+            self.xy[index], self.yaw[index], self.size[index], self.roundness, self.float32
+        )
 
     def corners(self) -> F64:
         """Return the corners ``(N, 4, 2)``."""
@@ -87,26 +102,40 @@ class Footprints:
         return rectangle_corners(self.xy, self.yaw, self.size)
 
     def centres(self) -> F64:
-        """Return the reference point ``(N, 2)`` of the body: the box centre, or for float32 presets the rounded shape's centroid."""
-        return np.asarray(shapely.get_coordinates(shapely.centroid(self.shapes()))) if self.float32 else self.xy
+        """Return the reference point ``(N, 2)`` of the body: the box centre, or for float32 presets
+        the rounded shape's centroid.
+        """
+        return (
+            np.asarray(shapely.get_coordinates(shapely.centroid(self.shapes())))
+            if self.float32
+            else self.xy
+        )
 
     def shapes(self) -> Geometries:
         """Return the footprints ``(N,)`` as shapely polygons."""
         boxes = shapely.polygons(self.corners())
         r = self._corner_radius_m()
-        return boxes if r is None else np.asarray(shapely.buffer(shapely.buffer(boxes, -r, quad_segs=16), r, quad_segs=16))
+        return (
+            boxes
+            if r is None
+            else np.asarray(
+                shapely.buffer(shapely.buffer(boxes, -r, quad_segs=16), r, quad_segs=16)
+            )
+        )
 
     def bumpers(self) -> tuple[Geometries, Geometries]:
-        """Return front and rear bumpers ``(N,)``: segments; with rounded corners the footprint's part within a corner radius of them."""
+        """Return front and rear bumpers ``(N,)``: segments; with rounded corners the footprint's
+        part within a corner radius of them.
+        """
         at = self.corners()
         front, rear = shapely.linestrings(at[:, 0:2]), shapely.linestrings(at[:, 2:4])
         r = self._corner_radius_m()
         if r is None:
             return front, rear
         body = self.shapes()
-        return shapely.intersection(shapely.buffer(front, r, quad_segs=16), body), shapely.intersection(
-            shapely.buffer(rear, r, quad_segs=16), body
-        )
+        return shapely.intersection(
+            shapely.buffer(front, r, quad_segs=16), body
+        ), shapely.intersection(shapely.buffer(rear, r, quad_segs=16), body)
 
     def _corner_radius_m(self) -> F64 | None:
         return self.roundness * self.size.min(axis=1) / 2 if self.roundness > 0 else None
@@ -114,21 +143,25 @@ class Footprints:
 
 def ego_footprints(rollout: RolloutLog, preset: Preset, origin: F64) -> Footprints:
     """Return the ego's footprint at every logged time, centred at the box centre."""
-    return ego_footprints_at(rollout.ego.xyz[:, :2] - origin[:2], yaw_from_quat(rollout.ego.quat), rollout, preset)
+    return ego_footprints_at(
+        rollout.ego.xyz[:, :2] - origin[:2], yaw_from_quat(rollout.ego.quat), rollout, preset
+    )
 
 
 def ego_footprints_at(xy: F64, yaw: F64, rollout: RolloutLog, preset: Preset) -> Footprints:
     """Return the ego's footprint at given box centres ``(N, 2)`` and headings ``(N,)``."""
     length_m, width_m = preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)
-    size = np.broadcast_to(held(np.array([length_m, width_m]), preset) * (1.0 - preset.shrink), (len(xy), 2))
+    size = np.broadcast_to(
+        held(np.array([length_m, width_m]), preset) * (1.0 - preset.shrink), (len(xy), 2)
+    )
     return Footprints(np.asarray(xy), np.asarray(yaw), size, preset.roundness, preset.float32)
 
 
 class ActorTable:
     """Tracks of all actors of a rollout, laid end to end, so that many times are looked up at once.
 
-    An actor exists from its first to its last logged time, both included; between logged times its pose is interpolated (position
-    linearly, rotation by slerp).
+    An actor exists from its first to its last logged time, both included; between logged times its
+    pose is interpolated (position linearly, rotation by slerp).
     """
 
     def __init__(self, rollout: RolloutLog, preset: Preset, origin: F64) -> None:
@@ -136,9 +169,13 @@ class ActorTable:
         self.ids = tuple(actor.actor_id for actor in actors)
         self._t = [actor.track.t_us for actor in actors]
         self._start = np.concatenate([[0], np.cumsum([len(t) for t in self._t])]).astype(np.int64)
-        self._xy = np.concatenate([np.zeros((0, 2)), *(actor.track.xyz[:, :2] - origin[:2] for actor in actors)])
+        self._xy = np.concatenate(
+            [np.zeros((0, 2)), *(actor.track.xyz[:, :2] - origin[:2] for actor in actors)]
+        )
         self._quat = np.concatenate([np.zeros((0, 4)), *(actor.track.quat for actor in actors)])
-        size = np.array([[actor.box.length_m, actor.box.width_m] for actor in actors]).reshape(-1, 2)
+        size = np.array([[actor.box.length_m, actor.box.width_m] for actor in actors]).reshape(
+            -1, 2
+        )
         self.size = held(size, preset) * (1.0 - preset.shrink)
         self.preset = preset
         self.radius_m = np.hypot(self.size[:, 0], self.size[:, 1]) / 2  # (A,)
@@ -166,14 +203,20 @@ class ActorTable:
         return self.boxes_at(actor, row, fraction)
 
     def boxes_at(self, actor: I64, row: I64, fraction: F64) -> Footprints:
-        """Return the boxes ``(M,)`` of actors at a share ``(M,)`` of the way from logged rows ``(M,)`` to the rows after them."""
+        """Return the boxes ``(M,)`` of actors at a share ``(M,)`` of the way from logged rows
+        ``(M,)`` to the rows after them.
+        """
         follows = np.where(fraction > 0, row + 1, row)
         xy = self._xy[row] * (1 - fraction)[:, None] + self._xy[follows] * fraction[:, None]
         yaw = yaw_from_quat(self._quat[row])
         between = np.flatnonzero(fraction)
         if len(between):
-            yaw[between] = yaw_from_quat(slerp(self._quat[row[between]], self._quat[follows[between]], fraction[between]))
-        return Footprints(held(xy, self.preset), yaw, self.size[actor], self.preset.roundness, self.preset.float32)
+            yaw[between] = yaw_from_quat(
+                slerp(self._quat[row[between]], self._quat[follows[between]], fraction[between])
+            )
+        return Footprints(
+            held(xy, self.preset), yaw, self.size[actor], self.preset.roundness, self.preset.float32
+        )
 
     def times_of(self, actor: int) -> I64:
         """Return the logged times of one actor."""
@@ -184,7 +227,9 @@ class ActorTable:
         return self._xy[self._start[actor] : self._start[actor + 1]]
 
     def _locate(self, actor: int, t_us: I64) -> tuple[I64, F64, Bool]:
-        """Return per time ``(Q,)`` the logged row before or at it, the share of the way to the next row, and whether the actor is there."""
+        """Return per time ``(Q,)`` the logged row before or at it, the share of the way to the next
+        row, and whether the actor is there.
+        """
         track_t = self._t[actor]
         i = np.searchsorted(track_t, t_us, side="right") - 1
         present = (i >= 0) & (t_us <= track_t[-1])
@@ -214,7 +259,9 @@ class ActorsAt:
         return np.asarray(self.table._xy[self.row] * (1 - f) + self.table._xy[follows] * f)
 
     def centre_distance_m(self, xy: F64) -> F64:
-        """Return distances ``(A, Q)`` from points ``(Q, 2)`` to the centres; inf where an actor is absent."""
+        """Return distances ``(A, Q)`` from points ``(Q, 2)`` to the centres; inf where an actor is
+        absent.
+        """
         delta = self.centres() - xy[None]
         return np.where(self.present, np.hypot(delta[..., 0], delta[..., 1]), np.inf)
 

@@ -1,6 +1,7 @@
 """Health of the camera images in a log: black ones, and ones that stand still while the car moves.
 
-Both are the renderer's failure. They are counted; only some presets drop the rollout of a black image.
+Both are the renderer's failure. They are counted; only some presets drop the rollout of a black
+image.
 """
 
 from __future__ import annotations
@@ -26,11 +27,16 @@ def decode(image: LoggedImage) -> U8:
     from alpasim_plugin.core.reading.images import decode_image
 
     where = f"camera {image.camera!r} at {image.end_us} us"
-    return np.asarray(decode_image(image.data, where, "decoding a logged image", "log PNG or JPEG"), dtype=np.uint8)
+    return np.asarray(
+        decode_image(image.data, where, "decoding a logged image", "log PNG or JPEG"),
+        dtype=np.uint8,
+    )
 
 
 def evaluate_images(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
-    """Give ``img_is_black`` and ``img_is_frozen``, one row per image time: 1 if any camera's image of that time is. No images, no rows."""
+    """Give ``img_is_black`` and ``img_is_frozen``, one row per image time: 1 if any camera's image
+    of that time is. No images, no rows.
+    """
     images = [image for image in rollout.images if preset.image_camera in (None, image.camera)]
     if preset.image_rule == "at_or_after_step":
         if not images:
@@ -53,7 +59,9 @@ def evaluate_images(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[M
 
 
 def frozen_times(images: Sequence[LoggedImage], rollout: RolloutLog) -> set[int]:
-    """Return the times of images that equal the one before from the same camera, byte for byte, though the ego moved more than 0.1 m."""
+    """Return the times of images that equal the one before from the same camera, byte for byte,
+    though the ego moved more than 0.1 m.
+    """
     before: dict[str, LoggedImage] = {}
     found: set[int] = set()
     for image in sorted(images, key=lambda one: one.end_us):
@@ -61,8 +69,12 @@ def frozen_times(images: Sequence[LoggedImage], rollout: RolloutLog) -> set[int]
         if last is None or last.data != image.data:
             before[image.camera] = image
             continue
-        # Counted from the first of the equal pictures, so that a creeping car leaves it behind as well.
-        ends = [np.interp([last.end_us, image.end_us], rollout.ego.t_us, rollout.ego.xyz[:, k]) for k in (0, 1)]
+        # Counted from the first of the equal pictures, so that a creeping car leaves it behind as
+        # well.
+        ends = [
+            np.interp([last.end_us, image.end_us], rollout.ego.t_us, rollout.ego.xyz[:, k])
+            for k in (0, 1)
+        ]
         if float(np.hypot(*(np.diff(e)[0] for e in ends))) > FROZEN_MOVE_M:
             found.add(image.end_us)
     return found

@@ -1,7 +1,9 @@
-"""How the ego moves, also where nothing is touched: comfort, braking, time to collision, who is ahead, wrong way, red light, impact.
+"""How the ego moves, also where nothing is touched: comfort, braking, time to collision, who is
+ahead, wrong way, red light, impact.
 
-The bounds are nuPlan's (`evaluators.scores.nuplan`), the safe distance is that of responsibility-sensitive safety: Shalev-Shwartz et al.,
-"On a formal model of safe and scalable self-driving cars", definition 1.
+The bounds are nuPlan's (`evaluators.scores.nuplan`), the safe distance is that of
+responsibility-sensitive safety: Shalev-Shwartz et al., "On a formal model of safe and scalable
+self-driving cars", definition 1.
 """
 
 from __future__ import annotations
@@ -15,17 +17,24 @@ from evaluators.scores import nuplan
 from evaluators.scores.judged import Judged
 from evaluators.scores.states import EgoStates, Tracks
 
-RESPONSE_S, RSS_ACCEL_MPS2, RSS_BRAKE_MPS2, RSS_MOST_BRAKE_MPS2 = 1.0, 3.5, 4.0, 8.0
-NO_ONE_AHEAD, NO_CONTACT, NO_LANES = "nobody is ahead in the ego's way", "nothing touches the ego", "the map has no lanes"
+RESPONSE_S = 1.0
+RSS_ACCEL_MPS2 = 3.5
+RSS_BRAKE_MPS2 = 4.0
+RSS_MOST_BRAKE_MPS2 = 8.0
+NO_ONE_AHEAD = "nobody is ahead in the ego's way"
+NO_CONTACT = "nothing touches the ego"
+NO_LANES = "the map has no lanes"
 NO_STATES = "the states of traffic lights are not known"
 FEW = "the log has three steps or fewer"
 
 
 def safe_distance_m(v_mps: F64, ahead_mps: F64) -> F64:
-    """Return the gap ``(N,)`` at which a vehicle still stops behind one that brakes as hard as it can, metres.
+    """Return the gap ``(N,)`` at which a vehicle still stops behind one that brakes as hard as it
+    can, metres.
 
     Args:
-        v_mps: ``(N,)`` speed of the vehicle behind, which accelerates for `RESPONSE_S` and then brakes gently.
+        v_mps: ``(N,)`` speed of the vehicle behind, which accelerates for `RESPONSE_S` and then
+            brakes gently.
         ahead_mps: ``(N,)`` speed of the one ahead; what comes towards it is taken to stand.
 
     >>> float(safe_distance_m(np.array([10.0]), np.array([10.0]))[0])
@@ -37,9 +46,11 @@ def safe_distance_m(v_mps: F64, ahead_mps: F64) -> F64:
 
 
 def rss_margin_m(ego: EgoStates, tracks: Tracks) -> F64:
-    """Return ``(T,)`` by how much the gap to who is ahead exceeds the safe one, the least of all; infinite where nobody is ahead.
+    """Return ``(T,)`` by how much the gap to who is ahead exceeds the safe one, the least of all;
+    infinite where nobody is ahead.
 
-    Ahead is whose box reaches into the strip that the ego's box sweeps if it goes straight on, and whose middle is before the ego's.
+    Ahead is whose box reaches into the strip that the ego's box sweeps if it goes straight on, and
+    whose middle is before the ego's.
     """
     to = tracks.xy - ego.centre
     along = to[..., 0] * ego.heading[:, 0] + to[..., 1] * ego.heading[:, 1]
@@ -47,33 +58,61 @@ def rss_margin_m(ego: EgoStates, tracks: Tracks) -> F64:
     c, s = np.abs(np.cos(tracks.yaw - ego.yaw)), np.abs(np.sin(tracks.yaw - ego.yaw))
     length, width = (tracks.size[:, [d]] / 2 for d in (0, 1))
     gap_m = along - ego.size[0] / 2 - (length * c + width * s)
-    ahead_mps = tracks.velocity[..., 0] * ego.heading[:, 0] + tracks.velocity[..., 1] * ego.heading[:, 1]
-    margin_m = gap_m - safe_distance_m(np.broadcast_to(np.maximum(ego.velocity[:, 0], 0.0), gap_m.shape), ahead_mps)
+    ahead_mps = (
+        tracks.velocity[..., 0] * ego.heading[:, 0] + tracks.velocity[..., 1] * ego.heading[:, 1]
+    )
+    margin_m = gap_m - safe_distance_m(
+        np.broadcast_to(np.maximum(ego.velocity[:, 0], 0.0), gap_m.shape), ahead_mps
+    )
     counts = tracks.there & (along > 0) & (aside < ego.size[1] / 2 + length * s + width * c)
     return np.asarray(np.where(counts, margin_m, np.inf).min(axis=0, initial=np.inf))
 
 
 def evaluate_motion(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
-    """Give the metrics of motion per step; nothing by AlpaSim's presets, whose metrics are AlpaSim's."""
+    """Give the metrics of motion per step; nothing by AlpaSim's presets, whose metrics are
+    AlpaSim's.
+    """
     if preset.aliases:
         return []
     t_us = rollout.ego.t_us
     drive = Judged(rollout, scene, preset, rollout.ego)
     enough = len(t_us) > nuplan.LEAST_INSTANTS
     moves = nuplan.motion(drive.ego) if enough else None
-    against = drive.against_m >= nuplan.AGAINST_M if drive.has_map else np.zeros(len(t_us), dtype=np.bool_)
+    against = (
+        drive.against_m >= nuplan.AGAINST_M
+        if drive.has_map
+        else np.zeros(len(t_us), dtype=np.bool_)
+    )
     margin_m, impact_mps = rss_margin_m(drive.ego, drive.tracks), np.full(len(t_us), np.nan)
     for one in drive.hits:
         if t_us[one.step] >= handover_us(rollout) and np.isnan(impact_mps[one.step]):
             impact_mps[one.step] = one.delta_v_mps / nuplan.MASS_SHARE
     return [
-        series("hard_brake", t_us, False if moves is None else moves["lon_accel"] < nuplan.COMFORT["lon_accel"][0], enough, FEW),
-        series("uncomfortable", t_us, False if moves is None else nuplan.uncomfortable(moves), enough, FEW),
+        series(
+            "hard_brake",
+            t_us,
+            False if moves is None else moves["lon_accel"] < nuplan.COMFORT["lon_accel"][0],
+            enough,
+            FEW,
+        ),
+        series(
+            "uncomfortable",
+            t_us,
+            False if moves is None else nuplan.uncomfortable(moves),
+            enough,
+            FEW,
+        ),
         series("time_to_collision_s", t_us, np.minimum(drive.ttc_s, nuplan.TTC_HORIZON_S)),
         series("rss_margin_m", t_us, margin_m, np.isfinite(margin_m), NO_ONE_AHEAD),
         series("impact_speed_mps", t_us, impact_mps, np.isfinite(impact_mps), NO_CONTACT),
         series("wrong_way", t_us, against, drive.has_map, NO_LANES),
-        series("red_light", t_us, False if drive.ran_red is None else drive.ran_red, drive.ran_red is not None, NO_STATES),
+        series(
+            "red_light",
+            t_us,
+            False if drive.ran_red is None else drive.ran_red,
+            drive.ran_red is not None,
+            NO_STATES,
+        ),
     ]
 
 

@@ -1,12 +1,16 @@
-"""Lane keeping: off the road, in a wrong lane, and the gap to the border of the lanes around the ego.
+"""Lane keeping: off the road, in a wrong lane, and the gap to the border of the lanes around the
+ego.
 
-Protocol (paper, appendix "Off-road"). Nearby lanes are those whose centre line passes within 6 m of the ego's box centre, in 3-D and
-whatever their direction. A step is on the road if one nearby lane's area contains the footprint (touching its border from inside is
-inside), or else if the union of all nearby areas does. Only if neither holds, the road edges decide: the step is off-road if the footprint
-is nearer than 1 mm to a road-edge polyline. "Off-road" thus means *touching the edge* outside the lanes: far beyond the edge, where nothing
-is touched, a step counts as on the road. The drive to there has crossed the edge, and steps after the first event are dropped.
+Protocol (paper, appendix "Off-road"). Nearby lanes are those whose centre line passes within 6 m of
+the ego's box centre, in 3-D and whatever their direction. A step is on the road if one nearby
+lane's area contains the footprint (touching its border from inside is inside), or else if the union
+of all nearby areas does. Only if neither holds, the road edges decide: the step is off-road if the
+footprint is nearer than 1 mm to a road-edge polyline. "Off-road" thus means *touching the edge*
+outside the lanes: far beyond the edge, where nothing is touched, a step counts as on the road. The
+drive to there has crossed the edge, and steps after the first event are dropped.
 
-Preset ``strict`` measures by how much the footprint leaves the drivable surface (`evaluators.metrics.surface`).
+Preset ``strict`` measures by how much the footprint leaves the drivable surface
+(`evaluators.metrics.surface`).
 """
 
 from __future__ import annotations
@@ -39,20 +43,28 @@ class Containment:
     near: Bool  # (T, L) lanes within the radius
     in_one: Bool  # (T,) one lane's area contains the footprint
     in_union: Bool  # (T,) the union of nearby areas contains it
-    boundary_gap_m: F64  # (T,) distance to the union's border where it contains the footprint, else 0
+    boundary_gap_m: (
+        F64  # (T,) distance to the union's border where it contains the footprint, else 0
+    )
 
 
 def containment(road: Road, ego: Footprints, xyz: F64) -> Containment:
-    """Test footprints ``(T,)`` with box centres ``(T, 3)`` against single lanes and against the union of nearby lanes."""
+    """Test footprints ``(T,)`` with box centres ``(T, 3)`` against single lanes and against the
+    union of nearby lanes.
+    """
     near = road.lanes_near(xyz)
     shapes = ego.shapes()
     step, lane = pairs_of(near)
     areas = road.areas(lane)
     vertices, owner = shapely.get_coordinates(shapes, return_index=True)
-    vertex = vertices[np.searchsorted(owner, np.arange(len(shapes)))]  # one of each footprint: a lane without it cannot contain the rest
+    vertex = vertices[
+        np.searchsorted(owner, np.arange(len(shapes)))
+    ]  # one of each footprint: a lane without it cannot contain the rest
     holds_vertex = shapely.intersects_xy(areas, *vertex[step].T)
     in_one = np.zeros(len(near), dtype=np.bool_)
-    in_one[step[holds_vertex][shapely.contains(areas[holds_vertex], shapes[step[holds_vertex]])]] = True
+    in_one[
+        step[holds_vertex][shapely.contains(areas[holds_vertex], shapes[step[holds_vertex]])]
+    ] = True
     sets, group = _distinct(near)
     in_union, gap_m = np.zeros_like(in_one), np.zeros(len(near))
     rows = np.flatnonzero(near.any(axis=1))
@@ -65,7 +77,8 @@ def containment(road: Road, ego: Footprints, xyz: F64) -> Containment:
         touched[step[open_][shapely.intersects(areas[open_], shapes[step[open_]])]] = True
         single = near[rows].sum(axis=1) == 1
         held = borders.held(sets, group[rows], ego.take(rows))
-        # Where the border stays clear of a footprint, all of it is in the union or nothing, as its one vertex is.
+        # Where the border stays clear of a footprint, all of it is in the union or nothing, as its
+        # one vertex is.
         inside = np.where(single, in_one[rows], vertex_held[rows] & ~held.crossed)
         sure = held.sure & (single | held.crossed | (vertex_held == touched)[rows])
         in_union[rows[sure & inside]] = True
@@ -81,7 +94,9 @@ def containment(road: Road, ego: Footprints, xyz: F64) -> Containment:
 
 
 def _distinct(near: Bool) -> tuple[Bool, I64]:
-    """Return the distinct rows ``(G, L)`` of ``(T, L)``, and which of them each row is ``(T,)``; most rows are as the one before."""
+    """Return the distinct rows ``(G, L)`` of ``(T, L)``, and which of them each row is ``(T,)``;
+    most rows are as the one before.
+    """
     packed = np.packbits(near, axis=1)
     fresh = np.concatenate([[True], (packed[1:] != packed[:-1]).any(axis=1)])
     number: dict[bytes, int] = {}
@@ -93,9 +108,10 @@ def _distinct(near: Bool) -> tuple[Bool, I64]:
 def wrong_lane(road: Road, near: Bool, xy: F64, yaw: F64, preset: Preset) -> Bool:
     """Return whether the ego is in a lane of the opposite direction.
 
-    Looked at are the nearby lanes that contain its centre ``(T, 2)``; one opposes where its direction differs from the ego's heading
-    ``(T,)`` by more than 120 degrees. In a junction lanes of many directions overlap, so by default a step is wrong only if all of the
-    lanes under the ego oppose; AlpaSim calls it wrong if any does.
+    Looked at are the nearby lanes that contain its centre ``(T, 2)``; one opposes where its
+    direction differs from the ego's heading ``(T,)`` by more than 120 degrees. In a junction lanes
+    of many directions overlap, so by default a step is wrong only if all of the lanes under the ego
+    oppose; AlpaSim calls it wrong if any does.
     """
     step, lane = np.nonzero(near)
     inside = shapely.contains(road.areas(lane), shapely.points(xy[step]))
@@ -109,10 +125,16 @@ def wrong_lane(road: Road, near: Bool, xy: F64, yaw: F64, preset: Preset) -> Boo
 
 
 def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
-    """Give ``offroad``, ``wrong_lane`` and ``min_distance_to_lane_boundary_m`` per step; a missing map is invalid, never zero."""
+    """Give ``offroad``, ``wrong_lane`` and ``min_distance_to_lane_boundary_m`` per step; a missing
+    map is invalid, never zero.
+    """
     t_us = rollout.ego.t_us
     names = ("offroad", "wrong_lane", "min_distance_to_lane_boundary_m")
-    lane_map = scene.alpasim_map if preset.alpasim_map and scene.alpasim_map is not None else scene.lane_map
+    lane_map = (
+        scene.alpasim_map
+        if preset.alpasim_map and scene.alpasim_map is not None
+        else scene.lane_map
+    )
     if not lane_map.lanes:
         if preset.missing_road == "absent":
             return []

@@ -1,7 +1,9 @@
-"""How a drive ends, in words: every outcome is defined here once, and those that no other evaluator gives are found here.
+"""How a drive ends, in words: every outcome is defined here once, and those that no other evaluator
+gives are found here.
 
-An ego that is much slower than the recording is excused where it has a cause: a road user on the recorded path ahead of it or about to
-be there, a place at which the recording was slow as well, or the end of the path.
+An ego that is much slower than the recording is excused where it has a cause: a road user on the
+recorded path ahead of it or about to be there, a place at which the recording was slow as well, or
+the end of the path.
 """
 
 from __future__ import annotations
@@ -57,12 +59,18 @@ OUTCOMES = {  # the gravest first
     )
 }
 NO_OUTCOME = "no event"
-CONTACT_SIDES = ("collision_front", "collision_lateral", "collision_rear")  # events name a contact by its side
+CONTACT_SIDES = (
+    "collision_front",
+    "collision_lateral",
+    "collision_rear",
+)  # events name a contact by its side
 REACHED = 0.95  # share of the recorded path from which on a drive has reached its end
 
 
 def outcomes_of(rollout: Rollout) -> frozenset[str]:
-    """Return the names of the outcomes of a rollout; none where another part of the program failed."""
+    """Return the names of the outcomes of a rollout; none where another part of the program
+    failed.
+    """
     if not rollout.ok:
         return frozenset({POLICY_FAULT} if rollout.failure_class == POLICY_FAULT else ())
     return frozenset(name for name in OUTCOMES if rollout.flag(name))
@@ -71,7 +79,9 @@ def outcomes_of(rollout: Rollout) -> frozenset[str]:
 def told(had: Iterable[str]) -> list[Outcome]:
     """Return the outcomes that are named, the gravest first."""
     names = set(had)
-    return [one for name, one in OUTCOMES.items() if name in names and not names & set(one.implied_by)]
+    return [
+        one for name, one in OUTCOMES.items() if name in names and not names & set(one.implied_by)
+    ]
 
 
 def in_words(had: Iterable[str]) -> str:
@@ -85,19 +95,30 @@ def in_words(had: Iterable[str]) -> str:
 
 
 def first_failure(manifest: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """Return the event of a manifest with which its drive failed first, a contact at any side among them; None where it did not.
+    """Return the event of a manifest with which its drive failed first, a contact at any side among
+    them; None where it did not.
 
     Example:
         >>> first_failure({"events": [{"metric": "offroad", "t_us": 9}, {"metric": "collision_front", "t_us": 5}]})["t_us"]
         5
     """
-    failures = (one for one in manifest.get("events") or () if one["metric"] in OUTCOMES or one["metric"] in CONTACT_SIDES)
+    failures = (
+        one
+        for one in manifest.get("events") or ()
+        if one["metric"] in OUTCOMES or one["metric"] in CONTACT_SIDES
+    )
     return min(failures, key=lambda one: int(one["t_us"]), default=None)
 
 
 def event_words(metric: str) -> str:
-    """Name an event of a manifest: an outcome, another metric with a label, or the side of a contact as the collision that it is."""
-    return OUTCOMES[metric].words if metric in OUTCOMES else METRICS.shown(metric).label or OUTCOMES["collision_any"].words
+    """Name an event of a manifest: an outcome, another metric with a label, or the side of a
+    contact as the collision that it is.
+    """
+    return (
+        OUTCOMES[metric].words
+        if metric in OUTCOMES
+        else METRICS.shown(metric).label or OUTCOMES["collision_any"].words
+    )
 
 
 def has_ended(rollout: Rollout) -> bool:
@@ -107,20 +128,32 @@ def has_ended(rollout: Rollout) -> bool:
 
 def reached_end(rollout: Rollout) -> bool:
     """Tell whether a drive without a failure came to the end of the recorded path."""
-    return rollout.ok and not outcomes_of(rollout) and (rollout.metrics.get("progress") or 0.0) >= REACHED
+    return (
+        rollout.ok
+        and not outcomes_of(rollout)
+        and (rollout.metrics.get("progress") or 0.0) >= REACHED
+    )
 
 
 LEFT_ROUTE_M = 4.0  # AlpaSim's corridor
 STAND_MPS, STAND_S = 0.3, 3.0
-SLOW_SHARE, LEAST_MPS, SLOW_S = 0.5, 2.0, 1.0
-AHEAD_M, AHEAD_S, BEHIND_M = 15.0, 3.0, 2.0  # where a road user, or a slow place of the recording, is a cause
+SLOW_SHARE = 0.5
+LEAST_MPS = 2.0
+SLOW_S = 1.0
+AHEAD_M, AHEAD_S, BEHIND_M = (
+    15.0,
+    3.0,
+    2.0,
+)  # where a road user, or a slow place of the recording, is a cause
 BESIDE_M = 1.0  # between the ego's way and a road user
 SOON_S = (0.0, 1.0, 2.0)  # when a road user may be there
 AFTER_S = 3.0  # what has been a cause excuses for so long
 
 
 def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
-    """Give ``stalled``, ``braked_without_cause`` and ``left_route`` per step; nothing by AlpaSim's presets, whose metrics are AlpaSim's."""
+    """Give ``stalled``, ``braked_without_cause`` and ``left_route`` per step; nothing by AlpaSim's
+    presets, whose metrics are AlpaSim's.
+    """
     if preset.aliases:
         return []
     t_us, origin = rollout.ego.t_us, origin_of(rollout.ego_log, preset)
@@ -128,7 +161,12 @@ def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
     ego = ego_footprints(rollout, preset, origin)
     line = path.xyz[:, :2] - origin[:2]
     aside_m = on_route(line, path.t_us, t_us, ego.xy).aside_m
-    s = followed(line, to_path(line, ego.xy)[1], ego.xy, float(np.interp(t_us[0], path.t_us, arc_lengths(line))))
+    s = followed(
+        line,
+        to_path(line, ego.xy)[1],
+        ego.xy,
+        float(np.interp(t_us[0], path.t_us, arc_lengths(line))),
+    )
     has_side = np.isfinite(aside_m)
     why = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
     stalled, braked = _slow(rollout, preset, line, path.t_us, s)
@@ -139,7 +177,9 @@ def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
     ]
 
 
-def _slow(rollout: RolloutLog, preset: Preset, line: F64, recorded_us: I64, s: F64) -> tuple[Bool, Bool]:
+def _slow(
+    rollout: RolloutLog, preset: Preset, line: F64, recorded_us: I64, s: F64
+) -> tuple[Bool, Bool]:
     """Return at which steps ``(T,)`` the ego has stood too long, and has braked without a cause."""
     t_us = rollout.ego.t_us
     seconds = (t_us - t_us[0]) * 1e-6
@@ -152,7 +192,9 @@ def _slow(rollout: RolloutLog, preset: Preset, line: F64, recorded_us: I64, s: F
     stands = engaged & (v < STAND_MPS)
     slow = engaged & (expected > LEAST_MPS) & (v < SLOW_SHARE * expected)
     ahead = np.zeros(len(t_us), dtype=np.bool_)
-    asked = np.flatnonzero(_recently((stands | slow)[::-1], -seconds[::-1])[::-1])  # what comes before a slow step may excuse it
+    asked = np.flatnonzero(
+        _recently((stands | slow)[::-1], -seconds[::-1])[::-1]
+    )  # what comes before a slow step may excuse it
     ahead[asked] = actor_ahead(rollout, preset, line, s, AHEAD_M + AHEAD_S * fastest, asked)
     excused = _recently(ahead, seconds) | (s >= along[-1] - AHEAD_M)
     stood_s, slow_s = _lasting(stands & ~excused, seconds), _lasting(slow & ~excused, seconds)
@@ -176,17 +218,23 @@ def recorded_speed(along: F64, seconds: F64, v: F64, s: F64) -> tuple[F64, F64]:
         s: ``(T,)`` arc length of the ego on the recorded path.
 
     Returns:
-        ``(T,)`` its least speed from there to `AHEAD_M` ahead, m/s, and ``(T,)`` the seconds for which it stood there.
+        ``(T,)`` its least speed from there to `AHEAD_M` ahead, m/s, and ``(T,)`` the seconds for
+        which it stood there.
     """
     dwell = np.append(np.diff(seconds), 0.0)
     first = np.clip(np.searchsorted(along, s - BEHIND_M, "right") - 1, 0, None)
     last = np.maximum(np.searchsorted(along, s + AHEAD_M, "right"), first + 1)
     windows = [slice(a, b) for a, b in zip(first.tolist(), last.tolist(), strict=True)]
-    return np.array([v[w].min() for w in windows]), np.array([dwell[w][v[w] < LEAST_MPS].sum() for w in windows])
+    return np.array([v[w].min() for w in windows]), np.array(
+        [dwell[w][v[w] < LEAST_MPS].sum() for w in windows]
+    )
 
 
-def actor_ahead(rollout: RolloutLog, preset: Preset, line: F64, s: F64, reach_m: F64, steps: I64) -> Bool:
-    """Return at which of some steps ``(K,)`` a road user is on the recorded path ahead of the ego, or is about to be.
+def actor_ahead(
+    rollout: RolloutLog, preset: Preset, line: F64, s: F64, reach_m: F64, steps: I64
+) -> Bool:
+    """Return at which of some steps ``(K,)`` a road user is on the recorded path ahead of the ego,
+    or is about to be.
 
     Args:
         rollout: The log.
@@ -205,19 +253,28 @@ def actor_ahead(rollout: RolloutLog, preset: Preset, line: F64, s: F64, reach_m:
     s, reach_m = s[steps], reach_m[steps]
     for soon_s in SOON_S:
         there = actors.at(rollout.ego.t_us[steps] + round(soon_s * 1e6))
-        actor, step = np.nonzero(there.present & (there.centre_distance_m(ego_xy) < reach_m + actors.radius_m[:, None]))
+        actor, step = np.nonzero(
+            there.present & (there.centre_distance_m(ego_xy) < reach_m + actors.radius_m[:, None])
+        )
         boxes = there.footprints(actor, step)
         corners = to_path(line, boxes.corners().reshape(-1, 2))[1].reshape(-1, 4)
         gap_m = corners.max(axis=1) - s[step]
         near = (gap_m > 0.0) & (gap_m < reach_m[step] + boxes.size[:, 0])
-        near[near] = shapely.distance(boxes.take(np.flatnonzero(near)).shapes(), way) < rollout.ego_box.width_m / 2 + BESIDE_M
+        near[near] = (
+            shapely.distance(boxes.take(np.flatnonzero(near)).shapes(), way)
+            < rollout.ego_box.width_m / 2 + BESIDE_M
+        )
         out[step[near]] = True
     return out
 
 
 def _lasting(condition: Bool, seconds: F64) -> F64:
-    """Return for how many seconds ``(T,)`` a condition has held without a break; -1 where it does not."""
-    began = np.maximum.accumulate(np.where(condition & ~np.append(False, condition[:-1]), seconds, -np.inf))
+    """Return for how many seconds ``(T,)`` a condition has held without a break; -1 where it does
+    not.
+    """
+    began = np.maximum.accumulate(
+        np.where(condition & ~np.append(False, condition[:-1]), seconds, -np.inf)
+    )
     return np.where(condition, seconds - np.where(condition, began, 0.0), -1.0)
 
 

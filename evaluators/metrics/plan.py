@@ -1,6 +1,8 @@
-"""Quality of the policy's plans: consistency, open-loop collisions, minADE of their samples; and the gap between two plans of one query.
+"""Quality of the policy's plans: consistency, open-loop collisions, minADE of their samples; and
+the gap between two plans of one query.
 
-Plans are rig poses; for the metrics they are moved to the box centre. All errors are in plan view. One row per policy query, at its time.
+Plans are rig poses; for the metrics they are moved to the box centre. All errors are in plan view.
+One row per policy query, at its time.
 """
 
 from __future__ import annotations
@@ -12,7 +14,15 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.geometry import interpolate, matrix_from_quat, wrap_angle
-from alpasim_plugin.core.types import F64, I64, LoggedPlan, MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.core.types import (
+    F64,
+    I64,
+    LoggedPlan,
+    MetricSeries,
+    RolloutLog,
+    Scene,
+    Trajectory,
+)
 from evaluators.metrics.footprint import ActorTable, ego_footprints_at, held, origin_of
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.route import recorded_path
@@ -36,7 +46,9 @@ class TrajectoryTable:
         return slice(int(self.start[i]), int(self.start[i + 1]))
 
     def position(self, i: int, t_us: I64) -> F64:
-        """Return the centre ``(M, 3)`` of trajectory ``i`` at times inside it, linear between its poses."""
+        """Return the centre ``(M, 3)`` of trajectory ``i`` at times inside it, linear between its
+        poses.
+        """
         t, xyz = self.t_us[self.rows(i)], self.xyz[self.rows(i)]
         grid, at = (t - t[0]).astype(np.float64), (t_us - t[0]).astype(np.float64)
         return np.stack([np.interp(at, grid, xyz[:, d]) for d in range(3)], axis=1)
@@ -47,7 +59,9 @@ class TrajectoryTable:
         return np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
 
 
-def trajectory_table(trajectories: Sequence[Trajectory], T_rig_box: F64, origin: F64, preset: Preset) -> TrajectoryTable:
+def trajectory_table(
+    trajectories: Sequence[Trajectory], T_rig_box: F64, origin: F64, preset: Preset
+) -> TrajectoryTable:
     """Move rig trajectories in the world to the box centre and lay them end to end."""
     sizes = [len(one) for one in trajectories]
     xyz = np.concatenate([np.zeros((0, 3)), *(one.xyz for one in trajectories)])
@@ -61,27 +75,45 @@ def trajectory_table(trajectories: Sequence[Trajectory], T_rig_box: F64, origin:
 
 
 def evaluate_plans(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
-    """Give ``plan_deviation``, ``open_loop_collision`` and ``min_ade@...`` per policy query; empty plans have no row."""
+    """Give ``plan_deviation``, ``open_loop_collision`` and ``min_ade@...`` per policy query; empty
+    plans have no row.
+    """
     plans = [plan for plan in rollout.plans if len(plan.trajectory)]
     origin = origin_of(rollout.ego_log, preset)
     table = trajectory_table([plan.trajectory for plan in plans], rollout.T_rig_box, origin, preset)
     now_us = np.array([plan.now_us for plan in plans], dtype=np.int64)
-    out = [series("open_loop_collision", now_us, open_loop_collisions(rollout, table, now_us, preset, origin))]
+    out = [
+        series(
+            "open_loop_collision",
+            now_us,
+            open_loop_collisions(rollout, table, now_us, preset, origin),
+        )
+    ]
     deviation = plan_deviation(table, preset)
-    out.append(series("plan_deviation", now_us[1:], deviation, np.isfinite(deviation), "the plan and the one before it share no time"))
+    out.append(
+        series(
+            "plan_deviation",
+            now_us[1:],
+            deviation,
+            np.isfinite(deviation),
+            "the plan and the one before it share no time",
+        )
+    )
     if any(plan.samples for plan in plans):
         out.extend(min_ade(rollout, plans, preset, origin))
     if preset.aliases:
-        # AlpaSim reads this flag out of pickled bytes of the driver. Those are never unpickled here; without them it says "not triggered".
+        # AlpaSim reads this flag out of pickled bytes of the driver. Those are never unpickled
+        # here; without them it says "not triggered".
         out.append(series("safety_monitor_triggered", now_us, np.zeros(len(now_us))))
     return out
 
 
 def plan_deviation(table: TrajectoryTable, preset: Preset) -> F64:
-    """Return the weighted mean distance ``(N - 1,)`` between consecutive plans, NaN where they share no time.
+    """Return the weighted mean distance ``(N - 1,)`` between consecutive plans, NaN where they
+    share no time.
 
-    The old plan is read at the new plan's times, its first pose (where the ego is) left out, up to the old plan's end; the k-th such time
-    weighs ``exp(-plan_decay k)``.
+    The old plan is read at the new plan's times, its first pose (where the ego is) left out, up to
+    the old plan's end; the k-th such time weighs ``exp(-plan_decay k)``.
     """
     n = max(len(table.start) - 2, 0)
     out = np.full(n, np.nan)
@@ -91,14 +123,23 @@ def plan_deviation(table: TrajectoryTable, preset: Preset) -> F64:
         common = (t_new >= t_old[0]) & (t_new <= t_old[-1])
         if not common.any():
             continue
-        off = held(table.xyz[new][1:][common], preset) - held(table.position(i, t_new[common]), preset)
+        off = held(table.xyz[new][1:][common], preset) - held(
+            table.position(i, t_new[common]), preset
+        )
         weight = np.exp(-preset.plan_decay * np.arange(len(off)))
-        out[i] = float(np.sum(weight * np.linalg.norm(off[:, : 3 if preset.plan_with_z else 2], axis=1)) / np.sum(weight))
+        out[i] = float(
+            np.sum(weight * np.linalg.norm(off[:, : 3 if preset.plan_with_z else 2], axis=1))
+            / np.sum(weight)
+        )
     return out
 
 
-def open_loop_collisions(rollout: RolloutLog, table: TrajectoryTable, now_us: I64, preset: Preset, origin: F64) -> F64:
-    """Return per plan ``(N,)`` 1 if a planned footprint within the horizon touches an actor where the log has it at that time, else 0."""
+def open_loop_collisions(
+    rollout: RolloutLog, table: TrajectoryTable, now_us: I64, preset: Preset, origin: F64
+) -> F64:
+    """Return per plan ``(N,)`` 1 if a planned footprint within the horizon touches an actor where
+    the log has it at that time, else 0.
+    """
     out = np.zeros(len(now_us))
     actors = ActorTable(rollout, preset, origin)
     owner = table.owner
@@ -110,19 +151,24 @@ def open_loop_collisions(rollout: RolloutLog, table: TrajectoryTable, now_us: I6
         part = rows[low : low + _CHUNK]
         ego = ego_footprints_at(table.xyz[part, :2], table.yaw[part], rollout, preset)
         there = actors.at(table.t_us[part])
-        near = there.centre_distance_m(ego.xy) <= ego.radius_m[None] + actors.radius_m[:, None] + 1e-6
+        near = (
+            there.centre_distance_m(ego.xy) <= ego.radius_m[None] + actors.radius_m[:, None] + 1e-6
+        )
         pose, actor = np.nonzero(near.T)
         touch = shapely.intersects(ego.shapes()[pose], there.footprints(actor, pose).shapes())
         out[owner[part[pose[touch]]]] = 1.0
     return out
 
 
-def min_ade(rollout: RolloutLog, plans: Sequence[LoggedPlan], preset: Preset, origin: F64) -> list[MetricSeries]:
+def min_ade(
+    rollout: RolloutLog, plans: Sequence[LoggedPlan], preset: Preset, origin: F64
+) -> list[MetricSeries]:
     """Return minADE per horizon, one row per plan that has samples.
 
-    The error of a sample is the mean, over the log's times from the plan's query time to the first one at or after now + horizon, of its
-    distance from the target path at the same time; the least over the samples counts. It is invalid where the log, the target or every
-    sample ends before the horizon.
+    The error of a sample is the mean, over the log's times from the plan's query time to the first
+    one at or after now + horizon, of its distance from the target path at the same time; the least
+    over the samples counts. It is invalid where the log, the target or every sample ends before the
+    horizon.
     """
     target = rollout.ego if preset.min_ade_target == "self" else recorded_path(rollout, preset)
     line_us = rollout.ego.t_us
@@ -141,21 +187,36 @@ def min_ade(rollout: RolloutLog, plans: Sequence[LoggedPlan], preset: Preset, or
             if first <= last < len(usable):
                 span = slice(first, last + 1)
                 reach = [k for k in range(len(plan.samples)) if _covers(samples, k, usable[span])]
-                errors = [_errors(samples, k, usable[span], target_xyz[span], preset).mean() for k in reach]
+                errors = [
+                    _errors(samples, k, usable[span], target_xyz[span], preset).mean()
+                    for k in reach
+                ]
                 values[i, j] = min(errors, default=np.nan)
     reason = "the log, the target or every sample ends before the horizon"
-    names = [MIN_ADE.format(float(horizon_s), preset.min_ade_target) for horizon_s in preset.min_ade_horizons_s]
-    return [series(name, now_us, values[:, j], np.isfinite(values[:, j]), reason) for j, name in enumerate(names)]
+    names = [
+        MIN_ADE.format(float(horizon_s), preset.min_ade_target)
+        for horizon_s in preset.min_ade_horizons_s
+    ]
+    return [
+        series(name, now_us, values[:, j], np.isfinite(values[:, j]), reason)
+        for j, name in enumerate(names)
+    ]
 
 
 def _min_ade_by_index(
-    rollout: RolloutLog, asked: Sequence[LoggedPlan], line_us: I64, target_xyz: F64, preset: Preset, origin: F64
+    rollout: RolloutLog,
+    asked: Sequence[LoggedPlan],
+    line_us: I64,
+    target_xyz: F64,
+    preset: Preset,
+    origin: F64,
 ) -> list[MetricSeries]:
     """Give minADE as AlpaSim counts it.
 
-    The running mean starts at the query time, but is read at an index counted from the first log time after now; where logged times are
-    finer than the control step, this reads later than the horizon. Horizons beyond the log have no row. One sample that is too short
-    removes all minADE metrics of the rollout.
+    The running mean starts at the query time, but is read at an index counted from the first log
+    time after now; where logged times are finer than the control step, this reads later than the
+    horizon. Horizons beyond the log have no row. One sample that is too short removes all minADE
+    metrics of the rollout.
     """
     rows: list[list[tuple[int, float]]] = [[] for _ in preset.min_ade_horizons_s]
     longest_us = max(preset.min_ade_horizons_s) * 1e6
@@ -165,16 +226,29 @@ def _min_ade_by_index(
         span = np.flatnonzero((line_us >= plan.query_us) & (line_us <= until))
         if not all(_covers(samples, k, line_us[span]) for k in range(len(plan.samples))):
             return []
-        errors = np.stack([_errors(samples, k, line_us[span], target_xyz[span], preset) for k in range(len(plan.samples))])
+        errors = np.stack(
+            [
+                _errors(samples, k, line_us[span], target_xyz[span], preset)
+                for k in range(len(plan.samples))
+            ]
+        )
         running = np.cumsum(errors, axis=1) / np.arange(1, len(span) + 1)
         best = running.min(axis=0)
         after_now = int(np.searchsorted(line_us, plan.now_us)) + 1
-        reads = [int(np.searchsorted(line_us, plan.now_us + horizon_s * 1e6)) - after_now for horizon_s in preset.min_ade_horizons_s]
+        reads = [
+            int(np.searchsorted(line_us, plan.now_us + horizon_s * 1e6)) - after_now
+            for horizon_s in preset.min_ade_horizons_s
+        ]
         for j, read in enumerate([read for read in reads if read < len(span)]):
             rows[j].append((plan.now_us, float(best[read])))
-    names = [MIN_ADE.format(float(horizon_s), preset.min_ade_target) for horizon_s in preset.min_ade_horizons_s]
+    names = [
+        MIN_ADE.format(float(horizon_s), preset.min_ade_target)
+        for horizon_s in preset.min_ade_horizons_s
+    ]
     return [
-        series(name, np.array([t for t, _ in found], dtype=np.int64), np.array([v for _, v in found]))
+        series(
+            name, np.array([t for t, _ in found], dtype=np.int64), np.array([v for _, v in found])
+        )
         for name, found in zip(names, rows, strict=True)
         if found
     ]
@@ -199,11 +273,13 @@ DIVERGED_M = 0.5  # a 1.88 m car has 0.8 m to either side in a 3.5 m lane
 
 @dataclass(frozen=True)
 class Divergence:
-    """The first query at which the plans of two policies, or of one policy behind two renderers, differ.
+    """The first query at which the plans of two policies, or of one policy behind two renderers,
+    differ.
 
     Attributes:
         t_us: Time of the query.
-        gap_m: Distance between the plans at the horizon, or at the end of the shorter plan where that comes first.
+        gap_m: Distance between the plans at the horizon, or at the end of the shorter plan where
+            that comes first.
         ahead_us: How far ahead of the query that is.
     """
 
@@ -221,8 +297,8 @@ def plan_gap(one: Trajectory, other: Trajectory, at_us: Sequence[int]) -> tuple[
         at_us: ``(H,)`` absolute times.
 
     Returns:
-        Distance ``(H,)`` in plan view, metres, and heading of ``other`` less that of ``one`` ``(H,)``, radians in (-pi, pi]; NaN at times
-        that either plan does not reach.
+        Distance ``(H,)`` in plan view, metres, and heading of ``other`` less that of ``one``
+        ``(H,)``, radians in (-pi, pi]; NaN at times that either plan does not reach.
     """
     times = np.asarray(at_us, dtype=np.int64)
     first, last = max(one.t_us[0], other.t_us[0]), min(one.t_us[-1], other.t_us[-1])
@@ -231,12 +307,15 @@ def plan_gap(one: Trajectory, other: Trajectory, at_us: Sequence[int]) -> tuple[
     if inside.any():
         a, b = interpolate(one, times[inside]), interpolate(other, times[inside])
         gap[inside] = np.linalg.norm(b[:, :2, 3] - a[:, :2, 3], axis=1)
-        turn[inside] = wrap_angle(np.arctan2(b[:, 1, 0], b[:, 0, 0]) - np.arctan2(a[:, 1, 0], a[:, 0, 0]))
+        turn[inside] = wrap_angle(
+            np.arctan2(b[:, 1, 0], b[:, 0, 0]) - np.arctan2(a[:, 1, 0], a[:, 0, 0])
+        )
     return gap, turn
 
 
 def first_divergence(one: Sequence[LoggedPlan], other: Sequence[LoggedPlan]) -> Divergence | None:
-    """Return the first query common to both at which their plans lie more than `DIVERGED_M` apart at `HORIZON_US`; None if there is none.
+    """Return the first query common to both at which their plans lie more than `DIVERGED_M` apart
+    at `HORIZON_US`; None if there is none.
 
     Plans that end before the horizon are compared at the end of the shorter one.
     """

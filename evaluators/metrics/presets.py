@@ -1,7 +1,9 @@
-"""Evaluator presets: every convention that changes a number, in one frozen record that is stamped on the results.
+"""Evaluator presets: every convention that changes a number, in one frozen record that is stamped
+on the results.
 
-`paper` follows the closed-loop appendix of the OneFixer paper, `alpasim` AlpaSim's code with its quirks, and `strict` is what we hold to be
-right. A preset only selects; the evaluators hold the code of each choice.
+`paper` follows the closed-loop appendix of the OneFixer paper, `alpasim` AlpaSim's code with its
+quirks, and `strict` is what we hold to be right. A preset only selects; the evaluators hold the
+code of each choice.
 """
 
 from __future__ import annotations
@@ -18,42 +20,63 @@ class Preset:
     """Conventions of one scoring protocol."""
 
     name: str
-    reproduces: str | None = None  # whose evaluation, in which version: stamped on the results with the rest
-    protocol: str | None = None  # the benchmark whose score is given as well, by its name in `evaluators.scores`
-    # Footprint. The sizes of all boxes are scaled by 1 - shrink; corners are rounded by roundness * shorter side / 2.
+    reproduces: str | None = (
+        None  # whose evaluation, in which version: stamped on the results with the rest
+    )
+    protocol: str | None = (
+        None  # the benchmark whose score is given as well, by its name in `evaluators.scores`
+    )
+    # Footprint. The sizes of all boxes are scaled by 1 - shrink; corners are rounded by roundness *
+    # shorter side / 2.
     ego_size_m: tuple[float, float] | None = None  # length, width; None: as logged
     shrink: float = 0.0
     roundness: float = 0.0
-    # Collision. "every": each touching actor is classified. "last": only the last one that the spatial index returns is.
+    # Collision. "every": each touching actor is classified. "last": only the last one that the
+    # spatial index returns is.
     hits: Literal["every", "last"] = "every"
     # "at_steps": logged instants only. "between_steps": the motion between them too.
     contact: Literal["at_steps", "between_steps"] = "at_steps"
-    # Road. Lanes whose centre passes within lane_radius_m (3-D) of the ego box centre: its line, or only its stored vertices.
+    # Road. Lanes whose centre passes within lane_radius_m (3-D) of the ego box centre: its line, or
+    # only its stored vertices.
     lane_radius_m: float = 6.0
     lane_query: Literal["line", "vertices"] = "line"
     lane_half_width_m: float = 1.85  # buffer of the centre where an edge is missing
     seam_m: float = 1e-6  # gaps between lanes up to this wide are closed; 1 um is rounding
-    # Off the road. "edge_touch": no nearby lane holds the footprint and it touches a road edge. "margin": it sticks out of the drivable
-    # surface, all lanes and drivable areas of the ego's level.
+    # Off the road. "edge_touch": no nearby lane holds the footprint and it touches a road edge.
+    # "margin": it sticks out of the drivable surface, all lanes and drivable areas of the ego's
+    # level.
     offroad_rule: Literal["edge_touch", "margin"] = "edge_touch"
-    edge_touch_m: float = 0.001  # off-road below this distance from a road edge, if no lane contains the footprint
-    # "any": every edge at the ego's height. "nearest_vertex": the edge that owns the vertex nearest in 3-D. "nearest_of_level": the same of
-    # the edges whose vertex beside the ego is at its height.
+    edge_touch_m: float = (
+        0.001  # off-road below this distance from a road edge, if no lane contains the footprint
+    )
+    # "any": every edge at the ego's height. "nearest_vertex": the edge that owns the vertex nearest
+    # in 3-D. "nearest_of_level": the same of the edges whose vertex beside the ego is at its
+    # height.
     edge_query: Literal["any", "nearest_vertex", "nearest_of_level"] = "any"
-    edge_height_m: float = 3.0  # edges and surfaces farther above or below the box centre belong to another road
-    alpasim_map: bool = False  # read the road as AlpaSim's own loader does, where the scene says that this differs
-    # Wrong lane. "none_agrees": no lane under the ego runs its way. "any_opposes": at least one runs against it.
-    missing_road: Literal["invalid", "absent", "error"] = "invalid"  # no map, or an edge is needed and there is none
+    edge_height_m: float = (
+        3.0  # edges and surfaces farther above or below the box centre belong to another road
+    )
+    alpasim_map: bool = (
+        False  # read the road as AlpaSim's own loader does, where the scene says that this differs
+    )
+    # Wrong lane. "none_agrees": no lane under the ego runs its way. "any_opposes": at least one
+    # runs against it.
+    missing_road: Literal["invalid", "absent", "error"] = (
+        "invalid"  # no map, or an edge is needed and there is none
+    )
     wrong_lane_rule: Literal["none_agrees", "any_opposes"] = "none_agrees"
     wrap_heading: bool = True  # compare headings modulo a full turn
-    # Precision. False: float64 relative to a local origin. True: coordinates as they stand, poses and corners in float32.
+    # Precision. False: float64 relative to a local origin. True: coordinates as they stand, poses
+    # and corners in float32.
     float32: bool = False
     # Recorded path.
     invented_starts: bool = False  # the first two rows of the recording-based metrics are constants
     distance_from: Literal["handover", "log_start"] = "handover"  # where dist_traveled_m starts
-    # What progress_rel_to_total is a share of: the recorded path, or its part up to where the recording is when the rollout ends.
+    # What progress_rel_to_total is a share of: the recorded path, or its part up to where the
+    # recording is when the rollout ends.
     progress_of: Literal["path", "reachable"] = "path"
-    corridor: bool = False  # whether leaving the recorded path to the side by stop_beyond_gt_m is a fault of its own
+    # whether leaving the recorded path to the side by stop_beyond_gt_m is a fault of its own
+    corridor: bool = False
     # Plans.
     open_loop_horizon_us: int = 3_000_000
     min_ade_horizons_s: tuple[float, ...] = (0.5, 1.0, 2.5, 5.0)
@@ -67,16 +90,26 @@ class Preset:
     image_rule: Literal["own_times", "at_or_after_step"] = "own_times"
     # From steps to one value per rollout.
     aliases: bool = False  # give AlpaSim's second names of the same value as well
-    replay_is_scored: bool = False  # a rollout that never leaves the warm-up: scored whole, or invalid
+    replay_is_scored: bool = (
+        False  # a rollout that never leaves the warm-up: scored whole, or invalid
+    )
     honour_valid: bool = True  # skip invalid steps, or reduce over every row
-    stop_after: tuple[str, ...] = ("collision_any", "offroad")  # rows after the first event are dropped
-    stop_beyond_gt_m: float | None = None  # rows after the first one this far from the recorded path are dropped
+    stop_after: tuple[str, ...] = (
+        "collision_any",
+        "offroad",
+    )  # rows after the first event are dropped
+    stop_beyond_gt_m: float | None = (
+        None  # rows after the first one this far from the recorded path are dropped
+    )
     drop_black: bool = False  # a black image in a scored row removes the rollout
-    # The loop, not the scores: whether a rollout ends where the recorded path ends, if its scenario says so. AlpaSim drives on.
+    # The loop, not the scores: whether a rollout ends where the recorded path ends, if its scenario
+    # says so. AlpaSim drives on.
     stop_at_path_end: bool = True
 
     def __post_init__(self) -> None:
-        if self.roundness > 0 and (self.contact == "between_steps" or self.offroad_rule == "margin"):
+        if self.roundness > 0 and (
+            self.contact == "between_steps" or self.offroad_rule == "margin"
+        ):
             raise InputError(
                 "building an evaluator preset",
                 f"preset {self.name!r}",
@@ -129,21 +162,33 @@ PRESETS: dict[str, Preset] = {
     "paper": Preset(name="paper", ego_size_m=(4.855, 1.88)),
     ALPASIM.name: ALPASIM,
     ALPASIM_LATER.name: ALPASIM_LATER,
-    "strict": Preset(name="strict", contact="between_steps", seam_m=0.1, offroad_rule="margin", missing_road="error"),
-    # Other benchmarks go on after an event, and have no score where a part of it cannot be measured.
-    **{name: Preset(name=name, protocol=name, seam_m=0.1, stop_after=()) for name in ("nuplan", "navsim", "hugsim")},
+    "strict": Preset(
+        name="strict",
+        contact="between_steps",
+        seam_m=0.1,
+        offroad_rule="margin",
+        missing_road="error",
+    ),
+    # Other benchmarks go on after an event, and have no score where a part of it cannot be
+    # measured.
+    **{
+        name: Preset(name=name, protocol=name, seam_m=0.1, stop_after=())
+        for name in ("nuplan", "navsim", "hugsim")
+    },
     "ncap": Preset(name="ncap", protocol="ncap", contact="between_steps", seam_m=0.1),
 }
 
 
 DEFAULT = "strict"  # for verdicts of our own; the others are conventions that are named
 
-# Least and greatest share of contacts, in percent, that fall between two logged instants, in two samples (docs/presets.md).
+# Least and greatest share of contacts, in percent, that fall between two logged instants, in two
+# samples (docs/presets.md).
 UNSEEN = {"100 ms": (2, 5), "200 ms": (3, 14), "500 ms": (8, 49)}
 
 
 def contact_note(name: str) -> str:
-    """Say what a preset that looks for contact at logged instants only does not see; empty for others, and for unknown ones.
+    """Say what a preset that looks for contact at logged instants only does not see; empty for
+    others, and for unknown ones.
 
     >>> contact_note("strict")
     ''
@@ -153,8 +198,12 @@ def contact_note(name: str) -> str:
     chosen = PRESETS.get(name)
     if chosen is None or chosen.contact == "between_steps":
         return ""
-    first, *others = (f"{low} to {high} %{{}} at {{}}{step}" for step, (low, high) in UNSEEN.items())
-    missed = ", ".join([first.format(" of contacts", "steps of "), *(one.format("", "") for one in others)])
+    first, *others = (
+        f"{low} to {high} %{{}} at {{}}{step}" for step, (low, high) in UNSEEN.items()
+    )
+    missed = ", ".join(
+        [first.format(" of contacts", "steps of "), *(one.format("", "") for one in others)]
+    )
     return f"contact at logged instants only: missed are {missed}; --preset {DEFAULT} looks between them too"
 
 
@@ -171,11 +220,16 @@ HELP = {
 def described() -> dict[str, str]:
     """Return PRESET -> what it is, and what it does not see, the default first."""
     order = sorted(PRESETS, key=lambda name: name != DEFAULT)
-    return {name: "; ".join(filter(None, (HELP.get(name) or PRESETS[name].reproduces, _unseen(name)))) for name in order}
+    return {
+        name: "; ".join(filter(None, (HELP.get(name) or PRESETS[name].reproduces, _unseen(name))))
+        for name in order
+    }
 
 
 def _unseen(name: str) -> str:
-    return "" if PRESETS[name].protocol else contact_note(name)  # of benchmarks the contacts are those that they define
+    return (
+        "" if PRESETS[name].protocol else contact_note(name)
+    )  # of benchmarks the contacts are those that they define
 
 
 def preset(name: str | Preset) -> Preset:
@@ -187,5 +241,10 @@ def preset(name: str | Preset) -> Preset:
     if isinstance(name, Preset):
         return name
     if name not in PRESETS:
-        raise InputError("choosing an evaluator preset", f"name {name!r}", "no preset has that name", f"known: {', '.join(PRESETS)}")
+        raise InputError(
+            "choosing an evaluator preset",
+            f"name {name!r}",
+            "no preset has that name",
+            f"known: {', '.join(PRESETS)}",
+        )
     return PRESETS[name]

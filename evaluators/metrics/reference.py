@@ -1,7 +1,9 @@
-"""Reference implementations of contact and lane keeping, one step at a time, without filters or an index.
+"""Reference implementations of contact and lane keeping, one step at a time, without filters or an
+index.
 
-Contact is decided in exact rational arithmetic on the very corners that the array evaluators use, so at touching edges and corners both
-must agree without any tolerance. Distances and unions are floating point here as well.
+Contact is decided in exact rational arithmetic on the very corners that the array evaluators use,
+so at touching edges and corners both must agree without any tolerance. Distances and unions are
+floating point here as well.
 """
 
 from __future__ import annotations
@@ -16,9 +18,27 @@ from typing import Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import interpolate, inverse, offset_trajectory, quat_from_yaw, rectangle_corners, yaw_from_quat, yaw_of
+from alpasim_plugin.core.geometry import (
+    interpolate,
+    inverse,
+    offset_trajectory,
+    quat_from_yaw,
+    rectangle_corners,
+    yaw_from_quat,
+    yaw_of,
+)
 from alpasim_plugin.core.lane_areas import lane_polygon
-from alpasim_plugin.core.types import F64, Actor, Box, Lane, LaneMap, RolloutLog, Scene, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    F64,
+    Actor,
+    Box,
+    Lane,
+    LaneMap,
+    RolloutLog,
+    Scene,
+    Trajectory,
+    Vehicle,
+)
 from evaluators.metrics.footprint import origin_of
 from evaluators.metrics.presets import Preset
 
@@ -27,12 +47,14 @@ STEP_US = 100_000
 LANE_M = 3.5
 
 
-# --- contact ----------------------------------------------------------------------------------------------------------
+# --- contact
 
 
 @dataclass(frozen=True)
 class StepContact:
-    """What one step looks like: who touches the ego on which side, and the gap to the nearest actor (inf: nobody there)."""
+    """What one step looks like: who touches the ego on which side, and the gap to the nearest actor
+    (inf: nobody there).
+    """
 
     sides: dict[str, str]  # actor id -> front | rear | lateral
     gap_m: float
@@ -51,7 +73,13 @@ def contacts_by_step(rollout: RolloutLog, preset: Preset) -> list[StepContact]:
             if box is None:
                 continue
             if touch(ego, box):
-                sides[actor.actor_id] = "front" if touch(ego[0:2], box) else "rear" if touch(ego[2:4], box) else "lateral"
+                sides[actor.actor_id] = (
+                    "front"
+                    if touch(ego[0:2], box)
+                    else "rear"
+                    if touch(ego[2:4], box)
+                    else "lateral"
+                )
             gap_m = min(gap_m, 0.0 if touch(ego, box) else polygon_distance(ego, box))
         out.append(StepContact(sides, gap_m))
     return out
@@ -59,12 +87,16 @@ def contacts_by_step(rollout: RolloutLog, preset: Preset) -> list[StepContact]:
 
 def ego_corners(rollout: RolloutLog, preset: Preset, step: int, origin: F64) -> F64:
     """Return the ego's corners ``(4, 2)`` at a step."""
-    size = np.array(preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)) * (1.0 - preset.shrink)
+    size = np.array(preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)) * (
+        1.0 - preset.shrink
+    )
     return _corners(rollout.ego.xyz[step], rollout.ego.quat[step], size, origin)
 
 
 def actor_corners(actor: Actor, t_us: int, preset: Preset, origin: F64) -> F64 | None:
-    """Return an actor's corners ``(4, 2)`` at a time, None before its first and after its last logged time."""
+    """Return an actor's corners ``(4, 2)`` at a time, None before its first and after its last
+    logged time.
+    """
     track = actor.track
     if t_us < track.t_us[0] or t_us > track.t_us[-1]:
         return None
@@ -73,15 +105,23 @@ def actor_corners(actor: Actor, t_us: int, preset: Preset, origin: F64) -> F64 |
     if len(exact):
         return _corners(track.xyz[exact[0]], track.quat[exact[0]], size, origin)
     pose = interpolate(track, t_us)
-    return np.asarray(rectangle_corners(pose[None, :2, 3] - origin[:2], np.array([yaw_of(pose)]), size[None])[0])
+    return np.asarray(
+        rectangle_corners(pose[None, :2, 3] - origin[:2], np.array([yaw_of(pose)]), size[None])[0]
+    )
 
 
 def _corners(xyz: F64, quat: F64, size: F64, origin: F64) -> F64:
-    return np.asarray(rectangle_corners((xyz[:2] - origin[:2])[None], np.array([yaw_from_quat(quat)]), size[None])[0])
+    return np.asarray(
+        rectangle_corners(
+            (xyz[:2] - origin[:2])[None], np.array([yaw_from_quat(quat)]), size[None]
+        )[0]
+    )
 
 
 def touch(a: F64, b: F64) -> bool:
-    """Return whether two convex shapes (or a segment and one) share a point: no edge direction of either separates them. Exact."""
+    """Return whether two convex shapes (or a segment and one) share a point: no edge direction of
+    either separates them. Exact.
+    """
     shapes = [exact(a), exact(b)]
     for shape in shapes:
         for p, q in sides_of(shape):
@@ -93,21 +133,33 @@ def touch(a: F64, b: F64) -> bool:
 
 
 def polygon_distance(a: F64, b: F64) -> float:
-    """Return the distance of two disjoint convex polygons: the least over corners of one and sides of the other."""
+    """Return the distance of two disjoint convex polygons: the least over corners of one and sides
+    of the other.
+    """
     best = math.inf
     for points, ring in ((a, b), (b, a)):
         for x, y in points.tolist():
-            for (x0, y0), (x1, y1) in zip(ring.tolist(), np.roll(ring, -1, axis=0).tolist(), strict=True):
+            for (x0, y0), (x1, y1) in zip(
+                ring.tolist(), np.roll(ring, -1, axis=0).tolist(), strict=True
+            ):
                 best = min(best, point_to_segment((x, y), (x0, y0), (x1, y1))[0])
     return best
 
 
-def point_to_segment(p: Sequence[float], a: Sequence[float], b: Sequence[float]) -> tuple[float, float]:
-    """Return the distance of a point from a segment in any dimension, and the share of the segment at the nearest point."""
+def point_to_segment(
+    p: Sequence[float], a: Sequence[float], b: Sequence[float]
+) -> tuple[float, float]:
+    """Return the distance of a point from a segment in any dimension, and the share of the segment
+    at the nearest point.
+    """
     along = [y - x for x, y in zip(a, b, strict=True)]
     offset = [y - x for x, y in zip(a, p, strict=True)]
     length2 = sum(d * d for d in along)
-    f = min(max(sum(d * o for d, o in zip(along, offset, strict=True)) / length2, 0.0), 1.0) if length2 > 0 else 0.0
+    f = (
+        min(max(sum(d * o for d, o in zip(along, offset, strict=True)) / length2, 0.0), 1.0)
+        if length2 > 0
+        else 0.0
+    )
     return math.sqrt(sum((o - f * d) ** 2 for d, o in zip(along, offset, strict=True))), f
 
 
@@ -118,15 +170,21 @@ def exact(shape: F64) -> list[Point]:
 
 def sides_of(shape: list[Point]) -> list[tuple[Point, Point]]:
     """Return the sides of a closed ring, or the one segment of two points."""
-    return [(shape[0], shape[1])] if len(shape) == 2 else [(shape[i], shape[(i + 1) % len(shape)]) for i in range(len(shape))]
+    return (
+        [(shape[0], shape[1])]
+        if len(shape) == 2
+        else [(shape[i], shape[(i + 1) % len(shape)]) for i in range(len(shape))]
+    )
 
 
-# --- road -------------------------------------------------------------------------------------------------------------
+# --- road
 
 
 @dataclass(frozen=True)
 class StepRoad:
-    """What one step looks like; ``offroad`` is None where a road edge is needed and the map has none."""
+    """What one step looks like; ``offroad`` is None where a road edge is needed and the map has
+    none.
+    """
 
     near: frozenset[str]
     on_road: bool
@@ -143,9 +201,15 @@ def road_by_step(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[Step
     for i in range(len(rollout.ego)):
         centre = rollout.ego.xyz[i] - origin
         body = shapely.Polygon(ego_corners(rollout, preset, i, origin))
-        near = {key: lane for key, lane in lanes.items() if line_distance(centre, lane.centre) <= preset.lane_radius_m}
+        near = {
+            key: lane
+            for key, lane in lanes.items()
+            if line_distance(centre, lane.centre) <= preset.lane_radius_m
+        }
         areas = [lane_polygon(lane, preset.lane_half_width_m) for lane in near.values()]
-        union = shapely.union_all(areas).buffer(preset.seam_m / 2 if len(areas) > 1 else 0.0, join_style="mitre")
+        union = shapely.union_all(areas).buffer(
+            preset.seam_m / 2 if len(areas) > 1 else 0.0, join_style="mitre"
+        )
         inside_union = bool(areas) and bool(union.contains(body))
         on_road = any(area.contains(body) for area in areas) or inside_union
         touching = any(_touches(edge, body, float(centre[2]), preset) for edge in edges)
@@ -164,7 +228,9 @@ def line_distance(point: F64, line: F64) -> float:
     """Return the least distance of a point from the segments of a polyline."""
     if len(line) == 1:
         return float(np.linalg.norm(point - line[0]))
-    return min(point_to_segment(point.tolist(), a.tolist(), b.tolist())[0] for a, b in pairwise(line))
+    return min(
+        point_to_segment(point.tolist(), a.tolist(), b.tolist())[0] for a, b in pairwise(line)
+    )
 
 
 def shifted(lane: Lane, origin: F64) -> Lane:
@@ -176,16 +242,21 @@ def shifted(lane: Lane, origin: F64) -> Lane:
 
 def _touches(edge: F64, body: Any, z: float, preset: Preset) -> bool:
     for a, b in pairwise(edge):
-        if abs((a[2] + b[2]) / 2 - z) <= preset.edge_height_m and shapely.LineString([a[:2], b[:2]]).distance(body) < preset.edge_touch_m:
+        if (
+            abs((a[2] + b[2]) / 2 - z) <= preset.edge_height_m
+            and shapely.LineString([a[:2], b[:2]]).distance(body) < preset.edge_touch_m
+        ):
             return True
     return False
 
 
-# --- a drive to try both on -------------------------------------------------------------------------------------------
+# --- a drive to try both on
 
 
 def busy_road(n_actors: int, n_steps: int) -> tuple[RolloutLog, Scene]:
-    """Return a drive that weaves along and off a winding four-lane road, with others everywhere on and beside it. Always the same."""
+    """Return a drive that weaves along and off a winding four-lane road, with others everywhere on
+    and beside it. Always the same.
+    """
     rng = np.random.Generator(np.random.Philox(1))
     s = np.cumsum(rng.uniform(0.5, 1.5, n_steps))
     lane_map = winding_road(float(s[-1]) + 50.0)
@@ -200,7 +271,9 @@ def busy_road(n_actors: int, n_steps: int) -> tuple[RolloutLog, Scene]:
     T_rig_box[:3, 3] = [vehicle.rear_axle_to_centre_m, 0.0, vehicle.box.height_m / 2]
     recorded = offset_trajectory(ego, inverse(T_rig_box))
     by_id = {one.actor_id: one for one in others}
-    log = RolloutLog("bench", "bench", vehicle.box, T_rig_box, ego, by_id, (), (), recorded, 0, 0, 0, STEP_US)
+    log = RolloutLog(
+        "bench", "bench", vehicle.box, T_rig_box, ego, by_id, (), (), recorded, 0, 0, 0, STEP_US
+    )
     return log, Scene("bench", lane_map, recorded, vehicle)
 
 
@@ -212,9 +285,14 @@ def winding_road(length_m: float) -> LaneMap:
         y = (k - 1) * LANE_M
         for i in range(0, len(s) - 1, 20):
             piece = s[i : i + 21]
-            line = {side: _along(piece, np.full(len(piece), y + d), np.zeros(len(piece))).xyz for side, d in _OFFSETS.items()}
+            line = {
+                side: _along(piece, np.full(len(piece), y + d), np.zeros(len(piece))).xyz
+                for side, d in _OFFSETS.items()
+            }
             lanes[f"l{k}-{i}"] = Lane(f"l{k}-{i}", line["centre"], line["left"], line["right"])
-    edges = tuple(_along(s, np.full(len(s), y), np.zeros(len(s))).xyz for y in (-1.5 * LANE_M, 2.5 * LANE_M))
+    edges = tuple(
+        _along(s, np.full(len(s), y), np.zeros(len(s))).xyz for y in (-1.5 * LANE_M, 2.5 * LANE_M)
+    )
     return LaneMap(lanes, edges)
 
 
@@ -226,4 +304,6 @@ def _along(s: F64, y: F64, yaw: F64) -> Trajectory:
     bend = 15.0 * np.sin(s * 2 * np.pi / 300.0)
     heading = np.arctan(15.0 * 2 * np.pi / 300.0 * np.cos(s * 2 * np.pi / 300.0))
     xyz = np.stack([s - y * np.sin(heading), bend + y * np.cos(heading), np.zeros(len(s))], axis=1)
-    return Trajectory(np.arange(len(s), dtype=np.int64) * STEP_US, xyz, quat_from_yaw(heading + yaw))
+    return Trajectory(
+        np.arange(len(s), dtype=np.int64) * STEP_US, xyz, quat_from_yaw(heading + yaw)
+    )

@@ -48,7 +48,9 @@ class Polylines:
 
     @cached_property
     def _segments(self) -> Geometries:
-        return np.asarray(shapely.linestrings(np.stack([self.start[:, :2], self.end[:, :2]], axis=1)))
+        return np.asarray(
+            shapely.linestrings(np.stack([self.start[:, :2], self.end[:, :2]], axis=1))
+        )
 
     @cached_property
     def _tree(self) -> shapely.STRtree:
@@ -57,10 +59,13 @@ class Polylines:
     def line_within(self, xyz: F64, radius_m: float) -> Bool:
         """Return which lines ``(T, L)`` come within a radius of points ``(T, 3)``, in 3-D."""
         out = np.zeros((len(xyz), self.n_lines), dtype=np.bool_)
-        # Points in a row are near each other: lines, then segments are sorted out by the bounds of each run, and only then measured. The
-        # slack keeps rounding from hiding a segment.
+        # Points in a row are near each other: lines, then segments are sorted out by the bounds of
+        # each run, and only then measured. The slack keeps rounding from hiding a segment.
         run = np.arange(0, len(xyz), _RUN)
-        low, high = np.minimum.reduceat(xyz, run) - (radius_m + 1e-6), np.maximum.reduceat(xyz, run) + (radius_m + 1e-6)
+        low, high = (
+            np.minimum.reduceat(xyz, run) - (radius_m + 1e-6),
+            np.maximum.reduceat(xyz, run) + (radius_m + 1e-6),
+        )
         least, most = self._bounds
         meet = np.ones((len(run), self.n_lines), dtype=np.bool_)
         for d in (0, 1):
@@ -80,7 +85,9 @@ class Polylines:
         return out
 
     def vertex_within(self, xyz: F64, radius_m: float) -> Bool:
-        """Return which lines ``(T, L)`` own a vertex within a radius of points ``(T, 3)``, in 3-D."""
+        """Return which lines ``(T, L)`` own a vertex within a radius of points ``(T, 3)``, in
+        3-D.
+        """
         out = np.zeros((len(xyz), self.n_lines), dtype=np.bool_)
         if len(self.vertices):
             found = scipy.spatial.cKDTree(self.vertices).query_ball_point(xyz, radius_m)
@@ -89,17 +96,23 @@ class Polylines:
         return out
 
     def nearest_vertex_owner(self, xyz: F64) -> I64:
-        """Return the line ``(T,)`` that owns the vertex nearest to each point ``(T, 3)``, in 3-D."""
+        """Return the line ``(T,)`` that owns the vertex nearest to each point ``(T, 3)``, in
+        3-D.
+        """
         return np.asarray(self.vertex_owner[scipy.spatial.cKDTree(self.vertices).query(xyz)[1]])
 
     def nearest_of_level(self, xyz: F64, height_m: float) -> I64:
-        """Return the nearest line ``(T,)`` at the height of each point ``(T, 3)``, -1 where there is none.
+        """Return the nearest line ``(T,)`` at the height of each point ``(T, 3)``, -1 where there
+        is none.
 
-        Each line with a vertex within `LEVEL_RADIUS_M` in 3-D is judged by its vertex nearest in plan view: that one must lie within
-        ``height_m`` of the point's height, and the line whose such vertex is nearest in 3-D is taken.
+        Each line with a vertex within `LEVEL_RADIUS_M` in 3-D is judged by its vertex nearest in
+        plan view: that one must lie within ``height_m`` of the point's height, and the line whose
+        such vertex is nearest in 3-D is taken.
         """
         out = np.full(len(xyz), -1, dtype=np.int64)
-        start = np.concatenate([[0], np.flatnonzero(np.diff(self.vertex_owner)) + 1, [len(self.vertices)]])
+        start = np.concatenate(
+            [[0], np.flatnonzero(np.diff(self.vertex_owner)) + 1, [len(self.vertices)]]
+        )
         for i, near in enumerate(self.vertex_within(xyz, LEVEL_RADIUS_M)):
             best_m = np.inf
             for line in np.flatnonzero(near):
@@ -111,7 +124,9 @@ class Polylines:
         return out
 
     def touched(self, footprints: Geometries, z: F64, limit_m: float, height_m: float) -> Bool:
-        """Return whether each footprint is nearer than a limit to a segment whose middle is at most ``height_m`` above or below it."""
+        """Return whether each footprint is nearer than a limit to a segment whose middle is at most
+        ``height_m`` above or below it.
+        """
         out = np.zeros(len(footprints), dtype=np.bool_)
         body, segment = self._tree.query(footprints, predicate="dwithin", distance=limit_m)
         middle = (self.start[segment, 2] + self.end[segment, 2]) / 2
@@ -142,20 +157,29 @@ class Road:
         self._rings = lane_map.drivable_areas
 
     def areas(self, lane: I64) -> Geometries:
-        """Return the prepared areas ``(M,)`` of lanes ``(M,)``; a drive comes near few lanes of a map, so they are built when asked for."""
+        """Return the prepared areas ``(M,)`` of lanes ``(M,)``; a drive comes near few lanes of a
+        map, so they are built when asked for.
+        """
         asked = np.zeros(len(self._lanes), dtype=np.bool_)
         asked[lane] = True
         new = [k for k in np.flatnonzero(asked).tolist() if self._areas[k] is None]
         if new:
             preset = self._preset
-            self._areas[new] = lane_polygons([self._lanes[k] for k in new], self.origin, preset.lane_half_width_m, preset.alpasim_map)
+            self._areas[new] = lane_polygons(
+                [self._lanes[k] for k in new],
+                self.origin,
+                preset.lane_half_width_m,
+                preset.alpasim_map,
+            )
             shapely.prepare(self._areas[new])
         return np.asarray(self._areas[lane])
 
     @cached_property
     def edges(self) -> Geometries:
         """Road edges in plan view, ``(E,)``."""
-        return np.array([_line(edge[:, :2] - self.origin[:2]) for edge in self._edges], dtype=object)
+        return np.array(
+            [_line(edge[:, :2] - self.origin[:2]) for edge in self._edges], dtype=object
+        )
 
     @cached_property
     def _edge(self) -> Polylines:
@@ -171,13 +195,17 @@ class Road:
         return Surface(areas, outlines, self._preset.seam_m, self._preset.edge_height_m)
 
     def lanes_near(self, xyz: F64) -> Bool:
-        """Return which lanes ``(T, L)`` pass near points ``(T, 3)``, by the preset's radius and query, in 3-D whatever their direction."""
+        """Return which lanes ``(T, L)`` pass near points ``(T, 3)``, by the preset's radius and
+        query, in 3-D whatever their direction.
+        """
         if self._preset.lane_query == "vertices":
             return self._centre.vertex_within(xyz, self._preset.lane_radius_m)
         return self._centre.line_within(xyz, self._preset.lane_radius_m)
 
     def union(self, lanes: Bool) -> Any:
-        """Return the prepared union of the lanes marked in ``(L,)``; kept, as unions are costly and recur along a drive."""
+        """Return the prepared union of the lanes marked in ``(L,)``; kept, as unions are costly and
+        recur along a drive.
+        """
         key = np.packbits(lanes).tobytes()
         if key not in self._unions:
             shape = join(self.areas(np.flatnonzero(lanes)), self._preset.seam_m)
@@ -186,11 +214,16 @@ class Road:
         return self._unions[key]
 
     def borders(self, sets: Bool) -> Borders | None:
-        """Return borders that know the union of each set of lanes ``(G, L)``; None where only `union` knows it.
+        """Return borders that know the union of each set of lanes ``(G, L)``; None where only
+        `union` knows it.
 
-        That is where no seam is closed: rounding then decides whether lanes that share an edge are joined there.
+        That is where no seam is closed: rounding then decides whether lanes that share an edge are
+        joined there.
         """
-        if not 0 < self._preset.seam_m <= MOST_SEAM_M or float(np.abs(self._centre.vertices).max(initial=0.0)) > MOST_XY_M:
+        if (
+            not 0 < self._preset.seam_m <= MOST_SEAM_M
+            or float(np.abs(self._centre.vertices).max(initial=0.0)) > MOST_XY_M
+        ):
             return None
         if self._borders is None or not self._borders.know(sets):
             lanes = np.flatnonzero(sets.any(axis=0))
@@ -198,27 +231,38 @@ class Road:
         return self._borders
 
     def touches_edge(self, footprints: Geometries, xyz: F64) -> Bool:
-        """Return whether footprints ``(T,)`` with box centres ``(T, 3)`` lie nearer than the preset's threshold to the road edge.
+        """Return whether footprints ``(T,)`` with box centres ``(T, 3)`` lie nearer than the
+        preset's threshold to the road edge.
 
-        ``edge_query`` "any": to any edge at the ego's height. "nearest_vertex": to the edge that owns the vertex nearest to the centre.
-        "nearest_of_level": to the one of `_Polylines.nearest_of_level`.
+        ``edge_query`` "any": to any edge at the ego's height. "nearest_vertex": to the edge that
+        owns the vertex nearest to the centre. "nearest_of_level": to the one of
+        `_Polylines.nearest_of_level`.
         """
         limit_m = self._preset.edge_touch_m
         if self._preset.edge_query == "nearest_of_level":
             owner = self._edge.nearest_of_level(xyz, self._preset.edge_height_m)
-            return np.asarray((owner >= 0) & (shapely.distance(self.edges[owner], footprints) < limit_m))
+            return np.asarray(
+                (owner >= 0) & (shapely.distance(self.edges[owner], footprints) < limit_m)
+            )
         if self._preset.edge_query == "nearest_vertex":
-            return np.asarray(shapely.distance(self.edges[self._edge.nearest_vertex_owner(xyz)], footprints) < limit_m)
+            return np.asarray(
+                shapely.distance(self.edges[self._edge.nearest_vertex_owner(xyz)], footprints)
+                < limit_m
+            )
         return self._edge.touched(footprints, xyz[:, 2], limit_m, self._preset.edge_height_m)
 
     def heading_at(self, lane: I64, xy: F64) -> F64:
-        """Return the direction of lanes ``(M,)`` beside points ``(M, 2)``: from 1 cm before to 1 cm after the centre's nearest point."""
+        """Return the direction of lanes ``(M,)`` beside points ``(M, 2)``: from 1 cm before to 1 cm
+        after the centre's nearest point.
+        """
         for k in np.unique(lane).tolist():
             if self._centres[k] is None:
                 self._centres[k] = _line(self._lanes[k].centre[:, :2] - self.origin[:2])
         lines = self._centres[lane]
         s = shapely.line_locate_point(lines, shapely.points(xy))
-        before = shapely.get_coordinates(shapely.line_interpolate_point(lines, np.maximum(s - 0.01, 0.0)))
+        before = shapely.get_coordinates(
+            shapely.line_interpolate_point(lines, np.maximum(s - 0.01, 0.0))
+        )
         after = shapely.get_coordinates(shapely.line_interpolate_point(lines, s + 0.01))
         delta = after - before
         return np.asarray(np.arctan2(delta[:, 1], delta[:, 0]))
@@ -227,11 +271,16 @@ class Road:
 def join(areas: Geometries, seam_m: float) -> Any:
     """Return the union of lane areas with gaps up to ``seam_m`` wide closed.
 
-    Lanes that share an edge, but not its vertices, differ there by rounding. Without closing, rounding would decide whether a footprint
-    across the edge is contained, and differently at every origin.
+    Lanes that share an edge, but not its vertices, differ there by rounding. Without closing,
+    rounding would decide whether a footprint across the edge is contained, and differently at every
+    origin.
     """
     shape = areas[0] if len(areas) == 1 else shapely.union_all(areas)
-    return shapely.buffer(shape, seam_m / 2, join_style="mitre") if seam_m > 0 and len(areas) > 1 else shape
+    return (
+        shapely.buffer(shape, seam_m / 2, join_style="mitre")
+        if seam_m > 0 and len(areas) > 1
+        else shape
+    )
 
 
 def _line(xy: F64) -> Any:
@@ -243,7 +292,9 @@ _CACHED_ROADS = 8
 
 
 def road_of(lane_map: LaneMap, origin: F64, preset: Preset) -> Road:
-    """Return the prepared road of a map; the last few are kept, as rollouts of one scene come in a row."""
+    """Return the prepared road of a map; the last few are kept, as rollouts of one scene come in a
+    row.
+    """
     key = (id(lane_map), origin.tobytes(), preset)
     held = _cache.get(key)
     # An id can be reused after its object is gone; the weak reference shows that.

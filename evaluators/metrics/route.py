@@ -1,11 +1,14 @@
-"""The drive against the recorded one: distance from its path, from its position at the time, and progress along it.
+"""The drive against the recorded one: distance from its path, from its position at the time, and
+progress along it.
 
-Beyond the ends of that path the lateral distance is measured from its straight continuation: driving on is no error. Where the recorded
-car stands at an end, what its position does there is noise and no path. Progress moves along the path with the ego: where the path comes
-back beside itself, the nearest point of the whole path may be one that is still a long way ahead.
+Beyond the ends of that path the lateral distance is measured from its straight continuation:
+driving on is no error. Where the recorded car stands at an end, what its position does there is
+noise and no path. Progress moves along the path with the ego: where the path comes back beside
+itself, the nearest point of the whole path may be one that is still a long way ahead.
 
-The point compared is the ego's box centre; the recorded path is the recorded rig trajectory moved to the box centre with the log's
-rig-to-box pose. All distances are in plan view. The paper's route distance is the mean over the scored steps of the distance to that path.
+The point compared is the ego's box centre; the recorded path is the recorded rig trajectory moved
+to the box centre with the log's rig-to-box pose. All distances are in plan view. The paper's route
+distance is the mean over the scored steps of the distance to that path.
 """
 
 from __future__ import annotations
@@ -22,8 +25,11 @@ from evaluators.metrics.presets import PRESETS, Preset
 from evaluators.metrics.score import relevant, series, with_preset
 
 DIRECTION_M = 1.0
-STAND_M = 0.5  # what a recording does within this distance of its first or last position is standing there
-_ROWS = 32  # points handled at once, so that what is computed of them stays in the processor's cache
+# what a recording does within this distance of its first or last position is standing there
+STAND_M = 0.5
+_ROWS = (
+    32  # points handled at once, so that what is computed of them stays in the processor's cache
+)
 
 
 def recorded_path(rollout: RolloutLog, preset: Preset) -> Trajectory:
@@ -40,7 +46,8 @@ def to_path(path: F64, points: F64) -> tuple[F64, F64]:
         points: ``(T, 2)``.
 
     Returns:
-        Distances ``(T,)`` and arc lengths ``(T,)`` of the nearest point of the path; of several nearest ones the first.
+        Distances ``(T,)`` and arc lengths ``(T,)`` of the nearest point of the path; of several
+        nearest ones the first.
     """
     line = shapely.linestrings(np.repeat(path, 2, axis=0) if len(path) == 1 else path)
     at = shapely.points(points)
@@ -48,7 +55,9 @@ def to_path(path: F64, points: F64) -> tuple[F64, F64]:
 
 
 def moving(path: F64) -> I64:
-    """Return which vertices of a path ``(N, 2)`` remain when it stands at neither end: the ends, and those beyond `STAND_M` of them."""
+    """Return which vertices of a path ``(N, 2)`` remain when it stands at neither end: the ends,
+    and those beyond `STAND_M` of them.
+    """
     away = [np.hypot(*(path - end).T) > STAND_M for end in (path[0], path[-1])]
     if not (away[0].any() and away[1].any()):
         return np.zeros(1, dtype=np.int64)
@@ -57,7 +66,8 @@ def moving(path: F64) -> I64:
 
 
 def followed(path: F64, s: F64, points: F64, first_m: float) -> F64:
-    """Return ``(T,)`` arc lengths on a path that move no farther from step to step than points that move beside it.
+    """Return ``(T,)`` arc lengths on a path that move no farther from step to step than points that
+    move beside it.
 
     Args:
         path: ``(N, 2)`` vertices.
@@ -65,7 +75,8 @@ def followed(path: F64, s: F64, points: F64, first_m: float) -> F64:
         points: ``(T, 2)``.
         first_m: Arc length about which the first one is sought.
 
-    Each is the nearest point of the path within 2 m, and twice what the point has moved, of the one before.
+    Each is the nearest point of the path within 2 m, and twice what the point has moved, of the one
+    before.
     """
     at = arc_lengths(path)
     out, reach_m = np.array(s), 2.0 + 2.0 * np.hypot(*np.diff(points, axis=0, prepend=points[:1]).T)
@@ -75,7 +86,13 @@ def followed(path: F64, s: F64, points: F64, first_m: float) -> F64:
         before = float(out[k - 1]) if k else first_m
         low, high = max(before - reach_m[k], 0.0), min(before + reach_m[k], float(at[-1]))
         inner = path[np.searchsorted(at, low, "right") : np.searchsorted(at, high)]
-        out[k] = low + to_path(np.concatenate([_at(path, at, low)[None], inner, _at(path, at, high)[None]]), points[[k]])[1][0]
+        out[k] = (
+            low
+            + to_path(
+                np.concatenate([_at(path, at, low)[None], inner, _at(path, at, high)[None]]),
+                points[[k]],
+            )[1][0]
+        )
     return out
 
 
@@ -85,7 +102,8 @@ def _at(path: F64, along: F64, s: float) -> F64:
 
 
 def left_of(path: F64, s: F64, points: F64) -> F64:
-    """Return ``(T,)`` +1 where a point lies left of the path, -1 right of it, 0 on it, NaN where the path has no length.
+    """Return ``(T,)`` +1 where a point lies left of the path, -1 right of it, 0 on it, NaN where
+    the path has no length.
 
     Args:
         path: ``(N, 2)`` vertices.
@@ -106,7 +124,8 @@ def left_of(path: F64, s: F64, points: F64) -> F64:
 
 
 def beside(path: F64, s: F64, points: F64, distance_m: F64) -> F64:
-    """Return ``(T,)`` the distance of points from a path that goes straight on at both ends, NaN where the path has no direction.
+    """Return ``(T,)`` the distance of points from a path that goes straight on at both ends, NaN
+    where the path has no direction.
 
     Args:
         path: ``(N, 2)`` vertices.
@@ -114,7 +133,8 @@ def beside(path: F64, s: F64, points: F64, distance_m: F64) -> F64:
         points: ``(T, 2)``.
         distance_m: ``(T,)`` distance from the path itself.
 
-    The direction at an end is that of the path's last `DIRECTION_M` metres. A path that stands at an end is cut by `moving` first.
+    The direction at an end is that of the path's last `DIRECTION_M` metres. A path that stands at
+    an end is cut by `moving` first.
     """
     at = arc_lengths(path)
     length_m = float(at[-1])
@@ -122,7 +142,10 @@ def beside(path: F64, s: F64, points: F64, distance_m: F64) -> F64:
         return np.full(len(points), np.nan)
     out = np.array(distance_m)
     inner, outer = _at(path, at, DIRECTION_M), _at(path, at, length_m - DIRECTION_M)
-    for end, inside, is_there in ((path[0], inner, s <= 0.0), (path[-1], outer, s >= length_m * (1 - 1e-12))):
+    for end, inside, is_there in (
+        (path[0], inner, s <= 0.0),
+        (path[-1], outer, s >= length_m * (1 - 1e-12)),
+    ):
         away = end - inside
         away = away / np.hypot(*away)
         offset = points - end
@@ -132,7 +155,8 @@ def beside(path: F64, s: F64, points: F64, distance_m: F64) -> F64:
 
 
 def from_corridor(path: F64, s: F64, points: F64, distance_m: F64) -> F64:
-    """Return ``(T,)`` the distance of points from a path that goes straight on at its far end only, along its last segment.
+    """Return ``(T,)`` the distance of points from a path that goes straight on at its far end only,
+    along its last segment.
 
     AlpaSim's later rule; `beside` is ours. Arguments as there.
     """
@@ -147,13 +171,15 @@ def from_corridor(path: F64, s: F64, points: F64, distance_m: F64) -> F64:
 
 
 def progress_so_far(path: F64, points: F64) -> F64:
-    """Return ``(T,)`` how far point k has come along the first k + 1 vertices of a path, as a share of their length.
+    """Return ``(T,)`` how far point k has come along the first k + 1 vertices of a path, as a share
+    of their length.
 
     Args:
         path: ``(T, 2)`` where the recording is at each step.
         points: ``(T, 2)`` where the ego is.
 
-    1 where that part of the path has no length: the recording has not moved, so there is nothing to be behind of.
+    1 where that part of the path has no length: the recording has not moved, so there is nothing to
+    be behind of.
     """
     n = len(path)
     s = arc_lengths(path)
@@ -165,7 +191,9 @@ def progress_so_far(path: F64, points: F64) -> F64:
     out = np.ones(n)
     for low in range(1, n, _ROWS):
         rows = np.arange(low, min(low + _ROWS, n))
-        there = slice(0, int(rows[-1]))  # segments that start at or after vertex k do not exist yet for point k
+        there = slice(
+            0, int(rows[-1])
+        )  # segments that start at or after vertex k do not exist yet for point k
         to_x, to_y = points[rows, :1] - x[there], points[rows, 1:] - y[there]  # (R, S)
         f = np.clip((to_x * along_x[there] + to_y * along_y[there]) / over[there], 0.0, 1.0)
         to_x -= f * along_x[there]
@@ -186,7 +214,8 @@ class OnRoute:
     Attributes:
         length_m: Length of the path.
         along_m: ``(T,)`` how far along it, continuous from step to step.
-        aside_m: ``(T,)`` how far beside it, NaN where it has no direction; it goes straight on at both ends.
+        aside_m: ``(T,)`` how far beside it, NaN where it has no direction; it goes straight on at
+            both ends.
         side: ``(T,)`` as `left_of`.
     """
 
@@ -197,13 +226,17 @@ class OnRoute:
 
 
 def on_route(path: F64, recorded_us: I64, t_us: I64, points: F64) -> OnRoute:
-    """Set points ``(T, 2)`` at times ``(T,)`` beside a recorded path ``(N, 2)`` with times ``(N,)``."""
+    """Set points ``(T, 2)`` at times ``(T,)`` beside a recorded path ``(N, 2)`` with times
+    ``(N,)``.
+    """
     keep = moving(path)
     line = path[keep]
     along = arc_lengths(line)
     distance_m, s = to_path(line, points)
     followed_m = followed(line, s, points, float(np.interp(t_us[0], recorded_us[keep], along)))
-    return OnRoute(float(along[-1]), followed_m, beside(line, s, points, distance_m), left_of(line, s, points))
+    return OnRoute(
+        float(along[-1]), followed_m, beside(line, s, points, distance_m), left_of(line, s, points)
+    )
 
 
 def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> list[MetricSeries]:
@@ -216,7 +249,13 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
     distance_m, s = to_path(path, ego)
     length_m = float(arc_lengths(path)[-1])
     covered = (t_us >= recorded.t_us[0]) & (t_us <= recorded.t_us[-1])
-    there = held(interpolate(recorded, np.clip(t_us, recorded.t_us[0], recorded.t_us[-1]))[:, :3, 3], preset)[:, :2] - origin[:2]
+    there = (
+        held(
+            interpolate(recorded, np.clip(t_us, recorded.t_us[0], recorded.t_us[-1]))[:, :3, 3],
+            preset,
+        )[:, :2]
+        - origin[:2]
+    )
     away_m = np.hypot(*(ego - there).T)
     on = None if preset.aliases else on_route(path, recorded.t_us, t_us, ego)
     share, of_m = (s, length_m) if on is None else (on.along_m, on.length_m)
@@ -231,7 +270,8 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
     first = int(np.argmax(engaged)) if preset.distance_from == "handover" else 0
     traveled_m = np.maximum(driven_m - driven_m[first], 0.0)
     if preset.invented_starts:
-        # AlpaSim fills the first two rows in by hand, and projects the ego on its own path instead of adding up its steps.
+        # AlpaSim fills the first two rows in by hand, and projects the ego on its own path instead
+        # of adding up its steps.
         traveled_m = to_path(rollout.ego.xyz[:, :2] - origin[:2], ego)[1]
         share[:2] = [0.0, share[2] / 2] if len(share) > 2 else 0.0
         so_far[:2] = 1.0
@@ -264,9 +304,15 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
 
 
 def lateral_bias(rollout: RolloutLog) -> MetricSeries:
-    """Return ``lateral_bias_m`` of a rollout, for tables of presets whose metrics do not have it, such as ``alpasim``."""
+    """Return ``lateral_bias_m`` of a rollout, for tables of presets whose metrics do not have it,
+    such as ``alpasim``.
+    """
     # The map plays no part in it.
-    return next(one for one in evaluate_route(rollout, None, PRESETS["paper"]) if one.name == "lateral_bias_m")
+    return next(
+        one
+        for one in evaluate_route(rollout, None, PRESETS["paper"])
+        if one.name == "lateral_bias_m"
+    )
 
 
 FACTORY = with_preset(evaluate_route)

@@ -1,4 +1,6 @@
-"""The entry point `score`, and the checks that a log must pass before any number is taken from it."""
+"""The entry point `score`, and the checks that a log must pass before any number is taken from
+it.
+"""
 
 from __future__ import annotations
 
@@ -37,15 +39,23 @@ def resolve_evaluators(more: Sequence[str] = ()) -> tuple[PartSpec, ...]:
 
 def resolve_plugins() -> tuple[PartSpec, ...]:
     """Resolve the evaluators of other packages alone."""
-    return tuple(resolve("evaluator", name) for name in names("evaluator") if name not in BUILTIN["evaluator"])
+    return tuple(
+        resolve("evaluator", name)
+        for name in names("evaluator")
+        if name not in BUILTIN["evaluator"]
+    )
 
 
 def score(
-    rollout: RolloutLog, scene: Scene, preset: str | Preset = DEFAULT, evaluators: Sequence[PartSpec] | None = None
+    rollout: RolloutLog,
+    scene: Scene,
+    preset: str | Preset = DEFAULT,
+    evaluators: Sequence[PartSpec] | None = None,
 ) -> list[MetricSeries]:
     """Score one rollout.
 
-    A value is NaN and ``valid`` is False where an evaluator has no ground to give one; ``reason`` then says why.
+    A value is NaN and ``valid`` is False where an evaluator has no ground to give one; ``reason``
+    then says why.
 
     Args:
         rollout: What was driven.
@@ -57,7 +67,8 @@ def score(
         One series per metric, over the whole log including the warm-up.
 
     Raises:
-        EvaluatorError: The log cannot be scored (NaN pose, repeated time), an evaluator failed, or two gave the same metric.
+        EvaluatorError: The log cannot be scored (NaN pose, repeated time), an evaluator failed, or
+            two gave the same metric.
         InputError: Unknown preset.
     """
     chosen = find_preset(preset)
@@ -69,16 +80,21 @@ def score(
         for one in run_evaluator(spec.name, build(spec, preset=chosen), rollout, scene, known):
             if one.name in out:
                 found = f"metric {one.name!r} was given twice"
-                raise EvaluatorError("scoring a rollout", f"evaluator {spec.name!r}", found, "rename one of them")
+                raise EvaluatorError(
+                    "scoring a rollout", f"evaluator {spec.name!r}", found, "rename one of them"
+                )
             out[one.name] = one
     return list(out.values())
 
 
-def run_evaluator(name: str, evaluator: Evaluator, rollout: RolloutLog, scene: Scene, known: MetricTable = METRICS) -> list[MetricSeries]:
+def run_evaluator(
+    name: str, evaluator: Evaluator, rollout: RolloutLog, scene: Scene, known: MetricTable = METRICS
+) -> list[MetricSeries]:
     """Run one evaluator, check its answer and give every series its metric from a table.
 
     Raises:
-        EvaluatorError: It failed, gave a metric that the table does not hold, or series of unlike lengths; it is named.
+        EvaluatorError: It failed, gave a metric that the table does not hold, or series of unlike
+            lengths; it is named.
     """
     try:
         answer = [replace(one, metric=known.info(one.name)) for one in evaluator(rollout, scene)]
@@ -92,7 +108,9 @@ def run_evaluator(name: str, evaluator: Evaluator, rollout: RolloutLog, scene: S
             "run with --debug for the traceback",
         ) from exc
     for one in answer:
-        if not (one.t_us.shape == one.value.shape == one.valid.shape) or (one.reason == "" and not bool(np.all(one.valid))):
+        if not (one.t_us.shape == one.value.shape == one.valid.shape) or (
+            one.reason == "" and not bool(np.all(one.valid))
+        ):
             raise EvaluatorError(
                 "scoring a rollout",
                 f"evaluator {name!r}, metric {one.name!r}",
@@ -104,9 +122,16 @@ def run_evaluator(name: str, evaluator: Evaluator, rollout: RolloutLog, scene: S
 
 
 def series(
-    name: str, t_us: I64, value: npt.ArrayLike, valid: Bool | bool = True, reason: str = "", *, keep_values: bool = False
+    name: str,
+    t_us: I64,
+    value: npt.ArrayLike,
+    valid: Bool | bool = True,
+    reason: str = "",
+    *,
+    keep_values: bool = False,
 ) -> MetricSeries:
-    """Build a series of one of our metrics, or of one that the evaluator's ``metrics`` hold: `score` then gives it what they say.
+    """Build a series of one of our metrics, or of one that the evaluator's ``metrics`` hold:
+    `score` then gives it what they say.
 
     Args:
         name: Metric.
@@ -137,8 +162,9 @@ def check_rollout(rollout: RolloutLog) -> None:
     """Refuse logs from which no number may be taken.
 
     Raises:
-        EvaluatorError: No ego pose, times that do not increase, poses that are not finite, quaternions that are not rotations, or a
-            size that is not positive; for the ego, the recorded drive or any actor.
+        EvaluatorError: No ego pose, times that do not increase, poses that are not finite,
+            quaternions that are not rotations, or a size that is not positive; for the ego, the
+            recorded drive or any actor.
     """
     _check_track("the ego", rollout.ego, rollout)
     _check_track("the recorded drive", rollout.ego_log, rollout)
@@ -146,19 +172,28 @@ def check_rollout(rollout: RolloutLog) -> None:
     for actor in rollout.actors.values():
         _check_track(f"actor {actor.actor_id!r}", actor.track, rollout)
         _check_size(f"actor {actor.actor_id!r}", actor.box.length_m, actor.box.width_m, rollout)
-    plans = [(plan.now_us, one) for plan in rollout.plans for one in (plan.trajectory, *plan.samples) if len(one)]
+    plans = [
+        (plan.now_us, one)
+        for plan in rollout.plans
+        for one in (plan.trajectory, *plan.samples)
+        if len(one)
+    ]
     if not _all_sound([one for _, one in plans]):
         for now_us, one in plans:
             _check_track(f"the plan at {now_us} us", one, rollout)
 
 
 def _all_sound(tracks: Sequence[Trajectory]) -> bool:
-    """Check many tracks at once; the slower `_check_track` finds the culprit and words the error."""
+    """Check many tracks at once; the slower `_check_track` finds the culprit and words the
+    error.
+    """
     if not tracks:
         return True
     if any(one.xyz.shape != (len(one), 3) or one.quat.shape != (len(one), 4) for one in tracks):
         return False
-    t_us, xyz, quat = (np.concatenate([getattr(one, name) for one in tracks]) for name in ("t_us", "xyz", "quat"))
+    t_us, xyz, quat = (
+        np.concatenate([getattr(one, name) for one in tracks]) for name in ("t_us", "xyz", "quat")
+    )
     first = np.zeros(len(t_us), dtype=np.bool_)
     first[np.cumsum([0, *(len(one) for one in tracks[:-1])])] = True
     increasing = bool(np.all((np.diff(t_us) > 0) | first[1:]))
@@ -178,11 +213,17 @@ def _check_track(who: str, track: Trajectory, rollout: RolloutLog) -> None:
     if len(track) == 0:
         raise refuse("no pose at all")
     if track.xyz.shape != (len(track), 3) or track.quat.shape != (len(track), 4):
-        raise refuse(f"{len(track)} times, positions of shape {track.xyz.shape}, rotations of shape {track.quat.shape}")
+        raise refuse(
+            f"{len(track)} times, positions of shape {track.xyz.shape}, rotations of shape {track.quat.shape}"
+        )
     steps = np.diff(track.t_us)
     if np.any(steps <= 0):
         i = int(np.argmax(steps <= 0))
-        kind = "is repeated" if steps[i] == 0 else f"is followed by the earlier {int(track.t_us[i + 1])} us"
+        kind = (
+            "is repeated"
+            if steps[i] == 0
+            else f"is followed by the earlier {int(track.t_us[i + 1])} us"
+        )
         raise refuse(f"time {int(track.t_us[i])} us {kind}")
     finite = np.isfinite(track.xyz).all(axis=1) & np.isfinite(track.quat).all(axis=1)
     if not finite.all():
@@ -190,7 +231,9 @@ def _check_track(who: str, track: Trajectory, rollout: RolloutLog) -> None:
     off = np.abs(np.linalg.norm(track.quat, axis=1) - 1.0)
     if float(off.max()) > 1e-3:
         i = int(np.argmax(off))
-        raise refuse(f"a quaternion of length {float(np.linalg.norm(track.quat[i])):.6g} at {int(track.t_us[i])} us")
+        raise refuse(
+            f"a quaternion of length {float(np.linalg.norm(track.quat[i])):.6g} at {int(track.t_us[i])} us"
+        )
 
 
 def _check_size(who: str, length_m: float, width_m: float, rollout: RolloutLog) -> None:
@@ -204,5 +247,7 @@ def _check_size(who: str, length_m: float, width_m: float, rollout: RolloutLog) 
 
 
 def with_preset(function: Callable[..., list[MetricSeries]]) -> Callable[[Preset], Any]:
-    """Return the factory of an evaluator that is a function ``(rollout, scene, preset) -> series``."""
+    """Return the factory of an evaluator that is a function ``(rollout, scene, preset) ->
+    series``.
+    """
     return lambda preset: partial(function, preset=preset)

@@ -1,9 +1,10 @@
 """The drivable surface of a map as one shape, and the signed margin of footprints to its border.
 
-The surface is the union of all lane areas and drivable areas on the ego's level. Gaps between them up to the preset's ``seam_m`` wide are
-closed; the border elsewhere stays where the map has it. The margin is the least over the footprint's points of the signed distance to the
-border, positive inside: inside, the gap to the border; outside, minus how far the point that sticks out most is from the surface. It is
-continuous and defined however far from the map the ego is.
+The surface is the union of all lane areas and drivable areas on the ego's level. Gaps between them
+up to the preset's ``seam_m`` wide are closed; the border elsewhere stays where the map has it. The
+margin is the least over the footprint's points of the signed distance to the border, positive
+inside: inside, the gap to the border; outside, minus how far the point that sticks out most is from
+the surface. It is continuous and defined however far from the map the ego is.
 """
 
 from __future__ import annotations
@@ -22,25 +23,34 @@ from evaluators.metrics.footprint import Geometries
 MARGIN_M = 1e-6  # accuracy of the margin
 SLOPE = 0.2  # a road on the ego's level may lie this much higher or lower per metre of distance
 _GRID_M = 1e-7  # shared edges that differ by rounding only are joined on this grid
-_MOUTH = 0.35  # a gap is open along less than this share of its outline; what closing adds to bends of the outer border is open to more
+# a gap is open along less than this share of its outline; what closing adds to bends of the outer
+# border is open to more
+_MOUTH = 0.35
 _N_FEATURES = 6
 
 
 class Surface:
     """The drivable surface of one map, metres relative to its origin."""
 
-    def __init__(self, areas: Geometries, outlines: Sequence[F64], seam_m: float, level_m: float) -> None:
+    def __init__(
+        self, areas: Geometries, outlines: Sequence[F64], seam_m: float, level_m: float
+    ) -> None:
         """Take shapes and their outlines in space.
 
         Args:
             areas: ``(B,)`` plan-view polygons.
             outlines: B polylines ``(N, 3)`` that give their heights.
             seam_m: Widest gap to close.
-            level_m: What lies farther above or below than this, and `SLOPE` per metre of distance, is another road.
+            level_m: What lies farther above or below than this, and `SLOPE` per metre of distance,
+                is another road.
         """
         self._areas, self._seam_m, self._level_m = areas, seam_m, level_m
-        self._outlines = [np.repeat(line, 2, axis=0) if len(line) == 1 else line for line in outlines]
-        self._bounds = np.array([(line.min(axis=0), line.max(axis=0)) for line in self._outlines]).reshape(-1, 2, 3)
+        self._outlines = [
+            np.repeat(line, 2, axis=0) if len(line) == 1 else line for line in outlines
+        ]
+        self._bounds = np.array(
+            [(line.min(axis=0), line.max(axis=0)) for line in self._outlines]
+        ).reshape(-1, 2, 3)
         self._regions: dict[bytes, Region] = {}
 
     @property
@@ -49,10 +59,14 @@ class Surface:
         return bool(np.all(shapely.is_empty(self._areas)))
 
     def margin_m(self, footprints: Geometries, xyz: F64) -> F64:
-        """Return the signed margins ``(T,)`` of footprints ``(T,)`` with box centres ``(T, 3)``, -inf where nothing is on their level."""
+        """Return the signed margins ``(T,)`` of footprints ``(T,)`` with box centres ``(T, 3)``,
+        -inf where nothing is on their level.
+        """
         level = self.on_level(xyz)
         out = np.full(len(footprints), -np.inf)
-        _, first, group = np.unique(np.packbits(level, axis=1), axis=0, return_index=True, return_inverse=True)
+        _, first, group = np.unique(
+            np.packbits(level, axis=1), axis=0, return_index=True, return_inverse=True
+        )
         group = group.reshape(-1)
         for g, representative in enumerate(first):
             if level[representative].any():
@@ -61,10 +75,16 @@ class Surface:
         return out
 
     def on_level(self, xyz: F64) -> Bool:
-        """Return which areas ``(T, B)`` are on the level of points ``(T, 3)``: not on a bridge above nor on a road below."""
-        # Near enough even if the whole outline were at its extreme height and at the nearest corner of its bounds.
+        """Return which areas ``(T, B)`` are on the level of points ``(T, 3)``: not on a bridge
+        above nor on a road below.
+        """
+        # Near enough even if the whole outline were at its extreme height and at the nearest corner
+        # of its bounds.
         low, high = self._bounds[:, 0], self._bounds[:, 1]  # (B, 3)
-        outside = np.maximum(np.maximum(low[None, :, :2] - xyz[:, None, :2], xyz[:, None, :2] - high[None, :, :2]), 0.0)
+        outside = np.maximum(
+            np.maximum(low[None, :, :2] - xyz[:, None, :2], xyz[:, None, :2] - high[None, :, :2]),
+            0.0,
+        )
         at_least_m = np.hypot(outside[..., 0], outside[..., 1])  # (T, B)
         rise_m = np.maximum(high[None, :, 2] - xyz[:, None, 2], xyz[:, None, 2] - low[None, :, 2])
         out = np.asarray(rise_m <= self._level_m + SLOPE * at_least_m)
@@ -72,7 +92,9 @@ class Surface:
             rows, line = np.flatnonzero(~out[:, b]), self._outlines[b]
             flat, points = shapely.linestrings(line[:, :2]), shapely.points(xyz[rows, :2])
             z = np.interp(shapely.line_locate_point(flat, points), arc_lengths(line), line[:, 2])
-            out[rows, b] = np.abs(z - xyz[rows, 2]) <= self._level_m + SLOPE * shapely.distance(flat, points)
+            out[rows, b] = np.abs(z - xyz[rows, 2]) <= self._level_m + SLOPE * shapely.distance(
+                flat, points
+            )
         return out
 
     def region(self, chosen: Bool) -> Region:
@@ -89,10 +111,16 @@ class Region:
     def __init__(self, shape: Any) -> None:
         self.shape = shape
         shapely.prepare(shape)
-        rings = [shapely.get_coordinates(ring) for part in shapely.get_parts(shape) for ring in shapely.get_rings(part)]
+        rings = [
+            shapely.get_coordinates(ring)
+            for part in shapely.get_parts(shape)
+            for ring in shapely.get_rings(part)
+        ]
         self._start = np.concatenate([np.zeros((0, 2)), *(ring[:-1] for ring in rings)])
         self._end = np.concatenate([np.zeros((0, 2)), *(ring[1:] for ring in rings)])
-        self._tree = shapely.STRtree(shapely.linestrings(np.stack([self._start, self._end], axis=1)))
+        self._tree = shapely.STRtree(
+            shapely.linestrings(np.stack([self._start, self._end], axis=1))
+        )
 
     def margin_m(self, footprints: Geometries) -> F64:
         """Return the signed margins ``(T,)`` of polygons, -inf where the shape is empty."""
@@ -109,17 +137,24 @@ class Region:
         return self._nearest(shapely.points(xy))[1]
 
     def _nearest(self, shapes: Geometries) -> tuple[I64, F64]:
-        """Return the nearest border segment and its distance per shape; among equally near ones any."""
-        (_, segment), distance = self._tree.query_nearest(shapes, return_distance=True, all_matches=False)
+        """Return the nearest border segment and its distance per shape; among equally near ones
+        any.
+        """
+        (_, segment), distance = self._tree.query_nearest(
+            shapes, return_distance=True, all_matches=False
+        )
         return np.asarray(segment), np.asarray(distance)
 
     def _depth_m(self, footprints: Geometries) -> F64:
-        """Return how far ``(N,)`` footprints stick out: the greatest distance to the shape among their points, to `MARGIN_M`.
+        """Return how far ``(N,)`` footprints stick out: the greatest distance to the shape among
+        their points, to `MARGIN_M`.
 
-        What sticks out is cut into ever smaller pieces. The distance to one border segment is convex, and so is the mean of two; over a
-        piece neither exceeds its greatest value at the piece's corners, and the distance to the shape exceeds neither. Pieces that
-        cannot hold a greater distance than one already found are dropped. Two segments are needed for gaps: halfway between two parallel
-        borders no single one bounds the distance well, and no corner of a piece need lie there.
+        What sticks out is cut into ever smaller pieces. The distance to one border segment is
+        convex, and so is the mean of two; over a piece neither exceeds its greatest value at the
+        piece's corners, and the distance to the shape exceeds neither. Pieces that cannot hold a
+        greater distance than one already found are dropped. Two segments are needed for gaps:
+        halfway between two parallel borders no single one bounds the distance well, and no corner
+        of a piece need lie there.
         """
         best = np.zeros(len(footprints))
         pieces = shapely.difference(footprints, self.shape)
@@ -136,7 +171,9 @@ class Region:
         return best
 
     def _halfway_m(self, corner: F64, piece: I64, nearest: I64, distance: F64) -> F64:
-        """Return for each piece the distance ``(M,)`` of a point of the footprint about as far from one border as from another."""
+        """Return for each piece the distance ``(M,)`` of a point of the footprint about as far from
+        one border as from another.
+        """
         n = np.bincount(piece)
         last = np.cumsum(n) - 1
         a = np.lexsort((distance, piece))[last]
@@ -144,51 +181,72 @@ class Region:
         b = np.lexsort((np.where(other, distance, -1.0), piece))[last]
         lead = []  # by how much the border near a is nearer than the one near b, at a and at b
         for at in (a, b):
-            to = [segment_distance(self._start[nearest[k]], self._end[nearest[k]], corner[at]) for k in (a, b)]
+            to = [
+                segment_distance(self._start[nearest[k]], self._end[nearest[k]], corner[at])
+                for k in (a, b)
+            ]
             lead.append(to[1] - to[0])
         span = lead[0] - lead[1]
         f = np.clip(np.divide(lead[0], span, out=np.zeros_like(span), where=span > 0), 0.0, 1.0)
         point = corner[a] + f[:, None] * (corner[b] - corner[a])
         return np.where(shapely.contains_xy(self.shape, point), 0.0, self.border_distance_m(point))
 
-    def _bound_m(self, pieces: Geometries, corner: F64, piece: I64, nearest: I64, distance: F64) -> F64:
+    def _bound_m(
+        self, pieces: Geometries, corner: F64, piece: I64, nearest: I64, distance: F64
+    ) -> F64:
         """Return for each piece a distance ``(M,)`` that none of its points exceeds."""
         n = np.bincount(piece, minlength=len(pieces))
         begin = np.cumsum(n) - n
         deepest = np.lexsort((distance, piece))[begin + n - 1]
         spread = [begin + (k * n) // 4 for k in range(4)]
         middle, _ = self._nearest(shapely.centroid(pieces))
-        features = np.stack([middle, *(nearest[v] for v in (deepest, *spread))], axis=1)  # (M, _N_FEATURES)
-        away = np.stack([segment_distance(self._start[f], self._end[f], corner) for f in features[piece].T], axis=1)
+        features = np.stack(
+            [middle, *(nearest[v] for v in (deepest, *spread))], axis=1
+        )  # (M, _N_FEATURES)
+        away = np.stack(
+            [segment_distance(self._start[f], self._end[f], corner) for f in features[piece].T],
+            axis=1,
+        )
         bound = np.full(len(pieces), np.inf)
         for i, j in combinations_with_replacement(range(_N_FEATURES), 2):
             np.minimum(bound, np.maximum.reduceat((away[:, i] + away[:, j]) / 2, begin), out=bound)
         return bound
 
 
-@np.errstate(divide="ignore", invalid="ignore")  # flags that the geometry library raises inside and has dealt with
+@np.errstate(
+    divide="ignore", invalid="ignore"
+)  # flags that the geometry library raises inside and has dealt with
 def closed_union(areas: Geometries, seam_m: float) -> Any:
     """Return the union of areas with the gaps between them up to ``seam_m`` wide filled.
 
-    Filled is what a disc of that diameter cannot reach from outside (morphological closing). Closing also rounds off bends of the outer
-    border by small slivers. These are open to the outside along much of their outline, unlike gaps, and are left out, so that the outer
-    border is the map's own.
+    Filled is what a disc of that diameter cannot reach from outside (morphological closing).
+    Closing also rounds off bends of the outer border by small slivers. These are open to the
+    outside along much of their outline, unlike gaps, and are left out, so that the outer border is
+    the map's own.
     """
     shape = shapely.union_all(areas[~shapely.is_empty(areas)], grid_size=_GRID_M)
     if seam_m <= 0 or shapely.is_empty(shape):
         return shape
-    radius_m = 0.505 * seam_m  # arcs are drawn as polygons inside the circle; a gap of seam_m must close all the same
+    radius_m = (
+        0.505 * seam_m
+    )  # arcs are drawn as polygons inside the circle; a gap of seam_m must close all the same
     wide = shapely.buffer(shape, radius_m, quad_segs=16)
-    added = shapely.get_parts(shapely.difference(shapely.buffer(wide, -radius_m, quad_segs=16), shape))
+    added = shapely.get_parts(
+        shapely.difference(shapely.buffer(wide, -radius_m, quad_segs=16), shape)
+    )
     added = added[shapely.area(added) > 0]
     if not len(added):
         return shape
-    gaps = shapely.buffer(added[_open_share(added, Region(shape)) < _MOUTH], 5 * _GRID_M, join_style="mitre")
+    gaps = shapely.buffer(
+        added[_open_share(added, Region(shape)) < _MOUTH], 5 * _GRID_M, join_style="mitre"
+    )
     return shapely.union_all(np.concatenate([[shape], gaps]), grid_size=_GRID_M)
 
 
 def _open_share(added: Geometries, region: Region) -> F64:
-    """Return the share ``(M,)`` of the outline of each polygon that does not run along a region's border."""
+    """Return the share ``(M,)`` of the outline of each polygon that does not run along a region's
+    border.
+    """
     ring, part = shapely.get_coordinates(shapely.get_exterior_ring(added), return_index=True)
     side = np.flatnonzero(part[1:] == part[:-1])
     length = np.linalg.norm(ring[side + 1] - ring[side], axis=1)
@@ -201,8 +259,15 @@ def _quartered(owner: I64, pieces: Geometries) -> tuple[I64, Geometries]:
     """Cut pieces at the middle of their bounds; empty quarters are left out."""
     low_x, low_y, high_x, high_y = shapely.bounds(pieces).reshape(-1, 4).T
     x, y = (low_x + high_x) / 2, (low_y + high_y) / 2
-    quarters = [(low_x, low_y, x, y), (x, low_y, high_x, y), (low_x, y, x, high_y), (x, y, high_x, high_y)]
-    cut = np.concatenate([shapely.intersection(pieces, shapely.box(*quarter)) for quarter in quarters])
+    quarters = [
+        (low_x, low_y, x, y),
+        (x, low_y, high_x, y),
+        (low_x, y, x, high_y),
+        (x, y, high_x, high_y),
+    ]
+    cut = np.concatenate(
+        [shapely.intersection(pieces, shapely.box(*quarter)) for quarter in quarters]
+    )
     keep = np.flatnonzero(~shapely.is_empty(cut))
     return np.tile(owner, 4)[keep], cut[keep]
 

@@ -1,9 +1,11 @@
 """First contact of two moving rectangles, exact to one nanometre.
 
-Each body's centre moves on a straight line and its heading turns at a constant rate. Two rectangles are apart if and only if one of the
-four directions of their sides separates them (separating axis theorem). The gap along such a direction is a smooth function of time, up
-to downward kinks, whose second derivative is bounded by the speeds. A stretch of time is ruled out where one gap, less what that
-curvature could hide, stays above zero; any other stretch is halved. So no contact is passed over, however short.
+Each body's centre moves on a straight line and its heading turns at a constant rate. Two rectangles
+are apart if and only if one of the four directions of their sides separates them (separating axis
+theorem). The gap along such a direction is a smooth function of time, up to downward kinks, whose
+second derivative is bounded by the speeds. A stretch of time is ruled out where one gap, less what
+that curvature could hide, stays above zero; any other stretch is halved. So no contact is passed
+over, however short.
 
 Lengths are metres. Time is the share ``tau`` of the stretch, 0 to 1.
 """
@@ -32,7 +34,9 @@ class Motions:
 
     def take(self, rows: I64) -> Motions:
         """Return some of the pairs."""
-        return Motions(self.start[rows], self.shift[rows], self.yaw[rows], self.turn[rows], self.half[rows])
+        return Motions(
+            self.start[rows], self.shift[rows], self.yaw[rows], self.turn[rows], self.half[rows]
+        )
 
     def distance_m(self) -> F64:
         """Return the least distance ``(M,)`` of the centres."""
@@ -47,7 +51,9 @@ class Motions:
 
 
 def gaps(pairs: Motions, tau: F64) -> F64:
-    """Return the gaps ``(M, 8)`` along the sides' directions at ``(M,)``: the bodies are apart where the largest is positive."""
+    """Return the gaps ``(M, 8)`` along the sides' directions at ``(M,)``: the bodies are apart
+    where the largest is positive.
+    """
     at = pairs.start + tau[:, None] * pairs.shift
     yaw = pairs.yaw + tau[:, None] * pairs.turn
     c, s = np.abs(np.cos(yaw[:, 1] - yaw[:, 0])), np.abs(np.sin(yaw[:, 1] - yaw[:, 0]))
@@ -56,7 +62,10 @@ def gaps(pairs: Motions, tau: F64) -> F64:
         cos, sin = np.cos(yaw[:, body]), np.sin(yaw[:, body])
         own, other = pairs.half[:, body], pairs.half[:, 1 - body]
         offsets = (cos * at[:, 0] + sin * at[:, 1], cos * at[:, 1] - sin * at[:, 0])
-        reach = (own[:, 0] + other[:, 0] * c + other[:, 1] * s, own[:, 1] + other[:, 0] * s + other[:, 1] * c)
+        reach = (
+            own[:, 0] + other[:, 0] * c + other[:, 1] * s,
+            own[:, 1] + other[:, 0] * s + other[:, 1] * c,
+        )
         for axis in (0, 1):
             k = 4 * body + 2 * axis
             out[:, k], out[:, k + 1] = offsets[axis] - reach[axis], -offsets[axis] - reach[axis]
@@ -66,30 +75,42 @@ def gaps(pairs: Motions, tau: F64) -> F64:
 def curvature(pairs: Motions) -> F64:
     """Return a bound ``(M, 8)`` on the second derivative of each gap between its kinks.
 
-    With n turning at rate w and r moving by v: (n . r)'' = n''. r + 2 n'. v, at most w^2 |r| + 2 |w| |v|. The other body's reach along n is
-    a cosine of the relative heading with its half diagonal as amplitude.
+    With n turning at rate w and r moving by v: (n . r)'' = n''. r + 2 n'. v, at most w^2 |r| + 2
+    |w| |v|. The other body's reach along n is a cosine of the relative heading with its half
+    diagonal as amplitude.
     """
-    far = np.maximum(np.linalg.norm(pairs.start, axis=1), np.linalg.norm(pairs.start + pairs.shift, axis=1))
+    far = np.maximum(
+        np.linalg.norm(pairs.start, axis=1), np.linalg.norm(pairs.start + pairs.shift, axis=1)
+    )
     speed = np.linalg.norm(pairs.shift, axis=1)
     relative = (pairs.turn[:, 1] - pairs.turn[:, 0]) ** 2
     turn, radius = np.abs(pairs.turn), pairs.radius_m()
-    per_body = [turn[:, b] ** 2 * far + 2 * turn[:, b] * speed + relative * radius[:, 1 - b] for b in (0, 1)]
+    per_body = [
+        turn[:, b] ** 2 * far + 2 * turn[:, b] * speed + relative * radius[:, 1 - b] for b in (0, 1)
+    ]
     return np.repeat(np.stack(per_body, axis=1), _N_GAPS // 2, axis=1)
 
 
 def slope(pairs: Motions) -> F64:
     """Return a bound ``(M,)`` on how fast any gap changes."""
-    far = np.maximum(np.linalg.norm(pairs.start, axis=1), np.linalg.norm(pairs.start + pairs.shift, axis=1))
+    far = np.maximum(
+        np.linalg.norm(pairs.start, axis=1), np.linalg.norm(pairs.start + pairs.shift, axis=1)
+    )
     turn = np.abs(pairs.turn)
-    return np.asarray(np.linalg.norm(pairs.shift, axis=1) + turn.max(axis=1) * far + turn.sum(axis=1) * pairs.radius_m().max(axis=1))
+    return np.asarray(
+        np.linalg.norm(pairs.shift, axis=1)
+        + turn.max(axis=1) * far
+        + turn.sum(axis=1) * pairs.radius_m().max(axis=1)
+    )
 
 
 def first_contact(pairs: Motions) -> F64:
     """Return when each pair first touches.
 
     Returns:
-        ``(M,)`` tau, inf where it never does. Where a time is given, the bodies are at most `TOUCH_M` apart at it, and more than zero apart
-        until `TOUCH_M` of motion before it; where none is given, they are apart throughout.
+        ``(M,)`` tau, inf where it never does. Where a time is given, the bodies are at most
+        `TOUCH_M` apart at it, and more than zero apart until `TOUCH_M` of motion before it; where
+        none is given, they are apart throughout.
     """
     n = len(pairs.start)
     found = np.full(n, np.inf)
@@ -107,9 +128,13 @@ def first_contact(pairs: Motions) -> F64:
         short = open_ & (steep[owner] * width <= TOUCH_M / 4)
         np.minimum.at(found, owner[short], low[short])
         rows = np.flatnonzero(open_ & ~short)
-        owner, low, width = owner[rows], low[rows], width[rows] / 2
+        owner = owner[rows]
+        low = low[rows]
+        width = width[rows] / 2
         at_low, at_high = at_low[rows], at_high[rows]
         at_middle = gaps(pairs.take(owner), low + width)
-        owner, low, width = np.tile(owner, 2), np.concatenate([low, low + width]), np.tile(width, 2)
+        owner = np.tile(owner, 2)
+        low = np.concatenate([low, low + width])
+        width = np.tile(width, 2)
         at_low, at_high = np.concatenate([at_low, at_middle]), np.concatenate([at_middle, at_high])
     return found

@@ -1,4 +1,6 @@
-"""Reports from a run folder: HTML, Markdown, JUnit and the terminal table. A pure reader: no renderer, no policy, no scenario files."""
+"""Reports from a run folder: HTML, Markdown, JUnit and the terminal table. A pure reader: no
+renderer, no policy, no scenario files.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,16 @@ if TYPE_CHECKING:
     from evaluators.report.terminal import ending_lines, next_line, render_presets, render_table
 
 __all__ = [
-    "ending_lines", "fixer_lines", "next_line", "plan_warnings", "render_presets", "render_table", "write_junit", "write_report",
+    "ending_lines",
+    "fixer_lines",
+    "next_line",
+    "plan_warnings",
+    "render_presets",
+    "render_table",
+    "write_junit",
+    "write_report",
     "write_summary_md",
-]  # fmt: skip
+]
 
 _HOMES = {
     ".ci": ("write_junit", "write_summary_md"),

@@ -1,7 +1,9 @@
-"""Lay out a scene seen from above: lanes, the logged drive, what each rollout drove, and where it went wrong.
+"""Lay out a scene seen from above: lanes, the logged drive, what each rollout drove, and where it
+went wrong.
 
-Only geometry is made here, as SVG path data in small integers (one unit is about a quarter of a screen pixel); colours, strokes and
-hover texts belong to the template. The map is turned so that the logged drive runs from left to right.
+Only geometry is made here, as SVG path data in small integers (one unit is about a quarter of a
+screen pixel); colours, strokes and hover texts belong to the template. The map is turned so that
+the logged drive runs from left to right.
 """
 
 from __future__ import annotations
@@ -19,10 +21,14 @@ from alpasim_plugin.log.run_folder.rows import Rollout, Series
 from evaluators.report.numbers import fixed
 from evaluators.report.rollouts import Event, clock_zero_us, events_of
 
-Variants = Mapping[tuple[str, str], tuple[int, int]]  # (renderer, policy) -> (colour index, dash index)
+Variants = Mapping[
+    tuple[str, str], tuple[int, int]
+]  # (renderer, policy) -> (colour index, dash index)
 UNITS_ACROSS = 4000  # width of the drawing in integer units
 MARGIN_M = 10.0
-MAX_OFFSET_M = 5.0  # one rollout that is far away must not flatten the others; the map shows where it went
+MAX_OFFSET_M = (
+    5.0  # one rollout that is far away must not flatten the others; the map shows where it went
+)
 STRAY_M = 40.0  # how far from the log's bounds the view follows a rollout
 MIN_ASPECT = 0.12  # height / width
 
@@ -52,7 +58,9 @@ class Mark:
 
 @dataclass(frozen=True)
 class OffsetChart:
-    """Signed distance from the logged path over time; width 1000, height 200, zero in the middle."""
+    """Signed distance from the logged path over time; width 1000, height 200, zero in the
+    middle.
+    """
 
     tracks: tuple[Track, ...]
     reach: str
@@ -89,7 +97,9 @@ class SceneView:
 
 
 def chord_angle(log: F64) -> float:
-    """Return the direction in radians from the first to the last of ``(N, 2)`` points; 0 where they are hardly apart."""
+    """Return the direction in radians from the first to the last of ``(N, 2)`` points; 0 where they
+    are hardly apart.
+    """
     chord = log[-1] - log[0]
     return math.atan2(chord[1], chord[0]) if float(np.hypot(*chord)) > 1.0 else 0.0
 
@@ -121,7 +131,10 @@ class _Frame:
     def units(self, xy: F64) -> F64:
         """Map ``(N, 2)`` world metres to drawing units, y down."""
         metres = self._turned(xy)
-        return np.stack([(metres[:, 0] - self.low[0]) * self.scale, (self.high[1] - metres[:, 1]) * self.scale], 1)
+        return np.stack(
+            [(metres[:, 0] - self.low[0]) * self.scale, (self.high[1] - metres[:, 1]) * self.scale],
+            1,
+        )
 
     def sees(self, units: F64) -> bool:
         """Return whether the bounds of a line touch the drawing."""
@@ -130,7 +143,8 @@ class _Frame:
 
 
 def path_data(units: F64, closed: bool = False, tolerance: float = 1.5) -> str:
-    """Write a polyline as compact relative SVG path data, dropping points nearer than ``tolerance`` units to the line.
+    """Write a polyline as compact relative SVG path data, dropping points nearer than ``tolerance``
+    units to the line.
 
     Args:
         units: ``(N, 2)`` drawing units.
@@ -141,7 +155,9 @@ def path_data(units: F64, closed: bool = False, tolerance: float = 1.5) -> str:
     whole = whole[np.concatenate([[True], np.any(np.diff(whole, axis=0) != 0, axis=1)])]
     if len(whole) < 2:
         return ""
-    kept = shapely.get_coordinates(shapely.simplify(shapely.linestrings(whole), tolerance, preserve_topology=False)).astype(int)
+    kept = shapely.get_coordinates(
+        shapely.simplify(shapely.linestrings(whole), tolerance, preserve_topology=False)
+    ).astype(int)
     steps = np.diff(kept, axis=0)
     body = " ".join(f"{dx} {dy}" for dx, dy in steps)
     return f"M{kept[0, 0]} {kept[0, 1]}l{body}" + ("z" if closed else "")
@@ -179,7 +195,9 @@ def scene_view(
     names_policy = len({r.policy for r in rollouts}) > 1
 
     def label(rollout: Rollout) -> str:
-        return " \u00b7 ".join([rollout.renderer, *([rollout.policy] if names_policy else []), f"seed {rollout.seed}"])
+        return " \u00b7 ".join(
+            [rollout.renderer, *([rollout.policy] if names_policy else []), f"seed {rollout.seed}"]
+        )
 
     tracks = [
         Track(*variant_of[r.renderer, r.policy], label(r), path_data(frame.units(driven[r.cell])))
@@ -189,14 +207,20 @@ def scene_view(
     vehicle = content.get("vehicle") or {}
     logged = [series[r.cell]["ego_x_m"][0] for r in rollouts if "ego_x_m" in series.get(r.cell, {})]
     zero_us = clock_zero_us(content, min((int(t_us[0]) for t_us in logged), default=0))
-    bar_m = next(b for b in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 1e9) if b * frame.scale > 0.08 * UNITS_ACROSS)
+    bar_m = next(
+        b
+        for b in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 1e9)
+        if b * frame.scale > 0.08 * UNITS_ACROSS
+    )
     lanes = content.get("lanes") or []
     events = [event for rollout in rollouts for event in events_of(rollout, series)]
     at_us, at_text = _moment(logged, events, zero_us)
 
     def draw(xy: F64, closed: bool) -> str:
         units = frame.units(xy)
-        return path_data(units, closed, tolerance=0.0 if closed else 1.5) if frame.sees(units) else ""
+        return (
+            path_data(units, closed, tolerance=0.0 if closed else 1.5) if frame.sees(units) else ""
+        )
 
     return SceneView(
         scene=scene,
@@ -210,7 +234,10 @@ def scene_view(
         crosswalks=_areas(content.get("crosswalks") or [], frame),
         log=path_data(frame.units(log)),
         tracks=tuple(tracks),
-        marks=tuple(_mark(event, frame, vehicle, variant_of, label(event.rollout), zero_us) for event in events),
+        marks=tuple(
+            _mark(event, frame, vehicle, variant_of, label(event.rollout), zero_us)
+            for event in events
+        ),
         bar_units=round(bar_m * frame.scale),
         bar_label=f"{bar_m:.0f}\u00a0m",
         north_deg=round(frame.north_deg, 1),
@@ -245,8 +272,14 @@ def lane_ring(lane: Mapping[str, Any]) -> list[list[float]]:
 
 
 def painted_edges(lane: Mapping[str, Any]) -> list[list[list[float]] | None]:
-    """List a lane's edges without those that carry no paint, such as the paths across an intersection."""
-    sides = zip((lane.get("left"), lane.get("right")), lane.get("paint") or ("unknown", "unknown"), strict=True)
+    """List a lane's edges without those that carry no paint, such as the paths across an
+    intersection.
+    """
+    sides = zip(
+        (lane.get("left"), lane.get("right")),
+        lane.get("paint") or ("unknown", "unknown"),
+        strict=True,
+    )
     return [edge for edge, paint in sides if paint != "none"]
 
 
@@ -261,7 +294,9 @@ def _lines(lines: Sequence[Sequence[Sequence[float]] | None], frame: _Frame) -> 
 
 
 def _areas(rings: Sequence[Sequence[Sequence[float]]], frame: _Frame) -> str:
-    """Write rings into one path, all turning the same way, so that overlapping rings add up instead of cutting holes."""
+    """Write rings into one path, all turning the same way, so that overlapping rings add up instead
+    of cutting holes.
+    """
     drawn = []
     for ring in rings:
         if len(ring) < 3:
@@ -274,11 +309,29 @@ def _areas(rings: Sequence[Sequence[Sequence[float]]], frame: _Frame) -> str:
     return "".join(drawn)
 
 
-def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], variant_of: Variants, label: str, zero_us: int) -> Mark:
+def _mark(
+    event: Event,
+    frame: _Frame,
+    vehicle: Mapping[str, Any],
+    variant_of: Variants,
+    label: str,
+    zero_us: int,
+) -> Mark:
     variant = variant_of.get((event.rollout.renderer, event.rollout.policy), (0, 0))[0]
-    when = f"at {fixed((event.t_us - zero_us) * 1e-6, 1)}\u00a0s" if event.t_us is not None else "at a time that no step shows"
+    when = (
+        f"at {fixed((event.t_us - zero_us) * 1e-6, 1)}\u00a0s"
+        if event.t_us is not None
+        else "at a time that no step shows"
+    )
     if event.x_m is None or event.y_m is None:
-        return Mark(variant, event.kind, f"{label}: {event.what} {when}", None, None, folder=event.rollout.path)
+        return Mark(
+            variant,
+            event.kind,
+            f"{label}: {event.what} {when}",
+            None,
+            None,
+            folder=event.rollout.path,
+        )
     yaw = event.yaw_rad or 0.0
     turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
     ahead = float(vehicle.get("rear_axle_to_centre_m") or 0.0) if event.yaw_rad is not None else 0.0
@@ -289,11 +342,25 @@ def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], variant_of: V
         box = corners(centre[0], event.yaw_rad, vehicle["length_m"], vehicle["width_m"])
         footprint = path_data(frame.units(box), closed=True, tolerance=0.0)
     where = f"x {fixed(centre[0, 0], 1)}, y {fixed(centre[0, 1], 1)}\u00a0m"
-    return Mark(variant, event.kind, f"{label}: {event.what} {when}, {where}", round(at[0]), round(at[1]), footprint, event.rollout.path)
+    return Mark(
+        variant,
+        event.kind,
+        f"{label}: {event.what} {when}, {where}",
+        round(at[0]),
+        round(at[1]),
+        footprint,
+        event.rollout.path,
+    )
 
 
-def _offset_chart(rollouts: Sequence[Rollout], series: Series, variant_of: Variants, label: Any) -> OffsetChart | None:
-    own = {r.cell: series[r.cell]["lateral_bias_m"] for r in rollouts if "lateral_bias_m" in series.get(r.cell, {})}
+def _offset_chart(
+    rollouts: Sequence[Rollout], series: Series, variant_of: Variants, label: Any
+) -> OffsetChart | None:
+    own = {
+        r.cell: series[r.cell]["lateral_bias_m"]
+        for r in rollouts
+        if "lateral_bias_m" in series.get(r.cell, {})
+    }
     if not own:
         return None
     reach = max(0.5, *(float(np.abs(v).max()) for _, v in own.values()))
@@ -303,9 +370,21 @@ def _offset_chart(rollouts: Sequence[Rollout], series: Series, variant_of: Varia
     for rollout in rollouts:
         if rollout.cell in own and (rollout.renderer, rollout.policy) in variant_of:
             t_us, offset = own[rollout.cell]
-            units = np.stack([(t_us - t_us[0]) / end_us * 1000.0, 100.0 - offset / shown * 100.0], 1)
-            tracks.append(Track(*variant_of[rollout.renderer, rollout.policy], label(rollout), path_data(units, tolerance=0.7)))
-    return OffsetChart(tuple(tracks), f"{shown:g}\u00a0m" + (" and more" if reach > shown else ""), f"{end_us * 1e-6:.1f}")
+            units = np.stack(
+                [(t_us - t_us[0]) / end_us * 1000.0, 100.0 - offset / shown * 100.0], 1
+            )
+            tracks.append(
+                Track(
+                    *variant_of[rollout.renderer, rollout.policy],
+                    label(rollout),
+                    path_data(units, tolerance=0.7),
+                )
+            )
+    return OffsetChart(
+        tuple(tracks),
+        f"{shown:g}\u00a0m" + (" and more" if reach > shown else ""),
+        f"{end_us * 1e-6:.1f}",
+    )
 
 
 LEAST_PATH_M = 1.0
@@ -327,16 +406,22 @@ class RoadUser:
     way: str
 
 
-def road_users(content: Mapping[str, Any], at_us: int, log: F64, draw: Callable[[F64, bool], str]) -> list[RoadUser]:
-    """Lay out the road users of a scene; empty for scene files of earlier versions, which have no tracks.
+def road_users(
+    content: Mapping[str, Any], at_us: int, log: F64, draw: Callable[[F64, bool], str]
+) -> list[RoadUser]:
+    """Lay out the road users of a scene; empty for scene files of earlier versions, which have no
+    tracks.
 
     Args:
         content: ``scenes/SCENE.json``.
         at_us: Time of the picture; a road user that is not there then is drawn at its nearest time.
         log: ``(N, 2)`` the logged drive, metres, world.
-        draw: From ``(N, 2)`` world metres and whether the line is closed to SVG path data; empty where nothing of it is in the picture.
+        draw: From ``(N, 2)`` world metres and whether the line is closed to SVG path data; empty
+            where nothing of it is in the picture.
     """
-    known = [actor for actor in content.get("actors") or [] if actor.get("x_m") and actor.get("length_m")]
+    known = [
+        actor for actor in content.get("actors") or [] if actor.get("x_m") and actor.get("length_m")
+    ]
 
     def distance(actor: Mapping[str, Any]) -> float:
         xy = np.column_stack([actor["x_m"], actor["y_m"]])
@@ -351,9 +436,19 @@ def _road_user(actor: Mapping[str, Any], at_us: int, draw: Callable[[F64, bool],
     xy = np.column_stack([actor["x_m"], actor["y_m"]]).astype(float)
     moves = float(np.ptp(xy, axis=0).max()) > LEAST_PATH_M
     k = int(np.argmin(np.abs(np.asarray(actor["t_us"]) - at_us)))
-    body = draw(corners(xy[k], float(actor["yaw_rad"][k]), actor["length_m"], actor["width_m"]), True)
-    how = ("reacts once the policy drives" if actor.get("reacts") else "as recorded or scripted") if moves else "stands"
-    return RoadUser(f"{actor.get('label') or 'road user'} {actor.get('id') or ''}, {how}".strip(), body, draw(xy, False) if moves else "")
+    body = draw(
+        corners(xy[k], float(actor["yaw_rad"][k]), actor["length_m"], actor["width_m"]), True
+    )
+    how = (
+        ("reacts once the policy drives" if actor.get("reacts") else "as recorded or scripted")
+        if moves
+        else "stands"
+    )
+    return RoadUser(
+        f"{actor.get('label') or 'road user'} {actor.get('id') or ''}, {how}".strip(),
+        body,
+        draw(xy, False) if moves else "",
+    )
 
 
 def corners(centre: F64 | Sequence[float], yaw_rad: float, length_m: float, width_m: float) -> F64:

@@ -30,9 +30,17 @@ MAX_BYTES = 1_000_000  # job pages refuse more than 1 MiB
 CUT_NOTE = "\n_Cut here: the full tables are in report.html and rollouts.parquet._\n"
 LEDGER_RATES = ("collision_at_fault", "collision_any", "offroad")
 LEDGER_NOTE = "Rates: least and greatest, had every missing rollout and every cut step been without, and with, the event."
-MAX_WITH_VALUES = 2000  # cases whose metric values are written, 2 KB each: CI servers refuse files of tens of megabytes
+# cases whose metric values are written, 2 KB each: CI servers refuse files of tens of megabytes
+MAX_WITH_VALUES = 2000
 SUMMARY_VARIABLE = "GITHUB_STEP_SUMMARY"
-MARKS = {"pass": "pass", "regression": "FAIL", "undecided": "undecided", "policy": "error", "infrastructure": "error", "evaluator": "error"}
+MARKS = {
+    "pass": "pass",
+    "regression": "FAIL",
+    "undecided": "undecided",
+    "policy": "error",
+    "infrastructure": "error",
+    "evaluator": "error",
+}
 INTERVAL_NOTE = "a to b is the 95 % interval with scenes as clusters."
 
 
@@ -55,14 +63,24 @@ def summary_md(run: Run) -> str:
     finding = find(run)
     parts = [f"## {escape(finding.head)}\n"]
     if len(finding.outcomes) > 1:
-        parts += [f"- **{escape(name)}**: {escape(text)}\n" for name, text in finding.outcomes[LEADING:]]
+        parts += [
+            f"- **{escape(name)}**: {escape(text)}\n" for name, text in finding.outcomes[LEADING:]
+        ]
         parts += [f"\n**{escape(finding.title)}**\n\n"]
     parts += [f"- **{escape(finding.name_of(p))}**: {escape(p.text)}\n" for p in finding.points]
     parts += [f"> {escape(caution)}\n" for caution in finding.cautions]
     rows = tables.metric_rows(run.summary, run.invalid_reasons, run.table)
     if rows:
-        head = ["metric", *(f"{c.variant} ({plural(c.n_rollouts, 'rollout')}, {plural(c.n_scenes, 'scene')})" for c in tables.columns(run))]
-        body = [[metric_label(r.name, r.unit, r.arrow), *(cell_text(c) for c in r.cells)] for r in rows]
+        head = [
+            "metric",
+            *(
+                f"{c.variant} ({plural(c.n_rollouts, 'rollout')}, {plural(c.n_scenes, 'scene')})"
+                for c in tables.columns(run)
+            ),
+        ]
+        body = [
+            [metric_label(r.name, r.unit, r.arrow), *(cell_text(c) for c in r.cells)] for r in rows
+        ]
         preset = str(run.summary.get("preset"))
         note = INTERVAL_NOTE + (f" Contact {said[8:]}." if (said := contact_note(preset)) else "")
         parts.append(f"\n### Results, preset {escape(preset)}\n\n{table(head, body)}\n{note}\n")
@@ -70,23 +88,44 @@ def summary_md(run: Run) -> str:
     if pairs:
         head = ["renderer", "metric", "difference", "95 % interval", "p", "verdict"]
         for base in dict.fromkeys(p.baseline for p in pairs):
-            body = [[p.variant, p.metric, p.diff.text, p.interval.text, p.p_value.text, p.verdict] for p in pairs if p.baseline == base]
+            body = [
+                [p.variant, p.metric, p.diff.text, p.interval.text, p.p_value.text, p.verdict]
+                for p in pairs
+                if p.baseline == base
+            ]
             parts.append(f"\n### Paired differences from {escape(base)}\n\n{table(head, body)}")
     fixed = fixer_rows(run.summary)
     if fixed:
         head = ["renderer", *(name for name, _ in COLUMNS)]
-        parts.append(f"\n### Fixers\n\n{table(head, [[row.renderer, *(c.text for c in row.cells)] for row in fixed])}")
+        parts.append(
+            f"\n### Fixers\n\n{table(head, [[row.renderer, *(c.text for c in row.cells)] for row in fixed])}"
+        )
     times = speed(run)
     if times.rows:
-        head = ["renderer", "ms per frame, median", "95th percentile", "frames/s", "first frame, ms", *times.stages]
-        body = [[r.renderer, *(c.text for c in r.cells), *(c.text for c in r.stages)] for r in times.rows]
-        parts.append(f"\n### Speed\n\n{table(head, body)}" + (f"{escape(times.pool)}\n" if times.pool else ""))
+        head = [
+            "renderer",
+            "ms per frame, median",
+            "95th percentile",
+            "frames/s",
+            "first frame, ms",
+            *times.stages,
+        ]
+        body = [
+            [r.renderer, *(c.text for c in r.cells), *(c.text for c in r.stages)]
+            for r in times.rows
+        ]
+        parts.append(
+            f"\n### Speed\n\n{table(head, body)}"
+            + (f"{escape(times.pool)}\n" if times.pool else "")
+        )
     removed = ledger(run, LEDGER_RATES)
     if removed:
         head = ["renderer", *(name for _, name, _ in LEDGER_COLUMNS), *LEDGER_RATES]
         body = []
         for r in removed:
-            counts = [f"{c.text} ({c.note})" if c.note and c.text != "0" else c.text for c in r.counts]
+            counts = [
+                f"{c.text} ({c.note})" if c.note and c.text != "0" else c.text for c in r.counts
+            ]
             body.append([r.renderer, *counts, *(c.text for c in r.bounds)])
         parts.append(f"\n### What the numbers leave out\n\n{table(head, body)}\n{LEDGER_NOTE}\n")
     failures, more = failure_rows(run)
@@ -96,8 +135,13 @@ def summary_md(run: Run) -> str:
         for failure in failures:
             one = failure.rollout
             what = "; ".join(f"{label}: {text}" for label, text in failure.parts)
-            body.append([one.failure_class, one.renderer, one.policy, one.scene, str(one.seed), what])
-        parts.append(f"\n### Failures\n\n{table(head, body)}" + (f"{more} more in rollouts.parquet.\n" if more else ""))
+            body.append(
+                [one.failure_class, one.renderer, one.policy, one.scene, str(one.seed), what]
+            )
+        parts.append(
+            f"\n### Failures\n\n{table(head, body)}"
+            + (f"{more} more in rollouts.parquet.\n" if more else "")
+        )
     command = provenance(run).command
     parts.append(f"\n### Made with\n\n```\n{terminal(command).replace('```', '')}\n```\n")
     return "".join(parts)
@@ -106,11 +150,16 @@ def summary_md(run: Run) -> str:
 def table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
     """Render a Markdown table."""
     lines = [head, ["---"] * len(head), *body]
-    return "".join("| " + " | ".join(cell if i == 1 else escape(cell) for cell in line) + " |\n" for i, line in enumerate(lines))
+    return "".join(
+        "| " + " | ".join(cell if i == 1 else escape(cell) for cell in line) + " |\n"
+        for i, line in enumerate(lines)
+    )
 
 
 def cut(text: str, limit: int = MAX_BYTES) -> str:
-    """Cut at the end of a line so that the text with its note stays within ``limit`` bytes of UTF-8."""
+    """Cut at the end of a line so that the text with its note stays within ``limit`` bytes of
+    UTF-8.
+    """
     data = text.encode()
     if len(data) <= limit:
         return text
@@ -144,7 +193,11 @@ def write_junit(run_dir: Path | str | Run) -> Path:
 
 def _write_xml(path: Path, root: ET.Element) -> Path:
     ET.indent(root)
-    write_text(path, '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n", "writing a report")
+    write_text(
+        path,
+        '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n",
+        "writing a report",
+    )
     return path
 
 
@@ -153,19 +206,24 @@ def junit(run: Run, outcomes_fail: bool = True) -> ET.Element:
 
     Args:
         run: The run.
-        outcomes_fail: A drive with an outcome is a failed case; otherwise the outcome is a property of the case alone.
+        outcomes_fail: A drive with an outcome is a failed case; otherwise the outcome is a property
+            of the case alone.
     """
     failed = [r for r in run.rollouts if not r.ok]
     counts = {
         "tests": str(len(run.rollouts)),
-        "failures": str(sum(bool(outcomes_of(r)) for r in run.rollouts if r.ok) if outcomes_fail else 0),
+        "failures": str(
+            sum(bool(outcomes_of(r)) for r in run.rollouts if r.ok) if outcomes_fail else 0
+        ),
         "errors": str(len(failed)),
         "skipped": "0",
         "time": f"{sum(r.wall_s or 0.0 for r in run.rollouts):.3f}",
     }
     root = ET.Element("testsuites", {"name": "simrun", **counts})
     asked = run.info.get("asked") or []
-    name = str(asked[0]) if len(asked) == 1 else run.folder.resolve().name  # what the command named, where that was one thing
+    name = (
+        str(asked[0]) if len(asked) == 1 else run.folder.resolve().name
+    )  # what the command named, where that was one thing
     suite = ET.SubElement(root, "testsuite", {"name": clean(name), **counts})
     if run.info.get("started_at"):
         suite.set("timestamp", clean(str(run.info["started_at"])))
@@ -185,17 +243,38 @@ def junit(run: Run, outcomes_fail: bool = True) -> ET.Element:
 def _case(suite: ET.Element, rollout: Rollout, with_values: bool, outcomes_fail: bool) -> None:
     name = f"{rollout.renderer}/{rollout.policy}/{rollout.seed}"
     case = ET.SubElement(
-        suite, "testcase", {"classname": clean(rollout.scene), "name": clean(name), "time": f"{rollout.wall_s or 0.0:.3f}"}
+        suite,
+        "testcase",
+        {
+            "classname": clean(rollout.scene),
+            "name": clean(name),
+            "time": f"{rollout.wall_s or 0.0:.3f}",
+        },
     )
-    values = {m: "invalid" if v is None else repr(v) for m, v in rollout.metrics.items()} if rollout.ok and with_values else {}
+    values = (
+        {m: "invalid" if v is None else repr(v) for m, v in rollout.metrics.items()}
+        if rollout.ok and with_values
+        else {}
+    )
     had = outcomes_of(rollout) if rollout.ok else frozenset()
-    facts = ({"path": rollout.path} if rollout.path else {}) | ({"outcome": in_words(had)} if rollout.ok else {})
+    facts = ({"path": rollout.path} if rollout.path else {}) | (
+        {"outcome": in_words(had)} if rollout.ok else {}
+    )
     _properties(case, facts | values)
     if had and outcomes_fail:
-        ET.SubElement(case, "failure", {"type": told(had)[0].name, "message": clean(in_words(had))}).text = clean(in_words(had))
+        ET.SubElement(
+            case, "failure", {"type": told(had)[0].name, "message": clean(in_words(had))}
+        ).text = clean(in_words(had))
     if not rollout.ok:
-        first = next((line for line in rollout.failure.splitlines() if line.strip()), "no message was recorded")
-        error = ET.SubElement(case, "error", {"type": clean(rollout.failure_class or "unknown"), "message": clean(first)})
+        first = next(
+            (line for line in rollout.failure.splitlines() if line.strip()),
+            "no message was recorded",
+        )
+        error = ET.SubElement(
+            case,
+            "error",
+            {"type": clean(rollout.failure_class or "unknown"), "message": clean(first)},
+        )
         error.text = clean(rollout.failure)
 
 
@@ -206,8 +285,11 @@ def _properties(parent: ET.Element, values: dict[str, str]) -> None:
             ET.SubElement(holder, "property", {"name": clean(name), "value": clean(value)})
 
 
-def gate_md(verdict: GateVerdict, gate: str, run: str, worst: Sequence[Mapping[str, Any]] = ()) -> str:
-    """Render a verdict as Markdown: heading, what led to it, every check, the scenes that did worst.
+def gate_md(
+    verdict: GateVerdict, gate: str, run: str, worst: Sequence[Mapping[str, Any]] = ()
+) -> str:
+    """Render a verdict as Markdown: heading, what led to it, every check, the scenes that did
+    worst.
 
     Args:
         verdict: What `judge` gave.
@@ -217,24 +299,53 @@ def gate_md(verdict: GateVerdict, gate: str, run: str, worst: Sequence[Mapping[s
     """
     head = f"## Gate: {verdict.outcome.title}\n\n"
     head += f"Run {escape(run)}, gate {escape(gate)}, compared with {escape(verdict.baseline)}. Exit code {verdict.exit_code}.\n\n"
-    reasons = "".join(f"- {escape(reason)}\n" for reason in verdict.outcome.reasons) if verdict.outcome.cause != "pass" else ""
+    reasons = (
+        "".join(f"- {escape(reason)}\n" for reason in verdict.outcome.reasons)
+        if verdict.outcome.cause != "pass"
+        else ""
+    )
     rows = [
-        [check.metric, _variant(check), MARKS[check.cause] + ("" if check.binding else " (not binding)"), check.kind, check.text]
+        [
+            check.metric,
+            _variant(check),
+            MARKS[check.cause] + ("" if check.binding else " (not binding)"),
+            check.kind,
+            check.text,
+        ]
         for check in verdict.checks
     ]
     checks = "\n" + table(["metric", "renderer", "result", "rule", "numbers"], rows) if rows else ""
     failures = verdict.failures
-    failed = f"\n{failures['n_failed']} of {failures['n_rollouts']} rollouts failed.\n" if failures["n_failed"] else ""
+    failed = (
+        f"\n{failures['n_failed']} of {failures['n_rollouts']} rollouts failed.\n"
+        if failures["n_failed"]
+        else ""
+    )
     pairs = [
-        [pair["scene"], f"{pair['renderer']}/{pair['policy']}", str(pair["seed"]), pair["metric"], short(pair["was"]), short(pair["now"])]
+        [
+            pair["scene"],
+            f"{pair['renderer']}/{pair['policy']}",
+            str(pair["seed"]),
+            pair["metric"],
+            short(pair["was"]),
+            short(pair["now"]),
+        ]
         for pair in worst
     ]
-    scenes = "\nThe worst scenes:\n\n" + table(["scene", "renderer", "seed", "metric", "baseline", "now"], pairs) if pairs else ""
+    scenes = (
+        "\nThe worst scenes:\n\n"
+        + table(["scene", "renderer", "seed", "metric", "baseline", "now"], pairs)
+        if pairs
+        else ""
+    )
     return head + reasons + checks + scenes + failed
 
 
-def write_gate_files(verdict: GateVerdict, gate: str, run: Run, folder: Path, stored: Sequence[Row] | None = None) -> list[Path]:
-    """Write ``gate.md``, ``gate.junit.xml`` and in the run folder ``gate.json``; append the Markdown to what $GITHUB_STEP_SUMMARY names.
+def write_gate_files(
+    verdict: GateVerdict, gate: str, run: Run, folder: Path, stored: Sequence[Row] | None = None
+) -> list[Path]:
+    """Write ``gate.md``, ``gate.junit.xml`` and in the run folder ``gate.json``; append the
+    Markdown to what $GITHUB_STEP_SUMMARY names.
 
     Raises:
         InfrastructureError: The disk refused.
@@ -252,7 +363,9 @@ def write_gate_files(verdict: GateVerdict, gate: str, run: Run, folder: Path, st
 
 
 def append_job_summary(text: str) -> Path | None:
-    """Append Markdown to the CI job's summary file, if $GITHUB_STEP_SUMMARY names one; the whole file stays below 1 MiB."""
+    """Append Markdown to the CI job's summary file, if $GITHUB_STEP_SUMMARY names one; the whole
+    file stays below 1 MiB.
+    """
     named = os.environ.get(SUMMARY_VARIABLE)
     if not named:
         return None
@@ -268,16 +381,24 @@ def append_job_summary(text: str) -> Path | None:
 def gate_junit(verdict: GateVerdict, gate: str, run: Run) -> ET.Element:
     """Build one suite of checks in front of the run's own suite of rollouts.
 
-    A check that is worse or over its limit is a failure of type ``regression``, one that is not decided a failure of type ``undecided``, or
-    skipped where it does not bind. How the drives ended is said of them and fails nothing here: the gate's checks are the verdict.
+    A check that is worse or over its limit is a failure of type ``regression``, one that is not
+    decided a failure of type ``undecided``, or skipped where it does not bind. How the drives ended
+    is said of them and fails nothing here: the gate's checks are the verdict.
     """
     root = junit(run, outcomes_fail=False)
     suite = ET.Element("testsuite", {"name": clean(f"gate {gate}")})
     n_failures = n_skipped = 0
     for check in verdict.checks:
-        names = {"classname": clean(f"gate.{_variant(check)}"), "name": clean(f"{check.metric} {check.kind}")}
+        names = {
+            "classname": clean(f"gate.{_variant(check)}"),
+            "name": clean(f"{check.metric} {check.kind}"),
+        }
         case = ET.SubElement(suite, "testcase", names)
-        said = [key for key in ("diff", "ci95", "interval", "margin", "mean", "max", "min", "n_scenes") if key in check.entry]
+        said = [
+            key
+            for key in ("diff", "ci95", "interval", "margin", "mean", "max", "min", "n_scenes")
+            if key in check.entry
+        ]
         _properties(case, {key: str(check.entry[key]) for key in said})
         if check.cause == "pass":
             continue
@@ -285,9 +406,16 @@ def gate_junit(verdict: GateVerdict, gate: str, run: Run) -> ET.Element:
             ET.SubElement(case, "skipped", {"message": clean(check.text)})
             n_skipped += 1
             continue
-        ET.SubElement(case, "failure", {"type": check.cause, "message": clean(check.text)}).text = clean(check.text)
+        ET.SubElement(
+            case, "failure", {"type": check.cause, "message": clean(check.text)}
+        ).text = clean(check.text)
         n_failures += 1
-    counts = {"tests": len(verdict.checks), "failures": n_failures, "errors": 0, "skipped": n_skipped}
+    counts = {
+        "tests": len(verdict.checks),
+        "failures": n_failures,
+        "errors": 0,
+        "skipped": n_skipped,
+    }
     for key, value in counts.items():
         suite.set(key, str(value))
         root.set(key, str(value + int(root.get(key, "0"))))

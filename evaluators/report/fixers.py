@@ -20,7 +20,10 @@ COLUMNS = (  # head, what it means
     ("frames", "camera frames that went through it"),
     ("hit rate", "share of drafted frames whose true pose came within tolerance"),
     ("made again", "how often a block was drafted again before it was complete, per block"),
-    ("pose error", "largest distance between the camera pose of a frame handed to the policy and the true one"),
+    (
+        "pose error",
+        "largest distance between the camera pose of a frame handed to the policy and the true one",
+    ),
     ("refused", "frames that the guard replaced by the raw frame"),
 )
 
@@ -37,7 +40,10 @@ class FixerRow:
 def fixer_rows(summary: Mapping[str, Any]) -> list[FixerRow]:
     """Lay out the fixers of a run; empty where there are none."""
     fixers = summary.get("fixers") or {}
-    return [FixerRow(name, bool(entry.get("trained")), _cells(entry, refused(summary, name))) for name, entry in fixers.items()]
+    return [
+        FixerRow(name, bool(entry.get("trained")), _cells(entry, refused(summary, name)))
+        for name, entry in fixers.items()
+    ]
 
 
 def fixer_lines(summary: Mapping[str, Any]) -> list[str]:
@@ -57,19 +63,29 @@ def fixer_cautions(summary: Mapping[str, Any]) -> list[str]:
     said = []
     for name, entry in (summary.get("fixers") or {}).items():
         if not entry.get("trained"):
-            said.append(f"{name} is {entry.get('label')}: its results say nothing about a trained fixer.")
+            said.append(
+                f"{name} is {entry.get('label')}: its results say nothing about a trained fixer."
+            )
         events = refused(summary, name)
         if events:
-            kinds = ", ".join(f"{kind.removeprefix(GUARD)} {n}" for kind, n in sorted(events.items()))
+            kinds = ", ".join(
+                f"{kind.removeprefix(GUARD)} {n}" for kind, n in sorted(events.items())
+            )
             total = plural(sum(events.values()), "frame")
-            said.append(f"{name}: the fixer failed on {total} of {entry.get('frames')} ({kinds}); the raw frames were passed on.")
+            said.append(
+                f"{name}: the fixer failed on {total} of {entry.get('frames')} ({kinds}); the raw frames were passed on."
+            )
     return said
 
 
 def refused(summary: Mapping[str, Any], renderer: str) -> dict[str, int]:
     """Return how many frames of a renderer the fixer's guard replaced, by kind of event."""
     entry = (summary.get("censoring") or {}).get(renderer) or {}
-    return {kind: int(n) for kind, n in (entry.get("frame_events") or {}).items() if kind.startswith(GUARD)}
+    return {
+        kind: int(n)
+        for kind, n in (entry.get("frame_events") or {}).items()
+        if kind.startswith(GUARD)
+    }
 
 
 def _cells(entry: Mapping[str, Any], events: Mapping[str, int]) -> tuple[Cell, ...]:
@@ -86,7 +102,11 @@ def _cells(entry: Mapping[str, Any], events: Mapping[str, int]) -> tuple[Cell, .
         Cell(f"{fixed(100 * rate, 1)}\u00a0%", sort=rate) if rate is not None else none,
         Cell(short(per_block), sort=per_block) if per_block is not None and speculative else none,
         Cell(short(off, "m"), sort=off) if off is not None else none,
-        Cell(str(sum(events.values())), "; ".join(f"{kind}: {n}" for kind, n in events.items()), sort=sum(events.values())),
+        Cell(
+            str(sum(events.values())),
+            "; ".join(f"{kind}: {n}" for kind, n in events.items()),
+            sort=sum(events.values()),
+        ),
     )
 
 
@@ -125,7 +145,10 @@ def speed(run: Run) -> Speed:
     """Lay out milliseconds per frame, whole and by stage."""
     entries: Mapping[str, Mapping[str, Any]] = run.summary.get("speed") or {}
     names = list(dict.fromkeys(stage for e in entries.values() for stage in e.get("stages") or {}))
-    sums = {r: sum(_per_frame(s) or 0.0 for s in (e.get("stages") or {}).values()) for r, e in entries.items()}
+    sums = {
+        r: sum(_per_frame(s) or 0.0 for s in (e.get("stages") or {}).values())
+        for r, e in entries.items()
+    }
     longest = max(sums.values(), default=0.0)
     index = {name: i for i, name in enumerate(run.renderers)}
     rows = []
@@ -144,7 +167,9 @@ def speed(run: Run) -> Speed:
             cells.append(absent if number is None else Cell(short(number), sort=number))
         of_stages = tuple(_stage(stages.get(name) or {}) for name in names)
         total = short(sums[renderer] or None, "ms")
-        rows.append(SpeedRow(renderer, index.get(renderer, 0), tuple(cells), of_stages, tuple(bar), total))
+        rows.append(
+            SpeedRow(renderer, index.get(renderer, 0), tuple(cells), of_stages, tuple(bar), total)
+        )
     pool = run.summary.get("pool") or {}
     said = []
     if pool.get("workers"):
@@ -162,10 +187,17 @@ def _stage(entry: Mapping[str, Any]) -> Cell:
         return missing("this renderer has no such stage")
     said = [f"p95 {short(p95)}"] if p95 is not None else []
     said += [f"{fixed(100 * share, 0)}\u00a0%"] if share is not None else []
-    return Cell(short(p50), "median; 95th percentile; share of the loop's time", " \u00b7 ".join(said), sort=p50)
+    return Cell(
+        short(p50),
+        "median; 95th percentile; share of the loop's time",
+        " \u00b7 ".join(said),
+        sort=p50,
+    )
 
 
 def _per_frame(stage: Mapping[str, Any]) -> float | None:
-    """Return what a stage costs per frame: its mean where it is stated, since some stages run once for several frames."""
+    """Return what a stage costs per frame: its mean where it is stated, since some stages run once
+    for several frames.
+    """
     mean = finite(stage.get("per_frame_ms"))
     return finite(stage.get("p50_ms")) if mean is None else mean

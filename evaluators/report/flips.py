@@ -1,4 +1,6 @@
-"""Arms side by side: strips of one cell at the same times, and the cells whose outcome differs from the baseline's."""
+"""Arms side by side: strips of one cell at the same times, and the cells whose outcome differs from
+the baseline's.
+"""
 
 from __future__ import annotations
 
@@ -63,13 +65,21 @@ class Comparison:
 
 
 def colours_of(run: Run) -> dict[tuple[str, str], tuple[int, int]]:
-    """Return (renderer, policy) -> (colour, dash): a colour for each renderer, or for each policy where there is one renderer."""
+    """Return (renderer, policy) -> (colour, dash): a colour for each renderer, or for each policy
+    where there is one renderer.
+    """
     if len(run.renderers) == 1:
         return {(run.renderers[0], policy): (i, 0) for i, policy in enumerate(run.policies)}
-    return {(renderer, policy): (i, j) for i, renderer in enumerate(run.renderers) for j, policy in enumerate(run.policies)}
+    return {
+        (renderer, policy): (i, j)
+        for i, renderer in enumerate(run.renderers)
+        for j, policy in enumerate(run.policies)
+    }
 
 
-def comparisons(run: Run, scenes: Sequence[str], limit: int, budget_bytes: int) -> tuple[list[Comparison], list[str]]:
+def comparisons(
+    run: Run, scenes: Sequence[str], limit: int, budget_bytes: int
+) -> tuple[list[Comparison], list[str]]:
     """Pick one cell per scene, the one that most arms finished, and inline its strips.
 
     Args:
@@ -89,10 +99,14 @@ def comparisons(run: Run, scenes: Sequence[str], limit: int, budget_bytes: int) 
         cells: dict[tuple[str, int], list[Rollout]] = {}
         for rollout in run.by_scene.get(scene, ()):
             if run.file_of(rollout, "strip.jpg") is not None:
-                cells.setdefault(("" if by_policy else rollout.policy, rollout.seed), []).append(rollout)
+                cells.setdefault(("" if by_policy else rollout.policy, rollout.seed), []).append(
+                    rollout
+                )
         if not cells:
             continue
-        (policy, seed), members = max(cells.items(), key=lambda item: len(item[1]))  # the first of equals
+        (policy, seed), members = max(
+            cells.items(), key=lambda item: len(item[1])
+        )  # the first of equals
         if shown and (len(shown) >= limit or spent >= budget_bytes):
             left_out.append(scene)
             continue
@@ -107,11 +121,15 @@ def comparisons(run: Run, scenes: Sequence[str], limit: int, budget_bytes: int) 
     return shown, left_out
 
 
-def _comparison(run: Run, scene: str, policy: str, seed: int, members: list[Rollout]) -> Comparison | None:
+def _comparison(
+    run: Run, scene: str, policy: str, seed: int, members: list[Rollout]
+) -> Comparison | None:
     by_policy = len(run.renderers) == 1
     by_name = {r.policy if by_policy else r.renderer: r for r in members}
     colours, names = colours_of(run), run.policies if by_policy else run.renderers
-    strips, absent, times = [], [], []
+    strips = []
+    absent = []
+    times = []
     for name in names:
         rollout = by_name.get(name)
         path = run.file_of(rollout, "strip.jpg") if rollout else None
@@ -120,19 +138,25 @@ def _comparison(run: Run, scene: str, policy: str, seed: int, members: list[Roll
             absent.append(name)
             continue
         colour = colours[rollout.renderer, rollout.policy][0]
-        strips.append(Strip(name, colour, *encoded, run.href(rollout, "front.mp4"), run.href(rollout)))
+        strips.append(
+            Strip(name, colour, *encoded, run.href(rollout, "front.mp4"), run.href(rollout))
+        )
         times.append(tuple(int(t) for t in run.manifest(rollout).get("strip_t_us") or ()))
     if not strips:
         return None
     differing = len(set(times)) > 1
     zero = int((run.scene_data(scene) or {}).get("start_us") or 0)
-    printed = () if differing else tuple(f"t = {fixed((t - zero) * 1e-6, 1)}\u00a0s" for t in times[0])
+    printed = (
+        () if differing else tuple(f"t = {fixed((t - zero) * 1e-6, 1)}\u00a0s" for t in times[0])
+    )
     where = policy or (run.renderers[0] if len(run.policies) > 1 else run.policies[0])
     return Comparison(scene, where, seed, printed, tuple(strips), tuple(absent), differing)
 
 
 def inline_jpeg(path: Path) -> tuple[str, int, int] | None:
-    """Encode a picture as a ``data:`` address, smaller where it is large; None where it is not a readable picture."""
+    """Encode a picture as a ``data:`` address, smaller where it is large; None where it is not a
+    readable picture.
+    """
     try:
         data = read_bytes(path, "reading a picture of a run", SOURCE_BYTES)
         image = decode_image(data, path, "reading a picture of a run")
@@ -141,7 +165,13 @@ def inline_jpeg(path: Path) -> tuple[str, int, int] | None:
     height, width = image.shape[:2]
     if len(data) > MAX_BYTES or width > MAX_WIDTH:
         scale = min(1.0, MAX_WIDTH / width)
-        image = cv2.resize(image, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA) if scale < 1.0 else image
+        image = (
+            cv2.resize(
+                image, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA
+            )
+            if scale < 1.0
+            else image
+        )
         done, buffer = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])
         if done and buffer.size < len(data):
             data = buffer.tobytes()
@@ -151,7 +181,9 @@ def inline_jpeg(path: Path) -> tuple[str, int, int] | None:
 
 FLIPS_NAME = "flips.json"
 MAX_FLIP_ROWS = 400
-FlipKey = tuple[str, str, str, int, str]  # renderer, policy, scene, seed of the other side; RENDERER/POLICY of the baseline's
+FlipKey = tuple[
+    str, str, str, int, str
+]  # renderer, policy, scene, seed of the other side; RENDERER/POLICY of the baseline's
 
 
 @dataclass(frozen=True)
@@ -161,7 +193,8 @@ class Flip:
     Attributes:
         base, other: The rollouts of the baseline and of the other arm.
         was, now: Their outcomes in words.
-        tone: "worse" where an event came and none went, "better" where one went and none came, else "mixed".
+        tone: "worse" where an event came and none went, "better" where one went and none came, else
+            "mixed".
     """
 
     base: Rollout
@@ -181,14 +214,18 @@ class Flip:
         one, two = self.base, self.other
         if one.policy == two.policy:
             return one.renderer, two.renderer
-        return (one.policy, two.policy) if one.renderer == two.renderer else (one.variant, two.variant)
+        return (
+            (one.policy, two.policy) if one.renderer == two.renderer else (one.variant, two.variant)
+        )
 
 
 def find_flips(run: Run) -> tuple[list[Flip], int]:
-    """Find every flip of a run: between renderers with the same policy, and between policies behind the same renderer.
+    """Find every flip of a run: between renderers with the same policy, and between policies behind
+    the same renderer.
 
     Returns:
-        The flips, worse ones first and then as in ``rollouts.parquet``, and the number of pairs compared.
+        The flips, worse ones first and then as in ``rollouts.parquet``, and the number of pairs
+        compared.
     """
     bases = flip_bases(run)
     known: dict[tuple[str, str, str, int], Rollout] = {}
@@ -214,15 +251,21 @@ def find_flips(run: Run) -> tuple[list[Flip], int]:
 
 
 def flip_bases(run: Run) -> list[Base]:
-    """Return what outcomes are compared with: the baseline's renderer, and its policy where there are several."""
+    """Return what outcomes are compared with: the baseline's renderer, and its policy where there
+    are several.
+    """
     named = (run.info.get("config") or {}).get("baseline")
-    _, by_policy = axis_bases([Arm(r, policy) for r in run.renderers for policy in run.policies], named)
+    _, by_policy = axis_bases(
+        [Arm(r, policy) for r in run.renderers for policy in run.policies], named
+    )
     found = [Base(renderer=baseline_of(run))] if len(run.renderers) > 1 else []
     return [*found, *([by_policy] if by_policy else [])]
 
 
 def baseline_of(run: Run) -> str | None:
-    """Return the renderer that the others are compared with: as in the paired differences, else the first one."""
+    """Return the renderer that the others are compared with: as in the paired differences, else the
+    first one.
+    """
     for pairs in (run.summary.get("paired") or {}).values():
         for entry in pairs.values():
             if entry.get("baseline") in run.renderers:
@@ -255,7 +298,8 @@ def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
     """Lay out the flips with their pictures, as far as a budget goes.
 
     Args:
-        run: The run; ``flips.json`` holds when plans diverged and where the frames of that time are.
+        run: The run; ``flips.json`` holds when plans diverged and where the frames of that time
+            are.
         budget_bytes: Most bytes of pictures to inline.
 
     Returns:
@@ -277,30 +321,54 @@ def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
 
 def key_of_entry(entry: Mapping[str, Any]) -> FlipKey:
     """Return the key of an entry of ``flips.json``."""
-    against = entry.get("against") or cell_name(str(entry["baseline"]), str(entry["policy"]))  # earlier files name the renderer alone
+    against = entry.get("against") or cell_name(
+        str(entry["baseline"]), str(entry["policy"])
+    )  # earlier files name the renderer alone
     return (entry["renderer"], entry["policy"], entry["scene"], entry["seed"], str(against))
 
 
 def _row(run: Run, flip: Flip, entry: Mapping[str, Any] | None, room: bool) -> FlipRow:
     colours = colours_of(run)
-    sides = tuple((name, r, colours[r.renderer, r.policy][0]) for name, r in zip(flip.sides, (flip.base, flip.other), strict=True))
-    links = tuple((name, colour, run.href(r, "front.mp4"), run.href(r)) for name, r, colour in sides)
+    sides = tuple(
+        (name, r, colours[r.renderer, r.policy][0])
+        for name, r in zip(flip.sides, (flip.base, flip.other), strict=True)
+    )
+    links = tuple(
+        (name, colour, run.href(r, "front.mp4"), run.href(r)) for name, r, colour in sides
+    )
     if entry is None:
         looked = (run.folder / FLIPS_NAME).is_file()
-        why = "not looked for: there are too many flips" if looked else "the run folder has no logs to look for it in"
+        why = (
+            "not looked for: there are too many flips"
+            if looked
+            else "the run folder has no logs to look for it in"
+        )
         return FlipRow(flip, missing(why), missing(why), "", (), why, links)
     if entry.get("t_us") is None:
         why = str(entry.get("reason") or "the plans never diverge by more than the threshold")
         return FlipRow(flip, missing(why), missing(why), "", (), why, links)
     seconds = float(entry["after_us"]) * 1e-6
-    time, gap = Cell(f"{fixed(seconds, 1)}\u00a0s", sort=seconds), Cell(short(float(entry["gap_m"]), "m"), sort=float(entry["gap_m"]))
+    time, gap = (
+        Cell(f"{fixed(seconds, 1)}\u00a0s", sort=seconds),
+        Cell(short(float(entry["gap_m"]), "m"), sort=float(entry["gap_m"])),
+    )
     pictures = []
     for side, _, colour in sides if room else ():
         name = (entry.get("frames") or {}).get(side)
         file = run.folder / name if name else None
-        inside = file is not None and file.is_file() and file.resolve().is_relative_to(run.folder.resolve())
+        inside = (
+            file is not None
+            and file.is_file()
+            and file.resolve().is_relative_to(run.folder.resolve())
+        )
         encoded = inline_jpeg(file) if file is not None and inside else None
         if encoded is not None:
             pictures.append((side, colour, *encoded))
-    why = "" if pictures else str(entry.get("frames_reason") or "left out to keep this file small; they are in flips/")
+    why = (
+        ""
+        if pictures
+        else str(
+            entry.get("frames_reason") or "left out to keep this file small; they are in flips/"
+        )
+    )
     return FlipRow(flip, time, gap, str(entry.get("source") or ""), tuple(pictures), why, links)

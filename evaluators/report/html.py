@@ -38,7 +38,14 @@ from evaluators.report.fixers import COLUMNS, fixer_rows, speed
 from evaluators.report.flips import FlipKey, colours_of, comparisons, flip_bases, flip_rows
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, fixed, plural
-from evaluators.report.provenance import LEDGER_COLUMNS, certificate, failure_rows, invalid_rows, ledger, provenance
+from evaluators.report.provenance import (
+    LEDGER_COLUMNS,
+    certificate,
+    failure_rows,
+    invalid_rows,
+    ledger,
+    provenance,
+)
 from evaluators.report.rollouts import drift_charts, read_series, rollout_block
 from evaluators.report.strata import heads, strata, strata_chart, stratum_rows
 from evaluators.report.tables import SCENE_METRICS, scene_rows
@@ -82,13 +89,22 @@ def write_report(run_dir: Path | str | Run, replays: Mapping[FlipKey, str] = NO_
 
 def render_report(run: Run, replays: Mapping[FlipKey, str] = NO_REPLAYS) -> str:
     """Render the report as a string; ``replays`` as in `write_report`."""
-    return render_page("report.html.j2", ("theme", "report"), ("theme", "report", "rollouts"), dash=DASH, replays=replays, **context(run))
+    return render_page(
+        "report.html.j2",
+        ("theme", "report"),
+        ("theme", "report", "rollouts"),
+        dash=DASH,
+        replays=replays,
+        **context(run),
+    )
 
 
 class CompiledBeside(BytecodeCache):
-    """Keeps compiled templates in a ``__pycache__``, as Python does with modules, and where Python does.
+    """Keeps compiled templates in a ``__pycache__``, as Python does with modules, and where Python
+    does.
 
-    A file that is not whole, or of other versions, is made again; where none can be written, every process compiles.
+    A file that is not whole, or of other versions, is made again; where none can be written, every
+    process compiles.
     """
 
     folder = Path(__file__).with_name("__pycache__")
@@ -106,7 +122,10 @@ class CompiledBeside(BytecodeCache):
         """Keep the code of a template."""
         if not sys.dont_write_bytecode:
             with suppress(OSError, InfrastructureError):
-                write_bytes(self.folder / f"{bucket.key}.template", self._whole(bucket, marshal.dumps(bucket.code)))
+                write_bytes(
+                    self.folder / f"{bucket.key}.template",
+                    self._whole(bucket, marshal.dumps(bucket.code)),
+                )
 
     def _whole(self, bucket: Bucket, code: bytes) -> bytes:
         return self.head + hashlib.sha256(bucket.checksum.encode() + code).digest() + code
@@ -114,7 +133,9 @@ class CompiledBeside(BytecodeCache):
 
 @cache
 def environment_of(*packages: str) -> Environment:
-    """Return the templates of packages, the first that has a name; a process reads each template once."""
+    """Return the templates of packages, the first that has a name; a process reads each template
+    once.
+    """
     loader = ChoiceLoader([PackageLoader(package) for package in packages])
     return Environment(
         loader=loader,
@@ -127,12 +148,19 @@ def environment_of(*packages: str) -> Environment:
 
 
 def render_page(template: str, styles: Sequence[str], scripts: Sequence[str], **values: Any) -> str:
-    """Render a template with style sheets and scripts inside the page; the hash allows the page to run this script and no other."""
+    """Render a template with style sheets and scripts inside the page; the hash allows the page to
+    run this script and no other.
+    """
     environment = environment_of("evaluators.report")
     style = "\n".join(asset(environment, f"{name}.css") for name in styles)
     script = "\n".join(asset(environment, f"{name}.js") for name in scripts)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    page = {"style": Markup(style), "script": Markup(script), "script_hash": digest, "plural": plural}
+    page = {
+        "style": Markup(style),
+        "script": Markup(script),
+        "script_hash": digest,
+        "plural": plural,
+    }
     return environment.get_template(template).render(page | values)
 
 
@@ -143,21 +171,31 @@ def context(run: Run) -> dict[str, Any]:
     interesting = by_interest(run)
     variant_of = colours_of(run)
     looked_at = None if sample is None else interesting[: 2 * MAX_SCENE_PLOTS]
-    views, no_view = scene_views(run, series if looked_at is None else read_series(run, looked_at), looked_at or interesting, variant_of)
+    views, no_view = scene_views(
+        run,
+        series if looked_at is None else read_series(run, looked_at),
+        looked_at or interesting,
+        variant_of,
+    )
     strips, no_strip = comparisons(run, interesting, MAX_STRIP_SCENES, STRIP_BUDGET_BYTES)
     rows = tables.metric_rows(run.summary, run.invalid_reasons, run.table)
     pairs = tables.pair_rows(run.summary, run.table)
     by_scene, more_scene_rows = scene_rows(run, interesting)
     failures, more_failures = failure_rows(run)
     headline = [row for row in rows if row.is_headline] or rows
-    colours = {}  # every column has the colour of its renderer, or of its policy where there is one renderer
+    # every column has the colour of its renderer, or of its policy where there is one renderer
+    colours = {}
     for i, variant in enumerate(run.variants):
         first = next(iter(run.rollouts_of(variant)), None)
         colours[variant] = i if first is None else variant_of[first.renderer, first.policy][0]
     by_policy = len(run.renderers) == 1 and len(run.policies) > 1
     flips, more_flips, flip_pairs = flip_rows(run, FLIP_BUDGET_BYTES)
     split = strata(run, sample)
-    of_sample = "" if sample is None else f"From {plural(len(sample), 'scene')} of {len(run.scenes)}, evenly chosen from their list."
+    of_sample = (
+        ""
+        if sample is None
+        else f"From {plural(len(sample), 'scene')} of {len(run.scenes)}, evenly chosen from their list."
+    )
     return {
         "run": run,
         "title": ", ".join(run.renderers) or "empty run",
@@ -171,7 +209,11 @@ def context(run: Run) -> dict[str, Any]:
         "variant_colour": colours,
         "forest": forest(run, colours),
         "flips": flips,
-        "whys": {one.path: page for one in run.rollouts if one.ok and outcomes_of(one) and (page := run.href(one, WHY_NAME))},
+        "whys": {
+            one.path: page
+            for one in run.rollouts
+            if one.ok and outcomes_of(one) and (page := run.href(one, WHY_NAME))
+        },
         "more_flips": more_flips,
         "flip_pairs": flip_pairs,
         "baseline": " or ".join(base.name for base in flip_bases(run)),
@@ -184,7 +226,9 @@ def context(run: Run) -> dict[str, Any]:
         "headline_rows": headline,
         "other_rows": [row for row in rows if row not in headline],
         "headline_pairs": [p for p in pairs if p.metric in {row.name for row in headline}] or pairs,
-        "other_pairs": [p for p in pairs if headline and p.metric not in {row.name for row in headline}],
+        "other_pairs": [
+            p for p in pairs if headline and p.metric not in {row.name for row in headline}
+        ],
         "coloured": run.policies if by_policy else run.renderers,
         "dashed": len(run.policies) > 1 and not by_policy,
         "policies": run.policies,
@@ -212,7 +256,9 @@ def context(run: Run) -> dict[str, Any]:
 
 
 def sampled_scenes(run: Run) -> list[str] | None:
-    """Return the scenes whose steps are read for charts of the whole run; None where all are: `SERIES_ROLLOUTS` fit into memory."""
+    """Return the scenes whose steps are read for charts of the whole run; None where all are:
+    `SERIES_ROLLOUTS` fit into memory.
+    """
     if len(run.rollouts) <= SERIES_ROLLOUTS:
         return None
     scenes, wanted = run.scenes, max(1, SERIES_ROLLOUTS * len(run.scenes) // len(run.rollouts))
@@ -220,7 +266,9 @@ def sampled_scenes(run: Run) -> list[str] | None:
 
 
 def by_interest(run: Run) -> list[str]:
-    """Sort scenes by how much there is to see: events and failures first, then the largest distance from the logged path."""
+    """Sort scenes by how much there is to see: events and failures first, then the largest distance
+    from the logged path.
+    """
 
     def interest(scene: str) -> tuple[int, float]:
         rollouts = run.by_scene.get(scene, ())
@@ -232,12 +280,16 @@ def by_interest(run: Run) -> list[str]:
 
 
 def scene_views(
-    run: Run, series: Series, interesting: list[str], variant_of: Mapping[tuple[str, str], tuple[int, int]]
+    run: Run,
+    series: Series,
+    interesting: list[str],
+    variant_of: Mapping[tuple[str, str], tuple[int, int]],
 ) -> tuple[list[SceneView], list[str]]:
     """Lay out the most telling scenes within the limits of count and size.
 
     Returns:
-        The drawings (in the order of the run where all are shown at once, else the most telling first), and the scenes not drawn.
+        The drawings (in the order of the run where all are shown at once, else the most telling
+        first), and the scenes not drawn.
     """
     drawn: dict[str, SceneView] = {}
     spent = 0
@@ -252,7 +304,12 @@ def scene_views(
             view = scene_view(scene, content, rollouts, series, variant_of)
         if view is not None:
             drawn[scene] = view
-            spent += len(view.lanes) + len(view.lines) + len(view.edges) + sum(len(t.d) for t in view.tracks)
+            spent += (
+                len(view.lanes)
+                + len(view.lines)
+                + len(view.edges)
+                + sum(len(t.d) for t in view.tracks)
+            )
     order = run.scenes if len(drawn) <= OPEN_SCENE_PLOTS else interesting
     return [drawn[s] for s in order if s in drawn], [s for s in run.scenes if s not in drawn]
 
@@ -282,7 +339,9 @@ def _facts(run: Run) -> list[tuple[str, str]]:
         ("policy" if len(run.policies) == 1 else "policies", ", ".join(run.policies) or DASH),
         ("preset", str(run.summary.get("preset") or run.info.get("preset") or DASH)),
     ]
-    return [*facts, ("wall time", duration(float(wall)))] if isinstance(wall, int | float) else facts
+    return (
+        [*facts, ("wall time", duration(float(wall)))] if isinstance(wall, int | float) else facts
+    )
 
 
 @dataclass(frozen=True)
@@ -303,7 +362,8 @@ class Shot:
 
 
 def shots(run: Run, interesting: Sequence[str]) -> list[Shot]:
-    """Pick at most three pictures: of drives that failed, one an arm first; else of the arms in the most telling scene.
+    """Pick at most three pictures: of drives that failed, one an arm first; else of the arms in the
+    most telling scene.
 
     Args:
         run: The run.
@@ -312,12 +372,21 @@ def shots(run: Run, interesting: Sequence[str]) -> list[Shot]:
     rank = {scene: i for i, scene in enumerate(interesting)}
     order = list(OUTCOMES)
     done = [one for one in run.rollouts if one.ok]
-    failed = sorted((one for one in done if outcomes_of(one)), key=lambda r: (min(order.index(o) for o in outcomes_of(r)), rank[r.scene]))
+    failed = sorted(
+        (one for one in done if outcomes_of(one)),
+        key=lambda r: (min(order.index(o) for o in outcomes_of(r)), rank[r.scene]),
+    )
     firsts = {one.variant: one for one in reversed(failed)}.values()
     rest = [one for one in done if interesting and one.scene == interesting[0]]
     found: list[Shot] = []
-    for rollout in dict.fromkeys(one.cell for one in [*list(firsts)[::-1], *failed, *(rest if not failed else [])]):
-        shot = _shot(run, next(one for one in done if one.cell == rollout)) if len(found) < SHOTS else None
+    for rollout in dict.fromkeys(
+        one.cell for one in [*list(firsts)[::-1], *failed, *(rest if not failed else [])]
+    ):
+        shot = (
+            _shot(run, next(one for one in done if one.cell == rollout))
+            if len(found) < SHOTS
+            else None
+        )
         found += [shot] if shot else []
     return found
 
@@ -330,7 +399,9 @@ def _shot(run: Run, rollout: Rollout) -> Shot | None:
         return None
     first = first_failure(manifest)
     k = min(USUAL_FRAME, len(times) - 1)
-    if first is not None:  # what led to it: after a contact the camera may be inside the other vehicle
+    if (
+        first is not None
+    ):  # what led to it: after a contact the camera may be inside the other vehicle
         k = max((i for i, t_us in enumerate(times) if t_us <= int(first["t_us"])), default=0)
     try:
         strip = decode_image(read_bytes(path, DOING_SHOT, SOURCE_BYTES), path, DOING_SHOT)
@@ -338,9 +409,31 @@ def _shot(run: Run, rollout: Rollout) -> Shot | None:
         return None  # the report says elsewhere that the picture is absent
     width = strip.shape[1] // len(times)
     picture = strip[:, k * width : (k + 1) * width]
-    picture = cv2.resize(picture, (SHOT_WIDTH_PX, round(picture.shape[0] * SHOT_WIDTH_PX / width)), interpolation=cv2.INTER_AREA)
+    picture = cv2.resize(
+        picture,
+        (SHOT_WIDTH_PX, round(picture.shape[0] * SHOT_WIDTH_PX / width)),
+        interpolation=cv2.INTER_AREA,
+    )
     done, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
-    said = in_words(outcomes_of(rollout)) + (f" at {fixed(float(first['t_s']), 1)}\u00a0s" if first is not None else "")
-    arm = rollout.policy if len(run.renderers) == 1 else rollout.renderer if len(run.policies) == 1 else rollout.variant
+    said = in_words(outcomes_of(rollout)) + (
+        f" at {fixed(float(first['t_s']), 1)}\u00a0s" if first is not None else ""
+    )
+    arm = (
+        rollout.policy
+        if len(run.renderers) == 1
+        else rollout.renderer
+        if len(run.policies) == 1
+        else rollout.variant
+    )
     link = run.href(rollout, WHY_NAME) or run.href(rollout)
-    return Shot(arm, rollout.scene, said, "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode(), link) if done else None
+    return (
+        Shot(
+            arm,
+            rollout.scene,
+            said,
+            "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode(),
+            link,
+        )
+        if done
+        else None
+    )

@@ -1,4 +1,6 @@
-"""Format numbers for display: percent with counts, matching decimals, a minus sign (U+2212), and a dash with a reason where missing."""
+"""Format numbers for display: percent with counts, matching decimals, a minus sign (U+2212), and a
+dash with a reason where missing.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 DASH, NARROW = "\u2014", "\u202f"
-LEAST_SPAN = {"m": 0.1, "points": 1.0, "s": 0.1}  # of an axis, by unit: less than this is not worth a picture
+LEAST_SPAN = {
+    "m": 0.1,
+    "points": 1.0,
+    "s": 0.1,
+}  # of an axis, by unit: less than this is not worth a picture
 ARROWS = {"lower": "\u2193", "higher": "\u2191"}
 ARROW_WORDS = {"lower": "lower is better", "higher": "higher is better"}
 
@@ -20,7 +26,8 @@ class Cell:
     Attributes:
         text: What is printed; an em dash where the number is missing.
         note: Shown on hover: the reason of a missing number, or counts behind a present one.
-        detail: Second, smaller line: the interval, for rates behind the count, "7/300 (1.0 to 5.0 %)"; may be empty.
+        detail: Second, smaller line: the interval, for rates behind the count, "7/300 (1.0 to 5.0
+            %)"; may be empty.
         sort: Key for sorting; None sorts last.
         tone: "worse", "better" or "" (nothing to say).
     """
@@ -43,7 +50,9 @@ def missing(reason: str) -> Cell:
 
 
 def finite(value: Any) -> float | None:
-    """Return a finite float, or None for None, NaN, infinities and anything that is not a number."""
+    """Return a finite float, or None for None, NaN, infinities and anything that is not a
+    number.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     return float(value) if math.isfinite(value) else None
@@ -59,7 +68,9 @@ def interval(value: Any, centre: float | None = None) -> tuple[float, float] | N
 
 
 def decimals(*values: float | None, digits: int = 3, most: int = 4) -> int:
-    """Choose how many decimals show ``digits`` significant digits of the largest of the values (at most ``most``)."""
+    """Choose how many decimals show ``digits`` significant digits of the largest of the values (at
+    most ``most``).
+    """
     largest = max((abs(v) for v in values if v is not None), default=0.0)
     if largest == 0.0:
         return 1
@@ -83,7 +94,9 @@ def short(value: float | None, unit: str = "") -> str:
 
 
 def count_of(mean: float, n: int) -> str:
-    """Print "7 of 300" for a rate whose mean is a whole count; empty where it is not (a mean of scene means, say)."""
+    """Print "7 of 300" for a rate whose mean is a whole count; empty where it is not (a mean of
+    scene means, say).
+    """
     k = mean * n
     return f"{round(k)} of {n}" if n > 0 and abs(k - round(k)) < 1e-6 * max(1.0, k) else ""
 

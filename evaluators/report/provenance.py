@@ -1,4 +1,6 @@
-"""Where a run comes from, whether a repeated rollout is bit-identical, and what did not enter its numbers: failures and removed steps."""
+"""Where a run comes from, whether a repeated rollout is bit-identical, and what did not enter its
+numbers: failures and removed steps.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,15 @@ def provenance(run: Run) -> Provenance:
         path = run.scene_path(name)
         notes = tuple(str(n) for n in entry.get("notes") or ())
         href = path.relative_to(run.folder).as_posix() if path else None
-        scenes.append(SceneSource(name, str(entry.get("source") or ""), str(entry.get("content_hash") or ""), notes, href))
+        scenes.append(
+            SceneSource(
+                name,
+                str(entry.get("source") or ""),
+                str(entry.get("content_hash") or ""),
+                notes,
+                href,
+            )
+        )
     command = info.get("command") or []
     return Provenance(
         shlex.join(str(word) for word in command) if isinstance(command, list) else str(command),
@@ -74,15 +84,24 @@ def provenance(run: Run) -> Provenance:
 
 
 def commit_text(info: Mapping[str, Any]) -> str:
-    """Name the project's commit of a ``run.json``, with a word where files differed from it; empty where there is none."""
+    """Name the project's commit of a ``run.json``, with a word where files differed from it; empty
+    where there is none.
+    """
     project = info.get("project") or {}
-    return f"{project['commit']}{', files changed' if project.get('dirty') else ''}" if project.get("commit") else ""
+    return (
+        f"{project['commit']}{', files changed' if project.get('dirty') else ''}"
+        if project.get("commit")
+        else ""
+    )
 
 
 def _pairs(value: Any) -> tuple[tuple[str, str], ...]:
     if not isinstance(value, Mapping):
         return ()
-    return tuple((str(k), "none" if v is None else v if isinstance(v, str) else json.dumps(v)) for k, v in value.items())
+    return tuple(
+        (str(k), "none" if v is None else v if isinstance(v, str) else json.dumps(v))
+        for k, v in value.items()
+    )
 
 
 @dataclass(frozen=True)
@@ -114,18 +133,40 @@ def certificate(run: Run) -> Certificate:
         after = {"equal": ", and so is what follows"}.get(str(fork.get("continuation")), "")
         return Certificate("equal", "better", f"{said}{after}.", ())
     if not isinstance(entry, Mapping):
-        return Certificate("none", "unclear", "This run has no certificate: nothing was driven, or an older version made it.", ())
+        return Certificate(
+            "none",
+            "unclear",
+            "This run has no certificate: nothing was driven, or an older version made it.",
+            (),
+        )
     if entry.get("status") == "skipped":
-        return Certificate("not made", "unclear", f"No rollout was repeated: {entry.get('reason')}.", ())
+        return Certificate(
+            "not made", "unclear", f"No rollout was repeated: {entry.get('reason')}.", ()
+        )
     cell = entry.get("cell") or {}
     wall = finite(entry.get("wall_s"))
     what = f"{cell.get('renderer')} · {cell.get('policy')} · {cell.get('scene')} · seed {cell.get('seed')}"
-    steps = f"{plural(int(entry.get('steps') or 0), 'step')}" + (f", {duration(wall)}" if wall is not None else "")
+    steps = f"{plural(int(entry.get('steps') or 0), 'step')}" + (
+        f", {duration(wall)}" if wall is not None else ""
+    )
     digests, repeated = entry.get("digests") or {}, entry.get("repeated") or {}
-    components = tuple(Component(name, repeated.get(name) == value, value, repeated.get(name, "")) for name, value in digests.items())
+    components = tuple(
+        Component(name, repeated.get(name) == value, value, repeated.get(name, ""))
+        for name, value in digests.items()
+    )
     if entry.get("status") == "equal":
-        return Certificate("equal", "better", f"{what} was made again ({steps}) and is the same to the bit.", components)
-    return Certificate("different", "worse", f"{what} was made again ({steps}) and differs first in {_first(entry)}.", components)
+        return Certificate(
+            "equal",
+            "better",
+            f"{what} was made again ({steps}) and is the same to the bit.",
+            components,
+        )
+    return Certificate(
+        "different",
+        "worse",
+        f"{what} was made again ({steps}) and differs first in {_first(entry)}.",
+        components,
+    )
 
 
 def certificate_caution(run: Run) -> list[str]:
@@ -133,7 +174,9 @@ def certificate_caution(run: Run) -> list[str]:
     entry = run.summary.get("determinism") or {}
     if entry.get("status") != "different":
         return []
-    return [f"The run is not deterministic: a repeated rollout differs first in {_first(entry)}. Paired differences hold that noise too."]
+    return [
+        f"The run is not deterministic: a repeated rollout differs first in {_first(entry)}. Paired differences hold that noise too."
+    ]
 
 
 def _first(entry: Mapping[str, Any]) -> str:
@@ -155,19 +198,32 @@ class FailureRow:
 
 
 def failure_rows(run: Run) -> tuple[list[FailureRow], int]:
-    """List failed rollouts with what was attempted, with which object, what was found, and what to do.
+    """List failed rollouts with what was attempted, with which object, what was found, and what to
+    do.
 
     Returns:
         The rows, and how many more there are than are shown.
     """
     cells = (run.summary.get("failures") or {}).get("cells") or []
-    errors = {(c["renderer"], c["policy"], c["scene"], c["seed"]): c.get("error") or {} for c in cells}
+    errors = {
+        (c["renderer"], c["policy"], c["scene"], c["seed"]): c.get("error") or {} for c in cells
+    }
     failed = [r for r in run.rollouts if not r.ok]
     rows = []
     for rollout in failed[:MAX_FAILURE_ROWS]:
         error = errors.get(rollout.cell, {})
-        parts = tuple((label, str(error[label])) for label in ("doing", "with", "found", "do") if error.get(label))
-        rows.append(FailureRow(rollout, parts or (("found", rollout.failure or "no message was recorded"),), run.href(rollout)))
+        parts = tuple(
+            (label, str(error[label]))
+            for label in ("doing", "with", "found", "do")
+            if error.get(label)
+        )
+        rows.append(
+            FailureRow(
+                rollout,
+                parts or (("found", rollout.failure or "no message was recorded"),),
+                run.href(rollout),
+            )
+        )
     return rows, len(failed) - len(rows)
 
 
@@ -190,7 +246,11 @@ LEDGER_COLUMNS = (  # key, head, what it means
     ("steps_after_drift", "after drift", "steps after leaving the logged path too far"),
     ("steps_scored", "scored", "steps that enter the metrics"),
     ("frames", "frames", "camera frames of rollouts that ran to their end"),
-    ("frame_events", "of them bad", "frames in which a guard saw something: black, or a fixer's frame that was replaced by the raw one"),
+    (
+        "frame_events",
+        "of them bad",
+        "frames in which a guard saw something: black, or a fixer's frame that was replaced by the raw one",
+    ),
 )
 
 
@@ -198,7 +258,8 @@ def ledger(run: Run, rates: tuple[str, ...]) -> list[LedgerRow]:
     """Lay out the censoring ledger; empty where the summary has none.
 
     Args:
-        rates: Rates whose best and worst case are shown, should every rollout without a value have been without or with the event.
+        rates: Rates whose best and worst case are shown, should every rollout without a value have
+            been without or with the event.
     """
     rows = []
     for renderer, entry in (run.summary.get("censoring") or {}).items():
@@ -210,16 +271,29 @@ def ledger(run: Run, rates: tuple[str, ...]) -> list[LedgerRow]:
             number = finite(found)
             if isinstance(found, Mapping):
                 total = sum(int(n) for n in found.values())
-                counts.append(Cell(str(total), "", ", ".join(f"{cause} {n}" for cause, n in found.items()), sort=total))
+                counts.append(
+                    Cell(
+                        str(total),
+                        "",
+                        ", ".join(f"{cause} {n}" for cause, n in found.items()),
+                        sort=total,
+                    )
+                )
             else:
-                counts.append(missing("not counted") if number is None else Cell(fixed(number, 0), sort=number))
+                counts.append(
+                    missing("not counted")
+                    if number is None
+                    else Cell(fixed(number, 0), sort=number)
+                )
         for rate in rates:
             ends = interval((entry.get("bounds") or {}).get(rate))
             if ends is None:
                 bounds.append(missing("not a rate of this run"))
                 continue
             low, high = (fixed(100 * v, 1) for v in ends)
-            bounds.append(Cell(f"{low}\u00a0%" if low == high else f"{low} to {high}\u00a0%", sort=ends[1]))
+            bounds.append(
+                Cell(f"{low}\u00a0%" if low == high else f"{low} to {high}\u00a0%", sort=ends[1])
+            )
         rows.append(LedgerRow(renderer, tuple(counts), tuple(bounds)))
     return rows
 
@@ -239,6 +313,12 @@ def invalid_rows(run: Run) -> list[InvalidRow]:
     rows = []
     for renderer, entry in (run.summary.get("censoring") or {}).items():
         for metric, found in ((entry or {}).get("invalid") or {}).items():
-            reasons = "; ".join(f"{reason} ({n})" for reason, n in (found.get("reasons") or {}).items())
-            rows.append(InvalidRow(renderer, metric, int(found.get("rollouts") or 0), reasons or "not given"))
+            reasons = "; ".join(
+                f"{reason} ({n})" for reason, n in (found.get("reasons") or {}).items()
+            )
+            rows.append(
+                InvalidRow(
+                    renderer, metric, int(found.get("rollouts") or 0), reasons or "not given"
+                )
+            )
     return rows

@@ -1,8 +1,10 @@
-"""Each rollout of a run: when and where its outcomes began, all of them over time, and as columns inside the page.
+"""Each rollout of a run: when and where its outcomes began, all of them over time, and as columns
+inside the page.
 
-The browser draws the table row by row as it is scrolled, so it may have any length. The page holds one block: a header in JSON, then the
-columns as bytes, compressed together. 100,000 rollouts with 25 metrics take some seven megabytes; a row of HTML each would take a hundred.
-Numbers are rounded to 13 significant bits (four digits), which the tables of the run are not.
+The browser draws the table row by row as it is scrolled, so it may have any length. The page holds
+one block: a header in JSON, then the columns as bytes, compressed together. 100,000 rollouts with
+25 metrics take some seven megabytes; a row of HTML each would take a hundred. Numbers are rounded
+to 13 significant bits (four digits), which the tables of the run are not.
 """
 
 from __future__ import annotations
@@ -22,14 +24,37 @@ import numpy.typing as npt
 from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.log.run_folder.rows import Own, Rollout, Series, series_by_cell
 from alpasim_plugin.log.run_folder.schema import WHY_NAME
-from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT, has_ended, in_words, outcomes_of, told
+from evaluators.metrics.outcomes import (
+    OUTCOMES,
+    POLICY_FAULT,
+    has_ended,
+    in_words,
+    outcomes_of,
+    told,
+)
 from evaluators.opening import Run
 from evaluators.report.charts import Chart, Curve, line_chart
 
-COLLISION = ("collision_any", "collision_at_fault", "collision_front", "collision_lateral", "collision_rear")
+COLLISION = (
+    "collision_any",
+    "collision_at_fault",
+    "collision_front",
+    "collision_lateral",
+    "collision_rear",
+)
 SIDES = {"collision_front": "front", "collision_lateral": "side", "collision_rear": "rear"}
-OTHERS = tuple(name for name in OUTCOMES if name != POLICY_FAULT and not name.startswith("collision"))
-SERIES = (*COLLISION, *OTHERS, "eval_relevant", "ego_x_m", "ego_y_m", "ego_yaw_rad", "lateral_bias_m")
+OTHERS = tuple(
+    name for name in OUTCOMES if name != POLICY_FAULT and not name.startswith("collision")
+)
+SERIES = (
+    *COLLISION,
+    *OTHERS,
+    "eval_relevant",
+    "ego_x_m",
+    "ego_y_m",
+    "ego_yaw_rad",
+    "lateral_bias_m",
+)
 
 
 @dataclass(frozen=True)
@@ -38,9 +63,11 @@ class Event:
 
     Attributes:
         kind: "collision", or the name of an outcome that touches nothing.
-        t_s: Seconds since the rollout's first step; None where no step shows the event that the rollout's metric counts.
+        t_s: Seconds since the rollout's first step; None where no step shows the event that the
+            rollout's metric counts.
         t_us: The same instant on the rollout's own clock; None with ``t_s``.
-        x_m, y_m, yaw_rad: Pose of the ego's rear axle at that time, world; None with ``t_s`` or where poses are not logged.
+        x_m, y_m, yaw_rad: Pose of the ego's rear axle at that time, world; None with ``t_s`` or
+            where poses are not logged.
         side: Which part of the ego was touched, or "".
     """
 
@@ -66,7 +93,8 @@ def clock_zero_us(content: Mapping[str, Any], first_us: int) -> int:
 
     Args:
         content: ``scenes/SCENE.json``.
-        first_us: The first logged pose, which counts where the scene does not say when it runs (scored logs of others).
+        first_us: The first logged pose, which counts where the scene does not say when it runs
+            (scored logs of others).
     """
     return max(int(content.get("start_us") or 0), first_us)
 
@@ -79,7 +107,8 @@ def read_series(run: Run, scenes: Sequence[str] | None = None) -> Series:
 def events_of(rollout: Rollout, series: Series) -> list[Event]:
     """List the events that the rollout's own metrics count, at most one of each kind.
 
-    Steps that do not count (``eval_relevant`` 0, during warm-up) are passed over, so that the time shown is that of the event counted.
+    Steps that do not count (``eval_relevant`` 0, during warm-up) are passed over, so that the time
+    shown is that of the event counted.
     """
     own = series.get(rollout.cell, {})
     found = []
@@ -143,10 +172,11 @@ class RolloutBlock:
 def rollout_block(run: Run) -> RolloutBlock:
     """Pack the rollouts of a run.
 
-    The block is gzip of: length of the header (uint32), header (UTF-8 JSON, spaces up to a multiple of four), columns. Little-endian. The
-    header names the columns in their order, each ``{"name", "type", "values"?}``: type is ``u8``, ``u32`` or ``f32``; the bytes of a column
-    stand by significance, all lowest ones first, which compresses better. ``values`` are the texts that a ``u32`` column counts through.
-    A missing number is NaN.
+    The block is gzip of: length of the header (uint32), header (UTF-8 JSON, spaces up to a multiple
+    of four), columns. Little-endian. The header names the columns in their order, each ``{"name",
+    "type", "values"?}``: type is ``u8``, ``u32`` or ``f32``; the bytes of a column stand by
+    significance, all lowest ones first, which compresses better. ``values`` are the texts that a
+    ``u32`` column counts through. A missing number is NaN.
     """
     rollouts = run.rollouts[:MAX_ROLLOUTS]
     parents = [os.path.split(r.path) for r in rollouts]
@@ -166,21 +196,49 @@ def rollout_block(run: Run) -> RolloutBlock:
         "folder": (quote(parent) for parent, _ in parents),
         "leaf": (quote(leaf) for _, leaf in parents),
         "outcome": (in_words(outcomes_of(r)) if has_ended(r) else "failed" for r in rollouts),
-        "failure": ((f"{r.failure_class or 'unknown cause'}: {r.failure}"[:MAX_TEXT] if not r.ok else "") for r in rollouts),
+        "failure": (
+            (f"{r.failure_class or 'unknown cause'}: {r.failure}"[:MAX_TEXT] if not r.ok else "")
+            for r in rollouts
+        ),
     }
     for name, column in texts.items():
         codes, values = _coded(column)
         add(name, "u32", codes, values=values)
     add("state", "u8", _states(run, parents))
-    add("wall_s", "f32", _rounded([r.wall_s for r in rollouts]), unit="s", percent=False, headline=False, flag=False)
+    add(
+        "wall_s",
+        "f32",
+        _rounded([r.wall_s for r in rollouts]),
+        unit="s",
+        percent=False,
+        headline=False,
+        flag=False,
+    )
     for metric in run.table.ordered(run.metric_names):
         numbers = _rounded([r.metrics.get(metric) for r in rollouts])
         facts = run.table.shown(metric)
-        add(metric, "f32", numbers, unit=facts.unit, percent=facts.in_percent, headline=facts.is_headline, flag=facts.is_flag)
-    head = json.dumps({"rows": len(rollouts), "columns": header, "renderers": run.renderers}, separators=(",", ":")).encode()
+        add(
+            metric,
+            "f32",
+            numbers,
+            unit=facts.unit,
+            percent=facts.in_percent,
+            headline=facts.is_headline,
+            flag=facts.is_flag,
+        )
+    head = json.dumps(
+        {"rows": len(rollouts), "columns": header, "renderers": run.renderers},
+        separators=(",", ":"),
+    ).encode()
     head += b" " * (-len(head) % 4)
-    packed = gzip.compress(np.uint32(len(head)).tobytes() + head + b"".join(one.tobytes() for one in columns), compresslevel=9, mtime=0)
-    return RolloutBlock(base64.b64encode(packed).decode(), len(rollouts), len(run.rollouts) - len(rollouts))
+    packed = gzip.compress(
+        np.uint32(len(head)).tobytes() + head + b"".join(one.tobytes() for one in columns),
+        compresslevel=9,
+        mtime=0,
+    )
+    return RolloutBlock(
+        base64.b64encode(packed).decode(), len(rollouts), len(run.rollouts) - len(rollouts)
+    )
 
 
 def _coded(values: Iterable[str]) -> tuple[npt.NDArray[np.uint32], list[str]]:
@@ -191,10 +249,14 @@ def _coded(values: Iterable[str]) -> tuple[npt.NDArray[np.uint32], list[str]]:
 
 
 def _rounded(values: Sequence[float | None]) -> npt.NDArray[np.float32]:
-    """Return numbers ``(N,)`` with `KEPT_BITS` significant bits, NaN for None; bits that say nothing are what does not compress."""
+    """Return numbers ``(N,)`` with `KEPT_BITS` significant bits, NaN for None; bits that say
+    nothing are what does not compress.
+    """
     exact = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
     mantissa, exponent = np.frexp(exact)
-    return np.asarray(np.ldexp(np.round(np.ldexp(mantissa, KEPT_BITS)), exponent - KEPT_BITS), dtype="<f4")
+    return np.asarray(
+        np.ldexp(np.round(np.ldexp(mantissa, KEPT_BITS)), exponent - KEPT_BITS), dtype="<f4"
+    )
 
 
 def _states(run: Run, parents: Sequence[tuple[str, str]]) -> U8:
@@ -210,12 +272,23 @@ def _states(run: Run, parents: Sequence[tuple[str, str]]) -> U8:
         if parent not in names:
             names[parent] = frozenset()
             path = run.folder / parent
-            if parent and path.is_dir() and path.resolve().is_relative_to(run.folder.resolve()):  # links may lead out of the run
+            if (
+                parent and path.is_dir() and path.resolve().is_relative_to(run.folder.resolve())
+            ):  # links may lead out of the run
                 with os.scandir(path) as found:
-                    names[parent] = frozenset(one.name for one in found if one.is_dir(follow_symlinks=False))
+                    names[parent] = frozenset(
+                        one.name for one in found if one.is_dir(follow_symlinks=False)
+                    )
         if leaf in names[parent]:
-            state |= HAS_FOLDER | (HAS_CLIP if has_clips and (run.folder / parent / leaf / CLIP).is_file() else 0)
-            state |= HAS_WHY if state & (COLLIDED | OTHERWISE) and (run.folder / parent / leaf / WHY_NAME).is_file() else 0
+            state |= HAS_FOLDER | (
+                HAS_CLIP if has_clips and (run.folder / parent / leaf / CLIP).is_file() else 0
+            )
+            state |= (
+                HAS_WHY
+                if state & (COLLIDED | OTHERWISE)
+                and (run.folder / parent / leaf / WHY_NAME).is_file()
+                else 0
+            )
         states.append(state)
     return np.array(states, dtype=np.uint8)
 
@@ -223,8 +296,12 @@ def _states(run: Run, parents: Sequence[tuple[str, str]]) -> U8:
 N_BINS = 60  # of the time axis
 
 
-def drift_charts(rollouts: Sequence[Rollout], series: Series, variant_of: dict[tuple[str, str], tuple[int, int]]) -> list[Chart]:
-    """Draw how far from the logged path the ego is over time, and how many rollouts are still without an event."""
+def drift_charts(
+    rollouts: Sequence[Rollout], series: Series, variant_of: dict[tuple[str, str], tuple[int, int]]
+) -> list[Chart]:
+    """Draw how far from the logged path the ego is over time, and how many rollouts are still
+    without an event.
+    """
     charts = []
     by_variant: dict[tuple[str, str], list[Rollout]] = {}
     for rollout in rollouts:
@@ -237,20 +314,32 @@ def drift_charts(rollouts: Sequence[Rollout], series: Series, variant_of: dict[t
 
     def curves(make: Callable[[list[Rollout]], tuple[F64, ...]]) -> list[Curve]:
         names = {key: " \u00b7 ".join(key) if several else key[0] for key in by_variant}
-        return [Curve(names[key], *variant_of[key], *make(members)) for key, members in by_variant.items()]
+        return [
+            Curve(names[key], *variant_of[key], *make(members))
+            for key, members in by_variant.items()
+        ]
 
     charts.append(
         Chart(
             "Distance from the logged path over time",
             "Line: median over rollouts. Band: 10th to 90th percentile. Drawn while at least half of the rollouts still run.",
-            line_chart(curves(lambda members: _offset_band(members, series)), "s since start", "m beside the path"),
+            line_chart(
+                curves(lambda members: _offset_band(members, series)),
+                "s since start",
+                "m beside the path",
+            ),
         )
     )
     charts.append(
         Chart(
             "Rollouts without a collision or off-road event so far",
             "Share of completed rollouts, by time of the first counted event.",
-            line_chart(curves(lambda members: _survival(members, series)), "s since start", "% of rollouts", y_top=104.0),
+            line_chart(
+                curves(lambda members: _survival(members, series)),
+                "s since start",
+                "% of rollouts",
+                y_top=104.0,
+            ),
         )
     )
     return charts
@@ -265,7 +354,9 @@ def _offset_band(members: list[Rollout], series: Series) -> tuple[F64, ...]:
         seconds = (t_us - t_us[0]) * 1e-6
         inside = grid <= seconds[-1] + 1e-9
         row[inside] = np.abs(np.interp(grid[inside], seconds, offset))
-    enough = np.count_nonzero(np.isfinite(values), axis=0) * 2 >= len(own)  # later, the few long scenes would pass for a trend
+    enough = np.count_nonzero(np.isfinite(values), axis=0) * 2 >= len(
+        own
+    )  # later, the few long scenes would pass for a trend
     low, middle, high = np.nanpercentile(values[:, enough], [10, 50, 90], axis=0)
     return grid[enough], middle, low, high
 
@@ -273,7 +364,10 @@ def _offset_band(members: list[Rollout], series: Series) -> tuple[F64, ...]:
 def _survival(members: list[Rollout], series: Series) -> tuple[F64, ...]:
     ends = [series[r.cell]["lateral_bias_m"][0] for r in members]
     end_s = max(float(t[-1] - t[0]) for t in ends) * 1e-6
-    firsts = [min((e.t_s for e in events_of(r, series) if e.t_s is not None), default=np.inf) for r in members]
+    firsts = [
+        min((e.t_s for e in events_of(r, series) if e.t_s is not None), default=np.inf)
+        for r in members
+    ]
     times = np.array(sorted(t for t in firsts if np.isfinite(t)))
     x = np.concatenate([[0.0], np.repeat(times, 2), [end_s]])
     alive = 100.0 * (1.0 - np.arange(len(times) + 1) / len(members))

@@ -1,4 +1,6 @@
-"""Run folders, also unfinished or damaged ones: described by ``run.json`` and ``summary.json``, found below a folder, and chosen."""
+"""Run folders, also unfinished or damaged ones: described by ``run.json`` and ``summary.json``,
+found below a folder, and chosen.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,14 @@ from alpasim_plugin.core.checksums import read_sealed
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lock import holder_of
 from alpasim_plugin.core.reading.files import as_shape, read_json_as
-from alpasim_plugin.log.run_folder.schema import CONTENTS, LOCK, ROLLOUTS, RUN_INFO, SUMMARY, cell_name
+from alpasim_plugin.log.run_folder.schema import (
+    CONTENTS,
+    LOCK,
+    ROLLOUTS,
+    RUN_INFO,
+    SUMMARY,
+    cell_name,
+)
 from alpasim_plugin.log.run_folder.shapes import RunInfo, Summary
 from evaluators.metrics import MetricTable
 
@@ -33,10 +42,11 @@ class RunEntry:
 
     Attributes:
         folder: Its path, as found.
-        state: ``finished``; ``running`` where a process writes it; ``unfinished`` where none does any more; ``damaged`` where it cannot be
-            read.
+        state: ``finished``; ``running`` where a process writes it; ``unfinished`` where none does
+            any more; ``damaged`` where it cannot be read.
         problem: Why it is damaged, else empty.
-        info: ``run.json``, or its copy in ``contents.json`` where it is damaged; empty where there is neither.
+        info: ``run.json``, or its copy in ``contents.json`` where it is damaged; empty where there
+            is neither.
     """
 
     folder: Path
@@ -61,7 +71,9 @@ class RunEntry:
 
     @property
     def project(self) -> Mapping[str, Any]:
-        """Give what `alpasim_plugin.runs.provenance.Project` names; empty for a run of an earlier version."""
+        """Give what `alpasim_plugin.runs.provenance.Project` names; empty for a run of an earlier
+        version.
+        """
         return self.info.get("project") or {}
 
     @property
@@ -71,22 +83,32 @@ class RunEntry:
 
     @property
     def commit_text(self) -> str:
-        """Give the commit for a table: seven digits, and ``+`` where files differed from it; "" without one."""
+        """Give the commit for a table: seven digits, and ``+`` where files differed from it; ""
+        without one.
+        """
         return self.commit[:7] + ("+" if self.commit and self.project.get("dirty") else "")
 
     @property
     def weights(self) -> frozenset[tuple[str, str]]:
         """Give name of a weight file and its SHA-256; where the file lay does not matter."""
-        return frozenset((Path(path).name, str(digest)) for path, digest in (self.info.get("weights") or {}).items())
+        return frozenset(
+            (Path(path).name, str(digest))
+            for path, digest in (self.info.get("weights") or {}).items()
+        )
 
     @property
     def scenes(self) -> dict[str, str]:
         """Give scene id -> content hash."""
-        return {name: str(facts.get("content_hash") or "") for name, facts in (self.info.get("scenes") or {}).items()}
+        return {
+            name: str(facts.get("content_hash") or "")
+            for name, facts in (self.info.get("scenes") or {}).items()
+        }
 
     @property
     def outcome(self) -> Mapping[str, Any]:
-        """Give ``n_rollouts`` and ``n_failed``, from ``run.json`` or, for a run of an earlier version, from the summary; else empty."""
+        """Give ``n_rollouts`` and ``n_failed``, from ``run.json`` or, for a run of an earlier
+        version, from the summary; else empty.
+        """
         if self.state != "finished":
             return {}
         stated: Mapping[str, Any] = self.info.get("outcome") or self.summary.get("failures") or {}
@@ -94,12 +116,16 @@ class RunEntry:
 
     @property
     def planned(self) -> int | None:
-        """Give how many rollouts were planned; None for scored logs that are not finished, and without ``run.json``."""
+        """Give how many rollouts were planned; None for scored logs that are not finished, and
+        without ``run.json``.
+        """
         if "n_rollouts" in self.outcome:
             return int(self.outcome["n_rollouts"])
         if not self.info or self.kind == "score":
             return None
-        sizes = [len(self.info.get(name) or ()) for name in ("renderers", "policies", "scenes", "seeds")]
+        sizes = [
+            len(self.info.get(name) or ()) for name in ("renderers", "policies", "scenes", "seeds")
+        ]
         return sizes[0] * sizes[1] * sizes[2] * sizes[3]
 
     @cached_property
@@ -111,25 +137,43 @@ class RunEntry:
         """
         if self.state != "finished":
             return {}
-        summary: Mapping[str, Any] = read_json_as(Summary, self.folder / SUMMARY, DOING, do_this=CHECK)
+        summary: Mapping[str, Any] = read_json_as(
+            Summary, self.folder / SUMMARY, DOING, do_this=CHECK
+        )
         return summary
 
     def metric(self, metric: str, renderer: str, policy: str) -> Mapping[str, Any]:
         """Return the entry of a metric in ``summary.json``; empty where it has none."""
         table = self.summary.get("metrics") or {}
-        of = table.get(cell_name(renderer, policy)) or (table.get(renderer) if len(self.info.get("policies") or ()) == 1 else None) or {}
+        of = (
+            table.get(cell_name(renderer, policy))
+            or (table.get(renderer) if len(self.info.get("policies") or ()) == 1 else None)
+            or {}
+        )
         return of.get(metric) or {}
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything for JSON."""
         info = self.info
-        listed = {name: list(info.get(name) or ()) for name in ("renderers", "policies", "seeds", "asked")}
+        listed = {
+            name: list(info.get(name) or ()) for name in ("renderers", "policies", "seeds", "asked")
+        }
         return {
-            "folder": str(self.folder), "state": self.state, "problem": self.problem, "kind": self.kind, "key": info.get("key"),
-            "started_at": info.get("started_at"), "project": dict(self.project) or None, "version": info.get("version"),
-            "preset": info.get("preset"), **listed, "scenes": self.scenes, "weights": dict(info.get("weights") or {}),
-            "rollouts": self.planned, "failed": self.outcome.get("n_failed"),
-        }  # fmt: skip
+            "folder": str(self.folder),
+            "state": self.state,
+            "problem": self.problem,
+            "kind": self.kind,
+            "key": info.get("key"),
+            "started_at": info.get("started_at"),
+            "project": dict(self.project) or None,
+            "version": info.get("version"),
+            "preset": info.get("preset"),
+            **listed,
+            "scenes": self.scenes,
+            "weights": dict(info.get("weights") or {}),
+            "rollouts": self.planned,
+            "failed": self.outcome.get("n_failed"),
+        }
 
 
 def as_time(text: object) -> datetime | None:
@@ -146,9 +190,12 @@ def read_entry(folder: Path, with_summary: bool = False) -> RunEntry:
 
     Args:
         folder: The run folder.
-        with_summary: Read ``summary.json`` too, so that damage of it is noticed here; its size makes it five times slower.
+        with_summary: Read ``summary.json`` too, so that damage of it is noticed here; its size
+            makes it five times slower.
     """
-    finished = os.path.isfile(folder / CONTENTS)  # False too where the folder may not be looked into
+    finished = os.path.isfile(
+        folder / CONTENTS
+    )  # False too where the folder may not be looked into
     info: Mapping[str, Any] = {}
     problem = ""
     try:
@@ -175,7 +222,9 @@ def read_entry(folder: Path, with_summary: bool = False) -> RunEntry:
 
 def _run_info(path: Path, is_copy: bool) -> Mapping[str, Any]:
     content, _ = read_sealed(path, DOING, CHECK)
-    shaped: Mapping[str, Any] = as_shape(RunInfo, (content.get("run") or {}) if is_copy else content, path, DOING, CHECK)
+    shaped: Mapping[str, Any] = as_shape(
+        RunInfo, (content.get("run") or {}) if is_copy else content, path, DOING, CHECK
+    )
     return shaped
 
 
@@ -186,7 +235,8 @@ SKIPPED = frozenset(("node_modules", "__pycache__", "site-packages"))
 def find_runs(roots: Sequence[Path], with_summary: bool = False) -> list[RunEntry]:
     """Describe every run folder below some folders, or those folders themselves, the newest first.
 
-    A folder that a killed run left behind is one too. Nothing is searched inside a run folder, so forks inside a run are part of it.
+    A folder that a killed run left behind is one too. Nothing is searched inside a run folder, so
+    forks inside a run are part of it.
 
     Args:
         roots: Folders; one that is reached twice is listed once.
@@ -199,7 +249,12 @@ def find_runs(roots: Sequence[Path], with_summary: bool = False) -> list[RunEntr
     for root in roots:
         if not root.is_dir():
             what = "a file" if root.exists() else "no such folder"
-            raise InputError(DOING, str(root), what, "name the folder that holds the run folders; simrun run writes them below runs/")
+            raise InputError(
+                DOING,
+                str(root),
+                what,
+                "name the folder that holds the run folders; simrun run writes them below runs/",
+            )
         for folder in _run_folders(root, set()):
             state = folder.stat()
             found.setdefault((state.st_dev, state.st_ino), folder)
@@ -213,7 +268,9 @@ def find_runs(roots: Sequence[Path], with_summary: bool = False) -> list[RunEntr
 
 
 def _run_folders(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
-    """Yield the run folders below a folder, in the order of names; links are followed, circles are not."""
+    """Yield the run folders below a folder, in the order of names; links are followed, circles are
+    not.
+    """
     state = folder.stat()
     if (state.st_dev, state.st_ino) in seen:
         return
@@ -264,7 +321,12 @@ class Choice:
     def __post_init__(self) -> None:
         for one in (*self.commits, *self.weights):
             if len(one) < LEAST_DIGITS:
-                raise InputError(DOING, f"--commit or --weights {one!r}", "too short", f"give at least {LEAST_DIGITS} characters")
+                raise InputError(
+                    DOING,
+                    f"--commit or --weights {one!r}",
+                    "too short",
+                    f"give at least {LEAST_DIGITS} characters",
+                )
 
     def takes(self, entry: RunEntry) -> bool:
         """Tell whether a run is all that is asked for."""
@@ -284,7 +346,9 @@ class Choice:
 
 
 def chosen(entries: Iterable[RunEntry], choice: Choice) -> tuple[list[RunEntry], list[RunEntry]]:
-    """Split runs into those that a choice takes, and those of the rest whose ``run.json`` is lost, so that nothing can be asked of them."""
+    """Split runs into those that a choice takes, and those of the rest whose ``run.json`` is lost,
+    so that nothing can be asked of them.
+    """
     taken, lost = [], []
     for entry in entries:
         if choice.takes(entry):
@@ -304,12 +368,15 @@ def _each_is_named(asked: Sequence[str], known: Sequence[str]) -> bool:
 
 
 def _scene(name: str) -> str:
-    """Spell a scene or a suite one way: ``smoke/curve`` has the id ``smoke-curve``, and a suite's file ends with .yaml."""
+    """Spell a scene or a suite one way: ``smoke/curve`` has the id ``smoke-curve``, and a suite's
+    file ends with .yaml.
+    """
     return name.removesuffix(".yaml").replace("/", "-").removeprefix("suites-")
 
 
 def as_day(text: str, option: str, now: datetime) -> datetime:
-    """Read a date, a time, or an age such as ``7d`` or ``12h``; without a zone it is UTC, as in ``run.json``.
+    """Read a date, a time, or an age such as ``7d`` or ``12h``; without a zone it is UTC, as in
+    ``run.json``.
 
     Example:
         >>> as_day("2d", "--since", datetime(2026, 3, 10, 12, tzinfo=UTC)).isoformat()
@@ -326,12 +393,19 @@ def as_day(text: str, option: str, now: datetime) -> datetime:
             return now - timedelta(hours=hours * float(text[:-1]))
         found = datetime.fromisoformat(text)
     except (ValueError, OverflowError):
-        raise InputError(DOING, f"{option} {text}", "neither a date nor an age", "write 2026-03-01, 2026-03-01T18:00, 7d or 12h") from None
+        raise InputError(
+            DOING,
+            f"{option} {text}",
+            "neither a date nor an age",
+            "write 2026-03-01, 2026-03-01T18:00, 7d or 12h",
+        ) from None
     return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
 
 
 def shown_folder(folder: Path, roots: Sequence[Path]) -> str:
-    """Return a folder's path below the root that it was found in, where there is one root, else as it was found."""
+    """Return a folder's path below the root that it was found in, where there is one root, else as
+    it was found.
+    """
     if len(roots) == 1 and folder != roots[0] and folder.is_relative_to(roots[0]):
         return folder.relative_to(roots[0]).as_posix()
     return str(folder)

@@ -1,4 +1,6 @@
-"""Results by how far the ego was from the logged path, and by how much of the picture the renderer covered."""
+"""Results by how far the ego was from the logged path, and by how much of the picture the renderer
+covered.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,11 @@ from evaluators.statistics.intervals import clustered
 
 DISTANCE, OPACITY = "lateral_bias_m", "opacity_mean"
 DISTANCE_EDGES_M = (0.25, 0.5, 1.0, 2.0)
-OPACITY_SHARES = (25, 50, 75)  # percentiles of the run's own frames: what is much covered depends on how much sky there is
+OPACITY_SHARES = (
+    25,
+    50,
+    75,
+)  # percentiles of the run's own frames: what is much covered depends on how much sky there is
 EVENTS = (("collision_at_fault", "at-fault collisions"), ("offroad", "off-road"))
 VALUES = ("plan_deviation", "min_ade@1.0s(gt)")
 SERIES = (DISTANCE, OPACITY, *VALUES, *COLLISION, "offroad", "eval_relevant")
@@ -35,8 +41,8 @@ class Bin:
     Attributes:
         seconds: Time driven there, of the scored part of all rollouts.
         events: Rollouts whose first event of the kind began there, by metric.
-        means: By metric: mean over scenes of the scene's mean over steps, and its interval (None, None where there is none); absent where
-            unknown.
+        means: By metric: mean over scenes of the scene's mean over steps, and its interval (None,
+            None where there is none); absent where unknown.
     """
 
     variant: int
@@ -78,30 +84,59 @@ class StratumRow:
 
 
 def strata(run: Run, scenes: Sequence[str] | None = None) -> list[Strata]:
-    """Split the scored steps of a run by distance and by opacity; a variable that the run does not hold is left out.
+    """Split the scored steps of a run by distance and by opacity; a variable that the run does not
+    hold is left out.
 
     Args:
         run: The run.
         scenes: Whose steps count; None: all.
     """
     series = series_by_cell(run.steps(SERIES, scenes))
-    steps = [_Steps(r, series[r.cell]) for r in run.rollouts if r.ok and DISTANCE in series.get(r.cell, {})]
+    steps = [
+        _Steps(r, series[r.cell])
+        for r in run.rollouts
+        if r.ok and DISTANCE in series.get(r.cell, {})
+    ]
     steps = [one for one in steps if len(one.t_us)]
     found = []
     if steps:
         labels = [*_labels(DISTANCE_EDGES_M, "m"), NOT_BESIDE]
         note = "Time, events and plans by how far the ego's box centre was from the logged path at that moment."
         groups = [one.distance_bin() for one in steps]
-        found.append(_split("By distance from the logged path", note, "distance from the path", "m", labels, steps, groups, run))
+        found.append(
+            _split(
+                "By distance from the logged path",
+                note,
+                "distance from the path",
+                "m",
+                labels,
+                steps,
+                groups,
+                run,
+            )
+        )
     covered = [one for one in steps if one.opacity is not None]
     if covered:
         seen = [np.asarray(one.opacity) for one in covered]
         every = np.concatenate([values[np.isfinite(values)] for values in seen])
-        quartiles = np.floor(np.percentile(every, OPACITY_SHARES) * 1000) / 1000 if every.size else ()  # down: 0.9996 is not 1
+        quartiles = (
+            np.floor(np.percentile(every, OPACITY_SHARES) * 1000) / 1000 if every.size else ()
+        )  # down: 0.9996 is not 1
         edges = tuple(dict.fromkeys(float(v) for v in quartiles))
         note = "Opacity: mean over the picture of what the Gaussians cover; little means sky, or holes. Limits are quartiles of this run."
         groups = [np.where(np.isfinite(values), np.digitize(values, edges), -1) for values in seen]
-        found.append(_split("By rendered opacity", note, "rendered opacity", "", _labels(edges, ""), covered, groups, run))
+        found.append(
+            _split(
+                "By rendered opacity",
+                note,
+                "rendered opacity",
+                "",
+                _labels(edges, ""),
+                covered,
+                groups,
+                run,
+            )
+        )
     return found
 
 
@@ -116,15 +151,26 @@ def stratum_rows(one: Strata) -> list[StratumRow]:
                 rate = f"{short(100 * n / b.seconds)} per 100 s driven" if b.seconds > 0 else ""
                 counts.append(Cell(str(n), rate, sort=n))
             values = [_mean(b, name) for name in VALUES]
-            time = Cell(f"{fixed(b.seconds, 1)}\u00a0s", plural(b.rollouts, "rollout"), sort=b.seconds)
-            rows.append(StratumRow(stratum.label, order, b.renderer, b.variant, (time, *counts, *values)))
+            time = Cell(
+                f"{fixed(b.seconds, 1)}\u00a0s", plural(b.rollouts, "rollout"), sort=b.seconds
+            )
+            rows.append(
+                StratumRow(stratum.label, order, b.renderer, b.variant, (time, *counts, *values))
+            )
     return rows
 
 
 def heads() -> list[tuple[str, str]]:
     """Give the heads of the columns with their meaning."""
-    events = [(word, f"rollouts whose first {word.removesuffix('s')} event began there") for _, word in EVENTS]
-    return [("time driven", "scored steps of all rollouts"), *events, *((f"{name} (m)", METRICS[name].help) for name in VALUES)]
+    events = [
+        (word, f"rollouts whose first {word.removesuffix('s')} event began there")
+        for _, word in EVENTS
+    ]
+    return [
+        ("time driven", "scored steps of all rollouts"),
+        *events,
+        *((f"{name} (m)", METRICS[name].help) for name in VALUES),
+    ]
 
 
 class _Steps:
@@ -133,7 +179,11 @@ class _Steps:
     def __init__(self, rollout: Rollout, own: Own) -> None:
         self.rollout, self.own = rollout, own
         t_us = own["eval_relevant"][0] if "eval_relevant" in own else own[DISTANCE][0]
-        counted = own["eval_relevant"][1] >= 0.5 if "eval_relevant" in own else np.ones(len(t_us), dtype=bool)
+        counted = (
+            own["eval_relevant"][1] >= 0.5
+            if "eval_relevant" in own
+            else np.ones(len(t_us), dtype=bool)
+        )
         self.first: dict[str, int] = {}
         for name, _ in EVENTS:
             if name in own and rollout.flag(name):
@@ -147,7 +197,9 @@ class _Steps:
         self.opacity = self._at(OPACITY)
 
     def _at(self, name: str) -> F64 | None:
-        """Return a series at the scored steps: the newest value, NaN before the first; several cameras are averaged."""
+        """Return a series at the scored steps: the newest value, NaN before the first; several
+        cameras are averaged.
+        """
         if name not in self.own:
             return None
         times, where = np.unique(self.own[name][0], return_inverse=True)
@@ -163,19 +215,34 @@ class _Steps:
         return np.where(beside, found, len(DISTANCE_EDGES_M) + 1)
 
     def values(self, name: str, group: I64, k: int) -> F64:
-        """Return the values of a metric at the steps of one group; times without a value have none."""
+        """Return the values of a metric at the steps of one group; times without a value have
+        none.
+        """
         if name not in self.own:
             return np.zeros(0)
         times, values = self.own[name]
         return np.asarray(values[np.isin(times, self.t_us[group == k])])
 
 
-def _split(title: str, note: str, axis: str, unit: str, labels: Sequence[str], steps: list[_Steps], groups: list[I64], run: Run) -> Strata:
+def _split(
+    title: str,
+    note: str,
+    axis: str,
+    unit: str,
+    labels: Sequence[str],
+    steps: list[_Steps],
+    groups: list[I64],
+    run: Run,
+) -> Strata:
     strata_found = []
     for k, label in enumerate(labels):
         bins = []
         for variant, renderer in enumerate(run.renderers):
-            mine = [(s, g) for s, g in zip(steps, groups, strict=True) if s.rollout.renderer == renderer and bool((g == k).any())]
+            mine = [
+                (s, g)
+                for s, g in zip(steps, groups, strict=True)
+                if s.rollout.renderer == renderer and bool((g == k).any())
+            ]
             if mine:
                 bins.append(_bin(variant, renderer, mine, k))
         if bins:
@@ -198,7 +265,11 @@ def _bin(variant: int, renderer: str, mine: list[tuple[_Steps, I64]], k: int) ->
             interval = clustered(values, scenes)
             enough = len(set(scenes)) >= LEAST_SCENES and interval.low is not None
             # Neither metric can be negative; a t interval over few scenes does not know that.
-            means[name] = (interval.centre, max(interval.low or 0.0, 0.0) if enough else None, interval.high if enough else None)
+            means[name] = (
+                interval.centre,
+                max(interval.low or 0.0, 0.0) if enough else None,
+                interval.high if enough else None,
+            )
     return Bin(variant, renderer, seconds, len(mine), events, means)
 
 
@@ -207,7 +278,12 @@ def _mean(b: Bin, name: str) -> Cell:
         return missing(f"fewer than {LEAST_STEPS} steps here have it")
     mean, low, high = b.means[name]
     detail = "" if low is None or high is None else f"{short(low)} to {short(high)}"
-    return Cell(short(mean), "" if detail else f"no interval: it needs {LEAST_SCENES} scenes", detail, sort=mean)
+    return Cell(
+        short(mean),
+        "" if detail else f"no interval: it needs {LEAST_SCENES} scenes",
+        detail,
+        sort=mean,
+    )
 
 
 def _labels(edges: Sequence[float], unit: str) -> list[str]:
@@ -215,14 +291,18 @@ def _labels(edges: Sequence[float], unit: str) -> list[str]:
     if not edges:
         return ["all"]
     inner = [f"{a:g} to {b:g}{tail}" for a, b in pairwise(edges)]
-    top = "1" if not unit and edges[-1] >= 1.0 else f"{edges[-1]:g}{tail} and more"  # no more than all of a picture can be covered
+    top = (
+        "1" if not unit and edges[-1] >= 1.0 else f"{edges[-1]:g}{tail} and more"
+    )  # no more than all of a picture can be covered
     return [f"below {edges[0]:g}{tail}", *inner, top]
 
 
 def strata_chart(one: Strata) -> Chart | None:
     """Draw the steadiness of plans by stratum; None where it is known in fewer than two."""
     name = VALUES[0]
-    known = [s for s in one.strata if s.label != NOT_BESIDE and any(name in b.means for b in s.bins)]
+    known = [
+        s for s in one.strata if s.label != NOT_BESIDE and any(name in b.means for b in s.bins)
+    ]
     if len(known) < 2:
         return None
     variants = sorted({b.variant for s in known for b in s.bins})
@@ -240,8 +320,15 @@ def strata_chart(one: Strata) -> Chart | None:
     for k in range(1, len(known)):
         axes.upright(k - 0.5, GRID, 0.8)
     ticks = [s.label.replace(f"\u00a0{one.unit}", "") if one.unit else s.label for s in known]
-    ticks = [tick.replace(" and more", "+").replace("below ", "< ").replace(" to ", "\u2013") for tick in ticks]
+    ticks = [
+        tick.replace(" and more", "+").replace("below ", "< ").replace(" to ", "\u2013")
+        for tick in ticks
+    ]
     axes.ticks[0], axes.limits[0] = list(enumerate(ticks)), (-0.5, len(known) - 0.5)
     axes.limits[1] = 0.0, 1.08 * axes.range(1)[1]  # the highest marker is whole
     axes.labels = [f"{one.axis}, {one.unit}" if one.unit else one.axis, "m between plans in a row"]
-    return Chart(f"Steadiness of plans by {one.axis}", "Mean of plan_deviation; bars: 95 % over scenes, from three scenes on.", axes.svg())
+    return Chart(
+        f"Steadiness of plans by {one.axis}",
+        "Mean of plan_deviation; bars: 95 % over scenes, from three scenes on.",
+        axes.svg(),
+    )

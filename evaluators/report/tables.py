@@ -81,7 +81,9 @@ class PairRow:
 
 
 def metric_rows(
-    summary: Mapping[str, Any], reasons: Mapping[tuple[str, str], str] | None = None, known: MetricTable = METRICS
+    summary: Mapping[str, Any],
+    reasons: Mapping[tuple[str, str], str] | None = None,
+    known: MetricTable = METRICS,
 ) -> list[MetricRow]:
     """Lay out metrics x variants from ``summary.json``.
 
@@ -99,11 +101,19 @@ def metric_rows(
         facts = known.shown(name)
         percent = facts.in_percent
         reason_of = [(reasons or {}).get((variant, name), "") for variant in variants]
-        halves = [(ends[1] - ends[0]) / 2 for e in entries if (ends := interval(e.get("ci95_clustered")))]
+        halves = [
+            (ends[1] - ends[0]) / 2 for e in entries if (ends := interval(e.get("ci95_clustered")))
+        ]
         means = [m for e in entries if (m := finite(e.get("mean")))]
-        places = 1 if percent else max(decimals(*means), decimals(*halves, digits=2) if halves else 0)
-        cells = tuple(metric_cell(facts, e, places, why) for e, why in zip(entries, reason_of, strict=True))
-        spans, scale_text = _spans(entries, 100.0 if percent else 1.0, facts.is_flag, "%" if percent else unit)
+        places = (
+            1 if percent else max(decimals(*means), decimals(*halves, digits=2) if halves else 0)
+        )
+        cells = tuple(
+            metric_cell(facts, e, places, why) for e, why in zip(entries, reason_of, strict=True)
+        )
+        spans, scale_text = _spans(
+            entries, 100.0 if percent else 1.0, facts.is_flag, "%" if percent else unit
+        )
         rows.append(
             MetricRow(
                 name=name,
@@ -120,32 +130,44 @@ def metric_rows(
     return rows
 
 
-def metric_cell(metric: MetricInfo, entry: Mapping[str, Any], places: int, reason: str = "") -> Cell:
+def metric_cell(
+    metric: MetricInfo, entry: Mapping[str, Any], places: int, reason: str = ""
+) -> Cell:
     """Print a mean with its interval, scenes as clusters, and for rates the count."""
     mean = finite(entry.get("mean"))
     n_rollouts, n_scenes = int(entry.get("n_rollouts") or 0), int(entry.get("n_scenes") or 0)
     if mean is None:
         stated = reason or str(entry.get("reason") or "")
-        return missing(stated or ("valid in no rollout" if entry else "not computed for this renderer"))
+        return missing(
+            stated or ("valid in no rollout" if entry else "not computed for this renderer")
+        )
     scale = 100.0 if metric.in_percent else 1.0
     clustered = interval(entry.get("ci95_clustered"))
     notes = [f"{plural(n_rollouts, 'rollout')}, {plural(n_scenes, 'scene')}"]
     if entry.get("n_invalid"):
         notes.append(f"invalid in {entry['n_invalid']} more" + (f" ({reason})" if reason else ""))
     if clustered is None:
-        notes.append(f"no interval over scenes: {entry.get('ci95_clustered_reason') or 'it needs at least two scenes'}")
+        notes.append(
+            f"no interval over scenes: {entry.get('ci95_clustered_reason') or 'it needs at least two scenes'}"
+        )
     if entry.get("note"):
         notes.append(str(entry["note"]))
     counted = count_of(mean, n_rollouts) if metric.is_flag else ""
     detail = DASH if clustered is None else " to ".join(fixed(v * scale, places) for v in clustered)
     if counted:
-        detail = f"{counted.replace(' of ', '/')} ({detail}{'' if clustered is None else NARROW + '%'})"
+        detail = (
+            f"{counted.replace(' of ', '/')} ({detail}{'' if clustered is None else NARROW + '%'})"
+        )
         if mean == 0.0 and clustered is not None:
-            notes.append(f"no event in {n_rollouts}: only rates above {fixed(clustered[1] * scale, places)} % are excluded")
+            notes.append(
+                f"no event in {n_rollouts}: only rates above {fixed(clustered[1] * scale, places)} % are excluded"
+            )
     return Cell(fixed(mean * scale, places), "; ".join(notes), detail, mean)
 
 
-def _spans(entries: list[Mapping[str, Any]], scale: float, rate: bool, unit: str) -> tuple[tuple[Span | None, ...], str]:
+def _spans(
+    entries: list[Mapping[str, Any]], scale: float, rate: bool, unit: str
+) -> tuple[tuple[Span | None, ...], str]:
     """Place means and intervals of one metric on one axis that includes zero."""
     values: list[float] = [0.0]
     for e in entries:
@@ -184,17 +206,32 @@ def _spans(entries: list[Mapping[str, Any]], scale: float, rate: bool, unit: str
 
 
 def pair_rows(summary: Mapping[str, Any], known: MetricTable = METRICS) -> list[PairRow]:
-    """Lay out the paired differences, headline metrics first within each variant; those with a fixer's own base come last."""
+    """Lay out the paired differences, headline metrics first within each variant; those with a
+    fixer's own base come last.
+    """
     rows = []
     for variant, pairs in pair_tables(summary):
         for name in known.ordered(pairs):
             entry = pairs[name] or {}
-            stats = {**((summary.get("metrics") or {}).get(variant, {}).get(name) or {}), **entry}  # older summaries: in metrics only
-            rows.append(_pair_row(variant, known.shown(name), entry, str(stats.get("unit", "")), str(stats.get("direction", "none"))))
+            stats = {
+                **((summary.get("metrics") or {}).get(variant, {}).get(name) or {}),
+                **entry,
+            }  # older summaries: in metrics only
+            rows.append(
+                _pair_row(
+                    variant,
+                    known.shown(name),
+                    entry,
+                    str(stats.get("unit", "")),
+                    str(stats.get("direction", "none")),
+                )
+            )
     return rows
 
 
-def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any], unit: str, direction: str) -> PairRow:
+def _pair_row(
+    variant: str, metric: MetricInfo, entry: Mapping[str, Any], unit: str, direction: str
+) -> PairRow:
     diff = finite(entry.get("diff"))
     bounds = interval(entry.get("ci95"), diff)
     scale, unit = (100.0, "points") if metric.in_percent else (1.0, unit)
@@ -215,9 +252,15 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any], unit: 
             families = interval((entry.get("families") or {}).get("ci95"))
             reach = max(map(abs, (diff, *bounds, *(families or ())))) or 1.0
             at = [round(50 + 46 * v / reach, 2) for v in (diff, *bounds, *(families or ()))]
-            span = Span(at[0], at[1], at[2], at[3] if families else None, at[4] if families else None, 50.0)
+            span = Span(
+                at[0], at[1], at[2], at[3] if families else None, at[4] if families else None, 50.0
+            )
     p = finite(entry.get("p_value"))
-    p_cell = missing(reason or "no test was made") if p is None else Cell(p_text(p), str(entry.get("test") or ""), sort=p)
+    p_cell = (
+        missing(reason or "no test was made")
+        if p is None
+        else Cell(p_text(p), str(entry.get("test") or ""), sort=p)
+    )
     tone = tone_of(entry, direction)
     verdict = str(entry.get("verdict") or {"unclear": "undecided"}.get(tone, tone))
     verdict = {
@@ -226,12 +269,28 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any], unit: 
         ("non-inferior", "better"): "better",
     }.get((verdict, str(entry.get("difference"))), verdict)
     margin, more = finite(entry.get("margin")), more_scenes_text(entry.get("more_scenes"))
-    said = [f"margin {short(margin * scale, unit)}"] if margin is not None and entry.get("direction") != "none" else []
+    said = (
+        [f"margin {short(margin * scale, unit)}"]
+        if margin is not None and entry.get("direction") != "none"
+        else []
+    )
     base, hint = (
         str(entry.get("baseline") or "\u2014"),
         "; ".join([*said, *([more] if more else []), *([families_said] if families_said else [])]),
     )
-    return PairRow(variant, base, metric.name, metric.help, diff_cell, bounds_cell, p_cell, verdict, tone, span, hint)
+    return PairRow(
+        variant,
+        base,
+        metric.name,
+        metric.help,
+        diff_cell,
+        bounds_cell,
+        p_cell,
+        verdict,
+        tone,
+        span,
+        hint,
+    )
 
 
 def _pair_note(entry: Mapping[str, Any]) -> str:
@@ -266,7 +325,9 @@ def columns(run: Run) -> list[Column]:
     for variant in run.variants:
         rollouts = run.rollouts_of(variant)
         done = [r for r in rollouts if r.ok]
-        heads.append(Column(variant, len(done), len(rollouts) - len(done), len({r.scene for r in done})))
+        heads.append(
+            Column(variant, len(done), len(rollouts) - len(done), len({r.scene for r in done}))
+        )
     return heads
 
 
@@ -301,7 +362,8 @@ class SceneRow:
 
 
 def scene_rows(run: Run, interesting: Sequence[str] = ()) -> tuple[list[SceneRow], int]:
-    """Lay out scenes x variants, in the order of the run; where there is no room for all, the most telling scenes first.
+    """Lay out scenes x variants, in the order of the run; where there is no room for all, the most
+    telling scenes first.
 
     Args:
         run: The run.
@@ -315,7 +377,9 @@ def scene_rows(run: Run, interesting: Sequence[str] = ()) -> tuple[list[SceneRow
         groups.setdefault((rollout.scene, rollout.renderer, rollout.policy), []).append(rollout)
     renderer_index = {name: i for i, name in enumerate(run.renderers)}
     is_large, colours = len(groups) > MAX_SCENE_ROWS, colours_of(run)
-    rank = {name: i for i, name in enumerate(interesting if interesting and is_large else run.scenes)}
+    rank = {
+        name: i for i, name in enumerate(interesting if interesting and is_large else run.scenes)
+    }
     keys = sorted(groups, key=lambda k: (rank[k[0]], renderer_index[k[1]], k[2]))
     rows = []
     for key in keys[: TELLING_ROWS if is_large else MAX_SCENE_ROWS]:
@@ -331,11 +395,17 @@ def _chip(run: Run, rollout: Rollout) -> Chip:
     had = told(outcomes_of(rollout))
     if had:
         letters = "".join(dict.fromkeys(one.letter for one in had))
-        state, letter, said = _state(had[0].name), f" {letters}", in_words(one.name for one in had)
+        state = _state(had[0].name)
+        letter = f" {letters}"
+        said = in_words(one.name for one in had)
     elif not rollout.ok:
-        state, letter, said = "failed", " F", f"failed ({rollout.failure_class or 'unknown cause'})"
+        state = "failed"
+        letter = " F"
+        said = f"failed ({rollout.failure_class or 'unknown cause'})"
     else:
-        state, letter, said = "ok", "", "no event"
+        state = "ok"
+        letter = ""
+        said = "no event"
     facts = [f"seed {rollout.seed}: {said}"]
     facts += [f"{rollout.frames} frames"] if rollout.frames is not None else []
     facts += [duration(rollout.wall_s)] if rollout.wall_s is not None else []
@@ -358,7 +428,11 @@ def _state(outcome: str) -> str:
 def _count(done: list[Rollout], names: tuple[str, ...]) -> Cell:
     known = [r for r in done if any(r.metrics.get(name) is not None for name in names)]
     k = sum(r.flag(*names) for r in known)
-    return Cell(f"{k} of {len(known)}", sort=k / len(known), tone="worse" if k else "") if known else _nothing(done)
+    return (
+        Cell(f"{k} of {len(known)}", sort=k / len(known), tone="worse" if k else "")
+        if known
+        else _nothing(done)
+    )
 
 
 def _mean(run: Run, done: list[Rollout], name: str) -> Cell:
@@ -367,7 +441,11 @@ def _mean(run: Run, done: list[Rollout], name: str) -> Cell:
         return _nothing(done)
     mean = float(np.mean(values))
     note = "" if len(values) == len(done) else f"valid in {len(values)} of {len(done)}"
-    return Cell(f"{fixed(100 * mean, 1)}\u00a0%" if run.table.shown(name).in_percent else short(mean, "m"), note, sort=mean)
+    return Cell(
+        f"{fixed(100 * mean, 1)}\u00a0%" if run.table.shown(name).in_percent else short(mean, "m"),
+        note,
+        sort=mean,
+    )
 
 
 def _nothing(done: list[Rollout]) -> Cell:

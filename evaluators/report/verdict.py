@@ -1,7 +1,8 @@
-"""What a run was found to be, at the head of its report: by a gate, kept in the run folder, or by a decision that ended the run.
+"""What a run was found to be, at the head of its report: by a gate, kept in the run folder, or by a
+decision that ended the run.
 
-Of a gate: verdict, baseline, every check, the worst scenes first. Of a decision: the last lines on a terminal, the section with its
-picture, and the gate's verdict on a run decided so.
+Of a gate: verdict, baseline, every check, the worst scenes first. Of a decision: the last lines on
+a terminal, the section with its picture, and the gate's verdict on a run decided so.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ TONES = {"pass": "better", "regression": "worse", "undecided": "unclear"}
 WORST_CASE = "any bound"
 
 
-def write_gate(run: Run, verdict: GateVerdict, gate: str, worst: Sequence[Mapping[str, Any]]) -> Path:
+def write_gate(
+    run: Run, verdict: GateVerdict, gate: str, worst: Sequence[Mapping[str, Any]]
+) -> Path:
     """Keep a verdict in the run folder, for its report, and return the file.
 
     Args:
@@ -43,12 +46,18 @@ def write_gate(run: Run, verdict: GateVerdict, gate: str, worst: Sequence[Mappin
         gate: Name or file of the gate.
         worst: As `worst_of` gives it.
     """
-    write_json(run.folder / GATE_NAME, {"of": _content(run), "gate": gate, "worst": list(worst), **verdict.as_dict()})
+    write_json(
+        run.folder / GATE_NAME,
+        {"of": _content(run), "gate": gate, "worst": list(worst), **verdict.as_dict()},
+    )
     return run.folder / GATE_NAME
 
 
-def worst_of(run: Run, verdict: GateVerdict, stored: Sequence[Row] | None = None) -> list[dict[str, Any]]:
-    """Return the pairs that did worst in every check that did not pass, once each, those of a shown regression first.
+def worst_of(
+    run: Run, verdict: GateVerdict, stored: Sequence[Row] | None = None
+) -> list[dict[str, Any]]:
+    """Return the pairs that did worst in every check that did not pass, once each, those of a shown
+    regression first.
 
     Args:
         run: The run.
@@ -57,14 +66,21 @@ def worst_of(run: Run, verdict: GateVerdict, stored: Sequence[Row] | None = None
     """
     rows = rows_of_run(run)
     base_rows = rows if stored is None else stored
-    checks = sorted((check for check in verdict.checks if check.cause != "pass"), key=lambda check: check.cause != "regression")
+    checks = sorted(
+        (check for check in verdict.checks if check.cause != "pass"),
+        key=lambda check: check.cause != "regression",
+    )
     pairs: dict[tuple[str, ...], dict[str, Any]] = {}
     for check in checks:
         for pair in worst_pairs(check, run, rows, base_rows):
-            name = tuple(str(pair[key]) for key in ("metric", "renderer", "policy", "scene", "seed"))
+            name = tuple(
+                str(pair[key]) for key in ("metric", "renderer", "policy", "scene", "seed")
+            )
             if name not in pairs:
                 pairs[name] = pair
-            elif pairs[name]["was"] is None:  # a limit has no baseline, the margin of the same metric has
+            elif (
+                pairs[name]["was"] is None
+            ):  # a limit has no baseline, the margin of the same metric has
                 pairs[name] |= {"was": pair["was"]}
     return list(pairs.values())
 
@@ -74,8 +90,11 @@ def _content(run: Run) -> str:
     return str(checksums_of(run.folder, [ROLLOUTS])[ROLLOUTS]["sha256"])
 
 
-def worst_pairs(check: Check, run: Run, rows: Sequence[Row], base_rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the pairs in which an arm did worst against its baseline, or its worst rollouts where a limit is broken.
+def worst_pairs(
+    check: Check, run: Run, rows: Sequence[Row], base_rows: Sequence[Row]
+) -> list[dict[str, Any]]:
+    """Return the pairs in which an arm did worst against its baseline, or its worst rollouts where
+    a limit is broken.
 
     Args:
         check: One that did not pass.
@@ -93,12 +112,24 @@ def worst_pairs(check: Check, run: Run, rows: Sequence[Row], base_rows: Sequence
     for row in rows:
         key, now = (str(row["scene"]), int(row["seed"])), value_of(row, check.metric)
         before = was.get(key)
-        if (row["renderer"], row["policy"]) != (check.renderer, check.policy) or now is None or (check.kind == "margin" and before is None):
+        if (
+            (row["renderer"], row["policy"]) != (check.renderer, check.policy)
+            or now is None
+            or (check.kind == "margin" and before is None)
+        ):
             continue
         worse = sign * (now - (before or 0.0))
         if worse > 0.0:
-            pair: dict[str, Any] = {"scene": key[0], "seed": key[1], "was": before, "now": now, "worse": worse}
-            found.append(pair | {"metric": check.metric, "renderer": check.renderer, "policy": check.policy})
+            pair: dict[str, Any] = {
+                "scene": key[0],
+                "seed": key[1],
+                "was": before,
+                "now": now,
+                "worse": worse,
+            }
+            found.append(
+                pair | {"metric": check.metric, "renderer": check.renderer, "policy": check.policy}
+            )
     return sorted(found, key=lambda pair: -pair["worse"])[:WORST]
 
 
@@ -135,7 +166,9 @@ def gate_section(run: Run) -> GateSection | None:
         return None
     places = {one.cell: run.href(one, WHY_NAME) or run.href(one) for one in run.rollouts}
     order = {"regression": 0, "undecided": 1}
-    checks = sorted(told["checks"], key=lambda one: (order.get(one["cause"], 2), not one["binding"]))
+    checks = sorted(
+        told["checks"], key=lambda one: (order.get(one["cause"], 2), not one["binding"])
+    )
     return GateSection(
         WORDS[told["outcome"]["cause"]],
         TONES.get(told["outcome"]["cause"], "broken"),
@@ -143,7 +176,13 @@ def gate_section(run: Run) -> GateSection | None:
         told["baseline"],
         told["outcome"]["exit_code"],
         [
-            (one["metric"], f"{one['renderer']}/{one['policy']}", TONES.get(one["cause"], "broken"), _result(one), one["text"])
+            (
+                one["metric"],
+                f"{one['renderer']}/{one['policy']}",
+                TONES.get(one["cause"], "broken"),
+                _result(one),
+                one["text"],
+            )
             for one in checks
         ],
         [_worst(run, one, places) for one in told["worst"]],
@@ -154,14 +193,19 @@ def _result(check: Mapping[str, Any]) -> str:
     return f"{check['cause']}{'' if check['binding'] else ', not binding'}"
 
 
-def _worst(run: Run, pair: Mapping[str, Any], places: Mapping[Any, str | None]) -> tuple[str, int, str, str, str, str | None]:
+def _worst(
+    run: Run, pair: Mapping[str, Any], places: Mapping[Any, str | None]
+) -> tuple[str, int, str, str, str, str | None]:
     unit = run.table.shown(pair["metric"]).unit
-    was, now = ("\u2014" if value is None else short(float(value), unit) for value in (pair["was"], pair["now"]))
+    was, now = (
+        "\u2014" if value is None else short(float(value), unit)
+        for value in (pair["was"], pair["now"])
+    )
     place = places.get((pair["renderer"], pair["policy"], pair["scene"], pair["seed"]))
     return pair["scene"], pair["seed"], pair["metric"], was, now, place
 
 
-# --- a decision ---------------------------------------------------------------------------------------------------------
+# --- a decision
 
 
 @dataclass(frozen=True)
@@ -185,7 +229,11 @@ def verdict_line(decision: Decision) -> str:
     n, most = len(decision["order"]), decision["ceiling"]
     after = f"after {n} of {most['scenes']} scenes, {decision['rollouts']} of at most {most['rollouts']} rollouts"
     cause = decision["outcome"]["cause"]
-    verdict = decision["verdict"] if cause in ("pass", "regression", "undecided") else WORDS[cause].lower()
+    verdict = (
+        decision["verdict"]
+        if cause in ("pass", "regression", "undecided")
+        else WORDS[cause].lower()
+    )
     text = f"{decision['candidate']} against {decision['baseline']}: {verdict}, {after}"
     why = "" if decision["stopped"] == "decided" else f" ({decision['stopped']})"
     return labelled("verdict", text + why)
@@ -198,7 +246,10 @@ def metric_lines(decision: Decision) -> list[str]:
         note = "" if row.binding else ", not binding"
         text = f"{row.metric}: {row.diff} ({row.interval}, margin {row.margin}{note}): {row.verdict}, e-values {row.evidence}"
         lines.append(labelled("", text))
-    return [*lines, *(labelled("error" if i == 0 else "", text) for i, text in enumerate(guarantee(decision)))]
+    return [
+        *lines,
+        *(labelled("error" if i == 0 else "", text) for i, text in enumerate(guarantee(decision))),
+    ]
 
 
 def guarantee(decision: Decision) -> list[str]:
@@ -225,18 +276,31 @@ def metric_rows(decision: Decision, known: MetricTable = METRICS) -> list[Metric
     rows = []
     for name, one in decision["question"]["metrics"].items():
         now = last[name]
-        scale, unit, places = _print_as(known.info(name), [now["diff"], one["margin"], *now["interval"]])
+        scale, unit, places = _print_as(
+            known.info(name), [now["diff"], one["margin"], *now["interval"]]
+        )
         ends = [None if v is None else fixed(scale * v, places, sign=True) for v in now["interval"]]
-        tone = {"non-inferior": "better", "better": "better", "undecided": "unclear"}.get(now["verdict"], "worse")
+        tone = {"non-inferior": "better", "better": "better", "undecided": "unclear"}.get(
+            now["verdict"], "worse"
+        )
         rows.append(
             MetricRow(
-                name, now["verdict"], tone,
-                "no pair" if now["diff"] is None else f"{fixed(scale * now['diff'], places, sign=True)}{unit}",
-                "no bound yet" if ends == [None, None] else f"{ends[0] or WORST_CASE} to {ends[1] or WORST_CASE}",
-                f"{scale * one['margin']:g}", f"{now['e_good']:.3g} and {now['e_bad']:.3g}",
-                now["n_scenes"], one["guarantee"], one["binding"],
+                name,
+                now["verdict"],
+                tone,
+                "no pair"
+                if now["diff"] is None
+                else f"{fixed(scale * now['diff'], places, sign=True)}{unit}",
+                "no bound yet"
+                if ends == [None, None]
+                else f"{ends[0] or WORST_CASE} to {ends[1] or WORST_CASE}",
+                f"{scale * one['margin']:g}",
+                f"{now['e_good']:.3g} and {now['e_bad']:.3g}",
+                now["n_scenes"],
+                one["guarantee"],
+                one["binding"],
             )
-        )  # fmt: skip
+        )
     return rows
 
 
@@ -279,7 +343,9 @@ def chart(decision: Decision, metric: MetricInfo) -> Any:
     scale, unit, _ = _print_as(metric, [])
     n = np.array([look["n_scenes"] for look in looks], dtype=np.float64)
     seen = [look["metrics"][name] for look in looks]
-    diff, low, high = scale * np.array([[one["diff"], *one["interval"]] for one in seen], dtype=np.float64).T  # None becomes NaN
+    diff, low, high = (
+        scale * np.array([[one["diff"], *one["interval"]] for one in seen], dtype=np.float64).T
+    )  # None becomes NaN
     sign = -1.0 if metric.direction == "higher" else 1.0
     threshold = scale * sign * one["threshold"]
     limits = [threshold, -threshold] if metric.direction == "none" else [threshold]
@@ -294,9 +360,20 @@ def chart(decision: Decision, metric: MetricInfo) -> Any:
     known = np.concatenate([diff, limits, [0.0], low[late:], high[late:]])
     known = known[np.isfinite(known)]
     room = 0.15 * max(float(np.ptp(known)), 1e-9)
-    axes.limits = [(0.0, float(n[-1]) * 1.02), (float(known.min()) - room, float(known.max()) + room)]
-    axes.labels = ["scenes", (f"{unit.strip()}, " if unit.strip() else "") + f"{decision['candidate']} minus {decision['baseline']}"]
-    return Chart(name, "Line: mean difference. Band: what is not refuted, at every look. Dashed: the margin.", axes.svg())
+    axes.limits = [
+        (0.0, float(n[-1]) * 1.02),
+        (float(known.min()) - room, float(known.max()) + room),
+    ]
+    axes.labels = [
+        "scenes",
+        (f"{unit.strip()}, " if unit.strip() else "")
+        + f"{decision['candidate']} minus {decision['baseline']}",
+    ]
+    return Chart(
+        name,
+        "Line: mean difference. Band: what is not refuted, at every look. Dashed: the margin.",
+        axes.svg(),
+    )
 
 
 def _print_as(metric: MetricInfo, values: Sequence[float | None]) -> tuple[float, str, int]:
@@ -311,25 +388,41 @@ CAUSES: dict[str, Cause] = {"non-inferior": "pass", "worse": "regression", "unde
 
 
 def judge_decided(
-    rows: Sequence[Row], spec: GateSpec, decision: Decision, stored: Sequence[Row] | None = None, known: MetricTable = METRICS
+    rows: Sequence[Row],
+    spec: GateSpec,
+    decision: Decision,
+    stored: Sequence[Row] | None = None,
+    known: MetricTable = METRICS,
 ) -> GateVerdict:
     """Judge rollout rows whose number was decided while they were driven.
 
-    The intervals of `judge` are those of a fixed number of scenes, so its margins are replaced by the decision's verdicts; limits and
-    failures stay.
+    The intervals of `judge` are those of a fixed number of scenes, so its margins are replaced by
+    the decision's verdicts; limits and failures stay.
 
     Args:
         rows: Every rollout that was driven.
         spec: The gate whose margins were asked about.
         decision: What was decided.
-        stored: Rows of a stored baseline, of the scenes and seeds that were driven; without it the baseline was driven, too.
+        stored: Rows of a stored baseline, of the scenes and seeds that were driven; without it the
+            baseline was driven, too.
         known: What the metrics are.
     """
     plain = judge(rows, spec, stored, decision["baseline"], known)
     found = {row.metric: row for row in metric_rows(decision, known)}
-    checks = tuple(_decided(check, found[check.metric], spec, decision) if check.kind == "margin" else check for check in plain.checks)
-    outcomes = [Outcome(check.cause, (check.text,)) for check in checks if check.binding or check.cause == "regression"]
-    return replace(plain, outcome=worst([outcome_of_failures(plain.failures, spec.max_failed), *outcomes]), checks=checks)
+    checks = tuple(
+        _decided(check, found[check.metric], spec, decision) if check.kind == "margin" else check
+        for check in plain.checks
+    )
+    outcomes = [
+        Outcome(check.cause, (check.text,))
+        for check in checks
+        if check.binding or check.cause == "regression"
+    ]
+    return replace(
+        plain,
+        outcome=worst([outcome_of_failures(plain.failures, spec.max_failed), *outcomes]),
+        checks=checks,
+    )
 
 
 def _decided(check: Check, row: MetricRow, spec: GateSpec, decision: Decision) -> Check:
@@ -344,6 +437,14 @@ def _decided(check: Check, row: MetricRow, spec: GateSpec, decision: Decision) -
         text += f"; {entry['n_missing']} of {planned} cells have no pair, the gate allows {spec.max_missing:.0%}"
     elif cause == "undecided" and check.binding:
         text += f"; {decision['stopped']}"
-    kept = {key: value for key, value in entry.items() if key not in ("ci95", "p_value", "test", "more_scenes", "method", "difference")}
-    told = {"interval": look["interval"], "verdict": look["verdict"], "method": decision["question"]["metrics"][check.metric]["method"]}
+    kept = {
+        key: value
+        for key, value in entry.items()
+        if key not in ("ci95", "p_value", "test", "more_scenes", "method", "difference")
+    }
+    told = {
+        "interval": look["interval"],
+        "verdict": look["verdict"],
+        "method": decision["question"]["metrics"][check.metric]["method"],
+    }
     return replace(check, cause=cause, text=text, entry=kept | told)

@@ -1,4 +1,6 @@
-"""What several scores ask of one trajectory of the ego: contacts, time to collision, road, direction, comfort."""
+"""What several scores ask of one trajectory of the ego: contacts, time to collision, road,
+direction, comfort.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ from evaluators.scores import nuplan
 from evaluators.scores.states import states_of
 
 Part = float | str  # a value, or what is missing
-NO_MAP, NO_LIMITS, SHORT = "a map", "the speed limits of the lanes", "more than three instants"
+NO_MAP = "a map"
+NO_LIMITS = "the speed limits of the lanes"
+SHORT = "more than three instants"
 NO_SIGNALS = "the states of the traffic lights"
 RED = ("red", "red_yellow")
 LEVEL_M = 3.0  # a line farther above or below the middle of the ego belongs to another road
@@ -25,7 +29,9 @@ LEVEL_M = 3.0  # a line farther above or below the middle of the ego belongs to 
 class Judged:
     """One trajectory of the ego's box centre, driven or planned, among the road users of a log."""
 
-    def __init__(self, rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory) -> None:
+    def __init__(
+        self, rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory
+    ) -> None:
         origin = origin_of(scene.ego_log, preset)
         self.ego, self.tracks = states_of(rollout, preset, centre, origin)
         self._lanes = list(scene.lane_map.lanes.values())
@@ -59,7 +65,9 @@ class Judged:
 
     @cached_property
     def astray(self) -> Bool | None:
-        """Where ``(T,)`` no single lane holds the ego: it is in several, or off the road; None without a map."""
+        """Where ``(T,)`` no single lane holds the ego: it is in several, or off the road; None
+        without a map.
+        """
         if not self.has_map:
             return None
         step, lane = self._in_lanes
@@ -84,7 +92,13 @@ class Judged:
         if beside is not None:
             step, lane = self._in_lanes
             beside = beside.copy()
-            beside[step[np.array([self._lanes[k].is_intersection for k in lane.tolist()], dtype=np.bool_)]] = True
+            beside[
+                step[
+                    np.array(
+                        [self._lanes[k].is_intersection for k in lane.tolist()], dtype=np.bool_
+                    )
+                ]
+            ] = True
         return nuplan.time_to_collision(self.ego, self.tracks, self.hits, beside)
 
     def time_to_collision(self) -> Part:
@@ -99,14 +113,20 @@ class Judged:
 
     @cached_property
     def against_m(self) -> F64:
-        """Metres ``(T,)`` driven against the lanes within the last `nuplan.AGAINST_S`; of several lanes the one that agrees best counts."""
+        """Metres ``(T,)`` driven against the lanes within the last `nuplan.AGAINST_S`; of several
+        lanes the one that agrees best counts.
+        """
         step, lane = self._in_lanes
         moved = np.diff(self.ego.centre, axis=0, prepend=self.ego.centre[:1])[step]
         heading = self.road.heading_at(lane, self.ego.centre[step])
         best = np.full(len(self._xyz), -np.inf)
         np.maximum.at(best, step, moved[:, 0] * np.cos(heading) + moved[:, 1] * np.sin(heading))
-        total = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(best), np.maximum(-best, 0.0), 0.0))])
-        first = np.searchsorted(self.ego.t_us, self.ego.t_us - round(nuplan.AGAINST_S * 1e6), side="right")
+        total = np.concatenate(
+            [[0.0], np.cumsum(np.where(np.isfinite(best), np.maximum(-best, 0.0), 0.0))]
+        )
+        first = np.searchsorted(
+            self.ego.t_us, self.ego.t_us - round(nuplan.AGAINST_S * 1e6), side="right"
+        )
         return np.asarray(total[1:] - total[first])
 
     def direction(self) -> Part:
@@ -115,7 +135,9 @@ class Judged:
 
     @cached_property
     def ran_red(self) -> Bool | None:
-        """Where ``(T,)`` the middle of the ego's front passes the line of a traffic light that is red; None where no states are known."""
+        """Where ``(T,)`` the middle of the ego's front passes the line of a traffic light that is
+        red; None where no states are known.
+        """
         if self._signals is None:
             return None
         front, t_us = self.ego.centre + self.ego.size[0] / 2 * self.ego.heading, self.ego.t_us
@@ -129,7 +151,11 @@ class Judged:
                 share = beyond[k] / (beyond[k] - beyond[k + 1])
                 aside = (front[k] + share * (front[k + 1] - front[k]) - start[:2]) @ along
                 there = 0.0 <= aside <= along @ along and abs(self._xyz[k, 2] - start[2]) <= LEVEL_M
-                out[k + 1] |= there and one.colour_at(round(float(t_us[k] + share * (t_us[k + 1] - t_us[k])))) in RED
+                out[k + 1] |= (
+                    there
+                    and one.colour_at(round(float(t_us[k] + share * (t_us[k + 1] - t_us[k]))))
+                    in RED
+                )
         return out
 
     def traffic_lights(self) -> Part:
@@ -137,14 +163,18 @@ class Judged:
         return NO_SIGNALS if self.ran_red is None else float(not self.ran_red.any())
 
     def speed_limit(self) -> Part:
-        """Return nuPlan's score of the speed limit: the highest of the lanes under the ego, where one is known."""
+        """Return nuPlan's score of the speed limit: the highest of the lanes under the ego, where
+        one is known.
+        """
         limits = np.array([one.speed_limit_mps or np.nan for one in self._lanes])
         if not self.has_map or np.isnan(limits).all():
             return NO_LIMITS
         step, lane = self._in_lanes
         allowed = np.full(len(self._xyz), -np.inf)
         np.maximum.at(allowed, step, np.where(np.isnan(limits), np.inf, limits)[lane])
-        return nuplan.speed_limit_score(np.where(np.isfinite(allowed), self.ego.speed - allowed, 0.0), self.ego.t_us)
+        return nuplan.speed_limit_score(
+            np.where(np.isfinite(allowed), self.ego.speed - allowed, 0.0), self.ego.t_us
+        )
 
     @cached_property
     def uncomfortable(self) -> Bool:
@@ -153,19 +183,38 @@ class Judged:
 
     def comfort(self) -> Part:
         """Return whether the drive is within nuPlan's bounds of comfort."""
-        return SHORT if len(self._xyz) <= nuplan.LEAST_INSTANTS else float(not self.uncomfortable.any())
+        return (
+            SHORT
+            if len(self._xyz) <= nuplan.LEAST_INSTANTS
+            else float(not self.uncomfortable.any())
+        )
 
     def lane_keeping(self, off_m: float = 0.5, for_s: float = 2.0) -> Part:
-        """Return whether the ego never stays farther from the middle of its lane than this for so long; at junctions it may."""
+        """Return whether the ego never stays farther from the middle of its lane than this for so
+        long; at junctions it may.
+        """
         if not self.has_map:
             return NO_MAP
         step, lane = self._in_lanes
         free = np.array([self._lanes[k].is_intersection for k in lane.tolist()], dtype=np.bool_)
-        centres = [shapely.linestrings(self._lanes[k].centre[:, :2] - self.road.origin[:2]) for k in lane.tolist()]
+        centres = [
+            shapely.linestrings(self._lanes[k].centre[:, :2] - self.road.origin[:2])
+            for k in lane.tolist()
+        ]
         away = np.full(len(self._xyz), np.inf)
         np.minimum.at(
-            away, step, np.where(free, 0.0, shapely.distance(np.array(centres, dtype=object), shapely.points(self.ego.centre[step])))
+            away,
+            step,
+            np.where(
+                free,
+                0.0,
+                shapely.distance(
+                    np.array(centres, dtype=object), shapely.points(self.ego.centre[step])
+                ),
+            ),
         )
         far = np.isfinite(away) & (away > off_m)
-        began = np.maximum.accumulate(np.where(far, 0, self.ego.t_us))  # the last instant at which it was not far
+        began = np.maximum.accumulate(
+            np.where(far, 0, self.ego.t_us)
+        )  # the last instant at which it was not far
         return float(not np.any(far & (self.ego.t_us - began > for_s * 1e6)))

@@ -1,7 +1,8 @@
-"""What the scores of other benchmarks read of a drive: states of the ego and boxes of the others, on one line of time.
+"""What the scores of other benchmarks read of a drive: states of the ego and boxes of the others,
+on one line of time.
 
-A log holds poses. Velocity is their central difference, acceleration its difference, both in the axes of the vehicle; whoever has measured
-ones gives them instead.
+A log holds poses. Velocity is their central difference, acceleration its difference, both in the
+axes of the vehicle; whoever has measured ones gives them instead.
 """
 
 from __future__ import annotations
@@ -96,23 +97,42 @@ class Tracks:
         return np.asarray(np.hypot(self.velocity[..., 0], self.velocity[..., 1]))
 
     def boxes(self, actor: I64, step: I64, after_s: float = 0.0) -> Footprints:
-        """Return the boxes of pairs ``(M,)`` of actor and step, moved on at their velocity for some seconds."""
-        return Footprints(self.xy[actor, step] + after_s * self.velocity[actor, step], self.yaw[actor, step], self.size[actor])
+        """Return the boxes of pairs ``(M,)`` of actor and step, moved on at their velocity for some
+        seconds.
+        """
+        return Footprints(
+            self.xy[actor, step] + after_s * self.velocity[actor, step],
+            self.yaw[actor, step],
+            self.size[actor],
+        )
 
 
 def ego_states(rollout: RolloutLog, preset: Preset, rear: Trajectory, origin: F64) -> EgoStates:
-    """Return the states of a trajectory of the rig, driven or planned; positions are relative to an origin ``(3,)``."""
+    """Return the states of a trajectory of the rig, driven or planned; positions are relative to an
+    origin ``(3,)``.
+    """
     t_us = rear.t_us
     yaw, rear_xy = np.unwrap(yaw_from_quat(rear.quat)), rear.xyz[:, :2] - origin[:2]
     velocity = in_axes(_rate(rear_xy, t_us), yaw)
     # d/dt of a velocity given in the turning axes: its own rate, and what the turning adds.
     turn = _rate(yaw, t_us)[:, None] * np.stack([-velocity[:, 1], velocity[:, 0]], axis=1)
     size = preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)
-    return EgoStates(t_us, rear_xy, yaw, velocity, _rate(velocity, t_us) + turn, size, float(rollout.T_rig_box[0, 3]))
+    return EgoStates(
+        t_us,
+        rear_xy,
+        yaw,
+        velocity,
+        _rate(velocity, t_us) + turn,
+        size,
+        float(rollout.T_rig_box[0, 3]),
+    )
 
 
-def states_of(rollout: RolloutLog, preset: Preset, centre: Trajectory, origin: F64) -> tuple[EgoStates, Tracks]:
-    """Return the states of a trajectory of the ego's box centre, driven or planned, and the others as the log has them at its times.
+def states_of(
+    rollout: RolloutLog, preset: Preset, centre: Trajectory, origin: F64
+) -> tuple[EgoStates, Tracks]:
+    """Return the states of a trajectory of the ego's box centre, driven or planned, and the others
+    as the log has them at its times.
 
     Positions are relative to an origin ``(3,)``.
     """
@@ -121,7 +141,9 @@ def states_of(rollout: RolloutLog, preset: Preset, centre: Trajectory, origin: F
     table = ActorTable(rollout, preset, origin)
     at = table.at(t_us)
     actor, step = np.nonzero(at.present)
-    xy, yaws, v = np.zeros((len(table), len(t_us), 2)), np.zeros(at.present.shape), np.zeros((len(table), len(t_us), 2))
+    xy = np.zeros((len(table), len(t_us), 2))
+    yaws = np.zeros(at.present.shape)
+    v = np.zeros((len(table), len(t_us), 2))
     boxes = at.footprints(actor, step)
     xy[actor, step], yaws[actor, step] = boxes.xy, boxes.yaw
     for a in range(len(table)):
@@ -132,32 +154,46 @@ def states_of(rollout: RolloutLog, preset: Preset, centre: Trajectory, origin: F
 
 
 def _rate(values: F64, t_us: I64) -> F64:
-    """Return the central difference in time of values ``(T, ...)``, per second; 0 of a single one."""
-    return np.zeros_like(values) if len(values) < 2 else np.asarray(np.gradient(values, t_us * 1e-6, axis=0))
+    """Return the central difference in time of values ``(T, ...)``, per second; 0 of a single
+    one.
+    """
+    return (
+        np.zeros_like(values)
+        if len(values) < 2
+        else np.asarray(np.gradient(values, t_us * 1e-6, axis=0))
+    )
 
 
 def in_axes(vectors: F64, yaw: F64) -> F64:
     """Return vectors ``(T, 2)`` of the world along and to the left of headings ``(T,)``."""
     c, s = np.cos(yaw), np.sin(yaw)
-    return np.stack([c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0]], axis=1)
+    return np.stack(
+        [c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0]], axis=1
+    )
 
 
 def smooth(values: F64, window: int = 8, order: int = 2) -> F64:
-    """Return values ``(T,)`` through a Savitzky-Golay filter, whose window is never longer than they are."""
+    """Return values ``(T,)`` through a Savitzky-Golay filter, whose window is never longer than
+    they are.
+    """
     return savitzky_golay(values, min(window, _enough(values, order)), order)
 
 
 def derivative(values: F64, t_us: I64, window: int = 5, order: int = 2, times: int = 1) -> F64:
-    """Return a derivative in time of values ``(T,)`` by a Savitzky-Golay filter at the mean step, per second to the power of ``times``."""
+    """Return a derivative in time of values ``(T,)`` by a Savitzky-Golay filter at the mean step,
+    per second to the power of ``times``.
+    """
     step_s = float(np.mean(np.diff(t_us))) * 1e-6
     return savitzky_golay(values, min(window, _enough(values, order)), order, times, step_s)
 
 
 def savitzky_golay(values: F64, window: int, order: int, times: int = 0, step: float = 1.0) -> F64:
-    """Return values ``(T,)``, or a derivative of them, by polynomials fitted to a moving window (Savitzky and Golay 1964).
+    """Return values ``(T,)``, or a derivative of them, by polynomials fitted to a moving window
+    (Savitzky and Golay 1964).
 
-    The half window at either end is read off the polynomial of the outermost window. It is `scipy.signal.savgol_filter` to the last bit;
-    its module takes longer to load than a drive takes to score.
+    The half window at either end is read off the polynomial of the outermost window. It is
+    `scipy.signal.savgol_filter` to the last bit; its module takes longer to load than a drive takes
+    to score.
 
     Args:
         values: ``(T,)``, T not below ``window``.
@@ -167,15 +203,20 @@ def savitzky_golay(values: F64, window: int, order: int, times: int = 0, step: f
         step: Between two values.
     """
     half, n = window // 2, len(values)
-    # The weights of a window's values: those of the polynomial's coefficient, from its oldest value to its newest.
-    offset = np.arange(half - 0.5 if window % 2 == 0 else half, -half - 0.5 if window % 2 == 0 else -half - 1, -1.0)
+    # The weights of a window's values: those of the polynomial's coefficient, from its oldest value
+    # to its newest.
+    offset = np.arange(
+        half - 0.5 if window % 2 == 0 else half, -half - 0.5 if window % 2 == 0 else -half - 1, -1.0
+    )
     wanted = np.zeros(order + 1)
     wanted[times] = math.factorial(times) / step**times
     eps = np.finfo(np.float64).eps
     design = offset ** np.arange(order + 1.0)[:, None]
     weights = np.linalg.lstsq(design, wanted, rcond=eps * max(design.shape))[0][::-1]
     padded = np.concatenate([np.zeros(half), values, np.zeros(half)])
-    begin = half - (window - 1) // 2  # in the padded values: an even window reaches one value further ahead than back
+    begin = (
+        half - (window - 1) // 2
+    )  # in the padded values: an even window reaches one value further ahead than back
     at = [padded[begin + k : begin + k + n] for k in range(window)]
     if window % 2 and np.all(np.abs(weights - weights[::-1]) <= eps):  # the order of the sum
         out = at[half] * weights[half]
@@ -192,14 +233,21 @@ def savitzky_golay(values: F64, window: int, order: int, times: int = 0, step: f
     for start, first, last in ((0, 0, half), (n - window, n - half, n)):
         fit = np.vander(np.arange(window, dtype=np.float64), order + 1)
         scale = np.sqrt(np.sum(fit * fit, axis=0))
-        solved = np.linalg.lstsq(fit / scale, values[start : start + window, None], rcond=window * eps)[0]
+        solved = np.linalg.lstsq(
+            fit / scale, values[start : start + window, None], rcond=window * eps
+        )[0]
         polynomial = np.polyder(solved[:, 0] / scale, times)
-        out[first:last] = np.polyval(polynomial, np.arange(first - start, last - start, dtype=np.float64)) / step**times
+        out[first:last] = (
+            np.polyval(polynomial, np.arange(first - start, last - start, dtype=np.float64))
+            / step**times
+        )
     return np.asarray(out)
 
 
 def _enough(values: F64, order: int) -> int:
     if len(values) <= order:
         found = f"{len(values)} instants, a polynomial of order {order}"
-        raise EvaluatorError("smoothing a drive", "a Savitzky-Golay filter", found, "score a log of more steps")
+        raise EvaluatorError(
+            "smoothing a drive", "a Savitzky-Golay filter", found, "score a log of more steps"
+        )
     return len(values)

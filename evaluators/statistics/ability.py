@@ -1,10 +1,13 @@
-"""How able a driver is, from which scenes it passes: the Rasch model of item response theory, with scenes weighed by known drivers.
+"""How able a driver is, from which scenes it passes: the Rasch model of item response theory, with
+scenes weighed by known drivers.
 
-A driver of ability a passes a scene of difficulty d with the chance 1 / (1 + exp(d - a)). Both are in logits; 0 is the mean difficulty of
-the known scenes. Difficulties have normal priors and come with a spread, which every chance is averaged over. Given difficulties, the
-number of scenes passed says all about an ability, and larger numbers are more likely the abler a driver is. So the interval holds those
-abilities under which the number is neither too small nor too large, each with a chance of 2.5 % at most: no prior on the driver, no large
-sample. Scenes discriminate alike: a slope a scene (2PL) would need dozens of known drivers.
+A driver of ability a passes a scene of difficulty d with the chance 1 / (1 + exp(d - a)). Both are
+in logits; 0 is the mean difficulty of the known scenes. Difficulties have normal priors and come
+with a spread, which every chance is averaged over. Given difficulties, the number of scenes passed
+says all about an ability, and larger numbers are more likely the abler a driver is. So the interval
+holds those abilities under which the number is neither too small nor too large, each with a chance
+of 2.5 % at most: no prior on the driver, no large sample. Scenes discriminate alike: a slope a
+scene (2PL) would need dozens of known drivers.
 """
 
 from __future__ import annotations
@@ -40,7 +43,8 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Ability:
-    """The ability of a driver, in logits. Where it passes all scenes or none there is no estimate but one bound, one-sided at 95 %.
+    """The ability of a driver, in logits. Where it passes all scenes or none there is no estimate
+    but one bound, one-sided at 95 %.
 
     Attributes:
         estimate: Under which the expected number of passes is the observed one.
@@ -56,7 +60,8 @@ class Ability:
 
 
 def calibrate(passed: F64) -> Calibration:
-    """Fit abilities and difficulties to what known drivers passed: the mode under the priors, and the spread by its curvature.
+    """Fit abilities and difficulties to what known drivers passed: the mode under the priors, and
+    the spread by its curvature.
 
     Args:
         passed: ``(J, I)`` of J drivers in I scenes: 1 passed, 0 failed, NaN not driven.
@@ -80,14 +85,17 @@ def calibrate(passed: F64) -> Calibration:
         at += np.clip(step, -1.0, 1.0)
         if np.abs(step).max() < 1e-9:
             break
-    centred = np.eye(scenes) - 1.0 / scenes  # where the scale begins is a convention, and no uncertainty
+    centred = (
+        np.eye(scenes) - 1.0 / scenes
+    )  # where the scale begins is a convention, and no uncertainty
     spread = np.sqrt(np.diag(centred @ np.linalg.inv(curvature)[drivers:, drivers:] @ centred))
     zero = at[drivers:].mean()
     return Calibration(at[drivers:] - zero, spread, at[:drivers] - zero)
 
 
 def chances(ability: float, difficulty: F64, spread: F64) -> F64:
-    """Return the chance ``(I,)`` to pass each scene, averaged over what is not known of its difficulty ``(I,)``.
+    """Return the chance ``(I,)`` to pass each scene, averaged over what is not known of its
+    difficulty ``(I,)``.
 
     Example:
         >>> chances(0.0, np.array([0.0, 1.0]), np.zeros(2)).round(3).tolist()
@@ -128,11 +136,19 @@ def ability_of(passes: int, difficulty: F64, spread: F64) -> Ability:
     tail = 2 * TAIL if one_sided else TAIL
 
     def root(excess: Callable[[F64], float]) -> float:
-        return float(scipy.optimize.brentq(lambda a: excess(chances(a, difficulty, spread)), -MOST, MOST, xtol=1e-6))
+        return float(
+            scipy.optimize.brentq(
+                lambda a: excess(chances(a, difficulty, spread)), -MOST, MOST, xtol=1e-6
+            )
+        )
 
     low = root(lambda p: float(count_chances(p)[passes:].sum()) - tail) if passes > 0 else None
-    high = root(lambda p: tail - float(count_chances(p)[: passes + 1].sum())) if passes < n else None
+    high = (
+        root(lambda p: tail - float(count_chances(p)[: passes + 1].sum())) if passes < n else None
+    )
     if one_sided:
         what = "passes" if passes else "fails"
-        return Ability(None, low, high, f"it {what} all {n} scenes: there is one bound, and no score")
+        return Ability(
+            None, low, high, f"it {what} all {n} scenes: there is one bound, and no score"
+        )
     return Ability(root(lambda p: float(p.sum()) - passes), low, high)

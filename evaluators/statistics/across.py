@@ -24,12 +24,15 @@ class Comparison:
     """Paired differences.
 
     Attributes:
-        paired: VARIANT -> METRIC -> what `statistics.paired.compare` gives; a variant is RENDERER, or RENDERER/POLICY where there are
-            several policies.
-        with_base: The same of renderers with a fixer against the renderer below it, where that is not the baseline.
+        paired: VARIANT -> METRIC -> what `statistics.paired.compare` gives; a variant is RENDERER,
+            or RENDERER/POLICY where there are several policies.
+        with_base: The same of renderers with a fixer against the renderer below it, where that is
+            not the baseline.
         metrics: What the metrics are.
-        arms: The same of policies behind one renderer, RENDERER/POLICY -> METRIC; empty where one arm is the baseline of all.
-        notes: What a reader must know, such as policies that were paired although their names differ.
+        arms: The same of policies behind one renderer, RENDERER/POLICY -> METRIC; empty where one
+            arm is the baseline of all.
+        notes: What a reader must know, such as policies that were paired although their names
+            differ.
     """
 
     paired: Mapping[str, Mapping[str, Mapping[str, Any]]]
@@ -39,12 +42,19 @@ class Comparison:
     arms: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
 
 
-def compare_within(run: Run, baseline: str | None = None, margins: Mapping[str, float] | None = None, listed: int = LISTED) -> Comparison:
-    """Compare the arms of one run with one of them, by default with the run's own baseline, or with the first.
+def compare_within(
+    run: Run,
+    baseline: str | None = None,
+    margins: Mapping[str, float] | None = None,
+    listed: int = LISTED,
+) -> Comparison:
+    """Compare the arms of one run with one of them, by default with the run's own baseline, or with
+    the first.
 
     Args:
         run: The run.
-        baseline: RENDERER, POLICY or RENDERER/POLICY; None: renderers with the run's own, and policies too where there are several.
+        baseline: RENDERER, POLICY or RENDERER/POLICY; None: renderers with the run's own, and
+            policies too where there are several.
         margins, listed: As for `evaluators.statistics.paired.paired`.
 
     Raises:
@@ -56,40 +66,74 @@ def compare_within(run: Run, baseline: str | None = None, margins: Mapping[str, 
     base = None if baseline is None else base_named(baseline, arms, DOING, where)
     if len(arms) < 2:
         only = arms[0].name if arms else "none"
-        raise InputError(DOING, where, f"only one arm, {only}", "name a second run, or run two renderers or two policies")
+        raise InputError(
+            DOING,
+            where,
+            f"only one arm, {only}",
+            "name a second run, or run two renderers or two policies",
+        )
     if base is not None and base.policy is not None:
-        return Comparison(paired_arms(table, base.pairs(arms), run.table, margins=margins, listed=listed), metrics=run.table)
-    by_renderer, by_policy = axis_bases(arms, baseline or (run.info.get("config") or {}).get("baseline"))
+        return Comparison(
+            paired_arms(table, base.pairs(arms), run.table, margins=margins, listed=listed),
+            metrics=run.table,
+        )
+    by_renderer, by_policy = axis_bases(
+        arms, baseline or (run.info.get("config") or {}).get("baseline")
+    )
     if base is not None and by_renderer is None:
-        raise InputError(DOING, where, f"only one renderer, {known[0]}", f"choose one of {', '.join(choices(arms))}")
+        raise InputError(
+            DOING,
+            where,
+            f"only one renderer, {known[0]}",
+            f"choose one of {', '.join(choices(arms))}",
+        )
     name = "" if by_renderer is None else by_renderer.renderer
-    bases = {one: below for one, below in (run.info.get("bases") or {}).items() if one in known and below in known}
+    bases = {
+        one: below
+        for one, below in (run.info.get("bases") or {}).items()
+        if one in known and below in known
+    }
     partner = {other: str(name) for other in known if name and other != name}
     below = {one: other for one, other in bases.items() if name not in (one, other)}
     found = _pairs(table, table, partner, "", margins, run.table, listed)
-    with_base = {} if baseline is not None else _pairs(table, table, below, "", margins, run.table, listed)
+    with_base = (
+        {} if baseline is not None else _pairs(table, table, below, "", margins, run.table, listed)
+    )
     between = [] if baseline is not None or by_policy is None else by_policy.pairs(arms)
     of_policies = paired_arms(table, between, run.table, margins=margins, listed=listed)
     return Comparison(found, (), with_base, run.table, of_policies)
 
 
 def compare_runs(
-    first: Run, second: Run, baseline: str | None = None, margins: Mapping[str, float] | None = None, listed: int = LISTED
+    first: Run,
+    second: Run,
+    baseline: str | None = None,
+    margins: Mapping[str, float] | None = None,
+    listed: int = LISTED,
 ) -> Comparison:
-    """Compare the second run with the first: each arm with the one of the same name, or all with ``baseline`` of the first run.
+    """Compare the second run with the first: each arm with the one of the same name, or all with
+    ``baseline`` of the first run.
 
-    A policy is paired with the policy of the same name; where the runs share none and have one each, with the other's. A baseline is a
-    RENDERER, a POLICY or a RENDERER/POLICY of the first run.
+    A policy is paired with the policy of the same name; where the runs share none and have one
+    each, with the other's. A baseline is a RENDERER, a POLICY or a RENDERER/POLICY of the first
+    run.
 
     Raises:
-        InputError: The runs differ in preset or in a scene's content, share no scene, a renderer or policy has no partner, or a metric is
-            another quantity in the other run.
+        InputError: The runs differ in preset or in a scene's content, share no scene, a renderer or
+            policy has no partner, or a metric is another quantity in the other run.
     """
     both = f"{first.folder} and {second.folder}"
     presets = [str(run.summary.get("preset")) for run in (first, second)]
     if presets[0] != presets[1]:
-        raise InputError(DOING, both, f"presets {presets[0]!r} and {presets[1]!r}", "give the command of one run again with --preset")
-    check_scenes(scene_hashes(first), scene_hashes(second), both, DOING, "run both on the same scene files")
+        raise InputError(
+            DOING,
+            both,
+            f"presets {presets[0]!r} and {presets[1]!r}",
+            "give the command of one run again with --preset",
+        )
+    check_scenes(
+        scene_hashes(first), scene_hashes(second), both, DOING, "run both on the same scene files"
+    )
     table, base = table_of_run(second), table_of_run(first)
     partner_of = {policy: policy for policy in table.policies if policy in base.policies}
     notes: tuple[str, ...] = ()
@@ -98,7 +142,10 @@ def compare_runs(
         if len(theirs) != 1 or len(ours) != 1:
             do = "compare runs of one policy each or of the same policies, or name one with --baseline RENDERER/POLICY"
             raise InputError(DOING, f"policies {theirs} and {ours}", "none in common", do)
-        partner_of, notes = {ours[0]: theirs[0]}, (f"policy {ours[0]} is compared with policy {theirs[0]}",)
+        partner_of, notes = (
+            {ours[0]: theirs[0]},
+            (f"policy {ours[0]} is compared with policy {theirs[0]}",),
+        )
     there, here = base.renderers, table.renderers
     notes += weights_note(first, second)
     if baseline is not None:
@@ -108,22 +155,42 @@ def compare_runs(
             mine = arms_of((r, policy) for policy in table.policies for r in table.sides(policy))
             chosen_arms = [(arm, named.of(arm)) for arm in mine if named.of(arm) in theirs_arms]
             if not chosen_arms:
-                raise InputError(DOING, f"baseline {baseline!r}", f"behind no renderer of {second.folder}", "name RENDERER/POLICY")
-            metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, DOING, both)
-            pairs = paired_arms(table, chosen_arms, metrics, base, margins, listed, f"{first.folder}: ")
+                raise InputError(
+                    DOING,
+                    f"baseline {baseline!r}",
+                    f"behind no renderer of {second.folder}",
+                    "name RENDERER/POLICY",
+                )
+            metrics = second.table.joined(
+                first.table, {*table.metrics} & {*base.metrics}, DOING, both
+            )
+            pairs = paired_arms(
+                table, chosen_arms, metrics, base, margins, listed, f"{first.folder}: "
+            )
             return Comparison(pairs, weights_note(first, second), metrics=metrics)
     alone = there[0] if len(there) == 1 else None
     partner = {name: baseline or (name if name in there else alone) for name in here}
     lone = [name for name, other in partner.items() if other is None]
     if lone:
-        raise InputError(DOING, f"renderers {lone} of {second.folder}", f"{first.folder} has {', '.join(there)}", "name one by --baseline")
+        raise InputError(
+            DOING,
+            f"renderers {lone} of {second.folder}",
+            f"{first.folder} has {', '.join(there)}",
+            "name one by --baseline",
+        )
     chosen = {name: other for name, other in partner.items() if other is not None}
     metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, DOING, both)
-    return Comparison(_pairs(table, base, chosen, f"{first.folder}: ", margins, metrics, listed, partner_of), notes, metrics=metrics)
+    return Comparison(
+        _pairs(table, base, chosen, f"{first.folder}: ", margins, metrics, listed, partner_of),
+        notes,
+        metrics=metrics,
+    )
 
 
 def weights_note(first: Run, second: Run) -> tuple[str, ...]:
-    """Say which files of weights are not the same in two runs: their arms differ in these, whatever their names."""
+    """Say which files of weights are not the same in two runs: their arms differ in these, whatever
+    their names.
+    """
     before, after = (dict(run.info.get("weights") or {}) for run in (first, second))
     changed = sorted(name for name in before.keys() & after.keys() if before[name] != after[name])
     return (f"other weights: {', '.join(changed)}",) if changed else ()
@@ -132,7 +199,10 @@ def weights_note(first: Run, second: Run) -> tuple[str, ...]:
 def _names_policy(baseline: str | None, table: RolloutTable) -> bool:
     """Tell whether a baseline says with which policy to compare."""
     arms = arms_of((r, policy) for policy in table.policies for r in table.sides(policy))
-    return baseline in {*table.policies, *(arm.name for arm in arms)} and baseline not in table.renderers
+    return (
+        baseline in {*table.policies, *(arm.name for arm in arms)}
+        and baseline not in table.renderers
+    )
 
 
 def _pairs(
@@ -159,12 +229,22 @@ def _pairs(
     out: dict[str, dict[str, Any]] = {}
     for policy in table.policies:
         of_base = policy if policy_of is None else policy_of.get(policy)
-        here, there = table.sides(policy), base.sides(of_base, policy) if of_base in base.policies else {}
+        here, there = (
+            table.sides(policy),
+            base.sides(of_base, policy) if of_base in base.policies else {},
+        )
         for renderer, other in partner.items():
             if renderer in here and other in there:
                 variant = renderer if len(table.policies) == 1 else cell_name(renderer, policy)
                 out[variant] = {
-                    name: compare(here[renderer], there[other], metrics.info(name), prefix + other, (margins or {}).get(name), listed)
+                    name: compare(
+                        here[renderer],
+                        there[other],
+                        metrics.info(name),
+                        prefix + other,
+                        (margins or {}).get(name),
+                        listed,
+                    )
                     for name in dict.fromkeys([*table.metrics, *base.metrics])
                 }
     return out

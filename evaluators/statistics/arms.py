@@ -1,4 +1,6 @@
-"""Arms: what is compared is a policy behind a renderer with its weights, and which other arm each one is compared with."""
+"""Arms: what is compared is a policy behind a renderer with its weights, and which other arm each
+one is compared with.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from alpasim_plugin.log.run_folder.sides import RendererRows, Side
 
 @dataclass(frozen=True)
 class Arm:
-    """A policy behind a renderer; within a run the renderer's name stands for its weights, whose digests are in ``run.json``."""
+    """A policy behind a renderer; within a run the renderer's name stands for its weights, whose
+    digests are in ``run.json``.
+    """
 
     renderer: str
     policy: str
@@ -26,7 +30,8 @@ class Arm:
 
 @dataclass(frozen=True)
 class Base:
-    """What arms are compared with: a renderer behind which each policy also drove, a policy behind each renderer, or one arm.
+    """What arms are compared with: a renderer behind which each policy also drove, a policy behind
+    each renderer, or one arm.
 
     Attributes:
         renderer: The renderer; None: each arm's own.
@@ -48,7 +53,9 @@ class Base:
     def pairs(self, arms: Sequence[Arm]) -> list[tuple[Arm, Arm]]:
         """Return every arm that has another one to be compared with, and that one."""
         known = set(arms)
-        return [(arm, self.of(arm)) for arm in arms if self.of(arm) != arm and self.of(arm) in known]
+        return [
+            (arm, self.of(arm)) for arm in arms if self.of(arm) != arm and self.of(arm) in known
+        ]
 
 
 def short_name(arm: Arm, other: Arm) -> str:
@@ -59,7 +66,9 @@ def short_name(arm: Arm, other: Arm) -> str:
 
 
 def as_policy(side: Side, policy: str) -> Side:
-    """Return rollouts as if a policy of that name had driven them, so that they pair with that policy's."""
+    """Return rollouts as if a policy of that name had driven them, so that they pair with that
+    policy's.
+    """
     if isinstance(side, RendererColumns):
         return replace(side, cells=replace(side.cells, policy=policy))
     if isinstance(side, RendererRows):
@@ -94,13 +103,21 @@ def base_named(text: str, arms: Sequence[Arm], doing: str, where: str) -> Base:
         return Base(policy=text)
     found = next((arm for arm in arms if text == arm.name), None)
     if found is None:
-        raise InputError(doing, f"baseline {text!r}", f"{where} does not have it", f"choose one of {', '.join(choices(arms)) or 'none'}")
+        raise InputError(
+            doing,
+            f"baseline {text!r}",
+            f"{where} does not have it",
+            f"choose one of {', '.join(choices(arms)) or 'none'}",
+        )
     return Base(found.renderer, found.policy)
 
 
 def choices(arms: Sequence[Arm]) -> list[str]:
     """Return the names that `base_named` knows, without those that name every arm."""
-    renderers, policies = (list(dict.fromkeys(names)) for names in ([a.renderer for a in arms], [a.policy for a in arms]))
+    renderers, policies = (
+        list(dict.fromkeys(names))
+        for names in ([a.renderer for a in arms], [a.policy for a in arms])
+    )
     if len(policies) == 1:
         return renderers
     return policies if len(renderers) == 1 else [*renderers, *policies, *(arm.name for arm in arms)]
@@ -134,7 +151,10 @@ def axis_bases(arms: Sequence[Arm], baseline: str | None = None) -> tuple[Base |
         arms: Those that there are, in the order of the command.
         baseline: A name that `base_named` knows; what it does not say is the first of its kind.
     """
-    renderers, policies = (list(dict.fromkeys(names)) for names in ([a.renderer for a in arms], [a.policy for a in arms]))
+    renderers, policies = (
+        list(dict.fromkeys(names))
+        for names in ([a.renderer for a in arms], [a.policy for a in arms])
+    )
     named = Base()
     if baseline in {*renderers, *policies, *(arm.name for arm in arms)}:
         named = base_named(str(baseline), arms, "", "")

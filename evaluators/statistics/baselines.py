@@ -1,4 +1,6 @@
-"""Rows of a run, stored as a baseline with what they were made with, refused where that differs, and used as one side of a decision."""
+"""Rows of a run, stored as a baseline with what they were made with, refused where that differs,
+and used as one side of a decision.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,10 @@ def table_of_run(run: Run) -> RolloutTable:
     Raises:
         InputError: ``rollouts.parquet`` cannot be read.
     """
-    return RolloutTable.of_files([run.folder / ROLLOUTS], lambda renderer, metric: run.invalid_reasons.get((renderer, metric), ""))
+    return RolloutTable.of_files(
+        [run.folder / ROLLOUTS],
+        lambda renderer, metric: run.invalid_reasons.get((renderer, metric), ""),
+    )
 
 
 def rows_of_run(run: Run) -> list[dict[str, Any]]:
@@ -77,7 +82,9 @@ class StoredBaseline(TypedDict):
 
 
 class BaselineRow(TypedDict):
-    """The key and the status of a row of a stored baseline; its metrics are numbers or null, with flags NAME_valid."""
+    """The key and the status of a row of a stored baseline; its metrics are numbers or null, with
+    flags NAME_valid.
+    """
 
     renderer: str
     policy: str
@@ -100,9 +107,25 @@ class Baseline:
 
 def baseline_of(run: Run) -> Baseline:
     """Return a run's results as a baseline."""
-    kept = ("key", "command", "version", "started_at", "versions", "hardware", "renderers", "policies", "seeds")
+    kept = (
+        "key",
+        "command",
+        "version",
+        "started_at",
+        "versions",
+        "hardware",
+        "renderers",
+        "policies",
+        "seeds",
+    )
     made_with = {key: run.info[key] for key in kept if key in run.info}
-    return Baseline(_preset(run), scene_hashes(run), dict(run.info.get("weights") or {}), rows_of_run(run), made_with)
+    return Baseline(
+        _preset(run),
+        scene_hashes(run),
+        dict(run.info.get("weights") or {}),
+        rows_of_run(run),
+        made_with,
+    )
 
 
 def write_baseline(run: Run, path: Path) -> None:
@@ -114,8 +137,17 @@ def write_baseline(run: Run, path: Path) -> None:
     """
     failed = [r for r in run.rollouts if not r.ok]
     if failed or not run.rollouts:
-        found = f"{len(failed)} of {len(run.rollouts)} rollouts failed" if failed else "it holds no rollouts"
-        raise InputError("storing a baseline", str(run.folder), found, "store a run in which every rollout ran to its end")
+        found = (
+            f"{len(failed)} of {len(run.rollouts)} rollouts failed"
+            if failed
+            else "it holds no rollouts"
+        )
+        raise InputError(
+            "storing a baseline",
+            str(run.folder),
+            found,
+            "store a run in which every rollout ran to its end",
+        )
     write_json(path, asdict(baseline_of(run)), "writing a report")
 
 
@@ -127,17 +159,33 @@ def read_baseline(path: Path) -> Baseline:
     """
     if path.is_dir():
         return baseline_of(read_run(path))
-    content = read_json_object(path, DOING, do_this="write one with simrun gate RUN --write-baseline FILE")
+    content = read_json_object(
+        path, DOING, do_this="write one with simrun gate RUN --write-baseline FILE"
+    )
     names = set(Baseline.__dataclass_fields__)
     if set(content) != names or content["schema_version"] != SCHEMA_VERSION:
-        raise InputError(DOING, str(path), f"not a baseline of version {SCHEMA_VERSION}", "write it again with this version")
+        raise InputError(
+            DOING,
+            str(path),
+            f"not a baseline of version {SCHEMA_VERSION}",
+            "write it again with this version",
+        )
     do = "restore the file or write it again"
     as_shape(StoredBaseline, content, path, DOING, do)
     for i, row in enumerate(content["rows"]):
         as_shape(BaselineRow, row, f"{path}, row {i}", DOING, do)
-        odd = next((name for name, value in row.items() if f"{name}_valid" in row and not isinstance(value, float | int | None)), None)
+        odd = next(
+            (
+                name
+                for name, value in row.items()
+                if f"{name}_valid" in row and not isinstance(value, float | int | None)
+            ),
+            None,
+        )
         if odd is not None:
-            raise InputError(DOING, f"{path}, row {i}", f"{odd}: {kind_of(row[odd])}, wanted a number", do)
+            raise InputError(
+                DOING, f"{path}, row {i}", f"{odd}: {kind_of(row[odd])}, wanted a number", do
+            )
     return Baseline(**content)
 
 
@@ -147,13 +195,23 @@ def check_matches(baseline: Baseline, run: Run, path: Path) -> None:
     Scenes that only one side has are missing cells, not a mismatch.
 
     Raises:
-        InputError: Other preset, other weights, a scene with another content, or no scene in common.
+        InputError: Other preset, other weights, a scene with another content, or no scene in
+            common.
     """
-    check_made_alike(baseline, _preset(run), scene_hashes(run), dict(run.info.get("weights") or {}), path)
+    check_made_alike(
+        baseline, _preset(run), scene_hashes(run), dict(run.info.get("weights") or {}), path
+    )
 
 
-def check_made_alike(baseline: Baseline, preset: str, hashes: Mapping[str, str], weights: Mapping[str, Any], path: Path) -> None:
-    """Refuse a baseline that was made with something else than a run, which need not have been driven yet.
+def check_made_alike(
+    baseline: Baseline,
+    preset: str,
+    hashes: Mapping[str, str],
+    weights: Mapping[str, Any],
+    path: Path,
+) -> None:
+    """Refuse a baseline that was made with something else than a run, which need not have been
+    driven yet.
 
     Args:
         baseline: The baseline.
@@ -166,14 +224,22 @@ def check_made_alike(baseline: Baseline, preset: str, hashes: Mapping[str, str],
         InputError: As `check_matches`.
     """
     if baseline.preset != preset:
-        raise InputError(DOING, str(path), f"preset {baseline.preset!r}, the run has {preset!r}", APPROVE)
+        raise InputError(
+            DOING, str(path), f"preset {baseline.preset!r}, the run has {preset!r}", APPROVE
+        )
     if dict(baseline.weights) != weights:
-        names = sorted(name for name in {*baseline.weights, *weights} if baseline.weights.get(name) != weights.get(name))
+        names = sorted(
+            name
+            for name in {*baseline.weights, *weights}
+            if baseline.weights.get(name) != weights.get(name)
+        )
         raise InputError(DOING, str(path), f"other weights: {', '.join(names)}", APPROVE)
     check_scenes(baseline.scenes, hashes, str(path), DOING, APPROVE)
 
 
-def check_scenes(here: Mapping[str, str], there: Mapping[str, str], with_what: str, doing: str, do_this: str) -> None:
+def check_scenes(
+    here: Mapping[str, str], there: Mapping[str, str], with_what: str, doing: str, do_this: str
+) -> None:
     """Refuse two sets of scenes that share none, or share a name with another content.
 
     Raises:
@@ -181,7 +247,9 @@ def check_scenes(here: Mapping[str, str], there: Mapping[str, str], with_what: s
     """
     changed = sorted(name for name in here.keys() & there.keys() if here[name] != there[name])
     if changed:
-        raise InputError(doing, with_what, f"scenes with another content: {', '.join(changed)}", do_this)
+        raise InputError(
+            doing, with_what, f"scenes with another content: {', '.join(changed)}", do_this
+        )
     if not here.keys() & there.keys():
         raise InputError(doing, with_what, "no scene in common", do_this)
 
@@ -194,10 +262,17 @@ def scene_hashes(run: Run) -> dict[str, str]:
     """
     scenes = run.info.get("scenes") or {}
     hashes = {name: str(facts.get("content_hash") or "") for name, facts in scenes.items()}
-    bare = sorted(name for name in {r.scene for r in run.rollouts} | set(hashes) if not hashes.get(name))
+    bare = sorted(
+        name for name in {r.scene for r in run.rollouts} | set(hashes) if not hashes.get(name)
+    )
     if bare:
         found = f"no content hash for {', '.join(bare)}"
-        raise InputError("reading the scenes of a run", str(run.folder / "run.json"), found, "make the run again with this version")
+        raise InputError(
+            "reading the scenes of a run",
+            str(run.folder / "run.json"),
+            found,
+            "make the run again with this version",
+        )
     return hashes
 
 
@@ -234,7 +309,12 @@ class StoredSide:
 
 
 def stored_side(
-    rows: Sequence[Row], renderer: str, policy: str, planned: Collection[tuple[str, int]], max_missing: float, path: Path
+    rows: Sequence[Row],
+    renderer: str,
+    policy: str,
+    planned: Collection[tuple[str, int]],
+    max_missing: float,
+    path: Path,
 ) -> StoredSide:
     """Return the side of a renderer from the rows of a stored baseline.
 
@@ -247,11 +327,17 @@ def stored_side(
         path: The baseline's file or folder.
 
     Raises:
-        InputError: It lacks the renderer or the policy, or more of the planned rollouts than allowed.
+        InputError: It lacks the renderer or the policy, or more of the planned rollouts than
+            allowed.
     """
     mine = of_policy(rows, policy)
     if not mine:
-        raise InputError(DOING, str(path), f"no rollout of policy {policy}", f"drive one of {', '.join(policies_of(rows))}")
+        raise InputError(
+            DOING,
+            str(path),
+            f"no rollout of policy {policy}",
+            f"drive one of {', '.join(policies_of(rows))}",
+        )
     known = sorted({str(row["renderer"]) for row in mine})
     if renderer not in known:
         raise InputError(
@@ -260,11 +346,18 @@ def stored_side(
             f"no rollout of renderer {renderer}",
             f"name one of {', '.join(known)}: `baseline` of a gate, --baseline of decide",
         )
-    side = StoredSide(renderer, f"{renderer} of {path}", tuple(row for row in mine if row["renderer"] == renderer))
+    side = StoredSide(
+        renderer, f"{renderer} of {path}", tuple(row for row in mine if row["renderer"] == renderer)
+    )
     there = {(str(row["scene"]), int(row["seed"])) for row in side.rows if is_ok(row)}
     lacking = sorted(set(planned) - there)
     if len(lacking) > max_missing * len(planned):
         named = ", ".join(f"{scene} seed {seed}" for scene, seed in lacking[:NAMED])
         found = f"{len(lacking)} of the {len(planned)} scenes and seeds that may be driven are not in it: {named}"
-        raise InputError(DOING, str(path), found, "make the baseline on all scenes and seeds of the suite, or name a smaller suite")
+        raise InputError(
+            DOING,
+            str(path),
+            found,
+            "make the baseline on all scenes and seeds of the suite, or name a smaller suite",
+        )
     return side

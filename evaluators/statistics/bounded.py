@@ -1,13 +1,18 @@
-"""Bounds of a mean whose values have a least and a greatest possible one: they hold where a few scenes go very wrong and none was drawn.
+"""Bounds of a mean whose values have a least and a greatest possible one: they hold where a few
+scenes go very wrong and none was drawn.
 
-A t interval knows only the spread that it saw. If one of forty scenes goes wrong by 4 m, the mean is 0.1 m worse, and of twenty scenes
-three in five draws show none of it. The bound of Gaffke takes the worst value that is possible for a scene that was not drawn: it is the
-97.5 % quantile of the weighted mean of the values and of that one, with random weights that are uniform on the simplex. Of 0 and 1 it is
-the bound of Clopper and Pearson, of n values that are all alike it is the rule of three, of many it is the normal one. That it is too low
-in 2.5 % of draws at most is proved for two values; for others no exception is known, and docs/experiments/verdicts.md found none.
+A t interval knows only the spread that it saw. If one of forty scenes goes wrong by 4 m, the mean
+is 0.1 m worse, and of twenty scenes three in five draws show none of it. The bound of Gaffke takes
+the worst value that is possible for a scene that was not drawn: it is the 97.5 % quantile of the
+weighted mean of the values and of that one, with random weights that are uniform on the simplex. Of
+0 and 1 it is the bound of Clopper and Pearson, of n values that are all alike it is the rule of
+three, of many it is the normal one. That it is too low in 2.5 % of draws at most is proved for two
+values; for others no exception is known, and docs/experiments/verdicts.md found none.
 
-Source: Gaffke, Three test statistics for a nonparametric one-sided hypothesis on the mean of a nonnegative variable, Mathematical Methods
-of Statistics 14, 2005; Learned-Miller and Thomas, A new confidence interval for the mean of a bounded random variable, arXiv:1905.06208.
+Source: Gaffke, Three test statistics for a nonparametric one-sided hypothesis on the mean of a
+    nonnegative variable, Mathematical Methods
+of Statistics 14, 2005; Learned-Miller and Thomas, A new confidence interval for the mean of a
+bounded random variable, arXiv:1905.06208.
 """
 
 from __future__ import annotations
@@ -20,7 +25,8 @@ import scipy  # its submodules load on first use
 from alpasim_plugin.core.types import F64
 from evaluators.statistics.intervals import TAIL
 
-# The integral is taken over the logarithm of the frequency, in units of 1 / norm of the coefficients.
+# The integral is taken over the logarithm of the frequency, in units of 1 / norm of the
+# coefficients.
 STEP = 0.05
 FREQUENCIES = np.exp(np.arange(math.log(1e-5), math.log(1e3), STEP))
 TOLERANCE = 1e-9  # of a bound, as a share of the range
@@ -28,10 +34,12 @@ BINS = 256
 
 
 def chance_above(values: F64, at: float, most: float) -> F64:
-    """Return the chance ``(...)`` that the weighted mean of the values and of ``most`` is at least ``at``.
+    """Return the chance ``(...)`` that the weighted mean of the values and of ``most`` is at least
+    ``at``.
 
-    With weights E_i / sum E of independent exponential E_i it is the chance that sum E_i (x_i - at) is at least 0, which Gil-Pelaez'
-    inversion of the characteristic function gives. It is a p-value against "the mean is at least ``at``".
+    With weights E_i / sum E of independent exponential E_i it is the chance that sum E_i (x_i - at)
+    is at least 0, which Gil-Pelaez' inversion of the characteristic function gives. It is a p-value
+    against "the mean is at least ``at``".
 
     Args:
         values: ``(..., n)``, none above ``most``.
@@ -48,9 +56,11 @@ def chance_above(values: F64, at: float, most: float) -> F64:
 
 
 def _with_worst(values: F64, most: float) -> tuple[F64, F64]:
-    """Return the different values and their counts ``(k,)``, with the worst as one more; many are put into bins that keep their mean.
+    """Return the different values and their counts ``(k,)``, with the worst as one more; many are
+    put into bins that keep their mean.
 
-    A value between two edges counts in shares for both, which widens the bounds a little and never narrows them.
+    A value between two edges counts in shares for both, which widens the bounds a little and never
+    narrows them.
     """
     found, counts = np.unique(np.append(values, most), return_counts=True)
     if len(found) <= BINS:
@@ -59,7 +69,9 @@ def _with_worst(values: F64, most: float) -> tuple[F64, F64]:
     place = (found[:-1] - edges[0]) / (edges[1] - edges[0])
     left = np.minimum(place.astype(np.int64), BINS - 2)
     share = place - left
-    filled = np.bincount(left, (1.0 - share) * counts[:-1], BINS) + np.bincount(left + 1, share * counts[:-1], BINS)
+    filled = np.bincount(left, (1.0 - share) * counts[:-1], BINS) + np.bincount(
+        left + 1, share * counts[:-1], BINS
+    )
     return np.append(edges, found[-1]), np.append(filled, counts[-1])
 
 
@@ -71,7 +83,9 @@ def _chance(found: F64, counts: F64, at: float) -> float:
     turned = np.arctan(angles) @ counts
     fading = 0.5 * (np.log1p(angles**2) @ counts)
     # The first term is what lies below the least frequency, where the integrand is linear.
-    total = STEP * (float(np.sum(np.sin(turned) * np.exp(-fading))) + (1.0 / STEP - 0.5) * float(turned[0]))
+    total = STEP * (
+        float(np.sum(np.sin(turned) * np.exp(-fading))) + (1.0 / STEP - 0.5) * float(turned[0])
+    )
     return min(max(0.5 + total / math.pi, 0.0), 1.0)
 
 
@@ -94,12 +108,15 @@ def upper_bound(values: F64, most: float, tail: float = TAIL) -> float:
     low = float(np.mean(np.asarray(values) / scale))
     if low >= found[-1]:
         return most
-    root = scipy.optimize.brentq(lambda at: _chance(found, counts, at) - tail, low, found[-1], xtol=TOLERANCE)
+    root = scipy.optimize.brentq(
+        lambda at: _chance(found, counts, at) - tail, low, found[-1], xtol=TOLERANCE
+    )
     return min(scale * float(root), most)
 
 
 def mean_bounds(values: F64, least: float, most: float) -> tuple[float, float]:
-    """Return the 95 % bounds of a mean from independent ``(n,)`` values that lie between ``least`` and ``most``.
+    """Return the 95 % bounds of a mean from independent ``(n,)`` values that lie between ``least``
+    and ``most``.
 
     Example:
         >>> [round(bound, 3) for bound in mean_bounds(np.array([0.0] * 57 + [1.0] * 3), -1.0, 1.0)]
@@ -110,7 +127,8 @@ def mean_bounds(values: F64, least: float, most: float) -> tuple[float, float]:
 
 
 def scenes_to_exclude(distance: float, reach: float, tail: float = TAIL) -> int:
-    """Return how many scenes that are all alike show that the mean is not ``distance`` worse than they are.
+    """Return how many scenes that are all alike show that the mean is not ``distance`` worse than
+    they are.
 
     Args:
         distance: From what the scenes show to the margin, above 0.
@@ -121,4 +139,8 @@ def scenes_to_exclude(distance: float, reach: float, tail: float = TAIL) -> int:
         >>> scenes_to_exclude(0.05, 1.0), scenes_to_exclude(0.1, 4.0)
         (72, 146)
     """
-    return 2 if distance >= reach else max(2, math.ceil(math.log(tail) / math.log1p(-distance / reach)))
+    return (
+        2
+        if distance >= reach
+        else max(2, math.ceil(math.log(tail) / math.log1p(-distance / reach)))
+    )

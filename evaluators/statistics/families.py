@@ -1,7 +1,8 @@
-"""What families of scenes say about a difference: an interval with families as the unit, and the difference without one of them.
+"""What families of scenes say about a difference: an interval with families as the unit, and the
+difference without one of them.
 
-Scenes of one family have their road or their script in common. Where few families differ much, an interval over scenes is too short for a
-claim about scenes of other families.
+Scenes of one family have their road or their script in common. Where few families differ much, an
+interval over scenes is too short for a claim about scenes of other families.
 """
 
 from __future__ import annotations
@@ -23,26 +24,34 @@ LEAST_FAMILIES = 3
 
 
 def grouped(paths: Mapping[str, str]) -> dict[str, str]:
-    """Return SCENE -> its family: the file of scenes made from one by seeds, else the folder of the scene's file."""
+    """Return SCENE -> its family: the file of scenes made from one by seeds, else the folder of the
+    scene's file.
+    """
     by_file = len(set(paths.values())) <= len(paths) / 2
     return {scene: path if by_file else PurePath(path).parent.name for scene, path in paths.items()}
 
 
 def family_bounds(means: F64, family: I64) -> list[float]:
-    """Return [low, high] of the mean ``(G,)`` of scenes with their families ``(G,)`` as clusters: t with one degree less than families.
+    """Return [low, high] of the mean ``(G,)`` of scenes with their families ``(G,)`` as clusters: t
+    with one degree less than families.
 
-    The variance is that of sums of families' residuals (Liang and Zeger, Biometrika 73, 1986), times F / (F - 1).
+    The variance is that of sums of families' residuals (Liang and Zeger, Biometrika 73, 1986),
+    times F / (F - 1).
 
     >>> [round(end, 3) for end in family_bounds(np.array([0.0, 0.0, 1.0, 1.0, 2.0, 2.0]), np.array([0, 0, 1, 1, 2, 2]))]
     [-1.484, 3.484]
     """
     centre, sums = float(np.mean(means)), np.bincount(family, means - np.mean(means))
     n = len(sums)
-    half = float(scipy.special.stdtrit(n - 1, 0.975) * np.sqrt(n / (n - 1) * np.sum(sums**2)) / len(means))
+    half = float(
+        scipy.special.stdtrit(n - 1, 0.975) * np.sqrt(n / (n - 1) * np.sum(sums**2)) / len(means)
+    )
     return [centre - half, centre + half]
 
 
-def by_family(here: Side, there: Side, metric: MetricInfo, family_of: Mapping[str, str], margin: float) -> dict[str, Any] | None:
+def by_family(
+    here: Side, there: Side, metric: MetricInfo, family_of: Mapping[str, str], margin: float
+) -> dict[str, Any] | None:
     """Return the families' view of a difference; None with fewer than three of them.
 
     Args:
@@ -52,8 +61,8 @@ def by_family(here: Side, there: Side, metric: MetricInfo, family_of: Mapping[st
         margin: How much worse is accepted.
 
     Returns:
-        ``n``; ``ci95`` with families as the unit; ``without``: the ``family`` that moves the difference most, and ``diff`` and ``ci95``
-        (scenes as unit) of the scenes of the others.
+        ``n``; ``ci95`` with families as the unit; ``without``: the ``family`` that moves the
+        difference most, and ``diff`` and ``ci95`` (scenes as unit) of the scenes of the others.
     """
     pairs = Pairs(here, there, metric.name)
     if not len(pairs.mine):
@@ -74,4 +83,8 @@ def by_family(here: Side, there: Side, metric: MetricInfo, family_of: Mapping[st
     out = int(np.argmax(left))
     rest, _ = difference_bounds(delta[family != out], pairs.scenes[family != out], metric, margin)
     rest = within(rest, low, high)
-    return {"n": len(labels), "ci95": ends, "without": {"family": labels[out], "diff": rest.centre, "ci95": rest.bounds}}
+    return {
+        "n": len(labels),
+        "ci95": ends,
+        "without": {"family": labels[out], "diff": rest.centre, "ci95": rest.bounds},
+    }

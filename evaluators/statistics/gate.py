@@ -1,4 +1,6 @@
-"""The gate: margins, limits and the least amount of data as YAML (docs/ci.md); its verdict on a run, and the outcome that follows."""
+"""The gate: margins, limits and the least amount of data as YAML (docs/ci.md); its verdict on a
+run, and the outcome that follows.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,13 @@ from evaluators.metrics.presets import PRESETS
 from evaluators.statistics.arms import Arm, Base, as_policy, base_named, short_name, usual_base
 from evaluators.statistics.baselines import of_policy, policies_of
 from evaluators.statistics.paired import compare, reach_of
-from evaluators.statistics.verdicts import Cause, Outcome, outcome_of_failures, scenes_without_event, worst
+from evaluators.statistics.verdicts import (
+    Cause,
+    Outcome,
+    outcome_of_failures,
+    scenes_without_event,
+    worst,
+)
 
 DOING, DOING_JUDGE = "reading a gate", "judging a run"
 LIBRARY = Path(__file__).resolve().parents[2] / "configs" / "gates"
@@ -33,15 +41,23 @@ class _Strict(BaseModel):
 class MetricRule(_Strict):
     """What one metric must meet: a margin on the paired difference, limits on the mean, or both."""
 
-    margin: float | None = Field(default=None, ge=0.0, description="How much worse is accepted (without a better side: either way).")
+    margin: float | None = Field(
+        default=None,
+        ge=0.0,
+        description="How much worse is accepted (without a better side: either way).",
+    )
     max: float | None = Field(default=None, description="Largest mean accepted.")
     min: float | None = Field(default=None, description="Smallest mean accepted.")
-    must_decide: bool = Field(default=True, description="Undecided fails the gate with code 3; false: only worse does.")
+    must_decide: bool = Field(
+        default=True, description="Undecided fails the gate with code 3; false: only worse does."
+    )
 
     @model_validator(mode="after")
     def _says_something(self) -> MetricRule:
         if self.margin is None and self.max is None and self.min is None:
-            raise ValueError("a rule without margin, max or min | add one of them, or remove the metric")
+            raise ValueError(
+                "a rule without margin, max or min | add one of them, or remove the metric"
+            )
         return self
 
 
@@ -50,18 +66,29 @@ class GateSpec(_Strict):
 
     version: Literal[1] = Field(description="Version of this schema: 1.")
     description: str = Field(default="", description="One sentence for people.")
-    preset: str | None = Field(default=None, description="Evaluator preset that the run must have been scored with.")
+    preset: str | None = Field(
+        default=None, description="Evaluator preset that the run must have been scored with."
+    )
     baseline: str | None = Field(
         default=None,
         description="RENDERER, POLICY or both with a slash to compare with; none: the first, or the same of a stored baseline.",
     )
-    renderers: tuple[str, ...] = Field(default=(), description="Renderers to judge; none: all but the baseline.")
-    min_scenes: int = Field(default=2, ge=2, description="Fewest scenes with a pair that a paired verdict may stand on.")
-    population: Literal["scenes", "suite"] = Field(
-        default="scenes", description="suite: these scenes are all that is asked about; else they are draws, and others may be far worse."
+    renderers: tuple[str, ...] = Field(
+        default=(), description="Renderers to judge; none: all but the baseline."
     )
-    max_failed: float = Field(default=0.0, ge=0.0, lt=1.0, description="Share of rollouts that may fail to run.")
-    max_missing: float = Field(default=0.0, ge=0.0, lt=1.0, description="Share of cells that may lack a pair, per metric.")
+    min_scenes: int = Field(
+        default=2, ge=2, description="Fewest scenes with a pair that a paired verdict may stand on."
+    )
+    population: Literal["scenes", "suite"] = Field(
+        default="scenes",
+        description="suite: these scenes are all that is asked about; else they are draws, and others may be far worse.",
+    )
+    max_failed: float = Field(
+        default=0.0, ge=0.0, lt=1.0, description="Share of rollouts that may fail to run."
+    )
+    max_missing: float = Field(
+        default=0.0, ge=0.0, lt=1.0, description="Share of cells that may lack a pair, per metric."
+    )
     metrics: dict[str, MetricRule] = Field(min_length=1, description="Metric to rule.")
 
 
@@ -76,12 +103,18 @@ def load_gate(path_or_name: str | Path, known: MetricTable = METRICS) -> tuple[G
         The gate and the file it came from.
 
     Raises:
-        InputError: No such file, bad YAML, an unknown key, metric or preset: with file, line and column.
+        InputError: No such file, bad YAML, an unknown key, metric or preset: with file, line and
+            column.
     """
     shipped = LIBRARY / f"{path_or_name}.yaml"
     path = next((one for one in (Path(path_or_name), shipped) if one.is_file()), None)
     if path is None:
-        raise InputError(DOING, str(path_or_name), "no such file", f"name a YAML file, or a shipped gate: {', '.join(shipped_gates())}")
+        raise InputError(
+            DOING,
+            str(path_or_name),
+            "no such file",
+            f"name a YAML file, or a shipped gate: {', '.join(shipped_gates())}",
+        )
     document = load_yaml(path, DOING)
     spec = validate(GateSpec, document, DOING)
     _check_names(spec, document, known)
@@ -98,12 +131,21 @@ def _check_names(spec: GateSpec, document: Document, known: MetricTable) -> None
         try:
             facts = known.info(name)
         except (EvaluatorError, InputError) as error:
-            raise document.error(DOING, ("metrics", name), f"no metric {name!r}", "simrun list metrics prints the known ones") from error
+            raise document.error(
+                DOING,
+                ("metrics", name),
+                f"no metric {name!r}",
+                "simrun list metrics prints the known ones",
+            ) from error
         if rule.margin == 0.0 and facts.direction == "none":
             found = f"a margin of 0 for {name!r}, which has no better side"
-            raise document.error(DOING, ("metrics", name), found, "give the change to either side that is accepted")
+            raise document.error(
+                DOING, ("metrics", name), found, "give the change to either side that is accepted"
+            )
     if spec.preset is not None and spec.preset not in PRESETS:
-        raise document.error(DOING, ("preset",), f"preset {spec.preset!r}", f"known: {', '.join(PRESETS)}")
+        raise document.error(
+            DOING, ("preset",), f"preset {spec.preset!r}", f"known: {', '.join(PRESETS)}"
+        )
 
 
 Kind = Literal["margin", "limit"]
@@ -141,11 +183,20 @@ class GateVerdict:
     def as_dict(self) -> dict[str, Any]:
         """Return the verdict for JSON."""
         checks = [asdict(check) for check in self.checks]
-        return {"outcome": self.outcome.as_dict(), "baseline": self.baseline, "failures": dict(self.failures), "checks": checks}
+        return {
+            "outcome": self.outcome.as_dict(),
+            "baseline": self.baseline,
+            "failures": dict(self.failures),
+            "checks": checks,
+        }
 
 
 def judge(
-    rows: Sequence[Row], spec: GateSpec, stored: Sequence[Row] | None = None, stored_name: str = "", known: MetricTable = METRICS
+    rows: Sequence[Row],
+    spec: GateSpec,
+    stored: Sequence[Row] | None = None,
+    stored_name: str = "",
+    known: MetricTable = METRICS,
 ) -> GateVerdict:
     """Judge rollout rows.
 
@@ -159,17 +210,34 @@ def judge(
     Raises:
         InputError: A renderer that the gate names is not there, or nothing is left to judge.
     """
-    return judge_sides(_sides(rows), failures_of(rows), spec, None if stored is None else _sides(stored), stored_name, known)
+    return judge_sides(
+        _sides(rows),
+        failures_of(rows),
+        spec,
+        None if stored is None else _sides(stored),
+        stored_name,
+        known,
+    )
 
 
 def judge_table(
-    table: RolloutTable, spec: GateSpec, stored: Sequence[Row] | None = None, stored_name: str = "", known: MetricTable = METRICS
+    table: RolloutTable,
+    spec: GateSpec,
+    stored: Sequence[Row] | None = None,
+    stored_name: str = "",
+    known: MetricTable = METRICS,
 ) -> GateVerdict:
     """Judge rollouts in columns; see `judge`."""
     by_class = table.failures()
-    failures = {"n_rollouts": table.n_rollouts, "n_failed": sum(by_class.values()), "by_class": by_class}
+    failures = {
+        "n_rollouts": table.n_rollouts,
+        "n_failed": sum(by_class.values()),
+        "by_class": by_class,
+    }
     sides = {policy: table.sides(policy) for policy in table.policies}
-    return judge_sides(sides, failures, spec, None if stored is None else _sides(stored), stored_name, known)
+    return judge_sides(
+        sides, failures, spec, None if stored is None else _sides(stored), stored_name, known
+    )
 
 
 def judge_sides(
@@ -189,7 +257,9 @@ def judge_sides(
         stored: The same of a stored baseline.
     """
     if not any(sides.values()):
-        raise InputError("judging a run", "its rollouts", "there are none", "give a run with rollouts")
+        raise InputError(
+            "judging a run", "its rollouts", "there are none", "give a run with rollouts"
+        )
     checks: list[Check] = []
     arms = [Arm(renderer, policy) for policy, here in sides.items() for renderer in here]
     has_margin = any(rule.margin is not None for rule in spec.metrics.values())
@@ -203,15 +273,34 @@ def judge_sides(
             metric = known.info(wanted)
             if rule.margin is not None:
                 name = short_name(other, arm)
-                against = name if stored is None else f"{name} of {stored_name or 'the baseline'}"  # else it reads "clean against clean"
-                found[wanted] = _margin(side, behind, (arm.renderer, arm.policy), name, against, metric, rule, spec)
+                against = (
+                    name if stored is None else f"{name} of {stored_name or 'the baseline'}"
+                )  # else it reads "clean against clean"
+                found[wanted] = _margin(
+                    side, behind, (arm.renderer, arm.policy), name, against, metric, rule, spec
+                )
             if rule.max is not None or rule.min is not None:
                 checks.append(_limit(side, (arm.renderer, arm.policy), metric, rule))
-        checks += [_with_event(check, found, known) if spec.population == "scenes" else check for check in found.values()]
-    causes = [Outcome(check.cause, (check.text,)) for check in checks if check.binding or check.cause == "regression"]
+        checks += [
+            _with_event(check, found, known) if spec.population == "scenes" else check
+            for check in found.values()
+        ]
+    causes = [
+        Outcome(check.cause, (check.text,))
+        for check in checks
+        if check.binding or check.cause == "regression"
+    ]
     outcome = worst([outcome_of_failures(failures, spec.max_failed), *causes])
-    kind = "" if base is None or (base.renderer and base.policy) else "renderer " if base.renderer else "policy "
-    name = stored_name if base is None or stored is not None else f"{kind}{base.name} of the same run"
+    kind = (
+        ""
+        if base is None or (base.renderer and base.policy)
+        else "renderer "
+        if base.renderer
+        else "policy "
+    )
+    name = (
+        stored_name if base is None or stored is not None else f"{kind}{base.name} of the same run"
+    )
     return GateVerdict(outcome, tuple(checks), failures, name)
 
 
@@ -228,31 +317,52 @@ def failures_of(rows: Sequence[Row]) -> dict[str, Any]:
     return {"n_rollouts": len(rows), "n_failed": sum(by_class.values()), "by_class": by_class}
 
 
-def _base(arms: Sequence[Arm], spec: GateSpec, stored: Mapping[str, Sides] | None, has_margin: bool) -> Base | None:
-    """Return what arms are compared with; None: with the same arm of a stored baseline, or limits alone hold for all policies."""
+def _base(
+    arms: Sequence[Arm], spec: GateSpec, stored: Mapping[str, Sides] | None, has_margin: bool
+) -> Base | None:
+    """Return what arms are compared with; None: with the same arm of a stored baseline, or limits
+    alone hold for all policies.
+    """
     if spec.baseline is None:
         by_policy_alone = len({arm.renderer for arm in arms}) == 1 and not has_margin
         return None if stored is not None or by_policy_alone else usual_base(arms)
-    there = arms if stored is None else [Arm(renderer, policy) for policy, here in stored.items() for renderer in here]
-    return base_named(spec.baseline, there, DOING_JUDGE, "the run" if stored is None else "the stored baseline")
+    there = (
+        arms
+        if stored is None
+        else [Arm(renderer, policy) for policy, here in stored.items() for renderer in here]
+    )
+    return base_named(
+        spec.baseline, there, DOING_JUDGE, "the run" if stored is None else "the stored baseline"
+    )
 
 
 def _judged(arms: Sequence[Arm], spec: GateSpec, base: Base | None, has_margin: bool) -> list[Arm]:
     known = {arm.renderer for arm in arms}
     absent = [name for name in spec.renderers if name not in known]
     if absent:
-        raise InputError(DOING_JUDGE, f"renderers {absent}", "the run has none of these", f"it has {', '.join(sorted(known))}")
+        raise InputError(
+            DOING_JUDGE,
+            f"renderers {absent}",
+            "the run has none of these",
+            f"it has {', '.join(sorted(known))}",
+        )
     if spec.renderers:
         return [arm for arm in arms if arm.renderer in spec.renderers]
     judged = [arm for arm in arms if base is None or base.of(arm) != arm]
     if not judged and has_margin and base is not None:
         do = "run two renderers or two policies, or give --baseline-file"
-        raise InputError(DOING_JUDGE, f"baseline {base.name!r}", "the run has nothing else to compare with it", do)
+        raise InputError(
+            DOING_JUDGE,
+            f"baseline {base.name!r}",
+            "the run has nothing else to compare with it",
+            do,
+        )
     return judged or list(arms)  # a gate of limits alone needs no second arm
 
 
 def _partner(arm: Arm, base: Base | None, there: Mapping[str, Sides], is_stored: bool) -> Arm:
-    """Return the arm that an arm is compared with; of a stored baseline of one other policy, that policy's.
+    """Return the arm that an arm is compared with; of a stored baseline of one other policy, that
+    policy's.
 
     Raises:
         InputError: There is none.
@@ -266,16 +376,30 @@ def _partner(arm: Arm, base: Base | None, there: Mapping[str, Sides], is_stored:
     where = "the stored baseline" if is_stored else "the run"
     names = ", ".join(one.name for one in known)
     raise InputError(
-        DOING_JUDGE, f"baseline {wanted.name!r}", f"{where} does not have it", f"`baseline` of the gate may be one of: {names}"
+        DOING_JUDGE,
+        f"baseline {wanted.name!r}",
+        f"{where} does not have it",
+        f"`baseline` of the gate may be one of: {names}",
     )
 
 
 def _margin(
-    side: Side, base: Side, variant: tuple[str, str], name: str, against: str, metric: MetricInfo, rule: MetricRule, spec: GateSpec
+    side: Side,
+    base: Side,
+    variant: tuple[str, str],
+    name: str,
+    against: str,
+    metric: MetricInfo,
+    rule: MetricRule,
+    spec: GateSpec,
 ) -> Check:
-    entry = compare(side, base, metric, name, rule.margin or 0.0, sampled=spec.population == "scenes")
+    entry = compare(
+        side, base, metric, name, rule.margin or 0.0, sampled=spec.population == "scenes"
+    )
     planned = entry["n_cells"] + entry["n_missing"]
-    cause: Cause = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}[entry["verdict"]]  # type: ignore[assignment]
+    cause: Cause = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}[
+        entry["verdict"]
+    ]  # type: ignore[assignment]
     said = _paired_text(entry, metric.name, variant[0], against)
     least = scenes_without_event(entry["margin"], reach_of(metric, entry["margin"])) or 0
     if entry["n_scenes"] < spec.min_scenes:
@@ -290,27 +414,54 @@ def _margin(
 
 
 def _with_event(check: Check, found: Mapping[str, Check], known: MetricTable) -> Check:
-    """Return the check of a distance, which passes only together with the event that counts what lies beyond its cap."""
+    """Return the check of a distance, which passes only together with the event that counts what
+    lies beyond its cap.
+    """
     event = known.info(check.metric).event
     if check.cause != "pass" or not event or (event in found and found[event].cause == "pass"):
         return check
-    why = f"{event} is {found[event].entry['verdict']}" if event in found else f"the gate has no margin for {event}"
-    return replace(check, cause="undecided", text=f"{check.text}, but a distance decides only together with its event: {why}")
+    why = (
+        f"{event} is {found[event].entry['verdict']}"
+        if event in found
+        else f"the gate has no margin for {event}"
+    )
+    return replace(
+        check,
+        cause="undecided",
+        text=f"{check.text}, but a distance decides only together with its event: {why}",
+    )
 
 
 def _limit(side: Side, variant: tuple[str, str], metric: MetricInfo, rule: MetricRule) -> Check:
     values = side.values(metric.name)
     known = values[np.isfinite(values)]
     bounds = {"max": rule.max, "min": rule.min}
-    limits = " and ".join(f"{kind} {value:g}" for kind, value in bounds.items() if value is not None)
+    limits = " and ".join(
+        f"{kind} {value:g}" for kind, value in bounds.items() if value is not None
+    )
     if not len(known):
         text = f"{variant[0]}: {metric.name} has no valid value, its limit is {limits}"
-        return Check(*variant, metric.name, "limit", "undecided", text, {"mean": None, **bounds}, rule.must_decide)
+        return Check(
+            *variant,
+            metric.name,
+            "limit",
+            "undecided",
+            text,
+            {"mean": None, **bounds},
+            rule.must_decide,
+        )
     mean = float(known.mean())
-    broken = (rule.max is not None and mean > rule.max) or (rule.min is not None and mean < rule.min)
+    broken = (rule.max is not None and mean > rule.max) or (
+        rule.min is not None and mean < rule.min
+    )
     text = f"{variant[0]}: {metric.name} {_number(mean, metric.unit)}, limit {limits}"
     return Check(
-        *variant, metric.name, "limit", "regression" if broken else "pass", text, {"mean": mean, **bounds, "n_rollouts": len(known)}
+        *variant,
+        metric.name,
+        "limit",
+        "regression" if broken else "pass",
+        text,
+        {"mean": mean, **bounds, "n_rollouts": len(known)},
     )
 
 
@@ -326,7 +477,11 @@ def _paired_text(entry: Mapping[str, Any], metric: str, renderer: str, against: 
     text += f" (95 % {low} to {high}, margin {_number(entry['margin'], unit)}): {entry['verdict']}"
     if entry["verdict"] == "undecided":
         more = entry["more_scenes"]
-        text += f", about {more} more scenes would decide it" if more else ", more scenes of this kind would not decide it"
+        text += (
+            f", about {more} more scenes would decide it"
+            if more
+            else ", more scenes of this kind would not decide it"
+        )
     return text
 
 

@@ -1,8 +1,9 @@
 """Intervals of a mean over rollouts, at 95 %.
 
-`normal_half_width` is the paper's formula. It treats the seeds of one scene as independent, which makes it too short where scenes differ;
-`clustered` takes the scene as the unit. A quantity that does not exist is None and comes with a reason. The measured
-coverage of each is in docs/experiments/interval-coverage.md.
+`normal_half_width` is the paper's formula. It treats the seeds of one scene as independent, which
+makes it too short where scenes differ; `clustered` takes the scene as the unit. A quantity that
+does not exist is None and comes with a reason. The measured coverage of each is in
+docs/experiments/interval-coverage.md.
 """
 
 from __future__ import annotations
@@ -22,12 +23,15 @@ LEVEL = 0.95
 TAIL = (1 - LEVEL) / 2
 ROUNDING = 1e-12  # values that differ by no more than this, relative, are equal
 TOO_LARGE = "the values are too large for their spread to be a number"
-LARGE = 1e150  # the squares of larger values are no numbers, and those of their inverses lose their digits
+# the squares of larger values are no numbers, and those of their inverses lose their digits
+LARGE = 1e150
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A centre with bounds; bounds are None where they do not exist, and ``reason`` then says why. ``note`` qualifies bounds that exist."""
+    """A centre with bounds; bounds are None where they do not exist, and ``reason`` then says why.
+    ``note`` qualifies bounds that exist.
+    """
 
     centre: float
     low: float | None = None
@@ -43,7 +47,8 @@ class Interval:
 
 
 def within(interval: Interval, low: float, high: float) -> Interval:
-    """Cut an interval to the values that are possible; what it covers does not change, since nothing true lies outside.
+    """Cut an interval to the values that are possible; what it covers does not change, since
+    nothing true lies outside.
 
     Example:
         >>> within(Interval(0.97, 0.66, 1.28), 0.0, 1.0).bounds
@@ -51,7 +56,9 @@ def within(interval: Interval, low: float, high: float) -> Interval:
     """
     if interval.low is None or interval.high is None:
         return interval
-    return replace(interval, low=min(max(interval.low, low), high), high=max(min(interval.high, high), low))
+    return replace(
+        interval, low=min(max(interval.low, low), high), high=max(min(interval.high, high), low)
+    )
 
 
 def are_alike(values: F64) -> Bool:
@@ -60,7 +67,8 @@ def are_alike(values: F64) -> Bool:
 
 
 def normal_half_width(values: npt.ArrayLike) -> tuple[float | None, str]:
-    """Return 1.96 s / sqrt(N) with the sample standard deviation s of ``(N,)`` values (paper, appendix), and why it is missing.
+    """Return 1.96 s / sqrt(N) with the sample standard deviation s of ``(N,)`` values (paper,
+    appendix), and why it is missing.
 
     Example:
         >>> round(normal_half_width([0.0, 0.0, 1.0, 1.0])[0], 4)
@@ -76,7 +84,9 @@ def normal_half_width(values: npt.ArrayLike) -> tuple[float | None, str]:
 
 
 def scaled(values: F64) -> tuple[F64, float]:
-    """Return values whose squares are finite and, of their spread, not lost; and what to multiply with: 1 but for extreme values."""
+    """Return values whose squares are finite and, of their spread, not lost; and what to multiply
+    with: 1 but for extreme values.
+    """
     most = float(np.max(np.abs(values), initial=0.0))
     scale = 1.0 if most == 0 or 1 / LARGE <= most <= LARGE else most
     return values / scale, scale
@@ -101,7 +111,13 @@ def t_interval(values: npt.ArrayLike, what: str = "values") -> Interval:
     if len(x) < 2:
         return Interval(centre, reason=f"needs at least two {what}, found {len(x)}")
     if are_alike(x):
-        return Interval(centre, centre, centre, note=f"all {len(x)} {what} are equal: the interval has no width", method=f"t on {what}")
+        return Interval(
+            centre,
+            centre,
+            centre,
+            note=f"all {len(x)} {what} are equal: the interval has no width",
+            method=f"t on {what}",
+        )
     low, high = (float(bound) * scale for bound in t_bounds(x))
     if not np.isfinite([low, high]).all():
         return Interval(centre, reason=TOO_LARGE)
@@ -109,7 +125,9 @@ def t_interval(values: npt.ArrayLike, what: str = "values") -> Interval:
 
 
 def t_bounds(means: F64) -> tuple[F64, F64]:
-    """Return the t bounds ``(...,)`` of the mean over the last axis of ``(..., G)`` independent values."""
+    """Return the t bounds ``(...,)`` of the mean over the last axis of ``(..., G)`` independent
+    values.
+    """
     n = means.shape[-1]
     centre = means.mean(axis=-1)
     half = float(scipy.special.stdtrit(n - 1, 1 - TAIL)) * means.std(axis=-1, ddof=1) / np.sqrt(n)
@@ -117,11 +135,14 @@ def t_bounds(means: F64) -> tuple[F64, F64]:
 
 
 def logit_t_bounds(means: F64) -> tuple[F64, F64]:
-    """Return bounds ``(...,)`` of a rate from the rates ``(..., G)`` of G scenes, always within [0, 1].
+    """Return bounds ``(...,)`` of a rate from the rates ``(..., G)`` of G scenes, always within [0,
+    1].
 
-    The t interval is taken on logit(p), with the standard error of the scene means divided by p (1 - p) (delta method; the logit interval
-    of survey statistics, with scenes as sampling units). Where the scenes do not differ there is no spread to go by: the bounds are then
-    the Clopper-Pearson ones of p G events in G trials, one trial per scene, as if the seeds of a scene were copies.
+    The t interval is taken on logit(p), with the standard error of the scene means divided by p (1
+    - p) (delta method; the logit interval of survey statistics, with scenes as sampling units).
+    Where the scenes do not differ there is no spread to go by: the bounds are then the
+    Clopper-Pearson ones of p G events in G trials, one trial per scene, as if the seeds of a scene
+    were copies.
     """
     n = means.shape[-1]
     p = means.mean(axis=-1)
@@ -138,15 +159,19 @@ def logit_t_bounds(means: F64) -> tuple[F64, F64]:
 
 
 def cluster_means(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> tuple[F64, I64]:
-    """Return the mean ``(G,)`` and size ``(G,)`` of each cluster; the one partition every statistic uses.
+    """Return the mean ``(G,)`` and size ``(G,)`` of each cluster; the one partition every statistic
+    uses.
 
     Args:
         values: ``(N,)``.
-        clusters: Name of each value's cluster, or its number from 0 up; the result is in their order, without numbers that no value has.
+        clusters: Name of each value's cluster, or its number from 0 up; the result is in their
+            order, without numbers that no value has.
     """
     group = np.asarray(clusters)
     x, scale = scaled(np.asarray(values, dtype=np.float64))
-    if not np.issubdtype(group.dtype, np.integer):  # names; numbers are not sorted, as a run may have millions of cells
+    if not np.issubdtype(
+        group.dtype, np.integer
+    ):  # names; numbers are not sorted, as a run may have millions of cells
         group = np.unique(group, return_inverse=True)[1].reshape(-1)
     size = np.bincount(group)
     there = size > 0
@@ -155,14 +180,20 @@ def cluster_means(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> tuple
 
 
 def n_clusters(clusters: I64) -> int:
-    """Return how many different clusters there are among the numbers ``(N,)`` of the values' clusters, from 0 up."""
+    """Return how many different clusters there are among the numbers ``(N,)`` of the values'
+    clusters, from 0 up.
+    """
     return int(np.count_nonzero(np.bincount(clusters)))
 
 
-def clustered(values: npt.ArrayLike, clusters: Sequence[str] | I64, is_rate: bool = False) -> Interval:
-    """Return the interval with scenes as clusters: t on the scene means, for rates on the logit scale (`logit_t_bounds`).
+def clustered(
+    values: npt.ArrayLike, clusters: Sequence[str] | I64, is_rate: bool = False
+) -> Interval:
+    """Return the interval with scenes as clusters: t on the scene means, for rates on the logit
+    scale (`logit_t_bounds`).
 
-    Its centre is the mean of the scene means, which is the mean of the values where every scene has as many.
+    Its centre is the mean of the scene means, which is the mean of the values where every scene has
+    as many.
 
     Args:
         values: ``(N,)``.
@@ -182,13 +213,20 @@ def rate_interval(means: F64) -> Interval:
     n, centre = len(means), float(np.mean(means))
     if means.min() < 0.0 or means.max() > 1.0:
         found = f"values from {means.min():g} to {means.max():g}"
-        raise EvaluatorError("computing the interval of a rate", f"{n} scene means", found, "give rates as fractions in [0, 1]")
+        raise EvaluatorError(
+            "computing the interval of a rate",
+            f"{n} scene means",
+            found,
+            "give rates as fractions in [0, 1]",
+        )
     if n < 2:
         return Interval(centre, reason=f"needs at least two scenes, found {n}")
     low, high = logit_t_bounds(means)
     if are_alike(means):
         note = f"{centre * n:g} of {n} scenes: exact bounds, as equal scenes have no spread"
-        return Interval(centre, float(low), float(high), note=note, method="exact, scenes as trials")
+        return Interval(
+            centre, float(low), float(high), note=note, method="exact, scenes as trials"
+        )
     return Interval(centre, float(low), float(high), method="t on scenes, logit scale")
 
 
@@ -219,9 +257,11 @@ def wilson_rate(k: int, n: int) -> tuple[float, float]:
 
 
 def design_effect(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> float | None:
-    """Return how many times larger the variance of the mean is with scenes as clusters than by the paper's formula.
+    """Return how many times larger the variance of the mean is with scenes as clusters than by the
+    paper's formula.
 
-    None where either has no spread. 4 means that the paper's interval is half as long as it should be.
+    None where either has no spread. 4 means that the paper's interval is half as long as it should
+    be.
     """
     x, _ = scaled(np.asarray(values, dtype=np.float64))
     means, _ = cluster_means(x, clusters)
@@ -231,8 +271,12 @@ def design_effect(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> float
 
 
 def _clopper_pearson(k: F64, n: int) -> tuple[F64, F64]:
-    low = np.where(k <= 0, 0.0, scipy.special.betaincinv(np.where(k > 0, k, 1.0), n - k + 1, TAIL))  # quantiles of beta distributions
-    high = np.where(k >= n, 1.0, scipy.special.betaincinv(k + 1, np.where(k < n, n - k, 1.0), 1 - TAIL))
+    low = np.where(
+        k <= 0, 0.0, scipy.special.betaincinv(np.where(k > 0, k, 1.0), n - k + 1, TAIL)
+    )  # quantiles of beta distributions
+    high = np.where(
+        k >= n, 1.0, scipy.special.betaincinv(k + 1, np.where(k < n, n - k, 1.0), 1 - TAIL)
+    )
     return np.asarray(low), np.asarray(high)
 
 
@@ -245,14 +289,19 @@ BLOCK = 4_000_000  # drawn scenes held in memory at once
 
 
 def redraws(scenes: int, generator: np.random.Generator, draws: int = DRAWS) -> I64:
-    """Return draws ``(draws, scenes)`` of as many scenes as there are, with replacement, by number."""
+    """Return draws ``(draws, scenes)`` of as many scenes as there are, with replacement, by
+    number.
+    """
     return generator.integers(0, scenes, size=(draws, scenes))
 
 
-def cluster_bootstrap(values: npt.ArrayLike, clusters: Sequence[str] | I64, drawn: Callable[[int], I64]) -> Interval:
+def cluster_bootstrap(
+    values: npt.ArrayLike, clusters: Sequence[str] | I64, drawn: Callable[[int], I64]
+) -> Interval:
     """Return the percentile interval of the mean over scenes.
 
-    Too short where scenes are few (docs/experiments/interval-coverage.md); it is a second opinion that assumes no shape, not the default.
+    Too short where scenes are few (docs/experiments/interval-coverage.md); it is a second opinion
+    that assumes no shape, not the default.
 
     Args:
         values: ``(N,)``.
@@ -271,12 +320,19 @@ def cluster_bootstrap(values: npt.ArrayLike, clusters: Sequence[str] | I64, draw
         return Interval(centre, reason=f"needs at least two scenes, found {len(means)}")
     places = drawn(len(means))
     low, high = np.quantile(means.take(places).mean(axis=1), [TAIL, 1 - TAIL]) * scale
-    note = f"all {len(means)} scenes are equal: the interval has no width" if are_alike(means) else ""
-    return Interval(centre, float(low), float(high), note=note, method=f"cluster bootstrap, {len(places)} draws")
+    note = (
+        f"all {len(means)} scenes are equal: the interval has no width" if are_alike(means) else ""
+    )
+    return Interval(
+        centre, float(low), float(high), note=note, method=f"cluster bootstrap, {len(places)} draws"
+    )
 
 
 def resampled_means(means: F64, generator: np.random.Generator, draws: int = DRAWS) -> F64:
     """Return the mean ``(draws,)`` of each draw of G scenes out of ``(G,)``."""
     rows = max(1, BLOCK // len(means))
-    parts = [means.take(redraws(len(means), generator, min(rows, draws - start))).mean(axis=1) for start in range(0, draws, rows)]
+    parts = [
+        means.take(redraws(len(means), generator, min(rows, draws - start))).mean(axis=1)
+        for start in range(0, draws, rows)
+    ]
     return np.concatenate(parts)

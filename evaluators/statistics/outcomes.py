@@ -6,9 +6,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from alpasim_plugin.log.run_folder.rows import Rollout
-from evaluators.metrics.outcomes import CONTACT_SIDES, OUTCOMES, has_ended, outcomes_of, reached_end, told
+from evaluators.metrics.outcomes import (
+    CONTACT_SIDES,
+    OUTCOMES,
+    has_ended,
+    outcomes_of,
+    reached_end,
+    told,
+)
 
-Times = Mapping[tuple[str, str, str, int], Mapping[str, float]]  # cell -> outcome -> seconds after the first frame
+Times = Mapping[
+    tuple[str, str, str, int], Mapping[str, float]
+]  # cell -> outcome -> seconds after the first frame
 LISTED = 20  # cells named per outcome in summary.json
 NAMED = 2  # in a sentence
 
@@ -18,15 +27,32 @@ def rollouts_of(manifests: Iterable[Mapping[str, Any]]) -> tuple[list[Rollout], 
     rows: list[Rollout] = []
     times: dict[tuple[str, str, str, int], dict[str, float]] = {}
     for one in manifests:
-        metrics = {name: facts["value"] if facts["valid"] else None for name, facts in (one.get("metrics") or {}).items()}
-        numbers = {name: value for name, value in metrics.items() if isinstance(value, int | float) or value is None}
+        metrics = {
+            name: facts["value"] if facts["valid"] else None
+            for name, facts in (one.get("metrics") or {}).items()
+        }
+        numbers = {
+            name: value
+            for name, value in metrics.items()
+            if isinstance(value, int | float) or value is None
+        }
         error = one.get("error") or {}
         row = Rollout(
-            one["renderer"], one["policy"], one["scene"], int(one["seed"]), one["status"], str(error.get("failure_class") or ""),
-            str(error.get("found") or ""), metrics=numbers,
-        )  # fmt: skip
+            one["renderer"],
+            one["policy"],
+            one["scene"],
+            int(one["seed"]),
+            one["status"],
+            str(error.get("failure_class") or ""),
+            str(error.get("found") or ""),
+            metrics=numbers,
+        )
         rows.append(row)
-        found = {event["metric"]: float(event["t_s"]) for event in one.get("events") or [] if "t_s" in event}
+        found = {
+            event["metric"]: float(event["t_s"])
+            for event in one.get("events") or []
+            if "t_s" in event
+        }
         contact = [found[side] for side in CONTACT_SIDES if side in found]
         if contact:
             found |= dict.fromkeys(("collision_any", "collision_at_fault"), min(contact))
@@ -34,7 +60,9 @@ def rollouts_of(manifests: Iterable[Mapping[str, Any]]) -> tuple[list[Rollout], 
     return rows, times
 
 
-def outcome_table(rollouts: Sequence[Rollout], times: Times | None = None) -> dict[str, dict[str, Any]]:
+def outcome_table(
+    rollouts: Sequence[Rollout], times: Times | None = None
+) -> dict[str, dict[str, Any]]:
     """Count outcomes by arm.
 
     Args:
@@ -42,9 +70,10 @@ def outcome_table(rollouts: Sequence[Rollout], times: Times | None = None) -> di
         times: When outcomes began, as far as it is known.
 
     Returns:
-        RENDERER/POLICY -> ``n_rollouts``; ``n_ended`` (ran to their end, or were broken by the policy); ``n_failed`` (of these: with an
-        outcome); ``n_reached_end`` (without one, at the end of the path); ``outcomes``: NAME -> ``n`` and ``cells`` (the first
-        `LISTED`: ``scene``, ``seed``, ``t_s`` or None).
+        RENDERER/POLICY -> ``n_rollouts``; ``n_ended`` (ran to their end, or were broken by the
+        policy); ``n_failed`` (of these: with an outcome); ``n_reached_end`` (without one, at the
+        end of the path); ``outcomes``: NAME -> ``n`` and ``cells`` (the first `LISTED`: ``scene``,
+        ``seed``, ``t_s`` or None).
     """
     arms: dict[str, list[Rollout]] = {}
     for rollout in rollouts:
@@ -58,13 +87,19 @@ def _of_arm(rollouts: Sequence[Rollout], times: Times) -> dict[str, Any]:
     for rollout in ended:
         began = times.get(rollout.cell, {})
         for one in told(outcomes_of(rollout)):
-            found.setdefault(one.name, []).append({"scene": rollout.scene, "seed": rollout.seed, "t_s": began.get(one.name)})
+            found.setdefault(one.name, []).append(
+                {"scene": rollout.scene, "seed": rollout.seed, "t_s": began.get(one.name)}
+            )
     return {
         "n_rollouts": len(rollouts),
         "n_ended": len(ended),
         "n_failed": sum(bool(outcomes_of(r)) for r in ended),
         "n_reached_end": sum(reached_end(r) for r in ended),
-        "outcomes": {name: {"n": len(found[name]), "cells": found[name][:LISTED]} for name in OUTCOMES if name in found},
+        "outcomes": {
+            name: {"n": len(found[name]), "cells": found[name][:LISTED]}
+            for name in OUTCOMES
+            if name in found
+        },
     }
 
 
@@ -84,10 +119,20 @@ def sentence(entry: Mapping[str, Any]) -> str:
         return "no drive has ended"
     parts = [_counted(name, facts, n) for name, facts in entry["outcomes"].items()]
     if n == 1:
-        ends = "reaches the end" if reached else "" if parts else "no event, but the end is not reached"
+        ends = (
+            "reaches the end"
+            if reached
+            else ""
+            if parts
+            else "no event, but the end is not reached"
+        )
         return "; ".join([*parts, *([ends] if ends else [])])
     all_of = "both" if n == 2 else f"all {n}"
-    ends = f"{all_of} reach the end" if reached == n else f"{reached} of {n} reach{'es' if reached == 1 else ''} the end"
+    ends = (
+        f"{all_of} reach the end"
+        if reached == n
+        else f"{reached} of {n} reach{'es' if reached == 1 else ''} the end"
+    )
     return "; ".join([*parts, ends] if parts or reached == n else ["no event", ends])
 
 
@@ -104,4 +149,6 @@ def _counted(name: str, facts: Mapping[str, Any], n: int) -> str:
 
 def _place(cell: Mapping[str, Any], with_seed: bool) -> str:
     seed = f" seed {cell['seed']}" if with_seed else ""
-    return f"{cell['scene']}{seed}" + (f" at {cell['t_s']:.1f} s" if cell["t_s"] is not None else "")
+    return f"{cell['scene']}{seed}" + (
+        f" at {cell['t_s']:.1f} s" if cell["t_s"] is not None else ""
+    )

@@ -1,7 +1,8 @@
 """Paired differences between renderers on shared scene-seed cells.
 
-Two renderers meet the same scenes, seeds and noise, so the difference per cell is far less spread than either value. Cells of one scene are
-not independent: differences are averaged per scene, and the scene is the unit of interval and test.
+Two renderers meet the same scenes, seeds and noise, so the difference per cell is far less spread
+than either value. Cells of one scene are not independent: differences are averaged per scene, and
+the scene is the unit of interval and test.
 """
 
 from __future__ import annotations
@@ -27,12 +28,25 @@ from evaluators.statistics.intervals import (
     t_interval,
     within,
 )
-from evaluators.statistics.verdicts import LEAST_SCENES, REACH, difference, harm, more_scenes, p_value, sign_test, verdict
+from evaluators.statistics.verdicts import (
+    LEAST_SCENES,
+    REACH,
+    difference,
+    harm,
+    more_scenes,
+    p_value,
+    sign_test,
+    verdict,
+)
 
 Table = dict[str, dict[str, dict[str, Any]]]  # RENDERER -> METRIC -> numbers
 
 LISTED = 50  # missing cells named per metric; the count is always whole
-UNDONE_BY = {"non-inferior": "worse", "better": "worse", "worse": "better"}  # what is seen -> what scenes that were not drawn may be
+UNDONE_BY = {
+    "non-inferior": "worse",
+    "better": "worse",
+    "worse": "better",
+}  # what is seen -> what scenes that were not drawn may be
 NO_PAIR = "no scene-seed cell has this metric on both sides"
 
 
@@ -50,7 +64,8 @@ def paired(
         rows: As for `aggregate`.
         baseline: Renderer that the others are compared with.
         metrics: Which metrics; all that any row has by default.
-        margins: How much worse is accepted, by metric, in its unit; the metric's own margin for the others.
+        margins: How much worse is accepted, by metric, in its unit; the metric's own margin for the
+            others.
         listed: How many missing cells to name per metric.
         known: What the metrics are.
 
@@ -60,7 +75,14 @@ def paired(
     Raises:
         InputError: No row has the baseline.
     """
-    return paired_sides(by_renderer(rows), metric_names(rows) if metrics is None else metrics, baseline, margins, listed, known)
+    return paired_sides(
+        by_renderer(rows),
+        metric_names(rows) if metrics is None else metrics,
+        baseline,
+        margins,
+        listed,
+        known,
+    )
 
 
 def paired_sides(
@@ -82,16 +104,30 @@ def paired_sides(
         InputError: No side is the baseline.
     """
     if baseline not in sides:
-        raise InputError("pairing renderers", f"baseline {baseline!r}", "no rollout has it", f"choose one of {', '.join(sides)}")
+        raise InputError(
+            "pairing renderers",
+            f"baseline {baseline!r}",
+            "no rollout has it",
+            f"choose one of {', '.join(sides)}",
+        )
     return {
-        renderer: {name: compare(side, sides[baseline], known.info(name), baseline, (margins or {}).get(name), listed) for name in metrics}
+        renderer: {
+            name: compare(
+                side, sides[baseline], known.info(name), baseline, (margins or {}).get(name), listed
+            )
+            for name in metrics
+        }
         for renderer, side in sides.items()
         if renderer != baseline
     }
 
 
 def base_pairs(
-    sides: Mapping[str, Side], metrics: Sequence[str], baseline: str | None, bases: Mapping[str, str], known: MetricTable = METRICS
+    sides: Mapping[str, Side],
+    metrics: Sequence[str],
+    baseline: str | None,
+    bases: Mapping[str, str],
+    known: MetricTable = METRICS,
 ) -> Table:
     """Compare every renderer with a fixer with the renderer below it: what the fixer itself does.
 
@@ -99,7 +135,8 @@ def base_pairs(
         sides: RENDERER -> its rollouts, of one policy.
         metrics: Which metrics.
         baseline: What the others are compared with already; a fixer over it is left out here.
-        bases: Renderer with a fixer -> the renderer below it; pairs of which one was not driven are left out.
+        bases: Renderer with a fixer -> the renderer below it; pairs of which one was not driven are
+            left out.
         known: What the metrics are.
 
     Returns:
@@ -108,12 +145,21 @@ def base_pairs(
     out = {}
     for name, base in bases.items():
         if {name, base} <= sides.keys() and baseline not in (name, base):
-            out[name] = {metric: compare(sides[name], sides[base], known.info(metric), base) for metric in metrics}
+            out[name] = {
+                metric: compare(sides[name], sides[base], known.info(metric), base)
+                for metric in metrics
+            }
     return out
 
 
 def compare(
-    here: Side, there: Side, metric: MetricInfo, baseline: str, margin: float | None = None, listed: int = LISTED, sampled: bool = True
+    here: Side,
+    there: Side,
+    metric: MetricInfo,
+    baseline: str,
+    margin: float | None = None,
+    listed: int = LISTED,
+    sampled: bool = True,
 ) -> dict[str, Any]:
     """Compare one metric of two renderers on their shared cells.
 
@@ -123,18 +169,22 @@ def compare(
         baseline: What to call ``there``.
         margin: How much worse is accepted, in the metric's unit; None: its own margin.
         listed: How many missing cells to name.
-        sampled: Scenes are draws from a population. False: they are all that is asked about, and no unseen one needs a guard.
+        sampled: Scenes are draws from a population. False: they are all that is asked about, and no
+            unseen one needs a guard.
 
     Returns:
-        ``baseline``; ``diff`` (here minus there: mean over scenes of the scene's mean difference); ``ci95`` ([low, high], scenes as unit)
-        and its ``method``; ``guarded`` (the bounds that a verdict and a difference must hold for as well, or None, with which nothing is
-        decided: `difference_bounds`); ``p_value`` and ``test``; ``margin`` and ``verdict`` (non-inferior, worse, undecided); ``difference``
-        (better, worse, none shown; independent of the margin); ``more_scenes`` (how many would decide an undecided verdict, else None);
-        ``spread`` (standard deviation of the difference between scenes); ``scenes`` (``up``, ``down``, ``same``, and ``p_value`` of their
-        exact sign test); for flags ``cells`` (``only_here``, ``only_baseline``, and the exact McNemar ``p_value``, as if cells were
-        independent);
-        ``n_cells``, ``n_scenes``, ``n_missing`` and ``missing`` (planned cells without a pair: cell, side, why); ``unit``, ``direction``;
-        ``reason`` where numbers are None, ``note`` where they need care.
+        ``baseline``; ``diff`` (here minus there: mean over scenes of the scene's mean difference);
+        ``ci95`` ([low, high], scenes as unit) and its ``method``; ``guarded`` (the bounds that a
+        verdict and a difference must hold for as well, or None, with which nothing is decided:
+        `difference_bounds`); ``p_value`` and ``test``; ``margin`` and ``verdict`` (non-inferior,
+        worse, undecided); ``difference`` (better, worse, none shown; independent of the margin);
+        ``more_scenes`` (how many would decide an undecided verdict, else None); ``spread``
+        (standard deviation of the difference between scenes); ``scenes`` (``up``, ``down``,
+        ``same``, and ``p_value`` of their exact sign test); for flags ``cells`` (``only_here``,
+        ``only_baseline``, and the exact McNemar ``p_value``, as if cells were independent);
+        ``n_cells``, ``n_scenes``, ``n_missing`` and ``missing`` (planned cells without a pair:
+        cell, side, why); ``unit``, ``direction``; ``reason`` where numbers are None, ``note`` where
+        they need care.
     """
     margin = metric.accepted if margin is None else margin
     pairs = Pairs(here, there, metric.name)
@@ -165,48 +215,86 @@ def compare(
         return entry | {"reason": TOO_LARGE}
     means, _ = cluster_means(delta, pairs.scenes)
     up, down = int(np.sum(means > 0)), int(np.sum(means < 0))
-    entry["scenes"] = {"up": up, "down": down, "same": len(means) - up - down, "p_value": sign_test(up, down)}
+    entry["scenes"] = {
+        "up": up,
+        "down": down,
+        "same": len(means) - up - down,
+        "p_value": sign_test(up, down),
+    }
     if metric.is_flag:
-        gained, lost = int(np.sum((pairs.mine > 0) & (pairs.base == 0))), int(np.sum((pairs.mine == 0) & (pairs.base > 0)))
-        entry["cells"] = {"only_here": gained, "only_baseline": lost, "p_value": sign_test(gained, lost)}
+        gained, lost = (
+            int(np.sum((pairs.mine > 0) & (pairs.base == 0))),
+            int(np.sum((pairs.mine == 0) & (pairs.base > 0))),
+        )
+        entry["cells"] = {
+            "only_here": gained,
+            "only_baseline": lost,
+            "p_value": sign_test(gained, lost),
+        }
     interval, guarded = difference_bounds(delta, pairs.scenes, metric, margin)
     interval = within(interval, *metric.difference_range)
-    entry["diff"], entry["ci95"], entry["method"] = interval.centre, interval.bounds, interval.method or None
+    entry["diff"], entry["ci95"], entry["method"] = (
+        interval.centre,
+        interval.bounds,
+        interval.method or None,
+    )
     if interval.reason:
         return entry | {"reason": interval.reason}
-    entry["guarded"], entry["spread"] = guarded, scaled(means)[1] * float(np.std(scaled(means)[0], ddof=1))
+    entry["guarded"], entry["spread"] = (
+        guarded,
+        scaled(means)[1] * float(np.std(scaled(means)[0], ddof=1)),
+    )
     entry["p_value"], entry["test"] = p_value(means, metric.is_flag)
     notes = [interval.note] if interval.note else []
 
     def said(*bounds: list[float] | None) -> tuple[str, str]:
         p = entry["p_value"]
-        return verdict(bounds[0], p, margin, metric.direction), difference(bounds[-1], p, metric.direction)
+        return verdict(bounds[0], p, margin, metric.direction), difference(
+            bounds[-1], p, metric.direction
+        )
 
     seen, both = interval.bounds, _both(interval.bounds, guarded) if sampled else interval.bounds
-    alone, shown = said(seen), said(both, seen if metric.is_flag else both)  # a flag's sign test needs no bound of what was not drawn
+    alone, shown = (
+        said(seen),
+        said(both, seen if metric.is_flag else both),
+    )  # a flag's sign test needs no bound of what was not drawn
     if len(means) < LEAST_SCENES:
         notes.append(f"{len(means)} scenes: a verdict needs at least {LEAST_SCENES}")
     elif guarded is None and sampled:
-        notes.append("nothing says how much a scene can differ, so that nothing is decided without a margin")
+        notes.append(
+            "nothing says how much a scene can differ, so that nothing is decided without a margin"
+        )
     else:
         entry["verdict"], entry["difference"] = shown
-    others = sorted({UNDONE_BY[one] for one, other in zip(alone, shown, strict=True) if one != other})
+    others = sorted(
+        {UNDONE_BY[one] for one, other in zip(alone, shown, strict=True) if one != other}
+    )
     if others and guarded is not None:
         many = f"{len(means)} scenes cannot exclude that a few others are {' or '.join(others)}"
         notes.append(f"{many} by up to {reach_of(metric, margin):g} {metric.unit}".rstrip())
     if notes:
         entry["note"] = "; ".join(notes)
     if entry["verdict"] == "undecided" and (metric.direction != "none" or margin > 0.0):
-        mean = abs(interval.centre) if metric.direction == "none" else harm([interval.centre] * 2, metric.direction)[0]
-        entry["more_scenes"] = more_scenes(mean, entry["spread"], len(means), margin, reach_of(metric, margin) or None)
+        mean = (
+            abs(interval.centre)
+            if metric.direction == "none"
+            else harm([interval.centre] * 2, metric.direction)[0]
+        )
+        entry["more_scenes"] = more_scenes(
+            mean, entry["spread"], len(means), margin, reach_of(metric, margin) or None
+        )
     return entry
 
 
-def difference_bounds(delta: F64, scenes: I64, metric: MetricInfo, margin: float) -> tuple[Interval, list[float] | None]:
-    """Return the interval of a mean difference, and the guarded bounds that a verdict must hold for too; None where there are none.
+def difference_bounds(
+    delta: F64, scenes: I64, metric: MetricInfo, margin: float
+) -> tuple[Interval, list[float] | None]:
+    """Return the interval of a mean difference, and the guarded bounds that a verdict must hold for
+    too; None where there are none.
 
-    Rates take the interval of `flag_interval`, other quantities with bounds that of `evaluators.statistics.bounded`, all others t. The
-    guarded bounds allow for scenes at the worst possible value that were not drawn; without bounds, differences are cut to `reach_of`.
+    Rates take the interval of `flag_interval`, other quantities with bounds that of
+    `evaluators.statistics.bounded`, all others t. The guarded bounds allow for scenes at the worst
+    possible value that were not drawn; without bounds, differences are cut to `reach_of`.
 
     Args:
         delta: ``(N,)`` differences per cell.
@@ -222,9 +310,17 @@ def difference_bounds(delta: F64, scenes: I64, metric: MetricInfo, margin: float
     if metric.is_flag:
         return flag_interval(delta, scenes), guarded
     plain = t_interval(means, "scenes")
-    if guarded is None or plain.bounds is None or not (are_alike(means) or np.isfinite(metric.difference_range).all()):
+    if (
+        guarded is None
+        or plain.bounds is None
+        or not (are_alike(means) or np.isfinite(metric.difference_range).all())
+    ):
         return plain, guarded
-    note = f"all {n} scenes are equal, so that they have no spread to go by" if are_alike(means) else ""
+    note = (
+        f"all {n} scenes are equal, so that they have no spread to go by"
+        if are_alike(means)
+        else ""
+    )
     method = f"mean of scenes that differ by at most {reach:g} {metric.unit}".rstrip()
     return Interval(plain.centre, guarded[0], guarded[1], note=note, method=method), guarded
 
@@ -237,20 +333,25 @@ def _both(bounds: list[float] | None, guarded: list[float] | None) -> list[float
 
 
 def flag_interval(delta: F64, scenes: I64) -> Interval:
-    """Return the interval of a difference of rates from ``(N,)`` differences per cell, in [-1, 1], and their scenes; see `flag_bounds`."""
+    """Return the interval of a difference of rates from ``(N,)`` differences per cell, in [-1, 1],
+    and their scenes; see `flag_bounds`.
+    """
     gained, _ = cluster_means(np.maximum(delta, 0.0), scenes)
     lost, _ = cluster_means(np.maximum(-delta, 0.0), scenes)
     low, high = (float(b) for b in flag_bounds(gained, lost))
     changed = int(np.sum((gained > 0) | (lost > 0)))
     note = f"{changed} of {len(gained)} scenes changed" if changed < LEAST_SCENES else ""
-    return Interval(float(np.mean(gained - lost)), low, high, note=note, method="gained and lost rates joined")
+    return Interval(
+        float(np.mean(gained - lost)), low, high, note=note, method="gained and lost rates joined"
+    )
 
 
 def flag_bounds(gained: F64, lost: F64) -> tuple[F64, F64]:
     """Return bounds ``(...,)`` of a difference of rates; never without width.
 
-    The rates of cells that gained and that lost the event get their own intervals (`logit_t_bounds`), which are joined by the method of
-    variance estimates recovery (Zou and Donner, Statistics in Medicine 27, 2008).
+    The rates of cells that gained and that lost the event get their own intervals
+    (`logit_t_bounds`), which are joined by the method of variance estimates recovery (Zou and
+    Donner, Statistics in Medicine 27, 2008).
 
     Args:
         gained: ``(..., G)`` share of a scene's cells in which only the renderer has the event.
@@ -266,7 +367,8 @@ def flag_bounds(gained: F64, lost: F64) -> tuple[F64, F64]:
 def reach_of(metric: MetricInfo, margin: float) -> float:
     """Return how much worse a scene can be, in the metric's unit; 0 where nothing says so.
 
-    Where differences have no bounds it is `REACH` times the metric's own margin, or the given one where it has none.
+    Where differences have no bounds it is `REACH` times the metric's own margin, or the given one
+    where it has none.
     """
     most = max(metric.difference_range)
     return float(most) if np.isfinite(most) else REACH * (metric.accepted or margin)
@@ -279,7 +381,9 @@ class Pairs:
         self.sides = (here, here.values(metric)), (there, there.values(metric))
         mine, base = self.sides[0][1], self.sides[1][1]
         index = here.place_in(there)
-        partner = np.where(index >= 0, base[index], np.nan) if len(base) else np.full(len(mine), np.nan)
+        partner = (
+            np.where(index >= 0, base[index], np.nan) if len(base) else np.full(len(mine), np.nan)
+        )
         both: Bool = np.isfinite(mine) & np.isfinite(partner)
         self.mine, self.base, self.scenes = mine[both], partner[both], here.scene[both]
         only_there = np.flatnonzero(there.place_in(here) < 0)
@@ -288,12 +392,19 @@ class Pairs:
 
     def missing(self, metric: str, listed: int) -> list[dict[str, Any]]:
         """Name the first cells without a pair, with side and cause."""
-        lone = sorted(side.cells[i] for side, places in self._lone for i in places[:listed].tolist())  # both are sorted already
+        lone = sorted(
+            side.cells[i] for side, places in self._lone for i in places[:listed].tolist()
+        )  # both are sorted already
         return [_lost(cell, *self.sides, metric) for cell in lone[:listed]]
 
 
-def _lost(cell: Cell, here: tuple[Side, F64], there: tuple[Side, F64], metric: str) -> dict[str, Any]:
-    why = {"here": here[0].why_missing(cell, metric, here[1]), "baseline": there[0].why_missing(cell, metric, there[1])}
+def _lost(
+    cell: Cell, here: tuple[Side, F64], there: tuple[Side, F64], metric: str
+) -> dict[str, Any]:
+    why = {
+        "here": here[0].why_missing(cell, metric, here[1]),
+        "baseline": there[0].why_missing(cell, metric, there[1]),
+    }
     gone = {side: text for side, text in why.items() if text}
     policy, scene, seed = cell
     return {
@@ -301,5 +412,7 @@ def _lost(cell: Cell, here: tuple[Side, F64], there: tuple[Side, F64], metric: s
         "scene": scene,
         "seed": seed,
         "missing": "both" if len(gone) == 2 else next(iter(gone)),
-        "why": f"both: {why['here']}" if len(set(why.values())) == 1 else "; ".join(f"{side}: {text}" for side, text in gone.items()),
+        "why": f"both: {why['here']}"
+        if len(set(why.values())) == 1
+        else "; ".join(f"{side}: {text}" for side, text in gone.items()),
     }

@@ -1,7 +1,10 @@
-"""From series over a rollout to one value per metric: which steps count, and how their values are reduced.
+"""From series over a rollout to one value per metric: which steps count, and how their values are
+reduced.
 
-Order (paper, appendix "Closed-loop replay evaluation"): steps before the policy takes over are dropped; steps after the first off-road or
-collision event are dropped, the event's own step stays; flags are reduced by their maximum, other metrics as they say themselves.
+Order (paper, appendix "Closed-loop replay evaluation"): steps before the policy takes over are
+    dropped; steps after the first off-road or
+collision event are dropped, the event's own step stays; flags are reduced by their maximum, other
+metrics as they say themselves.
 """
 
 from __future__ import annotations
@@ -19,9 +22,18 @@ from evaluators.metrics.presets import DEFAULT, Preset
 from evaluators.metrics.presets import preset as find_preset
 
 EVENTS = (
-    "collision_front", "collision_lateral", "collision_rear", "offroad", "wrong_lane", "left_route", "stalled", "braked_without_cause",
-    "hard_brake", "wrong_way", "red_light",
-)  # fmt: skip
+    "collision_front",
+    "collision_lateral",
+    "collision_rear",
+    "offroad",
+    "wrong_lane",
+    "left_route",
+    "stalled",
+    "braked_without_cause",
+    "hard_brake",
+    "wrong_way",
+    "red_light",
+)
 
 NEVER_ENGAGED = "the policy never took over: every step belongs to the warm-up"
 BLACK = "dropped: a camera image is black in the scored part"
@@ -29,7 +41,9 @@ BLACK = "dropped: a camera image is black in the scored part"
 
 @dataclass(frozen=True)
 class RolloutValue:
-    """One metric of one rollout; ``value`` is None where not valid, and ``reason`` then says why."""
+    """One metric of one rollout; ``value`` is None where not valid, and ``reason`` then says
+    why.
+    """
 
     value: float | None
     valid: bool
@@ -38,7 +52,9 @@ class RolloutValue:
     direction: Direction
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the fields for a manifest; an infinite value, for which JSON has no number, is the text "inf" or "-inf"."""
+        """Return the fields for a manifest; an infinite value, for which JSON has no number, is the
+        text "inf" or "-inf".
+        """
         infinite = self.value is not None and np.isinf(self.value)
         return self.__dict__ | ({"value": str(self.value)} if infinite else {})
 
@@ -50,7 +66,9 @@ class Ledger:
     steps_total: int
     steps_warmup: int  # before the policy took over
     steps_after_event: int  # after the first off-road or collision event
-    steps_after_drift: int  # after the first step beyond the preset's distance from the recorded path
+    steps_after_drift: (
+        int  # after the first step beyond the preset's distance from the recorded path
+    )
     steps_scored: int
     dropped: str  # why the whole rollout does not count, or ""
 
@@ -65,7 +83,9 @@ class Reduction:
 
     values: dict[str, RolloutValue]
     ledger: Ledger
-    events: tuple[dict[str, Any], ...]  # {"metric", "t_us"}: first time of each kind of event among the scored steps
+    events: tuple[
+        dict[str, Any], ...
+    ]  # {"metric", "t_us"}: first time of each kind of event among the scored steps
 
     def as_row(self) -> dict[str, Any]:
         """Return flat columns: METRIC and METRIC_valid, as in rollouts.parquet."""
@@ -79,7 +99,9 @@ class Reduction:
         return {name: one.as_dict() for name, one in self.values.items()}
 
 
-def rollout_values(series: Sequence[MetricSeries], preset: str | Preset = DEFAULT) -> dict[str, RolloutValue]:
+def rollout_values(
+    series: Sequence[MetricSeries], preset: str | Preset = DEFAULT
+) -> dict[str, RolloutValue]:
     """Return one value per metric of a rollout, after dropping the steps that do not count.
 
     Args:
@@ -97,12 +119,18 @@ def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = DEFAUL
     chosen = find_preset(preset)
     table = {one.name: one for one in series}
     if "eval_relevant" not in table:
-        raise EvaluatorError("reducing a rollout", f"series {sorted(table)}", "no eval_relevant", "pass everything that score() returned")
+        raise EvaluatorError(
+            "reducing a rollout",
+            f"series {sorted(table)}",
+            "no eval_relevant",
+            "pass everything that score() returned",
+        )
     for name, parts in _DERIVED_FLAGS.items():
         if name not in table and all(part in table for part in parts):
             table[name] = _any_of(name, [table[part] for part in parts])
     first_us, last_us, ledger = _window(table, chosen)
-    # eval_relevant selects steps; as a value of its own it says nothing, but AlpaSim's tables have it.
+    # eval_relevant selects steps; as a value of its own it says nothing, but AlpaSim's tables have
+    # it.
     values = {
         name: _reduce(one, first_us, last_us, chosen, ledger.dropped)
         for name, one in table.items()
@@ -111,10 +139,16 @@ def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = DEFAUL
     if not ledger.dropped:
         line = table["eval_relevant"].t_us
         scored = line[(line >= first_us) & (line <= last_us)]
-        values["duration_frac_20s"] = _value(METRICS["duration_frac_20s"], float(scored[-1] - scored[0]) / 20e6)
+        values["duration_frac_20s"] = _value(
+            METRICS["duration_frac_20s"], float(scored[-1] - scored[0]) / 20e6
+        )
     if "progress_rel_to_total" in values:
         values["progress_clipped_rel"] = values["progress_rel_to_total"]
-    found = [] if ledger.dropped else [(_first_time(table[name], first_us), name) for name in EVENTS if name in table]
+    found = (
+        []
+        if ledger.dropped
+        else [(_first_time(table[name], first_us), name) for name in EVENTS if name in table]
+    )
     times = [(t, name) for t, name in found if t is not None and t <= last_us]
     events = ({"metric": name, "t_us": t} for t, name in sorted(times, key=lambda event: event[0]))
     return Reduction(values, ledger, tuple(events))
@@ -128,7 +162,9 @@ _DERIVED_FLAGS = {
 
 
 def _any_of(name: str, parts: Sequence[MetricSeries]) -> MetricSeries:
-    """Combine flags on one time line: 1 where any is known to be 1, unknown where none is and one is unknown."""
+    """Combine flags on one time line: 1 where any is known to be 1, unknown where none is and one
+    is unknown.
+    """
     fired = np.any([np.where(part.valid, part.value, 0.0) > 0 for part in parts], axis=0)
     known = fired | np.all([part.valid for part in parts], axis=0)
     value = np.where(known, fired.astype(np.float64), np.nan)
@@ -148,7 +184,11 @@ def _window(table: dict[str, MetricSeries], preset: Preset) -> tuple[int, int, L
     else:
         return 0, -1, Ledger(n, n, 0, 0, 0, NEVER_ENGAGED)
     first_us = int(line[first])
-    if preset.drop_black and "img_is_black" in table and _first_time(table["img_is_black"], first_us) is not None:
+    if (
+        preset.drop_black
+        and "img_is_black" in table
+        and _first_time(table["img_is_black"], first_us) is not None
+    ):
         return 0, -1, Ledger(n, first, 0, 0, 0, BLACK)
     stops = [_first_time(table[name], first_us) for name in preset.stop_after if name in table]
     event_us = min((t for t in stops if t is not None), default=int(line[-1]))
@@ -156,11 +196,17 @@ def _window(table: dict[str, MetricSeries], preset: Preset) -> tuple[int, int, L
     last_us = event_us
     if preset.stop_beyond_gt_m is not None and "dist_to_gt_trajectory" in table:
         one = table["dist_to_gt_trajectory"]
-        far = (one.value >= preset.stop_beyond_gt_m) & (one.t_us >= first_us) & (one.t_us <= event_us)
+        far = (
+            (one.value >= preset.stop_beyond_gt_m) & (one.t_us >= first_us) & (one.t_us <= event_us)
+        )
         if far.any():
             last_us = int(one.t_us[np.argmax(far)])
     scored = int(np.sum((line >= first_us) & (line <= last_us)))
-    return first_us, last_us, Ledger(n, first, after_event, n - first - after_event - scored, scored, "")
+    return (
+        first_us,
+        last_us,
+        Ledger(n, first, after_event, n - first - after_event - scored, scored, ""),
+    )
 
 
 def _first_time(one: MetricSeries, first_us: int) -> int | None:
@@ -168,22 +214,32 @@ def _first_time(one: MetricSeries, first_us: int) -> int | None:
     return int(one.t_us[np.argmax(fired)]) if fired.any() else None
 
 
-def _reduce(one: MetricSeries, first_us: int, last_us: int, preset: Preset, dropped: str) -> RolloutValue:
+def _reduce(
+    one: MetricSeries, first_us: int, last_us: int, preset: Preset, dropped: str
+) -> RolloutValue:
     if dropped:
         return _value(one.metric, None, dropped)
     rows = (one.t_us >= first_us) & (one.t_us <= last_us)
     value, valid = one.value[rows], one.valid[rows]
     if not len(value):
         return _value(one.metric, None, "no value among the scored steps")
-    # Combined events have no value where a part is unknown; such rows are empty in AlpaSim's tables and never read.
+    # Combined events have no value where a part is unknown; such rows are empty in AlpaSim's tables
+    # and never read.
     if not preset.honour_valid and not one.metric.derived:
         return _value(one.metric, _REDUCE[one.metric.aggregation](value, one.t_us[rows]))
     if one.metric.aggregation == "last":
-        return _value(one.metric, float(value[-1])) if valid[-1] else _value(one.metric, None, one.reason)
+        return (
+            _value(one.metric, float(value[-1]))
+            if valid[-1]
+            else _value(one.metric, None, one.reason)
+        )
     known = value[valid]
     fired = bool(np.any(known > 0))
-    if not len(known) or (one.metric.is_flag and one.metric.aggregation == "max" and not fired and not valid.all()):
-        # A flag that did not fire where it is known may have fired where it is not: unknown, never zero.
+    if not len(known) or (
+        one.metric.is_flag and one.metric.aggregation == "max" and not fired and not valid.all()
+    ):
+        # A flag that did not fire where it is known may have fired where it is not: unknown, never
+        # zero.
         return _value(one.metric, None, one.reason)
     return _value(one.metric, _REDUCE[one.metric.aggregation](known, one.t_us[rows][valid]))
 

@@ -1,4 +1,6 @@
-"""The blocks of summary.json: means with intervals, paired differences, and what each rule removed, with the bounds that this allows."""
+"""The blocks of summary.json: means with intervals, paired differences, and what each rule removed,
+with the bounds that this allows.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,15 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.log.run_folder.columns import RolloutTable
 from alpasim_plugin.log.run_folder.schema import cell_name
-from alpasim_plugin.log.run_folder.sides import RendererRows, Row, Side, by_renderer, failure_of, metric_names, reason_of
+from alpasim_plugin.log.run_folder.sides import (
+    RendererRows,
+    Row,
+    Side,
+    by_renderer,
+    failure_of,
+    metric_names,
+    reason_of,
+)
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.statistics.arms import Arm, axis_bases
 from evaluators.statistics.families import by_family
@@ -35,24 +45,30 @@ BOOTSTRAP_SCENES = 1000  # beyond, the bootstrap costs seconds and says what the
 
 
 def aggregate(rows: Sequence[Row], known: MetricTable = METRICS) -> Table:
-    """Average rollouts per renderer and metric, with the paper's and the scene-clustered 95 % interval.
+    """Average rollouts per renderer and metric, with the paper's and the scene-clustered 95 %
+    interval.
 
     Args:
-        rows: One mapping per rollout with ``renderer``, ``policy``, ``scene``, ``seed``, ``status`` and the metrics, either flat
-            (``METRIC``, ``METRIC_valid``) or under ``metrics``. Rows whose status is not "ok" and invalid values do not enter.
+        rows: One mapping per rollout with ``renderer``, ``policy``, ``scene``, ``seed``, ``status``
+            and the metrics, either flat (``METRIC``, ``METRIC_valid``) or under ``metrics``. Rows
+            whose status is not "ok" and invalid values do not enter.
         known: What the metrics are.
 
     Returns:
-        RENDERER -> METRIC -> ``mean``, ``ci95`` (half-width 1.96 s / sqrt(N)), ``ci95_clustered`` ([low, high], scenes as clusters) and
-        its ``ci95_clustered_method``, ``ci95_bootstrap`` ([low, high], scenes redrawn), ``design_effect``, ``n_rollouts``, ``n_scenes``,
-        ``n_invalid``, ``unit``, ``direction``; for rates also ``n_events``, ``ci95_wilson`` and ``ci95_exact`` (both as if rollouts were
-        independent). What does not exist is None, with ``reason`` (no mean) or ``ci95_reason`` / ``ci95_clustered_reason`` /
+        RENDERER -> METRIC -> ``mean``, ``ci95`` (half-width 1.96 s / sqrt(N)), ``ci95_clustered``
+        ([low, high], scenes as clusters) and its ``ci95_clustered_method``, ``ci95_bootstrap``
+        ([low, high], scenes redrawn), ``design_effect``, ``n_rollouts``, ``n_scenes``,
+        ``n_invalid``, ``unit``, ``direction``; for rates also ``n_events``, ``ci95_wilson`` and
+        ``ci95_exact`` (both as if rollouts were independent). What does not exist is None, with
+        ``reason`` (no mean) or ``ci95_reason`` / ``ci95_clustered_reason`` /
         ``ci95_bootstrap_reason``; ``note`` qualifies the clustered interval.
     """
     return aggregate_sides(by_renderer(rows), metric_names(rows), known)
 
 
-def aggregate_sides(sides: Mapping[str, Side], metrics: Sequence[str], known: MetricTable = METRICS) -> Table:
+def aggregate_sides(
+    sides: Mapping[str, Side], metrics: Sequence[str], known: MetricTable = METRICS
+) -> Table:
     """Average rollouts per renderer and metric; see `aggregate`.
 
     Args:
@@ -61,7 +77,10 @@ def aggregate_sides(sides: Mapping[str, Side], metrics: Sequence[str], known: Me
         known: What they are.
     """
     # Metric by metric: renderers share its column and its draws.
-    found = {name: {renderer: _entry(side, known.info(name)) for renderer, side in sides.items()} for name in metrics}
+    found = {
+        name: {renderer: _entry(side, known.info(name)) for renderer, side in sides.items()}
+        for name in metrics
+    }
     return {renderer: {name: found[name][renderer] for name in metrics} for renderer in sides}
 
 
@@ -84,19 +103,26 @@ def _entry(side: Side, metric: MetricInfo) -> dict[str, Any]:
         "direction": metric.direction,
     }
     if n == 0:
-        return entry | {"reason": "no rollout finished" if n_ran == 0 else f"valid in none of {n_ran} rollouts"}
+        return entry | {
+            "reason": "no rollout finished" if n_ran == 0 else f"valid in none of {n_ran} rollouts"
+        }
     entry["mean"] = mean_of(values)
     entry["ci95"], why = normal_half_width(values)
     if why:
         entry["ci95_reason"] = why
     interval = within(clustered(values, scenes, metric.is_flag), *metric.value_range)
-    entry["ci95_clustered"], entry["ci95_clustered_method"] = interval.bounds, interval.method or None
+    entry["ci95_clustered"], entry["ci95_clustered_method"] = (
+        interval.bounds,
+        interval.method or None,
+    )
     entry["design_effect"] = design_effect(values, scenes)
     if interval.reason:
         entry["ci95_clustered_reason"] = interval.reason
     notes = [interval.note] if interval.note else []
     if abs(interval.centre - entry["mean"]) > 1e-9 * max(1.0, abs(entry["mean"])):
-        notes.append(f"scenes have different numbers of values: the interval is about the mean over scenes, {interval.centre:.4g}")
+        notes.append(
+            f"scenes have different numbers of values: the interval is about the mean over scenes, {interval.centre:.4g}"
+        )
     if notes:
         entry["note"] = "; ".join(notes)
     if entry["n_scenes"] > BOOTSTRAP_SCENES:
@@ -109,19 +135,35 @@ def _entry(side: Side, metric: MetricInfo) -> dict[str, Any]:
     if metric.is_flag:
         k = int(np.sum(values > 0))
         entry |= {"n_events": k, "ci95_wilson": None, "ci95_exact": None}
-        if bool(np.all((values == 0.0) | (values == 1.0))):  # as if rollouts were independent trials
-            entry["ci95_wilson"], entry["ci95_exact"] = list(wilson_rate(k, n)), list(exact_rate(k, n))
+        if bool(
+            np.all((values == 0.0) | (values == 1.0))
+        ):  # as if rollouts were independent trials
+            entry["ci95_wilson"], entry["ci95_exact"] = (
+                list(wilson_rate(k, n)),
+                list(exact_rate(k, n)),
+            )
     return entry
 
 
 @lru_cache(maxsize=1)
 def _redraws(metric: str, scenes: int) -> I64:
-    """Return the draws of a metric's scenes; keyed by the metric alone, so that renderers meet the same ones."""
+    """Return the draws of a metric's scenes; keyed by the metric alone, so that renderers meet the
+    same ones.
+    """
     return redraws(scenes, stream(metric, 0, "aggregate/bootstrap"))
 
 
-STEP_RULES = ("steps_total", "steps_warmup", "steps_after_event", "steps_after_drift", "steps_scored")
-CUT_RULES = ("steps_after_event", "steps_after_drift")  # the policy drove there, but what happened does not count
+STEP_RULES = (
+    "steps_total",
+    "steps_warmup",
+    "steps_after_event",
+    "steps_after_drift",
+    "steps_scored",
+)
+CUT_RULES = (
+    "steps_after_event",
+    "steps_after_drift",
+)  # the policy drove there, but what happened does not count
 FIXER_GUARD = "fixer-"  # frame events of this kind: the fixer's frame was replaced by the raw one
 
 
@@ -129,18 +171,22 @@ def censoring(rows: Sequence[Row], known: MetricTable = METRICS) -> dict[str, di
     """Count what did not enter the table, per renderer and cause.
 
     Args:
-        rows: Rollout rows or manifests as for `aggregate`, with ``censored`` (a `Ledger` as dict), ``frames`` and ``frame_events`` where a
-            rollout was scored, and ``failure_class`` or ``error`` where it failed.
+        rows: Rollout rows or manifests as for `aggregate`, with ``censored`` (a `Ledger` as dict),
+            ``frames`` and ``frame_events`` where a rollout was scored, and ``failure_class`` or
+            ``error`` where it failed.
         known: What the metrics are.
 
     Returns:
-        RENDERER -> ``rollouts`` (planned), ``failed`` (by failure class), ``dropped`` (by reason), the step counts of the ledger summed
-        over rollouts, ``frames`` (rendered in rollouts that ran to their end), ``frame_events`` (by kind: ``black``, ``fixer-nan``, ...),
-        ``frames_passed_raw`` (the fixer's guard took the raw frame), ``invalid`` (METRIC -> number of rollouts and their reasons), and for
-        every rate METRIC -> [least, greatest]: ``bounds_rollouts`` (every missing rollout without, and with, the event),
-        ``bounds_rollouts_ci95`` (the same with sampling error: the low end of the 95 % interval over scenes of the one, the high end of
-        the other; None with one scene) and ``bounds`` (also every step that was cut from a scored rollout without, and with, the event),
-        with ``cut`` (METRIC -> rollouts that were cut before the event was seen).
+        RENDERER -> ``rollouts`` (planned), ``failed`` (by failure class), ``dropped`` (by reason),
+        the step counts of the ledger summed over rollouts, ``frames`` (rendered in rollouts that
+        ran to their end), ``frame_events`` (by kind: ``black``, ``fixer-nan``, ...),
+        ``frames_passed_raw`` (the fixer's guard took the raw frame), ``invalid`` (METRIC -> number
+        of rollouts and their reasons), and for every rate METRIC -> [least, greatest]:
+        ``bounds_rollouts`` (every missing rollout without, and with, the event),
+        ``bounds_rollouts_ci95`` (the same with sampling error: the low end of the 95 % interval
+        over scenes of the one, the high end of the other; None with one scene) and ``bounds`` (also
+        every step that was cut from a scored rollout without, and with, the event), with ``cut``
+        (METRIC -> rollouts that were cut before the event was seen).
     """
     names = metric_names(rows)
     return {name: _of_renderer(side, names, known) for name, side in by_renderer(rows).items()}
@@ -154,7 +200,9 @@ def _of_renderer(side: RendererRows, names: Sequence[str], known: MetricTable) -
         events.update(row.get("frame_events") or {})
     out: dict[str, Any] = {
         "rollouts": len(side.rows),
-        "failed": dict(Counter(failure_of(row) for row, ok in zip(side.rows, side.ok, strict=True) if not ok)),
+        "failed": dict(
+            Counter(failure_of(row) for row, ok in zip(side.rows, side.ok, strict=True) if not ok)
+        ),
         "dropped": dict(Counter(ledger["dropped"] for ledger in ledgers if ledger["dropped"])),
         **{rule: sum(int(ledger[rule]) for ledger in ledgers) for rule in STEP_RULES},
         "frames": sum(int(row.get("frames") or 0) for row in done),
@@ -167,7 +215,10 @@ def _of_renderer(side: RendererRows, names: Sequence[str], known: MetricTable) -
         "cut": {},
     }
     steps = [row.get("censored") or {} for row in side.rows]
-    cut = np.array([sum(int(ledger.get(rule) or 0) for rule in CUT_RULES) for ledger in steps], dtype=np.float64)
+    cut = np.array(
+        [sum(int(ledger.get(rule) or 0) for rule in CUT_RULES) for ledger in steps],
+        dtype=np.float64,
+    )
     scored = np.array([int(ledger.get("steps_scored") or 0) for ledger in steps], dtype=np.float64)
     for name in names:
         values = side.raw(name)
@@ -178,13 +229,20 @@ def _of_renderer(side: RendererRows, names: Sequence[str], known: MetricTable) -
         metric = known.info(name)
         if metric.is_flag:
             is_share = metric.aggregation == "mean"
-            out["bounds_rollouts"][name], out["bounds"][name], out["cut"][name] = rate_bounds(values, cut, scored, is_share)
-            ends = [clustered(np.where(np.isfinite(values), values, fill), side.scene[side.cell], True) for fill in (0.0, 1.0)]
+            out["bounds_rollouts"][name], out["bounds"][name], out["cut"][name] = rate_bounds(
+                values, cut, scored, is_share
+            )
+            ends = [
+                clustered(np.where(np.isfinite(values), values, fill), side.scene[side.cell], True)
+                for fill in (0.0, 1.0)
+            ]
             out["bounds_rollouts_ci95"][name] = [ends[0].low, ends[1].high]
     return out
 
 
-def rate_bounds(values: F64, cut: F64, scored: F64, is_share: bool) -> tuple[list[float], list[float], int]:
+def rate_bounds(
+    values: F64, cut: F64, scored: F64, is_share: bool
+) -> tuple[list[float], list[float], int]:
     """Return the least and greatest that a rate could be, given what is missing.
 
     Args:
@@ -194,17 +252,27 @@ def rate_bounds(values: F64, cut: F64, scored: F64, is_share: bool) -> tuple[lis
         is_share: The flag of a rollout is the share of its steps that fired, not whether any did.
 
     Returns:
-        Bounds over missing rollouts; bounds over missing rollouts and cut steps; how many rollouts were cut before the event was seen.
+        Bounds over missing rollouts; bounds over missing rollouts and cut steps; how many rollouts
+        were cut before the event was seen.
     """
     known = np.isfinite(values)
-    seen, n, missing = values[known], len(values), int(np.sum(~known))
+    seen = values[known]
+    n = len(values)
+    missing = int(np.sum(~known))
     cut, scored = cut[known], scored[known]
     least, greatest = seen, np.where(cut > 0, 1.0, seen)
     if is_share:
         steps = np.maximum(scored + cut, 1.0)
-        least, greatest = np.where(cut > 0, seen * scored / steps, seen), np.where(cut > 0, (seen * scored + cut) / steps, seen)
+        least, greatest = (
+            np.where(cut > 0, seen * scored / steps, seen),
+            np.where(cut > 0, (seen * scored + cut) / steps, seen),
+        )
     over_rollouts = [float(seen.sum()) / n, (float(seen.sum()) + missing) / n]
-    return over_rollouts, [float(least.sum()) / n, (float(greatest.sum()) + missing) / n], int(np.sum(greatest > seen))
+    return (
+        over_rollouts,
+        [float(least.sum()) / n, (float(greatest.sum()) + missing) / n],
+        int(np.sum(greatest > seen)),
+    )
 
 
 NO_BASES: Mapping[str, str] = {}
@@ -217,15 +285,18 @@ def numbers(
     known: MetricTable = METRICS,
     family_of: Mapping[str, str] = NO_BASES,
 ) -> dict[str, Any]:
-    """Return the blocks ``metrics``, ``paired``, ``paired_with_base`` and ``paired_arms`` of ``summary.json`` (docs/statistics.md).
+    """Return the blocks ``metrics``, ``paired``, ``paired_with_base`` and ``paired_arms`` of
+    ``summary.json`` (docs/statistics.md).
 
     Args:
         table: The rollouts.
-        baseline: RENDERER, POLICY or RENDERER/POLICY that the others are compared with; what it does not name, or a policy did not meet,
-            is the first of its kind.
-        bases: Renderer with a fixer -> the renderer below it; where both were driven and it is not the baseline, the two are paired too.
+        baseline: RENDERER, POLICY or RENDERER/POLICY that the others are compared with; what it
+            does not name, or a policy did not meet, is the first of its kind.
+        bases: Renderer with a fixer -> the renderer below it; where both were driven and it is not
+            the baseline, the two are paired too.
         known: What the metrics are.
-        family_of: SCENE -> its family; where it has three or more, differences of headline metrics say what families say (`by_family`).
+        family_of: SCENE -> its family; where it has three or more, differences of headline metrics
+            say what families say (`by_family`).
     """
     sides = {policy: table.sides(policy) for policy in table.policies}
     arms = [Arm(renderer, policy) for policy, here in sides.items() for renderer in here]
@@ -235,12 +306,16 @@ def numbers(
         first = next(iter(here), None) if len(here) > 1 else None
         named = None if by_renderer_base is None else by_renderer_base.renderer
         chosen[policy] = named if len(here) > 1 and named in here else first
-    metrics = {policy: aggregate_sides(here, table.metrics, known) for policy, here in sides.items()}
+    metrics = {
+        policy: aggregate_sides(here, table.metrics, known) for policy, here in sides.items()
+    }
     paired: dict[str, Table] = {}
     with_base: dict[str, Table] = {}
     for policy, here in sides.items():
         base = chosen[policy]
-        paired[policy] = {} if base is None else paired_sides(here, table.metrics, base, known=known)
+        paired[policy] = (
+            {} if base is None else paired_sides(here, table.metrics, base, known=known)
+        )
         with_base[policy] = base_pairs(here, table.metrics, base, bases, known)
         for name, entries in paired[policy].items():
             _add_families(entries, here[name], here[str(base)], family_of, known)
@@ -248,12 +323,21 @@ def numbers(
     arm_pairs = [] if by_policy_base is None else by_policy_base.pairs(arms)
     across = paired_arms(table, arm_pairs, known)
     for arm, other in arm_pairs:
-        pair = table.sides(arm.policy)[arm.renderer], table.sides(other.policy, arm.policy)[other.renderer]
+        pair = (
+            table.sides(arm.policy)[arm.renderer],
+            table.sides(other.policy, arm.policy)[other.renderer],
+        )
         _add_families(across[arm.name], *pair, family_of, known)
     return {name: by_policy(part, dict) for name, part in parts.items()} | {"paired_arms": across}
 
 
-def _add_families(entries: dict[str, Any], here: Side, there: Side, family_of: Mapping[str, str], known: MetricTable) -> None:
+def _add_families(
+    entries: dict[str, Any],
+    here: Side,
+    there: Side,
+    family_of: Mapping[str, str],
+    known: MetricTable,
+) -> None:
     """Add ``families`` to the differences of headline metrics that have an interval."""
     for metric in known.headline if family_of else ():
         entry = entries.get(metric) or {}
@@ -287,16 +371,27 @@ def paired_arms(
     base = table if base is None else base
     out: Table = {}
     for arm, other in pairs:
-        here, there = table.sides(arm.policy)[arm.renderer], base.sides(other.policy, arm.policy)[other.renderer]
+        here, there = (
+            table.sides(arm.policy)[arm.renderer],
+            base.sides(other.policy, arm.policy)[other.renderer],
+        )
         out[arm.name] = {
-            name: compare(here, there, known.info(name), prefix + other.name, (margins or {}).get(name), listed)
+            name: compare(
+                here,
+                there,
+                known.info(name),
+                prefix + other.name,
+                (margins or {}).get(name),
+                listed,
+            )
             for name in dict.fromkeys([*table.metrics, *base.metrics])
         }
     return out
 
 
 def by_policy(of: Mapping[str, Any], table: Callable[[Any], Mapping[str, Any]]) -> dict[str, Any]:
-    """Make a table per policy. With one policy its keys are RENDERER, with several RENDERER/POLICY: policies are never averaged.
+    """Make a table per policy. With one policy its keys are RENDERER, with several RENDERER/POLICY:
+    policies are never averaged.
 
     Args:
         of: POLICY -> what the table is made of.
@@ -305,5 +400,9 @@ def by_policy(of: Mapping[str, Any], table: Callable[[Any], Mapping[str, Any]]) 
     out: dict[str, Any] = {}
     for policy, some in of.items():
         part = table(some)
-        out |= part if len(of) == 1 else {cell_name(renderer, policy): entry for renderer, entry in part.items()}
+        out |= (
+            part
+            if len(of) == 1
+            else {cell_name(renderer, policy): entry for renderer, entry in part.items()}
+        )
     return out

@@ -1,4 +1,6 @@
-"""Verdicts: on a paired difference with a margin, how many scenes would decide it, and the outcome of a run with its exit code."""
+"""Verdicts: on a paired difference with a margin, how many scenes would decide it, and the outcome
+of a run with its exit code.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,14 @@ from evaluators.statistics.intervals import TAIL, are_alike, scaled
 
 Cause = Literal["pass", "regression", "policy", "undecided", "infrastructure", "evaluator"]
 
-EXIT_CODES: dict[Cause, int] = {"pass": 0, "regression": 1, "policy": 2, "undecided": 3, "infrastructure": 4, "evaluator": 5}
+EXIT_CODES: dict[Cause, int] = {
+    "pass": 0,
+    "regression": 1,
+    "policy": 2,
+    "undecided": 3,
+    "infrastructure": 4,
+    "evaluator": 5,
+}
 WORDS: dict[Cause, str] = {
     "pass": "PASS",
     "regression": "FAIL",
@@ -25,8 +34,16 @@ WORDS: dict[Cause, str] = {
     "infrastructure": "INFRASTRUCTURE FAILURE",
     "evaluator": "EVALUATOR FAILURE",
 }
-# Where causes meet, the first one found here decides: numbers from an incomplete run may mislead either way.
-SEVERITY: tuple[Cause, ...] = ("evaluator", "infrastructure", "policy", "regression", "undecided", "pass")
+# Where causes meet, the first one found here decides: numbers from an incomplete run may mislead
+# either way.
+SEVERITY: tuple[Cause, ...] = (
+    "evaluator",
+    "infrastructure",
+    "policy",
+    "regression",
+    "undecided",
+    "pass",
+)
 
 
 @dataclass(frozen=True)
@@ -69,15 +86,20 @@ def outcome_of_failures(failures: Mapping[str, Any], max_share: float = 0.0) -> 
     """Judge rollouts that could not be run or scored.
 
     Args:
-        failures: The ``failures`` block of summary.json: ``n_failed``, ``n_rollouts``, ``by_class``.
+        failures: The ``failures`` block of summary.json: ``n_failed``, ``n_rollouts``,
+            ``by_class``.
         max_share: Share of the planned rollouts that may fail.
     """
-    n, n_failed, by_class = int(failures["n_rollouts"]), int(failures["n_failed"]), failures["by_class"]
+    n = int(failures["n_rollouts"])
+    n_failed = int(failures["n_failed"])
+    by_class = failures["by_class"]
     if n_failed <= max_share * n:
         return Outcome("pass")
     causes = ", ".join(f"{name} {count}" for name, count in by_class.items())
     said = f"{n_failed} of {n} rollouts could not be run or scored ({causes})"
-    alone: Cause | None = next((cause for cause in ("evaluator", "policy") if set(by_class) == {cause}), None)
+    alone: Cause | None = next(
+        (cause for cause in ("evaluator", "policy") if set(by_class) == {cause}), None
+    )
     return Outcome(alone or "infrastructure", (said,))
 
 
@@ -86,7 +108,9 @@ Difference = Literal["better", "worse", "none shown"]
 
 ALPHA = 0.05
 LEAST_SCENES = 6  # the fewest that can reach p < 0.05 in the two-sided sign test
-REACH = 40.0  # margins: a scene's difference in a quantity without bounds counts up to so much; beyond, it is an event's matter
+# margins: a scene's difference in a quantity without bounds counts up to so much; beyond, it is an
+# event's matter
+REACH = 40.0
 
 
 def harm(bounds: list[float], direction: Direction) -> tuple[float, float]:
@@ -94,13 +118,17 @@ def harm(bounds: list[float], direction: Direction) -> tuple[float, float]:
     return (bounds[0], bounds[1]) if direction == "lower" else (-bounds[1], -bounds[0])
 
 
-def verdict(bounds: list[float] | None, p: float | None, margin: float, direction: Direction) -> Verdict:
+def verdict(
+    bounds: list[float] | None, p: float | None, margin: float, direction: Direction
+) -> Verdict:
     """Judge a difference by its 95 % interval.
 
-    Non-inferior: the whole interval is better than ``margin`` worse. Worse: the whole interval is more than ``margin`` worse, and the test
-    of no difference rejects too (p < 0.05). Undecided: neither. A metric without a better side needs a margin, and a change to either side
-    counts as worse. If the bounds hold the guarded ones (`evaluators.statistics.bounded`), each answer is wrong in at most 2.5 % of runs,
-    also where a few scenes differ greatly and none was drawn (docs/experiments/verdicts.md).
+    Non-inferior: the whole interval is better than ``margin`` worse. Worse: the whole interval is
+        more than ``margin`` worse, and the test
+    of no difference rejects too (p < 0.05). Undecided: neither. A metric without a better side
+    needs a margin, and a change to either side counts as worse. If the bounds hold the guarded ones
+    (`evaluators.statistics.bounded`), each answer is wrong in at most 2.5 % of runs, also where a
+    few scenes differ greatly and none was drawn (docs/experiments/verdicts.md).
 
     Args:
         bounds: [low, high] of renderer minus baseline, or None.
@@ -112,23 +140,36 @@ def verdict(bounds: list[float] | None, p: float | None, margin: float, directio
         return "undecided"
     low, high = harm(bounds, direction)
     if direction == "none":
-        low, high = 0.0 if low <= 0.0 <= high else min(abs(low), abs(high)), max(abs(low), abs(high))
+        low, high = (
+            0.0 if low <= 0.0 <= high else min(abs(low), abs(high)),
+            max(abs(low), abs(high)),
+        )
     if high < margin:
         return "non-inferior"
     return "worse" if low > margin and p is not None and p < ALPHA else "undecided"
 
 
 def difference(bounds: list[float] | None, p: float | None, direction: Direction) -> Difference:
-    """Return whether a difference is shown, independent of the margin: the interval excludes 0 and the test rejects."""
-    if bounds is None or direction == "none" or p is None or p >= ALPHA or bounds[0] <= 0.0 <= bounds[1]:
+    """Return whether a difference is shown, independent of the margin: the interval excludes 0 and
+    the test rejects.
+    """
+    if (
+        bounds is None
+        or direction == "none"
+        or p is None
+        or p >= ALPHA
+        or bounds[0] <= 0.0 <= bounds[1]
+    ):
         return "none shown"
     return "worse" if harm(bounds, direction)[0] > 0.0 else "better"
 
 
 def sign_test(up: int, down: int) -> float:
-    """Return the exact two-sided p of ``up`` against ``down`` under a fair coin; 1 where both are 0.
+    """Return the exact two-sided p of ``up`` against ``down`` under a fair coin; 1 where both are
+    0.
 
-    On scenes that changed it is the sign test; on discordant cells of a flag it is the exact McNemar test.
+    On scenes that changed it is the sign test; on discordant cells of a flag it is the exact
+    McNemar test.
 
     Example:
         >>> round(sign_test(6, 0), 5)
@@ -140,18 +181,21 @@ def sign_test(up: int, down: int) -> float:
 def p_value(means: F64, is_flag: bool) -> tuple[float, str]:
     """Test that scene differences ``(G,)`` centre on zero.
 
-    Flags, and differences that are all alike (where t has no spread to go by), take the exact two-sided sign test on the scenes that
-    changed; other metrics the paired t test.
+    Flags, and differences that are all alike (where t has no spread to go by), take the exact
+    two-sided sign test on the scenes that changed; other metrics the paired t test.
     """
     means, _ = scaled(means)
     if is_flag or are_alike(means):
-        return sign_test(int(np.sum(means > 0)), int(np.sum(means < 0))), "exact sign test on scenes"
+        return sign_test(
+            int(np.sum(means > 0)), int(np.sum(means < 0))
+        ), "exact sign test on scenes"
     t = float(np.mean(means) / (np.std(means, ddof=1) / np.sqrt(len(means))))
     return 2.0 * float(scipy.special.stdtr(len(means) - 1, -abs(t))), "paired t test on scene means"
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Return p-values corrected for their number by Holm's step-down method; what is None is no test and stays so.
+    """Return p-values corrected for their number by Holm's step-down method; what is None is no
+    test and stays so.
 
     Source: Holm, Scandinavian Journal of Statistics 6 (1979).
 
@@ -172,10 +216,14 @@ POWER = 0.8
 MOST_SCENES = 100_000  # beyond, this suite cannot decide it
 
 
-def scenes_needed(distance: float, spread: float, power: float = POWER, tail: float = TAIL) -> int | None:
-    """Return the number of scenes at which a 95 % t interval leaves out the margin with probability ``power``.
+def scenes_needed(
+    distance: float, spread: float, power: float = POWER, tail: float = TAIL
+) -> int | None:
+    """Return the number of scenes at which a 95 % t interval leaves out the margin with probability
+    ``power``.
 
-    N is the least with N >= ((t(0.975, N-1) + t(power, N-1)) spread / distance)^2, the usual sample size of a one-sample t test.
+    N is the least with N >= ((t(0.975, N-1) + t(power, N-1)) spread / distance)^2, the usual sample
+    size of a one-sample t test.
 
     Args:
         distance: Of the true difference from the margin, in the metric's unit.
@@ -184,7 +232,8 @@ def scenes_needed(distance: float, spread: float, power: float = POWER, tail: fl
         tail: Probability of the interval's one end, 2.5 % for one of 95 %.
 
     Returns:
-        At least 2; None where more than `MOST_SCENES` would be needed, or the difference lies on the margin.
+        At least 2; None where more than `MOST_SCENES` would be needed, or the difference lies on
+        the margin.
 
     Example:
         >>> scenes_needed(distance=0.5, spread=1.0)
@@ -199,12 +248,15 @@ def scenes_needed(distance: float, spread: float, power: float = POWER, tail: fl
         return None
     while low < high:
         middle = (low + high) // 2
-        low, high = (low, middle) if _decides(middle, distance, spread, power, tail) else (middle + 1, high)
+        low, high = (
+            (low, middle) if _decides(middle, distance, spread, power, tail) else (middle + 1, high)
+        )
     return low
 
 
 def scenes_without_event(margin: float, reach: float = 1.0) -> int | None:
-    """Return how many scenes without a single difference show that the mean is not worse by the margin (exact bound).
+    """Return how many scenes without a single difference show that the mean is not worse by the
+    margin (exact bound).
 
     Args:
         margin: How much worse is accepted.
@@ -220,8 +272,11 @@ def scenes_without_event(margin: float, reach: float = 1.0) -> int | None:
     return found if found <= MOST_SCENES else None
 
 
-def more_scenes(harm: float, spread: float, n_scenes: int, margin: float, reach: float | None) -> int | None:
-    """Return about how many more scenes would decide an undecided verdict with 80 % probability, if what was seen is true.
+def more_scenes(
+    harm: float, spread: float, n_scenes: int, margin: float, reach: float | None
+) -> int | None:
+    """Return about how many more scenes would decide an undecided verdict with 80 % probability, if
+    what was seen is true.
 
     Args:
         harm: The difference seen, positive is worse.
@@ -231,11 +286,14 @@ def more_scenes(harm: float, spread: float, n_scenes: int, margin: float, reach:
         reach: The most that a scene can be worse; None where nothing is known of it.
 
     Returns:
-        At least 1; None where the difference lies on the margin or more than `MOST_SCENES` would be needed.
+        At least 1; None where the difference lies on the margin or more than `MOST_SCENES` would be
+        needed.
     """
     needed = scenes_needed(abs(harm - margin), spread)
     if needed is not None and reach is not None:  # as many again as show that nothing was missed
-        unseen = scenes_without_event(abs(margin - harm), reach - harm if harm < margin else reach + harm)
+        unseen = scenes_without_event(
+            abs(margin - harm), reach - harm if harm < margin else reach + harm
+        )
         needed = None if unseen is None else max(needed, unseen)
     return None if needed is None else max(1, max(needed, LEAST_SCENES) - n_scenes)
 

@@ -1,4 +1,6 @@
-"""The page of one drive's cause, offline: what the policy saw, planned and said of itself, what was tried, what to ask next."""
+"""The page of one drive's cause, offline: what the policy saw, planned and said of itself, what was
+tried, what to ask next.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,8 @@ class Look:
         T_world_rig: ``(4, 4)``: where the ego was.
         speed_mps: Along the rig.
         route: ``(N, 2)`` metres, rig frame, as it was given; empty where that is not known.
-        plans: Behind each renderer at that pose: the plan and its samples, each ``(N, 2)`` metres, rig frame, every half second.
+        plans: Behind each renderer at that pose: the plan and its samples, each ``(N, 2)`` metres,
+            rig frame, every half second.
         frames: What each renderer showed of the first camera: time, and ``(H, W, 3)`` or its JPEG.
         debug: What the policy said of itself, `Plan.debug`.
     """
@@ -76,7 +79,8 @@ class Parting:
         kind: ``renderer`` or ``policy``.
         t_us: The first query at which they are apart; None: never.
         gap_m: How far apart they are then, or at most.
-        frames: The other's picture and the own one at that query, ``(H, W, 3)`` each; none of a policy, which sees the same.
+        frames: The other's picture and the own one at that query, ``(H, W, 3)`` each; none of a
+            policy, which sees the same.
     """
 
     name: str
@@ -94,9 +98,11 @@ class Cause:
         outcome: In words.
         failed_us: When it failed first; None where it did not.
         start_us: The first camera frame.
-        sentences: What was found, the surest first: how sure ("shown", "seen", "not found"), and what.
+        sentences: What was found, the surest first: how sure ("shown", "seen", "not found"), and
+            what.
         looks: Queries to show, in order of time.
-        tried: A row a change: what was changed, how far plans are from the recorded drive with it, how the drive ends with it.
+        tried: A row a change: what was changed, how far plans are from the recorded drive with it,
+            how the drive ends with it.
         depends: A row an input: what was done to it, whether the plans changed, by how much.
         partings: When plans part from others'.
         commands: What can be asked next: a key, what it shows, the command.
@@ -126,11 +132,16 @@ def write_cause(run: Run, cause: Cause) -> Path:
     rollout = cause.rollout
     path = run.folder / rollout.path / WHY_NAME
     report = "../" * len(Path(rollout.path).parts) + "report.html"
-    cell = cells_of(run, Wanted((rollout.scene,), (rollout.policy,), (rollout.seed,), (rollout.renderer,)))[0]
+    cell = cells_of(
+        run, Wanted((rollout.scene,), (rollout.policy,), (rollout.seed,), (rollout.renderer,))
+    )[0]
     logs = read_logs(run, cell)
     document = cell_data(run, cell, logs, None)
     place = Place(np.array(document.pop("origin")), document.pop("zero_us"))
-    document |= {"failed": None if cause.failed_us is None else place.ms([cause.failed_us])[0], "own": rollout.renderer}
+    document |= {
+        "failed": None if cause.failed_us is None else place.ms([cause.failed_us])[0],
+        "own": rollout.renderer,
+    }
     log = next(iter(logs.values()))
     camera = next(iter(log.info["cameras"]), None) if isinstance(log, RolloutLog) else None
     scale = 1.0 if camera is None else min(1.0, WIDTH_PX / camera.width)
@@ -152,24 +163,40 @@ def write_cause(run: Run, cause: Cause) -> Path:
 
 
 def _look(look: Look, place: Place, scale: float) -> dict[str, Any]:
-    """Return a query for the page: times in milliseconds, lines in world centimetres, pictures as JPEG."""
+    """Return a query for the page: times in milliseconds, lines in world centimetres, pictures as
+    JPEG.
+    """
 
     def line(xy: F64) -> list[list[int]]:
         """Return rig coordinates ``(N, 2)`` in world centimetres, without rows of NaN."""
         known = xy[np.isfinite(xy).all(axis=1)]
-        return place.cm(transform_points(look.T_world_rig, np.column_stack([known[:, :2], np.zeros(len(known))]))[:, :2])
+        return place.cm(
+            transform_points(
+                look.T_world_rig, np.column_stack([known[:, :2], np.zeros(len(known))])
+            )[:, :2]
+        )
 
     def picture(frame: U8 | bytes) -> str:
         if isinstance(frame, bytes) and scale == 1.0 and frame.startswith(JPEG_START):
             return base64.b64encode(frame).decode()
-        return jpeg(smaller(decode_image(frame, "a camera frame") if isinstance(frame, bytes) else frame, WIDTH_PX))
+        return jpeg(
+            smaller(
+                decode_image(frame, "a camera frame") if isinstance(frame, bytes) else frame,
+                WIDTH_PX,
+            )
+        )
 
     return {
         "t": place.ms([look.t_us])[0],
         "speed": round(look.speed_mps, 2),
         "route": line(look.route),
-        "plans": {name: {"lines": [line(one) for one in lines]} for name, lines in look.plans.items()},
-        "seen": {name: {"jpeg": picture(frame), "t": place.ms([t_us])[0]} for name, (t_us, frame) in look.frames.items()},
+        "plans": {
+            name: {"lines": [line(one) for one in lines]} for name, lines in look.plans.items()
+        },
+        "seen": {
+            name: {"jpeg": picture(frame), "t": place.ms([t_us])[0]}
+            for name, (t_us, frame) in look.frames.items()
+        },
         "said": said(look.debug, scale, line),
     }
 
@@ -178,8 +205,9 @@ def said(debug: Mapping[str, Any], scale: float, line: Any) -> dict[str, Any]:
     """Sort what a policy says of itself in ``Plan.debug`` by what it can be shown as.
 
     Args:
-        debug: By name. Pictures are ``(H, W, 3)`` uint8; heat maps ``(H, W)`` numbers, over the first camera's picture; ``boxes...`` are
-            ``(N, 4)`` pixels of it, x0 y0 x1 y1; ``line...`` are ``(N, 2)`` metres, rig frame. Numbers, words and short lists are text;
+        debug: By name. Pictures are ``(H, W, 3)`` uint8; heat maps ``(H, W)`` numbers, over the
+            first camera's picture; ``boxes...`` are ``(N, 4)`` pixels of it, x0 y0 x1 y1;
+            ``line...`` are ``(N, 2)`` metres, rig frame. Numbers, words and short lists are text;
             anything else is named with its type.
         scale: Of the page's picture against the camera's.
         line: Brings rig coordinates into the page's.
@@ -193,13 +221,21 @@ def said(debug: Mapping[str, Any], scale: float, line: Any) -> dict[str, Any]:
                 out["images"].append([str(name), jpeg(smaller(array, WIDTH_PX))])
                 continue
             if name.startswith("boxes") and array.ndim == 2 and array.shape[1] == 4:
-                out["boxes"] += [[str(name), *(round(float(v) * scale, 1) for v in row)] for row in array]
+                out["boxes"] += [
+                    [str(name), *(round(float(v) * scale, 1) for v in row)] for row in array
+                ]
                 continue
             if name.startswith("line") and array.ndim == 2 and array.shape[1] >= 2:
                 out["lines"].append([str(name), line(array[:, :2].astype(np.float64))])
                 continue
             if array.ndim == 2 and min(array.shape) >= 4 and np.isfinite(array).any():
-                out["heat"].append([str(name), heat_png(array), *(f"{v:.3g}" for v in (np.nanmin(array), np.nanmax(array)))])
+                out["heat"].append(
+                    [
+                        str(name),
+                        heat_png(array),
+                        *(f"{v:.3g}" for v in (np.nanmin(array), np.nanmax(array))),
+                    ]
+                )
                 continue
         out["text"].append([str(name), _words(value, array)])
     return out
@@ -212,22 +248,30 @@ def _words(value: Any, array: npt.NDArray[Any] | None) -> str:
         return str(value)[:300]
     if array is not None and array.dtype.kind in "fiubU" and array.size <= 12:
         return np.array2string(array, precision=3, separator=", ")
-    return f"not shown: {type(value).__name__}" + ("" if array is None else f" of shape {array.shape}")
+    return f"not shown: {type(value).__name__}" + (
+        "" if array is None else f" of shape {array.shape}"
+    )
 
 
 def heat_png(values: npt.NDArray[Any]) -> str:
-    """Return a heat map as PNG in base64: yellow where values are high, clear where they are low or missing."""
+    """Return a heat map as PNG in base64: yellow where values are high, clear where they are low or
+    missing.
+    """
     known = np.where(np.isfinite(values), values, np.nan).astype(np.float64)
     low, high = np.nanmin(known), np.nanmax(known)
     share = np.nan_to_num((known - low) / (high - low) if high > low else known * 0.0)
-    bgra = np.stack([40 * np.ones_like(share), 60 + 170 * share, 250 * np.ones_like(share), 200 * share], axis=2)
+    bgra = np.stack(
+        [40 * np.ones_like(share), 60 + 170 * share, 250 * np.ones_like(share), 200 * share], axis=2
+    )
     done, png = cv2.imencode(".png", bgra.astype(np.uint8))
     if not done:
-        raise InputError(DOING, f"heat map {values.shape}", "the encoder refused", "give a smaller one")
+        raise InputError(
+            DOING, f"heat map {values.shape}", "the encoder refused", "give a smaller one"
+        )
     return base64.b64encode(png.tobytes()).decode()
 
 
-# --- from a log alone -----------------------------------------------------------------------------------------------
+# --- from a log alone
 
 
 def failed_at(manifest: Mapping[str, Any]) -> int | None:
@@ -237,8 +281,14 @@ def failed_at(manifest: Mapping[str, Any]) -> int | None:
 
 
 def chosen(all_of: Sequence[Item], failed_us: int | None, times_us: Sequence[int]) -> list[Item]:
-    """Return at most `MOST_LOOKS` of what has these times: what lies before the failure, or an even choice."""
-    near = [one for one, t in zip(all_of, times_us, strict=True) if failed_us is None or failed_us - BEFORE_US <= t <= failed_us + AFTER_US]
+    """Return at most `MOST_LOOKS` of what has these times: what lies before the failure, or an even
+    choice.
+    """
+    near = [
+        one
+        for one, t in zip(all_of, times_us, strict=True)
+        if failed_us is None or failed_us - BEFORE_US <= t <= failed_us + AFTER_US
+    ]
     return near[::-1][:: -(-len(near) // MOST_LOOKS) or 1][::-1]
 
 
@@ -247,11 +297,16 @@ def looks_of(log: RolloutLog, renderer: str, failed_us: int | None) -> list[Look
     camera = next(iter(log.info["cameras"]), None)
     images = [image for image in log.images if camera is not None and image.camera == camera.name]
     ends, found = np.array([image.end_us for image in images]), []
-    moved = np.hypot(*np.gradient(log.ego.xyz[:, :2], (log.ego.t_us - log.ego.t_us[0]) * 1e-6, axis=0).T)
+    moved = np.hypot(
+        *np.gradient(log.ego.xyz[:, :2], (log.ego.t_us - log.ego.t_us[0]) * 1e-6, axis=0).T
+    )
     plans = [plan for plan in log.plans if len(plan.trajectory) > 1]
     for plan in chosen(plans, failed_us, [one.now_us for one in plans]):
         pose = interpolate(log.ego, [plan.now_us])[0] @ inverse(log.T_rig_box)
-        lines = [half_seconds(one.t_us, transform_points(inverse(pose), one.xyz)) for one in (plan.trajectory, *plan.samples[:MAX_SAMPLES])]
+        lines = [
+            half_seconds(one.t_us, transform_points(inverse(pose), one.xyz))
+            for one in (plan.trajectory, *plan.samples[:MAX_SAMPLES])
+        ]
         newest = int(np.searchsorted(ends, plan.now_us, "right")) - 1
         seen = {renderer: (images[newest].end_us, images[newest].data)} if newest >= 0 else {}
         speed = float(np.interp(plan.now_us, log.ego.t_us, moved))
@@ -274,10 +329,22 @@ def cause_of_log(run: Run, rollout: Rollout, told: Sequence[Mapping[str, Any]]) 
     partings = []
     for entry in told:
         kind = "renderer" if entry["baseline"] != rollout.renderer else "policy"
-        name = str(entry["baseline"]) if kind == "renderer" else str(entry["against"]).removeprefix(rollout.renderer + "/")
+        name = (
+            str(entry["baseline"])
+            if kind == "renderer"
+            else str(entry["against"]).removeprefix(rollout.renderer + "/")
+        )
         files = [run.folder / one for one in (entry.get("frames") or {}).values()]
-        frames = [decode_image(file.read_bytes(), str(file)) for file in files if kind == "renderer" and file.is_file()]
-        pair = (frames[0], frames[1]) if len(frames) == 2 and frames[0].shape == frames[1].shape else None
+        frames = [
+            decode_image(file.read_bytes(), str(file))
+            for file in files
+            if kind == "renderer" and file.is_file()
+        ]
+        pair = (
+            (frames[0], frames[1])
+            if len(frames) == 2 and frames[0].shape == frames[1].shape
+            else None
+        )
         if entry.get("t_us") is not None:
             partings.append(Parting(name, kind, int(entry["t_us"]), float(entry["gap_m"]), pair))
     return Cause(
@@ -299,8 +366,14 @@ def cause_of_log(run: Run, rollout: Rollout, told: Sequence[Mapping[str, Any]]) 
 
 
 def behind_others(run: Run, rollout: Rollout) -> list[tuple[str, str]]:
-    """Say behind which renderers of the run the same drive ends without an event: what they show differently is then what made it fail."""
-    same = [r for r in run.rollouts if (r.policy, r.scene, r.seed) == (rollout.policy, rollout.scene, rollout.seed)]
+    """Say behind which renderers of the run the same drive ends without an event: what they show
+    differently is then what made it fail.
+    """
+    same = [
+        r
+        for r in run.rollouts
+        if (r.policy, r.scene, r.seed) == (rollout.policy, rollout.scene, rollout.seed)
+    ]
     better = [r.renderer for r in same if r.ok and not outcomes_of(r)]
     if not better or not outcomes_of(rollout):
         return []
@@ -316,26 +389,49 @@ def _seen_before(run: Run, rollout: Rollout, failed_us: int | None) -> list[tupl
 def sentence(one: Parting, start_us: int) -> tuple[str, str]:
     """Say when plans part, and how sure that is."""
     if one.t_us is None:
-        return "seen", f"Plans never part from those of the {one.kind} {one.name}: they are the same within {one.gap_m:.2f} m."
+        return (
+            "seen",
+            f"Plans never part from those of the {one.kind} {one.name}: they are the same within {one.gap_m:.2f} m.",
+        )
     at_s = (one.t_us - start_us) * 1e-6
-    return "seen", f"Plans part from those of the {one.kind} {one.name} at {at_s:.1f} s, by {one.gap_m:.2f} m."
+    return (
+        "seen",
+        f"Plans part from those of the {one.kind} {one.name} at {at_s:.1f} s, by {one.gap_m:.2f} m.",
+    )
 
 
-def commands(run: Run, rollout: Rollout, start_us: int, failed_us: int | None, partings: Sequence[Parting]) -> list[tuple[str, str, str]]:
+def commands(
+    run: Run, rollout: Rollout, start_us: int, failed_us: int | None, partings: Sequence[Parting]
+) -> list[tuple[str, str, str]]:
     """Return what can be asked next: a key, what it shows, the command."""
     root, name = shlex.quote(str(run.folder)), shlex.quote(cell_name(*rollout.cell))
     parted = next((one.t_us for one in partings if one.t_us is not None), failed_us or start_us)
     own, at = rollout.renderer, max(0.0, (parted - start_us) * 1e-6)
-    other = next((one.name for one in partings if one.kind == "renderer"), "clean" if own != "clean" else "3dgs")
+    other = next(
+        (one.name for one in partings if one.kind == "renderer"),
+        "clean" if own != "clean" else "3dgs",
+    )
     return [
-        ("w", "try single changes of what the policy sees and answers", f"simrun why {shlex.quote(str(run.folder / rollout.path))}"),
-        ("f", f"drive on from there behind {other}", f"simrun fork {root} --cell {name} --at {at:.1f} --renderer {other}"),
-        ("p", "compare plans at the same poses", f"simrun probe {root} --cell {name} --renderers {other},{own}"),
+        (
+            "w",
+            "try single changes of what the policy sees and answers",
+            f"simrun why {shlex.quote(str(run.folder / rollout.path))}",
+        ),
+        (
+            "f",
+            f"drive on from there behind {other}",
+            f"simrun fork {root} --cell {name} --at {at:.1f} --renderer {other}",
+        ),
+        (
+            "p",
+            "compare plans at the same poses",
+            f"simrun probe {root} --cell {name} --renderers {other},{own}",
+        ),
         ("v", "watch the drive", f"simrun view {shlex.quote(str(run.folder / rollout.path))}"),
     ]
 
 
-# --- where plans part -----------------------------------------------------------------------------------------------
+# --- where plans part
 
 
 def most_different(one: U8, other: U8) -> tuple[int, int, int, int]:
@@ -351,13 +447,29 @@ def most_different(one: U8, other: U8) -> tuple[int, int, int, int]:
 
 def _parting(one: Parting, start_us: int) -> dict[str, Any]:
     at = None if one.t_us is None else (one.t_us - start_us) * 1e-6
-    entry: dict[str, Any] = {"name": one.name, "kind": one.kind, "at_s": at, "gap_m": one.gap_m, "pictures": []}
+    entry: dict[str, Any] = {
+        "name": one.name,
+        "kind": one.kind,
+        "at_s": at,
+        "gap_m": one.gap_m,
+        "pictures": [],
+    }
     if one.frames is not None:
         x, y, w, h = most_different(*one.frames)
         for rgb in one.frames:
             marked = rgb.copy()
-            cv2.rectangle(marked, (x, y), (x + w - 1, y + h - 1), (255, 210, 0), max(1, rgb.shape[1] // 200))
-            crop = cv2.resize(rgb[y : y + h, x : x + w], (w * 2, h * 2), interpolation=cv2.INTER_CUBIC)
-            entry["pictures"].append([jpeg(smaller(picture, WIDTH_PX)) for picture in (marked, crop)])
-        entry["levels"] = float(np.abs(np.subtract(*(f[y : y + h, x : x + w].astype(np.int16) for f in one.frames))).mean())
+            cv2.rectangle(
+                marked, (x, y), (x + w - 1, y + h - 1), (255, 210, 0), max(1, rgb.shape[1] // 200)
+            )
+            crop = cv2.resize(
+                rgb[y : y + h, x : x + w], (w * 2, h * 2), interpolation=cv2.INTER_CUBIC
+            )
+            entry["pictures"].append(
+                [jpeg(smaller(picture, WIDTH_PX)) for picture in (marked, crop)]
+            )
+        entry["levels"] = float(
+            np.abs(
+                np.subtract(*(f[y : y + h, x : x + w].astype(np.int16) for f in one.frames))
+            ).mean()
+        )
     return entry

@@ -1,4 +1,5 @@
-"""Which cells of a run a page replays, and what it replays of them as JSON: an index of the run, and one document for each cell.
+"""Which cells of a run a page replays, and what it replays of them as JSON: an index of the run,
+and one document for each cell.
 
 Changed outcomes come first, then events, then a few quiet ones, the most different drives first.
 """
@@ -23,8 +24,22 @@ from evaluators.metrics.outcomes import has_ended, in_words, outcomes_of
 from evaluators.opening import Run
 from evaluators.report.flips import FLIPS_NAME, Flip, baseline_of, find_flips, key_of_entry
 from evaluators.report.rollouts import clock_zero_us
-from evaluators.viewer.drive_data import Place, Tracks, drive_data, map_data, plans_part, recorded_drive
-from evaluators.viewer.pictures import NO_FRAMES, Fineness, encoded, frame_rows, sources, trust_by_time
+from evaluators.viewer.drive_data import (
+    Place,
+    Tracks,
+    drive_data,
+    map_data,
+    plans_part,
+    recorded_drive,
+)
+from evaluators.viewer.pictures import (
+    NO_FRAMES,
+    Fineness,
+    encoded,
+    frame_rows,
+    sources,
+    trust_by_time,
+)
 
 DOING, READING = "choosing rollouts to watch", "reading a rollout to watch"
 QUIET_CELLS = 3  # cells in which nothing happened, shown by default
@@ -35,7 +50,8 @@ ORDER: tuple[Interest, ...] = ("flip", "event", "failure", "quiet")
 
 @dataclass(frozen=True)
 class WatchedCell:
-    """The rollouts of one scene, policy and seed, one for each renderer, which are replayed side by side.
+    """The rollouts of one scene, policy and seed, one for each renderer, which are replayed side by
+    side.
 
     Attributes:
         policy: The policy; where policies stand side by side, their renderer.
@@ -59,12 +75,16 @@ class WatchedCell:
     @property
     def id(self) -> str:
         """Give a name for addresses and elements: letters and digits."""
-        return hashlib.sha256(repr((self.scene, self.policy, self.seed, self.take)).encode()).hexdigest()[:12]
+        return hashlib.sha256(
+            repr((self.scene, self.policy, self.seed, self.take)).encode()
+        ).hexdigest()[:12]
 
     @property
     def name(self) -> str:
         """Give the name for people."""
-        return f"{self.scene}, {self.policy}, seed {self.seed}" + (f", log {self.take + 1}" if self.take else "")
+        return f"{self.scene}, {self.policy}, seed {self.seed}" + (
+            f", log {self.take + 1}" if self.take else ""
+        )
 
     @property
     def interest(self) -> Interest:
@@ -77,7 +97,9 @@ class WatchedCell:
 
     @property
     def apart_m(self) -> float:
-        """Say how different the drives are: between the longest and the shortest, and the largest distance from the recorded path."""
+        """Say how different the drives are: between the longest and the shortest, and the largest
+        distance from the recorded path.
+        """
         driven = [m for r in self.rollouts if (m := r.metrics.get("dist_traveled_m")) is not None]
         aside = [m for r in self.rollouts if (m := r.metrics.get("lateral_distance_m")) is not None]
         return max(driven, default=0.0) - min(driven, default=0.0) + max(aside, default=0.0)
@@ -89,18 +111,29 @@ class WatchedCell:
 
     def outcomes(self) -> dict[str, str]:
         """Give the outcome of each rollout in words, by what it is called."""
-        failed = {self.side(r): f"failed: {r.failure_class or 'unknown'}" for r in self.rollouts if not has_ended(r)}
-        return {self.side(r): failed.get(self.side(r)) or in_words(outcomes_of(r)) for r in self.rollouts}
+        failed = {
+            self.side(r): f"failed: {r.failure_class or 'unknown'}"
+            for r in self.rollouts
+            if not has_ended(r)
+        }
+        return {
+            self.side(r): failed.get(self.side(r)) or in_words(outcomes_of(r))
+            for r in self.rollouts
+        }
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What was asked for; an empty tuple is everything. A scene may be named as when it was driven: smoke/curve is smoke-curve."""
+    """What was asked for; an empty tuple is everything. A scene may be named as when it was driven:
+    smoke/curve is smoke-curve.
+    """
 
     scenes: Annotated[tuple[str, ...], Flag("Scene to show. Repeatable.", "--scene")] = ()
     policies: Annotated[tuple[str, ...], Flag("Policy to show. Repeatable.", "--policy")] = ()
     seeds: Annotated[tuple[int, ...], Flag("Seed to show. Repeatable.", "--seed")] = ()
-    renderers: Annotated[tuple[str, ...], Flag("Renderer to show; all by default. Repeatable.", "--renderer")] = ()
+    renderers: Annotated[
+        tuple[str, ...], Flag("Renderer to show; all by default. Repeatable.", "--renderer")
+    ] = ()
 
     @property
     def is_all(self) -> bool:
@@ -118,7 +151,11 @@ def check_wanted(run: Run, wanted: Wanted) -> None:
         ("--scene", wanted.scenes, run.scenes),
         ("--policy", wanted.policies, run.policies),
         ("--renderer", wanted.renderers, run.renderers),
-        ("--seed", wanted.seeds, sorted({*(run.info.get("seeds") or ()), *(r.seed for r in run.rollouts)})),
+        (
+            "--seed",
+            wanted.seeds,
+            sorted({*(run.info.get("seeds") or ()), *(r.seed for r in run.rollouts)}),
+        ),
     ):
         strange = [one for one in asked if not _spellings(one) & {*known}]
         if strange:
@@ -142,29 +179,58 @@ def cells_of(run: Run, wanted: Wanted = Wanted(), arms: bool = False) -> list[Wa
     by_policy = arms and has_policies_alone(run)
     grouped: dict[tuple[str, str, int, int], list[Rollout]] = {}
     base = baseline_of(run)
-    rank = {name: i for i, name in enumerate(run.policies if by_policy else sorted(run.renderers, key=lambda name: name != base))}
+    rank = {
+        name: i
+        for i, name in enumerate(
+            run.policies if by_policy else sorted(run.renderers, key=lambda name: name != base)
+        )
+    }
     scene = {name: i for i, name in enumerate(run.scenes)}
     for rollout in sorted(
-        run.rollouts, key=lambda r: (scene[r.scene], *((r.seed, rank[r.policy]) if by_policy else (r.policy, r.seed, rank[r.renderer])))
+        run.rollouts,
+        key=lambda r: (
+            scene[r.scene],
+            *((r.seed, rank[r.policy]) if by_policy else (r.policy, r.seed, rank[r.renderer])),
+        ),
     ):
         if not _asked(rollout, wanted):
             continue
-        key, take = (rollout.scene, rollout.renderer if by_policy else rollout.policy, rollout.seed), 0
-        while any((r.renderer, r.policy) == (rollout.renderer, rollout.policy) for r in grouped.get((*key, take), ())):
+        key, take = (
+            (rollout.scene, rollout.renderer if by_policy else rollout.policy, rollout.seed),
+            0,
+        )
+        while any(
+            (r.renderer, r.policy) == (rollout.renderer, rollout.policy)
+            for r in grouped.get((*key, take), ())
+        ):
             take += 1
         grouped.setdefault((*key, take), []).append(rollout)
     flips: dict[tuple[str, str, int], list[Flip]] = {}
     for flip in find_flips(run)[0]:
-        inside = flip.base.renderer == flip.other.renderer if by_policy else flip.base.policy == flip.other.policy
-        if inside and _asked(flip.other, wanted):  # a cell shows one policy behind all renderers, or the other way round
+        inside = (
+            flip.base.renderer == flip.other.renderer
+            if by_policy
+            else flip.base.policy == flip.other.policy
+        )
+        if inside and _asked(
+            flip.other, wanted
+        ):  # a cell shows one policy behind all renderers, or the other way round
             fixed = flip.other.renderer if by_policy else flip.other.policy
             flips.setdefault((flip.other.scene, fixed, flip.other.seed), []).append(flip)
-    cells = [WatchedCell(*key, tuple(members), tuple(flips.get(key[:3], ())), by_policy) for key, members in grouped.items()]
-    return sorted(cells, key=lambda cell: (ORDER.index(cell.interest), -cell.apart_m))  # stable: equal ones stay in the run's order
+    cells = [
+        WatchedCell(*key, tuple(members), tuple(flips.get(key[:3], ())), by_policy)
+        for key, members in grouped.items()
+    ]
+    return sorted(
+        cells, key=lambda cell: (ORDER.index(cell.interest), -cell.apart_m)
+    )  # stable: equal ones stay in the run's order
 
 
-def shown_by_default(cells: Sequence[WatchedCell], wanted: Wanted, at_most: int | None) -> list[WatchedCell]:
-    """Return the cells that a page tries to hold: all that are telling and `QUIET_CELLS` others, or all that were asked for.
+def shown_by_default(
+    cells: Sequence[WatchedCell], wanted: Wanted, at_most: int | None
+) -> list[WatchedCell]:
+    """Return the cells that a page tries to hold: all that are telling and `QUIET_CELLS` others, or
+    all that were asked for.
 
     Args:
         cells: As `cells_of` returns them.
@@ -179,7 +245,9 @@ def shown_by_default(cells: Sequence[WatchedCell], wanted: Wanted, at_most: int 
     return watchable[:at_most]
 
 
-def telling(cells: Iterable[WatchedCell], kinds: Sequence[Interest] = ("flip",)) -> list[WatchedCell]:
+def telling(
+    cells: Iterable[WatchedCell], kinds: Sequence[Interest] = ("flip",)
+) -> list[WatchedCell]:
     """Return the watchable cells of some kinds."""
     return [cell for cell in cells if cell.interest in kinds and cell.watchable]
 
@@ -191,7 +259,9 @@ def _asked(rollout: Rollout, wanted: Wanted) -> bool:
         (rollout.seed, wanted.seeds),
         (rollout.renderer, wanted.renderers),
     )
-    return all(not asked or any(value in _spellings(one) for one in asked) for value, asked in pairs)
+    return all(
+        not asked or any(value in _spellings(one) for one in asked) for value, asked in pairs
+    )
 
 
 def _spellings(asked: object) -> set[object]:
@@ -199,18 +269,24 @@ def _spellings(asked: object) -> set[object]:
     return {asked, asked.replace("/", "-")} if isinstance(asked, str) else {asked}
 
 
-Logs = Mapping[str, RolloutLog | SimrunError | None]  # folder of a rollout -> its log, or why it cannot be read
+Logs = Mapping[
+    str, RolloutLog | SimrunError | None
+]  # folder of a rollout -> its log, or why it cannot be read
 
 
 def read_logs(run: Run, cell: WatchedCell) -> Logs:
-    """Read the logs of a cell's finished rollouts: their own, or those that they were scored from; None where neither is there."""
+    """Read the logs of a cell's finished rollouts: their own, or those that they were scored from;
+    None where neither is there.
+    """
     return {rollout.path: _read_log(run, rollout) for rollout in cell.rollouts if rollout.ok}
 
 
 def _read_log(run: Run, rollout: Rollout) -> RolloutLog | SimrunError | None:
     path = run.file_of(rollout, LOG_NAME)
     if path is None:
-        stated = run.manifest(rollout).get("log")  # as it was named to simrun score, so from the same working directory
+        stated = run.manifest(rollout).get(
+            "log"
+        )  # as it was named to simrun score, so from the same working directory
         path = None if stated is None else Path(str(stated))
     try:
         return read_log(path) if path is not None and path.is_file() else None
@@ -219,7 +295,9 @@ def _read_log(run: Run, rollout: Rollout) -> RolloutLog | SimrunError | None:
 
 
 def read_log(path: Path) -> RolloutLog:
-    """Read a log, or return what was read of it a moment ago: flips share their baseline's, and pages show what flips were found in."""
+    """Read a log, or return what was read of it a moment ago: flips share their baseline's, and
+    pages show what flips were found in.
+    """
     return _log_as_of(path, path.stat().st_mtime_ns if path.exists() else 0)
 
 
@@ -228,7 +306,9 @@ def _log_as_of(path: Path, mtime_ns: int) -> RolloutLog:
     return read_asl(path)
 
 
-def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, camera: str | None = None) -> dict[str, Any]:
+def cell_data(
+    run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, camera: str | None = None
+) -> dict[str, Any]:
     """Return everything that a page shows of a cell.
 
     Args:
@@ -244,33 +324,49 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, ca
     content = run.scene_data(cell.scene)
     if content is None:
         found = f"no file of scene {cell.scene} in {run.folder / 'scenes'}"
-        raise InputError(READING, cell.name, found, "make the run again; runs of earlier versions kept no maps")
+        raise InputError(
+            READING, cell.name, found, "make the run again; runs of earlier versions kept no maps"
+        )
     recorded = recorded_drive(content, cell.scene)
     place = Place(recorded[0], clock_zero_us(content, _first_us(run, cell, logs)))
     tracks = Tracks()
     drives: list[dict[str, Any]] = []
     for rollout in cell.rollouts:
         if not rollout.ok:
-            drives.append({"renderer": cell.side(rollout), "failed": f"{rollout.failure_class}: {rollout.failure}"})
+            drives.append(
+                {
+                    "renderer": cell.side(rollout),
+                    "failed": f"{rollout.failure_class}: {rollout.failure}",
+                }
+            )
             continue
         log = logs[rollout.path]
         if isinstance(log, SimrunError):
-            drives.append({"renderer": cell.side(rollout), "failed": f"its log cannot be read: {log.found}"})
+            drives.append(
+                {"renderer": cell.side(rollout), "failed": f"its log cannot be read: {log.found}"}
+            )
             continue
         facts = frame_rows(run, rollout)
-        drive = {"renderer": cell.side(rollout)} | drive_data(run, rollout, log, content, place, tracks, facts)
+        drive = {"renderer": cell.side(rollout)} | drive_data(
+            run, rollout, log, content, place, tracks, facts
+        )
         drive |= {"why": run.href(rollout, WHY_NAME) or ""}
         if fine is not None:
             kept = [one for one in sources(run, rollout, log) if camera in (None, one.camera)]
             drive["cameras"] = [encoded(one, fine, place.zero_us) for one in kept]
             known = {} if log is None else {camera.name: camera for camera in log.info["cameras"]}
             for one in drive["cameras"]:
-                trusted = {place.ms([t_us])[0]: text for t_us, text in trust_by_time(facts, one["name"]).items()}
+                trusted = {
+                    place.ms([t_us])[0]: text
+                    for t_us, text in trust_by_time(facts, one["name"]).items()
+                }
                 if trusted:
                     one["trust"] = [trusted.get(t, "") for t in one["t"]]
                 if one["name"] in known:
                     one["lens"] = lens_data(known[one["name"]], one["width"])
-            drive["no_frames"] = "" if kept else no_frames(run.manifest(rollout), log is not None, camera)
+            drive["no_frames"] = (
+                "" if kept else no_frames(run.manifest(rollout), log is not None, camera)
+            )
         drives.append(drive)
     ends = [drive["ego"]["t"][-1] for drive in drives if "ego" in drive]
     return {
@@ -287,7 +383,9 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, ca
 
 
 def lens_data(camera: CameraSpec, width_px: int) -> dict[str, Any]:
-    """Return what projects rig coordinates into a picture of at most this width: fx, fy, cx, cy, and the mounting, 3 rows of 4."""
+    """Return what projects rig coordinates into a picture of at most this width: fx, fy, cx, cy,
+    and the mounting, 3 rows of 4.
+    """
     scale = min(1.0, width_px / camera.width)
     k = [round(float(camera.K[at]) * scale, 3) for at in ((0, 0), (1, 1), (0, 2), (1, 2))]
     return {"k": k, "T": camera.T_rig_camera[:3].round(5).ravel().tolist()}
@@ -296,7 +394,11 @@ def lens_data(camera: CameraSpec, width_px: int) -> dict[str, Any]:
 def _first_us(run: Run, cell: WatchedCell, logs: Logs) -> int:
     """Return the time of a cell's first logged pose."""
     firsts = [int(log.ego.t_us[0]) for log in logs.values() if isinstance(log, RolloutLog)]
-    tables = (run.steps_of(rollout)["t_us"] for rollout in cell.rollouts if logs.get(rollout.path, "") is None)
+    tables = (
+        run.steps_of(rollout)["t_us"]
+        for rollout in cell.rollouts
+        if logs.get(rollout.path, "") is None
+    )
     return min([*firsts, *(min(t.to_pylist()) for t in tables if len(t))], default=0)
 
 
@@ -307,26 +409,38 @@ def no_frames(manifest: Mapping[str, Any], has_log: bool, camera: str | None) ->
     return NO_FRAMES if camera is None else f"This rollout has no frames of a camera {camera}."
 
 
-def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCell], state: Mapping[str, Any]) -> dict[str, Any]:
+def index_data(
+    run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCell], state: Mapping[str, Any]
+) -> dict[str, Any]:
     """Return what a page must know before it shows a cell.
 
     Args:
         run: The run.
         cells: All cells that were asked for, the most telling first.
         here: Those whose documents the page has or can get.
-        state: ``live``, ``notes`` (what was left out, one sentence each), ``report`` (its address, or "") and, of a run that goes on,
-            ``done`` and ``planned``.
+        state: ``live``, ``notes`` (what was left out, one sentence each), ``report`` (its address,
+            or "") and, of a run that goes on, ``done`` and ``planned``.
     """
     ids, by_policy = {cell.id for cell in here}, any(cell.by_policy for cell in cells)
-    units = {name: facts for table in (run.summary.get("metrics") or {}).values() for name, facts in table.items()}
+    units = {
+        name: facts
+        for table in (run.summary.get("metrics") or {}).values()
+        for name, facts in table.items()
+    }
     metrics = {}
     for name in run.table.ordered({*run.table, *units}):
         metric, stated = run.table.shown(name), units.get(name) or {}
-        metrics[name] = {"unit": metric.unit or str(stated.get("unit") or ""), "help": metric.help, "flag": metric.is_flag}
+        metrics[name] = {
+            "unit": metric.unit or str(stated.get("unit") or ""),
+            "help": metric.help,
+            "flag": metric.is_flag,
+        }
     return {
         "run": run.folder.resolve().name,
         "renderers": run.policies if by_policy else run.renderers,
-        "baseline": next((cell.side(flip.base) for cell in cells for flip in cell.flips), baseline_of(run)),
+        "baseline": next(
+            (cell.side(flip.base) for cell in cells for flip in cell.flips), baseline_of(run)
+        ),
         "first_curves": run.table.first_curves(),
         "metrics": metrics,
         "cells": [
@@ -338,7 +452,15 @@ def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCel
                 "take": cell.take,
                 "interest": cell.interest,
                 "outcomes": cell.outcomes(),
-                "flips": [{"renderer": cell.side(flip.other), "was": flip.was, "now": flip.now, "tone": flip.tone} for flip in cell.flips],
+                "flips": [
+                    {
+                        "renderer": cell.side(flip.other),
+                        "was": flip.was,
+                        "now": flip.now,
+                        "tone": flip.tone,
+                    }
+                    for flip in cell.flips
+                ],
                 "here": cell.id in ids,
             }
             for cell in cells

@@ -1,4 +1,6 @@
-"""Numbers of a page in whole centimetres, milliseconds and milliradians: the map of a scene, and what moves and happens in a rollout."""
+"""Numbers of a page in whole centimetres, milliseconds and milliradians: the map of a scene, and
+what moves and happens in a rollout.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,8 @@ class Place:
 
     Attributes:
         origin: ``(2,)`` metres, world: the first point of the recorded drive.
-        zero_us: The first camera frame (`evaluators.report.events.clock_zero_us`), on the scene's clock.
+        zero_us: The first camera frame (`evaluators.report.events.clock_zero_us`), on the scene's
+            clock.
     """
 
     origin: F64
@@ -39,23 +42,36 @@ class Place:
 
     def cm(self, xy: npt.ArrayLike) -> list[list[int]]:
         """Return ``(N, 2)`` world metres as x and y in whole centimetres."""
-        scaled = np.rint((np.asarray(xy, dtype=np.float64).reshape(-1, 2) - self.origin) * 100.0).astype(int)
+        scaled = np.rint(
+            (np.asarray(xy, dtype=np.float64).reshape(-1, 2) - self.origin) * 100.0
+        ).astype(int)
         return [scaled[:, 0].tolist(), scaled[:, 1].tolist()]
 
     def ms(self, t_us: I64 | Sequence[int]) -> list[int]:
         """Return times ``(N,)`` in whole milliseconds."""
-        ms: list[int] = np.rint((np.asarray(t_us, dtype=np.int64) - self.zero_us) / 1000.0).astype(int).tolist()
+        ms: list[int] = (
+            np.rint((np.asarray(t_us, dtype=np.int64) - self.zero_us) / 1000.0).astype(int).tolist()
+        )
         return ms
 
     def track(self, trajectory: Trajectory) -> dict[str, list[int]]:
-        """Return a trajectory as t (ms), x, y (cm) and a (heading, mrad; continuous, so that it can be interpolated)."""
+        """Return a trajectory as t (ms), x, y (cm) and a (heading, mrad; continuous, so that it can
+        be interpolated).
+        """
         x, y = self.cm(trajectory.xyz[:, :2])
-        return {"t": self.ms(trajectory.t_us), "x": x, "y": y, "a": mrad(yaw_from_quat(trajectory.quat))}
+        return {
+            "t": self.ms(trajectory.t_us),
+            "x": x,
+            "y": y,
+            "a": mrad(yaw_from_quat(trajectory.quat)),
+        }
 
 
 def mrad(yaw: npt.ArrayLike) -> list[int]:
     """Return headings ``(N,)`` in radians as continuous whole milliradians."""
-    out: list[int] = np.rint(np.unwrap(np.asarray(yaw, dtype=np.float64)) * 1000.0).astype(int).tolist()
+    out: list[int] = (
+        np.rint(np.unwrap(np.asarray(yaw, dtype=np.float64)) * 1000.0).astype(int).tolist()
+    )
     return out
 
 
@@ -81,12 +97,15 @@ def recorded_drive(content: Mapping[str, Any], scene: str) -> F64:
     """
     log = np.column_stack([content["ego_log"]["x_m"], content["ego_log"]["y_m"]]).astype(np.float64)
     if len(log) < 2:
-        raise InputError("drawing a scene", scene, f"a recorded drive of {len(log)} points", "make the run again")
+        raise InputError(
+            "drawing a scene", scene, f"a recorded drive of {len(log)} points", "make the run again"
+        )
     return log
 
 
 def drawn_map(content: Mapping[str, Any]) -> dict[str, list[F64]]:
-    """Return what every view from above draws of a map, as the report's does: ``lanes``, ``paint``, ``edges`` and ``crosswalks``.
+    """Return what every view from above draws of a map, as the report's does: ``lanes``, ``paint``,
+    ``edges`` and ``crosswalks``.
 
     Args:
         content: ``scenes/SCENE.json``.
@@ -98,7 +117,11 @@ def drawn_map(content: Mapping[str, Any]) -> dict[str, list[F64]]:
 
     def arrays(lines: Sequence[Any], least: int) -> list[F64]:
         """Return the lines of at least so many points."""
-        return [np.asarray(line, dtype=np.float64)[:, :2] for line in lines if line is not None and len(line) >= least]
+        return [
+            np.asarray(line, dtype=np.float64)[:, :2]
+            for line in lines
+            if line is not None and len(line) >= least
+        ]
 
     return {
         "lanes": arrays([lane_ring(lane) for lane in lanes], 3),
@@ -120,12 +143,21 @@ def map_data(content: Mapping[str, Any], log: F64, place: Place) -> dict[str, An
 
     def near(lines: Sequence[F64]) -> list[list[list[int]]]:
         """Simplify the lines that come near."""
-        shapes = shapely.simplify([shapely.linestrings(line) for line in lines], TOLERANCE_M, preserve_topology=False)
-        kept = {shape.wkb: shape for shape in shapes if window.intersects(shape)}  # a border shared by two lanes is drawn once
+        shapes = shapely.simplify(
+            [shapely.linestrings(line) for line in lines], TOLERANCE_M, preserve_topology=False
+        )
+        kept = {
+            shape.wkb: shape for shape in shapes if window.intersects(shape)
+        }  # a border shared by two lanes is drawn once
         return [place.cm(shapely.get_coordinates(shape)) for shape in kept.values()]
 
     lines = {kind: near(some) for kind, some in drawn_map(content).items()}
-    return {"turn": round(chord_angle(log), 4), **lines, "log": place.cm(log), "source": str(content.get("source") or "")}
+    return {
+        "turn": round(chord_angle(log), 4),
+        **lines,
+        "log": place.cm(log),
+        "source": str(content.get("source") or ""),
+    }
 
 
 PLAN_STEP_US = 500_000
@@ -152,14 +184,21 @@ class Tracks:
 
 
 def drive_data(
-    run: Run, rollout: Rollout, log: RolloutLog | None, content: Mapping[str, Any], place: Place, tracks: Tracks, frames: Rows
+    run: Run,
+    rollout: Rollout,
+    log: RolloutLog | None,
+    content: Mapping[str, Any],
+    place: Place,
+    tracks: Tracks,
+    frames: Rows,
 ) -> dict[str, Any]:
     """Return what a page draws of a rollout, without its camera frames.
 
     Args:
         run: The run.
         rollout: One that ran to its end.
-        log: Its log; None where the run folder has none: then nothing is planned and road users go as recorded.
+        log: Its log; None where the run folder has none: then nothing is planned and road users go
+            as recorded.
         content: ``scenes/SCENE.json``.
         place: Where numbers count from.
         tracks: Gets the ways of the road users.
@@ -180,50 +219,102 @@ def drive_data(
     }
 
 
-def _ego(log: RolloutLog | None, steps: pa.Table, content: Mapping[str, Any], place: Place) -> tuple[dict[str, list[int]], F64]:
+def _ego(
+    log: RolloutLog | None, steps: pa.Table, content: Mapping[str, Any], place: Place
+) -> tuple[dict[str, list[int]], F64]:
     """Return the way of the ego's box centre, and its length and width in metres."""
     if log is not None:
         return place.track(log.ego), np.array([log.ego_box.length_m, log.ego_box.width_m])
     vehicle = content.get("vehicle") or {}
-    own = next(iter(series_by_cell(steps.filter(pc.is_in(steps["metric"], pa.array(POSE_SERIES)))).values()), {}) if len(steps) else {}
+    own = (
+        next(
+            iter(
+                series_by_cell(
+                    steps.filter(pc.is_in(steps["metric"], pa.array(POSE_SERIES)))
+                ).values()
+            ),
+            {},
+        )
+        if len(steps)
+        else {}
+    )
     if any(name not in own for name in POSE_SERIES) or "length_m" not in vehicle:
-        raise InputError("reading a rollout to watch", "the table of steps", "neither a log nor the ego's poses", "run it again")
+        raise InputError(
+            "reading a rollout to watch",
+            "the table of steps",
+            "neither a log nor the ego's poses",
+            "run it again",
+        )
     (t_us, x), (_, y), (_, yaw) = (own[name] for name in POSE_SERIES)
     ahead_m = float(vehicle["rear_axle_to_centre_m"])
     x_cm, y_cm = place.cm(np.stack([x + ahead_m * np.cos(yaw), y + ahead_m * np.sin(yaw)], axis=1))
-    return {"t": place.ms(t_us), "x": x_cm, "y": y_cm, "a": mrad(yaw)}, np.array([vehicle["length_m"], vehicle["width_m"]])
+    return {"t": place.ms(t_us), "x": x_cm, "y": y_cm, "a": mrad(yaw)}, np.array(
+        [vehicle["length_m"], vehicle["width_m"]]
+    )
 
 
-def _road_users(log: RolloutLog | None, content: Mapping[str, Any], place: Place, tracks: Tracks) -> list[int]:
+def _road_users(
+    log: RolloutLog | None, content: Mapping[str, Any], place: Place, tracks: Tracks
+) -> list[int]:
     if log is not None:
-        boxes = {a.actor_id: (a.box.length_m, a.box.width_m, a.box.height_m) for a in log.actors.values()}
-        return [tracks.add(_user(a.actor_id, a.label, boxes[a.actor_id], place.track(a.track))) for a in log.actors.values()]
+        boxes = {
+            a.actor_id: (a.box.length_m, a.box.width_m, a.box.height_m) for a in log.actors.values()
+        }
+        return [
+            tracks.add(_user(a.actor_id, a.label, boxes[a.actor_id], place.track(a.track)))
+            for a in log.actors.values()
+        ]
     found = []
     for actor in content.get("actors") or []:
         if actor.get("x_m") and actor.get("length_m"):
             x, y = place.cm(np.column_stack([actor["x_m"], actor["y_m"]]))
             way = {"t": place.ms(actor["t_us"]), "x": x, "y": y, "a": mrad(actor["yaw_rad"])}
-            found.append(tracks.add(_user(actor.get("id") or "", actor.get("label") or "", (actor["length_m"], actor["width_m"]), way)))
+            found.append(
+                tracks.add(
+                    _user(
+                        actor.get("id") or "",
+                        actor.get("label") or "",
+                        (actor["length_m"], actor["width_m"]),
+                        way,
+                    )
+                )
+            )
     return found
 
 
-def _user(name: str, label: str, size_m: tuple[float, ...], way: dict[str, list[int]]) -> dict[str, Any]:
-    if len({*zip(way["x"], way["y"], way["a"], strict=True)}) == 1:  # it stands: two poses say when it is there
+def _user(
+    name: str, label: str, size_m: tuple[float, ...], way: dict[str, list[int]]
+) -> dict[str, Any]:
+    if (
+        len({*zip(way["x"], way["y"], way["a"], strict=True)}) == 1
+    ):  # it stands: two poses say when it is there
         way = {key: [values[0], values[-1]] for key, values in way.items()}
-    return {"id": name, "label": label or "other", "size": [round(100 * side) for side in size_m], **way}
+    return {
+        "id": name,
+        "label": label or "other",
+        "size": [round(100 * side) for side in size_m],
+        **way,
+    }
 
 
 def _plan(plan: LoggedPlan, place: Place) -> dict[str, Any]:
     """Return a plan and its samples, every half second: points from now on."""
     lines = []
     for line in (plan.trajectory, *plan.samples[:MAX_SAMPLES]):
-        times = np.arange(line.t_us[0], line.t_us[-1] + 1, PLAN_STEP_US) if len(line) else np.empty(0)
-        lines.append(place.cm(np.stack([np.interp(times, line.t_us, line.xyz[:, k]) for k in (0, 1)], axis=1)))
+        times = (
+            np.arange(line.t_us[0], line.t_us[-1] + 1, PLAN_STEP_US) if len(line) else np.empty(0)
+        )
+        lines.append(
+            place.cm(
+                np.stack([np.interp(times, line.t_us, line.xyz[:, k]) for k in (0, 1)], axis=1)
+            )
+        )
     return {"t": round((plan.now_us - place.zero_us) / 1000), "lines": lines}
 
 
 def curves(steps: pa.Table, place: Place) -> dict[str, Any]:
-    """Return every metric over time: t (ms), v (null where invalid), and why it is invalid where it is.
+    """Return every metric over time: t (ms), v (null where invalid), and why it is invalid where it
+    is.
 
     Args:
         steps: As `Run.steps_of` returns them.
@@ -243,15 +334,23 @@ def curves(steps: pa.Table, place: Place) -> dict[str, Any]:
             continue
         here = slice(start, stop)
         why = list(dict.fromkeys(str(text) for text in reason[here] if text))
-        out[str(names[start])] = {"t": place.ms(t_us[here]), "v": rounded(value[here])} | ({"why": "; ".join(why)} if why else {})
+        out[str(names[start])] = {"t": place.ms(t_us[here]), "v": rounded(value[here])} | (
+            {"why": "; ".join(why)} if why else {}
+        )
     return out
 
 
-def moments(rollout: Rollout, steps: pa.Table, manifest: Mapping[str, Any], place: Place, frames: Rows) -> list[dict[str, Any]]:
-    """List what happened when: counted collisions and departures from the road, and frames that a guard replaced or named."""
+def moments(
+    rollout: Rollout, steps: pa.Table, manifest: Mapping[str, Any], place: Place, frames: Rows
+) -> list[dict[str, Any]]:
+    """List what happened when: counted collisions and departures from the road, and frames that a
+    guard replaced or named.
+    """
     known = steps.filter(pc.is_in(steps["metric"], pa.array(SERIES))) if steps.num_rows else steps
     series = series_by_cell(known)
-    first_us = min((int(t[0]) for own in series.values() for t, _ in own.values()), default=place.zero_us)
+    first_us = min(
+        (int(t[0]) for own in series.values() for t, _ in own.values()), default=place.zero_us
+    )
     found: list[dict[str, Any]] = []
     for event in events_of(rollout, series):
         ms = None if event.t_us is None else round((event.t_us - place.zero_us) / 1000)
@@ -265,12 +364,18 @@ def _with_whom(event: Event, manifest: Mapping[str, Any], first_us: int) -> str:
     if event.kind != "collision" or event.t_us is None:
         return ""
     at_s = (event.t_us - first_us) * 1e-6
-    near = [c for c in manifest.get("contacts") or [] if abs(float(c["t_s"]) - at_s) <= CONTACT_TOLERANCE_S]
+    near = [
+        c
+        for c in manifest.get("contacts") or []
+        if abs(float(c["t_s"]) - at_s) <= CONTACT_TOLERANCE_S
+    ]
     return f" with {near[0]['actor_id']}" if near else ""
 
 
 def _frame_events(frames: Rows, place: Place) -> list[dict[str, Any]]:
-    """Return when an event of the frames began, such as a fixer's frame that was replaced; one that goes on is told once."""
+    """Return when an event of the frames began, such as a fixer's frame that was replaced; one that
+    goes on is told once.
+    """
     found: list[dict[str, Any]] = []
     before: set[str] = set()
     for row in frames:
@@ -278,13 +383,20 @@ def _frame_events(frames: Rows, place: Place) -> list[dict[str, Any]]:
         t_us = row.get("t_us")
         if isinstance(t_us, int):
             t_ms = round((t_us - place.zero_us) / 1000)
-            found += [{"t": t_ms, "kind": "frame", "text": f"frame: {name}"} for name in sorted(now - before)]
+            found += [
+                {"t": t_ms, "kind": "frame", "text": f"frame: {name}"}
+                for name in sorted(now - before)
+            ]
         before = now
     return found[:MAX_FRAME_EVENTS]
 
 
-def plans_part(flips: Sequence[Mapping[str, Any]], place: Place, by_policy: bool) -> list[dict[str, Any]]:
-    """Return when plans first diverged, of entries of ``flips.json``; ``by_policy`` as in `WatchedCell`."""
+def plans_part(
+    flips: Sequence[Mapping[str, Any]], place: Place, by_policy: bool
+) -> list[dict[str, Any]]:
+    """Return when plans first diverged, of entries of ``flips.json``; ``by_policy`` as in
+    `WatchedCell`.
+    """
 
     def sides(entry: Mapping[str, Any]) -> tuple[str, str]:
         """Return what the two are called."""

@@ -1,4 +1,6 @@
-"""The page: one HTML file without outside requests that holds cells as far as its size allows, or the shell that a server fills."""
+"""The page: one HTML file without outside requests that holds cells as far as its size allows, or
+the shell that a server fills.
+"""
 
 from __future__ import annotations
 
@@ -54,10 +56,14 @@ class Fitted:
     too_many: tuple[WatchedCell, ...]
 
 
-def fit(run: Run, cells: Sequence[WatchedCell], budget_bytes: int, wanted: Fineness, camera: str | None) -> Fitted:
-    """Choose how finely frames are kept, and how many cells there is room for; the first cell is always kept.
+def fit(
+    run: Run, cells: Sequence[WatchedCell], budget_bytes: int, wanted: Fineness, camera: str | None
+) -> Fitted:
+    """Choose how finely frames are kept, and how many cells there is room for; the first cell is
+    always kept.
 
-    Frames are thinned out evenly, down to every `MOST_STRIDE`-th, before cells are left out from the end.
+    Frames are thinned out evenly, down to every `MOST_STRIDE`-th, before cells are left out from
+    the end.
 
     Args:
         run: The run.
@@ -79,13 +85,24 @@ def fit(run: Run, cells: Sequence[WatchedCell], budget_bytes: int, wanted: Finen
     factor = next((factor for factor in factors if used[factor] <= budget_bytes), factors[-1])
     fine = replace(wanted, stride=wanted.stride * factor)
     kept = len(made)
-    return Fitted(tuple(cells[:kept]), tuple(as_json(thinned(one, factor)) for one in made), fine, tuple(cells[kept:]))
+    return Fitted(
+        tuple(cells[:kept]),
+        tuple(as_json(thinned(one, factor)) for one in made),
+        fine,
+        tuple(cells[kept:]),
+    )
 
 
 def thinned(document: Mapping[str, Any], factor: int) -> dict[str, Any]:
     """Return a cell's document with every factor-th camera frame alone."""
     drives = [
-        {**drive, "cameras": [{**one, "t": one["t"][::factor], "jpeg": one["jpeg"][::factor]} for one in drive["cameras"]]}
+        {
+            **drive,
+            "cameras": [
+                {**one, "t": one["t"][::factor], "jpeg": one["jpeg"][::factor]}
+                for one in drive["cameras"]
+            ],
+        }
         if "cameras" in drive
         else drive
         for drive in document["drives"]
@@ -94,13 +111,16 @@ def thinned(document: Mapping[str, Any], factor: int) -> dict[str, Any]:
 
 
 def as_json(value: Any) -> str:
-    """Write compact JSON that can stand in a script element: nothing in it can end the element or begin another.
+    """Write compact JSON that can stand in a script element: nothing in it can end the element or
+    begin another.
 
     Example:
         >>> as_json({"scene": "</script><!--"})
         '{"scene":"\\\\u003c/script\\\\u003e\\\\u003c!--"}'
     """
-    text = json.dumps(value, separators=(",", ":"), allow_nan=False)  # ASCII: line separators of JavaScript are escaped too
+    text = json.dumps(
+        value, separators=(",", ":"), allow_nan=False
+    )  # ASCII: line separators of JavaScript are escaped too
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
@@ -113,7 +133,16 @@ def names(cells: Iterable[WatchedCell], at_most: int = 12) -> str:
 
 MB = 1_000_000
 DEFAULT_MB = 15.0  # megabytes, not mebibytes
-SCRIPTS = ("theme.js", "timeline.js", "overlay.js", "cameras.js", "birdseye.js", "curves.js", "moments.js", "player.js")
+SCRIPTS = (
+    "theme.js",
+    "timeline.js",
+    "overlay.js",
+    "cameras.js",
+    "birdseye.js",
+    "curves.js",
+    "moments.js",
+    "player.js",
+)
 STYLES = ("theme.css", "viewer.css")
 
 
@@ -141,7 +170,13 @@ class Page:
     notes: tuple[str, ...]
 
 
-def make_page(run: Run, cells: Sequence[WatchedCell], shown: Sequence[WatchedCell], options: Options, report: str = "") -> Page:
+def make_page(
+    run: Run,
+    cells: Sequence[WatchedCell],
+    shown: Sequence[WatchedCell],
+    options: Options,
+    report: str = "",
+) -> Page:
     """Return an offline page.
 
     Args:
@@ -154,7 +189,11 @@ def make_page(run: Run, cells: Sequence[WatchedCell], shown: Sequence[WatchedCel
     Raises:
         InputError: A rollout's files are damaged.
     """
-    shell = len(render(as_json(index_data(run, cells, (), {"live": False, "notes": [], "report": report})), {}))
+    shell = len(
+        render(
+            as_json(index_data(run, cells, (), {"live": False, "notes": [], "report": report})), {}
+        )
+    )
     fitted = fit(run, shown, options.max_bytes - shell - NOTES_BYTES, options.fine, options.camera)
     notes = _notes(cells, shown, fitted.too_many, fitted.fine)
     index = index_data(run, cells, fitted.cells, {"live": False, "notes": notes, "report": report})
@@ -176,10 +215,17 @@ def render(index: str, documents: Mapping[str, str], live: bool = False) -> str:
 
 def fill(template: str, scripts: Sequence[str], styles: Sequence[str], **values: Any) -> str:
     """Fill a template of a page that holds its scripts and styles and allows no others."""
-    environment = environment_of("evaluators.viewer", "evaluators.report")  # colours are the report's
+    environment = environment_of(
+        "evaluators.viewer", "evaluators.report"
+    )  # colours are the report's
     script = "\n".join(asset(environment, name) for name in scripts)
     style = "\n".join(asset(environment, name) for name in styles)
-    own = {"style": Markup(style), "style_hash": _sha256(style), "script": Markup(script), "script_hash": _sha256(script)}
+    own = {
+        "style": Markup(style),
+        "style_hash": _sha256(style),
+        "script": Markup(script),
+        "script_hash": _sha256(script),
+    }
     return environment.get_template(template).render(**own, **values)
 
 
@@ -187,22 +233,37 @@ def _sha256(text: str) -> str:
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
-def _notes(cells: Sequence[WatchedCell], shown: Sequence[WatchedCell], too_many: Sequence[WatchedCell], fine: Fineness) -> list[str]:
+def _notes(
+    cells: Sequence[WatchedCell],
+    shown: Sequence[WatchedCell],
+    too_many: Sequence[WatchedCell],
+    fine: Fineness,
+) -> list[str]:
     """Say what the page does not hold, one sentence each."""
     ids = {cell.id for cell in shown}
     left = [cell for cell in cells if cell.id not in ids and cell.watchable]
     failed = [cell for cell in cells if not cell.watchable]
     notes = []
     if too_many:
-        notes.append(f"No room for {plural(len(too_many), 'cell')}: {names(too_many)}. --max-mb makes room.")
+        notes.append(
+            f"No room for {plural(len(too_many), 'cell')}: {names(too_many)}. --max-mb makes room."
+        )
     if left:
-        what = "in which nothing happened" if all(cell.interest == "quiet" for cell in left) else "not chosen"
+        what = (
+            "in which nothing happened"
+            if all(cell.interest == "quiet" for cell in left)
+            else "not chosen"
+        )
         how = "--scene, --policy and --seed choose, --cells sets how many."
         notes.append(f"{plural(len(left), 'cell')} {what} left out: {names(left)}. {how}")
     if failed:
-        notes.append(f"Nothing to see of {plural(len(failed), 'cell')} in which every rollout failed: {names(failed)}.")
+        notes.append(
+            f"Nothing to see of {plural(len(failed), 'cell')} in which every rollout failed: {names(failed)}."
+        )
     if fine.stride > 1:
-        notes.append(f"Every {ordinal(fine.stride)} camera frame is kept: --max-mb makes room. Poses, plans and metrics are whole.")
+        notes.append(
+            f"Every {ordinal(fine.stride)} camera frame is kept: --max-mb makes room. Poses, plans and metrics are whole."
+        )
     return notes
 
 
@@ -241,7 +302,9 @@ class Written:
     notes: tuple[str, ...]
 
 
-def write_page(run: Run, path: Path, wanted: Wanted, options: Options, at_most: int | None) -> Written:
+def write_page(
+    run: Run, path: Path, wanted: Wanted, options: Options, at_most: int | None
+) -> Written:
     """Write an offline page.
 
     Args:
@@ -258,16 +321,24 @@ def write_page(run: Run, path: Path, wanted: Wanted, options: Options, at_most: 
     check_wanted(run, wanted)
     cells = cells_of(run, wanted, arms=True)
     if not any(cell.watchable for cell in cells):
-        raise InputError(DOING, str(run.folder), "no finished rollout that was asked for", "ask for others; simrun report lists failures")
+        raise InputError(
+            DOING,
+            str(run.folder),
+            "no finished rollout that was asked for",
+            "ask for others; simrun report lists failures",
+        )
     with reporting(run):
         beside = path.resolve().parent == run.folder.resolve() and (run.folder / REPORT).is_file()
-        page = make_page(run, cells, shown_by_default(cells, wanted, at_most), options, REPORT if beside else "")
+        page = make_page(
+            run, cells, shown_by_default(cells, wanted, at_most), options, REPORT if beside else ""
+        )
     write_text(path, page.html, DOING)
     return Written(path, path.stat().st_size, page.cells, tuple(cells), page.notes)
 
 
 def write_flips_page(run_dir: Path | Run) -> Mapping[FlipKey, str]:
-    """Write ``flips.html`` of a run folder: its changed outcomes alone, small. Without any, one of an earlier command is removed.
+    """Write ``flips.html`` of a run folder: its changed outcomes alone, small. Without any, one of
+    an earlier command is removed.
 
     Returns:
         Key of a changed rollout -> its address in the page, for those for which there was room.
@@ -283,9 +354,15 @@ def write_flips_page(run_dir: Path | Run) -> Mapping[FlipKey, str]:
     with reporting(run):
         page = make_page(run, flipped, flipped[:MAX_FLIP_CELLS], FLIPS_OPTIONS, REPORT)
     write_text(run.folder / FLIPS_PAGE, page.html, DOING)
-    return {flip.key: f"{FLIPS_PAGE}#{address(cell, cell.side(flip.other))}" for cell in page.cells for flip in cell.flips}
+    return {
+        flip.key: f"{FLIPS_PAGE}#{address(cell, cell.side(flip.other))}"
+        for cell in page.cells
+        for flip in cell.flips
+    }
 
 
 def address(cell: WatchedCell, renderer: str) -> str:
     """Return the part of an address that opens a cell with one of its drives followed."""
-    return urlencode({"scene": cell.scene, "policy": cell.policy, "seed": cell.seed, "renderer": renderer})
+    return urlencode(
+        {"scene": cell.scene, "policy": cell.policy, "seed": cell.seed, "renderer": renderer}
+    )

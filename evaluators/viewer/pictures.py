@@ -1,4 +1,6 @@
-"""The camera frames of a rollout, from its log or else its video, made small enough for a page, and where a fixer took them from."""
+"""The camera frames of a rollout, from its log or else its video, made small enough for a page, and
+where a fixer took them from.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,14 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import GUESSED_SHARE, RECORDED_SHARE, TRUST_CELLS, U8, LoggedImage, RolloutLog
+from alpasim_plugin.core.types import (
+    GUESSED_SHARE,
+    RECORDED_SHARE,
+    TRUST_CELLS,
+    U8,
+    LoggedImage,
+    RolloutLog,
+)
 from alpasim_plugin.log import decode_image, read_facts
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, VIDEO_NAME
@@ -63,7 +72,8 @@ class Source:
         return decode_image(image.data, f"camera {self.camera!r} at {image.end_us} us")
 
     def filmed(self, stride: int = 1) -> Iterator[tuple[int, U8]]:
-        """Yield time in microseconds and ``(H, W, 3)`` uint8 sRGB of every stride-th frame of the video; nothing where there is none.
+        """Yield time in microseconds and ``(H, W, 3)`` uint8 sRGB of every stride-th frame of the
+        video; nothing where there is none.
 
         Raises:
             InputError: A frame cannot be decoded.
@@ -74,29 +84,51 @@ class Source:
         with VideoReader(path) as video:
             for index, frame in enumerate(video):
                 if index % stride == 0:
-                    yield start_us + round(frame.time * video.format.time_base * 1_000_000), frame.image
+                    yield (
+                        start_us + round(frame.time * video.format.time_base * 1_000_000),
+                        frame.image,
+                    )
 
 
 def sources(run: Run, rollout: Rollout, log: RolloutLog | None) -> list[Source]:
-    """Return the cameras of a rollout that have frames, in the log's order; empty where none was kept."""
+    """Return the cameras of a rollout that have frames, in the log's order; empty where none was
+    kept.
+    """
     if log is not None and log.images:
         cameras = dict.fromkeys(image.camera for image in log.images)
-        return [Source(name, tuple(image for image in log.images if image.camera == name)) for name in cameras]
+        return [
+            Source(name, tuple(image for image in log.images if image.camera == name))
+            for name in cameras
+        ]
     video = run.file_of(rollout, VIDEO_NAME)
     if video is None:
         return []
-    return [Source(VIDEO_NAME.removesuffix(".mp4"), video=(video, log.render_start_us if log is not None else 0))]
+    return [
+        Source(
+            VIDEO_NAME.removesuffix(".mp4"),
+            video=(video, log.render_start_us if log is not None else 0),
+        )
+    ]
 
 
 def encoded(source: Source, fine: Fineness, zero_us: int) -> dict[str, Any]:
-    """Return a camera's frames for a page: name, size in pixels, times in milliseconds, and JPEG in base64."""
+    """Return a camera's frames for a page: name, size in pixels, times in milliseconds, and JPEG in
+    base64.
+    """
 
     def made(t_us: int, rgb: U8) -> tuple[int, tuple[int, ...], str]:
         picture = smaller(rgb, fine.width_px)
         return round((t_us - zero_us) / 1000), picture.shape, jpeg(picture)
 
-    with ThreadPoolExecutor(thread_name_prefix="pictures") as threads:  # OpenCV does not hold Python's lock
-        frames = list(threads.map(lambda image: made(image.end_us, source.decoded(image)), source.images[:: fine.stride]))
+    with ThreadPoolExecutor(
+        thread_name_prefix="pictures"
+    ) as threads:  # OpenCV does not hold Python's lock
+        frames = list(
+            threads.map(
+                lambda image: made(image.end_us, source.decoded(image)),
+                source.images[:: fine.stride],
+            )
+        )
     frames += [made(t_us, rgb) for t_us, rgb in source.filmed(fine.stride)]
     height, width = frames[-1][1][:2] if frames else (0, 0)
     t_ms, data = [t for t, _, _ in frames], [data for _, _, data in frames]
@@ -109,7 +141,12 @@ def jpeg(rgb: U8) -> str:
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
     done, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
     if not done:
-        raise InputError("encoding a camera frame", f"array {rgb.shape}", "the encoder refused", "use smaller images")
+        raise InputError(
+            "encoding a camera frame",
+            f"array {rgb.shape}",
+            "the encoder refused",
+            "use smaller images",
+        )
     return base64.b64encode(data.tobytes()).decode()
 
 
@@ -130,18 +167,30 @@ def frame_rows(run: Run, rollout: Rollout) -> Rows:
 
 def trust_by_time(rows: Rows, camera: str) -> dict[int, str]:
     """Return the text of `fixers.trust.trust_cells` of a camera's frames by time, microseconds."""
-    return {int(row["t_us"]): str(row[TRUST_CELLS]) for row in rows if row.get("camera") == camera and TRUST_CELLS in row}
+    return {
+        int(row["t_us"]): str(row[TRUST_CELLS])
+        for row in rows
+        if row.get("camera") == camera and TRUST_CELLS in row
+    }
 
 
 def seen_before(rows: Rows, t_us: int) -> str:
-    """Say how much of the pictures in the second before an instant was guessed and recorded; empty where no fixer says so.
+    """Say how much of the pictures in the second before an instant was guessed and recorded; empty
+    where no fixer says so.
 
     Example:
         >>> seen_before([{"t_us": 0, "guessed_share": 0.1, "recorded_share": 0.5}], 300_000)
         '10 % of what it saw in the second before was made up by the fixer, 50 % was recorded'
     """
-    near = [row for row in rows if GUESSED_SHARE in row and t_us - BEFORE_US <= int(row["t_us"]) <= t_us]
+    near = [
+        row for row in rows if GUESSED_SHARE in row and t_us - BEFORE_US <= int(row["t_us"]) <= t_us
+    ]
     if not near:
         return ""
-    guessed, recorded = (sum(float(row[name]) for row in near) / len(near) for name in (GUESSED_SHARE, RECORDED_SHARE))
-    return f"{guessed:.0%} of what it saw in the second before was made up by the fixer, {recorded:.0%} was recorded".replace("%", " %")
+    guessed, recorded = (
+        sum(float(row[name]) for row in near) / len(near)
+        for name in (GUESSED_SHARE, RECORDED_SHARE)
+    )
+    return f"{guessed:.0%} of what it saw in the second before was made up by the fixer, {recorded:.0%} was recorded".replace(
+        "%", " %"
+    )

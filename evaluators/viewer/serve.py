@@ -1,4 +1,6 @@
-"""Show a run in a browser on this machine while it goes on. Only GET, only this machine, only files of the run."""
+"""Show a run in a browser on this machine while it goes on. Only GET, only this machine, only files
+of the run.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,15 @@ from urllib.parse import unquote, urlsplit
 from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
 from alpasim_plugin.log.run_folder.reader import RunSoFar
 from evaluators.opening import Run
-from evaluators.viewer.cells import Wanted, WatchedCell, cell_data, cells_of, check_wanted, index_data, read_logs
+from evaluators.viewer.cells import (
+    Wanted,
+    WatchedCell,
+    cell_data,
+    cells_of,
+    check_wanted,
+    index_data,
+    read_logs,
+)
 from evaluators.viewer.page import Options, as_json, render
 
 DOING = "serving a run"
@@ -46,7 +56,8 @@ HEADERS = {
 }
 
 NOTHING: Mapping[str, str] = {}
-# A run folder may come from anybody: a page in it may show what it holds itself, in an origin of its own, and ask nobody for anything.
+# A run folder may come from anybody: a page in it may show what it holds itself, in an origin of
+# its own, and ask nobody for anything.
 OF_A_RUN = {
     "Content-Security-Policy": "sandbox allow-scripts allow-popups; default-src 'none'; script-src 'unsafe-inline'; "
     "style-src 'unsafe-inline'; img-src 'self' data:; media-src 'self' data:; font-src data:"
@@ -66,14 +77,24 @@ def loopback(text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]") or "127.0.0.1"
     if not port.isdecimal() or int(port) > 65535:
-        raise InputError(DOING, f"--serve {text}", "no port", "give HOST:PORT, such as 127.0.0.1:8000, or a port alone")
+        raise InputError(
+            DOING,
+            f"--serve {text}",
+            "no port",
+            "give HOST:PORT, such as 127.0.0.1:8000, or a port alone",
+        )
     try:
         near = host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         near = False
     if not near:
         found = "not an address of this machine alone"
-        raise InputError(DOING, f"--serve {text}", found, "give 127.0.0.1:PORT and reach it from elsewhere through ssh -L")
+        raise InputError(
+            DOING,
+            f"--serve {text}",
+            found,
+            "give 127.0.0.1:PORT and reach it from elsewhere through ssh -L",
+        )
     return host, int(port)
 
 
@@ -93,7 +114,13 @@ class RunServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, address: tuple[str, int], read: Callable[[], RunSoFar[Run]], wanted: Wanted, options: Options) -> None:
+    def __init__(
+        self,
+        address: tuple[str, int],
+        read: Callable[[], RunSoFar[Run]],
+        wanted: Wanted,
+        options: Options,
+    ) -> None:
         if ":" in address[0]:
             self.address_family = socket.AF_INET6
         self._read, self._wanted, self._options = read, wanted, options
@@ -105,7 +132,9 @@ class RunServer(ThreadingHTTPServer):
             super().__init__(address, _Handler)
         except OSError as error:
             what = f"{address[0]}:{address[1]}"
-            raise InfrastructureError(DOING, what, error.strerror or str(error), "choose another port, or 0 for any") from error
+            raise InfrastructureError(
+                DOING, what, error.strerror or str(error), "choose another port, or 0 for any"
+            ) from error
 
     @property
     def url(self) -> str:
@@ -115,8 +144,13 @@ class RunServer(ThreadingHTTPServer):
 
     @property
     def hosts(self) -> frozenset[str]:
-        """Give the values of the header Host that are answered: a page of another name that resolves to this machine is not."""
-        return frozenset(f"{name}:{self.server_address[1]}" for name in ("localhost", "127.0.0.1", "[::1]", urlsplit(self.url).hostname))
+        """Give the values of the header Host that are answered: a page of another name that
+        resolves to this machine is not.
+        """
+        return frozenset(
+            f"{name}:{self.server_address[1]}"
+            for name in ("localhost", "127.0.0.1", "[::1]", urlsplit(self.url).hostname)
+        )
 
     def seen(self) -> RunSoFar[Run]:
         """Return the run as it was a moment ago."""
@@ -159,19 +193,31 @@ class RunServer(ThreadingHTTPServer):
         if found is None:
             return None
         run = self.run
-        return cell_data(run, found, read_logs(run, found), self._options.fine, self._options.camera)
+        return cell_data(
+            run, found, read_logs(run, found), self._options.fine, self._options.camera
+        )
 
 
 def file_below(root: Path, name: str) -> Path | None:
-    """Find a file of a folder by its path in an address; None where there is none, or where the path leads elsewhere.
+    """Find a file of a folder by its path in an address; None where there is none, or where the
+    path leads elsewhere.
 
     Hidden files, unknown suffixes and links out of the folder are not found.
     """
     parts = PurePosixPath(name).parts
-    if "\0" in name or "\\" in name or name.startswith("/") or any(part.startswith(".") for part in parts):
+    if (
+        "\0" in name
+        or "\\" in name
+        or name.startswith("/")
+        or any(part.startswith(".") for part in parts)
+    ):
         return None
     path = root.joinpath(*parts)
-    if path.suffix not in TYPES or not path.is_file() or not path.resolve().is_relative_to(root.resolve()):
+    if (
+        path.suffix not in TYPES
+        or not path.is_file()
+        or not path.resolve().is_relative_to(root.resolve())
+    ):
         return None
     return path
 
@@ -199,7 +245,9 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(render(as_json(self.server.index()), {}, live=True).encode(), TYPES[".html"])
         elif path == "/index.json":
             self._send(as_json(self.server.index()).encode(), TYPES[".json"])
-        elif folder == "cells" and (cell := self.server.cell(name.removesuffix(".json"))) is not None:
+        elif (
+            folder == "cells" and (cell := self.server.cell(name.removesuffix(".json"))) is not None
+        ):
             self._send(as_json(cell).encode(), TYPES[".json"])
         elif folder == "run" and (file := file_below(self.server.root, name)) is not None:
             self._send_file(file)
@@ -222,9 +270,16 @@ class _Handler(BaseHTTPRequestHandler):
             if left:  # it was cut meanwhile: the client sees too few bytes
                 self.close_connection = True
 
-    def _head(self, size: int, kind: str, status: HTTPStatus, more: Mapping[str, str] = NOTHING) -> None:
+    def _head(
+        self, size: int, kind: str, status: HTTPStatus, more: Mapping[str, str] = NOTHING
+    ) -> None:
         self.send_response(status)
-        for name, value in {"Content-Type": kind, "Content-Length": str(size), **HEADERS, **more}.items():
+        for name, value in {
+            "Content-Type": kind,
+            "Content-Length": str(size),
+            **HEADERS,
+            **more,
+        }.items():
             self.send_header(name, value)
         self.end_headers()
 
@@ -232,10 +287,18 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(f"{why}\n".encode(), TYPES[".md"], status)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Refuse what is no GET, or no HTTP, in plain text and without echoing it; the connection is closed."""
+        """Refuse what is no GET, or no HTTP, in plain text and without echoing it; the connection
+        is closed.
+        """
         self.close_connection = True
-        status = HTTPStatus.METHOD_NOT_ALLOWED if code == HTTPStatus.NOT_IMPLEMENTED else HTTPStatus(code)
-        self._refuse(status, "only GET" if status == HTTPStatus.METHOD_NOT_ALLOWED else status.phrase)
+        status = (
+            HTTPStatus.METHOD_NOT_ALLOWED
+            if code == HTTPStatus.NOT_IMPLEMENTED
+            else HTTPStatus(code)
+        )
+        self._refuse(
+            status, "only GET" if status == HTTPStatus.METHOD_NOT_ALLOWED else status.phrase
+        )
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing: the terminal shows where the page is."""

@@ -23,7 +23,9 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
         net.write.weight.mul_(6)
     path = tmp_path_factory.mktemp("served") / "small.safetensors"
     settings = fixer_settings("onefixer", ["weights.bundle=null", "holes=noise"])
-    save_bundle(path, {"generator": net.state_dict()}, settings, trained=True, note="a small network")
+    save_bundle(
+        path, {"generator": net.state_dict()}, settings, trained=True, note="a small network"
+    )
     return path
 
 

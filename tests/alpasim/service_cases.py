@@ -45,10 +45,15 @@ def channel_to(host: Host) -> Iterator[Any]:
 
 
 @contextmanager
-def in_front_of(upstream: Host, policy: HostPolicy = HostPolicy(), **settings: Any) -> Iterator[tuple[Any, Assembled]]:
+def in_front_of(
+    upstream: Host, policy: HostPolicy = HostPolicy(), **settings: Any
+) -> Iterator[tuple[Any, Assembled]]:
     """Run the service in front of another; give a stub of it and its parts."""
     made = assemble(Settings(upstream=Upstream(upstream.address), threads=1, **settings))
-    with hosted({"SensorsimService": made.service}, policy=policy) as host, channel_to(host) as channel:
+    with (
+        hosted({"SensorsimService": made.service}, policy=policy) as host,
+        channel_to(host) as channel,
+    ):
         yield Stub(channel, "SensorsimService"), made
     made.close()
 

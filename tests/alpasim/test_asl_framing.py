@@ -17,7 +17,11 @@ from tests.examples import examples
 
 def entry(t_us: int = 7, ids: tuple[str, ...] = ("EGO",)) -> logging_pb2.LogEntry:
     pose = logging_pb2.ActorPoses.ActorPose
-    return logging_pb2.LogEntry(actor_poses=logging_pb2.ActorPoses(timestamp_us=t_us, actor_poses=[pose(actor_id=i) for i in ids]))
+    return logging_pb2.LogEntry(
+        actor_poses=logging_pb2.ActorPoses(
+            timestamp_us=t_us, actor_poses=[pose(actor_id=i) for i in ids]
+        )
+    )
 
 
 def write(path: Path, entries: list[logging_pb2.LogEntry]) -> Path:
@@ -28,13 +32,17 @@ def write(path: Path, entries: list[logging_pb2.LogEntry]) -> Path:
 
 
 entries_strategy = st.lists(
-    st.builds(entry, st.integers(0, 2**63), st.lists(st.text(max_size=200), max_size=5).map(tuple)), min_size=1, max_size=8
+    st.builds(entry, st.integers(0, 2**63), st.lists(st.text(max_size=200), max_size=5).map(tuple)),
+    min_size=1,
+    max_size=8,
 )
 
 
 @settings(max_examples=examples(60), deadline=None)
 @given(entries=entries_strategy)
-def test_any_entries_come_back_in_order(tmp_path_factory: pytest.TempPathFactory, entries: list[logging_pb2.LogEntry]) -> None:
+def test_any_entries_come_back_in_order(
+    tmp_path_factory: pytest.TempPathFactory, entries: list[logging_pb2.LogEntry]
+) -> None:
     path = write(tmp_path_factory.mktemp("asl") / "a.asl", entries)
     reader = AslReader(path)
     assert list(reader) == entries
@@ -45,7 +53,9 @@ def test_any_entries_come_back_in_order(tmp_path_factory: pytest.TempPathFactory
 @settings(max_examples=examples(60), deadline=None)
 @given(entries=entries_strategy, data=st.data())
 def test_a_cut_anywhere_loses_only_the_last_entry(
-    tmp_path_factory: pytest.TempPathFactory, entries: list[logging_pb2.LogEntry], data: st.DataObject
+    tmp_path_factory: pytest.TempPathFactory,
+    entries: list[logging_pb2.LogEntry],
+    data: st.DataObject,
 ) -> None:
     path = write(tmp_path_factory.mktemp("asl") / "a.asl", entries)
     whole = path.read_bytes()
@@ -66,7 +76,11 @@ def test_a_cut_anywhere_loses_only_the_last_entry(
 
 def test_length_is_big_endian(tmp_path: Path) -> None:
     path = write(tmp_path / "a.asl", [entry()])
-    assert struct.unpack(">I", path.read_bytes()[:4])[0] == entry().ByteSize() == len(path.read_bytes()) - 4
+    assert (
+        struct.unpack(">I", path.read_bytes()[:4])[0]
+        == entry().ByteSize()
+        == len(path.read_bytes()) - 4
+    )
 
 
 def test_truncated_tail_reads_as_a_sentence(tmp_path: Path) -> None:
@@ -75,7 +89,10 @@ def test_truncated_tail_reads_as_a_sentence(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-3])
     reader = AslReader(path)
     list(reader)
-    assert str(reader.truncated) == f"{path}: last entry cut at byte {4 + size} ({size - 3} of {size} bytes); 1 whole entries read"
+    assert (
+        str(reader.truncated)
+        == f"{path}: last entry cut at byte {4 + size} ({size - 3} of {size} bytes); 1 whole entries read"
+    )
 
 
 def test_overwritten_length_is_damage_not_a_cut_tail(tmp_path: Path) -> None:

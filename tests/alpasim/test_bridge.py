@@ -1,4 +1,6 @@
-"""The thin distribution for AlpaSim's environment: built from this checkout, installed beside packages with AlpaSim's pins, and used."""
+"""The thin distribution for AlpaSim's environment: built from this checkout, installed beside
+packages with AlpaSim's pins, and used.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ from alpasim_plugin.log.wire import sensorsim_pb2
 from tests.alpasim.service_cases import CAMERA, StandInRenderer, drive, hosted
 from tests.alpasim.test_wire_generated import environment
 
-# AlpaSim's own pins (main, 3032e0c): alpasim_grpc wants protobuf < 5 and was built with grpcio 1.62.3.
+# AlpaSim's own pins (main, 3032e0c): alpasim_grpc wants protobuf < 5 and was built with grpcio
+# 1.62.3.
 PINS = ("protobuf>=4.25,<5", "grpcio==1.62.3", "numpy>=2,<2.3", "hydra-core")
 USING = """
 import sys
@@ -44,7 +47,10 @@ sys.exit(code)
 """
 
 REPO = Path(__file__).resolve().parents[2]
-PAGE, SCENES = REPO / "docs" / "alpasim.md", REPO.parent / "shared" / "data" / "alpasim-golden" / "scenes"
+PAGE, SCENES = (
+    REPO / "docs" / "alpasim.md",
+    REPO.parent / "shared" / "data" / "alpasim-golden" / "scenes",
+)
 WIZARD = "SIMRUN_ALPASIM_PYTHON"
 
 
@@ -62,7 +68,9 @@ def test_the_bridge_imports_nothing_heavy_and_nothing_of_the_project(staged: Pat
     for path in modules:
         for node in ast.walk(ast.parse(path.read_text())):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-            names += [node.module or ""] if isinstance(node, ast.ImportFrom) and node.level == 0 else []
+            names += (
+                [node.module or ""] if isinstance(node, ast.ImportFrom) and node.level == 0 else []
+            )
             assert {name.split(".")[0] for name in names} <= allowed, path
 
 
@@ -81,23 +89,39 @@ def test_presets_are_of_the_group_renderer_and_name_one_endpoint(staged: Path) -
     assert kinds == {"onefixer": "sensorsim", "onefixer_world_model": "video_model"}
 
 
-LINES = [shlex.split(line, comments=True) for line in re.findall(r"-m alpasim_wizard (.*)", PAGE.read_text().replace("\\\n", " "))]
+LINES = [
+    shlex.split(line, comments=True)
+    for line in re.findall(r"-m alpasim_wizard (.*)", PAGE.read_text().replace("\\\n", " "))
+]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", LINES, ids=lambda words: " ".join(words[2:]))
-def test_alpasims_wizard_gives_an_address_of_every_service_that_is_not_skipped(staged: Path, tmp_path: Path, words: list[str]) -> None:
+def test_alpasims_wizard_gives_an_address_of_every_service_that_is_not_skipped(
+    staged: Path, tmp_path: Path, words: list[str]
+) -> None:
     python = os.environ.get(WIZARD)
     if python is None:
         pytest.skip(f"needs {WIZARD}, a Python that has AlpaSim's wizard")
     facts = staged / f"{building.PACKAGE}-0.dist-info"
     facts.mkdir(exist_ok=True)
-    (facts / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {building.PACKAGE}\nVersion: 0\n")
-    (facts / "entry_points.txt").write_text(f"[alpasim.configs]\nonefixer = {building.PACKAGE}.configs\n")
-    still = "wizard.run_method=NONE", "wizard.validate_mount_points=false", "scenes.scene_ids=null", f"scenes.local_usdz_dir={SCENES}"
+    (facts / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {building.PACKAGE}\nVersion: 0\n"
+    )
+    (facts / "entry_points.txt").write_text(
+        f"[alpasim.configs]\nonefixer = {building.PACKAGE}.configs\n"
+    )
+    still = (
+        "wizard.run_method=NONE",
+        "wizard.validate_mount_points=false",
+        "scenes.scene_ids=null",
+        f"scenes.local_usdz_dir={SCENES}",
+    )
     command = [python, "-m", "alpasim_wizard", *words, *still, f"wizard.log_dir={tmp_path}"]
     path = os.pathsep.join([str(staged), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=os.environ | {"PYTHONPATH": path})
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=tmp_path, env=os.environ | {"PYTHONPATH": path}
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     network = yaml.safe_load((tmp_path / "generated-network-config.yaml").read_text())
     asked = yaml.safe_load((tmp_path / "generated-user-config-0.yaml").read_text())["endpoints"]
@@ -106,7 +130,9 @@ def test_alpasims_wizard_gives_an_address_of_every_service_that_is_not_skipped(s
         assert all(one["address"].startswith("localhost:") for one in service["endpoints"])
 
 
-def test_the_client_asks_again_only_after_what_may_pass(upstream: Host, renderer: StandInRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_client_asks_again_only_after_what_may_pass(
+    upstream: Host, renderer: StandInRenderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("alpasim_plugin.alpasim.bridge.client.PAUSES_S", (0.0, 0.0))
     frame, seen = drive(1)[0], []
 
@@ -123,7 +149,10 @@ def test_the_client_asks_again_only_after_what_may_pass(upstream: Host, renderer
         assert list(client.render([frame])) == [CAMERA]
         renderer.fault = fault(grpc.StatusCode.DEADLINE_EXCEEDED, "Stopped waiting for backend", 2)
         assert list(client.render([frame])) == [CAMERA]
-        for code, text, times, calls in ((grpc.StatusCode.UNAVAILABLE, "away", 9, 3), (grpc.StatusCode.UNKNOWN, "broken", 9, 1)):
+        for code, text, times, calls in (
+            (grpc.StatusCode.UNAVAILABLE, "away", 9, 3),
+            (grpc.StatusCode.UNKNOWN, "broken", 9, 1),
+        ):
             renderer.fault = fault(code, text, times)
             with pytest.raises(grpc.RpcError, match=text):
                 client.render([frame])
@@ -145,7 +174,9 @@ def test_the_client_refuses_what_the_runtime_refuses(items: int) -> None:
             client.render(frames)
 
 
-def test_the_check_prints_what_a_service_is(upstream: Host, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_check_prints_what_a_service_is(
+    upstream: Host, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert check.main([upstream.address, "scene"]) == 0
     out = capsys.readouterr().out
     assert "version stand-in" in out
@@ -155,13 +186,19 @@ def test_the_check_prints_what_a_service_is(upstream: Host, capsys: pytest.Captu
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_the_wheel_installs_beside_alpasims_pins_and_talks_to_a_service(upstream: Host, tmp_path: Path) -> None:
+def test_the_wheel_installs_beside_alpasims_pins_and_talks_to_a_service(
+    upstream: Host, tmp_path: Path
+) -> None:
     wheel = building.build(tmp_path / "dist")
     python = environment(tmp_path / "venv", *PINS)
     subprocess.run([python, "-m", "pip", "install", "-q", str(wheel)], check=True)
-    versions = subprocess.run([python, "-m", "pip", "list", "--format=freeze"], check=True, capture_output=True, text=True).stdout
+    versions = subprocess.run(
+        [python, "-m", "pip", "list", "--format=freeze"], check=True, capture_output=True, text=True
+    ).stdout
     assert "protobuf==4.25" in versions
     assert "grpcio==1.62.3" in versions
-    done = subprocess.run([python, "-c", USING, upstream.address], capture_output=True, text=True, cwd=tmp_path)
+    done = subprocess.run(
+        [python, "-c", USING, upstream.address], capture_output=True, text=True, cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     assert "version stand-in" in done.stdout

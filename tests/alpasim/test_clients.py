@@ -1,4 +1,6 @@
-"""Our loop in front of AlpaSim's services over real sockets: drivers, renderers, and both at once."""
+"""Our loop in front of AlpaSim's services over real sockets: drivers, renderers, and both at
+once.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,13 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError, PolicyEr
 from alpasim_plugin.core.parts import build, resolve
 from alpasim_plugin.core.types import RolloutLog, Scenario
 from alpasim_plugin.log import decode_image
-from alpasim_plugin.log.wire import FRONT_WIDE, SERVICE_PATHS, common_pb2, egodriver_pb2, sensorsim_pb2
+from alpasim_plugin.log.wire import (
+    FRONT_WIDE,
+    SERVICE_PATHS,
+    common_pb2,
+    egodriver_pb2,
+    sensorsim_pb2,
+)
 from alpasim_plugin.log.wire.services import Stub, handlers
 from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.recorder import Recorder
@@ -61,8 +69,12 @@ class Calls(grpc.ServerInterceptor):
         return continuation(details)
 
 
-def serve(name: str, implementation: object, interceptor: Calls | None = None) -> tuple[grpc.Server, str]:
-    server = grpc.server(futures.ThreadPoolExecutor(8), interceptors=(interceptor,) if interceptor else ())
+def serve(
+    name: str, implementation: object, interceptor: Calls | None = None
+) -> tuple[grpc.Server, str]:
+    server = grpc.server(
+        futures.ThreadPoolExecutor(8), interceptors=(interceptor,) if interceptor else ()
+    )
     server.add_generic_rpc_handlers((handlers(name, implementation),))
     port = server.add_insecure_port("127.0.0.1:0")
     server.start()
@@ -74,7 +86,12 @@ def driver(scene: str) -> Iterator[tuple[DriverService, str, Calls]]:
     """Our own policy behind AlpaSim's driver service."""
     calls = Calls()
     spec = resolve("policy", "lane-camera")
-    service = DriverService(spec.name, spec.digest, lambda scenario: build(spec, scenario=scenario), scenario_finder([scene]))
+    service = DriverService(
+        spec.name,
+        spec.digest,
+        lambda scenario: build(spec, scenario=scenario),
+        scenario_finder([scene]),
+    )
     server, address = serve("EgodriverService", service, calls)
     yield service, address, calls
     server.stop(0)
@@ -98,7 +115,9 @@ def test_a_driver_over_sockets_drives_as_the_policy_in_the_process(
     service, address, calls = driver
     outside, facts = drive(scenario, "clean", f"alpasim://{address}?encoding=png")
     assert np.abs(outside.ego.xyz - inside.ego.xyz).max() < 2e-5  # poses are float32 on the wire
-    assert [len(plan.samples) for plan in outside.plans] == [len(plan.samples) for plan in inside.plans]
+    assert [len(plan.samples) for plan in outside.plans] == [
+        len(plan.samples) for plan in inside.plans
+    ]
     for one, other in zip(outside.plans, inside.plans, strict=True):
         np.testing.assert_array_equal(one.trajectory.t_us, other.trajectory.t_us)
         np.testing.assert_allclose(one.trajectory.xyz, other.trajectory.xyz, atol=1e-3)
@@ -115,17 +134,45 @@ def test_renderer_and_driver_over_sockets_at_once(
     with Host({"SensorsimService": made.service}, "127.0.0.1:0") as host:
         outside, _ = drive(scenario, f"nre://{host.address}", f"alpasim://{driver[1]}?encoding=png")
     assert np.abs(outside.ego.xyz - inside.ego.xyz).max() < 1e-3
-    for one, other in zip(outside.images[:4], inside.images[:4], strict=True):  # in the warm-up, at equal poses but for their rounding
-        difference = np.abs(decode_image(one.data).astype(int) - decode_image(other.data).astype(int))
+    for one, other in zip(
+        outside.images[:4], inside.images[:4], strict=True
+    ):  # in the warm-up, at equal poses but for their rounding
+        difference = np.abs(
+            decode_image(one.data).astype(int) - decode_image(other.data).astype(int)
+        )
         assert difference.mean() < 0.05
         assert np.percentile(difference, 99.9) <= 2
 
 
-def test_a_run_behind_a_renderer_service_says_which_one(scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_behind_a_renderer_service_says_which_one(
+    scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     made = assemble(Settings(renderer="clean", scenes=(scene,)))
     with Host({"SensorsimService": made.service}, "127.0.0.1:0") as host:
-        given = ["--renderer", f"nre://{host.address}", "--policy", "lane-camera", "--out", str(tmp_path / "a"), "--workers", "1"]
-        assert run_command([*given, "--no-report", "--certify", "none", "--set", "timing.duration_us=700000", scene]) == 0
+        given = [
+            "--renderer",
+            f"nre://{host.address}",
+            "--policy",
+            "lane-camera",
+            "--out",
+            str(tmp_path / "a"),
+            "--workers",
+            "1",
+        ]
+        assert (
+            run_command(
+                [
+                    *given,
+                    "--no-report",
+                    "--certify",
+                    "none",
+                    "--set",
+                    "timing.duration_us=700000",
+                    scene,
+                ]
+            )
+            == 0
+        )
     (path,) = (tmp_path / "a").rglob("manifest.json")
     manifest = json.loads(path.read_text())
     assert manifest["renderer_facts"]["service"].startswith("simrun-")
@@ -176,7 +223,10 @@ def test_the_first_motion_is_the_whole_context_with_its_speeds(scenario: Scenari
     wanted = [int(t) for t in log.t_us if t < scenario.start_us] + [scenario.start_us]
     assert [p.timestamp_us for p in first.trajectory.poses] == wanted
     assert len(first.dynamic_states) == len(wanted)
-    assert all(abs(state.linear_velocity.x - first.dynamic_states[-1].linear_velocity.x) < 0.5 for state in first.dynamic_states)
+    assert all(
+        abs(state.linear_velocity.x - first.dynamic_states[-1].linear_velocity.x) < 0.5
+        for state in first.dynamic_states
+    )
     assert first.dynamic_states[0].linear_velocity.x > 3.0
     assert [p.timestamp_us for p in second.trajectory.poses] == [scenario.start_us + 100_000]
     (camera,) = own.sessions[0].rollout_spec.vehicle.available_cameras
@@ -185,7 +235,9 @@ def test_the_first_motion_is_the_whole_context_with_its_speeds(scenario: Scenari
 
 
 def test_an_end_of_session_and_a_missing_service_are_said(scenario: Scenario) -> None:
-    server, address = serve("EgodriverService", Scripted(egodriver_pb2.DriveResponse(terminate_session=True)))
+    server, address = serve(
+        "EgodriverService", Scripted(egodriver_pb2.DriveResponse(terminate_session=True))
+    )
     with pytest.raises(PolicyError, match="ends the session"):
         drive(scenario, "clean", f"alpasim://{address}")
     server.stop(0)
@@ -197,8 +249,12 @@ def test_an_end_of_session_and_a_missing_service_are_said(scenario: Scenario) ->
         drive(scenario, "clean", f"alpasim://{address}?cameras=camera_left:left")
 
 
-def test_nothing_at_an_address_is_an_infrastructure_failure(monkeypatch: pytest.MonkeyPatch, scenario: Scenario) -> None:
-    monkeypatch.setattr("alpasim_plugin.alpasim.client.channel.Service.wait_ready.__defaults__", (0.2,))
+def test_nothing_at_an_address_is_an_infrastructure_failure(
+    monkeypatch: pytest.MonkeyPatch, scenario: Scenario
+) -> None:
+    monkeypatch.setattr(
+        "alpasim_plugin.alpasim.client.channel.Service.wait_ready.__defaults__", (0.2,)
+    )
     with pytest.raises(InfrastructureError, match="nothing answers"):
         drive(scenario, "nre://127.0.0.1:1", "log-replay")
 
@@ -215,18 +271,25 @@ class Failing:
     def get_available_scenes(self, request: Any, context: Any) -> common_pb2.AvailableScenesReturn:
         return common_pb2.AvailableScenesReturn(scene_ids=["*"])
 
-    def get_available_cameras(self, request: Any, context: Any) -> sensorsim_pb2.AvailableCamerasReturn:
+    def get_available_cameras(
+        self, request: Any, context: Any
+    ) -> sensorsim_pb2.AvailableCamerasReturn:
         return sensorsim_pb2.AvailableCamerasReturn()
 
     def batch_render_rgb(self, request: Any, context: Any) -> sensorsim_pb2.BatchRGBRenderReturn:
         self.asked += 1
         if self.asked <= self.times:
             context.abort(self.code, "not now")
-        item = sensorsim_pb2.BatchRGBRenderReturnItem(camera_name=request.items[0].camera_name, success=False, error_message="out of film")
+        item = sensorsim_pb2.BatchRGBRenderReturnItem(
+            camera_name=request.items[0].camera_name, success=False, error_message="out of film"
+        )
         return sensorsim_pb2.BatchRGBRenderReturn(items=[item])
 
 
-@pytest.mark.parametrize(("code", "asked", "text"), [("UNAVAILABLE", 3, "out of film"), ("UNKNOWN", 1, "UNKNOWN: not now")])
+@pytest.mark.parametrize(
+    ("code", "asked", "text"),
+    [("UNAVAILABLE", 3, "out of film"), ("UNKNOWN", 1, "UNKNOWN: not now")],
+)
 def test_renders_are_tried_again_as_alpasim_does(
     scenario: Scenario, monkeypatch: pytest.MonkeyPatch, code: str, asked: int, text: str
 ) -> None:
@@ -239,10 +302,15 @@ def test_renders_are_tried_again_as_alpasim_does(
     assert own.asked == asked
 
 
-def test_sessions_of_several_threads_do_not_meet(scenario: Scenario, inside: RolloutLog, driver: tuple[DriverService, str, Calls]) -> None:
+def test_sessions_of_several_threads_do_not_meet(
+    scenario: Scenario, inside: RolloutLog, driver: tuple[DriverService, str, Calls]
+) -> None:
     logs: list[RolloutLog] = []
     address = f"alpasim://{driver[1]}?encoding=png"
-    threads = [threading.Thread(target=lambda: logs.append(drive(scenario, "clean", address)[0])) for _ in range(2)]
+    threads = [
+        threading.Thread(target=lambda: logs.append(drive(scenario, "clean", address)[0]))
+        for _ in range(2)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -252,21 +320,39 @@ def test_sessions_of_several_threads_do_not_meet(scenario: Scenario, inside: Rol
     assert np.abs(logs[0].ego.xyz - inside.ego.xyz).max() < 2e-5
 
 
-def test_our_driver_service_is_tolerant_where_alpasim_needs_it(driver: tuple[DriverService, str, Calls]) -> None:
+def test_our_driver_service_is_tolerant_where_alpasim_needs_it(
+    driver: tuple[DriverService, str, Calls],
+) -> None:
     with grpc.insecure_channel(driver[1]) as channel:
         stub = Stub(channel, "EgodriverService")
         stub.close_session(egodriver_pb2.DriveSessionCloseRequest(session_uuid="never opened"))
-        stub.start_session(egodriver_pb2.DriveSessionRequest(session_uuid="a", debug_info={"scene_id": "short-curve"}))
-        assert not stub.drive(egodriver_pb2.DriveRequest(session_uuid="a", time_now_us=1)).trajectory.poses  # nothing seen yet
+        stub.start_session(
+            egodriver_pb2.DriveSessionRequest(
+                session_uuid="a", debug_info={"scene_id": "short-curve"}
+            )
+        )
+        assert not stub.drive(
+            egodriver_pb2.DriveRequest(session_uuid="a", time_now_us=1)
+        ).trajectory.poses  # nothing seen yet
         with pytest.raises(grpc.RpcError) as twice:
-            stub.start_session(egodriver_pb2.DriveSessionRequest(session_uuid="a", debug_info={"scene_id": "short-curve"}))
+            stub.start_session(
+                egodriver_pb2.DriveSessionRequest(
+                    session_uuid="a", debug_info={"scene_id": "short-curve"}
+                )
+            )
         assert twice.value.code() == grpc.StatusCode.INVALID_ARGUMENT
         with pytest.raises(grpc.RpcError) as unknown:
             stub.drive(egodriver_pb2.DriveRequest(session_uuid="b"))
         assert "call start_session first" in unknown.value.details()
-        lens = sensorsim_pb2.CameraSpec(logical_id="c", resolution_h=10, resolution_w=10, ftheta_param={"max_angle": 1.0})
-        camera = sensorsim_pb2.AvailableCamerasReturn.AvailableCamera(logical_id="c", intrinsics=lens)
-        request = egodriver_pb2.DriveSessionRequest(session_uuid="d", debug_info={"scene_id": "short-curve"})
+        lens = sensorsim_pb2.CameraSpec(
+            logical_id="c", resolution_h=10, resolution_w=10, ftheta_param={"max_angle": 1.0}
+        )
+        camera = sensorsim_pb2.AvailableCamerasReturn.AvailableCamera(
+            logical_id="c", intrinsics=lens
+        )
+        request = egodriver_pb2.DriveSessionRequest(
+            session_uuid="d", debug_info={"scene_id": "short-curve"}
+        )
         request.rollout_spec.vehicle.available_cameras.append(camera)
         with pytest.raises(grpc.RpcError) as lensed:
             stub.start_session(request)
@@ -282,7 +368,10 @@ def test_the_pre_flight_check_of_a_good_and_of_a_bad_driver(
     assert run_command(["check-driver", driver[1], "--scenario", scene, *timing]) == 0
     told = json.loads(capsys.readouterr().out)
     good = {one["name"]: one["result"] for one in told["checks"]}
-    assert told["ability"]["text"] == "no score: no known driver drove these scenes with timing.duration_us=1900000"
+    assert (
+        told["ability"]["text"]
+        == "no score: no known driver drove these scenes with timing.duration_us=1900000"
+    )
     assert [(one["ended"], one["lost"]) for one in told["scenes"]] == [("no event", 0)]
     assert told["scenes"][0]["resident_mib"] > 10  # the service is in this process
     assert set(good.values()) == {"passed", "noted"}
@@ -293,7 +382,10 @@ def test_the_pre_flight_check_of_a_good_and_of_a_bad_driver(
     server, address = serve("EgodriverService", Scripted(late))
     assert run_command(["check-driver", address, "--scenario", scene, *timing]) == 1
     server.stop(0)
-    bad = {one["name"]: (one["result"], one["text"]) for one in json.loads(capsys.readouterr().out)["checks"]}
+    bad = {
+        one["name"]: (one["result"], one["text"])
+        for one in json.loads(capsys.readouterr().out)["checks"]
+    }
     assert bad["the shape of plans"][0] == "failed"
     assert "not at time_now" in bad["the shape of plans"][1]
     assert "do not increase" in bad["the shape of plans"][1]

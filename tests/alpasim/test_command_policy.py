@@ -23,7 +23,14 @@ from alpasim_plugin.core import subprocesses as children
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.parts import build, resolve
-from alpasim_plugin.core.subprocesses import MOST_BYTES, Child, end_children, exit_reason, parts_print_to_stderr, say
+from alpasim_plugin.core.subprocesses import (
+    MOST_BYTES,
+    Child,
+    end_children,
+    exit_reason,
+    parts_print_to_stderr,
+    say,
+)
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
 from policies.conformance import STRAIGHT, canned_scenario, observations
@@ -33,7 +40,17 @@ pytestmark = pytest.mark.slow
 REPO = Path(__file__).resolve().parents[2]
 HEAVY = "torch numba scipy shapely pydantic yaml pyarrow typer av matplotlib"
 PAGE = (REPO / "docs" / "policy-commands.md").read_text(encoding="utf-8")
-SHORT = ("--set", "timing.duration_us=600000", "--certify", "none", "--no-report", "--images", "none", "--workers", "1")
+SHORT = (
+    "--set",
+    "timing.duration_us=600000",
+    "--certify",
+    "none",
+    "--no-report",
+    "--images",
+    "none",
+    "--workers",
+    "1",
+)
 
 
 @pytest.fixture
@@ -41,7 +58,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Give a folder with the script of the page and worse ones."""
     (script,) = re.findall(r"^```python\n(.*?)^```", PAGE, re.M | re.S)
     light = f"    import sys\n    print('heavy:', sorted({set(HEAVY.split())!r} & sys.modules.keys()))\n"
-    (tmp_path / "remote_policy.py").write_text(script.replace("    serve_policy(Cruise)", f"{light}    serve_policy(Cruise)"))
+    (tmp_path / "remote_policy.py").write_text(
+        script.replace("    serve_policy(Cruise)", f"{light}    serve_policy(Cruise)")
+    )
     act = "    def act(self, observation):"
     worse = script.replace(act, f"{act}\n        self.fault(observation)").split("if __name__")[0]
     (tmp_path / "worse.py").write_text(
@@ -80,7 +99,10 @@ def made(command: str) -> Policy:
 def drive(policy: Policy) -> list[np.ndarray]:
     scenario = canned_scenario()
     policy.reset(0, scenario.route)
-    return [policy.act(one).xy for one in observations(STRAIGHT, {camera.name: camera for camera in scenario.cameras})]
+    return [
+        policy.act(one).xy
+        for one in observations(STRAIGHT, {camera.name: camera for camera in scenario.cameras})
+    ]
 
 
 def until(condition: Callable[[], bool], seconds: float = 20.0) -> bool:
@@ -93,59 +115,118 @@ def until(condition: Callable[[], bool], seconds: float = 20.0) -> bool:
 def is_gone(pid: int) -> bool:
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except (FileNotFoundError, ProcessLookupError):  # the latter where it ends between opening and reading
+    except (
+        FileNotFoundError,
+        ProcessLookupError,
+    ):  # the latter where it ends between opening and reading
         return True
 
 
 @pytest.mark.slow
-def test_the_script_of_the_page_drives_as_in_the_process(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_script_of_the_page_drives_as_in_the_process(
+    folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     logs: list[list[RolloutLog]] = []
     for name in (python("remote_policy.py"), "remote_policy.py:Cruise"):
         out = str(len(logs))
-        words = ["--renderer", "clean", "--policy", name, "smoke/straight", "--seeds", "4,5", "--out", out, *SHORT, "--json"]
+        words = [
+            "--renderer",
+            "clean",
+            "--policy",
+            name,
+            "smoke/straight",
+            "--seeds",
+            "4,5",
+            "--out",
+            out,
+            *SHORT,
+            "--json",
+        ]
         assert run_command(words) == 0
-        printed = json.loads(capfd.readouterr().out)  # the command's output does not break the document
+        printed = json.loads(
+            capfd.readouterr().out
+        )  # the command's output does not break the document
         assert printed["summary"]["failures"]["n_failed"] == 0
         logs.append([read_asl(path) for path in sorted((folder / out).rglob("rollout.asl"))])
-        assert ["rollout with seed 5" in path.read_text() for path in sorted((folder / out).rglob("output.log"))] == [False, True]
+        assert [
+            "rollout with seed 5" in path.read_text()
+            for path in sorted((folder / out).rglob("output.log"))
+        ] == [False, True]
         if out == "0":
             (first, _) = (path.read_text() for path in sorted((folder / out).rglob("output.log")))
-            assert "heavy: []" in first, "the environment of a served policy would need more than the page says"
-            (manifest, _) = (json.loads(path.read_text()) for path in sorted((folder / out).rglob("manifest.json")))
+            assert "heavy: []" in first, (
+                "the environment of a served policy would need more than the page says"
+            )
+            (manifest, _) = (
+                json.loads(path.read_text())
+                for path in sorted((folder / out).rglob("manifest.json"))
+            )
             assert manifest["policy_facts"]["command"].endswith("remote_policy.py")
             assert "output.log" in manifest["files"]
     for outside, inside in zip(*logs, strict=True):
-        assert np.abs(outside.ego.xyz - inside.ego.xyz).max() < 2e-5  # poses are float32 on the wire
+        assert (
+            np.abs(outside.ego.xyz - inside.ego.xyz).max() < 2e-5
+        )  # poses are float32 on the wire
     assert children._running == [], "the command outlives its run"
     for words in (
         ["check", "0", "--repair"],
-        ["fork", "0", "--cell", f"clean/{python('remote_policy.py')}/smoke-straight/5", "--at", "0.5"],
+        [
+            "fork",
+            "0",
+            "--cell",
+            f"clean/{python('remote_policy.py')}/smoke-straight/5",
+            "--at",
+            "0.5",
+        ],
     ):
         if words[0] == "check":
             min((folder / "0").rglob("rollout.asl")).unlink()
         assert run_command([*words, "--json"]) == 2
-        assert "no command is run because a file names it" in json.loads(capfd.readouterr().out)["error"]["found"]
+        assert (
+            "no command is run because a file names it"
+            in json.loads(capfd.readouterr().out)["error"]["found"]
+        )
 
 
 @pytest.mark.slow
 def test_check_policy_takes_a_command(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["check-policy", python("remote_policy.py"), "--latency-limit-ms", "60000"]) == 0
+    assert (
+        run_command(["check-policy", python("remote_policy.py"), "--latency-limit-ms", "60000"])
+        == 0
+    )
     assert "FAIL" not in capfd.readouterr().out
 
 
 @pytest.mark.slow
-def test_a_command_that_dies_is_told_with_its_last_words_and_starts_anew(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    command = ["--renderer", "clean", "--policy", python("worse.py", "dies"), "smoke/straight", "--seeds", "1,2", "--out", "out", *SHORT]
+def test_a_command_that_dies_is_told_with_its_last_words_and_starts_anew(
+    folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    command = [
+        "--renderer",
+        "clean",
+        "--policy",
+        python("worse.py", "dies"),
+        "smoke/straight",
+        "--seeds",
+        "1,2",
+        "--out",
+        "out",
+        *SHORT,
+    ]
     assert run_command([*command, "--json"]) == 2
     (one, two) = json.loads(capfd.readouterr().out)["summary"]["failures"]["cells"]
     for cell in (one, two):
         assert cell["error"]["failure_class"] == "policy"
         assert "exit code 3; its last lines:" in cell["error"]["found"]
         assert cell["error"]["found"].endswith("cannot find the road")
-    assert "seed 2 | cannot find the road" in two["error"]["found"], "the second rollout had a command of its own"
+    assert "seed 2 | cannot find the road" in two["error"]["found"], (
+        "the second rollout had a command of its own"
+    )
 
 
-def test_an_exception_of_the_served_policy_is_told_and_its_traceback_printed(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_an_exception_of_the_served_policy_is_told_and_its_traceback_printed(
+    folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(PolicyError, match="RuntimeError: no lane in sight"):
         drive(made(python("worse.py", "raises")))
     end_children()
@@ -184,7 +265,9 @@ def test_a_port_is_asked_for_by_its_place_holder(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_a_command_ends_with_the_process_that_started_it_however_that_ends(tmp_path: Path, number: int) -> None:
+def test_a_command_ends_with_the_process_that_started_it_however_that_ends(
+    tmp_path: Path, number: int
+) -> None:
     starting = """
 import sys, time
 from alpasim_plugin.core.subprocesses import Child
@@ -192,7 +275,9 @@ code = "import os, time; print(os.getpid()); time.sleep(60)"
 Child([sys.executable, "-S", "-c", code], {}, lambda line: print(line, flush=True), lambda: None)
 time.sleep(60)
 """
-    with subprocess.Popen([sys.executable, "-c", starting], stdout=subprocess.PIPE, text=True, cwd=REPO) as parent:
+    with subprocess.Popen(
+        [sys.executable, "-c", starting], stdout=subprocess.PIPE, text=True, cwd=REPO
+    ) as parent:
         assert parent.stdout is not None
         pid = int(parent.stdout.readline())
         assert not is_gone(pid)
@@ -200,7 +285,9 @@ time.sleep(60)
         assert until(lambda: is_gone(pid))
 
 
-def test_a_command_deaf_to_sigterm_is_killed_with_what_it_started(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_command_deaf_to_sigterm_is_killed_with_what_it_started(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(children, "GRACE_S", 0.3)
     deaf = "import os, signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); os.fork(); "
     code = deaf + "os.write(1, b'%d\\n' % os.getpid()); time.sleep(60)"
@@ -216,7 +303,10 @@ def test_a_command_deaf_to_sigterm_is_killed_with_what_it_started(monkeypatch: p
 
 def test_commands_are_read_as_a_shell_would_and_refused_before_a_run() -> None:
     command = Command.parse("?cameras=front,left&timeout_s=2.5 sh drive.sh --net 'a b.pt'")
-    assert (command.words, command.options) == (("sh", "drive.sh", "--net", "a b.pt"), {"cameras": "front,left", "timeout_s": "2.5"})
+    assert (command.words, command.options) == (
+        ("sh", "drive.sh", "--net", "a b.pt"),
+        {"cameras": "front,left", "timeout_s": "2.5"},
+    )
     for text, found in (
         ("", "no program"),
         ("?timeout_s=2", "no program"),
@@ -228,11 +318,17 @@ def test_commands_are_read_as_a_shell_would_and_refused_before_a_run() -> None:
         with pytest.raises(InputError, match=re.escape(found)):
             resolve("policy", f"exec:{text}")
     assert resolve("policy", "exec:sh a.sh").digest is None
-    assert split_policies("clean,exec:sh a.sh --size '5,3', learned") == ["clean", "exec:sh a.sh --size '5,3'", "learned"]
+    assert split_policies("clean,exec:sh a.sh --size '5,3', learned") == [
+        "clean",
+        "exec:sh a.sh --size '5,3'",
+        "learned",
+    ]
     assert (exit_reason(0), exit_reason(143)) == ("exit code 0", "exit code 143 (SIGTERM)")
 
 
-def test_output_of_parts_goes_to_a_file_that_has_an_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_output_of_parts_goes_to_a_file_that_has_an_end(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with parts_print_to_stderr(tmp_path / "none.log"):
         pass
     assert not (tmp_path / "none.log").exists()

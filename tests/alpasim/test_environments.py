@@ -2,8 +2,9 @@
 
     pytest -m slow tests/alpasim/test_environments.py
 
-Each environment has a package of its own version in front of this environment's packages, and runs the tests of the wire, of logs, and of
-clients and services over real sockets. ``SIMRUN_TORCH`` names a wheel of the oldest torch, which no index gives for CPUs everywhere.
+Each environment has a package of its own version in front of this environment's packages, and runs
+the tests of the wire, of logs, and of clients and services over real sockets. ``SIMRUN_TORCH``
+names a wheel of the oldest torch, which no index gives for CPUs everywhere.
 """
 
 from __future__ import annotations
@@ -30,8 +31,13 @@ TESTS = (
     "tests/log",
 )
 TORCH = os.environ.get("SIMRUN_TORCH", "torch==2.8.*")
-WITH_NETWORKS = ("tests/alpasim/test_sensorsim_service.py", "tests/alpasim/test_world_model.py", "tests/nets", "tests/fixers",
-                 "tests/block_fixers")  # fmt: skip
+WITH_NETWORKS = (
+    "tests/alpasim/test_sensorsim_service.py",
+    "tests/alpasim/test_world_model.py",
+    "tests/nets",
+    "tests/fixers",
+    "tests/block_fixers",
+)
 
 
 @pytest.mark.slow
@@ -52,9 +58,26 @@ def test_the_project_works_at_both_ends_of_its_requirements(
     venv.create(folder, with_pip=True)
     python = folder / "bin" / "python"
     (own,) = folder.glob("lib/python*/site-packages")
-    (own / "behind.pth").write_text("\n".join(dict.fromkeys([*site.getsitepackages(), *(p for p in sys.path if "site-packages" in p)])))
-    subprocess.run([python, "-m", "pip", "install", "-q", "--no-deps", "--ignore-installed", *packages], check=True)
-    told = subprocess.run([python, "-c", f"import {module} as m; print(m.__version__)"], check=True, capture_output=True, text=True)
+    (own / "behind.pth").write_text(
+        "\n".join(
+            dict.fromkeys([*site.getsitepackages(), *(p for p in sys.path if "site-packages" in p)])
+        )
+    )
+    subprocess.run(
+        [python, "-m", "pip", "install", "-q", "--no-deps", "--ignore-installed", *packages],
+        check=True,
+    )
+    told = subprocess.run(
+        [python, "-c", f"import {module} as m; print(m.__version__)"],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
     assert told.stdout.startswith(version)
-    done = subprocess.run([python, "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests], cwd=REPO, capture_output=True, text=True)
+    done = subprocess.run(
+        [python, "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests],
+        cwd=REPO,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]

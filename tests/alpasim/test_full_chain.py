@@ -1,4 +1,6 @@
-"""The whole chain: our loop, our renderer service with the fixer, another renderer behind it, our driver service, a score."""
+"""The whole chain: our loop, our renderer service with the fixer, another renderer behind it, our
+driver service, a score.
+"""
 
 from __future__ import annotations
 
@@ -40,17 +42,26 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("scenes") / "curve.yaml"
     timing = {"duration_us": 400_000, "warmup_us": 200_000}
     camera = {"width": 96, "height": 64, "name": "front"}
-    path.write_text(yaml.safe_dump(written | {"scene_id": "chain-curve", "timing": timing, "cameras": [camera]}))
+    path.write_text(
+        yaml.safe_dump(written | {"scene_id": "chain-curve", "timing": timing, "cameras": [camera]})
+    )
     return str(path)
 
 
 class Inside:
-    """A channel without a socket: a call runs the implementation in the caller's thread. Messages are serialised all the same."""
+    """A channel without a socket: a call runs the implementation in the caller's thread. Messages
+    are serialised all the same.
+    """
 
     def __init__(self, services: dict[str, object]) -> None:
         self._services = {SERVICE_PATHS[name]: (name, one) for name, one in services.items()}
 
-    def unary_unary(self, path: str, request_serializer: Callable[[Any], bytes], response_deserializer: Callable[[bytes], Any]) -> Any:
+    def unary_unary(
+        self,
+        path: str,
+        request_serializer: Callable[[Any], bytes],
+        response_deserializer: Callable[[bytes], Any],
+    ) -> Any:
         prefix, _, call = path.rpartition("/")
         name, one = self._services.get(f"{prefix}/", ("", None))
 
@@ -91,7 +102,9 @@ class Network:
     def add(self, services: dict[str, object]) -> str:
         if self.over_sockets:
             server = grpc.server(futures.ThreadPoolExecutor(4), options=list(OPTIONS))
-            server.add_generic_rpc_handlers(tuple(handlers(name, one) for name, one in services.items()))
+            server.add_generic_rpc_handlers(
+                tuple(handlers(name, one) for name, one in services.items())
+            )
             port = server.add_insecure_port("127.0.0.1:0")
             server.start()
             self.stack.callback(server.stop, 0)
@@ -101,7 +114,9 @@ class Network:
         address = f"inside:{len(known)}"
         known[address] = Inside(services)
         self.monkeypatch.setattr("grpc.insecure_channel", lambda target, options=(): known[target])
-        self.monkeypatch.setattr("alpasim_plugin.alpasim.client.channel.Service.wait_ready", lambda service: None)
+        self.monkeypatch.setattr(
+            "alpasim_plugin.alpasim.client.channel.Service.wait_ready", lambda service: None
+        )
         return address
 
 
@@ -112,13 +127,34 @@ def renderer(scene: str) -> dict[str, object]:
 
 
 @contextmanager
-def chain(network: Network, scene: str, renderer: dict[str, object], overrides: list[str]) -> Iterator[tuple[str, str, str]]:
-    """Start the services; give the addresses of the fixed renderer, the one behind it, and the driver."""
+def chain(
+    network: Network, scene: str, renderer: dict[str, object], overrides: list[str]
+) -> Iterator[tuple[str, str, str]]:
+    """Start the services; give the addresses of the fixed renderer, the one behind it, and the
+    driver.
+    """
     base = network.add(renderer)
-    front = assemble(Settings(overrides=overrides, scenes=(scene,), upstream=Upstream(base), threads=1, reliability=1.0))
+    front = assemble(
+        Settings(
+            overrides=overrides,
+            scenes=(scene,),
+            upstream=Upstream(base),
+            threads=1,
+            reliability=1.0,
+        )
+    )
     spec = resolve("policy", "lane-camera")
-    driver = DriverService(spec.name, spec.digest, lambda scenario: build(spec, scenario=scenario), scenario_finder([scene]))
-    yield network.add({"SensorsimService": front.service}), base, network.add({"EgodriverService": driver})
+    driver = DriverService(
+        spec.name,
+        spec.digest,
+        lambda scenario: build(spec, scenario=scenario),
+        scenario_finder([scene]),
+    )
+    yield (
+        network.add({"SensorsimService": front.service}),
+        base,
+        network.add({"EgodriverService": driver}),
+    )
     front.close()
 
 
@@ -127,11 +163,15 @@ def loaded(scene: str) -> Scenario:
     return load_scenario(scene)
 
 
-def drive(scene: str, renderer: str, policy: str, overrides: list[str] | None = None, seed: int = 0) -> RolloutLog:
+def drive(
+    scene: str, renderer: str, policy: str, overrides: list[str] | None = None, seed: int = 0
+) -> RolloutLog:
     scenario = loaded(scene)
     with Recorder(scenario, seed, images="png") as recorder:
         made = make_renderer(renderer, scenario, seed, threads=1, overrides=overrides or ())
-        run_rollout(scenario, made, build(resolve("policy", policy), scenario=scenario), seed, recorder)
+        run_rollout(
+            scenario, made, build(resolve("policy", policy), scenario=scenario), seed, recorder
+        )
     return recorder.log()
 
 
@@ -141,16 +181,35 @@ def measured(rollout: RolloutLog, scene: str) -> dict[str, float | None]:
 
 
 def both(
-    scene: str, renderer: dict[str, object], overrides: list[str], encoding: str, monkeypatch: pytest.MonkeyPatch, renderers: list[str]
+    scene: str,
+    renderer: dict[str, object],
+    overrides: list[str],
+    encoding: str,
+    monkeypatch: pytest.MonkeyPatch,
+    renderers: list[str],
 ) -> list[list[RolloutLog]]:
-    """Drive every renderer over sockets, then without any; ``{front}`` and ``{base}`` in a name are the services' addresses."""
+    """Drive every renderer over sockets, then without any; ``{front}`` and ``{base}`` in a name are
+    the services' addresses.
+    """
     logs = []
     for over_sockets in (True, False):
-        with ExitStack() as stack, chain(Network(monkeypatch, over_sockets, stack), scene, renderer, overrides) as (front, base, driver):
+        with (
+            ExitStack() as stack,
+            chain(Network(monkeypatch, over_sockets, stack), scene, renderer, overrides) as (
+                front,
+                base,
+                driver,
+            ),
+        ):
             own = [*overrides, "noise=content"]
             names = [name.format(front=front, base=base) for name in renderers]
             policy = f"alpasim://{driver}?encoding={encoding}"
-            logs.append([drive(scene, name, policy, own if name.startswith("onefixer") else None) for name in names])
+            logs.append(
+                [
+                    drive(scene, name, policy, own if name.startswith("onefixer") else None)
+                    for name in names
+                ]
+            )
         monkeypatch.undo()
     return logs
 
@@ -165,23 +224,35 @@ def assert_equal(one: RolloutLog, other: RolloutLog, scene: str) -> None:
 def apart(one: RolloutLog, other: RolloutLog, frames: int) -> float:
     """Return the mean absolute difference of the first frames, in grey levels."""
     pairs = zip(one.images[:frames], other.images[:frames], strict=True)
-    return float(np.mean([np.abs(decode_image(a.data).astype(int) - decode_image(b.data).astype(int)).mean() for a, b in pairs]))
+    return float(
+        np.mean(
+            [
+                np.abs(decode_image(a.data).astype(int) - decode_image(b.data).astype(int)).mean()
+                for a, b in pairs
+            ]
+        )
+    )
 
 
 def test_the_chain_over_sockets_equals_the_chain_in_one_process(
     scene: str, renderer: dict[str, object], overrides: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pictures = ["nre://{front}?encoding=png", "onefixer+nre://{base}"]
-    (served, fixed_here), (inside, fixed_inside) = both(scene, renderer, overrides, "png", monkeypatch, pictures)
+    (served, fixed_here), (inside, fixed_inside) = both(
+        scene, renderer, overrides, "png", monkeypatch, pictures
+    )
     assert_equal(served, inside, scene)  # exactly: images, poses and scores
     assert_equal(fixed_here, fixed_inside, scene)
-    # A fixer in our process draws its semantic map at float64 poses, the served one at those of the wire.
+    # A fixer in our process draws its semantic map at float64 poses, the served one at those of the
+    # wire.
     assert np.abs(fixed_here.ego.xyz - served.ego.xyz).max() < 1e-4
     assert apart(fixed_here, served, 99) < 0.05
     jpegs = ["nre://{front}?encoding=jpeg", "nre://{base}"]
     (jpeg, raw), (jpeg_inside, _) = both(scene, renderer, overrides, "jpeg", monkeypatch, jpegs)
     assert apart(raw, served, 3) > 0.2  # the fixer was there
     assert_equal(jpeg, jpeg_inside, scene)
-    for one, other in zip(jpeg.images[:3], served.images[:3], strict=True):  # in the warm-up, at equal poses: the codec alone
+    for one, other in zip(
+        jpeg.images[:3], served.images[:3], strict=True
+    ):  # in the warm-up, at equal poses: the codec alone
         coded = decode_image(encode_image(decode_image(other.data), "jpeg"))
         np.testing.assert_array_equal(decode_image(one.data), coded)

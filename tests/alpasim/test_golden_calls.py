@@ -1,4 +1,6 @@
-"""The calls that AlpaSim's own runtime made, as its logs hold them, made again to our service: every answer valid and in order."""
+"""The calls that AlpaSim's own runtime made, as its logs hold them, made again to our service:
+every answer valid and in order.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +22,22 @@ class RecordedRenderer(StandInRenderer):
 
     def __init__(self, entries: list[Entry]) -> None:
         super().__init__()
-        self._cameras = next(e.available_cameras_return for e in entries if e.HasField("available_cameras_return"))
-        images = (e.driver_camera_image.camera_image for e in entries if e.HasField("driver_camera_image"))
+        self._cameras = next(
+            e.available_cameras_return for e in entries if e.HasField("available_cameras_return")
+        )
+        images = (
+            e.driver_camera_image.camera_image for e in entries if e.HasField("driver_camera_image")
+        )
         self._images = {(i.logical_id, i.frame_end_us): i.image_bytes for i in images}
 
-    def get_available_cameras(self, asked: Any, context: Any) -> sensorsim_pb2.AvailableCamerasReturn:
+    def get_available_cameras(
+        self, asked: Any, context: Any
+    ) -> sensorsim_pb2.AvailableCamerasReturn:
         return self._cameras
 
-    def get_available_ego_masks(self, asked: Any, context: Any) -> sensorsim_pb2.AvailableEgoMasksReturn:
+    def get_available_ego_masks(
+        self, asked: Any, context: Any
+    ) -> sensorsim_pb2.AvailableEgoMasksReturn:
         return sensorsim_pb2.AvailableEgoMasksReturn()
 
     def _image(self, asked: sensorsim_pb2.RGBRenderRequest, context: Any) -> bytes:
@@ -58,18 +68,33 @@ def replay(log: Path, scenes: Path, **settings: Any) -> list[bytes]:
             elif kind == "available_cameras_return":
                 assert cameras == entry.available_cameras_return
             elif kind == "available_ego_masks_request":
-                assert stub.get_available_ego_masks(entry.available_ego_masks_request) == sensorsim_pb2.AvailableEgoMasksReturn()
+                assert (
+                    stub.get_available_ego_masks(entry.available_ego_masks_request)
+                    == sensorsim_pb2.AvailableEgoMasksReturn()
+                )
             elif kind == "batch_render_request":
                 reply = stub.batch_render_rgb(entry.batch_render_request, timeout=300)
-                assert sorted(i.camera_name for i in reply.items) == sorted(i.camera_name for i in entry.batch_render_request.items)
+                assert sorted(i.camera_name for i in reply.items) == sorted(
+                    i.camera_name for i in entry.batch_render_request.items
+                )
                 for item in reply.items:
                     assert item.success
-                    asked = next(i.request for i in entry.batch_render_request.items if i.camera_name == item.camera_name)
+                    asked = next(
+                        i.request
+                        for i in entry.batch_render_request.items
+                        if i.camera_name == item.camera_name
+                    )
                     assert item.result.image_bytes[:2] == b"\xff\xd8"
                     assert asked.image_format == sensorsim_pb2.JPEG
-                    assert decode_image(item.result.image_bytes).shape == (asked.resolution_h, asked.resolution_w, 3)
+                    assert decode_image(item.result.image_bytes).shape == (
+                        asked.resolution_h,
+                        asked.resolution_w,
+                        3,
+                    )
                     images.append(item.result.image_bytes)
-        assert made.tree.counts.starts == (0 if made.fixers is None else 1), "every frame but the first continues the drive"
+        assert made.tree.counts.starts == (0 if made.fixers is None else 1), (
+            "every frame but the first continues the drive"
+        )
         assert made.tree.counts.frames in (0, len(images))
         assert not made.service.statuses
     return images
@@ -81,7 +106,11 @@ def test_the_calls_of_one_recorded_drive(shared_data: Path, overrides: list[str]
     images = replay(log, scene, overrides=overrides, reliability=1.0)
     assert len(images) > 20
     handed_on = replay(log, scene, renderer="identity")
-    recorded = [e.driver_camera_image.camera_image.image_bytes for e in AslReader(log) if e.HasField("driver_camera_image")]
+    recorded = [
+        e.driver_camera_image.camera_image.image_bytes
+        for e in AslReader(log)
+        if e.HasField("driver_camera_image")
+    ]
     assert handed_on == recorded
     assert images != handed_on
 
@@ -93,4 +122,6 @@ def test_the_calls_of_all_recorded_drives(shared_data: Path) -> None:
     logs = complete_logs(shared_data)
     assert len(logs) > 20
     for log in logs:
-        assert replay(log, shared_data / "alpasim-golden" / "scenes" / f"{log.parents[1].name}.usdz")
+        assert replay(
+            log, shared_data / "alpasim-golden" / "scenes" / f"{log.parents[1].name}.usdz"
+        )

@@ -1,4 +1,6 @@
-"""Callers that mean harm, at every server alike: whatever they leave open, others are served, and what they leave behind ends."""
+"""Callers that mean harm, at every server alike: whatever they leave open, others are served, and
+what they leave behind ends.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,14 @@ from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
 from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.log.wire import common_pb2, egodriver_pb2, health_pb2, reflection_pb2
 from alpasim_plugin.log.wire.services import Stub, methods
-from tests.alpasim.service_cases import START_US, StandInRenderer, channel_to, hosted, pinhole, request
+from tests.alpasim.service_cases import (
+    START_US,
+    StandInRenderer,
+    channel_to,
+    hosted,
+    pinhole,
+    request,
+)
 from tests.alpasim.test_server_lenses import ftheta
 
 EMPTY = common_pb2.Empty()
@@ -48,7 +57,11 @@ class Cruise(Policy):
         pass
 
     def act(self, observation: Observation) -> Plan:
-        self.poses, self.cameras, self.frames = len(observation.history), observation.cameras, observation.frames
+        self.poses, self.cameras, self.frames = (
+            len(observation.history),
+            observation.cameras,
+            observation.frames,
+        )
         times = observation.t_us + 100_000 * np.arange(41)
         x = 10e-6 * (times - observation.t_us)
         return Plan(observation.t_us, times, np.stack([x, 0 * x], axis=1), 0 * x)
@@ -113,7 +126,9 @@ def watch(channel: Any, silence: Silence) -> Any:
 
 
 def say_nothing(service: str, method: str) -> Callable[[Any, Silence], Any]:
-    return lambda channel, silence: channel.stream_stream(methods(service)[method].path)(iter(silence))
+    return lambda channel, silence: channel.stream_stream(methods(service)[method].path)(
+        iter(silence)
+    )
 
 
 def reflect(channel: Any, silence: Silence) -> Any:
@@ -128,7 +143,9 @@ def reflect(channel: Any, silence: Silence) -> Any:
 
 @pytest.mark.parametrize("name", SERVICES)
 @pytest.mark.parametrize("open_call", [watch, reflect], ids=["watch", "reflect"])
-def test_streams_that_stay_open_hold_nobody_up(name: str, open_call: Callable[[Any, Silence], Any]) -> None:
+def test_streams_that_stay_open_hold_nobody_up(
+    name: str, open_call: Callable[[Any, Silence], Any]
+) -> None:
     silence = Silence()
     with served(name) as host, channel_to(host) as channel:
         calls = [open_call(channel, silence) for _ in range(40)]
@@ -140,9 +157,13 @@ def test_streams_that_stay_open_hold_nobody_up(name: str, open_call: Callable[[A
 
 @pytest.mark.parametrize("name", SERVICES)
 @pytest.mark.parametrize(
-    "of", [("Health", "Check"), ("Health", "Watch"), ("ServerReflection", "ServerReflectionInfo"), None], ids=lambda of: of and of[1]
+    "of",
+    [("Health", "Check"), ("Health", "Watch"), ("ServerReflection", "ServerReflectionInfo"), None],
+    ids=lambda of: of and of[1],
 )
-def test_calls_whose_message_never_comes_hold_nobody_up(name: str, of: tuple[str, str] | None) -> None:
+def test_calls_whose_message_never_comes_hold_nobody_up(
+    name: str, of: tuple[str, str] | None
+) -> None:
     silence, open_call = Silence(), say_nothing(*(of or (name, "get_version")))
     with served(name) as host, channel_to(host) as channel:
         calls = [open_call(channel, silence) for _ in range(100)]
@@ -179,12 +200,20 @@ def test_watchers_are_counted_and_a_check_still_answers(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_callers_without_the_token_are_refused_without_a_thread_that_works(name: str, tmp_path: Path) -> None:
+def test_callers_without_the_token_are_refused_without_a_thread_that_works(
+    name: str, tmp_path: Path
+) -> None:
     (tmp_path / "token").write_text("secret\n")
     silence = Silence()
-    with served(name, policy=HostPolicy(token_file=tmp_path / "token")) as host, channel_to(host) as channel:
+    with (
+        served(name, policy=HostPolicy(token_file=tmp_path / "token")) as host,
+        channel_to(host) as channel,
+    ):
         for _ in range(40):
-            assert failure(lambda: next(say_nothing(name, "get_version")(channel, silence)))[0] is Code.UNAUTHENTICATED
+            assert (
+                failure(lambda: next(say_nothing(name, "get_version")(channel, silence)))[0]
+                is Code.UNAUTHENTICATED
+            )
         assert is_served(host, name, metadata=[("authorization", "Bearer secret")])
         silence.over.set()
 
@@ -208,7 +237,10 @@ def test_a_server_that_everybody_reaches_says_so_unless_callers_are_checked(
 def test_a_message_that_is_none_is_the_callers_fault() -> None:
     with served("EgodriverService") as host, channel_to(host) as channel:
         for path in (methods("EgodriverService")["drive"].path, methods("Health")["Check"].path):
-            assert failure(lambda path=path: channel.unary_unary(path)(b"\xff\xff\xff"))[0] is Code.INVALID_ARGUMENT
+            assert (
+                failure(lambda path=path: channel.unary_unary(path)(b"\xff\xff\xff"))[0]
+                is Code.INVALID_ARGUMENT
+            )
 
 
 def test_a_frame_of_too_many_pixels_is_refused_before_it_takes_memory() -> None:
@@ -227,10 +259,14 @@ def test_frames_of_too_many_pixels_together_are_refused_before_any_is_made() -> 
         frames.answers(asked, CallTime())
 
 
-def test_a_loaded_scene_is_served_while_another_loads_and_who_has_gone_does_not_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loaded_scene_is_served_while_another_loads_and_who_has_gone_does_not_wait(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     scenes = SceneCache(["smoke/straight", "smoke/curve"], None, False)
     loaded, other = scenes.ids
-    first, entered, leave = scenes.get(loaded), threading.Event(), threading.Event()
+    first = scenes.get(loaded)
+    entered = threading.Event()
+    leave = threading.Event()
     monkeypatch.setattr(scenes, "_load", lambda source: [entered.set(), leave.wait(30)])
     loading = threading.Thread(target=scenes.get, args=(other,))
     loading.start()
@@ -244,24 +280,31 @@ def test_a_loaded_scene_is_served_while_another_loads_and_who_has_gone_does_not_
     assert scenes.loaded == [loaded, other]
 
 
-# --- sessions of a driver -------------------------------------------------------------------------------------------------
+# --- sessions of a driver
 
 
 def opening(name: str) -> egodriver_pb2.DriveSessionRequest:
     request = egodriver_pb2.DriveSessionRequest(session_uuid=name)
     mount = common_pb2.Pose(quat=common_pb2.Quat(w=1.0))
-    request.rollout_spec.vehicle.available_cameras.add(logical_id="front", intrinsics=pinhole(name="front"), rig_to_camera=mount)
+    request.rollout_spec.vehicle.available_cameras.add(
+        logical_id="front", intrinsics=pinhole(name="front"), rig_to_camera=mount
+    )
     return request
 
 
-def seen(name: str, t_us: int, size: tuple[int, int] = (48, 32)) -> egodriver_pb2.RolloutCameraImage:
+def seen(
+    name: str, t_us: int, size: tuple[int, int] = (48, 32)
+) -> egodriver_pb2.RolloutCameraImage:
     picture = encode_image(np.zeros((*size[::-1], 3), np.uint8))
     camera_image = {"logical_id": "front", "frame_end_us": t_us, "image_bytes": picture}
     return egodriver_pb2.RolloutCameraImage(session_uuid=name, camera_image=camera_image)
 
 
 def moved(name: str, *times_us: int) -> egodriver_pb2.RolloutEgoTrajectory:
-    poses = [{"timestamp_us": t_us, "pose": {"vec": {"x": t_us * 1e-5}, "quat": {"w": 1.0}}} for t_us in times_us]
+    poses = [
+        {"timestamp_us": t_us, "pose": {"vec": {"x": t_us * 1e-5}, "quat": {"w": 1.0}}}
+        for t_us in times_us
+    ]
     return egodriver_pb2.RolloutEgoTrajectory(session_uuid=name, trajectory={"poses": poses})
 
 
@@ -293,7 +336,9 @@ def test_a_sessions_past_has_an_end_and_so_have_the_times_that_are_kept() -> Non
         stub.start_session(opening("a"))
         stub.submit_image_observation(seen("a", 1))
         for block in range(3):
-            stub.submit_egomotion_observation(moved("a", *range(block * MOST_POSES + 1, (block + 1) * MOST_POSES)))
+            stub.submit_egomotion_observation(
+                moved("a", *range(block * MOST_POSES + 1, (block + 1) * MOST_POSES))
+            )
         stub.drive(egodriver_pb2.DriveRequest(session_uuid="a", time_now_us=3 * MOST_POSES))
     assert made[0].poses == MOST_POSES
     assert service.drives_s.maxlen is not None
@@ -308,8 +353,13 @@ def test_a_policy_is_shown_the_pinhole_of_a_camera_with_an_f_theta_lens_and_one_
         stub.start_session(asked)
         stub.submit_image_observation(seen("a", 1, (160, 90)))
         stub.submit_egomotion_observation(moved("a", 1))
-        assert stub.drive(egodriver_pb2.DriveRequest(session_uuid="a", time_now_us=1)).trajectory.poses
-        assert failure(lambda: stub.submit_image_observation(seen("a", 2, (320, 180))))[0] is Code.INVALID_ARGUMENT
+        assert stub.drive(
+            egodriver_pb2.DriveRequest(session_uuid="a", time_now_us=1)
+        ).trajectory.poses
+        assert (
+            failure(lambda: stub.submit_image_observation(seen("a", 2, (320, 180))))[0]
+            is Code.INVALID_ARGUMENT
+        )
     (shown,) = made[0].cameras.values()
     straight = straight_of(ftheta(False), 160, 90)
     assert (shown.width, shown.height) == straight.size == made[0].frames["front"].rgb.shape[1::-1]
@@ -329,5 +379,10 @@ def test_times_that_no_rollout_has_are_the_callers_fault() -> None:
                 (stub.submit_egomotion_observation, moved("a", t_us)),
                 (stub.submit_image_observation, seen("a", t_us)),
             ):
-                assert failure(lambda call=call, request=request: call(request))[0] is Code.INVALID_ARGUMENT
-        assert stub.drive(egodriver_pb2.DriveRequest(session_uuid="a", time_now_us=2)).trajectory.poses
+                assert (
+                    failure(lambda call=call, request=request: call(request))[0]
+                    is Code.INVALID_ARGUMENT
+                )
+        assert stub.drive(
+            egodriver_pb2.DriveRequest(session_uuid="a", time_now_us=2)
+        ).trajectory.poses

@@ -1,4 +1,6 @@
-"""A peer that goes away is a fault of the machine and is driven again; one that answers late or wrongly is the policy's own fault."""
+"""A peer that goes away is a fault of the machine and is driven again; one that answers late or
+wrongly is the policy's own fault.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,17 @@ from alpasim_plugin.log.wire import egodriver_pb2
 from tests.alpasim.service_cases import hosted
 
 REPO = Path(__file__).resolve().parents[2]
-SHORT = ("--set", "timing.duration_us=600000", "--certify", "none", "--no-report", "--images", "none", "--workers", "1")
+SHORT = (
+    "--set",
+    "timing.duration_us=600000",
+    "--certify",
+    "none",
+    "--no-report",
+    "--images",
+    "none",
+    "--workers",
+    "1",
+)
 SCRIPT = """
 import os, signal, sys
 import numpy as np
@@ -57,7 +69,9 @@ def free_port() -> int:
 @contextmanager
 def driver(address: str, *more: str) -> Iterator[None]:
     environment = {**os.environ, "PYTHONPATH": str(REPO)}
-    with subprocess.Popen([sys.executable, "-c", SCRIPT, address, *more], env=environment) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, address, *more], env=environment
+    ) as process:
         try:
             with grpc.insecure_channel(address) as channel:
                 grpc.channel_ready_future(channel).result(60)
@@ -116,11 +130,18 @@ class Answering:
         ("UNKNOWN", "Exception calling application", PolicyError),
     ],
 )
-def test_only_what_a_driver_does_itself_is_its_own_fault(code: str, text: str, kind: type[SimrunError]) -> None:
+def test_only_what_a_driver_does_itself_is_its_own_fault(
+    code: str, text: str, kind: type[SimrunError]
+) -> None:
     with hosted({"EgodriverService": Answering(grpc.StatusCode[code], text)}) as host:
         service = Service("EgodriverService", host.address, PolicyError, retries=False)
         with pytest.raises(SimrunError) as caught:
-            service.call("drive", egodriver_pb2.DriveRequest(), 0.3 if code == "DEADLINE_EXCEEDED" else 10.0, at_us=1_700_000)
+            service.call(
+                "drive",
+                egodriver_pb2.DriveRequest(),
+                0.3 if code == "DEADLINE_EXCEEDED" else 10.0,
+                at_us=1_700_000,
+            )
         service.close()
     assert type(caught.value) is kind
     assert caught.value.doing == "calling EgodriverService.drive"

@@ -1,4 +1,6 @@
-"""The truth gate: a map whose lines are painted beside where it has them is off; a picture without paint is no evidence."""
+"""The truth gate: a map whose lines are painted beside where it has them is off; a picture without
+paint is no evidence.
+"""
 
 from __future__ import annotations
 
@@ -42,8 +44,13 @@ SPEC = CameraSpec("front", 480, 270, np.array([[240.0, 0, 240], [0, 240.0, 135],
 def road(aside_m: float = 0.0, dashed: bool = False) -> LaneMap:
     """A straight road along x with three lines; the middle of its right lane is y = 0."""
     paints = ("solid_white", "dashed_white" if dashed else "solid_yellow", "solid_white")
-    lines = [np.array([[-10.0, y + aside_m, 0.0], [150.0, y + aside_m, 0.0]]) for y in (5.25, 1.75, -1.75)]
-    return LaneMap({}, markings=tuple(Marking(line, paint) for line, paint in zip(lines, paints, strict=True)))  # type: ignore[arg-type]
+    lines = [
+        np.array([[-10.0, y + aside_m, 0.0], [150.0, y + aside_m, 0.0]])
+        for y in (5.25, 1.75, -1.75)
+    ]
+    return LaneMap(
+        {}, markings=tuple(Marking(line, paint) for line, paint in zip(lines, paints, strict=True))
+    )  # type: ignore[arg-type]
 
 
 def prepared(aside_m: float = 0.0, **options: bool) -> PreparedMap:
@@ -52,8 +59,14 @@ def prepared(aside_m: float = 0.0, **options: bool) -> PreparedMap:
 
 def photograph(contrast: int = 90, noise: float = 6.0, aside_m: float = 0.0, **options: bool) -> U8:
     """A grey road with the paint of `road`, as thin as paint is, and a textured roadside."""
-    thin = draw_map(prepare_map(road(aside_m, **options), style=replace(OPENGL, line_px=5.0)), SPEC, AHEAD)
-    out = 80 + np.random.default_rng(0).normal(0, noise, (270, 480, 1)) + (thin.max(axis=2, keepdims=True) > 60) * contrast
+    thin = draw_map(
+        prepare_map(road(aside_m, **options), style=replace(OPENGL, line_px=5.0)), SPEC, AHEAD
+    )
+    out = (
+        80
+        + np.random.default_rng(0).normal(0, noise, (270, 480, 1))
+        + (thin.max(axis=2, keepdims=True) > 60) * contrast
+    )
     out[:130] = 60 + 100 * np.random.default_rng(1).random((130, 480, 1))
     return np.repeat(np.clip(out, 0, 255), 3, axis=2).astype(np.uint8)
 
@@ -78,35 +91,55 @@ def test_a_map_that_is_aside_is_off_and_the_answer_says_where_the_paint_is(aside
 
 
 def test_a_picture_without_paint_is_no_evidence() -> None:
-    for rgb in (photograph(contrast=0), photograph(contrast=0, noise=40.0), np.zeros((270, 480, 3), np.uint8)):
+    for rgb in (
+        photograph(contrast=0),
+        photograph(contrast=0, noise=40.0),
+        np.zeros((270, 480, 3), np.uint8),
+    ):
         assert judged(rgb, prepared()) is None
         assert judged(rgb, prepared(1.75)) is None
 
 
 def test_a_map_without_lines_or_with_few_in_view_is_not_judged() -> None:
     assert judged(photograph(), prepare_map(LaneMap({}))) is None
-    assert judged(photograph(), prepared(), se2(0, 0, np.pi) @ AHEAD @ np.diag([1.0, 1, 1, 1])) is None
+    assert (
+        judged(photograph(), prepared(), se2(0, 0, np.pi) @ AHEAD @ np.diag([1.0, 1, 1, 1])) is None
+    )
     small = replace(SPEC, width=48, height=27, K=np.diag([0.1, 0.1, 1]) @ SPEC.K)
     tiny = cv2.resize(photograph(), (48, 27), interpolation=cv2.INTER_AREA)
     assert contradiction(prepared(1.75), small, AHEAD, (), tiny) is None
 
 
 def test_a_road_user_hides_lines_from_the_comparison() -> None:
-    bus, striped = ActorBox(se2(8.0, 0.0, 0.0, 1.6), Box(6.0, 14.0, 3.2), "bus"), photograph(contrast=0)
+    bus, striped = (
+        ActorBox(se2(8.0, 0.0, 0.0, 1.6), Box(6.0, 14.0, 3.2), "bus"),
+        photograph(contrast=0),
+    )
     lines = line_pixels(draw_map(prepared(1.75), SPEC, AHEAD)) & (np.arange(270)[:, None] > 150)
-    striped[np.roll(lines, 30, axis=1)] = 200  # the lines of the map, beside where it has them, painted on the bus
+    striped[np.roll(lines, 30, axis=1)] = (
+        200  # the lines of the map, beside where it has them, painted on the bus
+    )
     assert contradiction(prepared(1.75), SPEC, AHEAD, (bus,), striped) is None
 
 
 def test_paint_that_stays_where_the_recording_shows_it_is_no_evidence() -> None:
-    """A poor reconstruction seen from a metre beside the path: its lines are aside by that metre. Others still are evidence."""
+    """A poor reconstruction seen from a metre beside the path: its lines are aside by that metre.
+    Others still are evidence.
+    """
     unmoved = photograph(aside_m=0.9)
     assert judged(unmoved, prepared()).aside_m == pytest.approx(0.9)
     assert contradiction(prepared(), SPEC, AHEAD, (), unmoved, beside_m=1.0) is None
-    assert contradiction(prepared(), SPEC, AHEAD, (), photograph(aside_m=1.75), beside_m=1.0) is not None
+    assert (
+        contradiction(prepared(), SPEC, AHEAD, (), photograph(aside_m=1.75), beside_m=1.0)
+        is not None
+    )
     path = np.array([[0.0, 0.0], [50.0, 0.0]])
-    assert beside(path, se2(4.0, 1.0, 0.1), se2(4.0, 1.0, 0.1) @ AHEAD) == pytest.approx(np.cos(0.1))
-    assert beside(path, se2(4.0, -1.0, 0.0), se2(0, 0, np.pi) @ AHEAD) == pytest.approx(1.0), "of a camera that looks back"
+    assert beside(path, se2(4.0, 1.0, 0.1), se2(4.0, 1.0, 0.1) @ AHEAD) == pytest.approx(
+        np.cos(0.1)
+    )
+    assert beside(path, se2(4.0, -1.0, 0.0), se2(0, 0, np.pi) @ AHEAD) == pytest.approx(1.0), (
+        "of a camera that looks back"
+    )
 
 
 def test_a_large_picture_is_compared_at_a_small_width() -> None:
@@ -137,13 +170,21 @@ def test_chance_is_one_half_and_pieces_at_the_edge_have_one_side() -> None:
 def ask(size: tuple[int, int] = (240, 136)) -> Any:
     scenario = load_scenario("smoke/straight")
     t_us = scenario.start_us + 1_000_000
-    pose = wire_pose(interpolate(scenario.ego_log, t_us) @ scenario.cameras[0].T_rig_camera, "a test")
+    pose = wire_pose(
+        interpolate(scenario.ego_log, t_us) @ scenario.cameras[0].T_rig_camera, "a test"
+    )
     lens = pinhole(*size, "front")
     lens.opencv_pinhole_param.focal_length_x = lens.opencv_pinhole_param.focal_length_y = 130
     return sensorsim_pb2.RGBRenderRequest(
-        scene_id=scenario.scene_id, resolution_w=size[0], resolution_h=size[1], camera_intrinsics=lens, frame_start_us=t_us - 30_000,
-        frame_end_us=t_us, image_format=sensorsim_pb2.PNG, sensor_pose=sensorsim_pb2.PosePair(start_pose=pose, end_pose=pose),
-    )  # fmt: skip
+        scene_id=scenario.scene_id,
+        resolution_w=size[0],
+        resolution_h=size[1],
+        camera_intrinsics=lens,
+        frame_start_us=t_us - 30_000,
+        frame_end_us=t_us,
+        image_format=sensorsim_pb2.PNG,
+        sensor_pose=sensorsim_pb2.PosePair(start_pose=pose, end_pose=pose),
+    )
 
 
 @pytest.mark.parametrize(("aside_m", "is_off"), [(0.0, False), (1.75, True)])
@@ -151,13 +192,24 @@ def test_a_server_drops_a_wrong_map_and_says_so(
     aside_m: float, is_off: bool, overrides: list[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     def served(*more: str, moved_m: float = aside_m) -> tuple[U8, int]:
-        made = assemble(Settings(renderer="onefixer+clean", scenes=["smoke/straight"], overrides=[*overrides, *more], threads=1))
+        made = assemble(
+            Settings(
+                renderer="onefixer+clean",
+                scenes=["smoke/straight"],
+                overrides=[*overrides, *more],
+                threads=1,
+            )
+        )
         assert made.scenes is not None
         entry, asked = made.scenes.get(ask().scene_id), ask()
         if entry.scene_map is not None:
-            lines = replace(entry.scene_map, origin=entry.scene_map.origin + np.array([0.0, moved_m, 0.0]))
+            lines = replace(
+                entry.scene_map, origin=entry.scene_map.origin + np.array([0.0, moved_m, 0.0])
+            )
             made.scenes._loaded[asked.scene_id] = replace(entry, scene_map=lines)
-        return decode_image(made.service.frames.answers([asked], CallTime())[0]), made.service.frames.events[MAP_OFF]
+        return decode_image(
+            made.service.frames.answers([asked], CallTime())[0]
+        ), made.service.frames.events[MAP_OFF]
 
     image, events = served()
     assert events == is_off

@@ -1,4 +1,6 @@
-"""AlpaSim's controller, physics and traffic services as remotes of our loop, over sockets, against small servers of the same services."""
+"""AlpaSim's controller, physics and traffic services as remotes of our loop, over sockets, against
+small servers of the same services.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,9 @@ class Service:
 
 
 class Vehicle(Service):
-    """Our bicycle behind VDCService, as strict as AlpaSim's: its own time, its own speed, no plan before now."""
+    """Our bicycle behind VDCService, as strict as AlpaSim's: its own time, its own speed, no plan
+    before now.
+    """
 
     def __init__(self, scenario: Scenario, deprecated: bool = False) -> None:
         super().__init__()
@@ -61,21 +65,39 @@ class Vehicle(Service):
         self.state: EgoState | None = None
         return super().start_session(request, context)
 
-    def run_controller_and_vehicle(self, request: Any, context: Any) -> controller_pb2.RunControllerAndVehicleModelResponse:
+    def run_controller_and_vehicle(
+        self, request: Any, context: Any
+    ) -> controller_pb2.RunControllerAndVehicleModelResponse:
         self.calls.append("run")
         given, moving = request.state, request.state.state
         pose = read_transform(given.pose, "state")
         if self.state is None:
-            self.state = EgoState(given.timestamp_us, pose, moving.linear_velocity.x, 0.0, moving.angular_velocity.z)
-        assert self.state.t_us == given.timestamp_us == request.planned_trajectory_in_rig.poses[0].timestamp_us
+            self.state = EgoState(
+                given.timestamp_us, pose, moving.linear_velocity.x, 0.0, moving.angular_velocity.z
+            )
+        assert (
+            self.state.t_us
+            == given.timestamp_us
+            == request.planned_trajectory_in_rig.poses[0].timestamp_us
+        )
         plan = in_world(pose, read_trajectory(request.planned_trajectory_in_rig, "plan"))
-        self.state = self.tracker.advance(replace(self.state, T_world_rig=pose), plan, request.future_time_us)
+        self.state = self.tracker.advance(
+            replace(self.state, T_world_rig=pose), plan, request.future_time_us
+        )
         wire, now = wire_pose(self.state.T_world_rig, "state"), self.state.t_us
         answer = controller_pb2.RunControllerAndVehicleModelResponse
         if self.deprecated:
             at = common_pb2.PoseAtTime(pose=wire, timestamp_us=now)
             return answer(pose_local_to_rig=at, dynamic_state=wire_dynamics(self.state))
-        return answer(states=[answer.PropagatedState(timestamp_us=now, pose_local_to_rig=wire, dynamic_state=wire_dynamics(self.state))])
+        return answer(
+            states=[
+                answer.PropagatedState(
+                    timestamp_us=now,
+                    pose_local_to_rig=wire,
+                    dynamic_state=wire_dynamics(self.state),
+                )
+            ]
+        )
 
 
 def in_world(T_world_rig: Any, plan: Trajectory) -> Trajectory:
@@ -85,7 +107,9 @@ def in_world(T_world_rig: Any, plan: Trajectory) -> Trajectory:
 class Slope(Service):
     """A ground that rises by a tenth along x, whatever the scenario says."""
 
-    def ground_intersection(self, request: Any, context: Any) -> physics_pb2.PhysicsGroundIntersectionReturn:
+    def ground_intersection(
+        self, request: Any, context: Any
+    ) -> physics_pb2.PhysicsGroundIntersectionReturn:
         assert request.ego_data.aabb.size_x > 3.0
         out = physics_pb2.PhysicsGroundIntersectionReturn()
         for one in request.ego_data.ego_trajectory_aabb.poses:
@@ -96,7 +120,9 @@ class Slope(Service):
 
 
 class Traffic(Service):
-    """Replays the tracks, 2 m to the left from the hand-over on; leaves out what has no track then."""
+    """Replays the tracks, 2 m to the left from the hand-over on; leaves out what has no track
+    then.
+    """
 
     def get_metadata(self, request: Any, context: Any) -> traffic_pb2.TrafficModuleMetadata:
         return traffic_pb2.TrafficModuleMetadata(minimum_history_length_us=500_000)
@@ -111,7 +137,9 @@ class Traffic(Service):
             track = read_trajectory(one.trajectory, one.object_id)
             if one.is_static or not track.t_us[0] <= t <= track.t_us[-1]:
                 continue
-            pose = interpolate(track, t) @ se2(0.0, 2.0 if t > self.opened.handover_time_us else 0.0, 0.0)
+            pose = interpolate(track, t) @ se2(
+                0.0, 2.0 if t > self.opened.handover_time_us else 0.0, 0.0
+            )
             added = out.object_trajectory_updates.add(object_id=one.object_id).trajectory
             added.poses.add(timestamp_us=t, pose=wire_pose(pose, "answer"))
             added.poses.add(timestamp_us=t + 100_000, pose=wire_pose(pose, "a forecast"))
@@ -138,7 +166,9 @@ class Empty:
 
 
 @pytest.mark.parametrize("deprecated", [False, True])
-def test_a_vehicle_behind_a_socket_drives_as_the_same_in_the_process(scenario: Scenario, deprecated: bool) -> None:
+def test_a_vehicle_behind_a_socket_drives_as_the_same_in_the_process(
+    scenario: Scenario, deprecated: bool
+) -> None:
     service = Vehicle(scenario, deprecated)
     with hosted({"VDCService": service}) as host:
         spec = resolve("controller", f"vdc://{host.address}")
@@ -147,7 +177,9 @@ def test_a_vehicle_behind_a_socket_drives_as_the_same_in_the_process(scenario: S
         outside = drive(scenario, remote)
         remote.close()
     inside = drive(scenario, make_controller("bicycle", scenario.vehicle))
-    assert np.abs(outside.ego.xyz - inside.ego.xyz).max() < 1e-4  # the wheel's first angle is not on the wire, poses are float32
+    assert (
+        np.abs(outside.ego.xyz - inside.ego.xyz).max() < 1e-4
+    )  # the wheel's first angle is not on the wire, poses are float32
     assert np.abs(outside.ego.xyz[-1] - outside.ego.xyz[0]).max() > 8.0
     assert service.calls == ["start", *["run"] * 12, "close"]
 
@@ -155,15 +187,23 @@ def test_a_vehicle_behind_a_socket_drives_as_the_same_in_the_process(scenario: S
 def test_physics_sets_the_ego_on_its_ground(scenario: Scenario) -> None:
     services = {"VDCService": Vehicle(scenario), "PhysicsService": Slope()}
     with hosted(services) as host:
-        remote = VdcController(scenario.vehicle, f"{host.address}?physics={host.address}", scenario.scene_id)
+        remote = VdcController(
+            scenario.vehicle, f"{host.address}?physics={host.address}", scenario.scene_id
+        )
         rollout = drive(scenario, remote)
         remote.close()
         services["PhysicsService"].scenes = ("elsewhere",)
         with pytest.raises(InputError, match="no scene 'smoke-lead_car' among its 1: elsewhere"):
-            VdcController(scenario.vehicle, f"{host.address}?physics={host.address}", scenario.scene_id)
+            VdcController(
+                scenario.vehicle, f"{host.address}?physics={host.address}", scenario.scene_id
+            )
     free = rollout.ego.t_us > scenario.start_us + scenario.warmup_us
-    np.testing.assert_allclose(rollout.ego.xyz[free, 2], 0.1 * rollout.ego.xyz[free, 0] + 0.75, atol=1e-4)
-    assert np.abs(rollout.ego.xyz[~free, 2] - scenario.vehicle.box.height_m / 2).max() < 0.05  # the recording's own ground
+    np.testing.assert_allclose(
+        rollout.ego.xyz[free, 2], 0.1 * rollout.ego.xyz[free, 0] + 0.75, atol=1e-4
+    )
+    assert (
+        np.abs(rollout.ego.xyz[~free, 2] - scenario.vehicle.box.height_m / 2).max() < 0.05
+    )  # the recording's own ground
 
 
 def test_a_traffic_service_moves_the_others(scenario: Scenario) -> None:
@@ -180,7 +220,9 @@ def test_a_traffic_service_moves_the_others(scenario: Scenario) -> None:
     a, b = rollout.actors[moving].track, own.actors[moving].track
     late = a.t_us > scenario.start_us + scenario.warmup_us
     np.testing.assert_allclose(a.xyz[~late], b.xyz[~late], atol=1e-4)
-    assert np.abs(np.linalg.norm(a.xyz[late] - b.xyz[late], axis=1) - 2.0).max() < 0.5  # b reacts, a follows its track 2 m aside
+    assert (
+        np.abs(np.linalg.norm(a.xyz[late] - b.xyz[late], axis=1) - 2.0).max() < 0.5
+    )  # b reacts, a follows its track 2 m aside
 
 
 def test_answers_that_are_none_are_the_services_failure(scenario: Scenario) -> None:
@@ -205,15 +247,24 @@ def test_answers_that_are_none_are_the_services_failure(scenario: Scenario) -> N
             drive(scenario, VdcController(scenario.vehicle, host.address))
         with pytest.raises(InfrastructureError, match="track 'ghost' is unknown"):
             drive(scenario, actors=RemoteActors(scenario, host.address, 0))
-    with hosted({"TrafficService": Forgetful()}) as host, pytest.raises(InputError, match="needs 60 s of the past"):
+    with (
+        hosted({"TrafficService": Forgetful()}) as host,
+        pytest.raises(InputError, match="needs 60 s of the past"),
+    ):
         RemoteActors(scenario, host.address, 0)
 
 
 def test_a_plan_is_sent_from_now_on_in_the_rigs_frame_of_now() -> None:
     x = np.arange(5.0)
-    plan = Trajectory(100_000 * np.arange(5, dtype=np.int64), np.column_stack([x, 0 * x, 0 * x]), np.tile([1.0, 0, 0, 0], (5, 1)))
+    plan = Trajectory(
+        100_000 * np.arange(5, dtype=np.int64),
+        np.column_stack([x, 0 * x, 0 * x]),
+        np.tile([1.0, 0, 0, 0], (5, 1)),
+    )
     for now, want in ((150_000, [150_000, 200_000, 300_000, 400_000]), (500_000, [500_000])):
         state = EgoState(now, se2(1.5, 1.0, np.pi / 2), 5.0)
         sent = plan_in_rig(plan, state)
         assert sent.t_us.tolist() == want
-    assert plan_in_rig(plan, EgoState(150_000, se2(1.5, 1.0, np.pi / 2), 5.0)).xyz[1].tolist() == pytest.approx([-1.0, -0.5, 0.0])
+    assert plan_in_rig(plan, EgoState(150_000, se2(1.5, 1.0, np.pi / 2), 5.0)).xyz[
+        1
+    ].tolist() == pytest.approx([-1.0, -0.5, 0.0])

@@ -38,29 +38,52 @@ def served() -> Iterator[tuple[Any, Assembled]]:
         yield Stub(channel, "SensorsimService"), made
 
 
-def ask(t_s: float = 1.0, spec: sensorsim_pb2.CameraSpec | None = None) -> sensorsim_pb2.RGBRenderRequest:
+def ask(
+    t_s: float = 1.0, spec: sensorsim_pb2.CameraSpec | None = None
+) -> sensorsim_pb2.RGBRenderRequest:
     """Return the request for the recorded pose after a time, with the first moving car."""
     scenario = load_scenario(SCENE)
     t_us = scenario.start_us + int(t_s * 1e6)
     pose: F64 = interpolate(scenario.ego_log, t_us) @ scenario.cameras[0].T_rig_camera
-    pair = sensorsim_pb2.PosePair(start_pose=wire_pose(pose, "a test"), end_pose=wire_pose(pose, "a test"))
+    pair = sensorsim_pb2.PosePair(
+        start_pose=wire_pose(pose, "a test"), end_pose=wire_pose(pose, "a test")
+    )
     asked = sensorsim_pb2.RGBRenderRequest(
-        scene_id=scenario.scene_id, resolution_w=W, resolution_h=H, camera_intrinsics=spec or pinhole(W, H, "front"),
-        frame_start_us=t_us - 30_000, frame_end_us=t_us, sensor_pose=pair, image_format=sensorsim_pb2.PNG,
-    )  # fmt: skip
+        scene_id=scenario.scene_id,
+        resolution_w=W,
+        resolution_h=H,
+        camera_intrinsics=spec or pinhole(W, H, "front"),
+        frame_start_us=t_us - 30_000,
+        frame_end_us=t_us,
+        sensor_pose=pair,
+        image_format=sensorsim_pb2.PNG,
+    )
     for actor in scenario.actors:
         if not actor.is_static:
             box = wire_pose(interpolate(actor.track, t_us), "a test")
-            asked.dynamic_objects.add(track_id=actor.actor_id, pose_pair=sensorsim_pb2.PosePair(start_pose=box, end_pose=box))
+            asked.dynamic_objects.add(
+                track_id=actor.actor_id,
+                pose_pair=sensorsim_pb2.PosePair(start_pose=box, end_pose=box),
+            )
     return asked
 
 
-def test_a_frame_equals_the_renderers_own_at_the_pose_of_the_wire(served: tuple[Any, Assembled]) -> None:
+def test_a_frame_equals_the_renderers_own_at_the_pose_of_the_wire(
+    served: tuple[Any, Assembled],
+) -> None:
     asked, scenario = ask(), load_scenario(SCENE)
     view = read_view(asked)
-    camera = replace(scenario.cameras[0], name="front", width=W, height=H, K=np.array([[40.0, 0, 32], [0, 40, 18], [0, 0, 1]]))
+    camera = replace(
+        scenario.cameras[0],
+        name="front",
+        width=W,
+        height=H,
+        K=np.array([[40.0, 0, 32], [0, 40, 18], [0, 0, 1]]),
+    )
     boxes = {track: pair[1] for track, pair in view.objects.items()}
-    direct = CleanRenderer(scenario, 0, "cpu", 1).render(RenderRequest(view.t_us, camera, view.T_world_camera, boxes))
+    direct = CleanRenderer(scenario, 0, "cpu", 1).render(
+        RenderRequest(view.t_us, camera, view.T_world_camera, boxes)
+    )
     (data,) = answers(served[0], [asked])
     np.testing.assert_array_equal(decode_image(data), direct.rgb)
 
@@ -72,21 +95,37 @@ def test_a_moved_object_and_another_lens_are_seen(served: tuple[Any, Assembled])
         o.pose_pair.end_pose.vec.z -= 100.0  # as the runtime hides an actor
     (hidden,) = answers(served[0], [asked])
     assert hidden != before
-    lens = sensorsim_pb2.FthetaCameraParam(principal_point_x=32, principal_point_y=18, angle_to_pixeldist_poly=[0.0, 40.0, 0.0, 0.0])
+    lens = sensorsim_pb2.FthetaCameraParam(
+        principal_point_x=32, principal_point_y=18, angle_to_pixeldist_poly=[0.0, 40.0, 0.0, 0.0]
+    )
     lens.reference_poly = sensorsim_pb2.FthetaCameraParam.ANGLE_TO_PIXELDIST
-    round_lens = sensorsim_pb2.CameraSpec(ftheta_param=lens, logical_id="front", resolution_w=W, resolution_h=H)
+    round_lens = sensorsim_pb2.CameraSpec(
+        ftheta_param=lens, logical_id="front", resolution_w=W, resolution_h=H
+    )
     (bent,) = answers(served[0], [ask(spec=round_lens)])
-    centre = np.s_[14:22, 26:38]  # within 0.15 rad of the axis the lenses agree to a quarter of a pixel
+    centre = np.s_[
+        14:22, 26:38
+    ]  # within 0.15 rad of the axis the lenses agree to a quarter of a pixel
     a, b = (decode_image(x)[centre].astype(int) for x in (before, bent))
     assert np.abs(a - b).mean() < 6
     assert before != bent
 
 
 def test_an_own_splat_is_served_with_the_road_users_of_the_request(tmp_path: Path) -> None:
-    """A PLY file replaces what the scenario builds; a car of the request is drawn in it as Gaussians, where the request puts it."""
-    ground = np.stack(np.meshgrid(np.linspace(-20, 120, 120), np.linspace(-20, 20, 40), [-0.05]), axis=-1).reshape(-1, 3)
+    """A PLY file replaces what the scenario builds; a car of the request is drawn in it as
+    Gaussians, where the request puts it.
+    """
+    ground = np.stack(
+        np.meshgrid(np.linspace(-20, 120, 120), np.linspace(-20, 20, 40), [-0.05]), axis=-1
+    ).reshape(-1, 3)
     n = len(ground)
-    cloud = GaussianCloud(ground, np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 3), 0.7), np.full(n, 0.99), np.full((n, 1, 3), -1.0))
+    cloud = GaussianCloud(
+        ground,
+        np.tile([1.0, 0, 0, 0], (n, 1)),
+        np.full((n, 3), 0.7),
+        np.full(n, 0.99),
+        np.full((n, 1, 3), -1.0),
+    )
     write_ply(tmp_path / "own.ply", cloud)
     overrides = [f"background.file={tmp_path / 'own.ply'}"]
     made = assemble(Settings(renderer="clean", scenes=[SCENE], overrides=overrides, threads=1))
@@ -102,7 +141,9 @@ def test_an_own_splat_is_served_with_the_road_users_of_the_request(tmp_path: Pat
                 o.pose_pair.end_pose.vec.z += up_m
             shown.append(decode_image(answers(stub, [asked])[0]).astype(int))
     hidden, ahead, left = shown
-    places = [np.argwhere(np.abs(one - hidden).max(axis=2) > 24)[:, 1].mean() for one in (ahead, left)]
+    places = [
+        np.argwhere(np.abs(one - hidden).max(axis=2) > 24)[:, 1].mean() for one in (ahead, left)
+    ]
     assert abs(places[0] - W / 2) < 3
     assert places[1] < places[0] - 2
 
@@ -110,11 +151,16 @@ def test_an_own_splat_is_served_with_the_road_users_of_the_request(tmp_path: Pat
 def test_questions_about_scenes_are_answered(served: tuple[Any, Assembled]) -> None:
     stub, made = served
     (scene_id,) = stub.get_available_scenes(common_pb2.Empty()).scene_ids
-    cameras = stub.get_available_cameras(sensorsim_pb2.AvailableCamerasRequest(scene_id=scene_id)).available_cameras
+    cameras = stub.get_available_cameras(
+        sensorsim_pb2.AvailableCamerasRequest(scene_id=scene_id)
+    ).available_cameras
     assert [camera.logical_id for camera in cameras] == ["front", FRONT_WIDE]
     assert cameras[0].rig_to_camera == cameras[1].rig_to_camera
     assert cameras[1].intrinsics.logical_id == FRONT_WIDE
-    assert stub.prefetch_scene(sensorsim_pb2.ScenePrefetchRequest(scene_id=scene_id)) == common_pb2.Empty()
+    assert (
+        stub.prefetch_scene(sensorsim_pb2.ScenePrefetchRequest(scene_id=scene_id))
+        == common_pb2.Empty()
+    )
     assert [s.scene_id for s in stub.get_loaded_scenes(common_pb2.Empty()).scenes] == [scene_id]
     asked = sensorsim_pb2.AvailableTrajectoriesRequest(scene_id=scene_id)
     path = stub.get_available_trajectories(asked).available_trajectories[0].trajectory
@@ -127,24 +173,42 @@ def test_questions_about_scenes_are_answered(served: tuple[Any, Assembled]) -> N
 @pytest.mark.parametrize(
     ("call", "code", "found"),
     [
-        (lambda stub: stub.render_rgb(changed(scene_id="other")), "NOT_FOUND", "none of the 1 known"),
-        (lambda stub: stub.prefetch_scene(sensorsim_pb2.ScenePrefetchRequest(scene_id="other")), "NOT_FOUND", "none of the 1 known"),
-        (lambda stub: stub.render_rgb(changed(track="ghost")), "INVALID_ARGUMENT", "'ghost', not in the scene"),
         (
-            lambda stub: stub.render_lidar(sensorsim_pb2.LidarRenderRequest(lidar_config={"lidar_type": 7})),
+            lambda stub: stub.render_rgb(changed(scene_id="other")),
+            "NOT_FOUND",
+            "none of the 1 known",
+        ),
+        (
+            lambda stub: stub.prefetch_scene(sensorsim_pb2.ScenePrefetchRequest(scene_id="other")),
+            "NOT_FOUND",
+            "none of the 1 known",
+        ),
+        (
+            lambda stub: stub.render_rgb(changed(track="ghost")),
+            "INVALID_ARGUMENT",
+            "'ghost', not in the scene",
+        ),
+        (
+            lambda stub: stub.render_lidar(
+                sensorsim_pb2.LidarRenderRequest(lidar_config={"lidar_type": 7})
+            ),
             "UNIMPLEMENTED",
             "type 7 needs an --upstream",
         ),
     ],
 )
-def test_what_is_not_here_is_refused_with_a_reason(served: tuple[Any, Assembled], call: Any, code: str, found: str) -> None:
+def test_what_is_not_here_is_refused_with_a_reason(
+    served: tuple[Any, Assembled], call: Any, code: str, found: str
+) -> None:
     with pytest.raises(grpc.RpcError) as caught:
         call(served[0])
     assert caught.value.code().name == code
     assert found in caught.value.details()
 
 
-def changed(scene_id: str | None = None, track: str | None = None) -> sensorsim_pb2.RGBRenderRequest:
+def changed(
+    scene_id: str | None = None, track: str | None = None
+) -> sensorsim_pb2.RGBRenderRequest:
     asked = ask()
     if scene_id is not None:
         asked.scene_id = scene_id
@@ -155,10 +219,16 @@ def changed(scene_id: str | None = None, track: str | None = None) -> sensorsim_
 
 @pytest.mark.slow
 @pytest.mark.slow
-def test_our_own_service_behind_the_fixer_equals_both_in_one(served: tuple[Any, Assembled], overrides: list[str], tmp_path: Path) -> None:
-    """Upstream and fixer in two servers give the pictures of one server where the upstream is fully trusted and has no holes."""
+def test_our_own_service_behind_the_fixer_equals_both_in_one(
+    served: tuple[Any, Assembled], overrides: list[str], tmp_path: Path
+) -> None:
+    """Upstream and fixer in two servers give the pictures of one server where the upstream is fully
+    trusted and has no holes.
+    """
     _, behind = served
-    both = assemble(Settings(renderer="onefixer+clean", overrides=overrides, scenes=[SCENE], threads=1))
+    both = assemble(
+        Settings(renderer="onefixer+clean", overrides=overrides, scenes=[SCENE], threads=1)
+    )
     frames = [ask(1.0 + 0.1 * i) for i in range(3)]
     with hosted({"SensorsimService": both.service}) as host, channel_to(host) as channel:
         one = answers(Stub(channel, "SensorsimService"), frames)

@@ -1,4 +1,6 @@
-"""The renderer service over real sockets, in front of another renderer: same request, same bytes; every drive as if it were alone."""
+"""The renderer service over real sockets, in front of another renderer: same request, same bytes;
+every drive as if it were alone.
+"""
 
 from __future__ import annotations
 
@@ -39,24 +41,35 @@ JPEG, PNG = sensorsim_pb2.JPEG, sensorsim_pb2.PNG
 
 def batch(requests: list[sensorsim_pb2.RGBRenderRequest]) -> sensorsim_pb2.BatchRGBRenderRequest:
     item = sensorsim_pb2.BatchRGBRenderRequestItem
-    return sensorsim_pb2.BatchRGBRenderRequest(items=[item(camera_name=r.camera_intrinsics.logical_id, request=r) for r in requests])
+    return sensorsim_pb2.BatchRGBRenderRequest(
+        items=[item(camera_name=r.camera_intrinsics.logical_id, request=r) for r in requests]
+    )
 
 
-def test_identity_hands_images_and_answers_on_bit_by_bit(upstream: Host, renderer: StandInRenderer) -> None:
+def test_identity_hands_images_and_answers_on_bit_by_bit(
+    upstream: Host, renderer: StandInRenderer
+) -> None:
     frames = [*drive(3), *drive(2, image_format=JPEG)]
     with channel_to(upstream) as channel, in_front_of(upstream, renderer="identity") as (stub, _):
         direct = Stub(channel, "SensorsimService")
         assert answers(stub, frames) == answers(direct, frames)
-        assert stub.batch_render_rgb(batch(frames[:1])) == direct.batch_render_rgb(batch(frames[:1]))
+        assert stub.batch_render_rgb(batch(frames[:1])) == direct.batch_render_rgb(
+            batch(frames[:1])
+        )
         lidar = sensorsim_pb2.LidarRenderRequest(scene_id="scene")
         assert stub.render_lidar(lidar) == direct.render_lidar(lidar)
-        aggregated = sensorsim_pb2.AggregatedRenderRequest(rgb_requests=frames[:1], lidar_requests=[])
+        aggregated = sensorsim_pb2.AggregatedRenderRequest(
+            rgb_requests=frames[:1], lidar_requests=[]
+        )
         assert stub.render_aggregated(aggregated) == direct.render_aggregated(aggregated)
         for call, asked in (
             ("get_available_scenes", EMPTY),
             ("get_available_ego_masks", EMPTY),
             ("get_available_cameras", sensorsim_pb2.AvailableCamerasRequest(scene_id="scene")),
-            ("get_available_trajectories", sensorsim_pb2.AvailableTrajectoriesRequest(scene_id="scene")),
+            (
+                "get_available_trajectories",
+                sensorsim_pb2.AvailableTrajectoriesRequest(scene_id="scene"),
+            ),
         ):
             assert getattr(stub, call)(asked) == getattr(direct, call)(asked)
         with pytest.raises(grpc.RpcError, match="UNIMPLEMENTED"):
@@ -68,7 +81,10 @@ def test_identity_hands_images_and_answers_on_bit_by_bit(upstream: Host, rendere
 def test_interleaved_drives_get_the_bytes_that_each_gets_alone(
     upstream: Host, overrides: list[str], tmp_path: Path, image_format: int
 ) -> None:
-    drives = [drive(12, parts_at=5 + i, image_format=image_format, **kind) for i, kind in enumerate(SLOWLY_APART)]
+    drives = [
+        drive(12, parts_at=5 + i, image_format=image_format, **kind)
+        for i, kind in enumerate(SLOWLY_APART)
+    ]
     options = {"overrides": overrides, "masks": {CAMERA: holes(tmp_path)}}
     alone = []
     for one in drives:
@@ -82,7 +98,9 @@ def test_interleaved_drives_get_the_bytes_that_each_gets_alone(
     assert len({data for one in alone for data in one}) > 20
 
 
-def test_concurrent_calls_get_the_bytes_of_calls_one_by_one(upstream: Host, overrides: list[str], renderer: StandInRenderer) -> None:
+def test_concurrent_calls_get_the_bytes_of_calls_one_by_one(
+    upstream: Host, overrides: list[str], renderer: StandInRenderer
+) -> None:
     drives = [drive(6), drive(6), drive(6, parts_at=2, aside_mps=0.5)]
     with in_front_of(upstream, overrides=overrides) as (stub, _):
         alone = [answers(stub, one) for one in drives]
@@ -97,12 +115,22 @@ def test_concurrent_calls_get_the_bytes_of_calls_one_by_one(upstream: Host, over
     assert len(renderer.calls) == 6 + 3  # equal requests were rendered once
 
 
-def test_answers_equal_the_fixer_in_this_process(upstream: Host, overrides: list[str], tmp_path: Path) -> None:
+def test_answers_equal_the_fixer_in_this_process(
+    upstream: Host, overrides: list[str], tmp_path: Path
+) -> None:
     frames = drive(6, parts_at=1, aside_mps=4.0)
     mask = holes(tmp_path)
-    with in_front_of(upstream, overrides=overrides, masks={CAMERA: mask}, reliability=0.9) as (stub, _):
+    with in_front_of(upstream, overrides=overrides, masks={CAMERA: mask}, reliability=0.9) as (
+        stub,
+        _,
+    ):
         served = [decode_image(data) for data in answers(stub, frames)]
-    fixer = make_fixer("onefixer", fixer_settings("onefixer", [*overrides, "noise=content"]), scene_id="scene", threads=1)
+    fixer = make_fixer(
+        "onefixer",
+        fixer_settings("onefixer", [*overrides, "noise=content"]),
+        scene_id="scene",
+        threads=1,
+    )
     trusted = np.full((HEIGHT, WIDTH), 255, np.uint8)
     trusted[:, : WIDTH // 3] = 0
     alpha = trusted_opacity(0.9, trusted, HEIGHT, WIDTH)
@@ -112,13 +140,17 @@ def test_answers_equal_the_fixer_in_this_process(upstream: Host, overrides: list
         assert (got != picture(asked)).any()
 
 
-def test_a_batch_has_one_item_for_each_camera_with_success_set(upstream: Host, overrides: list[str], renderer: StandInRenderer) -> None:
+def test_a_batch_has_one_item_for_each_camera_with_success_set(
+    upstream: Host, overrides: list[str], renderer: StandInRenderer
+) -> None:
     cameras = [CAMERA, "camera_rear_tele_30fov"]
     frames = [drive(2, camera=camera) for camera in cameras]
     with in_front_of(upstream, overrides=overrides, reliability=1.0) as (stub, _):
         for pair in zip(*frames, strict=True):
             reply = stub.batch_render_rgb(batch(list(pair)))
-            assert [(item.camera_name, item.success, item.error_message) for item in reply.items] == [(c, True, "") for c in cameras]
+            assert [
+                (item.camera_name, item.success, item.error_message) for item in reply.items
+            ] == [(c, True, "") for c in cameras]
             assert [item.result.image_bytes for item in reply.items] == answers(stub, pair)
         twice = batch([frames[0][0], frames[0][0]])
         with pytest.raises(grpc.RpcError, match="a camera name twice"):
@@ -126,7 +158,9 @@ def test_a_batch_has_one_item_for_each_camera_with_success_set(upstream: Host, o
     assert renderer.calls == ["batch_render_rgb"] * 2  # handed on as a batch
 
 
-def test_aggregated_renders_are_fixed_and_keep_the_drivers_data(upstream: Host, overrides: list[str]) -> None:
+def test_aggregated_renders_are_fixed_and_keep_the_drivers_data(
+    upstream: Host, overrides: list[str]
+) -> None:
     frame = drive(1)[0]
     with in_front_of(upstream, overrides=overrides) as (stub, _):
         reply = stub.render_aggregated(sensorsim_pb2.AggregatedRenderRequest(rgb_requests=[frame]))
@@ -134,7 +168,9 @@ def test_aggregated_renders_are_fixed_and_keep_the_drivers_data(upstream: Host, 
         assert reply.driver_data == b"for the driver"
 
 
-def test_the_version_changes_with_settings_and_weights_and_names_the_upstream(upstream: Host, overrides: list[str], tmp_path: Path) -> None:
+def test_the_version_changes_with_settings_and_weights_and_names_the_upstream(
+    upstream: Host, overrides: list[str], tmp_path: Path
+) -> None:
     def version(**settings: object) -> common_pb2.VersionId:
         with in_front_of(upstream, **settings) as (stub, _):
             return stub.get_version(EMPTY)
@@ -154,7 +190,9 @@ def test_the_version_changes_with_settings_and_weights_and_names_the_upstream(up
     assert (first.grpc_api_version.minor, first.git_hash[40:]) == (54, "+abc")
 
 
-def test_trust_falls_with_the_distance_from_the_path_that_the_upstream_lists(upstream: Host, overrides: list[str]) -> None:
+def test_trust_falls_with_the_distance_from_the_path_that_the_upstream_lists(
+    upstream: Host, overrides: list[str]
+) -> None:
     with in_front_of(upstream, overrides=overrides) as (_, made):
         source = made.service.frames.source
         trust = []

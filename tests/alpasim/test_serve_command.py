@@ -1,4 +1,6 @@
-"""The command itself, as a process: it says where it listens, serves, and ends well on a signal. And the commands of its page."""
+"""The command itself, as a process: it says where it listens, serves, and ends well on a signal.
+And the commands of its page.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +24,28 @@ from tests.alpasim.service_cases import answers, drive
 
 
 def test_the_command_serves_until_it_is_stopped(upstream: Host) -> None:
-    command = [sys.executable, "-m", "alpasim_plugin.cli.main", "serve", "--listen", "127.0.0.1:0", "--renderer", "identity", "--json"]
-    with subprocess.Popen([*command, "--upstream", upstream.address], stdout=subprocess.PIPE, text=True) as process:
+    command = [
+        sys.executable,
+        "-m",
+        "alpasim_plugin.cli.main",
+        "serve",
+        "--listen",
+        "127.0.0.1:0",
+        "--renderer",
+        "identity",
+        "--json",
+    ]
+    with subprocess.Popen(
+        [*command, "--upstream", upstream.address], stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None
         opened = json.loads(process.stdout.readline())
         with grpc.insecure_channel(opened["at"]) as channel:
             stub = Stub(channel, "SensorsimService")
-            assert "identity" in stub.get_version(common_pb2.Empty(), timeout=60, wait_for_ready=True).version_id
+            assert (
+                "identity"
+                in stub.get_version(common_pb2.Empty(), timeout=60, wait_for_ready=True).version_id
+            )
             assert len(answers(stub, drive(2))) == 2
         process.send_signal(signal.SIGTERM)
         counts = json.loads(process.stdout.readline())
@@ -40,9 +57,15 @@ def test_the_command_serves_until_it_is_stopped(upstream: Host) -> None:
 def test_the_commands_of_the_page_are_valid(repo: Path) -> None:
     """Every `simrun` line of the page parses; files and addresses in it are not touched."""
     page = (repo / "docs" / "alpasim.md").read_text()
-    lines = [line.partition("#")[0] for block in re.findall(r"```bash\n(.*?)```", page, re.DOTALL) for line in block.splitlines()]
+    lines = [
+        line.partition("#")[0]
+        for block in re.findall(r"```bash\n(.*?)```", page, re.DOTALL)
+        for line in block.splitlines()
+    ]
     commands = [shlex.split(line)[1:] for line in lines if line.startswith("simrun ")]
-    commands = [words for words in commands if words[0] in verbs()]  # those of the laboratory are there where it is installed
+    commands = [
+        words for words in commands if words[0] in verbs()
+    ]  # those of the laboratory are there where it is installed
     assert len(commands) >= 3
     for verb, *rest in commands:
         command = typer.main.get_command(make_app(verb))

@@ -1,4 +1,6 @@
-"""A server gives its fixer the recorded frames of a scene, and equal requests the same ones whatever was asked before."""
+"""A server gives its fixer the recorded frames of a scene, and equal requests the same ones
+whatever was asked before.
+"""
 
 from __future__ import annotations
 

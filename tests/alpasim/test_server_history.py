@@ -1,4 +1,6 @@
-"""Histories without sessions: every frame finds its own drive's past, whoever else is on the same road."""
+"""Histories without sessions: every frame finds its own drive's past, whoever else is on the same
+road.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +20,16 @@ from tests.alpasim.service_cases import START_US, STEP_US, drive, request
 Tree = HistoryTree[tuple[bytes, ...]]
 
 
-def tree(max_bytes: int = 1 << 30, expiry_s: float = 60.0, clock: Callable[[], float] = lambda: 0.0) -> Tree:
+def tree(
+    max_bytes: int = 1 << 30, expiry_s: float = 60.0, clock: Callable[[], float] = lambda: 0.0
+) -> Tree:
     return HistoryTree(max_bytes, expiry_s, clock)
 
 
 def serve(kept: Tree, view: View, size: int = 100) -> tuple[bytes, ...]:
-    """Give a view its lineage: the keys of all frames from the start of its drive to itself. That is all that a fixer could depend on."""
+    """Give a view its lineage: the keys of all frames from the start of its drive to itself. That
+    is all that a fixer could depend on.
+    """
     known = kept.find(view)
     if known is None:
         parent = kept.parent_of(view)
@@ -44,14 +50,27 @@ def interleaved(drives: Sequence[Sequence[View]], seed: int) -> list[View]:
     return out
 
 
-SLOWLY_APART = ({}, {}, {"aside_mps": 0.05}, {"aside_mps": 0.5}, {"brake_mps2": 8.0}, {"brake_mps2": 3.0, "aside_mps": 0.3})
+SLOWLY_APART = (
+    {},
+    {},
+    {"aside_mps": 0.05},
+    {"aside_mps": 0.5},
+    {"brake_mps2": 8.0},
+    {"brake_mps2": 3.0, "aside_mps": 0.3},
+)
 FAST_APART = ({}, {}, {"aside_mps": 1.5}, {"aside_mps": -1.2}, {"brake_mps2": 8.0})
 
 
 @pytest.mark.parametrize(("shutter_us", "kinds"), [(30_000, SLOWLY_APART), (0, FAST_APART)])
-def test_interleaved_drives_have_the_past_that_each_has_alone(shutter_us: int, kinds: Sequence[dict[str, float]]) -> None:
-    """Drives that are equal, swerve, or brake to a stop, so that one lies a step or more behind another in the same lane."""
-    drives = [views(22, parts_at=6 + i, shutter_us=shutter_us, **kind) for i, kind in enumerate(kinds)]
+def test_interleaved_drives_have_the_past_that_each_has_alone(
+    shutter_us: int, kinds: Sequence[dict[str, float]]
+) -> None:
+    """Drives that are equal, swerve, or brake to a stop, so that one lies a step or more behind
+    another in the same lane.
+    """
+    drives = [
+        views(22, parts_at=6 + i, shutter_us=shutter_us, **kind) for i, kind in enumerate(kinds)
+    ]
     alone = []
     for one in drives:
         own = tree()
@@ -65,9 +84,13 @@ def test_interleaved_drives_have_the_past_that_each_has_alone(shutter_us: int, k
 
 
 def test_a_step_back_forks_and_leaves_the_first_branch_alone() -> None:
-    kept, first, second = tree(), views(12), views(12, parts_at=5, aside_mps=0.4)
+    kept = tree()
+    first = views(12)
+    second = views(12, parts_at=5, aside_mps=0.4)
     before = [serve(kept, view) for view in first]
-    after = [serve(kept, view) for view in second[3:]]  # back to a frame that is known, then another way
+    after = [
+        serve(kept, view) for view in second[3:]
+    ]  # back to a frame that is known, then another way
     assert [serve(kept, view) for view in first] == before
     assert after[-1][:6] == before[5][:6]
     assert (after[-1][-1], kept.counts.forks, kept.counts.starts) == (second[-1].key, 1, 1)
@@ -91,8 +114,14 @@ def test_drives_that_differ_in_traffic_alone_stay_apart() -> None:
     def with_car(requests: list[sensorsim_pb2.RGBRenderRequest], later_mps: float) -> list[View]:
         for step, r in enumerate(requests):
             car = r.dynamic_objects.add(track_id="car")
-            for pose, t_s in ((car.pose_pair.start_pose, step * 0.1 - 0.03), (car.pose_pair.end_pose, step * 0.1)):
-                pose.vec.x, pose.quat.w = 20 + 10 * min(t_s, 0.3) + later_mps * max(t_s - 0.3, 0.0), 1.0
+            for pose, t_s in (
+                (car.pose_pair.start_pose, step * 0.1 - 0.03),
+                (car.pose_pair.end_pose, step * 0.1),
+            ):
+                pose.vec.x, pose.quat.w = (
+                    20 + 10 * min(t_s, 0.3) + later_mps * max(t_s - 0.3, 0.0),
+                    1.0,
+                )
         return [read_view(r) for r in requests]
 
     drives = [with_car(drive(10), speed) for speed in (10.0, 9.0)]
@@ -139,10 +168,17 @@ def test_motion_is_continued_in_place_and_turn() -> None:
         (lambda r: r.ClearField("sensor_pose"), r"\|q\|\^2 = 0"),
         (lambda r: setattr(r.sensor_pose.end_pose.vec, "x", float("nan")), "nan"),
         (lambda r: setattr(r.sensor_pose.start_pose.quat, "w", 2.0), r"\|q\|\^2"),
-        (lambda r: [r.dynamic_objects.add(track_id="a", pose_pair=r.sensor_pose) for _ in range(2)], "a track id twice"),
+        (
+            lambda r: [
+                r.dynamic_objects.add(track_id="a", pose_pair=r.sensor_pose) for _ in range(2)
+            ],
+            "a track id twice",
+        ),
     ],
 )
-def test_a_request_that_is_no_view_is_refused(change: Callable[[sensorsim_pb2.RGBRenderRequest], object], found: str) -> None:
+def test_a_request_that_is_no_view_is_refused(
+    change: Callable[[sensorsim_pb2.RGBRenderRequest], object], found: str
+) -> None:
     bad = drive(1)[0]
     change(bad)
     with pytest.raises(InputError, match=found):

@@ -1,4 +1,6 @@
-"""Every lens of the wire: the picture through it shows each direction at the pixel where the lens model puts it."""
+"""Every lens of the wire: the picture through it shows each direction at the pixel where the lens
+model puts it.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +21,15 @@ RAYS = np.array([[0.0, 0.0], [0.3, -0.1], [-0.5, 0.2], [0.6, 0.3], [-0.2, -0.35]
 
 
 def shown_at(lens: Lens, pixel: F64) -> F64:
-    """Return the direction x/z, y/z that a place of the picture shows, read off the covering pinhole."""
+    """Return the direction x/z, y/z that a place of the picture shows, read off the covering
+    pinhole.
+    """
     if lens.resample is None:
         return (pixel - lens.K[:2, 2]) / lens.K[[0, 1], [0, 1]]
     column, row = pixel - 0.5
-    place = cv2.remap(lens.resample, np.float32([[column]]), np.float32([[row]]), cv2.INTER_LINEAR)[0, 0]
+    place = cv2.remap(lens.resample, np.float32([[column]]), np.float32([[row]]), cv2.INTER_LINEAR)[
+        0, 0
+    ]
     return (place + 0.5 - lens.K[:2, 2]) / lens.K[[0, 1], [0, 1]]
 
 
@@ -38,7 +44,9 @@ def distorted() -> Spec:
 
 
 def fisheye() -> Spec:
-    p = sensorsim_pb2.OpenCVFisheyeCameraParam(principal_point_x=160, principal_point_y=90, focal_length_x=200, focal_length_y=190)
+    p = sensorsim_pb2.OpenCVFisheyeCameraParam(
+        principal_point_x=160, principal_point_y=90, focal_length_x=200, focal_length_y=190
+    )
     p.radial_coeffs.extend([0.02, -0.01, 0.003, 0.0])
     return Spec(opencv_fisheye_param=p, resolution_w=320, resolution_h=180, logical_id="c")
 
@@ -57,36 +65,68 @@ def ftheta(backward: bool) -> Spec:
 
 def by_opencv(spec: Spec) -> F64:
     p, rays = spec.opencv_pinhole_param, np.column_stack([RAYS, np.ones(len(RAYS))])
-    K = np.array([[p.focal_length_x, 0, p.principal_point_x], [0, p.focal_length_y, p.principal_point_y], [0, 0, 1]])
+    K = np.array(
+        [
+            [p.focal_length_x, 0, p.principal_point_x],
+            [0, p.focal_length_y, p.principal_point_y],
+            [0, 0, 1],
+        ]
+    )
     k, t = list(p.radial_coeffs), list(p.tangential_coeffs)
-    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, np.array([*k[:2], *t, *k[2:], *p.thin_prism_coeffs]))[0][:, 0]
+    return cv2.projectPoints(
+        rays, np.zeros(3), np.zeros(3), K, np.array([*k[:2], *t, *k[2:], *p.thin_prism_coeffs])
+    )[0][:, 0]
 
 
 def by_opencv_fisheye(spec: Spec) -> F64:
     p, rays = spec.opencv_fisheye_param, np.column_stack([RAYS, np.ones(len(RAYS))])
-    K = np.array([[p.focal_length_x, 0, p.principal_point_x], [0, p.focal_length_y, p.principal_point_y], [0, 0, 1]])
-    return cv2.fisheye.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), K, np.array(p.radial_coeffs))[0][:, 0]
+    K = np.array(
+        [
+            [p.focal_length_x, 0, p.principal_point_x],
+            [0, p.focal_length_y, p.principal_point_y],
+            [0, 0, 1],
+        ]
+    )
+    return cv2.fisheye.projectPoints(
+        rays[:, None], np.zeros(3), np.zeros(3), K, np.array(p.radial_coeffs)
+    )[0][:, 0]
 
 
 def by_ftheta(spec: Spec) -> F64:
-    """The overlay's formula: theta = atan2(|xy|, z); pixel = [[c, d], [e, 1]] (r(theta) xy / |xy|) + principal point."""
+    """The overlay's formula: theta = atan2(|xy|, z); pixel = [[c, d], [e, 1]] (r(theta) xy / |xy|)
+    + principal point.
+    """
     p, rho = spec.ftheta_param, np.linalg.norm(RAYS, axis=1)
     theta = np.arctan2(rho, 1.0)
     if p.reference_poly == sensorsim_pb2.FthetaCameraParam.ANGLE_TO_PIXELDIST:
         r = np.polynomial.polynomial.polyval(theta, np.array(p.angle_to_pixeldist_poly))
     else:
         radii = np.linspace(0, 400, 400_001)
-        r = np.interp(theta, np.polynomial.polynomial.polyval(radii, np.array(p.pixeldist_to_angle_poly)), radii)
+        r = np.interp(
+            theta,
+            np.polynomial.polynomial.polyval(radii, np.array(p.pixeldist_to_angle_poly)),
+            radii,
+        )
     flat = RAYS / np.maximum(rho, 1e-12)[:, None] * r[:, None]
     c = p.linear_cde
-    return flat @ np.array([[c.linear_c, c.linear_d], [c.linear_e, 1.0]]).T + [p.principal_point_x, p.principal_point_y]
+    return flat @ np.array([[c.linear_c, c.linear_d], [c.linear_e, 1.0]]).T + [
+        p.principal_point_x,
+        p.principal_point_y,
+    ]
 
 
 @pytest.mark.parametrize(
     ("spec", "project"),
-    [(distorted(), by_opencv), (fisheye(), by_opencv_fisheye), (ftheta(True), by_ftheta), (ftheta(False), by_ftheta)],
+    [
+        (distorted(), by_opencv),
+        (fisheye(), by_opencv_fisheye),
+        (ftheta(True), by_ftheta),
+        (ftheta(False), by_ftheta),
+    ],
 )
-def test_each_direction_is_shown_where_the_lens_puts_it(spec: Spec, project: Callable[[Spec], F64]) -> None:
+def test_each_direction_is_shown_where_the_lens_puts_it(
+    spec: Spec, project: Callable[[Spec], F64]
+) -> None:
     lens = read_lens(spec, 320, 180)
     for ray, pixel in zip(RAYS, project(spec), strict=True):
         assert 1 < pixel[0] < 319
@@ -95,7 +135,10 @@ def test_each_direction_is_shown_where_the_lens_puts_it(spec: Spec, project: Cal
 
 
 @pytest.mark.parametrize("size", [(320, 180), (640, 360)])
-@pytest.mark.parametrize(("spec", "project"), [(distorted(), by_opencv), (fisheye(), by_opencv_fisheye), (ftheta(False), by_ftheta)])
+@pytest.mark.parametrize(
+    ("spec", "project"),
+    [(distorted(), by_opencv), (fisheye(), by_opencv_fisheye), (ftheta(False), by_ftheta)],
+)
 def test_the_pinhole_of_a_lens_takes_each_direction_from_where_the_lens_puts_it(
     spec: Spec, project: Callable[[Spec], F64], size: tuple[int, int]
 ) -> None:
@@ -104,7 +147,9 @@ def test_the_pinhole_of_a_lens_takes_each_direction_from_where_the_lens_puts_it(
     assert straight.size[0] == size[0]
     for (x, y), pixel in zip(RAYS, project(spec) * size[0] / 320, strict=True):
         column, row = straight.K[0] @ [x, y, 1] - 0.5, straight.K[1] @ [x, y, 1] - 0.5
-        found = cv2.remap(straight.place, np.float32([[column]]), np.float32([[row]]), cv2.INTER_LINEAR)[0, 0]
+        found = cv2.remap(
+            straight.place, np.float32([[column]]), np.float32([[row]]), cv2.INTER_LINEAR
+        )[0, 0]
         np.testing.assert_allclose(found + 0.5, pixel, atol=0.05)
 
 
@@ -120,7 +165,9 @@ def test_the_asked_size_scales_a_pinhole_per_axis_and_an_ftheta_lens_by_the_mean
     np.testing.assert_allclose(K, [[20, 0, 16], [0, 40, 16], [0, 0, 1]])
     spec = ftheta(False)
     whole, half = read_lens(spec, 320, 180), read_lens(spec, 160, 90)
-    np.testing.assert_allclose(shown_at(half, np.array([60.0, 30.0])), shown_at(whole, np.array([120.0, 60.0])), atol=1e-4)
+    np.testing.assert_allclose(
+        shown_at(half, np.array([60.0, 30.0])), shown_at(whole, np.array([120.0, 60.0])), atol=1e-4
+    )
 
 
 def test_a_picture_through_a_lens_is_the_scene_and_black_beyond_it() -> None:
@@ -128,8 +175,13 @@ def test_a_picture_through_a_lens_is_the_scene_and_black_beyond_it() -> None:
     spec.opencv_fisheye_param.max_angle = 0.6
     lens = read_lens(spec, 320, 180)
     width, height = lens.cover
-    x, y = np.meshgrid((np.arange(width) + 0.5 - lens.K[0, 2]) / lens.K[0, 0], (np.arange(height) + 0.5 - lens.K[1, 2]) / lens.K[1, 1])
-    covering = np.stack([128 + 100 * x, 128 + 100 * y, 0 * x], axis=-1).clip(0, 255).astype(np.uint8)
+    x, y = np.meshgrid(
+        (np.arange(width) + 0.5 - lens.K[0, 2]) / lens.K[0, 0],
+        (np.arange(height) + 0.5 - lens.K[1, 2]) / lens.K[1, 1],
+    )
+    covering = (
+        np.stack([128 + 100 * x, 128 + 100 * y, 0 * x], axis=-1).clip(0, 255).astype(np.uint8)
+    )
     image = lens.image(covering)
     np.testing.assert_allclose(image[90, 160, :2].astype(int), 128, atol=1)
     assert image[0, 0].tolist() == [0, 0, 0]
@@ -143,12 +195,20 @@ def test_a_picture_through_a_lens_is_the_scene_and_black_beyond_it() -> None:
         (lambda s: s.ClearField("resolution_w"), "no calibrated resolution"),
         (lambda s: s.ftheta_param.ClearField("angle_to_pixeldist_poly"), "no polynomial"),
         (lambda s: s.ftheta_param.angle_to_pixeldist_poly.__setitem__(1, -190.0), "does not grow"),
-        (lambda s: s.ftheta_param.angle_to_pixeldist_poly.__setitem__(1, 60.0), "degrees from the axis"),
-        (lambda s: s.ftheta_param.angle_to_pixeldist_poly.__setitem__(1, float("nan")), "does not grow"),
+        (
+            lambda s: s.ftheta_param.angle_to_pixeldist_poly.__setitem__(1, 60.0),
+            "degrees from the axis",
+        ),
+        (
+            lambda s: s.ftheta_param.angle_to_pixeldist_poly.__setitem__(1, float("nan")),
+            "does not grow",
+        ),
         (lambda s: s.bivariate_windshield_model_param.horizontal_poly.append(1.0), "windshield"),
     ],
 )
-def test_intrinsics_that_are_no_lens_are_refused(change: Callable[[Spec], object], found: str) -> None:
+def test_intrinsics_that_are_no_lens_are_refused(
+    change: Callable[[Spec], object], found: str
+) -> None:
     spec = ftheta(False)
     change(spec)
     with pytest.raises(InputError, match=found):

@@ -1,4 +1,6 @@
-"""What a server must survive: faulty upstreams, callers that leave or send nonsense; and how it lets callers in and ends."""
+"""What a server must survive: faulty upstreams, callers that leave or send nonsense; and how it
+lets callers in and ends.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,14 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.log.wire import common_pb2, health_pb2, reflection_pb2, sensorsim_pb2
 from alpasim_plugin.log.wire.services import Stub, methods
-from tests.alpasim.service_cases import StandInRenderer, answers, channel_to, drive, hosted, in_front_of
+from tests.alpasim.service_cases import (
+    StandInRenderer,
+    answers,
+    channel_to,
+    drive,
+    hosted,
+    in_front_of,
+)
 
 EMPTY = common_pb2.Empty()
 Code = grpc.StatusCode
@@ -40,17 +49,39 @@ def failure(call: Callable[[], object]) -> tuple[Any, str]:
     ("sent", "text", "code", "details"),
     [
         (Code.UNAVAILABLE, "away", Code.UNAVAILABLE, "upstream: UNAVAILABLE: away"),
-        (Code.RESOURCE_EXHAUSTED, "queue full", Code.UNAVAILABLE, "upstream: RESOURCE_EXHAUSTED: queue full"),
+        (
+            Code.RESOURCE_EXHAUSTED,
+            "queue full",
+            Code.UNAVAILABLE,
+            "upstream: RESOURCE_EXHAUSTED: queue full",
+        ),
         (Code.DEADLINE_EXCEEDED, "slow", Code.UNAVAILABLE, "upstream: DEADLINE_EXCEEDED: slow"),
-        (Code.DEADLINE_EXCEEDED, "Stopped waiting for backend", Code.DEADLINE_EXCEEDED, "Stopped waiting for backend"),
-        (Code.UNKNOWN, "Exception calling application", Code.UNKNOWN, "upstream: UNKNOWN: Exception calling application"),
+        (
+            Code.DEADLINE_EXCEEDED,
+            "Stopped waiting for backend",
+            Code.DEADLINE_EXCEEDED,
+            "Stopped waiting for backend",
+        ),
+        (
+            Code.UNKNOWN,
+            "Exception calling application",
+            Code.UNKNOWN,
+            "upstream: UNKNOWN: Exception calling application",
+        ),
         (Code.UNKNOWN, "Stream removed", Code.UNAVAILABLE, "upstream: UNKNOWN: Stream removed"),
         (Code.NOT_FOUND, "no such scene", Code.NOT_FOUND, "upstream: NOT_FOUND: no such scene"),
     ],
 )
 @pytest.mark.parametrize("served", ["onefixer", "identity"])
 def test_an_upstreams_failure_arrives_as_the_status_that_is_retried_or_not(
-    upstream: Host, renderer: StandInRenderer, overrides: list[str], sent: Any, text: str, code: Any, details: str, served: str
+    upstream: Host,
+    renderer: StandInRenderer,
+    overrides: list[str],
+    sent: Any,
+    text: str,
+    code: Any,
+    details: str,
+    served: str,
 ) -> None:
     frames = drive(3)
     options = {"overrides": overrides} if served == "onefixer" else {}
@@ -70,11 +101,18 @@ def test_an_upstreams_failure_arrives_as_the_status_that_is_retried_or_not(
         (lambda data: b"", "0 bytes"),
         (lambda data: b"<html>busy</html>", "no whole PNG"),
         (lambda data: data[:60] + bytes(40) + data[100:], "picture"),
-        (lambda data: encode_image(np.zeros((20, 70, 3), np.uint8)), r"\(20, 70\) after \(32, 48\)"),
+        (
+            lambda data: encode_image(np.zeros((20, 70, 3), np.uint8)),
+            r"\(20, 70\) after \(32, 48\)",
+        ),
     ],
 )
 def test_a_broken_or_resized_picture_is_retried_and_never_enters_a_history(
-    upstream: Host, renderer: StandInRenderer, overrides: list[str], spoil: Callable[[bytes], bytes], found: str
+    upstream: Host,
+    renderer: StandInRenderer,
+    overrides: list[str],
+    spoil: Callable[[bytes], bytes],
+    found: str,
 ) -> None:
     frames = drive(3)
     with in_front_of(upstream, overrides=overrides) as (stub, _):
@@ -90,9 +128,14 @@ def test_a_broken_or_resized_picture_is_retried_and_never_enters_a_history(
         assert made.tree.counts.frames == 3
 
 
-def test_an_upstream_that_dies_and_comes_back_goes_on_where_it_was(renderer: StandInRenderer, overrides: list[str]) -> None:
+def test_an_upstream_that_dies_and_comes_back_goes_on_where_it_was(
+    renderer: StandInRenderer, overrides: list[str]
+) -> None:
     frames = drive(4)
-    with hosted({"SensorsimService": renderer}) as first, in_front_of(first, overrides=overrides) as (stub, _):
+    with (
+        hosted({"SensorsimService": renderer}) as first,
+        in_front_of(first, overrides=overrides) as (stub, _),
+    ):
         whole = answers(stub, frames)
     dying = Host({"SensorsimService": renderer}, "127.0.0.1:0").start()
     with in_front_of(dying, overrides=overrides) as (stub, _):
@@ -111,8 +154,12 @@ def test_an_upstream_that_dies_and_comes_back_goes_on_where_it_was(renderer: Sta
             again.stop(0.0)
 
 
-def test_a_caller_that_leaves_or_is_late_costs_nobody_else(upstream: Host, renderer: StandInRenderer, overrides: list[str]) -> None:
-    frames, entered, leave = drive(2), threading.Event(), threading.Event()
+def test_a_caller_that_leaves_or_is_late_costs_nobody_else(
+    upstream: Host, renderer: StandInRenderer, overrides: list[str]
+) -> None:
+    frames = drive(2)
+    entered = threading.Event()
+    leave = threading.Event()
 
     def slow(asked: Any, context: Any, data: bytes) -> bytes:
         entered.set()
@@ -134,7 +181,9 @@ def test_a_caller_that_leaves_or_is_late_costs_nobody_else(upstream: Host, rende
 
 
 @pytest.mark.parametrize("count", [44, pytest.param(200, marks=pytest.mark.slow)])
-def test_malformed_messages_change_nothing(upstream: Host, overrides: list[str], count: int) -> None:
+def test_malformed_messages_change_nothing(
+    upstream: Host, overrides: list[str], count: int
+) -> None:
     frames, rng = drive(3), np.random.default_rng(7)
     whole = frames[0].SerializeToString()
     with in_front_of(upstream, overrides=overrides) as (stub, made):
@@ -153,7 +202,14 @@ def test_malformed_messages_change_nothing(upstream: Host, overrides: list[str],
                     codes.add(Code.OK)
                 except grpc.RpcError as error:
                     codes.add(error.code())
-            assert codes <= {Code.OK, Code.INVALID_ARGUMENT, Code.INTERNAL, Code.NOT_FOUND, Code.UNIMPLEMENTED, Code.UNAVAILABLE}
+            assert codes <= {
+                Code.OK,
+                Code.INVALID_ARGUMENT,
+                Code.INTERNAL,
+                Code.NOT_FOUND,
+                Code.UNIMPLEMENTED,
+                Code.UNAVAILABLE,
+            }
             assert not any("Traceback" in key for key in made.service.statuses)
         assert answers(stub, frames) == before
         assert not made.service.frames._in_work
@@ -170,18 +226,32 @@ def test_health_and_reflection_answer_under_public_names(upstream: Host) -> None
         assert next(watched).status == 1
         reflect, question = Stub(to, "ServerReflection"), reflection_pb2.ServerReflectionRequest
         listed, file, missing = reflect.ServerReflectionInfo(
-            iter([question(list_services="*"), question(file_containing_symbol=name), question(file_containing_symbol="nobody.Service")])
+            iter(
+                [
+                    question(list_services="*"),
+                    question(file_containing_symbol=name),
+                    question(file_containing_symbol="nobody.Service"),
+                ]
+            )
         )
         assert name in [s.name for s in listed.list_services_response.service]
-        assert b"nre.grpc.protos.sensorsim" in file.file_descriptor_response.file_descriptor_proto[0]
-        assert b"simrun.wire.sensorsim" not in file.file_descriptor_response.file_descriptor_proto[0]
+        assert (
+            b"nre.grpc.protos.sensorsim" in file.file_descriptor_response.file_descriptor_proto[0]
+        )
+        assert (
+            b"simrun.wire.sensorsim" not in file.file_descriptor_response.file_descriptor_proto[0]
+        )
         assert missing.error_response.error_code == 5
         threading.Thread(target=host.stop, args=(5.0,)).start()
         assert next(watched).status == 2
 
 
-def test_running_calls_finish_while_the_server_stops(upstream: Host, renderer: StandInRenderer, overrides: list[str]) -> None:
-    frame, entered, leave = drive(1)[0], threading.Event(), threading.Event()
+def test_running_calls_finish_while_the_server_stops(
+    upstream: Host, renderer: StandInRenderer, overrides: list[str]
+) -> None:
+    frame = drive(1)[0]
+    entered = threading.Event()
+    leave = threading.Event()
     renderer.fault = lambda asked, context, data: (entered.set(), leave.wait(30), data)[2]
     made = assemble(Settings(upstream=Upstream(upstream.address), overrides=overrides, threads=1))
     host = Host({"SensorsimService": made.service}, "127.0.0.1:0").start()
@@ -194,18 +264,34 @@ def test_running_calls_finish_while_the_server_stops(upstream: Host, renderer: S
         leave.set()
         assert running.result(timeout=30).image_bytes
         ending.join(30)
-        assert failure(lambda: Stub(channel, "SensorsimService").get_version(EMPTY, timeout=5))[0] == Code.UNAVAILABLE
+        assert (
+            failure(lambda: Stub(channel, "SensorsimService").get_version(EMPTY, timeout=5))[0]
+            == Code.UNAVAILABLE
+        )
     made.close()
 
 
-def test_only_callers_with_the_token_are_served_but_health_is_open(upstream: Host, tmp_path: Path) -> None:
+def test_only_callers_with_the_token_are_served_but_health_is_open(
+    upstream: Host, tmp_path: Path
+) -> None:
     (tmp_path / "token").write_text(" secret \n")
     policy = HostPolicy(token_file=tmp_path / "token")
     with in_front_of(upstream, policy, renderer="identity") as (stub, made):
         assert failure(lambda: stub.get_version(EMPTY))[0] == Code.UNAUTHENTICATED
-        assert failure(lambda: stub.get_version(EMPTY, metadata=[("authorization", "Bearer wrong")]))[0] == Code.UNAUTHENTICATED
-        assert "identity" in stub.get_version(EMPTY, metadata=[("authorization", "Bearer secret")]).version_id
-        with hosted({"SensorsimService": made.service}, policy=policy) as host, channel_to(host) as channel:
+        assert (
+            failure(lambda: stub.get_version(EMPTY, metadata=[("authorization", "Bearer wrong")]))[
+                0
+            ]
+            == Code.UNAUTHENTICATED
+        )
+        assert (
+            "identity"
+            in stub.get_version(EMPTY, metadata=[("authorization", "Bearer secret")]).version_id
+        )
+        with (
+            hosted({"SensorsimService": made.service}, policy=policy) as host,
+            channel_to(host) as channel,
+        ):
             assert Stub(channel, "Health").Check(health_pb2.HealthCheckRequest()).status == 1
 
 
@@ -213,32 +299,68 @@ def test_only_callers_with_the_token_are_served_but_health_is_open(upstream: Hos
 def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Return a key and a certificate that signs itself."""
     key, cert = (tmp_path_factory.mktemp("tls") / name for name in ("key.pem", "cert.pem"))
-    made = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2"]
-    extra = ["-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1", "-keyout", str(key), "-out", str(cert)]
+    made = [
+        "openssl",
+        "req",
+        "-x509",
+        "-newkey",
+        "ec",
+        "-pkeyopt",
+        "ec_paramgen_curve:P-256",
+        "-nodes",
+        "-days",
+        "2",
+    ]
+    extra = [
+        "-subj",
+        "/CN=localhost",
+        "-addext",
+        "subjectAltName=DNS:localhost,IP:127.0.0.1",
+        "-keyout",
+        str(key),
+        "-out",
+        str(cert),
+    ]
     subprocess.run([*made, *extra], check=True, capture_output=True)
     return key, cert
 
 
-HELLO = bytes.fromhex("1603010200010001fc0303")  # a TLS client's first bytes, of more that never come
+HELLO = bytes.fromhex(
+    "1603010200010001fc0303"
+)  # a TLS client's first bytes, of more that never come
 
 
 @pytest.mark.parametrize("with_tls", [True, False], ids=["tls", "plain"])
 def test_handshakes_that_never_end_hold_nobody_up_and_are_ended(
-    pair: tuple[Path, Path], renderer: StandInRenderer, monkeypatch: pytest.MonkeyPatch, with_tls: bool
+    pair: tuple[Path, Path],
+    renderer: StandInRenderer,
+    monkeypatch: pytest.MonkeyPatch,
+    with_tls: bool,
 ) -> None:
     monkeypatch.setattr(hosting, "HANDSHAKE_S", 1.0)
     key, cert = pair
-    ways = grpc.insecure_channel, lambda address: grpc.secure_channel(address, grpc.ssl_channel_credentials(cert.read_bytes()))
+    ways = (
+        grpc.insecure_channel,
+        lambda address: grpc.secure_channel(
+            address, grpc.ssl_channel_credentials(cert.read_bytes())
+        ),
+    )
     right, wrong = ways[with_tls], ways[not with_tls]
     with contextlib.ExitStack() as stack:
         policy = HostPolicy(cert, key) if with_tls else HostPolicy()
         host = stack.enter_context(hosted({"SensorsimService": renderer}, policy=policy))
         place = host.address.rpartition(":")
-        opened = [stack.enter_context(socket.create_connection((place[0], int(place[2])))) for _ in range(90)]
+        opened = [
+            stack.enter_context(socket.create_connection((place[0], int(place[2]))))
+            for _ in range(90)
+        ]
         for i, one in enumerate(opened):
             one.sendall((b"", HELLO, b"GET / HTTP/1.1\r\n\r\n")[i % 3])
         with wrong(host.address) as channel:
-            assert failure(lambda: Stub(channel, "SensorsimService").get_version(EMPTY, timeout=5))[0] == Code.UNAVAILABLE
+            assert (
+                failure(lambda: Stub(channel, "SensorsimService").get_version(EMPTY, timeout=5))[0]
+                == Code.UNAVAILABLE
+            )
         with right(host.address) as channel:
             assert Stub(channel, "SensorsimService").get_version(EMPTY, timeout=20)
         for one in opened:
@@ -248,18 +370,33 @@ def test_handshakes_that_never_end_hold_nobody_up_and_are_ended(
                     pass
 
 
-def test_tls_with_an_upstream_behind_tls_and_a_token(pair: tuple[Path, Path], renderer: StandInRenderer, tmp_path: Path) -> None:
+def test_tls_with_an_upstream_behind_tls_and_a_token(
+    pair: tuple[Path, Path], renderer: StandInRenderer, tmp_path: Path
+) -> None:
     key, cert = pair
     (tmp_path / "token").write_text("secret")
-    with hosted({"SensorsimService": renderer}, policy=HostPolicy(cert, key, token_file=tmp_path / "token")) as behind:
-        service = assemble(Settings(renderer="identity", upstream=Upstream(behind.address, cert, "secret")))
-        with hosted({"SensorsimService": service.service}, policy=HostPolicy(cert, key, tls_client_ca=cert)) as host:
+    with hosted(
+        {"SensorsimService": renderer}, policy=HostPolicy(cert, key, token_file=tmp_path / "token")
+    ) as behind:
+        service = assemble(
+            Settings(renderer="identity", upstream=Upstream(behind.address, cert, "secret"))
+        )
+        with hosted(
+            {"SensorsimService": service.service}, policy=HostPolicy(cert, key, tls_client_ca=cert)
+        ) as host:
             trusted = cert.read_bytes()
             own = grpc.ssl_channel_credentials(trusted, key.read_bytes(), trusted)
             with grpc.secure_channel(host.address, own) as channel:
                 assert len(answers(Stub(channel, "SensorsimService"), drive(1))) == 1
-            with grpc.secure_channel(host.address, grpc.ssl_channel_credentials(trusted)) as channel:  # shows no certificate
-                assert failure(lambda: Stub(channel, "SensorsimService").get_version(EMPTY, timeout=5))[0] == Code.UNAVAILABLE
+            with grpc.secure_channel(
+                host.address, grpc.ssl_channel_credentials(trusted)
+            ) as channel:  # shows no certificate
+                assert (
+                    failure(
+                        lambda: Stub(channel, "SensorsimService").get_version(EMPTY, timeout=5)
+                    )[0]
+                    == Code.UNAVAILABLE
+                )
         service.close()
     with pytest.raises(InputError, match="one of certificate and key"):
         HostPolicy(cert).credentials()
@@ -288,14 +425,20 @@ def test_a_taken_port_is_an_infrastructure_error(upstream: Host) -> None:
         (["--upstream", "h:1", "--tls-cert", "/none.pem"], "one of certificate and key"),
     ],
 )
-def test_options_that_do_not_fit_are_refused_before_the_port_opens(args: list[str], found: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_that_do_not_fit_are_refused_before_the_port_opens(
+    args: list[str], found: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(["serve", *args]) == 2
     assert found in capsys.readouterr().err
 
 
 def test_formats_that_are_not_made_are_refused(upstream: Host, overrides: list[str]) -> None:
     with in_front_of(upstream, overrides=overrides) as (stub, _):
-        for name, quality in ((sensorsim_pb2.AVC, 95.0), (sensorsim_pb2.UNDEFINED, 95.0), (sensorsim_pb2.JPEG, 101.0)):
+        for name, quality in (
+            (sensorsim_pb2.AVC, 95.0),
+            (sensorsim_pb2.UNDEFINED, 95.0),
+            (sensorsim_pb2.JPEG, 101.0),
+        ):
             asked = drive(1, image_format=name)[0]
             asked.image_quality = quality
             assert failure(lambda asked=asked: stub.render_rgb(asked))[0] == Code.INVALID_ARGUMENT

@@ -1,4 +1,6 @@
-"""The shutter of a request: when each pixel is exposed, through any lens, and that a served frame shows it."""
+"""The shutter of a request: when each pixel is exposed, through any lens, and that a served frame
+shows it.
+"""
 
 from __future__ import annotations
 
@@ -32,40 +34,69 @@ DOWN, UP = sensorsim_pb2.ROLLING_TOP_TO_BOTTOM, sensorsim_pb2.ROLLING_BOTTOM_TO_
 RIGHT, LEFT = sensorsim_pb2.ROLLING_LEFT_TO_RIGHT, sensorsim_pb2.ROLLING_RIGHT_TO_LEFT
 
 
-def ask(shutter_type: int = DOWN, turn_rad: float = 0.03, ms: int = 30, spec: sensorsim_pb2.CameraSpec | None = None) -> Any:
-    """Return the request of a frame of the recorded drive, the rig turning while the shutter is open."""
+def ask(
+    shutter_type: int = DOWN,
+    turn_rad: float = 0.03,
+    ms: int = 30,
+    spec: sensorsim_pb2.CameraSpec | None = None,
+) -> Any:
+    """Return the request of a frame of the recorded drive, the rig turning while the shutter is
+    open.
+    """
     scenario = load_scenario(SCENE)
     t_us = scenario.start_us + 2_000_000
     start, end = (interpolate(scenario.ego_log, t) for t in (t_us - 1000 * ms, t_us))
-    poses = [wire_pose(T @ scenario.cameras[0].T_rig_camera, "a test") for T in (start, end @ se2(0, 0, turn_rad))]
+    poses = [
+        wire_pose(T @ scenario.cameras[0].T_rig_camera, "a test")
+        for T in (start, end @ se2(0, 0, turn_rad))
+    ]
     asked = sensorsim_pb2.RGBRenderRequest(
-        scene_id=scenario.scene_id, resolution_w=W, resolution_h=H, camera_intrinsics=spec or pinhole(W, H, "front"),
-        frame_start_us=t_us - 1000 * ms, frame_end_us=t_us, image_format=sensorsim_pb2.PNG,
+        scene_id=scenario.scene_id,
+        resolution_w=W,
+        resolution_h=H,
+        camera_intrinsics=spec or pinhole(W, H, "front"),
+        frame_start_us=t_us - 1000 * ms,
+        frame_end_us=t_us,
+        image_format=sensorsim_pb2.PNG,
         sensor_pose=sensorsim_pb2.PosePair(start_pose=poses[0], end_pose=poses[1]),
-    )  # fmt: skip
+    )
     asked.camera_intrinsics.shutter_type = shutter_type
     for actor in scenario.actors:
         if not actor.is_static:
-            pair = [wire_pose(interpolate(actor.track, t), "a test") for t in (t_us - 1000 * ms, t_us)]
-            asked.dynamic_objects.add(track_id=actor.actor_id, pose_pair=sensorsim_pb2.PosePair(start_pose=pair[0], end_pose=pair[1]))
+            pair = [
+                wire_pose(interpolate(actor.track, t), "a test") for t in (t_us - 1000 * ms, t_us)
+            ]
+            asked.dynamic_objects.add(
+                track_id=actor.actor_id,
+                pose_pair=sensorsim_pb2.PosePair(start_pose=pair[0], end_pose=pair[1]),
+            )
     return asked
 
 
 def exposure(asked: Any, shutter: Shutter = "asked") -> Exposure | None:
     view = read_view(asked)
-    return exposure_of(asked.camera_intrinsics, view, {name: pair[1] for name, pair in view.objects.items()}, shutter)
+    return exposure_of(
+        asked.camera_intrinsics,
+        view,
+        {name: pair[1] for name, pair in view.objects.items()},
+        shutter,
+    )
 
 
 @pytest.mark.parametrize("spec", [distorted(), fisheye(), ftheta(False), ftheta(True)])
 @pytest.mark.parametrize("shutter_type", [DOWN, UP, RIGHT, LEFT])
-def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(spec: Any, shutter_type: int) -> None:
+def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(
+    spec: Any, shutter_type: int
+) -> None:
     asked = ask(shutter_type, spec=spec)
     asked.resolution_w, asked.resolution_h = 160, 90
     found, lens = exposure(asked), read_lens(asked.camera_intrinsics, 160, 90)
     assert found is not None
     assert lens.resample is not None
     assert found.share.shape == lens.cover[::-1]
-    read = cv2.remap(found.share, lens.resample, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    read = cv2.remap(
+        found.share, lens.resample, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     rows, columns = np.mgrid[:90, :160]
     expected = rows / 89 if shutter_type in (DOWN, UP) else columns / 159
     expected = 1 - expected if shutter_type in (UP, LEFT) else expected
@@ -82,7 +113,9 @@ def test_what_the_lens_does_not_see_is_exposed_never() -> None:
     column, row = np.floor(lens.resample).astype(int).reshape(-1, 2).T
     for dx in (0, 1):
         for dy in (0, 1):
-            used[np.clip(row + dy, 0, lens.cover[1] - 1), np.clip(column + dx, 0, lens.cover[0] - 1)] = True
+            used[
+                np.clip(row + dy, 0, lens.cover[1] - 1), np.clip(column + dx, 0, lens.cover[0] - 1)
+            ] = True
     assert sees[used].all()
     assert not sees.all()
 
@@ -103,7 +136,9 @@ def test_what_rolls(asked: Any, shutter: Shutter, rolls: bool) -> None:
     found = exposure(asked, shutter)
     assert (found is not None) == rolls
     if found is not None:
-        assert (found.share[0, 0] < found.share[-1, 0]) == (asked.camera_intrinsics.shutter_type != UP)
+        assert (found.share[0, 0] < found.share[-1, 0]) == (
+            asked.camera_intrinsics.shutter_type != UP
+        )
         assert set(found.actors_start) == {o.track_id for o in asked.dynamic_objects}
 
 
@@ -114,9 +149,14 @@ def served(shutter: Shutter, asked: Any) -> U8:
 
 def test_a_served_frame_is_the_renderers_own_with_that_exposure_and_one_pose_a_row() -> None:
     asked = ask()
-    rolled, still, forced = served("asked", asked), served("global", asked), served("rolling", ask(sensorsim_pb2.GLOBAL))
+    rolled = served("asked", asked)
+    still = served("global", asked)
+    forced = served("rolling", ask(sensorsim_pb2.GLOBAL))
     np.testing.assert_array_equal(rolled, forced)
-    assert np.abs(rolled[: H // 2].astype(int) - still[: H // 2]).mean() > 3 * np.abs(rolled[-2:].astype(int) - still[-2:]).mean()
+    assert (
+        np.abs(rolled[: H // 2].astype(int) - still[: H // 2]).mean()
+        > 3 * np.abs(rolled[-2:].astype(int) - still[-2:]).mean()
+    )
 
 
 def test_the_map_has_the_shutter_of_the_frame() -> None:
@@ -128,11 +168,17 @@ def test_the_map_has_the_shutter_of_the_frame() -> None:
     camera = lens.spec("front", np.eye(4))
     boxes = {name: pair[1] for name, pair in view.objects.items()}
     request = RenderRequest(view.t_us, camera, view.T_world_camera, boxes, exposure=exposure(asked))
-    drawn, still = drawn_map(entry, request, lens, 1), drawn_map(entry, replace(request, exposure=None), lens, 1)
+    drawn, still = (
+        drawn_map(entry, request, lens, 1),
+        drawn_map(entry, replace(request, exposure=None), lens, 1),
+    )
     assert drawn is not None
     assert still is not None
     assert (drawn != still).any()
     assert entry.scene_map is not None
     for band in bands(request):
         users = actor_boxes(band.actors, entry.scenario.actors)
-        np.testing.assert_array_equal(drawn[band.rows], draw_map(entry.scene_map, camera, band.T_world_camera, users)[band.rows])
+        np.testing.assert_array_equal(
+            drawn[band.rows],
+            draw_map(entry.scene_map, camera, band.T_world_camera, users)[band.rows],
+        )

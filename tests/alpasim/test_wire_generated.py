@@ -1,4 +1,6 @@
-"""What is checked in is what the compiler writes, and it loads under every protobuf that the project allows, beside AlpaSim's own."""
+"""What is checked in is what the compiler writes, and it loads under every protobuf that the
+project allows, beside AlpaSim's own.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +17,9 @@ from tests.alpasim import compile_protos as compiling
 PROTOS = compiling.PROTOS
 WIRE = PROTOS.parent
 
-# Loads the package from a copy outside the project under another name, as the bridge distribution has it, then a foreign file that defines
-# `common.Vec3` into the default pool, and sends a message there and back.
+# Loads the package from a copy outside the project under another name, as the bridge distribution
+# has it, then a foreign file that defines `common.Vec3` into the default pool, and sends a message
+# there and back.
 LOADING = """
 import sys, google.protobuf
 sys.path.insert(0, sys.argv[1])
@@ -63,12 +66,17 @@ def test_a_changed_source_is_noticed(tmp_path: Path) -> None:
         (tmp_path / path.name).write_bytes(path.read_bytes())
     with (tmp_path / "common.proto").open("a") as file:
         file.write("// more\n")
-    found, kept = compiling.digests(tmp_path), json.loads((PROTOS / compiling.CHECKSUMS).read_text())
+    found, kept = (
+        compiling.digests(tmp_path),
+        json.loads((PROTOS / compiling.CHECKSUMS).read_text()),
+    )
     assert {name for name in kept if kept[name] != found[name]} == {"common.proto"}
 
 
 def test_the_messages_load_under_another_name_beside_foreign_ones(tmp_path: Path) -> None:
-    done = subprocess.run([sys.executable, "-c", LOADING, str(copied(tmp_path))], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", LOADING, str(copied(tmp_path))], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -76,7 +84,9 @@ def test_the_messages_load_under_another_name_beside_foreign_ones(tmp_path: Path
 @pytest.mark.parametrize("protobuf", ["==4.25.*", "==5.29.*", ">=6,<7"])
 def test_the_messages_load_under_every_allowed_protobuf(tmp_path: Path, protobuf: str) -> None:
     python = environment(tmp_path / "venv", f"protobuf{protobuf}", "grpcio>=1.62")
-    done = subprocess.run([python, "-c", LOADING, str(copied(tmp_path))], capture_output=True, text=True)
+    done = subprocess.run(
+        [python, "-c", LOADING, str(copied(tmp_path))], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(protobuf.lstrip("=>")[0])
 
@@ -88,4 +98,6 @@ def test_the_compiler_writes_what_is_checked_in(tmp_path: Path) -> None:
     out.mkdir()
     subprocess.run([python, compiling.__file__, str(out)], check=True)
     names = [compiling.CHECKSUMS, *compiling.digests(PROTOS)]
-    assert {name: (out / name).read_bytes() for name in names} == {name: (PROTOS / name).read_bytes() for name in names}
+    assert {name: (out / name).read_bytes() for name in names} == {
+        name: (PROTOS / name).read_bytes() for name in names
+    }

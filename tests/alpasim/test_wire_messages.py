@@ -12,7 +12,9 @@ from alpasim_plugin.log import wire
 from alpasim_plugin.log.asl import AslReader
 
 GRPC = ("health_pb2", "reflection_pb2")  # gRPC's own services
-MODULES = [getattr(wire, name) for name in wire.__all__ if name.endswith("_pb2") and name not in GRPC]
+MODULES = [
+    getattr(wire, name) for name in wire.__all__ if name.endswith("_pb2") and name not in GRPC
+]
 
 
 def messages(descriptors: list[Descriptor]) -> Iterator[Descriptor]:
@@ -23,11 +25,17 @@ def messages(descriptors: list[Descriptor]) -> Iterator[Descriptor]:
 
 
 def all_messages() -> list[Descriptor]:
-    return [m for module in MODULES for m in messages(list(module.DESCRIPTOR.message_types_by_name.values()))]
+    return [
+        m
+        for module in MODULES
+        for m in messages(list(module.DESCRIPTOR.message_types_by_name.values()))
+    ]
 
 
 def test_counts_are_those_of_the_published_interface() -> None:
-    """0.54.0 has 108 messages and 357 fields; `ScenePrefetchRequest` (twice) and two fields of `RolloutSpec` are newer."""
+    """0.54.0 has 108 messages and 357 fields; `ScenePrefetchRequest` (twice) and two fields of
+    `RolloutSpec` are newer.
+    """
     assert len(all_messages()) == 108 + 2
     assert sum(len(m.fields) for m in all_messages()) == 357 + 2 + 2
     assert sum(len(module.DESCRIPTOR.services_by_name) for module in MODULES) == 7

@@ -1,4 +1,6 @@
-"""Block-causal attention with one explicit mask: the reference of `attention.block_causal_attention`."""
+"""Block-causal attention with one explicit mask: the reference of
+`attention.block_causal_attention`.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,17 @@ from alpasim_plugin.block_fixers.attention import visible_latents
 
 
 def block_causal_reference(
-    q: Tensor, k: Tensor, v: Tensor, tokens: int, block_latents: int, window: int | None = None, sink: int = 0
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    tokens: int,
+    block_latents: int,
+    window: int | None = None,
+    sink: int = 0,
 ) -> Tensor:
-    """Attend with an explicit mask and a written-out softmax; arguments as of `block_causal_attention`."""
+    """Attend with an explicit mask and a written-out softmax; arguments as of
+    `block_causal_attention`.
+    """
     frames = q.shape[1] // tokens
     mask = torch.zeros(frames, frames, dtype=torch.bool, device=q.device)
     for start in range(0, frames, block_latents):

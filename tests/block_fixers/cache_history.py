@@ -9,11 +9,16 @@ from alpasim_plugin.block_fixers.kv_cache import BlockCache, GraphCache, Rolling
 
 
 def history(cache: BlockCache, layer: int) -> tuple[Tensor, Tensor]:
-    """Return a layer's cached keys and values, oldest first, ``(B, latents * tokens, heads, head_width)``."""
+    """Return a layer's cached keys and values, oldest first, ``(B, latents * tokens, heads,
+    head_width)``.
+    """
     if isinstance(cache, RollingCache):
         ring = cache.size - cache.sink
         rolling = range(max(cache.sink, cache.filled - ring), cache.filled)
-        slots = [*range(min(cache.sink, cache.filled)), *(cache.sink + (i - cache.sink) % ring for i in rolling)]
+        slots = [
+            *range(min(cache.sink, cache.filled)),
+            *(cache.sink + (i - cache.sink) % ring for i in rolling),
+        ]
         rows = cache._token_rows(slots).to(cache.device)
         return cache.keys[layer][:, rows], cache.values[layer][:, rows]
     assert isinstance(cache, GraphCache)

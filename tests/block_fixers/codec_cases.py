@@ -14,14 +14,23 @@ from alpasim_plugin.block_fixers.wan_vae_blocks import WanLayout
 from alpasim_plugin.core import seeding
 
 SMALL = WanLayout.of_base(8)
-UNEVEN = WanLayout(colours=3, latent=16, stem=4, encoder=(8, 12, 20, 24), decoder_in=(28, 12, 8, 6), decoder_out=(20, 16, 10, 4))
+UNEVEN = WanLayout(
+    colours=3,
+    latent=16,
+    stem=4,
+    encoder=(8, 12, 20, 24),
+    decoder_in=(28, 12, 8, 6),
+    decoder_out=(20, 16, 10, 4),
+)
 
 DEEPER = WanLayout(3, 16, 4, (4, 8, 8, 12), (12, 8, 8, 4), (12, 12, 8, 4), blocks=3)
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:
     """Return standard normal numbers, the same every time."""
-    return torch.from_numpy(seeding.stream("tests", seed, f"codec{shape}").standard_normal(shape)).float()
+    return torch.from_numpy(
+        seeding.stream("tests", seed, f"codec{shape}").standard_normal(shape)
+    ).float()
 
 
 def clip(frames: int, height: int, width: int, batch: int = 1, seed: int = 0) -> Tensor:
@@ -29,8 +38,14 @@ def clip(frames: int, height: int, width: int, batch: int = 1, seed: int = 0) ->
     return noise(batch, 3, frames, height, width, seed=seed).tanh()
 
 
-def golden(shared_data: Path, stem: str) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
+def golden(
+    shared_data: Path, stem: str
+) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
     """Return weights, inputs and outputs, and settings of one network's golden tensors."""
     folder = shared_data / "golden-nets"
     config = json.loads((folder / f"{stem}.config.json").read_text())
-    return load_file(folder / f"{stem}.weights.safetensors"), load_file(folder / f"{stem}.io.safetensors"), config
+    return (
+        load_file(folder / f"{stem}.weights.safetensors"),
+        load_file(folder / f"{stem}.io.safetensors"),
+        config,
+    )

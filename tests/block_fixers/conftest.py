@@ -1,4 +1,6 @@
-"""Fixtures of the block generators' tests: small networks are fastest on one thread, and bit-equality needs the same number throughout."""
+"""Fixtures of the block generators' tests: small networks are fastest on one thread, and
+bit-equality needs the same number throughout.
+"""
 
 from __future__ import annotations
 

@@ -9,7 +9,15 @@ from alpasim_plugin.block_fixers.sizes import DiTSizes
 from tests.block_fixers.dit_reference import random_weights
 
 SMALL = DiTSizes(
-    width=24, blocks=2, head_width=12, mlp_width=40, adaln_rank=5, text_width=7, context_width=9, latent_channels=4, map_channels=3
+    width=24,
+    blocks=2,
+    head_width=12,
+    mlp_width=40,
+    adaln_rank=5,
+    text_width=7,
+    context_width=9,
+    latent_channels=4,
+    map_channels=3,
 )
 
 
@@ -17,7 +25,15 @@ def network(sizes: DiTSizes = SMALL, seed: int = 0, **options) -> CosmosCausalDi
     return CosmosCausalDiT.from_state_dict(random_weights(sizes, seed), **options)
 
 
-def clip(frames: int, sizes: DiTSizes = SMALL, batch: int = 1, height: int = 4, width: int = 6, tokens: int = 3, seed: int = 1):
+def clip(
+    frames: int,
+    sizes: DiTSizes = SMALL,
+    batch: int = 1,
+    height: int = 4,
+    width: int = 6,
+    tokens: int = 3,
+    seed: int = 1,
+):
     """Return x, t (one step per block of 2), text, hdmap."""
     g = torch.Generator().manual_seed(seed)
     x = torch.randn(batch, sizes.latent_channels, frames, height, width, generator=g)

@@ -1,4 +1,6 @@
-"""A recorder that runs the function again at every replay: the reference of `CudaRecorder`, for machines without a GPU."""
+"""A recorder that runs the function again at every replay: the reference of `CudaRecorder`, for
+machines without a GPU.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +15,22 @@ from alpasim_plugin.block_fixers.graphs import Recording
 
 
 class EagerRecorder:
-    """Replay by calling the function; as with a graph, outputs are static buffers and undefined before the first replay."""
+    """Replay by calling the function; as with a graph, outputs are static buffers and undefined
+    before the first replay.
+    """
 
     def record(self, function: Callable[[], Any]) -> Recording:
         """Allocate output buffers, full of NaN."""
-        outputs = tree_map_only(Tensor, lambda x: torch.full_like(x, torch.nan if x.is_floating_point() else 0), function())
+        outputs = tree_map_only(
+            Tensor,
+            lambda x: torch.full_like(x, torch.nan if x.is_floating_point() else 0),
+            function(),
+        )
 
         def replay() -> None:
-            for kept, new in zip(tree_flatten(outputs)[0], tree_flatten(function())[0], strict=True):
+            for kept, new in zip(
+                tree_flatten(outputs)[0], tree_flatten(function())[0], strict=True
+            ):
                 if isinstance(kept, Tensor):
                     kept.copy_(new)
 

@@ -14,9 +14,17 @@ from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import fixer_settings
 
 SMALL_DIT = (
-    "weights.bundle=null", "history=last-forward", "holes=render",
-    "dit.width=24", "dit.blocks=2", "dit.head_width=12", "dit.mlp_width=40", "dit.adaln_rank=5", "dit.text_width=7", "dit.context_width=9",
-)  # fmt: skip
+    "weights.bundle=null",
+    "history=last-forward",
+    "holes=render",
+    "dit.width=24",
+    "dit.blocks=2",
+    "dit.head_width=12",
+    "dit.mlp_width=40",
+    "dit.adaln_rank=5",
+    "dit.text_width=7",
+    "dit.context_width=9",
+)
 
 
 @dataclass(frozen=True)
@@ -39,7 +47,12 @@ def small_settings(*overrides: str, name: str = "onefixer-dit-tiny") -> OneFixer
 def busy_settings(folder: Path, *overrides: str) -> OneFixerSettings:
     """Return settings whose weights make every layer count, which an identity's do not."""
     settings = small_settings("holes=noise", *overrides)
-    must_match = settings.block_latents, settings.decoder.kind, settings.render_input, settings.opacity_input
+    must_match = (
+        settings.block_latents,
+        settings.decoder.kind,
+        settings.render_input,
+        settings.opacity_input,
+    )
     path = folder / f"blocks_of_{'_'.join(map(str, must_match))}.safetensors"
     if not path.exists():
         save_stand_in(path, settings)

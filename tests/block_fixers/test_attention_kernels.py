@@ -23,7 +23,12 @@ def test_kernels_agree_on_a_cpu(name):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", ["cudnn", "efficient"])
 def test_kernels_that_a_cpu_lacks_are_refused(name):
-    with pytest.raises(InputError, match=rf"choosing an attention kernel[\s\S]*{name}[\s\S]*use auto"), attention_kernel(name):
+    with (
+        pytest.raises(
+            InputError, match=rf"choosing an attention kernel[\s\S]*{name}[\s\S]*use auto"
+        ),
+        attention_kernel(name),
+    ):
         pass
 
 
@@ -35,7 +40,9 @@ def test_unknown_kernel_is_refused():
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", ["flash", "cudnn", "efficient", "math"])
 def test_kernels_agree_on_a_gpu(name):
-    q, k, v = (torch.randn(1, 4, n, 64, device="cuda", dtype=torch.bfloat16) for n in (200, 600, 600))
+    q, k, v = (
+        torch.randn(1, 4, n, 64, device="cuda", dtype=torch.bfloat16) for n in (200, 600, 600)
+    )
     exact = torch.nn.functional.scaled_dot_product_attention(q.double(), k.double(), v.double())
     with attention_kernel(name, "cuda", torch.bfloat16):
         out = torch.nn.functional.scaled_dot_product_attention(q, k, v)

@@ -23,5 +23,7 @@ print("torch._dynamo" in sys.modules)
 @pytest.mark.slow
 def test_building_networks_does_not_load_the_compiler(repo):
     """It would take seconds, and happens when arithmetic is done on the meta device."""
-    out = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True, cwd=repo)
+    out = subprocess.run(
+        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True, cwd=repo
+    )
     assert out.stdout.strip() == "False"

@@ -1,4 +1,6 @@
-"""Random sizes, options and shapes: the network is the written-out one, its cache is its mask, and sizes are read off the tensors."""
+"""Random sizes, options and shapes: the network is the written-out one, its cache is its mask, and
+sizes are read off the tensors.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,25 @@ from tests.block_fixers.dit_cases import clip, furthest, stream
 from tests.block_fixers.dit_reference import random_weights, velocity
 from tests.examples import examples
 
-HEAD_WIDTHS = (16, 18, 20, 22, 26, 32, 34, 40, 48, 50, 62, 64, 74, 80, 96, 100, 128)  # remainders 0, 2, 4 of 6
+HEAD_WIDTHS = (
+    16,
+    18,
+    20,
+    22,
+    26,
+    32,
+    34,
+    40,
+    48,
+    50,
+    62,
+    64,
+    74,
+    80,
+    96,
+    100,
+    128,
+)  # remainders 0, 2, 4 of 6
 
 
 @st.composite
@@ -45,14 +65,35 @@ def test_any_size_is_read_and_computed(data, sizes):
     weights = random_weights(sizes, seed)
     x, t, text, hdmap = clip(frames, sizes, batch, height, width, tokens, seed)
     g = torch.Generator().manual_seed(seed)
-    mask = (torch.rand(batch, 1, frames, height, width, generator=g) > 0.5).float() if data.draw(st.booleans()) else None
-    padding = (torch.rand(batch, 1, height, width, generator=g) > 0.5).float() if data.draw(st.booleans()) else None
+    mask = (
+        (torch.rand(batch, 1, frames, height, width, generator=g) > 0.5).float()
+        if data.draw(st.booleans())
+        else None
+    )
+    padding = (
+        (torch.rand(batch, 1, height, width, generator=g) > 0.5).float()
+        if data.draw(st.booleans())
+        else None
+    )
     net = CosmosCausalDiT.from_state_dict(weights, rope_ratios=ratios)
     assert net.sizes == sizes
     expanded = None if padding is None else padding[:, :, None].expand(-1, -1, frames, -1, -1)
-    expected = velocity(weights, x, t, text, hdmap, mask, block or frames, ratios, expanded, window, sink, start)
+    expected = velocity(
+        weights, x, t, text, hdmap, mask, block or frames, ratios, expanded, window, sink, start
+    )
     with torch.no_grad():
-        v = net(x, t, text, hdmap, mask, block, padding_mask=padding, window=window, sink=sink, start=start)
+        v = net(
+            x,
+            t,
+            text,
+            hdmap,
+            mask,
+            block,
+            padding_mask=padding,
+            window=window,
+            sink=sink,
+            start=start,
+        )
     assert furthest(v, expected) < 1e-4
 
 
@@ -67,13 +108,20 @@ def test_any_size_streams_as_its_mask_says(data, sizes):
     x, t, text, hdmap = clip(block * blocks, sizes, batch, 2, 4, tokens)
     net = CosmosCausalDiT.from_state_dict(weights)
     with torch.no_grad():
-        v = stream(net, net.new_cache(batch, 2, 4, window, sink), x, t, text, hdmap, (block,) * blocks)
-    assert furthest(v, velocity(weights, x, t, text, hdmap, None, block, window=window, sink=sink)) < 1e-4
+        v = stream(
+            net, net.new_cache(batch, 2, 4, window, sink), x, t, text, hdmap, (block,) * blocks
+        )
+    assert (
+        furthest(v, velocity(weights, x, t, text, hdmap, None, block, window=window, sink=sink))
+        < 1e-4
+    )
 
 
 @pytest.mark.parametrize("shape", [(16, 1), (16, 16), (24, 12)])
 def test_sizes_that_coincide_are_still_told_apart(shape):
-    """Width, inner width, rank, context and text all equal: only counts of heads and channels are left to read."""
+    """Width, inner width, rank, context and text all equal: only counts of heads and channels are
+    left to read.
+    """
     width, head_width = shape
     sizes = DiTSizes(width, 2, max(2, head_width), width, width, width, width, 16, 16)
     weights = random_weights(sizes)

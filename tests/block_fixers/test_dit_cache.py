@@ -76,7 +76,10 @@ def test_window_smaller_than_a_block_sees_the_block_and_nothing_else():
 def test_one_frame_rollout():
     net, (x, t, text, hdmap) = network(), clip(1)
     with torch.no_grad():
-        assert furthest(net.step(x, t, text, hdmap, net.new_cache(1, 4, 6)), net(x, t, text, hdmap)) < 1e-6
+        assert (
+            furthest(net.step(x, t, text, hdmap, net.new_cache(1, 4, 6)), net(x, t, text, hdmap))
+            < 1e-6
+        )
 
 
 def test_block_opened_again_shorter_after_it_took_old_slots_is_refused():
@@ -85,7 +88,10 @@ def test_block_opened_again_shorter_after_it_took_old_slots_is_refused():
     for _ in range(2):
         net.step(x, t, text, hdmap, cache)
     net.step(x, t, text, hdmap, cache, write=False)
-    with pytest.raises(InputError, match=r"1 latents after a forward with 2 at latent 4[\s\S]*repeat a block with its first length"):
+    with pytest.raises(
+        InputError,
+        match=r"1 latents after a forward with 2 at latent 4[\s\S]*repeat a block with its first length",
+    ):
         net.step(x[:, :, :1], t[:, :1], text, hdmap[:, :, :1], cache)
     assert net.step(x, t, text, hdmap, cache).isfinite().all()
 
@@ -176,4 +182,8 @@ def test_reopened_block_sends_nothing_to_the_device_and_a_moved_rotation_is_a_ne
     assert not made
     cache._token_rows = kept
     cache.commit()
-    assert (cache.visible, cache.begin(2) is table, cache.visible) == ((2, 0, True), True, (4, 0, True))
+    assert (cache.visible, cache.begin(2) is table, cache.visible) == (
+        (2, 0, True),
+        True,
+        (4, 0, True),
+    )

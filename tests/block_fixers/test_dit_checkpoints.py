@@ -1,4 +1,6 @@
-"""Weights: every deviation is named, everything a training checkpoint carries besides is tolerated, nothing but tensors is unpickled."""
+"""Weights: every deviation is named, everything a training checkpoint carries besides is tolerated,
+nothing but tensors is unpickled.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,10 @@ def test_transposed_tensor_is_named_alone(key):
     shape = SMALL.shapes()[key]
     with pytest.raises(InputError) as caught:
         load(sd)
-    assert caught.value.found == f"wrong shape: {key} is {list(shape[::-1])} for {list(shape)}, transposed"
+    assert (
+        caught.value.found
+        == f"wrong shape: {key} is {list(shape[::-1])} for {list(shape)}, transposed"
+    )
 
 
 @pytest.mark.parametrize("key", KEYS)
@@ -83,15 +88,29 @@ def test_heads_that_do_not_divide_the_width_are_refused():
 
 def dressed(sd):
     """Return the same weights as a training run would store them."""
-    out = {f"net.{key.replace('blocks.0.', 'blocks.0._checkpoint_wrapped_module.')}": value for key, value in sd.items()}
+    out = {
+        f"net.{key.replace('blocks.0.', 'blocks.0._checkpoint_wrapped_module.')}": value
+        for key, value in sd.items()
+    }
     out |= {f"net_ema.{key}": torch.zeros_like(value) for key, value in sd.items()}
-    out |= {"net.pos_embedder.seq": torch.arange(64.0), "net.pos_embedder.dim_spatial_range": torch.zeros(2)}
-    out |= {"net.pos_embedder.dim_temporal_range": torch.zeros(2), "net.accum_iteration": torch.tensor(7)}
-    out |= {"net.accum_train_in_hours": torch.tensor(1.5), "net.blocks.0.self_attn.q_norm._extra_state": torch.zeros(0)}
+    out |= {
+        "net.pos_embedder.seq": torch.arange(64.0),
+        "net.pos_embedder.dim_spatial_range": torch.zeros(2),
+    }
+    out |= {
+        "net.pos_embedder.dim_temporal_range": torch.zeros(2),
+        "net.accum_iteration": torch.tensor(7),
+    }
+    out |= {
+        "net.accum_train_in_hours": torch.tensor(1.5),
+        "net.blocks.0.self_attn.q_norm._extra_state": torch.zeros(0),
+    }
     return out | {"optim.step": torch.tensor(3), "logvar.0.weight": torch.zeros(4, 4)}
 
 
-@pytest.mark.parametrize("wrap", [lambda sd: sd, lambda sd: {"model": sd}, lambda sd: {"state_dict": sd, "epoch": 3}])
+@pytest.mark.parametrize(
+    "wrap", [lambda sd: sd, lambda sd: {"model": sd}, lambda sd: {"state_dict": sd, "epoch": 3}]
+)
 def test_everything_a_training_run_stores_besides_is_tolerated(wrap):
     sd, c = random_weights(SMALL), clip(3)
     with torch.no_grad():
@@ -127,7 +146,9 @@ def test_half_precision_tensors_are_widened(dtype):
 def test_overflow_on_the_way_to_half_precision_is_named():
     sd = random_weights(SMALL)
     sd["x_embedder.proj.1.weight"][0, 0] = 1e5
-    with pytest.raises(InputError, match=r"x_embedder.proj.1.weight holds 1e\+05, beyond torch.float16"):
+    with pytest.raises(
+        InputError, match=r"x_embedder.proj.1.weight holds 1e\+05, beyond torch.float16"
+    ):
         load(sd, dtype=torch.float16)
     assert load(sd, dtype=torch.bfloat16).dtype == torch.bfloat16
 
@@ -136,18 +157,22 @@ def test_overflow_on_the_way_to_half_precision_is_named():
 def test_weights_that_are_not_finite_are_named(value):
     sd = random_weights(SMALL)
     sd["blocks.1.mlp.layer2.weight"][2, 3] = value
-    with pytest.raises(InputError, match=r"blocks.1.mlp.layer2.weight holds 1 values that are not finite, of 960"):
+    with pytest.raises(
+        InputError, match=r"blocks.1.mlp.layer2.weight holds 1 values that are not finite, of 960"
+    ):
         load(sd)
 
 
 def test_integer_weights_are_named():
     sd = random_weights(SMALL)
     sd["final_layer.linear.weight"] = sd["final_layer.linear.weight"].to(torch.int8)
-    with pytest.raises(InputError, match=r"final_layer.linear.weight holds torch.int8[\s\S]*quantise after loading"):
+    with pytest.raises(
+        InputError, match=r"final_layer.linear.weight holds torch.int8[\s\S]*quantise after loading"
+    ):
         load(sd)
 
 
-# --- files ----------------------------------------------------------------------------------------------------------
+# --- files
 
 
 def test_safetensors_round_trip_with_digest_and_precision(tmp_path):
@@ -157,7 +182,9 @@ def test_safetensors_round_trip_with_digest_and_precision(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["net.safetensors"]
     back = load_weights(path, sha256=file_sha256(path).upper())
     assert all(torch.equal(back[key], sd[key]) for key in sd)
-    assert {value.dtype for value in load_weights(path, torch.bfloat16).values()} == {torch.bfloat16}
+    assert {value.dtype for value in load_weights(path, torch.bfloat16).values()} == {
+        torch.bfloat16
+    }
     with pytest.raises(InputError, match=f"sha256 {file_sha256(path)}, not 00"):
         load_weights(path, sha256="00")
 
@@ -183,7 +210,10 @@ def test_truncated_safetensors_is_refused(tmp_path, keep):
     path = tmp_path / "net.safetensors"
     write_safetensors(path, random_weights(SMALL))
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(InputError, match=r"not a complete safetensors file of \d+ bytes[\s\S]*truncated or of another format"):
+    with pytest.raises(
+        InputError,
+        match=r"not a complete safetensors file of \d+ bytes[\s\S]*truncated or of another format",
+    ):
         load_weights(path)
 
 
@@ -223,7 +253,10 @@ def test_pickle_with_code_is_refused_and_not_run(tmp_path, plain):
         path.write_bytes(pickle.dumps({"trap": Trap(sprung)}))
     else:
         torch.save(content, path)
-    with pytest.raises(InputError, match=r"a pickle that holds more than tensors \(Unsupported .*\); loading it could run code"):
+    with pytest.raises(
+        InputError,
+        match=r"a pickle that holds more than tensors \(Unsupported .*\); loading it could run code",
+    ):
         load_weights(path)
     assert not sprung.exists()
 

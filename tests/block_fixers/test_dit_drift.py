@@ -1,4 +1,6 @@
-"""Long rollouts in half precision: the error against float32 by index, at far positions, and when a fixer feeds on its own history."""
+"""Long rollouts in half precision: the error against float32 by index, at far positions, and when a
+fixer feeds on its own history.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,12 @@ SHIPPED = DiTSizes(192, 6, 48, 384, 16, 64, 64)
 LIMITS = {"bf16": 0.03, "fp16": 0.004}
 
 
-def errors(sizes: DiTSizes, precision: Precision, blocks: int, height: int, width: int, start: int = 0) -> torch.Tensor:
-    """Return the relative error of every block of a rollout whose history is kept at that precision, ``(blocks,)``."""
+def errors(
+    sizes: DiTSizes, precision: Precision, blocks: int, height: int, width: int, start: int = 0
+) -> torch.Tensor:
+    """Return the relative error of every block of a rollout whose history is kept at that
+    precision, ``(blocks,)``.
+    """
     net = CosmosCausalDiT.from_state_dict(random_weights(sizes)).folded(1000.0)
     small = at_precision(net, precision)
     g = torch.Generator().manual_seed(3)
@@ -32,7 +38,10 @@ def errors(sizes: DiTSizes, precision: Precision, blocks: int, height: int, widt
         for _ in range(blocks):
             x = torch.randn(1, sizes.latent_channels, 2, height, width, generator=g)
             hdmap = torch.randn(1, sizes.map_channels, 2, height, width, generator=g)
-            exact, v = (n.step(x, 1000.0, p, hdmap, c) for n, p, c in zip((net, small), prompts, caches, strict=True))
+            exact, v = (
+                n.step(x, 1000.0, p, hdmap, c)
+                for n, p, c in zip((net, small), prompts, caches, strict=True)
+            )
             assert v.isfinite().all()
             out.append((v - exact).norm() / exact.norm())
     assert [(c.keys.data_ptr(), c.nbytes) for c in caches] == before
@@ -78,5 +87,7 @@ def test_half_precision_network_at_position_ten_thousand_is_the_written_out_one(
     with torch.no_grad():
         v = net(*c, start=10_000)
         wrong = net(*c, block_latents=1, start=10_000)
-    assert float((v - expected).norm() / expected.norm()) < (0.03 if dtype == torch.bfloat16 else 0.004)
+    assert float((v - expected).norm() / expected.norm()) < (
+        0.03 if dtype == torch.bfloat16 else 0.004
+    )
     assert float((wrong - expected).norm() / expected.norm()) > 0.1

@@ -1,4 +1,6 @@
-"""Two execution paths, one network: whole clip, blocks through either cache, and the written-out reference agree."""
+"""Two execution paths, one network: whole clip, blocks through either cache, and the written-out
+reference agree.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ from tests.examples import examples
 SIZES = [
     SMALL,
     DiTSizes(16, 1, 16, 24, 3, 5, 16, 16, 16),  # one block, one head, context as wide as the stream
-    DiTSizes(96, 3, 8, 64, 96, 11, 6, 16, 1),  # many heads of the smallest useful width, square AdaLN, map of one channel
+    DiTSizes(
+        96, 3, 8, 64, 96, 11, 6, 16, 1
+    ),  # many heads of the smallest useful width, square AdaLN, map of one channel
     DiTSizes(64, 2, 64, 256, 16, 48, 40, 16, 16),
     DiTSizes(20, 2, 10, 33, 4, 3, 2, 5, 7),  # no power of two anywhere
     DiTSizes(24, 2, 12, 40, 5, 7, 9, 4, 3, 6),  # every block sees the opacity
@@ -26,11 +30,16 @@ SIZES = [
 
 
 @pytest.mark.parametrize("sizes", SIZES, ids=lambda s: f"{s.width}x{s.blocks}x{s.head_width}")
-@pytest.mark.parametrize(("frames", "block", "ratios"), [(5, 2, (3.0, 3.0, 1.0)), (3, 3, (1.0, 2.0, 1.5)), (1, 2, (1.0, 1.0, 1.0))])
+@pytest.mark.parametrize(
+    ("frames", "block", "ratios"),
+    [(5, 2, (3.0, 3.0, 1.0)), (3, 3, (1.0, 2.0, 1.5)), (1, 2, (1.0, 1.0, 1.0))],
+)
 def test_network_is_the_written_out_one_at_any_size(sizes, frames, block, ratios):
     weights = random_weights(sizes, 3)
     x, t, text, hdmap = clip(frames, sizes, batch=2)
-    mask = (torch.rand(2, 1, frames, 4, 6, generator=torch.Generator().manual_seed(0)) > 0.5).float()
+    mask = (
+        torch.rand(2, 1, frames, 4, 6, generator=torch.Generator().manual_seed(0)) > 0.5
+    ).float()
     net = network(sizes, 3, rope_ratios=ratios)
     assert net.sizes == sizes
     with torch.no_grad():
@@ -50,7 +59,9 @@ def test_rolling_cache_is_the_growing_one(blocks, window, sink, batch, size):
     sink = min(sink, window)
     net = network()
     x, t, text, hdmap = clip(sum(blocks), batch=batch, height=size[0], width=size[1])
-    caches = [net.new_cache(batch, *size, window, sink, keeps_graph=graph) for graph in (False, True)]
+    caches = [
+        net.new_cache(batch, *size, window, sink, keeps_graph=graph) for graph in (False, True)
+    ]
     out = [stream(net, cache, x, t, text, hdmap, blocks).detach() for cache in caches]
     assert furthest(*out) < 1e-5
     for layer in range(SMALL.blocks):
@@ -66,14 +77,18 @@ def test_rolling_cache_is_the_growing_one(blocks, window, sink, batch, size):
     sink=st.integers(0, 3),
     size=st.sampled_from([(2, 2), (4, 6)]),
 )
-def test_blocks_through_a_cache_are_the_whole_clip_under_the_same_window(frames, block, window, sink, size):
+def test_blocks_through_a_cache_are_the_whole_clip_under_the_same_window(
+    frames, block, window, sink, size
+):
     sink = min(sink, window)
     net = network()
     x, t, text, hdmap = clip(frames, height=size[0], width=size[1])
     lengths = [min(block, frames - start) for start in range(0, frames, block)]
     with torch.no_grad():
         blocks = stream(net, net.new_cache(1, *size, window, sink), x, t, text, hdmap, lengths)
-        assert furthest(blocks, net(x, t, text, hdmap, None, block, window=window, sink=sink)) < 1e-5
+        assert (
+            furthest(blocks, net(x, t, text, hdmap, None, block, window=window, sink=sink)) < 1e-5
+        )
         if window >= frames:
             assert furthest(blocks, net(x, t, text, hdmap, None, block)) < 1e-5
 
@@ -108,7 +123,9 @@ def test_later_blocks_do_not_reach_earlier_ones():
 
 
 def test_past_beyond_the_window_is_forgotten_and_the_sink_is_not():
-    one_layer = network(DiTSizes(**{**SMALL.__dict__, "blocks": 1}))  # several layers would pass it on from block to block
+    one_layer = network(
+        DiTSizes(**{**SMALL.__dict__, "blocks": 1})
+    )  # several layers would pass it on from block to block
     x, t, text, hdmap = clip(8)
     far, sunk = x.clone(), x.clone()
     far[:, :, 2:4] += 5
@@ -135,7 +152,10 @@ def test_prepared_text_is_the_text(tokens):
     x, t, text, hdmap = clip(4, tokens=tokens)
     with torch.no_grad():
         assert torch.equal(net(x, t, net.encode_text(text), hdmap), net(x, t, text, hdmap))
-        assert furthest(net(x, t, text, hdmap), velocity(random_weights(SMALL), x, t, text, hdmap)) < 1e-5
+        assert (
+            furthest(net(x, t, text, hdmap), velocity(random_weights(SMALL), x, t, text, hdmap))
+            < 1e-5
+        )
 
 
 def test_one_prompt_serves_a_batch_of_views():
@@ -144,7 +164,9 @@ def test_one_prompt_serves_a_batch_of_views():
     with torch.no_grad():
         views = net(x, t, text[:1], hdmap)
         assert furthest(views, net(x, t, text[:1].expand(3, -1, -1), hdmap)) < 1e-5
-        alone = torch.cat([net(x[i : i + 1], t[i : i + 1], text[:1], hdmap[i : i + 1]) for i in range(3)])
+        alone = torch.cat(
+            [net(x[i : i + 1], t[i : i + 1], text[:1], hdmap[i : i + 1]) for i in range(3)]
+        )
     assert furthest(views, alone) < 1e-5
 
 
@@ -192,7 +214,9 @@ def test_gradients_reach_back_as_far_as_the_history_is_not_cut():
             cut = slice(2 * block, 2 * block + 2)
             v = net.step(leaf[:, :, cut], t[:, cut], text, hdmap[:, :, cut], cache)
         (grad,) = torch.autograd.grad(v.square().sum(), leaf)
-        assert [bool(grad[:, :, cut].abs().max() > 0) for cut in (slice(0, 2), slice(2, 4))] == reached
+        assert [
+            bool(grad[:, :, cut].abs().max() > 0) for cut in (slice(0, 2), slice(2, 4))
+        ] == reached
         assert grad[:, :, 4:].abs().max() > 0
 
 
@@ -200,6 +224,8 @@ def test_gradients_of_a_clip_are_those_of_its_blocks():
     net, (x, t, text, hdmap) = network(), clip(4)
     cache = net.new_cache(1, 4, 6, window=None, keeps_graph=True)
     whole = torch.autograd.grad(net(x, t, text, hdmap).square().mean(), list(net.parameters()))
-    blocks = torch.autograd.grad(stream(net, cache, x, t, text, hdmap, (2, 2)).square().mean(), list(net.parameters()))
+    blocks = torch.autograd.grad(
+        stream(net, cache, x, t, text, hdmap, (2, 2)).square().mean(), list(net.parameters())
+    )
     for a, b in zip(whole, blocks, strict=True):
         assert furthest(a, b) < 1e-5

@@ -1,4 +1,6 @@
-"""Hold the transformer and the sampler against tensors of the original networks; SOURCE.md beside the data says how they were made."""
+"""Hold the transformer and the sampler against tensors of the original networks; SOURCE.md beside
+the data says how they were made.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +17,18 @@ from tests.block_fixers.cache_history import history
 from tests.block_fixers.dit_cases import furthest, stream
 
 EPSILON = torch.finfo(torch.float32).eps
-TOLERANCE = 1e-5  # ten times tighter than asked; the original itself moves by 4e-6 with another arithmetic
+TOLERANCE = (
+    1e-5  # ten times tighter than asked; the original itself moves by 4e-6 with another arithmetic
+)
 
 
 @pytest.fixture(scope="module")
 def golden(shared_data):
     folder = shared_data / "golden-nets"
-    return {name: load_file(folder / f"{name}.safetensors") for name in ("dit.weights", "dit.io", "dit_rollout.io")}
+    return {
+        name: load_file(folder / f"{name}.safetensors")
+        for name in ("dit.weights", "dit.io", "dit_rollout.io")
+    }
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +65,10 @@ def test_whole_clip_without_rope_stretch(golden, io):
 
 def test_first_latent_given_and_padding(net, io):
     mask = first_given(6)
-    assert furthest(net(**inputs(io), condition_mask=mask), io["out.clip.first_frame_given.r3.out"]) < TOLERANCE
+    assert (
+        furthest(net(**inputs(io), condition_mask=mask), io["out.clip.first_frame_given.r3.out"])
+        < TOLERANCE
+    )
     out = net(**inputs(io), condition_mask=mask, padding_mask=io["in.clip.padding_mask_pixels"])
     assert furthest(out, io["out.clip.padding_mask.r3.out"]) < TOLERANCE
 
@@ -69,16 +79,30 @@ def test_batch_of_two(net, io):
 
 def test_bidirectional_teacher(net, io):
     t, mask = io["in.clip.t"], first_given(6)
-    assert furthest(net(**inputs(io), condition_mask=mask, block_latents=None), io["out.teacher.per_frame_t.out"]) < TOLERANCE
+    assert (
+        furthest(
+            net(**inputs(io), condition_mask=mask, block_latents=None),
+            io["out.teacher.per_frame_t.out"],
+        )
+        < TOLERANCE
+    )
     one = net(**inputs(io, t=t[:, :1]), condition_mask=mask, block_latents=None)
     assert furthest(one, io["out.teacher.one_t.out"]) < TOLERANCE
 
 
 def test_blocks_through_a_cache_that_covers_the_clip(net, io):
     clip, mask = inputs(io, t=io["in.cached_full.t"]), first_given(6)
-    assert furthest(net(**clip, condition_mask=mask), io["out.cached_full.wholeclip.out"]) < TOLERANCE
+    assert (
+        furthest(net(**clip, condition_mask=mask), io["out.cached_full.wholeclip.out"]) < TOLERANCE
+    )
     cache = net.new_cache(1, 8, 12, window=6)
-    assert furthest(stream(net, cache, **clip, blocks=(2, 2, 2), mask=mask), io["out.cached_full.blocks.out"]) < TOLERANCE
+    assert (
+        furthest(
+            stream(net, cache, **clip, blocks=(2, 2, 2), mask=mask),
+            io["out.cached_full.blocks.out"],
+        )
+        < TOLERANCE
+    )
     keys, values = history(cache, 0)
     assert furthest(keys, io["out.cached_full.block0.k_cache"]) < TOLERANCE
     assert furthest(values, io["out.cached_full.block0.v_cache"]) < TOLERANCE
@@ -88,13 +112,19 @@ def test_blocks_through_a_cache_that_covers_the_clip(net, io):
 @pytest.mark.parametrize(("window", "sink"), [(4, 0), (4, 2), (6, 0)])
 def test_two_forwards_a_block_through_a_rolling_window(net, io, window, sink, keeps_graph):
     cache = net.new_cache(1, 8, 12, window, sink, keeps_graph=keeps_graph)
-    mask, noisy, context = first_given(10), [], []
+    mask = first_given(10)
+    noisy = []
+    context = []
     for block in range(5):
         cut = slice(2 * block, 2 * block + 2)
-        text, hdmap, m = io["in.window.text"], io["in.window.hdmap"][:, :, cut], mask[:, :, cut]
+        text = io["in.window.text"]
+        hdmap = io["in.window.hdmap"][:, :, cut]
+        m = mask[:, :, cut]
         t = float(io["in.window.t_per_block"][block])
         noisy.append(net.step(io["in.window.x"][:, :, cut], t, text, hdmap, cache, False, m))
-        context.append(net.step(io["in.window.x_context"][:, :, cut], 128.0, text, hdmap, cache, True, m))
+        context.append(
+            net.step(io["in.window.x_context"][:, :, cut], 128.0, text, hdmap, cache, True, m)
+        )
     name = f"out.window{window}_sink{sink}.rolling"
     assert furthest(torch.cat(noisy, 2), io[f"{name}.out_noisy"]) < TOLERANCE
     assert furthest(torch.cat(context, 2), io[f"{name}.out_context"]) < TOLERANCE
@@ -106,8 +136,12 @@ def test_every_intermediate_tensor_of_the_first_block(net, io):
     seen = {}
     block = net.blocks[0]
     hooks = [
-        block.self_attn.register_forward_hook(lambda _, i, o: seen.update(self_attn_in=i[0], self_attn_out=o)),
-        block.cross_attn.register_forward_hook(lambda _, i, o: seen.update(cross_attn_in=i[0], cross_attn_out=o)),
+        block.self_attn.register_forward_hook(
+            lambda _, i, o: seen.update(self_attn_in=i[0], self_attn_out=o)
+        ),
+        block.cross_attn.register_forward_hook(
+            lambda _, i, o: seen.update(cross_attn_in=i[0], cross_attn_out=o)
+        ),
         block.mlp.register_forward_hook(lambda _, i, o: seen.update(mlp_in=i[0], mlp_out=o)),
         block.register_forward_hook(lambda _, i, o: seen.update(out=o)),
     ]
@@ -120,7 +154,9 @@ def test_every_intermediate_tensor_of_the_first_block(net, io):
     found |= {"block0_q_before_rope": q, "block0_k_before_rope": k}
     found |= {"block0_q_after_rope": rotate(q, table), "block0_k_after_rope": rotate(k, table)}
     for name, value in found.items():
-        assert furthest(value, io[f"out.clip.mask0.r3.mid.{name}"]) < 3e-5, name  # values here reach 17
+        assert furthest(value, io[f"out.clip.mask0.r3.mid.{name}"]) < 3e-5, (
+            name
+        )  # values here reach 17
 
 
 def test_embeddings(net, io):
@@ -142,20 +178,33 @@ def test_embeddings(net, io):
 
 
 def test_time_steps_rounded_as_the_training_code_rounds_them(io):
-    """Sines differ by an ulp or two between processors; a bfloat16 result moves only where that crosses a rounding boundary."""
-    t, exact, rounded = io["in.time.t"], io["out.time.sinusoid_fp32"], io["out.time.sinusoid_bf16_path"]
+    """Sines differ by an ulp or two between processors; a bfloat16 result moves only where that
+    crosses a rounding boundary.
+    """
+    t = io["in.time.t"]
+    exact = io["out.time.sinusoid_fp32"]
+    rounded = io["out.time.sinusoid_bf16_path"]
     torch.testing.assert_close(sinusoid(t, 64), exact, atol=4 * EPSILON, rtol=0)
     found = sinusoid(t, 64, torch.bfloat16)
     assert torch.equal(found, found.bfloat16().float())
-    torch.testing.assert_close(found, rounded, atol=4 * EPSILON, rtol=torch.finfo(torch.bfloat16).eps)
-    assert int((found != rounded).sum()) <= 2  # of 512; 22 differ where the steps themselves are not rounded
+    torch.testing.assert_close(
+        found, rounded, atol=4 * EPSILON, rtol=torch.finfo(torch.bfloat16).eps
+    )
+    assert (
+        int((found != rounded).sum()) <= 2
+    )  # of 512; 22 differ where the steps themselves are not rounded
 
 
 @pytest.mark.parametrize("case", ["rollout", "rollout_nocond_bigcache"])
 def test_two_step_sampler_over_five_blocks(net, golden, case):
     io = golden["dit_rollout.io"]
-    noise, fresh = io[f"in.{case}.noise_BTCHW"].transpose(1, 2), io[f"in.{case}.fresh_noise_in_call_order"]
-    cache, calls, out = net.new_cache(1, 8, 12, window=4), [], []
+    noise, fresh = (
+        io[f"in.{case}.noise_BTCHW"].transpose(1, 2),
+        io[f"in.{case}.fresh_noise_in_call_order"],
+    )
+    cache = net.new_cache(1, 8, 12, window=4)
+    calls = []
+    out = []
 
     class Recorder:
         def step(self, x, *rest):
@@ -167,11 +216,29 @@ def test_two_step_sampler_over_five_blocks(net, golden, case):
         draws = [fresh[2 * block + i].transpose(0, 1)[None] for i in range(2)]
         given = io[f"in.{case}.gt_first_latent"] if case == "rollout" and block == 0 else None
         sources, hdmap = [noise[:, :, cut], *draws], io[f"in.{case}.hdmap"][:, :, cut]
-        out.append(sample_block(Recorder(), sources, io[f"in.{case}.text"], hdmap, cache, from_names([1000, 450]), given=given))
+        out.append(
+            sample_block(
+                Recorder(),
+                sources,
+                io[f"in.{case}.text"],
+                hdmap,
+                cache,
+                from_names([1000, 450]),
+                given=given,
+            )
+        )
     assert furthest(torch.cat(out, 2), io[f"out.{case}.result_BCTHW"]) < TOLERANCE
     if case == "rollout":
-        assert furthest(torch.stack([x for x, _ in calls]), io["out.rollout.net_inputs_in_call_order"]) < TOLERANCE
-        assert furthest(torch.stack([v for _, v in calls]), io["out.rollout.net_outputs_in_call_order"]) < TOLERANCE
+        assert (
+            furthest(torch.stack([x for x, _ in calls]), io["out.rollout.net_inputs_in_call_order"])
+            < TOLERANCE
+        )
+        assert (
+            furthest(
+                torch.stack([v for _, v in calls]), io["out.rollout.net_outputs_in_call_order"]
+            )
+            < TOLERANCE
+        )
 
 
 def test_noise_levels_are_the_recorded_ones():

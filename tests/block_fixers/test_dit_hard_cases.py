@@ -1,4 +1,6 @@
-"""Long rollouts, far positions, half precision, the full size without its weights, first weights."""
+"""Long rollouts, far positions, half precision, the full size without its weights, first
+weights.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,15 @@ from tests.block_fixers.dit_cases import SMALL, clip, furthest, network, stream
 from tests.block_fixers.dit_reference import random_weights, rope_angles, velocity
 
 WIDE = DiTSizes(
-    width=128, blocks=3, head_width=32, mlp_width=256, adaln_rank=16, text_width=8, context_width=16, latent_channels=4, map_channels=3
+    width=128,
+    blocks=3,
+    head_width=32,
+    mlp_width=256,
+    adaln_rank=16,
+    text_width=8,
+    context_width=16,
+    latent_channels=4,
+    map_channels=3,
 )
 
 
@@ -35,7 +45,10 @@ def test_far_positions_are_right_and_only_differences_matter(start):
 def test_rope_angles_are_the_written_out_ones(head_width, ratios):
     assert sum(axis_widths(head_width)) == head_width
     ours = Rope3D(head_width, ratios).angles(10_000, 2, 3, 2)
-    assert furthest(ours.reshape(-1, head_width), rope_angles(10_000, 2, 3, 2, head_width, ratios)) < 1e-9
+    assert (
+        furthest(ours.reshape(-1, head_width), rope_angles(10_000, 2, 3, 2, head_width, ratios))
+        < 1e-9
+    )
 
 
 def test_odd_heads_have_no_rotation():
@@ -67,7 +80,11 @@ def test_half_precision_stays_near_float32(dtype, tolerance):
     exact = velocity(weights, *c)
     net = CosmosCausalDiT.from_state_dict(weights, dtype=dtype)
     with torch.no_grad():
-        for v in (net(*c), stream(net, net.new_cache(1, 4, 6), *c, (2, 2, 2)), net.folded(500.0)(c[0], 500.0, *c[2:])):
+        for v in (
+            net(*c),
+            stream(net, net.new_cache(1, 4, 6), *c, (2, 2, 2)),
+            net.folded(500.0)(c[0], 500.0, *c[2:]),
+        ):
             assert v.dtype == torch.float32
             assert v.isfinite().all()
         assert float((net(*c) - exact).norm() / exact.norm()) < tolerance
@@ -88,7 +105,11 @@ def test_time_and_modulation_stay_float32_in_a_half_precision_network(route):
     assert set(seen) == {torch.float32}
     if route == "loaded":
         kept = {name for name, p in net.named_parameters() if p.dtype == torch.float32}
-        assert kept == {name for name, _ in net.named_parameters() if "adaln" in name or name.startswith("t_embed")}
+        assert kept == {
+            name
+            for name, _ in net.named_parameters()
+            if "adaln" in name or name.startswith("t_embed")
+        }
 
 
 def test_full_size_has_the_published_number_of_parameters():
@@ -96,7 +117,9 @@ def test_full_size_has_the_published_number_of_parameters():
         net = CosmosCausalDiT(DiTSizes())
     assert sum(p.numel() for p in net.parameters()) == DiTSizes().parameters == 2_059_305_984
     assert sum(p.numel() for p in net.blocks.parameters()) == 1_937_782_784
-    assert {key: tuple(value.shape) for key, value in net.state_dict().items()} == DiTSizes().shapes()
+    assert {
+        key: tuple(value.shape) for key, value in net.state_dict().items()
+    } == DiTSizes().shapes()
 
 
 @pytest.mark.slow
@@ -105,7 +128,10 @@ def test_full_size_runs_without_numbers_at_544x960():
     sd = {key: torch.empty(shape, device="meta") for key, shape in sizes.shapes().items()}
     net = CosmosCausalDiT.from_state_dict(sd, dtype=torch.bfloat16).requires_grad_(False)
     assert net.sizes == sizes
-    x, text = torch.empty(1, 16, 2, 68, 120, device="meta"), torch.empty(1, 512, 100352, device="meta")
+    x, text = (
+        torch.empty(1, 16, 2, 68, 120, device="meta"),
+        torch.empty(1, 512, 100352, device="meta"),
+    )
     cache = net.new_cache(1, 68, 120, window=12)
     assert cache.nbytes / 2**30 == pytest.approx(5.23, abs=0.01)  # the published size of this cache
     context = net.encode_text(text)
@@ -136,7 +162,9 @@ def test_folded_network_refuses_another_time_step_and_a_second_folding():
     net = network().folded(1000.0)
     x, t, text, hdmap = clip(2)
     for wrong in (128.0, t):
-        with pytest.raises(InputError, match=r"folded for t=1000.0[\s\S]*use the network that is not folded"):
+        with pytest.raises(
+            InputError, match=r"folded for t=1000.0[\s\S]*use the network that is not folded"
+        ):
             net(x, wrong, text, hdmap)
     with pytest.raises(InputError, match="fold the original network"):
         net.folded(128.0)

@@ -28,7 +28,11 @@ def parts(settings: OneFixerSettings) -> dict[str, dict[str, torch.Tensor]]:
     """Return a transformer, an autoencoder and a prompt of two tokens."""
     sizes = DiTSizes(**settings.dit.model_dump())
     prompt = torch.arange(2.0 * sizes.text_width).view(2, -1).sin()
-    return {"dit": initial_weights(sizes, 5), "vae": TinyVAE.random(seed=5).state_dict(), "prompt": {"text": prompt}}
+    return {
+        "dit": initial_weights(sizes, 5),
+        "vae": TinyVAE.random(seed=5).state_dict(),
+        "prompt": {"text": prompt},
+    }
 
 
 @pytest.fixture
@@ -44,7 +48,9 @@ def at(bundle: Path, *overrides: str) -> OneFixerSettings:
 
 
 def spoil(bundle: Path, **changes: torch.Tensor | None) -> None:
-    """Write the bundle again with tensors replaced, or left out; a double underscore stands for a dot."""
+    """Write the bundle again with tensors replaced, or left out; a double underscore stands for a
+    dot.
+    """
     header, tensors = read_metadata(bundle), load_file(bundle)
     for name, value in changes.items():
         key = name.replace("__", ".")
@@ -68,8 +74,12 @@ def test_a_bundle_is_loaded_whole(bundle: Path) -> None:
     out = pixels(run_blocks(session, FRAMES, MAPS))
     assert np.abs(out.astype(int) - pixels(FRAMES)).max() > 2
     spoil(bundle, prompt__text=None)
-    other = small_settings("holes=noise", f"weights.bundle={bundle.rename(bundle.with_name('b.safetensors'))}")
-    assert not np.array_equal(pixels(run_blocks(fixer(other), FRAMES, MAPS)), out), "the prompt counts"
+    other = small_settings(
+        "holes=noise", f"weights.bundle={bundle.rename(bundle.with_name('b.safetensors'))}"
+    )
+    assert not np.array_equal(pixels(run_blocks(fixer(other), FRAMES, MAPS)), out), (
+        "the prompt counts"
+    )
 
 
 def test_what_is_set_otherwise_than_trained_for_is_in_the_label(bundle: Path) -> None:
@@ -83,7 +93,13 @@ def test_weights_for_other_conventions_are_refused(bundle: Path) -> None:
 
 
 def test_half_precision_tensors_are_widened(bundle: Path) -> None:
-    spoil(bundle, **{f"dit__{key}".replace(".", "__"): value.half() for key, value in parts(at(bundle))["dit"].items()})
+    spoil(
+        bundle,
+        **{
+            f"dit__{key}".replace(".", "__"): value.half()
+            for key, value in parts(at(bundle))["dit"].items()
+        },
+    )
     networks = load_networks(at(bundle))
     assert {p.dtype for p in networks.dit.parameters()} == {torch.float32}
 
@@ -103,7 +119,10 @@ def test_missing_extra_and_transposed_tensors_are_named(bundle: Path) -> None:
 
 
 def test_a_bundle_without_an_autoencoder_is_refused(bundle: Path) -> None:
-    spoil(bundle, **{key.replace(".", "__"): None for key in load_file(bundle) if key.startswith("vae.")})
+    spoil(
+        bundle,
+        **{key.replace(".", "__"): None for key in load_file(bundle) if key.startswith("vae.")},
+    )
     assert "no vae.*" in refusal(at(bundle))
     with pytest.raises(InputError, match="give dit, vae"):
         save_bundle(bundle, {"dit": {}}, at(bundle), trained=False)
@@ -126,7 +145,9 @@ def test_a_pickle_a_foreign_file_and_no_file_are_refused(bundle: Path, tmp_path:
     assert "not safetensors" in refusal(at(bundle))
 
 
-def test_a_checkpoint_of_a_transformer_by_path_with_anything_but_tensors_is_refused(tmp_path: Path) -> None:
+def test_a_checkpoint_of_a_transformer_by_path_with_anything_but_tensors_is_refused(
+    tmp_path: Path,
+) -> None:
     class Payload:
         def __reduce__(self):
             return (print, ("loaded",))

@@ -39,25 +39,38 @@ CASES = [
 
 @pytest.fixture(scope="module")
 def others() -> list[np.ndarray]:
-    """What the cases so far came to: were two alike, a test could not tell one choice from another."""
+    """What the cases so far came to: were two alike, a test could not tell one choice from
+    another.
+    """
     return []
 
 
 @pytest.mark.parametrize("overrides", first_of(CASES, 4), ids=",".join)
-def test_blocks_equal_the_whole_clip(weights: Path, others: list[np.ndarray], overrides: tuple[str, ...]) -> None:
+def test_blocks_equal_the_whole_clip(
+    weights: Path, others: list[np.ndarray], overrides: tuple[str, ...]
+) -> None:
     settings = busy_settings(weights, *overrides)
     frames = moving_picture(29)
     maps = maps_of(frames)
     session = fixer(settings)
     seen = record_videos(session)
     out = pixels(run_blocks(session, frames, maps))
-    assert overrides == ("fold=false",) or all(np.abs(out.astype(int) - other).max() > 1 for other in others)
+    assert overrides == ("fold=false",) or all(
+        np.abs(out.astype(int) - other).max() > 1 for other in others
+    )
     others.append(out)
 
     streamed = torch.cat(seen, dim=2)
     (views,) = group_views(frames, maps if settings.uses_map else [], streamed.shape[2])
     clip = to_clip(views, streamed.shape[2])
-    noise = latent_noise("scene", 0, views.cameras, session.pipeline.draws, range((streamed.shape[2] - 1) // 4 + 1), (16, 4, 6))
+    noise = latent_noise(
+        "scene",
+        0,
+        views.cameras,
+        session.pipeline.draws,
+        range((streamed.shape[2] - 1) // 4 + 1),
+        (16, 4, 6),
+    )
     exact = load_networks(settings.model_copy(update={"fold": False}))
     whole = refine_clip(exact, settings, clip.rgb, clip.alpha, clip.maps, noise)
     assert float((streamed - whole).abs().max()) < 1e-5
@@ -70,7 +83,10 @@ def test_any_number_of_frames_and_any_size(weights: Path, count: int) -> None:
     maps = maps_of(frames)
     out = pixels(run_blocks(fixer(settings), frames, maps))
     assert out.shape == (count, 29, 50, 3)
-    assert np.abs(out.astype(int) - whole_clip(settings, Recorded(frames, maps), "scene", 0)).max() <= 1
+    assert (
+        np.abs(out.astype(int) - whole_clip(settings, Recorded(frames, maps), "scene", 0)).max()
+        <= 1
+    )
 
 
 def test_a_short_block_is_the_block_with_its_last_frame_repeated(weights: Path) -> None:
@@ -79,6 +95,9 @@ def test_a_short_block_is_the_block_with_its_last_frame_repeated(weights: Path) 
     maps = maps_of(frames)
     short = fixer(settings).step(frames[:2], maps[:2])
     still = [frames[0], *([frames[1]] * 4)]
-    times = [frame.__class__(frame.t_us + i, frame.camera, frame.rgb, frame.alpha) for i, frame in enumerate(still)]
+    times = [
+        frame.__class__(frame.t_us + i, frame.camera, frame.rgb, frame.alpha)
+        for i, frame in enumerate(still)
+    ]
     filled = fixer(settings).step(times, [maps[0], *([maps[1]] * 4)])
     assert np.array_equal(pixels(list(short)), pixels(list(filled))[:2])

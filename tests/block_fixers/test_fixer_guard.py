@@ -51,13 +51,17 @@ def test_frozen_counts_only_where_the_render_moves() -> None:
     assert guard.check_frames(fine, out, raw, None) == ["", "fixer-frozen", ""]
     standing = np.stack([raw[0]] * 3)
     assert guard.check_frames(fine, standing, standing, (raw[0], raw[0])) == ["", "", ""]
-    assert guard.check_frames(fine, out, raw, (raw[0], raw[2]))[0] == "fixer-frozen", "also across blocks"
+    assert guard.check_frames(fine, out, raw, (raw[0], raw[2]))[0] == "fixer-frozen", (
+        "also across blocks"
+    )
     flicker = standing.copy()
     flicker[1, 0, 0, 0] ^= 1
     assert guard.check_frames(fine, standing, flicker, None) == ["", "", ""]
 
 
-def test_numbers_that_are_none_are_replaced_and_do_not_stay(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_numbers_that_are_none_are_replaced_and_do_not_stay(
+    weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     session = fixer(busy_settings(weights))
     real = onefixer.latent_noise
 
@@ -76,15 +80,23 @@ def test_numbers_that_are_none_are_replaced_and_do_not_stay(weights: Path, monke
     assert np.abs(pixels(after).astype(int) - pixels(FRAMES[13:])).max() > 2
 
 
-def test_a_previewed_failure_leaves_no_trace(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_previewed_failure_leaves_no_trace(
+    weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     settings = busy_settings(weights)
     alone = pixels(run_blocks(fixer(settings), FRAMES[:21], MAPS[:21]))
     session = fixer(settings)
     real = onefixer.latent_noise
     out = list(session.step(FRAMES[:5], MAPS[:5]))
     for start, end in ((5, 13), (13, 21)):
-        monkeypatch.setattr(onefixer, "latent_noise", lambda *args: [torch.full_like(eps, torch.nan) for eps in real(*args)])
-        assert session.preview(moving_picture(end)[start:end], MAPS[start:end])[0].events == ("fixer-nan",)
+        monkeypatch.setattr(
+            onefixer,
+            "latent_noise",
+            lambda *args: [torch.full_like(eps, torch.nan) for eps in real(*args)],
+        )
+        assert session.preview(moving_picture(end)[start:end], MAPS[start:end])[0].events == (
+            "fixer-nan",
+        )
         monkeypatch.setattr(onefixer, "latent_noise", real)
         session.preview(FRAMES[start : start + 1], MAPS[start : start + 1])
         out += session.step(FRAMES[start:end], MAPS[start:end])

@@ -32,7 +32,7 @@ def still(value: int | U8, count: int = 13, alpha: float | None = None) -> list[
     return [Frame(i * STEP_US, "front", picture, cover) for i in range(count)]
 
 
-# --- opacity --------------------------------------------------------------------------------------------------------
+# --- opacity
 
 
 def test_a_render_without_any_opacity_is_made_of_noise(weights: Path) -> None:
@@ -41,7 +41,9 @@ def test_a_render_without_any_opacity_is_made_of_noise(weights: Path) -> None:
     others = [replace(f, alpha=np.zeros(SIZE, np.float32)) for f in moving_picture(13, key="other")]
     maps = maps_of(frames)
     one = pixels(run_blocks(fixer(settings), frames, maps))
-    assert np.array_equal(pixels(run_blocks(fixer(settings), others, maps)), one), "nothing of the render is left"
+    assert np.array_equal(pixels(run_blocks(fixer(settings), others, maps)), one), (
+        "nothing of the render is left"
+    )
     assert not np.array_equal(pixels(run_blocks(fixer(settings, seed=1), frames, maps)), one)
 
 
@@ -65,7 +67,7 @@ def test_an_untrained_fixer_fills_holes_from_the_render() -> None:
     assert 0 < difference[:, : SIZE[0] // 2, : SIZE[1] // 3].mean() < 40  # a blurred copy
 
 
-# --- pictures -------------------------------------------------------------------------------------------------------
+# --- pictures
 
 
 @pytest.mark.parametrize("value", [0, 128, 255])
@@ -81,15 +83,25 @@ def checkerboard() -> U8:
     return np.repeat(board[..., None], 3, axis=2).astype(np.uint8)
 
 
-@pytest.mark.parametrize("picture", [0, 255, checkerboard(), np.random.Generator(np.random.Philox(1)).integers(0, 2, (*SIZE, 3)) * 255])
+@pytest.mark.parametrize(
+    "picture",
+    [
+        0,
+        255,
+        checkerboard(),
+        np.random.Generator(np.random.Philox(1)).integers(0, 2, (*SIZE, 3)) * 255,
+    ],
+)
 @pytest.mark.parametrize("alpha", [None, 0.0, 0.5])
-def test_saturated_pictures_give_finite_ones(weights: Path, picture: int | U8, alpha: float | None) -> None:
+def test_saturated_pictures_give_finite_ones(
+    weights: Path, picture: int | U8, alpha: float | None
+) -> None:
     frames = still(picture if isinstance(picture, int) else picture.astype(np.uint8), alpha=alpha)
     out = run_blocks(fixer(busy_settings(weights)), frames, maps_of(frames))
     assert all("fixer-nan" not in frame.events for frame in out)
 
 
-# --- long rollouts --------------------------------------------------------------------------------------------------
+# --- long rollouts
 
 
 def drive(count: int, size: tuple[int, int] = SIZE) -> Iterator[tuple[list[Frame], list[U8]]]:
@@ -100,7 +112,10 @@ def drive(count: int, size: tuple[int, int] = SIZE) -> Iterator[tuple[list[Frame
     while start < count:
         due = min(5 if start == 0 else 8, count - start)
         order = [min(i % 64, 64 - i % 64) for i in range(start, start + due)]
-        yield [replace(clip[k], t_us=(start + j) * STEP_US) for j, k in enumerate(order)], [maps[k] for k in order]
+        yield (
+            [replace(clip[k], t_us=(start + j) * STEP_US) for j, k in enumerate(order)],
+            [maps[k] for k in order],
+        )
         start += due
 
 
@@ -118,10 +133,14 @@ def resident_bytes() -> int:
     return int(table.read_text().split()[1]) * resource.getpagesize() if table.exists() else 0
 
 
-def drift(settings: OneFixerSettings, reduced: str, count: int, size: tuple[int, int] = SIZE) -> np.ndarray:
+def drift(
+    settings: OneFixerSettings, reduced: str, count: int, size: tuple[int, int] = SIZE
+) -> np.ndarray:
     """Return per block the mean difference in grey levels of a precision from float32."""
     exact = OneFixer(settings, "scene")
-    half = OneFixer(settings.model_copy(update={"precision": reduced, "codec_precision": reduced}), "scene")
+    half = OneFixer(
+        settings.model_copy(update={"precision": reduced, "codec_precision": reduced}), "scene"
+    )
     out = []
     for block, maps in drive(count, size):
         pair = [pixels(list(session.step(block, maps))).astype(int) for session in (exact, half)]
@@ -145,8 +164,12 @@ def test_a_long_rollout_stays_finite_in_constant_memory(weights: Path) -> None:
     assert resident[-1] - resident[0] < 4e6
 
 
-@pytest.mark.parametrize(("history", "precision", "levels"), [("finalise", "bf16", 1.0), ("last-forward", "fp16", 0.2)])
-def test_reduced_precision_does_not_drift(weights: Path, history: str, precision: str, levels: float) -> None:
+@pytest.mark.parametrize(
+    ("history", "precision", "levels"), [("finalise", "bf16", 1.0), ("last-forward", "fp16", 0.2)]
+)
+def test_reduced_precision_does_not_drift(
+    weights: Path, history: str, precision: str, levels: float
+) -> None:
     series = drift(busy_settings(weights, f"history={history}"), precision, 101, TINY)
     early, late = series[2:7].mean(), series[-5:].mean()
     assert series.max() < levels
@@ -157,7 +180,12 @@ def test_reduced_precision_does_not_drift(weights: Path, history: str, precision
 @pytest.mark.parametrize("precision", ["bf16", "fp16"])
 def test_reduced_precision_over_3600_frames(weights: Path, precision: str) -> None:
     series = drift(busy_settings(weights, "history=finalise"), precision, 3600, TINY)
-    print(f"\n{precision}: " + "  ".join(f"{i * 8}: {series[i : i + 10].mean():.4f}" for i in (2, 56, 112, 225, 337, 440)))
+    print(
+        f"\n{precision}: "
+        + "  ".join(
+            f"{i * 8}: {series[i : i + 10].mean():.4f}" for i in (2, 56, 112, 225, 337, 440)
+        )
+    )
     assert series[-50:].mean() < 1.5 * series[2:52].mean()
 
 
@@ -172,5 +200,8 @@ def test_the_shipped_size_over_900_frames(tmp_path: Path, precision: str) -> Non
     assert isinstance(settings, OneFixerSettings)
     torch.set_num_threads(2)
     series = drift(settings, precision, 900, (144, 256))
-    print(f"\n{precision}: " + "  ".join(f"{i * 8}: {series[i : i + 5].mean():.4f}" for i in (1, 28, 56, 84, 107)))
+    print(
+        f"\n{precision}: "
+        + "  ".join(f"{i * 8}: {series[i : i + 5].mean():.4f}" for i in (1, 28, 56, 84, 107))
+    )
     assert series[-20:].mean() < 1.5 * series[2:22].mean()

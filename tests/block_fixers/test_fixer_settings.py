@@ -26,7 +26,9 @@ def refusal(*overrides: str, name: str = "onefixer-dit-tiny") -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["onefixer", "onefixer-dit-tiny", "onefixer-dit-s", "onefixer-2b", "identity"])
+@pytest.mark.parametrize(
+    "name", ["onefixer", "onefixer-dit-tiny", "onefixer-dit-s", "onefixer-2b", "identity"]
+)
 def test_every_fixer_has_settings_that_load(name: str) -> None:
     assert name in names("fixer")
     assert isinstance(fixer_settings(name), FixerSettings)
@@ -88,16 +90,22 @@ def test_a_bundle_and_parts_do_not_go_together() -> None:
 
 
 def test_paths_start_where_they_were_written() -> None:
-    settings = fixer_settings("onefixer-dit-tiny", ["weights.dit=nets/a.safetensors", "weights.vae=/b.safetensors"])
+    settings = fixer_settings(
+        "onefixer-dit-tiny", ["weights.dit=nets/a.safetensors", "weights.vae=/b.safetensors"]
+    )
     assert isinstance(settings, OneFixerSettings)
     assert settings.weights.dit == str(Path.cwd() / "nets/a.safetensors")
     assert settings.weights.vae == "/b.safetensors"
 
 
-def test_a_bundle_that_ships_steps_aside_for_parts_and_keeps_its_sizes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bundle_that_ships_steps_aside_for_parts_and_keeps_its_sizes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shipped = tmp_path / "shipped.yaml"
     plain = Path(str(resources.files("configs.fixers"))) / "onefixer-dit-tiny.yaml"
-    shipped.write_text(plain.read_text().partition("weights:")[0] + "weights: {bundle: here.safetensors}\n")
+    shipped.write_text(
+        plain.read_text().partition("weights:")[0] + "weights: {bundle: here.safetensors}\n"
+    )
     monkeypatch.setattr("alpasim_plugin.fixers.settings.resources.files", lambda package: tmp_path)
 
     def weights(*overrides: str) -> WeightsSettings:
@@ -108,7 +116,9 @@ def test_a_bundle_that_ships_steps_aside_for_parts_and_keeps_its_sizes(tmp_path:
     assert (weights("weights.dit=/a").bundle, weights("weights.dit=/a").dit) == (None, "/a")
     assert weights("weights.bundle=/b").bundle == "/b"
     assert weights("weights.bundle=null", "dit.width=24").bundle is None
-    with pytest.raises(InputError, match=r"fixer\.dit\.width[\s\S]*have their sizes[\s\S]*weights\.bundle=null"):
+    with pytest.raises(
+        InputError, match=r"fixer\.dit\.width[\s\S]*have their sizes[\s\S]*weights\.bundle=null"
+    ):
         weights("dit.width=24")
 
 

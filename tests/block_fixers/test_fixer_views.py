@@ -39,7 +39,9 @@ def test_filling_up_repeats_edges_and_the_last_frame() -> None:
         expected = np.pad(images[1], ((0, 15), (0, 2), (0, 0)), mode="edge") / np.float32(127.5) - 1
         for t in (1, 2, 4):
             assert np.allclose(video[0, :, t].permute(1, 2, 0).numpy(), expected, atol=1e-6)
-    assert np.array_equal(clip.alpha[0, 0, 4].numpy(), np.pad(frames[1].alpha, ((0, 15), (0, 2)), mode="edge"))
+    assert np.array_equal(
+        clip.alpha[0, 0, 4].numpy(), np.pad(frames[1].alpha, ((0, 15), (0, 2)), mode="edge")
+    )
     assert to_images(clip.rgb, views.size).shape == (1, 2, 17, 30, 3)
 
 

@@ -29,7 +29,11 @@ def paths(shared_data: Path, tmp_path: Path) -> list[str]:
     prompt = tmp_path / "prompt.safetensors"
     width = load_width(folder / "dit.weights.safetensors")
     write_safetensors(prompt, {"text": torch.linspace(-1, 1, 3 * width).view(3, width)})
-    files = {"dit": folder / "dit.weights.safetensors", "vae": folder / "wan_vae.weights.safetensors", "prompt": prompt}
+    files = {
+        "dit": folder / "dit.weights.safetensors",
+        "vae": folder / "wan_vae.weights.safetensors",
+        "prompt": prompt,
+    }
     return [f"weights.{part}={path}" for part, path in files.items()]
 
 
@@ -50,24 +54,47 @@ def settings_of(*overrides: str) -> OneFixerSettings:
 @pytest.mark.parametrize("decoder", first_of(["taehv", "latent"]))
 def test_blocks_equal_the_whole_clip(paths: list[str], shared_data: Path, decoder: str) -> None:
     taehv = f"weights.decoder={shared_data / 'golden-nets' / 'taehv.weights.safetensors'}"
-    settings = settings_of(*paths, f"decoder.kind={decoder}", *([taehv] if decoder == "taehv" else []))
+    settings = settings_of(
+        *paths, f"decoder.kind={decoder}", *([taehv] if decoder == "taehv" else [])
+    )
     session = fixer(settings)
     assert session.trained
     assert session.label == "onefixer-2b, weights of dit.weights.safetensors"
     out = pixels(run_blocks(session, FRAMES, MAPS))
-    assert np.abs(out.astype(int) - whole_clip(settings, Recorded(FRAMES, MAPS), "scene", 0)).max() <= 1
+    assert (
+        np.abs(out.astype(int) - whole_clip(settings, Recorded(FRAMES, MAPS), "scene", 0)).max()
+        <= 1
+    )
     assert np.abs(out.astype(int) - pixels(FRAMES)).mean() > 1
 
 
 def test_parts_that_are_missing_are_named(paths: list[str]) -> None:
-    for missing, part in ((paths[:2], "prompt"), (paths[1:], "dit"), ([paths[0], paths[2]], "vae"), (paths, "decoder")):
+    for missing, part in (
+        (paths[:2], "prompt"),
+        (paths[1:], "dit"),
+        ([paths[0], paths[2]], "vae"),
+        (paths, "decoder"),
+    ):
         with pytest.raises(InputError, match=rf"weights\.{part}"):
             load_networks(settings_of(*missing))
 
 
 def test_random_weights_stand_in_for_timing() -> None:
-    sizes = ["width=24", "blocks=1", "head_width=12", "mlp_width=24", "adaln_rank=4", "text_width=8", "context_width=8"]
-    small = [f"dit.{size}" for size in sizes] + ["vae.base=8", "untrained=random", "decoder.kind=latent", "precision=bf16"]
+    sizes = [
+        "width=24",
+        "blocks=1",
+        "head_width=12",
+        "mlp_width=24",
+        "adaln_rank=4",
+        "text_width=8",
+        "context_width=8",
+    ]
+    small = [f"dit.{size}" for size in sizes] + [
+        "vae.base=8",
+        "untrained=random",
+        "decoder.kind=latent",
+        "precision=bf16",
+    ]
     session = fixer(settings_of(*small))
     assert session.label == "onefixer-2b, untrained (random)"
     assert len(session.step(FRAMES[:5], MAPS[:5])) == 5

@@ -15,7 +15,13 @@ from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.interfaces import Fixer
 from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import make_fixer
-from tests.block_fixers.fixer_cases import busy_settings, fixer, record_videos, run_blocks, small_settings
+from tests.block_fixers.fixer_cases import (
+    busy_settings,
+    fixer,
+    record_videos,
+    run_blocks,
+    small_settings,
+)
 from tests.fixers.clip_cases import SIZE, maps_of, moving_picture, pixels
 
 pytestmark = pytest.mark.slow
@@ -43,10 +49,14 @@ def test_a_session_keeps_both_contracts(busy) -> None:
     assert [(frame.t_us, frame.camera, frame.rgb.dtype, frame.rgb.shape) for frame in out] == [
         (frame.t_us, frame.camera, np.uint8, (*SIZE, 3)) for frame in FRAMES[:5]
     ]
-    assert np.abs(pixels(list(out)).astype(int) - pixels(FRAMES[:5])).mean() > 2  # these weights do something
+    assert (
+        np.abs(pixels(list(out)).astype(int) - pixels(FRAMES[:5])).mean() > 2
+    )  # these weights do something
 
 
-def test_stages_add_up_to_less_than_the_calls_and_a_committed_draft_costs_only_its_write(busy) -> None:
+def test_stages_add_up_to_less_than_the_calls_and_a_committed_draft_costs_only_its_write(
+    busy,
+) -> None:
     session = fixer(busy)
     assert session.stage_ms == {"encode": 0.0, "dit": 0.0, "decode": 0.0, "cache write": 0.0}
     began = time.perf_counter()
@@ -70,7 +80,9 @@ def test_reset_reproduces_a_rollout_bit_by_bit(busy, alone: np.ndarray) -> None:
 
 def test_noise_follows_scene_seed_and_camera_and_nothing_else(busy, alone: np.ndarray) -> None:
     assert np.array_equal(pixels(run_blocks(fixer(busy), FRAMES, MAPS)), alone)
-    assert not np.array_equal(pixels(run_blocks(fixer(busy, scene_id="elsewhere"), FRAMES, MAPS)), alone)
+    assert not np.array_equal(
+        pixels(run_blocks(fixer(busy, scene_id="elsewhere"), FRAMES, MAPS)), alone
+    )
     renamed = [replace(frame, camera="rear") for frame in FRAMES]
     assert not np.array_equal(pixels(run_blocks(fixer(busy), renamed, MAPS)), alone)
 
@@ -146,11 +158,19 @@ def test_cameras_in_one_batch_come_out_as_each_alone(busy) -> None:
     seen = record_videos(session)
     out: list[Frame] = []
     for start, end in ((0, 5), (5, 13), (13, 21)):
-        mixed = [frame for pair in zip(right[start:end], left[start:end], strict=True) for frame in pair]
-        mixed_maps = [m for pair in zip(maps["right"][start:end], maps["left"][start:end], strict=True) for m in pair]
+        mixed = [
+            frame for pair in zip(right[start:end], left[start:end], strict=True) for frame in pair
+        ]
+        mixed_maps = [
+            m
+            for pair in zip(maps["right"][start:end], maps["left"][start:end], strict=True)
+            for m in pair
+        ]
         order = np.argsort([0 if i % 3 else 1 for i in range(len(mixed))], kind="stable")
         answer = session.step([mixed[i] for i in order], [mixed_maps[i] for i in order])
-        assert [(f.camera, f.t_us) for f in answer] == [(mixed[i].camera, mixed[i].t_us) for i in order]
+        assert [(f.camera, f.t_us) for f in answer] == [
+            (mixed[i].camera, mixed[i].t_us) for i in order
+        ]
         out += sorted(answer, key=lambda f: f.t_us)
     together = torch.cat(seen, dim=2)
     for b, name in enumerate(("left", "right")):
@@ -164,7 +184,9 @@ def test_cameras_of_two_sizes_share_a_rollout(busy) -> None:
     session = fixer(busy)
     out: list[Frame] = []
     for start, end in ((0, 5), (5, 13)):
-        out += session.step([*FRAMES[start:end], *wide[start:end]], [*MAPS[start:end], *maps_of(wide[start:end])])
+        out += session.step(
+            [*FRAMES[start:end], *wide[start:end]], [*MAPS[start:end], *maps_of(wide[start:end])]
+        )
     for frames in (FRAMES[:13], wide):
         camera = frames[0].camera
         mine = pixels([frame for frame in out if frame.camera == camera])
@@ -180,11 +202,13 @@ def test_map_is_seen_only_where_the_settings_use_it(weights: Path) -> None:
         return pixels(list(fixer(settings).step(FRAMES[:5], maps)))
 
     assert not np.array_equal(first_block(seen, MAPS[:5]), first_block(seen, black))
-    assert not np.array_equal(first_block(seen, black), first_block(seen, []))  # a black map says "no road", none says nothing
+    assert not np.array_equal(
+        first_block(seen, black), first_block(seen, [])
+    )  # a black map says "no road", none says nothing
     assert np.array_equal(first_block(unseen, MAPS[:5]), first_block(unseen, []))
 
 
-# --- untrained ------------------------------------------------------------------------------------------------------
+# --- untrained
 
 
 def test_an_untrained_fixer_says_so_and_hands_an_opaque_render_through() -> None:
@@ -208,11 +232,13 @@ def test_an_untrained_fixer_is_the_autoencoders_round_trip() -> None:
 
 
 def test_steps_after_the_name_are_in_the_label() -> None:
-    session = make_fixer("onefixer-dit-tiny@2", small_settings("steps=[1000,500]"), scene_id="scene")
+    session = make_fixer(
+        "onefixer-dit-tiny@2", small_settings("steps=[1000,500]"), scene_id="scene"
+    )
     assert session.label == "onefixer-dit-tiny@2, untrained (identity)"
 
 
-# --- blocks that are refused ----------------------------------------------------------------------------------------
+# --- blocks that are refused
 
 
 def refused(session, block, maps, *words: str) -> None:
@@ -226,21 +252,38 @@ def test_blocks_that_do_not_continue_the_rollout_are_refused(busy) -> None:
     session = fixer(busy)
     first = pixels(list(session.step(FRAMES[:5], MAPS[:5])))
     refused(session, FRAMES[:8], MAPS[:8], "0 us after one at 400000 us", "order of time")
-    refused(session, [replace(f, camera="rear") for f in FRAMES[5:13]], MAPS[5:13], "'rear'", "'front'", "same cameras")
-    refused(session, moving_picture(13, size=(48, 48))[5:], maps_of(moving_picture(8, size=(48, 48))), "(48, 48)", "(32, 48)")
+    refused(
+        session,
+        [replace(f, camera="rear") for f in FRAMES[5:13]],
+        MAPS[5:13],
+        "'rear'",
+        "'front'",
+        "same cameras",
+    )
+    refused(
+        session,
+        moving_picture(13, size=(48, 48))[5:],
+        maps_of(moving_picture(8, size=(48, 48))),
+        "(48, 48)",
+        "(32, 48)",
+    )
     refused(session, FRAMES[5:13], [], "no map after blocks with one")
     refused(session, FRAMES[5:14], MAPS[5:14], "{'front': 9}", "at most 8")
     out = session.step(FRAMES[5:13], MAPS[5:13])
     again = fixer(busy)
     assert np.array_equal(pixels(list(again.step(FRAMES[:5], MAPS[:5]))), first)
-    assert np.array_equal(pixels(list(again.step(FRAMES[5:13], MAPS[5:13]))), pixels(list(out))), "refusals leave no trace"
+    assert np.array_equal(pixels(list(again.step(FRAMES[5:13], MAPS[5:13]))), pixels(list(out))), (
+        "refusals leave no trace"
+    )
 
 
 def test_blocks_that_are_none_are_refused(busy) -> None:
     session = fixer(busy)
     refused(session, [], [], "no frames")
     refused(session, FRAMES[:5], MAPS[:4], "4 for 5 frames")
-    refused(session, [*FRAMES[:2], replace(FRAMES[2], camera="rear")], [], "{'front': 2, 'rear': 1}")
+    refused(
+        session, [*FRAMES[:2], replace(FRAMES[2], camera="rear")], [], "{'front': 2, 'rear': 1}"
+    )
     refused(session, [FRAMES[0], FRAMES[0]], [], "two frames at one time")
     refused(session, [replace(FRAMES[0], rgb=FRAMES[0].rgb.astype(np.float32))], [], "float32")
     refused(session, [replace(FRAMES[0], alpha=np.ones((8, 8), np.float32))], [], "alpha of (8, 8)")

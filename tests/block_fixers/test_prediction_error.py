@@ -15,7 +15,9 @@ from alpasim_plugin.core.types import F64, CameraSpec, RenderRequest
 CAMERA = CameraSpec("front", 8, 8, np.eye(3), np.eye(4))
 
 
-def facing_z(x: float = 0.0, actors: Mapping[str, F64] | None = None, start_x: float | None = None) -> RenderRequest:
+def facing_z(
+    x: float = 0.0, actors: Mapping[str, F64] | None = None, start_x: float | None = None
+) -> RenderRequest:
     end, start = np.eye(4), np.eye(4)
     end[0, 3], start[0, 3] = x, x if start_x is None else start_x
     return RenderRequest(0, CAMERA, np.stack([start, end]), actors or {})
@@ -39,7 +41,9 @@ def test_the_last_bit_makes_another_view_within_any_tolerance() -> None:
 
 
 def test_the_pose_at_shutter_start_counts_as_well() -> None:
-    assert deviation(facing_z(0.0, start_x=-0.5), facing_z(0.0, start_x=-0.1)).camera_m == pytest.approx(0.4)
+    assert deviation(
+        facing_z(0.0, start_x=-0.5), facing_z(0.0, start_x=-0.1)
+    ).camera_m == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize("angle", [1e-9, 1e-6, 1e-3, 0.1, 1.0, 3.0, math.pi])
@@ -49,7 +53,9 @@ def test_small_and_large_rotations_are_measured_exactly(angle: float) -> None:
 
 def test_an_actors_displacement_counts_less_the_further_away_it_is() -> None:
     def off(depth: float) -> float:
-        return deviation(facing_z(actors={"a": at_depth(depth)}), facing_z(actors={"a": at_depth(depth, 0.1)})).actor_m
+        return deviation(
+            facing_z(actors={"a": at_depth(depth)}), facing_z(actors={"a": at_depth(depth, 0.1)})
+        ).actor_m
 
     assert off(5.0) == off(9.0) == pytest.approx(0.1)
     assert off(40.0) == pytest.approx(0.025, rel=1e-3)
@@ -57,7 +63,9 @@ def test_an_actors_displacement_counts_less_the_further_away_it_is() -> None:
 
 def test_an_actor_that_turns_on_the_spot_counts() -> None:
     turned = se3([0.0, 0.0, 10.0], [math.cos(0.02), 0.0, 0.0, math.sin(0.02)])
-    assert deviation(facing_z(actors={"a": at_depth(10.0)}), facing_z(actors={"a": turned})).actor_m == pytest.approx(0.1, rel=1e-3)
+    assert deviation(
+        facing_z(actors={"a": at_depth(10.0)}), facing_z(actors={"a": turned})
+    ).actor_m == pytest.approx(0.1, rel=1e-3)
 
 
 @pytest.mark.parametrize("swap", [False, True])

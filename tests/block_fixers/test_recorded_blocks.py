@@ -1,4 +1,6 @@
-"""Blocks through recordings at fixed addresses are the blocks themselves, also when one is made again."""
+"""Blocks through recordings at fixed addresses are the blocks themselves, also when one is made
+again.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +16,22 @@ from tests.block_fixers.fixer_cases import busy_settings, fixer, run_blocks
 from tests.examples import first_of
 from tests.fixers.clip_cases import maps_of, moving_picture
 
-CASES = [(), ("steps=[1000,500]", "window=4", "sink=1"), ("history=finalise",), ("window=1",), ("decoder.kind=latent", "uses_map=false")]
+CASES = [
+    (),
+    ("steps=[1000,500]", "window=4", "sink=1"),
+    ("history=finalise",),
+    ("window=1",),
+    ("decoder.kind=latent", "uses_map=false"),
+]
 
 
 def frames_of(session, frames, redo=()):
-    """Return every frame's pixels; blocks named in ``redo`` are first made with other pictures and taken back."""
-    maps, out, block = maps_of(frames), [], 0
+    """Return every frame's pixels; blocks named in ``redo`` are first made with other pictures and
+    taken back.
+    """
+    maps = maps_of(frames)
+    out = []
+    block = 0
     while len(out) < len(frames):
         cut = slice(len(out), len(out) + session.blocks.frames(block))
         if block in redo:
@@ -35,7 +47,9 @@ def test_recorded_blocks_equal_eager_ones(weights: Path, overrides: tuple[str, .
     frames = moving_picture(5 + 8 * 7)
     plain, recorded = fixer(settings), fixer(settings)
     recorded.pipeline = BlockPipeline(recorded.networks, settings, recorder=EagerRecorder())
-    for ours, due in zip(frames_of(recorded, frames, redo=(2, 6)), frames_of(plain, frames), strict=True):
+    for ours, due in zip(
+        frames_of(recorded, frames, redo=(2, 6)), frames_of(plain, frames), strict=True
+    ):
         assert (ours == due).all()
     history = recorded._history[0].state.history
     assert isinstance(history.fix, GraphedFunction)
@@ -72,10 +86,14 @@ def test_cuda_graphs_equal_eager_blocks(weights: Path, precision: str) -> None:
     settings = busy_settings(weights, f"precision={precision}", f"codec_precision={precision}")
     frames = moving_picture(5 + 8 * 9)
     sessions = [type(fixer(settings))(settings, "scene", 0, "cuda") for _ in range(2)]
-    sessions[1].pipeline = BlockPipeline(sessions[1].networks, settings.model_copy(update={"graphs": "off"}))
+    sessions[1].pipeline = BlockPipeline(
+        sessions[1].networks, settings.model_copy(update={"graphs": "off"})
+    )
     assert isinstance(sessions[0].pipeline.recorder, CudaRecorder)
     assert sessions[1].pipeline.recorder is None
-    for ours, due in zip(*(frames_of(session, frames, redo=(6,)) for session in sessions), strict=True):
+    for ours, due in zip(
+        *(frames_of(session, frames, redo=(6,)) for session in sessions), strict=True
+    ):
         assert (ours == due).all()
     assert sessions[0]._history[0].state.history.fix.counts["replayed"] >= 3
     torch.cuda.synchronize()

@@ -1,4 +1,6 @@
-"""Opacity mixing, flow steps, schedule and the block sampler read like their equations and refuse what has no meaning."""
+"""Opacity mixing, flow steps, schedule and the block sampler read like their equations and refuse
+what has no meaning.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,10 @@ def noise(*shape, seed=0):
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
-@pytest.mark.parametrize(("first", "frames", "latents"), [(True, 1, 1), (True, 5, 2), (True, 9, 3), (False, 4, 1), (False, 8, 2)])
+@pytest.mark.parametrize(
+    ("first", "frames", "latents"),
+    [(True, 1, 1), (True, 5, 2), (True, 9, 3), (False, 4, 1), (False, 8, 2)],
+)
 def test_mask_is_the_largest_opacity_of_each_latent(first, frames, latents):
     opacity = torch.rand(2, 1, frames, 16, 24, generator=torch.Generator().manual_seed(1))
     mask = opacity_mask(opacity, first)
@@ -46,16 +51,22 @@ def test_streamed_masks_are_the_whole_one():
 
 @pytest.mark.parametrize("first", [True, False])
 def test_opacity_values_are_means_of_four_by_four_pixels_of_every_frame(first):
-    opacity = torch.rand(2, 1, 5 if first else 8, 16, 24, generator=torch.Generator().manual_seed(1))
+    opacity = torch.rand(
+        2, 1, 5 if first else 8, 16, 24, generator=torch.Generator().manual_seed(1)
+    )
     values = opacity_values(opacity, first)
     assert values.shape == (2, 16, 2, 2, 3)
     for channel in range(16):
-        frame, row, column = channel // 4, channel // 2 % 2, channel % 2
+        frame = channel // 4
+        row = channel // 2 % 2
+        column = channel % 2
         at = 1 + frame if first else 4 + frame  # of the second latent
         cell = opacity[:, 0, at, 8 + 4 * row : 12 + 4 * row, 16 + 4 * column : 20 + 4 * column]
         assert furthest(values[:, channel, 1, 1, 2], cell.mean((1, 2))) < 1e-6
     if first:
-        assert torch.equal(values[:, 0:4, 0], values[:, 12:16, 0]), "the first frame stands for those before it"
+        assert torch.equal(values[:, 0:4, 0], values[:, 12:16, 0]), (
+            "the first frame stands for those before it"
+        )
 
 
 def test_opaque_render_is_kept_and_empty_one_is_noise_bit_for_bit():
@@ -98,7 +109,9 @@ def test_one_step_inverts_the_interpolant_at_every_time():
 
 
 def test_released_schedules():
-    assert [level.sigma for level in steps(4)] == pytest.approx([1.0, 0.9375, 0.83333, 0.625], abs=1e-5)
+    assert [level.sigma for level in steps(4)] == pytest.approx(
+        [1.0, 0.9375, 0.83333, 0.625], abs=1e-5
+    )
     assert [level.sigma for level in steps(2)] == pytest.approx([1.0, 0.83333], abs=1e-5)
     assert [(level.t, level.sigma) for level in steps(1)] == [(1000.0, 1.0)]
     assert named(450).sigma == pytest.approx(0.8036, abs=1e-4)
@@ -113,7 +126,14 @@ def test_cache_write_is_told_128_and_noised_like_its_nearest_neighbour():
 
 
 @pytest.mark.parametrize(
-    "call", [lambda: steps(0), lambda: named(0), lambda: named(1001), lambda: from_names([]), lambda: from_names([500, 500])]
+    "call",
+    [
+        lambda: steps(0),
+        lambda: named(0),
+        lambda: named(1001),
+        lambda: from_names([]),
+        lambda: from_names([500, 500]),
+    ],
 )
 def test_senseless_schedules_are_refused(call):
     with pytest.raises(InputError, match="choosing denoising steps"):
@@ -150,7 +170,16 @@ def test_one_step_is_equation_two_and_folding_changes_nothing():
     eps = noise(*z_1.shape)
     args = (text, hdmap, two, steps(1), "finalise")
     three = net.new_cache(1, 4, 6)
-    folded = sample_block(net.folded(1000.0), [z_1, eps], text, hdmap, three, steps(1), "finalise", finalise_net=net.folded(128.0))
+    folded = sample_block(
+        net.folded(1000.0),
+        [z_1, eps],
+        text,
+        hdmap,
+        three,
+        steps(1),
+        "finalise",
+        finalise_net=net.folded(128.0),
+    )
     two.reset()
     assert furthest(folded, sample_block(net, [z_1, eps], *args)) < 1e-5
     assert furthest(history(two, 1)[0], history(three, 1)[0]) < 1e-5
@@ -165,7 +194,9 @@ def test_block_left_open_can_be_guessed_again_and_then_kept_for_nothing(history)
     for _ in range(4):
         truth = sample_block(net, sources, text, hdmap, kept, steps(1), history)
         sample_block(net, sources, text, hdmap + 1, guessed, steps(1), history, commit=False)
-        assert torch.equal(sample_block(net, sources, text, hdmap, guessed, steps(1), history, commit=False), truth)
+        assert torch.equal(
+            sample_block(net, sources, text, hdmap, guessed, steps(1), history, commit=False), truth
+        )
         guessed.commit()
     assert guessed.position == kept.position == 8
     assert torch.equal(guessed.keys, kept.keys)
@@ -195,5 +226,8 @@ def test_given_latents_pass_through_untouched():
 
 def test_wrong_number_of_noise_draws_is_refused():
     net, (z_1, _, text, hdmap) = network(), clip(2)
-    with pytest.raises(InputError, match=r"1 sources for 1 steps[\s\S]*give 2: one per step, one for the cache write"):
+    with pytest.raises(
+        InputError,
+        match=r"1 sources for 1 steps[\s\S]*give 2: one per step, one for the cache write",
+    ):
         sample_block(net, [z_1], text, hdmap, net.new_cache(1, 4, 6), steps(1))

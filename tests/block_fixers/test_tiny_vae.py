@@ -11,19 +11,29 @@ from torch import Tensor
 
 from alpasim_plugin.block_fixers.clips import crop_clip, pad_clip
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
-from alpasim_plugin.block_fixers.tiny_vae_nets import COMPONENTS, CosineTransform, TinySizes, from_grid, to_grid
+from alpasim_plugin.block_fixers.tiny_vae_nets import (
+    COMPONENTS,
+    CosineTransform,
+    TinySizes,
+    from_grid,
+    to_grid,
+)
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from tests.block_fixers.codec_cases import clip, noise
 
-SIZES = TinySizes(encoder_quarter=8, encoder_eighth=12, decoder_eighth=16, decoder_quarter=10, decoder_frame=6)
+SIZES = TinySizes(
+    encoder_quarter=8, encoder_eighth=12, decoder_eighth=16, decoder_quarter=10, decoder_frame=6
+)
 
 
 def trained_like(seed: int = 0) -> TinyVAE:
     """Return a network whose corrections are not zero and whose statistics are not trivial."""
     vae = TinyVAE.random(SIZES, seed)
     for part in (vae.encoder, vae.decoder):
-        torch.nn.init.normal_(part.head.weight, std=0.1, generator=torch.Generator().manual_seed(seed))
+        torch.nn.init.normal_(
+            part.head.weight, std=0.1, generator=torch.Generator().manual_seed(seed)
+        )
     vae.stats.mean.copy_(0.1 * noise(16))
     vae.stats.std.copy_(1 + 0.1 * noise(16).tanh())
     return vae.requires_grad_(False)
@@ -39,15 +49,28 @@ def vae() -> TinyVAE:
 
 def test_components_are_orthonormal() -> None:
     kernel = CosineTransform().kernel.flatten(1).double()
-    torch.testing.assert_close(kernel @ kernel.T, torch.eye(len(COMPONENTS), dtype=torch.float64), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        kernel @ kernel.T, torch.eye(len(COMPONENTS), dtype=torch.float64), atol=1e-6, rtol=0
+    )
 
 
 def test_analysis_undoes_synthesis_and_the_residue_holds_the_rest() -> None:
     transform, z = CosineTransform(), noise(2, 3, 2, 3, 16)
     torch.testing.assert_close(transform.analyse(transform.synthesise(z)), z, atol=1e-5, rtol=0)
     grid = to_grid(clip(8, 16, 24))
-    torch.testing.assert_close(transform.synthesise(transform.analyse(grid)) + transform.residue(grid), grid, atol=1e-5, rtol=0)
-    assert transform.analyse(transform.residue(grid)).sub(transform.analyse(torch.zeros_like(grid))).abs().max() < 1e-5
+    torch.testing.assert_close(
+        transform.synthesise(transform.analyse(grid)) + transform.residue(grid),
+        grid,
+        atol=1e-5,
+        rtol=0,
+    )
+    assert (
+        transform.analyse(transform.residue(grid))
+        .sub(transform.analyse(torch.zeros_like(grid)))
+        .abs()
+        .max()
+        < 1e-5
+    )
 
 
 def test_components_follow_their_names() -> None:
@@ -56,9 +79,14 @@ def test_components_follow_their_names() -> None:
     black = CosineTransform().analyse(to_grid(torch.zeros(1, 3, 4, 8, 8))).flatten()
     changed = (grey - black).abs() > 1e-5
     assert changed.tolist() == [name == (0, 0, 0, 0) for name in names]
-    ramp = torch.linspace(-1, 1, 8).view(1, 1, 1, 8, 1).expand(1, 3, 4, 8, 8)  # grey, constant in time and along rows: darker at the top
+    ramp = (
+        torch.linspace(-1, 1, 8).view(1, 1, 1, 8, 1).expand(1, 3, 4, 8, 8)
+    )  # grey, constant in time and along rows: darker at the top
     seen = (CosineTransform().analyse(to_grid(ramp)).flatten() - black).abs() > 1e-5
-    assert [name for name, on in zip(names, seen.tolist(), strict=True) if on] == [(0, 0, 1, 0), (0, 0, 3, 0)]
+    assert [name for name, on in zip(names, seen.tolist(), strict=True) if on] == [
+        (0, 0, 1, 0),
+        (0, 0, 3, 0),
+    ]
 
 
 def test_grid_and_back_is_the_same_video() -> None:
@@ -73,7 +101,9 @@ def test_grid_and_back_is_the_same_video() -> None:
 
 def test_untrained_decoding_with_its_own_render_returns_the_render() -> None:
     untrained, video = TinyVAE.random(SIZES), clip(9, 16, 24)
-    torch.testing.assert_close(untrained.decode(untrained.encode(video), render=video), video, atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        untrained.decode(untrained.encode(video), render=video), video, atol=1e-5, rtol=0
+    )
 
 
 def test_untrained_round_trip_of_a_smooth_clip_is_close_and_of_noise_is_blurred() -> None:
@@ -88,14 +118,23 @@ def test_untrained_round_trip_of_a_smooth_clip_is_close_and_of_noise_is_blurred(
 def test_full_opacity_is_as_none_and_zero_opacity_keeps_no_detail() -> None:
     untrained, video = TinyVAE.random(SIZES), clip(5, 16, 16)
     z, cover = untrained.encode(video), torch.ones(1, 1, 5, 16, 16)
-    torch.testing.assert_close(untrained.decode(z, render=video, opacity=cover), untrained.decode(z, render=video), atol=1e-6, rtol=0)
-    torch.testing.assert_close(untrained.decode(z, render=video, opacity=0 * cover), untrained.decode(z), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        untrained.decode(z, render=video, opacity=cover),
+        untrained.decode(z, render=video),
+        atol=1e-6,
+        rtol=0,
+    )
+    torch.testing.assert_close(
+        untrained.decode(z, render=video, opacity=0 * cover), untrained.decode(z), atol=1e-6, rtol=0
+    )
 
 
 def test_full_opacity_is_as_none_for_a_trained_network(vae: TinyVAE) -> None:
     video = clip(5, 16, 16)
     z, cover = vae.encode(video), torch.ones(1, 1, 5, 16, 16)
-    torch.testing.assert_close(vae.decode(z, render=video, opacity=cover), vae.decode(z, render=video), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        vae.decode(z, render=video, opacity=cover), vae.decode(z, render=video), atol=1e-5, rtol=0
+    )
 
 
 def test_a_hole_in_the_render_is_filled_by_the_latent_alone() -> None:
@@ -112,15 +151,25 @@ def test_a_hole_in_the_render_is_filled_by_the_latent_alone() -> None:
 
 
 @pytest.mark.parametrize("counts", [[1, 4, 4, 4], [5, 8], [13], [9, 4]])
-def test_encoding_in_any_blocks_is_bit_equal_to_the_whole_clip(vae: TinyVAE, counts: list[int]) -> None:
+def test_encoding_in_any_blocks_is_bit_equal_to_the_whole_clip(
+    vae: TinyVAE, counts: list[int]
+) -> None:
     video, stream = clip(13, 16, 24, batch=2), vae.encoder_stream()
-    assert torch.equal(torch.cat([stream.push(part) for part in video.split(counts, dim=2)], dim=2), vae.encode(video))
+    assert torch.equal(
+        torch.cat([stream.push(part) for part in video.split(counts, dim=2)], dim=2),
+        vae.encode(video),
+    )
 
 
 @pytest.mark.parametrize("seen", ["nothing", "render", "render and opacity"])
 @pytest.mark.parametrize("counts", [[1, 1, 1, 1], [2, 2], [1, 3]])
-def test_decoding_in_any_blocks_is_bit_equal_to_the_whole_clip(vae: TinyVAE, counts: list[int], seen: str) -> None:
-    z, stream, start, parts = noise(2, 16, 4, 2, 3), vae.decoder_stream(), 0, []
+def test_decoding_in_any_blocks_is_bit_equal_to_the_whole_clip(
+    vae: TinyVAE, counts: list[int], seen: str
+) -> None:
+    z = noise(2, 16, 4, 2, 3)
+    stream = vae.decoder_stream()
+    start = 0
+    parts = []
     given = {} if seen == "nothing" else {"render": clip(13, 16, 24, batch=2)}
     if seen == "render and opacity":
         given["opacity"] = noise(2, 1, 13, 16, 24).sigmoid()
@@ -137,7 +186,9 @@ def test_one_pass_over_the_whole_clip_agrees_with_one_latent_a_pass(vae: TinyVAE
     video = clip(13, 24, 16)
     z = vae.encode(video)
     torch.testing.assert_close(whole.encode(video), z, atol=1e-5, rtol=0)
-    torch.testing.assert_close(whole.decode(z, render=video), vae.decode(z, render=video), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        whole.decode(z, render=video), vae.decode(z, render=video), atol=1e-5, rtol=0
+    )
 
 
 def test_blocks_never_depend_on_later_ones(vae: TinyVAE) -> None:
@@ -146,7 +197,9 @@ def test_blocks_never_depend_on_later_ones(vae: TinyVAE) -> None:
     a, b = vae.encode(video), vae.encode(changed)
     assert torch.equal(a[:, :, :2], b[:, :, :2])
     assert not torch.equal(a[:, :, 2:], b[:, :, 2:])
-    assert torch.equal(vae.decode(a, render=video)[:, :, :5], vae.decode(b, render=changed)[:, :, :5])
+    assert torch.equal(
+        vae.decode(a, render=video)[:, :, :5], vae.decode(b, render=changed)[:, :, :5]
+    )
 
 
 def test_the_latent_before_is_remembered(vae: TinyVAE) -> None:
@@ -158,7 +211,10 @@ def test_the_latent_before_is_remembered(vae: TinyVAE) -> None:
 def test_interleaved_and_forked_streams_equal_each_alone(vae: TinyVAE) -> None:
     z = [noise(1, 16, 3, 2, 2, seed=seed) for seed in (1, 2)]
     streams = [vae.decoder_stream() for _ in z]
-    parts = [[stream.push(x[:, :, i : i + 1]) for stream, x in zip(streams, z, strict=True)] for i in range(2)]
+    parts = [
+        [stream.push(x[:, :, i : i + 1]) for stream, x in zip(streams, z, strict=True)]
+        for i in range(2)
+    ]
     fork = streams[0].fork()
     last = [stream.push(x[:, :, 2:]) for stream, x in zip(streams, z, strict=True)]
     assert torch.equal(fork.push(z[0][:, :, 2:]), last[0])
@@ -169,13 +225,20 @@ def test_interleaved_and_forked_streams_equal_each_alone(vae: TinyVAE) -> None:
 @pytest.mark.slow
 def test_900_frames_stream_in_constant_memory_and_stay_finite() -> None:
     vae = trained_like()
-    encoder, decoder, sizes = vae.encoder_stream(), vae.decoder_stream(), set()
+    encoder = vae.encoder_stream()
+    decoder = vae.decoder_stream()
+    sizes = set()
     with torch.inference_mode():
         for step in range(226):
             frames = clip(1 if step == 0 else 4, 48, 64, seed=step)
             out = decoder.push(encoder.push(frames), render=frames)
             assert out.isfinite().all()
-            sizes.add(sum(kept.untyped_storage().nbytes() for kept in (*(encoder.state or ()), *(decoder.state or ()))))
+            sizes.add(
+                sum(
+                    kept.untyped_storage().nbytes()
+                    for kept in (*(encoder.state or ()), *(decoder.state or ()))
+                )
+            )
     assert len(sizes) == 1
 
 
@@ -183,7 +246,9 @@ def test_900_frames_stream_in_constant_memory_and_stay_finite() -> None:
 
 
 @pytest.mark.parametrize(("frames", "latents"), [(1, 1), (5, 2)])
-def test_one_and_five_frames_give_one_and_two_latents(vae: TinyVAE, frames: int, latents: int) -> None:
+def test_one_and_five_frames_give_one_and_two_latents(
+    vae: TinyVAE, frames: int, latents: int
+) -> None:
     z = vae.encode(clip(frames, 16, 24))
     assert z.shape == (1, 16, latents, 2, 3)
     assert vae.decode(z).shape == (1, 3, frames, 16, 24)
@@ -245,7 +310,9 @@ def test_running_in_bfloat16_stays_close_and_keeps_constants_exact(vae: TinyVAE,
 
 def test_random_weights_depend_on_the_seed_alone() -> None:
     before = torch.get_rng_state()
-    a, b, c = TinyVAE.random(SIZES, 1).state_dict(), TinyVAE.random(SIZES, 1).state_dict(), TinyVAE.random(SIZES, 2).state_dict()
+    a = TinyVAE.random(SIZES, 1).state_dict()
+    b = TinyVAE.random(SIZES, 1).state_dict()
+    c = TinyVAE.random(SIZES, 2).state_dict()
     assert all(torch.equal(a[key], b[key]) for key in a)
     assert not torch.equal(a["encoder.stem.weight"], c["encoder.stem.weight"])
     assert torch.equal(torch.get_rng_state(), before)
@@ -261,7 +328,11 @@ def test_a_few_steps_of_training_lower_the_error_of_both_parts() -> None:
         optimiser.step()
         losses.append(loss.item())
     assert losses[-1] < 0.99 * losses[0]
-    assert all(p.grad is not None and p.grad.abs().max() > 0 for name, p in net.named_parameters() if "see_" not in name)
+    assert all(
+        p.grad is not None and p.grad.abs().max() > 0
+        for name, p in net.named_parameters()
+        if "see_" not in name
+    )
 
 
 def test_saving_and_loading_gives_bit_equal_results(vae: TinyVAE, tmp_path: Path) -> None:
@@ -269,7 +340,10 @@ def test_saving_and_loading_gives_bit_equal_results(vae: TinyVAE, tmp_path: Path
     vae.save(path, {"trained": "no"})
     loaded, video = TinyVAE.load(path), clip(5, 16, 16)
     assert loaded.sizes == SIZES
-    assert torch.equal(loaded.decode(loaded.encode(video), render=video), vae.decode(vae.encode(video), render=video))
+    assert torch.equal(
+        loaded.decode(loaded.encode(video), render=video),
+        vae.decode(vae.encode(video), render=video),
+    )
     assert "transform.kernel" not in load_weights(path)
 
 

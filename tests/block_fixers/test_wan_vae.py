@@ -13,7 +13,12 @@ from torch import Tensor
 
 from alpasim_plugin.block_fixers.clips import crop_clip, pad_clip
 from alpasim_plugin.block_fixers.wan_vae import WanVAE
-from alpasim_plugin.block_fixers.wan_vae_blocks import WanLayout, causal_conv, causal_conv3d, read_layout
+from alpasim_plugin.block_fixers.wan_vae_blocks import (
+    WanLayout,
+    causal_conv,
+    causal_conv3d,
+    read_layout,
+)
 from alpasim_plugin.core.errors import InputError
 from tests.block_fixers.codec_cases import DEEPER, SMALL, UNEVEN, clip, noise
 from tests.examples import examples, first_of
@@ -34,14 +39,20 @@ def push_all(stream, x: Tensor, counts: list[int]) -> Tensor:
 # Streams
 
 
-@pytest.mark.parametrize("counts", first_of([[1, 4, 4, 4], [5, 8], [5, 4, 4], [13], [1, 12], [9, 4]], 2))
-def test_encoding_in_any_blocks_is_bit_equal_to_the_whole_clip(vae: WanVAE, counts: list[int]) -> None:
+@pytest.mark.parametrize(
+    "counts", first_of([[1, 4, 4, 4], [5, 8], [5, 4, 4], [13], [1, 12], [9, 4]], 2)
+)
+def test_encoding_in_any_blocks_is_bit_equal_to_the_whole_clip(
+    vae: WanVAE, counts: list[int]
+) -> None:
     video = clip(13, 16, 24, batch=2)
     assert torch.equal(push_all(vae.encoder_stream(), video, counts), vae.encode(video))
 
 
 @pytest.mark.parametrize("counts", first_of([[1, 1, 1, 1, 1], [2, 2, 1], [5], [1, 4], [3, 2]], 2))
-def test_decoding_in_any_blocks_is_bit_equal_to_the_whole_clip(vae: WanVAE, counts: list[int]) -> None:
+def test_decoding_in_any_blocks_is_bit_equal_to_the_whole_clip(
+    vae: WanVAE, counts: list[int]
+) -> None:
     z = noise(2, 16, 5, 2, 3)
     assert torch.equal(push_all(vae.decoder_stream(), z, counts), vae.decode(z))
 
@@ -52,7 +63,9 @@ def test_one_pass_over_the_whole_clip_agrees_with_one_latent_a_pass(layout: WanL
     whole.latents_per_pass = None
     video, z = clip(13, 24, 16), noise(1, 16, 4, 3, 2)
     torch.testing.assert_close(whole.encode(video), steps.encode(video), atol=1e-5, rtol=0)
-    torch.testing.assert_close(whole.decode(z, clamp=False), steps.decode(z, clamp=False), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        whole.decode(z, clamp=False), steps.decode(z, clamp=False), atol=1e-5, rtol=0
+    )
 
 
 def test_frames_never_depend_on_later_ones(vae: WanVAE) -> None:
@@ -68,7 +81,10 @@ def test_frames_never_depend_on_later_ones(vae: WanVAE) -> None:
 def test_two_streams_interleaved_equal_each_alone(vae: WanVAE) -> None:
     videos = [clip(9, 16, 16, seed=seed) for seed in (1, 2)]
     streams = [vae.encoder_stream() for _ in videos]
-    mixed = [[stream.push(video[:, :, a:b]) for stream, video in zip(streams, videos, strict=True)] for a, b in ((0, 1), (1, 5), (5, 9))]
+    mixed = [
+        [stream.push(video[:, :, a:b]) for stream, video in zip(streams, videos, strict=True)]
+        for a, b in ((0, 1), (1, 5), (5, 9))
+    ]
     for video, parts in zip(videos, zip(*mixed, strict=True), strict=True):
         assert torch.equal(torch.cat(parts, dim=2), vae.encode(video))
 
@@ -113,7 +129,10 @@ def test_900_frames_stream_in_constant_memory_and_stay_finite(vae: WanVAE) -> No
             out = decoder.push(encoder.push(frames))
             assert out.shape == frames.shape
             assert out.isfinite().all()
-            held = [kept.untyped_storage().nbytes() for kept in (*(encoder.state or ()), *(decoder.state or ()))]
+            held = [
+                kept.untyped_storage().nbytes()
+                for kept in (*(encoder.state or ()), *(decoder.state or ()))
+            ]
             if step >= 2:
                 sizes.add(sum(held))
     assert len(sizes) == 1
@@ -124,7 +143,10 @@ def test_a_state_holds_no_more_than_its_own_frames(vae: WanVAE) -> None:
     push_all(stream, clip(9, 32, 32), [5, 4])
     assert stream.state is not None
     assert len(stream.state) == 24
-    assert all(kept.untyped_storage().nbytes() == kept.numel() * kept.element_size() and kept.shape[1] <= 2 for kept in stream.state)
+    assert all(
+        kept.untyped_storage().nbytes() == kept.numel() * kept.element_size() and kept.shape[1] <= 2
+        for kept in stream.state
+    )
 
 
 # Sizes and hard inputs
@@ -156,8 +178,13 @@ def test_six_frames_padded_encode_as_nine_and_crop_back(vae: WanVAE) -> None:
     assert crop_clip(vae.decode(vae.encode(padded)), size).shape == video.shape
 
 
-@pytest.mark.parametrize(("frames", "text"), [(5, "5 frames in the middle"), (1, "1 frames in the middle"), (0, "0 frames in the middle")])
-def test_odd_counts_in_the_middle_of_a_stream_are_refused_and_leave_it_alone(vae: WanVAE, frames: int, text: str) -> None:
+@pytest.mark.parametrize(
+    ("frames", "text"),
+    [(5, "5 frames in the middle"), (1, "1 frames in the middle"), (0, "0 frames in the middle")],
+)
+def test_odd_counts_in_the_middle_of_a_stream_are_refused_and_leave_it_alone(
+    vae: WanVAE, frames: int, text: str
+) -> None:
     stream = vae.encoder_stream()
     stream.push(clip(1, 16, 16))
     before = stream.state
@@ -166,8 +193,12 @@ def test_odd_counts_in_the_middle_of_a_stream_are_refused_and_leave_it_alone(vae
     assert stream.state is before
 
 
-@pytest.mark.parametrize(("height", "width", "good"), [(17, 24, "24 x 24"), (16, 30, "16 x 32"), (4, 8, "8 x 8")])
-def test_sides_that_are_no_multiple_of_eight_are_refused(vae: WanVAE, height: int, width: int, good: str) -> None:
+@pytest.mark.parametrize(
+    ("height", "width", "good"), [(17, 24, "24 x 24"), (16, 30, "16 x 32"), (4, 8, "8 x 8")]
+)
+def test_sides_that_are_no_multiple_of_eight_are_refused(
+    vae: WanVAE, height: int, width: int, good: str
+) -> None:
     with pytest.raises(InputError, match=f"pad to {good} "):
         vae.encode(clip(1, height, width))
 
@@ -181,7 +212,11 @@ def test_a_stream_whose_frame_size_changes_is_refused(vae: WanVAE) -> None:
 
 @pytest.mark.parametrize(
     "bad",
-    [torch.zeros(1, 3, 1, 16, 16, dtype=torch.uint8), torch.zeros(3, 1, 16, 16), torch.zeros(1, 4, 1, 16, 16)],
+    [
+        torch.zeros(1, 3, 1, 16, 16, dtype=torch.uint8),
+        torch.zeros(3, 1, 16, 16),
+        torch.zeros(1, 4, 1, 16, 16),
+    ],
     ids=["uint8", "4d", "rgba"],
 )
 def test_what_is_no_video_is_refused(vae: WanVAE, bad: Tensor) -> None:
@@ -222,12 +257,22 @@ def test_one_bad_pixel_does_not_reach_earlier_frames(vae: WanVAE) -> None:
 
 
 @settings(max_examples=examples(30), deadline=None)
-@given(past=st.integers(0, 2), frames=st.integers(1, 5), inputs=st.integers(1, 5), outputs=st.integers(1, 5), side=st.sampled_from([1, 3]))
-def test_summed_2d_convolutions_equal_the_3d_one(past: int, frames: int, inputs: int, outputs: int, side: int) -> None:
+@given(
+    past=st.integers(0, 2),
+    frames=st.integers(1, 5),
+    inputs=st.integers(1, 5),
+    outputs=st.integers(1, 5),
+    side=st.sampled_from([1, 3]),
+)
+def test_summed_2d_convolutions_equal_the_3d_one(
+    past: int, frames: int, inputs: int, outputs: int, side: int
+) -> None:
     joined = noise(2, past + frames, 4, 5, inputs, seed=past)
     weight, bias = noise(outputs, inputs, 3, side, side), noise(outputs)
     expected = causal_conv3d(joined, weight, bias, frames)
-    torch.testing.assert_close(causal_conv(joined, weight, bias, frames), expected, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(
+        causal_conv(joined, weight, bias, frames), expected, atol=1e-5, rtol=1e-5
+    )
 
 
 # Checkpoints
@@ -238,7 +283,9 @@ def test_sizes_are_read_off_the_tensors(layout: WanLayout) -> None:
     sd = WanVAE.random(layout).state_dict()
     assert read_layout(sd) == layout
     video = clip(5, 16, 16)
-    assert torch.equal(WanVAE.from_state_dict(sd).encode(video), WanVAE.random(layout).encode(video))
+    assert torch.equal(
+        WanVAE.from_state_dict(sd).encode(video), WanVAE.random(layout).encode(video)
+    )
 
 
 @pytest.mark.parametrize(("base", "millions"), [(96, 126.9), (24, 8.04)])
@@ -252,10 +299,16 @@ def test_the_keys_are_those_of_the_published_file(vae: WanVAE) -> None:
     keys = set(vae.state_dict())
     assert len(keys) == 194
     assert {
-        "encoder.conv1.weight", "encoder.downsamples.3.shortcut.weight", "encoder.downsamples.5.time_conv.bias",
-        "encoder.middle.1.norm.gamma", "decoder.upsamples.4.shortcut.bias", "decoder.upsamples.11.resample.1.weight",
-        "decoder.head.2.bias", "conv1.weight", "conv2.bias",
-    } <= keys  # fmt: skip
+        "encoder.conv1.weight",
+        "encoder.downsamples.3.shortcut.weight",
+        "encoder.downsamples.5.time_conv.bias",
+        "encoder.middle.1.norm.gamma",
+        "decoder.upsamples.4.shortcut.bias",
+        "decoder.upsamples.11.resample.1.weight",
+        "decoder.head.2.bias",
+        "conv1.weight",
+        "conv2.bias",
+    } <= keys
     assert not [key for key in keys if "stats" in key]
 
 
@@ -267,17 +320,25 @@ def test_loading_copies_and_freezes(vae: WanVAE) -> None:
 
 
 def test_outer_dictionaries_are_opened(vae: WanVAE) -> None:
-    assert torch.equal(WanVAE.from_state_dict({"state_dict": vae.state_dict()}).conv1.weight, vae.conv1.weight)
+    assert torch.equal(
+        WanVAE.from_state_dict({"state_dict": vae.state_dict()}).conv1.weight, vae.conv1.weight
+    )
 
 
 @pytest.mark.parametrize("stored", [torch.float16, torch.bfloat16, torch.float64])
-def test_half_and_double_precision_tensors_load_into_single(vae: WanVAE, stored: torch.dtype) -> None:
+def test_half_and_double_precision_tensors_load_into_single(
+    vae: WanVAE, stored: torch.dtype
+) -> None:
     sd = {key: value.to(stored) for key, value in vae.state_dict().items()}
     loaded = WanVAE.from_state_dict(sd)
     assert loaded.dtype == torch.float32
     z = loaded.encode(clip(5, 16, 16))
     assert z.dtype == torch.float32
-    assert (z - vae.encode(clip(5, 16, 16))).abs().max() < {torch.float16: 2e-3, torch.bfloat16: 2e-2, torch.float64: 1e-6}[stored]
+    assert (z - vae.encode(clip(5, 16, 16))).abs().max() < {
+        torch.float16: 2e-3,
+        torch.bfloat16: 2e-2,
+        torch.float64: 1e-6,
+    }[stored]
 
 
 def test_one_half_precision_tensor_among_single_ones_loads(vae: WanVAE) -> None:
@@ -299,8 +360,14 @@ def test_running_in_half_precision_stays_close(vae: WanVAE, dtype: torch.dtype) 
 
 Spoil = Callable[[dict[str, Tensor]], object]
 SPOILED: dict[str, tuple[Spoil, str]] = {
-    "missing bias": (lambda sd: sd.pop("encoder.middle.0.residual.2.bias"), "missing: encoder.middle.0.residual.2.bias"),
-    "missing width": (lambda sd: sd.pop("encoder.downsamples.6.residual.3.gamma"), "missing: encoder.downsamples.6.residual.3.gamma"),
+    "missing bias": (
+        lambda sd: sd.pop("encoder.middle.0.residual.2.bias"),
+        "missing: encoder.middle.0.residual.2.bias",
+    ),
+    "missing width": (
+        lambda sd: sd.pop("encoder.downsamples.6.residual.3.gamma"),
+        "missing: encoder.downsamples.6.residual.3.gamma",
+    ),
     "no halving": (
         lambda sd: [sd.pop(key) for key in list(sd) if ".resample." in key],
         "missing: encoder.downsamples.2.resample.1.weight",
@@ -309,21 +376,39 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
         lambda sd: [sd.pop(key) for key in list(sd) if key.startswith("decoder.upsamples.13.")],
         "missing: decoder.upsamples.13.residual.0.gamma",
     ),
-    "extra": (lambda sd: sd.update({"encoder.extra.weight": torch.zeros(1)}), "unexpected: encoder.extra.weight"),
+    "extra": (
+        lambda sd: sd.update({"encoder.extra.weight": torch.zeros(1)}),
+        "unexpected: encoder.extra.weight",
+    ),
     "transposed": (
-        lambda sd: sd.update({"encoder.downsamples.3.residual.2.weight": sd["encoder.downsamples.3.residual.2.weight"].transpose(0, 1)}),
+        lambda sd: sd.update(
+            {
+                "encoder.downsamples.3.residual.2.weight": sd[
+                    "encoder.downsamples.3.residual.2.weight"
+                ].transpose(0, 1)
+            }
+        ),
         r"encoder.downsamples.3.residual.2.weight is \[8, 16, 3, 3, 3\] for \[16, 8, 3, 3, 3\], transposed",
     ),
     "transposed kernel": (
-        lambda sd: sd.update({"decoder.upsamples.3.time_conv.weight": sd["decoder.upsamples.3.time_conv.weight"].transpose(2, 4)}),
+        lambda sd: sd.update(
+            {
+                "decoder.upsamples.3.time_conv.weight": sd[
+                    "decoder.upsamples.3.time_conv.weight"
+                ].transpose(2, 4)
+            }
+        ),
         r"decoder.upsamples.3.time_conv.weight is \[64, 32, 1, 1, 3\] for \[64, 32, 3, 1, 1\], transposed",
     ),
     "wrong shape": (
         lambda sd: sd.update({"conv2.weight": torch.zeros(16, 16)}),
         r"wrong shape: conv2.weight is \[16, 16\] for \[16, 16, 1, 1, 1\]",
     ),
-    "integers": (lambda sd: sd.update({"conv2.bias": torch.zeros(16, dtype=torch.int64)}), "not floating point: conv2.bias"),
-}  # fmt: skip
+    "integers": (
+        lambda sd: sd.update({"conv2.bias": torch.zeros(16, dtype=torch.int64)}),
+        "not floating point: conv2.bias",
+    ),
+}
 
 
 @pytest.mark.parametrize("name", SPOILED)
@@ -339,9 +424,16 @@ def test_a_spoiled_checkpoint_is_named_in_four_parts(vae: WanVAE, name: str) -> 
 
 
 def test_many_faults_are_listed_in_one_error(vae: WanVAE) -> None:
-    sd = {key: value for key, value in vae.state_dict().items() if not key.startswith("decoder.middle.")}
+    sd = {
+        key: value
+        for key, value in vae.state_dict().items()
+        if not key.startswith("decoder.middle.")
+    }
     sd["stray"] = torch.zeros(1)
-    with pytest.raises(InputError, match=r"missing: decoder.middle.0.residual.0.gamma.* and 9 more; unexpected: stray"):
+    with pytest.raises(
+        InputError,
+        match=r"missing: decoder.middle.0.residual.0.gamma.* and 9 more; unexpected: stray",
+    ):
         WanVAE.from_state_dict(sd)
 
 

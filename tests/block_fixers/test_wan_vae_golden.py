@@ -30,40 +30,66 @@ def vae(numbers: Any) -> WanVAE:
 
 @pytest.mark.parametrize("latents_per_pass", [1, 2, None])
 @pytest.mark.parametrize("name", CLIPS)
-def test_clip_encodes_to_the_original_latents(vae: WanVAE, numbers: Any, name: str, latents_per_pass: int | None) -> None:
+def test_clip_encodes_to_the_original_latents(
+    vae: WanVAE, numbers: Any, name: str, latents_per_pass: int | None
+) -> None:
     vae.latents_per_pass = latents_per_pass
     z = vae.encode(numbers[1][f"in.{name}"])
-    torch.testing.assert_close(z, numbers[1][f"out.{name}.latent_normalised"], atol=TOLERANCE, rtol=0)
+    torch.testing.assert_close(
+        z, numbers[1][f"out.{name}.latent_normalised"], atol=TOLERANCE, rtol=0
+    )
 
 
 @pytest.mark.parametrize("latents_per_pass", [1, 2, None])
 @pytest.mark.parametrize("name", CLIPS)
-def test_latents_decode_to_the_original_frames(vae: WanVAE, numbers: Any, name: str, latents_per_pass: int | None) -> None:
+def test_latents_decode_to_the_original_frames(
+    vae: WanVAE, numbers: Any, name: str, latents_per_pass: int | None
+) -> None:
     vae.latents_per_pass = latents_per_pass
     video = vae.decode(numbers[1][f"out.{name}.latent_normalised"], clamp=False)
-    torch.testing.assert_close(video, numbers[1][f"out.{name}.recon_unclamped"], atol=TOLERANCE, rtol=0)
+    torch.testing.assert_close(
+        video, numbers[1][f"out.{name}.recon_unclamped"], atol=TOLERANCE, rtol=0
+    )
 
 
 @pytest.mark.parametrize(("clamp", "what"), [(True, "decode_clamped"), (False, "decode_unclamped")])
-def test_random_latents_decode_to_the_original_frames(vae: WanVAE, numbers: Any, clamp: bool, what: str) -> None:
+def test_random_latents_decode_to_the_original_frames(
+    vae: WanVAE, numbers: Any, clamp: bool, what: str
+) -> None:
     video = vae.decode(numbers[1]["in.latent_b1_t4_4x6"], clamp=clamp)
-    torch.testing.assert_close(video, numbers[1][f"out.latent_b1_t4_4x6.{what}"], atol=TOLERANCE, rtol=0)
+    torch.testing.assert_close(
+        video, numbers[1][f"out.latent_b1_t4_4x6.{what}"], atol=TOLERANCE, rtol=0
+    )
 
 
 def test_unnormalised_means_are_the_original_ones(vae: WanVAE, numbers: Any) -> None:
     mu = vae.stats.denormalise(vae.encode(numbers[1]["in.clip_b1_t9_32x48"]))
-    torch.testing.assert_close(mu, numbers[1]["out.clip_b1_t9_32x48.latent_raw_mu"], atol=TOLERANCE, rtol=0)
+    torch.testing.assert_close(
+        mu, numbers[1]["out.clip_b1_t9_32x48.latent_raw_mu"], atol=TOLERANCE, rtol=0
+    )
 
 
-def test_every_chunk_leaves_the_original_encoder_output_and_state(vae: WanVAE, numbers: Any) -> None:
+def test_every_chunk_leaves_the_original_encoder_output_and_state(
+    vae: WanVAE, numbers: Any
+) -> None:
     _, io, config = numbers
     name = "clip_b1_t17_40x64"
-    video, state, start = io[f"in.{name}"], None, 0
+    video = io[f"in.{name}"]
+    state = None
+    start = 0
     for index, count in enumerate([1, 4, 4, 4, 4]):
         streaming = StreamingState(state)
-        out = channels_first(vae.encoder.next(channels_last(video[:, :, start : start + count]), streaming))
-        torch.testing.assert_close(out, io[f"out.{name}.encoder_chunk{index}"], atol=TOLERANCE, rtol=0)
-        slots = [tuple(slot) for slot in config["cases"][name]["encoder_cache_slots_after_each_chunk"][index] if slot is not None]
+        out = channels_first(
+            vae.encoder.next(channels_last(video[:, :, start : start + count]), streaming)
+        )
+        torch.testing.assert_close(
+            out, io[f"out.{name}.encoder_chunk{index}"], atol=TOLERANCE, rtol=0
+        )
+        slots = [
+            tuple(slot)
+            for slot in config["cases"][name]["encoder_cache_slots_after_each_chunk"][index]
+            if slot is not None
+        ]
         assert [tuple(channels_first(kept).shape) for kept in streaming.state] == slots
         state, start = streaming.state, start + count
 
@@ -76,12 +102,21 @@ def test_decoder_state_has_the_original_slots(vae: WanVAE, numbers: Any) -> None
         frames = stream.push(io[f"out.{name}.latent_normalised"][:, :, index : index + 1])
         assert frames.shape[2] == config["cases"][name]["decoder_frames_per_chunk"][index]
         assert stream.state is not None
-        for kept, slot in zip(stream.state, [slot for slot in slots if slot is not None], strict=True):
-            # "Rep" marks a temporal upsampling that has only seen the first latent: it remembers nothing. One latent later the original
-            # fills up with a zero frame, which here is not stored.
+        for kept, slot in zip(
+            stream.state, [slot for slot in slots if slot is not None], strict=True
+        ):
+            # "Rep" marks a temporal upsampling that has only seen the first latent: it remembers
+            # nothing. One latent later the original fills up with a zero frame, which here is not
+            # stored.
             batch, frames_kept, height, width, channels = kept.shape
-            assert slot == "Rep" or [batch, channels, height, width] == [slot[0], slot[1], *slot[3:]]
-            assert frames_kept in ([0] if slot == "Rep" else [slot[2] - 1, slot[2]] if index == 1 else [slot[2]])
+            assert slot == "Rep" or [batch, channels, height, width] == [
+                slot[0],
+                slot[1],
+                *slot[3:],
+            ]
+            assert frames_kept in (
+                [0] if slot == "Rep" else [slot[2] - 1, slot[2]] if index == 1 else [slot[2]]
+            )
 
 
 def test_statistics_are_the_published_ones(numbers: Any) -> None:

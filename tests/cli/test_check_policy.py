@@ -1,4 +1,6 @@
-"""``simrun check-policy``: what it prints, and that a policy's own prints do not break ``--json``."""
+"""``simrun check-policy``: what it prints, and that a policy's own prints do not break
+``--json``.
+"""
 
 from __future__ import annotations
 
@@ -58,34 +60,60 @@ def parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_a_policy_that_prints_leaves_one_document_on_stdout(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_policy_that_prints_leaves_one_document_on_stdout(
+    parts: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(["check-policy", "talking_policies.py:Talks", "--json"]) == 0
     printed = capsys.readouterr()
     document = json.loads(printed.out)
     assert document["ok"]
-    assert {"sensors", "values", "times", "frame", "units", "side", "determinism", "reset"} <= {row["check"] for row in document["checks"]}
+    assert {"sensors", "values", "times", "frame", "units", "side", "determinism", "reset"} <= {
+        row["check"] for row in document["checks"]
+    }
     assert "planning" in printed.err
 
 
 def test_a_fault_is_exit_code_1_and_a_line(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["check-policy", "talking_policies.py:Transposed"]) == 1
-    assert "FAIL values: in the situation 'straight' the plan has times_us (41,), xy (2, 41)" in capsys.readouterr().out
+    assert (
+        "FAIL values: in the situation 'straight' the plan has times_us (41,), xy (2, 41)"
+        in capsys.readouterr().out
+    )
 
 
 def test_a_policy_that_cannot_be_made_is_a_finding_and_one_that_is_not_there_an_error(
     parts: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run_command(["check-policy", "talking_policies.py:Fails"]) == 1
-    assert "FAIL made: making a policy failed: OSError: weights.pt is missing" in capsys.readouterr().out
+    assert (
+        "FAIL made: making a policy failed: OSError: weights.pt is missing"
+        in capsys.readouterr().out
+    )
     assert run_command(["check-policy", "talking_policies.py:Absent"]) == 2
 
 
-SHORT = ["--workers", "1", "--certify", "none", "--no-report", "--set", "timing.duration_us=600000", "smoke/straight"]
+SHORT = [
+    "--workers",
+    "1",
+    "--certify",
+    "none",
+    "--no-report",
+    "--set",
+    "timing.duration_us=600000",
+    "smoke/straight",
+]
 GREY = ["--renderer", "tests.runs.grey_renderer:Grey"]
 
 
-def test_a_run_with_a_policy_that_prints_gives_one_document(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command([*GREY, "--policy", "talking_policies.py:Talks", "--out", "run", "--json", *SHORT]) == 0
+def test_a_run_with_a_policy_that_prints_gives_one_document(
+    parts: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        run_command(
+            [*GREY, "--policy", "talking_policies.py:Talks", "--out", "run", "--json", *SHORT]
+        )
+        == 0
+    )
     assert json.loads(capsys.readouterr().out)["exit_code"] == 0
 
 
@@ -98,18 +126,35 @@ def test_a_run_with_a_policy_that_prints_gives_one_document(parts: Path, capsys:
         ("Fails", "weights.pt is missing"),
     ],
 )
-def test_in_a_run_the_faults_of_a_policy_are_its_own(parts: Path, name: str, found: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command([*GREY, "--policy", f"talking_policies.py:{name}", "--out", "run", *SHORT]) == 2
+def test_in_a_run_the_faults_of_a_policy_are_its_own(
+    parts: Path, name: str, found: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        run_command([*GREY, "--policy", f"talking_policies.py:{name}", "--out", "run", *SHORT]) == 2
+    )
     told = capsys.readouterr().err
     assert found in told
     assert "1 of 1 rollouts failed, all by the policy's own fault" in told
     assert "infrastructure" not in told
 
 
-def test_plans_in_centimetres_are_warned_of_and_plans_in_metres_are_not(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command([*GREY, "--policy", "talking_policies.py:Talks", "--out", "metres", *SHORT]) == 0
+def test_plans_in_centimetres_are_warned_of_and_plans_in_metres_are_not(
+    parts: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        run_command([*GREY, "--policy", "talking_policies.py:Talks", "--out", "metres", *SHORT])
+        == 0
+    )
     assert "warning" not in capsys.readouterr().out
-    assert run_command([*GREY, "--policy", "talking_policies.py:Centimetres", "--out", "centimetres", *SHORT]) == 0
+    assert (
+        run_command(
+            [*GREY, "--policy", "talking_policies.py:Centimetres", "--out", "centimetres", *SHORT]
+        )
+        == 0
+    )
     told = " ".join(capsys.readouterr().out.split())
-    assert "reach further than the vehicle can drive in that time; their speed is 100 times the ego's, as if in centimetres" in told
+    assert (
+        "reach further than the vehicle can drive in that time; their speed is 100 times the ego's, as if in centimetres"
+        in told
+    )
     assert "as if in centimetres" in (parts / "centimetres" / "summary.md").read_text()

@@ -28,7 +28,9 @@ def bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
     (folder / "broken.yaml").write_text("version: 1\nroad: [\n")
     (folder / "typo.yaml").write_text("version: 1\nroda: {}\n")
     (folder / "empty").mkdir()
-    (folder / "cut.xml").write_text('<?xml version="1.0"?><commonRoad commonRoadVersion="2018b" timeStepSize="0.1"><lanelet id="1">')
+    (folder / "cut.xml").write_text(
+        '<?xml version="1.0"?><commonRoad commonRoadVersion="2018b" timeStepSize="0.1"><lanelet id="1">'
+    )
     (folder / "notes.txt").write_text("hello")
     scene = ["smoke/straight"]
     return {
@@ -39,8 +41,14 @@ def bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
         "folder without scenarios": ([*GOOD, str(folder / "empty")], "empty"),
         "truncated XML": ([*GOOD, str(folder / "cut.xml")], "cut.xml"),
         "file of another kind": ([*GOOD, str(folder / "notes.txt")], "notes.txt"),
-        "unknown renderer": (["--renderer", "clena", "--policy", "log-replay", *scene], "did you mean 'clean'"),
-        "unknown policy": (["--renderer", "clean", "--policy", "lane-cam", *scene], "did you mean 'lane-camera'"),
+        "unknown renderer": (
+            ["--renderer", "clena", "--policy", "log-replay", *scene],
+            "did you mean 'clean'",
+        ),
+        "unknown policy": (
+            ["--renderer", "clean", "--policy", "lane-cam", *scene],
+            "did you mean 'lane-camera'",
+        ),
         "policy that does not import": (["--policy", "no.such:Thing", *scene], "no.such:Thing"),
         "unknown preset": ([*GOOD, "--preset", "papr", *scene], "known: paper"),
         "baseline that is not run": ([*GOOD, "--baseline", "3dgs", *scene], "baseline '3dgs'"),
@@ -48,11 +56,20 @@ def bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
         "no seeds": ([*GOOD, "--seeds", "0", *scene], "--seeds 0"),
         "misspelt verb": (["scroe", "drive.asl"], "simrun score"),
         "seed named twice": ([*GOOD, "--seeds", "1,2,1", *scene], "1 twice"),
-        "renderer named twice": (["--renderer", "clean,clean", "--policy", "log-replay", *scene], "clean twice"),
+        "renderer named twice": (
+            ["--renderer", "clean,clean", "--policy", "log-replay", *scene],
+            "clean twice",
+        ),
         "override of an unknown key": ([*GOOD, "--set", "rats.camera_us=1", *scene], "rates"),
-        "camera period that is no multiple": ([*GOOD, "--set", "rates.camera_us=150001", *scene], "multiple"),
+        "camera period that is no multiple": (
+            [*GOOD, "--set", "rates.camera_us=150001", *scene],
+            "multiple",
+        ),
         "one-frame scene": ([*GOOD, "--set", "timing.duration_us=1", *scene], "duration_us"),
-        "no camera for the policy": (["--renderer", "clean", "--policy", "lane-camera", "--set", "cameras=[]", *scene], "camera"),
+        "no camera for the policy": (
+            ["--renderer", "clean", "--policy", "lane-camera", "--set", "cameras=[]", *scene],
+            "camera",
+        ),
     }
 
 
@@ -82,7 +99,9 @@ SITUATIONS = (
 
 
 @pytest.mark.parametrize("situation", SITUATIONS)
-def test_bad_input_is_a_four_part_error_with_exit_code_2(situation: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_a_four_part_error_with_exit_code_2(
+    situation: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     command, mention = bad_inputs(tmp_path)[situation]
     assert run_command([*command, "--out", str(tmp_path / "out")]) == 2
     captured = capsys.readouterr()
@@ -108,8 +127,20 @@ def test_unknown_options_are_usage_errors(capsys: pytest.CaptureFixture[str]) ->
     assert run_command(["--rendrer", "clean", "smoke/straight"]) == 2
 
 
-def test_a_dry_run_counts_without_running(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["--renderer", "clean,3dgs", "--seeds", "3", "--dry-run", "--json", "--out", str(tmp_path / "out"), "suites/smoke"]
+def test_a_dry_run_counts_without_running(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [
+        "--renderer",
+        "clean,3dgs",
+        "--seeds",
+        "3",
+        "--dry-run",
+        "--json",
+        "--out",
+        str(tmp_path / "out"),
+        "suites/smoke",
+    ]
     assert run_command(command) == 0
     plan = json.loads(capsys.readouterr().out)
     assert plan["rollouts"] == 2 * 3 * len(plan["scenes"])
@@ -117,28 +148,55 @@ def test_a_dry_run_counts_without_running(tmp_path: Path, capsys: pytest.Capture
     assert not (tmp_path / "out").exists()
 
 
-def test_a_run_prints_its_table_and_writes_the_contracted_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = [*GOOD, "--workers", "1", "--set", "timing.duration_us=1000000", "--out", str(tmp_path), "smoke/straight"]
+def test_a_run_prints_its_table_and_writes_the_contracted_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [
+        *GOOD,
+        "--workers",
+        "1",
+        "--set",
+        "timing.duration_us=1000000",
+        "--out",
+        str(tmp_path),
+        "smoke/straight",
+    ]
     assert run_command(command) == 0
     captured = capsys.readouterr()
     assert "lateral_distance_m" in captured.out
-    assert captured.out.splitlines()[-1].startswith("next     simrun --renderer clean,3dgs --policy lane-camera --seeds 1 smoke/straight ")
+    assert captured.out.splitlines()[-1].startswith(
+        "next     simrun --renderer clean,3dgs --policy lane-camera --seeds 1 smoke/straight "
+    )
     assert "report.html" in captured.out
     assert f"simrun view {tmp_path}" in captured.out
-    names = {"run.json", "rollouts.parquet", "steps.parquet", "summary.json", "summary.md", "junit.xml", "report.html"}
+    names = {
+        "run.json",
+        "rollouts.parquet",
+        "steps.parquet",
+        "summary.json",
+        "summary.md",
+        "junit.xml",
+        "report.html",
+    }
     assert names <= {p.name for p in tmp_path.iterdir()}
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert {"preset", "metrics", "paired", "censoring", "failures", "speed"} <= set(summary)
     entry = summary["metrics"]["clean"]["collision_any"]
-    assert {"mean", "ci95", "ci95_clustered", "n_rollouts", "n_scenes", "unit", "direction"} <= set(entry)
-    assert run_command([*command, "--no-report"]) == 0  # the page of the command before would show another run's numbers
+    assert {"mean", "ci95", "ci95_clustered", "n_rollouts", "n_scenes", "unit", "direction"} <= set(
+        entry
+    )
+    assert (
+        run_command([*command, "--no-report"]) == 0
+    )  # the page of the command before would show another run's numbers
     assert f"simrun report {tmp_path}" in capsys.readouterr().out
     assert not (tmp_path / "report.html").exists()
     assert run_command(["report", str(tmp_path)]) == 0
     assert (tmp_path / "report.html").exists()
 
 
-def test_a_run_folder_that_cannot_be_made_is_a_four_part_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_folder_that_cannot_be_made_is_a_four_part_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "file").write_text("in the way")
     assert run_command([*GOOD, "--out", str(tmp_path / "file"), "--quiet", "smoke/straight"]) == 4
     parts = four_parts(capsys.readouterr().err)
@@ -149,10 +207,23 @@ def test_a_run_folder_that_cannot_be_made_is_a_four_part_error(tmp_path: Path, c
 def test_policy_of_the_working_directory_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "policy_of_this_folder.py").write_text("from policies.simple import ConstantVelocity as Mine\n")
+    (tmp_path / "policy_of_this_folder.py").write_text(
+        "from policies.simple import ConstantVelocity as Mine\n"
+    )
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [p for p in sys.path if p])  # as a console script finds it: without the working directory
-    command = ["simrun", "--renderer", "clean", "--policy", "policy_of_this_folder:Mine", "--dry-run", "--json", "smoke/straight"]
+    monkeypatch.setattr(
+        sys, "path", [p for p in sys.path if p]
+    )  # as a console script finds it: without the working directory
+    command = [
+        "simrun",
+        "--renderer",
+        "clean",
+        "--policy",
+        "policy_of_this_folder:Mine",
+        "--dry-run",
+        "--json",
+        "smoke/straight",
+    ]
     monkeypatch.setattr(sys, "argv", command)
     with pytest.raises(SystemExit) as left:
         main()
@@ -160,7 +231,9 @@ def test_policy_of_the_working_directory_is_found(
     assert json.loads(capsys.readouterr().out)["policies"] == ["policy_of_this_folder:Mine"]
 
 
-def test_report_of_a_folder_that_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_report_of_a_folder_that_is_no_run_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(["report", str(tmp_path)]) == 2
     assert "give a folder written by simrun" in four_parts(capsys.readouterr().err)["do"]
 
@@ -181,7 +254,11 @@ def test_every_preset_is_listed_with_what_it_is_the_default_first_and_with_the_c
     assert next(iter(listed)) == "strict"
     assert set(listed) == set(PRESETS)
     assert all(listed.values())
-    assert {name for name, text in listed.items() if "49 % at 500 ms" in text} == {"paper", "alpasim", "alpasim@6f1029c"}
+    assert {name for name, text in listed.items() if "49 % at 500 ms" in text} == {
+        "paper",
+        "alpasim",
+        "alpasim@6f1029c",
+    }
 
 
 def test_doctor_tries_the_parts(capsys: pytest.CaptureFixture[str]) -> None:
@@ -197,7 +274,9 @@ def test_help_of_every_verb_has_an_example(capsys: pytest.CaptureFixture[str]) -
         assert "simrun" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("text", "seeds"), [("1", [0]), ("3", [0, 1, 2]), ("4,7", [4, 7]), ("0,", [0])])
+@pytest.mark.parametrize(
+    ("text", "seeds"), [("1", [0]), ("3", [0, 1, 2]), ("4,7", [4, 7]), ("0,", [0])]
+)
 def test_seeds_are_a_count_or_a_list(text: str, seeds: list[int]) -> None:
     assert parse_seeds(text) == seeds
 

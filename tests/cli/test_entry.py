@@ -1,4 +1,6 @@
-"""How the program begins and ends: plug-in verbs, what no part of it has foreseen, lost outputs, signals during imports, a Tab."""
+"""How the program begins and ends: plug-in verbs, what no part of it has foreseen, lost outputs,
+signals during imports, a Tab.
+"""
 
 from __future__ import annotations
 
@@ -69,8 +71,9 @@ os.kill(os.getpid(), signal.SIGINT)
 """
 VERBS = {
     **{name: f"greeting:{name}" for name in ("greet", "fails", "hungry", "full", "several")},
-    "slow-import": "signalled:command", "no-source": "nowhere.at.all:command",
-}  # fmt: skip
+    "slow-import": "signalled:command",
+    "no-source": "nowhere.at.all:command",
+}
 
 
 @pytest.fixture(scope="module")
@@ -87,11 +90,15 @@ def install(folder: Path, verbs: dict[str, str]) -> None:
     info = folder / "greeting-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: greeting\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("\n".join(["[simrun.commands]", *(f"{name} = {target}" for name, target in verbs.items())]))
+    (info / "entry_points.txt").write_text(
+        "\n".join(["[simrun.commands]", *(f"{name} = {target}" for name, target in verbs.items())])
+    )
 
 
 def with_packages(packages: Path) -> dict[str, str]:
-    return os.environ | {"PYTHONPATH": os.pathsep.join([str(packages), os.environ.get("PYTHONPATH", "")])}
+    return os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(packages), os.environ.get("PYTHONPATH", "")])
+    }
 
 
 def simrun(packages: Path, *words: str, **more: object) -> subprocess.CompletedProcess[str]:
@@ -106,10 +113,12 @@ def four_parts(text: str) -> dict[str, str]:
     return parts
 
 
-# --- verbs of installed packages ------------------------------------------------------------------------------------------
+# --- verbs of installed packages
 
 
-def test_a_verb_of_an_installed_package_runs_and_is_listed_by_its_docstring_without_being_imported(packages: Path) -> None:
+def test_a_verb_of_an_installed_package_runs_and_is_listed_by_its_docstring_without_being_imported(
+    packages: Path,
+) -> None:
     done = simrun(packages, "greet", "--name", "Ada")
     assert (done.stdout, done.returncode) == ("hello Ada\n", 0)
     assert simrun(packages, "several", "two").stdout == "two done\n"
@@ -140,10 +149,12 @@ def test_a_verb_of_an_extra_that_is_not_installed_says_which_brings_it(
     assert "alpasim-onefixer[lab]" in four_parts(capsys.readouterr().err)["do"]
 
 
-# --- what nothing has foreseen --------------------------------------------------------------------------------------------
+# --- what nothing has foreseen
 
 
-def test_an_exception_that_is_not_ours_has_four_parts_and_an_exit_code_of_its_own(packages: Path) -> None:
+def test_an_exception_that_is_not_ours_has_four_parts_and_an_exit_code_of_its_own(
+    packages: Path,
+) -> None:
     done = simrun(packages, "fails")
     assert done.returncode == InternalError.exit_code == 70
     parts = four_parts(done.stderr)
@@ -157,7 +168,9 @@ def test_an_exception_that_is_not_ours_has_four_parts_and_an_exit_code_of_its_ow
     assert 'raise ValueError("seven")' in traced.stderr
 
 
-def test_with_json_it_is_one_document(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_with_json_it_is_one_document(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def broken(args: list[str]) -> int:
         raise RecursionError("too deep")
 
@@ -169,16 +182,28 @@ def test_with_json_it_is_one_document(monkeypatch: pytest.MonkeyPatch, capsys: p
     assert document["error"]["found"].startswith("RecursionError: too deep")
 
 
-@pytest.mark.parametrize(("verb", "found"), [("hungry", "out of memory: of 1 TB"), ("full", "No space left on device: /somewhere/file")])
-def test_too_little_memory_or_disk_is_a_failure_of_the_machine(packages: Path, verb: str, found: str) -> None:
+@pytest.mark.parametrize(
+    ("verb", "found"),
+    [("hungry", "out of memory: of 1 TB"), ("full", "No space left on device: /somewhere/file")],
+)
+def test_too_little_memory_or_disk_is_a_failure_of_the_machine(
+    packages: Path, verb: str, found: str
+) -> None:
     done = simrun(packages, verb)
     assert done.returncode == 4
     assert four_parts(done.stderr)["found"] == found
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no device that is always full")
-@pytest.mark.parametrize("words", first_of([["list", "scenarios"], ["list", "scenarios", "--json"], ["--version"], ["--help"]]))
-def test_a_full_disk_under_the_output_is_seen_even_at_the_very_end(packages: Path, words: list[str]) -> None:
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="this system has no device that is always full"
+)
+@pytest.mark.parametrize(
+    "words",
+    first_of([["list", "scenarios"], ["list", "scenarios", "--json"], ["--version"], ["--help"]]),
+)
+def test_a_full_disk_under_the_output_is_seen_even_at_the_very_end(
+    packages: Path, words: list[str]
+) -> None:
     with Path("/dev/full").open("w") as full:
         done = simrun(packages, *words, stdout=full)
     assert done.returncode == 4
@@ -186,7 +211,12 @@ def test_a_full_disk_under_the_output_is_seen_even_at_the_very_end(packages: Pat
         assert four_parts(done.stderr)["found"].startswith("No space left on device")
 
 
-@pytest.mark.parametrize("words", first_of([["list", "scenarios"], ["list", "scenarios", "--json"], ["--help"], ["report", "--help"]]))
+@pytest.mark.parametrize(
+    "words",
+    first_of(
+        [["list", "scenarios"], ["list", "scenarios", "--json"], ["--help"], ["report", "--help"]]
+    ),
+)
 def test_a_reader_that_has_gone_is_no_failed_gate(packages: Path, words: list[str]) -> None:
     reader, writer = os.pipe()
     os.close(reader)
@@ -196,19 +226,28 @@ def test_a_reader_that_has_gone_is_no_failed_gate(packages: Path, words: list[st
 
 
 def test_an_interrupt_during_imports_leaves_without_a_traceback(packages: Path) -> None:
-    # A process that a shell put into the background ignores the signal, and so would its children; a function that subprocess calls after
-    # a fork would have gRPC, where a test before has loaded it, write to stderr.
+    # A process that a shell put into the background ignores the signal, and so would its children;
+    # a function that subprocess calls after a fork would have gRPC, where a test before has loaded
+    # it, write to stderr.
     begin = "import os, signal, sys as s; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execv(s.executable, [s.executable, *s.argv[1:]])"
     command = [sys.executable, "-c", begin, "-m", "alpasim_plugin.cli.main", "slow-import"]
-    done = subprocess.run(command, env=with_packages(packages), text=True, check=False, capture_output=True)
+    done = subprocess.run(
+        command, env=with_packages(packages), text=True, check=False, capture_output=True
+    )
     assert (done.returncode, done.stderr) == (130, "")
 
 
 @pytest.mark.parametrize(
     ("words", "found"),
-    [(["--rendrer", "clean", "smoke/straight"], "--renderer"), (["list", "renderes"], "'renderers'"), (["list", "--workers"], "--workers")],
+    [
+        (["--rendrer", "clean", "smoke/straight"], "--renderer"),
+        (["list", "renderes"], "'renderers'"),
+        (["list", "--workers"], "--workers"),
+    ],
 )
-def test_an_error_of_usage_has_four_parts_too(words: list[str], found: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_error_of_usage_has_four_parts_too(
+    words: list[str], found: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(words) == 2
     parts = four_parts(capsys.readouterr().err)
     assert found in parts["found"]
@@ -224,18 +263,22 @@ def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert json.loads(capsys.readouterr().out)["version"]
 
 
-# --- a Tab ----------------------------------------------------------------------------------------------------------------
+# --- a Tab
 
 
 def offered(packages: Path, *words: str) -> list[str]:
     """Return what bash gets for the last of the words."""
     environment = {
-        "COMP_WORDS": "\n".join(["simrun", *words]), "COMP_CWORD": str(len(words)), "_SIMRUN_COMPLETE": "complete_bash",
-    }  # fmt: skip
+        "COMP_WORDS": "\n".join(["simrun", *words]),
+        "COMP_CWORD": str(len(words)),
+        "_SIMRUN_COMPLETE": "complete_bash",
+    }
     code = "import os, sys; os.environ.update(%r); sys.argv = ['simrun']; from alpasim_plugin.cli.main import main; main()"
     path = os.pathsep.join([str(packages), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, "-c", code % environment]
-    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=True
+    )
     assert done.stderr == ""
     return done.stdout.split()
 
@@ -253,7 +296,9 @@ def offered(packages: Path, *words: str) -> list[str]:
         ]
     ),
 )
-def test_a_tab_offers_verbs_options_and_names(packages: Path, words: list[str], among: list[str]) -> None:
+def test_a_tab_offers_verbs_options_and_names(
+    packages: Path, words: list[str], among: list[str]
+) -> None:
     assert set(among) <= set(offered(packages, *words))
 
 
@@ -265,6 +310,8 @@ def test_no_name_with_a_colon_is_offered(packages: Path) -> None:
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 @pytest.mark.slow
-def test_the_program_gives_each_shell_a_script(packages: Path, shell: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_program_gives_each_shell_a_script(
+    packages: Path, shell: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("_SIMRUN_COMPLETE", f"source_{shell}")
     assert "_SIMRUN_COMPLETE" in simrun(packages).stdout

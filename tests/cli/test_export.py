@@ -1,4 +1,6 @@
-"""``simrun export``: run folders and scenes in the form that AlpaSim's evaluation takes, and the same scores from them."""
+"""``simrun export``: run folders and scenes in the form that AlpaSim's evaluation takes, and the
+same scores from them.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +23,32 @@ POLICIES = ("log-replay", "constant-velocity")
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two policies, two seeds, neither with a camera, in a scene without other road users: an infinite distance to the nearest one."""
+    """Two policies, two seeds, neither with a camera, in a scene without other road users: an
+    infinite distance to the nearest one.
+    """
     root = tmp_path_factory.mktemp("runs") / "own"
-    command = ["--renderer", "clean", "--policy", ",".join(POLICIES), "--seeds", "2", "--workers", "1", "--quiet", "--no-report"]
-    timing = ["--set", "timing.duration_us=500000", "--set", "timing.warmup_us=200000", "--preset", "alpasim", "--certify", "none"]
+    command = [
+        "--renderer",
+        "clean",
+        "--policy",
+        ",".join(POLICIES),
+        "--seeds",
+        "2",
+        "--workers",
+        "1",
+        "--quiet",
+        "--no-report",
+    ]
+    timing = [
+        "--set",
+        "timing.duration_us=500000",
+        "--set",
+        "timing.warmup_us=200000",
+        "--preset",
+        "alpasim",
+        "--certify",
+        "none",
+    ]
     assert run_command([*command, *timing, "--out", str(root), "smoke/straight"]) == 0
     return root
 
@@ -40,7 +64,9 @@ def test_run_json_says_what_was_asked_and_of_which_commit_and_code(run: Path) ->
     info = read_run_json(run)
     assert info["asked"] == ["smoke/straight"]
     assert info["outcome"] == {"n_rollouts": 4, "n_failed": 0}
-    assert (info["project"]["commit"] is None) == bool(info["project"]["reason"])  # the tests may run outside a repository
+    assert (info["project"]["commit"] is None) == bool(
+        info["project"]["reason"]
+    )  # the tests may run outside a repository
     assert all(len(info["code"][name]) == 12 for name in ("loop", "scoring"))
 
 
@@ -55,12 +81,22 @@ def test_each_renderer_and_policy_has_a_run_folder_of_alpasims_form(exported: Pa
         assert len(found) == 2
         assert all((log.parent / "_complete").is_file() for log in found)
         assert {log.parent.parent.name for log in found} == {"smoke-straight"}
-        assert set(yaml.safe_load((folder / "run_metadata.yaml").read_text())) == {"run_uuid", "run_name"}
+        assert set(yaml.safe_load((folder / "run_metadata.yaml").read_text())) == {
+            "run_uuid",
+            "run_name",
+        }
         wizard = yaml.safe_load((folder / "wizard-config.yaml").read_text())
-        assert sorted(Path(wizard["scenes"]["scene_cache"], wizard["scenes"]["sceneset_path"]).glob("**/*.usdz"))
+        assert sorted(
+            Path(wizard["scenes"]["scene_cache"], wizard["scenes"]["sceneset_path"]).glob(
+                "**/*.usdz"
+            )
+        )
         settings = load_settings(folder / "eval-config.yaml")
         assert settings.parse_unstructured_debug_info is False
-    names = {yaml.safe_load((exported / "clean" / p / "run_metadata.yaml").read_text())["run_uuid"] for p in POLICIES}
+    names = {
+        yaml.safe_load((exported / "clean" / p / "run_metadata.yaml").read_text())["run_uuid"]
+        for p in POLICIES
+    }
     assert len(names) == 2
 
 
@@ -68,10 +104,14 @@ def test_session_ids_sort_as_seeds_and_cameras_have_alpasims_name(exported: Path
     for policy in POLICIES:
         read = [read_asl(log) for log in logs(exported, policy)]
         assert [one.seed for one in read] == [0, 1]
-        assert [one.session_uuid for one in read] == [log.parent.name for log in logs(exported, policy)]
+        assert [one.session_uuid for one in read] == [
+            log.parent.name for log in logs(exported, policy)
+        ]
         for one in read:
             assert {image.camera for image in one.images} == {FRONT}
-            assert [image.end_us for image in one.images] == [int(t) for t in one.ego.t_us if t >= one.render_start_us]
+            assert [image.end_us for image in one.images] == [
+                int(t) for t in one.ego.t_us if t >= one.render_start_us
+            ]
             assert [camera.name for camera in one.info["cameras"]] == [FRONT]
 
 
@@ -79,35 +119,63 @@ def test_the_added_frames_leave_the_rest_of_the_log_as_it_was(run: Path, exporte
     own = run / "rollouts" / "clean" / "log-replay" / "smoke-straight" / "0" / "rollout.asl"
     added = {"batch_render_request", "driver_camera_image"}
     before = [entry for entry in AslReader(own)]
-    after = [entry for entry in AslReader(logs(exported, "log-replay")[0]) if entry.WhichOneof("log_entry") not in added]
+    after = [
+        entry
+        for entry in AslReader(logs(exported, "log-replay")[0])
+        if entry.WhichOneof("log_entry") not in added
+    ]
     assert len(before) == len(after)
     with_camera = {"available_cameras_return", "driver_session_request"}
-    assert all(a == b for a, b in zip(before, after, strict=True) if a.WhichOneof("log_entry") not in with_camera)
+    assert all(
+        a == b
+        for a, b in zip(before, after, strict=True)
+        if a.WhichOneof("log_entry") not in with_camera
+    )
 
 
-def test_scores_of_the_export_are_those_of_the_run(run: Path, exported: Path, tmp_path: Path) -> None:
+def test_scores_of_the_export_are_those_of_the_run(
+    run: Path, exported: Path, tmp_path: Path
+) -> None:
     before = pq.read_table(run / "rollouts.parquet").to_pylist()
     wanted = {(row["policy"], row["seed"]): row for row in before}
     command = ["score", str(exported), "--preset", "alpasim", "--no-report", "--quiet"]
     for scene in ("smoke/straight", str(exported / "scenes")):
         out = tmp_path / Path(scene).name
-        assert run_command([*command, "--scene", scene, "--out", str(out)]) == 0  # two policies in one go
+        assert (
+            run_command([*command, "--scene", scene, "--out", str(out)]) == 0
+        )  # two policies in one go
         rows = pq.read_table(out / "rollouts.parquet").to_pylist()
         assert len({row["rollout"] for row in rows}) == 4
         for row in rows:
             own = wanted[row["policy"], row["seed"]]
-            for name in ("min_distance_to_lane_boundary_m", "progress_rel", "dist_to_gt_trajectory", "plan_deviation", "offroad"):
+            for name in (
+                "min_distance_to_lane_boundary_m",
+                "progress_rel",
+                "dist_to_gt_trajectory",
+                "plan_deviation",
+                "offroad",
+            ):
                 assert row[name] == pytest.approx(own[name], abs=1e-9), name
-            assert row["min_distance_to_obstacle_m"] == own["min_distance_to_obstacle_m"] == float("inf")
+            assert (
+                row["min_distance_to_obstacle_m"]
+                == own["min_distance_to_obstacle_m"]
+                == float("inf")
+            )
         steps = pq.read_table(out / "steps.parquet").to_pylist()
-        assert {row["value"] for row in steps if row["metric"] == "min_distance_to_obstacle_m"} == {float("inf")}
+        assert {row["value"] for row in steps if row["metric"] == "min_distance_to_obstacle_m"} == {
+            float("inf")
+        }
         assert (out / "aggregate" / "results-summary.json").is_file()
 
 
-def test_what_alpasim_will_lack_is_said(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_alpasim_will_lack_is_said(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(["export", str(run), "--alpasim", str(tmp_path / "out"), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert [(one["policy"], one["rollouts"], one["failed"]) for one in printed["runs"]] == [(p, 2, 0) for p in POLICIES]
+    assert [(one["policy"], one["rollouts"], one["failed"]) for one in printed["runs"]] == [
+        (p, 2, 0) for p in POLICIES
+    ]
     notes = " ".join(printed["runs"][0]["notes"])
     assert "no camera image" in notes
     assert "no minADE" in notes
@@ -116,16 +184,36 @@ def test_what_alpasim_will_lack_is_said(run: Path, tmp_path: Path, capsys: pytes
 
 def test_scenes_alone(tmp_path: Path) -> None:
     assert run_command(["export", "smoke/straight", "--alpasim", str(tmp_path / "out")]) == 0
-    assert [path.name for path in (tmp_path / "out" / "scenes").iterdir()] == ["smoke-straight.usdz"]
+    assert [path.name for path in (tmp_path / "out" / "scenes").iterdir()] == [
+        "smoke-straight.usdz"
+    ]
 
 
-def test_refusals_say_what_to_do(run: Path, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_refusals_say_what_to_do(
+    run: Path, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(["export", str(run), "--alpasim", str(exported)]) == 2
     assert "not empty" in capsys.readouterr().err
-    assert run_command(["export", str(run), "smoke/straight", "--alpasim", str(tmp_path / "out")]) == 2
+    assert (
+        run_command(["export", str(run), "smoke/straight", "--alpasim", str(tmp_path / "out")]) == 2
+    )
     assert "one run at a time" in capsys.readouterr().err
     scored = tmp_path / "scored"
-    assert run_command(["score", str(run), "--scene", "smoke/straight", "--out", str(scored), "--no-report", "--quiet"]) == 0
+    assert (
+        run_command(
+            [
+                "score",
+                str(run),
+                "--scene",
+                "smoke/straight",
+                "--out",
+                str(scored),
+                "--no-report",
+                "--quiet",
+            ]
+        )
+        == 0
+    )
     assert run_command(["export", str(scored), "--alpasim", str(tmp_path / "out")]) == 2
     assert "without the logs" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

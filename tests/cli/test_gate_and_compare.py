@@ -1,4 +1,6 @@
-"""``simrun compare`` and ``simrun gate`` as a CI job meets them: exit codes, files, baselines that do not fit."""
+"""``simrun compare`` and ``simrun gate`` as a CI job meets them: exit codes, files, baselines that
+do not fit.
+"""
 
 from __future__ import annotations
 
@@ -23,13 +25,22 @@ metrics:
 
 
 def plan(**fields) -> Plan:
-    small = {"scenes": SCENES, "seeds": (0, 1), "steps": 40, "pictures": False, "clips": False, "invalid": ()}
+    small = {
+        "scenes": SCENES,
+        "seeds": (0, 1),
+        "steps": 40,
+        "pictures": False,
+        "clips": False,
+        "invalid": (),
+    }
     return Plan(**{"renderers": ("clean", "onefixer"), **small, **fields})
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Make a good run, a bad one, one with a failed rollout, one with few scenes, one of other scene content."""
+    """Make a good run, a bad one, one with a failed rollout, one with few scenes, one of other
+    scene content.
+    """
     folder = tmp_path_factory.mktemp("runs")
     bad = {"clean": 0.15, "onefixer": 12.0}
     plans = {
@@ -55,7 +66,10 @@ def _set_failure_class(folder: Path, name: str) -> None:
     table = pq.read_table(folder / "rollouts.parquet")
     column = table.column_names.index("failure_class")
     classes = [None if value is None else name for value in table["failure_class"].to_pylist()]
-    pq.write_table(table.set_column(column, "failure_class", pa.array(classes, pa.string())), folder / "rollouts.parquet")
+    pq.write_table(
+        table.set_column(column, "failure_class", pa.array(classes, pa.string())),
+        folder / "rollouts.parquet",
+    )
 
 
 @pytest.fixture
@@ -75,7 +89,9 @@ def gate_file(tmp_path: Path) -> str:
         ("unscored", 5, "EVALUATOR FAILURE"),
     ],
 )
-def test_the_exit_code_follows_the_cause_and_agrees_with_what_is_printed(runs, gate_file, capsys, run, code, title):
+def test_the_exit_code_follows_the_cause_and_agrees_with_what_is_printed(
+    runs, gate_file, capsys, run, code, title
+):
     assert run_command(["gate", str(runs[run]), "--gate", gate_file]) == code
     last = capsys.readouterr().out.strip().splitlines()[-1]
     assert last.startswith(f"{title} (exit code {code})")
@@ -89,7 +105,9 @@ def test_json_is_one_document_with_every_check(runs, gate_file, capsys):
     said = json.loads(capsys.readouterr().out)
     assert said["outcome"]["cause"] == "regression"
     assert {c["metric"] for c in said["checks"]} == {"lateral_distance_m", "offroad"}
-    assert [c["entry"]["verdict"] for c in said["checks"] if c["cause"] == "regression"] == ["worse"]
+    assert [c["entry"]["verdict"] for c in said["checks"] if c["cause"] == "regression"] == [
+        "worse"
+    ]
 
 
 def test_junit_has_a_failure_for_each_broken_rule_and_keeps_the_rollouts(runs, gate_file, tmp_path):
@@ -107,11 +125,15 @@ def test_junit_has_a_failure_for_each_broken_rule_and_keeps_the_rollouts(runs, g
 def test_an_undecided_rule_that_need_not_decide_is_skipped_in_junit(runs, gate_file, tmp_path):
     run_command(["gate", str(runs["good"]), "--gate", gate_file, "--out", str(tmp_path)])
     gate = ET.parse(tmp_path / "gate.junit.xml").getroot().find("testsuite")
-    assert [c.attrib["name"] for c in gate.findall("testcase") if c.find("skipped") is not None] == ["offroad margin"]
+    assert [
+        c.attrib["name"] for c in gate.findall("testcase") if c.find("skipped") is not None
+    ] == ["offroad margin"]
     assert gate.attrib["skipped"] == "1"
 
 
-def test_the_ci_summary_file_is_appended_to_and_stays_below_one_mebibyte(runs, gate_file, tmp_path, monkeypatch):
+def test_the_ci_summary_file_is_appended_to_and_stays_below_one_mebibyte(
+    runs, gate_file, tmp_path, monkeypatch
+):
     page = tmp_path / "step.md"
     page.write_text("earlier step")
     monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(page))
@@ -125,12 +147,25 @@ def test_the_ci_summary_file_is_appended_to_and_stays_below_one_mebibyte(runs, g
     assert page.stat().st_size == 2**20 - 10
 
 
-def test_a_run_passes_against_its_own_stored_baseline_and_a_worse_one_fails(runs, gate_file, tmp_path, capsys):
+def test_a_run_passes_against_its_own_stored_baseline_and_a_worse_one_fails(
+    runs, gate_file, tmp_path, capsys
+):
     stored = tmp_path / "baseline.json"
     assert run_command(["gate", str(runs["good"]), "--write-baseline", str(stored)]) == 0
-    assert run_command(["gate", str(runs["good"]), "--gate", gate_file, "--baseline-file", str(stored)]) == 0
-    assert run_command(["gate", str(runs["bad"]), "--gate", gate_file, "--baseline-file", str(stored)]) == 1
-    assert run_command(["gate", str(runs["few"]), "--gate", gate_file, "--baseline-file", str(stored)]) == 3  # scenes missing
+    assert (
+        run_command(
+            ["gate", str(runs["good"]), "--gate", gate_file, "--baseline-file", str(stored)]
+        )
+        == 0
+    )
+    assert (
+        run_command(["gate", str(runs["bad"]), "--gate", gate_file, "--baseline-file", str(stored)])
+        == 1
+    )
+    assert (
+        run_command(["gate", str(runs["few"]), "--gate", gate_file, "--baseline-file", str(stored)])
+        == 3
+    )  # scenes missing
     capsys.readouterr()
 
 
@@ -144,16 +179,26 @@ def test_a_run_passes_against_its_own_stored_baseline_and_a_worse_one_fails(runs
         ({"schema_version": 99}, "not a baseline of version 1"),
     ],
 )
-def test_a_baseline_made_with_something_else_is_refused(runs, gate_file, tmp_path, capsys, change, mention):
+def test_a_baseline_made_with_something_else_is_refused(
+    runs, gate_file, tmp_path, capsys, change, mention
+):
     stored = tmp_path / "baseline.json"
     run_command(["gate", str(runs["good"]), "--write-baseline", str(stored)])
     stored.write_text(json.dumps(json.loads(stored.read_text()) | change))
-    assert run_command(["gate", str(runs["good"]), "--gate", gate_file, "--baseline-file", str(stored)]) == 2
+    assert (
+        run_command(
+            ["gate", str(runs["good"]), "--gate", gate_file, "--baseline-file", str(stored)]
+        )
+        == 2
+    )
     assert mention in capsys.readouterr().err
 
 
 def test_a_run_with_holes_cannot_become_a_baseline(runs, tmp_path, capsys):
-    assert run_command(["gate", str(runs["failed"]), "--write-baseline", str(tmp_path / "b.json")]) == 2
+    assert (
+        run_command(["gate", str(runs["failed"]), "--write-baseline", str(tmp_path / "b.json")])
+        == 2
+    )
     assert "1 of 32 rollouts failed" in capsys.readouterr().err
     assert not (tmp_path / "b.json").exists()
 
@@ -174,7 +219,7 @@ def test_a_gate_for_another_preset_and_bad_usage_are_refused(runs, tmp_path, cap
     capsys.readouterr()
 
 
-# --- compare ------------------------------------------------------------------------------------------------------------
+# --- compare
 
 
 @pytest.mark.parametrize("verb", ["compare", "aggregate"])
@@ -189,9 +234,13 @@ def test_other_metrics_than_those_of_the_headline_are_printed_on_demand(verb, ru
 def test_compare_within_a_run_is_the_paired_block_of_its_summary(runs, capsys):
     assert run_command(["compare", str(runs["bad"]), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)["paired"]["onefixer"]["lateral_distance_m"]
-    stored = json.loads((runs["bad"] / "summary.json").read_text())["paired"]["onefixer"]["lateral_distance_m"]
+    stored = json.loads((runs["bad"] / "summary.json").read_text())["paired"]["onefixer"][
+        "lateral_distance_m"
+    ]
     assert said == stored
-    turned = _compare(capsys, str(runs["bad"]), "--baseline", "onefixer")["clean"]["lateral_distance_m"]
+    turned = _compare(capsys, str(runs["bad"]), "--baseline", "onefixer")["clean"][
+        "lateral_distance_m"
+    ]
     assert turned["diff"] == pytest.approx(-said["diff"])
 
 
@@ -200,7 +249,9 @@ def _compare(capsys, *arguments: str) -> dict:
     return json.loads(capsys.readouterr().out)["paired"]
 
 
-def test_compare_of_two_runs_pairs_the_same_renderer_on_shared_cells_and_lists_the_rest(runs, capsys):
+def test_compare_of_two_runs_pairs_the_same_renderer_on_shared_cells_and_lists_the_rest(
+    runs, capsys
+):
     found = _compare(capsys, str(runs["good"]), str(runs["few"]))
     entry = found["onefixer"]["lateral_distance_m"]
     assert (entry["n_scenes"], entry["n_missing"]) == (3, 10)
@@ -212,7 +263,9 @@ def test_compare_of_two_runs_pairs_the_same_renderer_on_shared_cells_and_lists_t
 
 
 def test_compare_prints_verdicts_and_cells_without_a_pair(runs, gate_file, capsys):
-    assert run_command(["compare", str(runs["good"]), str(runs["failed"]), "--gate", gate_file]) == 0
+    assert (
+        run_command(["compare", str(runs["good"]), str(runs["failed"]), "--gate", gate_file]) == 0
+    )
     out = capsys.readouterr().out
     assert "onefixer minus" in out
     assert "no pair: lane-camera, scene-03, seed 1: every metric: here: failed (renderer)" in out
@@ -245,14 +298,20 @@ def test_runs_of_another_preset_or_scene_content_are_not_compared(runs, tmp_path
 
 
 def arms_run(folder: Path, renderers: tuple[str, ...], policies: tuple[str, ...]) -> Path:
-    return vouch_for(make_run(folder, plan(renderers=renderers, policies=policies, scenes=SCENES[:4], seeds=(0,))))
+    return vouch_for(
+        make_run(
+            folder, plan(renderers=renderers, policies=policies, scenes=SCENES[:4], seeds=(0,))
+        )
+    )
 
 
 def test_policies_behind_one_renderer_are_compared_and_judged_within_a_run(tmp_path, capsys):
     run = arms_run(tmp_path / "run", ("clean",), ("a", "b", "c"))
     assert run_command(["compare", str(run), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert {name: entries["progress"]["baseline"] for name, entries in said["paired_arms"].items()} == {
+    assert {
+        name: entries["progress"]["baseline"] for name, entries in said["paired_arms"].items()
+    } == {
         "clean/b": "clean/a",
         "clean/c": "clean/a",
     }
@@ -265,27 +324,45 @@ def test_policies_behind_one_renderer_are_compared_and_judged_within_a_run(tmp_p
     run_command(["gate", str(run), "--gate", str(gate), "--json"])
     verdict = json.loads(capsys.readouterr().out)
     assert verdict["baseline"] == "policy b of the same run"
-    assert [(check["policy"], check["entry"]["baseline"]) for check in verdict["checks"]] == [("a", "b"), ("c", "b")]
+    assert [(check["policy"], check["entry"]["baseline"]) for check in verdict["checks"]] == [
+        ("a", "b"),
+        ("c", "b"),
+    ]
 
 
 def test_any_arm_is_a_baseline_where_renderers_and_policies_differ(tmp_path, capsys):
     run = arms_run(tmp_path / "run", ("clean", "3dgs"), ("a", "b"))
     found = _compare(capsys, str(run), "--baseline", "clean/a")
     assert set(found) == {"clean/b", "3dgs/a", "3dgs/b"}
-    assert {entry["baseline"] for entries in found.values() for entry in entries.values()} == {"clean/a"}
+    assert {entry["baseline"] for entries in found.values() for entry in entries.values()} == {
+        "clean/a"
+    }
     assert run_command(["compare", str(run), "--baseline", "omnidreams"]) == 2
-    assert "choose one of clean, 3dgs, a, b, clean/a, 3dgs/a, clean/b, 3dgs/b" in capsys.readouterr().err
+    assert (
+        "choose one of clean, 3dgs, a, b, clean/a, 3dgs/a, clean/b, 3dgs/b"
+        in capsys.readouterr().err
+    )
 
 
 def test_another_policy_of_a_stored_baseline_is_named_or_the_only_one(tmp_path, capsys):
-    stored, run = arms_run(tmp_path / "stored", ("clean",), ("a",)), arms_run(tmp_path / "run", ("clean",), ("b",))
+    stored, run = (
+        arms_run(tmp_path / "stored", ("clean",), ("a",)),
+        arms_run(tmp_path / "run", ("clean",), ("b",)),
+    )
     gate = tmp_path / "gate.yaml"
     gate.write_text("version: 1\nmetrics:\n  progress: {margin: 0.9}\n")
     run_command(["gate", str(run), "--gate", str(gate), "--baseline-file", str(stored), "--json"])
     (check,) = json.loads(capsys.readouterr().out)["checks"]
-    assert (check["policy"], check["entry"]["baseline"], check["entry"]["n_scenes"]) == ("b", "a", 4)
+    assert (check["policy"], check["entry"]["baseline"], check["entry"]["n_scenes"]) == (
+        "b",
+        "a",
+        4,
+    )
     two = arms_run(tmp_path / "two", ("clean",), ("a", "c"))
     assert run_command(["gate", str(run), "--gate", str(gate), "--baseline-file", str(two)]) == 2
     assert "may be one of: clean/a, clean/c" in capsys.readouterr().err
     assert run_command(["compare", str(two), str(run), "--baseline", "c", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["paired"]["clean/b"]["progress"]["baseline"] == f"{two}: clean/c"
+    assert (
+        json.loads(capsys.readouterr().out)["paired"]["clean/b"]["progress"]["baseline"]
+        == f"{two}: clean/c"
+    )

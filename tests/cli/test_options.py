@@ -1,4 +1,6 @@
-"""What is given on the command line reaches the job: every group of options, by what the job receives."""
+"""What is given on the command line reaches the job: every group of options, by what the job
+receives.
+"""
 
 from __future__ import annotations
 
@@ -38,42 +40,160 @@ def called(monkeypatch: pytest.MonkeyPatch) -> Any:
     return watch
 
 
-def test_a_run_gets_its_cluster_its_store_its_limit_and_its_retries(called: Any, tmp_path: Path) -> None:
+def test_a_run_gets_its_cluster_its_store_its_limit_and_its_retries(
+    called: Any, tmp_path: Path
+) -> None:
     cluster = ("--executor", "slurm:cpu?cores=2&gpus=0.5&memory=7.5", "--store", str(tmp_path))
-    more = ("--time-limit", "90", "--retry", "--certify", "none", "--no-report", "--wait", "--workers", "3")
-    given = called(run, "execute_run", "--renderer", "clean", *cluster, *more, "--out", str(tmp_path / "out"), "smoke/straight")
+    more = (
+        "--time-limit",
+        "90",
+        "--retry",
+        "--certify",
+        "none",
+        "--no-report",
+        "--wait",
+        "--workers",
+        "3",
+    )
+    given = called(
+        run,
+        "execute_run",
+        "--renderer",
+        "clean",
+        *cluster,
+        *more,
+        "--out",
+        str(tmp_path / "out"),
+        "smoke/straight",
+    )
     resources = given["executor"].resources
-    assert (str(given["executor"]), resources.cores, resources.gpus, resources.memory_gib) == ("slurm:cpu", 2, 0.5, 7.5)
-    assert (given["store"], given["workers"], given["limit_s"], given["retry"]) == (str(tmp_path), 3, 90.0, True)
-    assert (given["certificate"], given["report"], given["wait"], given["resume"]) == ("none", False, True, False)
+    assert (str(given["executor"]), resources.cores, resources.gpus, resources.memory_gib) == (
+        "slurm:cpu",
+        2,
+        0.5,
+        7.5,
+    )
+    assert (given["store"], given["workers"], given["limit_s"], given["retry"]) == (
+        str(tmp_path),
+        3,
+        90.0,
+        True,
+    )
+    assert (given["certificate"], given["report"], given["wait"], given["resume"]) == (
+        "none",
+        False,
+        True,
+        False,
+    )
 
 
-def test_what_a_worker_of_a_cluster_needs_is_refused_without_one(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["--renderer", "clean", "--executor", "local?cores=1", "--dry-run", "smoke/straight"]) == 2
+def test_what_a_worker_of_a_cluster_needs_is_refused_without_one(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert (
+        run_command(
+            ["--renderer", "clean", "--executor", "local?cores=1", "--dry-run", "smoke/straight"]
+        )
+        == 2
+    )
     assert "--executor local?cores=1" in capsys.readouterr().err
 
 
 def test_a_decision_gets_its_question_and_its_design(called: Any) -> None:
-    asked = ("--metric", "progress=0.05", "--ask", "better", "--expect", "0.2", "--method", "asymptotic", "--alpha", "0.01")
-    scenes = ("--first-look", "12", "--min-scenes", "7", "--scene-cost", "3", "--order-seed", "5", "--max-missing", "0.1", "--budget", "40")
-    given = called(decide, "decide_into", "decide", "--renderer", "clean,3dgs", *asked, *scenes, "--seeds", "auto:3", "smoke/straight")
-    question, design, plan = given["question"], given["design"], given["plan"]
+    asked = (
+        "--metric",
+        "progress=0.05",
+        "--ask",
+        "better",
+        "--expect",
+        "0.2",
+        "--method",
+        "asymptotic",
+        "--alpha",
+        "0.01",
+    )
+    scenes = (
+        "--first-look",
+        "12",
+        "--min-scenes",
+        "7",
+        "--scene-cost",
+        "3",
+        "--order-seed",
+        "5",
+        "--max-missing",
+        "0.1",
+        "--budget",
+        "40",
+    )
+    given = called(
+        decide,
+        "decide_into",
+        "decide",
+        "--renderer",
+        "clean,3dgs",
+        *asked,
+        *scenes,
+        "--seeds",
+        "auto:3",
+        "smoke/straight",
+    )
+    question = given["question"]
+    design = given["design"]
+    plan = given["plan"]
     (metric,) = question.metrics
-    assert (metric.metric, metric.margin, metric.asked, metric.method) == ("progress", 0.05, "better", "asymptotic")
+    assert (metric.metric, metric.margin, metric.asked, metric.method) == (
+        "progress",
+        0.05,
+        "better",
+        "asymptotic",
+    )
     assert abs(metric.expected) == 0.2
     assert (question.alpha, question.first_look, question.min_scenes) == (0.01, 12, 7)
-    assert (design.scene_cost, design.order_seed, design.max_missing, design.budget, design.auto_seeds) == (3.0, 5, 0.1, 40, True)
-    assert (plan.seeds, plan.options.baseline, plan.asked) == ((0, 1, 2), "clean", ("smoke/straight",))
+    assert (
+        design.scene_cost,
+        design.order_seed,
+        design.max_missing,
+        design.budget,
+        design.auto_seeds,
+    ) == (3.0, 5, 0.1, 40, True)
+    assert (plan.seeds, plan.options.baseline, plan.asked) == (
+        (0, 1, 2),
+        "clean",
+        ("smoke/straight",),
+    )
 
 
 def test_a_gate_that_drives_takes_the_options_of_a_decision(called: Any, tmp_path: Path) -> None:
-    words = ("gate", str(tmp_path), "--until-decided", "--scenes", "smoke/straight", "--renderer", "clean,3dgs")
-    given = called(gate, "decide_into", *words, "--order", "stratified", "--budget", "12", "--set", "timing.duration_us=1000000")
+    words = (
+        "gate",
+        str(tmp_path),
+        "--until-decided",
+        "--scenes",
+        "smoke/straight",
+        "--renderer",
+        "clean,3dgs",
+    )
+    given = called(
+        gate,
+        "decide_into",
+        *words,
+        "--order",
+        "stratified",
+        "--budget",
+        "12",
+        "--set",
+        "timing.duration_us=1000000",
+    )
     assert (given["design"].order, given["design"].budget) == ("stratified", 12)
-    assert [cell.ref.overrides for cell in given["plan"].cells] == [("timing.duration_us=1000000",)] * 2
+    assert [cell.ref.overrides for cell in given["plan"].cells] == [
+        ("timing.duration_us=1000000",)
+    ] * 2
 
 
-def test_a_page_of_drives_gets_its_limits(called: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_page_of_drives_gets_its_limits(
+    called: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(view, "find_cell", lambda what, doing: (what, None))
     more = ("--camera", "front", "--cells", "3", "--max-mb", "5", "--seed", "1", "--serve", "0")
     given = called(view, "_serve", "view", str(tmp_path), *more)
@@ -87,20 +207,42 @@ def test_a_server_gets_its_bounds_and_whom_it_trusts(called: Any, tmp_path: Path
     bounds = ("--history-mb", "16", "--expiry-s", "60", "--prefetch", "--shutter", "rolling")
     upstream = ("--upstream", f"host:1?ca=ca.pem&token_file={tmp_path / 'token'}&image=as-asked")
     settings = called(serve, "assemble", "serve", *bounds, *upstream)["settings"]
-    assert (settings.history_bytes, settings.expiry_s, settings.upstream.as_png) == (16 << 20, 60.0, False)
+    assert (settings.history_bytes, settings.expiry_s, settings.upstream.as_png) == (
+        16 << 20,
+        60.0,
+        False,
+    )
     assert settings.shutter == "rolling"
     assert (settings.upstream.token, settings.upstream.ca) == ("secret", Path("ca.pem"))
 
 
-@pytest.mark.parametrize("words", [("serve", "--renderer", "identity", "--upstream", "host:1"), ("serve-policy", "lane-camera")])
-def test_callers_of_every_server_are_let_in_as_asked(called: Any, tmp_path: Path, words: tuple[str, ...]) -> None:
-    files = ("--tls-cert", "cert.pem", "--tls-key", "key.pem", "--tls-client-ca", "callers.pem", "--token-file", str(tmp_path / "token"))
+@pytest.mark.parametrize(
+    "words",
+    [("serve", "--renderer", "identity", "--upstream", "host:1"), ("serve-policy", "lane-camera")],
+)
+def test_callers_of_every_server_are_let_in_as_asked(
+    called: Any, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    files = (
+        "--tls-cert",
+        "cert.pem",
+        "--tls-key",
+        "key.pem",
+        "--tls-client-ca",
+        "callers.pem",
+        "--token-file",
+        str(tmp_path / "token"),
+    )
     given = called(serve, "Host", *words, "--drain-s", "1", "--expiry-s", "9", *files)["policy"]
-    assert (given.tls_cert, given.tls_key, given.tls_client_ca) == (Path("cert.pem"), Path("key.pem"), Path("callers.pem"))
+    assert (given.tls_cert, given.tls_key, given.tls_client_ca) == (
+        Path("cert.pem"),
+        Path("key.pem"),
+        Path("callers.pem"),
+    )
     assert (given.token_file, given.drain_s, given.expiry_s) == (tmp_path / "token", 1.0, 9.0)
 
 
-# --- from a dataclass to options ------------------------------------------------------------------------------------------
+# --- from a dataclass to options
 
 
 @dataclass(frozen=True)
@@ -138,7 +280,9 @@ def test_a_dataclass_becomes_options_and_comes_back_whole() -> None:
 def test_a_verb_may_take_a_part_of_a_jobs_options() -> None:
     found = []
 
-    def work(job: Annotated[Job, Only("times")], more: Annotated[tuple[Path, ...], Flag("More.")] = ()) -> None:
+    def work(
+        job: Annotated[Job, Only("times")], more: Annotated[tuple[Path, ...], Flag("More.")] = ()
+    ) -> None:
         found.append((job, more))
 
     call(work, "--times", "4", "--more", "p")

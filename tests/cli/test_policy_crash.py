@@ -1,4 +1,6 @@
-"""A policy that raises: where it did is in the terminal, the traceback in a log that is named, and the check finds it."""
+"""A policy that raises: where it did is in the terminal, the traceback in a log that is named, and
+the check finds it.
+"""
 
 from __future__ import annotations
 
@@ -41,8 +43,21 @@ def test_the_check_drives_long_enough_to_find_a_policy_that_raises_after_a_while
     assert "late.py:16" in fault
 
 
-def test_the_terminal_has_file_line_and_the_end_of_the_traceback(late: str, tmp_path: Path, capfd) -> None:
-    drive = ["--renderer", "clean", "--policy", late, "--set", "timing.duration_us=2000000", "--certify", "none", "--workers", "1"]
+def test_the_terminal_has_file_line_and_the_end_of_the_traceback(
+    late: str, tmp_path: Path, capfd
+) -> None:
+    drive = [
+        "--renderer",
+        "clean",
+        "--policy",
+        late,
+        "--set",
+        "timing.duration_us=2000000",
+        "--certify",
+        "none",
+        "--workers",
+        "1",
+    ]
     assert run_command(["run", *drive, "--out", str(tmp_path / "run"), "smoke/straight"]) == 2
     said = capfd.readouterr().err
     assert f"IndexError: list index out of range at {tmp_path}/late.py:16, in lookup" in said

@@ -30,7 +30,9 @@ def near(picture: np.ndarray, rgb: tuple[int, int, int]) -> int:
 
 
 @pytest.mark.slow
-def test_a_preview_shows_the_ego_the_others_and_the_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_preview_shows_the_ego_the_others_and_the_camera(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "scene.yaml").write_text(SCENE)
     out = tmp_path / "scene.png"
     assert run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(out), "--json"]) == 0
@@ -45,10 +47,15 @@ def test_a_preview_shows_the_ego_the_others_and_the_camera(tmp_path: Path, capsy
 
 
 @pytest.mark.slow
-def test_a_page_holds_the_picture_and_asks_for_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_page_holds_the_picture_and_asks_for_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "scene.yaml").write_text(SCENE)
     out = tmp_path / "scene.html"
-    assert run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(out), "--seed", "4"]) == 0
+    assert (
+        run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(out), "--seed", "4"])
+        == 0
+    )
     assert "scene seed 4 varies" in capsys.readouterr().out
     text = out.read_text()
     assert text.count("data:image/png;base64,") == 1
@@ -58,7 +65,10 @@ def test_a_page_holds_the_picture_and_asks_for_nothing(tmp_path: Path, capsys: p
 
 
 def test_the_map_has_the_shape_of_its_place_and_holds_the_drive() -> None:
-    for low, high in ((np.zeros(2), np.array([80.0, 3.0])), (np.array([-5.0, -40.0]), np.array([5.0, 40.0]))):
+    for low, high in (
+        (np.zeros(2), np.array([80.0, 3.0])),
+        (np.array([-5.0, -40.0]), np.array([5.0, 40.0])),
+    ):
         first, last = window(low, high, 0.5)
         width, height = last - first
         assert height == pytest.approx(0.5 * width)
@@ -66,13 +76,27 @@ def test_the_map_has_the_shape_of_its_place_and_holds_the_drive() -> None:
         assert (last >= high).all()
 
 
-def test_a_background_is_named_with_what_it_covers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_background_is_named_with_what_it_covers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     n = 400
     means = np.stack([np.linspace(0.0, 40.0, n), np.full(n, -1.8), np.full(n, 0.2)], axis=1)
     quats = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
-    write_ply(tmp_path / "s.ply", GaussianCloud(means, quats, np.full((n, 3), 0.3), np.full(n, 0.9), np.full((n, 1, 3), 0.5)))
+    write_ply(
+        tmp_path / "s.ply",
+        GaussianCloud(means, quats, np.full((n, 3), 0.3), np.full(n, 0.9), np.full((n, 1, 3), 0.5)),
+    )
     scene = SCENE + f"background: {{file: {tmp_path / 's.ply'}}}\n"
     (tmp_path / "scene.yaml").write_text(scene.replace("3000000", "1000000"))
-    assert run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(tmp_path / "p.png"), "--json"]) == 0
-    (said,) = [line for line in json.loads(capsys.readouterr().out)["facts"] if line.startswith("background ")]
+    assert (
+        run_command(
+            ["preview", str(tmp_path / "scene.yaml"), "--out", str(tmp_path / "p.png"), "--json"]
+        )
+        == 0
+    )
+    (said,) = [
+        line
+        for line in json.loads(capsys.readouterr().out)["facts"]
+        if line.startswith("background ")
+    ]
     assert "% of the route" in said

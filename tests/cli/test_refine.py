@@ -24,9 +24,16 @@ def source(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_video_is_refined_and_the_summary_says_what_was_done(source: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_video_is_refined_and_the_summary_says_what_was_done(
+    source: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out, side = source.with_name("out.mp4"), source.with_name("side.mp4")
-    assert run_command(["refine", str(source), "-o", str(out), "--fixer", "identity", "--compare", str(side)]) == 0
+    assert (
+        run_command(
+            ["refine", str(source), "-o", str(out), "--fixer", "identity", "--compare", str(side)]
+        )
+        == 0
+    )
     captured = capsys.readouterr()
     assert "7 of 64x36 at 29.97 frames per second" in captured.out
     assert "equal, mean 0.00 and at most 0 grey levels" in captured.out
@@ -38,8 +45,18 @@ def test_a_video_is_refined_and_the_summary_says_what_was_done(source: Path, cap
         assert (video.format.width, video.format.height) == (128, 36)
 
 
-def test_json_is_one_document_with_every_number(source: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["refine", str(source), "-o", str(source.with_name("out.mp4")), "--fixer", "identity", "--json"]
+def test_json_is_one_document_with_every_number(
+    source: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [
+        "refine",
+        str(source),
+        "-o",
+        str(source.with_name("out.mp4")),
+        "--fixer",
+        "identity",
+        "--json",
+    ]
     assert run_command(command) == 0
     captured = capsys.readouterr()
     document = json.loads(captured.out)
@@ -63,8 +80,12 @@ def test_json_is_one_document_with_every_number(source: Path, capsys: pytest.Cap
         (["--fixer", "identity", "--opacity", "none.mp4"], "none.mp4"),
     ],
 )
-def test_bad_options_are_four_part_errors(source: Path, options: list[str], mention: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["refine", str(source), "-o", str(source.with_name("out.mp4")), *options]) == 2
+def test_bad_options_are_four_part_errors(
+    source: Path, options: list[str], mention: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        run_command(["refine", str(source), "-o", str(source.with_name("out.mp4")), *options]) == 2
+    )
     error = capsys.readouterr().err
     assert mention in error
     assert error.startswith("error: ")
@@ -80,16 +101,31 @@ def pictures(folder: Path, count: int = 3, height: int = 36, channels: int = 3) 
     return folder
 
 
-def test_folders_of_pictures_pass_without_a_codec(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_folders_of_pictures_pass_without_a_codec(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     source, alpha = pictures(tmp_path / "in"), pictures(tmp_path / "alpha", channels=1)
     out, side = tmp_path / "out", tmp_path / "side"
-    command = ["refine", str(source), "-o", str(out), "--fixer", "identity", "--opacity", str(alpha), "--compare", str(side)]
+    command = [
+        "refine",
+        str(source),
+        "-o",
+        str(out),
+        "--fixer",
+        "identity",
+        "--opacity",
+        str(alpha),
+        "--compare",
+        str(side),
+    ]
     assert run_command(command) == 0
     assert "equal" in capsys.readouterr().out
     assert sorted(file.name for file in out.iterdir()) == [f"frame_{i:02d}.png" for i in range(3)]
     for i in range(3):
         name = f"frame_{i:02d}.png"
-        assert np.array_equal(cv2.imread(str(out / name)), cv2.imread(str(source / name)))  # to the last bit
+        assert np.array_equal(
+            cv2.imread(str(out / name)), cv2.imread(str(source / name))
+        )  # to the last bit
         assert cv2.imread(str(side / name)).shape == (36, 128, 3)
     assert run_command(command) == 2
     assert "exists already" in capsys.readouterr().err
@@ -99,7 +135,9 @@ def test_folders_of_pictures_pass_without_a_codec(tmp_path: Path, capsys: pytest
 def test_folders_that_make_no_clip_are_refused_and_nothing_is_left(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], source: Path
 ) -> None:
-    good, mixed, empty = pictures(tmp_path / "good"), pictures(tmp_path / "mixed"), tmp_path / "empty"
+    good = pictures(tmp_path / "good")
+    mixed = pictures(tmp_path / "mixed")
+    empty = tmp_path / "empty"
     empty.mkdir()
     assert cv2.imwrite(str(mixed / "frame_01.png"), np.zeros((20, 64, 3), np.uint8))
     broken = pictures(tmp_path / "broken")
@@ -108,13 +146,18 @@ def test_folders_that_make_no_clip_are_refused_and_nothing_is_left(
     deep.mkdir()
     assert cv2.imwrite(str(deep / "a.png"), np.zeros((36, 64, 3), np.uint16))
     cases = [
-        ([str(empty)], "no .png files"), ([str(mixed)], "frame_01.png is 64x20, the first is 64x36"), ([str(deep)], "16 bits"),
+        ([str(empty)], "no .png files"),
+        ([str(mixed)], "frame_01.png is 64x20, the first is 64x36"),
+        ([str(deep)], "16 bits"),
         ([str(broken)], "frame_02.png is no readable picture"),
         ([str(good), "--opacity", str(source)], "the opacity is a video, the input a folder"),
         ([str(pictures(tmp_path / "clear", channels=4))], "4 channels"),
-    ]  # fmt: skip
+    ]
     for arguments, mention in cases:
-        assert run_command(["refine", *arguments, "-o", str(tmp_path / "out"), "--fixer", "identity"]) == 2
+        assert (
+            run_command(["refine", *arguments, "-o", str(tmp_path / "out"), "--fixer", "identity"])
+            == 2
+        )
         assert mention in capsys.readouterr().err
         assert not (tmp_path / "out").exists()
 
@@ -134,10 +177,19 @@ class Inverts:
 """
 
 
-def test_a_fixer_that_does_not_know_the_video_does_no_damage_and_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_fixer_that_does_not_know_the_video_does_no_damage_and_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "fixers_of_a_user.py").write_text(INVERTS)
     source, out = pictures(tmp_path / "in", count=5), tmp_path / "out"
-    command = ["refine", str(source), "-o", str(out), "--fixer", f"{tmp_path}/fixers_of_a_user.py:Inverts"]
+    command = [
+        "refine",
+        str(source),
+        "-o",
+        str(out),
+        "--fixer",
+        f"{tmp_path}/fixers_of_a_user.py:Inverts",
+    ]
     assert run_command(command) == 0
     told = " ".join(capsys.readouterr().err.split())
     assert "inverts, trained changes this video too much for a repair: PSNR" in told
@@ -152,13 +204,25 @@ def test_a_fixer_that_does_not_know_the_video_does_no_damage_and_is_named(tmp_pa
 
 def test_opacity_says_what_may_change(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "fixers_of_a_user.py").write_text(INVERTS)
-    source, alpha = pictures(tmp_path / "in", count=5), pictures(tmp_path / "alpha", count=5, channels=1)
-    command = ["refine", str(source), "-o", str(tmp_path / "out"), "--fixer", f"{tmp_path}/fixers_of_a_user.py:Inverts"]
+    source, alpha = (
+        pictures(tmp_path / "in", count=5),
+        pictures(tmp_path / "alpha", count=5, channels=1),
+    )
+    command = [
+        "refine",
+        str(source),
+        "-o",
+        str(tmp_path / "out"),
+        "--fixer",
+        f"{tmp_path}/fixers_of_a_user.py:Inverts",
+    ]
     assert run_command([*command, "--opacity", str(alpha)]) == 0
     assert "the input's own" not in capsys.readouterr().err
 
 
-def test_a_pipe_is_told_the_time_left(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_pipe_is_told_the_time_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     seconds = iter([0.0, 20.0, 21.0, 40.0])
     monkeypatch.setattr(refine.time, "perf_counter", lambda: next(seconds))
     with refine.frame_progress(silent=False) as show:
@@ -166,4 +230,7 @@ def test_a_pipe_is_told_the_time_left(monkeypatch: pytest.MonkeyPatch, capsys: p
         show(11, 100)
         show(20, None)
     lines = capsys.readouterr().err.splitlines()
-    assert lines == ["refined 10/100 frames, 0.5 frames/s, about 3 min left", "refined 20 frames, 0.5 frames/s"]
+    assert lines == [
+        "refined 10/100 frames, 0.5 frames/s, about 3 min left",
+        "refined 20 frames, 0.5 frames/s",
+    ]

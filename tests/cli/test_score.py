@@ -1,4 +1,6 @@
-"""``simrun score``: logs of AlpaSim and ours, several at once, errors by cause, exit codes, and the files of a run."""
+"""``simrun score``: logs of AlpaSim and ours, several at once, errors by cause, exit codes, and the
+files of a run.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,33 @@ def golden(request: pytest.FixtureRequest) -> Path:
 def our_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of ours: one scene, one policy, two seeds, without pictures."""
     root = tmp_path_factory.mktemp("runs") / "own"
-    command = ["--renderer", "clean", "--policy", "log-replay", "--seeds", "2", "--images", "none", "--workers", "1", "--quiet"]
-    assert run_command([*command, "--no-report", "--set", "timing.duration_us=1500000", "--out", str(root), "smoke/straight"]) == 0
+    command = [
+        "--renderer",
+        "clean",
+        "--policy",
+        "log-replay",
+        "--seeds",
+        "2",
+        "--images",
+        "none",
+        "--workers",
+        "1",
+        "--quiet",
+    ]
+    assert (
+        run_command(
+            [
+                *command,
+                "--no-report",
+                "--set",
+                "timing.duration_us=1500000",
+                "--out",
+                str(root),
+                "smoke/straight",
+            ]
+        )
+        == 0
+    )
     return root
 
 
@@ -34,13 +61,25 @@ def rows(folder: Path) -> list[dict]:
 
 def test_a_log_of_ours_scores_as_its_run_did(our_run, tmp_path, capsys):
     out = tmp_path / "scored"
-    assert run_command(["score", str(our_run), "--scene", "smoke/straight", "--out", str(out), "--json"]) == 0
+    assert (
+        run_command(
+            ["score", str(our_run), "--scene", "smoke/straight", "--out", str(out), "--json"]
+        )
+        == 0
+    )
     printed = json.loads(capsys.readouterr().out)
-    assert (printed["out"], printed["exit_code"], printed["summary"]["preset"]) == (str(out), 0, "strict")
+    assert (printed["out"], printed["exit_code"], printed["summary"]["preset"]) == (
+        str(out),
+        0,
+        "strict",
+    )
     before, after = rows(our_run), rows(out)
     names = [row["rollout"] for row in after]
     assert names == sorted(names)  # session ids, which sort as the seeds
-    assert names == [json.loads((our_run / row["path"] / "manifest.json").read_text())["session_uuid"] for row in before]
+    assert names == [
+        json.loads((our_run / row["path"] / "manifest.json").read_text())["session_uuid"]
+        for row in before
+    ]
     for one, two in zip(before, after, strict=True):
         for key in one:
             if key not in ("path", "wall_s"):
@@ -56,23 +95,47 @@ def test_a_log_of_ours_scores_as_its_run_did(our_run, tmp_path, capsys):
 def test_several_presets_stand_side_by_side_and_say_what_is_missing(our_run, tmp_path, capsys):
     out = tmp_path / "scored"
     presets = "strict,nuplan,navsim,ncap"
-    command = ["score", str(our_run), "--scene", "smoke/straight", "--preset", presets, "--out", str(out), "--no-report"]
+    command = [
+        "score",
+        str(our_run),
+        "--scene",
+        "smoke/straight",
+        "--preset",
+        presets,
+        "--out",
+        str(out),
+        "--no-report",
+    ]
     assert run_command([*command, "--quiet"]) == 0
     table = capsys.readouterr().out
-    assert [line.split()[0] for line in table.splitlines() if "pdms" in line or "_score" in line] == ["nuplan", "navsim", "navsim", "ncap"]
+    assert [
+        line.split()[0] for line in table.splitlines() if "pdms" in line or "_score" in line
+    ] == ["nuplan", "navsim", "navsim", "ncap"]
     assert "strict" in table
     assert "speed limits" in table
     assert {path.name for path in out.iterdir()} == {"strict", "nuplan", "navsim", "ncap"}
     assert run_command([*command, "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert (printed["exit_code"], list(printed["presets"])) == (0, ["strict", "nuplan", "navsim", "ncap"])
+    assert (printed["exit_code"], list(printed["presets"])) == (
+        0,
+        ["strict", "nuplan", "navsim", "ncap"],
+    )
     assert printed["presets"]["ncap"]["summary"]["metrics"]["clean"]["ncap_score"]["mean"] == 5.0
     assert run_command([*command[:5], "strict,waymax"]) == 2
 
 
 def test_the_same_command_again_gives_the_same_tables(our_run, tmp_path):
     out = tmp_path / "scored"
-    command = ["score", str(our_run), "--scene", "smoke/straight", "--out", str(out), "--quiet", "--no-report"]
+    command = [
+        "score",
+        str(our_run),
+        "--scene",
+        "smoke/straight",
+        "--out",
+        str(out),
+        "--quiet",
+        "--no-report",
+    ]
     assert run_command(command) == 0
     first = (out / "steps.parquet").read_bytes()
     assert run_command(command) == 0
@@ -81,7 +144,16 @@ def test_the_same_command_again_gives_the_same_tables(our_run, tmp_path):
 
 def test_another_set_of_results_in_the_folder_is_not_overwritten(our_run, tmp_path, capsys):
     out = tmp_path / "scored"
-    command = ["score", str(our_run), "--scene", "smoke/straight", "--out", str(out), "--quiet", "--no-report"]
+    command = [
+        "score",
+        str(our_run),
+        "--scene",
+        "smoke/straight",
+        "--out",
+        str(out),
+        "--quiet",
+        "--no-report",
+    ]
     assert run_command(command) == 0
     assert run_command([*command, "--preset", "paper"]) == 2
     assert "holds other results" in capsys.readouterr().err
@@ -90,11 +162,25 @@ def test_another_set_of_results_in_the_folder_is_not_overwritten(our_run, tmp_pa
 def test_golden_logs_by_pattern_with_scenes_by_folder(golden, tmp_path, capsys):
     out = tmp_path / "scored"
     pattern = str(golden / "rollouts" / "synthetic-c*-in-a" / "*" / "rollout.asl")
-    command = ["score", pattern, "--scene", str(golden / "scenes"), "--preset", "alpasim", "--settings", str(golden / "eval-config.yaml")]
+    command = [
+        "score",
+        pattern,
+        "--scene",
+        str(golden / "scenes"),
+        "--preset",
+        "alpasim",
+        "--settings",
+        str(golden / "eval-config.yaml"),
+    ]
     assert run_command([*command, "--no-report", "--out", str(out)]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert lines[0].startswith("[1/2] ")
-    want = {row["rollout_id"]: row for row in json.loads((golden / "aggregate" / "results-summary.json").read_text())["rollouts"]}
+    want = {
+        row["rollout_id"]: row
+        for row in json.loads((golden / "aggregate" / "results-summary.json").read_text())[
+            "rollouts"
+        ]
+    }
     got = {row["rollout"]: row for row in rows(out)}
     assert len(got) == 2
     for name, row in got.items():
@@ -103,23 +189,47 @@ def test_golden_logs_by_pattern_with_scenes_by_folder(golden, tmp_path, capsys):
         assert row["collision_at_fault"] == want[name]["metrics"]["collision_at_fault"]
         assert row["offroad_or_collision"] == want[name]["metrics"]["offroad_or_collision"]
     summary = json.loads((out / "aggregate" / "results-summary.json").read_text())
-    assert {row["rollout_id"]: row["score"] for row in summary["rollouts"]} == pytest.approx({name: want[name]["score"] for name in got})
+    assert {row["rollout_id"]: row["score"] for row in summary["rollouts"]} == pytest.approx(
+        {name: want[name]["score"] for name in got}
+    )
     names = pq.read_table(out / "aggregate" / "metrics_results.parquet").column_names
-    assert set(names) == set(pq.read_table(golden / "aggregate" / "metrics_results.parquet").column_names)
+    assert set(names) == set(
+        pq.read_table(golden / "aggregate" / "metrics_results.parquet").column_names
+    )
     assert summary["metrics_results"][0]["run_name"] == "golden-dev"
 
 
-def test_an_incomplete_rollout_is_a_failed_row_and_skips_alpasims_aggregation(golden, tmp_path, capsys):
+def test_an_incomplete_rollout_is_a_failed_row_and_skips_alpasims_aggregation(
+    golden, tmp_path, capsys
+):
     folder = golden / "cases" / "failed-rollout"
-    command = ["score", str(folder), "--scene", str(folder / "scenes"), "--no-report", "--preset", "alpasim", "--quiet"]
+    command = [
+        "score",
+        str(folder),
+        "--scene",
+        str(folder / "scenes"),
+        "--no-report",
+        "--preset",
+        "alpasim",
+        "--quiet",
+    ]
     assert run_command([*command, "--out", str(tmp_path / "a")]) == 4
     assert "aggregation was not written" in capsys.readouterr().err
     assert not (tmp_path / "a" / "aggregate").exists()
-    allowed = [*command, "--settings", str(folder / "eval-config.yaml"), "--out", str(tmp_path / "b")]
+    allowed = [
+        *command,
+        "--settings",
+        str(folder / "eval-config.yaml"),
+        "--out",
+        str(tmp_path / "b"),
+    ]
     assert run_command(allowed) == 0
     table = rows(tmp_path / "b")
     assert [row["status"] for row in table].count("failed") == 1
-    assert next(row for row in table if row["status"] == "failed")["failure"] == "the rollout ended after 25 of 46 control steps"
+    assert (
+        next(row for row in table if row["status"] == "failed")["failure"]
+        == "the rollout ended after 25 of 46 control steps"
+    )
     summary = json.loads((tmp_path / "b" / "aggregate" / "results-summary.json").read_text())
     assert [(row["status"], row["score"]) for row in summary["rollouts"]] == [("fail", 0.0)] * 3
 
@@ -129,8 +239,16 @@ def test_a_missing_map_stops_the_scene_score_and_nothing_else(golden, tmp_path, 
     command = ["score", str(folder), "--scene", str(folder / "scenes"), "--no-report", "--quiet"]
     assert run_command([*command, "--preset", "alpasim", "--out", str(tmp_path / "a")]) == 5
     assert "missing metric 'offroad'" in capsys.readouterr().err
-    assert sorted(p.name for p in (tmp_path / "a" / "aggregate").iterdir()) == ["metrics_results.parquet", "metrics_unprocessed.parquet"]
-    off = ["--settings", str(folder / "eval-config-no-scene-score.yaml"), "--out", str(tmp_path / "b")]
+    assert sorted(p.name for p in (tmp_path / "a" / "aggregate").iterdir()) == [
+        "metrics_results.parquet",
+        "metrics_unprocessed.parquet",
+    ]
+    off = [
+        "--settings",
+        str(folder / "eval-config-no-scene-score.yaml"),
+        "--out",
+        str(tmp_path / "b"),
+    ]
     assert run_command([*command, "--preset", "alpasim", *off]) == 0
     assert run_command([*command, "--preset", "strict", "--out", str(tmp_path / "c")]) == 5
     assert {row["failure_class"] for row in rows(tmp_path / "c")} == {"evaluator"}
@@ -146,10 +264,16 @@ def test_one_damaged_log_does_not_lose_the_others(golden, tmp_path, capsys):
         (logs / name / "rollout.asl").write_bytes(first.read_bytes()[:size])
     out = tmp_path / "scored"
     scene = str(golden / "scenes" / f"{GOLDEN_SCENE}.usdz")
-    assert run_command(["score", str(logs), "--scene", scene, "--no-report", "--out", str(out)]) == 2
+    assert (
+        run_command(["score", str(logs), "--scene", scene, "--no-report", "--out", str(out)]) == 2
+    )
     found = {row["rollout"]: (row["status"], row["failure_class"]) for row in rows(out)}
     name = first.parent.name  # the session id, of which the second log is another copy
-    assert found == {f"{name} (whole)": ("ok", None), name: ("failed", "infrastructure"), "beheaded": ("failed", "input")}
+    assert found == {
+        f"{name} (whole)": ("ok", None),
+        name: ("failed", "infrastructure"),
+        "beheaded": ("failed", "input"),
+    }
     said = capsys.readouterr().err
     assert "of 80 control steps" in said
     parts = [line.split(":")[0].strip() for line in said.splitlines()[-8:]]
@@ -158,10 +282,28 @@ def test_one_damaged_log_does_not_lose_the_others(golden, tmp_path, capsys):
 
 def test_lanes_without_rails_are_centres_widened(golden, tmp_path):
     folder = golden / "cases" / "rails-stripped"
-    command = ["score", str(folder), "--scene", str(folder / "scenes"), "--no-report", "--preset", "alpasim", "--quiet", "--no-rails"]
+    command = [
+        "score",
+        str(folder),
+        "--scene",
+        str(folder / "scenes"),
+        "--no-report",
+        "--preset",
+        "alpasim",
+        "--quiet",
+        "--no-rails",
+    ]
     out = tmp_path / "scored"
-    assert run_command([*command, "--settings", str(folder / "eval-config.yaml"), "--out", str(out)]) == 0
-    want = {row["rollout_id"]: row for row in json.loads((folder / "aggregate" / "results-summary.json").read_text())["rollouts"]}
+    assert (
+        run_command([*command, "--settings", str(folder / "eval-config.yaml"), "--out", str(out)])
+        == 0
+    )
+    want = {
+        row["rollout_id"]: row
+        for row in json.loads((folder / "aggregate" / "results-summary.json").read_text())[
+            "rollouts"
+        ]
+    }
     for row in rows(out):
         name = "min_distance_to_lane_boundary_m"
         assert row[name] == pytest.approx(want[row["rollout"]]["metrics"][name], abs=1e-4)
@@ -175,14 +317,26 @@ def test_bad_commands_say_what_to_do(our_run, tmp_path, capsys):
     cases = {
         "another scene": ([*own, "--scene", "smoke/curve"], "not among the 1 scenes"),
         "no such scene": ([*own, "--scene", str(tmp_path / "none.usdz")], "none.usdz"),
-        "unknown preset": ([*own, "--scene", "smoke/straight", "--preset", "alpasimm"], "known: paper, alpasim"),
-        "settings of another preset": ([*own, "--scene", "smoke/straight", "--settings", str(settings)], "--preset alpasim"),
+        "unknown preset": (
+            [*own, "--scene", "smoke/straight", "--preset", "alpasimm"],
+            "known: paper, alpasim",
+        ),
+        "settings of another preset": (
+            [*own, "--scene", "smoke/straight", "--settings", str(settings)],
+            "--preset alpasim",
+        ),
         "unknown setting": (
             [*own, "--scene", "smoke/straight", "--preset", "alpasim", "--settings", str(settings)],
             "vehicle_shrink_factor",
         ),
-        "no log": (["score", str(tmp_path / "nothing"), "--scene", "smoke/straight"], "a folder without .asl logs"),
-        "no match": (["score", str(tmp_path / "*.asl"), "--scene", "smoke/straight"], "no such file, folder or match"),
+        "no log": (
+            ["score", str(tmp_path / "nothing"), "--scene", "smoke/straight"],
+            "a folder without .asl logs",
+        ),
+        "no match": (
+            ["score", str(tmp_path / "*.asl"), "--scene", "smoke/straight"],
+            "no such file, folder or match",
+        ),
     }
     for situation, (command, text) in cases.items():
         assert run_command(command) == 2, situation

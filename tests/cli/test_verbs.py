@@ -34,15 +34,24 @@ CORE = {path: command for path, command in ALL.items() if path[0] in OWN}
 
 
 def options_of(command: Any) -> list[str]:
-    """Return the long name of every option of a command; of one with two states the second, which is not the default."""
-    names = [[name for name in (*parameter.opts, *parameter.secondary_opts) if name.startswith("--")] for parameter in command.params]
+    """Return the long name of every option of a command; of one with two states the second, which
+    is not the default.
+    """
+    names = [
+        [name for name in (*parameter.opts, *parameter.secondary_opts) if name.startswith("--")]
+        for parameter in command.params
+    ]
     return [found[-1] for found in names if found and found[0] != "--help"]
 
 
 @pytest.mark.parametrize("path", sorted(ALL), ids=" ".join)
 def test_every_verb_takes_json_and_debug_and_shows_an_example(path: tuple[str, ...]) -> None:
     assert {"--json", "--debug"} <= set(options_of(ALL[path]))
-    assert f"simrun {' '.join(path)}" in (ALL[path].epilog or "") or ALL[path].hidden or path == ("run",)
+    assert (
+        f"simrun {' '.join(path)}" in (ALL[path].epilog or "")
+        or ALL[path].hidden
+        or path == ("run",)
+    )
 
 
 def test_the_core_has_few_verbs_and_options() -> None:
@@ -53,13 +62,21 @@ def test_the_core_has_few_verbs_and_options() -> None:
 @cache
 def written(folder: str, ending: str) -> str:
     """Return the text of all files of a folder, but for this one."""
-    return "\n".join(path.read_text(encoding="utf-8") for path in sorted((REPO / folder).rglob(f"*{ending}")) if path != Path(__file__))
+    return "\n".join(
+        path.read_text(encoding="utf-8")
+        for path in sorted((REPO / folder).rglob(f"*{ending}"))
+        if path != Path(__file__)
+    )
 
 
 @pytest.mark.parametrize(("folder", "ending"), [("tests", ".py"), ("docs", ".md")])
 def test_every_option_of_the_core_is_in_a_test_and_on_a_page(folder: str, ending: str) -> None:
     named = sorted({option for command in CORE.values() for option in options_of(command)})
-    absent = [option for option in named if not re.search(rf"{re.escape(option)}(?![\w-])", written(folder, ending))]
+    absent = [
+        option
+        for option in named
+        if not re.search(rf"{re.escape(option)}(?![\w-])", written(folder, ending))
+    ]
     assert absent == []
 
 
@@ -70,18 +87,29 @@ def test_pandas_is_loaded_for_other_peoples_code_alone() -> None:
         "from alpasim_plugin.core.parts.source import load; load('json:loads', 'policy')\n"
         "print(table.to_pandas().a[0], 'pandas' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split() == ["False", "b", "True"]
+    assert subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout.split() == ["False", "b", "True"]
 
 
 def test_a_listing_loads_no_numerical_library() -> None:
     code = "import sys; from alpasim_plugin.cli.main import run_command; run_command(['--help']); print('numpy' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip().endswith("False")
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        .stdout.strip()
+        .endswith("False")
+    )
 
 
 def test_a_run_is_planned_and_reported_without_plots_networks_or_kernels() -> None:
     """Its workers load what drives; while they are started, nothing else is to load here."""
     code = "import sys, alpasim_plugin.cli.run; print({'matplotlib', 'numba', 'torch', 'av'} & sys.modules.keys())"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "set()"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        == "set()"
+    )
 
 
 def test_the_collector_is_off_while_a_verb_is_imported_and_on_while_it_runs() -> None:
@@ -91,7 +119,9 @@ def test_the_collector_is_off_while_a_verb_is_imported_and_on_while_it_runs() ->
         "main.make_app, sys.argv = make_app, ['simrun', 'list', 'renderers']\n"
         "try:\n    main.main()\nfinally:\n    print(gc.isenabled(), gc.get_freeze_count() > 1000)"
     )
-    lines = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.splitlines()
+    lines = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout.splitlines()
     assert (lines[0], lines[-1]) == ("False", "True True")
 
 

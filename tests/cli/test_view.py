@@ -12,7 +12,9 @@ from alpasim_plugin.cli.main import run_command
 from tests.report.make_run import Plan
 from tests.viewer.make_watched import make_watched, unfinished
 
-PLAN = Plan(renderers=("clean", "3dgs"), scenes=("smoke-straight", "urban-left_turn"), seeds=(0,), steps=10)
+PLAN = Plan(
+    renderers=("clean", "3dgs"), scenes=("smoke-straight", "urban-left_turn"), seeds=(0,), steps=10
+)
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +29,9 @@ def run(made: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "run"))
 
 
-def test_an_unfinished_run_is_shown_as_far_as_it_has_got(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unfinished_run_is_shown_as_far_as_it_has_got(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(["view", str(run), "--json"]) == 0
     printed = capsys.readouterr()
     facts = json.loads(printed.out)
@@ -38,7 +42,9 @@ def test_an_unfinished_run_is_shown_as_far_as_it_has_got(run: Path, capsys: pyte
     assert run_command(["view", str(run)]) == 0  # its own page is replaced
 
 
-def test_a_rollout_is_shown_beside_the_others_of_its_cell(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rollout_is_shown_beside_the_others_of_its_cell(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder, out = run / "rollouts/3dgs/lane-camera/smoke-straight/0", tmp_path / "one.html"
     assert run_command(["view", str(folder), "--out", str(out), "--max-mb", "8"]) == 0
     assert "1 of 1 cells" in capsys.readouterr().out
@@ -51,7 +57,9 @@ def test_a_rollout_is_shown_beside_the_others_of_its_cell(run: Path, tmp_path: P
     assert "name its run folder" in capsys.readouterr().err
 
 
-def test_what_cannot_be_shown_is_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_shown_is_refused(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for arguments, said in (
         ([str(tmp_path / "nowhere")], "no such folder"),
         ([str(tmp_path)], "no run.json and no manifest.json"),
@@ -59,7 +67,10 @@ def test_what_cannot_be_shown_is_refused(run: Path, tmp_path: Path, capsys: pyte
         ([str(run), "--seed", "7"], "it has 0"),
         ([str(run), "--serve", "0.0.0.0:80"], "not an address of this machine alone"),
         ([str(run), "--serve", "80", "--out", "x.html"], "give one of them"),
-        ([str(run), "--scene", "urban-left_turn", "--renderer", "3dgs"], "no finished rollout that was asked for"),
+        (
+            [str(run), "--scene", "urban-left_turn", "--renderer", "3dgs"],
+            "no finished rollout that was asked for",
+        ),
     ):
         assert run_command(["view", *arguments]) == 2
         assert said in capsys.readouterr().err

@@ -16,14 +16,18 @@ from tests.examples import examples
 
 VEHICLE = Vehicle()
 # No limits: the wheel follows at once, so that a manoeuvre can be anything.
-FREE = Vehicle(max_steer_rad=1.2, max_steer_rate_radps=1e6, max_accel_mps2=100.0, max_brake_mps2=100.0)
+FREE = Vehicle(
+    max_steer_rad=1.2, max_steer_rate_radps=1e6, max_accel_mps2=100.0, max_brake_mps2=100.0
+)
 
 
-def exact_arc(state: BicycleState, accel_mps2: float, dt_s: float, wheelbase_m: float) -> BicycleState:
+def exact_arc(
+    state: BicycleState, accel_mps2: float, dt_s: float, wheelbase_m: float
+) -> BicycleState:
     """Return the closed solution for a held wheel and a constant acceleration: an arc of a circle.
 
-    The heading depends on the path length alone, ``yaw = yaw0 + s tan(steer) / L``, and the chord of an arc of length s and turn
-    ``2 b`` is ``s sin(b) / b`` at the mean heading.
+    The heading depends on the path length alone, ``yaw = yaw0 + s tan(steer) / L``, and the chord
+    of an arc of length s and turn ``2 b`` is ``s sin(b) / b`` at the mean heading.
     """
     s = state.speed_mps * dt_s + 0.5 * accel_mps2 * dt_s**2
     turn = s * math.tan(state.steer_rad) / wheelbase_m
@@ -51,15 +55,25 @@ def test_error_against_the_exact_circle_falls_with_the_fourth_power_of_the_step(
     assert np.all((orders > 3.8) & (orders < 4.2)), (errors, orders)
 
 
-def test_default_step_stays_within_a_tenth_of_a_millimetre_on_the_tightest_circle_for_a_minute() -> None:
+def test_default_step_stays_within_a_tenth_of_a_millimetre_on_the_tightest_circle_for_a_minute() -> (
+    None
+):
     start = BicycleState(0.0, 0.0, 0.0, 5.0, VEHICLE.max_steer_rad)
     end = step(start, Command(VEHICLE.max_steer_rad), 60.0, VEHICLE)
     assert error_m(end, exact_arc(start, 0.0, 60.0, VEHICLE.wheelbase_m)) < 1e-4
 
 
 @settings(deadline=None, max_examples=examples(60))
-@given(speed=st.floats(-10, 40), steer=st.floats(-0.55, 0.55), yaw=st.floats(-4, 4), drive=st.floats(-3, 3), seconds=st.floats(0.001, 2.0))
-def test_any_held_command_matches_the_closed_solution(speed: float, steer: float, yaw: float, drive: float, seconds: float) -> None:
+@given(
+    speed=st.floats(-10, 40),
+    steer=st.floats(-0.55, 0.55),
+    yaw=st.floats(-4, 4),
+    drive=st.floats(-3, 3),
+    seconds=st.floats(0.001, 2.0),
+)
+def test_any_held_command_matches_the_closed_solution(
+    speed: float, steer: float, yaw: float, drive: float, seconds: float
+) -> None:
     start = BicycleState(1e5, -2e5, yaw, speed, steer)
     end = step(start, Command(steer, drive), seconds, VEHICLE)
     exact = exact_arc(start, drive, seconds, VEHICLE.wheelbase_m)
@@ -69,22 +83,34 @@ def test_any_held_command_matches_the_closed_solution(speed: float, steer: float
 
 
 def test_turning_wheel_follows_the_integral_of_the_heading() -> None:
-    """With a steer that grows linearly, yaw is the integral of v tan(steer) / L = -v ln(cos(steer)) / (L rate)."""
+    """With a steer that grows linearly, yaw is the integral of v tan(steer) / L = -v ln(cos(steer))
+    / (L rate).
+    """
     speed, target = 4.0, 0.5
     seconds = target / VEHICLE.max_steer_rate_radps
     end = step(BicycleState(0.0, 0.0, 0.0, speed, 0.0), Command(10.0), seconds, VEHICLE)
     assert end.steer_rad == pytest.approx(target, abs=1e-12)
-    expected = -speed * math.log(math.cos(target)) / (VEHICLE.wheelbase_m * VEHICLE.max_steer_rate_radps)
+    expected = (
+        -speed * math.log(math.cos(target)) / (VEHICLE.wheelbase_m * VEHICLE.max_steer_rate_radps)
+    )
     assert end.yaw_rad == pytest.approx(expected, abs=1e-9)
 
 
 def test_error_falls_with_the_fourth_power_of_the_step_where_the_wheel_arrives_within_one() -> None:
-    """The command of every 50 ms is reached after a part of it, at another instant each time; the finest step is the truth."""
+    """The command of every 50 ms is reached after a part of it, at another instant each time; the
+    finest step is the truth.
+    """
 
     def drive(step_s: float) -> BicycleState:
         state = BicycleState(0.0, 0.0, 0.0, 15.0, 0.0)
         for k in range(80):
-            state = step(state, Command(0.12 * math.sin(0.35 * k) + 0.017 * (k % 3), -1.0), 0.05, VEHICLE, step_s)
+            state = step(
+                state,
+                Command(0.12 * math.sin(0.35 * k) + 0.017 * (k % 3), -1.0),
+                0.05,
+                VEHICLE,
+                step_s,
+            )
         return state
 
     truth = drive(2e-4)
@@ -132,7 +158,9 @@ def test_reverse_gear_stops_the_car_and_then_drives_it_back() -> None:
 def test_reversing_retraces_the_forward_path() -> None:
     start = BicycleState(0.0, 0.0, 0.3, 7.0, 0.4)
     there = step(start, Command(0.4), 5.0, VEHICLE)
-    back = step(BicycleState(there.x_m, there.y_m, there.yaw_rad, -7.0, 0.4), Command(0.4), 5.0, VEHICLE)
+    back = step(
+        BicycleState(there.x_m, there.y_m, there.yaw_rad, -7.0, 0.4), Command(0.4), 5.0, VEHICLE
+    )
     assert error_m(back, start) < 1e-7
 
 
@@ -144,8 +172,12 @@ def test_near_right_angle_steering_stays_finite_and_exact() -> None:
 
 def test_accelerations_are_cut_to_what_the_vehicle_can() -> None:
     start = BicycleState(0.0, 0.0, 0.0, 20.0, 0.0)
-    assert step(start, Command(0.0, 99.0), 1.0, VEHICLE).speed_mps == pytest.approx(20.0 + VEHICLE.max_accel_mps2)
-    assert step(start, Command(0.0, 0.0, 99.0), 1.0, VEHICLE).speed_mps == pytest.approx(20.0 - VEHICLE.max_brake_mps2)
+    assert step(start, Command(0.0, 99.0), 1.0, VEHICLE).speed_mps == pytest.approx(
+        20.0 + VEHICLE.max_accel_mps2
+    )
+    assert step(start, Command(0.0, 0.0, 99.0), 1.0, VEHICLE).speed_mps == pytest.approx(
+        20.0 - VEHICLE.max_brake_mps2
+    )
 
 
 def test_zero_seconds_change_nothing() -> None:
@@ -153,7 +185,10 @@ def test_zero_seconds_change_nothing() -> None:
     assert step(start, Command(0.5, 1.0), 0.0, VEHICLE) == start
 
 
-@pytest.mark.parametrize(("command", "seconds"), [(Command(math.nan), 0.1), (Command(0.0, math.inf), 0.1), (Command(0.0), -0.1)])
+@pytest.mark.parametrize(
+    ("command", "seconds"),
+    [(Command(math.nan), 0.1), (Command(0.0, math.inf), 0.1), (Command(0.0), -0.1)],
+)
 def test_senseless_input_is_refused_with_its_value(command: Command, seconds: float) -> None:
     with pytest.raises(InputError, match="advancing the vehicle") as caught:
         step(BicycleState(0.0, 0.0, 0.0, 1.0, 0.0), command, seconds, VEHICLE)

@@ -1,4 +1,6 @@
-"""The CAN bus: frames against real databases and a real drive, and what happens to commands that are lost, late, wrong or missing."""
+"""The CAN bus: frames against real databases and a real drive, and what happens to commands that
+are lost, late, wrong or missing.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.runs.rollout import run_rollout
 from scenarios.load import load_scenario
 
-pytest.importorskip("cantools", reason="cantools is not installed: pip install 'alpasim-onefixer[can]'")
+pytest.importorskip(
+    "cantools", reason="cantools is not installed: pip install 'alpasim-onefixer[can]'"
+)
 can = pytest.importorskip("can")
 
 from alpasim_plugin.control.bicycle import BicycleState  # noqa: E402
@@ -57,17 +61,21 @@ def send(bus: can.BusABC, frame: tuple[int, bytes]) -> None:
 
 
 def commands(codec: Codec, wheel_deg: float, accel_mps2: float) -> list[tuple[int, bytes]]:
-    return [codec.encode_command(codec.map.steer, wheel_deg), codec.encode_command(codec.map.accel, accel_mps2)]
+    return [
+        codec.encode_command(codec.map.steer, wheel_deg),
+        codec.encode_command(codec.map.accel, accel_mps2),
+    ]
 
 
 NOTHING = quantities(BicycleState(0, 0, 0, 10.0, 0.0), 0.0, 0.0, np.zeros((0, 3)), 15.0, Vehicle())
 
 
-# --- frames ---------------------------------------------------------------------------------------------------------
+# --- frames
 
 
 def test_checksums_by_hand() -> None:
-    # CRC-8 SAE J1850 of the text 123456789 is 4B in the published catalogue; here identifier 0x3231 is its first two bytes.
+    # CRC-8 SAE J1850 of the text 123456789 is 4B in the published catalogue; here identifier 0x3231
+    # is its first two bytes.
     assert checksum_of("crc8_j1850", 0x3231, b"3456789\0", 7) == 0x4B
     assert checksum_of("sum_tesla", 0x488, bytes([1, 2, 0, 0]), 3) == (0x88 + 4 + 3) & 0xFF
     assert checksum_of("sum_toyota", 0x25, bytes(8), 7) == 0x2D
@@ -77,22 +85,35 @@ def test_a_real_drive_decodes_to_what_its_publisher_states(shared_data: Path) ->
     codec = open_codec(*load_map("toyota", str(shared_data / "opendbc" / "_toyota_2017.dbc")))
     recording = read_recording(shared_data / "comma2k19")
     series, counts = decode(recording, codec)
-    assert counts == {"STEER_ANGLE_SENSOR": 3314, "WHEEL_SPEEDS": 3313, "KINEMATICS": 3314, "SPEED": 1657}  # no checksum fails
+    assert counts == {
+        "STEER_ANGLE_SENSOR": 3314,
+        "WHEEL_SPEEDS": 3313,
+        "KINEMATICS": 3314,
+        "SPEED": 1657,
+    }  # no checksum fails
     stated = shared_data / "comma2k19" / "processed_log" / "CAN"
-    np.testing.assert_array_equal(series["steering_wheel_deg"][1], np.load(stated / "steering_angle" / "value.npy").ravel())
-    wheels = np.mean([series[f"wheel_{name}_kph"][1] for name in ("fl", "fr", "rl", "rr")], axis=0) / 3.6
+    np.testing.assert_array_equal(
+        series["steering_wheel_deg"][1], np.load(stated / "steering_angle" / "value.npy").ravel()
+    )
+    wheels = (
+        np.mean([series[f"wheel_{name}_kph"][1] for name in ("fl", "fr", "rl", "rr")], axis=0) / 3.6
+    )
     np.testing.assert_allclose(wheels, np.load(stated / "speed" / "value.npy").ravel(), atol=1e-12)
     with pytest.raises(InputError, match="no frame of bus 7"):
         read_recording(shared_data / "comma2k19", 7)
 
 
-def test_a_real_drive_replays_as_bus_traffic(shared_data: Path, wires: tuple[can.BusABC, can.BusABC]) -> None:
+def test_a_real_drive_replays_as_bus_traffic(
+    shared_data: Path, wires: tuple[can.BusABC, can.BusABC]
+) -> None:
     codec = open_codec(*load_map("toyota", str(shared_data / "opendbc" / "_toyota_2017.dbc")))
     whole = read_recording(shared_data / "comma2k19")
     second = replace(whole, t_s=whole.t_s[:900], address=whole.address[:900], data=whole.data[:900])
     waited: list[float] = []
     count, _ = replay(second, codec, wires[0], 2.0, clock=lambda: sum(waited), sleep=waited.append)
-    assert sum(waited) == pytest.approx([t for t, _ in second.frames(codec)][-1] / 2)  # twice as fast as recorded
+    assert sum(waited) == pytest.approx(
+        [t for t, _ in second.frames(codec)][-1] / 2
+    )  # twice as fast as recorded
     heard = []
     while (frame := wires[1].recv(0)) is not None:
         heard.append((frame.arbitration_id, bytes(frame.data)))
@@ -100,18 +121,31 @@ def test_a_real_drive_replays_as_bus_traffic(shared_data: Path, wires: tuple[can
     assert len(heard) == count > 500
 
 
-@pytest.mark.parametrize(("name", "dbc"), [("toyota", "_toyota_2017.dbc"), ("tesla", "tesla_model3_party.dbc"), ("example", None)])
-def test_rounding_stays_within_half_a_step_of_the_signal(name: str, dbc: str | None, request: pytest.FixtureRequest) -> None:
+@pytest.mark.parametrize(
+    ("name", "dbc"),
+    [("toyota", "_toyota_2017.dbc"), ("tesla", "tesla_model3_party.dbc"), ("example", None)],
+)
+def test_rounding_stays_within_half_a_step_of_the_signal(
+    name: str, dbc: str | None, request: pytest.FixtureRequest
+) -> None:
     path = None if dbc is None else str(request.getfixturevalue("shared_data") / "opendbc" / dbc)
     codec = open_codec(*load_map(name, path))
-    route = np.column_stack([np.linspace(0, 40, 20), 0.002 * np.linspace(0, 40, 20) ** 2, np.zeros(20)])
+    route = np.column_stack(
+        [np.linspace(0, 40, 20), 0.002 * np.linspace(0, 40, 20) ** 2, np.zeros(20)]
+    )
     for i in range(200):
         state = BicycleState(0.0, 0.0, 0.0, 0.1 + 0.113 * i, 0.05 * np.sin(i / 7))
         for sent in codec.map.send:
-            frame_id, data = codec.encode(sent, quantities(state, 0.01, 0.3, route, codec.map.steering_ratio, Vehicle()))
-            assert (frame_id, len(data)) == (codec.message(sent.message).frame_id, codec.message(sent.message).length)
+            frame_id, data = codec.encode(
+                sent, quantities(state, 0.01, 0.3, route, codec.map.steering_ratio, Vehicle())
+            )
+            assert (frame_id, len(data)) == (
+                codec.message(sent.message).frame_id,
+                codec.message(sent.message).length,
+            )
     for signal, one in codec.rounding.items():
-        # 1.5 degrees from step to step of the coarse signal, and a fine one that reaches 0.7 either way: 0.05 are out of reach.
+        # 1.5 degrees from step to step of the coarse signal, and a fine one that reaches 0.7 either
+        # way: 0.05 are out of reach.
         assert one.saturated <= (20 if signal.endswith("STEER_FRACTION") else 0), signal
         assert one.worst <= one.resolution * (0.5 + 1e-6), signal
         assert one.count + one.saturated == 200
@@ -126,7 +160,9 @@ def test_databases_that_do_not_fit_are_refused(shared_data: Path, tmp_path: Path
     folder = shared_data / "opendbc"
     with pytest.raises(InputError, match="no 'DI_speed'"):
         open_codec(*load_map("tesla", str(folder / "comma_body.dbc")))
-    with pytest.raises(InputError, match=r"1073808953|40140639|frame id"):  # a pseudo message with an impossible identifier
+    with pytest.raises(
+        InputError, match=r"1073808953|40140639|frame id"
+    ):  # a pseudo message with an impossible identifier
         open_codec(*load_map("toyota", str(folder / "toyota_2017_ref_pt.dbc")))
     (tmp_path / "no.dbc").write_text("not a database")
     with pytest.raises(InputError, match="repair the database"):
@@ -137,13 +173,15 @@ def test_databases_that_do_not_fit_are_refused(shared_data: Path, tmp_path: Path
         load_map("tesla")
 
 
-@pytest.mark.parametrize("text", ["", "?map=example", "vcan0?maps=x", "vcan0?timeout_ms=0", "vcan0?timeout_ms=ten"])
+@pytest.mark.parametrize(
+    "text", ["", "?map=example", "vcan0?maps=x", "vcan0?timeout_ms=0", "vcan0?timeout_ms=ten"]
+)
 def test_bad_addresses(text: str) -> None:
     with pytest.raises(InputError, match="can://"):
         Address.parse(text)
 
 
-# --- commands -------------------------------------------------------------------------------------------------------
+# --- commands
 
 
 def test_commands_that_answer_are_fresh(codec: Codec, wires: tuple[can.BusABC, can.BusABC]) -> None:
@@ -159,7 +197,9 @@ def test_commands_that_answer_are_fresh(codec: Codec, wires: tuple[can.BusABC, c
     assert one.counts["lost"] == one.counts["malformed"] == 0
 
 
-def test_a_missing_command_is_held_and_then_the_brake_grows(codec: Codec, wires: tuple[can.BusABC, can.BusABC]) -> None:
+def test_a_missing_command_is_held_and_then_the_brake_grows(
+    codec: Codec, wires: tuple[can.BusABC, can.BusABC]
+) -> None:
     bus, unit = wires
     one = exchange(codec, bus)
     for frame in commands(open_codec(*load_map("example")), 5.0, 1.0):
@@ -176,13 +216,21 @@ def test_a_missing_command_is_held_and_then_the_brake_grows(codec: Codec, wires:
     assert one.counts["held"] == held
 
 
-def test_without_any_command_the_vehicle_brakes(codec: Codec, wires: tuple[can.BusABC, can.BusABC]) -> None:
+def test_without_any_command_the_vehicle_brakes(
+    codec: Codec, wires: tuple[can.BusABC, can.BusABC]
+) -> None:
     one = exchange(codec, wires[0])
     got = [one.step(t, NOTHING) for t in (0, 1_000_000, 3_000_000)]
-    assert [(g.mark, round(g.accel_mps2, 6)) for g in got] == [("ramped", 0.0), ("ramped", -2.0), ("ramped", STOP_MPS2)]
+    assert [(g.mark, round(g.accel_mps2, 6)) for g in got] == [
+        ("ramped", 0.0),
+        ("ramped", -2.0),
+        ("ramped", STOP_MPS2),
+    ]
 
 
-def test_every_fault_is_counted_by_cause(codec: Codec, wires: tuple[can.BusABC, can.BusABC]) -> None:
+def test_every_fault_is_counted_by_cause(
+    codec: Codec, wires: tuple[can.BusABC, can.BusABC]
+) -> None:
     bus, unit = wires
     one, other = exchange(codec, bus), open_codec(*load_map("example"))
     frames = [commands(other, 1.0, 0.5) for _ in range(6)]
@@ -196,10 +244,20 @@ def test_every_fault_is_counted_by_cause(codec: Codec, wires: tuple[can.BusABC, 
     send(unit, (steer_id, data[:5]))  # cut short
     off = other.pack("ACCEL_CMD", {"ACCEL": 1.0, "ENABLE": 0}, "COUNTER", other.map.accel.checksum)
     send(unit, off)
-    send(unit, other.pack("ACCEL_CMD", {"ACCEL": -30.0, "ENABLE": 1}, "COUNTER", other.map.accel.checksum))
+    send(
+        unit,
+        other.pack("ACCEL_CMD", {"ACCEL": -30.0, "ENABLE": 1}, "COUNTER", other.map.accel.checksum),
+    )
     send(unit, (0x7AB, b"\1\2"))  # of nobody here
     got = one.step(0, NOTHING)
-    wanted = {"repeated": 2, "lost": 4, "malformed": 2, "not_enabled": 1, "out_of_range": 1, "other": 1}
+    wanted = {
+        "repeated": 2,
+        "lost": 4,
+        "malformed": 2,
+        "not_enabled": 1,
+        "out_of_range": 1,
+        "other": 1,
+    }
     assert {name: one.counts[name] for name in wanted} == wanted
     assert (got.wheel_deg, got.accel_mps2) == (pytest.approx(1.0), pytest.approx(0.5))
 
@@ -214,10 +272,12 @@ def test_a_frame_of_random_bytes_never_becomes_a_command(codec: Codec) -> None:
             accepted += 1
         except BadFrame:
             pass
-    assert accepted < 2000 / 256  # as many as an 8-bit checksum lets pass, times half for the enabling bit and a ninth for the length
+    assert (
+        accepted < 2000 / 256
+    )  # as many as an 8-bit checksum lets pass, times half for the enabling bit and a ninth for the length
 
 
-# --- driving --------------------------------------------------------------------------------------------------------
+# --- driving
 
 
 def test_the_path_is_the_routes_cubic() -> None:
@@ -238,7 +298,9 @@ def drive(scenario: Scenario, name: str) -> tuple[np.ndarray, dict]:
     """Drive over a bus of two threads; return the driven path and the policy's facts."""
     stop, address = threading.Event(), Address.parse(name)
     with open_bus(address) as bus:
-        unit = threading.Thread(target=serve, args=(bus, LaneKeeper(open_codec(*load_map("example"))), stop))
+        unit = threading.Thread(
+            target=serve, args=(bus, LaneKeeper(open_codec(*load_map("example"))), stop)
+        )
         unit.start()
         try:
             policy = CanPolicy(scenario, f"{name}?timeout_ms=5000")
@@ -265,7 +327,9 @@ def test_a_control_unit_drives_a_curve_and_twice_the_same(curve: Scenario) -> No
 
 
 def test_without_a_control_unit_the_ego_stops_and_the_facts_say_so() -> None:
-    scenario = load_scenario("smoke/straight", overrides=("timing.duration_us=3000000", "timing.warmup_us=200000"))
+    scenario = load_scenario(
+        "smoke/straight", overrides=("timing.duration_us=3000000", "timing.warmup_us=200000")
+    )
     policy = CanPolicy(scenario, "test-nobody?timeout_ms=1")
     log = run_rollout(scenario, NoCamera(), policy).log()
     facts = policy.facts()["frames"]

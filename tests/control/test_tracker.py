@@ -1,4 +1,6 @@
-"""The tracker on steps, curves, lane changes, stops, and on plans that are short, noisy, kinked or broken."""
+"""The tracker on steps, curves, lane changes, stops, and on plans that are short, noisy, kinked or
+broken.
+"""
 
 from __future__ import annotations
 
@@ -24,20 +26,35 @@ Array = npt.ArrayLike
 
 
 def plan_of(t_s: Array, x: Array, y: Array, yaw: Array) -> Trajectory:
-    t, x_, y_, yaw_ = (np.broadcast_to(np.asarray(v, dtype=np.float64), np.shape(t_s)) for v in (t_s, x, y, yaw))
+    t, x_, y_, yaw_ = (
+        np.broadcast_to(np.asarray(v, dtype=np.float64), np.shape(t_s)) for v in (t_s, x, y, yaw)
+    )
     with np.errstate(invalid="ignore"):  # some plans are broken on purpose
-        return Trajectory(np.rint(t * 1e6).astype(np.int64), np.column_stack([x_, y_, np.zeros_like(x_)]), quat_from_yaw(yaw_))
+        return Trajectory(
+            np.rint(t * 1e6).astype(np.int64),
+            np.column_stack([x_, y_, np.zeros_like(x_)]),
+            quat_from_yaw(yaw_),
+        )
 
 
-def drive(plan: Trajectory | Callable[[EgoState], Trajectory], start: EgoState, seconds: float, step_us: int = 100_000) -> list[EgoState]:
+def drive(
+    plan: Trajectory | Callable[[EgoState], Trajectory],
+    start: EgoState,
+    seconds: float,
+    step_us: int = 100_000,
+) -> list[EgoState]:
     states = [start]
     for _ in range(round(seconds * 1e6 / step_us)):
         now = states[-1]
-        states.append(TRACKER.advance(now, plan(now) if callable(plan) else plan, now.t_us + step_us))
+        states.append(
+            TRACKER.advance(now, plan(now) if callable(plan) else plan, now.t_us + step_us)
+        )
     return states
 
 
-def at(x: float = 0.0, y: float = 0.0, yaw: float = 0.0, speed: float = 0.0, steer: float = 0.0) -> EgoState:
+def at(
+    x: float = 0.0, y: float = 0.0, yaw: float = 0.0, speed: float = 0.0, steer: float = 0.0
+) -> EgoState:
     return EgoState(0, se2(x, y, yaw), speed, steer_rad=steer)
 
 
@@ -46,7 +63,9 @@ def xy(states: list[EgoState]) -> npt.NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("speed", first_of([1.0, 35.0, 3.0, 5.0, 10.0, 20.0], 2))
-def test_half_a_metre_beside_a_straight_plan_is_closed_with_one_small_overshoot(speed: float) -> None:
+def test_half_a_metre_beside_a_straight_plan_is_closed_with_one_small_overshoot(
+    speed: float,
+) -> None:
     t = np.arange(0, 40, 0.1)
     states = drive(plan_of(t, speed * t, 0, 0), at(y=0.5, speed=speed), max(6.0, 30.0 / speed))
     y = xy(states)[:, 1]
@@ -58,11 +77,16 @@ def test_half_a_metre_beside_a_straight_plan_is_closed_with_one_small_overshoot(
     assert max(abs(s.yaw_rate_radps * s.speed_mps) for s in states) < 1.5, "comfort"
 
 
-@pytest.mark.parametrize(("speed", "radius"), first_rows_of([(2, 6), (35, 400), (5, 10), (10, 20), (15, 60), (30, 200)], 2))
+@pytest.mark.parametrize(
+    ("speed", "radius"),
+    first_rows_of([(2, 6), (35, 400), (5, 10), (10, 20), (15, 60), (30, 200)], 2),
+)
 def test_circle_is_held_to_a_centimetre(speed: float, radius: float) -> None:
     t = np.arange(0, 30, 0.1)
     a = speed * t / radius
-    states = drive(plan_of(t, radius * np.sin(a), radius * (1 - np.cos(a)), a), at(speed=speed), 15.0)
+    states = drive(
+        plan_of(t, radius * np.sin(a), radius * (1 - np.cos(a)), a), at(speed=speed), 15.0
+    )
     off = np.hypot(xy(states)[:, 0], xy(states)[:, 1] - radius) - radius
     assert np.abs(off[-30:]).max() < 0.01
     assert np.abs(off).max() < 0.4, "while the wheel is still turning in"
@@ -90,7 +114,9 @@ def test_mirrored_plan_gives_the_mirrored_drive() -> None:
 
 
 def test_drive_does_not_depend_on_where_in_the_world_it_happens() -> None:
-    t = np.arange(0, 10, 0.0937)  # the preview's nodes, 0.8 m apart, do not lie on the path's knots: there its direction has two values
+    t = np.arange(
+        0, 10, 0.0937
+    )  # the preview's nodes, 0.8 m apart, do not lie on the path's knots: there its direction has two values
     a = 8 * t / 25
     x, y = 25 * np.sin(a), 25 * (1 - np.cos(a))
     here = drive(plan_of(t, x, y, a), at(speed=8.0), 6.0)
@@ -109,7 +135,12 @@ def test_noisy_plan_that_stops_is_left_standing_without_creeping_or_reversing(sp
     random = np.random.default_rng(0)
 
     def noisy(_: EgoState) -> Trajectory:
-        return plan_of(t, x + random.normal(0, 0.05, len(t)), random.normal(0, 0.05, len(t)), random.normal(0, 0.02, len(t)))
+        return plan_of(
+            t,
+            x + random.normal(0, 0.05, len(t)),
+            random.normal(0, 0.05, len(t)),
+            random.normal(0, 0.02, len(t)),
+        )
 
     states = drive(noisy, at(speed=speed), stop_s + 6)
     assert min(s.speed_mps for s in states) == 0.0
@@ -173,12 +204,20 @@ def test_any_finite_plan_keeps_state_finite_and_within_the_limits(data: st.DataO
     n = data.draw(st.integers(1, 12))
     coordinate = st.floats(-60, 60)
     x, y, yaw = (data.draw(st.lists(coordinate, min_size=n, max_size=n)) for _ in range(3))
-    start = at(speed=data.draw(st.floats(-3, 35)), steer=data.draw(st.floats(-0.6, 0.6)), yaw=data.draw(st.floats(-3, 3)))
+    start = at(
+        speed=data.draw(st.floats(-3, 35)),
+        steer=data.draw(st.floats(-0.6, 0.6)),
+        yaw=data.draw(st.floats(-3, 3)),
+    )
     for a, b in pairwise(drive(plan_of(0.3 * np.arange(n), x, y, yaw), start, 1.0)):
         assert np.isfinite(b.T_world_rig).all()
         assert abs(b.steer_rad) <= VEHICLE.max_steer_rad + 1e-9
         assert abs(b.steer_rad - a.steer_rad) <= VEHICLE.max_steer_rate_radps * 0.1 + 1e-9
-        assert -VEHICLE.max_brake_mps2 * 0.1 - 1e-9 <= abs(b.speed_mps) - abs(a.speed_mps) <= VEHICLE.max_accel_mps2 * 0.1 + 1e-9
+        assert (
+            -VEHICLE.max_brake_mps2 * 0.1 - 1e-9
+            <= abs(b.speed_mps) - abs(a.speed_mps)
+            <= VEHICLE.max_accel_mps2 * 0.1 + 1e-9
+        )
 
 
 def test_advancing_twice_from_the_same_state_gives_the_same_and_leaves_the_input_alone() -> None:
@@ -211,7 +250,9 @@ def test_no_plan_brakes_gently_to_a_stop() -> None:
     ],
 )
 @pytest.mark.parametrize("name", ["bicycle", "perfect"])
-def test_broken_plan_is_a_policy_error_that_says_what_was_found(name: str, plan: Trajectory, found: str) -> None:
+def test_broken_plan_is_a_policy_error_that_says_what_was_found(
+    name: str, plan: Trajectory, found: str
+) -> None:
     with pytest.raises(PolicyError, match="following a plan") as caught:
         make_controller(name, VEHICLE).advance(at(speed=1.0), plan, 100_000)
     assert found in caught.value.found
@@ -234,7 +275,9 @@ def test_perfect_controller_stands_on_the_plan_and_holds_its_last_pose() -> None
     a = 5 * t / 10
     plan = plan_of(t, 10 * np.sin(a), 10 * (1 - np.cos(a)), a)
     state = perfect.advance(at(speed=5.0), plan, 1_000_000)
-    assert np.allclose(state.T_world_rig[:2, 3], [10 * np.sin(0.5), 10 * (1 - np.cos(0.5))], atol=1e-12)
+    assert np.allclose(
+        state.T_world_rig[:2, 3], [10 * np.sin(0.5), 10 * (1 - np.cos(0.5))], atol=1e-12
+    )
     state = perfect.advance(state, plan, 1_100_000)
     assert state.speed_mps == pytest.approx(5.0, abs=1e-2)
     assert state.yaw_rate_radps == pytest.approx(0.5, abs=1e-6)

@@ -33,7 +33,9 @@ WRITERS: dict[str, Callable[[Path, int], None]] = {
     "text": lambda path, n: write_text(path, f"é {n}"),
     "json": lambda path, n: write_json(path, {"n": n}),
     "array": lambda path, n: write_array(path, np.full(4, n)),
-    "safetensors": lambda path, n: write_safetensors(path, {"n": torch.full((4,), n)}, {"of": "test"}),
+    "safetensors": lambda path, n: write_safetensors(
+        path, {"n": torch.full((4,), n)}, {"of": "test"}
+    ),
 }
 
 
@@ -99,7 +101,10 @@ def test_a_block_that_fails_leaves_the_old_folder(tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "a"
     with atomic_folder(folder, "writing") as partial:
         (partial / "x").write_text("old")
-    for error, seen in ((ValueError("no"), ValueError), (OSError(28, "No space left"), InfrastructureError)):
+    for error, seen in (
+        (ValueError("no"), ValueError),
+        (OSError(28, "No space left"), InfrastructureError),
+    ):
         with pytest.raises(seen), atomic_folder(folder, "writing") as partial:  # noqa: PT012 - the block is what fails
             (partial / "x").write_text("new")
             raise error
@@ -110,7 +115,9 @@ def test_a_block_that_fails_leaves_the_old_folder(tmp_path: Path) -> None:
     assert [path.name for path in folder.parent.iterdir()] == ["a"]
 
 
-def test_the_old_folder_returns_if_the_new_one_cannot_be_renamed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_old_folder_returns_if_the_new_one_cannot_be_renamed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = tmp_path / "a"
     folder.mkdir()
     (folder / "x").write_text("old")
@@ -131,7 +138,12 @@ def test_the_old_folder_returns_if_the_new_one_cannot_be_renamed(tmp_path: Path,
 def test_temporary_names_are_hidden_and_unique() -> None:
     names = {temporary_path(Path("/a/b.json")) for _ in range(1000)}
     assert len(names) == 1000
-    assert all(p.parent == Path("/a") and p.name.startswith(f".b.json.{os.getpid()}.") and p.suffix == ".tmp" for p in names)
+    assert all(
+        p.parent == Path("/a")
+        and p.name.startswith(f".b.json.{os.getpid()}.")
+        and p.suffix == ".tmp"
+        for p in names
+    )
 
 
 def test_two_writers_in_one_process_do_not_meet(tmp_path: Path) -> None:

@@ -1,4 +1,6 @@
-"""The cache of things that are costly to make: made once, whole or not there, made again when damaged."""
+"""The cache of things that are costly to make: made once, whole or not there, made again when
+damaged.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ def test_is_made_at_the_first_call_and_read_at_the_second(own_cache: Path) -> No
     assert sorted(p.name for p in (own_cache / "texts").iterdir()) == ["k", "k.lock"]
 
 
-def test_damaged_folder_is_made_again_with_a_warning(own_cache: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_damaged_folder_is_made_again_with_a_warning(
+    own_cache: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     def make(folder: Path) -> None:
         (folder / "text").write_text("good 2")
 
@@ -55,7 +59,14 @@ def test_damaged_folder_is_made_again_with_a_warning(own_cache: Path, capfd: pyt
 
 def test_again_replaces_what_is_there() -> None:
     for text in ("good old", "good new"):
-        got = cached("texts", "k", lambda folder, text=text: (folder / "text").write_text(text) and None, read, "a text", again=True)  # type: ignore[misc]
+        got = cached(
+            "texts",
+            "k",
+            lambda folder, text=text: (folder / "text").write_text(text) and None,
+            read,
+            "a text",
+            again=True,
+        )  # type: ignore[misc]
         assert got == text
 
 
@@ -67,10 +78,21 @@ def test_failure_while_making_leaves_nothing_and_the_next_call_tries_again(own_c
     with pytest.raises(RuntimeError, match="fell over"):
         cached("texts", "k", fails, read, "a text")
     assert [p.name for p in (own_cache / "texts").iterdir()] == ["k.lock"]
-    assert cached("texts", "k", lambda folder: (folder / "text").write_text("good") and None, read, "a text") == "good"  # type: ignore[misc]
+    assert (
+        cached(
+            "texts",
+            "k",
+            lambda folder: (folder / "text").write_text("good") and None,
+            read,
+            "a text",
+        )
+        == "good"
+    )  # type: ignore[misc]
 
 
-def test_folder_that_cannot_be_written_names_the_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_that_cannot_be_written_names_the_variable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path / "file" / "cache"))
     with pytest.raises(InfrastructureError, match="SIMRUN_CACHE"):
@@ -92,7 +114,9 @@ def test_of_processes_that_ask_at_once_one_makes_and_the_others_wait(own_cache: 
         """
     )
     command, pipe = [sys.executable, "-c", script], subprocess.PIPE
-    asking = [subprocess.Popen([*command, name], stdout=pipe, stderr=pipe, text=True) for name in "ab"]
+    asking = [
+        subprocess.Popen([*command, name], stdout=pipe, stderr=pipe, text=True) for name in "ab"
+    ]
     answers = [p.communicate(timeout=250) for p in asking]
     assert {out.strip() for out, _ in answers} in ({"a"}, {"b"})
     assert sum("a text ..." in err for _, err in answers) == 1

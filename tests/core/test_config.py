@@ -59,10 +59,24 @@ def error_of(tmp_path: Path, text: str, model: type[BaseModel] = Car) -> InputEr
 
 
 def test_numbers_and_words_follow_yaml_1_2(tmp_path: Path) -> None:
-    data = load_yaml(write(tmp_path, "a: 1e-3\nb: no\nc: 12:30\nd: 8_000_000\ne: 0x1F\nf: ~\ng: true\nh: 010\ni: -.5\nj: 1.\n")).data
+    data = load_yaml(
+        write(
+            tmp_path,
+            "a: 1e-3\nb: no\nc: 12:30\nd: 8_000_000\ne: 0x1F\nf: ~\ng: true\nh: 010\ni: -.5\nj: 1.\n",
+        )
+    ).data
     assert data == {
-        "a": 0.001, "b": "no", "c": "12:30", "d": 8_000_000, "e": 31, "f": None, "g": True, "h": 10, "i": -0.5, "j": 1.0,
-    }  # fmt: skip
+        "a": 0.001,
+        "b": "no",
+        "c": "12:30",
+        "d": 8_000_000,
+        "e": 31,
+        "f": None,
+        "g": True,
+        "h": 10,
+        "i": -0.5,
+        "j": 1.0,
+    }
 
 
 def test_every_key_knows_its_line_and_column(tmp_path: Path) -> None:
@@ -87,7 +101,9 @@ def test_every_key_knows_its_line_and_column(tmp_path: Path) -> None:
         ("a: 1\n---\nb: 2\n", ":2:", "not valid YAML"),
     ],
 )
-def test_bad_yaml_is_refused_where_it_stands(tmp_path: Path, text: str, where: str, found: str) -> None:
+def test_bad_yaml_is_refused_where_it_stands(
+    tmp_path: Path, text: str, where: str, found: str
+) -> None:
     path = write(tmp_path, text)
     with pytest.raises(InputError) as e:
         load_yaml(path)
@@ -108,7 +124,9 @@ def test_alias_bomb_is_stopped(tmp_path: Path) -> None:
         load_yaml(write(tmp_path, "\n".join(lines)))
 
 
-@pytest.mark.parametrize("levels", [60, 900, 5_000])  # 5000: the compiled parser's own bound, where it has one, is met first
+@pytest.mark.parametrize(
+    "levels", [60, 900, 5_000]
+)  # 5000: the compiled parser's own bound, where it has one, is met first
 @pytest.mark.parametrize(("before", "after"), [("[", "]"), ("{a: ", "}"), ("- ", ""), ("? ", "")])
 def test_deep_nesting_is_stopped(tmp_path: Path, before: str, after: str, levels: int) -> None:
     with pytest.raises(InputError, match="nested deeper") as caught:
@@ -163,11 +181,21 @@ def test_extends_in_a_circle_or_to_nowhere_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "line", "found", "hint"),
     [
-        ("version: 1\nlenght_m: 3\nlength_m: 3\n", ":2:1", "unknown key 'lenght_m'", "did you mean 'length_m'?"),
+        (
+            "version: 1\nlenght_m: 3\nlength_m: 3\n",
+            ":2:1",
+            "unknown key 'lenght_m'",
+            "did you mean 'length_m'?",
+        ),
         ("version: 1\nlength_m: -3\n", ":2:1", "length_m = -3", "greater than 0"),
         ("version: 1\nlength_m: '3'\n", ":2:1", "length_m = '3' (text)", "number"),
         ("version: 1\nlength_m: 3\ndoors: 4.5\n", ":3:1", "doors = 4.5", "integer"),
-        ("version: 1\nlength_m: 3\ndoors: true\n", ":3:1", "doors = True (true or false)", "integer"),
+        (
+            "version: 1\nlength_m: 3\ndoors: true\n",
+            ":3:1",
+            "doors = True (true or false)",
+            "integer",
+        ),
         ("version: 1\nlength_m: .inf\n", ":2:1", "length_m = inf", "finite"),
         ("version: 1\nlength_m: .nan\n", ":2:1", "length_m = nan", "finite"),
         ("length_m: 3\n", ":1:1", "the file has no 'version'", "add version: Version"),
@@ -177,7 +205,9 @@ def test_extends_in_a_circle_or_to_nowhere_is_refused(tmp_path: Path) -> None:
         ("", "", "the file = None (nothing)", "object"),
     ],
 )
-def test_wrong_content_is_named_with_position_and_hint(tmp_path: Path, text: str, line: str, found: str, hint: str) -> None:
+def test_wrong_content_is_named_with_position_and_hint(
+    tmp_path: Path, text: str, line: str, found: str, hint: str
+) -> None:
     e = error_of(tmp_path, text)
     assert line in e.with_what
     assert found in e.found
@@ -206,11 +236,17 @@ def test_tagged_unions_name_the_nearest_kind_and_the_keys_of_that_kind(tmp_path:
 
 
 def test_overrides_set_values_by_key_index_and_id(tmp_path: Path) -> None:
-    document = load_yaml(write(tmp_path, "a: {b: 1}\nc:\n  - {id: lead, v: 1}\n  - {id: rear, v: 2}\n"))
-    changed = apply_overrides(document, ["a.b=7", "a.new=[1, 2]", "c.rear.v=9", "c.0.v=1e1", "text=no"])
+    document = load_yaml(
+        write(tmp_path, "a: {b: 1}\nc:\n  - {id: lead, v: 1}\n  - {id: rear, v: 2}\n")
+    )
+    changed = apply_overrides(
+        document, ["a.b=7", "a.new=[1, 2]", "c.rear.v=9", "c.0.v=1e1", "text=no"]
+    )
     assert changed.data == {
-        "a": {"b": 7, "new": [1, 2]}, "c": [{"id": "lead", "v": 10.0}, {"id": "rear", "v": 9}], "text": "no",
-    }  # fmt: skip
+        "a": {"b": 7, "new": [1, 2]},
+        "c": [{"id": "lead", "v": 10.0}, {"id": "rear", "v": 9}],
+        "text": "no",
+    }
     assert changed.overrides == ("a.b=7", "a.new=[1, 2]", "c.rear.v=9", "c.0.v=1e1", "text=no")
     assert document.data["a"] == {"b": 1}, "the document itself is not changed"
 

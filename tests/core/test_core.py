@@ -8,7 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.clock import Clock
-from alpasim_plugin.core.errors import EvaluatorError, InfrastructureError, InputError, PolicyError, RendererError
+from alpasim_plugin.core.errors import (
+    EvaluatorError,
+    InfrastructureError,
+    InputError,
+    PolicyError,
+    RendererError,
+)
 from alpasim_plugin.core.seeding import derive_seed, stream
 from alpasim_plugin.core.types import Rates
 
@@ -27,7 +33,9 @@ def test_clock_does_not_drift_over_an_hour_at_thirty_hertz() -> None:
     assert [t.t_us for t in clock.ticks()][-1] == clock.n_steps * 33_333
 
 
-@pytest.mark.parametrize("rates", [Rates(0), Rates(100_000, 150_000), Rates(100_000, 100_000, 50_000), Rates(-1)])
+@pytest.mark.parametrize(
+    "rates", [Rates(0), Rates(100_000, 150_000), Rates(100_000, 100_000, 50_000), Rates(-1)]
+)
 def test_periods_that_are_no_multiple_are_refused(rates: Rates) -> None:
     with pytest.raises(InputError, match=r"multiple of rates\.control_us"):
         Clock(0, 1_000_000, rates)
@@ -42,13 +50,20 @@ def test_streams_depend_on_their_key_alone() -> None:
     first = stream("scene", 3, "policy", 7).normal(size=4)
     stream("other", 3, "policy", 7).normal(size=100)
     np.testing.assert_array_equal(first, stream("scene", 3, "policy", 7).normal(size=4))
-    for other in (("scene2", 3, "policy", 7), ("scene", 4, "policy", 7), ("scene", 3, "actors", 7), ("scene", 3, "policy", 8)):
+    for other in (
+        ("scene2", 3, "policy", 7),
+        ("scene", 4, "policy", 7),
+        ("scene", 3, "actors", 7),
+        ("scene", 3, "policy", 8),
+    ):
         assert not np.array_equal(first, stream(*other).normal(size=4))
 
 
 def test_streams_are_the_same_on_every_platform() -> None:
     assert derive_seed("scene", 0, "policy", 0) == 0x3CB2424955DFCEC0
-    np.testing.assert_allclose(stream("scene", 0, "policy").random(2), [0.54300724, 0.97485974], atol=1e-8)
+    np.testing.assert_allclose(
+        stream("scene", 0, "policy").random(2), [0.54300724, 0.97485974], atol=1e-8
+    )
 
 
 @given(st.text(max_size=8), st.text(max_size=8))
@@ -59,8 +74,16 @@ def test_fields_of_a_key_cannot_run_into_each_other(a: str, b: str) -> None:
 
 def test_an_error_shows_its_four_parts_one_a_line() -> None:
     text = str(InputError("reading a scene", "a.yaml:3:5", "no key 'roda'", "did you mean 'road'?"))
-    assert [line.split(":")[0].strip() for line in text.splitlines()] == ["error", "with", "found", "do"]
+    assert [line.split(":")[0].strip() for line in text.splitlines()] == [
+        "error",
+        "with",
+        "found",
+        "do",
+    ]
 
 
 def test_exit_codes_tell_the_cause() -> None:
-    assert [e.exit_code for e in (InputError, InfrastructureError, RendererError, PolicyError, EvaluatorError)] == [2, 4, 4, 2, 5]
+    assert [
+        e.exit_code
+        for e in (InputError, InfrastructureError, RendererError, PolicyError, EvaluatorError)
+    ] == [2, 4, 4, 2, 5]

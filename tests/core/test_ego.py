@@ -1,4 +1,6 @@
-"""States read off a recording: one call for many times gives what one call each gives, at the ends of the log too."""
+"""States read off a recording: one call for many times gives what one call each gives, at the ends
+of the log too.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,9 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import ego_state_from_log, ego_states_from_log, quat_from_yaw
 from alpasim_plugin.core.types import Trajectory, Vehicle
 
-T_US = np.arange(0, 2_000_001, 50_000, dtype=np.int64) + 1_700_000_000_000_000  # epoch times: too long for a float's mantissa
+T_US = (
+    np.arange(0, 2_000_001, 50_000, dtype=np.int64) + 1_700_000_000_000_000
+)  # epoch times: too long for a float's mantissa
 
 
 def circle(speed_mps: float, radius_m: float) -> Trajectory:
@@ -45,6 +49,11 @@ def test_a_log_of_one_pose_stands_still_and_times_outside_are_refused() -> None:
     log = circle(8.0, 40.0)
     alone = Trajectory(log.t_us[:1], log.xyz[:1], log.quat[:1])
     (still,) = ego_states_from_log(alone, [int(T_US[0])], Vehicle())
-    assert (still.speed_mps, still.accel_mps2, still.yaw_rate_radps, still.steer_rad) == (0.0, 0.0, 0.0, 0.0)
+    assert (still.speed_mps, still.accel_mps2, still.yaw_rate_radps, still.steer_rad) == (
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    )
     with pytest.raises(InputError, match="the trajectory covers"):
         ego_states_from_log(log, [int(T_US[-1]) + 1], Vehicle())

@@ -1,4 +1,6 @@
-"""Rigid motion and polylines against scipy and closed forms, at the corners where such code breaks."""
+"""Rigid motion and polylines against scipy and closed forms, at the corners where such code
+breaks.
+"""
 
 from __future__ import annotations
 
@@ -35,14 +37,18 @@ from tests.examples import examples
 EPOCH_US = 1_689_697_803_493_732  # a recorded time stamp: larger than a float32, and than 2^50
 
 four = st.lists(st.floats(-1, 1), min_size=4, max_size=4)
-unit_quats = four.filter(lambda q: np.linalg.norm(q) > 1e-3).map(lambda q: np.array(q) / np.linalg.norm(q))
+unit_quats = four.filter(lambda q: np.linalg.norm(q) > 1e-3).map(
+    lambda q: np.array(q) / np.linalg.norm(q)
+)
 
 
 @settings(deadline=None)
 @given(unit_quats)
 def test_rotation_matrix_agrees_with_scipy_and_survives_the_way_back(quat: np.ndarray) -> None:
     matrix = matrix_from_quat(quat)
-    np.testing.assert_allclose(matrix, Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(
+        matrix, Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix(), atol=1e-12
+    )
     back = quat_from_matrix(matrix)
     assert abs(abs(back @ quat) - 1) < 1e-12
     assert back[0] >= 0
@@ -67,12 +73,18 @@ def test_slerp_agrees_with_scipy(q0: np.ndarray, q1: np.ndarray, fraction: float
     ours = slerp(q0[None], q1[None], np.array([fraction]))[0]
     if abs(q0 @ q1) < 1e-6:
         return  # opposite rotations: the shorter arc is not unique
-    theirs = Slerp([0, 1], Rotation.from_quat(np.stack([q0, q1])[:, [1, 2, 3, 0]]))(fraction).as_quat()[[3, 0, 1, 2]]
+    theirs = Slerp([0, 1], Rotation.from_quat(np.stack([q0, q1])[:, [1, 2, 3, 0]]))(
+        fraction
+    ).as_quat()[[3, 0, 1, 2]]
     assert abs(abs(ours @ theirs) - 1) < 1e-9
 
 
 def test_interpolation_at_epoch_microseconds_keeps_every_microsecond() -> None:
-    line = Trajectory(EPOCH_US + np.array([0, 100_000]), np.array([[0.0, 0, 0], [1.0, 0, 0]]), quat_from_yaw(np.zeros(2)))
+    line = Trajectory(
+        EPOCH_US + np.array([0, 100_000]),
+        np.array([[0.0, 0, 0], [1.0, 0, 0]]),
+        quat_from_yaw(np.zeros(2)),
+    )
     for dt in (0, 1, 50_000, 99_999, 100_000):
         assert interpolate(line, EPOCH_US + dt)[0, 3] == pytest.approx(dt / 100_000, abs=1e-15)
 
@@ -117,22 +129,34 @@ def test_a_spline_is_scipys_to_the_last_bit(points: int, derivative: int) -> Non
     random = np.random.default_rng(points)
     at = np.cumsum(random.uniform(0.01, 5.0, points))
     line = 1e4 * random.normal(size=(points, 3))
-    asked = np.concatenate([at, random.uniform(at[0], at[-1], 40), [at[0] - 1.0, at[-1] + 1.0]])  # knots, between them, outside
-    np.testing.assert_array_equal(CubicSpline(at, line)(asked, derivative), scipy.interpolate.CubicSpline(at, line)(asked, derivative))
+    asked = np.concatenate(
+        [at, random.uniform(at[0], at[-1], 40), [at[0] - 1.0, at[-1] + 1.0]]
+    )  # knots, between them, outside
+    np.testing.assert_array_equal(
+        CubicSpline(at, line)(asked, derivative),
+        scipy.interpolate.CubicSpline(at, line)(asked, derivative),
+    )
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 50])
 def test_tridiagonal_systems_are_solved_as_lapack_does_where_rows_are_exchanged_too(n: int) -> None:
     random = np.random.default_rng(n)
     for _ in range(20):
-        below, diagonal, above, right = (random.normal(size=size) for size in (n - 1, n, n - 1, (n, 3)))
-        np.testing.assert_array_equal(solve_tridiagonal(below, diagonal, above, right), lapack.dgtsv(below, diagonal, above, right)[3])
+        below, diagonal, above, right = (
+            random.normal(size=size) for size in (n - 1, n, n - 1, (n, 3))
+        )
+        np.testing.assert_array_equal(
+            solve_tridiagonal(below, diagonal, above, right),
+            lapack.dgtsv(below, diagonal, above, right)[3],
+        )
 
 
 def test_one_quaternion_is_that_of_many_to_the_last_bit() -> None:
     random = np.random.default_rng(0)
     turned = Rotation.from_rotvec(np.pi * np.eye(3)).as_matrix()  # 180 degrees about each axis
-    noisy = Rotation.random(200, random_state=1).as_matrix() * (1 + 1e-9 * random.normal(size=(200, 3, 3)))
+    noisy = Rotation.random(200, random_state=1).as_matrix() * (
+        1 + 1e-9 * random.normal(size=(200, 3, 3))
+    )
     planar = Rotation.from_rotvec(random.uniform(-4, 4, (50, 1)) * [0.0, 0.0, 1.0]).as_matrix()
     matrices = np.concatenate([turned, np.eye(3)[None], noisy, planar, -turned])
     many = quat_from_matrix(matrices)

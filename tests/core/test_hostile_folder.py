@@ -18,13 +18,36 @@ from alpasim_plugin.core.subprocesses import OURS, SAFE_PATH, own_path_only
 from tests.examples import first_of
 
 REPO = Path(__file__).resolve().parents[2]
-# What libraries of ours import if it is there, and what Python itself imports when it starts a worker.
+# What libraries of ours import if it is there, and what Python itself imports when it starts a
+# worker.
 BAITS = (
-    "colorama", "numexpr", "bottleneck", "pytz", "coverage", "multiprocessing", "selectors", "pickle", "runpy", "sitecustomize",
-    "usercustomize", "IPython", "readline",
-)  # fmt: skip
+    "colorama",
+    "numexpr",
+    "bottleneck",
+    "pytz",
+    "coverage",
+    "multiprocessing",
+    "selectors",
+    "pickle",
+    "runpy",
+    "sitecustomize",
+    "usercustomize",
+    "IPython",
+    "readline",
+)
 SCRIPT = f"import sys\nsys.path.append({str(REPO)!r})\nfrom alpasim_plugin.cli.main import main\nif __name__ == '__main__':\n    main()\n"
-DRIVE = ("run", "--renderer", "clean", "--images", "none", "--certify", "none", "--no-report", "--seeds", "2")
+DRIVE = (
+    "run",
+    "--renderer",
+    "clean",
+    "--images",
+    "none",
+    "--certify",
+    "none",
+    "--no-report",
+    "--seeds",
+    "2",
+)
 POLICY = """
 import with_me
 from pydantic import BaseModel
@@ -42,13 +65,24 @@ def hostile(tmp_path: Path) -> Path:
     tmp_path = tmp_path / "work"
     tmp_path.mkdir()
     for name in BAITS:
-        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'a').write('{name} ')\n")
+        (tmp_path / f"{name}.py").write_text(
+            f"open({str(tmp_path / 'ran')!r}, 'a').write('{name} ')\n"
+        )
     (tmp_path / "evil.py").write_text((tmp_path / "pytz.py").read_text())
     info = tmp_path / "evil-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: evil\nVersion: 1.0\n")
-    groups = ("simrun.policies", "simrun.evaluators", "simrun.sources", "simrun.renderers", "pydantic", "numba_extensions")
-    (info / "entry_points.txt").write_text("".join(f"[{group}]\nevil = evil:Evil\n" for group in groups))
+    groups = (
+        "simrun.policies",
+        "simrun.evaluators",
+        "simrun.sources",
+        "simrun.renderers",
+        "pydantic",
+        "numba_extensions",
+    )
+    (info / "entry_points.txt").write_text(
+        "".join(f"[{group}]\nevil = evil:Evil\n" for group in groups)
+    )
     return tmp_path
 
 
@@ -57,9 +91,21 @@ def simrun(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     script = folder.parent / "bin" / "simrun"
     script.parent.mkdir(exist_ok=True)
     script.write_text(SCRIPT)
-    environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONSAFEPATH")}
+    environment = {
+        key: value
+        for key, value in os.environ.items()
+        if key not in ("PYTHONPATH", "PYTHONSAFEPATH")
+    }
     command = [sys.executable, str(script), *arguments]
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=240)
+    return subprocess.run(
+        command,
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=240,
+    )
 
 
 def ran(folder: Path) -> str:
@@ -68,14 +114,22 @@ def ran(folder: Path) -> str:
 
 QUICK = (["runs", "."], ["report", "one"], ["list", "policies"])
 MORE = (
-    ["compare", "one"], ["check", "one"], ["gate", "one"], ["view", "one"], ["preview", "smoke/straight"],
-    [*DRIVE, "--dry-run", "smoke/straight"], ["list", "metrics"], ["score", "one"],
-)  # fmt: skip
+    ["compare", "one"],
+    ["check", "one"],
+    ["gate", "one"],
+    ["view", "one"],
+    ["preview", "smoke/straight"],
+    [*DRIVE, "--dry-run", "smoke/straight"],
+    ["list", "metrics"],
+    ["score", "one"],
+)
 
 
 @pytest.mark.slow  # `test_ways_to_run_code` tries the same folder in a few seconds
 @pytest.mark.parametrize("commands", [QUICK, MORE], ids=["quick", "more"])
-def test_no_command_runs_what_lies_in_the_working_directory(hostile: Path, commands: Sequence[list[str]]) -> None:
+def test_no_command_runs_what_lies_in_the_working_directory(
+    hostile: Path, commands: Sequence[list[str]]
+) -> None:
     first = simrun(hostile, *DRIVE, "--workers", "2", "--out", "one", "smoke/straight")
     assert first.returncode == 0, first.stderr
     assert ran(hostile) == ""
@@ -86,22 +140,42 @@ def test_no_command_runs_what_lies_in_the_working_directory(hostile: Path, comma
         assert "evil" not in done.stdout, command
 
 
-NAMES = ("pack.inner.policy:Mine", "my_policy.py:Mine", "my_policy:Mine", "pack/inner/policy.py:Mine")
+NAMES = (
+    "pack.inner.policy:Mine",
+    "my_policy.py:Mine",
+    "my_policy:Mine",
+    "pack/inner/policy.py:Mine",
+)
 
 
 @pytest.mark.parametrize("name", first_of(NAMES))
 @pytest.mark.slow
-def test_a_part_of_the_working_directory_works_by_name_with_what_it_imports_also_in_workers(hostile: Path, name: str) -> None:
+def test_a_part_of_the_working_directory_works_by_name_with_what_it_imports_also_in_workers(
+    hostile: Path, name: str
+) -> None:
     (hostile / "my_policy.py").write_text(POLICY)
     (hostile / "with_me.py").write_text(BASE)
     inner = hostile / "pack" / "inner"
     inner.mkdir(parents=True)
     (hostile / "pack" / "__init__.py").write_text("")
     (inner / "__init__.py").write_text("")
-    (inner / "policy.py").write_text(POLICY.replace("import with_me", "from .. import with_me\nfrom pack.inner import also"))
+    (inner / "policy.py").write_text(
+        POLICY.replace("import with_me", "from .. import with_me\nfrom pack.inner import also")
+    )
     (inner / "also.py").write_text("")
     (hostile / "pack" / "with_me.py").write_text(BASE)
-    done = simrun(hostile, *DRIVE, "--policy", name, "--workers", "2", "--out", "mine", "smoke/straight", "--json")
+    done = simrun(
+        hostile,
+        *DRIVE,
+        "--policy",
+        name,
+        "--workers",
+        "2",
+        "--out",
+        "mine",
+        "smoke/straight",
+        "--json",
+    )
     assert done.returncode == 0, done.stderr
     assert json.loads((hostile / "mine" / "run.json").read_text())["policies"]
     assert ran(hostile) == ""
@@ -131,7 +205,9 @@ def test_two_files_beside_modules_of_one_name_are_refused(tmp_path: Path) -> Non
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "part.py").write_text("from same_name_twice import Mine\n")
-        (tmp_path / name / "same_name_twice.py").write_text(f"{BASE}class Mine(Base):\n    note = '{name}'\n")
+        (tmp_path / name / "same_name_twice.py").write_text(
+            f"{BASE}class Mine(Base):\n    note = '{name}'\n"
+        )
     assert resolve("policy", f"{tmp_path}/a/part.py:Mine").note == "a"
     with pytest.raises(InputError, match="same_name_twice was imported from"):
         resolve("policy", f"{tmp_path}/b/part.py:Mine")
@@ -146,7 +222,9 @@ def test_a_worker_on_a_cluster_has_no_working_directory_on_its_path_unless_the_u
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     own_path_only()
     assert str(tmp_path) in sys.path
-    assert SAFE_PATH not in os.environ, "a command of the user's that the worker starts finds files beside its script"
+    assert SAFE_PATH not in os.environ, (
+        "a command of the user's that the worker starts finds files beside its script"
+    )
     monkeypatch.delenv("PYTHONPATH")
     own_path_only()
     assert not {"", str(tmp_path)} & set(sys.path)

@@ -34,7 +34,9 @@ with lock.one_writer(Path(sys.argv[1]), "writing", "a folder"):
 
 
 def hold(path: Path, how: str = "flock") -> subprocess.Popen[str]:
-    process = subprocess.Popen([sys.executable, "-c", HOLDER, str(path), how], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(path), how], stdout=subprocess.PIPE, text=True
+    )
     assert process.stdout is not None
     assert process.stdout.readline() == "held\n"
     return process
@@ -52,11 +54,15 @@ def how(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     return str(request.param)
 
 
-def test_a_second_process_is_refused_by_name_and_a_killed_one_holds_nothing(tmp_path: Path, how: str) -> None:
+def test_a_second_process_is_refused_by_name_and_a_killed_one_holds_nothing(
+    tmp_path: Path, how: str
+) -> None:
     path = tmp_path / "folder" / ".lock"
     process = hold(path, how)
     with (
-        pytest.raises(InfrastructureError, match=f"process {process.pid} on .* is writing it") as caught,
+        pytest.raises(
+            InfrastructureError, match=f"process {process.pid} on .* is writing it"
+        ) as caught,
         one_writer(path, "writing", "it"),
     ):
         pass
@@ -82,7 +88,11 @@ def test_who_waits_says_for_whom_and_gets_the_lock(tmp_path: Path, how: str) -> 
 
 def test_the_holder_itself_is_refused_a_second_time(tmp_path: Path, how: str) -> None:
     path = tmp_path / ".lock"
-    with one_writer(path, "writing", "it"), pytest.raises(InfrastructureError), one_writer(path, "writing", "it"):
+    with (
+        one_writer(path, "writing", "it"),
+        pytest.raises(InfrastructureError),
+        one_writer(path, "writing", "it"),
+    ):
         pass
 
 
@@ -105,7 +115,10 @@ def test_what_a_holder_left_is_judged_by_machine_number_and_start(
         with one_writer(path, "writing", "it"):
             pass
         return
-    with pytest.raises(InfrastructureError, match="on another") as caught, one_writer(path, "writing", "it"):
+    with (
+        pytest.raises(InfrastructureError, match="on another") as caught,
+        one_writer(path, "writing", "it"),
+    ):
         pass
     assert f"remove {named if how == 'text' else path}" in caught.value.do_this
 

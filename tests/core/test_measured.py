@@ -34,7 +34,9 @@ def work(folder: Path, log: Path, item: int) -> tuple[int, int]:
     started.mkdir(exist_ok=True)
     (started / str(os.getpid())).touch()
     until_s = time.monotonic() + 60.0
-    while len(list(started.iterdir())) < 2 and time.monotonic() < until_s:  # so that neither does all of it alone
+    while (
+        len(list(started.iterdir())) < 2 and time.monotonic() < until_s
+    ):  # so that neither does all of it alone
         time.sleep(0.01)
     share_measurements(folder)
     return os.getpid(), measured("speed", partial(take, log))["pid"]
@@ -42,13 +44,20 @@ def work(folder: Path, log: Path, item: int) -> tuple[int, int]:
 
 def test_of_two_processes_at_once_one_measures_and_both_have_its_values(tmp_path: Path) -> None:
     log = tmp_path / "log"
-    answers = [got for _, got in run_in_processes(partial(work, tmp_path / "measured" / "run", log), [0, 1, 2, 3], 2, 1)]
+    answers = [
+        got
+        for _, got in run_in_processes(
+            partial(work, tmp_path / "measured" / "run", log), [0, 1, 2, 3], 2, 1
+        )
+    ]
     assert len({pid for pid, _ in answers}) == 2
     (measurer,) = log.read_text().split()
     assert {measurer} == {str(taken) for _, taken in answers}
 
 
-def test_another_run_measures_again_and_what_was_measured_alone_is_kept_by_the_process(tmp_path: Path) -> None:
+def test_another_run_measures_again_and_what_was_measured_alone_is_kept_by_the_process(
+    tmp_path: Path,
+) -> None:
     log = tmp_path / "log"
     for folder in (None, tmp_path / "m" / "a", tmp_path / "m" / "b", None):
         share_measurements(folder)

@@ -13,7 +13,14 @@ from alpasim_plugin.core.errors import InfrastructureError
 from tests.other_user import NOBODY, as_root, run_as_nobody, shared_folder
 
 REPO = Path(__file__).resolve().parents[2]
-VARIABLES = ("SIMRUN_CACHE", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "SIMRUN_SCRATCH", "NUMBA_DISABLE_JIT", "MPLCONFIGDIR")
+VARIABLES = (
+    "SIMRUN_CACHE",
+    "XDG_CACHE_HOME",
+    "NUMBA_CACHE_DIR",
+    "SIMRUN_SCRATCH",
+    "NUMBA_DISABLE_JIT",
+    "MPLCONFIGDIR",
+)
 SAYS = """
 import os, sys
 sys.path.insert(0, {repo!r})
@@ -35,14 +42,20 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def said_by_nobody(home: Path, **variables: str) -> tuple[list[str], str]:
-    """Return what another user's process chooses who cannot write the source, and what is known of its cache."""
-    done = run_as_nobody([sys.executable, "-c", SAYS.format(repo=str(REPO))], HOME=str(home), **variables)
+    """Return what another user's process chooses who cannot write the source, and what is known of
+    its cache.
+    """
+    done = run_as_nobody(
+        [sys.executable, "-c", SAYS.format(repo=str(REPO))], HOME=str(home), **variables
+    )
     assert done.returncode == 0, done.stderr
     first, second = done.stdout.splitlines()
     return first.split("|"), second
 
 
-def test_a_named_cache_goes_before_the_standard_folders_and_those_before_the_home(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_named_cache_goes_before_the_standard_folders_and_those_before_the_home(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert places.cache() == places.Place(home / ".cache" / "simrun", "below the home folder")
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # to be ignored, says the standard
     assert places.cache().path == home / ".cache" / "simrun"
@@ -93,7 +106,9 @@ def test_kernels_of_a_source_that_cannot_be_written_lie_in_the_cache() -> None:
         assert found[2] == f"{kept}/numba", "a named folder that cannot be written"
 
 
-def test_where_nothing_can_be_written_nothing_is_compiled_and_it_is_said(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_nothing_can_be_written_nothing_is_compiled_and_it_is_said(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     monkeypatch.setattr(places, "_make_temporary", lambda: None)
     monkeypatch.setattr(places, "_notes", {})
@@ -105,7 +120,9 @@ def test_where_nothing_can_be_written_nothing_is_compiled_and_it_is_said(home: P
         places.require_kernels()
 
 
-def test_the_scratch_folder_has_a_name_of_its_own_that_is_kept(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_scratch_folder_has_a_name_of_its_own_that_is_kept(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = places.scratch().path
     assert first is not None
     assert first == places.scratch().path

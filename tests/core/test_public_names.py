@@ -13,10 +13,10 @@ from alpasim_plugin.core.parts.source import reached
 def test_every_public_name_is_there_and_has_one_home(repo: Path) -> None:
     listed = {name for names in simrun.HOMES.values() for name in names}
     assert listed | {"__version__"} == set(simrun.__all__)
-    code = (
-        "import sys, simrun; [getattr(simrun, n) for n in ('Plan', 'InputError', 'plan_times')]; print({'torch', 'numba'} & {*sys.modules})"
+    code = "import sys, simrun; [getattr(simrun, n) for n in ('Plan', 'InputError', 'plan_times')]; print({'torch', 'numba'} & {*sys.modules})"
+    told = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=repo, check=True
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=repo, check=True)
     assert told.stdout.strip() == "set()"
     assert simrun.load_scenario.__module__ == "scenarios.load"
 

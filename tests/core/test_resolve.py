@@ -13,7 +13,17 @@ from alpasim_plugin.core.parts.resolve import PLAIN_KINDS
 from alpasim_plugin.core.parts.source import OWN_ROOT, code_digest, code_files, load, reached
 from alpasim_plugin.core.parts.spec import BUILTIN, KINDS
 
-DECLARED = ("settings_model", "describe", "files", "trained", "note", "is_remote", "missing", "metrics", "controller")
+DECLARED = (
+    "settings_model",
+    "describe",
+    "files",
+    "trained",
+    "note",
+    "is_remote",
+    "missing",
+    "metrics",
+    "controller",
+)
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
@@ -21,14 +31,18 @@ def test_every_shipped_part_resolves_and_has_a_digest_and_help(kind: str) -> Non
     for name, text in names(kind).items():  # type: ignore[arg-type]
         behind = {"/": "127.0.0.1:1", ":": "sh serve.sh"}.get(name[-1], "")
         spec = resolve(kind, name + behind)  # type: ignore[arg-type]
-        assert (spec.digest is None) == bool(behind), name  # what is behind an address or a command is not known here
+        assert (spec.digest is None) == bool(behind), (
+            name
+        )  # what is behind an address or a command is not known here
         assert text
         assert "\n" not in text
 
 
 @pytest.mark.parametrize("kind", PLAIN_KINDS)
 def test_shipped_parts_of_plain_kinds_declare_nothing(kind: str) -> None:
-    for target in (target for name, (target, _) in BUILTIN[kind].items() if not name.endswith("://")):
+    for target in (
+        target for name, (target, _) in BUILTIN[kind].items() if not name.endswith("://")
+    ):
         factory = load(target, kind)
         own = {name for name in DECLARED if getattr(factory, name, None)}
         assert own == set(), target
@@ -69,7 +83,13 @@ def test_the_digest_follows_imports_wherever_they_stand(tmp_path: Path) -> None:
         (package / f"{name}.py").write_text(f"NAME = '{name}'\n")
     (tmp_path / "beside.py").write_text("import pack.part\n")
     part = package / "part.py"
-    assert {Path(path).name for path in reached(part)} == {"__init__.py", "part.py", "near.py", "other.py", "beside.py"}
+    assert {Path(path).name for path in reached(part)} == {
+        "__init__.py",
+        "part.py",
+        "near.py",
+        "other.py",
+        "beside.py",
+    }
     before = code_digest(part)
     (package / "typed.py").write_text("NAME = 'another'\n")
     assert code_digest(part) == before
@@ -93,7 +113,12 @@ def test_optional_members_get_their_defaults_and_required_ones_are_named() -> No
             return request
 
     renderer = complete(Bare(), Renderer)
-    assert (renderer.lookahead, renderer.block, dict(renderer.stage_ms), renderer.facts()) == (0, None, {}, {})  # type: ignore[attr-defined]
+    assert (renderer.lookahead, renderer.block, dict(renderer.stage_ms), renderer.facts()) == (
+        0,
+        None,
+        {},
+        {},
+    )  # type: ignore[attr-defined]
     assert renderer.render_batch([1, 2]) == [1, 2]  # type: ignore[attr-defined]
     with pytest.raises(InputError, match="a Bare without reset, step"):
         complete(Bare(), Fixer)
@@ -133,7 +158,9 @@ def own_files(path: Path) -> set[str]:
 
 def test_the_digest_follows_names_that_our_packages_import_lazily(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
-    file.write_text("from evaluators import PRESETS\nfrom alpasim_plugin.gaussians import (\n    GaussianCloud,\n)\n")
+    file.write_text(
+        "from evaluators import PRESETS\nfrom alpasim_plugin.gaussians import (\n    GaussianCloud,\n)\n"
+    )
     assert {"evaluators/metrics/presets.py", "alpasim_plugin/gaussians/cloud.py"} <= own_files(file)
     assert "alpasim_plugin/gaussians/raster/rasterize_cpu.py" not in own_files(file)
 
@@ -144,17 +171,29 @@ def test_a_part_that_may_name_others_depends_on_all_of_ours(tmp_path: Path) -> N
     assert "alpasim_plugin/gaussians/raster/rasterize_cpu.py" in own_files(file)
 
 
-def test_a_class_named_through_its_package_has_the_digest_of_its_own_module(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_class_named_through_its_package_has_the_digest_of_its_own_module(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     home = "policies/simple.py"
     digest = resolve("policy", "policies:ConstantVelocity").digest
     whole = spec.code_digest
-    monkeypatch.setattr(spec, "code_digest", lambda file: whole(file) + ("edited" if str(file).endswith(home) else ""))
+    monkeypatch.setattr(
+        spec,
+        "code_digest",
+        lambda file: whole(file) + ("edited" if str(file).endswith(home) else ""),
+    )
     assert resolve("policy", "policies:ConstantVelocity").digest != digest
 
 
 def test_settings_in_brackets_make_another_arm_of_one_fixer() -> None:
-    plain, without = resolve_renderer("identity"), resolve_renderer("identity[references=0,tolerance_m=0.5]+clean")
-    assert (without.name, str(without)) == ("identity[references=0,tolerance_m=0.5]+clean", "identity[references=0,tolerance_m=0.5]+clean")
+    plain, without = (
+        resolve_renderer("identity"),
+        resolve_renderer("identity[references=0,tolerance_m=0.5]+clean"),
+    )
+    assert (without.name, str(without)) == (
+        "identity[references=0,tolerance_m=0.5]+clean",
+        "identity[references=0,tolerance_m=0.5]+clean",
+    )
     assert without.fixer is not None
     assert plain.fixer is not None
     assert without.fixer.settings.tolerance_m == 0.5  # type: ignore[union-attr]
@@ -166,7 +205,9 @@ def test_a_bracket_counts_for_its_own_arm_and_over_what_is_set_for_all() -> None
     assert (own.fixer.settings.tolerance_m, own.fixer.settings.tolerance_deg) == (0.5, 0.75)  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize("name", ["clean[a=1]", "identity[]", "identity[a]", "identity[a=1", "identity[a=1][b=2]"])
+@pytest.mark.parametrize(
+    "name", ["clean[a=1]", "identity[]", "identity[a]", "identity[a=1", "identity[a=1][b=2]"]
+)
 def test_brackets_without_settings_are_refused(name: str) -> None:
     with pytest.raises(InputError, match="bracket"):
         resolve_renderer(name)

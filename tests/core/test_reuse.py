@@ -24,7 +24,18 @@ class Odd:
     def __init__(self, gain):
         pass
 """
-QUICK = ("--seeds", "1", "--workers", "1", "--images", "none", "--certify", "none", "--no-report", "--json")
+QUICK = (
+    "--seeds",
+    "1",
+    "--workers",
+    "1",
+    "--images",
+    "none",
+    "--certify",
+    "none",
+    "--no-report",
+    "--json",
+)
 SHORT = (*QUICK, "--set", "timing.duration_us=1200000")
 
 
@@ -52,11 +63,23 @@ def made(folder: Path, renderer: str, *more: str) -> int:
     return next(folder.glob("run/rollouts/*/*/*/0/rollout.asl")).stat().st_mtime_ns
 
 
-def test_a_remote_part_is_never_reused_unasked(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_remote_part_is_never_reused_unasked(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     first, second = made(folder, "Remote"), made(folder, "Remote")
     assert second != first
     assert made(folder, "Remote", "--resume") == second
-    run_command(["--renderer", "parts_of_a_user.py:Remote", "--policy", "constant-velocity", *SHORT, "--dry-run", "smoke/straight"])
+    run_command(
+        [
+            "--renderer",
+            "parts_of_a_user.py:Remote",
+            "--policy",
+            "constant-velocity",
+            *SHORT,
+            "--dry-run",
+            "smoke/straight",
+        ]
+    )
     plan = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert plan["never_reused"] == ["renderer parts_of_a_user.py:Remote"]
 
@@ -65,8 +88,24 @@ def test_a_part_with_a_digest_is_reused(folder: Path) -> None:
     assert made(folder, "Grey") == made(folder, "Grey")
 
 
-def test_a_factory_that_asks_for_something_else_is_told_what_there_is(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["--renderer", "clean", "--policy", "parts_of_a_user.py:Odd", *SHORT, "--out", "odd", "smoke/straight"]) == 2
+def test_a_factory_that_asks_for_something_else_is_told_what_there_is(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        run_command(
+            [
+                "--renderer",
+                "clean",
+                "--policy",
+                "parts_of_a_user.py:Odd",
+                *SHORT,
+                "--out",
+                "odd",
+                "smoke/straight",
+            ]
+        )
+        == 2
+    )
     failed = json.loads(capsys.readouterr().out)["summary"]["failures"]["cells"][0]["error"]
     assert (failed["found"], failed["failure_class"]) == ("its factory asks for gain", "policy")
     assert "scenario" in failed["do"]

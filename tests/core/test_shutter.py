@@ -1,4 +1,6 @@
-"""A rolling shutter cut into bands: every pixel once, each at its time, and no more bands than the motion needs."""
+"""A rolling shutter cut into bands: every pixel once, each at its time, and no more bands than the
+motion needs.
+"""
 
 from __future__ import annotations
 
@@ -8,30 +10,55 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.core.shutter import MOST_BANDS, Along, at_share, bands, bands_of, between, motion_px, rolling
+from alpasim_plugin.core.shutter import (
+    MOST_BANDS,
+    Along,
+    at_share,
+    bands,
+    bands_of,
+    between,
+    motion_px,
+    rolling,
+)
 from alpasim_plugin.core.types import F64, CameraSpec, Exposure, RenderRequest
 
 WIDTH, HEIGHT = 64, 32
-FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # a camera that looks along x of its rig
-SPEC = CameraSpec("front", WIDTH, HEIGHT, np.array([[400.0, 0, 32], [0, 400.0, 16], [0, 0, 1]]), FORWARD)
+FORWARD = np.array(
+    [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]]
+)  # a camera that looks along x of its rig
+SPEC = CameraSpec(
+    "front", WIDTH, HEIGHT, np.array([[400.0, 0, 32], [0, 400.0, 16], [0, 0, 1]]), FORWARD
+)
 
 
 def asked(
-    start: F64, end: F64, actors: dict[str, tuple[F64, F64]] | None = None, along: Along = "rows", back: bool = False
+    start: F64,
+    end: F64,
+    actors: dict[str, tuple[F64, F64]] | None = None,
+    along: Along = "rows",
+    back: bool = False,
 ) -> RenderRequest:
     """A request from rig poses at shutter start and end."""
     given = actors or {}
-    exposure = Exposure(rolling(WIDTH, HEIGHT, along, back), {name: pair[0] for name, pair in given.items()})
+    exposure = Exposure(
+        rolling(WIDTH, HEIGHT, along, back), {name: pair[0] for name, pair in given.items()}
+    )
     T = np.stack([start @ FORWARD, end @ FORWARD])
-    return RenderRequest(0, SPEC, T, {name: pair[1] for name, pair in given.items()}, exposure=exposure)
+    return RenderRequest(
+        0, SPEC, T, {name: pair[1] for name, pair in given.items()}, exposure=exposure
+    )
 
 
 FAST = asked(se2(0, 0, 0), se2(0.6, 0, 0.05))
 
 
-@pytest.mark.parametrize(("along", "back"), [("rows", False), ("rows", True), ("columns", False), ("columns", True)])
+@pytest.mark.parametrize(
+    ("along", "back"), [("rows", False), ("rows", True), ("columns", False), ("columns", True)]
+)
 @pytest.mark.parametrize("count", [1, 5, HEIGHT, 3 * WIDTH])
-def test_bands_hold_every_pixel_once_and_time_runs_along_the_axis(along: Along, back: bool, count: int) -> None:
+def test_bands_hold_every_pixel_once_and_time_runs_along_the_axis(
+    along: Along, back: bool, count: int
+) -> None:
     request = asked(se2(0, 0, 0), se2(0.6, 0, 0.05), along=along, back=back)
     times, seen = np.full((HEIGHT, WIDTH), np.nan), np.zeros((HEIGHT, WIDTH), int)
     for band in bands_of(request, count):
@@ -93,7 +120,11 @@ def test_poses_in_between_are_linear_and_turn_evenly_also_by_half_a_turn() -> No
 
 
 def test_road_users_are_where_they_are_at_the_time_of_the_band() -> None:
-    request = asked(se2(0, 0, 0), se2(1, 0, 0), {"a": (se2(5, 0, 0), se2(6, 0, 0)), "b": (se2(9, 1, 0), se2(9, 1, 0))})
+    request = asked(
+        se2(0, 0, 0),
+        se2(1, 0, 0),
+        {"a": (se2(5, 0, 0), se2(6, 0, 0)), "b": (se2(9, 1, 0), se2(9, 1, 0))},
+    )
     T, actors = at_share(request, 0.5)
     assert (T[0, 3], actors["a"][0, 3], actors["b"][0, 3]) == pytest.approx((0.5, 5.5, 9.0))
 

@@ -17,15 +17,22 @@ from alpasim_plugin.core.signals import Stopped, stoppable
 @pytest.fixture
 def nothing_ignored() -> Iterator[None]:
     """Default handlers, also where the tests were started under nohup, which ignores SIGHUP."""
-    before = {one: signal.signal(one, signal.SIG_DFL) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    before = {
+        one: signal.signal(one, signal.SIG_DFL)
+        for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    }
     yield
     for one, handler in before.items():
         signal.signal(one, handler)
 
 
 @pytest.mark.usefixtures("nothing_ignored")
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_a_signal_unwinds_the_block_and_names_the_exit_code(number: signal.Signals, code: int) -> None:
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
+def test_a_signal_unwinds_the_block_and_names_the_exit_code(
+    number: signal.Signals, code: int
+) -> None:
     before = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     unwound = False
     with pytest.raises(Stopped) as caught, stoppable():  # noqa: PT012 - the block is what is stopped
@@ -42,7 +49,9 @@ def test_a_signal_unwinds_the_block_and_names_the_exit_code(number: signal.Signa
 
 def test_no_handler_of_exceptions_takes_it_for_an_error() -> None:
     assert not issubclass(Stopped, Exception)
-    assert not issubclass(Stopped, KeyboardInterrupt)  # the command line's library would turn that into its own exit code
+    assert not issubclass(
+        Stopped, KeyboardInterrupt
+    )  # the command line's library would turn that into its own exit code
 
 
 def test_a_signal_that_was_ignored_stays_ignored() -> None:

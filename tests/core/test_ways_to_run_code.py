@@ -1,6 +1,7 @@
 """Ways in which files from a stranger could run as code: none does, in whatever verb meets them.
 
-Each way is a bait that leaves its name in a file if it is run. The working directory is the stranger's folder.
+Each way is a bait that leaves its name in a file if it is run. The working directory is the
+stranger's folder.
 """
 
 from __future__ import annotations
@@ -47,7 +48,11 @@ def python_file(*names: str) -> Way:
         for name in names:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_text(bait.python)
-        return [["compare", "run"], ["list", "policies"], ["run", "--dry-run", *DRIVE[1:], "smoke/straight"]]
+        return [
+            ["compare", "run"],
+            ["list", "policies"],
+            ["run", "--dry-run", *DRIVE[1:], "smoke/straight"],
+        ]
 
     return way
 
@@ -57,15 +62,26 @@ def metadata(folder: Path, bait: Bait) -> list[list[str]]:
     info = folder / "evil-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: evil\nVersion: 1.0\n")
-    groups = ("simrun.policies", "simrun.commands", "simrun.evaluators", "simrun.sources", "numba_extensions", "pydantic")
-    (info / "entry_points.txt").write_text("".join(f"[{group}]\nevil = evil:Evil\n" for group in groups))
+    groups = (
+        "simrun.policies",
+        "simrun.commands",
+        "simrun.evaluators",
+        "simrun.sources",
+        "numba_extensions",
+        "pydantic",
+    )
+    (info / "entry_points.txt").write_text(
+        "".join(f"[{group}]\nevil = evil:Evil\n" for group in groups)
+    )
     return [["list", "policies"], ["--help"], ["evil"]]
 
 
 def path_file(folder: Path, bait: Bait) -> list[list[str]]:
     (folder / "evil.pth").write_text(f"import os; exec({bait.python!r})\n")
     (folder / "lib" / "python3.11" / "site-packages").mkdir(parents=True)
-    (folder / "lib" / "python3.11" / "site-packages" / "evil.pth").write_text(f"import os; exec({bait.python!r})\n")
+    (folder / "lib" / "python3.11" / "site-packages" / "evil.pth").write_text(
+        f"import os; exec({bait.python!r})\n"
+    )
     (folder / "pyvenv.cfg").write_text("home = .\n")
     return [["compare", "run"]]
 
@@ -74,14 +90,22 @@ def git_hooks(folder: Path, bait: Bait) -> list[list[str]]:
     subprocess.run(["git", "init", "-q", "."], cwd=folder, check=True)
     (folder / "kept.txt").write_text("as committed")
     subprocess.run(["git", "add", "kept.txt"], cwd=folder, check=True)
-    subprocess.run(["git", "-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "a"], cwd=folder, check=True)
+    subprocess.run(
+        ["git", "-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "a"],
+        cwd=folder,
+        check=True,
+    )
     (folder / "kept.txt").write_text("otherwise")
     hook = folder / "hook"
     hook.write_text(f"#!/bin/sh\n{bait.shell}\n")
     hook.chmod(hook.stat().st_mode | stat.S_IXUSR)
     core = (f"core.{name}" for name in ("fsmonitor", "sshCommand", "pager", "editor", "hooksPath"))
     for name in (*core, "diff.external", "filter.x.clean", "gpg.program"):
-        subprocess.run(["git", "config", name, str(hook) if name != "core.hooksPath" else "."], cwd=folder, check=True)
+        subprocess.run(
+            ["git", "config", name, str(hook) if name != "core.hooksPath" else "."],
+            cwd=folder,
+            check=True,
+        )
     for name in ("post-checkout", "pre-commit", "post-index-change"):
         (folder / name).write_bytes(hook.read_bytes())
         (folder / name).chmod(0o755)
@@ -91,16 +115,27 @@ def git_hooks(folder: Path, bait: Bait) -> list[list[str]]:
 
 def yaml_tags(folder: Path, bait: Bait) -> list[list[str]]:
     (folder / "tag.yaml").write_text(f"!!python/object/apply:os.system [{bait.shell!r}]\n")
-    (folder / "key.yaml").write_text(f"version: 1\nscene_id: !!python/object/apply:os.system [{bait.shell!r}]\n")
+    (folder / "key.yaml").write_text(
+        f"version: 1\nscene_id: !!python/object/apply:os.system [{bait.shell!r}]\n"
+    )
     commands = [["run", "--dry-run", *DRIVE[1:], name] for name in ("tag.yaml", "key.yaml")]
     return [*commands, ["gate", "run", "--gate", "tag.yaml"]]
 
 
 def pickles_of_a_run(folder: Path, bait: Bait) -> list[list[str]]:
-    for name in (".slurm/s/1_0_result.pkl", ".slurm/s/1_submitted.pkl", "results.pkl", "rollouts.pkl"):
+    for name in (
+        ".slurm/s/1_0_result.pkl",
+        ".slurm/s/1_submitted.pkl",
+        "results.pkl",
+        "rollouts.pkl",
+    ):
         (folder / "run" / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / "run" / name).write_bytes(pickle.dumps(("success", bait)))
-    return [["check", "run"], ["report", "run"], [*DRIVE, "--out", "run", "--resume", "smoke/straight"]]
+    return [
+        ["check", "run"],
+        ["report", "run"],
+        [*DRIVE, "--out", "run", "--resume", "smoke/straight"],
+    ]
 
 
 def weights(folder: Path, bait: Bait) -> list[list[str]]:
@@ -108,7 +143,16 @@ def weights(folder: Path, bait: Bait) -> list[list[str]]:
     (folder / "evil.pkl.pt").write_bytes(pickle.dumps(bait))
     (folder / "evil.safetensors").write_bytes(pickle.dumps(bait))
     return [
-        ["run", *DRIVE[3:], "--renderer", "onefixer", "--set", f"fixer.weights={name}", "--dry-run", "smoke/straight"]
+        [
+            "run",
+            *DRIVE[3:],
+            "--renderer",
+            "onefixer",
+            "--set",
+            f"fixer.weights={name}",
+            "--dry-run",
+            "smoke/straight",
+        ]
         for name in ("evil.pt", "evil.pkl.pt", "evil.safetensors")
     ]
 
@@ -117,12 +161,20 @@ def object_arrays(folder: Path, bait: Bait) -> list[list[str]]:
     np.save(folder / "evil.npy", np.array([bait], dtype=object), allow_pickle=True)
     np.savez(folder / "evil.npz", a=np.array([bait], dtype=object))
     (folder / "evil.asl").write_bytes((folder / "evil.npy").read_bytes())
-    return [["score", "evil.asl", "--scene", "smoke/straight", "--out", "scored"], ["preview", "evil.npz"]]
+    return [
+        ["score", "evil.asl", "--scene", "smoke/straight", "--out", "scored"],
+        ["preview", "evil.npz"],
+    ]
 
 
 def archive_that_leaves_its_folder(folder: Path, bait: Bait) -> list[list[str]]:
     with zipfile.ZipFile(folder / "evil.usdz", "w") as archive:
-        for name in ("../evil.py", "../../sitecustomize.py", "/tmp/evil-of-an-archive.py", "metadata.yaml"):
+        for name in (
+            "../evil.py",
+            "../../sitecustomize.py",
+            "/tmp/evil-of-an-archive.py",
+            "metadata.yaml",
+        ):
             archive.writestr(name, bait.python)
     return [["run", "--dry-run", *DRIVE[1:], "evil.usdz"], ["preview", "evil.usdz"]]
 
@@ -143,12 +195,20 @@ def names_in_a_run(folder: Path, bait: Bait) -> list[list[str]]:
     for old, new in (("constant-velocity", "evil.py:Evil"), ('"clean"', '"exec:sh -c $(touch x)"')):
         path.write_text(path.read_text().replace(old, new))
     vouch_for(folder / "run")
-    return [["compare", "run"], ["report", "run"], ["view", "run"], ["check", "run"], ["gate", "run"]]
+    return [
+        ["compare", "run"],
+        ["report", "run"],
+        ["view", "run"],
+        ["check", "run"],
+        ["gate", "run"],
+    ]
 
 
 def names_in_a_scenario(folder: Path, bait: Bait) -> list[list[str]]:
     (folder / "evil.py").write_text(bait.python + "class Evil: pass\n")
-    (folder / "scene.yaml").write_text("version: 1\nextends: smoke/straight\npolicy: evil.py:Evil\nrenderer: evil:Evil\n")
+    (folder / "scene.yaml").write_text(
+        "version: 1\nextends: smoke/straight\npolicy: evil.py:Evil\nrenderer: evil:Evil\n"
+    )
     (folder / "weights.yaml").write_text("version: 1\nextends: evil.py\n")
     return [["run", "--dry-run", *DRIVE[1:], name] for name in ("scene.yaml", "weights.yaml")]
 
@@ -159,7 +219,9 @@ def notebook_and_startup(folder: Path, bait: Bait) -> list[list[str]]:
     (folder / "matplotlibrc").write_text(f"backend: module://evil\n# {bait.shell}\n")
     (folder / "evil.py").write_text(bait.python)
     (folder / "conftest.py").write_text(bait.python)
-    (folder / "setup.cfg").write_text("[options.entry_points]\nsimrun.policies =\n  evil = evil:Evil\n")
+    (folder / "setup.cfg").write_text(
+        "[options.entry_points]\nsimrun.policies =\n  evil = evil:Evil\n"
+    )
     return [["report", "run"], ["preview", "smoke/straight", "--out", "p.png"]]
 
 
@@ -167,7 +229,11 @@ def shells(folder: Path, bait: Bait) -> list[list[str]]:
     """Give names that a shell would run."""
     names = (f"$({bait.shell})", f"; {bait.shell} #", f"`{bait.shell}`", f"| {bait.shell}")
     commands = [["run", "--dry-run", *DRIVE[1:], name.replace("/", "")] for name in names]
-    return [*commands, ["compare", names[0]], [*DRIVE, "--dry-run", "--policy", f"exec:true {names[1]}", "smoke/straight"]]
+    return [
+        *commands,
+        ["compare", names[0]],
+        [*DRIVE, "--dry-run", "--policy", f"exec:true {names[1]}", "smoke/straight"],
+    ]
 
 
 def programs(folder: Path, bait: Bait) -> list[list[str]]:
@@ -178,12 +244,23 @@ def programs(folder: Path, bait: Bait) -> list[list[str]]:
 
 
 WAYS: dict[str, Way] = {
-    "module of a library that is missing": python_file("colorama.py", "numexpr.py", "coverage.py", "pytz.py", "bottleneck.py"),
-    "module of the standard library": python_file("pickle.py", "selectors.py", "multiprocessing.py", "json.py", "runpy.py"),
-    "package of ours": python_file("alpasim_plugin/__init__.py", "evaluators/__init__.py", "policies/__init__.py", "scenarios/__init__.py"),
+    "module of a library that is missing": python_file(
+        "colorama.py", "numexpr.py", "coverage.py", "pytz.py", "bottleneck.py"
+    ),
+    "module of the standard library": python_file(
+        "pickle.py", "selectors.py", "multiprocessing.py", "json.py", "runpy.py"
+    ),
+    "package of ours": python_file(
+        "alpasim_plugin/__init__.py",
+        "evaluators/__init__.py",
+        "policies/__init__.py",
+        "scenarios/__init__.py",
+    ),
     "sitecustomize": python_file("sitecustomize.py"),
     "usercustomize": python_file("usercustomize.py"),
-    "__main__ and __init__": python_file("__main__.py", "__init__.py", "run/__init__.py", "run/__main__.py"),
+    "__main__ and __init__": python_file(
+        "__main__.py", "__init__.py", "run/__init__.py", "run/__main__.py"
+    ),
     "compiled cache": python_file("__pycache__/colorama.cpython-311.pyc", "numba_cache.py"),
     "distribution metadata and entry points": metadata,
     "path file": path_file,
@@ -199,13 +276,27 @@ WAYS: dict[str, Way] = {
     "start-up files of notebooks, matplotlib and pytest": notebook_and_startup,
     "words that a shell would run": shells,
     "programs beside the command": programs,
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("finished")
-    assert run_command([*DRIVE, "--policy", "constant-velocity", "--workers", "1", "--out", str(folder / "run"), "smoke/straight"]) == 0
+    assert (
+        run_command(
+            [
+                *DRIVE,
+                "--policy",
+                "constant-velocity",
+                "--workers",
+                "1",
+                "--out",
+                str(folder / "run"),
+                "smoke/straight",
+            ]
+        )
+        == 0
+    )
     return folder / "run"
 
 
@@ -218,9 +309,15 @@ ALL_AT_ONCE = [
 
 
 @pytest.mark.parametrize(
-    "names", [pytest.param(tuple(WAYS), id="all ways at once"), *(pytest.param((name,), id=name, marks=pytest.mark.slow) for name in WAYS)]
+    "names",
+    [
+        pytest.param(tuple(WAYS), id="all ways at once"),
+        *(pytest.param((name,), id=name, marks=pytest.mark.slow) for name in WAYS),
+    ],
 )
-def test_nothing_of_a_strangers_folder_runs(names: tuple[str, ...], finished: Path, tmp_path: Path) -> None:
+def test_nothing_of_a_strangers_folder_runs(
+    names: tuple[str, ...], finished: Path, tmp_path: Path
+) -> None:
     folder = tmp_path / "stranger"
     folder.mkdir()
     subprocess.run(["cp", "-r", str(finished), str(folder / "run")], check=True)
@@ -235,7 +332,9 @@ def test_nothing_of_a_strangers_folder_runs(names: tuple[str, ...], finished: Pa
         assert "\x1b" not in done.stderr, "control characters reach the terminal"
     outside = tmp_path / "not-mine.txt"
     assert not outside.exists() or outside.read_text() == "mine", "written through a link"
-    assert {path.name for path in tmp_path.iterdir()} <= {"bin", "not-mine.txt", "stranger"}, "written outside of the folder"
+    assert {path.name for path in tmp_path.iterdir()} <= {"bin", "not-mine.txt", "stranger"}, (
+        "written outside of the folder"
+    )
 
 
 def test_the_baits_work_where_they_are_run(tmp_path: Path) -> None:
@@ -246,7 +345,16 @@ def test_the_baits_work_where_they_are_run(tmp_path: Path) -> None:
     assert bait.mark.read_text().split() == ["bait"] * 3
 
 
-@pytest.mark.parametrize("text", ["<script>alert(1)</script>", "<img src=x onerror=alert(1)>", "\x1b]0;evil\x07", "\x1b[2J", "\u202eevil"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "<script>alert(1)</script>",
+        "<img src=x onerror=alert(1)>",
+        "\x1b]0;evil\x07",
+        "\x1b[2J",
+        "\u202eevil",
+    ],
+)
 def test_text_of_a_stranger_stays_text(text: str) -> None:
     from alpasim_plugin.core.errors import InputError
     from alpasim_plugin.core.escape import markdown, terminal

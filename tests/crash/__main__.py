@@ -1,8 +1,10 @@
-"""Kill runs, start two at once, and fill the disk at every write; then finish them and compare with an undisturbed run. Kill readers too.
+"""Kill runs, start two at once, and fill the disk at every write; then finish them and compare with
+an undisturbed run. Kill readers too.
 
     python -m tests.crash --kills 100 --seed 0
 
-Linux only: it looks for orphans in /proc. Exit code 1 if anything was lost, done twice, left running or left behind.
+Linux only: it looks for orphans in /proc. Exit code 1 if anything was lost, done twice, left
+running or left behind.
 """
 
 from __future__ import annotations
@@ -49,12 +51,18 @@ class Kill:
 
 
 def kills(count: int, seed: int, run_s: float) -> list[Kill]:
-    """Draw kills: every combination of target, signal and phase in turn, at a drawn instant of the phase."""
+    """Draw kills: every combination of target, signal and phase in turn, at a drawn instant of the
+    phase.
+    """
     stream = random.Random(seed)
-    combinations = [(target, number, phase) for phase in PHASES for target in TARGETS for number in SIGNALS]
+    combinations = [
+        (target, number, phase) for phase in PHASES for target in TARGETS for number in SIGNALS
+    ]
     stream.shuffle(combinations)
     chosen = [combinations[i % len(combinations)] for i in range(count)]
-    return [Kill(*one, stream.uniform(0.0, run_s if one[2] == "anywhere" else 0.4)) for one in chosen]
+    return [
+        Kill(*one, stream.uniform(0.0, run_s if one[2] == "anywhere" else 0.4)) for one in chosen
+    ]
 
 
 def reached(phase: str, root: Path, driver: Driver, before: int) -> bool:
@@ -69,7 +77,13 @@ def reached(phase: str, root: Path, driver: Driver, before: int) -> bool:
         case "driving":
             return any((cell / "rollout.asl.part").exists() for cell in cells) or done > before
         case "scoring":
-            return any((cell / "frames.jsonl").exists() and not (cell / "manifest.json").exists() for cell in cells) or done > before
+            return (
+                any(
+                    (cell / "frames.jsonl").exists() and not (cell / "manifest.json").exists()
+                    for cell in cells
+                )
+                or done > before
+            )
         case "reporting":
             return (root / "summary.json").exists() or any(root.glob(".repeat.*"))
     return True
@@ -96,7 +110,9 @@ class Campaign:
     def _said(self) -> Path:
         return self.work / "stderr.txt"
 
-    def _run(self, root: Path, scene: Scene | None = None, before: Callable[[], object] = lambda: None) -> Driver:
+    def _run(
+        self, root: Path, scene: Scene | None = None, before: Callable[[], object] = lambda: None
+    ) -> Driver:
         return start((scene or self.scene).arguments(root), self._said(), before)
 
     def _report(self, label: str, found: list[str]) -> None:
@@ -116,14 +132,20 @@ class Campaign:
         self.tally["finished and compared"] += 1
 
     def kill(self, count: int, seed: int, budget_s: float) -> None:
-        """Kill runs one after the other, up to three times in one folder; then finish it and compare."""
+        """Kill runs one after the other, up to three times in one folder; then finish it and
+        compare.
+        """
         began, root = time.monotonic(), self.work / "killed"
         for number, kill in enumerate(kills(count, seed, self.run_s)):
             if time.monotonic() - began > budget_s:
                 print(f"stopped after {number} of {count} kills: the time is up")
                 break
             # With one worker the rollouts run in the driver itself.
-            scene = replace(self.scene, workers=1) if kill.target == "parent" and number % 3 else self.scene
+            scene = (
+                replace(self.scene, workers=1)
+                if kill.target == "parent" and number % 3
+                else self.scene
+            )
             whole = finished(root)
             code, found = self._strike(kill, root, scene)
             now = finished(root)
@@ -137,7 +159,10 @@ class Campaign:
                 f"exit code {code}",
             ):
                 self.tally[what] += 1
-            print(f"kill {number} ({kill}): exit code {code}, {len(now)} rollouts whole, {len(self.problems)} problems", flush=True)
+            print(
+                f"kill {number} ({kill}): exit code {code}, {len(now)} rollouts whole, {len(self.problems)} problems",
+                flush=True,
+            )
             if number % 3 == 2 or kill.phase == "reporting":
                 self.finish(root, f"kill {number} ({kill})")
                 shutil.rmtree(root)
@@ -149,11 +174,17 @@ class Campaign:
         before = len(list(root.glob("rollouts/*/*/*/*/manifest.json")))
         driver = self._run(root, scene)
         give_up = time.monotonic() + GIVE_UP_S
-        while driver.poll() is None and not reached(kill.phase, root, driver, before) and time.monotonic() < give_up:
+        while (
+            driver.poll() is None
+            and not reached(kill.phase, root, driver, before)
+            and time.monotonic() < give_up
+        ):
             time.sleep(0.002)
         time.sleep(kill.after_s)
         workers = workers_of(driver.pid) if driver.poll() is None else []
-        targets = ([driver.pid] if kill.target != "worker" and driver.poll() is None else []) + (workers if kill.target != "parent" else [])
+        targets = ([driver.pid] if kill.target != "worker" and driver.poll() is None else []) + (
+            workers if kill.target != "parent" else []
+        )
         for pid in targets:
             try:
                 os.kill(pid, kill.signal)
@@ -176,7 +207,9 @@ class Campaign:
         return code, found
 
     def pairs(self, count: int) -> None:
-        """Start two drivers of one folder at once: one is refused by name, or waits with ``--wait``."""
+        """Start two drivers of one folder at once: one is refused by name, or waits with
+        ``--wait``.
+        """
         for number in range(count):
             root, waiting = self.work / f"two-{number}", number % 2 == 1
             arguments = [*self.scene.arguments(root), *(["--wait"] if waiting else [])]
@@ -187,14 +220,26 @@ class Campaign:
             found = [] if codes == ([0, 0] if waiting else [0, 4]) else [f"exit codes {codes}"]
             if not waiting and not any("is writing it" in driver.said for driver in drivers):
                 found.append("the refusal names nobody")
-            self._report(label, found + in_child(partial(problems_after_finish, root, self.expected, {})))
+            self._report(
+                label, found + in_child(partial(problems_after_finish, root, self.expected, {}))
+            )
 
     def readers(self, count: int, seed: int) -> None:
-        """Kill ``gate`` and ``serve`` at any time: the run stays as it was, nothing keeps running, and the port can be had again."""
+        """Kill ``gate`` and ``serve`` at any time: the run stays as it was, nothing keeps running,
+        and the port can be had again.
+        """
         stream, root = random.Random(seed), self.work / "undisturbed"
         with socket.create_server(("127.0.0.1", 0)) as free:
             port = free.getsockname()[1]
-        serve = ["serve", "--scenes", "smoke/straight", "--renderer", "clean", "--listen", f"127.0.0.1:{port}"]
+        serve = [
+            "serve",
+            "--scenes",
+            "smoke/straight",
+            "--renderer",
+            "clean",
+            "--listen",
+            f"127.0.0.1:{port}",
+        ]
         for number in range(count):
             arguments, signal_ = (["gate", str(root)], serve)[number % 2], stream.choice(SIGNALS)
             driver, after_s = start(arguments, self._said()), stream.uniform(0.0, READ_S)
@@ -203,14 +248,20 @@ class Campaign:
                 os.kill(driver.pid, signal_)
                 self.tally[f"kills of {arguments[0]} by {signal_.name}"] += 1
             code = driver.wait()
-            found = [] if code in (0, 1, 3, 128 + signal_, -signal_) else [f"exit code {code}: {driver.said[-300:]}"]
+            found = (
+                []
+                if code in (0, 1, 3, 128 + signal_, -signal_)
+                else [f"exit code {code}: {driver.said[-300:]}"]
+            )
             found += ["a traceback"] if "Traceback" in driver.said else []
             found += ["it left a process"] if processes_of(driver.pid) else []
             self._report(f"{arguments[0]} {number} ({signal_.name} after {after_s:.2f} s)", found)
         self._report("readers", in_child(partial(problems_after_finish, root, self.expected, {})))
 
     def full_disk(self, every: int) -> None:
-        """Refuse the n-th write of a run; it must say so, lose nothing, and finish when the disk has room."""
+        """Refuse the n-th write of a run; it must say so, lose nothing, and finish when the disk
+        has room.
+        """
         one, counter = replace(self.scene, workers=1), self.work / "writes.txt"
         self._run(self.work / "counted", one, partial(fill_disk, 0, counter)).wait()
         writes = len(counter.read_text())
@@ -219,14 +270,19 @@ class Campaign:
             driver = self._run(root, one, partial(fill_disk, n, counter))
             code = driver.wait()
             good = code == 4 and "Traceback" not in driver.said and "free disk space" in driver.said
-            self._report(f"write {n} of {writes} refused", [] if good else [f"exit code {code}: {driver.said[-300:]}"])
+            self._report(
+                f"write {n} of {writes} refused",
+                [] if good else [f"exit code {code}: {driver.said[-300:]}"],
+            )
             self.tally[f"writes refused, of {writes}"] += 1
             self.finish(root, f"write {n} of {writes} refused")
             shutil.rmtree(root)
 
 
 def fill_disk(refused: int, counter: Path) -> None:
-    """Refuse one write of this process: every file of simrun ends with an fsync, where a full disk is noticed."""
+    """Refuse one write of this process: every file of simrun ends with an fsync, where a full disk
+    is noticed.
+    """
     fsync, made = os.fsync, 0
 
     def refuse(handle: int) -> None:
@@ -244,11 +300,25 @@ def fill_disk(refused: int, counter: Path) -> None:
 
 def main() -> int:
     """Run what the command line asks for and print what was found."""
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     options.add_argument("--kills", type=int, default=100)
     options.add_argument("--pairs", type=int, default=4, help="pairs of drivers started at once")
-    options.add_argument("--full-disk", type=int, default=0, metavar="N", help="refuse every N-th write of a run in turn; 1 is every write")
-    options.add_argument("--readers", type=int, default=0, metavar="N", help="kill simrun gate and simrun serve in turn, N times")
+    options.add_argument(
+        "--full-disk",
+        type=int,
+        default=0,
+        metavar="N",
+        help="refuse every N-th write of a run in turn; 1 is every write",
+    )
+    options.add_argument(
+        "--readers",
+        type=int,
+        default=0,
+        metavar="N",
+        help="kill simrun gate and simrun serve in turn, N times",
+    )
     options.add_argument("--seed", type=int, default=0)
     options.add_argument("--minutes", type=float, default=1e9, help="stop killing after this time")
     given = options.parse_args()

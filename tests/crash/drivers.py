@@ -1,6 +1,8 @@
-"""Drivers to kill: processes of their own, forked from one that has imported everything, so that a hundred of them take minutes.
+"""Drivers to kill: processes of their own, forked from one that has imported everything, so that a
+hundred of them take minutes.
 
-A driver is the command line, from its entry point on: its own process group, signal handlers, lock and workers.
+A driver is the command line, from its entry point on: its own process group, signal handlers, lock
+and workers.
 """
 
 from __future__ import annotations
@@ -58,7 +60,9 @@ class Driver:
         return self.says.read_text(errors="replace")
 
 
-def start(arguments: Sequence[str], says: Path, before: Callable[[], object] = lambda: None) -> Driver:
+def start(
+    arguments: Sequence[str], says: Path, before: Callable[[], object] = lambda: None
+) -> Driver:
     """Start a driver; ``before`` is called in it first."""
     pid = os.fork()
     if pid:
@@ -85,7 +89,9 @@ def start(arguments: Sequence[str], says: Path, before: Callable[[], object] = l
 
 
 def in_child(work: Callable[[], T]) -> T:
-    """Return what ``work`` returns, computed in a forked process, so that this one never starts a thread."""
+    """Return what ``work`` returns, computed in a forked process, so that this one never starts a
+    thread.
+    """
     read, write = os.pipe()
     pid = os.fork()
     if not pid:
@@ -119,7 +125,11 @@ def workers_of(driver: int) -> list[int]:
     """Return the processes that a driver started, without Python's resource tracker (Linux)."""
     try:
         children = Path(f"/proc/{driver}/task/{driver}/children").read_text().split()
-        return [int(child) for child in children if b"resource_tracker" not in Path(f"/proc/{child}/cmdline").read_bytes()]
+        return [
+            int(child)
+            for child in children
+            if b"resource_tracker" not in Path(f"/proc/{child}/cmdline").read_bytes()
+        ]
     except OSError:
         return []
 
@@ -127,7 +137,11 @@ def workers_of(driver: int) -> list[int]:
 def handles_signals(pid: int) -> bool:
     """Tell whether a driver has come as far as our handlers."""
     try:
-        caught = next(line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("SigCgt:"))
+        caught = next(
+            line
+            for line in Path(f"/proc/{pid}/status").read_text().splitlines()
+            if line.startswith("SigCgt:")
+        )
     except OSError:
         return False
     return bool(int(caught.split()[1], 16) >> (signal.SIGTERM - 1) & 1)

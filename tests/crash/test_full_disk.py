@@ -1,4 +1,6 @@
-"""A disk that is full at any write of a run: nothing is lost, and the same command finishes (`python -m tests.crash` kills as well)."""
+"""A disk that is full at any write of a run: nothing is lost, and the same command finishes
+(`python -m tests.crash` kills as well).
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,10 @@ QUICK = (4, 10, 12)  # facts of a rollout, a manifest, a table
 WRITES = 17  # of the run
 
 
-@pytest.mark.parametrize("refused", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in range(1, WRITES + 1)])
+@pytest.mark.parametrize(
+    "refused",
+    [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in range(1, WRITES + 1)],
+)
 def test_a_run_with_a_refused_write_says_so_and_the_same_command_finishes_it(
     refused: int, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,7 +1,9 @@
-"""Every verb on every machine that lacks something: ``python -m tests.degradation``; needs root, to become another user and to mount.
+"""Every verb on every machine that lacks something: ``python -m tests.degradation``; needs root, to
+become another user and to mount.
 
-``--machine`` and ``--verb`` take those whose name contains a word, or one of several with commas between. The table says the exit code of
-each cell; what ended otherwise than docs/cli.md says is printed below it, and makes the command end with 1.
+``--machine`` and ``--verb`` take those whose name contains a word, or one of several with commas
+between. The table says the exit code of each cell; what ended otherwise than docs/cli.md says is
+printed below it, and makes the command end with 1.
 """
 
 from __future__ import annotations
@@ -15,10 +17,18 @@ from tests.other_user import can_become_nobody, shared_folder
 
 
 def main() -> int:
-    """Print the table; return 1 if a cell ended in another way than documented, 4 where this machine does not allow the trial."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--machine", default="", help="machines whose name contains this, or one of several: A,B")
-    parser.add_argument("--verb", default="", help="verbs whose name contains this, or one of several: A,B")
+    """Print the table; return 1 if a cell ended in another way than documented, 4 where this
+    machine does not allow the trial.
+    """
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--machine", default="", help="machines whose name contains this, or one of several: A,B"
+    )
+    parser.add_argument(
+        "--verb", default="", help="verbs whose name contains this, or one of several: A,B"
+    )
     arguments = parser.parse_args()
     if not can_become_nobody():
         print("needs root that may mount, to become another user", file=sys.stderr)
@@ -39,7 +49,11 @@ def main() -> int:
                 print(f" {found.code}{'!' if found.wrong else ''} |", end="", flush=True)
                 wrong += [f"{name}, {verb}: {found.wrong}\n{found.said}\n"] if found.wrong else []
             print(flush=True)
-    print("\n" + "\n".join(wrong) if wrong else f"\nno cell of {len(verbs)} verbs ended otherwise than documented")
+    print(
+        "\n" + "\n".join(wrong)
+        if wrong
+        else f"\nno cell of {len(verbs)} verbs ended otherwise than documented"
+    )
     return 1 if wrong else 0
 
 

@@ -1,4 +1,6 @@
-"""The commands that the pages name: found, split into words, and sorted by what it takes to run them."""
+"""The commands that the pages name: found, split into words, and sorted by what it takes to run
+them.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +16,16 @@ SHELL = ("bash", "sh", "console", "")
 SIMRUN = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?simrun\s+(.*)$")
 OTHER = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(?:python3?(?:\.\d+)?|pip|pytest)\s")
 STEP = re.compile(r"^\s*- run: (.*)$", re.M)
-# What is not run from an empty folder, and why; the first rule that fits counts.
-# A picture of the order of commands; a record from before there were two test splits; what writes into the reader's own shell files.
+# What is not run from an empty folder, and why; the first rule that fits counts. A picture of the
+# order of commands; a record from before there were two test splits; what writes into the reader's
+# own shell files.
 NO_COMMAND = (r"──", r"--split test(?= |$)", r"-completion$")
 NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"──", "a picture of the order of commands"),
-    (r"-completion$", "writes into the shell's own files: tests/cli/test_entry.py asks for the scripts"),
+    (
+        r"-completion$",
+        "writes into the shell's own files: tests/cli/test_entry.py asks for the scripts",
+    ),
     (r"gate --self-test", "eight minutes; tests/runs/test_self_test.py runs it"),
     (r"onefixer-2b|--device cuda|--on h200", "needs weights of 4 GB, or a GPU"),
     (
@@ -34,14 +40,27 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
         r"^serve|127\.0\.0\.1:|can://|scene\.usdz",
         "needs a service or a bus, or goes on until it is stopped: test_service_commands.py beside this file; AlpaSim's own: tests/alpasim",
     ),
-    (r"--executor |s3://|/nfs/", "needs a cluster or a store of the reader's; tests/runs/test_ray.py and its siblings run them"),
+    (
+        r"--executor |s3://|/nfs/",
+        "needs a cluster or a store of the reader's; tests/runs/test_ray.py and its siblings run them",
+    ),
     (r"exec:docker|driver\.py", "needs a container or a driver of the reader's"),
     (r"--images folder/", "needs the reader's own pictures"),
-    (r"gate runs/|compare runs/main|my_policy:Mine", "a record of six runs; tests/cli/test_gate_and_compare.py runs each of its cases"),
+    (
+        r"gate runs/|compare runs/main|my_policy:Mine",
+        "a record of six runs; tests/cli/test_gate_and_compare.py runs each of its cases",
+    ),
 )
 SHORT = ("--set", "timing.duration_us=1200000", "--certify", "none", "--workers", "2")
-LONGER = ("--set", "timing.duration_us=3000000", *SHORT[2:])  # for AlpaSim's time line, which drives by the log for 1.7 s
-NOTHING_FITTED = ("--set", "degradation.kind=surrogate")  # for scenes that say nothing about their reconstruction
+LONGER = (
+    "--set",
+    "timing.duration_us=3000000",
+    *SHORT[2:],
+)  # for AlpaSim's time line, which drives by the log for 1.7 s
+NOTHING_FITTED = (
+    "--set",
+    "degradation.kind=surrogate",
+)  # for scenes that say nothing about their reconstruction
 
 
 @dataclass(frozen=True)
@@ -67,8 +86,13 @@ class Command:
 
 
 def pages(repo: Path) -> list[Path]:
-    """Return README and every page of docs/ but the laboratory's, which are not there where it is not (`tests/lab/docs`)."""
-    return [repo / "README.md", *(page for page in sorted((repo / "docs").rglob("*.md")) if not is_of_lab(repo, page))]
+    """Return README and every page of docs/ but the laboratory's, which are not there where it is
+    not (`tests/lab/docs`).
+    """
+    return [
+        repo / "README.md",
+        *(page for page in sorted((repo / "docs").rglob("*.md")) if not is_of_lab(repo, page)),
+    ]
 
 
 def lab_pages(repo: Path) -> list[Path]:
@@ -84,9 +108,19 @@ def is_of_lab(repo: Path, path: Path) -> bool:
 def lines_of(page: Path) -> list[str]:
     """Return the lines of a page's shell blocks and of the steps of its CI jobs, each whole."""
     text = page.read_text(encoding="utf-8")
-    blocks = [body for language, body in re.findall(r"^```(\w*)\n(.*?)^```", text, re.S | re.M) if language in SHELL]
-    steps = [step for body in re.findall(r"^```yaml\n(.*?)^```", text, re.S | re.M) for step in STEP.findall(body)]
-    return [line.strip() for body in blocks for line in body.replace("\\\n", " ").splitlines()] + steps
+    blocks = [
+        body
+        for language, body in re.findall(r"^```(\w*)\n(.*?)^```", text, re.S | re.M)
+        if language in SHELL
+    ]
+    steps = [
+        step
+        for body in re.findall(r"^```yaml\n(.*?)^```", text, re.S | re.M)
+        for step in STEP.findall(body)
+    ]
+    return [
+        line.strip() for body in blocks for line in body.replace("\\\n", " ").splitlines()
+    ] + steps
 
 
 def commands(repo: Path, of: Sequence[Path]) -> list[Command]:

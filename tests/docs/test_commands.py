@@ -1,4 +1,5 @@
-"""Every command on every page: it is understood by the command line, and it works from an empty folder with the built wheel.
+"""Every command on every page: it is understood by the command line, and it works from an empty
+folder with the built wheel.
 
 The second is slow: ``pytest -m slow`` on this file.
 """
@@ -24,7 +25,18 @@ import typer
 
 from alpasim_plugin.cli.main import GROUPS, make_app, verbs, with_verb
 from alpasim_plugin.log import write_mp4
-from tests.docs.commands import LONGER, NO_COMMAND, NOTHING_FITTED, OTHER, SHORT, SIMRUN, Command, commands, lines_of, pages
+from tests.docs.commands import (
+    LONGER,
+    NO_COMMAND,
+    NOTHING_FITTED,
+    OTHER,
+    SHORT,
+    SIMRUN,
+    Command,
+    commands,
+    lines_of,
+    pages,
+)
 
 REPO = Path(__file__).resolve().parents[2]
 COMMANDS = [one for one in commands(REPO, pages(REPO)) if not one.is_of_lab]
@@ -85,27 +97,46 @@ def needing_the_checkout(some: Sequence[Path]) -> list[str]:
         if page.parent.name == "experiments":
             continue
         for line in lines_of(page):
-            is_setup = (page.name == "README.md" and "pip install -q -e" in line) or ("suites/first" in line and ".venv/bin" in line)
+            is_setup = (page.name == "README.md" and "pip install -q -e" in line) or (
+                "suites/first" in line and ".venv/bin" in line
+            )
             is_command = SIMRUN.match(line) or OTHER.match(line)
-            is_bound = re.search(r"\.venv/bin/simrun|configs/|pip install[^|&;]* alpasim-onefixer", line)
+            is_bound = re.search(
+                r"\.venv/bin/simrun|configs/|pip install[^|&;]* alpasim-onefixer", line
+            )
             if is_command and is_bound and not is_setup:
                 needs.append(f"{page.name}: {line}")
     return needs
 
 
 def test_commands_do_not_need_the_checkout_nor_an_index() -> None:
-    """But for the two that set it up, and the records of experiments, which say where they were run."""
+    """But for the two that set it up, and the records of experiments, which say where they were
+    run.
+    """
     assert needing_the_checkout(pages(REPO)) == []
 
 
-# --- with the wheel, from an empty folder -------------------------------------------------------------------------------
+# --- with the wheel, from an empty folder
 
 
 @pytest.fixture(scope="module")
 def simrun(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build the wheel and give the command that it installs, in an environment whose libraries are those of the tests."""
+    """Build the wheel and give the command that it installs, in an environment whose libraries are
+    those of the tests.
+    """
     folder = tmp_path_factory.mktemp("wheel")
-    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", str(folder), str(REPO)]
+    build = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "-q",
+        "--no-deps",
+        "--no-build-isolation",
+        "-w",
+        str(folder),
+        str(REPO),
+    ]
     subprocess.run(build, check=True, cwd=folder)
     venv.create(folder / "env", with_pip=True)
     (packages,) = (folder / "env").glob("lib/python*/site-packages")
@@ -113,9 +144,15 @@ def simrun(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (packages / "libraries.pth").write_text("\n".join(libraries) + "\n")
     (wheel,) = folder.glob("*.whl")
     python = folder / "env" / "bin" / "python"
-    subprocess.run([python, "-m", "pip", "install", "-q", "--no-deps", "--no-index", str(wheel)], check=True)
+    subprocess.run(
+        [python, "-m", "pip", "install", "-q", "--no-deps", "--no-index", str(wheel)], check=True
+    )
     where = subprocess.run(
-        [python, "-c", "import scenarios; print(scenarios.__file__)"], check=True, capture_output=True, text=True, cwd=folder
+        [python, "-c", "import scenarios; print(scenarios.__file__)"],
+        check=True,
+        capture_output=True,
+        text=True,
+        cwd=folder,
     )
     assert where.stdout.startswith(str(packages)), "the checkout is in the way"
     return folder / "env" / "bin" / "simrun"
@@ -132,7 +169,9 @@ def empty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     policy = f"{own}\n\nMine = MyPolicy = Straight\n"
     (folder / "my_policy.py").write_text(policy)
     commanded = (REPO / "docs" / "policy-commands.md").read_text(encoding="utf-8")
-    (folder / "remote_policy.py").write_text("\n".join(re.findall(r"^```python\n(.*?)^```", commanded, re.S | re.M)))
+    (folder / "remote_policy.py").write_text(
+        "\n".join(re.findall(r"^```python\n(.*?)^```", commanded, re.S | re.M))
+    )
     (folder / "my_package").mkdir()
     (folder / "my_package" / "__init__.py").touch()
     (folder / "my_package" / "my_module.py").write_text(policy)
@@ -140,13 +179,23 @@ def empty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     (folder / "scenario.yaml").write_text(
         "version: 1\nroad: {segments: [{kind: straight, length_m: 120}]}\ntiming: {duration_us: 1200000}\n"
     )
-    picture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (144, 256, 3), dtype=np.uint8), (0, 0), 4)
-    for name, value in (("drive", picture), ("render", picture), ("alpha", np.full_like(picture, 255)), ("map", np.zeros_like(picture))):
+    picture = cv2.GaussianBlur(
+        np.random.default_rng(0).integers(0, 256, (144, 256, 3), dtype=np.uint8), (0, 0), 4
+    )
+    for name, value in (
+        ("drive", picture),
+        ("render", picture),
+        ("alpha", np.full_like(picture, 255)),
+        ("map", np.zeros_like(picture)),
+    ):
         write_mp4(folder / f"{name}.mp4", [value] * 6, 10.0)
     for name in ("frames", "alphas"):
         (folder / name).mkdir()
         for i in range(3):
-            cv2.imwrite(str(folder / name / f"{i}.png"), picture if name == "frames" else np.full_like(picture, 255))
+            cv2.imwrite(
+                str(folder / name / f"{i}.png"),
+                picture if name == "frames" else np.full_like(picture, 255),
+            )
     yield folder
     shutil.rmtree(folder, ignore_errors=True)
 
@@ -154,8 +203,17 @@ def empty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def shortened(words: tuple[str, ...]) -> list[str]:
     """Return a command that does the same in seconds: short drives, one seed, nothing fitted."""
     if words[:3] == ("new", "policy", "my_policy"):
-        return ["new", "policy", "my_first_policy"]  # the folder has a policy of the page's name already
-    args = ["scenario.yaml" if word == "SCENARIO" else re.sub("suites/(urban|hard)", "suites/smoke", word) for word in words]
+        return [
+            "new",
+            "policy",
+            "my_first_policy",
+        ]  # the folder has a policy of the page's name already
+    args = [
+        "scenario.yaml"
+        if word == "SCENARIO"
+        else re.sub("suites/(urban|hard)", "suites/smoke", word)
+        for word in words
+    ]
     if args[0] not in verbs() or args[0] == "run":
         fitting = [] if "suites/first" in args else NOTHING_FITTED
         short = LONGER if "timing.timeline=alpasim" in args else SHORT
@@ -165,23 +223,47 @@ def shortened(words: tuple[str, ...]) -> list[str]:
 
 
 def call(simrun: Path, folder: Path, words: list[str]) -> subprocess.CompletedProcess[str]:
-    environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    environment = {
+        key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")
+    }
     environment["PATH"] = f"{simrun.parent}{os.pathsep}{environment.get('PATH', '')}"
-    return subprocess.run([simrun, *words], cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [simrun, *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("command", RUN, ids=str)
-def test_the_command_works_from_an_empty_folder_with_the_wheel(simrun: Path, empty: Path, command: Command) -> None:
+def test_the_command_works_from_an_empty_folder_with_the_wheel(
+    simrun: Path, empty: Path, command: Command
+) -> None:
     words = shortened(command.words)
-    if command.words[0] in ("fork", "probe", "compare", "report", "score", "check", "view", "runs", "export"):
+    if command.words[0] in (
+        "fork",
+        "probe",
+        "compare",
+        "report",
+        "score",
+        "check",
+        "view",
+        "runs",
+        "export",
+    ):
         prepare(simrun, empty, [*words, "runs/smoke"] if words[0] == "runs" else words)
     if words[0] == "refine":  # other pages write the same files
-        for made in (empty / word for option, word in itertools.pairwise(words) if option in ("-o", "--compare")):
+        for made in (
+            empty / word
+            for option, word in itertools.pairwise(words)
+            if option in ("-o", "--compare")
+        ):
             shutil.rmtree(made) if made.is_dir() else made.unlink(missing_ok=True)
     done = call(simrun, empty, words)
-    assert done.returncode in (0, 1, 3) if "check-policy" in words or "compare" in words else done.returncode == 0, done.stderr[-3000:]
+    assert (
+        done.returncode in (0, 1, 3)
+        if "check-policy" in words or "compare" in words
+        else done.returncode == 0
+    ), done.stderr[-3000:]
     assert "Traceback" not in done.stderr
 
 
@@ -199,6 +281,14 @@ def prepare(simrun: Path, folder: Path, words: list[str]) -> None:
 
 def test_other_commands_of_the_pages_are_those_of_a_checkout_or_of_pip_or_the_wizard() -> None:
     # test_bridge.py runs the wizard
-    known = ("tests", "docs/scripts", "-m docs.scripts.", "-m alpasim_plugin.", "venv", "pip ", "-m alpasim_wizard ")
+    known = (
+        "tests",
+        "docs/scripts",
+        "-m docs.scripts.",
+        "-m alpasim_plugin.",
+        "venv",
+        "pip ",
+        "-m alpasim_wizard ",
+    )
     others = {line for page in pages(REPO) for line in lines_of(page) if OTHER.match(line)}
     assert [line for line in sorted(others) if not any(part in line for part in known)] == []

@@ -11,7 +11,18 @@ import pytest
 from alpasim_plugin.cli.main import run_command
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
-REST = ("--seeds", "1", "--workers", "1", "--images", "none", "--certify", "none", "--no-report", "--json")
+REST = (
+    "--seeds",
+    "1",
+    "--workers",
+    "1",
+    "--images",
+    "none",
+    "--certify",
+    "none",
+    "--no-report",
+    "--json",
+)
 SHORT = ("--set", "timing.duration_us=1200000")
 
 
@@ -28,14 +39,41 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     "words",
     [
-        ("--renderer", "my_parts.py:Brighten+my_parts.py:Night", "--policy", "lane-camera", *SHORT, "smoke/curve"),
-        ("--renderer", "clean", "--policy", "my_parts.py:Weighted", "--controller", "my_parts.py:Lag", "--evaluator", "my_parts.py:Jerk",
-         *SHORT, "smoke/curve"),
-        ("--renderer", "clean", "--policy", "log-replay", "--source", "my_parts.py:Csv", "drive.csv"),
+        (
+            "--renderer",
+            "my_parts.py:Brighten+my_parts.py:Night",
+            "--policy",
+            "lane-camera",
+            *SHORT,
+            "smoke/curve",
+        ),
+        (
+            "--renderer",
+            "clean",
+            "--policy",
+            "my_parts.py:Weighted",
+            "--controller",
+            "my_parts.py:Lag",
+            "--evaluator",
+            "my_parts.py:Jerk",
+            *SHORT,
+            "smoke/curve",
+        ),
+        (
+            "--renderer",
+            "clean",
+            "--policy",
+            "log-replay",
+            "--source",
+            "my_parts.py:Csv",
+            "drive.csv",
+        ),
     ],
     ids=["renderer and fixer", "policy, controller and metric", "source"],
-)  # fmt: skip
-def test_parts_of_the_page_drive(folder: Path, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+)
+def test_parts_of_the_page_drive(
+    folder: Path, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command([*words, "--out", "run", *REST]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["summary"]["failures"]["n_failed"] == 0

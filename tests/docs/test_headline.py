@@ -1,4 +1,6 @@
-"""The headline about driving is what its record says: how long the drives are, of which sets, over scenes and over families."""
+"""The headline about driving is what its record says: how long the drives are, of which sets, over
+scenes and over families.
+"""
 
 from __future__ import annotations
 
@@ -49,16 +51,26 @@ RECORD = """
 """
 
 
-def test_readme_and_results_say_what_the_record_says(headline: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+def test_readme_and_results_say_what_the_record_says(
+    headline: ModuleType, capsys: pytest.CaptureFixture[str]
+) -> None:
     pages = headline.written(headline.read_record(headline.RECORD.read_text(encoding="utf-8")))
     assert {path.name for path in pages} == {"README.md", "results.md"}
     for path, text in pages.items():
-        assert path.read_text(encoding="utf-8") == text, f"{path.name}: run python docs/scripts/headline.py"
+        assert path.read_text(encoding="utf-8") == text, (
+            f"{path.name}: run python docs/scripts/headline.py"
+        )
 
 
-def test_a_sentence_has_the_length_of_the_drives_the_sets_and_the_families(headline: ModuleType) -> None:
+def test_a_sentence_has_the_length_of_the_drives_the_sets_and_the_families(
+    headline: ModuleType,
+) -> None:
     said = headline.sentence(headline.read_record(RECORD.format(length="8 s each; `one` 9 s.")))
-    for part in ("12 drives of the policy `learned`", "cut to its first 8 of 19.8 s", "two frozen test sets, 3 families, 2 seeds"):
+    for part in (
+        "12 drives of the policy `learned`",
+        "cut to its first 8 of 19.8 s",
+        "two frozen test sets, 3 families, 2 seeds",
+    ):
         assert part in said.replace("\n", " ")
     assert "50.0 % behind `3dgs`, 8.3 % behind `onefixer` and 0.0 % behind `clean`" in said
     whole = headline.sentence(headline.read_record(RECORD.format(length="19.8 s each.")))
@@ -66,10 +78,16 @@ def test_a_sentence_has_the_length_of_the_drives_the_sets_and_the_families(headl
     assert "cut" not in whole
 
 
-def test_the_interval_over_families_is_that_of_the_scenes_whatever_they_are_within_a_family(headline: ModuleType) -> None:
+def test_the_interval_over_families_is_that_of_the_scenes_whatever_they_are_within_a_family(
+    headline: ModuleType,
+) -> None:
     record = headline.read_record(RECORD.format(length="19.8 s each."))
-    scenes = np.array([0.0, -0.5, -1.0, -1.0, 0.5, -0.5])  # sums of two: -1 of 4, -4 of 4 and 0 of 4 rollouts
-    assert record.over_families("onefixer") == pytest.approx([100 * end for end in family_bounds(scenes, np.array([0, 0, 1, 1, 2, 2]))])
+    scenes = np.array(
+        [0.0, -0.5, -1.0, -1.0, 0.5, -0.5]
+    )  # sums of two: -1 of 4, -4 of 4 and 0 of 4 rollouts
+    assert record.over_families("onefixer") == pytest.approx(
+        [100 * end for end in family_bounds(scenes, np.array([0, 0, 1, 1, 2, 2]))]
+    )
     assert record.without("onefixer") == ("hills", pytest.approx(-12.5))
 
 
@@ -84,7 +102,10 @@ def test_a_record_without_what_is_claimed_is_refused(headline: ModuleType) -> No
 
 
 def test_the_command_compares_and_fails_where_a_page_differs(
-    headline: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    headline: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     page = tmp_path / "README.md"
     page.write_text("stale\n")

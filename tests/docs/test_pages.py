@@ -32,7 +32,9 @@ def without_code(text: str) -> str:
 def anchors(page: Path) -> frozenset[str]:
     """Return the anchors of a page's headings, as GitHub makes them."""
     headings = HEADING.findall(without_code(page.read_text(encoding="utf-8")))
-    return frozenset(re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings)
+    return frozenset(
+        re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings
+    )
 
 
 def local_links(page: Path) -> list[tuple[Path, str]]:
@@ -52,14 +54,18 @@ def pages(repo: Path) -> list[Path]:
 
 
 def broken_links(repo: Path, pages: list[Path], to_lab: bool) -> list[str]:
-    """Return the links that lead nowhere, of those that lead to the laboratory's pages or of the others."""
+    """Return the links that lead nowhere, of those that lead to the laboratory's pages or of the
+    others.
+    """
     broken = []
     for page in pages:
         for file, anchor in local_links(page):
             if commands.is_of_lab(repo, file) != to_lab:
                 continue
             if not file.exists() or (anchor and anchor not in anchors(file)):
-                broken.append(f"{page.relative_to(repo)}: {file.name}{'#' if anchor else ''}{anchor}")
+                broken.append(
+                    f"{page.relative_to(repo)}: {file.name}{'#' if anchor else ''}{anchor}"
+                )
     return broken
 
 
@@ -69,19 +75,35 @@ def test_links_resolve(repo: Path, pages: list[Path]) -> None:
 
 def test_pages_of_the_docs_that_code_and_pages_name_exist(repo: Path, pages: list[Path]) -> None:
     folders = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs", "tests", "docs")
-    code = [path for folder in folders for suffix in ("py", "yaml") for path in (repo / folder).rglob(f"*.{suffix}")]
+    code = [
+        path
+        for folder in folders
+        for suffix in ("py", "yaml")
+        for path in (repo / folder).rglob(f"*.{suffix}")
+    ]
     missing = []
     for file in [*code, *pages]:
         mentions = MENTION.findall(file.read_text(encoding="utf-8"))
         there = (mention for mention in mentions if not mention.startswith(commands.LAB))
-        missing += [f"{file.relative_to(repo)}: {mention}" for mention in there if not (repo / mention).is_file()]
+        missing += [
+            f"{file.relative_to(repo)}: {mention}"
+            for mention in there
+            if not (repo / mention).is_file()
+        ]
     assert missing == []
 
 
 def too_long(repo: Path, pages: list[Path]) -> dict[str, int]:
     """Return the pages of too many lines; records of experiments may be longer."""
-    lengths = {str(page.relative_to(repo)): len(page.read_text(encoding="utf-8").splitlines()) for page in pages}
-    return {page: length for page, length in lengths.items() if length > MAX_LINES and not page.startswith(f"docs/{RECORDS}/")}
+    lengths = {
+        str(page.relative_to(repo)): len(page.read_text(encoding="utf-8").splitlines())
+        for page in pages
+    }
+    return {
+        page: length
+        for page, length in lengths.items()
+        if length > MAX_LINES and not page.startswith(f"docs/{RECORDS}/")
+    }
 
 
 def test_pages_are_short(repo: Path, pages: list[Path]) -> None:
@@ -93,20 +115,31 @@ def reachable(docs: Path) -> set[Path]:
     seen, queue = {docs / "index.md"}, [docs / "index.md"]
     while queue:
         for file, _ in local_links(queue.pop()):
-            if file.suffix == ".md" and file.is_file() and docs in file.parents and file not in seen:
+            if (
+                file.suffix == ".md"
+                and file.is_file()
+                and docs in file.parents
+                and file not in seen
+            ):
                 seen.add(file)
                 queue.append(file)
     return seen
 
 
 def test_every_page_is_reachable_from_the_index(repo: Path) -> None:
-    assert [page.name for page in sorted({*commands.pages(repo)[1:]} - reachable(repo / "docs"))] == []
+    assert [
+        page.name for page in sorted({*commands.pages(repo)[1:]} - reachable(repo / "docs"))
+    ] == []
 
 
 def unshown(folder: Path, pages: list[Path]) -> list[str]:
     """Return the pictures of a folder that no page shows."""
     shown = {file for page in pages for file, _ in local_links(page)}
-    return [path.name for path in folder.rglob("*") if path.suffix in (".png", ".jpg") and path.resolve() not in shown]
+    return [
+        path.name
+        for path in folder.rglob("*")
+        if path.suffix in (".png", ".jpg") and path.resolve() not in shown
+    ]
 
 
 def test_every_picture_is_shown(repo: Path, pages: list[Path]) -> None:
@@ -115,13 +148,23 @@ def test_every_picture_is_shown(repo: Path, pages: list[Path]) -> None:
 
 def files_not_there(repo: Path, pages: list[Path]) -> list[str]:
     """Return the source files that pages name and that do not exist."""
-    roots = (repo, repo / "alpasim_plugin", repo / "alpasim_plugin" / "gaussians", repo / "alpasim_plugin" / "lab", repo / "docs")
+    roots = (
+        repo,
+        repo / "alpasim_plugin",
+        repo / "alpasim_plugin" / "gaussians",
+        repo / "alpasim_plugin" / "lab",
+        repo / "docs",
+    )
     named = re.compile(r"\b([a-z][\w]*(?:/\w+)+\.(?:py|proto))\b")
     missing = []
     for page in pages:
         code = re.findall(r"`([^`\n]+)`", without_code(page.read_text(encoding="utf-8")))
         files = {file for text in code for file in named.findall(text)}
-        missing += [f"{page.relative_to(repo)}: {file}" for file in sorted(files) if not any((root / file).is_file() for root in roots)]
+        missing += [
+            f"{page.relative_to(repo)}: {file}"
+            for file in sorted(files)
+            if not any((root / file).is_file() for root in roots)
+        ]
     return missing
 
 
@@ -130,16 +173,28 @@ def test_files_that_pages_name_exist(repo: Path, pages: list[Path]) -> None:
 
 
 def imports_of_nothing(repo: Path, pages: list[Path]) -> list[str]:
-    """Return the names that examples in Python import and that do not exist; an example that does not parse raises."""
+    """Return the names that examples in Python import and that do not exist; an example that does
+    not parse raises.
+    """
     missing = []
     for page in pages:
-        for block in re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.S | re.M):
+        for block in re.findall(
+            r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.S | re.M
+        ):
             for node in ast.walk(ast.parse(block)):
-                if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in PACKAGES:
+                if (
+                    isinstance(node, ast.ImportFrom)
+                    and node.module
+                    and node.module.split(".")[0] in PACKAGES
+                ):
                     base = repo.joinpath(*node.module.split("."))
                     file = base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
                     text = file.read_text(encoding="utf-8") if file.is_file() else ""
-                    missing += [f"{page.name}: {node.module}.{a.name}" for a in node.names if not re.search(rf"\b{a.name}\b", text)]
+                    missing += [
+                        f"{page.name}: {node.module}.{a.name}"
+                        for a in node.names
+                        if not re.search(rf"\b{a.name}\b", text)
+                    ]
     return missing
 
 

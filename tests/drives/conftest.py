@@ -1,4 +1,6 @@
-"""A street of known shape, imported once; the fit is replaced by Gaussians at the points, which takes no time."""
+"""A street of known shape, imported once; the fit is replaced by Gaussians at the points, which
+takes no time.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +17,14 @@ from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 from tests.drives.street import write_kitti, write_transforms
 
 
-def at_once(views: Any, kept: Any, points: Any, *rest: Any) -> tuple[Reconstruction, dict[str, tuple[float, float, float]]]:
+def at_once(
+    views: Any, kept: Any, points: Any, *rest: Any
+) -> tuple[Reconstruction, dict[str, tuple[float, float, float]]]:
     """Stand in for `fitting.fitted`."""
     cloud = cloud_from_points(points.xyz, points.rgb)
-    return Reconstruction(cloud, {}, Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32))), {views[0].name: (1.1, 1.0, 0.9)}
+    return Reconstruction(cloud, {}, Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32))), {
+        views[0].name: (1.1, 1.0, 0.9)
+    }
 
 
 @pytest.fixture
@@ -41,7 +47,9 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def imported(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return an imported KITTI-like drive: 24 photographs with poses and one without, a right camera."""
+    """Return an imported KITTI-like drive: 24 photographs with poses and one without, a right
+    camera.
+    """
     folder = tmp_path_factory.mktemp("drive")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(build, "fitted", at_once)

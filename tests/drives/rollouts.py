@@ -15,9 +15,24 @@ def rollout_along(scenario: Scenario, aside_m: float, box: tuple[np.ndarray, flo
     ends = np.array([ego.t_us[0], ego.t_us[-1]])
     place = np.tile([*middle, 0.5], (2, 1))
     stands = Actor(
-        "obstacle-001-within-0.1m", "other", Box(side, side, 1.0), Trajectory(ends, place, np.tile([1.0, 0, 0, 0], (2, 1))), True
+        "obstacle-001-within-0.1m",
+        "other",
+        Box(side, side, 1.0),
+        Trajectory(ends, place, np.tile([1.0, 0, 0, 0], (2, 1))),
+        True,
     )
     return RolloutLog(
-        scenario.scene_id, "one", Box(4.0, 1.8, 1.6), np.eye(4), Trajectory(ego.t_us, xyz, ego.quat), {stands.actor_id: stands}, (), (),
-        ego, int(ego.t_us[0]), int(ego.t_us[0]), int(ego.t_us[0]), 100_000,
-    )  # fmt: skip
+        scenario.scene_id,
+        "one",
+        Box(4.0, 1.8, 1.6),
+        np.eye(4),
+        Trajectory(ego.t_us, xyz, ego.quat),
+        {stands.actor_id: stands},
+        (),
+        (),
+        ego,
+        int(ego.t_us[0]),
+        int(ego.t_us[0]),
+        int(ego.t_us[0]),
+        100_000,
+    )

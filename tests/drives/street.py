@@ -1,4 +1,6 @@
-"""A street of known shape, photographed: a bowed road between two walls, with a box beside the path, drawn by casting rays."""
+"""A street of known shape, photographed: a bowed road between two walls, with a box beside the
+path, drawn by casting rays.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +14,15 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import quat_from_matrix
 
-WIDTH, HEIGHT, FOCAL = 320, 128, 180.0
-CAMERA_M, STEP_M, COUNT = 1.5, 0.6, 24
-WALL_M, BOX_LOW, BOX_HIGH = 5.0, np.array([14.0, 2.0, 0.0]), np.array([18.0, 3.8, 1.4])
+WIDTH = 320
+HEIGHT = 128
+FOCAL = 180.0
+CAMERA_M = 1.5
+STEP_M = 0.6
+COUNT = 24
+WALL_M = 5.0
+BOX_LOW = np.array([14.0, 2.0, 0.0])
+BOX_HIGH = np.array([18.0, 3.8, 1.4])
 K = np.array([[FOCAL, 0.0, WIDTH / 2 + 3], [0.0, FOCAL, HEIGHT / 2 - 10], [0.0, 0.0, 1.0]])
 RIG_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -45,9 +53,18 @@ class Street:
         T[:3, 3] = x, -aside, float(self.ground(np.array(x))) + CAMERA_M
         return T
 
-    def photograph(self, T: np.ndarray, bend: np.ndarray | None = None, fisheye: bool = False) -> np.ndarray:
-        """Return what a camera at a pose sees, ``(H, W, 3)`` uint8 BGR; with a lens that bends lines where coefficients are given."""
-        key = (self.bow_m, np.round(T, 9).tobytes(), None if bend is None else bend.tobytes(), fisheye)
+    def photograph(
+        self, T: np.ndarray, bend: np.ndarray | None = None, fisheye: bool = False
+    ) -> np.ndarray:
+        """Return what a camera at a pose sees, ``(H, W, 3)`` uint8 BGR; with a lens that bends
+        lines where coefficients are given.
+        """
+        key = (
+            self.bow_m,
+            np.round(T, 9).tobytes(),
+            None if bend is None else bend.tobytes(),
+            fisheye,
+        )
         if key not in _seen:
             _seen[key] = self._photograph(T, bend, fisheye)
         return _seen[key]
@@ -68,10 +85,16 @@ class Street:
         t = np.where(ray[:, 2] < -1e-3, -CAMERA_M / np.minimum(ray[:, 2], -1e-3), far)
         for _ in range(8):  # the bowed road is met where the ray is as high as it
             x = at[0] + np.clip(t, 0, 200) * ray[:, 0]
-            t = np.where(ray[:, 2] < -1e-3, (self.ground(x) - at[2]) / np.minimum(ray[:, 2], -1e-3), far)
+            t = np.where(
+                ray[:, 2] < -1e-3, (self.ground(x) - at[2]) / np.minimum(ray[:, 2], -1e-3), far
+            )
         best, kind = np.where(t > 0, t, far), np.zeros(len(ray), dtype=int)
         for side in (1.0, -1.0):
-            t = np.where(ray[:, 1] * side > 1e-6, (side * WALL_M - at[1]) / np.where(np.abs(ray[:, 1]) > 1e-6, ray[:, 1], 1), far)
+            t = np.where(
+                ray[:, 1] * side > 1e-6,
+                (side * WALL_M - at[1]) / np.where(np.abs(ray[:, 1]) > 1e-6, ray[:, 1], 1),
+                far,
+            )
             z = at[2] + t * ray[:, 2]
             hit = (t > 0) & (t < best) & (z < 6.0)
             best, kind = np.where(hit, t, best), np.where(hit, 1, kind)
@@ -92,7 +115,9 @@ class Street:
 
 
 def noise(place: np.ndarray, cell_m: float) -> np.ndarray:
-    """Return smooth noise 0..1 at places ``(N, 3)``: values at the corners of cells, interpolated."""
+    """Return smooth noise 0..1 at places ``(N, 3)``: values at the corners of cells,
+    interpolated.
+    """
     q = place / cell_m
     base = np.floor(q).astype(np.int64)
     f = q - base
@@ -102,7 +127,11 @@ def noise(place: np.ndarray, cell_m: float) -> np.ndarray:
         offset = np.array([corner & 1, corner >> 1 & 1, corner >> 2 & 1])
         weight = np.prod(np.where(offset == 1, f, 1 - f), axis=1)
         i = (base + offset).astype(np.uint64)
-        h = i[:, 0] * np.uint64(0x9E3779B97F4A7C15) + i[:, 1] * np.uint64(0xC2B2AE3D27D4EB4F) + i[:, 2] * np.uint64(0x165667B19E3779F9)
+        h = (
+            i[:, 0] * np.uint64(0x9E3779B97F4A7C15)
+            + i[:, 1] * np.uint64(0xC2B2AE3D27D4EB4F)
+            + i[:, 2] * np.uint64(0x165667B19E3779F9)
+        )
         h ^= h >> np.uint64(29)
         h *= np.uint64(0xBF58476D1CE4E5B9)
         h ^= h >> np.uint64(32)
@@ -115,7 +144,13 @@ def stations() -> np.ndarray:
     return np.arange(COUNT) * STEP_M
 
 
-def write_transforms(folder: Path, axes: str = "opencv", say_axes: bool = True, street: Street | None = None, **keys: object) -> Path:
+def write_transforms(
+    folder: Path,
+    axes: str = "opencv",
+    say_axes: bool = True,
+    street: Street | None = None,
+    **keys: object,
+) -> Path:
     """Write the street as ``transforms.json``; keys of the document are added."""
     chosen = street or Street()
     (folder / "images").mkdir(parents=True)
@@ -131,26 +166,39 @@ def write_transforms(folder: Path, axes: str = "opencv", say_axes: bool = True, 
     return folder
 
 
-def write_kitti(folder: Path, street: Street | None = None, spare_pictures: int = 0, stereo: bool = True) -> Path:
+def write_kitti(
+    folder: Path, street: Street | None = None, spare_pictures: int = 0, stereo: bool = True
+) -> Path:
     """Write the street as a KITTI odometry folder; ``spare_pictures`` have no pose."""
     chosen = street or Street()
     base = 0.54
     for name, aside in (("image_l", 0.0), ("image_r", base))[: 2 if stereo else 1]:
         (folder / name).mkdir(parents=True)
         for i, x in enumerate(np.arange(COUNT + spare_pictures) * STEP_M):
-            cv2.imwrite(str(folder / name / f"{i:06d}.png"), cv2.cvtColor(chosen.photograph(chosen.pose(x, aside)), cv2.COLOR_BGR2GRAY))
+            cv2.imwrite(
+                str(folder / name / f"{i:06d}.png"),
+                cv2.cvtColor(chosen.photograph(chosen.pose(x, aside)), cv2.COLOR_BGR2GRAY),
+            )
     first = np.linalg.inv(chosen.pose(0.0))
     poses = [first @ chosen.pose(x) for x in stations()]
-    (folder / "poses.txt").write_text("\n".join(" ".join(f"{v:.9e}" for v in pose[:3].ravel()) for pose in poses) + "\n")
+    (folder / "poses.txt").write_text(
+        "\n".join(" ".join(f"{v:.9e}" for v in pose[:3].ravel()) for pose in poses) + "\n"
+    )
     P = np.column_stack([K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), np.zeros(3)])
     right = P.copy()
     right[0, 3] = -FOCAL * base
-    (folder / "calib.txt").write_text("\n".join(" ".join(f"{v:.12e}" for v in one.ravel()) for one in (P, right)))
+    (folder / "calib.txt").write_text(
+        "\n".join(" ".join(f"{v:.12e}" for v in one.ravel()) for one in (P, right))
+    )
     return folder
 
 
-def write_colmap(folder: Path, binary: bool, model: str = "SIMPLE_PINHOLE", bend: tuple[float, ...] = ()) -> Path:
-    """Write the street as a COLMAP model in ``sparse/0`` with pictures in ``images``; the unit is arbitrary."""
+def write_colmap(
+    folder: Path, binary: bool, model: str = "SIMPLE_PINHOLE", bend: tuple[float, ...] = ()
+) -> Path:
+    """Write the street as a COLMAP model in ``sparse/0`` with pictures in ``images``; the unit is
+    arbitrary.
+    """
     street, sparse = Street(), folder / "sparse/0"
     sparse.mkdir(parents=True)
     (folder / "images").mkdir()
@@ -161,19 +209,50 @@ def write_colmap(folder: Path, binary: bool, model: str = "SIMPLE_PINHOLE", bend
     rows = []
     for i, x in enumerate(stations()):
         T = street.pose(x)
-        cv2.imwrite(str(folder / f"images/{i:03d}.png"), street.photograph(T, coefficients, model == "OPENCV_FISHEYE"))
+        cv2.imwrite(
+            str(folder / f"images/{i:03d}.png"),
+            street.photograph(T, coefficients, model == "OPENCV_FISHEYE"),
+        )
         back = np.linalg.inv(T)
-        rows.append((i + 1, *quat_from_matrix(back[:3, :3]), *(0.5 * back[:3, 3]), 1, f"{i:03d}.png"))
-    places = np.array([[x, y, float(street.ground(np.array(x)))] for x in np.arange(2.0, 25.0, 0.5) for y in np.arange(-2.0, 2.1, 0.5)])
+        rows.append(
+            (i + 1, *quat_from_matrix(back[:3, :3]), *(0.5 * back[:3, 3]), 1, f"{i:03d}.png")
+        )
+    places = np.array(
+        [
+            [x, y, float(street.ground(np.array(x)))]
+            for x in np.arange(2.0, 25.0, 0.5)
+            for y in np.arange(-2.0, 2.1, 0.5)
+        ]
+    )
     if binary:
-        images = b"".join(struct.pack("<i7di", *row[:9]) + row[9].encode() + b"\0" + struct.pack("<Qddq", 1, 1.0, 2.0, -1) for row in rows)
-        points = b"".join(struct.pack("<Q3d3BdQii", i, *(0.5 * q), 90, 90, 90, 0.5, 1, 1, 0) for i, q in enumerate(places))
+        images = b"".join(
+            struct.pack("<i7di", *row[:9])
+            + row[9].encode()
+            + b"\0"
+            + struct.pack("<Qddq", 1, 1.0, 2.0, -1)
+            for row in rows
+        )
+        points = b"".join(
+            struct.pack("<Q3d3BdQii", i, *(0.5 * q), 90, 90, 90, 0.5, 1, 1, 0)
+            for i, q in enumerate(places)
+        )
         camera = struct.pack("<iiQQ", 1, number, WIDTH, HEIGHT) + struct.pack(f"<{len(p)}d", *p)
-        for name, count, body in (("cameras", 1, camera), ("images", len(rows), images), ("points3D", len(places), points)):
+        for name, count, body in (
+            ("cameras", 1, camera),
+            ("images", len(rows), images),
+            ("points3D", len(places), points),
+        ):
             (sparse / f"{name}.bin").write_bytes(struct.pack("<Q", count) + body)
     else:
-        (sparse / "cameras.txt").write_text(f"# cameras\n1 {model} {WIDTH} {HEIGHT} {' '.join(map(str, p))}\n")
-        (sparse / "images.txt").write_text("# images\n" + "".join(" ".join(map(str, row)) + "\n1.0 2.0 -1\n" for row in rows))
-        text = "".join(f"{i} {0.5 * q[0]} {0.5 * q[1]} {0.5 * q[2]} 90 90 90 0.5 1 0\n" for i, q in enumerate(places))
+        (sparse / "cameras.txt").write_text(
+            f"# cameras\n1 {model} {WIDTH} {HEIGHT} {' '.join(map(str, p))}\n"
+        )
+        (sparse / "images.txt").write_text(
+            "# images\n" + "".join(" ".join(map(str, row)) + "\n1.0 2.0 -1\n" for row in rows)
+        )
+        text = "".join(
+            f"{i} {0.5 * q[0]} {0.5 * q[1]} {0.5 * q[2]} 90 90 90 0.5 1 0\n"
+            for i, q in enumerate(places)
+        )
         (sparse / "points3D.txt").write_text("# points\n" + text)
     return folder

@@ -1,4 +1,6 @@
-"""Recordings that cannot be driven in are refused with what was found and what to do, and nothing is left behind."""
+"""Recordings that cannot be driven in are refused with what was found and what to do, and nothing
+is left behind.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,13 @@ def poses(change: Callable[[list[np.ndarray]], list[np.ndarray]]) -> Change:
 
     def apply(folder: Path) -> None:
         path = folder / "poses.txt"
-        rows = [np.array([float(word) for word in line.split()]).reshape(3, 4) for line in path.read_text().splitlines()]
-        path.write_text("\n".join(" ".join(f"{v:.9e}" for v in row.ravel()) for row in change(rows)))
+        rows = [
+            np.array([float(word) for word in line.split()]).reshape(3, 4)
+            for line in path.read_text().splitlines()
+        ]
+        path.write_text(
+            "\n".join(" ".join(f"{v:.9e}" for v in row.ravel()) for row in change(rows))
+        )
 
     return apply
 
@@ -83,7 +90,9 @@ def cut_off(folder: Path) -> None:
 def cut_off_jpeg(folder: Path) -> None:
     for path in sorted((folder / "image_r").iterdir()):
         data = cv2.imencode(".jpg", cv2.imread(str(path)))[1].tobytes()
-        path.with_suffix(".jpg").write_bytes(data[: len(data) // 2] if path.stem == "000003" else data)
+        path.with_suffix(".jpg").write_bytes(
+            data[: len(data) // 2] if path.stem == "000003" else data
+        )
         path.unlink()
 
 
@@ -94,7 +103,9 @@ def another_size(folder: Path) -> None:
 
 def printed_colours(folder: Path) -> None:
     for path in sorted((folder / "image_l").iterdir()):
-        path.with_suffix(".jpg").write_bytes(cv2.imencode(".jpg", cv2.imread(str(path)))[1].tobytes())
+        path.with_suffix(".jpg").write_bytes(
+            cv2.imencode(".jpg", cv2.imread(str(path)))[1].tobytes()
+        )
         path.unlink()
     path = folder / "image_l/000006.jpg"
     data = bytearray(path.read_bytes())
@@ -170,13 +181,20 @@ def test_a_colmap_model_that_is_cut_off_is_named(tmp_path: Path, name: str) -> N
 def test_nothing_known_names_the_forms(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "odd").mkdir()
     (tmp_path / "odd/notes.txt").write_text("none")
-    assert run_command(["import", "drive", str(tmp_path / "odd"), "--out", str(tmp_path / "out"), "--json"]) == 2
+    assert (
+        run_command(
+            ["import", "drive", str(tmp_path / "odd"), "--out", str(tmp_path / "out"), "--json"]
+        )
+        == 2
+    )
     error = json.loads(capsys.readouterr().out)["error"]
     assert "notes.txt" in error["found"]
     assert "KITTI" in error["do"]
 
 
-def test_photographs_without_poses_name_the_extra_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photographs_without_poses_name_the_extra_where_it_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import sys
 
     monkeypatch.setitem(sys.modules, "pycolmap", None)

@@ -1,4 +1,6 @@
-"""A recording becomes a folder that drives: what stands in it, how it is loaded, and that nothing is left half-written."""
+"""A recording becomes a folder that drives: what stands in it, how it is loaded, and that nothing
+is left half-written.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ from tests.drives.street import COUNT, STEP_M, Street, write_kitti, write_transf
 pytestmark = pytest.mark.slow
 
 
-def test_the_scenario_carries_photographs_model_and_a_corridor_without_paint(imported: Path) -> None:
+def test_the_scenario_carries_photographs_model_and_a_corridor_without_paint(
+    imported: Path,
+) -> None:
     scenario = load_scenario(imported / "scenario.yaml")
     assert scenario.source == "drive"
     assert scenario.model == str(imported / "model")
@@ -45,7 +49,9 @@ def test_the_wheels_stand_on_the_road_that_bows(imported: Path) -> None:
     street, x = Street(), np.arange(4.0, 16.0)
     found = height_at(scenario.ground, np.column_stack([x, np.zeros(len(x))]))
     true = street.ground(x)
-    slope = np.polyfit(x, found - true, 1)  # up is the road's own: its mean slope and height are not known
+    slope = np.polyfit(
+        x, found - true, 1
+    )  # up is the road's own: its mean slope and height are not known
     assert np.abs(found - true - np.polyval(slope, x)).max() < 0.05
     ego = scenario.ego_log.xyz
     assert np.abs(ego[:, 2] - height_at(scenario.ground, ego)).max() < 0.05
@@ -60,7 +66,9 @@ def test_the_photographs_are_read_by_the_one_reader(imported: Path) -> None:
     assert np.allclose(views[0].camera.K, first.K)
 
 
-def test_the_same_command_again_gives_the_same_and_another_import_is_refused(imported: Path, tmp_path: Path) -> None:
+def test_the_same_command_again_gives_the_same_and_another_import_is_refused(
+    imported: Path, tmp_path: Path
+) -> None:
     source = imported.parent / "street"
     assert import_drive(source, imported) == json.loads((imported / "quality.json").read_text())
     with pytest.raises(InputError, match="another import"):
@@ -71,7 +79,9 @@ def test_the_same_command_again_gives_the_same_and_another_import_is_refused(imp
 
 
 @pytest.mark.slow
-def test_an_import_that_is_stopped_goes_on_and_leaves_no_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick_fit: None) -> None:
+def test_an_import_that_is_stopped_goes_on_and_leaves_no_scenario(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick_fit: None
+) -> None:
     source, real = write_kitti(tmp_path / "street", stereo=False), build.measure
 
     def stop(*given: object) -> None:
@@ -88,7 +98,9 @@ def test_an_import_that_is_stopped_goes_on_and_leaves_no_scenario(tmp_path: Path
 
 
 @pytest.mark.slow
-def test_scale_without_metres_comes_from_the_cameras_height(tmp_path: Path, quick_fit: None) -> None:
+def test_scale_without_metres_comes_from_the_cameras_height(
+    tmp_path: Path, quick_fit: None
+) -> None:
     folder = write_transforms(tmp_path / "walk")
     document = json.loads((folder / "transforms.json").read_text())
     for frame in document["frames"]:
@@ -101,15 +113,21 @@ def test_scale_without_metres_comes_from_the_cameras_height(tmp_path: Path, quic
     assert np.linalg.norm(ego[-1] - ego[0]) == pytest.approx((COUNT - 1) * STEP_M, rel=0.03)
 
 
-def test_where_no_road_is_below_the_cameras_every_fifth_photograph_is_held_out(walk: Path, tmp_path: Path) -> None:
+def test_where_no_road_is_below_the_cameras_every_fifth_photograph_is_held_out(
+    walk: Path, tmp_path: Path
+) -> None:
     drive = read_source(walk, tmp_path, lambda stage, done, whole: None)
-    placed = place(replace(drive, metric=None), Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3))))
+    placed = place(
+        replace(drive, metric=None), Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    )
     shown = build.shown_photographs(drive, placed)
     assert sum(one.use == "held-out" for one in shown) == 5
     assert any("photographs taken along a road" in note for note in placed.notes)
 
 
-def test_views_are_half_as_wide_and_their_longer_side_is_not_small(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_views_are_half_as_wide_and_their_longer_side_is_not_small(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     drive = read_source(walk, tmp_path, lambda stage, done, whole: None)
     shown = build.Shown(drive.pictures[0], "front", "fitted", np.eye(4), "a.png", {})
     monkeypatch.setattr(build, "FIT_PX", 200)
@@ -118,9 +136,20 @@ def test_views_are_half_as_wide_and_their_longer_side_is_not_small(walk: Path, t
     assert shown.view().rgb.shape == (64, 160, 3)
 
 
-def test_the_command_tells_what_it_found(tmp_path: Path, quick_fit: None, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_tells_what_it_found(
+    tmp_path: Path, quick_fit: None, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = write_transforms(tmp_path / "walk", axes="opengl", say_axes=False, unit="m")
-    command = ["import", "drive", str(folder), "--out", str(tmp_path / "out"), "--camera-height", "1.5", "--json"]
+    command = [
+        "import",
+        "drive",
+        str(folder),
+        "--out",
+        str(tmp_path / "out"),
+        "--camera-height",
+        "1.5",
+        "--json",
+    ]
     assert run_command(command) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["scenario"] == str(tmp_path / "out/scenario.yaml")
@@ -136,21 +165,44 @@ XODR = """<?xml version="1.0"?><OpenDRIVE><header revMajor="1" revMinor="4"/><ro
 
 
 @pytest.mark.slow
-def test_a_given_map_is_laid_onto_the_ground_and_one_elsewhere_is_refused(tmp_path: Path, quick_fit: None) -> None:
+def test_a_given_map_is_laid_onto_the_ground_and_one_elsewhere_is_refused(
+    tmp_path: Path, quick_fit: None
+) -> None:
     folder = write_transforms(tmp_path / "walk", unit="m")
     (tmp_path / "here.xodr").write_text(XODR.format(x=-10, y=1.75))
     (tmp_path / "away.xodr").write_text(XODR.format(x=-10, y=501.75))
     with pytest.raises(InputError, match=r"\+500\.. m in y"):
         import_drive(folder, tmp_path / "out", lane_map=tmp_path / "away.xodr")
     assert not (tmp_path / "out").exists()
-    assert run_command(["import", "drive", str(folder), "--out", str(tmp_path / "out"), "--map", str(tmp_path / "here.xodr")]) == 0
+    assert (
+        run_command(
+            [
+                "import",
+                "drive",
+                str(folder),
+                "--out",
+                str(tmp_path / "out"),
+                "--map",
+                str(tmp_path / "here.xodr"),
+            ]
+        )
+        == 0
+    )
     scenario = load_scenario(tmp_path / "out/scenario.yaml")
     (lane,) = scenario.lane_map.lanes.values()
     assert np.abs(lane.centre[:, 2] - height_at(scenario.ground, lane.centre)).max() < 1e-9
-    assert np.abs(scenario.ego_log.xyz[:, 1] - np.interp(scenario.ego_log.xyz[:, 0], lane.centre[:, 0], lane.centre[:, 1])).max() < 0.3
+    assert (
+        np.abs(
+            scenario.ego_log.xyz[:, 1]
+            - np.interp(scenario.ego_log.xyz[:, 0], lane.centre[:, 0], lane.centre[:, 1])
+        ).max()
+        < 0.3
+    )
 
 
-def test_an_imported_drive_is_handed_on_as_a_scene_of_alpasim(imported: Path, tmp_path: Path) -> None:
+def test_an_imported_drive_is_handed_on_as_a_scene_of_alpasim(
+    imported: Path, tmp_path: Path
+) -> None:
     from scenarios.usdz import read_usdz
     from scenarios.usdz_write import write_usdz
 
@@ -167,12 +219,55 @@ def test_policies_drive_behind_the_reconstruction_and_clean_is_refused(
     imported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scenario = str(imported / "scenario.yaml")
-    short = ["--set", "timing.duration_us=700000", "--certify", "none", "--workers", "1", "--no-report", "--json"]
-    assert run_command(["--renderer", "3dgs", "--policy", "log-replay", scenario, "--out", str(tmp_path / "run"), *short]) == 0
+    short = [
+        "--set",
+        "timing.duration_us=700000",
+        "--certify",
+        "none",
+        "--workers",
+        "1",
+        "--no-report",
+        "--json",
+    ]
+    assert (
+        run_command(
+            [
+                "--renderer",
+                "3dgs",
+                "--policy",
+                "log-replay",
+                scenario,
+                "--out",
+                str(tmp_path / "run"),
+                *short,
+            ]
+        )
+        == 0
+    )
     told = json.loads(capsys.readouterr().out)
-    metrics = told["metrics"]["3dgs"] if "metrics" in told else json.loads((tmp_path / "run/summary.json").read_text())["metrics"]["3dgs"]
+    metrics = (
+        told["metrics"]["3dgs"]
+        if "metrics" in told
+        else json.loads((tmp_path / "run/summary.json").read_text())["metrics"]["3dgs"]
+    )
     assert metrics["collision_standing"]["mean"] == 0.0
     assert metrics["collision_any"]["mean"] == 0.0
     assert metrics["offroad"]["mean"] == 0.0
-    assert run_command(["--renderer", "clean", "--policy", "log-replay", scenario, "--out", str(tmp_path / "no"), *short]) != 0
-    assert "nothing was built" in capsys.readouterr().out + str([path.read_text() for path in (tmp_path / "no").rglob("manifest.json")])
+    assert (
+        run_command(
+            [
+                "--renderer",
+                "clean",
+                "--policy",
+                "log-replay",
+                scenario,
+                "--out",
+                str(tmp_path / "no"),
+                *short,
+            ]
+        )
+        != 0
+    )
+    assert "nothing was built" in capsys.readouterr().out + str(
+        [path.read_text() for path in (tmp_path / "no").rglob("manifest.json")]
+    )

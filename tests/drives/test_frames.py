@@ -1,4 +1,6 @@
-"""Which pictures of a film are used for finding the way: those in which the world moves, without the car itself."""
+"""Which pictures of a film are used for finding the way: those in which the world moves, without
+the car itself.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,11 @@ BONNET = 140  # its uppermost row
 
 def passing(count: int, step_px: int = 3) -> list[np.ndarray]:
     """Return pictures of a pattern that moves to the left."""
-    wide = cv2.GaussianBlur(stream("frames", 0, "pattern").uniform(0, 255, (SIZE[0], SIZE[1] + 200)).astype(np.float32), (0, 0), 2.0)
+    wide = cv2.GaussianBlur(
+        stream("frames", 0, "pattern").uniform(0, 255, (SIZE[0], SIZE[1] + 200)).astype(np.float32),
+        (0, 0),
+        2.0,
+    )
     wide = np.clip(128 + 4 * (wide - 128), 0, 255).astype(np.uint8)
     return [wide[:, i * step_px : i * step_px + SIZE[1]].copy() for i in range(count)]
 

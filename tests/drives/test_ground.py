@@ -1,4 +1,6 @@
-"""The ground below a drive: it bows, tilts and has kerbs; what stands on it, and how few points there are, does not move it."""
+"""The ground below a drive: it bows, tilts and has kerbs; what stands on it, and how few points
+there are, does not move it.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,11 @@ def path() -> np.ndarray:
 
 def points_on(xy: np.ndarray, lift: np.ndarray | float = 0.0, spread_m: float = 0.01) -> Points:
     z = road(xy[:, 0], xy[:, 1]) + lift
-    return Points(np.column_stack([xy, z]), np.full((len(xy), 3), 0.5), np.tile(np.eye(3) * spread_m**2, (len(xy), 1, 1)))
+    return Points(
+        np.column_stack([xy, z]),
+        np.full((len(xy), 3), 0.5),
+        np.tile(np.eye(3) * spread_m**2, (len(xy), 1, 1)),
+    )
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.02, 300.0])
@@ -51,14 +57,22 @@ def test_what_stands_on_it_does_not_lift_it() -> None:
 
 def test_few_points_under_the_path_are_helped_by_those_beside_it() -> None:
     rng = stream("ground", 0, "few")
-    under, beside = rng.uniform([0, -1.4], [60, 1.4], (20, 2)), rng.uniform([0, 1.7], [60, 1.95], (60, 2))
+    under, beside = (
+        rng.uniform([0, -1.4], [60, 1.4], (20, 2)),
+        rng.uniform([0, 1.7], [60, 1.95], (60, 2)),
+    )
     strip = fit_ground(points_on(np.concatenate([under, beside])), path())
     assert strip is not None
     assert strip.height == pytest.approx(HEIGHT_M, abs=0.1)
 
 
 def test_too_few_points_are_no_ground() -> None:
-    assert fit_ground(points_on(stream("ground", 0, "none").uniform([0, -1], [60, 1], (12, 2))), path()) is None
+    assert (
+        fit_ground(
+            points_on(stream("ground", 0, "none").uniform([0, -1], [60, 1], (12, 2))), path()
+        )
+        is None
+    )
     nothing = Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     assert fit_ground(nothing, path()) is None
 

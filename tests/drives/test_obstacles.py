@@ -37,17 +37,31 @@ def cloud_at(points: np.ndarray, size_m: float = 0.06, opacity: float = 0.9) -> 
 
 def straight(length_m: float = 30.0) -> Trajectory:
     x = np.arange(0.0, length_m)
-    return Trajectory((x * 1e5).astype(np.int64), np.column_stack([x, 0 * x, 0 * x]), np.tile([1.0, 0, 0, 0], (len(x), 1)))
+    return Trajectory(
+        (x * 1e5).astype(np.int64),
+        np.column_stack([x, 0 * x, 0 * x]),
+        np.tile([1.0, 0, 0, 0], (len(x), 1)),
+    )
 
 
 def points_at(xyz: np.ndarray, spread_m: float) -> Points:
-    return Points(xyz, np.full(xyz.shape, 0.5), np.tile(np.eye(3) * spread_m**2 / 3, (len(xyz), 1, 1)))
+    return Points(
+        xyz, np.full(xyz.shape, 0.5), np.tile(np.eye(3) * spread_m**2 / 3, (len(xyz), 1, 1))
+    )
 
 
 def test_a_parked_car_stands_where_it_is_seen() -> None:
     body = surface(LOW, HIGH, 4000)
-    found = standing_obstacles(cloud_at(body), points_at(body[::20], 0.05), flat(), straight(), Vehicle()).obstacles
-    corners = np.array([one.xyz[:2] + side * np.array([one.box.length_m, one.box.width_m]) / 2 for one in found for side in (-1, 1)])
+    found = standing_obstacles(
+        cloud_at(body), points_at(body[::20], 0.05), flat(), straight(), Vehicle()
+    ).obstacles
+    corners = np.array(
+        [
+            one.xyz[:2] + side * np.array([one.box.length_m, one.box.width_m]) / 2
+            for one in found
+            for side in (-1, 1)
+        ]
+    )
     assert corners.min(axis=0) == pytest.approx(LOW[:2], abs=0.3)
     assert corners.max(axis=0) == pytest.approx(HIGH[:2], abs=0.3)
     assert max(one.xyz[2] + one.box.height_m / 2 for one in found) == pytest.approx(1.5, abs=0.1)
@@ -59,11 +73,17 @@ def test_dark_doors_leave_no_hole_to_drive_into_and_what_stands_behind_is_apart(
     doors = (body[:, 0] > 13.7) & (body[:, 0] < 14.7) & (body[:, 1] < 3.0)
     hedge = surface(np.array([8.0, 5.2, 0.0]), np.array([20.0, 5.6, 1.2]), 4000)
     seen = np.concatenate([body[~doors], hedge])
-    found = standing_obstacles(cloud_at(seen), points_at(seen[::20], 0.05), flat(), straight(), Vehicle()).obstacles
+    found = standing_obstacles(
+        cloud_at(seen), points_at(seen[::20], 0.05), flat(), straight(), Vehicle()
+    ).obstacles
     sides = [(one.xyz[1] - one.box.width_m / 2, one.xyz[1] + one.box.width_m / 2) for one in found]
     assert all(high < 3.9 or low > 4.7 for low, high in sides)
     for x in np.arange(12.2, 16.3, 0.4):
-        near = [low for one, (low, _) in zip(found, sides, strict=True) if abs(x - one.xyz[0]) < one.box.length_m / 2 + 0.1]
+        near = [
+            low
+            for one, (low, _) in zip(found, sides, strict=True)
+            if abs(x - one.xyz[0]) < one.box.length_m / 2 + 0.1
+        ]
         assert min(near) == pytest.approx(LOW[1], abs=0.3)
 
 
@@ -71,25 +91,49 @@ def test_the_driven_path_is_free_and_what_was_opaque_there_is_counted() -> None:
     body = surface(LOW - np.array([0, 2.5, 0]), HIGH - np.array([0, 2.5, 0]), 4000)  # in the way
     found = standing_obstacles(cloud_at(body), points_at(body, 0.05), flat(), straight(), Vehicle())
     assert found.cleared > 50
-    assert all(abs(one.xyz[1]) - one.box.width_m / 2 > Vehicle().box.width_m / 2 - 0.1 for one in found.obstacles)
+    assert all(
+        abs(one.xyz[1]) - one.box.width_m / 2 > Vehicle().box.width_m / 2 - 0.1
+        for one in found.obstacles
+    )
 
 
-@pytest.mark.parametrize(("size_m", "opacity", "lift_m"), [(0.06, 0.1, 0.0), (1.0, 0.9, 0.0), (0.06, 0.9, 3.0), (0.06, 0.9, -1.4)])
-def test_haze_background_and_what_is_too_high_or_low_do_not_stand(size_m: float, opacity: float, lift_m: float) -> None:
+@pytest.mark.parametrize(
+    ("size_m", "opacity", "lift_m"),
+    [(0.06, 0.1, 0.0), (1.0, 0.9, 0.0), (0.06, 0.9, 3.0), (0.06, 0.9, -1.4)],
+)
+def test_haze_background_and_what_is_too_high_or_low_do_not_stand(
+    size_m: float, opacity: float, lift_m: float
+) -> None:
     body = surface(LOW, HIGH, 3000) + np.array([0, 0, lift_m])
-    assert standing_obstacles(cloud_at(body, size_m, opacity), points_at(body, 0.05), flat(), straight(), Vehicle()).obstacles == ()
+    assert (
+        standing_obstacles(
+            cloud_at(body, size_m, opacity), points_at(body, 0.05), flat(), straight(), Vehicle()
+        ).obstacles
+        == ()
+    )
 
 
 @pytest.mark.slow
-def test_contact_with_what_stands_is_reported_apart_and_is_unknown_where_it_was_not_looked_for(imported: Path) -> None:
+def test_contact_with_what_stands_is_reported_apart_and_is_unknown_where_it_was_not_looked_for(
+    imported: Path,
+) -> None:
     from evaluators.metrics.collision import evaluate_collision
     from evaluators.metrics.presets import preset
     from tests.drives.rollouts import rollout_along
 
     scenario = load_scenario(imported / "scenario.yaml")
-    for standing, aside, touched, valid in (("found", 0.0, 0.0, True), ("found", 2.5, 1.0, True), ("unknown", 0.0, 0.0, False)):
+    for standing, aside, touched, valid in (
+        ("found", 0.0, 0.0, True),
+        ("found", 2.5, 1.0, True),
+        ("unknown", 0.0, 0.0, False),
+    ):
         log = rollout_along(scenario, aside, box=(np.array([14.0, 2.5]), 1.0))
-        values = {one.name: one for one in evaluate_collision(log, replace(scenario.scene, standing=standing), preset("strict"))}
+        values = {
+            one.name: one
+            for one in evaluate_collision(
+                log, replace(scenario.scene, standing=standing), preset("strict")
+            )
+        }
         series = values["collision_standing"]
         assert bool(series.valid.all()) is valid
         assert (np.nanmax(series.value) if valid else 0.0) == touched

@@ -64,18 +64,32 @@ def test_a_colmap_model(tmp_path: Path, binary: bool) -> None:
 
 @pytest.mark.parametrize(
     ("model", "bend"),
-    [("SIMPLE_RADIAL", (-0.05,)), ("OPENCV", (-0.08, 0.01, 0.001, -0.001)), ("OPENCV_FISHEYE", (0.02, -0.01, 0.0, 0.0))],
+    [
+        ("SIMPLE_RADIAL", (-0.05,)),
+        ("OPENCV", (-0.08, 0.01, 0.001, -0.001)),
+        ("OPENCV_FISHEYE", (0.02, -0.01, 0.0, 0.0)),
+    ],
 )
-def test_photographs_are_freed_of_every_lens(tmp_path: Path, model: str, bend: tuple[float, ...]) -> None:
+def test_photographs_are_freed_of_every_lens(
+    tmp_path: Path, model: str, bend: tuple[float, ...]
+) -> None:
     drive = read_source(write_colmap(tmp_path / "a", True, model, bend), tmp_path, told)
     plain = read_source(write_colmap(tmp_path / "b", True), tmp_path, told)
     bent, straight = drive.pictures[5], plain.pictures[5]
     K = bent.lens.straight_K()
     H = straight.lens.K @ np.linalg.inv(K)
     back = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
-    warped = cv2.warpPerspective(straight.rgb(), np.linalg.inv(back) @ H @ back, (320, 128), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    warped = cv2.warpPerspective(
+        straight.rgb(),
+        np.linalg.inv(back) @ H @ back,
+        (320, 128),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+    )
     inner = (slice(20, -20), slice(30, -30))
-    off = np.abs(cv2.GaussianBlur(warped, (0, 0), 1.5)[inner].astype(float) - cv2.GaussianBlur(bent.rgb(), (0, 0), 1.5)[inner]).mean()
+    off = np.abs(
+        cv2.GaussianBlur(warped, (0, 0), 1.5)[inner].astype(float)
+        - cv2.GaussianBlur(bent.rgb(), (0, 0), 1.5)[inner]
+    ).mean()
     assert off < 6.0
     assert np.abs(straight.rgb()[inner].astype(float) - bent.rgb()[inner]).mean() > 2 * off
 
@@ -86,7 +100,9 @@ def test_a_kitti_folder_of_the_benchmarks_own_layout(tmp_path: Path) -> None:
     for old, new in (("image_l", "image_2"), ("image_r", "image_3")):
         (folder / old).rename(folder / new)
     rows = (folder / "calib.txt").read_text().splitlines()
-    (folder / "calib.txt").write_text("\n".join(f"P{i}: {rows[i % 2]}" for i in range(4)) + "\nTr: " + rows[0])
+    (folder / "calib.txt").write_text(
+        "\n".join(f"P{i}: {rows[i % 2]}" for i in range(4)) + "\nTr: " + rows[0]
+    )
     (tmp_path / "poses").mkdir()
     (folder / "poses.txt").rename(tmp_path / "poses/07.txt")
     (folder / "times.txt").write_text("\n".join(f"{0.12 * i:.4e}" for i in range(COUNT)))
@@ -94,7 +110,9 @@ def test_a_kitti_folder_of_the_benchmarks_own_layout(tmp_path: Path) -> None:
     assert drive.never_fitted == ("right",)
     assert [one.t_us for one in drive.of("left")[:3]] == [0, 120_000, 240_000]
     assert_is_the_street(placed)
-    assert np.linalg.norm(placed.mounts["right"][:3, 3] - placed.mounts["left"][:3, 3]) == pytest.approx(0.54, abs=0.01)
+    assert np.linalg.norm(
+        placed.mounts["right"][:3, 3] - placed.mounts["left"][:3, 3]
+    ) == pytest.approx(0.54, abs=0.01)
 
 
 def test_the_facts_of_a_real_street(data_set: Callable[[str], Path]) -> None:
@@ -108,7 +126,12 @@ def test_the_facts_of_a_real_street(data_set: Callable[[str], Path]) -> None:
 def test_the_facts_of_a_real_rig(data_set: Callable[[str], Path]) -> None:
     folder = data_set("dgp")
     drive = checked(read_source(folder, folder / "nowhere", told), folder)
-    assert (drive.front, len(drive.cameras), len(drive.pictures), len(drive.tracks)) == ("CAMERA_01", 6, 18, 9)
+    assert (drive.front, len(drive.cameras), len(drive.pictures), len(drive.tracks)) == (
+        "CAMERA_01",
+        6,
+        18,
+        9,
+    )
     assert drive.points is not None
     placed = place(drive, drive.points)
     assert placed.strip is not None
@@ -129,7 +152,9 @@ def test_times_put_photographs_in_order(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_real_rig_becomes_a_scenario_with_its_tracks(data_set: Callable[[str], Path], tmp_path: Path, quick_fit: None) -> None:
+def test_a_real_rig_becomes_a_scenario_with_its_tracks(
+    data_set: Callable[[str], Path], tmp_path: Path, quick_fit: None
+) -> None:
     from alpasim_plugin.drives.build import import_drive
     from scenarios.load import load_scenario
 

@@ -1,4 +1,6 @@
-"""Photographs and videos without poses: structure from motion finds the way of a car that drives straight on."""
+"""Photographs and videos without poses: structure from motion finds the way of a car that drives
+straight on.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def film(path: Path, black: int = 1) -> Path:
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=10)
         stream.width, stream.height, stream.bit_rate = 320, 128, 8_000_000
-        pictures = [np.zeros((128, 320, 3), np.uint8)] * black + [street.photograph(street.pose(x)) for x in stations()]
+        pictures = [np.zeros((128, 320, 3), np.uint8)] * black + [
+            street.photograph(street.pose(x)) for x in stations()
+        ]
         for picture in pictures:
             for packet in stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")):
                 container.mux(packet)
@@ -53,12 +57,18 @@ def test_a_video_becomes_a_drive(tmp_path: Path) -> None:
     placed = place(drive, _points(drive, path, told), camera_height_m=1.5)
     ego = placed.ego.xyz
     way = np.linalg.norm(ego[-1] - ego[0]) / ((times[-1] - times[0]) / 1e5)
-    assert drive.pictures[0].lens.K[0, 0] == pytest.approx(LENSES[PLAIN] * 320)  # what is begun with, as nothing here turns
-    free = drive.pictures[0].lens.K[0, 0] / FOCAL  # driving straight on: a longer lens and a longer way look the same
+    assert drive.pictures[0].lens.K[0, 0] == pytest.approx(
+        LENSES[PLAIN] * 320
+    )  # what is begun with, as nothing here turns
+    free = (
+        drive.pictures[0].lens.K[0, 0] / FOCAL
+    )  # driving straight on: a longer lens and a longer way look the same
     assert way == pytest.approx(STEP_M * free, rel=0.15)
     before = sorted(one.name for one in (work / FRAMES).iterdir())
     again = read_source(path, work, told)  # goes on from what was found
-    assert [one.T_world_camera.tolist() for one in again.pictures] == [one.T_world_camera.tolist() for one in drive.pictures]
+    assert [one.T_world_camera.tolist() for one in again.pictures] == [
+        one.T_world_camera.tolist() for one in drive.pictures
+    ]
     assert sorted(one.name for one in (work / FRAMES).iterdir()) == before
 
 
@@ -71,7 +81,9 @@ class Matched:
         self.at = []
         for i in range(FAR + 6):
             turn, _ = cv2.Rodrigues(np.array([0.0, 0.02 * i, 0.0]))
-            self.at.append(project((world - [0.3 * i, 0.0, 0.4 * i]) @ turn.T) + rng.normal(0, 0.2, (600, 2)))
+            self.at.append(
+                project((world - [0.3 * i, 0.0, 0.4 * i]) @ turn.T) + rng.normal(0, 0.2, (600, 2))
+            )
 
     def read_all_images(self) -> list[Any]:
         return [SimpleNamespace(name=f"{i:03d}", image_id=i) for i in range(len(self.at))]
@@ -83,7 +95,9 @@ class Matched:
         return True
 
     def read_matches(self, one: int, other: int) -> np.ndarray:
-        seen = np.flatnonzero(np.max([np.abs(self.at[i] - 400).max(axis=1) for i in (one, other)], axis=0) < 400)
+        seen = np.flatnonzero(
+            np.max([np.abs(self.at[i] - 400).max(axis=1) for i in (one, other)], axis=0) < 400
+        )
         return np.stack([seen, seen], axis=1).astype(np.uint32)
 
 
@@ -99,7 +113,10 @@ def test_a_wide_lens_is_told_from_a_plain_one() -> None:
 
     camera = pycolmap.Camera(model=PLAIN, width=800, height=800, params=[640, 400, 400, 0])
     for project, lens in ((plain, PLAIN), (wide, "SIMPLE_RADIAL_FISHEYE")):
-        fits = {name: _fits(Matched(project), one) for name, one in _lenses(camera, (400.0, 400.0)).items()}
+        fits = {
+            name: _fits(Matched(project), one)
+            for name, one in _lenses(camera, (400.0, 400.0)).items()
+        }
         assert (fits["SIMPLE_RADIAL_FISHEYE"] > CLEARLY * fits[PLAIN]) == (lens != PLAIN), fits
 
 
@@ -111,7 +128,9 @@ def test_a_camera_that_only_turns_is_refused(tmp_path: Path) -> None:
     folder.mkdir()
     for i in range(8):
         turn, _ = cv2.Rodrigues(np.array([0.0, 0.03 * (i - 4), 0.0]))
-        seen = cv2.warpPerspective(picture, K @ turn @ np.linalg.inv(K), (320, 128), flags=cv2.INTER_CUBIC)
+        seen = cv2.warpPerspective(
+            picture, K @ turn @ np.linalg.inv(K), (320, 128), flags=cv2.INTER_CUBIC
+        )
         cv2.imwrite(str(folder / f"{i}.png"), seen)
     with pytest.raises(InputError, match="only turns"):
         read_source(folder, tmp_path / "work", told)

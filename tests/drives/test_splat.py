@@ -1,4 +1,6 @@
-"""A trained model of the user's own drives: in a unit of its own, without harmonics, with broken Gaussians; and not in another frame."""
+"""A trained model of the user's own drives: in a unit of its own, without harmonics, with broken
+Gaussians; and not in another frame.
+"""
 
 from __future__ import annotations
 
@@ -34,10 +36,18 @@ def street_cloud(scale: float = UNIT, turn: np.ndarray | None = None) -> Gaussia
     points[:, 2] += Street().ground(points[:, 0])
     points = scale * (points if turn is None else points @ turn.T)
     n = len(points)
-    return GaussianCloud(points, np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 3), 0.08 * scale), np.full(n, 0.9), np.zeros((n, 1, 3)))
+    return GaussianCloud(
+        points,
+        np.tile([1.0, 0, 0, 0], (n, 1)),
+        np.full((n, 3), 0.08 * scale),
+        np.full(n, 0.9),
+        np.zeros((n, 1, 3)),
+    )
 
 
-def poses_of(folder: Path, scale: float = UNIT, turn: np.ndarray | None = None, photographs: bool = False) -> Path:
+def poses_of(
+    folder: Path, scale: float = UNIT, turn: np.ndarray | None = None, photographs: bool = False
+) -> Path:
     """Write the poses of the drive in the model's frame."""
     path = write_transforms(folder) / "transforms.json"
     document = json.loads(path.read_text())
@@ -65,21 +75,46 @@ def assert_drives(out: Path) -> None:
 def test_a_model_in_a_unit_of_its_own_and_upside_down(tmp_path: Path) -> None:
     turn = np.diag([1.0, -1.0, -1.0])
     write_ply(tmp_path / "street.ply", street_cloud(turn=turn))
-    quality = import_splat(tmp_path / "street.ply", poses_of(tmp_path / "poses", turn=turn), tmp_path / "out")
+    quality = import_splat(
+        tmp_path / "street.ply", poses_of(tmp_path / "poses", turn=turn), tmp_path / "out"
+    )
     assert_drives(tmp_path / "out")
     assert any("no photographs" in note for note in quality["notes"])
-    assert any("assumed; `simrun import drive` takes --camera-height" in note for note in quality["notes"])
-    assert run_command(["preview", str(tmp_path / "out" / "scenario.yaml"), "--out", str(tmp_path / "street.png")]) == 0
+    assert any(
+        "assumed; `simrun import drive` takes --camera-height" in note for note in quality["notes"]
+    )
+    assert (
+        run_command(
+            [
+                "preview",
+                str(tmp_path / "out" / "scenario.yaml"),
+                "--out",
+                str(tmp_path / "street.png"),
+            ]
+        )
+        == 0
+    )
     assert (tmp_path / "street.png").stat().st_size > 10_000
     assert quality["photographs"] == {}
     assert load_scenario(tmp_path / "out/scenario.yaml").recording == ()
     assert quality["coverage"][0]["share"] > 0.5
 
 
-def test_a_splat_without_harmonics_with_photographs_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_splat_without_harmonics_with_photographs_is_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_splat(tmp_path / "street.splat", street_cloud())
     poses = poses_of(tmp_path / "poses", photographs=True)
-    command = ["import", "splat", str(tmp_path / "street.splat"), "--poses", str(poses), "--out", str(tmp_path / "out"), "--json"]
+    command = [
+        "import",
+        "splat",
+        str(tmp_path / "street.splat"),
+        "--poses",
+        str(poses),
+        "--out",
+        str(tmp_path / "out"),
+        "--json",
+    ]
     assert run_command(command) == 0
     told = json.loads(capsys.readouterr().out)
     assert "held-out" in told
@@ -95,7 +130,9 @@ def test_broken_gaussians_are_left_out_and_said(tmp_path: Path) -> None:
     body = data.index(b"end_header\n") + len(b"end_header\n")
     data[body : body + 4] = np.float32(np.nan).tobytes()
     (tmp_path / "street.ply").write_bytes(bytes(data))
-    quality = import_splat(tmp_path / "street.ply", write_colmap(tmp_path / "poses", True), tmp_path / "out")
+    quality = import_splat(
+        tmp_path / "street.ply", write_colmap(tmp_path / "poses", True), tmp_path / "out"
+    )
     assert any("1 " in note and "17999" in note.replace(",", "") for note in quality["notes"])
     assert_drives(tmp_path / "out")
 
@@ -112,7 +149,9 @@ def test_poses_of_another_frame_are_refused_and_nothing_is_left(tmp_path: Path) 
 
 def test_a_model_that_hangs_below_its_road_is_refused(tmp_path: Path) -> None:
     cloud = street_cloud()
-    flipped = GaussianCloud(cloud.means * [1, 1, -1], cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
+    flipped = GaussianCloud(
+        cloud.means * [1, 1, -1], cloud.quats, cloud.scales, cloud.opacities, cloud.sh
+    )
     write_ply(tmp_path / "street.ply", flipped)
     with pytest.raises(InputError, match="upside down"):
         import_splat(tmp_path / "street.ply", poses_of(tmp_path / "poses"), tmp_path / "out")
@@ -121,7 +160,11 @@ def test_a_model_that_hangs_below_its_road_is_refused(tmp_path: Path) -> None:
 
 def test_thirty_million_gaussians_are_refused_by_their_header(tmp_path: Path) -> None:
     write_ply(tmp_path / "street.ply", street_cloud())
-    data = (tmp_path / "street.ply").read_bytes().replace(b"element vertex 18000", b"element vertex 30000000", 1)
+    data = (
+        (tmp_path / "street.ply")
+        .read_bytes()
+        .replace(b"element vertex 18000", b"element vertex 30000000", 1)
+    )
     (tmp_path / "street.ply").write_bytes(data)
     with pytest.raises(InputError, match="30,000,000"):
         import_splat(tmp_path / "street.ply", poses_of(tmp_path / "poses"), tmp_path / "out")

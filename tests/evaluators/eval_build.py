@@ -1,4 +1,6 @@
-"""Small worlds for evaluator tests: straight lanes, drives given by centre positions, actors given by centre positions."""
+"""Small worlds for evaluator tests: straight lanes, drives given by centre positions, actors given
+by centre positions.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,18 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_yaw
-from alpasim_plugin.core.types import Actor, Box, Lane, LaneMap, LoggedImage, LoggedPlan, RolloutLog, Scene, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    Actor,
+    Box,
+    Lane,
+    LaneMap,
+    LoggedImage,
+    LoggedPlan,
+    RolloutLog,
+    Scene,
+    Trajectory,
+    Vehicle,
+)
 
 DT_US = 100_000
 CAR = Box(4.5, 1.8, 1.5)
@@ -17,7 +30,9 @@ T_RIG_BOX[:3, 3] = [VEHICLE.rear_axle_to_centre_m, 0.0, VEHICLE.box.height_m / 2
 
 
 def track(x, y, yaw=0.0, z=0.0, t_us=None, n=None) -> Trajectory:
-    """Poses from numbers or arrays; as many as the longest of them, 0.1 s apart unless times are given."""
+    """Poses from numbers or arrays; as many as the longest of them, 0.1 s apart unless times are
+    given.
+    """
     n = n or (len(t_us) if t_us is not None else max(np.size(a) for a in (x, y, yaw, z)))
     t = np.arange(n, dtype=np.int64) * DT_US if t_us is None else np.asarray(t_us, dtype=np.int64)
     xyz = np.stack([np.broadcast_to(np.asarray(a, dtype=float), n) for a in (x, y, z)], axis=1)
@@ -28,7 +43,9 @@ def car(name: str, poses: Trajectory, box: Box = CAR) -> Actor:
     return Actor(name, "car", box, poses)
 
 
-def lane(name: str, y: float, half_width: float = 1.75, x0: float = -50.0, x1: float = 200.0, **kwargs) -> Lane:
+def lane(
+    name: str, y: float, half_width: float = 1.75, x0: float = -50.0, x1: float = 200.0, **kwargs
+) -> Lane:
     def line(at: float) -> np.ndarray:
         return np.array([[x0, at, 0.0], [x1, at, 0.0]])
 
@@ -49,11 +66,27 @@ def rollout(
     warmup_us: int = 0,
     box: Box = VEHICLE.box,
 ) -> RolloutLog:
-    """A log whose ego is at the given box centres; the recording is the same drive unless given (as box centres as well)."""
+    """A log whose ego is at the given box centres; the recording is the same drive unless given (as
+    box centres as well).
+    """
     recorded = offset_trajectory(log or ego, inverse(T_RIG_BOX))
     by_id: Mapping[str, Actor] = {one.actor_id: one for one in actors}
     start = int(ego.t_us[0])
-    return RolloutLog("scene", "uuid", box, T_RIG_BOX, ego, by_id, tuple(plans), tuple(images), recorded, start, start, warmup_us, DT_US)
+    return RolloutLog(
+        "scene",
+        "uuid",
+        box,
+        T_RIG_BOX,
+        ego,
+        by_id,
+        tuple(plans),
+        tuple(images),
+        recorded,
+        start,
+        start,
+        warmup_us,
+        DT_US,
+    )
 
 
 def scene(lane_map: LaneMap, log: RolloutLog) -> Scene:
@@ -63,7 +96,10 @@ def scene(lane_map: LaneMap, log: RolloutLog) -> Scene:
 TWO_LANES = road_map(
     lane("right", 0.0),
     lane("left", 3.5),
-    edges=[np.array([[-50.0, -1.75, 0.0], [200.0, -1.75, 0.0]]), np.array([[-50.0, 5.25, 0.0], [200.0, 5.25, 0.0]])],
+    edges=[
+        np.array([[-50.0, -1.75, 0.0], [200.0, -1.75, 0.0]]),
+        np.array([[-50.0, 5.25, 0.0], [200.0, 5.25, 0.0]]),
+    ],
 )
 
 

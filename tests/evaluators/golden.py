@@ -18,7 +18,14 @@ import pyarrow.parquet as pq
 from alpasim_plugin.core.types import MetricSeries, RolloutLog, Scene
 from alpasim_plugin.log import read_asl
 from evaluators import score
-from evaluators.alpasim import EvalSettings, ScoredRollout, load_settings, over_sweeps, reduce_run, scene_score
+from evaluators.alpasim import (
+    EvalSettings,
+    ScoredRollout,
+    load_settings,
+    over_sweeps,
+    reduce_run,
+    scene_score,
+)
 from evaluators.metrics.presets import Preset
 from scenarios.usdz import read_usdz_scene
 
@@ -37,7 +44,9 @@ def read_case(log: Path, scene: Path, rails: bool = True) -> tuple[RolloutLog, S
 
 
 @lru_cache(maxsize=128)
-def scored(log: Path, archive: Path, preset: Preset, rails: bool = True) -> tuple[MetricSeries, ...]:
+def scored(
+    log: Path, archive: Path, preset: Preset, rails: bool = True
+) -> tuple[MetricSeries, ...]:
     """Score a log against its scene; several tests look at the same series."""
     return tuple(score(*read_case(log, archive, rails), preset))
 
@@ -49,15 +58,22 @@ def close(got: float, want: float) -> bool:
 
 
 def expected(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return AlpaSim's table in a log's folder: metric -> times, values, valid; the placeholder row of an empty metric is left out."""
+    """Return AlpaSim's table in a log's folder: metric -> times, values, valid; the placeholder row
+    of an empty metric is left out.
+    """
     table = pq.read_table(folder / "expected_metrics.parquet").to_pydict()
     out: dict[str, list] = {}
-    for name, t, value, valid in zip(table["name"], table["timestamps_us"], table["values"], table["valid"], strict=True):
+    for name, t, value, valid in zip(
+        table["name"], table["timestamps_us"], table["values"], table["valid"], strict=True
+    ):
         rows = out.setdefault(name, [])
         if t is not None:
             rows.append((t, value, valid))
     empty = (np.zeros(0),) * 3
-    return {name: tuple(np.array(column) for column in zip(*rows, strict=True)) if rows else empty for name, rows in out.items()}
+    return {
+        name: tuple(np.array(column) for column in zip(*rows, strict=True)) if rows else empty
+        for name, rows in out.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -73,10 +89,15 @@ class GoldenSet:
     rails: bool = True
 
     def series(self, log: Path) -> tuple[MetricSeries, ...]:
-        return scored(log, self.scenes / f"{log.parent.parent.name}.usdz", self.settings.preset(), self.rails)
+        return scored(
+            log, self.scenes / f"{log.parent.parent.name}.usdz", self.settings.preset(), self.rails
+        )
 
     def run(self) -> list[ScoredRollout]:
-        return [ScoredRollout(log.parent.parent.name, log.parent.name, self.series(log), *RUN) for log in self.logs]
+        return [
+            ScoredRollout(log.parent.parent.name, log.parent.name, self.series(log), *RUN)
+            for log in self.logs
+        ]
 
     def table(self, log: Path) -> Path:
         """Give the folder with AlpaSim's table of a log."""
@@ -87,17 +108,38 @@ def golden_set(root: Path, name: str) -> GoldenSet:
     """Return the main set ("rollouts"), "other-settings", or one of the cases."""
     if name == "rollouts":
         logs = sorted(root.glob("rollouts/*/*/rollout.asl"))
-        return GoldenSet(name, root, tuple(logs), root / "scenes", load_settings(root / "eval-config.yaml"), "aggregate")
+        return GoldenSet(
+            name,
+            root,
+            tuple(logs),
+            root / "scenes",
+            load_settings(root / "eval-config.yaml"),
+            "aggregate",
+        )
     if name == "other-settings":
         folder = root / name
-        logs = [root / table.relative_to(folder).with_name("rollout.asl") for table in sorted(folder.glob("rollouts/*/*/*.parquet"))]
-        return GoldenSet(name, folder, tuple(logs), root / "scenes", load_settings(folder / "eval-config.yaml"), "aggregate")
+        logs = [
+            root / table.relative_to(folder).with_name("rollout.asl")
+            for table in sorted(folder.glob("rollouts/*/*/*.parquet"))
+        ]
+        return GoldenSet(
+            name,
+            folder,
+            tuple(logs),
+            root / "scenes",
+            load_settings(folder / "eval-config.yaml"),
+            "aggregate",
+        )
     folder = root / "cases" / name
     unscored = (folder / "aggregate-no-scene-score").exists()
-    settings = load_settings(folder / ("eval-config-no-scene-score.yaml" if unscored else "eval-config.yaml"))
+    settings = load_settings(
+        folder / ("eval-config-no-scene-score.yaml" if unscored else "eval-config.yaml")
+    )
     aggregate = "aggregate-no-scene-score" if unscored else "aggregate"
     logs = sorted(folder.glob("rollouts/*/*/rollout.asl"))
-    return GoldenSet(name, folder, tuple(logs), folder / "scenes", settings, aggregate, name != "rails-stripped")
+    return GoldenSet(
+        name, folder, tuple(logs), folder / "scenes", settings, aggregate, name != "rails-stripped"
+    )
 
 
 class Tally:
@@ -110,7 +152,11 @@ class Tally:
         got, want = np.asarray(got, dtype=float), np.asarray(want, dtype=float)
         same = (got == want) | (np.isnan(got) & np.isnan(want))
         off = np.where(same, 0.0, np.abs(np.where(same, 0.0, got) - np.where(same, 0.0, want)))
-        self.logs, self.values, self.equal = self.logs + 1, self.values + len(want), self.equal + int(same.sum())
+        self.logs, self.values, self.equal = (
+            self.logs + 1,
+            self.values + len(want),
+            self.equal + int(same.sum()),
+        )
         self.largest = max(self.largest, float(off.max(initial=0.0)))
 
     def row(self, name: str) -> str:
@@ -118,7 +164,9 @@ class Tally:
 
 
 def parity_table(root: Path) -> str:
-    """Compare every step of every metric, and every value of the tables over sweeps, of all golden sets."""
+    """Compare every step of every metric, and every value of the tables over sweeps, of all golden
+    sets.
+    """
     steps: dict[str, Tally] = defaultdict(Tally)
     tables: dict[str, Tally] = defaultdict(Tally)
     for name in SETS:
@@ -133,15 +181,26 @@ def parity_table(root: Path) -> str:
         assert set(numbers) == set(want) - {"run_uuid", "run_name"}
         both = [(numbers[key], want[key]) for key in numbers if want[key] is not None]
         tables[f"over sweeps, {name}"].add(*np.array(both, dtype=float).T)
-        rows = json.loads((one.folder / one.aggregate / "results-summary.json").read_text())["rollouts"]
+        rows = json.loads((one.folder / one.aggregate / "results-summary.json").read_text())[
+            "rollouts"
+        ]
         marks = {(row["clipgt_id"], row["rollout_id"]): row.get("score") for row in rows}
         kept = [r for r in reduced if not r.dropped and one.settings.scene_score.enabled]
         if kept:
             scores = [scene_score(r.values, one.settings.scene_score).score for r in kept]
-            tables[f"scene score, {name}"].add(np.array(scores), np.array([marks[r.of.scene, r.of.rollout] for r in kept]))
-    lines = ["| metric | logs | values | exactly equal | largest difference |", "|---|---|---|---|---|"]
+            tables[f"scene score, {name}"].add(
+                np.array(scores), np.array([marks[r.of.scene, r.of.rollout] for r in kept])
+            )
+    lines = [
+        "| metric | logs | values | exactly equal | largest difference |",
+        "|---|---|---|---|---|",
+    ]
     lines += [tally.row(f"`{metric}`") for metric, tally in sorted(steps.items())]
-    lines += ["", "| table | tables | values | exactly equal | largest difference |", "|---|---|---|---|---|"]
+    lines += [
+        "",
+        "| table | tables | values | exactly equal | largest difference |",
+        "|---|---|---|---|---|",
+    ]
     return "\n".join([*lines, *(tally.row(name) for name, tally in tables.items())])
 
 

@@ -1,4 +1,6 @@
-"""Reference implementations that tests hold the route, plan and lane evaluators to: one step at a time, no filters, no caches."""
+"""Reference implementations that tests hold the route, plan and lane evaluators to: one step at a
+time, no filters, no caches.
+"""
 
 from __future__ import annotations
 
@@ -17,16 +19,20 @@ from evaluators.metrics.route import moving, recorded_path
 
 
 def convex_contains(ring: F64, body: F64) -> bool:
-    """Return whether a convex ring ``(N, 2)`` in either order contains a body's corners, its border included. Exact."""
+    """Return whether a convex ring ``(N, 2)`` in either order contains a body's corners, its border
+    included. Exact.
+    """
     exact_ring = exact(ring)
     for x, y in exact(body):
-        turns = [(q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0]) for p, q in sides_of(exact_ring)]
+        turns = [
+            (q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0]) for p, q in sides_of(exact_ring)
+        ]
         if not (all(turn >= 0 for turn in turns) or all(turn <= 0 for turn in turns)):
             return False
     return True
 
 
-# --- recorded path ----------------------------------------------------------------------------------------------------
+# --- recorded path
 
 
 @dataclass(frozen=True)
@@ -40,12 +46,17 @@ class StepRoute:
 
 
 def route_by_step(rollout: RolloutLog) -> list[StepRoute]:
-    """Project every step on the recorded path, segment by segment; the recording must cover all steps and have a length."""
+    """Project every step on the recorded path, segment by segment; the recording must cover all
+    steps and have a length.
+    """
     recorded = recorded_path(rollout, PRESETS["paper"])
     path = recorded.xyz[:, :2]
     there = interpolate(recorded, rollout.ego.t_us)[:, :2, 3]
     line, out = path[moving(path)], []
-    s, before = float(np.interp(rollout.ego.t_us[0], recorded.t_us[moving(path)], arc_lengths(line))), there[0]
+    s, before = (
+        float(np.interp(rollout.ego.t_us[0], recorded.t_us[moving(path)], arc_lengths(line))),
+        there[0],
+    )
     for i in range(len(rollout.ego)):
         point = rollout.ego.xyz[i, :2]
         distance_m, _, _ = _along(path, point)
@@ -57,14 +68,23 @@ def route_by_step(rollout: RolloutLog) -> list[StepRoute]:
     return out
 
 
-def _along(path: F64, point: F64, about_m: float = 0.0, reach_m: float = math.inf) -> tuple[float, float, float]:
-    """Return (distance, arc length of the first nearest point at most ``reach_m`` from ``about_m``, total length)."""
-    best, best_s, s = math.inf, 0.0, 0.0
+def _along(
+    path: F64, point: F64, about_m: float = 0.0, reach_m: float = math.inf
+) -> tuple[float, float, float]:
+    """Return (distance, arc length of the first nearest point at most ``reach_m`` from ``about_m``,
+    total length).
+    """
+    best = math.inf
+    best_s = 0.0
+    s = 0.0
     if len(path) == 1:
         return float(np.linalg.norm(point - path[0])), 0.0, 0.0
     for a, b in pairwise(path.tolist()):
         length = math.dist(a, b)
-        low, high = (min(max((about_m + sign * reach_m - s) / length, 0.0), 1.0) if length > 0 else 0.0 for sign in (-1, 1))
+        low, high = (
+            min(max((about_m + sign * reach_m - s) / length, 0.0), 1.0) if length > 0 else 0.0
+            for sign in (-1, 1)
+        )
         ends = [[p + f * (q - p) for p, q in zip(a, b, strict=True)] for f in (low, high)]
         distance, f = point_to_segment(point.tolist(), *ends)
         if distance < best and s <= about_m + reach_m and s + length >= about_m - reach_m:
@@ -73,13 +93,17 @@ def _along(path: F64, point: F64, about_m: float = 0.0, reach_m: float = math.in
     return best, best_s, s
 
 
-# --- plans ------------------------------------------------------------------------------------------------------------
+# --- plans
 
 
 def open_loop_by_plan(rollout: RolloutLog, preset: Preset) -> list[bool]:
-    """Return for each plan with poses whether any of them within the horizon touches an actor; sharp-cornered footprints only."""
+    """Return for each plan with poses whether any of them within the horizon touches an actor;
+    sharp-cornered footprints only.
+    """
     origin = origin_of(rollout.ego_log, preset)
-    size = np.array(preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)) * (1.0 - preset.shrink)
+    size = np.array(preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)) * (
+        1.0 - preset.shrink
+    )
     out = []
     for plan in rollout.plans:
         hit = False
@@ -87,8 +111,12 @@ def open_loop_by_plan(rollout: RolloutLog, preset: Preset) -> list[bool]:
             if not plan.now_us < t_us <= plan.now_us + preset.open_loop_horizon_us:
                 continue
             pose = interpolate(plan.trajectory, t_us) @ rollout.T_rig_box
-            ego = rectangle_corners(pose[None, :2, 3] - origin[:2], np.array([yaw_of(pose)]), size[None])[0]
-            boxes = [actor_corners(actor, t_us, preset, origin) for actor in rollout.actors.values()]
+            ego = rectangle_corners(
+                pose[None, :2, 3] - origin[:2], np.array([yaw_of(pose)]), size[None]
+            )[0]
+            boxes = [
+                actor_corners(actor, t_us, preset, origin) for actor in rollout.actors.values()
+            ]
             hit = hit or any(box is not None and touch(ego, box) for box in boxes)
         if len(plan.trajectory):
             out.append(hit)

@@ -1,7 +1,10 @@
-"""Reference implementations of preset ``strict``: contact between steps in 40-digit decimals, and the off-road margin point by point.
+"""Reference implementations of preset ``strict``: contact between steps in 40-digit decimals, and
+the off-road margin point by point.
 
-Contact: the largest gap over the directions of both rectangles' sides is sampled densely in time, every dip between samples is searched
-for its bottom, and the first crossing is halved down. Margin: distances to every lane for points of the footprint, no union, no index.
+Contact: the largest gap over the directions of both rectangles' sides is sampled densely in time,
+    every dip between samples is searched
+for its bottom, and the first crossing is halved down. Margin: distances to every lane for points of
+the footprint, no union, no index.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from evaluators.metrics.reference import point_to_segment
 _C = Context(prec=40)
 _TWO_PI = Decimal("6.283185307179586476925286766559005768394338798750")
 
-# --- contact ----------------------------------------------------------------------------------------------------------
+# --- contact
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,10 @@ class Motion:
 
     def corners(self, tau: Decimal) -> list[tuple[Decimal, Decimal]]:
         """Return the corners at a share of the stretch."""
-        x, y = (_C.add(Decimal(a), _C.multiply(Decimal(b), tau)) for a, b in zip(self.xy, self.shift, strict=True))
+        x, y = (
+            _C.add(Decimal(a), _C.multiply(Decimal(b), tau))
+            for a, b in zip(self.xy, self.shift, strict=True)
+        )
         sin, cos = _sin_cos(_C.add(Decimal(self.yaw), _C.multiply(Decimal(self.turn), tau)))
         length, width = (Decimal(d) / 2 for d in self.size)
         local = [(length, width), (length, -width), (-length, -width), (-length, width)]
@@ -43,7 +49,9 @@ class Motion:
 
 
 def separation(a: Motion, b: Motion, tau: Decimal) -> Decimal:
-    """Return the largest gap between two rectangles along the directions of their sides: apart if positive."""
+    """Return the largest gap between two rectangles along the directions of their sides: apart if
+    positive.
+    """
     with localcontext(_C):
         return _separation(a, b, tau)
 
@@ -61,7 +69,9 @@ def _separation(a: Motion, b: Motion, tau: Decimal) -> Decimal:
 
 
 def first_touch(a: Motion, b: Motion, samples: int = 48) -> float | None:
-    """Return when two rectangles first touch, as a share of the stretch; None if they stay apart."""
+    """Return when two rectangles first touch, as a share of the stretch; None if they stay
+    apart.
+    """
     with localcontext(_C):
         return _first_touch(a, b, samples)
 
@@ -70,7 +80,10 @@ def _first_touch(a: Motion, b: Motion, samples: int) -> float | None:
     def gap(tau: Decimal) -> Decimal:
         return _separation(a, b, tau)
 
-    steepest = Decimal(math.dist(a.shift, b.shift) + (abs(a.turn) + abs(b.turn)) * (_reach(a, b) + math.hypot(*a.size, *b.size)))
+    steepest = Decimal(
+        math.dist(a.shift, b.shift)
+        + (abs(a.turn) + abs(b.turn)) * (_reach(a, b) + math.hypot(*a.size, *b.size))
+    )
     times = [Decimal(k) / samples for k in range(samples + 1)]
     gaps = [gap(t) for t in times]
     if gaps[0] <= 0:
@@ -78,7 +91,11 @@ def _first_touch(a: Motion, b: Motion, samples: int) -> float | None:
     for k in range(1, samples + 1):
         if gaps[k] > 0:
             low, high = times[k - 1], times[min(k + 1, samples)]
-            if gaps[k] >= gaps[k - 1] or (k < samples and gaps[k] > gaps[k + 1]) or gaps[k] * samples > steepest:
+            if (
+                gaps[k] >= gaps[k - 1]
+                or (k < samples and gaps[k] > gaps[k + 1])
+                or gaps[k] * samples > steepest
+            ):
                 continue
             bottom = _bottom(gap, low, high)
             if gap(bottom) > 0:
@@ -95,7 +112,9 @@ def _reach(a: Motion, b: Motion) -> float:
 
 
 def _bottom(gap: Callable[[Decimal], Decimal], low: Decimal, high: Decimal) -> Decimal:
-    """Return where a function with one dip is least; as soon as it is not positive, that point will do."""
+    """Return where a function with one dip is least; as soon as it is not positive, that point will
+    do.
+    """
     for _ in range(60):
         third = (high - low) / 3
         a, b = low + third, high - third
@@ -128,7 +147,9 @@ def _sin_cos(angle: Decimal) -> tuple[Decimal, Decimal]:
 
 
 def side_at(a: Motion, b: Motion, tau: float, tie_m: float) -> str:
-    """Return which side of the first rectangle the contact's normal leaves through: the direction along which they overlap least."""
+    """Return which side of the first rectangle the contact's normal leaves through: the direction
+    along which they overlap least.
+    """
     with localcontext(_C):
         box, other = a.corners(Decimal(tau)), b.corners(Decimal(tau))
         ahead = (box[0][0] - box[3][0], box[0][1] - box[3][1])
@@ -137,23 +158,35 @@ def side_at(a: Motion, b: Motion, tau: float, tie_m: float) -> str:
             for end, start in ((0, 3), (3, 0), (0, 1), (1, 0)):
                 n = (shape[end][0] - shape[start][0], shape[end][1] - shape[start][1])
                 length = (n[0] ** 2 + n[1] ** 2).sqrt()
-                gap = (min(n[0] * x + n[1] * y for x, y in other) - max(n[0] * x + n[1] * y for x, y in box)) / length
-                cos = (n[0] * ahead[0] + n[1] * ahead[1]) / length / (ahead[0] ** 2 + ahead[1] ** 2).sqrt()
+                gap = (
+                    min(n[0] * x + n[1] * y for x, y in other)
+                    - max(n[0] * x + n[1] * y for x, y in box)
+                ) / length
+                cos = (
+                    (n[0] * ahead[0] + n[1] * ahead[1])
+                    / length
+                    / (ahead[0] ** 2 + ahead[1] ** 2).sqrt()
+                )
                 found.append((gap, "lateral" if 2 * cos**2 < 1 else "front" if cos > 0 else "rear"))
     best = max(gap for gap, _ in found)
-    return min((side for gap, side in found if gap >= best - Decimal(tie_m)), key=("front", "rear", "lateral").index)
+    return min(
+        (side for gap, side in found if gap >= best - Decimal(tie_m)),
+        key=("front", "rear", "lateral").index,
+    )
 
 
-# --- margin -----------------------------------------------------------------------------------------------------------
+# --- margin
 
 Ring = Sequence[tuple[float, float]]
 
 
 def depth_by_points(corners: F64, rings: Sequence[Ring], n: int = 24) -> tuple[float, float]:
-    """Return the greatest distance to the rings' areas among points of a rectangle: a lower and an upper bound.
+    """Return the greatest distance to the rings' areas among points of a rectangle: a lower and an
+    upper bound.
 
-    A grid of points, then smaller and smaller grids around the best of them, give the lower bound; no point lies farther from the first
-    grid than half the diagonal of its cells, which gives the upper one.
+    A grid of points, then smaller and smaller grids around the best of them, give the lower bound;
+    no point lies farther from the first grid than half the diagonal of its cells, which gives the
+    upper one.
     """
 
     def at(u: float, v: float) -> float:
@@ -168,7 +201,11 @@ def depth_by_points(corners: F64, rings: Sequence[Ring], n: int = 24) -> tuple[f
         value, u, v = start
         step = 0.5 / n
         while step > 2e-8:
-            around = [(min(max(u + i * step, 0.0), 1.0), min(max(v + j * step, 0.0), 1.0)) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+            around = [
+                (min(max(u + i * step, 0.0), 1.0), min(max(v + j * step, 0.0), 1.0))
+                for i in (-1, 0, 1)
+                for j in (-1, 0, 1)
+            ]
             value, u, v = max((at(p, q), p, q) for p, q in around)
             step /= 2
         best = max(best, value)
@@ -177,7 +214,11 @@ def depth_by_points(corners: F64, rings: Sequence[Ring], n: int = 24) -> tuple[f
 
 def distance_to_areas(x: float, y: float, rings: Sequence[Ring]) -> float:
     """Return the distance of a point to the nearest area, 0 inside one."""
-    return 0.0 if any(inside_ring(x, y, ring) for ring in rings) else min(distance_to_ring(x, y, ring) for ring in rings)
+    return (
+        0.0
+        if any(inside_ring(x, y, ring) for ring in rings)
+        else min(distance_to_ring(x, y, ring) for ring in rings)
+    )
 
 
 def distance_to_ring(x: float, y: float, ring: Ring) -> float:

@@ -13,7 +13,9 @@ def plain_count_chances(chance: np.ndarray) -> np.ndarray:
     """Every pattern of passes and failures, one by one."""
     out = np.zeros(len(chance) + 1)
     for passed in itertools.product((0, 1), repeat=len(chance)):
-        out[sum(passed)] += np.prod([p if x else 1 - p for p, x in zip(chance, passed, strict=True)])
+        out[sum(passed)] += np.prod(
+            [p if x else 1 - p for p, x in zip(chance, passed, strict=True)]
+        )
     return out
 
 
@@ -41,12 +43,18 @@ def test_the_interval_is_that_of_every_ability_tried(passes: int) -> None:
 
 
 @pytest.mark.parametrize(("passes", "word"), [(0, "fails all 5"), (5, "passes all 5")])
-def test_where_all_outcomes_are_equal_there_is_one_bound_and_no_score(passes: int, word: str) -> None:
+def test_where_all_outcomes_are_equal_there_is_one_bound_and_no_score(
+    passes: int, word: str
+) -> None:
     found = ability_of(passes, np.zeros(5), np.zeros(5))
     assert found.estimate is None
     assert word in found.reason
     bound = np.log(0.05**0.2 / (1 - 0.05**0.2))  # 0.05 = p^5
-    assert (found.low, found.high) == ((None, pytest.approx(-bound, abs=1e-5)) if passes == 0 else (pytest.approx(bound, abs=1e-5), None))
+    assert (found.low, found.high) == (
+        (None, pytest.approx(-bound, abs=1e-5))
+        if passes == 0
+        else (pytest.approx(bound, abs=1e-5), None)
+    )
 
 
 def test_what_is_not_known_of_scenes_widens_the_interval_and_pulls_chances_to_one_half() -> None:
@@ -77,15 +85,25 @@ def test_the_mode_is_where_no_small_step_is_likelier() -> None:
             - (difficulty**2).sum() / 8
         )
 
-    shift = max(np.linspace(-3, 3, 6001), key=lambda s: log_posterior(found.ability + s, found.difficulty + s))
+    shift = max(
+        np.linspace(-3, 3, 6001),
+        key=lambda s: log_posterior(found.ability + s, found.difficulty + s),
+    )
     best = log_posterior(found.ability + shift, found.difficulty + shift)
     for k in range(7):
         for step in (-0.05, 0.05):
-            assert log_posterior(found.ability + shift, found.difficulty + shift + step * (np.arange(7) == k)) < best
+            assert (
+                log_posterior(
+                    found.ability + shift, found.difficulty + shift + step * (np.arange(7) == k)
+                )
+                < best
+            )
 
 
 def coverage(drivers: int, scenes: int, repeats: int, known: bool) -> tuple[float, float]:
-    """How often the interval holds a true ability, and how often there is a score. Known: difficulties are given, not calibrated."""
+    """How often the interval holds a true ability, and how often there is a score. Known:
+    difficulties are given, not calibrated.
+    """
     rng = np.random.Generator(np.random.Philox(39))
     inside, scored = [], 0
     for _ in range(repeats):
@@ -96,14 +114,22 @@ def coverage(drivers: int, scenes: int, repeats: int, known: bool) -> tuple[floa
         if known:
             found: Ability = ability_of(passes, difficulty, np.zeros(scenes))
         else:
-            fit = calibrate((rng.random((drivers, scenes)) < expit(known_drivers[:, None] - difficulty)).astype(float))
+            fit = calibrate(
+                (rng.random((drivers, scenes)) < expit(known_drivers[:, None] - difficulty)).astype(
+                    float
+                )
+            )
             found = ability_of(passes, fit.difficulty, fit.spread)
         scored += found.estimate is not None
-        inside.append((found.low is None or found.low <= able) and (found.high is None or able <= found.high))
+        inside.append(
+            (found.low is None or found.low <= able) and (found.high is None or able <= found.high)
+        )
     return float(np.mean(inside)), scored / repeats
 
 
-@pytest.mark.parametrize(("drivers", "scenes", "known"), [(0, 8, True), (0, 20, True), (4, 12, False), (14, 20, False)])
+@pytest.mark.parametrize(
+    ("drivers", "scenes", "known"), [(0, 8, True), (0, 20, True), (4, 12, False), (14, 20, False)]
+)
 def test_intervals_cover_the_true_ability(drivers: int, scenes: int, known: bool) -> None:
     covered, scored = coverage(drivers, scenes, 200, known)
     assert covered >= 0.95 - 2 * np.sqrt(0.95 * 0.05 / 200)

@@ -1,4 +1,6 @@
-"""Preset ``alpasim`` against AlpaSim's own scores of logs that its runtime wrote, step by step and after its modifiers."""
+"""Preset ``alpasim`` against AlpaSim's own scores of logs that its runtime wrote, step by step and
+after its modifiers.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +18,41 @@ from tests.evaluators.golden import close, expected, scored
 ALPASIM = PRESETS["alpasim"]
 IDS = {"clipgt_id", "rollout_id", "run_name", "run_uuid"}
 SCENES = (
-    *("black-frame-a", "curve-offroad-a", "curve-offroad-c", "cut-in-a", "cut-in-c", "drift-a", "front-brake-a", "heading-pi-a"),
-    *("intersection-a", "lane-change-a", "odd-rings-a", "opendrive-a", "plans-a", "rear-hit-a", "replay-a", "seam-a", "seam-c"),
-    *("stacked-a", "standstill-a", "standstill-c", "two-contacts-a", "two-contacts-c", "vru-offset-a"),
+    *(
+        "black-frame-a",
+        "curve-offroad-a",
+        "curve-offroad-c",
+        "cut-in-a",
+        "cut-in-c",
+        "drift-a",
+        "front-brake-a",
+        "heading-pi-a",
+    ),
+    *(
+        "intersection-a",
+        "lane-change-a",
+        "odd-rings-a",
+        "opendrive-a",
+        "plans-a",
+        "rear-hit-a",
+        "replay-a",
+        "seam-a",
+        "seam-c",
+    ),
+    *(
+        "stacked-a",
+        "standstill-a",
+        "standstill-c",
+        "two-contacts-a",
+        "two-contacts-c",
+        "vru-offset-a",
+    ),
 )
 
 
-def assert_steps(log: Path, archive: Path, preset: Preset, rails: bool = True, table: Path | None = None) -> None:
+def assert_steps(
+    log: Path, archive: Path, preset: Preset, rails: bool = True, table: Path | None = None
+) -> None:
     found = {one.name: one for one in scored(log, archive, preset, rails)}
     want = expected(table or log.parent)
     assert set(found) == set(want)
@@ -31,15 +61,34 @@ def assert_steps(log: Path, archive: Path, preset: Preset, rails: bool = True, t
         one = found[name]
         np.testing.assert_array_equal(one.t_us, t_us, err_msg=name)
         np.testing.assert_array_equal(one.valid, valid.astype(bool), err_msg=name)
-        if set(np.unique(value)) <= {0.0, 1.0} and name not in ("progress", "progress_rel", "progress_rel_to_total"):
+        if set(np.unique(value)) <= {0.0, 1.0} and name not in (
+            "progress",
+            "progress_rel",
+            "progress_rel_to_total",
+        ):
             np.testing.assert_array_equal(one.value, value, err_msg=name)
         else:
-            off = [(k, float(v), float(w)) for k, (v, w) in enumerate(zip(one.value, value, strict=True)) if not close(float(v), float(w))]
+            off = [
+                (k, float(v), float(w))
+                for k, (v, w) in enumerate(zip(one.value, value, strict=True))
+                if not close(float(v), float(w))
+            ]
             assert off == [], (name, off[:5])
 
 
-def assert_reduced(log: Path, archive: Path, preset: Preset, want: dict, rails: bool = True, skip: frozenset[str] = frozenset()) -> None:
-    values = {name: one.value for name, one in reduce_rollout(scored(log, archive, preset, rails), preset).values.items() if one.valid}
+def assert_reduced(
+    log: Path,
+    archive: Path,
+    preset: Preset,
+    want: dict,
+    rails: bool = True,
+    skip: frozenset[str] = frozenset(),
+) -> None:
+    values = {
+        name: one.value
+        for name, one in reduce_rollout(scored(log, archive, preset, rails), preset).values.items()
+        if one.valid
+    }
     for name in (set(values) | set(want)) - IDS - skip:
         got, value = values.get(name), want.get(name)
         if value is None:  # AlpaSim writes null for inf and NaN
@@ -81,12 +130,16 @@ def test_other_settings_of_the_scorers_are_followed(shared_data):
     preset = load_settings(folder / "eval-config.yaml").preset()
     assert len(rows) >= 11
     for (scene, rollout), row in rows.items():
-        log, archive = golden / "rollouts" / scene / rollout / "rollout.asl", golden / "scenes" / f"{scene}.usdz"
+        log, archive = (
+            golden / "rollouts" / scene / rollout / "rollout.asl",
+            golden / "scenes" / f"{scene}.usdz",
+        )
         assert_steps(log, archive, preset, table=folder / "rollouts" / scene / rollout)
         assert_reduced(log, archive, preset, row["metrics"])
 
 
-# Without any map AlpaSim takes 0 for the missing off-road column when it combines events; here that stays unknown.
+# Without any map AlpaSim takes 0 for the missing off-road column when it combines events; here that
+# stays unknown.
 UNKNOWN_WITHOUT_MAP = frozenset({"offroad_or_collision", "offroad_or_collision_at_fault"})
 
 

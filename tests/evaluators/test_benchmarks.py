@@ -1,4 +1,6 @@
-"""Scores of other benchmarks in small worlds, whose numbers follow from their definitions by hand."""
+"""Scores of other benchmarks in small worlds, whose numbers follow from their definitions by
+hand.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +30,15 @@ def braking(at=40.0, to=20.0):
     t = np.arange(N) * 0.1
     v = np.maximum(8.0 - 5.0 * np.maximum(t - 2.5, 0.0), 0.0)
     x = np.concatenate([[0.0], np.cumsum((v[1:] + v[:-1]) * 0.05)])
-    return rollout(track(x, 0.0), [car("stands", track(np.full(N, at), 0.0))], log=track(CRUISE, 0.0))
+    return rollout(
+        track(x, 0.0), [car("stands", track(np.full(N, at), 0.0))], log=track(CRUISE, 0.0)
+    )
 
 
-LIMITED = road_map(*(replace(one, speed_limit_mps=7.0) for one in TWO_LANES.lanes.values()), edges=TWO_LANES.road_edges)
+LIMITED = road_map(
+    *(replace(one, speed_limit_mps=7.0) for one in TWO_LANES.lanes.values()),
+    edges=TWO_LANES.road_edges,
+)
 
 
 def test_nuplan_of_a_clean_drive_is_known_only_where_the_speed_limits_are():
@@ -46,7 +53,12 @@ def test_nuplan_of_a_clean_drive_is_known_only_where_the_speed_limits_are():
 
 def test_nuplan_of_a_hard_stop_loses_progress_and_comfort_but_nothing_else():
     found = values(braking(), "nuplan", LIMITED)
-    assert found["nuplan_no_at_fault_collision"] == found["nuplan_driving_direction"] == found["nuplan_drivable_area"] == 1.0
+    assert (
+        found["nuplan_no_at_fault_collision"]
+        == found["nuplan_driving_direction"]
+        == found["nuplan_drivable_area"]
+        == 1.0
+    )
     assert found["nuplan_comfort"] == 0.0
     assert found["nuplan_progress"] == pytest.approx((8 * 2.5 + 6.4) / 63.2, abs=0.01)
     assert found["nuplan_making_progress"] == 1.0
@@ -60,39 +72,67 @@ def test_a_multiplier_of_zero_decides_whatever_else_is_missing():
 
 def test_an_object_costs_a_half_and_an_actor_that_runs_into_the_ego_nothing():
     cone = replace(car("cone", track(np.full(N, 40.0), 0.0)), label="other")
-    assert values(rollout(track(CRUISE, 0.0), [cone]), "nuplan")["nuplan_no_at_fault_collision"] == 0.5
+    assert (
+        values(rollout(track(CRUISE, 0.0), [cone]), "nuplan")["nuplan_no_at_fault_collision"] == 0.5
+    )
     chaser = car("chaser", track(np.linspace(-12.0, 70.0, N), 0.0))
-    assert values(rollout(track(CRUISE, 0.0), [chaser]), "nuplan")["nuplan_no_at_fault_collision"] == 1.0
+    assert (
+        values(rollout(track(CRUISE, 0.0), [chaser]), "nuplan")["nuplan_no_at_fault_collision"]
+        == 1.0
+    )
 
 
 def test_driving_against_the_lane_costs_the_direction_and_a_short_way_back_does_not():
     against = rollout(track(CRUISE[::-1], 0.0, yaw=np.pi))
     assert values(against, "nuplan")["nuplan_driving_direction"] == 0.0
-    back = rollout(track(np.append(CRUISE[:-10], CRUISE[-11] - 0.15 * np.arange(10)), 0.0), log=track(CRUISE, 0.0))
+    back = rollout(
+        track(np.append(CRUISE[:-10], CRUISE[-11] - 0.15 * np.arange(10)), 0.0),
+        log=track(CRUISE, 0.0),
+    )
     assert values(back, "nuplan")["nuplan_driving_direction"] == 1.0
 
 
 def test_leaving_the_road_by_20_cm_is_within_nuplans_area_and_not_within_navsims():
     y = np.full(N, -1.75 + 0.9 - 0.2)  # half the car is 0.9 m
     log = rollout(track(CRUISE, y), box=replace(car("a", track(0.0, 0.0)).box, width_m=1.8))
-    assert (values(log, "nuplan")["nuplan_drivable_area"], values(log, "navsim")["navsim_dac"]) == (1.0, 0.0)
+    assert (values(log, "nuplan")["nuplan_drivable_area"], values(log, "navsim")["navsim_dac"]) == (
+        1.0,
+        0.0,
+    )
 
 
 def test_navsim_names_what_is_missing_and_keeps_the_middle_of_the_lane():
     log = rollout(track(CRUISE, np.where(np.arange(N) < 30, 0.6, 0.0)))
     found = values(log, "navsim")
     assert found["navsim_lk"] == 0.0
-    assert values(rollout(track(CRUISE, np.where(np.arange(N) < 15, 0.6, 0.0))), "navsim")["navsim_lk"] == 1.0
+    assert (
+        values(rollout(track(CRUISE, np.where(np.arange(N) < 15, 0.6, 0.0))), "navsim")["navsim_lk"]
+        == 1.0
+    )
     assert "traffic lights" in found["navsim_epdms"]
-    assert found["navsim_pdms"] == pytest.approx((5 + 5) / 12)  # it reads no traffic lights; the jump to the side is no comfort
+    assert found["navsim_pdms"] == pytest.approx(
+        (5 + 5) / 12
+    )  # it reads no traffic lights; the jump to the side is no comfort
 
 
 @pytest.mark.parametrize(
     ("driven_m", "recorded_m", "ep"),
-    [(63.2, 63.2, 1.0), (31.6, 63.2, 0.5), (63.2, 47.4, 1.0), (2.0, 4.9, 1.0), (2.0, 5.1, 2.0 / 5.1), (-3.0, 40.0, 0.0)],
+    [
+        (63.2, 63.2, 1.0),
+        (31.6, 63.2, 0.5),
+        (63.2, 47.4, 1.0),
+        (2.0, 4.9, 1.0),
+        (2.0, 5.1, 2.0 / 5.1),
+        (-3.0, 40.0, 0.0),
+    ],
 )
-def test_navsims_progress_is_the_share_of_the_greater_of_the_egos_and_the_recordings(driven_m, recorded_m, ep):
-    log = rollout(track(np.linspace(10.0, 10.0 + driven_m, N), 0.0), log=track(np.linspace(10.0, 10.0 + recorded_m, N), 0.0))
+def test_navsims_progress_is_the_share_of_the_greater_of_the_egos_and_the_recordings(
+    driven_m, recorded_m, ep
+):
+    log = rollout(
+        track(np.linspace(10.0, 10.0 + driven_m, N), 0.0),
+        log=track(np.linspace(10.0, 10.0 + recorded_m, N), 0.0),
+    )
     found = values(log, "navsim")
     assert found["navsim_ep"] == pytest.approx(ep, abs=1e-6)
     assert [found[f"navsim_{name}"] for name in ("nc", "dac", "ttc", "hc")] == [1.0] * 4
@@ -104,7 +144,11 @@ def plans(log, length_m, n=3):
     rig = rollout(log.ego).ego_log
     out = []
     for k in (5, 20, 35)[:n]:
-        ahead = track(np.linspace(0.0, length_m, 21) + rig.xyz[k, 0], 0.0, t_us=log.ego.t_us[k] + 100_000 * np.arange(21))
+        ahead = track(
+            np.linspace(0.0, length_m, 21) + rig.xyz[k, 0],
+            0.0,
+            t_us=log.ego.t_us[k] + 100_000 * np.arange(21),
+        )
         out.append(LoggedPlan(int(log.ego.t_us[k]), int(log.ego.t_us[k]), ahead))
     return replace(log, plans=tuple(out))
 
@@ -112,11 +156,21 @@ def plans(log, length_m, n=3):
 def test_hugsim_judges_plans_and_multiplies_by_the_route():
     log = plans(rollout(track(CRUISE / 2, 0.0), log=track(CRUISE, 0.0)), 16.0)
     assert values(log, "hugsim")["hugsim_hd_score"] == pytest.approx(0.5, abs=0.01)
-    stands = plans(rollout(track(CRUISE / 2, 0.0), [car("stands", track(np.full(N, 32.0), 0.0))], log=track(CRUISE, 0.0)), 16.0)
+    stands = plans(
+        rollout(
+            track(CRUISE / 2, 0.0),
+            [car("stands", track(np.full(N, 32.0), 0.0))],
+            log=track(CRUISE, 0.0),
+        ),
+        16.0,
+    )
     found = values(stands, "hugsim")
     assert found["hugsim_nc"] == pytest.approx(2 / 3)  # the third plan runs into it
     assert found["hugsim_hd"] <= found["hugsim_nc"]
-    assert values(rollout(track(CRUISE, 0.0)), "hugsim")["hugsim_hd_score"] == "not measured: a plan of more than three poses"
+    assert (
+        values(rollout(track(CRUISE, 0.0)), "hugsim")["hugsim_hd_score"]
+        == "not measured: a plan of more than three poses"
+    )
 
 
 def test_ncap_is_5_without_contact_and_compares_the_impact_with_doing_nothing():
@@ -126,7 +180,9 @@ def test_ncap_is_5_without_contact_and_compares_the_impact_with_doing_nothing():
     assert passive == pytest.approx(8.0, abs=0.05)
     assert 0 < found["ncap_impact_mps"] <= 8.0
     assert found["ncap_score"] == pytest.approx(4 * (1 - found["ncap_impact_mps"] / passive))
-    whole = values(rollout(track(CRUISE, 0.0), [car("stands", track(np.full(N, 40.0), 0.0))]), "ncap")
+    whole = values(
+        rollout(track(CRUISE, 0.0), [car("stands", track(np.full(N, 40.0), 0.0))]), "ncap"
+    )
     assert whole["ncap_score"] == pytest.approx(0.0, abs=1e-9)
 
 
@@ -134,8 +190,13 @@ def test_what_a_scene_does_not_know_is_not_measured_and_never_zero():
     log = rollout(track(CRUISE, 0.0))
     bare = values(log, "nuplan", replace(TWO_LANES, lanes={}, road_edges=()))
     assert bare["nuplan_drivable_area"] == bare["nuplan_driving_direction"] == "not measured: a map"
-    assert "standing obstacles" in values(log, "nuplan", standing="unknown")["nuplan_no_at_fault_collision"]
-    assert values(replace(log, force_gt_us=10**9), "nuplan")["nuplan_score"].startswith("the policy never took over")
+    assert (
+        "standing obstacles"
+        in values(log, "nuplan", standing="unknown")["nuplan_no_at_fault_collision"]
+    )
+    assert values(replace(log, force_gt_us=10**9), "nuplan")["nuplan_score"].startswith(
+        "the policy never took over"
+    )
 
 
 def replanned(speeds_mps, log=None):
@@ -143,7 +204,11 @@ def replanned(speeds_mps, log=None):
     log = log or rollout(track(CRUISE, 0.0))
     out = []
     for k, speed in zip(range(0, N - 1, 5), speeds_mps, strict=False):
-        ahead = track(CRUISE[k] + speed * 0.1 * np.arange(46), 0.0, t_us=log.ego.t_us[k] + 100_000 * np.arange(46))
+        ahead = track(
+            CRUISE[k] + speed * 0.1 * np.arange(46),
+            0.0,
+            t_us=log.ego.t_us[k] + 100_000 * np.arange(46),
+        )
         out.append(LoggedPlan(int(log.ego.t_us[k]), int(log.ego.t_us[k]), ahead))
     return replace(log, plans=tuple(out))
 
@@ -156,10 +221,21 @@ def test_extended_comfort_is_the_share_of_plans_that_move_as_the_one_half_a_seco
         slower[:, 0] -= 1.5 * (0.1 * np.arange(46)) ** 2 * (k % 3 == 2)
         brakes.append(replace(one, trajectory=replace(one.trajectory, xyz=slower)))
     log = replace(rollout(track(CRUISE, 0.0)), plans=tuple(brakes))
-    assert values(log, "navsim")["navsim_ec"] == pytest.approx(3 / 7)  # of 7 pairs those after a change are not alike
-    swerve = [replace(one, trajectory=replace(one.trajectory, quat=track(0.0, 0.0, n=46, yaw=0.2 * k * 0.1 * np.arange(46)).quat))
-              for k, one in enumerate(replanned([8.0] * 8).plans)]  # fmt: skip
-    assert values(replace(log, plans=tuple(swerve)), "navsim")["navsim_ec"] == 0.0  # each turns 0.2 rad/s faster
+    assert values(log, "navsim")["navsim_ec"] == pytest.approx(
+        3 / 7
+    )  # of 7 pairs those after a change are not alike
+    swerve = [
+        replace(
+            one,
+            trajectory=replace(
+                one.trajectory, quat=track(0.0, 0.0, n=46, yaw=0.2 * k * 0.1 * np.arange(46)).quat
+            ),
+        )
+        for k, one in enumerate(replanned([8.0] * 8).plans)
+    ]
+    assert (
+        values(replace(log, plans=tuple(swerve)), "navsim")["navsim_ec"] == 0.0
+    )  # each turns 0.2 rad/s faster
 
 
 def test_plans_that_are_too_short_or_too_coarse_have_no_extended_comfort():
@@ -168,8 +244,15 @@ def test_plans_that_are_too_short_or_too_coarse_have_no_extended_comfort():
     one = replace(short, plans=replanned([8.0]).plans)
     assert "two plans 0.5 s apart" in values(one, "navsim")["navsim_ec"]
     fine = [(p, p.trajectory) for p in replanned([8.0] * 8).plans]
-    every = [replace(p, trajectory=replace(one, t_us=one.t_us[::5], xyz=one.xyz[::5], quat=one.quat[::5])) for p, one in fine]
-    assert "two plans 0.5 s apart" in values(replace(short, plans=tuple(every)), "navsim")["navsim_ec"]
+    every = [
+        replace(
+            p, trajectory=replace(one, t_us=one.t_us[::5], xyz=one.xyz[::5], quat=one.quat[::5])
+        )
+        for p, one in fine
+    ]
+    assert (
+        "two plans 0.5 s apart" in values(replace(short, plans=tuple(every)), "navsim")["navsim_ec"]
+    )
 
 
 def test_every_part_and_score_is_declared():

@@ -1,4 +1,6 @@
-"""Contact: hand-made situations, and the array search against the exact step-by-step reference on hard ones."""
+"""Contact: hand-made situations, and the array search against the exact step-by-step reference on
+hard ones.
+"""
 
 from __future__ import annotations
 
@@ -42,20 +44,41 @@ def assert_twins_agree(log, preset=PAPER, gap_tol_m=1e-9):
 
 def flags(log):
     found = by_name(score(log, scene(TWO_LANES, log), "paper"))
-    return {name: found[f"collision_{name}"].value.tolist() for name in ("any", "front", "rear", "lateral", "at_fault")}
+    return {
+        name: found[f"collision_{name}"].value.tolist()
+        for name in ("any", "front", "rear", "lateral", "at_fault")
+    }
 
 
 def test_car_driven_into_is_a_front_contact_at_fault():
     log = rollout(track([0.0, 1.0, 2.0], 0.0), [car("a", track(7.0, 0.0, n=3))])
     # Gap 7 - 2.4275 - 2.25 = 2.32 m at the first step.
-    assert flags(log) == {"any": [0, 0, 0], "front": [0, 0, 0], "rear": [0, 0, 0], "lateral": [0, 0, 0], "at_fault": [0, 0, 0]}
+    assert flags(log) == {
+        "any": [0, 0, 0],
+        "front": [0, 0, 0],
+        "rear": [0, 0, 0],
+        "lateral": [0, 0, 0],
+        "at_fault": [0, 0, 0],
+    }
     log = rollout(track([0.0, 2.0, 3.0], 0.0), [car("a", track(7.0, 0.0, n=3))])
-    assert flags(log) == {"any": [0, 0, 1], "front": [0, 0, 1], "rear": [0, 0, 0], "lateral": [0, 0, 0], "at_fault": [0, 0, 1]}
+    assert flags(log) == {
+        "any": [0, 0, 1],
+        "front": [0, 0, 1],
+        "rear": [0, 0, 0],
+        "lateral": [0, 0, 0],
+        "at_fault": [0, 0, 1],
+    }
 
 
 def test_hit_from_behind_is_a_rear_contact_and_not_at_fault():
     log = rollout(track(0.0, 0.0, n=2), [car("a", track([-6.0, -4.0], 0.0))])
-    assert flags(log) == {"any": [0, 1], "front": [0, 0], "rear": [0, 1], "lateral": [0, 0], "at_fault": [0, 0]}
+    assert flags(log) == {
+        "any": [0, 1],
+        "front": [0, 0],
+        "rear": [0, 1],
+        "lateral": [0, 0],
+        "at_fault": [0, 0],
+    }
 
 
 def test_hit_in_the_side_is_lateral_and_at_fault():
@@ -70,7 +93,14 @@ def test_an_actor_on_both_bumpers_counts_as_front():
 
 
 def test_every_touching_actor_is_classified():
-    log = rollout(track(0.0, 0.0), [car("ahead", track(4.0, 0.0)), car("behind", track(-4.0, 0.0)), car("beside", track(0.0, -1.5))])
+    log = rollout(
+        track(0.0, 0.0),
+        [
+            car("ahead", track(4.0, 0.0)),
+            car("behind", track(-4.0, 0.0)),
+            car("beside", track(0.0, -1.5)),
+        ],
+    )
     assert sides_by_step(log)[0] == [{"ahead": "front", "behind": "rear", "beside": "lateral"}]
     assert flags(log) == {"any": [1], "front": [1], "rear": [1], "lateral": [1], "at_fault": [1]}
 
@@ -96,7 +126,8 @@ def test_touching_is_contact_and_a_micrometre_away_is_not(x, y, side):
     away = rollout(track(0.0, 0.0), [car("a", track(x + nudge[0], y + nudge[1]))])
     assert_twins_agree(at)
     assert_twins_agree(away)
-    # The corners are rounded, so at the touching position itself either answer is right, but within one rounding of it.
+    # The corners are rounded, so at the touching position itself either answer is right, but within
+    # one rounding of it.
     near = rollout(track(0.0, 0.0), [car("a", track(x - nudge[0] * 1e-3, y - nudge[1] * 1e-3))])
     assert sides_by_step(near)[0] == [{"a": side}]
     assert sides_by_step(away)[0] == [{}]
@@ -140,7 +171,8 @@ def test_between_logged_times_an_actor_is_interpolated():
 def test_interpolated_headings_take_the_shorter_turn_across_180_degrees():
     turning = track(0.0, 3.0, yaw=[math.radians(175), math.radians(-175)], t_us=[0, 200_000])
     log = rollout(track(0.0, 0.0, n=3), [car("a", turning, Box(8.0, 1.0, 1.0))])
-    # On the longer way round the box would stand across the road at the middle step and hit the ego.
+    # On the longer way round the box would stand across the road at the middle step and hit the
+    # ego.
     assert flags(log)["any"] == [0, 0, 0]
     assert_twins_agree(log)
 
@@ -151,11 +183,15 @@ def test_footprint_size_is_the_papers_and_not_the_logged_one():
 
 
 def test_corners_run_from_front_left_clockwise():
-    at = rectangle_corners(np.array([[10.0, 5.0]]), np.array([np.pi / 2]), np.array([[4.0, 2.0]]))[0]
+    at = rectangle_corners(np.array([[10.0, 5.0]]), np.array([np.pi / 2]), np.array([[4.0, 2.0]]))[
+        0
+    ]
     np.testing.assert_allclose(at, [[9.0, 7.0], [11.0, 7.0], [11.0, 3.0], [9.0, 3.0]], atol=1e-15)
 
 
-angles = st.sampled_from([0.0, np.pi, -np.pi, np.pi / 2, -np.pi / 2, np.pi / 4, 3.0, -3.0]) | st.floats(-np.pi, np.pi)
+angles = st.sampled_from(
+    [0.0, np.pi, -np.pi, np.pi / 2, -np.pi / 2, np.pi / 4, 3.0, -3.0]
+) | st.floats(-np.pi, np.pi)
 # Quarter metres make touching edges and shared corners likely.
 coarse = st.integers(-32, 32).map(lambda k: k / 4)
 offsets = st.sampled_from([(0.0, 0.0), (691_000.0, 5_334_000.0), (-3e5, 1e-3)])
@@ -179,7 +215,17 @@ def situations(draw):
             yaw=[draw(angles) for _ in range(m)],
             t_us=np.arange(first, last + 1) * 100_000,
         )
-        size = draw(st.sampled_from([CAR, Box(0.5, 0.5, 1.8), Box(12.0, 2.5, 3.0), Box(4.0, 2.0, 1.5), Box(1e-3, 1e-3, 1.0)]))
+        size = draw(
+            st.sampled_from(
+                [
+                    CAR,
+                    Box(0.5, 0.5, 1.8),
+                    Box(12.0, 2.5, 3.0),
+                    Box(4.0, 2.0, 1.5),
+                    Box(1e-3, 1e-3, 1.0),
+                ]
+            )
+        )
         actors.append(car(f"a{k}", poses, size))
     size = draw(st.sampled_from([(4.855, 1.88), (4.0, 2.0)]))
     return rollout(ego, actors), size
@@ -197,10 +243,15 @@ def test_array_search_and_exact_twin_agree_on_hard_situations(case):
 @settings(max_examples=examples(60), deadline=None)
 @given(st.floats(-1e-9, 1e-9), st.floats(-np.pi, np.pi), st.sampled_from([0.0, 5e6]))
 def test_flips_stay_within_a_nanometre_of_touching(nudge, yaw, offset):
-    """Whole scene turned and moved: rounding of the corners may flip a contact only next to the touching position."""
+    """Whole scene turned and moved: rounding of the corners may flip a contact only next to the
+    touching position.
+    """
     c, s = np.cos(yaw), np.sin(yaw)
     distance = HALF_L + 2.25 + nudge
-    log = rollout(track(offset, -offset, yaw=yaw), [car("a", track(offset + c * distance, -offset + s * distance, yaw=yaw))])
+    log = rollout(
+        track(offset, -offset, yaw=yaw),
+        [car("a", track(offset + c * distance, -offset + s * distance, yaw=yaw))],
+    )
     sides, gap_m = sides_by_step(log)
     band_m = 1e-9 if offset else 1e-14 * 10
     rounding_m = np.spacing(2 * abs(offset) + 10.0) * 2

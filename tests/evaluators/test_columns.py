@@ -1,4 +1,6 @@
-"""Aggregation from columns, streamed, gives what the rows in memory give: means, intervals, pairs, verdicts, and what is missing."""
+"""Aggregation from columns, streamed, gives what the rows in memory give: means, intervals, pairs,
+verdicts, and what is missing.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ METRICS = ("offroad", "progress", "lateral_distance_m", "min_distance_to_obstacl
 KEYS = ("renderer", "policy", "scene", "seed", "status", "failure_class")
 
 
-def rows_like_a_run(renderers: Sequence[str], policies: Sequence[str], scenes: int, seeds: Sequence[int], key: int) -> list[dict[str, Any]]:
+def rows_like_a_run(
+    renderers: Sequence[str], policies: Sequence[str], scenes: int, seeds: Sequence[int], key: int
+) -> list[dict[str, Any]]:
     """Make rows with failures, invalid and infinite values, and cells that one side lacks."""
     rng = np.random.Generator(np.random.Philox(key))
     rows = []
@@ -36,25 +40,53 @@ def rows_like_a_run(renderers: Sequence[str], policies: Sequence[str], scenes: i
                 for seed in seeds:
                     for _ in range(1 if rng.random() < 0.9 else int(rng.integers(0, 2))):
                         failed = rng.random() < 0.05
-                        row: dict[str, Any] = dict(zip(KEYS, (renderer, policy, f"scene-{97 * scene % 31}", seed, "ok", None), strict=True))
+                        row: dict[str, Any] = dict(
+                            zip(
+                                KEYS,
+                                (renderer, policy, f"scene-{97 * scene % 31}", seed, "ok", None),
+                                strict=True,
+                            )
+                        )
                         if failed:
-                            row |= {"status": "failed", "failure_class": str(rng.choice(["policy", "renderer"]))}
-                        values = (float(hard + rng.normal() > 1.2), rng.random(), abs(hard + rng.normal()), rng.choice([np.inf, 3.0]))
+                            row |= {
+                                "status": "failed",
+                                "failure_class": str(rng.choice(["policy", "renderer"])),
+                            }
+                        values = (
+                            float(hard + rng.normal() > 1.2),
+                            rng.random(),
+                            abs(hard + rng.normal()),
+                            rng.choice([np.inf, 3.0]),
+                        )
                         for name, value in zip(METRICS, values, strict=True):
                             valid = not failed and rng.random() > 0.1
-                            row[name], row[f"{name}_valid"] = (float(value) if valid else None), (None if failed else valid)
+                            row[name], row[f"{name}_valid"] = (
+                                (float(value) if valid else None),
+                                (None if failed else valid),
+                            )
                         rows.append(row)
     return rows
 
 
 def table_of(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
     types = {**dict.fromkeys(KEYS, pa.string()), "seed": pa.int64()}
-    names = [name for name in rows[0] if name in types or name in METRICS or name.removesuffix("_valid") in METRICS]
-    kinds = {name: types.get(name, pa.bool_() if name.endswith("_valid") else pa.float64()) for name in names}
-    return pa.table({name: pa.array([row.get(name) for row in rows], kind) for name, kind in kinds.items()})
+    names = [
+        name
+        for name in rows[0]
+        if name in types or name in METRICS or name.removesuffix("_valid") in METRICS
+    ]
+    kinds = {
+        name: types.get(name, pa.bool_() if name.endswith("_valid") else pa.float64())
+        for name in names
+    }
+    return pa.table(
+        {name: pa.array([row.get(name) for row in rows], kind) for name, kind in kinds.items()}
+    )
 
 
-def by_rows(rows: Sequence[dict[str, Any]], baseline: str | None, bases: Mapping[str, str]) -> dict[str, Any]:
+def by_rows(
+    rows: Sequence[dict[str, Any]], baseline: str | None, bases: Mapping[str, str]
+) -> dict[str, Any]:
     """Aggregate as the documentation says, with rows in memory."""
     out: dict[str, dict[str, Any]] = {"metrics": {}, "paired": {}, "paired_with_base": {}}
     policies = list(dict.fromkeys(row["policy"] for row in rows))
@@ -62,10 +94,18 @@ def by_rows(rows: Sequence[dict[str, Any]], baseline: str | None, bases: Mapping
         mine = [row for row in rows if row["policy"] == policy]
         there = list(dict.fromkeys(row["renderer"] for row in mine))
         chosen = baseline if baseline in there else there[0]
-        parts = {"metrics": aggregate(mine), "paired": paired(mine, chosen) if len(there) > 1 else {}}
-        parts["paired_with_base"] = base_pairs(by_renderer(mine), metric_names(mine), chosen if len(there) > 1 else None, bases)
+        parts = {
+            "metrics": aggregate(mine),
+            "paired": paired(mine, chosen) if len(there) > 1 else {},
+        }
+        parts["paired_with_base"] = base_pairs(
+            by_renderer(mine), metric_names(mine), chosen if len(there) > 1 else None, bases
+        )
         for block, part in parts.items():
-            out[block] |= {name if len(policies) == 1 else f"{name}/{policy}": entry for name, entry in part.items()}
+            out[block] |= {
+                name if len(policies) == 1 else f"{name}/{policy}": entry
+                for name, entry in part.items()
+            }
     return out
 
 
@@ -74,7 +114,12 @@ def by_rows(rows: Sequence[dict[str, Any]], baseline: str | None, bases: Mapping
     [
         (("clean", "3dgs", "onefixer"), ("lane-camera",), 5, (0, 1, 2)),
         (("clean", "3dgs"), ("lane-camera", "learned"), 8, (7, 2**62)),
-        (("zebra", "ant"), ("p",), 1, (0, 1, 2, 3)),  # one scene has no interval; names out of order
+        (
+            ("zebra", "ant"),
+            ("p",),
+            1,
+            (0, 1, 2, 3),
+        ),  # one scene has no interval; names out of order
         (("alone",), ("p",), 4, (0,)),
     ],
 )
@@ -91,7 +136,11 @@ def test_columns_give_what_rows_give(
     wanted = by_rows(rows, baseline, bases)
 
     def numbers_by_renderer(table: RolloutTable) -> dict[str, Any]:
-        return {block: part for block, part in numbers(table, baseline, bases).items() if block != "paired_arms"}
+        return {
+            block: part
+            for block, part in numbers(table, baseline, bases).items()
+            if block != "paired_arms"
+        }
 
     assert numbers_by_renderer(RolloutTable.of_table(table_of(rows))) == wanted
     monkeypatch.setattr(columns, "BATCH_ROWS", 7)
@@ -102,7 +151,10 @@ def test_columns_give_what_rows_give(
 
 def test_several_runs_are_one_table_whatever_metrics_each_has(tmp_path: Path) -> None:
     first = rows_like_a_run(("clean", "3dgs"), ("p",), 6, (0, 1), 1)
-    second = [{**row, "scene": f"other-{row['scene']}"} for row in rows_like_a_run(("clean", "3dgs"), ("p",), 5, (0, 1), 2)]
+    second = [
+        {**row, "scene": f"other-{row['scene']}"}
+        for row in rows_like_a_run(("clean", "3dgs"), ("p",), 5, (0, 1), 2)
+    ]
     for row in second:
         del row["offroad"], row["offroad_valid"]
     for name, rows in (("a", first), ("b", second)):
@@ -111,9 +163,9 @@ def test_several_runs_are_one_table_whatever_metrics_each_has(tmp_path: Path) ->
     filled = [{"offroad": None, "offroad_valid": False, **row} for row in second]
     wanted = by_rows([*first, *filled], None, {})
     found = numbers(table)
-    assert {variant: dict(sorted(entry.items())) for variant, entry in found["metrics"].items()} == {
-        variant: dict(sorted(entry.items())) for variant, entry in wanted["metrics"].items()
-    }
+    assert {
+        variant: dict(sorted(entry.items())) for variant, entry in found["metrics"].items()
+    } == {variant: dict(sorted(entry.items())) for variant, entry in wanted["metrics"].items()}
     assert found["paired"]["3dgs"]["progress"] == wanted["paired"]["3dgs"]["progress"]
     failed = [row["failure_class"] for row in (*first, *second) if row["status"] == "failed"]
     assert table.failures() == {name: failed.count(name) for name in failed}
@@ -128,25 +180,44 @@ def test_a_table_without_its_keys_is_refused_by_name(tmp_path: Path) -> None:
 
 def test_a_run_without_rollouts_has_no_numbers() -> None:
     table = RolloutTable.of_table(table_of(rows_like_a_run(("a",), ("p",), 1, (0,), 3)).slice(0, 0))
-    assert numbers(table) == {"metrics": {}, "paired": {}, "paired_with_base": {}, "paired_arms": {}}
+    assert numbers(table) == {
+        "metrics": {},
+        "paired": {},
+        "paired_with_base": {},
+        "paired_arms": {},
+    }
     assert table.failures() == {}
 
 
 SPEC = GateSpec.model_validate(
-    {"version": 1, "metrics": {"offroad": {"margin": 0.1}, "lateral_distance_m": {"margin": 0.2, "max": 3.0}, "progress": {"min": 0.9}}}
+    {
+        "version": 1,
+        "metrics": {
+            "offroad": {"margin": 0.1},
+            "lateral_distance_m": {"margin": 0.2, "max": 3.0},
+            "progress": {"min": 0.9},
+        },
+    }
 )
 
 
-@pytest.mark.parametrize("stored", [None, rows_like_a_run(("clean", "3dgs", "onefixer"), ("a", "c"), 7, (1, 2, 5), 12)])
+@pytest.mark.parametrize(
+    "stored", [None, rows_like_a_run(("clean", "3dgs", "onefixer"), ("a", "c"), 7, (1, 2, 5), 12)]
+)
 def test_a_gate_judges_columns_as_rows_beside_stored_rows_too(stored):
     rows = rows_like_a_run(("clean", "3dgs", "onefixer"), ("a", "c"), 6, (0, 1, 2), 11)
-    assert judge_table(RolloutTable.of_table(table_of(rows)), SPEC, stored, "before") == judge(rows, SPEC, stored, "before")
+    assert judge_table(RolloutTable.of_table(table_of(rows)), SPEC, stored, "before") == judge(
+        rows, SPEC, stored, "before"
+    )
 
 
 def test_a_gate_of_rows_and_of_columns_refuses_a_baseline_that_is_not_there():
     rows = rows_like_a_run(("clean", "3dgs"), ("a",), 3, (0,), 13)
     spec = SPEC.model_copy(update={"baseline": "absent"})
-    for call in (lambda: judge(rows, spec), lambda: judge_table(RolloutTable.of_table(table_of(rows)), spec)):
+    for call in (
+        lambda: judge(rows, spec),
+        lambda: judge_table(RolloutTable.of_table(table_of(rows)), spec),
+    ):
         with pytest.raises(InputError, match="absent"):
             call()
 
@@ -156,15 +227,35 @@ def test_cells_of_rows_are_those_of_columns():
     there = RolloutTable.of_table(table_of(rows)).sides("p")["clean"]
     found = columns.Cells.of(RendererRows.of(rows).cells)
     assert (found.policy, found.scenes, found.seeds.tolist(), found.keys.tolist()) == (
-        there.cells.policy, there.cells.scenes, there.cells.seeds.tolist(), there.cells.keys.tolist()
-    )  # fmt: skip
+        there.cells.policy,
+        there.cells.scenes,
+        there.cells.seeds.tolist(),
+        there.cells.keys.tolist(),
+    )
     assert len(columns.Cells.of(())) == 0
 
 
 def test_the_reason_for_a_missing_value_is_asked_for_by_renderer_and_metric():
-    rows = [{"renderer": r, "policy": "p", "scene": "s", "seed": 0, "status": "ok", "failure_class": None} for r in ("clean", "3dgs")]
+    rows = [
+        {
+            "renderer": r,
+            "policy": "p",
+            "scene": "s",
+            "seed": 0,
+            "status": "ok",
+            "failure_class": None,
+        }
+        for r in ("clean", "3dgs")
+    ]
     rows = [row | {"offroad": None, "offroad_valid": False} for row in rows]
     data = pads.dataset(table_of(rows))
-    table = RolloutTable(data, "here", lambda renderer, metric: f"{metric} of {renderer}" if renderer == "clean" else "")
+    table = RolloutTable(
+        data,
+        "here",
+        lambda renderer, metric: f"{metric} of {renderer}" if renderer == "clean" else "",
+    )
     sides = table.sides("p")
-    assert [sides[name].reason(0, "offroad") for name in ("clean", "3dgs")] == ["offroad of clean", "not given"]
+    assert [sides[name].reason(0, "offroad") for name in ("clean", "3dgs")] == [
+        "offroad of clean",
+        "not given",
+    ]

@@ -1,4 +1,6 @@
-"""What follows from the evidence: looks, several metrics, suites driven whole, questions that are refused."""
+"""What follows from the evidence: looks, several metrics, suites driven whole, questions that are
+refused.
+"""
 
 from __future__ import annotations
 
@@ -16,34 +18,50 @@ def rng(key: int) -> np.random.Generator:
 
 
 def asked(*metrics: tuple[str, float], **fields) -> Question:
-    return Question(tuple(metric_question(name, margin, "non-inferior") for name, margin in metrics), **fields)
+    return Question(
+        tuple(metric_question(name, margin, "non-inferior") for name, margin in metrics), **fields
+    )
 
 
 def test_a_decision_stays_and_intervals_only_shrink_however_often_one_looks():
     question = asked(("collision_any", 0.2), ("lateral_distance_m", 0.2))
     values = {"collision_any": np.zeros(80), "lateral_distance_m": rng(8).normal(0.0, 0.2, 80)}
-    states = [state_after(question, {name: x[:n] for name, x in values.items()}, 80) for n in range(5, 81, 5)]
+    states = [
+        state_after(question, {name: x[:n] for name, x in values.items()}, 80)
+        for n in range(5, 81, 5)
+    ]
     answers = [state.answer for state in states]
     assert answers[0] == "open"
     assert answers[-1] == "good"
     assert answers == sorted(answers, key=["open", "good"].index)
     for k in range(2):
-        ends = np.array([[np.nan if end is None else end for end in state.metrics[k].interval] for state in states])
+        ends = np.array(
+            [
+                [np.nan if end is None else end for end in state.metrics[k].interval]
+                for state in states
+            ]
+        )
         ends = ends[np.isfinite(ends).all(axis=1)]
         assert np.all(np.diff(ends[:, 0]) >= -1e-9)
         assert np.all(np.diff(ends[:, 1]) <= 1e-9)
 
 
-@pytest.mark.parametrize(("shift", "answer", "word"), [(0.0, "good", "non-inferior"), (0.5, "bad", "worse")])
+@pytest.mark.parametrize(
+    ("shift", "answer", "word"), [(0.0, "good", "non-inferior"), (0.5, "bad", "worse")]
+)
 def test_a_metric_without_a_better_side_is_judged_by_the_size_of_the_change(shift, answer, word):
     for sign in (1.0, -1.0):
-        x = sign * shift + rng(9).normal(0.0, 0.2, 200)  # fewer cannot have shown a scene that is 4 m to one side
+        x = sign * shift + rng(9).normal(
+            0.0, 0.2, 200
+        )  # fewer cannot have shown a scene that is 4 m to one side
         state = state_after(asked(("lateral_bias_m", 0.2)), {"lateral_bias_m": x}, 200)
         assert (state.answer, state.metrics[0].answer) == (answer, word)
 
 
 def test_higher_is_better_turns_the_sign_of_what_is_printed_only():
-    gone = state_after(asked(("progress", 0.1)), {"progress": np.full(60, 0.5)}, 100)  # positive is worse: half of the progress is lost
+    gone = state_after(
+        asked(("progress", 0.1)), {"progress": np.full(60, 0.5)}, 100
+    )  # positive is worse: half of the progress is lost
     assert gone.answer == "bad"
     assert gone.metrics[0].diff == pytest.approx(-0.5)
     low, high = gone.metrics[0].interval
@@ -56,8 +74,15 @@ def test_one_metric_that_is_worse_decides_and_one_that_need_not_decide_does_not_
     question = Question((metric_question("lateral_distance_m", 0.1, "non-inferior"), rare))
     open_rare = state_after(question, {"lateral_distance_m": x, "offroad": np.zeros(200)}, 200)
     assert (open_rare.answer, open_rare.metrics[1].answer) == ("good", "undecided")
-    both = Question((metric_question("lateral_distance_m", 0.1, "non-inferior"), metric_question("offroad", 0.05, "non-inferior")))
-    bad = state_after(both, {"lateral_distance_m": x[:60], "offroad": np.array([0.0, 1.0, 1.0] * 20)}, 60)
+    both = Question(
+        (
+            metric_question("lateral_distance_m", 0.1, "non-inferior"),
+            metric_question("offroad", 0.05, "non-inferior"),
+        )
+    )
+    bad = state_after(
+        both, {"lateral_distance_m": x[:60], "offroad": np.array([0.0, 1.0, 1.0] * 20)}, 60
+    )
     assert bad.answer == "bad"
     assert outcome_of(both, bad, "").exit_code == 1
     assert outcome_of(both, bad, "").reasons == ("offroad is worse",)
@@ -68,7 +93,10 @@ def test_scenes_without_a_pair_leave_the_evidence_as_it_was():
     holed = x.copy()
     holed[[3, 17, 39]] = np.nan
     question = asked(("offroad", 0.1))
-    with_holes, without = state_after(question, {"offroad": holed}, 60), state_after(question, {"offroad": np.delete(x, [3, 17, 39])}, 60)
+    with_holes, without = (
+        state_after(question, {"offroad": holed}, 60),
+        state_after(question, {"offroad": np.delete(x, [3, 17, 39])}, 60),
+    )
     assert with_holes.metrics[0].n_scenes == 37
     assert with_holes.metrics[0] == without.metrics[0]
 
@@ -79,7 +107,10 @@ def test_a_suite_that_is_driven_whole_is_decided_by_its_mean():
         x = np.zeros(20)
         x[[3, 9, 19][-changed:]] = 1.0
         state = state_after(
-            question, {"offroad": x}, 20, {"offroad": adjusted_draws(x, question.metrics[0], [str(i) for i in range(20)], None)}
+            question,
+            {"offroad": x},
+            20,
+            {"offroad": adjusted_draws(x, question.metrics[0], [str(i) for i in range(20)], None)},
         )
         assert state.answer == answer
         assert state.metrics[0].interval == pytest.approx((changed / 20, changed / 20))
@@ -88,9 +119,16 @@ def test_a_suite_that_is_driven_whole_is_decided_by_its_mean():
 def test_no_decision_falls_before_the_fewest_scenes_and_none_on_nothing():
     question = asked(("lateral_distance_m", 0.1), first_look=5, min_scenes=30)
     x = np.full(40, -1.0)
-    assert [state_after(question, {"lateral_distance_m": x[:n]}, 40).answer for n in (29, 30)] == ["open", "good"]
+    assert [state_after(question, {"lateral_distance_m": x[:n]}, 40).answer for n in (29, 30)] == [
+        "open",
+        "good",
+    ]
     nothing = state_after(question, {"lateral_distance_m": np.full(4, np.nan)}, 40)
-    assert (nothing.answer, nothing.metrics[0].diff, nothing.metrics[0].interval) == ("open", None, (None, None))
+    assert (nothing.answer, nothing.metrics[0].diff, nothing.metrics[0].interval) == (
+        "open",
+        None,
+        (None, None),
+    )
 
 
 @pytest.mark.parametrize(
@@ -99,7 +137,10 @@ def test_no_decision_falls_before_the_fewest_scenes_and_none_on_nothing():
         (lambda: metric_question("lateral_bias_m", None, "better"), "no better side"),
         (lambda: metric_question("lateral_bias_m", 0.0, "non-inferior"), "a margin of 0"),
         (lambda: metric_question("progress", -0.1, "non-inferior"), "not a number from 0 up"),
-        (lambda: metric_question("lateral_distance_m", 0.1, "non-inferior", method="betting"), "no bounds"),
+        (
+            lambda: metric_question("lateral_distance_m", 0.1, "non-inferior", method="betting"),
+            "no bounds",
+        ),
     ],
 )
 def test_questions_without_an_answer_are_refused(make, found):
@@ -116,12 +157,20 @@ def test_questions_without_an_answer_are_refused(make, found):
         ("lateral_distance_m", "better", -0.2, 4.0),  # at least 0.1 m better
     ],
 )
-def test_metres_get_no_good_answer_by_scenes_that_cannot_have_shown_the_tail(metric, kind, usual, tail):
-    """2.5 % of scenes are 4 m worse, so that the mean is at the margin: a spread of the other scenes says nothing of them."""
+def test_metres_get_no_good_answer_by_scenes_that_cannot_have_shown_the_tail(
+    metric, kind, usual, tail
+):
+    """2.5 % of scenes are 4 m worse, so that the mean is at the margin: a spread of the other
+    scenes says nothing of them.
+    """
     question = Question((metric_question(metric, 0.1, kind),))
     wrong = 0
     for k in range(30):
-        x = usual + rng(k).normal(0.0, 0.05, 60) + np.where(rng(1000 + k).random(60) < 0.025, tail, 0.0)
+        x = (
+            usual
+            + rng(k).normal(0.0, 0.05, 60)
+            + np.where(rng(1000 + k).random(60) < 0.025, tail, 0.0)
+        )
         wrong += state_after(question, {metric: x}, 60).answer == "good"
     assert wrong <= 3
     alike = 2.0 * usual + rng(1).normal(0.0, 0.05, 200)
@@ -132,7 +181,16 @@ def test_metres_get_no_bad_answer_where_few_scenes_that_are_far_better_bring_the
     question = Question((metric_question("lateral_distance_m", 0.1, "non-inferior"),))
     wrong = 0
     for k in range(30):
-        x = 0.2 + rng(k).normal(0.0, 0.05, 60) - np.where(rng(1000 + k).random(60) < 0.025, 4.0, 0.0)
+        x = (
+            0.2
+            + rng(k).normal(0.0, 0.05, 60)
+            - np.where(rng(1000 + k).random(60) < 0.025, 4.0, 0.0)
+        )
         wrong += state_after(question, {"lateral_distance_m": x}, 60).answer == "bad"
     assert wrong <= 3
-    assert state_after(question, {"lateral_distance_m": 0.5 + rng(1).normal(0.0, 0.05, 200)}, 200).answer == "bad"
+    assert (
+        state_after(
+            question, {"lateral_distance_m": 0.5 + rng(1).normal(0.0, 0.05, 200)}, 200
+        ).answer
+        == "bad"
+    )

@@ -20,7 +20,14 @@ def rows(gained: str):
     for renderer in ("clean", "3dgs"):
         for scene in SCENES:
             hit = float(renderer == "3dgs" and scene.startswith(gained))
-            of = {"renderer": renderer, "policy": "p", "scene": scene, "seed": 0, "status": "ok", "failure_class": ""}
+            of = {
+                "renderer": renderer,
+                "policy": "p",
+                "scene": scene,
+                "seed": 0,
+                "status": "ok",
+                "failure_class": "",
+            }
             out.append(of | {"offroad": hit, "offroad_valid": True})
     return RolloutTable.of_table(pa.Table.from_pylist(out))
 
@@ -30,11 +37,21 @@ def test_a_difference_of_one_family_is_gone_without_it_and_wide_by_families():
     entry = numbers(rows("curve"), "clean", family_of=family_of)["paired"]["3dgs"]["offroad"]
     assert entry["diff"] == 0.25
     assert entry["families"]["n"] == 4
-    assert entry["families"]["ci95"][0] < 0.0 < entry["ci95"][0]  # scenes say that it is worse, families do not
-    assert (entry["families"]["without"]["family"], entry["families"]["without"]["diff"]) == ("curve", 0.0)
+    assert (
+        entry["families"]["ci95"][0] < 0.0 < entry["ci95"][0]
+    )  # scenes say that it is worse, families do not
+    assert (entry["families"]["without"]["family"], entry["families"]["without"]["diff"]) == (
+        "curve",
+        0.0,
+    )
     assert entry["families"]["without"]["ci95"][1] > 0.0
     assert "families" not in numbers(rows("curve"), "clean")["paired"]["3dgs"]["offroad"]
-    assert "families" not in numbers(rows("curve"), "clean", family_of=dict.fromkeys(SCENES, "one"))["paired"]["3dgs"]["offroad"]
+    assert (
+        "families"
+        not in numbers(rows("curve"), "clean", family_of=dict.fromkeys(SCENES, "one"))["paired"][
+            "3dgs"
+        ]["offroad"]
+    )
 
 
 def test_families_of_equal_size_have_the_t_interval_of_their_means():

@@ -17,10 +17,16 @@ SCENES = 200  # enough to exclude that a few scenes go wrong by metres
 
 
 def rows(shift=0.0, renderer="3dgs", events=0, n_scenes=SCENES, policy="p", black=0.0, spread=0.02):
-    """Rows of one renderer: a distance that is ``shift`` more than that of the others on the same cells, some off-road events."""
+    """Rows of one renderer: a distance that is ``shift`` more than that of the others on the same
+    cells, some off-road events.
+    """
     rng = np.random.Generator(np.random.Philox(9))
     shared = rng.normal(0.3, 0.2, n_scenes)
-    own = np.random.Generator(np.random.Philox(len(renderer))).normal(shift, spread, n_scenes) if shift else np.zeros(n_scenes)
+    own = (
+        np.random.Generator(np.random.Philox(len(renderer))).normal(shift, spread, n_scenes)
+        if shift
+        else np.zeros(n_scenes)
+    )
     return [
         {
             "renderer": renderer,
@@ -40,7 +46,11 @@ def rows(shift=0.0, renderer="3dgs", events=0, n_scenes=SCENES, policy="p", blac
 
 
 def gate(**fields):
-    rules = {"route_distance_m": MetricRule(margin=0.1), "offroad": MetricRule(margin=0.05), "img_is_black": MetricRule(max=0.0)}
+    rules = {
+        "route_distance_m": MetricRule(margin=0.1),
+        "offroad": MetricRule(margin=0.05),
+        "img_is_black": MetricRule(max=0.0),
+    }
     return GateSpec(**{"version": 1, "min_scenes": 10, "metrics": rules, **fields})
 
 
@@ -86,21 +96,40 @@ def test_failed_rollouts_are_infrastructure_and_unscored_ones_the_evaluators():
 
 
 def test_a_rule_that_need_not_decide_only_vetoes():
-    spec = gate(metrics={"offroad": MetricRule(margin=0.05, must_decide=False), "img_is_black": MetricRule(max=0.0)})
+    spec = gate(
+        metrics={
+            "offroad": MetricRule(margin=0.05, must_decide=False),
+            "img_is_black": MetricRule(max=0.0),
+        }
+    )
     verdict = judge([*rows(renderer="clean"), *rows(events=4)], spec)
-    assert {c.metric: c.cause for c in verdict.checks} == {"offroad": "undecided", "img_is_black": "pass"}
+    assert {c.metric: c.cause for c in verdict.checks} == {
+        "offroad": "undecided",
+        "img_is_black": "pass",
+    }
     assert verdict.exit_code == 0
     assert cause(rows(events=40), spec) == "regression"
 
 
 def test_a_distance_decides_only_together_with_its_event():
-    rules = {"route_distance_m": MetricRule(margin=0.1), "offroad": MetricRule(margin=0.05, must_decide=False)}
+    rules = {
+        "route_distance_m": MetricRule(margin=0.1),
+        "offroad": MetricRule(margin=0.05, must_decide=False),
+    }
     both = judge([*rows(renderer="clean"), *rows(events=4)], gate(metrics=rules))
-    assert {c.metric: c.cause for c in both.checks} == {"offroad": "undecided", "route_distance_m": "undecided"}
+    assert {c.metric: c.cause for c in both.checks} == {
+        "offroad": "undecided",
+        "route_distance_m": "undecided",
+    }
     assert "decides only together with its event: offroad is undecided" in both.outcome.reasons[0]
-    alone = judge([*rows(renderer="clean"), *rows()], gate(metrics={"route_distance_m": rules["route_distance_m"]}))
+    alone = judge(
+        [*rows(renderer="clean"), *rows()],
+        gate(metrics={"route_distance_m": rules["route_distance_m"]}),
+    )
     assert "the gate has no margin for offroad" in alone.outcome.reasons[0]
-    assert cause(rows(shift=0.5), gate(metrics=rules)) == "regression", "worse is shown by the distance alone"
+    assert cause(rows(shift=0.5), gate(metrics=rules)) == "regression", (
+        "worse is shown by the distance alone"
+    )
 
 
 def test_a_suite_that_is_all_that_is_asked_about_needs_no_unseen_scenes():
@@ -116,17 +145,26 @@ def test_renderers_and_policies_are_judged_one_by_one():
     both = [*rows(renderer="clean"), *rows(renderer="good"), *rows(shift=0.5, renderer="worse one")]
     verdict = judge(both, gate())
     distances = [c for c in verdict.checks if c.metric == "route_distance_m"]
-    assert {(c.renderer, c.cause) for c in distances} == {("good", "pass"), ("worse one", "regression")}
+    assert {(c.renderer, c.cause) for c in distances} == {
+        ("good", "pass"),
+        ("worse one", "regression"),
+    }
     assert judge(both, gate(renderers=("good",))).exit_code == 0
     other = [*rows(renderer="clean", policy="q"), *rows(shift=0.5, renderer="good", policy="q")]
     arms = judge([*both, *other], gate(renderers=("good",))).checks
-    assert {(c.policy, c.cause) for c in arms if c.metric == "route_distance_m"} == {("p", "pass"), ("q", "regression")}
+    assert {(c.policy, c.cause) for c in arms if c.metric == "route_distance_m"} == {
+        ("p", "pass"),
+        ("q", "regression"),
+    }
 
 
 def test_a_stored_baseline_meets_the_renderer_of_the_same_name():
     stored = [*rows(renderer="clean"), *rows()]
     verdict = judge([*rows(renderer="clean"), *rows(shift=0.5)], gate(), stored, "main.json")
-    assert {(c.renderer, c.cause) for c in verdict.checks if c.metric == "route_distance_m"} == {("clean", "pass"), ("3dgs", "regression")}
+    assert {(c.renderer, c.cause) for c in verdict.checks if c.metric == "route_distance_m"} == {
+        ("clean", "pass"),
+        ("3dgs", "regression"),
+    }
     assert verdict.baseline == "main.json"
 
 
@@ -143,7 +181,14 @@ def test_names_that_are_not_there_are_refused():
 
 
 def test_text_and_exit_code_come_from_one_object_and_the_worst_cause_decides():
-    assert EXIT_CODES == {"pass": 0, "regression": 1, "policy": 2, "undecided": 3, "infrastructure": 4, "evaluator": 5}
+    assert EXIT_CODES == {
+        "pass": 0,
+        "regression": 1,
+        "policy": 2,
+        "undecided": 3,
+        "infrastructure": 4,
+        "evaluator": 5,
+    }
     for one, other in itertools.product(SEVERITY, SEVERITY):
         assert worst([Outcome(one), Outcome(other)]).cause == min(one, other, key=SEVERITY.index)
     failures = {"n_failed": 2, "n_rollouts": 9, "by_class": {"evaluator": 1, "policy": 1}}
@@ -152,7 +197,7 @@ def test_text_and_exit_code_come_from_one_object_and_the_worst_cause_decides():
     assert outcome_of_failures(failures | {"n_failed": 0, "by_class": {}}).exit_code == 0
 
 
-# --- files --------------------------------------------------------------------------------------------------------------
+# --- files
 
 
 @pytest.mark.parametrize("name", shipped_gates())
@@ -164,10 +209,18 @@ def test_shipped_gates_load_by_name(name):
     ("text", "place", "mention"),
     [
         ("version: 1\nmetrics:\n  offroad: {margn: 0.1}\n", ":3:", "did you mean 'margin'?"),
-        ("version: 1\nmin_scene: 3\nmetrics: {offroad: {margin: 0.1}}\n", ":2:", "did you mean 'min_scenes'?"),
+        (
+            "version: 1\nmin_scene: 3\nmetrics: {offroad: {margin: 0.1}}\n",
+            ":2:",
+            "did you mean 'min_scenes'?",
+        ),
         ("version: 1\nmetrics:\n  offraod: {margin: 0.1}\n", ":3:", "no metric 'offraod'"),
         ("version: 1\nmetrics:\n  offroad: {margin: -0.1}\n", ":3:", "greater than or equal to 0"),
-        ("version: 1\nmetrics:\n  offroad: {must_decide: false}\n", ":3:", "a rule without margin, max or min"),
+        (
+            "version: 1\nmetrics:\n  offroad: {must_decide: false}\n",
+            ":3:",
+            "a rule without margin, max or min",
+        ),
         ("version: 1\nmetrics:\n  dist_traveled_m: {margin: 0}\n", ":3:", "no better side"),
         ("version: 1\npreset: papr\nmetrics: {offroad: {margin: 0.1}}\n", ":2:", "known: paper"),
         ("version: 2\nmetrics: {offroad: {margin: 0.1}}\n", ":1:", "version"),
@@ -192,13 +245,27 @@ def test_an_unknown_gate_lists_the_shipped_ones():
 @pytest.mark.parametrize("name", ["default", "policy"])
 def test_a_shipped_gate_lets_a_distance_decide_only_together_with_its_events(name):
     spec = load_gate(name)[0]
-    assert [metric for metric, rule in spec.metrics.items() if not rule.must_decide] == ["braked_without_cause"]
+    assert [metric for metric, rule in spec.metrics.items() if not rule.must_decide] == [
+        "braked_without_cause"
+    ]
     driven = rows(renderer="clean", n_scenes=300) + rows(renderer="3dgs", events=10, n_scenes=300)
-    more = {"lateral_distance_m": 0.1, "lateral_bias_m": 0.0, "progress": 1.0, "collision_at_fault": 0.0, "braked_without_cause": 0.0}
+    more = {
+        "lateral_distance_m": 0.1,
+        "lateral_bias_m": 0.0,
+        "progress": 1.0,
+        "collision_at_fault": 0.0,
+        "braked_without_cause": 0.0,
+    }
     run = [row | more for row in driven]
-    plain = spec.model_copy(update={"metrics": {key: rule for key, rule in spec.metrics.items() if rule.margin}})
+    plain = spec.model_copy(
+        update={"metrics": {key: rule for key, rule in spec.metrics.items() if rule.margin}}
+    )
     causes = {check.metric: check.cause for check in judge(run, plain).checks}
     undecided = {metric for metric, cause in causes.items() if cause == "undecided"}
-    assert undecided == {"offroad", *(metric for metric in spec.metrics if METRICS[metric].event == "offroad")} != {"offroad"}
+    assert (
+        undecided
+        == {"offroad", *(metric for metric in spec.metrics if METRICS[metric].event == "offroad")}
+        != {"offroad"}
+    )
     assert set(causes.values()) == {"pass", "undecided"}
     assert judge(run, plain).exit_code == 3

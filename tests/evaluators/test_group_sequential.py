@@ -14,7 +14,10 @@ TIMES = (0.2, 0.4, 0.6, 0.8, 1.0)
 
 @pytest.mark.parametrize(
     ("spending", "published"),
-    [("obrien-fleming", [4.8769, 3.3569, 2.6803, 2.2898, 2.0310]), ("pocock", [2.4380, 2.4268, 2.4101, 2.3966, 2.3859])],
+    [
+        ("obrien-fleming", [4.8769, 3.3569, 2.6803, 2.2898, 2.0310]),
+        ("pocock", [2.4380, 2.4268, 2.4101, 2.3966, 2.3859]),
+    ],
 )
 def test_bounds_are_the_published_ones_of_five_looks_at_one_sided_025(spending, published):
     assert boundaries(0.025, TIMES, spending) == pytest.approx(published, abs=2e-3)
@@ -25,7 +28,9 @@ def test_bounds_are_the_published_ones_of_five_looks_at_one_sided_025(spending, 
 def test_all_looks_together_refute_in_a_share_alpha_of_motions(spending):
     steps = np.random.default_rng(2).normal(size=(20_000, 5)) * np.sqrt(0.2)
     z = np.cumsum(steps, axis=1) / np.sqrt(TIMES)
-    assert np.mean((z >= boundaries(0.05, TIMES, spending)).any(axis=1)) == pytest.approx(0.05, abs=0.006)
+    assert np.mean((z >= boundaries(0.05, TIMES, spending)).any(axis=1)) == pytest.approx(
+        0.05, abs=0.006
+    )
 
 
 @pytest.mark.parametrize("method", ["obrien-fleming", "pocock"])

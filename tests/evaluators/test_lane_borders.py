@@ -1,4 +1,6 @@
-"""The border of the lanes around the ego, found without their union, against the reference that builds the union at every step."""
+"""The border of the lanes around the ego, found without their union, against the reference that
+builds the union at every step.
+"""
 
 from __future__ import annotations
 
@@ -28,26 +30,53 @@ def checked(lane_map, log):
     held = containment(road, ego_footprints(log, PAPER, origin), log.ego.xyz - origin)
     slow = road_by_step(log, where, PAPER)
     assert (held.in_one | held.in_union).tolist() == [one.on_road for one in slow]
-    np.testing.assert_allclose(held.boundary_gap_m, [one.boundary_gap_m for one in slow], rtol=0, atol=2e-9)
+    np.testing.assert_allclose(
+        held.boundary_gap_m, [one.boundary_gap_m for one in slow], rtol=0, atol=2e-9
+    )
     return road, held
 
 
 def strip(name, y0, y1, x0=-30.0, x1=30.0, vertices=2, turn=0.0, about=(0.0, 0.0)):
-    """A straight lane between two heights, with this many vertices an edge, turned about a point."""
+    """A straight lane between two heights, with this many vertices an edge, turned about a
+    point.
+    """
     x = np.linspace(x0, x1, vertices)
     c, s = np.cos(turn), np.sin(turn)
 
     def line(y):
         dx, dy = x - about[0], np.full(vertices, y) - about[1]
-        return np.stack([about[0] + c * dx - s * dy, about[1] + s * dx + c * dy, np.zeros(vertices)], axis=1)
+        return np.stack(
+            [about[0] + c * dx - s * dy, about[1] + s * dx + c * dy, np.zeros(vertices)], axis=1
+        )
 
     return Lane(name, line((y0 + y1) / 2), line(y1), line(y0))
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3])
-@pytest.mark.parametrize("gap_m", [0.0, 1e-12, 1e-9, 0.4e-6, 0.999e-6, 1e-6, 1.001e-6, 1.6e-6, 1e-5, 1e-3, 0.3, -1e-9, -1e-3, -0.5])
+@pytest.mark.parametrize(
+    "gap_m",
+    [
+        0.0,
+        1e-12,
+        1e-9,
+        0.4e-6,
+        0.999e-6,
+        1e-6,
+        1.001e-6,
+        1.6e-6,
+        1e-5,
+        1e-3,
+        0.3,
+        -1e-9,
+        -1e-3,
+        -0.5,
+    ],
+)
 def test_a_seam_of_any_width_between_two_lanes(gap_m, turn):
-    lanes = [strip("right", -2.0, 0.0, vertices=4, turn=turn), strip("left", gap_m, gap_m + 2.0, vertices=7, turn=turn)]
+    lanes = [
+        strip("right", -2.0, 0.0, vertices=4, turn=turn),
+        strip("left", gap_m, gap_m + 2.0, vertices=7, turn=turn),
+    ]
     y = np.array([0.0, 0.3, -0.8, 1.0 + gap_m, 1.06, 1.2, -1.06, -1.07])
     c, s = np.cos(turn), np.sin(turn)
     checked(road_map(*lanes), rollout(track(-s * y, c * y, yaw=turn)))
@@ -55,19 +84,29 @@ def test_a_seam_of_any_width_between_two_lanes(gap_m, turn):
 
 def test_a_wedge_that_opens_between_two_lanes():
     upper = Lane(
-        "upper", np.array([[-30, 1.0, 0], [30, 1.2, 0]]), np.array([[-30, 2.0, 0], [30, 2.0, 0]]), np.array([[-30, 0, 0], [30, 0.4, 0]])
+        "upper",
+        np.array([[-30, 1.0, 0], [30, 1.2, 0]]),
+        np.array([[-30, 2.0, 0], [30, 2.0, 0]]),
+        np.array([[-30, 0, 0], [30, 0.4, 0]]),
     )
     lanes = road_map(strip("lower", -2.0, 0.0), upper)
     checked(lanes, rollout(track(np.linspace(-29, 29, 12), 0.1)))
     checked(lanes, rollout(track(np.linspace(-29, 29, 12), -1.0)))
 
 
-@pytest.mark.parametrize("nudge_m", [0.0, 1e-12, -1e-12, 4e-7, -4e-7, 6e-7, -6e-7, 1e-5, -1e-5, 1e-3, -1e-3])
+@pytest.mark.parametrize(
+    "nudge_m", [0.0, 1e-12, -1e-12, 4e-7, -4e-7, 6e-7, -6e-7, 1e-5, -1e-5, 1e-3, -1e-3]
+)
 def test_corners_and_sides_exactly_on_the_border(nudge_m):
     lanes = road_map(strip("right", -1.0, 0.0, vertices=3), strip("left", 0.0, 1.0, vertices=5))
     checked(
         lanes,
-        rollout(track([0.0, 30.0 - LENGTH_M / 2 + nudge_m, -30.0 + LENGTH_M / 2], [1.0 - HALF_W + nudge_m, 0.0, HALF_W - 1.0 + nudge_m])),
+        rollout(
+            track(
+                [0.0, 30.0 - LENGTH_M / 2 + nudge_m, -30.0 + LENGTH_M / 2],
+                [1.0 - HALF_W + nudge_m, 0.0, HALF_W - 1.0 + nudge_m],
+            )
+        ),
     )
     # A corner on the outer border, the body turned.
     yaw = 0.4
@@ -77,13 +116,31 @@ def test_corners_and_sides_exactly_on_the_border(nudge_m):
 
 
 def test_crossing_lanes_slivers_needles_and_bow_ties_at_once():
-    bow = lane("bow", 1.5, left=np.array([[-20.0, 2.0, 0], [20.0, 2.5, 0]]), right=np.array([[20.0, 1.0, 0], [-20.0, 0.5, 0]]))
-    needle = lane("needle", 0.0, left=np.array([[-20.0, 0.0, 0], [20, 0, 0]]), right=np.array([[-20.0, 0.0, 0], [20, 0, 0]]))
+    bow = lane(
+        "bow",
+        1.5,
+        left=np.array([[-20.0, 2.0, 0], [20.0, 2.5, 0]]),
+        right=np.array([[20.0, 1.0, 0], [-20.0, 0.5, 0]]),
+    )
+    needle = lane(
+        "needle",
+        0.0,
+        left=np.array([[-20.0, 0.0, 0], [20, 0, 0]]),
+        right=np.array([[-20.0, 0.0, 0], [20, 0, 0]]),
+    )
     sliver = strip("sliver", 1.75, 1.75 + 2e-6, vertices=3)
     bare = Lane("bare", np.array([[-10.0, -4.0, 0], [0, -1, 0], [12.0, -1.0, 0]]), None, None)
-    across = [strip(f"x{k}", -1.75, 1.75, vertices=k + 2, turn=0.7 * k, about=(1.0, 0.5)) for k in range(4)]
+    across = [
+        strip(f"x{k}", -1.75, 1.75, vertices=k + 2, turn=0.7 * k, about=(1.0, 0.5))
+        for k in range(4)
+    ]
     steps = np.linspace(-9, 9, 40)
-    for lanes in ((*across, bow, needle, sliver, bare), (bow, bare), (across[1], sliver, needle), (needle, sliver)):
+    for lanes in (
+        (*across, bow, needle, sliver, bare),
+        (bow, bare),
+        (across[1], sliver, needle),
+        (needle, sliver),
+    ):
         checked(road_map(*lanes), rollout(track(steps, 1.2 * np.sin(steps), yaw=steps / 4)))
 
 
@@ -98,7 +155,9 @@ def test_pieces_of_a_lane_chain_that_bends_and_whose_ends_differ_by_rounding():
             rows.append(Lane(f"{k}.{i}", at, at + 1.75 * normal[a:b], at - 1.75 * normal[a:b]))
     x = np.linspace(4, 56, 60)
     on = np.interp(x, s, bend[:, 1])
-    road, held = checked(road_map(*rows), rollout(track(x, on + 3.0 * np.sin(x / 5), yaw=np.cos(x / 12) / 2)))
+    road, held = checked(
+        road_map(*rows), rollout(track(x, on + 3.0 * np.sin(x / 5), yaw=np.cos(x / 12) / 2))
+    )
     assert held.in_union.any()
     assert len(road._unions) < 8  # the rest is known from the border alone
 
@@ -109,7 +168,10 @@ def test_random_arrangements_far_from_neat():
         lanes = [
             strip(
                 f"l{k}",
-                *np.sort(np.round(rng.uniform(-4, 4, 2), int(rng.integers(0, 3))) + np.array([0.0, 1e-9 * rng.integers(0, 2)])),
+                *np.sort(
+                    np.round(rng.uniform(-4, 4, 2), int(rng.integers(0, 3)))
+                    + np.array([0.0, 1e-9 * rng.integers(0, 2)])
+                ),
                 *(-float(rng.integers(5, 20)), float(rng.integers(5, 20))),
                 int(rng.integers(2, 6)),
                 float(rng.choice([0.0, 0.0, 1e-7, 0.02, 1.0, np.pi / 2, np.pi])),
@@ -118,7 +180,9 @@ def test_random_arrangements_far_from_neat():
         ]
         n = 6
         at = np.round(rng.uniform(-6, 6, (2, n)) * 2) / 2
-        checked(road_map(*lanes), rollout(track(*at, yaw=rng.choice([0.0, np.pi / 2, 0.3, np.pi], n))))
+        checked(
+            road_map(*lanes), rollout(track(*at, yaw=rng.choice([0.0, np.pi / 2, 0.3, np.pi], n)))
+        )
 
 
 def test_a_long_drive_asks_for_few_unions_and_a_second_one_for_no_new_borders():
@@ -140,7 +204,11 @@ def test_distances_of_boxes_from_segments_are_those_of_their_shapes():
     n = 400
     segments = np.round(rng.uniform(-6, 6, (4, n)))
     segments[2] += (segments[0] == segments[2]) & (segments[1] == segments[3])
-    boxes = Footprints(np.round(rng.uniform(-2, 2, (n, 2))), rng.choice([0.0, np.pi / 2, 0.6, -2.0], n), np.tile([4.0, 2.0], (n, 1)))
+    boxes = Footprints(
+        np.round(rng.uniform(-2, 2, (n, 2))),
+        rng.choice([0.0, np.pi / 2, 0.6, -2.0], n),
+        np.tile([4.0, 2.0], (n, 1)),
+    )
     lines = shapely.linestrings(segments.T.reshape(n, 2, 2))
     distance_m, depth_m = box_to_segments(boxes, segments)
     shapes = boxes.shapes()
@@ -148,5 +216,7 @@ def test_distances_of_boxes_from_segments_are_those_of_their_shapes():
     inside = shapely.intersection(lines, shapes)
     deep = np.flatnonzero(shapely.length(inside) > 1e-6)
     middle = shapely.line_interpolate_point(inside[deep], 0.5, normalized=True)
-    np.testing.assert_allclose(depth_m[deep], shapely.distance(shapely.boundary(shapes[deep]), middle), atol=1e-9)
+    np.testing.assert_allclose(
+        depth_m[deep], shapely.distance(shapely.boundary(shapes[deep]), middle), atol=1e-9
+    )
     assert (depth_m[distance_m > 0] == -1).all()

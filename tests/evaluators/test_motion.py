@@ -42,12 +42,16 @@ def test_time_to_collision_and_impact_speed_of_a_drive_into_a_standing_car():
 
 
 def test_the_safe_distance_is_that_of_the_definition_and_nobody_beside_counts():
-    assert safe_distance_m(np.array([8.0]), np.array([0.0]))[0] == pytest.approx(8 + 1.75 + 11.5**2 / 8)
+    assert safe_distance_m(np.array([8.0]), np.array([0.0]))[0] == pytest.approx(
+        8 + 1.75 + 11.5**2 / 8
+    )
     standing, beside = track(np.full(N, 40.0), 0.0), track(CRUISE + 8.0, 3.0)
     log = rollout(track(CRUISE, 0.0), [car("stands", standing), car("beside", beside)])
     gap_m = 40.0 - 2.25 - CRUISE[20] - log.ego_box.length_m / 2
     assert scored(log)["rss_margin_m"].value[20] == pytest.approx(gap_m - 26.28125, abs=1e-6)
-    assert not scored(rollout(track(CRUISE, 0.0), [car("beside", beside)]))["rss_margin_m"].valid.any()
+    assert not scored(rollout(track(CRUISE, 0.0), [car("beside", beside)]))[
+        "rss_margin_m"
+    ].valid.any()
 
 
 def test_driving_against_the_lane_is_the_wrong_way_and_alpasims_preset_has_none_of_it():
@@ -84,7 +88,9 @@ def test_a_red_light_is_passed_where_the_front_crosses_its_line_while_it_is_red(
         signalled(("yellow", 10_000_000)),
         signalled(("red", 3_000_000), ("green", 7_000_000)),  # green when the front comes
         signalled(("red", 3_000_000), ("green", 7_000_000), offset_us=-10_000_000),
-        signalled(("red", 10_000_000), heading_rad=np.pi),  # for the traffic that comes towards the ego
+        signalled(
+            ("red", 10_000_000), heading_rad=np.pi
+        ),  # for the traffic that comes towards the ego
         signalled(("red", 10_000_000), y=3.5),  # over the lane beside
         signalled(("red", 10_000_000), z=6.0),  # on the bridge
         replace(TWO_LANES, signals=()),

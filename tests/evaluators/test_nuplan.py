@@ -14,39 +14,72 @@ from evaluators.scores import nuplan
 from evaluators.scores.states import EgoStates, Tracks, savitzky_golay
 
 FIXTURES = Path(__file__).parents[3] / "shared" / "data" / "nuplan-devkit-fixtures"
-OF_PLANS = ("planner_expert_average_l2_error_within_bound", "planner_miss_rate_within_bound")  # they compare plans; the files hold drives
+OF_PLANS = (
+    "planner_expert_average_l2_error_within_bound",
+    "planner_miss_rate_within_bound",
+)  # they compare plans; the files hold drives
 FILES = sorted(path for path in FIXTURES.glob("*/*.json") if path.parent.name not in OF_PLANS)
 WIDTH_M, FRONT_M, REAR_M = 2.297, 4.049, 1.127  # of the devkit's vehicle, from its rear axle
 SERIES = {f"ego_{name}": name for name in ("jerk", "lon_jerk", "lat_jerk", "yaw_rate")} | {
-    "ego_acceleration": "accel", "ego_lon_acceleration": "lon_accel", "ego_lat_acceleration": "lat_accel",
+    "ego_acceleration": "accel",
+    "ego_lon_acceleration": "lon_accel",
+    "ego_lat_acceleration": "lat_accel",
     "ego_yaw_acceleration": "yaw_accel",
-}  # fmt: skip
+}
 
 
 def states(rows) -> EgoStates:
-    pose, velocity, accel = (np.array([row[key] for row in rows], dtype=float) for key in ("pose", "velocity", "acceleration"))
+    pose, velocity, accel = (
+        np.array([row[key] for row in rows], dtype=float)
+        for key in ("pose", "velocity", "acceleration")
+    )
     t_us = np.array([row["time_us"] for row in rows])
     size = (FRONT_M + REAR_M, WIDTH_M)
     return EgoStates(t_us, pose[:, :2], pose[:, 2], velocity, accel, size, (FRONT_M - REAR_M) / 2)
 
 
 def tracks(worlds) -> Tracks:
-    kinds = {"bicycles": "vru", "pedestrians": "vru", "vehicles": "vehicle", "genericobjects": "object"}
-    ids = sorted({(kind, one["id"]) for world in worlds for kind in kinds for one in world.get(kind, [])})
+    kinds = {
+        "bicycles": "vru",
+        "pedestrians": "vru",
+        "vehicles": "vehicle",
+        "genericobjects": "object",
+    }
+    ids = sorted(
+        {(kind, one["id"]) for world in worlds for kind in kinds for one in world.get(kind, [])}
+    )
     shape = (len(ids), len(worlds))
-    there, xy, yaw, velocity = np.zeros(shape, bool), np.zeros((*shape, 2)), np.zeros(shape), np.zeros((*shape, 2))
+    there = np.zeros(shape, bool)
+    xy = np.zeros((*shape, 2))
+    yaw = np.zeros(shape)
+    velocity = np.zeros((*shape, 2))
     size = np.ones((len(ids), 2))
     for t, world in enumerate(worlds):
         for kind in kinds:
             for one in world.get(kind, []):
                 a, box = ids.index((kind, one["id"])), one["box"]
-                there[a, t], xy[a, t], yaw[a, t], size[a] = True, box["pose"][:2], box["pose"][2], box["size"][::-1]
+                there[a, t], xy[a, t], yaw[a, t], size[a] = (
+                    True,
+                    box["pose"][:2],
+                    box["pose"][2],
+                    box["size"][::-1],
+                )
                 velocity[a, t] = one["speed"] * np.array([np.cos(yaw[a, t]), np.sin(yaw[a, t])])
-    return Tracks(tuple(f"{kind} {one}" for kind, one in ids), tuple(kinds[kind] for kind, _ in ids), there, xy, yaw, size, velocity)
+    return Tracks(
+        tuple(f"{kind} {one}" for kind, one in ids),
+        tuple(kinds[kind] for kind, _ in ids),
+        there,
+        xy,
+        yaw,
+        size,
+        velocity,
+    )
 
 
 def found_statistics(name, scene) -> list[float | bool]:
-    """The values that the devkit lists for a metric, in its order, as far as our definitions give them."""
+    """The values that the devkit lists for a metric, in its order, as far as our definitions give
+    them.
+    """
     ego = states([scene["ego"], *scene.get("ego_future_states", [])])
     others = tracks([scene["world"], *scene.get("world_future_states", [])])
     hits = nuplan.collisions(ego, others)
@@ -57,27 +90,41 @@ def found_statistics(name, scene) -> list[float | bool]:
     if name == "ego_mean_speed":
         return [nuplan.statistics(ego.speed)["MEAN"]]
     if name == "ego_expert_l2_error":
-        of = nuplan.statistics(nuplan.position_errors(ego.rear_xy, states(scene["expert_ego_states"]).rear_xy))
+        of = nuplan.statistics(
+            nuplan.position_errors(ego.rear_xy, states(scene["expert_ego_states"]).rear_xy)
+        )
         return [of["MAX"], of["MEAN"], of["P90"]]
     if name == "no_ego_at_fault_collision":
         counts = [sum(one.kind == kind for one in guilty) for kind in ("vru", "vehicle", "object")]
         of = nuplan.statistics(np.array([one.delta_v_mps for one in guilty])) if guilty else {}
-        return [not guilty, len(guilty), *counts, *(of[kind] for kind in ("MAX", "MIN", "MEAN") if of)]
+        return [
+            not guilty,
+            len(guilty),
+            *counts,
+            *(of[kind] for kind in ("MAX", "MIN", "MEAN") if of),
+        ]
     if name == "time_to_collision_within_bound":
         given = scene["metric_parameters"]
-        least = nuplan.time_to_collision(ego, others, hits, None, given["time_step_size"], given["time_horizon"]).min()
+        least = nuplan.time_to_collision(
+            ego, others, hits, None, given["time_step_size"], given["time_horizon"]
+        ).min()
         return [round(least, 2), bool(least > given["least_min_ttc"])]
     raise AssertionError(f"no definition of ours is held to {name}")
 
 
 @pytest.mark.skipif(not FILES, reason="../shared/data/nuplan-devkit-fixtures is absent")
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_the_devkits_test_vectors_give_its_series_to_all_printed_digits_and_its_statistics_nearly(path):
+def test_the_devkits_test_vectors_give_its_series_to_all_printed_digits_and_its_statistics_nearly(
+    path,
+):
     scene = json.loads(path.read_text())
     name, expected = path.parent.name, scene["expected"]
     got = found_statistics(name, scene)
-    wanted = [value for kind, value in expected["statistics"] if name not in SERIES or kind != "BOOLEAN"]
-    # Two of the statistics printed there differ from ours by one unit of the second digit: 0.62 for 0.63 and 0.71 for 0.72.
+    wanted = [
+        value for kind, value in expected["statistics"] if name not in SERIES or kind != "BOOLEAN"
+    ]
+    # Two of the statistics printed there differ from ours by one unit of the second digit: 0.62 for
+    # 0.63 and 0.71 for 0.72.
     assert got == pytest.approx(wanted, abs=0.015)
     if name in SERIES:
         values = nuplan.motion(states([scene["ego"], *scene["ego_future_states"]]))[SERIES[name]]
@@ -88,15 +135,25 @@ def test_when_boxes_touch_is_what_a_search_in_small_steps_finds():
     rng = np.random.default_rng(5)
     n = 200
     ego = EgoStates(
-        np.arange(n) * 100_000, rng.uniform(-9, 9, (n, 2)), rng.uniform(-4, 4, n), np.column_stack([rng.uniform(0, 12, n), np.zeros(n)]),
-        np.zeros((n, 2)), (5.0, 2.0), 1.4,
-    )  # fmt: skip
+        np.arange(n) * 100_000,
+        rng.uniform(-9, 9, (n, 2)),
+        rng.uniform(-4, 4, n),
+        np.column_stack([rng.uniform(0, 12, n), np.zeros(n)]),
+        np.zeros((n, 2)),
+        (5.0, 2.0),
+        1.4,
+    )
     shape = (1, n)
     velocity = rng.uniform(-9, 9, (*shape, 2)) * (rng.random((*shape, 1)) < 0.7)  # some stand
     others = Tracks(
-        ("a",), ("vehicle",), np.ones(shape, bool), rng.uniform(-20, 20, (*shape, 2)), rng.uniform(-4, 4, shape),
-        np.array([[4.0, 1.8]]), velocity,
-    )  # fmt: skip
+        ("a",),
+        ("vehicle",),
+        np.ones(shape, bool),
+        rng.uniform(-20, 20, (*shape, 2)),
+        rng.uniform(-4, 4, shape),
+        np.array([[4.0, 1.8]]),
+        velocity,
+    )
     everyone, steps = np.zeros(n, dtype=np.int64), np.arange(n)
     first_s, last_s = nuplan.touching_s(ego, others, everyone, steps)
     for after_s in np.arange(0.0, 4.0, 0.05):
@@ -105,10 +162,14 @@ def test_when_boxes_touch_is_what_a_search_in_small_steps_finds():
         assert hit.tolist() == ((first_s <= after_s) & (after_s <= last_s)).tolist()
 
 
-@pytest.mark.parametrize(("values", "window"), [(5, 5), (8, 8), (9, 8), (40, 8), (40, 15), (3, 3), (4, 4)])
+@pytest.mark.parametrize(
+    ("values", "window"), [(5, 5), (8, 8), (9, 8), (40, 8), (40, 15), (3, 3), (4, 4)]
+)
 @pytest.mark.parametrize("times", [0, 1, 2])
 def test_smoothing_is_scipys_to_the_last_bit(values: int, window: int, times: int) -> None:
     random = np.random.default_rng(values)
     for given in (1e3 * random.normal(size=values), np.zeros(values), np.arange(float(values))):
         ours = savitzky_golay(given, window, 2, times, 0.1)
-        np.testing.assert_array_equal(ours, scipy.signal.savgol_filter(given, window, 2, deriv=times, delta=0.1))
+        np.testing.assert_array_equal(
+            ours, scipy.signal.savgol_filter(given, window, 2, deriv=times, delta=0.1)
+        )

@@ -1,4 +1,6 @@
-"""Off the road: the paper's rule on hand-made roads, and the array evaluation against the step-by-step twin."""
+"""Off the road: the paper's rule on hand-made roads, and the array evaluation against the
+step-by-step twin.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,12 @@ def test_ego_straddling_two_lanes_is_on_road():
 
 
 def test_ego_across_three_lanes_is_on_road():
-    lanes = road_map(lane("a", -2.0, 1.0), lane("b", 0.0, 1.0), lane("c", 2.0, 1.0), edges=[edge_line(3.0), edge_line(-3.0)])
+    lanes = road_map(
+        lane("a", -2.0, 1.0),
+        lane("b", 0.0, 1.0),
+        lane("c", 2.0, 1.0),
+        edges=[edge_line(3.0), edge_line(-3.0)],
+    )
     log = rollout(track(0.0, 0.0, yaw=np.pi / 2))  # 4.855 m across 6 m of lanes
     assert held(log, lanes).in_union.tolist() == [True]
     assert offroad_of(log, lanes).value.tolist() == [0.0]
@@ -69,7 +76,9 @@ def test_touching_the_lane_border_from_inside_is_on_road():
     log = rollout(track(0.0, -1.75 + HALF_W))
     origin = origin_of(scene(TWO_LANES, log).ego_log, PAPER)
     ring = np.array([[-50, -1.75], [200, -1.75], [200, 1.75], [-50, 1.75]]) - origin[:2]
-    assert held(log, TWO_LANES).in_one.tolist() == [convex_contains(ring, ego_corners(log, PAPER, 0, origin))]
+    assert held(log, TWO_LANES).in_one.tolist() == [
+        convex_contains(ring, ego_corners(log, PAPER, 0, origin))
+    ]
     # Inside, the road edge half a millimetre away does not matter; outside it does.
     assert offroad_of(rollout(track(0.0, -1.75 + HALF_W + 1e-6)), TWO_LANES).value.tolist() == [0.0]
     assert offroad_of(rollout(track(0.0, -1.75 + HALF_W - 1e-6)), TWO_LANES).value.tolist() == [1.0]
@@ -150,21 +159,30 @@ def test_driving_against_the_lane_is_wrong_and_a_shared_junction_is_not():
     assert found.value.tolist() == [1.0, 1.0]
     back = Lane("back", np.array([[200.0, 0.0, 0.0], [-50.0, 0.0, 0.0]]), None, None)
     shared = road_map(lane("there", 0.0), back)
-    assert by_name(score(log, scene(shared, log), "paper"))["wrong_lane"].value.tolist() == [0.0, 0.0]
+    assert by_name(score(log, scene(shared, log), "paper"))["wrong_lane"].value.tolist() == [
+        0.0,
+        0.0,
+    ]
     opposing = replace(PAPER, wrong_lane_rule="any_opposes")
-    assert by_name(score(log, scene(shared, log), opposing))["wrong_lane"].value.tolist() == [1.0, 1.0]
+    assert by_name(score(log, scene(shared, log), opposing))["wrong_lane"].value.tolist() == [
+        1.0,
+        1.0,
+    ]
 
 
 @pytest.mark.parametrize("yaw", [np.pi, -np.pi, np.pi - 1e-9, -np.pi + 1e-9])
 def test_driving_along_minus_x_in_a_lane_along_minus_x_is_right(yaw):
     west = Lane("west", np.array([[100.0, 0.0, 0.0], [-100.0, -1e-9, 0.0]]), None, None)
     log = rollout(track(0.0, 0.0, yaw=yaw))
-    assert by_name(score(log, scene(road_map(west), log), "paper"))["wrong_lane"].value.tolist() == [0.0]
+    assert by_name(score(log, scene(road_map(west), log), "paper"))[
+        "wrong_lane"
+    ].value.tolist() == [0.0]
 
 
 def test_reversed_right_edge_is_repaired_to_its_two_triangles():
     crossed = lane("a", 0.0, right=np.array([[200.0, -1.75, 0.0], [-50.0, -1.75, 0.0]]))
-    # The ring crosses itself at x = 75, y = 0: on the left of it two triangles meet the left edge only near the ends.
+    # The ring crosses itself at x = 75, y = 0: on the left of it two triangles meet the left edge
+    # only near the ends.
     log = rollout(track([-40.0, 75.0], [0.0, 0.0]))
     where = scene(road_map(crossed), log)
     area = road_of(where.lane_map, origin_of(where.ego_log, PAPER), PAPER).areas(np.array([0]))[0]
@@ -188,7 +206,10 @@ def test_a_lane_without_area_holds_nothing_and_harms_nothing():
 def test_utm_sized_coordinates_give_the_same_flags():
     shift = np.array([691_000.0, 5_334_000.0, 500.0])
     far = road_map(
-        *(replace(one, centre=one.centre + shift, left=one.left + shift, right=one.right + shift) for one in TWO_LANES.lanes.values()),
+        *(
+            replace(one, centre=one.centre + shift, left=one.left + shift, right=one.right + shift)
+            for one in TWO_LANES.lanes.values()
+        ),
         edges=[edge + shift for edge in TWO_LANES.road_edges],
     )
     ys = np.array([0.0, 0.8, 1.75, -0.8, -0.82, 4.3, 4.4])
@@ -200,7 +221,9 @@ def test_utm_sized_coordinates_give_the_same_flags():
 def test_unions_are_kept_for_the_next_rollout_and_not_mixed_between_maps():
     log = rollout(track(np.linspace(0, 20, 30), 1.75))
     first = offroad_of(log, TWO_LANES).value
-    other = road_map(lane("right", 0.0), lane("left", 9.0), edges=(*TWO_LANES.road_edges, edge_line(1.75)))
+    other = road_map(
+        lane("right", 0.0), lane("left", 9.0), edges=(*TWO_LANES.road_edges, edge_line(1.75))
+    )
     assert offroad_of(log, other).value.tolist() == [1.0] * 30
     np.testing.assert_array_equal(offroad_of(log, TWO_LANES).value, first)
 
@@ -217,10 +240,17 @@ def roads(draw):
         seam = draw(st.sampled_from([0.0, 0.0, 0.002, -0.5]))
         bend = draw(st.sampled_from([0.0, 0.5, 3.0]))
         xs = np.array([-30.0, -5.0, 0.0, 12.0, 30.0])
-        line = lambda at, bend=bend, xs=xs: np.stack([xs, at + bend * np.sin(xs / 9), np.zeros(5)], axis=1)  # noqa: E731
+
+        def line(at, bend=bend, xs=xs):
+            return np.stack([xs, at + bend * np.sin(xs / 9), np.zeros(5)], axis=1)
+
         left, right = line(y + width), line(y)
         kind = draw(st.sampled_from(["both", "both", "none", "reversed"]))
-        left, right = {"both": (left, right), "none": (None, right), "reversed": (left, right[::-1])}[kind]
+        left, right = {
+            "both": (left, right),
+            "none": (None, right),
+            "reversed": (left, right[::-1]),
+        }[kind]
         lanes.append(Lane(f"l{k}", line(y + width / 2), left, right))
         if draw(st.booleans()):
             edges.append(line(y + draw(st.sampled_from([0.0, width]))))
@@ -231,7 +261,11 @@ def roads(draw):
 @settings(max_examples=examples(120), deadline=None)
 @given(
     roads(),
-    st.lists(st.tuples(half_metre, half_metre, st.sampled_from([0.0, np.pi, -np.pi, 0.3, np.pi / 2])), min_size=1, max_size=4),
+    st.lists(
+        st.tuples(half_metre, half_metre, st.sampled_from([0.0, np.pi, -np.pi, 0.3, np.pi / 2])),
+        min_size=1,
+        max_size=4,
+    ),
     st.sampled_from([0.0, 4_000_000.0]),
 )
 def test_array_evaluation_and_twin_agree_on_hard_roads(lane_map, poses, offset):
@@ -240,17 +274,24 @@ def test_array_evaluation_and_twin_agree_on_hard_roads(lane_map, poses, offset):
     if offset:
         move = lambda points: None if points is None else points + shift  # noqa: E731
         lane_map = road_map(
-            *(replace(one, centre=move(one.centre), left=move(one.left), right=move(one.right)) for one in lane_map.lanes.values()),
+            *(
+                replace(one, centre=move(one.centre), left=move(one.left), right=move(one.right))
+                for one in lane_map.lanes.values()
+            ),
             edges=[edge + shift for edge in lane_map.road_edges],
         )
     log = rollout(track(x + offset, y - offset, yaw=yaw, z=0.8))
     where = scene(lane_map, log)
     slow = road_by_step(log, where, PAPER)
     fast = offroad_of(log, lane_map)
-    assert [None if not ok else bool(v) for v, ok in zip(fast.value, fast.valid, strict=True)] == [one.offroad for one in slow]
+    assert [None if not ok else bool(v) for v, ok in zip(fast.value, fast.valid, strict=True)] == [
+        one.offroad for one in slow
+    ]
     gap = by_name(score(log, where, "paper"))["min_distance_to_lane_boundary_m"].value
     np.testing.assert_allclose(gap, [one.boundary_gap_m for one in slow], atol=1e-9)
-    assert (held(log, lane_map).in_one | held(log, lane_map).in_union).tolist() == [one.on_road for one in slow]
+    assert (held(log, lane_map).in_one | held(log, lane_map).in_union).tolist() == [
+        one.on_road for one in slow
+    ]
 
 
 @settings(max_examples=examples(80), deadline=None)
@@ -260,9 +301,13 @@ def test_a_footprint_on_the_lane_border_flips_only_next_to_it(nudge, turn):
     c, s = np.cos(turn), np.sin(turn)
     spin = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     one = lane("a", 0.0)
-    turned = replace(one, centre=one.centre @ spin.T, left=one.left @ spin.T, right=one.right @ spin.T)
+    turned = replace(
+        one, centre=one.centre @ spin.T, left=one.left @ spin.T, right=one.right @ spin.T
+    )
     at = spin @ np.array([3.0, 1.75 - HALF_W + nudge, 0.0])
     log = rollout(track(at[0], at[1], yaw=turn))
     origin = origin_of(scene(road_map(turned), log).ego_log, PAPER)
     ring = np.concatenate([turned.left[:, :2], turned.right[::-1, :2]]) - origin[:2]
-    assert held(log, road_map(turned)).in_one.tolist() == [convex_contains(ring, ego_corners(log, PAPER, 0, origin))]
+    assert held(log, road_map(turned)).in_one.tolist() == [
+        convex_contains(ring, ego_corners(log, PAPER, 0, origin))
+    ]

@@ -1,4 +1,6 @@
-"""Outcomes without contact: standstill, braking without a cause and leaving the route, on hand-made drives along a straight road."""
+"""Outcomes without contact: standstill, braking without a cause and leaving the route, on hand-made
+drives along a straight road.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,13 @@ from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_y
 from alpasim_plugin.core.types import Actor, Box, LaneMap, RolloutLog, Scene, Trajectory, Vehicle
 from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators import reduce_rollout, score
-from evaluators.metrics.outcomes import OUTCOMES, evaluate_outcomes, in_words, outcomes_of, recorded_speed
+from evaluators.metrics.outcomes import (
+    OUTCOMES,
+    evaluate_outcomes,
+    in_words,
+    outcomes_of,
+    recorded_speed,
+)
 from evaluators.metrics.presets import PRESETS
 from evaluators.metrics.table import METRICS
 from evaluators.statistics.outcomes import outcome_table, rollouts_of, sentence
@@ -24,7 +32,11 @@ NAMES = ("stalled", "braked_without_cause", "left_route")
 def track(x, y=0.0) -> Trajectory:
     x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
     xyz = np.stack([x, y, np.zeros(len(x))], axis=1)
-    return Trajectory((np.arange(len(x)) * round(DT_S * 1e6)).astype(np.int64), xyz, quat_from_yaw(np.zeros(len(x))))
+    return Trajectory(
+        (np.arange(len(x)) * round(DT_S * 1e6)).astype(np.int64),
+        xyz,
+        quat_from_yaw(np.zeros(len(x))),
+    )
 
 
 def travelled(v) -> np.ndarray:
@@ -32,18 +44,40 @@ def travelled(v) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(np.asarray(v, float)[:-1] * DT_S)])
 
 
-def drive(ego: Trajectory, recorded: Trajectory | None = None, actors: dict[str, Trajectory] | None = None) -> tuple[RolloutLog, Scene]:
+def drive(
+    ego: Trajectory, recorded: Trajectory | None = None, actors: dict[str, Trajectory] | None = None
+) -> tuple[RolloutLog, Scene]:
     vehicle = Vehicle()
     T_rig_box = np.eye(4)
     T_rig_box[:3, 3] = [vehicle.rear_axle_to_centre_m, 0.0, vehicle.box.height_m / 2]
     path = offset_trajectory(track(V * T) if recorded is None else recorded, inverse(T_rig_box))
-    others = {name: Actor(name, "car", Box(4.5, 1.8, 1.5), one) for name, one in (actors or {}).items()}
-    log = RolloutLog("road", "road", vehicle.box, T_rig_box, ego, others, (), (), path, 0, 0, 0, round(DT_S * 1e6))
+    others = {
+        name: Actor(name, "car", Box(4.5, 1.8, 1.5), one) for name, one in (actors or {}).items()
+    }
+    log = RolloutLog(
+        "road",
+        "road",
+        vehicle.box,
+        T_rig_box,
+        ego,
+        others,
+        (),
+        (),
+        path,
+        0,
+        0,
+        0,
+        round(DT_S * 1e6),
+    )
     return log, Scene("road", LaneMap({}, ()), path, vehicle)
 
 
 def fired(*of) -> set[str]:
-    return {one.name for one in evaluate_outcomes(*drive(*of), PRESETS["paper"]) if bool(np.any(one.value > 0))}
+    return {
+        one.name
+        for one in evaluate_outcomes(*drive(*of), PRESETS["paper"])
+        if bool(np.any(one.value > 0))
+    }
 
 
 def slowing(to: float = 0.4, after_s: float = 3.0) -> np.ndarray:
@@ -86,7 +120,9 @@ def test_a_long_body_across_the_road_is_a_cause_although_no_corner_is_on_the_pat
     bus = log.actors["bus"]
     across = Trajectory(bus.track.t_us, bus.track.xyz, quat_from_yaw(np.full(len(T), np.pi / 2)))
     log.actors["bus"] = Actor("bus", "bus", Box(12.0, 2.5, 3.0), across)  # type: ignore[index]
-    assert not any(bool(np.any(one.value > 0)) for one in evaluate_outcomes(log, scene, PRESETS["paper"]))
+    assert not any(
+        bool(np.any(one.value > 0)) for one in evaluate_outcomes(log, scene, PRESETS["paper"])
+    )
 
 
 def test_a_stop_of_the_recording_excuses_a_stop_there_but_not_a_longer_one() -> None:
@@ -110,8 +146,13 @@ def test_a_drive_far_from_the_origin_is_judged_alike() -> None:
     far = np.array([4.5e5, 5.4e6, 0.0])
     log, scene = drive(track(travelled(slowing(0.0))))
     moved = lambda one: Trajectory(one.t_us, one.xyz + far, one.quat)  # noqa: E731
-    log, scene = replace(log, ego=moved(log.ego), ego_log=moved(log.ego_log)), replace(scene, ego_log=moved(scene.ego_log))
-    assert {one.name for one in evaluate_outcomes(log, scene, PRESETS["paper"]) if np.any(one.value > 0)} == {
+    log, scene = (
+        replace(log, ego=moved(log.ego), ego_log=moved(log.ego_log)),
+        replace(scene, ego_log=moved(scene.ego_log)),
+    )
+    assert {
+        one.name for one in evaluate_outcomes(log, scene, PRESETS["paper"]) if np.any(one.value > 0)
+    } == {
         "stalled",
         "braked_without_cause",
     }
@@ -143,20 +184,51 @@ def test_every_outcome_is_a_metric_or_a_failure_and_has_a_time_in_the_manifest()
 
 def test_outcomes_are_counted_by_arm_with_place_and_time() -> None:
     def manifest(policy: str, scene: str, **flags: float) -> dict:
-        metrics = {name: {"value": value, "valid": True} for name, value in ({"progress": 1.0} | flags).items()}
+        metrics = {
+            name: {"value": value, "valid": True}
+            for name, value in ({"progress": 1.0} | flags).items()
+        }
         events = [{"metric": name, "t_s": 3.1} for name in flags]
-        return {"renderer": "clean", "policy": policy, "scene": scene, "seed": 0, "status": "ok", "metrics": metrics, "events": events}
+        return {
+            "renderer": "clean",
+            "policy": policy,
+            "scene": scene,
+            "seed": 0,
+            "status": "ok",
+            "metrics": metrics,
+            "events": events,
+        }
 
-    broken = manifest("b", "two") | {"status": "failed", "metrics": {}, "error": {"failure_class": "policy", "found": "ValueError"}}
-    lost = manifest("b", "three") | {"status": "failed", "metrics": {}, "error": {"failure_class": "renderer", "found": "no"}}
-    table = outcome_table(*rollouts_of([manifest("a", "one"), manifest("b", "one", offroad=1.0), broken, lost]))
+    broken = manifest("b", "two") | {
+        "status": "failed",
+        "metrics": {},
+        "error": {"failure_class": "policy", "found": "ValueError"},
+    }
+    lost = manifest("b", "three") | {
+        "status": "failed",
+        "metrics": {},
+        "error": {"failure_class": "renderer", "found": "no"},
+    }
+    table = outcome_table(
+        *rollouts_of([manifest("a", "one"), manifest("b", "one", offroad=1.0), broken, lost])
+    )
     assert sentence(table["clean/a"]) == "reaches the end"
-    assert sentence(table["clean/b"]) == "policy fault in 1 of 2 (two); off-road in 1 of 2 (one at 3.1 s); 0 of 2 reach the end"
-    assert (table["clean/b"]["n_rollouts"], table["clean/b"]["n_ended"], table["clean/b"]["n_failed"]) == (3, 2, 2)
+    assert (
+        sentence(table["clean/b"])
+        == "policy fault in 1 of 2 (two); off-road in 1 of 2 (one at 3.1 s); 0 of 2 reach the end"
+    )
+    assert (
+        table["clean/b"]["n_rollouts"],
+        table["clean/b"]["n_ended"],
+        table["clean/b"]["n_failed"],
+    ) == (3, 2, 2)
 
 
 def test_a_rollout_that_something_else_broke_has_no_outcome() -> None:
-    assert outcomes_of(Rollout("r", "p", "s", 0, "failed", "renderer", metrics={"offroad": 1.0})) == frozenset()
+    assert (
+        outcomes_of(Rollout("r", "p", "s", 0, "failed", "renderer", metrics={"offroad": 1.0}))
+        == frozenset()
+    )
 
 
 def test_presets_that_reproduce_alpasim_get_no_metric_that_it_does_not_have() -> None:

@@ -33,12 +33,20 @@ def first_contacts(path) -> dict[str, int]:
     for t, world in zip(t_us, worlds, strict=True):
         for kind in ("vehicles", "bicycles", "pedestrians"):
             for one in world.get(kind, []):
-                rows, times, _ = tracks.setdefault(f"{kind}-{one['id']}", ([], [], Box(one["box"]["size"][1], one["box"]["size"][0], 1.5)))
+                rows, times, _ = tracks.setdefault(
+                    f"{kind}-{one['id']}",
+                    ([], [], Box(one["box"]["size"][1], one["box"]["size"][0], 1.5)),
+                )
                 rows.append(one["box"]["pose"])
                 times.append(t)
-    actors = {key: Actor(key, "car", box, poses(rows, times)) for key, (rows, times, box) in tracks.items()}
+    actors = {
+        key: Actor(key, "car", box, poses(rows, times))
+        for key, (rows, times, box) in tracks.items()
+    }
     ego = poses([state["pose"] for state in egos], t_us, CENTRE_AHEAD_M)
-    log = RolloutLog("s", "u", EGO, np.eye(4), ego, actors, (), (), ego, t_us[0], t_us[0], 0, 100_000)
+    log = RolloutLog(
+        "s", "u", EGO, np.eye(4), ego, actors, (), (), ego, t_us[0], t_us[0], 0, 100_000
+    )
     table = ActorTable(log, OWN_SIZE, np.zeros(3))
     contacts, _ = find_contacts(ego_footprints(log, OWN_SIZE, np.zeros(3)), table, ego.t_us)
     first: dict[str, int] = {}
@@ -57,4 +65,9 @@ def first_contacts(path) -> dict[str, int]:
     ],
 )
 def test_first_contacts_are_the_published_ones(shared_data, name, want):
-    assert first_contacts(shared_data / "nuplan-devkit-fixtures" / "no_ego_at_fault_collision" / f"{name}.json") == want
+    assert (
+        first_contacts(
+            shared_data / "nuplan-devkit-fixtures" / "no_ego_at_fault_collision" / f"{name}.json"
+        )
+        == want
+    )

@@ -12,7 +12,16 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
 from alpasim_plugin.core.types import LoggedImage, LoggedPlan, Trajectory
 from evaluators import PRESETS, rollout_values, score
-from tests.evaluators.eval_build import DT_US, T_RIG_BOX, TWO_LANES, by_name, car, rollout, scene, track
+from tests.evaluators.eval_build import (
+    DT_US,
+    T_RIG_BOX,
+    TWO_LANES,
+    by_name,
+    car,
+    rollout,
+    scene,
+    track,
+)
 from tests.evaluators.reference import open_loop_by_plan
 
 
@@ -21,9 +30,13 @@ def plan(now: int, x, y=0.0, samples=(), dt_us=DT_US) -> LoggedPlan:
 
     def poses(xs, ys) -> Trajectory:
         n = np.size(xs)
-        return offset_trajectory(track(xs, ys, t_us=now * DT_US + dt_us * np.arange(n)), inverse(T_RIG_BOX))
+        return offset_trajectory(
+            track(xs, ys, t_us=now * DT_US + dt_us * np.arange(n)), inverse(T_RIG_BOX)
+        )
 
-    return LoggedPlan(now * DT_US, (now + 1) * DT_US, poses(x, y), tuple(poses(*one) for one in samples))
+    return LoggedPlan(
+        now * DT_US, (now + 1) * DT_US, poses(x, y), tuple(poses(*one) for one in samples)
+    )
 
 
 def scored(log, preset="paper"):
@@ -42,14 +55,19 @@ def test_consecutive_plans_that_agree_have_no_deviation():
 
 
 def test_plan_deviation_weighs_the_k_th_common_time_by_exp_of_minus_a_tenth_k():
-    # Old plan at times 0..3, new one at 1..4 with its first pose left out: common times are 2 and 3.
+    # Old plan at times 0..3, new one at 1..4 with its first pose left out: common times are 2 and
+    # 3.
     plans = [plan(0, np.arange(4.0)), plan(1, np.arange(1.0, 5.0), np.array([9.0, 1.0, 3.0, 9.0]))]
     w = np.exp([0.0, -0.1])
-    assert scored(rollout(drive(), plans=plans))["plan_deviation"].value == pytest.approx([np.sum(w * [1.0, 3.0]) / w.sum()])
+    assert scored(rollout(drive(), plans=plans))["plan_deviation"].value == pytest.approx(
+        [np.sum(w * [1.0, 3.0]) / w.sum()]
+    )
 
 
 def test_plans_without_a_common_time_have_no_deviation():
-    found = scored(rollout(drive(), plans=[plan(0, [0.0, 1.0]), plan(20, [20.0, 21.0])]))["plan_deviation"]
+    found = scored(rollout(drive(), plans=[plan(0, [0.0, 1.0]), plan(20, [20.0, 21.0])]))[
+        "plan_deviation"
+    ]
     assert found.valid.tolist() == [False]
     assert found.reason == "the plan and the one before it share no time"
 
@@ -64,11 +82,23 @@ def test_empty_plans_have_no_row():
 
 def test_a_plan_is_tested_against_where_actors_really_are_within_three_seconds():
     parked = car("a", track(35.0, 0.0, n=40))
-    slow = rollout(drive(), [parked], plans=[plan(0, np.arange(30.0)), plan(0 + 1, 1 + np.arange(30.0)), plan(2, 2 + np.arange(30.0))])
-    # Contact from x >= 35 - 2.25 - 2.4275 = 30.32 on: only poses at x = 31 reach it, 2.9 s after step 2.
+    slow = rollout(
+        drive(),
+        [parked],
+        plans=[
+            plan(0, np.arange(30.0)),
+            plan(0 + 1, 1 + np.arange(30.0)),
+            plan(2, 2 + np.arange(30.0)),
+        ],
+    )
+    # Contact from x >= 35 - 2.25 - 2.4275 = 30.32 on: only poses at x = 31 reach it, 2.9 s after
+    # step 2.
     assert scored(slow)["open_loop_collision"].value.tolist() == [0.0, 0.0, 1.0]
     assert open_loop_by_plan(slow, PRESETS["paper"]) == [False, False, True]
-    jumps = [plan(0, np.array([0.0, 35.0]), dt_us=3_000_001), plan(1, np.array([1.0, 35.0]), dt_us=3_000_000)]
+    jumps = [
+        plan(0, np.array([0.0, 35.0]), dt_us=3_000_001),
+        plan(1, np.array([1.0, 35.0]), dt_us=3_000_000),
+    ]
     late = rollout(drive(), [parked], plans=jumps)
     assert scored(late)["open_loop_collision"].value.tolist() == [0.0, 1.0]
 
@@ -81,8 +111,17 @@ def test_the_plans_own_first_pose_does_not_count_and_a_vanished_actor_cannot_be_
 
 def test_open_loop_collisions_agree_with_the_twin_on_random_plans():
     rng = np.random.Generator(np.random.Philox(7))
-    actors = [car(f"a{k}", track(rng.uniform(0, 60, 20), rng.uniform(-12, 12, 20), yaw=rng.uniform(-3, 3, 20))) for k in range(4)]
-    plans = [plan(k, k + np.arange(12.0) + rng.normal(0, 1, 12), rng.normal(0, 2, 12), dt_us=70_000) for k in range(15)]
+    actors = [
+        car(
+            f"a{k}",
+            track(rng.uniform(0, 60, 20), rng.uniform(-12, 12, 20), yaw=rng.uniform(-3, 3, 20)),
+        )
+        for k in range(4)
+    ]
+    plans = [
+        plan(k, k + np.arange(12.0) + rng.normal(0, 1, 12), rng.normal(0, 2, 12), dt_us=70_000)
+        for k in range(15)
+    ]
     log = rollout(drive(), actors, plans=plans)
     want = open_loop_by_plan(log, PRESETS["paper"])
     assert 0 < sum(want) < len(want)
@@ -118,7 +157,11 @@ def test_min_ade_against_the_driven_path_has_its_own_name():
 
 
 def test_without_samples_there_is_no_min_ade():
-    assert not [name for name in scored(rollout(drive(), plans=[plan(0, np.arange(5.0))])) if name.startswith("min_ade")]
+    assert not [
+        name
+        for name in scored(rollout(drive(), plans=[plan(0, np.arange(5.0))]))
+        if name.startswith("min_ade")
+    ]
 
 
 def image(t_us: int, level: int, camera="front", suffix=".png") -> LoggedImage:
@@ -127,7 +170,9 @@ def image(t_us: int, level: int, camera="front", suffix=".png") -> LoggedImage:
 
 
 def test_black_means_no_byte_above_ten():
-    log = rollout(drive(), images=[image(0, 10), image(DT_US, 11), image(2 * DT_US, 0, suffix=".jpg")])
+    log = rollout(
+        drive(), images=[image(0, 10), image(DT_US, 11), image(2 * DT_US, 0, suffix=".jpg")]
+    )
     found = scored(log)["img_is_black"]
     assert found.t_us.tolist() == [0, DT_US, 2 * DT_US]
     assert found.value.tolist() == [1.0, 0.0, 1.0]
@@ -148,7 +193,11 @@ def test_a_black_frame_does_not_remove_the_rollout():
 def test_a_log_without_images_has_no_value_for_them():
     log = rollout(drive())
     value = rollout_values(score(log, scene(TWO_LANES, log)))["img_is_black"]
-    assert (value.value, value.valid, value.reason) == (None, False, "no value among the scored steps")
+    assert (value.value, value.valid, value.reason) == (
+        None,
+        False,
+        "no value among the scored steps",
+    )
 
 
 def test_bytes_that_are_no_image_are_an_error():
@@ -169,29 +218,45 @@ def test_min_ade_names_carry_every_digit_of_the_horizon():
 
 
 def test_horizons_in_any_order_are_read_as_alpasim_reads_them():
-    # Near the log's end the long horizon has no value; AlpaSim then gives it the short one's, since it drops by place.
+    # Near the log's end the long horizon has no value; AlpaSim then gives it the short one's, since
+    # it drops by place.
     xs = np.arange(35.0, 65.0)
     log = rollout(drive(), plans=[plan(35, xs, samples=[(xs, 0.1 * np.arange(30))])])
-    found = by_name(score(log, scene(TWO_LANES, log), replace(PRESETS["alpasim"], min_ade_horizons_s=(2.0, 0.2))))
+    found = by_name(
+        score(
+            log, scene(TWO_LANES, log), replace(PRESETS["alpasim"], min_ade_horizons_s=(2.0, 0.2))
+        )
+    )
     assert found["min_ade@2.0s(gt)"].value == pytest.approx([0.15])
     assert "min_ade@0.2s(gt)" not in found
-    ours = by_name(score(log, scene(TWO_LANES, log), replace(PRESETS["paper"], min_ade_horizons_s=(2.0, 0.2))))
+    ours = by_name(
+        score(log, scene(TWO_LANES, log), replace(PRESETS["paper"], min_ade_horizons_s=(2.0, 0.2)))
+    )
     assert not ours["min_ade@2.0s(gt)"].valid.any()
     assert ours["min_ade@0.2s(gt)"].value == pytest.approx([0.15])
 
 
 def test_a_picture_that_stays_while_the_car_moves_is_frozen_until_it_changes():
-    log = rollout(drive(), images=[image(k * DT_US, level) for k, level in enumerate((90, 90, 90, 91))])
+    log = rollout(
+        drive(), images=[image(k * DT_US, level) for k, level in enumerate((90, 90, 90, 91))]
+    )
     assert scored(log)["img_is_frozen"].value.tolist() == [0.0, 1.0, 1.0, 0.0]
 
 
 def test_one_frozen_camera_of_two_is_enough():
-    pictures = [image(0, 90, "left"), image(0, 50, "right"), image(DT_US, 91, "left"), image(DT_US, 50, "right")]
+    pictures = [
+        image(0, 90, "left"),
+        image(0, 50, "right"),
+        image(DT_US, 91, "left"),
+        image(DT_US, 50, "right"),
+    ]
     assert scored(rollout(drive(), images=pictures))["img_is_frozen"].value.tolist() == [0.0, 1.0]
 
 
 def test_equal_pictures_of_a_standing_car_are_not_frozen_but_creeping_on_behind_one_is():
     still = rollout(track(np.full(4, 3.0), 0.0), images=[image(k * DT_US, 90) for k in range(4)])
     assert scored(still)["img_is_frozen"].value.max() == 0.0
-    creeping = rollout(track(0.06 * np.arange(4), 0.0), images=[image(k * DT_US, 90) for k in range(4)])
+    creeping = rollout(
+        track(0.06 * np.arange(4), 0.0), images=[image(k * DT_US, 90) for k in range(4)]
+    )
     assert scored(creeping)["img_is_frozen"].value.tolist() == [0.0, 0.0, 1.0, 1.0]

@@ -1,4 +1,6 @@
-"""Intervals of rates and means where they are easy to get wrong: nobody, everybody, one scene, equal scenes, unequal seeds."""
+"""Intervals of rates and means where they are easy to get wrong: nobody, everybody, one scene,
+equal scenes, unequal seeds.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,15 @@ from scipy import stats
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.seeding import stream
 from evaluators import aggregate
-from evaluators.statistics.intervals import cluster_bootstrap, clustered, design_effect, exact_rate, rate_interval, redraws, wilson_rate
+from evaluators.statistics.intervals import (
+    cluster_bootstrap,
+    clustered,
+    design_effect,
+    exact_rate,
+    rate_interval,
+    redraws,
+    wilson_rate,
+)
 from tests.evaluators.test_tables_over_rollouts import rows_of
 from tests.examples import examples
 
@@ -45,7 +55,9 @@ def test_the_bounds_are_t_on_the_logit_scale():
     p, error = means.mean(), stats.sem(means)
     centre, half = np.log(p / (1 - p)), stats.t.ppf(0.975, 4) * error / (p * (1 - p))
     one = rate_interval(means)
-    assert (one.low, one.high) == pytest.approx(tuple(1 / (1 + np.exp(-(centre + s * half))) for s in (-1, 1)))
+    assert (one.low, one.high) == pytest.approx(
+        tuple(1 / (1 + np.exp(-(centre + s * half))) for s in (-1, 1))
+    )
     assert one.method == "t on scenes, logit scale"
 
 
@@ -94,7 +106,9 @@ def test_a_rate_carries_wilson_and_exact_bounds_as_if_rollouts_were_independent(
     found = aggregate(rows_of([[1.0, 0.0], [0.0, 0.0], [1.0, 0.0]], "offroad"))["3dgs"]["offroad"]
     assert found["ci95_wilson"] == pytest.approx(list(wilson_rate(2, 6)))
     assert found["ci95_exact"] == pytest.approx(list(exact_rate(2, 6)))
-    shares_of_time = aggregate(rows_of([[0.25, 0.0], [0.0, 1.0]], "open_loop_collision"))["3dgs"]["open_loop_collision"]
+    shares_of_time = aggregate(rows_of([[0.25, 0.0], [0.0, 1.0]], "open_loop_collision"))["3dgs"][
+        "open_loop_collision"
+    ]
     assert (shares_of_time["ci95_wilson"], shares_of_time["ci95_exact"]) == (None, None)
 
 
@@ -112,7 +126,10 @@ def test_the_bootstrap_follows_its_generator_and_nears_t_where_scenes_are_many()
 def test_bootstrap_draws_scenes_and_not_rollouts():
     values, scenes = np.repeat([0.0, 10.0], 100), ["a"] * 100 + ["b"] * 100
     one = cluster_bootstrap(values, scenes, by_key("x"))
-    assert (one.low, one.high) == (0.0, 10.0)  # both draws the same scene in a quarter of the draws each
+    assert (one.low, one.high) == (
+        0.0,
+        10.0,
+    )  # both draws the same scene in a quarter of the draws each
 
 
 def test_design_effect_is_the_number_of_seeds_where_seeds_are_copies_and_about_one_where_they_are_independent():
@@ -120,6 +137,8 @@ def test_design_effect_is_the_number_of_seeds_where_seeds_are_copies_and_about_o
     scenes = np.repeat(np.arange(300), 5)
     assert design_effect(np.repeat(rng.normal(size=300), 5), scenes) == pytest.approx(5.0, rel=0.02)
     assert design_effect(rng.normal(size=1500), scenes) == pytest.approx(1.0, abs=0.2)
-    assert design_effect([0.0, 0.0, 1e-308, 0.0], [0, 0, 1, 1]) == pytest.approx(design_effect([0.0, 0.0, 1.0, 0.0], [0, 0, 1, 1]))
+    assert design_effect([0.0, 0.0, 1e-308, 0.0], [0, 0, 1, 1]) == pytest.approx(
+        design_effect([0.0, 0.0, 1.0, 0.0], [0, 0, 1, 1])
+    )
     assert design_effect([1.0, 1.0], ["a", "b"]) is None
     assert design_effect([1.0, 2.0], ["a", "a"]) is None

@@ -1,4 +1,6 @@
-"""The human drives of real recordings, scored as log replay: safe, on the road, on their own path."""
+"""The human drives of real recordings, scored as log replay: safe, on the road, on their own
+path.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.geometry import interpolate, inverse, offset_trajectory, se3, trajectory_from_poses
+from alpasim_plugin.core.geometry import (
+    interpolate,
+    inverse,
+    offset_trajectory,
+    se3,
+    trajectory_from_poses,
+)
 from alpasim_plugin.core.types import LaneMap, RolloutLog, Scene
 from evaluators import PRESETS, rollout_values, score
 from evaluators.metrics.contact import find_contacts
@@ -79,7 +87,9 @@ def test_the_human_drive_hits_nobody_stays_on_the_road_and_on_its_path(shared_da
 
 # Steps (of 0.1 s) whose footprint the lanes do not hold; none of them touches a road edge.
 UNHELD = {
-    "7fab2350": range(150, 160),  # leaving a junction, over a wedge between the outlines of its turn lanes
+    "7fab2350": range(
+        150, 160
+    ),  # leaving a junction, over a wedge between the outlines of its turn lanes
     "adcf7d18": (),
     "3bffdcff": (),
 }
@@ -99,9 +109,14 @@ def test_lane_containment_agrees_with_a_plain_rule_written_elsewhere(shared_data
         assert unheld.tolist() == list(UNHELD[name])
 
 
-@pytest.mark.parametrize(("name", "gap_m", "at_s"), [("7fab2350", 0.521, 11.90), ("adcf7d18", 0.385, 4.90), ("3bffdcff", 0.190, 14.00)])
+@pytest.mark.parametrize(
+    ("name", "gap_m", "at_s"),
+    [("7fab2350", 0.521, 11.90), ("adcf7d18", 0.385, 4.90), ("3bffdcff", 0.190, 14.00)],
+)
 def test_least_gap_to_anybody_in_the_ego_plane_is_the_published_one(shared_data, name, gap_m, at_s):
-    """Each frame is seen in the ego's own plane, with the recorded car's size, as the publisher's annotations are."""
+    """Each frame is seen in the ego's own plane, with the recorded car's size, as the publisher's
+    annotations are.
+    """
     log = read(shared_data, name)
     own_size = replace(PAPER, ego_size_m=None)
     t_us = np.unique(np.concatenate([one.track.t_us for one in log.actors]))
@@ -111,12 +126,18 @@ def test_least_gap_to_anybody_in_the_ego_plane_is_the_published_one(shared_data,
     in_plane = {}
     for one in log.actors:
         seen = np.isin(one.track.t_us, t_us)
-        poses = to_ego[np.searchsorted(t_us, one.track.t_us[seen])] @ se3(one.track.xyz[seen], one.track.quat[seen])
-        in_plane[one.actor_id] = replace(one, track=trajectory_from_poses(one.track.t_us[seen], poses))
+        poses = to_ego[np.searchsorted(t_us, one.track.t_us[seen])] @ se3(
+            one.track.xyz[seen], one.track.quat[seen]
+        )
+        in_plane[one.actor_id] = replace(
+            one, track=trajectory_from_poses(one.track.t_us[seen], poses)
+        )
     still = trajectory_from_poses(t_us, np.broadcast_to(rollout.T_rig_box, (len(t_us), 4, 4)))
     flat = replace(rollout, ego=still, actors=in_plane)
     origin = np.zeros(3)
-    _, gaps = find_contacts(ego_footprints(flat, own_size, origin), ActorTable(flat, own_size, origin), t_us)
+    _, gaps = find_contacts(
+        ego_footprints(flat, own_size, origin), ActorTable(flat, own_size, origin), t_us
+    )
     best = int(np.argmin(gaps))
     assert gaps[best] == pytest.approx(gap_m, abs=1e-3)
     assert (t_us[best] - t_us[0]) * 1e-6 == pytest.approx(at_s, abs=0.01)

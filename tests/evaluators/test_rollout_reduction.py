@@ -17,7 +17,12 @@ PAPER = PRESETS["paper"]
 
 def table(**values):
     """Series on six steps; the policy drives from step 2 on unless said otherwise."""
-    columns = {"eval_relevant": [0, 0, 1, 1, 1, 1], "collision_any": 0.0, "collision_at_fault": 0.0, "offroad": 0.0} | values
+    columns = {
+        "eval_relevant": [0, 0, 1, 1, 1, 1],
+        "collision_any": 0.0,
+        "collision_at_fault": 0.0,
+        "offroad": 0.0,
+    } | values
     return [one if hasattr(one, "valid") else series(name, T, one) for name, one in columns.items()]
 
 
@@ -27,20 +32,35 @@ def value(name, **columns):
 
 def test_warm_up_steps_are_dropped():
     assert value("collision_any", collision_any=[1, 1, 0, 0, 0, 0]).value == 0.0
-    assert value("route_distance_m", route_distance_m=[9, 9, 1, 2, 3, 4]).value == pytest.approx(2.5)
+    assert value("route_distance_m", route_distance_m=[9, 9, 1, 2, 3, 4]).value == pytest.approx(
+        2.5
+    )
 
 
 def test_steps_after_the_first_event_are_dropped_and_its_own_step_stays():
-    columns = {"offroad": [0, 0, 0, 1, 0, 0], "collision_any": [0, 0, 0, 0, 1, 1], "route_distance_m": [0, 0, 1, 3, 100, 100]}
+    columns = {
+        "offroad": [0, 0, 0, 1, 0, 0],
+        "collision_any": [0, 0, 0, 0, 1, 1],
+        "route_distance_m": [0, 0, 1, 3, 100, 100],
+    }
     assert value("offroad", **columns).value == 1.0
     assert value("collision_any", **columns).value == 0.0
     assert value("route_distance_m", **columns).value == pytest.approx(2.0)
     ledger = reduce_rollout(table(**columns)).ledger
-    assert (ledger.steps_total, ledger.steps_warmup, ledger.steps_after_event, ledger.steps_scored) == (6, 2, 2, 2)
+    assert (
+        ledger.steps_total,
+        ledger.steps_warmup,
+        ledger.steps_after_event,
+        ledger.steps_scored,
+    ) == (6, 2, 2, 2)
 
 
 def test_any_contact_ends_the_rollout_a_rear_hit_too():
-    columns = {"collision_any": [0, 0, 1, 1, 1, 1], "collision_rear": [0, 0, 1, 0, 0, 0], "collision_at_fault": [0, 0, 0, 1, 1, 1]}
+    columns = {
+        "collision_any": [0, 0, 1, 1, 1, 1],
+        "collision_rear": [0, 0, 1, 0, 0, 0],
+        "collision_at_fault": [0, 0, 0, 1, 1, 1],
+    }
     assert value("collision_at_fault", **columns).value == 0.0
     assert value("collision_rear", **columns).value == 1.0
 
@@ -78,9 +98,19 @@ def test_a_flag_that_may_have_fired_where_it_is_unknown_is_unknown_and_never_zer
 
 
 def test_a_flag_that_fired_is_one_whatever_else_is_unknown():
-    fired = series("offroad", T, [0, 0, 1, 0, 0, 0], np.array([True, True, True, False, True, True]), "no edges")
+    fired = series(
+        "offroad",
+        T,
+        [0, 0, 1, 0, 0, 0],
+        np.array([True, True, True, False, True, True]),
+        "no edges",
+    )
     assert value("offroad", offroad=fired).value == 1.0
-    either = value("offroad_or_collision", offroad=series("offroad", T, 0.0, False, "no map"), collision_any=[0, 0, 0, 1, 0, 0])
+    either = value(
+        "offroad_or_collision",
+        offroad=series("offroad", T, 0.0, False, "no map"),
+        collision_any=[0, 0, 0, 1, 0, 0],
+    )
     assert either.value == 1.0
 
 
@@ -90,26 +120,44 @@ def test_unknown_steps_in_the_warm_up_do_not_matter():
 
 
 def test_gaps_of_steps_without_actors_are_skipped():
-    gap = series("min_distance_to_obstacle_m", T, [0, 0, 7, 8, np.inf, np.inf], np.array([1, 1, 1, 1, 0, 0], bool), "nobody")
+    gap = series(
+        "min_distance_to_obstacle_m",
+        T,
+        [0, 0, 7, 8, np.inf, np.inf],
+        np.array([1, 1, 1, 1, 0, 0], bool),
+        "nobody",
+    )
     assert value("min_distance_to_obstacle_m", min_distance_to_obstacle_m=gap).value == 7.0
 
 
 def test_a_last_value_that_is_invalid_is_not_replaced_by_an_earlier_one():
     one = series("progress", T, 0.5, np.array([1, 1, 1, 1, 1, 0], bool), "gone")
-    assert (value("progress", progress=one).value, value("progress", progress=one).reason) == (None, "gone")
+    assert (value("progress", progress=one).value, value("progress", progress=one).reason) == (
+        None,
+        "gone",
+    )
 
 
 def test_metrics_on_their_own_time_line_are_cut_by_time():
     t = np.array([150_000, 200_000, 400_000], dtype=np.int64)
     own = series("plan_deviation", t, [9.0, 1.0, 5.0])
     assert value("plan_deviation", plan_deviation=own).value == pytest.approx(3.0)
-    assert value("plan_deviation", plan_deviation=own, offroad=[0, 0, 0, 1, 0, 0]).value == pytest.approx(1.0)
+    assert value(
+        "plan_deviation", plan_deviation=own, offroad=[0, 0, 0, 1, 0, 0]
+    ).value == pytest.approx(1.0)
 
 
 def test_events_give_the_first_time_of_each_kind_among_the_scored_steps():
-    columns = {"offroad": [1, 0, 0, 0, 1, 1], "collision_front": [0, 0, 0, 0, 1, 0], "collision_rear": [0, 0, 0, 0, 0, 1]}
+    columns = {
+        "offroad": [1, 0, 0, 0, 1, 1],
+        "collision_front": [0, 0, 0, 0, 1, 0],
+        "collision_rear": [0, 0, 0, 0, 0, 1],
+    }
     found = reduce_rollout(table(**columns, collision_any=[0, 0, 0, 0, 1, 1])).events
-    assert [(e["metric"], e["t_us"]) for e in found] == [("collision_front", 400_000), ("offroad", 400_000)]
+    assert [(e["metric"], e["t_us"]) for e in found] == [
+        ("collision_front", 400_000),
+        ("offroad", 400_000),
+    ]
 
 
 def test_a_rollout_without_handover_has_no_value_unless_the_preset_scores_replays():
@@ -125,7 +173,11 @@ def test_the_paper_has_no_cut_at_four_metres_and_a_preset_may():
     cut = reduce_rollout(table(**columns), replace(PAPER, stop_beyond_gt_m=4.0))
     assert cut.values["collision_any"].value == 0.0
     assert cut.values["dist_to_gt_trajectory"].value == 5.0
-    assert (cut.ledger.steps_scored, cut.ledger.steps_after_event, cut.ledger.steps_after_drift) == (2, 1, 1)
+    assert (
+        cut.ledger.steps_scored,
+        cut.ledger.steps_after_event,
+        cut.ledger.steps_after_drift,
+    ) == (2, 1, 1)
 
 
 def test_black_images_remove_the_rollout_only_where_the_preset_says_so():

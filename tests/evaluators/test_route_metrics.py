@@ -105,20 +105,36 @@ xy = st.tuples(st.integers(-6, 6).map(float), st.integers(-6, 6).map(float))
 @given(st.lists(st.tuples(xy, xy), min_size=2, max_size=8), st.sampled_from([0.0, 5_334_000.0]))
 def test_array_projection_and_twin_agree(points, offset):
     recorded, driven = (np.array(column) for column in zip(*points, strict=True))
-    log = rollout(track(driven[:, 0] + offset, driven[:, 1]), log=track(recorded[:, 0] + offset, recorded[:, 1]))
+    log = rollout(
+        track(driven[:, 0] + offset, driven[:, 1]),
+        log=track(recorded[:, 0] + offset, recorded[:, 1]),
+    )
     if len(moving(recorded)) == 1:
         return
     found = scored(log)
     slow = route_by_step(log)
-    tol = 1e-9 if offset == 0 else 1e-6  # moving the rig to the box centre and back rounds at UTM size
-    np.testing.assert_allclose(found["dist_to_gt_trajectory"].value, [one.distance_m for one in slow], atol=tol)
-    np.testing.assert_allclose(found["dist_to_gt_location"].value, [one.away_m for one in slow], atol=tol)
+    tol = (
+        1e-9 if offset == 0 else 1e-6
+    )  # moving the rig to the box centre and back rounds at UTM size
+    np.testing.assert_allclose(
+        found["dist_to_gt_trajectory"].value, [one.distance_m for one in slow], atol=tol
+    )
+    np.testing.assert_allclose(
+        found["dist_to_gt_location"].value, [one.away_m for one in slow], atol=tol
+    )
     if offset == 0:
         # Where the ego is equally far from two parts of the path, rounding picks one of them.
-        for name, want in (("progress", [one.progress for one in slow]), ("progress_rel", [one.progress_rel for one in slow])):
+        for name, want in (
+            ("progress", [one.progress for one in slow]),
+            ("progress_rel", [one.progress_rel for one in slow]),
+        ):
             same = np.isclose(found[name].value, want, atol=1e-9)
-            for k in np.flatnonzero(~same)[:1]:  # progress goes on from where it was: a tie decides about all after it
-                assert is_ambiguous(recorded if name == "progress" else recorded[: k + 1], driven[k])
+            for k in np.flatnonzero(~same)[
+                :1
+            ]:  # progress goes on from where it was: a tie decides about all after it
+                assert is_ambiguous(
+                    recorded if name == "progress" else recorded[: k + 1], driven[k]
+                )
 
 
 def is_ambiguous(path, point):
@@ -137,16 +153,27 @@ def test_lateral_bias_is_the_signed_mean_left_positive_and_follows_the_paths_dir
     for heading in (0.0, 0.9, np.pi, -2.0):
         c, s = np.cos(heading), np.sin(heading)
         x, y = np.arange(5.0), np.array([0.0, 9.0, 0.5, 0.5, -1.6])
-        log = rollout(track(c * x - s * y, s * x + c * y, yaw=heading), log=track(c * x, s * x, yaw=heading))
+        log = rollout(
+            track(c * x - s * y, s * x + c * y, yaw=heading), log=track(c * x, s * x, yaw=heading)
+        )
         assert scored(log)["lateral_bias_m"].value == pytest.approx(y, abs=1e-9)
-    log = rollout(track(np.arange(5.0), np.array([9.0, 9.0, 0.5, 0.5, -0.4])), log=track(np.arange(5.0), 0.0), warmup_us=200_000)
-    assert rollout_values(score(log, scene(TWO_LANES, log)))["lateral_bias_m"].value == pytest.approx(0.2)  # the warm-up does not count
+    log = rollout(
+        track(np.arange(5.0), np.array([9.0, 9.0, 0.5, 0.5, -0.4])),
+        log=track(np.arange(5.0), 0.0),
+        warmup_us=200_000,
+    )
+    assert rollout_values(score(log, scene(TWO_LANES, log)))[
+        "lateral_bias_m"
+    ].value == pytest.approx(0.2)  # the warm-up does not count
 
 
 def test_lateral_bias_changes_side_with_a_bend_and_agrees_with_the_distance():
     angle = np.linspace(0.0, 1.5, 16)
     path = 20 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)
-    inside = 18 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1) + [0.0, 2.0]  # nearer to the centre of a left bend: left
+    inside = 18 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1) + [
+        0.0,
+        2.0,
+    ]  # nearer to the centre of a left bend: left
     found = scored(rollout(track(inside[:, 0], inside[:, 1]), log=track(path[:, 0], path[:, 1])))
     assert (found["lateral_bias_m"].value > 1.9).all()
     assert np.abs(found["lateral_bias_m"].value) == pytest.approx(found["lateral_distance_m"].value)
@@ -162,21 +189,35 @@ def test_driving_past_the_end_of_the_recording_counts_in_the_papers_distance_and
 
 
 @settings(max_examples=examples(40))
-@given(st.lists(st.floats(-0.4, 0.4), min_size=3, max_size=12), st.floats(-30, 60), st.floats(-20, 20))
+@given(
+    st.lists(st.floats(-0.4, 0.4), min_size=3, max_size=12), st.floats(-30, 60), st.floats(-20, 20)
+)
 def test_the_lateral_distance_is_that_from_a_path_with_a_mile_of_straight_at_each_end(turns, x, y):
     heading = np.cumsum(turns)
-    path = np.concatenate([[[0.0, 0.0]], np.cumsum(2.0 * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)])
+    path = np.concatenate(
+        [
+            [[0.0, 0.0]],
+            np.cumsum(2.0 * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0),
+        ]
+    )
     at = np.array([[x, y]])
     distance_m, s = to_path(path, at)
     found = beside(path, s, at, distance_m)[0]
-    ends = [path[0] - 1600 * (path[1] - path[0]) / 2.0, path[-1] + 1600 * (path[-1] - path[-2]) / 2.0]
+    ends = [
+        path[0] - 1600 * (path[1] - path[0]) / 2.0,
+        path[-1] + 1600 * (path[-1] - path[-2]) / 2.0,
+    ]
     longer = np.concatenate([ends[:1], path, ends[1:]])
     slow = min(point_to_segment(at[0], a, b)[0] for a, b in pairwise(longer))
     assert found <= distance_m[0] + 1e-9
     assert found >= slow - 1e-9
-    if 0 < s[0] < 2.0 * len(turns) - 1e-9:  # beside the path itself, even where a straight end passes nearer
+    if (
+        0 < s[0] < 2.0 * len(turns) - 1e-9
+    ):  # beside the path itself, even where a straight end passes nearer
         assert found == distance_m[0]
-    elif abs(found - slow) > 1e-9:  # the other end, going straight on, may pass nearer: only its own end counts
+    elif (
+        abs(found - slow) > 1e-9
+    ):  # the other end, going straight on, may pass nearer: only its own end counts
         assert found > slow
 
 
@@ -202,11 +243,16 @@ def test_noise_where_the_recorded_car_stands_moves_neither_distance_nor_progress
         if end == "last"
         else np.append(np.zeros(100), np.linspace(0, 20, 41))
     )
-    log = rollout(track(np.linspace(-18.0, 38.0, 141), 0.3), log=track(x + noise_m * rng.normal(size=141), noise_m * rng.normal(size=141)))
+    log = rollout(
+        track(np.linspace(-18.0, 38.0, 141), 0.3),
+        log=track(x + noise_m * rng.normal(size=141), noise_m * rng.normal(size=141)),
+    )
     found = scored(log)
     assert np.abs(found["lateral_distance_m"].value - 0.3).max() <= 40 * noise_m + 1e-9
     assert np.abs(found["lateral_bias_m"].value - 0.3).max() <= 40 * noise_m + 1e-9
-    assert found["progress"].value == pytest.approx(np.clip(np.linspace(-18.0, 38.0, 141) / 20.0, 0.0, 1.0), abs=noise_m + 1e-9)
+    assert found["progress"].value == pytest.approx(
+        np.clip(np.linspace(-18.0, 38.0, 141) / 20.0, 0.0, 1.0), abs=noise_m + 1e-9
+    )
 
 
 def test_a_recording_that_stands_all_the_time_has_no_length_whatever_its_noise():
@@ -220,9 +266,17 @@ def test_progress_on_the_way_out_of_a_u_turn_is_not_that_of_the_way_back_beside_
     turn = np.linspace(-np.pi / 2, np.pi / 2, 21)
     out, back = np.arange(0.0, 100.0), np.arange(100.0, -1.0, -1.0)
     path = np.concatenate(
-        [np.stack([out, 0 * out]), [100 + 2 * np.cos(turn), 2 + 2 * np.sin(turn)], np.stack([back, 4 + 0 * back])], axis=1
+        [
+            np.stack([out, 0 * out]),
+            [100 + 2 * np.cos(turn), 2 + 2 * np.sin(turn)],
+            np.stack([back, 4 + 0 * back]),
+        ],
+        axis=1,
     )
-    x, y = np.linspace(0, 10, 30), np.minimum(np.linspace(0, 6, 30), 3.0)  # leaves its way to the left, and stops there
+    x, y = (
+        np.linspace(0, 10, 30),
+        np.minimum(np.linspace(0, 6, 30), 3.0),
+    )  # leaves its way to the left, and stops there
     for k, want in ((0, 10.0), (200, 10.0)):  # however long it stays there
         ego = track(np.append(x, np.full(k, 10.0)), np.append(y, np.full(k, 3.0)))
         log = rollout(ego, log=track(path[0], path[1]))
@@ -238,4 +292,6 @@ def test_a_closed_loop_starts_at_its_start_and_ends_at_its_end():
     whole = scored(rollout(path))["progress"].value
     assert whole == pytest.approx(angle / (2 * np.pi), abs=1e-9)
     beside_m = track(path.xyz[:, 0] * 0.9, path.xyz[:, 1] * 0.9 + 3.0)
-    assert scored(rollout(beside_m, log=path))["progress"].value[[0, -1]] == pytest.approx([0, 1], abs=1e-3)
+    assert scored(rollout(beside_m, log=path))["progress"].value[[0, -1]] == pytest.approx(
+        [0, 1], abs=1e-3
+    )

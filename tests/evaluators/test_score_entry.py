@@ -39,7 +39,10 @@ def broken_track(index, **values) -> Trajectory:
         (broken_track(1, quat=np.inf), "a pose that is not finite at 100000 us"),
         (broken_track(2, quat=[2.0, 0, 0, 0]), "a quaternion of length 2 at 200000 us"),
         (Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4))), "no pose at all"),
-        (Trajectory(np.arange(3), np.zeros((2, 3)), np.zeros((3, 4))), "3 times, positions of shape (2, 3)"),
+        (
+            Trajectory(np.arange(3), np.zeros((2, 3)), np.zeros((3, 4))),
+            "3 times, positions of shape (2, 3)",
+        ),
     ],
 )
 @pytest.mark.parametrize("who", ["ego", "ego_log", "actor"])
@@ -48,13 +51,21 @@ def test_a_log_with_a_broken_track_is_refused(who, poses, text):
     with pytest.raises(EvaluatorError) as caught:
         score(*bad(**changes))
     assert text in str(caught.value)
-    assert {"ego": "the ego ", "ego_log": "the recorded drive", "actor": "actor 'a'"}[who] in caught.value.with_what
+    assert {"ego": "the ego ", "ego_log": "the recorded drive", "actor": "actor 'a'"}[
+        who
+    ] in caught.value.with_what
     assert "session 'uuid'" in caught.value.with_what
 
 
 def test_a_broken_plan_is_refused_and_named():
-    good, late = track(np.arange(3.0), 0.0, t_us=[0, 100, 200]), track(np.arange(3.0), 0.0, t_us=[300_000, 300_100, 300_100])
-    plans = (LoggedPlan(0, 100, good, (good, good)), LoggedPlan(300_000, 300_100, good, (good, late)))
+    good, late = (
+        track(np.arange(3.0), 0.0, t_us=[0, 100, 200]),
+        track(np.arange(3.0), 0.0, t_us=[300_000, 300_100, 300_100]),
+    )
+    plans = (
+        LoggedPlan(0, 100, good, (good, good)),
+        LoggedPlan(300_000, 300_100, good, (good, late)),
+    )
     with pytest.raises(EvaluatorError) as caught:
         score(*bad(plans=plans))
     assert caught.value.with_what.startswith("the plan at 300000 us")
@@ -89,7 +100,11 @@ def test_every_declared_metric_has_one_line_of_help():
     for name, facts in METRICS.items():
         assert facts.help, name
         assert "\n" not in facts.help
-        assert facts.is_flag or facts.direction == "none" or facts.unit in ("m", "", "dB", "ms", "s", "m/s")
+        assert (
+            facts.is_flag
+            or facts.direction == "none"
+            or facts.unit in ("m", "", "dB", "ms", "s", "m/s")
+        )
 
 
 def test_scoring_twice_gives_the_same_bytes():
@@ -131,7 +146,9 @@ def test_a_metric_given_twice_is_refused():
         score(log, where, evaluators=resolve_evaluators([f"{__name__}:Again"]))
 
 
-JERK = MetricInfo("m/s^3", "lower", "max", "largest jerk", label="jerk", margin=0.5, limits=(0.0, None))
+JERK = MetricInfo(
+    "m/s^3", "lower", "max", "largest jerk", label="jerk", margin=0.5, limits=(0.0, None)
+)
 
 
 class Jerky:
@@ -148,7 +165,10 @@ class Undeclared:
 
 def test_a_plugins_series_carries_what_its_evaluator_says():
     log, where = bad()
-    found = {one.name: one for one in score(log, where, evaluators=resolve_evaluators([f"{__name__}:Jerky"]))}
+    found = {
+        one.name: one
+        for one in score(log, where, evaluators=resolve_evaluators([f"{__name__}:Jerky"]))
+    }
     assert found["jerk_max"].metric == replace(JERK, name="jerk_max")
     assert rollout_values(list(found.values()))["jerk_max"].unit == "m/s^3"
     assert "jerk_max" not in METRICS
@@ -173,14 +193,19 @@ def test_a_table_comes_back_from_a_run_folder_as_it_was():
     stored = json.loads(json.dumps(table.as_dict(), allow_nan=False))
     assert dict(MetricTable.of_run({"metrics": stored})) == dict(table)
     assert dict(MetricTable.of_run({})) == dict(METRICS)
-    assert dict(MetricTable.of_run({"metrics": {"jerk": {**stored["jerk"], "of a later version": 1}}})) == dict(table)
+    assert dict(
+        MetricTable.of_run({"metrics": {"jerk": {**stored["jerk"], "of a later version": 1}}})
+    ) == dict(table)
 
 
 def test_two_runs_agree_on_unit_side_and_reduction_and_may_differ_in_words():
     other = METRICS.adding({"jerk": replace(JERK, help="the greatest jerk", label="", margin=1.0)})
     table = METRICS.adding({"jerk": JERK})
     assert table.joined(other, ["jerk"], "comparing runs", "a and b")["jerk"].help == "largest jerk"
-    assert METRICS.joined(other, ["jerk"], "comparing runs", "a and b")["jerk"].help == "the greatest jerk"
+    assert (
+        METRICS.joined(other, ["jerk"], "comparing runs", "a and b")["jerk"].help
+        == "the greatest jerk"
+    )
     for change in ({"unit": "g"}, {"direction": "higher"}, {"aggregation": "mean"}):
         other = METRICS.adding({"jerk": replace(JERK, **change)})
         assert table.joined(other, ["offroad"], "comparing runs", "a and b")
@@ -199,4 +224,7 @@ def test_two_runs_agree_on_unit_side_and_reduction_and_may_differ_in_words():
     ],
 )
 def test_a_metric_knows_the_range_of_its_values_and_of_their_differences(name, values, differences):
-    assert (METRICS.info(name).value_range, METRICS.info(name).difference_range) == (values, differences)
+    assert (METRICS.info(name).value_range, METRICS.info(name).difference_range) == (
+        values,
+        differences,
+    )

@@ -1,4 +1,6 @@
-"""Sequential decisions: e-processes under the null by exact enumeration, against plain loops on hard cases."""
+"""Sequential decisions: e-processes under the null by exact enumeration, against plain loops on
+hard cases.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,14 @@ from scipy import optimize
 
 from alpasim_plugin.core.errors import InputError
 from evaluators.statistics.sequential import asymptotic, betting, line
-from evaluators.statistics.sequential.control import RIDGE, Control, adjusted_draws, of_families, of_rows, predictions
+from evaluators.statistics.sequential.control import (
+    RIDGE,
+    Control,
+    adjusted_draws,
+    of_families,
+    of_rows,
+    predictions,
+)
 from evaluators.statistics.sequential.decision import closed
 from evaluators.statistics.sequential.draws import Draws, independent, without_replacement
 from evaluators.statistics.sequential.line import LEAST_SLOPE, USUAL_SLOPE, Plan, relative_slope
@@ -33,42 +42,73 @@ def capital(draws: Draws, mean: float, plan: Plan = PLAN) -> np.ndarray:
 
 def log_chance(gap: float, left: float, slope: float) -> float:
     """Siegmund (1985), equation 3.15, as it stands."""
-    normal = [0.5 * math.erfc(-at / math.sqrt(2 * left)) for at in (-gap - slope * left, slope * left - gap)]
+    normal = [
+        0.5 * math.erfc(-at / math.sqrt(2 * left))
+        for at in (-gap - slope * left, slope * left - gap)
+    ]
     return math.log(normal[0] + math.exp(-2 * slope * gap) * normal[1])
 
 
-def plain_log_capital(x: Sequence[float], low: float, high: float, mean: float, plan: Plan) -> list[float]:
+def plain_log_capital(
+    x: Sequence[float], low: float, high: float, mean: float, plan: Plan
+) -> list[float]:
     """Bet scene by scene, as the modules' texts say."""
     half = (high - low) / 2
     imagined = betting.PRIOR_SCENES * (2 * betting.PRIOR_WIDTH * half) ** 2
-    squares, fourths, capital, out = imagined, imagined * half**2, 0.0, []
+    squares = imagined
+    fourths = imagined * half**2
+    capital = 0.0
+    out = []
     for i, value in enumerate(x):
         spread = math.sqrt(squares / (betting.PRIOR_SCENES + i))
         left = max(plan.horizon - i, 1) / plan.horizon
-        slope = USUAL_SLOPE if plan.distance is None else max(LEAST_SLOPE, plan.distance * math.sqrt(plan.horizon) / spread / 2)
-        relative = float(relative_slope(np.array(capital - plan.log_bar), np.array(slope * math.sqrt(left))))
+        slope = (
+            USUAL_SLOPE
+            if plan.distance is None
+            else max(LEAST_SLOPE, plan.distance * math.sqrt(plan.horizon) / spread / 2)
+        )
+        relative = float(
+            relative_slope(np.array(capital - plan.log_bar), np.array(slope * math.sqrt(left)))
+        )
         wanted = relative / (spread * math.sqrt(left * plan.horizon))
         tail = fourths / squares
-        bet = float(np.roots([tail, 0.0, 1.0, -wanted])[np.argmin(np.abs(np.roots([tail, 0.0, 1.0, -wanted]).imag))].real)
+        bet = float(
+            np.roots([tail, 0.0, 1.0, -wanted])[
+                np.argmin(np.abs(np.roots([tail, 0.0, 1.0, -wanted]).imag))
+            ].real
+        )
         capital += math.log1p(min(bet, betting.AT_RISK / (mean - low)) * (value - mean))
         squares, fourths = squares + (value - mean) ** 2, fourths + (value - mean) ** 4
         out.append(capital)
     return out
 
 
-# --- the line -----------------------------------------------------------------------------------------------------------
+# --- the line
 
 
-@pytest.mark.parametrize(("gap", "left", "slope"), [(1.0, 1.0, 0.0), (0.01, 0.5, 1.4), (9.0, 1.0, 0.5), (0.3, 0.002, 1.0), (2.0, 1.0, 9.0)])
+@pytest.mark.parametrize(
+    ("gap", "left", "slope"),
+    [(1.0, 1.0, 0.0), (0.01, 0.5, 1.4), (9.0, 1.0, 0.5), (0.3, 0.002, 1.0), (2.0, 1.0, 9.0)],
+)
 def test_the_chance_of_reaching_a_line_is_that_of_the_formula(gap, left, slope):
-    assert float(line.log_chance(np.array(gap), np.array(left), np.array(slope))) == pytest.approx(log_chance(gap, left, slope), rel=1e-9)
+    assert float(line.log_chance(np.array(gap), np.array(left), np.array(slope))) == pytest.approx(
+        log_chance(gap, left, slope), rel=1e-9
+    )
 
 
 def test_the_chance_is_a_martingale_of_brownian_motion_and_begins_at_alpha():
-    """Over a step of 0.3, by integrating the density of a motion that does not reach the line on the way."""
-    slope, gap, step = 1.2, 0.8, 0.3
-    assert float(np.exp(line.log_chance(line.height(np.array(slope), 0.05), np.array(1.0), np.array(slope)))) == pytest.approx(0.05)
-    assert line.log_evidence(np.array([-0.2, 3.0, 0.0]), np.array([0.1, 0.2, 0.3]), np.array([1.2]), 0.05)[1] > -math.log(0.05)
+    """Over a step of 0.3, by integrating the density of a motion that does not reach the line on
+    the way.
+    """
+    slope = 1.2
+    gap = 0.8
+    step = 0.3
+    assert float(
+        np.exp(line.log_chance(line.height(np.array(slope), 0.05), np.array(1.0), np.array(slope)))
+    ) == pytest.approx(0.05)
+    assert line.log_evidence(
+        np.array([-0.2, 3.0, 0.0]), np.array([0.1, 0.2, 0.3]), np.array([1.2]), 0.05
+    )[1] > -math.log(0.05)
     w = np.linspace(-8.0, gap + slope * step, 200_001)
     # the density at w of a motion that stays below the line (Siegmund 1985, equation 3.14)
     stays = 1.0 - np.exp(-2.0 * gap * (gap + slope * step - w) / step)
@@ -87,11 +127,15 @@ def test_the_table_of_bets_is_the_derivative_of_the_chance(slope):
             continue
         h = 1e-5
         exact = (log_chance(gap - h, 1.0, slope) - log_chance(gap + h, 1.0, slope)) / (2 * h)
-        assert float(relative_slope(np.array(log_p), np.array(slope))) == pytest.approx(exact, rel=3e-3)
-    assert float(relative_slope(np.array(0.0), np.array(slope))) == 2.0 * slope  # past the line, Wald's test
+        assert float(relative_slope(np.array(log_p), np.array(slope))) == pytest.approx(
+            exact, rel=3e-3
+        )
+    assert (
+        float(relative_slope(np.array(0.0), np.array(slope))) == 2.0 * slope
+    )  # past the line, Wald's test
 
 
-# --- betting ------------------------------------------------------------------------------------------------------------
+# --- betting
 
 LAWS = {
     "a coin": ((0.0, 1.0), (0.7, 0.3)),
@@ -148,7 +192,12 @@ def test_a_control_leaves_the_capital_a_martingale_whatever_it_predicts():
         for sixth, last in ((1, 2), (2, 1)):
             order = [1, *start, rest[0], rest[sixth], rest[last]]
             x = SUITE[order]
-            found.append(capital(without_replacement(x, -1.0, 1.0, 7, *predictions(x, z[order])), float(SUITE.mean())))
+            found.append(
+                capital(
+                    without_replacement(x, -1.0, 1.0, 7, *predictions(x, z[order])),
+                    float(SUITE.mean()),
+                )
+            )
     pairs = np.array(found).reshape(-1, 2, 7)
     assert np.any(pairs[:, 0, 5] != pairs[:, 1, 5])
     assert pairs[:, :, 5].mean(axis=1) == pytest.approx(pairs[:, 0, 4], rel=1e-9)
@@ -171,7 +220,9 @@ def test_the_capital_is_that_of_betting_scene_by_scene(case, distance):
     plan = Plan(distance, max(50, len(x)), 0.05)
     draws = independent(x, -1.0, 1.0)
     found = betting.log_capital(draws, 0.05, betting.bet_sizes(draws, 0.05, plan))
-    assert found == pytest.approx(plain_log_capital(list(x), -1.0, 1.0, 0.05, plan), rel=1e-9, abs=1e-9)
+    assert found == pytest.approx(
+        plain_log_capital(list(x), -1.0, 1.0, 0.05, plan), rel=1e-9, abs=1e-9
+    )
     assert np.all(np.isfinite(found))
 
 
@@ -179,9 +230,14 @@ def test_the_capital_is_that_of_betting_scene_by_scene(case, distance):
 def test_the_capital_falls_with_the_hypothesis_and_bounds_are_nested(values):
     draws = independent(np.array(values), -1.0, 1.0)
     sizes = betting.bet_sizes(draws, 0.05, PLAN)
-    ladder = np.stack([betting.log_capital(draws, mean, sizes) for mean in np.linspace(-1.0, 1.0, 41)])
+    ladder = np.stack(
+        [betting.log_capital(draws, mean, sizes) for mean in np.linspace(-1.0, 1.0, 41)]
+    )
     assert np.all(np.diff(ladder, axis=0) <= 1e-9)
-    lows = [float(betting.lower_bound(draws.first(n), sizes[:n], PLAN.log_bar, -1.0, 1.0)) for n in range(1, draws.n + 1)]
+    lows = [
+        float(betting.lower_bound(draws.first(n), sizes[:n], PLAN.log_bar, -1.0, 1.0))
+        for n in range(1, draws.n + 1)
+    ]
     assert np.all(np.diff(lows) >= -1e-9)
     if lows[-1] > -1.0:
         assert betting.log_capital(draws, lows[-1], sizes).max() >= PLAN.log_bar
@@ -195,20 +251,28 @@ def test_a_suite_whose_scenes_left_cannot_make_up_for_it_is_refuted_at_once():
     assert betting.log_capital(late, 0.4, np.full(4, 1e-9))[-1] == np.inf
 
 
-# --- asymptotic ---------------------------------------------------------------------------------------------------------
+# --- asymptotic
 
 
 def plain_log_evidence(x: Sequence[float], mean: float, plan: Plan, first: int) -> list[float]:
     from scipy import stats
 
-    out, slope, height, is_past = [], 0.0, 0.0, False
+    out = []
+    slope = 0.0
+    height = 0.0
+    is_past = False
     for n in range(1, len(x) + 1):
-        spread = max(float(np.std(x[:n], ddof=1)) if n > 1 else 0.0, asymptotic.LEAST_SPREAD * (plan.distance or 0.0))
+        spread = max(
+            float(np.std(x[:n], ddof=1)) if n > 1 else 0.0,
+            asymptotic.LEAST_SPREAD * (plan.distance or 0.0),
+        )
         if n < first:
             out.append(-math.inf)
             continue
         slope = slope or float(plan.slope(np.array(spread)))
-        height = height or optimize.brentq(lambda a: log_chance(a, 1.0, slope) + plan.log_bar, 0.1, 9.0)  # noqa: B023 (used at once)
+        height = height or optimize.brentq(
+            lambda a, slope=slope: log_chance(a, 1.0, slope) + plan.log_bar, 0.1, 9.0
+        )
         t = (float(np.mean(x[:n])) - mean) * math.sqrt(n) / spread
         z = -math.copysign(1.0, t) * stats.norm.ppf(stats.t.cdf(-abs(t), n - 1))
         time = n / plan.horizon
@@ -220,7 +284,9 @@ def plain_log_evidence(x: Sequence[float], mean: float, plan: Plan, first: int) 
 
 
 def test_renderers_that_never_differ_give_no_evidence_without_a_plan():
-    found = asymptotic.log_evidence(independent(np.zeros(40), -np.inf, np.inf), 0.0, Plan(None, 100, 0.05))
+    found = asymptotic.log_evidence(
+        independent(np.zeros(40), -np.inf, np.inf), 0.0, Plan(None, 100, 0.05)
+    )
     assert np.all(found[asymptotic.FIRST_LOOK - 1 :] < 0.0)
 
 
@@ -234,7 +300,9 @@ def test_the_asymptotic_evidence_is_that_of_the_formula(case):
     }[case]
     mean, first = (1e6 if case == "far from zero" else 0.1), (2 if case == "two scenes" else 10)
     found = asymptotic.log_evidence(independent(x, -np.inf, np.inf), mean, PLAN, first)
-    assert found == pytest.approx(plain_log_evidence(list(x), mean, PLAN, first), rel=1e-6, abs=1e-6)
+    assert found == pytest.approx(
+        plain_log_evidence(list(x), mean, PLAN, first), rel=1e-6, abs=1e-6
+    )
 
 
 def test_the_asymptotic_bound_is_where_the_evidence_reaches_the_bar_and_bounds_are_nested():
@@ -243,7 +311,9 @@ def test_the_asymptotic_bound_is_where_the_evidence_reaches_the_bar_and_bounds_a
     for side, reaches in ((-1e-7, True), (1e-7, False)):
         evidence = asymptotic.log_evidence(draws, low + side, PLAN).max(axis=1)
         assert np.all((evidence >= PLAN.log_bar) == reaches)
-    over_time = np.stack([asymptotic.lower_bound(draws.first(n), PLAN) for n in range(asymptotic.FIRST_LOOK, 51, 3)])
+    over_time = np.stack(
+        [asymptotic.lower_bound(draws.first(n), PLAN) for n in range(asymptotic.FIRST_LOOK, 51, 3)]
+    )
     assert np.all(np.diff(over_time, axis=0) >= -1e-12)
     assert np.all(asymptotic.lower_bound(draws.first(asymptotic.FIRST_LOOK - 1), PLAN) == -np.inf)
 
@@ -255,7 +325,7 @@ def test_normal_scenes_are_wrongly_judged_in_about_the_promised_share_of_runs():
     assert 0.01 < wrong.mean() < 0.07
 
 
-# --- several metrics ----------------------------------------------------------------------------------------------------
+# --- several metrics
 
 
 @given(st.lists(st.sampled_from([0.0, 0.3, 1.0, 1.0, 5.0, 60.0, 1e4]), min_size=1, max_size=6))
@@ -269,7 +339,7 @@ def test_closed_testing_by_sorting_is_that_over_all_sets(e):
     assert np.all(found >= np.array(e) / len(e) - 1e-12)  # never less than Bonferroni
 
 
-# --- controls -----------------------------------------------------------------------------------------------------------
+# --- controls
 
 
 def test_what_a_control_takes_off_is_a_ridge_prediction_whose_mean_over_the_scenes_left_is_zero():
@@ -281,7 +351,9 @@ def test_what_a_control_takes_off_is_a_ridge_prediction_whose_mean_over_the_scen
         coefficients = np.zeros(2)
         if i >= 5:
             past = scaled[:i] - scaled[:i].mean(axis=0)
-            coefficients = np.linalg.solve(past.T @ past + RIDGE * np.eye(2), past.T @ (x[:i] - x[:i].mean()))
+            coefficients = np.linalg.solve(
+                past.T @ past + RIDGE * np.eye(2), past.T @ (x[:i] - x[:i].mean())
+            )
         of_all = (scaled[i:] - scaled[i:].mean(axis=0)) @ coefficients
         assert of_all.mean() == pytest.approx(0.0, abs=1e-12)
         assert (removed[i], reach[i]) == pytest.approx((of_all[0], np.abs(of_all).max()), abs=1e-9)
@@ -294,13 +366,17 @@ def test_a_control_that_knows_the_scenes_narrows_the_interval():
     x = 0.2 * hard[:30] + generator.normal(0.0, 0.05, 30)
     one = metric_question("lateral_distance_m", 0.1, "non-inferior")
     plain = adjusted_draws(x, one, order, None)
-    known = adjusted_draws(x, one, order, Control({s: (h,) for s, h in zip(order, hard, strict=True)}, ("difficulty",)))
+    known = adjusted_draws(
+        x, one, order, Control({s: (h,) for s, h in zip(order, hard, strict=True)}, ("difficulty",))
+    )
     lows = [float(asymptotic.lower_bound(draws, PLAN)) for draws in (plain, known)]
     assert lows[1] > lows[0]
 
 
 def test_families_are_files_or_folders_and_one_alone_is_refused():
-    by_seed = of_families({"a-1": "x/a.yaml", "a-2": "x/a.yaml", "b-1": "x/b.yaml", "b-2": "x/b.yaml"})
+    by_seed = of_families(
+        {"a-1": "x/a.yaml", "a-2": "x/a.yaml", "b-1": "x/b.yaml", "b-2": "x/b.yaml"}
+    )
     assert by_seed.names == ("family a", "family b")
     assert by_seed.features["b-2"] == (0.0, 1.0)
     assert of_families({"a": "x/a.yaml", "b": "y/b.yaml"}).names == ("family x", "family y")
@@ -310,8 +386,21 @@ def test_families_are_files_or_folders_and_one_alone_is_refused():
 
 def test_an_earlier_run_gives_differences_and_difficulty_and_must_hold_half_of_the_suite():
     rows = [
-        {"renderer": r, "policy": "p", "scene": s, "seed": 0, "status": "ok", "progress": v, "progress_valid": True}
-        for r, s, v in (("clean", "a", 0.9), ("3dgs", "a", 0.7), ("clean", "b", 0.5), ("3dgs", "b", 0.5))
+        {
+            "renderer": r,
+            "policy": "p",
+            "scene": s,
+            "seed": 0,
+            "status": "ok",
+            "progress": v,
+            "progress_valid": True,
+        }
+        for r, s, v in (
+            ("clean", "a", 0.9),
+            ("3dgs", "a", 0.7),
+            ("clean", "b", 0.5),
+            ("3dgs", "b", 0.5),
+        )
     ]
     found = of_rows(rows, "progress", ["a", "b", "c"], "3dgs", "clean", "runs/old")
     assert found.features["a"] == pytest.approx((-0.2, 0.9))

@@ -44,7 +44,9 @@ def test_where_scenes_are_scarce_more_seeds_are_driven():
 def test_variances_are_recovered_from_nested_draws():
     generator = np.random.Generator(np.random.Philox(1))
     values = generator.normal(0.0, 1.0, (4000, 1)) + generator.normal(0.0, 2.0, (4000, 3))
-    found = variances(SceneDifferences(values.mean(axis=1), values.var(axis=1, ddof=1), np.full(4000, 3.0), 0))
+    found = variances(
+        SceneDifferences(values.mean(axis=1), values.var(axis=1, ddof=1), np.full(4000, 3.0), 0)
+    )
     assert found == pytest.approx((1.0, 4.0), rel=0.15)
 
 
@@ -67,8 +69,18 @@ def row(renderer: str, scene: str, seed: int, value: float | None) -> dict:
 
 
 def test_scenes_come_in_their_order_and_one_that_lacks_a_pair_has_no_difference():
-    rows = [row("a", "x", 0, 0.5), row("a", "x", 1, 0.7), row("b", "x", 0, 0.4), row("b", "x", 1, 0.2)]
-    rows += [row("a", "y", 0, 0.5), row("b", "y", 0, 0.6), row("a", "z", 0, None), row("b", "z", 0, 0.1)]
+    rows = [
+        row("a", "x", 0, 0.5),
+        row("a", "x", 1, 0.7),
+        row("b", "x", 0, 0.4),
+        row("b", "x", 1, 0.2),
+    ]
+    rows += [
+        row("a", "y", 0, 0.5),
+        row("b", "y", 0, 0.6),
+        row("a", "z", 0, None),
+        row("b", "z", 0, 0.1),
+    ]
     sides = by_renderer(rows)
     found = scene_differences(sides["b"], sides["a"], "progress", ["z", "y", "x"])
     assert found.diff == pytest.approx([np.nan, 0.1, -0.3], nan_ok=True)

@@ -1,4 +1,6 @@
-"""Stratified order: the sample by exact enumeration of its coins, and e-processes on it over all courses."""
+"""Stratified order: the sample by exact enumeration of its coins, and e-processes on it over all
+courses.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,13 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from evaluators.statistics.sequential import asymptotic, betting
 from evaluators.statistics.sequential.control import Control, adjusted_draws, predictions
-from evaluators.statistics.sequential.draws import Draws, Strata, families_of, pivotal_sample, stratified
+from evaluators.statistics.sequential.draws import (
+    Draws,
+    Strata,
+    families_of,
+    pivotal_sample,
+    stratified,
+)
 from evaluators.statistics.sequential.line import Plan
 from evaluators.statistics.sequential.question import metric_question
 
@@ -47,7 +55,9 @@ def samples(left: int, wanted: int) -> Iterator[tuple[list[int], Fraction]]:
             yield found, coins.chance
 
 
-@pytest.mark.parametrize(("left", "wanted"), [(6, 3), (7, 3), (9, 2), (8, 5), (5, 1), (4, 4), (3, 5)])
+@pytest.mark.parametrize(
+    ("left", "wanted"), [(6, 3), (7, 3), (9, 2), (8, 5), (5, 1), (4, 4), (3, 5)]
+)
 def test_every_scene_has_the_same_chance_and_every_stretch_of_the_list_its_share(left, wanted):
     chances, total = [Fraction(0)] * left, Fraction(0)
     for found, chance in samples(left, wanted):
@@ -64,21 +74,27 @@ def test_every_scene_has_the_same_chance_and_every_stretch_of_the_list_its_share
 def test_families_of_equal_size_give_one_scene_each_to_every_batch():
     strata = Strata({f"{family}{i}": family for family in "abcd" for i in range(5)}, (4,) * 5)
     order = strata.order(np.random.Generator(np.random.Philox(1)))
-    assert [sorted(scene[0] for scene in order[at : at + 4]) for at in range(0, 20, 4)] == [list("abcd")] * 5
+    assert [sorted(scene[0] for scene in order[at : at + 4]) for at in range(0, 20, 4)] == [
+        list("abcd")
+    ] * 5
     assert strata.begins(10).tolist() == [0, 0, 0, 0, 4, 4, 4, 4, 8, 8]
     assert order != strata.order(np.random.Generator(np.random.Philox(2)))
 
 
 def test_families_of_unequal_size_are_drawn_in_proportion():
     sizes = {"a": 24, "b": 12, "c": 9, "d": 3}
-    strata = Strata({f"{family}{i}": family for family, size in sizes.items() for i in range(size)}, (8,) * 6)
+    strata = Strata(
+        {f"{family}{i}": family for family, size in sizes.items() for i in range(size)}, (8,) * 6
+    )
     order = strata.order(np.random.Generator(np.random.Philox(3)))
     first = Counter(scene[0] for scene in order[:8])
     assert sorted(order) == sorted(strata.family_of)
     assert all(abs(first[family] - size / 6) < 1 for family, size in sizes.items())
 
 
-SUITE = np.array([-1.0, -0.9, 0.9, 1.0, 0.3, -0.2, 0.8])  # families that differ as much as they can, of 2, 2, 2 and 1
+SUITE = np.array(
+    [-1.0, -0.9, 0.9, 1.0, 0.3, -0.2, 0.8]
+)  # families that differ as much as they can, of 2, 2, 2 and 1
 FAMILY = np.array([0, 0, 1, 1, 2, 2, 3])
 SIZES = (3, 2, 2)
 
@@ -94,13 +110,23 @@ def courses(left: tuple[int, ...], sizes: tuple[int, ...]) -> Iterator[tuple[lis
             yield [left[i] for i in found] + later, chance * then
 
 
-def all_draws(control: np.ndarray | None = None, less_means: bool = False) -> list[tuple[list[int], float, Draws]]:
+def all_draws(
+    control: np.ndarray | None = None, less_means: bool = False
+) -> list[tuple[list[int], float, Draws]]:
     """Return every course with its chance and draws, given the order within families."""
     begin = Strata({}, SIZES).begins(7)
     found = []
     for order, chance in courses(tuple(range(7)), SIZES):
         off = (None, None) if control is None else predictions(SUITE[order], control[order], begin)
-        found.append((order, float(chance), stratified(SUITE[order], -1.0, 1.0, FAMILY[order], begin, *off, less_means=less_means)))
+        found.append(
+            (
+                order,
+                float(chance),
+                stratified(
+                    SUITE[order], -1.0, 1.0, FAMILY[order], begin, *off, less_means=less_means
+                ),
+            )
+        )
     return found
 
 
@@ -108,14 +134,18 @@ KNOWN = np.array([[0.3], [-1.0], [0.2], [0.9], [0.0], [0.4], [1.0]])
 
 
 @pytest.mark.parametrize(("control", "less_means"), [(None, False), (KNOWN, True)])
-def test_the_capital_at_the_ends_of_batches_is_a_supermartingale_over_all_courses(control, less_means):
+def test_the_capital_at_the_ends_of_batches_is_a_supermartingale_over_all_courses(
+    control, less_means
+):
     for side in (1.0, -1.0):
         mean = side * float(SUITE.mean())
         now: dict[tuple[int, ...], float] = {(): 1.0}
         at, everything = 0, all_draws(control, less_means)
         for size in SIZES[:2]:
             at += size
-            expected, chance_of, capital_at = Counter[tuple[int, ...]](), Counter[tuple[int, ...]](), dict[tuple[int, ...], float]()
+            expected = Counter[tuple[int, ...]]()
+            chance_of = Counter[tuple[int, ...]]()
+            capital_at = dict[tuple[int, ...], float]()
             for order, chance, draws in everything:
                 one = draws if side > 0 else draws.mirrored()
                 path = betting.log_capital(one, mean, betting.bet_sizes(one, mean, PLAN))
@@ -126,7 +156,10 @@ def test_the_capital_at_the_ends_of_batches_is_a_supermartingale_over_all_course
                 capital_at[after] = float(np.exp(path[at - 1]))
             for before, value in now.items():
                 assert expected[before] / chance_of[before] <= value * (1 + 1e-12)
-            assert min(expected[before] / chance_of[before] / value for before, value in now.items()) < 1.0
+            assert (
+                min(expected[before] / chance_of[before] / value for before, value in now.items())
+                < 1.0
+            )
             now = capital_at
 
 
@@ -144,10 +177,14 @@ def test_sums_are_martingales_and_their_spread_is_that_within_families(less_mean
     number = strata.numbers(order)
     x = 10.0 * number + generator.normal(0.0, 0.5, 200)
     draws = stratified(x[:100], -np.inf, np.inf, number, strata.begins(100), less_means=less_means)
-    pooled = np.concatenate([x[:100][number[:100] == one] - x[:100][number[:100] == one].mean() for one in range(5)])
+    pooled = np.concatenate(
+        [x[:100][number[:100] == one] - x[:100][number[:100] == one].mean() for one in range(5)]
+    )
     assert draws.spread[99] == pytest.approx(np.sqrt(np.sum(pooled**2) / 95))
     assert draws.freedom[[4, 9, 99]].tolist() == [0.0, 5.0, 95.0]
-    assert np.isneginf(asymptotic.log_evidence(draws, float(x.mean()), PLAN, 20)[[4, 14, 20, 23]]).all()
+    assert np.isneginf(
+        asymptotic.log_evidence(draws, float(x.mean()), PLAN, 20)[[4, 14, 20, 23]]
+    ).all()
     assert np.isfinite(asymptotic.lower_bound(draws, PLAN))
 
 
@@ -165,14 +202,18 @@ def test_scenes_without_a_value_are_left_out_of_their_batches():
     order = ["a1", "b1", "a2", "b2", "b3", "a3"]
     one = metric_question("lateral_distance_m", 0.1, "non-inferior")
     draws = adjusted_draws(np.array([0.1, np.nan, 0.2, 0.3]), one, order, None, strata)
-    assert (draws.n, draws.begin.tolist(), draws.is_end.tolist()) == (3, [0, 1, 1], [True, False, True])
+    assert (draws.n, draws.begin.tolist(), draws.is_end.tolist()) == (
+        3,
+        [0, 1, 1],
+        [True, False, True],
+    )
     known = Control({scene: (float(i),) for i, scene in enumerate(order)}, ("difficulty",))
     assert adjusted_draws(np.array([0.1, np.nan, 0.2, 0.3]), one, order, known, strata).n == 3
 
 
 def test_families_are_files_or_folders_and_one_alone_is_refused():
-    assert families_of({"a-1": "x/a.yaml", "a-2": "x/a.yaml", "b": "x/b.yaml", "c": "y/c.yaml"}, "") == {
-        "a-1": "x", "a-2": "x", "b": "x", "c": "y"
-    }  # fmt: skip
+    assert families_of(
+        {"a-1": "x/a.yaml", "a-2": "x/a.yaml", "b": "x/b.yaml", "c": "y/c.yaml"}, ""
+    ) == {"a-1": "x", "a-2": "x", "b": "x", "c": "y"}
     with pytest.raises(InputError, match="one family, x"):
         families_of({"a": "x/a.yaml", "b": "x/b.yaml"}, "--order stratified")

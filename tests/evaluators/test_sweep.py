@@ -21,7 +21,13 @@ CAR = (4.5, 1.8)
 def pair(a: Motion, b: Motion) -> Motions:
     row = lambda *v: np.array([v], dtype=float)  # noqa: E731
     start = np.subtract(b.xy, a.xy)[None]
-    return Motions(start, np.subtract(b.shift, a.shift)[None], row(a.yaw, b.yaw), row(a.turn, b.turn), np.array([[a.size, b.size]]) / 2)
+    return Motions(
+        start,
+        np.subtract(b.shift, a.shift)[None],
+        row(a.yaw, b.yaw),
+        row(a.turn, b.turn),
+        np.array([[a.size, b.size]]) / 2,
+    )
 
 
 def contact(a: Motion, b: Motion) -> float | None:
@@ -48,13 +54,17 @@ def still(x: float, y: float, yaw: float = 0.0, size=CAR) -> Motion:
     return Motion((x, y), (0.0, 0.0), yaw, 0.0, size)
 
 
-def moving(x: float, y: float, dx: float, dy: float, yaw: float = 0.0, turn: float = 0.0, size=CAR) -> Motion:
+def moving(
+    x: float, y: float, dx: float, dy: float, yaw: float = 0.0, turn: float = 0.0, size=CAR
+) -> Motion:
     return Motion((x, y), (dx, dy), yaw, turn, size)
 
 
 def test_driving_into_a_standing_car_touches_where_the_gap_is_used_up():
     gap = 10.0 - (4.855 + 4.5) / 2
-    assert contact(moving(0, 0, 8.0, 0, size=EGO), still(10.0, 0.0)) == pytest.approx(gap / 8.0, abs=1e-9)
+    assert contact(moving(0, 0, 8.0, 0, size=EGO), still(10.0, 0.0)) == pytest.approx(
+        gap / 8.0, abs=1e-9
+    )
 
 
 def test_a_thin_post_that_crosses_between_the_ends_is_seen():
@@ -64,7 +74,9 @@ def test_a_thin_post_that_crosses_between_the_ends_is_seen():
 
 def test_a_turning_ego_sweeps_its_corner_into_a_wall():
     # Half diagonal h, corner at angle a: the corner's height is h sin(a + turn).
-    h, angle, wall = math.hypot(*EGO) / 2, math.atan2(EGO[1], EGO[0]), 1.5
+    h = math.hypot(*EGO) / 2
+    angle = math.atan2(EGO[1], EGO[0])
+    wall = 1.5
     ego = moving(0, 0, 0, 0, turn=0.5, size=EGO)
     box = still(0.0, wall + 0.5, size=(20.0, 1.0))
     assert contact(ego, box) == pytest.approx((math.asin(wall / h) - angle) / 0.5, abs=1e-8)
@@ -109,10 +121,22 @@ def test_contact_at_the_start_and_at_the_very_end():
 
 
 NEAR = st.floats(-9.0, 9.0)
-HEADING = st.one_of(st.floats(-3.2, 3.2), st.sampled_from([0.0, math.pi, -math.pi, math.pi / 2, math.nextafter(math.pi, 0)]))
+HEADING = st.one_of(
+    st.floats(-3.2, 3.2),
+    st.sampled_from([0.0, math.pi, -math.pi, math.pi / 2, math.nextafter(math.pi, 0)]),
+)
 TURN = st.one_of(st.just(0.0), st.floats(-0.8, 0.8))
 SIZE = st.sampled_from([CAR, EGO, (12.0, 2.5), (0.1, 0.1), (0.5, 0.5), (30.0, 0.02), (1e-3, 1e-3)])
-BODIES = st.builds(lambda x, y, dx, dy, *rest: Motion((x, y), (dx, dy), *rest), NEAR, NEAR, NEAR, NEAR, HEADING, TURN, SIZE)
+BODIES = st.builds(
+    lambda x, y, dx, dy, *rest: Motion((x, y), (dx, dy), *rest),
+    NEAR,
+    NEAR,
+    NEAR,
+    NEAR,
+    HEADING,
+    TURN,
+    SIZE,
+)
 
 
 @settings(max_examples=examples(25), deadline=None, derandomize=True)
@@ -127,7 +151,9 @@ GRAZE = st.sampled_from([0.0, 1e-12, -1e-12, 9e-10, 1.1e-9, 1e-8, -1e-8, 1e-6])
 @settings(max_examples=examples(20), deadline=None, derandomize=True)
 @given(HEADING, st.floats(1.0, 20.0), GRAZE, st.booleans())
 def test_grazing_passes_flip_only_inside_the_band_and_to_either_side(heading, speed, out, left):
-    """A car passes a parked one at a given gap; turned as a whole, as the rounding of corners differs with the heading."""
+    """A car passes a parked one at a given gap; turned as a whole, as the rounding of corners
+    differs with the heading.
+    """
     side = 1.0 if left else -1.0
     gap = side * ((1.88 + 1.8) / 2 + out)
     c, s = math.cos(heading), math.sin(heading)
@@ -135,7 +161,8 @@ def test_grazing_passes_flip_only_inside_the_band_and_to_either_side(heading, sp
     a = Motion(at(-speed, 0.0), at(2 * speed, 0.0), heading, 0.0, EGO)
     b = Motion(at(0.0, gap), (0.0, 0.0), heading, 0.0, CAR)
     assert_twins_agree(a, b)
-    # Corners are rounded at 1e-15 of 20 m, the tolerance is 1e-9: outside of twice that the answer is fixed.
+    # Corners are rounded at 1e-15 of 20 m, the tolerance is 1e-9: outside of twice that the answer
+    # is fixed.
     if abs(out) > 2 * TOUCH_M:
         assert (contact(a, b) is not None) == (out < 0)
 

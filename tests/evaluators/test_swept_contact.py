@@ -1,4 +1,6 @@
-"""Preset ``strict``: contact between steps over whole rollouts, its time, place, side and actor, and the twin on hard cases."""
+"""Preset ``strict``: contact between steps over whole rollouts, its time, place, side and actor,
+and the twin on hard cases.
+"""
 
 from __future__ import annotations
 
@@ -45,12 +47,19 @@ def test_a_pedestrian_who_runs_across_between_two_steps_is_hit():
     (event,) = contact_events(log)
     assert event.actor_id == "runner"
     assert event.t_s == pytest.approx(0.1 * (1.5 - HALF_W - 0.15) / 3.0, abs=1e-9)
-    assert (event.x_m, event.y_m) == pytest.approx((1.0 + AXLE - 0.1 * event.t_s / 0.1, HALF_W), abs=1e-5)
+    assert (event.x_m, event.y_m) == pytest.approx(
+        (1.0 + AXLE - 0.1 * event.t_s / 0.1, HALF_W), abs=1e-5
+    )
 
 
 def test_time_and_place_of_a_front_contact():
     log = rollout(track([0.0, 1.0, 2.0, 3.0], 0.0), [car("a", track(7.0, 0.4, n=4))])
-    values = {name: one.value for name, one in reduce_rollout(score(log, scene(TWO_LANES, log), STRICT), STRICT).values.items()}
+    values = {
+        name: one.value
+        for name, one in reduce_rollout(
+            score(log, scene(TWO_LANES, log), STRICT), STRICT
+        ).values.items()
+    }
     assert values["collision_front"] == 1.0
     assert values["contact_time_s"] == pytest.approx(0.1 * (7.0 - HALF_L - 2.25), abs=1e-9)
     assert values["contact_x_m"] == pytest.approx(AXLE + HALF_L, abs=1e-5)
@@ -69,7 +78,8 @@ def test_without_contact_time_and_place_are_invalid_with_a_reason():
 
 
 def test_a_side_swipe_that_reaches_the_bumper_by_the_next_step_is_lateral():
-    # The other comes from the left and slides forward along the ego; at the step it overlaps the front side as well.
+    # The other comes from the left and slides forward along the ego; at the step it overlaps the
+    # front side as well.
     log = rollout(track(0.0, 0.0, n=2), [car("a", track([0.0, 3.0], [2.5, 1.5]))])
     assert found(log, "paper")["collision_front"].value.tolist() == [0, 1]
     assert flag(log, "collision_lateral") == [0, 1]
@@ -77,14 +87,16 @@ def test_a_side_swipe_that_reaches_the_bumper_by_the_next_step_is_lateral():
 
 
 def test_every_touching_actor_has_its_own_side_and_keeps_it():
-    ahead, behind, beside = (
-        car("ahead", track([6.0, 4.0, 4.0], 0.0)),
-        car("behind", track([-6, -4.5, -4.5], 0.0)),
-        car("beside", track(0.0, [3, 1.7, 1.7])),
-    )
+    ahead = car("ahead", track([6.0, 4.0, 4.0], 0.0))
+    behind = car("behind", track([-6, -4.5, -4.5], 0.0))
+    beside = car("beside", track(0.0, [3, 1.7, 1.7]))
     log = rollout(track(0.0, 0.0, n=3), [ahead, behind, beside])
     events = {one.actor_id: one for one in contact_events(log)}
-    assert {name: one.side for name, one in events.items()} == {"ahead": "front", "behind": "rear", "beside": "lateral"}
+    assert {name: one.side for name, one in events.items()} == {
+        "ahead": "front",
+        "behind": "rear",
+        "beside": "lateral",
+    }
     for side in ("front", "rear", "lateral"):
         assert flag(log, f"collision_{side}") == [0, 1, 1]
     # Times differ; the row tells the earliest.
@@ -94,12 +106,18 @@ def test_every_touching_actor_has_its_own_side_and_keeps_it():
 
 @pytest.mark.parametrize(("degrees", "side"), [(40, "front"), (50, "lateral")])
 def test_a_corner_contact_goes_by_the_direction_of_the_blow(degrees, side):
-    """A wall whose face meets the ego's front left corner, seen from ahead or from the side of the diagonal."""
-    at = math.radians(90 + degrees)  # heading of the wall's long face, at right angles to the normal
+    """A wall whose face meets the ego's front left corner, seen from ahead or from the side of the
+    diagonal.
+    """
+    at = math.radians(
+        90 + degrees
+    )  # heading of the wall's long face, at right angles to the normal
     normal = np.array([math.sin(at), -math.cos(at)])
     corner = np.array([HALF_L, HALF_W])
     centres = [corner + normal * (0.5 + gap) for gap in (1.0, -0.2)]
-    wall = car("wall", track([c[0] for c in centres], [c[1] for c in centres], yaw=at), Box(6.0, 1.0, 1.0))
+    wall = car(
+        "wall", track([c[0] for c in centres], [c[1] for c in centres], yaw=at), Box(6.0, 1.0, 1.0)
+    )
     (event,) = contact_events(rollout(track(0.0, 0.0, n=2), [wall]))
     assert event.side == side
     assert (event.x_m, event.y_m) == pytest.approx((HALF_L + AXLE, HALF_W), abs=1e-5)
@@ -112,15 +130,22 @@ def test_a_long_bus_beside_the_ego_is_lateral_although_it_reaches_both_bumpers()
 
 
 def test_contact_from_the_first_pose_begins_at_zero_and_is_classified_as_overlap():
-    log = rollout(track([0.0, 0.1], 0.0), [car("ahead", track([4.0, 4.1], 0.0)), car("behind", track([-4.0, -3.9], 0.0))])
-    assert [(one.actor_id, one.t_s, one.side) for one in contact_events(log)] == [("ahead", 0.0, "front"), ("behind", 0.0, "rear")]
+    log = rollout(
+        track([0.0, 0.1], 0.0),
+        [car("ahead", track([4.0, 4.1], 0.0)), car("behind", track([-4.0, -3.9], 0.0))],
+    )
+    assert [(one.actor_id, one.t_s, one.side) for one in contact_events(log)] == [
+        ("ahead", 0.0, "front"),
+        ("behind", 0.0, "rear"),
+    ]
     assert flag(log, "collision_at_fault") == [1, 1]
 
 
 def test_an_actor_that_touches_twice_has_two_beginnings():
     log = rollout(track(0.0, 0.0, n=5), [car("a", track(0.0, [3.0, 1.7, 3.0, 1.7, 3.0]))])
     assert len(contact_events(log)) == 2
-    # The third row holds the end of the first contact: it still touches when the row's interval begins.
+    # The third row holds the end of the first contact: it still touches when the row's interval
+    # begins.
     assert flag(log, "collision_any") == [0, 1, 0, 1, 0]
 
 
@@ -129,7 +154,10 @@ def test_an_actor_counts_from_its_first_logged_time_even_between_steps():
     log = rollout(track(0.0, 0.0, n=4), [car("ghost", appears)])
     assert flag(log, "collision_any") == [0, 0, 1, 0]
     assert contact_events(log)[0].t_s == pytest.approx(0.15)
-    assert flag(rollout(track(0.0, 0.0, n=4), [car("seen once", track(0.0, 0.0, t_us=[150_000]))]), "collision_any") == [0, 0, 1, 0]
+    assert flag(
+        rollout(track(0.0, 0.0, n=4), [car("seen once", track(0.0, 0.0, t_us=[150_000]))]),
+        "collision_any",
+    ) == [0, 0, 1, 0]
 
 
 def test_an_actor_that_vanishes_before_it_arrives_does_not_touch():
@@ -155,20 +183,37 @@ def test_a_contact_before_the_handover_belongs_to_the_forced_rows():
     runner = car("runner", track(0.0, [3.0, -3.0, -3.0]), POST)
     log = rollout(track(0.0, 0.0, n=3), [runner], warmup_us=100_000)
     assert flag(log, "collision_any") == [1, 0, 0]
-    assert reduce_rollout(score(log, scene(TWO_LANES, log), STRICT), STRICT).values["collision_any"].value == 0.0
-    late = rollout(track(0.0, 0.0, n=3), [car("runner", track(0.0, [3.0, 3.0, -3.0]), POST)], warmup_us=100_000)
-    assert reduce_rollout(score(late, scene(TWO_LANES, late), STRICT), STRICT).values["collision_any"].value == 1.0
+    assert (
+        reduce_rollout(score(log, scene(TWO_LANES, log), STRICT), STRICT)
+        .values["collision_any"]
+        .value
+        == 0.0
+    )
+    late = rollout(
+        track(0.0, 0.0, n=3), [car("runner", track(0.0, [3.0, 3.0, -3.0]), POST)], warmup_us=100_000
+    )
+    assert (
+        reduce_rollout(score(late, scene(TWO_LANES, late), STRICT), STRICT)
+        .values["collision_any"]
+        .value
+        == 1.0
+    )
 
 
 def test_one_step_and_no_actors():
     assert flag(rollout(track(0.0, 0.0)), "collision_any") == [0]
-    assert flag(rollout(track(0.0, 0.0), [car("same", track(0.0, 0.0), Box(4.855, 1.88, 1.6))]), "collision_lateral") == [1]
+    assert flag(
+        rollout(track(0.0, 0.0), [car("same", track(0.0, 0.0), Box(4.855, 1.88, 1.6))]),
+        "collision_lateral",
+    ) == [1]
     assert contact_events(rollout(track([0.0, 1.0], 0.0))) == ()
 
 
 def test_a_rollout_longer_than_a_stretch_of_the_tree_misses_nobody():
     n = 70
-    posts = [car(f"p{k}", track(float(k) + 0.5, [0.0, 3.0] * (n // 2)), POST) for k in range(0, n, 7)]
+    posts = [
+        car(f"p{k}", track(float(k) + 0.5, [0.0, 3.0] * (n // 2)), POST) for k in range(0, n, 7)
+    ]
     log = rollout(track(np.arange(n, dtype=float), 0.0), posts)
     assert {one.actor_id for one in contact_events(log)} == {one.actor_id for one in posts}
 
@@ -186,7 +231,7 @@ def test_rounded_corners_are_refused():
         replace(STRICT, roundness=0.5)
 
 
-# --- twin -------------------------------------------------------------------------------------------------------------
+# --- twin
 
 
 def twin_rows(log) -> list[dict[str, str]]:
@@ -208,15 +253,22 @@ def twin_rows(log) -> list[dict[str, str]]:
     for i, names in enumerate(rows):
         for name in names:
             before = i > 0 and name in at_steps[i - 1].sides
-            last[name] = sides.get((i, name)) or (last[name] if before else overlap_side(log, log.actors[name], i))
+            last[name] = sides.get((i, name)) or (
+                last[name] if before else overlap_side(log, log.actors[name], i)
+            )
         out.append({name: last[name] for name in names})
     return out
 
 
 def overlap_side(log, actor, i):
     t = log.ego.t_us[i]
-    ego_size, size = (log.ego_box.length_m, log.ego_box.width_m), (actor.box.length_m, actor.box.width_m)
-    return side_at(moved(log.ego, t, t, ego_size, log), moved(actor.track, t, t, size, log), 0.0, PLACE_M)
+    ego_size, size = (
+        (log.ego_box.length_m, log.ego_box.width_m),
+        (actor.box.length_m, actor.box.width_m),
+    )
+    return side_at(
+        moved(log.ego, t, t, ego_size, log), moved(actor.track, t, t, size, log), 0.0, PLACE_M
+    )
 
 
 def pieces(log, actor, i):
@@ -228,7 +280,10 @@ def pieces(log, actor, i):
     knots = [first, *inside, last]
     ego_size = (log.ego_box.length_m, log.ego_box.width_m)
     for t0, t1 in pairwise(knots):
-        yield moved(log.ego, t0, t1, ego_size, log), moved(actor.track, t0, t1, (actor.box.length_m, actor.box.width_m), log)
+        yield (
+            moved(log.ego, t0, t1, ego_size, log),
+            moved(actor.track, t0, t1, (actor.box.length_m, actor.box.width_m), log),
+        )
 
 
 def moved(poses, t0, t1, size, log):
@@ -261,7 +316,9 @@ OFFSETS = st.sampled_from([(0.0, 0.0), (691_608.3, 5_334_760.7), (-8_000.25, 1e5
 
 @st.composite
 def worlds(draw):
-    """Few steps, a turning or standing ego anywhere on earth, actors that come, go, touch, stand and are logged on their own times."""
+    """Few steps, a turning or standing ego anywhere on earth, actors that come, go, touch, stand
+    and are logged on their own times.
+    """
     n = draw(st.integers(1, 4))
     x0, y0 = draw(OFFSETS)
     number = st.one_of(st.integers(-6, 6).map(float), st.floats(-7, 7))
@@ -278,7 +335,9 @@ def worlds(draw):
             xs, ys = [x0 + HALF_L + 2.25] * m, [y0 + draw(st.sampled_from([0.0, HALF_W + 0.9]))] * m
         box = draw(st.sampled_from([CAR, POST, Box(4.855, 1.88, 1.6), Box(12.0, 1e-3, 1.0)]))
         yaws = [draw(ANGLES) for _ in range(m)]
-        actors.append(car(f"a{a}", track(xs, ys, yaw=yaws, t_us=start + period * np.arange(m)), box))
+        actors.append(
+            car(f"a{a}", track(xs, ys, yaw=yaws, t_us=start + period * np.arange(m)), box)
+        )
     return rollout(track(ego_x, y0, yaw=ego_yaw), actors)
 
 
@@ -293,9 +352,13 @@ def test_random_worlds_agree_with_the_twin(log):
 
 
 def on_the_edge(log, row, name) -> bool:
-    """Tell whether the answer flips within a nanometre of size, or, for the side, within the tolerance of the place."""
+    """Tell whether the answer flips within a nanometre of size, or, for the side, within the
+    tolerance of the place.
+    """
     answers = set()
     for grow in (-2.5e-9, 2.5e-9, -3 * PLACE_M, 3 * PLACE_M):
-        box = replace(log.ego_box, length_m=log.ego_box.length_m + grow, width_m=log.ego_box.width_m + grow)
+        box = replace(
+            log.ego_box, length_m=log.ego_box.length_m + grow, width_m=log.ego_box.width_m + grow
+        )
         answers.add(fast_rows(replace(log, ego_box=box))[row].get(name))
     return len(answers) > 1

@@ -1,4 +1,6 @@
-"""Means, intervals, pairs and the ledger over rollouts, against numbers worked out by hand or by scipy."""
+"""Means, intervals, pairs and the ledger over rollouts, against numbers worked out by hand or by
+scipy.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +13,20 @@ from scipy import stats
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log.run_folder.sides import by_renderer, metric_names
 from evaluators import aggregate, censoring, paired
-from evaluators.statistics.intervals import clustered, exact_rate, normal_half_width, t_interval, wilson_rate
+from evaluators.statistics.intervals import (
+    clustered,
+    exact_rate,
+    normal_half_width,
+    t_interval,
+    wilson_rate,
+)
 from evaluators.statistics.paired import base_pairs
 
 
 def rows_of(values, metric="route_distance_m", renderer="3dgs", status="ok"):
-    """Rows from a table of values: one row of it per scene, one column per seed; None is invalid."""
+    """Rows from a table of values: one row of it per scene, one column per seed; None is
+    invalid.
+    """
     return [
         {
             "renderer": renderer,
@@ -42,7 +52,12 @@ def test_mean_and_the_papers_half_width():
     found = entry(values)
     assert found["mean"] == pytest.approx(4.0)
     assert found["ci95"] == pytest.approx(1.96 * np.std(flat, ddof=1) / np.sqrt(6))
-    assert (found["n_rollouts"], found["n_scenes"], found["unit"], found["direction"]) == (6, 3, "m", "lower")
+    assert (found["n_rollouts"], found["n_scenes"], found["unit"], found["direction"]) == (
+        6,
+        3,
+        "m",
+        "lower",
+    )
 
 
 def test_clustered_interval_is_a_t_interval_on_scene_means():
@@ -56,7 +71,10 @@ def test_with_unequal_seeds_scenes_weigh_alike_in_the_clustered_interval():
     found = entry([[1.0, 2.0, 3.0, None], [10.0]], "lateral_bias_m")
     assert found["mean"] == pytest.approx(4.0)  # over rollouts
     assert np.mean(found["ci95_clustered"]) == pytest.approx(6.0)  # over scenes
-    assert found["note"] == "scenes have different numbers of values: the interval is about the mean over scenes, 6"
+    assert (
+        found["note"]
+        == "scenes have different numbers of values: the interval is about the mean over scenes, 6"
+    )
     assert "note" not in entry([[1.0, 2.0], [10.0, 3.0]], "lateral_bias_m")
     assert found["n_invalid"] == 1
 
@@ -130,11 +148,13 @@ def test_nested_metrics_as_in_manifests_are_read_too():
 
 
 def test_tables_are_json():
-    rows = rows_of([[0.0, 1.0], [0.0, None]], "offroad") + rows_of([[1.0, 1.0], [0.0, 0.0]], "offroad", "clean")
+    rows = rows_of([[0.0, 1.0], [0.0, None]], "offroad") + rows_of(
+        [[1.0, 1.0], [0.0, 0.0]], "offroad", "clean"
+    )
     json.dumps([aggregate(rows), paired(rows, "clean"), censoring(rows)], allow_nan=False)
 
 
-# --- pairs --------------------------------------------------------------------------------------------------------------
+# --- pairs
 
 
 def pair(base, other, metric="route_distance_m"):
@@ -152,8 +172,13 @@ def test_differences_are_taken_cell_by_cell_and_averaged_per_scene():
     assert found["ci95"] == pytest.approx([low, high])
     assert found["p_value"] == pytest.approx(stats.ttest_1samp(means, 0.0).pvalue)
     assert (found["n_cells"], found["n_scenes"], found["baseline"]) == (6, 3, "clean")
-    assert (found["verdict"], found["difference"]) == ("undecided", "none shown"), "three scenes decide nothing"
-    for n, wanted in ((2, ("undecided", "none shown")), (20, ("worse", "worse"))):  # a few scenes may be far better unseen
+    assert (found["verdict"], found["difference"]) == ("undecided", "none shown"), (
+        "three scenes decide nothing"
+    )
+    for n, wanted in (
+        (2, ("undecided", "none shown")),
+        (20, ("worse", "worse")),
+    ):  # a few scenes may be far better unseen
         worse = pair(base * n, other * n)
         assert (worse["verdict"], worse["difference"]) == wanted
     better = pair(other * 20, base * 20)
@@ -165,7 +190,10 @@ def test_pairing_sees_what_overlapping_intervals_hide():
     other = [[i + 0.5 + 0.01 * (i % 8)] for i in range(60)]
     rows = rows_of(base, renderer="clean") + rows_of(other)
     alone = aggregate(rows)
-    assert alone["clean"]["route_distance_m"]["ci95_clustered"][1] > alone["3dgs"]["route_distance_m"]["ci95_clustered"][0]
+    assert (
+        alone["clean"]["route_distance_m"]["ci95_clustered"][1]
+        > alone["3dgs"]["route_distance_m"]["ci95_clustered"][0]
+    )
     assert paired(rows, "clean")["3dgs"]["route_distance_m"]["verdict"] == "worse"
 
 
@@ -176,7 +204,10 @@ def test_flags_take_the_exact_sign_test_on_scenes():
     assert found["p_value"] == pytest.approx(2 * 0.5**6)
     assert found["test"] == "exact sign test on scenes"
     assert found["verdict"] == "worse"
-    assert pair(base, [[1.0, 0.0]] * 5 + [[0.0, 0.0]] * 3, "collision_at_fault")["verdict"] == "undecided"  # p = 0.0625
+    assert (
+        pair(base, [[1.0, 0.0]] * 5 + [[0.0, 0.0]] * 3, "collision_at_fault")["verdict"]
+        == "undecided"
+    )  # p = 0.0625
 
 
 def test_seeds_of_one_scene_are_not_independent_evidence():
@@ -190,7 +221,12 @@ def test_no_difference_at_all_has_p_one_and_is_non_inferior_once_the_scenes_coul
     for n, wanted in ((3, "undecided"), (145, "undecided"), (146, "non-inferior")):
         same = [[float(i)] for i in range(n)]
         found = pair(same, same)
-        assert (found["diff"], found["p_value"], found["verdict"], found["difference"]) == (0.0, 1.0, wanted, "none shown")
+        assert (found["diff"], found["p_value"], found["verdict"], found["difference"]) == (
+            0.0,
+            1.0,
+            wanted,
+            "none shown",
+        )
 
 
 def test_equal_differences_have_no_spread_and_take_the_sign_test():
@@ -208,12 +244,20 @@ def test_cells_that_one_side_lacks_are_left_out_and_counted():
 
 
 def test_a_metric_without_a_better_side_gets_no_verdict():
-    assert pair([[0.0], [0.0], [0.1]], [[5.0], [5.0], [5.0]], "dist_traveled_m")["verdict"] == "undecided"
+    assert (
+        pair([[0.0], [0.0], [0.1]], [[5.0], [5.0], [5.0]], "dist_traveled_m")["verdict"]
+        == "undecided"
+    )
 
 
 def test_higher_is_better_for_progress():
-    assert pair([[0.1], [0.2], [0.1]] * 4, [[0.9], [0.9], [0.9]] * 4, "progress")["difference"] == "better"
-    assert pair([[0.9], [0.9], [0.9]] * 4, [[0.1], [0.2], [0.1]] * 4, "progress")["verdict"] == "worse"
+    assert (
+        pair([[0.1], [0.2], [0.1]] * 4, [[0.9], [0.9], [0.9]] * 4, "progress")["difference"]
+        == "better"
+    )
+    assert (
+        pair([[0.9], [0.9], [0.9]] * 4, [[0.1], [0.2], [0.1]] * 4, "progress")["verdict"] == "worse"
+    )
 
 
 def test_an_unknown_baseline_lists_the_known_ones():
@@ -221,17 +265,37 @@ def test_an_unknown_baseline_lists_the_known_ones():
         paired(rows_of([[1.0]]), "clean")
 
 
-# --- ledger -------------------------------------------------------------------------------------------------------------
+# --- ledger
 
 
 def test_the_ledger_counts_every_cause_and_bounds_every_rate():
-    ledger = {"steps_total": 10, "steps_warmup": 2, "steps_after_event": 3, "steps_after_drift": 0, "steps_scored": 5, "dropped": ""}
+    ledger = {
+        "steps_total": 10,
+        "steps_warmup": 2,
+        "steps_after_event": 3,
+        "steps_after_drift": 0,
+        "steps_scored": 5,
+        "dropped": "",
+    }
     rows = [{**row, "censored": ledger} for row in rows_of([[1.0, 0.0], [None, 0.0]], "offroad")]
-    rows += [{**rows[0], "scene": "scene-9", "status": "failed", "failure_class": "policy", "censored": None}]
+    rows += [
+        {
+            **rows[0],
+            "scene": "scene-9",
+            "status": "failed",
+            "failure_class": "policy",
+            "censored": None,
+        }
+    ]
     found = censoring(rows)["3dgs"]
     assert found["rollouts"] == 5
     assert found["failed"] == {"policy": 1}
-    assert (found["steps_total"], found["steps_warmup"], found["steps_after_event"], found["steps_scored"]) == (40, 8, 12, 20)
+    assert (
+        found["steps_total"],
+        found["steps_warmup"],
+        found["steps_after_event"],
+        found["steps_scored"],
+    ) == (40, 8, 12, 20)
     assert found["invalid"]["offroad"] == {"rollouts": 1, "reasons": {"not given": 1}}
     assert found["bounds_rollouts"]["offroad"] == [pytest.approx(1 / 5), pytest.approx(3 / 5)]
     low, high = found["bounds_rollouts_ci95"]["offroad"]
@@ -247,7 +311,9 @@ def test_bounds_with_sampling_error_hold_the_rate_where_crashes_hide_events():
     for _ in range(100):
         had = (rng.random(40) < 0.2).astype(float)
         gone = (had > 0) & (rng.random(40) < 0.5)
-        rows = rows_of([[None if lost else value] for lost, value in zip(gone, had, strict=True)], "offroad")
+        rows = rows_of(
+            [[None if lost else value] for lost, value in zip(gone, had, strict=True)], "offroad"
+        )
         low, high = censoring(rows)["3dgs"]["bounds_rollouts_ci95"]["offroad"]
         held += low <= 0.2 <= high
     assert held >= 93
@@ -266,19 +332,35 @@ def test_a_dropped_rollout_is_listed_with_its_reason():
     assert censoring(rows)["3dgs"]["dropped"] == {"never": 1}
 
 
-# --- intervals ----------------------------------------------------------------------------------------------------------
+# --- intervals
 
 
 def test_t_factors_are_the_tabulated_ones():
-    for n, factor in ((5, 2.776), (10, 2.262), (20, 2.093), (32, 2.0395), (60, 2.0010), (80, 1.9905), (300, 1.968)):
+    for n, factor in (
+        (5, 2.776),
+        (10, 2.262),
+        (20, 2.093),
+        (32, 2.0395),
+        (60, 2.0010),
+        (80, 1.9905),
+        (300, 1.968),
+    ):
         values = np.arange(n, dtype=float)
         one = t_interval(values)
-        assert (one.high - one.centre) / (np.std(values, ddof=1) / np.sqrt(n)) == pytest.approx(factor, abs=6e-4)
+        assert (one.high - one.centre) / (np.std(values, ddof=1) / np.sqrt(n)) == pytest.approx(
+            factor, abs=6e-4
+        )
 
 
 @pytest.mark.parametrize(
     ("k", "n", "low", "high"),
-    [(0, 60, 0.0, 0.060), (0, 300, 0.0, 0.0126), (1, 60, 0.003, 0.089), (21, 300, 0.046, 0.105), (3, 10, 0.108, 0.603)],
+    [
+        (0, 60, 0.0, 0.060),
+        (0, 300, 0.0, 0.0126),
+        (1, 60, 0.003, 0.089),
+        (21, 300, 0.046, 0.105),
+        (3, 10, 0.108, 0.603),
+    ],
 )
 def test_wilson_bounds_are_the_tabulated_ones(k, n, low, high):
     assert wilson_rate(k, n) == pytest.approx((low, high), abs=6e-4)
@@ -292,7 +374,9 @@ def test_exact_bounds_agree_with_scipy():
 
 def test_equal_seeds_per_scene_make_the_clustered_centre_the_mean():
     values = np.arange(12.0)
-    assert clustered(values, [f"s{i // 3}" for i in range(12)]).centre == pytest.approx(values.mean())
+    assert clustered(values, [f"s{i // 3}" for i in range(12)]).centre == pytest.approx(
+        values.mean()
+    )
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.8])
@@ -324,17 +408,30 @@ def test_intervals_of_bounded_quantities_stay_within_their_bounds():
     assert aggregate(lengths)["3dgs"]["lateral_distance_m"]["ci95_clustered"][0] == 0.0
     signed = rows_of([[0.0], [0.1], [1.5]], metric="lateral_bias_m")
     assert aggregate(signed)["3dgs"]["lateral_bias_m"]["ci95_clustered"][0] < 0.0
-    pair = paired(rows_of([[0.0], [0.0], [0.2]], "progress", "a") + rows_of([[1.0], [1.0], [0.2]], "progress", "b"), "a")["b"]["progress"]
+    pair = paired(
+        rows_of([[0.0], [0.0], [0.2]], "progress", "a")
+        + rows_of([[1.0], [1.0], [0.2]], "progress", "b"),
+        "a",
+    )["b"]["progress"]
     assert 0.9 < pair["ci95"][1] <= 1.0
     assert pair["ci95"][0] < 0.0
 
 
 def test_a_fixer_is_compared_with_what_it_repairs_too():
-    rows = rows_of([[1.0], [2.0], [3.0]], renderer="clean") + rows_of([[1.5], [2.6], [3.4]], renderer="3dgs")
+    rows = rows_of([[1.0], [2.0], [3.0]], renderer="clean") + rows_of(
+        [[1.5], [2.6], [3.4]], renderer="3dgs"
+    )
     rows += rows_of([[1.2], [2.1], [3.2]], renderer="onefixer")
-    found = base_pairs(by_renderer(rows), metric_names(rows), "clean", {"onefixer": "3dgs", "onefixer+clean": "clean"})
+    found = base_pairs(
+        by_renderer(rows),
+        metric_names(rows),
+        "clean",
+        {"onefixer": "3dgs", "onefixer+clean": "clean"},
+    )
     assert list(found) == ["onefixer"]
     entry = found["onefixer"]["route_distance_m"]
     assert (entry["baseline"], entry["diff"]) == ("3dgs", pytest.approx(-1.0 / 3.0))
     assert entry == paired(rows, "3dgs")["onefixer"]["route_distance_m"]
-    assert base_pairs(by_renderer(rows), metric_names(rows), "3dgs", {"onefixer": "3dgs"}) == {}  # paired with it already
+    assert (
+        base_pairs(by_renderer(rows), metric_names(rows), "3dgs", {"onefixer": "3dgs"}) == {}
+    )  # paired with it already

@@ -1,7 +1,8 @@
-"""AlpaSim's known defects and surprises, each by name: what preset ``alpasim`` reproduces, and what ``strict`` does instead.
+"""AlpaSim's known defects and surprises, each by name: what preset ``alpasim`` reproduces, and what
+``strict`` does instead.
 
-The numbers D-01, D-02, ... are those of docs/experiments/alpasim-parity.md. Quirks of AlpaSim's runtime, driver and physics are
-not about scoring a log and have no test here.
+The numbers D-01, D-02, ... are those of docs/experiments/alpasim-parity.md. Quirks of AlpaSim's
+runtime, driver and physics are not about scoring a log and have no test here.
 """
 
 from __future__ import annotations
@@ -16,13 +17,39 @@ import pytest
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
-from alpasim_plugin.core.types import LaneMap, LoggedImage, LoggedPlan, MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.core.types import (
+    LaneMap,
+    LoggedImage,
+    LoggedPlan,
+    MetricSeries,
+    RolloutLog,
+    Scene,
+    Trajectory,
+)
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.asl import AslFile, AslReader
 from evaluators import PRESETS, aggregate, reduce_rollout, resolve_evaluators, rollout_values, score
-from evaluators.alpasim import EvalSettings, ScoredRollout, metrics_unprocessed_table, over_sweeps, reduce_run, scene_score
+from evaluators.alpasim import (
+    EvalSettings,
+    ScoredRollout,
+    metrics_unprocessed_table,
+    over_sweeps,
+    reduce_run,
+    scene_score,
+)
 from evaluators.alpasim.settings import PlanDeviation, SceneScoreSettings, Scorers
-from tests.evaluators.eval_build import DT_US, T_RIG_BOX, TWO_LANES, by_name, car, lane, road_map, rollout, scene, track
+from tests.evaluators.eval_build import (
+    DT_US,
+    T_RIG_BOX,
+    TWO_LANES,
+    by_name,
+    car,
+    lane,
+    road_map,
+    rollout,
+    scene,
+    track,
+)
 from tests.log.make_rollout import write_rollout
 
 ALPASIM, STRICT = PRESETS["alpasim"], PRESETS["strict"]
@@ -31,13 +58,20 @@ DRIVE = track(np.arange(80) * 1.0, 0.0)
 FRONT_WIDE = "camera_front_wide_120fov"
 
 
-def both(log: RolloutLog, road: LaneMap = TWO_LANES) -> tuple[dict[str, MetricSeries], dict[str, MetricSeries]]:
+def both(
+    log: RolloutLog, road: LaneMap = TWO_LANES
+) -> tuple[dict[str, MetricSeries], dict[str, MetricSeries]]:
     """Score a log with ``alpasim`` and with ``strict``."""
-    return by_name(score(log, scene(road, log), "alpasim")), by_name(score(log, scene(road, log), "strict"))
+    return by_name(score(log, scene(road, log), "alpasim")), by_name(
+        score(log, scene(road, log), "strict")
+    )
 
 
 def values(log: RolloutLog, preset: str, road: LaneMap = TWO_LANES) -> dict[str, float | None]:
-    return {name: one.value for name, one in rollout_values(score(log, scene(road, log), preset), preset).items()}
+    return {
+        name: one.value
+        for name, one in rollout_values(score(log, scene(road, log), preset), preset).items()
+    }
 
 
 def image(t_us: int, bright: int, camera: str = FRONT_WIDE) -> LoggedImage:
@@ -45,20 +79,30 @@ def image(t_us: int, bright: int, camera: str = FRONT_WIDE) -> LoggedImage:
     return LoggedImage(camera, t_us - 30_000, t_us, data)
 
 
-def plan(now_us: int, xs: np.ndarray, samples=(), step_us: int = DT_US, query_us: int | None = None) -> LoggedPlan:
+def plan(
+    now_us: int, xs: np.ndarray, samples=(), step_us: int = DT_US, query_us: int | None = None
+) -> LoggedPlan:
     """A plan of box centres from ``now_us`` on; samples are (x, y) arrays at the same spacing."""
 
     def poses(x, y) -> Trajectory:
-        return offset_trajectory(track(x, y, t_us=now_us + step_us * np.arange(np.size(x))), inverse(T_RIG_BOX))
+        return offset_trajectory(
+            track(x, y, t_us=now_us + step_us * np.arange(np.size(x))), inverse(T_RIG_BOX)
+        )
 
-    return LoggedPlan(now_us, now_us + DT_US if query_us is None else query_us, poses(xs, 0.0), tuple(poses(*one) for one in samples))
+    return LoggedPlan(
+        now_us,
+        now_us + DT_US if query_us is None else query_us,
+        poses(xs, 0.0),
+        tuple(poses(*one) for one in samples),
+    )
 
 
-# --- contact ----------------------------------------------------------------------------------------------------------
+# --- contact
 
 
 def test_d01_of_several_contacts_only_the_last_named_one_is_classified():
-    # The box that the spatial index names last decides; where the car behind stands changes which one that is.
+    # The box that the spatial index names last decides; where the car behind stands changes which
+    # one that is.
     ahead = car("ahead", track(np.full(4, 4.5), 0.0))
     found = {}
     for shift in (0.0, 0.2):
@@ -68,29 +112,46 @@ def test_d01_of_several_contacts_only_the_last_named_one_is_classified():
         assert (strict["collision_front"].value[1], strict["collision_rear"].value[1]) == (1.0, 1.0)
         assert values(log, "strict")["collision_at_fault"] == 1.0
     assert found == {0.0: (1.0, 0.0), 0.2: (0.0, 1.0)}
-    assert values(log, "alpasim")["collision_at_fault"] == 0.0  # a front contact that is nobody's fault
+    assert (
+        values(log, "alpasim")["collision_at_fault"] == 0.0
+    )  # a front contact that is nobody's fault
 
 
 def test_d02_invalid_values_enter_alpasims_rollout_values():
     alone = rollout(STAND)
     assert values(alone, "alpasim")["min_distance_to_obstacle_m"] == np.inf
-    one = rollout_values(score(alone, scene(TWO_LANES, alone), "strict"), "strict")["min_distance_to_obstacle_m"]
+    one = rollout_values(score(alone, scene(TWO_LANES, alone), "strict"), "strict")[
+        "min_distance_to_obstacle_m"
+    ]
     assert (one.value, one.valid, one.reason) == (None, False, "no other actor is present")
 
 
 def test_d29_braking_for_a_follower_is_never_at_fault_and_pays():
     behind = car("behind", track(np.linspace(-30.0, -1.0, 4), 0.0))
-    log = rollout(track(np.array([0.0, 2.0, 3.0, 3.2]), 0.0), [behind], images=[image(0, 99), image(300_000, 99)])
+    log = rollout(
+        track(np.array([0.0, 2.0, 3.0, 3.2]), 0.0),
+        [behind],
+        images=[image(0, 99), image(300_000, 99)],
+    )
     for preset in ("alpasim", "strict"):
         got = values(log, preset)
-        assert (got["collision_any"], got["collision_rear"], got["collision_at_fault"]) == (1.0, 1.0, 0.0)
+        assert (got["collision_any"], got["collision_rear"], got["collision_at_fault"]) == (
+            1.0,
+            1.0,
+            0.0,
+        )
     run = [ScoredRollout("s", "a", tuple(score(log, scene(TWO_LANES, log), "alpasim")))]
     assert over_sweeps(reduce_run(run, ALPASIM))["avg_dist_between_incidents_at_fault"] == np.inf
-    passed = {"progress_clipped_rel": 0.9, "gt_dist_traveled_m": 50.0, "collision_at_fault": 0.0, "offroad": 0.0}
+    passed = {
+        "progress_clipped_rel": 0.9,
+        "gt_dist_traveled_m": 50.0,
+        "collision_at_fault": 0.0,
+        "offroad": 0.0,
+    }
     assert scene_score(passed, SceneScoreSettings()).passed
 
 
-# --- road -------------------------------------------------------------------------------------------------------------
+# --- road
 
 
 def test_d05_a_missing_map_counts_as_on_the_road_in_alpasims_combined_events():
@@ -113,7 +174,8 @@ def test_d06_far_off_the_road_is_on_the_road_for_alpasim():
 
 
 def test_d07_a_road_seven_metres_below_the_ego_is_searched_in_3d():
-    # Alone in its lane by plan view, but 7 m above it: no lane is near, and the edges are not touched either.
+    # Alone in its lane by plan view, but 7 m above it: no lane is near, and the edges are not
+    # touched either.
     alpasim, strict = both(rollout(track(np.arange(4.0), 0.0, z=7.0)))
     assert not alpasim["offroad"].value.any()
     assert not alpasim["min_distance_to_lane_boundary_m"].value.any()  # zero: not contained
@@ -138,14 +200,19 @@ def test_d08_a_seam_between_lanes_breaks_alpasims_union():
 
 def test_d09_alpasim_compares_headings_without_wrapping():
     west = lane("west", 0.0)
-    west = replace(west, centre=np.array([*west.centre[::-1], [0, 0, 0], [0, 0.0001, 0]]), left=west.right[::-1], right=west.left[::-1])
+    west = replace(
+        west,
+        centre=np.array([*west.centre[::-1], [0, 0, 0], [0, 0.0001, 0]]),
+        left=west.right[::-1],
+        right=west.left[::-1],
+    )
     log = rollout(track(-np.arange(4.0), 0.0, yaw=-np.pi + 1e-3))
     alpasim, strict = both(log, road_map(west, edges=TWO_LANES.road_edges))
     assert alpasim["wrong_lane"].value.all()
     assert not strict["wrong_lane"].value.any()
 
 
-# --- rows and time ----------------------------------------------------------------------------------------------------
+# --- rows and time
 
 
 def test_d11_a_rollout_without_handover_is_scored_whole_by_alpasim():
@@ -167,7 +234,10 @@ def test_d16_the_ego_is_found_by_name_wherever_a_log_puts_it(tmp_path):
                 entry.actor_poses.actor_poses.extend(poses)
             out.write(entry)
     for preset in ("alpasim", "strict"):
-        one, two = (by_name(score(log, scene(TWO_LANES, log), preset)) for log in map(read_asl, (path, first)))
+        one, two = (
+            by_name(score(log, scene(TWO_LANES, log), preset))
+            for log in map(read_asl, (path, first))
+        )
         assert set(one) == set(two)
         for name, series in one.items():
             np.testing.assert_array_equal(series.value, two[name].value)
@@ -182,7 +252,7 @@ def test_d26_the_first_two_recording_based_values_are_invented_by_alpasim():
     assert alpasim["progress_rel"].value[:2].tolist() == [1.0, 1.0]
 
 
-# --- images -----------------------------------------------------------------------------------------------------------
+# --- images
 
 
 def test_d03_without_front_wide_images_alpasims_whole_aggregation_stops():
@@ -198,10 +268,13 @@ def test_d25_an_image_is_counted_at_every_step_since_the_image_before():
     alpasim, strict = both(log)
     assert alpasim["img_is_black"].t_us.tolist() == [0, 100_000, 200_000, 300_000]
     assert alpasim["img_is_black"].value.tolist() == [0.0, 1.0, 1.0, 1.0]
-    assert (strict["img_is_black"].t_us.tolist(), strict["img_is_black"].value.tolist()) == ([0, 300_000], [0.0, 1.0])
+    assert (strict["img_is_black"].t_us.tolist(), strict["img_is_black"].value.tolist()) == (
+        [0, 300_000],
+        [0.0, 1.0],
+    )
 
 
-# --- plans ------------------------------------------------------------------------------------------------------------
+# --- plans
 
 
 def test_d04_one_sample_that_is_too_short_removes_all_of_alpasims_min_ade():
@@ -214,7 +287,10 @@ def test_d04_one_sample_that_is_too_short_removes_all_of_alpasims_min_ade():
 
 
 def test_d19_the_least_number_of_plan_times_is_read_and_never_used():
-    few, many = (EvalSettings(scorers=Scorers(plan_deviation=PlanDeviation(min_timesteps=n))).preset() for n in (1, 500))
+    few, many = (
+        EvalSettings(scorers=Scorers(plan_deviation=PlanDeviation(min_timesteps=n))).preset()
+        for n in (1, 500)
+    )
     assert few == many
     xs = np.arange(3.0)
     log = rollout(DRIVE, plans=[plan(0, xs), plan(DT_US, xs + 1.0)])
@@ -223,21 +299,27 @@ def test_d19_the_least_number_of_plan_times_is_read_and_never_used():
 
 
 def test_d28_an_answer_between_two_logged_times_is_read_from_the_next_one():
-    # A sample whose error grows by 1 cm a step shows which steps were averaged: logged times every 50 ms, answer at 120 ms.
+    # A sample whose error grows by 1 cm a step shows which steps were averaged: logged times every
+    # 50 ms, answer at 120 ms.
     fine = track(np.arange(240) * 0.5, 0.0, t_us=50_000 * np.arange(240))
     now = 120_000
     xs = np.arange(120) * 0.5 + now * 1e-5
-    log = rollout(fine, plans=[plan(now, xs, samples=[(xs, 0.01 * np.arange(120))], step_us=50_000, query_us=now)])
+    log = rollout(
+        fine,
+        plans=[plan(now, xs, samples=[(xs, 0.01 * np.arange(120))], step_us=50_000, query_us=now)],
+    )
     alpasim, strict = both(log)
     times = np.arange(150_000, 150_000 + 50_000 * 60, 50_000)
     error = 0.01 * (times - now) / 50_000
     by_horizon = [int(np.sum(times <= np.ceil((now + 500_000) / 50_000) * 50_000))]
     assert strict["min_ade@0.5s(gt)"].value == pytest.approx(error[: by_horizon[0]].mean())
     # Counted from the next logged time after now, one step is left out at the end.
-    assert alpasim["min_ade@0.5s(gt)"].value == pytest.approx(error[: by_horizon[0] - 1].mean(), rel=1e-3)
+    assert alpasim["min_ade@0.5s(gt)"].value == pytest.approx(
+        error[: by_horizon[0] - 1].mean(), rel=1e-3
+    )
 
 
-# --- trust ------------------------------------------------------------------------------------------------------------
+# --- trust
 
 
 class Bomb:
@@ -261,7 +343,11 @@ def test_d24_nothing_in_a_log_is_ever_unpickled(tmp_path):
     log = read_asl(armed)
     for preset in ("alpasim", "strict"):
         found = by_name(score(log, scene(TWO_LANES, log), preset))
-        assert not found["safety_monitor_triggered"].value.any() if preset == "alpasim" else "safety_monitor_triggered" not in found
+        assert (
+            not found["safety_monitor_triggered"].value.any()
+            if preset == "alpasim"
+            else "safety_monitor_triggered" not in found
+        )
     assert not proof.exists()
     pickle.loads(pickle.dumps(Bomb(proof)))
     assert proof.exists()  # the bomb was live
@@ -276,10 +362,12 @@ def test_d18_an_evaluator_that_fails_is_never_swallowed():
     log = rollout(STAND)
     for preset in ("alpasim", "strict"):
         with pytest.raises(EvaluatorError, match="out of order"):
-            score(log, scene(TWO_LANES, log), preset, resolve_evaluators([f"{__name__}:OutOfOrder"]))
+            score(
+                log, scene(TWO_LANES, log), preset, resolve_evaluators([f"{__name__}:OutOfOrder"])
+            )
 
 
-# --- tables over rollouts ---------------------------------------------------------------------------------------------
+# --- tables over rollouts
 
 
 def test_d23_alpasims_spread_depends_on_how_rollouts_are_named():
@@ -287,19 +375,37 @@ def test_d23_alpasims_spread_depends_on_how_rollouts_are_named():
         drives = [(scene_id, end) for scene_id in ("s1", "s2") for end in (4, 8)]
         out = []
         for name, (scene_id, end) in zip(names, drives, strict=True):
-            log = rollout(track(np.linspace(0.0, end, 5), 0.0), log=track(np.arange(5) * 2.0, 0.0), images=[image(400_000, 99)])
-            out.append(ScoredRollout(scene_id, name, tuple(score(log, scene(TWO_LANES, log), "alpasim"))))
+            log = rollout(
+                track(np.linspace(0.0, end, 5), 0.0),
+                log=track(np.arange(5) * 2.0, 0.0),
+                images=[image(400_000, 99)],
+            )
+            out.append(
+                ScoredRollout(scene_id, name, tuple(score(log, scene(TWO_LANES, log), "alpasim")))
+            )
         return out
 
-    one, two = (over_sweeps(reduce_run(run(names), ALPASIM)) for names in (("a", "b", "a", "b"), ("a", "b", "b", "a")))
+    one, two = (
+        over_sweeps(reduce_run(run(names), ALPASIM))
+        for names in (("a", "b", "a", "b"), ("a", "b", "b", "a"))
+    )
     assert one["progress"] == pytest.approx(two["progress"])
     assert one["progress_std"] == pytest.approx(0.5 / np.sqrt(2))
     assert two["progress_std"] == pytest.approx(0.0, abs=1e-6)
     # Intervals over scenes and seeds know no names.
     rows = [
-        {"renderer": "r", "policy": "p", "scene": s, "seed": k, "status": "ok", "progress": v, "progress_valid": True}
-        for s in ("s1", "s2") for k, v in enumerate((0.5, 1.0))
-    ]  # fmt: skip
+        {
+            "renderer": "r",
+            "policy": "p",
+            "scene": s,
+            "seed": k,
+            "status": "ok",
+            "progress": v,
+            "progress_valid": True,
+        }
+        for s in ("s1", "s2")
+        for k, v in enumerate((0.5, 1.0))
+    ]
     swapped = [dict(row, seed=1 - row["seed"]) if row["scene"] == "s2" else row for row in rows]
     clustered = [aggregate(some)["r"]["progress"]["ci95_clustered"] for some in (rows, swapped)]
     assert clustered[0] == pytest.approx(clustered[1])
@@ -307,17 +413,30 @@ def test_d23_alpasims_spread_depends_on_how_rollouts_are_named():
 
 def test_d27_times_of_written_tables_are_64_bit_integers():
     log = rollout(STAND)
-    run = [ScoredRollout("s", "a", tuple(score(log, scene(TWO_LANES, log), preset))) for preset in ("alpasim", "strict")]
+    run = [
+        ScoredRollout("s", "a", tuple(score(log, scene(TWO_LANES, log), preset)))
+        for preset in ("alpasim", "strict")
+    ]
     table = metrics_unprocessed_table(run)
     assert str(table.schema.field("timestamps_us").type) == "int64"
     empty = [row for row in table.to_pylist() if row["timestamps_us"] is None]
-    assert {row["name"] for row in empty} >= {"plan_deviation", "open_loop_collision"}  # no plans: one row without a time each
+    assert {row["name"] for row in empty} >= {
+        "plan_deviation",
+        "open_loop_collision",
+    }  # no plans: one row without a time each
 
 
 def test_one_rollout_that_never_leaves_the_lane_has_the_same_flags_in_both():
     """The guard of this file: where no quirk is touched, the presets agree."""
     log = rollout(DRIVE, [car("far", track(np.full(80, 150.0), 3.5))])
     alpasim, strict = both(log)
-    flags = ("collision_any", "collision_front", "collision_lateral", "collision_rear", "offroad", "wrong_lane")
+    flags = (
+        "collision_any",
+        "collision_front",
+        "collision_lateral",
+        "collision_rear",
+        "offroad",
+        "wrong_lane",
+    )
     assert all(not one[name].value.any() for one in (alpasim, strict) for name in flags)
     assert reduce_rollout(list(alpasim.values()), ALPASIM).ledger.steps_scored == 80

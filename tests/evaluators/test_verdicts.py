@@ -12,7 +12,9 @@ from tests.evaluators.test_tables_over_rollouts import rows_of
 
 
 def pair(base, other, metric="route_distance_m", **options):
-    return paired(rows_of(base, metric, "clean") + rows_of(other, metric, "3dgs"), "clean", **options)["3dgs"][metric]
+    return paired(
+        rows_of(base, metric, "clean") + rows_of(other, metric, "3dgs"), "clean", **options
+    )["3dgs"][metric]
 
 
 @pytest.mark.parametrize(
@@ -60,7 +62,14 @@ def test_margins_are_given_or_the_documented_defaults():
     assert pair(base, other, margins={"route_distance_m": 0.2})["margin"] == 0.2
     assert pair([[0.0]] * 3, [[0.0]] * 3, "offroad")["margin"] == 0.02
     many = [[float(i)] for i in range(200)]
-    assert pair(many, [[v[0] + 0.3 + 0.01 * (v[0] % 3)] for v in many], margins={"route_distance_m": 0.5})["verdict"] == "non-inferior"
+    assert (
+        pair(
+            many,
+            [[v[0] + 0.3 + 0.01 * (v[0] % 3)] for v in many],
+            margins={"route_distance_m": 0.5},
+        )["verdict"]
+        == "non-inferior"
+    )
 
 
 def test_an_undecided_difference_says_how_many_more_scenes_would_decide_it():
@@ -70,7 +79,9 @@ def test_an_undecided_difference_says_how_many_more_scenes_would_decide_it():
     assert found["verdict"] == "undecided"
     assert found["spread"] == pytest.approx(0.5, rel=0.6)
     assert 5 < found["more_scenes"] < 2000
-    assert pair([[1.0], [2.0]], [[1.0], [2.0]])["more_scenes"] == 146 - 2  # as many as show that nothing was missed
+    assert (
+        pair([[1.0], [2.0]], [[1.0], [2.0]])["more_scenes"] == 146 - 2
+    )  # as many as show that nothing was missed
 
 
 def test_rare_events_alone_never_decide_on_few_scenes():
@@ -98,7 +109,10 @@ def test_scenes_that_cannot_have_shown_a_rare_harm_decide_nothing_however_alike_
 def test_equal_scenes_have_no_spread_to_go_by():
     for equal in (0.0, 0.1 + 0.2, 1e-9):
         found = pair([[1.0 + i] for i in range(8)], [[1.0 + i + equal] for i in range(8)])
-        assert (found["verdict"], found["difference"] == "worse") == ("undecided", equal > 1e-6 and found["ci95"][0] > 0.0)
+        assert (found["verdict"], found["difference"] == "worse") == (
+            "undecided",
+            equal > 1e-6 and found["ci95"][0] > 0.0,
+        )
         assert found["ci95"] == found["guarded"]
         assert found["ci95"][1] > 1.0
         assert "8 scenes are equal" in found["note"]
@@ -120,7 +134,11 @@ def test_mcnemar_counts_cells_and_the_sign_test_scenes():
     base = [[0.0, 0.0, 1.0]] * 4 + [[0.0, 0.0, 0.0]] * 4
     other = [[1.0, 1.0, 0.0]] * 4 + [[0.0, 0.0, 0.0]] * 4
     found = pair(base, other, "collision_any")
-    assert found["cells"] == {"only_here": 8, "only_baseline": 4, "p_value": pytest.approx(stats.binomtest(8, 12).pvalue)}
+    assert found["cells"] == {
+        "only_here": 8,
+        "only_baseline": 4,
+        "p_value": pytest.approx(stats.binomtest(8, 12).pvalue),
+    }
     assert found["scenes"] == {"up": 4, "down": 0, "same": 4, "p_value": pytest.approx(2 * 0.5**4)}
     assert found["p_value"] == found["scenes"]["p_value"]
 
@@ -132,7 +150,12 @@ def test_every_cell_without_a_pair_is_named_with_its_side_and_cause():
     found = paired(base + other, "clean")["3dgs"]["route_distance_m"]
     assert (found["n_cells"], found["n_missing"]) == (2, 2)
     first, second = found["missing"]
-    assert (first["scene"], first["seed"], first["missing"], first["why"]) == ("scene-0", 1, "here", "here: failed (renderer)")
+    assert (first["scene"], first["seed"], first["missing"], first["why"]) == (
+        "scene-0",
+        1,
+        "here",
+        "here: failed (renderer)",
+    )
     assert (second["scene"], second["seed"], second["missing"]) == ("scene-1", 1, "both")
     assert second["why"] == "here: not planned; baseline: not valid (not given)"
     assert paired(base + other, "clean", listed=1)["3dgs"]["route_distance_m"]["n_missing"] == 2
@@ -150,7 +173,13 @@ def test_a_hundred_thousand_rollouts_are_not_slow_because_of_pairs():
         values[..., 1] = values[..., 1] < 0.1
         for i in range(scenes):
             for k in range(seeds):
-                row = {"renderer": renderer, "policy": "p", "scene": f"s{i:04d}", "seed": k, "status": "ok"}
+                row = {
+                    "renderer": renderer,
+                    "policy": "p",
+                    "scene": f"s{i:04d}",
+                    "seed": k,
+                    "status": "ok",
+                }
                 for name, v in zip(names, values[i, k].tolist(), strict=True):
                     row[name], row[f"{name}_valid"] = v, True
                 rows.append(row)
@@ -162,7 +191,9 @@ def test_a_hundred_thousand_rollouts_are_not_slow_because_of_pairs():
 
 def test_a_rate_is_worse_only_by_what_also_holds_for_scenes_that_were_not_drawn():
     def gained(k):
-        return pair([[0.0]] * 20, [[1.0]] * k + [[0.0]] * (20 - k), "offroad", margins={"offroad": 0.05})
+        return pair(
+            [[0.0]] * 20, [[1.0]] * k + [[0.0]] * (20 - k), "offroad", margins={"offroad": 0.05}
+        )
 
     assert [gained(k)["verdict"] for k in (6, 7)] == ["undecided", "worse"]
     assert gained(6)["ci95"][0] > 0.05 > gained(6)["guarded"][0]
@@ -170,7 +201,10 @@ def test_a_rate_is_worse_only_by_what_also_holds_for_scenes_that_were_not_drawn(
 
 def test_metres_are_worse_or_better_only_where_few_other_scenes_could_not_undo_it():
     def moved(by, n=20, **options):
-        base, other = [[50.0 + i] for i in range(n)], [[50.0 + i + by + 0.01 * (i % 3)] for i in range(n)]
+        base, other = (
+            [[50.0 + i] for i in range(n)],
+            [[50.0 + i + by + 0.01 * (i % 3)] for i in range(n)],
+        )
         found = pair(base, other, "lateral_distance_m", **options)
         return found["verdict"], found["difference"], found.get("note", "")
 

@@ -12,7 +12,9 @@ from alpasim_plugin.core.types import U8, Frame
 
 
 class Blend:
-    """Mix every frame with its camera's whole block and with the last frame of the block before: both matter bit for bit."""
+    """Mix every frame with its camera's whole block and with the last frame of the block before:
+    both matter bit for bit.
+    """
 
     trained = True
     label = "blend"
@@ -43,7 +45,9 @@ class Blend:
         for frame in block:
             mean = np.mean([f.rgb for f in block if f.camera == frame.camera], axis=0)
             past = self.past.get(frame.camera, frame.rgb)
-            out.append(replace(frame, rgb=(0.5 * frame.rgb + 0.25 * mean + 0.25 * past).astype(np.uint8)))
+            out.append(
+                replace(frame, rgb=(0.5 * frame.rgb + 0.25 * mean + 0.25 * past).astype(np.uint8))
+            )
         return out
 
 
@@ -71,7 +75,10 @@ class GuardSteps(Blend):
     """As a fixer whose guard passes every third frame on raw."""
 
     def _mix(self, block: Sequence[Frame]) -> list[Frame]:
-        return [replace(block[i], events=("fixer-nan",)) if i % 3 == 0 else fixed for i, fixed in enumerate(super()._mix(block))]
+        return [
+            replace(block[i], events=("fixer-nan",)) if i % 3 == 0 else fixed
+            for i, fixed in enumerate(super()._mix(block))
+        ]
 
 
 def fixed_offline(fixer: Blend, frames: Sequence[Frame]) -> list[Frame]:

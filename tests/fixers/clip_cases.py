@@ -13,12 +13,20 @@ STEP_US = 100_000
 
 
 def moving_picture(
-    count: int, size: tuple[int, int] = SIZE, key: str = "picture", holes: bool = True, camera: str = "front"
+    count: int,
+    size: tuple[int, int] = SIZE,
+    key: str = "picture",
+    holes: bool = True,
+    camera: str = "front",
 ) -> list[Frame]:
     """Return frames of a smooth texture that slides by, with a soft-edged hole in their opacity."""
     height, width = size
-    texture = stream("tests", 0, key).integers(0, 256, (height + 64, width + 64, 3)).astype(np.float32)
-    texture = cv2.normalize(cv2.GaussianBlur(texture, (0, 0), 2.5), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    texture = (
+        stream("tests", 0, key).integers(0, 256, (height + 64, width + 64, 3)).astype(np.float32)
+    )
+    texture = cv2.normalize(
+        cv2.GaussianBlur(texture, (0, 0), 2.5), None, 0, 255, cv2.NORM_MINMAX
+    ).astype(np.uint8)
     out = []
     for i in range(count):
         y, x = (i * 1) % 64, (i * 3) % 64
@@ -26,7 +34,14 @@ def moving_picture(
         if holes:
             alpha[: height // 2, : width // 3] = 0.0
             alpha[height // 2 :, : width // 6] = 0.5
-        out.append(Frame(i * STEP_US, camera, np.ascontiguousarray(texture[y : y + height, x : x + width]), alpha))
+        out.append(
+            Frame(
+                i * STEP_US,
+                camera,
+                np.ascontiguousarray(texture[y : y + height, x : x + width]),
+                alpha,
+            )
+        )
     return out
 
 

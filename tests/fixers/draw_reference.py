@@ -1,11 +1,14 @@
 """Reference implementation of the semantic map, which the fast kernels are compared with.
 
-Lines and triangles are halved until their pieces are short and seen under a small angle; every point is projected by the exact formula in
-float64. Then every pixel is tested against each stroke and shape: no bands, no shortcuts.
+Lines and triangles are halved until their pieces are short and seen under a small angle; every
+point is projected by the exact formula in float64. Then every pixel is tested against each stroke
+and shape: no bands, no shortcuts.
 
-- A stroke covers a sample when the sample's distance to the line, measured with vertical pixels stretched, is at most the radius that the
-  line has at the point nearest to the pixel's centre. 1/depth is linear along a stroke and over a shape.
-- Colour and depth of a stroke belong to the pixel, depth of a shape to the sample. The nearer wins; of equals the one drawn first.
+- A stroke covers a sample when the sample's distance to the line, measured with vertical pixels
+  stretched, is at most the radius that the line has at the point nearest to the pixel's centre.
+  1/depth is linear along a stroke and over a shape.
+- Colour and depth of a stroke belong to the pixel, depth of a shape to the sample. The nearer wins;
+  of equals the one drawn first.
 - Colours fade with ``clamp(1 - depth / depth_max)``, half widths with ``min(1, gain * fade)``.
 """
 
@@ -17,7 +20,14 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import transform_points
 from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec
-from alpasim_plugin.fixers.semantic_map.draw import MapCamera, actor_geometry, radius_of, samples_of, stretch_of, view_of
+from alpasim_plugin.fixers.semantic_map.draw import (
+    MapCamera,
+    actor_geometry,
+    radius_of,
+    samples_of,
+    stretch_of,
+    view_of,
+)
 from alpasim_plugin.fixers.semantic_map.kernels import (
     BACK,
     BIAS,
@@ -44,7 +54,8 @@ def draw_map_reference(
     step_m: float = 2.0,
     angle_rad: float = 0.05,
 ) -> U8:
-    """Draw what `alpasim_plugin.fixers.semantic_map.draw.draw_map` draws, from points at most ``step_m`` and ``angle_rad`` apart.
+    """Draw what `alpasim_plugin.fixers.semantic_map.draw.draw_map` draws, from points at most
+    ``step_m`` and ``angle_rad`` apart.
 
     Raises:
         InputError: As the fast one.
@@ -52,36 +63,56 @@ def draw_map_reference(
     _, _, pose = view_of(scene, camera, T_world_camera)
     T_camera_scene = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
     faces, edges = actor_geometry(actors, scene, pose)
-    first = strokes_reference(scene.segments, T_camera_scene, camera, scene.style, step_m, angle_rad)
-    strokes = np.concatenate([first, strokes_reference(edges, T_camera_scene, camera, scene.style, step_m, angle_rad)])
-    shapes = [shapes_reference(part, T_camera_scene, camera, scene.style, step_m, angle_rad) for part in (scene.triangles, faces)]
+    first = strokes_reference(
+        scene.segments, T_camera_scene, camera, scene.style, step_m, angle_rad
+    )
+    strokes = np.concatenate(
+        [first, strokes_reference(edges, T_camera_scene, camera, scene.style, step_m, angle_rad)]
+    )
+    shapes = [
+        shapes_reference(part, T_camera_scene, camera, scene.style, step_m, angle_rad)
+        for part in (scene.triangles, faces)
+    ]
     return draw_reference(strokes, len(first), np.concatenate(shapes), camera, scene.style)
 
 
 def project_points(camera: MapCamera, points: F64) -> F64:
-    """Project camera-frame points ``(N, 3)``, metres, to pixels ``(N, 2)`` in float64, without a table.
+    """Project camera-frame points ``(N, 3)``, metres, to pixels ``(N, 2)`` in float64, without a
+    table.
 
-    A pinhole needs z > 0: points at or behind its plane give NaN. An f-theta lens sees behind itself where its radius goes on.
+    A pinhole needs z > 0: points at or behind its plane give NaN. An f-theta lens sees behind
+    itself where its radius goes on.
     """
     x, y, z = points.T
     if isinstance(camera, CameraSpec):
         z = np.where(z > 0, z, np.nan)
         k = camera.K
-        return np.stack([k[0, 0] * x / z + k[0, 1] * y / z + k[0, 2], k[1, 1] * y / z + k[1, 2]], axis=1)
+        return np.stack(
+            [k[0, 0] * x / z + k[0, 1] * y / z + k[0, 2], k[1, 1] * y / z + k[1, 2]], axis=1
+        )
     across = np.hypot(x, y)
     radius = radius_of(camera, np.arctan2(across, z))
     unit = points[:, :2] / np.where(across > 0, across, 1.0)[:, None]
     return np.asarray((unit * radius[:, None]) @ np.array(camera.A).T + (camera.cx, camera.cy))
 
 
-def strokes_reference(segments: Segments, T_camera_scene: F64, camera: MapCamera, style: MapStyle, step_m: float, angle_rad: float) -> F64:
+def strokes_reference(
+    segments: Segments,
+    T_camera_scene: F64,
+    camera: MapCamera,
+    style: MapStyle,
+    step_m: float,
+    angle_rad: float,
+) -> F64:
     """Cut segments into short strokes ``(N, STROKE)``, clipped at the near and the far plane."""
     rows = [np.zeros((0, STROKE))]
     for ends, (width_px, *look) in zip(segments.ends, segments.style, strict=True):
         a, b = transform_points(T_camera_scene, ends)
         inside = [0.0, 1.0]
         if a[2] != b[2]:
-            crossings = sorted(((style.near_m - a[2]) / (b[2] - a[2]), (style.depth_max_m - a[2]) / (b[2] - a[2])))
+            crossings = sorted(
+                ((style.near_m - a[2]) / (b[2] - a[2]), (style.depth_max_m - a[2]) / (b[2] - a[2]))
+            )
             inside = [max(0.0, crossings[0]), min(1.0, crossings[1])]
         elif not style.near_m <= a[2] < style.depth_max_m:
             continue
@@ -91,25 +122,46 @@ def strokes_reference(segments: Segments, T_camera_scene: F64, camera: MapCamera
         points[:, 2] = np.maximum(points[:, 2], style.near_m)
         seen = np.column_stack([project_points(camera, points), 1.0 / points[:, 2]])
         half = width_px / 2 * camera.width / WIDTH_DEFINED_AT_PX
-        rows.append(np.column_stack([seen[:-1], seen[1:], np.tile((half, *look), (len(points) - 1, 1))]))
+        rows.append(
+            np.column_stack([seen[:-1], seen[1:], np.tile((half, *look), (len(points) - 1, 1))])
+        )
     return np.concatenate(rows)
 
 
-def shapes_reference(triangles: Triangles, T_camera_scene: F64, camera: MapCamera, style: MapStyle, side_m: float, angle_rad: float) -> F64:
+def shapes_reference(
+    triangles: Triangles,
+    T_camera_scene: F64,
+    camera: MapCamera,
+    style: MapStyle,
+    side_m: float,
+    angle_rad: float,
+) -> F64:
     """Cut triangles into small shapes ``(N, SHAPE)``, clipped at the near plane."""
     rows = [np.zeros((0, SHAPE))]
-    for corners, shade, look in zip(triangles.corners, triangles.shade, triangles.style, strict=True):
-        polygon = clip_reference(np.column_stack([transform_points(T_camera_scene, corners), shade]), style.near_m)
+    for corners, shade, look in zip(
+        triangles.corners, triangles.shade, triangles.style, strict=True
+    ):
+        polygon = clip_reference(
+            np.column_stack([transform_points(T_camera_scene, corners), shade]), style.near_m
+        )
         for k in range(1, len(polygon) - 1):
             for piece in _cut(polygon[[0, k, k + 1]], side_m, angle_rad):
-                seen = np.column_stack([project_points(camera, piece[:, :3]), 1.0 / piece[:, 2], piece[:, 3] / piece[:, 2]])
+                seen = np.column_stack(
+                    [
+                        project_points(camera, piece[:, :3]),
+                        1.0 / piece[:, 2],
+                        piece[:, 3] / piece[:, 2],
+                    ]
+                )
                 inverse = 1.0 / piece[:, 2]
                 rows.append(np.array([[*seen.ravel(), inverse.max(), inverse.min(), *look]]))
     return np.concatenate(rows)
 
 
 def clip_reference(polygon: F64, near_m: float) -> F64:
-    """Return the part of a convex polygon ``(N, 3+)`` with z of at least ``near_m``; further columns are interpolated."""
+    """Return the part of a convex polygon ``(N, 3+)`` with z of at least ``near_m``; further
+    columns are interpolated.
+    """
     out = []
     for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         if a[2] >= near_m:
@@ -122,7 +174,9 @@ def clip_reference(polygon: F64, near_m: float) -> F64:
 
 
 def _short(a: F64, b: F64, side_m: float, angle_rad: float) -> bool:
-    """Tell whether a piece between two camera-frame points is short enough to be taken as straight in any image."""
+    """Tell whether a piece between two camera-frame points is short enough to be taken as straight
+    in any image.
+    """
     nearest_m = min(float(np.linalg.norm(a[:3])), float(np.linalg.norm(b[:3])))
     return bool(np.linalg.norm((b - a)[:3]) <= min(side_m, angle_rad * nearest_m))
 
@@ -132,20 +186,30 @@ def _along(a: F64, b: F64, side_m: float, angle_rad: float) -> F64:
     if _short(a, b, side_m, angle_rad):
         return np.stack([a, b])
     middle = (a + b) / 2
-    return np.concatenate([_along(a, middle, side_m, angle_rad)[:-1], _along(middle, b, side_m, angle_rad)])
+    return np.concatenate(
+        [_along(a, middle, side_m, angle_rad)[:-1], _along(middle, b, side_m, angle_rad)]
+    )
 
 
 def _cut(triangle: F64, side_m: float, angle_rad: float) -> list[F64]:
     """Halve a triangle at its longest side until all sides are short."""
-    k = int(np.argmax([np.linalg.norm((triangle[i] - triangle[i - 2])[:3]) for i in range(3)]))  # the side from k to k + 1
-    a, b, c = triangle[k], triangle[k - 2], triangle[k - 1]
+    k = int(
+        np.argmax([np.linalg.norm((triangle[i] - triangle[i - 2])[:3]) for i in range(3)])
+    )  # the side from k to k + 1
+    a = triangle[k]
+    b = triangle[k - 2]
+    c = triangle[k - 1]
     if all(_short(p, q, side_m, angle_rad) for p, q in ((a, b), (b, c), (c, a))):
         return [triangle]
     middle = (a + b) / 2
-    return _cut(np.stack([a, middle, c]), side_m, angle_rad) + _cut(np.stack([middle, b, c]), side_m, angle_rad)
+    return _cut(np.stack([a, middle, c]), side_m, angle_rad) + _cut(
+        np.stack([middle, b, c]), side_m, angle_rad
+    )
 
 
-def draw_reference(strokes: F64, n_first: int, shapes: F64, camera: MapCamera, style: MapStyle) -> U8:
+def draw_reference(
+    strokes: F64, n_first: int, shapes: F64, camera: MapCamera, style: MapStyle
+) -> U8:
     """Draw strokes before ``n_first``, then all shapes, then the other strokes."""
     samples = samples_of(style)
     depth = np.zeros((camera.height, camera.width, len(samples)), np.float32)
@@ -162,7 +226,9 @@ def draw_reference(strokes: F64, n_first: int, shapes: F64, camera: MapCamera, s
 
 
 def _window(low: F64, high: F64, depth: F32) -> tuple[slice, slice, F64] | None:
-    """Return the rows, the columns and the centres ``(h, w, 2)`` of the pixels in a box of the image; None outside it."""
+    """Return the rows, the columns and the centres ``(h, w, 2)`` of the pixels in a box of the
+    image; None outside it.
+    """
     height, width = depth.shape[:2]
     x0, y0 = np.clip(np.floor(low) - 1, 0, (width, height)).astype(int)
     x1, y1 = np.clip(np.ceil(high) + 1, 0, (width, height)).astype(int)
@@ -172,7 +238,9 @@ def _window(low: F64, high: F64, depth: F32) -> tuple[slice, slice, F64] | None:
     return slice(y0, y1), slice(x0, x1), np.stack([x, y], axis=-1)
 
 
-def _stroke(stroke: F64, stretch: float, depth_max_m: float, samples: F64, depth: F32, colour: F64) -> None:
+def _stroke(
+    stroke: F64, stretch: float, depth_max_m: float, samples: F64, depth: F32, colour: F64
+) -> None:
     square = np.array([1.0, stretch])
     a, b = stroke[0:2], stroke[3:5]
     reach = stroke[HALF] / square
@@ -184,9 +252,15 @@ def _stroke(stroke: F64, stretch: float, depth_max_m: float, samples: F64, depth
     length2 = along @ along
 
     def nearest(points: F64) -> tuple[F64, F64]:
-        """Return the part along the line nearest to points ``(..., 2)``, and the squared distance."""
+        """Return the part along the line nearest to points ``(..., 2)``, and the squared
+        distance.
+        """
         offset = (points - a) * square
-        t = np.clip(offset @ along / length2, 0.0, 1.0) if length2 > 0 else np.zeros(offset.shape[:-1])
+        t = (
+            np.clip(offset @ along / length2, 0.0, 1.0)
+            if length2 > 0
+            else np.zeros(offset.shape[:-1])
+        )
         rest = offset - t[..., None] * along
         return t, np.sum(rest * rest, axis=-1)
 
@@ -197,7 +271,13 @@ def _stroke(stroke: F64, stretch: float, depth_max_m: float, samples: F64, depth
     covered = np.stack([nearest(centre + offset)[1] <= radius**2 for offset in samples], axis=-1)
     here = inverse / np.maximum(1.0 - stroke[BIAS] * inverse, 1e-3)
     painted = np.floor(stroke[RED : RED + 3] * fade[..., None] + 0.5)
-    _put(covered, np.broadcast_to(here[..., None], covered.shape), painted, depth[rows, columns], colour[rows, columns])
+    _put(
+        covered,
+        np.broadcast_to(here[..., None], covered.shape),
+        painted,
+        depth[rows, columns],
+        colour[rows, columns],
+    )
 
 
 def _shape(shape: F64, depth_max_m: float, samples: F64, depth: F32, colour: F64) -> None:
@@ -217,15 +297,22 @@ def _shape(shape: F64, depth_max_m: float, samples: F64, depth: F32, colour: F64
     inverse = np.clip(middle @ corners[:, 2], shape[FARTHEST], shape[NEAREST])
     fade = np.maximum(0.0, 1.0 - 1.0 / inverse / depth_max_m)
     back = np.clip(middle @ corners[:, 3] / inverse, 0.0, 1.0)[..., None]
-    painted = np.floor((shape[FRONT : FRONT + 3] * (1 - back) + shape[BACK : BACK + 3] * back) * fade[..., None] + 0.5)
+    painted = np.floor(
+        (shape[FRONT : FRONT + 3] * (1 - back) + shape[BACK : BACK + 3] * back) * fade[..., None]
+        + 0.5
+    )
     at_samples = np.stack([parts(centre + offset) for offset in samples], axis=-2)
     here = np.clip(at_samples @ corners[:, 2], shape[FARTHEST], shape[NEAREST])
     here = here / np.maximum(1.0 - shape[S_BIAS] * here, 1e-3)
-    _put(np.all(at_samples >= 0, axis=-1), here, painted, depth[rows, columns], colour[rows, columns])
+    _put(
+        np.all(at_samples >= 0, axis=-1), here, painted, depth[rows, columns], colour[rows, columns]
+    )
 
 
 def _put(covered: Bool, inverse: F64, painted: F64, depth: F32, colour: F64) -> None:
-    """Write covered samples ``(h, w, n)`` that are nearer than what is there; ``depth`` and ``colour`` are views of the buffers."""
+    """Write covered samples ``(h, w, n)`` that are nearer than what is there; ``depth`` and
+    ``colour`` are views of the buffers.
+    """
     wins = covered & (inverse.astype(np.float32) > depth)
     depth[wins] = inverse[wins]
     colour[wins] = np.broadcast_to(painted[:, :, None, :], colour.shape)[wins]

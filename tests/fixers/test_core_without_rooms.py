@@ -58,11 +58,17 @@ def alone(*code: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_without_the_rooms_core_modules_import_onefixer_repairs_and_an_absent_network_is_named_in_the_error() -> None:
-    alone(IMPORT_ALL, REPAIR, ABSENT)  # in one process: most of the time goes by while torch is imported
+def test_without_the_rooms_core_modules_import_onefixer_repairs_and_an_absent_network_is_named_in_the_error() -> (
+    None
+):
+    alone(
+        IMPORT_ALL, REPAIR, ABSENT
+    )  # in one process: most of the time goes by while torch is imported
 
 
-@pytest.mark.parametrize("name", ["CosmosCausalDiT", "DiTSizes", "TextContext", "TinyDecoder", "TinyVAE", "WanVAE"])
+@pytest.mark.parametrize(
+    "name", ["CosmosCausalDiT", "DiTSizes", "TextContext", "TinyDecoder", "TinyVAE", "WanVAE"]
+)
 def test_networks_of_the_block_generators_are_imported_by_their_public_names(name: str) -> None:
     from alpasim_plugin.fixers import network as nets
 

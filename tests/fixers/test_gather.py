@@ -6,13 +6,28 @@ import pytest
 import torch
 from torch import Tensor
 
-from alpasim_plugin.fixers.gather import gather_beside_cpu, gather_cells_cpu, likeness_cpu, mix_cpu, offsets_cpu
+from alpasim_plugin.fixers.gather import (
+    gather_beside_cpu,
+    gather_cells_cpu,
+    likeness_cpu,
+    mix_cpu,
+    offsets_cpu,
+)
 from alpasim_plugin.fixers.network.pixel_generator import PixelState, gather_cells
-from alpasim_plugin.fixers.network.reference_blend import BlendHeads, gather_beside, likeness, mix, offsets, sources_of
+from alpasim_plugin.fixers.network.reference_blend import (
+    BlendHeads,
+    gather_beside,
+    likeness,
+    mix,
+    offsets,
+    sources_of,
+)
 from alpasim_plugin.fixers.pixel_network import in_floats, smaller
 
 
-def images(batch: int, height: int, width: int, hidden: int) -> tuple[Tensor, Tensor, Tensor, PixelState]:
+def images(
+    batch: int, height: int, width: int, hidden: int
+) -> tuple[Tensor, Tensor, Tensor, PixelState]:
     draw = torch.Generator().manual_seed(batch + height + width + hidden)
 
     def image(h: int, w: int, channels: int) -> Tensor:
@@ -20,23 +35,33 @@ def images(batch: int, height: int, width: int, hidden: int) -> tuple[Tensor, Te
 
     render, sdmap, output, last = (image(height, width, 3) for _ in range(4))
     state = PixelState(
-        output, last, image(height // 4, width // 4, hidden), render.new_zeros(batch, 0, 1, 0), render.new_zeros(batch, 1, 1, 1),
+        output,
+        last,
+        image(height // 4, width // 4, hidden),
+        render.new_zeros(batch, 0, 1, 0),
+        render.new_zeros(batch, 1, 1, 1),
         render.new_zeros(batch, height, width, 1),
-    )  # fmt: skip
+    )
     return render, image(height, width, 1).abs(), sdmap, state
 
 
 def recordings(batch: int, references: int, height: int, width: int) -> Tensor:
     """References that hold, do not, or by half."""
     draw = torch.Generator().manual_seed(height + references)
-    out = torch.randint(0, 256, (batch, references, height, width, 4), dtype=torch.uint8, generator=draw)
+    out = torch.randint(
+        0, 256, (batch, references, height, width, 4), dtype=torch.uint8, generator=draw
+    )
     out[..., 3] = torch.tensor([0, 128, 255], dtype=torch.uint8)[(out[..., 3] % 3).long()]
     return out
 
 
-@pytest.mark.parametrize(("batch", "height", "width", "hidden"), [(1, 16, 16, 16), (3, 32, 48, 16), (2, 16, 80, 0)])
+@pytest.mark.parametrize(
+    ("batch", "height", "width", "hidden"), [(1, 16, 16, 16), (3, 32, 48, 16), (2, 16, 80, 0)]
+)
 @pytest.mark.parametrize("noisy", [True, False])
-def test_one_pass_gathers_the_same_bits(batch: int, height: int, width: int, hidden: int, noisy: bool) -> None:
+def test_one_pass_gathers_the_same_bits(
+    batch: int, height: int, width: int, hidden: int, noisy: bool
+) -> None:
     render, opacity, sdmap, state = images(batch, height, width, hidden)
     source = render * 0.25 if noisy else render
     given = render, opacity, sdmap, state, source
@@ -50,11 +75,24 @@ def test_one_pass_gathers_the_same_bits(batch: int, height: int, width: int, hid
 
 def test_values_are_rounded_to_bfloat16_as_torch_rounds_them() -> None:
     bits = torch.tensor(
-        [0x3F808000, 0x3F818000, 0x3F808001, 0x3F807FFF, 0x7F7FFFFF, 0x80000001, 0x7F800000, 0x7F800001, -1], dtype=torch.int64
+        [
+            0x3F808000,
+            0x3F818000,
+            0x3F808001,
+            0x3F807FFF,
+            0x7F7FFFFF,
+            0x80000001,
+            0x7F800000,
+            0x7F800001,
+            -1,
+        ],
+        dtype=torch.int64,
     )
     render, opacity, sdmap, state = images(1, 16, 16, 16)
     state.hidden[0, 0, 0, : len(bits)] = bits.to(torch.int32).view(torch.float32)
-    half = gather_cells_cpu(render, opacity, sdmap, state, render, torch.bfloat16).coarse[0, 0, 0, -16:]
+    half = gather_cells_cpu(render, opacity, sdmap, state, render, torch.bfloat16).coarse[
+        0, 0, 0, -16:
+    ]
     assert torch.equal(half.nan_to_num(7.0), state.hidden[0, 0, 0].bfloat16().nan_to_num(7.0))
 
 
@@ -66,7 +104,9 @@ def test_views_of_larger_images_and_values_that_are_not_numbers_pass_through() -
         render[half],
         opacity[half],
         sdmap[half],
-        state._replace(output=state.output[half], render=state.render[half], hidden=state.hidden[:, :4, :8]),
+        state._replace(
+            output=state.output[half], render=state.render[half], hidden=state.hidden[:, :4, :8]
+        ),
     )
     fast, plain = gather_cells_cpu(*views, views[2], torch.float32), gather_cells(*views, views[2])
     assert torch.equal(fast.coarse.nan_to_num(7.0), plain.coarse.nan_to_num(7.0))
@@ -75,40 +115,79 @@ def test_views_of_larger_images_and_values_that_are_not_numbers_pass_through() -
 
 @pytest.mark.parametrize(
     ("batch", "references", "height", "width", "scale"),
-    [(1, 1, 16, 16, 1), (2, 3, 32, 48, 1), (1, 4, 16, 80, 1), (2, 2, 32, 64, 2), (1, 1, 48, 96, 3), (1, 2, 32, 64, 8)],
+    [
+        (1, 1, 16, 16, 1),
+        (2, 3, 32, 48, 1),
+        (1, 4, 16, 80, 1),
+        (2, 2, 32, 64, 2),
+        (1, 1, 48, 96, 3),
+        (1, 2, 32, 64, 8),
+    ],
 )
-def test_one_pass_mixes_as_the_operations_one_by_one(batch: int, references: int, height: int, width: int, scale: int) -> None:
+def test_one_pass_mixes_as_the_operations_one_by_one(
+    batch: int, references: int, height: int, width: int, scale: int
+) -> None:
     draw = torch.Generator().manual_seed(height + references)
     repaired = torch.rand(batch, height, width, 3, generator=draw) * 2 - 1
     images = recordings(batch, references, height, width)
     at2 = (batch, references, height // (2 * scale), width // (2 * scale))
-    heads = BlendHeads(*(torch.randn(*at2, n, generator=draw) * size for n, size in ((4, 3.0), (2, 8.0), (12, 0.3))))
+    heads = BlendHeads(
+        *(
+            torch.randn(*at2, n, generator=draw) * size
+            for n, size in ((4, 3.0), (2, 8.0), (12, 0.3))
+        )
+    )
     seen, floats = repaired[:, : height // scale, : width // scale], in_floats(images)
-    beside = gather_beside(smaller(floats.flatten(0, 1), scale).unflatten(0, images.shape[:2]), seen)
+    beside = gather_beside(
+        smaller(floats.flatten(0, 1), scale).unflatten(0, images.shape[:2]), seen
+    )
     for dtype, share in ((torch.float32, 0.0), (torch.bfloat16, 2**-8)):
         for one, other in zip(gather_beside_cpu(images, seen, scale, dtype), beside, strict=True):
             assert one.dtype == dtype
             assert torch.allclose(one.float(), other, atol=2e-6, rtol=share)
-    exact = BlendHeads(*(part.double() for part in heads))  # in float32 the operations one by one are less exact
-    fast, plain = mix_cpu(repaired, images, heads, scale), mix(sources_of(repaired.double(), floats.double(), exact, scale))
-    for one, other in zip(fast, plain, strict=True):  # at the edge of what holds, a rounded offset weighs more than the rounding itself
+    exact = BlendHeads(
+        *(part.double() for part in heads)
+    )  # in float32 the operations one by one are less exact
+    fast, plain = (
+        mix_cpu(repaired, images, heads, scale),
+        mix(sources_of(repaired.double(), floats.double(), exact, scale)),
+    )
+    for one, other in zip(
+        fast, plain, strict=True
+    ):  # at the edge of what holds, a rounded offset weighs more than the rounding itself
         assert float((one - other).abs().quantile(0.99)) < 1e-5
         assert float((one - other).abs().max()) < 1e-3
-    half = BlendHeads(heads.weight.bfloat16(), heads.offset_px, heads.correction.bfloat16())  # read as they are
-    for one, other in zip(mix_cpu(repaired, images, half, scale), mix(sources_of(repaired, floats, half, scale)), strict=True):
+    half = BlendHeads(
+        heads.weight.bfloat16(), heads.offset_px, heads.correction.bfloat16()
+    )  # read as they are
+    for one, other in zip(
+        mix_cpu(repaired, images, half, scale),
+        mix(sources_of(repaired, floats, half, scale)),
+        strict=True,
+    ):
         assert torch.allclose(one, other, atol=2e-3)
 
 
 def test_a_reference_with_an_enormous_weight_is_the_picture_and_nothing_overflows() -> None:
-    repaired, images = torch.zeros(1, 16, 16, 3), torch.full((1, 2, 16, 16, 4), 255, dtype=torch.uint8)
-    heads = BlendHeads(torch.full((1, 2, 8, 8, 4), 200.0), torch.zeros(1, 2, 8, 8, 2), torch.zeros(1, 2, 8, 8, 12))
+    repaired, images = (
+        torch.zeros(1, 16, 16, 3),
+        torch.full((1, 2, 16, 16, 4), 255, dtype=torch.uint8),
+    )
+    heads = BlendHeads(
+        torch.full((1, 2, 8, 8, 4), 200.0), torch.zeros(1, 2, 8, 8, 2), torch.zeros(1, 2, 8, 8, 12)
+    )
     out, recorded = mix_cpu(repaired, images, heads)
     assert torch.allclose(out, torch.ones_like(out), atol=1e-5)
     assert torch.equal(recorded, torch.ones_like(recorded))
 
 
-@pytest.mark.parametrize(("batch", "references", "height", "width", "channels"), [(1, 1, 1, 1, 16), (2, 3, 9, 16, 16), (1, 2, 4, 20, 5)])
-def test_features_are_compared_as_the_operations_one_by_one_do(batch: int, references: int, height: int, width: int, channels: int) -> None:
+@pytest.mark.parametrize(
+    ("batch", "references", "height", "width", "channels"),
+    [(1, 1, 1, 1, 16), (2, 3, 9, 16, 16), (1, 2, 4, 20, 5)],
+)
+def test_features_are_compared_as_the_operations_one_by_one_do(
+    batch: int, references: int, height: int, width: int, channels: int
+) -> None:
     draw = torch.Generator().manual_seed(width)
     sought = torch.randn(batch, height, width, channels, generator=draw)
     shown = torch.randn(batch * references, height, width, channels, generator=draw)
@@ -116,11 +195,15 @@ def test_features_are_compared_as_the_operations_one_by_one_do(batch: int, refer
     coarse = sought.bfloat16(), shown.bfloat16()
     exact = likeness(*(x.double() for x in coarse))
     assert likeness_cpu(*coarse).dtype == torch.bfloat16
-    assert torch.allclose(likeness_cpu(*coarse).double(), exact, rtol=2**-8, atol=1e-6)  # rounded once, where operations round each product
+    assert torch.allclose(
+        likeness_cpu(*coarse).double(), exact, rtol=2**-8, atol=1e-6
+    )  # rounded once, where operations round each product
 
 
 @pytest.mark.parametrize(("images", "height", "width"), [(1, 2, 2), (3, 8, 16), (2, 6, 22)])
-def test_offsets_are_joined_as_the_operations_one_by_one_do(images: int, height: int, width: int) -> None:
+def test_offsets_are_joined_as_the_operations_one_by_one_do(
+    images: int, height: int, width: int
+) -> None:
     draw = torch.Generator().manual_seed(width)
     at2 = torch.randn(images, height, width, 2, generator=draw) * 3
     at4 = torch.randn(images, height // 2, width // 2, 2, generator=draw)
@@ -136,6 +219,12 @@ def test_weights_over_all_magnitudes_blend_as_in_float64() -> None:
     repaired, images = torch.rand(1, 16, 16, 3, generator=draw), recordings(1, 1, 16, 16)
     heads = BlendHeads(weight, torch.zeros(1, 1, 8, 8, 2), torch.zeros(1, 1, 8, 8, 12))
     out, recorded = mix_cpu(repaired, images, heads)
-    exact = mix(sources_of(repaired.double(), in_floats(images).double(), BlendHeads(*(part.double() for part in heads))))
+    exact = mix(
+        sources_of(
+            repaired.double(),
+            in_floats(images).double(),
+            BlendHeads(*(part.double() for part in heads)),
+        )
+    )
     assert torch.allclose(out.double(), exact[0], atol=1e-6)
     assert torch.allclose(recorded.double(), exact[1], atol=1e-6)

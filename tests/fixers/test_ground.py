@@ -1,4 +1,6 @@
-"""Recorded frames by two hypotheses of depth: the road shows where the render has a hole, and what stands on it keeps its own depth."""
+"""Recorded frames by two hypotheses of depth: the road shows where the render has a hole, and what
+stands on it keeps its own depth.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +11,29 @@ import pytest
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import F32, F64, U8, Box
-from alpasim_plugin.fixers.ground import FARTHEST_M, FREE_SHARE, NEAREST_M, carry, ground_hypothesis, with_users
-from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Picture, WarpTarget, on_boxes, place_boxes, plain_on_boxes, plain_points, warp
+from alpasim_plugin.fixers.ground import (
+    FARTHEST_M,
+    FREE_SHARE,
+    NEAREST_M,
+    carry,
+    ground_hypothesis,
+    with_users,
+)
+from alpasim_plugin.fixers.warp import (
+    INCONSISTENT,
+    VALID,
+    Picture,
+    WarpTarget,
+    on_boxes,
+    place_boxes,
+    plain_on_boxes,
+    plain_points,
+    warp,
+)
 
-WIDTH, HEIGHT, HEIGHT_M = 64, 48, 1.5
+WIDTH = 64
+HEIGHT = 48
+HEIGHT_M = 1.5
 K = np.array([[50.0, 0, 32], [0, 50.0, 16], [0, 0, 1]])
 FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, HEIGHT_M], [0, 0, 0, 1]])
 NOBODY: Mapping[str, F64] = {}
@@ -29,7 +50,9 @@ def rays(T_world_camera: F64) -> F64:
 
 
 def street(x_m: float, wall_m: float = np.inf) -> tuple[F64, F32, U8]:
-    """Pose, depth and picture of a road with a pattern that is fixed to the world, and of a wall across it with another."""
+    """Pose, depth and picture of a road with a pattern that is fixed to the world, and of a wall
+    across it with another.
+    """
     T = se2(x_m, 0.0, 0.0) @ FORWARD
     along = rays(T)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -37,7 +60,11 @@ def street(x_m: float, wall_m: float = np.inf) -> tuple[F64, F32, U8]:
     walled = depth > wall_m - x_m
     depth = np.where(walled, wall_m - x_m, depth)
     here = T[:3, 3] + along * np.where(np.isfinite(depth), depth, 0)[..., None]
-    grey = 128 + 60 * np.sin(1.3 * here[..., 0]) * np.cos(1.1 * here[..., 1]) + 60 * walled * np.sin(2.0 * here[..., 2])
+    grey = (
+        128
+        + 60 * np.sin(1.3 * here[..., 0]) * np.cos(1.1 * here[..., 1])
+        + 60 * walled * np.sin(2.0 * here[..., 2])
+    )
     grey[~np.isfinite(depth)] = 230
     rgb = np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
     return T, np.where(np.isfinite(depth), depth, 0).astype(np.float32), rgb
@@ -53,7 +80,10 @@ def plain_ground(view: WarpTarget, T_world_rig: F64) -> F32:
     height, width = view.depth.shape
     down = T_world_rig[:3, 2] @ view.T_world_camera[:3, :3] @ np.linalg.inv(view.K)
     height_m = T_world_rig[:3, 2] @ (view.T_world_camera[:3, 3] - T_world_rig[:3, 3])
-    slope = down[0] * (np.arange(width) + 0.5) + (down[1] * (np.arange(height) + 0.5) + down[2])[:, None]
+    slope = (
+        down[0] * (np.arange(width) + 0.5)
+        + (down[1] * (np.arange(height) + 0.5) + down[2])[:, None]
+    )
     z = np.divide(-height_m, slope, out=np.zeros_like(slope), where=slope < 0)
     free = ((view.depth <= 0) | (view.depth >= FREE_SHARE * z)) & (z > NEAREST_M) & (z < FARTHEST_M)
     return np.where(free & ~on_boxes((height, width), view.placed.seen), z, 0).astype(np.float32)
@@ -70,7 +100,9 @@ def test_the_road_is_seen_where_the_render_has(fog_m: float) -> None:
     depth[road] = fog_m
     view = WarpTarget(K, T, depth, NOBODY, {})
     pictures = [recorded(9.0), recorded(8.0)]
-    for image, by_two in zip(carry(pictures, view, rig(10.0)), carry(pictures, view, rig(10.0), threads=2), strict=True):
+    for image, by_two in zip(
+        carry(pictures, view, rig(10.0)), carry(pictures, view, rig(10.0), threads=2), strict=True
+    ):
         np.testing.assert_array_equal(image, by_two)
         assert off(image, truth, road) < 6
         assert (image[road][..., 3] == VALID).mean() > 0.9
@@ -115,10 +147,16 @@ def test_a_road_user_of_the_recorded_frame_is_not_painted_on_the_road() -> None:
     box, then = {"car": Box(4.0, 2.0, 1.5)}, se2(17.0, 0.0, 0.0, 0.75)
     T, depth, rgb = street(9.0)
     rear = (slice(18, 26), slice(25, 39))
-    rgb[rear] = 0  # it hid the road, of which its own reconstruction knows nothing, and has left since
+    rgb[rear] = (
+        0  # it hid the road, of which its own reconstruction knows nothing, and has left since
+    )
     recorded_car = Picture(K, T, rgb, depth, {"car": then})
     here, own, _ = street(9.0)
-    image, _ = carry([with_users(recorded_car, box), recorded(9.5)], WarpTarget(K, here, np.zeros_like(own), NOBODY, box), rig(9.0))
+    image, _ = carry(
+        [with_users(recorded_car, box), recorded(9.5)],
+        WarpTarget(K, here, np.zeros_like(own), NOBODY, box),
+        rig(9.0),
+    )
     hidden = (slice(19, 25), slice(26, 38))
     assert (image[hidden][..., 3] == INCONSISTENT).all()
     assert (image[19:25, :20, 3] == VALID).all()
@@ -127,30 +165,50 @@ def test_a_road_user_of_the_recorded_frame_is_not_painted_on_the_road() -> None:
 @pytest.mark.parametrize("seed", range(12))
 def test_where_a_box_is_seen_is_what_plain_arithmetic_says(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    actors = {f"{i}": se2(*rng.uniform(-12, 12, 2), rng.uniform(-3, 3), 0.8) for i in range(int(rng.integers(1, 6)))}
+    actors = {
+        f"{i}": se2(*rng.uniform(-12, 12, 2), rng.uniform(-3, 3), 0.8)
+        for i in range(int(rng.integers(1, 6)))
+    }
     boxes = {name: Box(*rng.uniform(0.3, 6.0, 3)) for name in actors}
-    T = se2(*rng.uniform(-9, 9, 2), rng.uniform(-3, 3)) @ FORWARD  # in some cases the camera stands in a box
+    T = (
+        se2(*rng.uniform(-9, 9, 2), rng.uniform(-3, 3)) @ FORWARD
+    )  # in some cases the camera stands in a box
     placed = place_boxes((HEIGHT, WIDTH), K, T, actors, boxes)
-    found, plain = on_boxes((HEIGHT, WIDTH), placed.seen), plain_on_boxes((HEIGHT, WIDTH), K, T, placed.T_box_world, placed.sizes)
+    found, plain = (
+        on_boxes((HEIGHT, WIDTH), placed.seen),
+        plain_on_boxes((HEIGHT, WIDTH), K, T, placed.T_box_world, placed.sizes),
+    )
     assert (found != plain).mean() <= 1e-3  # a ray exactly along a wall may fall to either side
 
 
-@pytest.mark.parametrize("height_m", [-1.0, 0.0, 1e-9, 1.5, 400.0])  # below the ground, on it, and of a helicopter
+@pytest.mark.parametrize(
+    "height_m", [-1.0, 0.0, 1e-9, 1.5, 400.0]
+)  # below the ground, on it, and of a helicopter
 def test_the_ground_is_where_a_ray_meets_the_plane_below_the_rig(height_m: float) -> None:
-    T_world_rig = se2(3.0, -2.0, 0.7) @ np.array([[1.0, 0, 0, 0], [0, 0.99, -0.14, 0], [0, 0.14, 0.99, 0], [0, 0, 0, 1]])  # rolled
+    T_world_rig = se2(3.0, -2.0, 0.7) @ np.array(
+        [[1.0, 0, 0, 0], [0, 0.99, -0.14, 0], [0, 0.14, 0.99, 0], [0, 0, 0, 1]]
+    )  # rolled
     T_rig_camera = FORWARD.copy()
     T_rig_camera[2, 3] = height_m
-    view = WarpTarget(K, T_world_rig @ T_rig_camera, np.zeros((HEIGHT, WIDTH), np.float32), NOBODY, {})
+    view = WarpTarget(
+        K, T_world_rig @ T_rig_camera, np.zeros((HEIGHT, WIDTH), np.float32), NOBODY, {}
+    )
     depth = ground_hypothesis(view, T_world_rig)
     assert (depth > 0).any() == (height_m == 1.5)  # from too far above the road is no plane
     below = plain_points(depth, K, view.T_world_camera)[depth > 0] - T_world_rig[:3, 3]
     assert np.abs(below @ T_world_rig[:3, 2]).max(initial=0) < 1e-4
 
 
-@pytest.mark.parametrize(("roll", "height_m"), [(0.0, 1.5), (0.3, 0.4), (np.pi, 1.5), (0.0, -1.0), (0.0, 0.0)])
-def test_the_ground_of_a_camera_that_leans_is_what_plain_arithmetic_says(roll: float, height_m: float) -> None:
+@pytest.mark.parametrize(
+    ("roll", "height_m"), [(0.0, 1.5), (0.3, 0.4), (np.pi, 1.5), (0.0, -1.0), (0.0, 0.0)]
+)
+def test_the_ground_of_a_camera_that_leans_is_what_plain_arithmetic_says(
+    roll: float, height_m: float
+) -> None:
     T = street(0.0)[0].copy()
-    T[:3, :3] = T[:3, :3] @ np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
+    T[:3, :3] = T[:3, :3] @ np.array(
+        [[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]
+    )
     T[2, 3] = height_m
     depth = np.random.default_rng(1).uniform(-5, 60, street(0.0)[1].shape).astype(np.float32)
     depth[::7] = np.nan

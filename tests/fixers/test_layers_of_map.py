@@ -9,7 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.types import Lane, LaneMap, Marking
-from alpasim_plugin.fixers.semantic_map.prepare import LaneLine, MapExtras, cut_dashes, lane_lines, prepare_map, triangulate
+from alpasim_plugin.fixers.semantic_map.prepare import (
+    LaneLine,
+    MapExtras,
+    cut_dashes,
+    lane_lines,
+    prepare_map,
+    triangulate,
+)
 from alpasim_plugin.fixers.semantic_map.style import LUDUS, OPENGL, STYLES, box_class
 from tests.examples import examples
 
@@ -20,15 +27,22 @@ def lane(key, y, left_paint="unknown", right_paint="unknown", reverse=False, **m
     edges = [np.column_stack([x, np.full(7, y + side), np.zeros(7)]) for side in (1.75, 0.0, -1.75)]
     if reverse:
         edges = [e[::-1] for e in edges[::-1]]
-    return Lane(key, edges[1], edges[0], edges[2], left_paint=left_paint, right_paint=right_paint, **more)
+    return Lane(
+        key, edges[1], edges[0], edges[2], left_paint=left_paint, right_paint=right_paint, **more
+    )
 
 
 def drawn(*lanes, **more):
-    return [(float(k.xyz[0, 1]), k.colour, k.patterns) for k in lane_lines(LaneMap({k.lane_id: k for k in lanes}, **more))]
+    return [
+        (float(k.xyz[0, 1]), k.colour, k.patterns)
+        for k in lane_lines(LaneMap({k.lane_id: k for k in lanes}, **more))
+    ]
 
 
 def test_edge_shared_by_two_lanes_is_drawn_once_with_the_paint_that_is_known():
-    found = drawn(lane("1", 0.0, "dashed_white", "solid_white"), lane("2", 3.5, "unknown", "unknown"))
+    found = drawn(
+        lane("1", 0.0, "dashed_white", "solid_white"), lane("2", 3.5, "unknown", "unknown")
+    )
     assert sorted(found) == [
         (-1.75, "white", ("solid",)),
         (1.75, "white", ("long_dashed",)),
@@ -40,14 +54,23 @@ def test_unknown_paint_is_drawn_as_nothing():
 
 
 def test_edge_shared_with_oncoming_traffic_is_drawn_once():
-    found = drawn(lane("1", 0.0, "double_yellow", "none"), lane("2", 3.5, "double_yellow", "none", reverse=True))
+    found = drawn(
+        lane("1", 0.0, "double_yellow", "none"),
+        lane("2", 3.5, "double_yellow", "none", reverse=True),
+    )
     assert found == [(1.75, "yellow", ("solid", "solid"))]
 
 
 def test_edges_that_cross_are_both_drawn():
     one, turned = lane("1", 0.0, "solid_white", "none"), lane("2", 0.0, "solid_white", "none")
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    two = Lane("2", turned.centre @ quarter.T, turned.left @ quarter.T + [20.0, -30.0, 0.0], None, left_paint="solid_white")
+    two = Lane(
+        "2",
+        turned.centre @ quarter.T,
+        turned.left @ quarter.T + [20.0, -30.0, 0.0],
+        None,
+        left_paint="solid_white",
+    )
     assert len(drawn(one, two)) == 2
 
 
@@ -59,11 +82,17 @@ def test_unpainted_edges_and_virtual_ones_inside_intersections_are_not_drawn():
 
 def test_marking_lines_are_drawn_with_the_lane_edges_of_known_paint_beside_which_none_runs():
     line = np.array([[0.0, 0, 0], [9, 0, 0]])
-    markings = (Marking(line, "dashed_yellow"), Marking(line + 1, "none"), Marking(line[:1], "unknown"))
+    markings = (
+        Marking(line, "dashed_yellow"),
+        Marking(line + 1, "none"),
+        Marking(line[:1], "unknown"),
+    )
     found = drawn(lane("1", 0.0, "solid_white"), markings=markings)
     assert found == [(0.0, "yellow", ("long_dashed",)), (1.75, "white", ("solid",))]
     along = (Marking(np.array([[-40.0, 1.75, 0], [80, 1.75, 0]]), "dashed_yellow"),)
-    assert drawn(lane("1", 0.0, "solid_white"), markings=along) == [(1.75, "yellow", ("long_dashed",))]
+    assert drawn(lane("1", 0.0, "solid_white"), markings=along) == [
+        (1.75, "yellow", ("long_dashed",))
+    ]
 
 
 def test_untyped_style_draws_every_line_solid():
@@ -77,7 +106,10 @@ def test_untyped_style_draws_every_line_solid():
 
 def test_line_of_no_known_pattern_is_three_times_as_wide():
     line = np.array([[0.0, 0, 0], [60, 0, 0]])
-    scene = prepare_map(LaneMap({}), MapExtras(lane_lines=(LaneLine(line, "white", ("other",)), LaneLine(line, "other"))))
+    scene = prepare_map(
+        LaneMap({}),
+        MapExtras(lane_lines=(LaneLine(line, "white", ("other",)), LaneLine(line, "other"))),
+    )
     assert scene.segments.style[:, 0].tolist() == [36.0, 12.0]
     assert scene.segments.style[:, 3:].tolist() == [[255, 255, 255], [181, 164, 71]]
 
@@ -96,13 +128,17 @@ def test_line_of_no_known_pattern_is_three_times_as_wide():
 )
 def test_patterns_paint_their_share(style, pattern, share):
     line = np.array([[0.0, 0, 0], [2628.0, 0, 0]])  # a whole number of periods of all of them
-    painted = sum(np.linalg.norm(piece[-1] - piece[0]) for piece in cut_dashes(line, style.patterns[pattern]))
+    painted = sum(
+        np.linalg.norm(piece[-1] - piece[0]) for piece in cut_dashes(line, style.patterns[pattern])
+    )
     assert painted / line[-1, 0] == pytest.approx(share, rel=2e-3)
 
 
 @settings(max_examples=examples(60), deadline=None)
 @given(
-    st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-5, 5)), min_size=2, max_size=8),
+    st.lists(
+        st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-5, 5)), min_size=2, max_size=8
+    ),
     st.floats(0.3, 4),
     st.floats(0.1, 9),
 )
@@ -112,7 +148,9 @@ def test_dashes_lie_on_their_line_and_are_as_long_as_they_should(points, on, off
     pieces = cut_dashes(line, ((on, off),))
     lengths = [np.linalg.norm(np.diff(piece, axis=0), axis=1).sum() for piece in pieces]
     full, rest = divmod(length, on + off)
-    assert sum(lengths) == pytest.approx(full * on + min(rest, on), abs=1e-6 * max(length, 1) + 1e-6 * len(pieces))
+    assert sum(lengths) == pytest.approx(
+        full * on + min(rest, on), abs=1e-6 * max(length, 1) + 1e-6 * len(pieces)
+    )
     for piece in pieces:
         for p in piece:
             a, b = line[:-1], line[1:]
@@ -130,7 +168,20 @@ RINGS = {
     "square": [(0, 0), (1, 0), (1, 1), (0, 1)],
     "clockwise": [(0, 0), (0, 1), (1, 1), (1, 0)],
     "arrow": [(0, 0), (4, 2), (0, 4), (1, 2)],
-    "comb": [(0, 0), (7, 0), (7, 3), (6, 3), (6, 1), (4, 1), (4, 3), (3, 3), (3, 1), (1, 1), (1, 3), (0, 3)],
+    "comb": [
+        (0, 0),
+        (7, 0),
+        (7, 3),
+        (6, 3),
+        (6, 1),
+        (4, 1),
+        (4, 3),
+        (3, 3),
+        (3, 1),
+        (1, 1),
+        (1, 3),
+        (0, 3),
+    ],
     "straight corners": [(0, 0), (1, 0), (2, 0), (2, 1), (2, 2), (1, 2), (0, 2), (0, 1)],
     "touching itself": [(0, 0), (2, 0), (1, 1), (2, 2), (0, 2), (1, 1)],
 }
@@ -150,7 +201,9 @@ def test_triangles_fill_the_ring_exactly(name):
     assert len(parts) == len(ring) - 2 - 2 * (name == "touching itself")
     whole = shapely.make_valid(shapely.Polygon(ring))
     assert sum(p.area for p in parts) == pytest.approx(whole.area)
-    assert shapely.union_all([p for p in parts if p.area > 0]).symmetric_difference(whole).area < 1e-9
+    assert (
+        shapely.union_all([p for p in parts if p.area > 0]).symmetric_difference(whole).area < 1e-9
+    )
 
 
 @settings(max_examples=examples(60), deadline=None)
@@ -173,4 +226,10 @@ def test_ring_without_area_is_filled_with_nothing():
 
 def test_styles_are_found_by_name_and_labels_by_any_case():
     assert set(STYLES) == {"opengl", "ludus"}
-    assert [box_class(k) for k in ("Car", "heavy_truck", "Person", "RIDER", "cone")] == ["car", "truck", "pedestrian", "cyclist", "other"]
+    assert [box_class(k) for k in ("Car", "heavy_truck", "Person", "RIDER", "cone")] == [
+        "car",
+        "truck",
+        "pedestrian",
+        "cyclist",
+        "other",
+    ]

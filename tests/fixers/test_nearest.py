@@ -1,4 +1,6 @@
-"""The control without a network shows references where they hold, the nearest first, and the render elsewhere."""
+"""The control without a network shows references where they hold, the nearest first, and the render
+elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,13 @@ def reference(grey: int, holds: list[int]) -> np.ndarray:
 
 def test_the_nearest_lies_on_top_and_what_is_doubted_is_not_shown() -> None:
     fixer = make_fixer("nearest", scene_id="s")
-    references = (reference(1, [VALID, 0, 0, INCONSISTENT]), reference(2, [VALID, VALID, 0, INCONSISTENT]))
-    (out,) = fixer.step([Frame(0, "front", np.full((1, 4, 3), 9, np.uint8), references=references)], [])
+    references = (
+        reference(1, [VALID, 0, 0, INCONSISTENT]),
+        reference(2, [VALID, VALID, 0, INCONSISTENT]),
+    )
+    (out,) = fixer.step(
+        [Frame(0, "front", np.full((1, 4, 3), 9, np.uint8), references=references)], []
+    )
     assert out.rgb[0, :, 0].tolist() == [1, 2, 9, 9]
     assert out.references == ()
 

@@ -1,4 +1,6 @@
-"""The map that a fixer sees and the road that is built show the same paint, whatever the map knows."""
+"""The map that a fixer sees and the road that is built show the same paint, whatever the map
+knows.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ def test_every_stroke_of_paint_lies_on_a_line_of_the_map(name: str) -> None:
     strokes = paint_strokes(site)
     on_walks = len(scenario.lane_map.crosswalks) or len(scenario.lane_map.stop_lines)
     lines = [site.frame.to_ground(line.xyz) for line in lane_lines(scenario.lane_map)]
-    dense = np.concatenate([resample(line, np.arange(0, arc_lengths(line)[-1], 0.2)) for line in lines])
+    dense = np.concatenate(
+        [resample(line, np.arange(0, arc_lengths(line)[-1], 0.2)) for line in lines]
+    )
     middle = (strokes.start + strokes.end) / 2
     distance = np.array([np.linalg.norm(dense - point, axis=1).min() for point in middle])
     assert on_walks or distance.max() < 0.35

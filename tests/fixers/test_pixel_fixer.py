@@ -1,4 +1,6 @@
-"""The per-frame session: streaming equals the training's rollout, cameras are independent, and no fault stays in the history."""
+"""The per-frame session: streaming equals the training's rollout, cameras are independent, and no
+fault stays in the history.
+"""
 
 from __future__ import annotations
 
@@ -46,12 +48,16 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def write_bundle(path: Path) -> Path:
     settings = fixer_settings("onefixer", ["weights.bundle=null", "holes=noise"])
     assert isinstance(settings, PixelFixerSettings)
-    save_bundle(path, {"generator": generator().state_dict()}, settings, trained=True, note="9 updates")
+    save_bundle(
+        path, {"generator": generator().state_dict()}, settings, trained=True, note="9 updates"
+    )
     return path
 
 
 def at(bundle: Path, *overrides: str) -> PixelFixerSettings:
-    settings = fixer_settings("onefixer", [f"weights.bundle={bundle}", "precision=fp32", "holes=noise", *overrides])
+    settings = fixer_settings(
+        "onefixer", [f"weights.bundle={bundle}", "precision=fp32", "holes=noise", *overrides]
+    )
     assert isinstance(settings, PixelFixerSettings)
     return settings
 
@@ -70,7 +76,12 @@ def test_one_frame_in_one_frame_out_and_the_label_says_the_precision(bundle: Pat
     assert fixer.trained
     assert fixer.label == "onefixer, 9 updates, fp32"
     (out,) = fixer.step(FRAMES[:1], MAPS[:1])
-    assert (out.t_us, out.camera, out.rgb.dtype, out.rgb.shape) == (0, "front", np.uint8, (*SIZE, 3))
+    assert (out.t_us, out.camera, out.rgb.dtype, out.rgb.shape) == (
+        0,
+        "front",
+        np.uint8,
+        (*SIZE, 3),
+    )
     assert out.alpha is FRAMES[0].alpha
 
 
@@ -78,7 +89,10 @@ def test_cameras_are_alike_alone_together_and_at_different_rates(bundle: Path) -
     left = moving_picture(8, key="left", camera="left")
     right = moving_picture(8, key="right", camera="right")
     small = moving_picture(8, (16, 32), key="small", camera="small")
-    alone = {name: pixels(run(session(bundle), clip)) for name, clip in (("left", left), ("small", small))}
+    alone = {
+        name: pixels(run(session(bundle), clip))
+        for name, clip in (("left", left), ("small", small))
+    }
     slow = pixels(run(session(bundle), right[::2]))
     fixer = session(bundle)
     out: dict[str, list[Frame]] = {"left": [], "right": [], "small": []}
@@ -99,7 +113,9 @@ def test_a_reset_session_starts_anew_and_noise_follows_the_seed(bundle: Path) ->
     assert not np.array_equal(other, first)
     assert not np.array_equal(pixels(run(session(bundle, "holes=render"), FRAMES)), first)
     opaque = [replace(frame, alpha=None) for frame in FRAMES]
-    assert np.array_equal(pixels(run(session(bundle), opaque)), pixels(run(session(bundle, seed=1), opaque)))
+    assert np.array_equal(
+        pixels(run(session(bundle), opaque)), pixels(run(session(bundle, seed=1), opaque))
+    )
 
 
 @pytest.mark.parametrize("size", [(17, 33), (30, 50), (16, 16)])
@@ -120,7 +136,9 @@ def test_a_missing_map_is_a_black_one(bundle: Path) -> None:
 def test_more_steps_sample_from_noisier_sources(bundle: Path) -> None:
     two = make_fixer("onefixer@2", at(bundle, "steps=[1000,500]"), scene_id="scene")
     assert two.label == "onefixer@2, 9 updates, steps [1000.0, 500.0] instead of [1000.0], fp32"
-    assert not np.array_equal(pixels(list(two.step(FRAMES[:1], ()))), pixels(run(session(bundle), FRAMES[:1])))
+    assert not np.array_equal(
+        pixels(list(two.step(FRAMES[:1], ()))), pixels(run(session(bundle), FRAMES[:1]))
+    )
 
 
 def test_a_refused_step_leaves_the_history(bundle: Path) -> None:
@@ -165,21 +183,31 @@ def test_bundles_of_the_two_kinds_are_told_apart(bundle: Path, tmp_path: Path) -
 
 
 def test_an_untrained_generator_returns_the_render(bundle: Path) -> None:
-    settings = fixer_settings("onefixer", ["weights.bundle=null", "generator.widths=[8,8,8]", "untrained=identity"])
+    settings = fixer_settings(
+        "onefixer", ["weights.bundle=null", "generator.widths=[8,8,8]", "untrained=identity"]
+    )
     fixer = make_fixer("onefixer", settings, scene_id="scene")
     assert not fixer.trained
     assert np.array_equal(pixels([fixer.step(FRAMES[:1], ())[0]]), pixels(FRAMES[:1]))
     with pytest.raises(InputError, match="untrained is 'refuse'"):
-        make_fixer("onefixer", fixer_settings("onefixer", ["weights.bundle=null", "untrained=refuse"]), scene_id="scene")
+        make_fixer(
+            "onefixer",
+            fixer_settings("onefixer", ["weights.bundle=null", "untrained=refuse"]),
+            scene_id="scene",
+        )
 
 
-# --- the harmlessness guard -------------------------------------------------------------------------------------------
+# --- the harmlessness guard
 
 
-def share(out: Tensor, opacity: float = 1.0, sdmap: float = -1.0, before: Tensor | None = None) -> Tensor:
+def share(
+    out: Tensor, opacity: float = 1.0, sdmap: float = -1.0, before: Tensor | None = None
+) -> Tensor:
     road = torch.full((1, 64, 64, 3), -0.2)
     before = road if before is None else before
-    found = render_share(out, road, torch.full((1, 64, 64, 1), opacity), torch.full_like(road, sdmap), before)
+    found = render_share(
+        out, road, torch.full((1, 64, 64, 1), opacity), torch.full_like(road, sdmap), before
+    )
     return torch.zeros(1, 64, 64, 1) if found is None else found
 
 
@@ -199,18 +227,38 @@ def test_an_invention_on_an_opaque_road_is_taken_back() -> None:
 def test_the_guard_on_a_processor_does_what_its_reference_says() -> None:
     source = torch.Generator().manual_seed(0)
     render = torch.rand(3, 32, 48, 3, generator=source) * 2 - 1
-    patches = F.interpolate(torch.rand(3, 3, 4, 6, generator=source), scale_factor=8).permute(0, 2, 3, 1) * 2 - 1
-    out = torch.where(patches[..., :1] > 0, patches, render) * torch.tensor([1.2, 1.0, 0.0])[:, None, None, None]
+    patches = (
+        F.interpolate(torch.rand(3, 3, 4, 6, generator=source), scale_factor=8).permute(0, 2, 3, 1)
+        * 2
+        - 1
+    )
+    out = (
+        torch.where(patches[..., :1] > 0, patches, render)
+        * torch.tensor([1.2, 1.0, 0.0])[:, None, None, None]
+    )
     out[2] = render[2]  # nothing changes: nothing is put back
     opacity, recorded = (torch.rand(3, 32, 48, 1, generator=source) for _ in range(2))
     opacity = (opacity + 0.9).clamp(max=1)
-    sdmap = torch.where(torch.rand(3, 32, 48, 1, generator=source) > 0.999, 1.0, -1.0).expand(-1, -1, -1, 3).contiguous()
-    before = F.interpolate(torch.rand(3, 3, 1, 1, generator=source), size=(32, 48)).permute(0, 2, 3, 1).contiguous()
-    kept, weight = (how(out, render, opacity, sdmap, before, *more) for how, more in ((keep_render, [recorded]), (render_share, [])))
+    sdmap = (
+        torch.where(torch.rand(3, 32, 48, 1, generator=source) > 0.999, 1.0, -1.0)
+        .expand(-1, -1, -1, 3)
+        .contiguous()
+    )
+    before = (
+        F.interpolate(torch.rand(3, 3, 1, 1, generator=source), size=(32, 48))
+        .permute(0, 2, 3, 1)
+        .contiguous()
+    )
+    kept, weight = (
+        how(out, render, opacity, sdmap, before, *more)
+        for how, more in ((keep_render, [recorded]), (render_share, []))
+    )
     assert kept is not None
     assert weight is not None
     assert 0.01 < float((weight > 0).float().mean()) < 0.9
-    torch.testing.assert_close(kept, torch.lerp(out, render, weight * (1 - recorded)), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        kept, torch.lerp(out, render, weight * (1 - recorded)), atol=1e-6, rtol=0
+    )
     assert keep_render(render, render, opacity, sdmap, before, recorded) is None
 
 
@@ -231,7 +279,9 @@ def reading(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with torch.no_grad():
         net.blend.write.bias[:4] = 4.0
     path = tmp_path_factory.mktemp("reading") / "small.safetensors"
-    settings = fixer_settings("onefixer", ["weights.bundle=null", "holes=render", "generator.blend=8", "references=2"])
+    settings = fixer_settings(
+        "onefixer", ["weights.bundle=null", "holes=render", "generator.blend=8", "references=2"]
+    )
     assert isinstance(settings, PixelFixerSettings)
     save_bundle(path, {"generator": net.state_dict()}, settings, trained=True)
     return path
@@ -262,12 +312,17 @@ def test_the_facts_of_a_frame_do_not_depend_on_the_number_of_threads(reading: Pa
         found.append(fixer.step([with_reference(FRAMES[0], 90)], MAPS[:1])[0].facts)
     torch.set_num_threads(before)
     assert found[0] == found[1] == found[2]
-    (half,) = session(reading, "holes=render", "precision=bf16").step([with_reference(FRAMES[0], 90)], MAPS[:1])
+    (half,) = session(reading, "holes=render", "precision=bf16").step(
+        [with_reference(FRAMES[0], 90)], MAPS[:1]
+    )
     assert half.facts["recorded_share"] == pytest.approx(found[0]["recorded_share"], abs=0.02)
 
 
 def test_cameras_with_and_without_references_are_one_batch_and_each_as_alone(reading: Path) -> None:
-    front, side = with_reference(FRAMES[0], 90), replace(FRAMES[1], camera="side", t_us=FRAMES[0].t_us)
+    front, side = (
+        with_reference(FRAMES[0], 90),
+        replace(FRAMES[1], camera="side", t_us=FRAMES[0].t_us),
+    )
     both = session(reading, "holes=render").step([front, side], MAPS[:2])
     for i, frame in enumerate((front, side)):
         (alone,) = session(reading, "holes=render").step([frame], MAPS[i : i + 1])
@@ -275,7 +330,9 @@ def test_cameras_with_and_without_references_are_one_batch_and_each_as_alone(rea
 
 
 def test_the_guard_never_keeps_the_render_where_a_reference_is_shown(reading: Path) -> None:
-    grey = replace(FRAMES[0], rgb=np.full((*SIZE, 3), 20, np.uint8), alpha=np.ones(SIZE, np.float32))
+    grey = replace(
+        FRAMES[0], rgb=np.full((*SIZE, 3), 20, np.uint8), alpha=np.ones(SIZE, np.float32)
+    )
     (out,) = session(reading, "holes=render").step([with_reference(grey, 240)], [])
     assert out.rgb.mean() > 200
 
@@ -287,5 +344,8 @@ def test_a_reference_of_another_size_is_refused(reading: Path) -> None:
 
 
 def test_weights_that_read_no_references_leave_them_alone(bundle: Path) -> None:
-    plain, given = (session(bundle).step([frame], MAPS[:1])[0] for frame in (FRAMES[0], with_reference(FRAMES[0], 200)))
+    plain, given = (
+        session(bundle).step([frame], MAPS[:1])[0]
+        for frame in (FRAMES[0], with_reference(FRAMES[0], 200))
+    )
     assert np.array_equal(plain.rgb, given.rgb)

@@ -1,4 +1,6 @@
-"""The generator in pixels: cells, sizes from weights, an explicit state, no trace of its grid at the start."""
+"""The generator in pixels: cells, sizes from weights, an explicit state, no trace of its grid at
+the start.
+"""
 
 import pytest
 import torch
@@ -6,8 +8,23 @@ from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.machine_probe import choose_precision
-from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes, PixelState, hole_mask, pixel_source, sparse_source
-from alpasim_plugin.fixers.network.pixel_layers import Conv3, Dense, Upsample, activation, cells, pack, pixels
+from alpasim_plugin.fixers.network.pixel_generator import (
+    PixelGenerator,
+    PixelSizes,
+    PixelState,
+    hole_mask,
+    pixel_source,
+    sparse_source,
+)
+from alpasim_plugin.fixers.network.pixel_layers import (
+    Conv3,
+    Dense,
+    Upsample,
+    activation,
+    cells,
+    pack,
+    pixels,
+)
 
 SMALL = PixelSizes((8, 12, 16), (1, 0, 2, 1, 1), 8, 4)
 
@@ -26,7 +43,9 @@ def frames(count: int, seed: int = 1, batch: int = 2) -> list[tuple[Tensor, Tens
     return [(2 * draw(3) - 1, draw(1), 2 * draw(3) - 1) for _ in range(count)]
 
 
-def rolled(net: PixelGenerator, clip: list[tuple[Tensor, Tensor, Tensor]]) -> tuple[list[Tensor], PixelState]:
+def rolled(
+    net: PixelGenerator, clip: list[tuple[Tensor, Tensor, Tensor]]
+) -> tuple[list[Tensor], PixelState]:
     state, out = net.start(clip[0][0]), []
     for render, opacity, sdmap in clip:
         made, state = net(render, opacity, sdmap, state)
@@ -49,8 +68,12 @@ def test_an_upsampled_cell_starts_flat() -> None:
 
 @pytest.mark.parametrize(("dtype", "share"), [(torch.float32, 2e-6), (torch.bfloat16, 2**-7)])
 @pytest.mark.parametrize(("inputs", "outputs"), [(5, 3), (48, 24), (160, 160)])
-def test_a_packed_layer_computes_what_it_computed_before(inputs: int, outputs: int, dtype: torch.dtype, share: float) -> None:
-    layers = torch.nn.ModuleList([Conv3(inputs, outputs), Dense(inputs, outputs), Dense(inputs, outputs, bias=False)])
+def test_a_packed_layer_computes_what_it_computed_before(
+    inputs: int, outputs: int, dtype: torch.dtype, share: float
+) -> None:
+    layers = torch.nn.ModuleList(
+        [Conv3(inputs, outputs), Dense(inputs, outputs), Dense(inputs, outputs, bias=False)]
+    )
     layers.requires_grad_(False).to(dtype)
     conv, dense, bare = layers
     x = torch.randn(2, 6, 9, inputs, dtype=dtype, generator=torch.Generator().manual_seed(inputs))
@@ -58,7 +81,9 @@ def test_a_packed_layer_computes_what_it_computed_before(inputs: int, outputs: i
     keys = layers.state_dict().keys()
     pack(layers)
     assert layers.state_dict().keys() == keys
-    for one, other in zip((conv(x), conv(x, activated=True), dense(x), bare(x)), plain, strict=True):
+    for one, other in zip(
+        (conv(x), conv(x, activated=True), dense(x), bare(x)), plain, strict=True
+    ):
         assert one.stride() == other.stride()
         torch.testing.assert_close(one, other, rtol=share, atol=share)
     x[1, 5, 8, 0] = float("nan")
@@ -81,12 +106,17 @@ def test_weights_say_the_sizes() -> None:
         ({"refine.bias": None}, "missing: refine.bias"),
         ({"more.weight": torch.zeros(2)}, "unknown: more.weight"),
         ({"mix.weight": torch.zeros(8, 8, 1, 1)}, r"mix.weight \[8, 8, 1, 1\] for \[8, 8, 3, 3\]"),
-        ({"mix.bias": torch.full((8,), float("nan"))}, "mix.bias holds 8 values that are not finite"),
+        (
+            {"mix.bias": torch.full((8,), float("nan"))},
+            "mix.bias holds 8 values that are not finite",
+        ),
         ({"stem.weight": None}, "no kernel stem.weight"),
     ],
 )
 def test_weights_that_do_not_fit_are_named(change: dict[str, Tensor | None], words: str) -> None:
-    tensors = {key: value for key, value in (network().state_dict() | change).items() if value is not None}
+    tensors = {
+        key: value for key, value in (network().state_dict() | change).items() if value is not None
+    }
     with pytest.raises(InputError, match=words):
         PixelGenerator.from_state_dict(tensors)
 
@@ -98,7 +128,9 @@ def test_the_state_is_all_that_goes_on() -> None:
     third, _ = net(*clip[2], after_two)
     assert torch.equal(third, whole[2])
     other, _ = rolled(net, [*clip[:3], frames(1, seed=9)[0]])
-    assert all(torch.equal(a, b) for a, b in zip(other[:3], whole[:3], strict=True))  # later frames change nothing
+    assert all(
+        torch.equal(a, b) for a, b in zip(other[:3], whole[:3], strict=True)
+    )  # later frames change nothing
     assert not torch.equal(net(*clip[3], after_two)[0], whole[3])  # and the past is seen
 
 
@@ -107,7 +139,9 @@ def test_attention_reaches_frames_that_the_images_of_the_state_do_not() -> None:
     net = network(sizes=sizes)
     clip = frames(7)
     plain = PixelGenerator(PixelSizes((8, 8, 8), detail=8, hidden=0))
-    plain.load_state_dict({key: value for key, value in net.state_dict().items() if not key.startswith("memory.")})
+    plain.load_state_dict(
+        {key: value for key, value in net.state_dict().items() if not key.startswith("memory.")}
+    )
     torch.testing.assert_close(
         rolled(net, clip)[0][6], rolled(plain.requires_grad_(False), clip)[0][6]
     )  # it begins as if it were not there
@@ -119,8 +153,12 @@ def test_attention_reaches_frames_that_the_images_of_the_state_do_not() -> None:
     forgetful = state.detached()._replace(kept=torch.zeros_like(state.kept))
     assert not torch.allclose(net(*clip[0], forgetful)[0], net(*clip[0], state)[0])
     _, early = rolled(net, clip[:3])
-    blank = early._replace(kept=torch.cat([early.kept[:, :1], torch.full_like(early.kept[:, 1:], 9.0)], dim=1))
-    torch.testing.assert_close(net(*clip[3], blank)[0], whole[3])  # slots that nothing has filled yet are not seen
+    blank = early._replace(
+        kept=torch.cat([early.kept[:, :1], torch.full_like(early.kept[:, 1:], 9.0)], dim=1)
+    )
+    torch.testing.assert_close(
+        net(*clip[3], blank)[0], whole[3]
+    )  # slots that nothing has filled yet are not seen
 
 
 def test_clips_of_a_batch_do_not_see_each_other() -> None:
@@ -148,7 +186,9 @@ def test_time_one_is_the_deployed_step_and_other_times_differ() -> None:
     deployed, _ = net(*frame, state, source)
     at_one, _ = net(*frame, state, source, torch.ones(2))
     torch.testing.assert_close(at_one, deployed, atol=1e-6, rtol=0)
-    assert not torch.allclose(net(*frame, state, source, torch.tensor([1.0, 0.5]))[0][1], deployed[1])
+    assert not torch.allclose(
+        net(*frame, state, source, torch.tensor([1.0, 0.5]))[0][1], deployed[1]
+    )
 
 
 def test_noise_enters_holes_alone() -> None:

@@ -1,4 +1,6 @@
-"""What a generator in pixels makes of references: nothing where there is none, the same in any order, and no harm where none holds."""
+"""What a generator in pixels makes of references: nothing where there is none, the same in any
+order, and no harm where none holds.
+"""
 
 from __future__ import annotations
 
@@ -34,8 +36,12 @@ def inputs(references: int, batch: int = 1, seed: int = 0) -> tuple[Tensor, Tens
     return render, torch.ones(batch, HEIGHT, WIDTH, 1), sdmap, images
 
 
-def call(net: PixelGenerator, render: Tensor, opacity: Tensor, sdmap: Tensor, references: Tensor | None) -> tuple[Tensor, PixelState]:
-    out: tuple[Tensor, PixelState] = net(render, opacity, sdmap, net.start(render), None, None, references)
+def call(
+    net: PixelGenerator, render: Tensor, opacity: Tensor, sdmap: Tensor, references: Tensor | None
+) -> tuple[Tensor, PixelState]:
+    out: tuple[Tensor, PixelState] = net(
+        render, opacity, sdmap, net.start(render), None, None, references
+    )
     return out
 
 
@@ -75,7 +81,8 @@ def test_a_recorded_step_equals_the_network(batch: int, references: int) -> None
         fast, after = step(render, opacity, sdmap, net.start(render), render, given)
     plain, state = call(net, render, opacity, sdmap, None if given is None else in_floats(given))
     assert len(step.recorded) == 1
-    # Where a reference ends, an offset that differs by rounding weighs more than the rounding itself.
+    # Where a reference ends, an offset that differs by rounding weighs more than the rounding
+    # itself.
     for a, b in ((fast, plain), (after.recorded, state.recorded)):
         assert float((a - b).abs().quantile(0.99)) < 1e-4
         assert float((a - b).abs().max()) < 1e-2
@@ -96,10 +103,17 @@ def test_a_network_that_looks_at_smaller_pictures_blends_at_full_size(references
     assert one.shape == after.render.shape == render.shape
     assert float((one - other).abs().quantile(0.99)) < 1e-4
 
-    seen = [F.avg_pool2d(x.permute(0, 3, 1, 2), 2).permute(0, 2, 3, 1) for x in (render, opacity, sdmap)]
+    seen = [
+        F.avg_pool2d(x.permute(0, 3, 1, 2), 2).permute(0, 2, 3, 1) for x in (render, opacity, sdmap)
+    ]
     if references == 0:  # the change of the render is all there is, and it is enlarged
         small, _ = call(net, *seen, None)
-        change = F.interpolate((small - seen[0]).permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False)
+        change = F.interpolate(
+            (small - seen[0]).permute(0, 3, 1, 2),
+            scale_factor=2,
+            mode="bilinear",
+            align_corners=False,
+        )
         assert torch.allclose(one, render + change.permute(0, 2, 3, 1), atol=1e-5)
 
 

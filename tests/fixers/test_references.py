@@ -1,4 +1,6 @@
-"""Recorded frames as references: which are chosen, and that a warp puts every surface where it is."""
+"""Recorded frames as references: which are chosen, and that a warp puts every surface where it
+is.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,37 @@ import pytest
 
 from alpasim_plugin.core.geometry import inverse, se2
 from alpasim_plugin.core.shutter import bands, rolling
-from alpasim_plugin.core.types import F32, F64, U8, Actor, Box, CameraSpec, Exposure, Frame, RecordedFrame, RenderRequest, Trajectory
+from alpasim_plugin.core.types import (
+    F32,
+    F64,
+    U8,
+    Actor,
+    Box,
+    CameraSpec,
+    Exposure,
+    Frame,
+    RecordedFrame,
+    RenderRequest,
+    Trajectory,
+)
 from alpasim_plugin.fixers.references import ReferenceIndex, ReferenceSession
-from alpasim_plugin.fixers.warp import INCONSISTENT, VALID, Lookup, Picture, WarpTarget, _look_up, plain_coordinates, warp, warp_coordinates
+from alpasim_plugin.fixers.warp import (
+    INCONSISTENT,
+    VALID,
+    Lookup,
+    Picture,
+    WarpTarget,
+    _look_up,
+    plain_coordinates,
+    warp,
+    warp_coordinates,
+)
 
 WIDTH, HEIGHT = 64, 32
 K = np.array([[40.0, 0, 32], [0, 40.0, 16], [0, 0, 1]])
-FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # a camera that looks along x of its rig
+FORWARD = np.array(
+    [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]]
+)  # a camera that looks along x of its rig
 NOBODY: Mapping[str, F64] = {}
 
 
@@ -30,14 +56,18 @@ def wall(x_m: float, T_world_camera: F64) -> F32:
     return np.full((HEIGHT, WIDTH), x_m - T_world_camera[0, 3], np.float32)
 
 
-def picture(T_world_camera: F64, depth: F32, rgb: U8 | None = None, actors: Mapping[str, F64] = NOBODY) -> Picture:
+def picture(
+    T_world_camera: F64, depth: F32, rgb: U8 | None = None, actors: Mapping[str, F64] = NOBODY
+) -> Picture:
     noise = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     return Picture(K, T_world_camera, noise if rgb is None else rgb, depth, actors)
 
 
 def columns() -> U8:
     """A picture whose red says the column, four grey levels each."""
-    return np.repeat(np.broadcast_to(4 * np.arange(WIDTH, dtype=np.uint8), (HEIGHT, WIDTH))[..., None], 3, axis=2)
+    return np.repeat(
+        np.broadcast_to(4 * np.arange(WIDTH, dtype=np.uint8), (HEIGHT, WIDTH))[..., None], 3, axis=2
+    )
 
 
 def test_a_frame_warped_into_its_own_view_is_itself() -> None:
@@ -51,7 +81,9 @@ def test_a_frame_warped_into_its_own_view_is_itself() -> None:
 
 def test_a_wall_seen_from_nearer_is_larger() -> None:
     far, near = at(0.0), at(10.0)
-    out = warp(picture(far, wall(20.0, far), columns()), WarpTarget(K, near, wall(20.0, near), {}, {}))
+    out = warp(
+        picture(far, wall(20.0, far), columns()), WarpTarget(K, near, wall(20.0, near), {}, {})
+    )
     # A pixel du from the middle, at 10 m, lay at du / 2 when the wall was 20 m away.
     expected = 4 * (32 + (np.arange(WIDTH) + 0.5 - 32) / 2 - 0.5)
     assert np.abs(out[HEIGHT // 2, :, 0] - expected).max() <= 1
@@ -65,7 +97,9 @@ def test_what_stood_behind_something_is_doubted_and_what_lay_outside_is_not_ther
     out = warp(picture(here, seen), WarpTarget(K, here, depth, {}, {}))
     assert (out[:, 20:40, 3] == INCONSISTENT).all()
     assert (out[:, :20, 3] == VALID).all()
-    aside = warp(picture(here, depth), WarpTarget(K, at(0.0, 12.0), depth, {}, {}))  # 12 m to the left: 24 px at 20 m
+    aside = warp(
+        picture(here, depth), WarpTarget(K, at(0.0, 12.0), depth, {}, {})
+    )  # 12 m to the left: 24 px at 20 m
     assert (aside[:, :24, 3] == 0).all()
     assert (aside[:, 24:, 3] == VALID).all()
 
@@ -73,41 +107,71 @@ def test_what_stood_behind_something_is_doubted_and_what_lay_outside_is_not_ther
 def test_nothing_but_the_rotation_moves_the_sky() -> None:
     sky = np.zeros((HEIGHT, WIDTH), np.float32)
     one = picture(at(0.0), sky, columns())
-    assert np.abs(warp(one, WarpTarget(K, at(40.0, 9.0), sky, {}, {}))[..., 0].astype(int) - one.rgb[..., 0]).max() <= 1
+    assert (
+        np.abs(
+            warp(one, WarpTarget(K, at(40.0, 9.0), sky, {}, {}))[..., 0].astype(int)
+            - one.rgb[..., 0]
+        ).max()
+        <= 1
+    )
     turned = warp(one, WarpTarget(K, at(0.0, 0.0, 0.1), sky, {}, {}))
     middle = 32 - 40 * np.tan(0.1)  # a turn to the left looks at what lay left of the middle
     assert turned[HEIGHT // 2, 32, 0] == pytest.approx(4 * middle, abs=3)
 
 
 def test_a_car_is_looked_up_where_it_was() -> None:
-    box, now, then = Box(4.0, 2.0, 1.5), se2(20.0, 0.0, 0.0, 0.75), se2(14.0, 3.0, 0.0, 0.75)
+    box = Box(4.0, 2.0, 1.5)
+    now = se2(20.0, 0.0, 0.0, 0.75)
+    then = se2(14.0, 3.0, 0.0, 0.75)
     here = at(0.0)
     depth = np.zeros((HEIGHT, WIDTH), np.float32)
     rows, car = slice(16, 19), slice(30, 34)
     depth[rows, car] = 18.0  # its rear
     before = np.zeros((HEIGHT, WIDTH), np.float32)
     before[:, :] = 12.0
-    out = warp(picture(here, before, columns(), {"car": then}), WarpTarget(K, here, depth, {"car": now}, {"car": box}))
+    out = warp(
+        picture(here, before, columns(), {"car": then}),
+        WarpTarget(K, here, depth, {"car": now}, {"car": box}),
+    )
     middle = 32 - 40 * 3.0 / 12.0  # 3 m to the left at 12 m
     assert out[17, 31:33, 0].mean() == pytest.approx(4 * (middle - 0.5), abs=4)
     assert (out[rows, car, 3] == VALID).all()
-    gone = warp(picture(here, before, columns()), WarpTarget(K, here, depth, {"car": now}, {"car": box}))
+    gone = warp(
+        picture(here, before, columns()), WarpTarget(K, here, depth, {"car": now}, {"car": box})
+    )
     assert (gone[rows, car, 3] == 0).all()
 
 
 def hard_case(seed: int) -> Lookup:
-    """Depths of zero, of centimetres and of kilometres, cameras that look away, boxes around the camera, actors that were absent."""
+    """Depths of zero, of centimetres and of kilometres, cameras that look away, boxes around the
+    camera, actors that were absent.
+    """
     rng = np.random.default_rng(seed)
     depth, then = (np.exp(rng.uniform(-4, 9, (HEIGHT, WIDTH))).astype(np.float32) for _ in range(2))
     depth[rng.random(depth.shape) < 0.2], then[rng.random(then.shape) < 0.2] = 0, 0
     view, other = at(0.0), at(*rng.uniform(-30, 30, 2), rng.uniform(-3, 3))
     count = int(rng.integers(0, 5))
-    T_now = np.array([se2(*rng.uniform(-8, 8, 2), rng.uniform(-3, 3), 0.8) for _ in range(count)]).reshape(-1, 4, 4)
-    T_then = np.array([se2(*rng.uniform(-20, 20, 2), rng.uniform(-3, 3), 0.8) for _ in range(count)]).reshape(-1, 4, 4)
+    T_now = np.array(
+        [se2(*rng.uniform(-8, 8, 2), rng.uniform(-3, 3), 0.8) for _ in range(count)]
+    ).reshape(-1, 4, 4)
+    T_then = np.array(
+        [se2(*rng.uniform(-20, 20, 2), rng.uniform(-3, 3), 0.8) for _ in range(count)]
+    ).reshape(-1, 4, 4)
     T_then[rng.random(count) < 0.3] = np.nan
     sizes = rng.uniform(0.3, 6.0, (count, 3))
     free_share = float(rng.choice([0.0, 0.4, np.inf]))
-    return Lookup(depth, K, view, K, inverse(other), then, inverse(T_now) if count else T_now, T_then, sizes, free_share)
+    return Lookup(
+        depth,
+        K,
+        view,
+        K,
+        inverse(other),
+        then,
+        inverse(T_now) if count else T_now,
+        T_then,
+        sizes,
+        free_share,
+    )
 
 
 @pytest.mark.parametrize("seed", range(24))
@@ -127,21 +191,34 @@ def test_a_picture_is_looked_up_as_opencv_does_to_rounding(seed: int) -> None:
     rgb = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     x, y = (rng.uniform(-0.5, side - 0.5, (37, 53)).astype(np.float32) for side in (WIDTH, HEIGHT))
     x[0, :4], y[0, :4] = (-0.5, 0.0, WIDTH - 1, WIDTH - 0.5), (HEIGHT - 0.5, HEIGHT - 1, 0.0, -0.5)
-    held, out = rng.choice([0, 128, 255], x.shape).astype(np.uint8), np.empty((*x.shape, 4), np.uint8)
-    _look_up(Picture(K, at(0.0), rgb, np.zeros(rgb.shape[:2], np.float32), {}).bordered, x, y, held, out)
-    differs = np.abs(out[..., :3].astype(int) - cv2.remap(rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+    held, out = (
+        rng.choice([0, 128, 255], x.shape).astype(np.uint8),
+        np.empty((*x.shape, 4), np.uint8),
+    )
+    _look_up(
+        Picture(K, at(0.0), rgb, np.zeros(rgb.shape[:2], np.float32), {}).bordered, x, y, held, out
+    )
+    differs = np.abs(
+        out[..., :3].astype(int)
+        - cv2.remap(rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    )
     assert differs.max() <= 1
     assert differs.mean() <= 1e-3
     assert np.array_equal(out[..., 3], held)
 
 
 def recorded(
-    places: Sequence[tuple[float, float]], step_us: int = 500_000, read: Callable[[], tuple[U8, F32]] | None = None
+    places: Sequence[tuple[float, float]],
+    step_us: int = 500_000,
+    read: Callable[[], tuple[U8, F32]] | None = None,
 ) -> list[RecordedFrame]:
     def none() -> tuple[U8, F32]:
         return np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.zeros((HEIGHT, WIDTH), np.float32)
 
-    return [RecordedFrame(i * step_us, "front", K, at(x, 0.0, yaw), {}, read or none) for i, (x, yaw) in enumerate(places)]
+    return [
+        RecordedFrame(i * step_us, "front", K, at(x, 0.0, yaw), {}, read or none)
+        for i, (x, yaw) in enumerate(places)
+    ]
 
 
 def test_the_nearest_frames_come_first_and_far_old_or_turned_ones_not_at_all() -> None:
@@ -166,22 +243,41 @@ def test_only_earlier_frames_are_references_where_the_past_is_asked_for() -> Non
     assert index.choose(at(6.0), 0, 3, past=True) == ()
 
 
-def session(which: str = "all", hysteresis: bool = True, road_m: float = 0.0) -> tuple[ReferenceSession, list[int]]:
+def session(
+    which: str = "all", hysteresis: bool = True, road_m: float = 0.0
+) -> tuple[ReferenceSession, list[int]]:
     reads: list[int] = []
 
     def read() -> tuple[U8, F32]:
         reads.append(1)
-        return np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8), np.full((HEIGHT, WIDTH), 20.0, np.float32)
+        return np.random.default_rng(0).integers(
+            0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8
+        ), np.full((HEIGHT, WIDTH), 20.0, np.float32)
 
-    car = Actor("car", "car", Box(4, 2, 1.5), Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])))
+    car = Actor(
+        "car",
+        "car",
+        Box(4, 2, 1.5),
+        Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])),
+    )
     frames = recorded([(float(x), 0.0) for x in range(0, 60, 2)], step_us=100_000, read=read)
-    ego_log = Trajectory(np.array([0, 6_000_000]), np.array([[0.0, 0, road_m], [60, 0, road_m]]), np.array([[1.0, 0, 0, 0]] * 2))
+    ego_log = Trajectory(
+        np.array([0, 6_000_000]),
+        np.array([[0.0, 0, road_m], [60, 0, road_m]]),
+        np.array([[1.0, 0, 0, 0]] * 2),
+    )
     return ReferenceSession(frames, [car], ego_log, 2, which, hysteresis), reads  # type: ignore[arg-type]
 
 
 def request(x: float, t_us: int) -> tuple[RenderRequest, Frame]:
     spec = CameraSpec("front", WIDTH, HEIGHT, K, FORWARD)
-    frame = Frame(t_us, "front", np.zeros((HEIGHT, WIDTH, 3), np.uint8), None, np.full((HEIGHT, WIDTH), 20.0, np.float32))
+    frame = Frame(
+        t_us,
+        "front",
+        np.zeros((HEIGHT, WIDTH, 3), np.uint8),
+        None,
+        np.full((HEIGHT, WIDTH), 20.0, np.float32),
+    )
     return RenderRequest(t_us, spec, np.stack([at(x), at(x)]), {}), frame
 
 
@@ -196,9 +292,13 @@ def test_a_recorded_frame_is_read_when_it_is_first_needed_and_then_kept() -> Non
 def test_the_ground_is_that_of_the_log_however_the_camera_is_said_to_be_mounted() -> None:
     asked, frame = request(10.0, 500_000)
     frame = replace(frame, depth=np.zeros((HEIGHT, WIDTH), np.float32))  # nothing but holes
-    wrong = replace(asked, camera=replace(asked.camera, T_rig_camera=se2(0.0, 0.0, 0.0, 1.0) @ FORWARD))
+    wrong = replace(
+        asked, camera=replace(asked.camera, T_rig_camera=se2(0.0, 0.0, 0.0, 1.0) @ FORWARD)
+    )
     images = session()[0].of(asked, frame)
-    for image, same, of_lower_road in zip(images, session()[0].of(wrong, frame), session(road_m=-1.0)[0].of(asked, frame), strict=True):
+    for image, same, of_lower_road in zip(
+        images, session()[0].of(wrong, frame), session(road_m=-1.0)[0].of(asked, frame), strict=True
+    ):
         np.testing.assert_array_equal(image, same)
         assert (image != of_lower_road).any()
 
@@ -221,7 +321,11 @@ def test_references_of_a_rolling_shutter_are_those_of_the_pose_at_each_row() -> 
     found, _ = session(hysteresis=False)
     asked, frame = request(10.0, 500_000)
     start, share = at(9.5, 0.0, 0.02), rolling(WIDTH, HEIGHT, "rows", backwards=False)
-    rolled = replace(asked, T_world_camera=np.stack([start, asked.T_world_camera[1]]), exposure=Exposure(share, {}))
+    rolled = replace(
+        asked,
+        T_world_camera=np.stack([start, asked.T_world_camera[1]]),
+        exposure=Exposure(share, {}),
+    )
     images = found.of(rolled, frame)
     assert len(images) == 2
     assert (images[0] != found.of(asked, frame)[0]).any()
@@ -229,5 +333,7 @@ def test_references_of_a_rolling_shutter_are_those_of_the_pose_at_each_row() -> 
     assert len(parts) > 2
     for band in parts:
         T = np.stack([band.T_world_camera] * 2)
-        for image, alone in zip(images, found.of(replace(asked, T_world_camera=T), frame), strict=True):
+        for image, alone in zip(
+            images, found.of(replace(asked, T_world_camera=T), frame), strict=True
+        ):
             np.testing.assert_array_equal(image[band.rows], alone[band.rows])

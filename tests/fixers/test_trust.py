@@ -1,4 +1,6 @@
-"""Where a picture comes from: means by cell, at sizes that cells do not divide, and the text that keeps them."""
+"""Where a picture comes from: means by cell, at sizes that cells do not divide, and the text that
+keeps them.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +13,15 @@ from alpasim_plugin.fixers.trust import CELL_PX, LEVELS, MADE_UP, MOST_COLUMNS, 
 from evaluators.viewer.pictures import seen_before, trust_by_time
 
 
-@pytest.mark.parametrize(("height", "width"), [(144, 256), (150, 250), (9, 7), (288, 512), (270, 600)])
+@pytest.mark.parametrize(
+    ("height", "width"), [(144, 256), (150, 250), (9, 7), (288, 512), (270, 600)]
+)
 def test_cells_are_the_means_of_their_pixels(height: int, width: int) -> None:
     rng = np.random.default_rng(height)
-    render, recorded = rng.uniform(-1, 1, (height, width, 3)).astype(np.float32), rng.random((height, width), np.float32)
+    render, recorded = (
+        rng.uniform(-1, 1, (height, width, 3)).astype(np.float32),
+        rng.random((height, width), np.float32),
+    )
     output = render + rng.uniform(-0.4, 0.4, render.shape).astype(np.float32)
     found = trust(output, render, recorded)
     guessed = np.minimum(np.abs(output - render).mean(axis=2) / MADE_UP, 1) * (1 - recorded)
@@ -27,14 +34,27 @@ def test_cells_are_the_means_of_their_pixels(height: int, width: int) -> None:
     for row, column in np.ndindex(*cells.shape[:2]):
         here = slice(row * side, (row + 1) * side), slice(column * side, (column + 1) * side)
         for k, shares in enumerate((recorded, guessed)):
-            assert abs(int(cells[row, column, k]) / LEVELS - shares[here].mean()) <= 0.5 / LEVELS + 1e-6
+            assert (
+                abs(int(cells[row, column, k]) / LEVELS - shares[here].mean())
+                <= 0.5 / LEVELS + 1e-6
+            )
 
 
-def test_a_render_that_stays_is_neither_recorded_nor_guessed_and_a_reference_is_never_guessed() -> None:
+def test_a_render_that_stays_is_neither_recorded_nor_guessed_and_a_reference_is_never_guessed() -> (
+    None
+):
     grey, zero = np.zeros((32, 48, 3), np.float32), np.zeros((32, 48), np.float32)
-    assert trust(grey, grey, zero) == {RECORDED_SHARE: 0, GUESSED_SHARE: 0, TRUST_CELLS: "3x2:" + 6 * "00"}
+    assert trust(grey, grey, zero) == {
+        RECORDED_SHARE: 0,
+        GUESSED_SHARE: 0,
+        TRUST_CELLS: "3x2:" + 6 * "00",
+    }
     assert trust(grey + 1, grey, zero)[TRUST_CELLS] == "3x2:" + 6 * "0f"
-    assert trust(grey + 1, grey, zero + 1) == {RECORDED_SHARE: 1, GUESSED_SHARE: 0, TRUST_CELLS: "3x2:" + 6 * "f0"}
+    assert trust(grey + 1, grey, zero + 1) == {
+        RECORDED_SHARE: 1,
+        GUESSED_SHARE: 0,
+        TRUST_CELLS: "3x2:" + 6 * "f0",
+    }
 
 
 @pytest.mark.parametrize("text", ["", "2x1:00", "2x1:00zz", "2:0000", "-2x-1:0000"])
@@ -45,10 +65,18 @@ def test_a_text_that_is_none_is_refused(text: str) -> None:
 
 def test_a_page_says_what_was_seen_in_the_second_before() -> None:
     rows = [
-        {"t_us": t, "camera": "front", GUESSED_SHARE: t / 1e7, RECORDED_SHARE: 0.5, TRUST_CELLS: "1x1:f0"}
+        {
+            "t_us": t,
+            "camera": "front",
+            GUESSED_SHARE: t / 1e7,
+            RECORDED_SHARE: 0.5,
+            TRUST_CELLS: "1x1:f0",
+        }
         for t in range(0, 2_000_001, 500_000)
     ]
-    assert seen_before(rows, 2_000_000).startswith("15 % of what it saw in the second before was made up by the fixer, 50 % was recorded")
+    assert seen_before(rows, 2_000_000).startswith(
+        "15 % of what it saw in the second before was made up by the fixer, 50 % was recorded"
+    )
     assert seen_before(rows, 9_000_000) == ""
     assert seen_before([{"t_us": 0, "camera": "front"}], 0) == ""
     assert trust_by_time(rows, "front")[500_000] == "1x1:f0"

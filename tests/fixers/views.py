@@ -12,7 +12,9 @@ from alpasim_plugin.fixers.semantic_map.prepare import MapExtras
 # Camera axes in a rig that looks along x.
 AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 PIN = CameraSpec("pin", 256, 144, np.array([[128.0, 0, 128], [0, 128, 72], [0, 0, 1]]), AHEAD)
-FISH = FThetaCamera("fish", 256, 144, 128.0, 72.0, FTheta((0.0, 1 / 122), (0.0, 122.0, 0.0, -4.0), 1.2))
+FISH = FThetaCamera(
+    "fish", 256, 144, 128.0, 72.0, FTheta((0.0, 1 / 122), (0.0, 122.0, 0.0, -4.0), 1.2)
+)
 EMPTY = LaneMap({})
 CAR = Box(4.5, 1.9, 1.6)
 

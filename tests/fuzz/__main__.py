@@ -1,8 +1,9 @@
 """Fuzz every reader: ``python -m tests.fuzz --inputs 20000 --jobs 1``.
 
-Input i of a seed is always the same. Children are reused from input to input; one that hangs is ended and replaced. ``--start`` goes on
-where an earlier call stopped; ``--seconds`` ends the run after a time; ``--only`` takes targets whose name contains a word; ``--input N``
-runs one input here, with its traceback. Ctrl-C and SIGTERM end the run with the table of what was done.
+Input i of a seed is always the same. Children are reused from input to input; one that hangs is
+ended and replaced. ``--start`` goes on where an earlier call stopped; ``--seconds`` ends the run
+after a time; ``--only`` takes targets whose name contains a word; ``--input N`` runs one input
+here, with its traceback. Ctrl-C and SIGTERM end the run with the table of what was done.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ from tests.fuzz.worker import Worker, rng_of
 
 def main() -> int:
     """Run the inputs and print a table; return 1 if there are findings."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--inputs", type=int, default=20_000)
     parser.add_argument("--seconds", type=float, default=math.inf)
     parser.add_argument("--jobs", type=int, default=1)
@@ -35,7 +38,10 @@ def main() -> int:
     if arguments.input is not None:
         target = targets[arguments.input % len(targets)]
         with workplace() as folder:
-            print(target.name, check(target, inputs(target, rng_of(arguments.seed, arguments.input)), folder))
+            print(
+                target.name,
+                check(target, inputs(target, rng_of(arguments.seed, arguments.input)), folder),
+            )
         return 0
     stopped: list[int] = []
     for stop in (signal.SIGINT, signal.SIGTERM):
@@ -51,7 +57,9 @@ def main() -> int:
         if (number := next(todo, None)) is not None:
             worker.give(number)
             busy.append(worker)
-    began, done, slowest = time.monotonic(), 0, (0.0, -1)
+    began = time.monotonic()
+    done = 0
+    slowest = (0.0, -1)
     while busy:
         ready = multiprocessing.connection.wait([w.pipe for w in busy], 1.0)
         for worker in [w for w in busy if w.pipe in ready or w.overdue()]:
@@ -67,12 +75,18 @@ def main() -> int:
                     print(f"\n{outcome}: {name}, input {number}: {where}", flush=True)
             if done % 100 == 0:
                 rate, found = done / (time.monotonic() - began), sum(map(len, findings.values()))
-                print(f"\r{done} of {arguments.inputs}, {rate:.1f} a second, {found} findings", end="", flush=True)
+                print(
+                    f"\r{done} of {arguments.inputs}, {rate:.1f} a second, {found} findings",
+                    end="",
+                    flush=True,
+                )
             if (following := next(todo, None)) is not None:
                 worker.give(following)
             else:
                 busy.remove(worker)
-    print("\n\n| reader | inputs | accepted | refused | traceback | hang | memory | crash |\n|---|---:|---:|---:|---:|---:|---:|---:|")
+    print(
+        "\n\n| reader | inputs | accepted | refused | traceback | hang | memory | crash |\n|---|---:|---:|---:|---:|---:|---:|---:|"
+    )
     kinds = ("accepted", "refused", "traceback", "hang", "memory", "crash")
     for target in targets:
         counts = [tally[target.name, kind] for kind in kinds]

@@ -12,12 +12,60 @@ from xml.etree import ElementTree
 
 import yaml
 
-NUMBERS = ("0", "-1", "1", "nan", "inf", "-inf", "1e308", "-1e308", "1e-308", "1e9", "-1e9", "1e5", "999999999999", "9223372036854775808",
-           "-9223372036854775809", "18446744073709551616", "0.0000001", "4300000000", "1" * 5000, "")  # fmt: skip
+NUMBERS = (
+    "0",
+    "-1",
+    "1",
+    "nan",
+    "inf",
+    "-inf",
+    "1e308",
+    "-1e308",
+    "1e-308",
+    "1e9",
+    "-1e9",
+    "1e5",
+    "999999999999",
+    "9223372036854775808",
+    "-9223372036854775809",
+    "18446744073709551616",
+    "0.0000001",
+    "4300000000",
+    "1" * 5000,
+    "",
+)
 VALUES: tuple[Any, ...] = (
-    0, -1, 1, 1e308, -1e308, 1e-308, 1e9, 1e6, float("nan"), float("inf"), 2**63, -(2**63) - 1, 2**64, 10**30, "", "x" * 5000, "nan", None,
-    True, [], {}, [1], [[]], {"a": 1}, "../../../etc/passwd", "/dev/zero", "\x1b[31m\x00|`<b>&\u202e", [1, "a", None], "\ud800", "12:30",
-)  # fmt: skip
+    0,
+    -1,
+    1,
+    1e308,
+    -1e308,
+    1e-308,
+    1e9,
+    1e6,
+    float("nan"),
+    float("inf"),
+    2**63,
+    -(2**63) - 1,
+    2**64,
+    10**30,
+    "",
+    "x" * 5000,
+    "nan",
+    None,
+    True,
+    [],
+    {},
+    [1],
+    [[]],
+    {"a": 1},
+    "../../../etc/passwd",
+    "/dev/zero",
+    "\x1b[31m\x00|`<b>&\u202e",
+    [1, "a", None],
+    "\ud800",
+    "12:30",
+)
 NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 WORD = re.compile(rb"[A-Za-z_]{2,}")
 
@@ -58,7 +106,16 @@ def _bytes(data: bytes, rng: random.Random) -> bytes:
             out[at:at] = rng.randbytes(rng.choice((1, 4, 64)))
         case 3:
             size = rng.choice((1, 2, 4, 8))
-            extreme = rng.choice((0, 1, (1 << 8 * size) - 1, 1 << (8 * size - 1), (1 << (8 * size - 1)) - 1, 100_000_000 % (1 << 8 * size)))
+            extreme = rng.choice(
+                (
+                    0,
+                    1,
+                    (1 << 8 * size) - 1,
+                    1 << (8 * size - 1),
+                    (1 << (8 * size - 1)) - 1,
+                    100_000_000 % (1 << 8 * size),
+                )
+            )
             out[at : at + size] = extreme.to_bytes(size, rng.choice(("little", "big")))
         case 4:
             del out[at : at + rng.choice((1, 4, 64, 1024))]
@@ -93,7 +150,13 @@ def _text(data: bytes, rng: random.Random) -> bytes:
 
 def _paths(node: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     out = [path]
-    inside = node.items() if isinstance(node, dict) else enumerate(node[:40]) if isinstance(node, list) else ()
+    inside = (
+        node.items()
+        if isinstance(node, dict)
+        else enumerate(node[:40])
+        if isinstance(node, list)
+        else ()
+    )
     for key, child in inside:
         out += _paths(child, (*path, key))
     return out
@@ -136,7 +199,9 @@ def _json(data: bytes, rng: random.Random) -> bytes:
 def _yaml(data: bytes, rng: random.Random) -> bytes:
     try:
         document = yaml.safe_load(data)
-        return yaml.safe_dump(damaged(document, rng), sort_keys=False, allow_unicode=True).encode("utf-8", "surrogatepass")
+        return yaml.safe_dump(damaged(document, rng), sort_keys=False, allow_unicode=True).encode(
+            "utf-8", "surrogatepass"
+        )
     except (yaml.YAMLError, ValueError, RecursionError):
         return _text(data, rng)
 
@@ -167,4 +232,8 @@ def _xml(data: bytes, rng: random.Random) -> bytes:
     return ElementTree.tostring(root)
 
 
-STRUCTURED: dict[str, Callable[[bytes, random.Random], bytes]] = {"json": _json, "yaml": _yaml, "xml": _xml}
+STRUCTURED: dict[str, Callable[[bytes, random.Random], bytes]] = {
+    "json": _json,
+    "yaml": _yaml,
+    "xml": _xml,
+}

@@ -1,6 +1,8 @@
-"""Inputs that once gave way: each is a command line over files that it writes. ``python -m tests.fuzz.seen`` prints what each does now.
+"""Inputs that once gave way: each is a command line over files that it writes. ``python -m
+tests.fuzz.seen`` prints what each does now.
 
-A case passes if it ends within the limits of time and memory, without a traceback: refused with code 2 and four parts, or accepted.
+A case passes if it ends within the limits of time and memory, without a traceback: refused with
+code 2 and four parts, or accepted.
 """
 
 from __future__ import annotations
@@ -48,8 +50,21 @@ def actors(text: str) -> Make:
 
 def surroundings(text: str) -> Make:
     """Build the scene as well: what stands beside the road is built with the renderer."""
-    return yaml(ROAD % 200 + f"environment: {{{text}}}\ntiming: {{duration_us: 600000, start_us: 100000, warmup_us: 100000}}\n",
-                ["--renderer", "clean", "--policy", "log-replay", "--images", "none", "--quiet", "--certify", "none"])  # fmt: skip
+    return yaml(
+        ROAD % 200
+        + f"environment: {{{text}}}\ntiming: {{duration_us: 600000, start_us: 100000, warmup_us: 100000}}\n",
+        [
+            "--renderer",
+            "clean",
+            "--policy",
+            "log-replay",
+            "--images",
+            "none",
+            "--quiet",
+            "--certify",
+            "none",
+        ],
+    )
 
 
 def parked(n: int) -> Make:
@@ -59,7 +74,9 @@ def parked(n: int) -> Make:
 
 def followers(n: int) -> Make:
     row = "{kind: idm, id: f%d, s_m: %.1f, speed_mps: 8, lane: 0}"
-    return yaml(ROAD % 3000 + "actors: [" + ", ".join(row % (i, 30 + 10 * i) for i in range(n)) + "]\n")
+    return yaml(
+        ROAD % 3000 + "actors: [" + ", ".join(row % (i, 30 + 10 * i) for i in range(n)) + "]\n"
+    )
 
 
 def xodr(length: str = "400", geometry: str = "<line/>", s: str = "0") -> Make:
@@ -101,8 +118,12 @@ def cuboid_width(width: float) -> Make:
 def commonroad_time(time_step: str) -> Make:
     def make(folder: Path) -> list[str]:
         states = make_commonroad.drive(20, 0)
-        states[0] = states[0].replace("<exact>0</exact></time>", f"<exact>{time_step}</exact></time>")
-        path = make_commonroad.write_commonroad(folder / "scene.xml", traffic=make_commonroad.obstacle(11, states))
+        states[0] = states[0].replace(
+            "<exact>0</exact></time>", f"<exact>{time_step}</exact></time>"
+        )
+        path = make_commonroad.write_commonroad(
+            folder / "scene.xml", traffic=make_commonroad.obstacle(11, states)
+        )
         return [*DRY, str(path)]
 
     return make
@@ -114,7 +135,12 @@ def arguments(*args: str) -> Make:
 
 def run_file(name: str, text: str, verb: str, more: tuple[str, ...] = ()) -> Make:
     def make(folder: Path) -> list[str]:
-        run = vouch_for(make_run(folder / "run", Plan(scenes=("plain",), seeds=(0, 1), steps=30, pictures=False, clips=False)))
+        run = vouch_for(
+            make_run(
+                folder / "run",
+                Plan(scenes=("plain",), seeds=(0, 1), steps=30, pictures=False, clips=False),
+            )
+        )
         path = next(run.rglob(name)) if "/" not in name else run / name
         if path.name == "summary.json" and text.startswith("metrics="):
             content = json.loads(path.read_text())
@@ -129,7 +155,12 @@ def run_file(name: str, text: str, verb: str, more: tuple[str, ...] = ()) -> Mak
 
 def gate_files(**files: str) -> Make:
     def make(folder: Path) -> list[str]:
-        run = vouch_for(make_run(folder / "run", Plan(scenes=("plain",), seeds=(0, 1), steps=30, pictures=False, clips=False)))
+        run = vouch_for(
+            make_run(
+                folder / "run",
+                Plan(scenes=("plain",), seeds=(0, 1), steps=30, pictures=False, clips=False),
+            )
+        )
         args = ["gate", str(run)]
         for option, text in files.items():
             path = folder / f"{option}.{'yaml' if option == 'gate' else 'json'}"
@@ -144,7 +175,16 @@ def raw_header(data: bytes) -> Make:
     def make(folder: Path) -> list[str]:
         path = folder / "weights.safetensors"
         path.write_bytes(struct.pack("<Q", len(data)) + data)
-        return [*DRY[:1], "--renderer", "onefixer", "--policy", "log-replay", "--set", f"fixer.weights.bundle={path}", "smoke/straight"]
+        return [
+            *DRY[:1],
+            "--renderer",
+            "onefixer",
+            "--policy",
+            "log-replay",
+            "--set",
+            f"fixer.weights.bundle={path}",
+            "smoke/straight",
+        ]
 
     return make
 
@@ -152,8 +192,22 @@ def raw_header(data: bytes) -> Make:
 def background(name: str, data: bytes) -> Make:
     def make(folder: Path) -> list[str]:
         (folder / name).write_bytes(data)
-        text = ROAD % 200 + f"background: {{file: {name}}}\n" + "timing: {duration_us: 300000, start_us: 100000, warmup_us: 0}\n"
-        quick = ["--renderer", "clean", "--policy", "log-replay", "--images", "none", "--quiet", "--certify", "none"]
+        text = (
+            ROAD % 200
+            + f"background: {{file: {name}}}\n"
+            + "timing: {duration_us: 300000, start_us: 100000, warmup_us: 0}\n"
+        )
+        quick = [
+            "--renderer",
+            "clean",
+            "--policy",
+            "log-replay",
+            "--images",
+            "none",
+            "--quiet",
+            "--certify",
+            "none",
+        ]
         return yaml(text, [*quick, "--workers", "1", "--out", str(folder / "out")])(folder)
 
     return make
@@ -166,15 +220,27 @@ def spz_of(points: int) -> bytes:
 
 
 def compressed_ply() -> bytes:
-    bounds = [f"{end}_{name}" for end in ("min", "max") for name in ("x", "y", "z", "scale_x", "scale_y", "scale_z")]
-    lines = ["ply", "format binary_little_endian 1.0", "element chunk 1", *(f"property float {b}" for b in bounds), "element vertex 1"]
+    bounds = [
+        f"{end}_{name}"
+        for end in ("min", "max")
+        for name in ("x", "y", "z", "scale_x", "scale_y", "scale_z")
+    ]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "element chunk 1",
+        *(f"property float {b}" for b in bounds),
+        "element vertex 1",
+    ]
     lines += [f"property float packed_{k}" for k in ("position", "rotation", "scale", "color")]
     return ("\n".join([*lines, "end_header"]) + "\n").encode() + b"\0" * (48 + 16)
 
 
 def png_header(width: int, height: int) -> bytes:
     def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
 
     head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     rows = zlib.compress(b"\0" * min((3 * width + 1) * height, 1 << 20), 9)
@@ -184,7 +250,14 @@ def png_header(width: int, height: int) -> bytes:
 def log_of(data: bytes) -> Make:
     def make(folder: Path) -> list[str]:
         (folder / "rollout.asl").write_bytes(data)
-        return ["score", str(folder / "rollout.asl"), "--scene", "smoke/straight", "--out", str(folder / "out")]
+        return [
+            "score",
+            str(folder / "rollout.asl"),
+            "--scene",
+            "smoke/straight",
+            "--out",
+            str(folder / "out"),
+        ]
 
     return make
 
@@ -217,12 +290,34 @@ SEEN: dict[str, Make] = {
     "1e12 seeds": arguments(*DRY, "--seeds", "1000000000000", "smoke/straight"),
     "4 MB of '- a'": yaml("- a\n" * 1_000_000),
     "bundle header deep": raw_header(b'{"a":' + b"[" * 100_000),
-    "baseline rows of numbers": gate_files(baseline_file=json.dumps(
-        {"preset": "paper", "scenes": {}, "weights": {}, "rows": 5, "made_with": {}, "schema_version": 1})),
-    "baseline scenes a list": gate_files(baseline_file=json.dumps(
-        {"preset": "paper", "scenes": [1], "weights": {}, "rows": [], "made_with": {}, "schema_version": 1})),
+    "baseline rows of numbers": gate_files(
+        baseline_file=json.dumps(
+            {
+                "preset": "paper",
+                "scenes": {},
+                "weights": {},
+                "rows": 5,
+                "made_with": {},
+                "schema_version": 1,
+            }
+        )
+    ),
+    "baseline scenes a list": gate_files(
+        baseline_file=json.dumps(
+            {
+                "preset": "paper",
+                "scenes": [1],
+                "weights": {},
+                "rows": [],
+                "made_with": {},
+                "schema_version": 1,
+            }
+        )
+    ),
     "baseline deep": gate_files(baseline_file="[" * 100_000),
-    "gate margins 1e999": gate_files(gate="version: 1\nmetrics: {collision_any: {margin: 1.0e+999}}\n"),
+    "gate margins 1e999": gate_files(
+        gate="version: 1\nmetrics: {collision_any: {margin: 1.0e+999}}\n"
+    ),
     "gate a list": gate_files(gate="- 1\n- 2\n"),
     "run.json []": run_file("run.json", "[]", "report"),
     "run.json scenes 5": run_file("run.json", '{"scenes": 5}', "report"),
@@ -230,8 +325,15 @@ SEEN: dict[str, Make] = {
     "summary metrics []": run_file("summary.json", "metrics=[]", "report"),
     "summary metrics 5, compared": run_file("summary.json", "metrics=5", "compare"),
     "run.json scenes 5, gated": run_file("run.json", '{"scenes": 5}', "gate"),
-    "fork at nan": run_file("run.json", '{"scenes": {}, "config": {}}', "fork", ("--cell", "clean/lane-camera/plain/0", "--at", "nan")),
-    "fork, run.json scenes 5": run_file("run.json", '{"scenes": 5}', "fork", ("--cell", "clean/lane-camera/plain/0", "--at", "1")),
+    "fork at nan": run_file(
+        "run.json",
+        '{"scenes": {}, "config": {}}',
+        "fork",
+        ("--cell", "clean/lane-camera/plain/0", "--at", "nan"),
+    ),
+    "fork, run.json scenes 5": run_file(
+        "run.json", '{"scenes": 5}', "fork", ("--cell", "clean/lane-camera/plain/0", "--at", "1")
+    ),
     "CommonRoad time -1e308": commonroad_time("-1e308"),
     "compressed PLY of floats": background("a.ply", compressed_ply()),
     "spz of 1e8 points": background("a.spz", spz_of(100_000_000)),
@@ -244,7 +346,7 @@ SEEN: dict[str, Make] = {
     "pipe as AlpaSim scene": pipe("scene.usdz", *DRY),
     "device as log": arguments("score", "/dev/zero", "--scene", "smoke/straight"),
     "error of 7 MB": yaml("version: 1\n" + "\n".join(f"key_{i}: 1" for i in range(100_000))),
-}  # fmt: skip
+}
 
 
 def _limit() -> None:
@@ -259,9 +361,14 @@ def outcome(make: Make) -> tuple[str, float]:
         began = time.perf_counter()
         try:
             process = subprocess.Popen(
-                [sys.executable, "-m", "alpasim_plugin.cli.main", *args], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-                preexec_fn=_limit, start_new_session=True, text=True,
-            )  # fmt: skip
+                [sys.executable, "-m", "alpasim_plugin.cli.main", *args],
+                cwd=folder,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                preexec_fn=_limit,
+                start_new_session=True,
+                text=True,
+            )
         except ValueError as error:
             return f"not a command line ({error})", 0.0
         try:

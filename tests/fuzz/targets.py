@@ -34,7 +34,7 @@ from tests.fuzz.uses import (
     use_video,
     use_views,
     use_weights,
-)  # fmt: skip
+)
 from tests.fuzz.valid_files import (
     RICH,
     SUITE,
@@ -55,7 +55,7 @@ from tests.fuzz.valid_files import (
     make_views,
     make_xodr,
     picture_bytes,
-)  # fmt: skip
+)
 
 FORMS = {".json": "json", ".jsonl": "text", ".yaml": "yaml", ".xml": "xml", ".xodr": "xml"}
 Files = dict[str, bytes]
@@ -66,7 +66,9 @@ def inputs(target: Target, rng: random.Random) -> Files:
     files = valid(target)
     if target.together is not None:
         return target.together(files, rng)
-    names = sorted({name for pattern in target.damage for name in files if Path(name).match(pattern)})
+    names = sorted(
+        {name for pattern in target.damage for name in files if Path(name).match(pattern)}
+    )
     name = rng.choice(names)
     if name.endswith(".usdz") and rng.random() < 0.85:
         files[name] = _inside_zip(files[name], rng)
@@ -98,14 +100,17 @@ def check(target: Target, files: Files, folder: Path) -> str:
     parts = (refusal.doing, refusal.with_what, refusal.found, refusal.do_this)
     if refusal.exit_code != 2:
         raise refusal
-    assert all(part.strip() and len(part) <= 300 and part.isprintable() for part in parts), f"parts of an error: {parts}"
+    assert all(part.strip() and len(part) <= 300 and part.isprintable() for part in parts), (
+        f"parts of an error: {parts}"
+    )
     return "refused"
 
 
 def out_of_memory(error: BaseException | None) -> None:
     """Raise the shortage of memory that an error stands for, if it does.
 
-    FFmpeg answers ENOMEM for a size beyond its own bound, without asking for the memory: that is a refusal.
+    FFmpeg answers ENOMEM for a size beyond its own bound, without asking for the memory: that is a
+    refusal.
     """
     while error is not None:
         if isinstance(error, MemoryError) and not type(error).__module__.startswith("av."):
@@ -125,7 +130,11 @@ def _valid(name: str) -> tuple[tuple[str, bytes], ...]:
         folder = Path(text) / "it"
         folder.mkdir()
         target.make(folder)
-        return tuple((p.relative_to(folder).as_posix(), p.read_bytes()) for p in sorted(folder.rglob("*")) if p.is_file())
+        return tuple(
+            (p.relative_to(folder).as_posix(), p.read_bytes())
+            for p in sorted(folder.rglob("*"))
+            if p.is_file()
+        )
 
 
 def _inside_zip(data: bytes, rng: random.Random) -> bytes:
@@ -140,44 +149,88 @@ def _inside_zip(data: bytes, rng: random.Random) -> bytes:
     return out.getvalue()
 
 
-REPORT = ("run.json", "summary.json", "rollouts.parquet", "steps.parquet", "scenes/*.json", "manifest.json", "*.jsonl", "*.asl")
+REPORT = (
+    "run.json",
+    "summary.json",
+    "rollouts.parquet",
+    "steps.parquet",
+    "scenes/*.json",
+    "manifest.json",
+    "*.jsonl",
+    "*.asl",
+)
 # One of seven is a report, which takes as long as seven of the others.
 TOGETHER = (
-    ("report", "@/run"), ("compare", "@/run"), ("gate", "@/run"), ("aggregate", "@/run", "--all"), ("check", "@/run"), ("runs", "@/run"),
+    ("report", "@/run"),
+    ("compare", "@/run"),
+    ("gate", "@/run"),
+    ("aggregate", "@/run", "--all"),
+    ("check", "@/run"),
+    ("runs", "@/run"),
     ("compare", "@/run", "--all"),
-)  # fmt: skip
+)
 CORE: tuple[Target, ...] = (
     Target("scenario", make_scene_file("smoke/lead_car.yaml"), one_of("*.yaml", drive)),
     Target("scenario, rich", make_file("scene.yaml", RICH.encode), one_of("*.yaml", drive)),
-    Target("scenario, crossing", make_scene_file("hard/crossing_pedestrian.yaml"), one_of("*.yaml", drive)),
-    Target("scenario, junction", make_scene_file("urban/junction_left.yaml"), one_of("*.yaml", drive)),
-    Target("suite", make_file("scene.yaml", SUITE.encode), command("--dry-run", "--policy", "log-replay", "@/scene.yaml")),
+    Target(
+        "scenario, crossing",
+        make_scene_file("hard/crossing_pedestrian.yaml"),
+        one_of("*.yaml", drive),
+    ),
+    Target(
+        "scenario, junction", make_scene_file("urban/junction_left.yaml"), one_of("*.yaml", drive)
+    ),
+    Target(
+        "suite",
+        make_file("scene.yaml", SUITE.encode),
+        command("--dry-run", "--policy", "log-replay", "@/scene.yaml"),
+    ),
     Target("CommonRoad", make_commonroad, one_of("*.xml", drive)),
     Target("OpenDRIVE", make_xodr, one_of("*.usdz", drive)),
     Target("AlpaSim scene", make_usdz, one_of("*.usdz", drive)),
     Target("Argoverse 2", make_argoverse, lambda folder: drive(folder / "log")),
-    Target("Cosmos-Drive-Dreams", make_cosmos, lambda folder: drive(folder / "clip", "timing.warmup_us=100000")),
+    Target(
+        "Cosmos-Drive-Dreams",
+        make_cosmos,
+        lambda folder: drive(folder / "clip", "timing.warmup_us=100000"),
+    ),
     Target("PLY", make_cloud("ply"), one_of("*.ply", use_gaussians)),
     Target("compressed PLY", make_cloud("compressed"), one_of("*.ply", use_gaussians)),
     Target("splat", make_cloud("splat"), one_of("*.splat", use_gaussians)),
     Target("SPZ", make_cloud("spz"), one_of("*.spz", use_gaussians)),
-    Target("background", make_background, command("--dry-run", "--policy", "log-replay", "@/scene.yaml"), ("a.ply",)),
+    Target(
+        "background",
+        make_background,
+        command("--dry-run", "--policy", "log-replay", "@/scene.yaml"),
+        ("a.ply",),
+    ),
     Target("weights", make_bundle, one_of("*.safetensors", use_bundle)),
     Target("rollout log", make_log, one_of("*.asl", use_log)),
     Target("run folder, report", make_run, resealed(command("report", "@/run")), REPORT),
     Target("run folder, compare", make_run, resealed(command("compare", "@/run")), REPORT[:4]),
     Target("run folder, gate", make_run, resealed(command("gate", "@/run")), REPORT[:4]),
-    *(Target(f"run folder together, {' '.join(word for word in words if '@' not in word)}", make_run, resealed(command(*words)),
-             together=damaged_together) for words in TOGETHER),
-    Target("gate and baseline", make_baseline, command("gate", "@/run", "--gate", "@/gate.yaml", "--baseline-file", "@/baseline.json"),
-           ("gate.yaml", "baseline.json")),
+    *(
+        Target(
+            f"run folder together, {' '.join(word for word in words if '@' not in word)}",
+            make_run,
+            resealed(command(*words)),
+            together=damaged_together,
+        )
+        for words in TOGETHER
+    ),
+    Target(
+        "gate and baseline",
+        make_baseline,
+        command("gate", "@/run", "--gate", "@/gate.yaml", "--baseline-file", "@/baseline.json"),
+        ("gate.yaml", "baseline.json"),
+    ),
     Target("run folder, check", make_run, command("check", "@/run"), REPORT),
     Target("torch weights", make_torch_weights, one_of("*.pt", use_weights)),
     Target("video", make_video, one_of("*.mp4", use_video)),
     Target("posed views", make_views, use_views),
     Target("PNG", make_file("a.png", lambda: picture_bytes(".png")), one_of("*.png", use_picture)),
     Target("JPEG", make_file("a.jpg", lambda: picture_bytes(".jpg")), one_of("*.jpg", use_picture)),
-)  # fmt: skip
+)
 
 
 def of_the_laboratory() -> tuple[Target, ...]:
@@ -194,7 +247,9 @@ TARGETS = (*CORE, *of_the_laboratory())
 
 @contextlib.contextmanager
 def workplace() -> Iterator[Path]:
-    """Give a folder for the files of one input after another; the working directory is there meanwhile."""
+    """Give a folder for the files of one input after another; the working directory is there
+    meanwhile.
+    """
     before = os.getcwd()
     with tempfile.TemporaryDirectory(prefix="simrun-fuzz-") as text:
         os.chdir(text)

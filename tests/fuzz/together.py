@@ -1,4 +1,6 @@
-"""Damage to files of a run folder that belong together: the schema says which columns the tables share, and JSON follows the tables."""
+"""Damage to files of a run folder that belong together: the schema says which columns the tables
+share, and JSON follows the tables.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +14,41 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS_TABLE, STEPS_TABLE, VALID, Column, columns_of, metrics_in
+from alpasim_plugin.log.run_folder.schema import (
+    KEYS,
+    ROLLOUTS_TABLE,
+    STEPS_TABLE,
+    VALID,
+    Column,
+    columns_of,
+    metrics_in,
+)
 
 Files = dict[str, bytes]
 Tables = dict[str, pa.Table]
 Texts = dict[str, str]
 SCHEMAS = (ROLLOUTS_TABLE, STEPS_TABLE)
-NAMES = ("", "x" * 5000, "../../../etc/passwd", "\x1b[31m", "<script>alert(1)</script>", "a/b", "nan", "\u202e", "clean", "null", " ", "\n")
+NAMES = (
+    "",
+    "x" * 5000,
+    "../../../etc/passwd",
+    "\x1b[31m",
+    "<script>alert(1)</script>",
+    "a/b",
+    "nan",
+    "\u202e",
+    "clean",
+    "null",
+    " ",
+    "\n",
+)
 NUMBERS = (1e308, -1e308, float("inf"), float("-inf"), float("nan"), 1e-308, -1.0, 0.0, 1e9, 0.5)
 WHOLES = (0, -1, 2**63 - 1, -(2**63), 10**9, 1)
 
 
 def damaged_together(files: Files, rng: random.Random, root: str = "run/") -> Files:
-    """Return the files of a run folder after one to three changes, each of which is made in every file that holds what is changed.
+    """Return the files of a run folder after one to three changes, each of which is made in every
+    file that holds what is changed.
 
     Args:
         files: By path; what lies below ``root`` is the run folder.
@@ -45,7 +69,13 @@ def damaged_together(files: Files, rng: random.Random, root: str = "run/") -> Fi
 
 def _rename(tables: Tables, documents: Texts, rng: random.Random) -> None:
     """Rename a renderer, policy, scene, status or metric wherever it stands."""
-    column = rng.choice([c.name for c in ROLLOUTS_TABLE.columns if c.kind == "text" and c.name in tables[ROLLOUTS_TABLE.name].column_names])
+    column = rng.choice(
+        [
+            c.name
+            for c in ROLLOUTS_TABLE.columns
+            if c.kind == "text" and c.name in tables[ROLLOUTS_TABLE.name].column_names
+        ]
+    )
     values = [v for v in tables[ROLLOUTS_TABLE.name][column].to_pylist() if isinstance(v, str)]
     if not values:
         return
@@ -64,7 +94,9 @@ def _rename_metric(tables: Tables, documents: Texts, rng: random.Random) -> None
         return
     old, new = rng.choice(metrics), rng.choice(NAMES)
     renamed = {old: new, old + VALID: new + VALID}
-    tables[ROLLOUTS_TABLE.name] = table.rename_columns([renamed.get(name, name) for name in table.column_names])
+    tables[ROLLOUTS_TABLE.name] = table.rename_columns(
+        [renamed.get(name, name) for name in table.column_names]
+    )
     steps = tables[STEPS_TABLE.name]
     if "metric" in steps.column_names:
         found = [new if value == old else value for value in steps["metric"].to_pylist()]
@@ -75,12 +107,19 @@ def _rename_metric(tables: Tables, documents: Texts, rng: random.Random) -> None
 def _extreme(tables: Tables, documents: Texts, rng: random.Random) -> None:
     """Set values of a column to extreme ones, in all tables that have it."""
     column = rng.choice(_columns(tables))
-    choices: tuple[Any, ...] = {"text": NAMES, "integer": WHOLES, "number": NUMBERS, "flag": (True, False)}[column.kind]
+    choices: tuple[Any, ...] = {
+        "text": NAMES,
+        "integer": WHOLES,
+        "number": NUMBERS,
+        "flag": (True, False),
+    }[column.kind]
     value, share = rng.choice((*choices, None)), rng.choice((1.0, 0.5, 0.1))
     types = {"text": pa.string(), "integer": pa.int64(), "number": pa.float64(), "flag": pa.bool_()}
     for name, table in tables.items():
         if column.name in table.column_names:
-            found = [value if rng.random() < share else old for old in table[column.name].to_pylist()]
+            found = [
+                value if rng.random() < share else old for old in table[column.name].to_pylist()
+            ]
             tables[name] = _with(table, column.name, found, types[column.kind])
 
 
@@ -110,13 +149,23 @@ def _rows(tables: Tables, documents: Texts, rng: random.Random) -> None:
     for name, one in tables.items():
         if all(key in one.column_names for key in KEYS):
             keys = list(zip(*(one[key].to_pylist() for key in KEYS), strict=True))
-            places = [i for i, key in enumerate(keys) for _ in range(0 if times < 0 else times if key == cell else 1)]
+            places = [
+                i
+                for i, key in enumerate(keys)
+                for _ in range(0 if times < 0 else times if key == cell else 1)
+            ]
             tables[name] = one.take(pa.array(places, pa.int64()))
 
 
 CHANGES: tuple[Callable[[Tables, dict[str, Any], random.Random], None], ...] = (
-    _rename, _rename_metric, _extreme, _extreme, _other_type, _drop_column, _rows,
-)  # fmt: skip
+    _rename,
+    _rename_metric,
+    _extreme,
+    _extreme,
+    _other_type,
+    _drop_column,
+    _rows,
+)
 
 
 def _columns(tables: Tables) -> list[Column]:
@@ -139,7 +188,9 @@ def _set(table: pa.Table, column: str, array: pa.Array) -> pa.Table:
 
 
 def _replace(documents: Texts, old: str, new: str) -> None:
-    """Replace a text in documents, as value and as key: no other place of JSON has it between bare quotes."""
+    """Replace a text in documents, as value and as key: no other place of JSON has it between bare
+    quotes.
+    """
     for name, text in documents.items():
         documents[name] = text.replace(json.dumps(old), json.dumps(new))
 

@@ -1,4 +1,6 @@
-"""What is done with what a reader accepted: it is driven, drawn, scored, reported or read to its end."""
+"""What is done with what a reader accepted: it is driven, drawn, scored, reported or read to its
+end.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ class Target:
     make: Callable[[Path], None]  # writes valid files into an empty folder
     use: Callable[[Path], None]  # reads the folder; raises what the reader raises
     damage: Sequence[str] = ("*",)  # patterns of the files to damage
-    together: Callable[[dict[str, bytes], random.Random], dict[str, bytes]] | None = None  # damages files that belong together
+    together: Callable[[dict[str, bytes], random.Random], dict[str, bytes]] | None = (
+        None  # damages files that belong together
+    )
 
 
 class Refused(Exception):
@@ -48,7 +52,9 @@ def drive(path: Path, *overrides: str) -> None:
 
 
 def command(*args: str) -> Callable[[Path], None]:
-    """Run a command line in this process; codes 0 and 1 to 3 are verdicts, a printed error with code 2 is a refusal."""
+    """Run a command line in this process; codes 0 and 1 to 3 are verdicts, a printed error with
+    code 2 is a refusal.
+    """
 
     def use(folder: Path) -> None:
         from alpasim_plugin.cli.main import run_command
@@ -57,17 +63,30 @@ def command(*args: str) -> Callable[[Path], None]:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             code = run_command([arg.replace("@", str(folder)) for arg in args])
         if code == 2:
-            lines = [line for line in err.getvalue().strip().splitlines() if line and not line.startswith("warning: ")]
-            assert [line.split(":")[0].strip() for line in lines] == ["error", "with", "found", "do"], err.getvalue()[:400]
+            lines = [
+                line
+                for line in err.getvalue().strip().splitlines()
+                if line and not line.startswith("warning: ")
+            ]
+            assert [line.split(":")[0].strip() for line in lines] == [
+                "error",
+                "with",
+                "found",
+                "do",
+            ], err.getvalue()[:400]
             raise Refused
-        is_verdict = args[0] == "gate" and code in (4, 5) and not err.getvalue()  # of rollouts that the tables call failed
+        is_verdict = (
+            args[0] == "gate" and code in (4, 5) and not err.getvalue()
+        )  # of rollouts that the tables call failed
         assert code in (0, 1, 3) or is_verdict, f"exit code {code}: {err.getvalue()[:400]}"
 
     return use
 
 
 def resealed(use: Callable[[Path], None]) -> Callable[[Path], None]:
-    """Seal a damaged run folder anew, as whoever damaged it on purpose would, so that what reads it behind the seal is reached."""
+    """Seal a damaged run folder anew, as whoever damaged it on purpose would, so that what reads it
+    behind the seal is reached.
+    """
 
     def sealed(folder: Path) -> None:
         with contextlib.suppress(Exception):  # damage that cannot even be sealed is read as it is

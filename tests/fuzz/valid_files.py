@@ -20,7 +20,9 @@ REPO = Path(__file__).resolve().parents[2]
 
 def make_scene_file(name: str) -> Callable[[Path], None]:
     def make(folder: Path) -> None:
-        merged = load_yaml(REPO / "scenarios" / name).data  # what it extends does not lie beside the damaged file
+        merged = load_yaml(
+            REPO / "scenarios" / name
+        ).data  # what it extends does not lie beside the damaged file
         (folder / "scene.yaml").write_text(yaml.safe_dump(merged, sort_keys=False))
 
     return make
@@ -55,7 +57,7 @@ timing: {duration_us: 2000000, warmup_us: 200000}
 cameras: [{name: front, width: 64, height: 36}]
 variations: {ego.cruise_mps: {low: 8, high: 10}}
 samples: [{timing.warmup_us: 100000}]
-"""  # noqa: E501 - one segment list a line
+"""
 
 
 SUITE = """version: 1
@@ -117,7 +119,9 @@ def make_cloud(writer: str) -> Callable[[Path], None]:
             head = struct.pack("<IIIBBBB", 0x5053474E, 2, 4, 0, 12, 0, 0)
             (folder / "a.spz").write_bytes(gzip.compress(head + random.Random(0).randbytes(4 * 20)))
         else:
-            (folder / "a.ply").write_bytes(compressed_ply().replace(b"property float packed_", b"property uint packed_"))
+            (folder / "a.ply").write_bytes(
+                compressed_ply().replace(b"property float packed_", b"property uint packed_")
+            )
 
     return make
 
@@ -135,13 +139,17 @@ def make_bundle(folder: Path) -> None:
 
     settings = json.dumps({"name": "onefixer-tiny", "steps": [1000.0], "vae": {"kind": "tiny"}})
     tensors = {f"{part}.a": np.zeros((2, 3), np.float32) for part in ("dit", "vae")}
-    (folder / "a.safetensors").write_bytes(save(tensors, {"format": "simrun-fixer-1", "settings": settings, "trained": "true"}))
+    (folder / "a.safetensors").write_bytes(
+        save(tensors, {"format": "simrun-fixer-1", "settings": settings, "trained": "true"})
+    )
 
 
 def make_torch_weights(folder: Path) -> None:
     import torch
 
-    torch.save({"state_dict": {"net.a": torch.zeros(2, 3), "net.b": torch.ones(4)}}, folder / "a.pt")
+    torch.save(
+        {"state_dict": {"net.a": torch.zeros(2, 3), "net.b": torch.ones(4)}}, folder / "a.pt"
+    )
 
 
 def make_video(folder: Path) -> None:
@@ -153,7 +161,12 @@ def make_video(folder: Path) -> None:
 def make_run(folder: Path) -> None:
     from tests.report.make_run import Plan, make_run
 
-    vouch_for(make_run(folder / "run", Plan(scenes=("plain", "other"), seeds=(0, 1), steps=20, pictures=False, clips=False)))
+    vouch_for(
+        make_run(
+            folder / "run",
+            Plan(scenes=("plain", "other"), seeds=(0, 1), steps=20, pictures=False, clips=False),
+        )
+    )
 
 
 def make_baseline(folder: Path) -> None:

@@ -55,12 +55,18 @@ def one(target: Target, seed: int, number: int, folder: Path) -> tuple[str, str]
 
 def _where() -> str:
     frames = traceback.extract_tb(sys.exc_info()[2])
-    own = [f"{Path(f.filename).name}:{f.lineno}" for f in frames if "site-packages" not in f.filename and "/tests/" not in f.filename]
+    own = [
+        f"{Path(f.filename).name}:{f.lineno}"
+        for f in frames
+        if "site-packages" not in f.filename and "/tests/" not in f.filename
+    ]
     return " > ".join(own[-4:])
 
 
 def child(pipe: multiprocessing.connection.Connection, seed: int, names: list[str]) -> None:
-    """Answer inputs until the pipe closes; Ctrl-C is for the parent, which then gives no further input."""
+    """Answer inputs until the pipe closes; Ctrl-C is for the parent, which then gives no further
+    input.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     targets = [t for t in TARGETS if t.name in names]
     with workplace() as folder:
@@ -71,7 +77,11 @@ def child(pipe: multiprocessing.connection.Connection, seed: int, names: list[st
             except Exception as error:
                 pipe.send(("invalid", target.name, f"{type(error).__name__}: {error}"))
                 return
-        held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() if sys.platform == "linux" else 0
+        held = (
+            int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+            if sys.platform == "linux"
+            else 0
+        )
         if held:
             resource.setrlimit(resource.RLIMIT_AS, (held + MEMORY_BYTES, resource.RLIM_INFINITY))
         pipe.send(("ready", "", ""))
@@ -90,7 +100,9 @@ class Worker:
         here, there = multiprocessing.get_context("spawn").Pipe()
         self.pipe = here
         names = [target.name for target in self.targets]
-        self.process = multiprocessing.get_context("spawn").Process(target=child, args=(there, self.seed, names), daemon=True)
+        self.process = multiprocessing.get_context("spawn").Process(
+            target=child, args=(there, self.seed, names), daemon=True
+        )
         self.process.start()
         there.close()
         state, name, text = self.pipe.recv()

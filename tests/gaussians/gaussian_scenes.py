@@ -11,7 +11,9 @@ from alpasim_plugin.gaussians.sh import dc_from_rgb
 LSB = 1.0 / 255.0
 
 
-def splats(means, scales=0.3, opacities=0.8, rgb=(1.0, 1.0, 1.0), quats=(1.0, 0.0, 0.0, 0.0)) -> GaussianCloud:
+def splats(
+    means, scales=0.3, opacities=0.8, rgb=(1.0, 1.0, 1.0), quats=(1.0, 0.0, 0.0, 0.0)
+) -> GaussianCloud:
     """Build a cloud of plain colours; scalars and single rows are repeated."""
     means = np.atleast_2d(np.asarray(means, dtype=np.float64))
     n = len(means)
@@ -27,7 +29,9 @@ def splats(means, scales=0.3, opacities=0.8, rgb=(1.0, 1.0, 1.0), quats=(1.0, 0.
 
 
 def random_cloud(n: int, seed: int = 0, degree: int = 3) -> GaussianCloud:
-    """Return Gaussians of all shapes and opacities in front of the camera at the origin looking along z."""
+    """Return Gaussians of all shapes and opacities in front of the camera at the origin looking
+    along z.
+    """
     rng = stream("raster-tests", seed, "cloud")
     return GaussianCloud(
         rng.uniform([-4, -3, 0.5], [4, 3, 12], (n, 3)),
@@ -38,7 +42,9 @@ def random_cloud(n: int, seed: int = 0, degree: int = 3) -> GaussianCloud:
     )
 
 
-def camera(width: int = 96, height: int = 64, f: float = 80.0, T_camera_world=None) -> PinholeCamera:
+def camera(
+    width: int = 96, height: int = 64, f: float = 80.0, T_camera_world=None
+) -> PinholeCamera:
     """Return a camera with square pixels and a slightly off-centre principal point."""
     K = np.array([[f, 0, width / 2 + 1.3], [0, f, height / 2 - 0.7], [0, 0, 1]])
     return PinholeCamera(width, height, K, np.eye(4) if T_camera_world is None else T_camera_world)
@@ -56,8 +62,12 @@ def random_rigid(seed: int, reach_m: float = 5.0) -> np.ndarray:
     return T
 
 
-def assert_same_image(found: RasterOutput, wanted: RasterOutput, tolerance: float = 2e-5, odd_share: float = 0.0) -> None:
-    """Compare colour, alpha and depth; ``odd_share`` of the pixels may differ by a documented discontinuity."""
+def assert_same_image(
+    found: RasterOutput, wanted: RasterOutput, tolerance: float = 2e-5, odd_share: float = 0.0
+) -> None:
+    """Compare colour, alpha and depth; ``odd_share`` of the pixels may differ by a documented
+    discontinuity.
+    """
     colour = np.abs(found.rgb - wanted.rgb).max(axis=2)
     opacity = np.abs(found.alpha - wanted.alpha)
     scale = np.maximum(wanted.depth, 1.0) / np.maximum(wanted.alpha, 1e-3)
@@ -65,4 +75,6 @@ def assert_same_image(found: RasterOutput, wanted: RasterOutput, tolerance: floa
     for name, error in (("rgb", colour), ("alpha", opacity), ("depth", depth)):
         odd = np.mean(error > tolerance)
         assert np.isfinite(error).all(), f"{name} holds NaN"
-        assert odd <= odd_share, f"{name}: {odd:.2%} of pixels differ by more than {tolerance}, at most {error.max():.3g}"
+        assert odd <= odd_share, (
+            f"{name}: {odd:.2%} of pixels differ by more than {tolerance}, at most {error.max():.3g}"
+        )

@@ -1,4 +1,6 @@
-"""Scenes of splats for training in float64, and gradients of them by slow ways that can be trusted."""
+"""Scenes of splats for training in float64, and gradients of them by slow ways that can be
+trusted.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +16,26 @@ from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
 from alpasim_plugin.gaussians.cloud import logit, sigmoid
 from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput, Splats
 from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
-from alpasim_plugin.gaussians.raster.rasterize_reference import composite_reference, project_gaussians
+from alpasim_plugin.gaussians.raster.rasterize_reference import (
+    composite_reference,
+    project_gaussians,
+)
 from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, rasterize_tensors
 
 
 def cloud_of(splats: Splats) -> GaussianCloud:
-    """Return splats as a cloud: float64 means, other fields float32, quaternions normalised; all must be drawable."""
+    """Return splats as a cloud: float64 means, other fields float32, quaternions normalised; all
+    must be drawable.
+    """
     means, log_scales, quaternions, logits, sh = (
-        t.detach().cpu().double().numpy() for t in (splats.means, splats.log_scales, splats.quaternions, splats.logit_opacities, splats.sh)
+        t.detach().cpu().double().numpy()
+        for t in (
+            splats.means,
+            splats.log_scales,
+            splats.quaternions,
+            splats.logit_opacities,
+            splats.sh,
+        )
     )
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
@@ -53,7 +67,17 @@ class Scene:
         return {name: getattr(self, name) for name in FIELDS}
 
 
-def scene(means, scales, cam: PinholeCamera, *, opacities=0.6, quaternions=None, sh=None, seed: int = 0, **other) -> Scene:
+def scene(
+    means,
+    scales,
+    cam: PinholeCamera,
+    *,
+    opacities=0.6,
+    quaternions=None,
+    sh=None,
+    seed: int = 0,
+    **other,
+) -> Scene:
     """Build a scene; what is not given is random, and every number is one that float32 can hold."""
     rng = stream("gradient-tests", seed, "scene")
     means = np.atleast_2d(np.asarray(means, float))
@@ -61,7 +85,9 @@ def scene(means, scales, cam: PinholeCamera, *, opacities=0.6, quaternions=None,
     arrays = (
         means,
         np.log(np.broadcast_to(np.asarray(scales, float), (n, 3))),
-        rng.normal(size=(n, 4)) if quaternions is None else np.broadcast_to(np.asarray(quaternions, float), (n, 4)),
+        rng.normal(size=(n, 4))
+        if quaternions is None
+        else np.broadcast_to(np.asarray(quaternions, float), (n, 4)),
         logit(np.broadcast_to(np.asarray(opacities, float), (n,))),
         rng.normal(size=(n, 4, 3)) * 0.2 if sh is None else np.asarray(sh, float),
     )
@@ -69,7 +95,9 @@ def scene(means, scales, cam: PinholeCamera, *, opacities=0.6, quaternions=None,
 
 
 def weights_of(cam: PinholeCamera) -> np.ndarray:
-    """Return ``(H, W, 5)`` random weights of colour, alpha and depth: the loss is the weighted sum."""
+    """Return ``(H, W, 5)`` random weights of colour, alpha and depth: the loss is the weighted
+    sum.
+    """
     return stream("gradient-tests", 0, "weights").normal(size=(cam.height, cam.width, 5))
 
 
@@ -79,9 +107,14 @@ def weighted(out: GradientOutput | object, s: Scene) -> Tensor:
     return (image * torch.as_tensor(weights_of(s.camera), dtype=image.dtype)).sum()
 
 
-def kernel_gradients(s: Scene, threads: int = 1, dtype: torch.dtype = torch.float32) -> tuple[Gradients, GradientOutput]:
+def kernel_gradients(
+    s: Scene, threads: int = 1, dtype: torch.dtype = torch.float32
+) -> tuple[Gradients, GradientOutput]:
     """Return the gradients of the compiled kernels, and the image that they belong to."""
-    tensors = {k: torch.tensor(a, dtype=dtype if k == "means" else torch.float32).requires_grad_(True) for k, a in s.arrays().items()}
+    tensors = {
+        k: torch.tensor(a, dtype=dtype if k == "means" else torch.float32).requires_grad_(True)
+        for k, a in s.arrays().items()
+    }
     background = torch.tensor(s.background, requires_grad=True)
     out = rasterize_gradient(Splats(**tensors), s.camera, background=background, threads=threads)
     weighted(out, s).backward()
@@ -91,25 +124,43 @@ def kernel_gradients(s: Scene, threads: int = 1, dtype: torch.dtype = torch.floa
 
 def torch_gradients(s: Scene) -> Gradients:
     """Return the gradients of `rasterize_torch` in float64."""
-    t = {name: torch.tensor(a).requires_grad_(True) for name, a in {**s.arrays(), "background": np.array(s.background)}.items()}
-    gaussians = GaussianTensors(t["means"], t["quaternions"], t["log_scales"].exp(), t["logit_opacities"].sigmoid(), t["sh"])
+    t = {
+        name: torch.tensor(a).requires_grad_(True)
+        for name, a in {**s.arrays(), "background": np.array(s.background)}.items()
+    }
+    gaussians = GaussianTensors(
+        t["means"], t["quaternions"], t["log_scales"].exp(), t["logit_opacities"].sigmoid(), t["sh"]
+    )
     weighted(rasterize_tensors(gaussians, s.camera, t["background"]), s).backward()
-    return {name: np.zeros_like(a) if (a := leaf.grad) is None else a.numpy() for name, leaf in t.items()}
+    return {
+        name: np.zeros_like(a) if (a := leaf.grad) is None else a.numpy()
+        for name, leaf in t.items()
+    }
 
 
 def reference_loss(s: Scene, values: dict[str, np.ndarray]) -> float:
     """Return the loss of the float64 reference at other values of the parameters."""
     cloud = GaussianCloud(
-        values["means"], values["quaternions"], np.exp(values["log_scales"]), sigmoid(values["logit_opacities"]), values["sh"]
+        values["means"],
+        values["quaternions"],
+        np.exp(values["log_scales"]),
+        sigmoid(values["logit_opacities"]),
+        values["sh"],
     )
     behind = np.asarray(values["background"], float).reshape(1, 1, 3)
-    colour, alpha, depth, _ = composite_reference(project_gaussians(cloud, s.camera), s.camera, behind)
+    colour, alpha, depth, _ = composite_reference(
+        project_gaussians(cloud, s.camera), s.camera, behind
+    )
     image = np.concatenate([colour, alpha[..., None], s.depth_weight * depth[..., None]], axis=2)
     return float((image * weights_of(s.camera)).sum())
 
 
-def central_differences(function: Callable[[], float], value: np.ndarray, step: float) -> np.ndarray:
-    """Return the gradient of a function by an array that it reads, changing it in place and back."""
+def central_differences(
+    function: Callable[[], float], value: np.ndarray, step: float
+) -> np.ndarray:
+    """Return the gradient of a function by an array that it reads, changing it in place and
+    back.
+    """
     out = np.zeros_like(value)
     for at in np.ndindex(value.shape):
         kept = value[at]
@@ -123,15 +174,29 @@ def central_differences(function: Callable[[], float], value: np.ndarray, step: 
 
 def numeric_gradients(s: Scene, step: float = 1e-6) -> Gradients:
     """Return central finite differences of the float64 reference."""
-    values = {**{k: a.copy() for k, a in s.arrays().items()}, "background": np.array(s.background, float)}
-    return {name: central_differences(lambda: reference_loss(s, values), array, step) for name, array in values.items()}
+    values = {
+        **{k: a.copy() for k, a in s.arrays().items()},
+        "background": np.array(s.background, float),
+    }
+    return {
+        name: central_differences(lambda: reference_loss(s, values), array, step)
+        for name, array in values.items()
+    }
 
 
-def assert_close(found: Gradients, wanted: Gradients, share: float, names=(*FIELDS, "background")) -> None:
-    """Compare row by row: each Gaussian's error in a field is at most ``share`` of the largest gradient of that row and field."""
+def assert_close(
+    found: Gradients, wanted: Gradients, share: float, names=(*FIELDS, "background")
+) -> None:
+    """Compare row by row: each Gaussian's error in a field is at most ``share`` of the largest
+    gradient of that row and field.
+    """
     for name in names:
-        a, b = (np.atleast_2d(g[name]).reshape(len(np.atleast_2d(g[name])), -1) for g in (found, wanted))
+        a, b = (
+            np.atleast_2d(g[name]).reshape(len(np.atleast_2d(g[name])), -1) for g in (found, wanted)
+        )
         assert np.isfinite(a).all(), name
         scale = np.maximum(np.abs(b).max(axis=1), 1e-3 * np.abs(b).max(initial=1e-12))
         error = np.abs(a - b).max(axis=1) / np.maximum(scale, 1e-12)
-        assert error.max(initial=0.0) <= share, f"{name}: row {error.argmax()} off by {error.max():.2g} of its largest, {a[error.argmax()]}"
+        assert error.max(initial=0.0) <= share, (
+            f"{name}: row {error.argmax()} off by {error.max():.2g} of its largest, {a[error.argmax()]}"
+        )

@@ -1,4 +1,6 @@
-"""Small hand-made scenarios for scene and renderer tests: straight 2 + 2 lanes, a curve, a crossing."""
+"""Small hand-made scenarios for scene and renderer tests: straight 2 + 2 lanes, a curve, a
+crossing.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,13 @@ def offset(line: F64, left_m: float) -> F64:
     return out
 
 
-def road_lanes(axis: F64, name: str, lanes_each_way: int = 2, is_intersection: bool = False, paint: bool = False) -> dict[str, Lane]:
+def road_lanes(
+    axis: F64,
+    name: str,
+    lanes_each_way: int = 2,
+    is_intersection: bool = False,
+    paint: bool = False,
+) -> dict[str, Lane]:
     """Lanes on both sides of a road's axis ``(N, 3)``; those on its right run along it."""
     out: dict[str, Lane] = {}
     for way, sign in (("a", -1.0), ("b", 1.0)):
@@ -59,8 +67,17 @@ def road_lanes(axis: F64, name: str, lanes_each_way: int = 2, is_intersection: b
             if way == "b":
                 inner, outer = inner[::-1].copy(), outer[::-1].copy()
             lane_id = f"{name}-{way}{i}"
-            known = {"left_paint": "double_yellow" if i == 0 else "dashed_white", "right_paint": "solid_white"} if paint else {}
-            out[lane_id] = Lane(lane_id, (inner + outer) / 2, inner, outer, is_intersection=is_intersection, **known)  # type: ignore[arg-type]
+            known = (
+                {
+                    "left_paint": "double_yellow" if i == 0 else "dashed_white",
+                    "right_paint": "solid_white",
+                }
+                if paint
+                else {}
+            )
+            out[lane_id] = Lane(
+                lane_id, (inner + outer) / 2, inner, outer, is_intersection=is_intersection, **known
+            )  # type: ignore[arg-type]
     return out
 
 
@@ -111,12 +128,16 @@ def line(start: tuple[float, float], end: tuple[float, float], step_m: float = 2
     return np.column_stack([xy, np.zeros(n)])
 
 
-def parked(actor_id: str, x: float, y: float, yaw: float = 0.0, label: str = "car", box: Box | None = None) -> Actor:
+def parked(
+    actor_id: str, x: float, y: float, yaw: float = 0.0, label: str = "car", box: Box | None = None
+) -> Actor:
     """An actor that stands still."""
     b = box or Box(4.6, 1.9, 1.5)
     t = np.array([0, 60_000_000])
     xyz = np.tile([x, y, b.height_m / 2], (2, 1))
-    return Actor(actor_id, label, b, Trajectory(t, xyz, np.tile(quat_from_yaw(yaw), (2, 1))), is_static=True)
+    return Actor(
+        actor_id, label, b, Trajectory(t, xyz, np.tile(quat_from_yaw(yaw), (2, 1))), is_static=True
+    )
 
 
 STREET_ACTORS = (
@@ -139,7 +160,9 @@ def straight(**kwargs: object) -> Scenario:
     walk = np.array([[78.0, -7.2, 0], [81.0, -7.2, 0], [81.0, 7.2, 0], [78.0, 7.2, 0]])
     stop = np.array([[76.5, -7.2, 0], [76.5, 0.0, 0]])
     kwargs.setdefault("actors", STREET_ACTORS)
-    lane_map = with_default_paint(LaneMap(lanes, crosswalks=(walk,), stop_lines=(stop,)))  # as a scenario is when it is loaded
+    lane_map = with_default_paint(
+        LaneMap(lanes, crosswalks=(walk,), stop_lines=(stop,))
+    )  # as a scenario is when it is loaded
     return make_scenario(lane_map, line((0, -1.8), (100, -1.8)), **kwargs)  # type: ignore[arg-type]
 
 

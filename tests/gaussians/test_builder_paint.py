@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Marking, Scenario
-from alpasim_plugin.gaussians.scene.paint import GAP_M, LINE_M, WHITE, YELLOW, Strokes, paint_strokes
+from alpasim_plugin.gaussians.scene.paint import (
+    GAP_M,
+    LINE_M,
+    WHITE,
+    YELLOW,
+    Strokes,
+    paint_strokes,
+)
 from alpasim_plugin.gaussians.scene.site import make_site
 from alpasim_plugin.world.paint import with_default_paint
 from tests.gaussians.scene_maps import LANE_M, line, make_scenario, road_lanes
@@ -31,7 +38,9 @@ def length(strokes: Strokes, chosen: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def two_by_two() -> tuple[Strokes, F64]:
-    return strokes_of(make_scenario(with_default_paint(LaneMap(road_lanes(line((-60, 0), (180, 0)), "r"))), PATH))
+    return strokes_of(
+        make_scenario(with_default_paint(LaneMap(road_lanes(line((-60, 0), (180, 0)), "r"))), PATH)
+    )
 
 
 def test_unknown_paint_is_nothing() -> None:
@@ -39,7 +48,9 @@ def test_unknown_paint_is_nothing() -> None:
     assert len(strokes.start) == 0
 
 
-def test_unknown_edge_between_lanes_of_one_direction_is_dashed_white(two_by_two: tuple[Strokes, F64]) -> None:
+def test_unknown_edge_between_lanes_of_one_direction_is_dashed_white(
+    two_by_two: tuple[Strokes, F64],
+) -> None:
     strokes, middle = two_by_two
     chosen = at(middle, -LANE_M)
     assert set(strokes.colour[chosen]) == {WHITE}
@@ -56,7 +67,9 @@ def test_dashes_are_three_metres_with_nine_between(two_by_two: tuple[Strokes, F6
     np.testing.assert_allclose(np.diff(dash_starts), LINE_M + GAP_M, atol=0.05)
 
 
-def test_unknown_edge_between_opposing_lanes_is_double_yellow(two_by_two: tuple[Strokes, F64]) -> None:
+def test_unknown_edge_between_opposing_lanes_is_double_yellow(
+    two_by_two: tuple[Strokes, F64],
+) -> None:
     strokes, middle = two_by_two
     pair = at(middle, 0.0, 0.2)
     assert set(strokes.colour[pair]) == {YELLOW}
@@ -85,7 +98,9 @@ def test_dashes_run_on_from_lane_to_lane() -> None:
 
 def test_known_paint_is_believed_and_shared_edges_are_painted_once() -> None:
     lanes = road_lanes(line((0, 0), (80, 0)), "r", 2)
-    lanes["r-a0"] = replace(lanes["r-a0"], right_paint="solid_yellow")  # the same place is r-a1's unknown left edge
+    lanes["r-a0"] = replace(
+        lanes["r-a0"], right_paint="solid_yellow"
+    )  # the same place is r-a1's unknown left edge
     strokes, middle = strokes_of(make_scenario(with_default_paint(LaneMap(lanes)), PATH))
     chosen = at(middle, -LANE_M)
     assert set(strokes.colour[chosen]) == {YELLOW}
@@ -109,7 +124,9 @@ def test_nothing_unknown_is_painted_inside_an_intersection() -> None:
 def test_map_with_marking_lines_keeps_unknown_lane_edges_bare() -> None:
     lanes = road_lanes(line((0, 0), (80, 0)), "r", 2)
     marking = Marking(line((0, -LANE_M), (80, -LANE_M)), "solid_white")
-    strokes, middle = strokes_of(make_scenario(with_default_paint(LaneMap(lanes, markings=(marking,))), PATH))
+    strokes, middle = strokes_of(
+        make_scenario(with_default_paint(LaneMap(lanes, markings=(marking,))), PATH)
+    )
     assert at(middle, -LANE_M).all()
     assert length(strokes, at(middle, -LANE_M)) == pytest.approx(80, rel=0.02)
 
@@ -117,7 +134,9 @@ def test_map_with_marking_lines_keeps_unknown_lane_edges_bare() -> None:
 def test_zebra_bars_lie_along_the_road_across_the_walk() -> None:
     walk = np.array([[30.0, -7.0, 0], [33.0, -7.0, 0], [33.0, 7.0, 0], [30.0, 7.0, 0]])
     strokes, middle = strokes_of(make_scenario(LaneMap({}, crosswalks=(walk,)), PATH))
-    direction = (strokes.end - strokes.start) / np.linalg.norm(strokes.end - strokes.start, axis=1, keepdims=True)
+    direction = (strokes.end - strokes.start) / np.linalg.norm(
+        strokes.end - strokes.start, axis=1, keepdims=True
+    )
     assert np.abs(direction[:, 1]).max() < 0.01
     assert len(strokes.start) >= 14
     np.testing.assert_allclose(np.diff(np.sort(middle[:, 1])), 0.9, atol=0.02)

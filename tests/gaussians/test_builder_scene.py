@@ -17,7 +17,16 @@ from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.gaussians.scene.site import contours, make_site
 from alpasim_plugin.world.ground import height_at
 from tests.examples import first_of
-from tests.gaussians.scene_maps import STREET_ACTORS, camera_spec, crossing, curve, line, make_scenario, road_lanes, straight
+from tests.gaussians.scene_maps import (
+    STREET_ACTORS,
+    camera_spec,
+    crossing,
+    curve,
+    line,
+    make_scenario,
+    road_lanes,
+    straight,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -26,7 +35,9 @@ def built(scenario: Scenario) -> SceneGraph:
     return build_scene(scenario, partial(height_at, scenario.ground))
 
 
-def view(scenario: Scenario, index: int, left_m: float = 0.0, width: int = 256, height: int = 144) -> PinholeCamera:
+def view(
+    scenario: Scenario, index: int, left_m: float = 0.0, width: int = 256, height: int = 144
+) -> PinholeCamera:
     T = se3(scenario.ego_log.xyz[index], scenario.ego_log.quat[index])
     T[:3, 3] += left_m * T[:3, 1]
     spec = camera_spec(width, height)
@@ -35,7 +46,12 @@ def view(scenario: Scenario, index: int, left_m: float = 0.0, width: int = 256, 
 
 def digest(graph: SceneGraph) -> bytes:
     nodes = (*graph.background, *graph.actors.values())
-    return b"".join(a.tobytes() for n in nodes for lv in n.levels for a in (lv.cloud.means, lv.cloud.quats, lv.cloud.scales, lv.cloud.sh))
+    return b"".join(
+        a.tobytes()
+        for n in nodes
+        for lv in n.levels
+        for a in (lv.cloud.means, lv.cloud.quats, lv.cloud.scales, lv.cloud.sh)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +83,9 @@ def empty_street(make: Callable[..., Scenario]) -> tuple[Scenario, SceneGraph]:
 
 @pytest.mark.parametrize("make", first_of([crossing, straight, curve]))
 @pytest.mark.parametrize("left_m", [0.0, 3.0])
-def test_ground_has_no_holes_from_the_path_or_three_metres_aside(make: Callable[..., Scenario], left_m: float) -> None:
+def test_ground_has_no_holes_from_the_path_or_three_metres_aside(
+    make: Callable[..., Scenario], left_m: float
+) -> None:
     scenario, graph = empty_street(make)
     n = len(scenario.ego_log)
     for index in (0, n // 2, n - 1):
@@ -76,24 +94,37 @@ def test_ground_has_no_holes_from_the_path_or_three_metres_aside(make: Callable[
         assert np.mean(alpha < 0.93) < 0.01
 
 
-def test_lane_lines_are_brighter_than_the_asphalt_beside_them(street: tuple[Scenario, SceneGraph]) -> None:
+def test_lane_lines_are_brighter_than_the_asphalt_beside_them(
+    street: tuple[Scenario, SceneGraph],
+) -> None:
     scenario, graph = street
     camera = view(scenario, 2, width=480, height=272)
     image = graph.render(camera, {}).rgb
     eye = camera.centre_world
 
     def seen(y_m: float, ahead_m: float) -> np.ndarray:
-        p = camera.T_camera_world[:3, :3] @ np.array([eye[0] + ahead_m, y_m, 0.0]) + camera.T_camera_world[:3, 3]
-        return np.asarray(image[int(camera.fy * p[1] / p[2] + camera.cy), int(camera.fx * p[0] / p[2] + camera.cx)])
+        p = (
+            camera.T_camera_world[:3, :3] @ np.array([eye[0] + ahead_m, y_m, 0.0])
+            + camera.T_camera_world[:3, 3]
+        )
+        return np.asarray(
+            image[
+                int(camera.fy * p[1] / p[2] + camera.cy), int(camera.fx * p[0] / p[2] + camera.cx)
+            ]
+        )
 
     for ahead in (10.0, 13.0, 17.0):
-        edge, lane, centre = seen(-7.2, ahead), seen(-1.8, ahead), seen(0.16, ahead)
+        edge = seen(-7.2, ahead)
+        lane = seen(-1.8, ahead)
+        centre = seen(0.16, ahead)
         assert edge.min() > lane.max() + 0.15  # the white line at the right edge
         assert centre[0] > centre[2] + 0.15  # the yellow line between the directions
         assert np.ptp(lane) < 0.06
 
 
-def test_coarser_levels_of_the_road_look_like_the_finer_ones(street: tuple[Scenario, SceneGraph]) -> None:
+def test_coarser_levels_of_the_road_look_like_the_finer_ones(
+    street: tuple[Scenario, SceneGraph],
+) -> None:
     scenario, graph = street
     camera = view(scenario, 2)
     fine = SceneGraph(graph.background, [], graph.sky, cell_px=1.0).render(camera, {}).rgb
@@ -114,7 +145,9 @@ def test_houses_leave_road_actors_and_each_other_alone() -> None:
 
 
 def test_environment_without_houses_trees_and_poles_builds_none() -> None:
-    scenario = straight(environment=Environment(buildings=0.0, trees_per_100m=0.0, poles_spacing_m=0.0))
+    scenario = straight(
+        environment=Environment(buildings=0.0, trees_per_100m=0.0, poles_spacing_m=0.0)
+    )
     kinds = {n.name.split("/")[0] for n in built(scenario).background}
     assert kinds == {"ground", "far-ground", "paint", "surroundings", "kerb"}
 
@@ -139,7 +172,10 @@ def test_scene_far_from_the_origin_equals_the_local_scene() -> None:
         assert v.left is not None
         assert v.right is not None
         lanes[k] = replace(v, centre=v.centre + shift, left=v.left + shift, right=v.right + shift)
-    moved = {name: tuple(c + shift for c in getattr(near.lane_map, name)) for name in ("crosswalks", "stop_lines")}
+    moved = {
+        name: tuple(c + shift for c in getattr(near.lane_map, name))
+        for name in ("crosswalks", "stop_lines")
+    }
     far = replace(
         near,
         lane_map=LaneMap(lanes, **moved),
@@ -159,10 +195,15 @@ def test_parked_log_of_one_pose_still_gives_a_scene() -> None:
 
 
 def test_map_without_edges_gets_a_road_around_its_centres() -> None:
-    lanes = {k: replace(v, left=None, right=None) for k, v in road_lanes(line((-20, 0), (120, 0)), "r", 1).items()}
+    lanes = {
+        k: replace(v, left=None, right=None)
+        for k, v in road_lanes(line((-20, 0), (120, 0)), "r", 1).items()
+    }
     scenario = make_scenario(LaneMap(lanes), line((0, -1.8), (60, -1.8)))
     site = make_site(scenario, partial(height_at, scenario.ground))
-    on = site.look_up(site.road, site.frame.to_ground(np.array([[20.0, -1.8], [20.0, 1.8], [20.0, 12.0]])))
+    on = site.look_up(
+        site.road, site.frame.to_ground(np.array([[20.0, -1.8], [20.0, 1.8], [20.0, 12.0]]))
+    )
     assert on.tolist() == [True, True, False]
     assert built(scenario).render(view(scenario, 3), {}).alpha[100:].min() > 0.8
 
@@ -179,7 +220,10 @@ def test_roadside_lines_have_the_road_on_their_left() -> None:
     for c in contours(site, 2.0, 40.0):
         d = np.gradient(c, axis=0)
         left = np.stack([-d[:, 1], d[:, 0]], axis=1) / np.linalg.norm(d, axis=1, keepdims=True)
-        assert site.look_up(site.off_road_m, c + left).mean() < site.look_up(site.off_road_m, c - left).mean()
+        assert (
+            site.look_up(site.off_road_m, c + left).mean()
+            < site.look_up(site.off_road_m, c - left).mean()
+        )
 
 
 def test_actor_fills_its_box_and_stays_inside(street: tuple[Scenario, SceneGraph]) -> None:
@@ -192,12 +236,20 @@ def test_actor_fills_its_box_and_stays_inside(street: tuple[Scenario, SceneGraph
         assert high[2] - low[2] > 1.4 * half[2]
 
 
-def test_actors_of_one_scene_differ_in_colour_and_keep_it(street: tuple[Scenario, SceneGraph]) -> None:
+def test_actors_of_one_scene_differ_in_colour_and_keep_it(
+    street: tuple[Scenario, SceneGraph],
+) -> None:
     models = {seed: [build_actor(a, "test", seed) for a in STREET_ACTORS[:2]] for seed in range(5)}
-    colours = {tuple(np.median(m.levels[0].cloud.sh[:, 0], axis=0).round(3)) for pair in models.values() for m in pair}
+    colours = {
+        tuple(np.median(m.levels[0].cloud.sh[:, 0], axis=0).round(3))
+        for pair in models.values()
+        for m in pair
+    }
     assert len(colours) >= 4
     again = build_actor(STREET_ACTORS[0], "test", 0)
-    np.testing.assert_array_equal(again.levels[0].cloud.sh, street[1].actors["car-1"].levels[0].cloud.sh)
+    np.testing.assert_array_equal(
+        again.levels[0].cloud.sh, street[1].actors["car-1"].levels[0].cloud.sh
+    )
 
 
 @pytest.mark.slow
@@ -205,10 +257,14 @@ def test_dusk_darkens_everything_below_the_sky(street: tuple[Scenario, SceneGrap
     scenario = straight(environment=Environment(sky="dusk"))
     day, dusk = (g.render(view(scenario, 2), {}) for g in (street[1], built(scenario)))
     ground = day.alpha > 0.98
-    np.testing.assert_allclose(dusk.rgb[ground].mean(axis=0) / day.rgb[ground].mean(axis=0), [0.74, 0.63, 0.62], atol=0.02)
+    np.testing.assert_allclose(
+        dusk.rgb[ground].mean(axis=0) / day.rgb[ground].mean(axis=0), [0.74, 0.63, 0.62], atol=0.02
+    )
 
 
-def test_file_background_is_scaled_turned_and_cut_into_blocks(street: tuple[Scenario, SceneGraph]) -> None:
+def test_file_background_is_scaled_turned_and_cut_into_blocks(
+    street: tuple[Scenario, SceneGraph],
+) -> None:
     cloud = street[1].actors["bus-1"].levels[0].cloud
     T = np.eye(4)
     T[:3, :3] = 2.0 * se3([0, 0, 0], quat_from_yaw(0.5))[:3, :3]
@@ -217,7 +273,9 @@ def test_file_background_is_scaled_turned_and_cut_into_blocks(street: tuple[Scen
     np.testing.assert_allclose(placed.means, cloud.means @ T[:3, :3].T + T[:3, 3], atol=1e-9)
     np.testing.assert_allclose(placed.scales, 2.0 * cloud.scales, rtol=1e-6)
     graph = with_background(street[1], cloud, T)
-    added = graph.background[len(street[1].background) :]  # what was there stays: its builder leaves the road out where the file has one
+    added = graph.background[
+        len(street[1].background) :
+    ]  # what was there stays: its builder leaves the road out where the file has one
     assert sum(len(n.levels[0].cloud) for n in added) == len(cloud)
     assert len(added) > 1
     assert set(graph.actors) == set(street[1].actors)

@@ -27,7 +27,9 @@ def test_field_of_view_spans_the_width():
 
 
 def test_slope_limits_follow_an_off_centre_principal_point():
-    low_x, high_x, _, _ = PinholeCamera(40, 20, K + np.array([[0, 0, 10.0], [0, 0, 0], [0, 0, 0]]), np.eye(4)).slope_limits()
+    low_x, high_x, _, _ = PinholeCamera(
+        40, 20, K + np.array([[0, 0, 10.0], [0, 0, 0], [0, 0, 0]]), np.eye(4)
+    ).slope_limits()
     assert low_x == pytest.approx(-(30 / 50 + 0.3 * 0.4))
     assert high_x == pytest.approx(10 / 50 + 0.3 * 0.4)
 
@@ -38,7 +40,10 @@ def test_no_pixels_is_an_error(width, height):
         PinholeCamera(width, height, K, np.eye(4))
 
 
-@pytest.mark.parametrize(("row", "column", "value"), [(0, 1, 0.5), (0, 0, -50.0), (1, 1, 0.0), (2, 2, 2.0), (0, 2, np.nan)])
+@pytest.mark.parametrize(
+    ("row", "column", "value"),
+    [(0, 1, 0.5), (0, 0, -50.0), (1, 1, 0.0), (2, 2, 2.0), (0, 2, np.nan)],
+)
 def test_intrinsics_that_are_no_pinhole_are_an_error(row, column, value):
     bad = K.copy()
     bad[row, column] = value

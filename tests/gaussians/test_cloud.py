@@ -79,7 +79,9 @@ def test_tiny_scales_and_odd_opacities_are_repaired_and_counted():
 
 
 def test_no_gaussians_clean_to_no_gaussians():
-    cloud, report = GaussianCloud.cleaned(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 4, 3)))
+    cloud, report = GaussianCloud.cleaned(
+        np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 4, 3))
+    )
     assert (len(cloud), report.n_input, cloud.sh_degree) == (0, 0, 1)
 
 
@@ -119,7 +121,9 @@ def test_moving_by_something_that_is_not_rigid_is_an_error():
 
 
 def test_joining_pads_lower_degrees_and_keeps_order():
-    joined = GaussianCloud.concatenate([random_cloud(3, 1, degree=0), random_cloud(2, 2, degree=2), GaussianCloud.empty()])
+    joined = GaussianCloud.concatenate(
+        [random_cloud(3, 1, degree=0), random_cloud(2, 2, degree=2), GaussianCloud.empty()]
+    )
     assert joined.sh.shape == (5, 9, 3)
     assert not joined.sh[:3, 1:].any()
     assert np.array_equal(joined.means[3:], random_cloud(2, 2).means)
@@ -128,7 +132,13 @@ def test_joining_pads_lower_degrees_and_keeps_order():
 
 def test_whole_numbers_become_floats_and_single_precision_stays():
     data = arrays()
-    cloud = GaussianCloud(np.arange(24).reshape(8, 3), data["quats"].astype(np.float32), data["scales"], data["opacities"], data["sh"])
+    cloud = GaussianCloud(
+        np.arange(24).reshape(8, 3),
+        data["quats"].astype(np.float32),
+        data["scales"],
+        data["opacities"],
+        data["sh"],
+    )
     assert cloud.means.dtype == np.float64
     assert cloud.quats.dtype == np.float32
 

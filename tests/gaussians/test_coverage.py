@@ -25,18 +25,31 @@ timing: {duration_us: 1000000}
 
 
 def street(n: int = 6000) -> GaussianCloud:
-    """Return a street of 80 x 16 m along x: ground, and two rows of house fronts up to 12 m high."""
+    """Return a street of 80 x 16 m along x: ground, and two rows of house fronts up to 12 m
+    high.
+    """
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(0, 80, n), rng.uniform(-8, 8, n), rng.normal(0, 0.02, n)])
-    wall = np.column_stack([rng.uniform(0, 80, n // 3), rng.choice([-8.0, 8.0], n // 3), 12 * rng.random(n // 3) ** 2])
+    wall = np.column_stack(
+        [rng.uniform(0, 80, n // 3), rng.choice([-8.0, 8.0], n // 3), 12 * rng.random(n // 3) ** 2]
+    )
     means = np.concatenate([ground, wall]).astype(np.float32)
     m = len(means)
     quats = np.tile(np.array([1, 0, 0, 0], np.float32), (m, 1))
-    return GaussianCloud(means, quats, np.full((m, 3), 0.3, np.float32), np.full(m, 0.9, np.float32), np.zeros((m, 1, 3), np.float32))
+    return GaussianCloud(
+        means,
+        quats,
+        np.full((m, 3), 0.3, np.float32),
+        np.full(m, 0.9, np.float32),
+        np.zeros((m, 1, 3), np.float32),
+    )
 
 
-# x right, y down, z forward, as structure from motion leaves a file; and a turn and a shift that no file tells of
-T_FILE_WORLD = np.array([[0.0, -1, 0, 40], [0, 0, -1, 3], [1, 0, 0, -900], [0, 0, 0, 1]]) @ se2(5.0, 2.0, 0.6)
+# x right, y down, z forward, as structure from motion leaves a file; and a turn and a shift that no
+# file tells of
+T_FILE_WORLD = np.array([[0.0, -1, 0, 40], [0, 0, -1, 3], [1, 0, 0, -900], [0, 0, 0, 1]]) @ se2(
+    5.0, 2.0, 0.6
+)
 
 
 def test_coverage_counts_the_part_of_the_path_that_has_gaussians_near_it() -> None:
@@ -51,7 +64,13 @@ def test_coverage_counts_the_part_of_the_path_that_has_gaussians_near_it() -> No
     above[2, 3] = 30.0
     assert coverage_of(placed_cloud(street(), above), PATH).covered == 0.0
     clear = street()
-    assert coverage_of(GaussianCloud(clear.means, clear.quats, clear.scales, 0 * clear.opacities, clear.sh), PATH).covered == 0.0
+    assert (
+        coverage_of(
+            GaussianCloud(clear.means, clear.quats, clear.scales, 0 * clear.opacities, clear.sh),
+            PATH,
+        ).covered
+        == 0.0
+    )
 
 
 def test_the_suggestion_stands_a_file_upright_on_the_route() -> None:
@@ -66,7 +85,9 @@ def test_the_suggestion_stands_a_file_upright_on_the_route() -> None:
     assert np.abs(ground).max() < 0.3  # most of the street is ground, at the height of the path
 
 
-def test_a_file_that_cannot_be_seen_is_refused_and_its_suggestion_is_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_cannot_be_seen_is_refused_and_its_suggestion_is_taken(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_ply(tmp_path / "lying.ply", placed_cloud(street(), T_FILE_WORLD))
     scene = tmp_path / "scene.yaml"
     scene.write_text(ROAD + "background: {file: lying.ply}\n")
@@ -80,7 +101,10 @@ def test_a_file_that_cannot_be_seen_is_refused_and_its_suggestion_is_taken(tmp_p
     scene.write_text(ROAD + f"background: {{file: lying.ply, transform: {matrix[1]}}}\n")
     assert run_command(["--renderer", "clean", "--dry-run", str(scene)]) == 0
     told = " ".join(capsys.readouterr().out.split())
-    assert re.search(r"background .*lying.ply: it spans x .* and covers \d+ % of the route; it replaces the built road", told)
+    assert re.search(
+        r"background .*lying.ply: it spans x .* and covers \d+ % of the route; it replaces the built road",
+        told,
+    )
 
 
 def test_the_road_is_kept_on_request(tmp_path: Path) -> None:

@@ -31,7 +31,9 @@ from alpasim_plugin.gaussians.sh import dc_from_rgb, sh_colours
 from tests.examples import examples
 from tests.gaussians.scene_maps import camera_spec, curve, parked, straight
 
-UNIT = Degradation("surrogate", severity=1.0, onset_m=0.3, full_m=3.0)  # the amounts that the expectations below are written for
+UNIT = Degradation(
+    "surrogate", severity=1.0, onset_m=0.3, full_m=3.0
+)  # the amounts that the expectations below are written for
 SCENARIO = straight(degradation=UNIT)
 
 
@@ -52,7 +54,9 @@ def degraded(w: float, severity: float = 1.0, scenario: Scenario = SCENARIO) -> 
 
 def test_weight_is_zero_on_the_path_one_beyond_full_and_grows_in_between() -> None:
     s = Surrogate(SCENARIO, [])
-    weights = [s.weight(se2(40.0, -1.8 + d, 0.3)) for d in (0.0, 0.29, 0.8, 1.3, 2.0, 2.9, 3.0, 9.0)]
+    weights = [
+        s.weight(se2(40.0, -1.8 + d, 0.3)) for d in (0.0, 0.29, 0.8, 1.3, 2.0, 2.9, 3.0, 9.0)
+    ]
     assert weights[:2] == [0.0, 0.0]
     assert weights[-2:] == [1.0, 1.0]
     assert weights == sorted(weights)
@@ -67,7 +71,9 @@ def test_weight_counts_sideways_distance_only_beyond_the_ends_of_the_log() -> No
 
 
 def test_weight_of_a_log_that_stands_still_is_measured_from_its_heading_line() -> None:
-    log = replace(SCENARIO.ego_log, xyz=np.repeat(SCENARIO.ego_log.xyz[:1], len(SCENARIO.ego_log), axis=0))
+    log = replace(
+        SCENARIO.ego_log, xyz=np.repeat(SCENARIO.ego_log.xyz[:1], len(SCENARIO.ego_log), axis=0)
+    )
     s = Surrogate(replace(SCENARIO, ego_log=log), [])
     assert s.weight(se2(3.0, -1.8, 0.0)) == 0.0
     assert s.weight(se2(0.0, 2.0, 0.0)) == 1.0
@@ -81,7 +87,9 @@ def test_weight_follows_the_lateral_offset_along_a_curve(offset_m: float, share:
     q = scenario.ego_log.quat[i]
     yaw = 2 * np.arctan2(q[3], q[0])
     x, y = scenario.ego_log.xyz[i, :2]
-    w = Surrogate(scenario, []).weight(se2(x - offset_m * np.sin(yaw), y + offset_m * np.cos(yaw), yaw))
+    w = Surrogate(scenario, []).weight(
+        se2(x - offset_m * np.sin(yaw), y + offset_m * np.cos(yaw), yaw)
+    )
     assert w == pytest.approx(np.clip((abs(offset_m) - 0.3) / 2.7, 0, 1), abs=0.5 / STEPS + 0.02)
 
 
@@ -110,17 +118,23 @@ def test_stretches_of_thin_paint_are_lost_and_more_of_them_farther_away() -> Non
     n = 600
     rng = np.random.default_rng(2)
     means = np.column_stack([np.linspace(2, 90, n), np.full(n, -3.6), np.full(n, 0.02)])
-    line = cloud_of(means, rng.normal(size=(n, 4)), np.tile([0.2, 0.06, 0.004], (n, 1)), np.full((n, 3), 0.9))
+    line = cloud_of(
+        means, rng.normal(size=(n, 4)), np.tile([0.2, 0.06, 0.004], (n, 1)), np.full((n, 3), 0.9)
+    )
     s = Surrogate(SCENARIO, [])
     left = [len(s.background(node(c=line), 0, line, w)) / n for w in (0.0, 0.5, 1.0)]
     assert 0.45 < left[0] < 0.9
     assert left[0] > left[1] > left[2]
-    thick = cloud_of(means, rng.normal(size=(n, 4)), np.tile([0.2, 0.12, 0.004], (n, 1)), np.full((n, 3), 0.9))
+    thick = cloud_of(
+        means, rng.normal(size=(n, 4)), np.tile([0.2, 0.12, 0.004], (n, 1)), np.full((n, 3), 0.9)
+    )
     assert len(s.background(node("m", thick), 0, thick, 0.0)) == n
 
 
 def sees(view: LogView, points: np.ndarray, size_m: np.ndarray) -> np.ndarray:
-    """Tell one view after the other which points ``(N, 3)`` of radius ``size_m (N,)`` lie in view and not behind what was seen."""
+    """Tell one view after the other which points ``(N, 3)`` of radius ``size_m (N,)`` lie in view
+    and not behind what was seen.
+    """
     camera = view.camera
     x, y, z = (points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]).T
     ahead = z > NEAR_M
@@ -128,7 +142,9 @@ def sees(view: LogView, points: np.ndarray, size_m: np.ndarray) -> np.ndarray:
     u = np.floor(camera.fx * x / safe + camera.cx)
     v = np.floor(camera.fy * y / safe + camera.cy)
     edge = EDGE_SHARE * camera.width
-    inside = ahead & (u >= -edge) & (u < camera.width + edge) & (v >= -edge) & (v < camera.height + edge)
+    inside = (
+        ahead & (u >= -edge) & (u < camera.width + edge) & (v >= -edge) & (v < camera.height + edge)
+    )
     row = np.clip(np.where(inside, v, 0), 0, camera.height - 1).astype(np.int64)
     column = np.clip(np.where(inside, u, 0), 0, camera.width - 1).astype(np.int64)
     return np.asarray(inside & (z < view.limit[row, column] + size_m))
@@ -139,9 +155,19 @@ def test_all_views_at_once_agree_with_one_after_the_other() -> None:
     views = []
     for i, (w, h) in enumerate(((64, 36), (40, 52), (64, 36))):
         spec = camera_spec(w, h)
-        camera = PinholeCamera.from_pose(w, h, spec.K, se2(8.0 * i, rng.normal(), 0.2 * rng.normal()) @ spec.T_rig_camera)
-        views.append(LogView(camera, rng.uniform(3, 40, (h, w)).astype(np.float32), rng.random((h, w)).astype(np.float32)))
-    points = np.column_stack([rng.uniform(-20, 80, 5000), rng.uniform(-30, 30, 5000), rng.uniform(-1, 9, 5000)])
+        camera = PinholeCamera.from_pose(
+            w, h, spec.K, se2(8.0 * i, rng.normal(), 0.2 * rng.normal()) @ spec.T_rig_camera
+        )
+        views.append(
+            LogView(
+                camera,
+                rng.uniform(3, 40, (h, w)).astype(np.float32),
+                rng.random((h, w)).astype(np.float32),
+            )
+        )
+    points = np.column_stack(
+        [rng.uniform(-20, 80, 5000), rng.uniform(-30, 30, 5000), rng.uniform(-1, 9, 5000)]
+    )
     size = rng.uniform(0, 1, 5000)
     slow = np.any([sees(v, points, size) for v in views], axis=0)
     np.testing.assert_array_equal(LogViews(views).see(points, size), slow)
@@ -155,11 +181,17 @@ def test_faults_grow_in_place_and_are_not_drawn_anew() -> None:
     assert len(large) < len(small) < len(original) + 1
 
     def by_name(c: GaussianCloud) -> dict[tuple[float, ...], np.ndarray]:
-        return {tuple(q): m for q, m in zip(c.quats, c.means, strict=True)}  # orientations are unchanged and serve as names
+        return {
+            tuple(q): m for q, m in zip(c.quats, c.means, strict=True)
+        }  # orientations are unchanged and serve as names
 
-    start, near, far = by_name(original), by_name(small), by_name(large)
+    start = by_name(original)
+    near = by_name(small)
+    far = by_name(large)
     assert len(start) == len(original)
-    assert set(far) <= set(near)  # what is missing nearer to the path is missing farther away as well
+    assert set(far) <= set(
+        near
+    )  # what is missing nearer to the path is missing farther away as well
     growth = [np.linalg.norm(far[q] - start[q]) - np.linalg.norm(near[q] - start[q]) for q in far]
     assert np.mean(np.array(growth) > 0) > 0.85
 
@@ -176,7 +208,9 @@ def test_degraded_clouds_can_be_drawn_even_at_high_severity() -> None:
 
 
 def test_same_reconstruction_for_every_rollout_and_another_for_another_scene_seed() -> None:
-    a, b, c = degraded(0.5), degraded(0.5), degraded(0.5, scenario=straight(seed=5))
+    a = degraded(0.5)
+    b = degraded(0.5)
+    c = degraded(0.5, scenario=straight(seed=5))
     np.testing.assert_array_equal(a.means, b.means)
     assert len(a) != len(c) or np.abs(a.means - c.means).max() > 0
 
@@ -184,19 +218,44 @@ def test_same_reconstruction_for_every_rollout_and_another_for_another_scene_see
 def test_gaussians_that_no_log_camera_saw_are_missing() -> None:
     spec = camera_spec(64, 36)
     camera = PinholeCamera.from_pose(64, 36, spec.K, se2(0, 0, 0) @ spec.T_rig_camera)
-    wall_at_20m = LogView(camera, np.full((36, 64), 20.0, dtype=np.float32), np.ones((36, 64), dtype=np.float32))
-    points = np.array([[15.0, 0, 1.5], [21.0, 0, 1.5], [40.0, 0, 1.5], [15.0, 60.0, 1.5], [-10.0, 0, 1.5]])
-    assert LogViews([wall_at_20m]).see(points, np.full(5, 0.1)).tolist() == [True, True, False, False, False]
-    open_sky = LogView(camera, np.zeros((36, 64), dtype=np.float32), np.zeros((36, 64), dtype=np.float32))
-    assert LogViews([open_sky]).see(points, np.full(5, 0.1)).tolist() == [True, True, True, False, False]
-    many = cloud_of(np.tile([40.0, 0, 1.5], (500, 1)), np.tile([1.0, 0, 0, 0], (500, 1)), np.full((500, 3), 0.1), np.full((500, 3), 0.5))
+    wall_at_20m = LogView(
+        camera, np.full((36, 64), 20.0, dtype=np.float32), np.ones((36, 64), dtype=np.float32)
+    )
+    points = np.array(
+        [[15.0, 0, 1.5], [21.0, 0, 1.5], [40.0, 0, 1.5], [15.0, 60.0, 1.5], [-10.0, 0, 1.5]]
+    )
+    assert LogViews([wall_at_20m]).see(points, np.full(5, 0.1)).tolist() == [
+        True,
+        True,
+        False,
+        False,
+        False,
+    ]
+    open_sky = LogView(
+        camera, np.zeros((36, 64), dtype=np.float32), np.zeros((36, 64), dtype=np.float32)
+    )
+    assert LogViews([open_sky]).see(points, np.full(5, 0.1)).tolist() == [
+        True,
+        True,
+        True,
+        False,
+        False,
+    ]
+    many = cloud_of(
+        np.tile([40.0, 0, 1.5], (500, 1)),
+        np.tile([1.0, 0, 0, 0], (500, 1)),
+        np.full((500, 3), 0.1),
+        np.full((500, 3), 0.5),
+    )
     kept = Surrogate(SCENARIO, [wall_at_20m]).background(node(c=many), 0, many, 0.0)
     assert len(kept) < 0.12 * 500
 
 
 def test_colour_without_view_dependence_is_the_mean_over_the_views_from_outside() -> None:
     normal = np.array([[0.6, 0.0, 0.8]])
-    base = cloud_of(np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]), np.ones((1, 3)), np.array([[0.3, 0.4, 0.5]]))
+    base = cloud_of(
+        np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]), np.ones((1, 3)), np.array([[0.3, 0.4, 0.5]])
+    )
     glossy = with_sheen(base, normal, np.array([0.3]), (0.7, 0.8, 0.9))
     rng = np.random.default_rng(0)
     d = rng.normal(size=(200_000, 3))
@@ -211,7 +270,9 @@ def test_colour_without_view_dependence_is_the_mean_over_the_views_from_outside(
 
 
 def test_sheen_adds_nothing_seen_head_on_and_the_most_at_grazing_angles() -> None:
-    base = cloud_of(np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]), np.ones((1, 3)), np.array([[0.3, 0.3, 0.3]]))
+    base = cloud_of(
+        np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]), np.ones((1, 3)), np.array([[0.3, 0.3, 0.3]])
+    )
     glossy = with_sheen(base, np.array([[0.0, 0.0, 1.0]]), np.array([0.25]), (1.0, 1.0, 1.0))
     np.testing.assert_allclose(sh_colours(glossy.sh, [[0.0, 0.0, -1.0]]), 0.3, atol=1e-6)
     np.testing.assert_allclose(sh_colours(glossy.sh, [[1.0, 0.0, 0.0]]), 0.55, atol=1e-6)
@@ -223,7 +284,9 @@ def test_exposure_wanders_smoothly_and_depends_on_time_and_rollout_seed_only() -
     gains = np.array([s.gain(int(x), 0, 0.5) for x in t])
     assert np.abs(np.diff(gains, axis=0)).max() < 0.06
     assert gains.std() > 0.005
-    np.testing.assert_array_equal(s.gain(700_000, 0, 0.5), Surrogate(SCENARIO, []).gain(700_000, 0, 0.5))
+    np.testing.assert_array_equal(
+        s.gain(700_000, 0, 0.5), Surrogate(SCENARIO, []).gain(700_000, 0, 0.5)
+    )
     assert np.abs(s.gain(700_000, 0, 0.5) - s.gain(700_000, 1, 0.5)).max() > 0
 
 
@@ -237,7 +300,10 @@ def test_actor_pose_error_grows_and_stays_rigid() -> None:
     s = Surrogate(SCENARIO, [])
     T = se2(20.0, 3.0, 0.4, 0.75)
     times = range(0, 8_000_000, 250_000)
-    errors = [np.mean([np.linalg.norm(s.pose("car-1", T, t, 0, w)[:3, 3] - T[:3, 3]) for t in times]) for w in (0.0, 0.5, 1.0)]
+    errors = [
+        np.mean([np.linalg.norm(s.pose("car-1", T, t, 0, w)[:3, 3] - T[:3, 3]) for t in times])
+        for w in (0.0, 0.5, 1.0)
+    ]
     assert errors == sorted(errors)
     assert errors[0] < 0.12
     moved = s.pose("car-1", T, 250_000, 0, 1.0)
@@ -248,10 +314,16 @@ def test_actor_pose_error_grows_and_stays_rigid() -> None:
 def test_ghost_trails_behind_the_actor_and_is_fainter() -> None:
     s = Surrogate(SCENARIO, [])
     T = se2(20.0, 3.0, 0.0)
-    behind = [(s.ghost_pose("a", T, t, 0, 1.0) - s.pose("a", T, t, 0, 1.0))[0, 3] for t in range(0, 4_000_000, 500_000)]
+    behind = [
+        (s.ghost_pose("a", T, t, 0, 1.0) - s.pose("a", T, t, 0, 1.0))[0, 3]
+        for t in range(0, 4_000_000, 500_000)
+    ]
     assert np.mean(behind) < -0.8
     c = cloud(50)
-    ghost, body = s.actor(node("a~ghost", c, "actor"), 0, c, 0.5), s.actor(node("a", c, "actor"), 0, c, 0.5)
+    ghost, body = (
+        s.actor(node("a~ghost", c, "actor"), 0, c, 0.5),
+        s.actor(node("a", c, "actor"), 0, c, 0.5),
+    )
     assert ghost.opacities.mean() < 0.5 * body.opacities.mean()
 
 
@@ -273,14 +345,19 @@ def test_log_times_are_inside_the_log_and_few(make: Callable[..., Scenario]) -> 
 
 
 def test_only_actors_present_are_posed() -> None:
-    early = replace(parked("early", 5, 0), track=replace(parked("early", 5, 0).track, t_us=np.array([0, 1_000_000])))
+    early = replace(
+        parked("early", 5, 0),
+        track=replace(parked("early", 5, 0).track, t_us=np.array([0, 1_000_000])),
+    )
     scenario = straight(actors=(parked("always", 9, 0), early))
     assert set(log_actors(scenario, 500_000)) == {"always", "early"}
     assert set(log_actors(scenario, 1_500_000)) == {"always"}
 
 
 def test_path_is_extended_straight_at_both_ends() -> None:
-    line = extended(np.array([[0.0, 0, 0], [10.0, 0, 0], [10.0, 5.0, 0]]), np.array([1.0, 0, 0, 0]), 100.0)
+    line = extended(
+        np.array([[0.0, 0, 0], [10.0, 0, 0], [10.0, 5.0, 0]]), np.array([1.0, 0, 0, 0]), 100.0
+    )
     np.testing.assert_allclose(line[0], [-100.0, 0, 0], atol=1e-9)
     np.testing.assert_allclose(line[-1], [10.0, 105.0, 0], atol=1e-9)
 

@@ -1,4 +1,6 @@
-"""Exercise the GPU way to train without a GPU: arguments, results and gradients against a stand-in that follows gsplat's interface."""
+"""Exercise the GPU way to train without a GPU: arguments, results and gradients against a stand-in
+that follows gsplat's interface.
+"""
 
 from __future__ import annotations
 
@@ -20,17 +22,38 @@ from tests.gaussians.gaussian_scenes import camera, random_cloud, random_rigid
 from tests.gaussians.gradient_scenes import FIELDS
 
 
-def stand_in(means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, packed, render_mode, sh_degree, **_):
-    """Return what ``gsplat.rasterization`` returns for one camera, unpacked; means on the screen get a gradient of (3, 4) each."""
+def stand_in(
+    means,
+    quats,
+    scales,
+    opacities,
+    colors,
+    viewmats,
+    Ks,
+    width,
+    height,
+    near_plane,
+    packed,
+    render_mode,
+    sh_degree,
+    **_,
+):
+    """Return what ``gsplat.rasterization`` returns for one camera, unpacked; means on the screen
+    get a gradient of (3, 4) each.
+    """
     assert not packed
     assert render_mode == "RGB+ED"
     assert colors.shape == (len(means), (sh_degree + 1) ** 2, 3)
     assert torch.allclose(quats.norm(dim=1), torch.ones(len(quats)))
     cam = PinholeCamera(width, height, Ks[0].double().numpy(), viewmats[0].double().numpy())
-    out = rasterize_tensors(GaussianTensors(means, quats, scales, opacities, colors), cam, near_m=near_plane)
+    out = rasterize_tensors(
+        GaussianTensors(means, quats, scales, opacities, colors), cam, near_m=near_plane
+    )
     on_screen = torch.zeros(1, len(means), 2) + 0 * means[None, :, :2]
     image = torch.cat([out.rgb, out.depth[..., None]], dim=2)
-    image = image + (on_screen * torch.tensor([3.0, 4.0])).sum() / out.rgb.numel() * torch.tensor([1.0, 1.0, 1.0, 0.0])
+    image = image + (on_screen * torch.tensor([3.0, 4.0])).sum() / out.rgb.numel() * torch.tensor(
+        [1.0, 1.0, 1.0, 0.0]
+    )
     radii = torch.tensor([[7, 9]]).expand(len(means), 2)
     return image[None], out.alpha[None, ..., None], {"means2d": on_screen, "radii": radii[None]}
 
@@ -40,14 +63,19 @@ def gsplat(monkeypatch):
     """Replace gsplat by the stand-in; the one-Gaussian check of the device has tests of its own."""
     module = types.ModuleType("gsplat")
     module.rasterization = stand_in
-    monkeypatch.setattr("alpasim_plugin.gaussians.raster.rasterize_gsplat.require_gsplat", lambda device: module)
+    monkeypatch.setattr(
+        "alpasim_plugin.gaussians.raster.rasterize_gsplat.require_gsplat", lambda device: module
+    )
 
 
 def test_gradients_and_images_equal_those_of_the_cpu(gsplat):
     T = random_rigid(4)
     cloud, cam = random_cloud(60, 4, 1).transformed(T), camera(T_camera_world=np.linalg.inv(T))
     results = []
-    for draw in (rasterize_gradient, lambda s, c, background: rasterize_gradient_gsplat(s, c, background, 0.1)):
+    for draw in (
+        rasterize_gradient,
+        lambda s, c, background: rasterize_gradient_gsplat(s, c, background, 0.1),
+    ):
         splats = Splats.from_cloud(cloud)
         leaves = [getattr(splats, name).requires_grad_(True) for name in FIELDS]
         out = draw(splats, cam, background=torch.tensor([0.2, 0.4, 0.6]))
@@ -88,7 +116,9 @@ def test_tensors_on_two_devices_are_refused():
 @pytest.mark.gpu
 def test_gpu_gradients_equal_those_of_the_cpu():
     cloud, results = random_cloud(300, 4), []
-    cloud = type(cloud)(cloud.means, cloud.quats, cloud.scales, np.minimum(cloud.opacities, 0.9), cloud.sh)  # gsplat 1.5 saturates at 0.999
+    cloud = type(cloud)(
+        cloud.means, cloud.quats, cloud.scales, np.minimum(cloud.opacities, 0.9), cloud.sh
+    )  # gsplat 1.5 saturates at 0.999
     for device in ("cpu", "cuda"):
         splats = Splats.from_cloud(cloud, device=device)
         leaves = [getattr(splats, name).requires_grad_(True) for name in FIELDS]

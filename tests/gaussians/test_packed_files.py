@@ -1,4 +1,6 @@
-"""Compressed PLY, .splat and SPZ: real files against each other, made-up ones against hand-worked bytes."""
+"""Compressed PLY, .splat and SPZ: real files against each other, made-up ones against hand-worked
+bytes.
+"""
 
 from __future__ import annotations
 
@@ -33,11 +35,14 @@ def biker(shared_data: Path) -> Path:
     return shared_data / "gaussians"
 
 
-# --- one model in two files -------------------------------------------------------------------------------------------
+# --- one model in two files
 
 
 def test_both_bikers_have_the_published_facts(biker: Path) -> None:
-    ply, spz = read_compressed_ply(biker / "biker.compressed.ply"), read_spz(biker / "biker.spz", axes="rub")
+    ply, spz = (
+        read_compressed_ply(biker / "biker.compressed.ply"),
+        read_spz(biker / "biker.spz", axes="rub"),
+    )
     assert len(ply.means) == len(spz.means) == 152746
     assert read_ply_header(biker / "biker.compressed.ply").element("chunk").count == 597
     low, high = (-0.62126, -3.18008, -0.53226), (0.41440, 0.0, 0.61328)
@@ -47,9 +52,14 @@ def test_both_bikers_have_the_published_facts(biker: Path) -> None:
 
 
 def test_both_bikers_agree_after_the_axis_flip(biker: Path) -> None:
-    ply, spz = read_compressed_ply(biker / "biker.compressed.ply"), read_spz(biker / "biker.spz", axes="rub")
+    ply, spz = (
+        read_compressed_ply(biker / "biker.compressed.ply"),
+        read_spz(biker / "biker.spz", axes="rub"),
+    )
     flipped = spz.means * (1, -1, -1)
-    assert np.abs(np.median(ply.means, axis=0) - np.median(flipped, axis=0)).max() == pytest.approx(7.3e-5, abs=5e-7)
+    assert np.abs(np.median(ply.means, axis=0) - np.median(flipped, axis=0)).max() == pytest.approx(
+        7.3e-5, abs=5e-7
+    )
     assert ply.means[:, 0].min() - flipped[:, 0].min() == pytest.approx(8.2e-5, abs=5e-7)
     for end in (np.min, np.max):
         assert np.abs(end(ply.means, axis=0) - end(flipped, axis=0)).max() < 0.5 / 4096
@@ -59,7 +69,9 @@ def test_both_bikers_are_one_model_in_one_place(biker: Path) -> None:
     ply, _ = read_gaussians(biker / "biker.compressed.ply")
     spz, report = read_gaussians(biker / "biker.spz")
     assert report.n_kept == 152746
-    assert np.abs(ply.means - spz.means).max() <= 0.5 / 4096 * 1.01  # half a step of 12 fractional bits
+    assert (
+        np.abs(ply.means - spz.means).max() <= 0.5 / 4096 * 1.01
+    )  # half a step of 12 fractional bits
     np.testing.assert_array_equal(ply.opacities, spz.opacities)
     same = np.abs(np.sum(ply.quats * spz.quats, axis=1))
     assert np.quantile(same, 0.001) > 0.99999
@@ -70,7 +82,9 @@ def test_both_bikers_are_one_model_in_one_place(biker: Path) -> None:
 
 @pytest.mark.parametrize("name", ["biker.compressed.ply", "biker.spz"])
 @pytest.mark.parametrize("percent", range(0, 100, 10))
-def test_biker_cut_short_is_refused_in_four_parts(biker: Path, tmp_path: Path, name: str, percent: int) -> None:
+def test_biker_cut_short_is_refused_in_four_parts(
+    biker: Path, tmp_path: Path, name: str, percent: int
+) -> None:
     data = (biker / name).read_bytes()
     cut = tmp_path / name
     cut.write_bytes(data[: len(data) * percent // 100])
@@ -86,26 +100,41 @@ def test_plain_reader_points_to_the_right_one_for_a_compressed_ply(biker: Path) 
     assert "read_gaussians" in caught.value.do_this
 
 
-# --- compressed PLY, worked by hand -----------------------------------------------------------------------------------
+# --- compressed PLY, worked by hand
 
 BOUNDS = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
 BOUNDS += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
 
 
-def write_compressed(path: Path, n: int, chunks: int, packed: tuple[int, int, int, int], sh: bytes = b"", n_sh: int = 0) -> Path:
-    head = f"ply\nformat binary_little_endian 1.0\nelement chunk {chunks}\n" + "".join(f"property float {b}\n" for b in BOUNDS)
-    head += f"element vertex {n}\n" + "".join(f"property uint packed_{p}\n" for p in ("position", "rotation", "scale", "color"))
+def write_compressed(
+    path: Path,
+    n: int,
+    chunks: int,
+    packed: tuple[int, int, int, int],
+    sh: bytes = b"",
+    n_sh: int = 0,
+) -> Path:
+    head = f"ply\nformat binary_little_endian 1.0\nelement chunk {chunks}\n" + "".join(
+        f"property float {b}\n" for b in BOUNDS
+    )
+    head += f"element vertex {n}\n" + "".join(
+        f"property uint packed_{p}\n" for p in ("position", "rotation", "scale", "color")
+    )
     if n_sh:
         head += f"element sh {n}\n" + "".join(f"property uchar f_rest_{i}\n" for i in range(n_sh))
     bounds = struct.pack("<12f", 0, 10, 20, 2, 12, 22, -3, -3, -3, -1, -1, -1)
-    path.write_bytes(head.encode() + b"end_header\n" + bounds * chunks + struct.pack("<4I", *packed) * n + sh)
+    path.write_bytes(
+        head.encode() + b"end_header\n" + bounds * chunks + struct.pack("<4I", *packed) * n + sh
+    )
     return path
 
 
 def test_packed_bits_are_spread_over_the_chunk(tmp_path: Path) -> None:
     position = 2047 << 21 | 0 << 11 | 2047
     colour = 255 << 24 | 0 << 16 | 51 << 8 | 102
-    path = write_compressed(tmp_path / "a.compressed.ply", 1, 1, (position, 511 << 20 | 511 << 10 | 511, 0, colour))
+    path = write_compressed(
+        tmp_path / "a.compressed.ply", 1, 1, (position, 511 << 20 | 511 << 10 | 511, 0, colour)
+    )
     raw = read_compressed_ply(path)
     np.testing.assert_allclose(raw.means, [[2, 10, 22]])
     np.testing.assert_allclose(raw.scales, np.exp([[-3, -3, -3]]))
@@ -117,7 +146,9 @@ def test_packed_bits_are_spread_over_the_chunk(tmp_path: Path) -> None:
 def test_harmonics_element_is_channel_major(tmp_path: Path) -> None:
     table = np.full(9, 128, np.uint8)
     table[1] = 255  # red, second coefficient
-    raw = read_compressed_ply(write_compressed(tmp_path / "a.compressed.ply", 1, 1, (0, 0, 0, 0), table.tobytes(), 9))
+    raw = read_compressed_ply(
+        write_compressed(tmp_path / "a.compressed.ply", 1, 1, (0, 0, 0, 0), table.tobytes(), 9)
+    )
     assert raw.sh.shape == (1, 4, 3)
     assert raw.sh[0, 2, 0] == 4
     np.testing.assert_allclose(np.delete(raw.sh[0, 1:].ravel(), 3), 0.5 / 256 * 8)
@@ -139,7 +170,7 @@ def test_left_out_component_is_restored_in_its_place(largest: int) -> None:
     np.testing.assert_allclose(unpack_rotation(np.array([packed], np.uint32))[0], quat, atol=1e-3)
 
 
-# --- .splat -----------------------------------------------------------------------------------------------------------
+# --- .splat
 
 
 def test_splat_round_trip_keeps_positions_and_scales_exactly(tmp_path: Path, biker: Path) -> None:
@@ -181,7 +212,7 @@ def test_splat_of_broken_size_is_refused(tmp_path: Path, size: int) -> None:
         read_splat(tmp_path / "a.splat")
 
 
-# --- SPZ, worked by hand ----------------------------------------------------------------------------------------------
+# --- SPZ, worked by hand
 
 
 def body_streams(version: int, n: int, degree: int) -> list[bytes]:
@@ -190,12 +221,16 @@ def body_streams(version: int, n: int, degree: int) -> list[bytes]:
     return [rng.integers(0, 256, size, dtype=np.uint8).tobytes() for size in sizes]
 
 
-def write_spz(path: Path, version: int, n: int, degree: int, streams: list[bytes], claim: int | None = None) -> Path:
+def write_spz(
+    path: Path, version: int, n: int, degree: int, streams: list[bytes], claim: int | None = None
+) -> Path:
     head = struct.pack("<IIIBBB", 0x5053474E, version, n if claim is None else claim, degree, 12, 0)
     if version == 4:
         used = streams if degree else streams[:5]
         packed = [zstandard.ZstdCompressor().compress(s) for s in used]
-        table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, used, strict=True))
+        table = b"".join(
+            struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, used, strict=True)
+        )
         path.write_bytes(head + struct.pack("<BI12x", len(used), 32) + table + b"".join(packed))
     else:
         path.write_bytes(gzip.compress(head + b"\0" + b"".join(streams)))
@@ -204,7 +239,9 @@ def write_spz(path: Path, version: int, n: int, degree: int, streams: list[bytes
 
 @pytest.mark.parametrize("version", [2, 3, 4])
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_every_version_unpacks_to_the_same_numbers(tmp_path: Path, version: int, degree: int) -> None:
+def test_every_version_unpacks_to_the_same_numbers(
+    tmp_path: Path, version: int, degree: int
+) -> None:
     streams = body_streams(version, 6, degree)
     streams[0] = b"".join(int(v).to_bytes(3, "little", signed=True) for v in range(-9, 9))
     raw = read_spz(write_spz(tmp_path / "a.spz", version, 6, degree, streams), axes="rub")
@@ -255,7 +292,9 @@ def test_turning_axes_turns_colour_with_direction(tmp_path: Path) -> None:
 def test_turning_axes_turns_the_ellipsoids(tmp_path: Path) -> None:
     path = write_spz(tmp_path / "a.spz", 3, 6, 0, body_streams(3, 6, 0))
     flip = np.diag([1.0, -1.0, -1.0])
-    before, after = (GaussianCloud(*read_spz(path, axes=axes)).covariances() for axes in ("rub", "rdf"))
+    before, after = (
+        GaussianCloud(*read_spz(path, axes=axes)).covariances() for axes in ("rub", "rdf")
+    )
     np.testing.assert_allclose(after, flip @ before @ flip, rtol=1e-5, atol=1e-12)
 
 
@@ -266,8 +305,12 @@ def test_fourth_degree_is_cut_and_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
-def test_count_beyond_the_data_is_refused_without_unpacking_it(tmp_path: Path, version: int) -> None:
-    path = write_spz(tmp_path / "a.spz", version, 2, 0, body_streams(version, 2, 0), claim=100_000_000)
+def test_count_beyond_the_data_is_refused_without_unpacking_it(
+    tmp_path: Path, version: int
+) -> None:
+    path = write_spz(
+        tmp_path / "a.spz", version, 2, 0, body_streams(version, 2, 0), claim=100_000_000
+    )
     with pytest.raises(InputError, match="Gaussians of a file = 100,000,000, outside"):
         read_spz(path)
 
@@ -298,7 +341,7 @@ def test_flipped_compressed_bytes_are_refused(tmp_path: Path, version: int) -> N
         read_spz(path)
 
 
-# --- dispatch ---------------------------------------------------------------------------------------------------------
+# --- dispatch
 
 
 def test_content_decides_before_the_suffix(tmp_path: Path, biker: Path) -> None:

@@ -13,7 +13,12 @@ from hypothesis.extra import numpy as hnp
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.gaussians import GaussianCloud, read_ply, write_ply
 from alpasim_plugin.gaussians.files import read_gaussians
-from alpasim_plugin.gaussians.files.ply import ply_rows, read_ply_arrays, read_ply_element, read_ply_header
+from alpasim_plugin.gaussians.files.ply import (
+    ply_rows,
+    read_ply_arrays,
+    read_ply_element,
+    read_ply_header,
+)
 from tests.examples import examples
 
 
@@ -34,16 +39,32 @@ def element(name: str, names: list[str], rows: np.ndarray) -> tuple[str, bytes]:
     return header, rows.astype("<f4").tobytes()
 
 
-def write_elements(path: Path, *parts: tuple[str, bytes], fmt: str = "binary_little_endian") -> Path:
-    head = f"ply\nformat {fmt} 1.0\ncomment made by a test\n" + "".join(h for h, _ in parts) + "end_header\n"
+def write_elements(
+    path: Path, *parts: tuple[str, bytes], fmt: str = "binary_little_endian"
+) -> Path:
+    head = (
+        f"ply\nformat {fmt} 1.0\ncomment made by a test\n"
+        + "".join(h for h, _ in parts)
+        + "end_header\n"
+    )
     path.write_bytes(head.encode() + b"".join(body for _, body in parts))
     return path
 
 
-NAMES = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+NAMES = [
+    "x",
+    "y",
+    "z",
+    "f_dc_0",
+    "f_dc_1",
+    "f_dc_2",
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
+    *(f"rot_{i}" for i in range(4)),
+]
 
 
-# --- a trained model --------------------------------------------------------------------------------------------------
+# --- a trained model
 
 
 @pytest.fixture
@@ -64,7 +85,10 @@ def test_trained_model_has_the_published_facts(train: Path) -> None:
     assert np.median(raw.scales) == pytest.approx(0.01177, abs=5e-6)
     assert raw.scales.max() == pytest.approx(0.5667, abs=5e-5)
     norms = np.linalg.norm(raw.quats, axis=1)
-    assert (norms.min(), norms.max()) == (pytest.approx(0.642, abs=5e-4), pytest.approx(1.319, abs=5e-4))
+    assert (norms.min(), norms.max()) == (
+        pytest.approx(0.642, abs=5e-4),
+        pytest.approx(1.319, abs=5e-4),
+    )
     np.testing.assert_allclose(raw.sh[:, 0].mean(axis=0), (0.1658, 0.2361, 0.0812), atol=5e-5)
 
 
@@ -83,7 +107,9 @@ def test_trained_model_comes_back_byte_for_byte(train: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("percent", range(0, 100, 10))
-def test_trained_model_cut_short_is_refused_in_four_parts(train: Path, tmp_path: Path, percent: int) -> None:
+def test_trained_model_cut_short_is_refused_in_four_parts(
+    train: Path, tmp_path: Path, percent: int
+) -> None:
     data = train.read_bytes()
     cut = tmp_path / "cut.ply"
     cut.write_bytes(data[: len(data) * percent // 100])
@@ -97,7 +123,7 @@ def test_trained_model_cut_short_is_refused_in_four_parts(train: Path, tmp_path:
         assert f"announces 1000 rows of 248 bytes, the file ends after {rows}" in text
 
 
-# --- round trips ------------------------------------------------------------------------------------------------------
+# --- round trips
 
 
 @pytest.mark.parametrize("k", [1, 4, 9, 16])
@@ -116,14 +142,27 @@ def test_every_degree_survives_a_round_trip(tmp_path: Path, k: int, precision: s
 @settings(max_examples=examples(50), deadline=None)
 @given(
     sh=hnp.arrays(
-        np.float32, st.tuples(st.integers(0, 4), st.sampled_from([1, 4, 9, 16]), st.just(3)), elements=st.floats(-9, 9, width=32)
+        np.float32,
+        st.tuples(st.integers(0, 4), st.sampled_from([1, 4, 9, 16]), st.just(3)),
+        elements=st.floats(-9, 9, width=32),
     ),
     mean=st.floats(-1e6, 1e6, width=32),
 )
-def test_means_and_colours_are_bit_exact(tmp_path_factory: pytest.TempPathFactory, sh: np.ndarray, mean: float) -> None:
+def test_means_and_colours_are_bit_exact(
+    tmp_path_factory: pytest.TempPathFactory, sh: np.ndarray, mean: float
+) -> None:
     n = len(sh)
     path = tmp_path_factory.mktemp("ply") / "a.ply"
-    write_ply(path, GaussianCloud(np.full((n, 3), mean, np.float32), np.tile([1, 0, 0, 0.0], (n, 1)), np.ones((n, 3)), np.full(n, 0.5), sh))
+    write_ply(
+        path,
+        GaussianCloud(
+            np.full((n, 3), mean, np.float32),
+            np.tile([1, 0, 0, 0.0], (n, 1)),
+            np.ones((n, 3)),
+            np.full(n, 0.5),
+            sh,
+        ),
+    )
     back = read_ply_arrays(path)
     assert back.sh.tobytes() == sh.tobytes()
     assert (back.means == np.float32(mean)).all()
@@ -141,10 +180,14 @@ def test_red_only_coefficient_lands_in_the_first_third_of_f_rest(tmp_path: Path)
     sh = np.zeros((1, 16, 3), np.float32)
     sh[0, 3, 0] = 0.75  # third coefficient beyond the constant, red
     rows = ply_rows(GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, sh))
-    assert [name for name in rows.dtype.names if name.startswith("f_rest") and rows[name][0]] == ["f_rest_2"]
+    assert [name for name in rows.dtype.names if name.startswith("f_rest") and rows[name][0]] == [
+        "f_rest_2"
+    ]
     sh[0, 3] = 0, 0.75, 0
     rows = ply_rows(GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, sh))
-    assert [name for name in rows.dtype.names if name.startswith("f_rest") and rows[name][0]] == ["f_rest_17"]
+    assert [name for name in rows.dtype.names if name.startswith("f_rest") and rows[name][0]] == [
+        "f_rest_17"
+    ]
 
 
 def test_red_only_coefficient_in_a_foreign_file_is_read_as_red(tmp_path: Path) -> None:
@@ -177,7 +220,7 @@ def test_big_endian_doubles_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(raw.scales[0], np.exp([0.08, 0.09, 0.10]), rtol=1e-15)
 
 
-# --- several models in one file ---------------------------------------------------------------------------------------
+# --- several models in one file
 
 
 @pytest.fixture
@@ -185,11 +228,17 @@ def street(tmp_path: Path) -> Path:
     background, actor = np.zeros((3, len(NAMES))), np.zeros((2, len(NAMES)))
     background[:, NAMES.index("rot_0")] = actor[:, NAMES.index("rot_0")] = 1
     actor[:, 0] = 5
-    return write_elements(tmp_path / "street.ply", element("vertex_background", NAMES, background), element("vertex_obj_000", NAMES, actor))
+    return write_elements(
+        tmp_path / "street.ply",
+        element("vertex_background", NAMES, background),
+        element("vertex_obj_000", NAMES, actor),
+    )
 
 
 def test_street_model_asks_which_part(street: Path) -> None:
-    with pytest.raises(InputError, match=r"2 models in one file: \['vertex_background', 'vertex_obj_000'\]") as caught:
+    with pytest.raises(
+        InputError, match=r"2 models in one file: \['vertex_background', 'vertex_obj_000'\]"
+    ) as caught:
         read_ply(street)
     assert "element='vertex_background'" in caught.value.do_this
 
@@ -213,7 +262,7 @@ def test_colours_over_time_are_refused_not_misread(tmp_path: Path) -> None:
         read_ply(path)
 
 
-# --- what is refused --------------------------------------------------------------------------------------------------
+# --- what is refused
 
 
 def test_missing_file_says_so(tmp_path: Path) -> None:
@@ -222,7 +271,9 @@ def test_missing_file_says_so(tmp_path: Path) -> None:
 
 
 def test_mesh_is_refused_by_its_missing_properties(tmp_path: Path) -> None:
-    path = write_elements(tmp_path / "mesh.ply", element("vertex", ["x", "y", "z"], np.zeros((2, 3))))
+    path = write_elements(
+        tmp_path / "mesh.ply", element("vertex", ["x", "y", "z"], np.zeros((2, 3)))
+    )
     with pytest.raises(InputError, match="missing properties"):
         read_ply(path)
 
@@ -248,7 +299,10 @@ def test_absurd_count_is_refused_without_allocating(tmp_path: Path) -> None:
         read_ply(path)
 
 
-@pytest.mark.parametrize("line", ["element vertex -5", "element vertex many", "element vertex", "property quark x", "hello"])
+@pytest.mark.parametrize(
+    "line",
+    ["element vertex -5", "element vertex many", "element vertex", "property quark x", "hello"],
+)
 def test_broken_header_line_is_named(tmp_path: Path, line: str) -> None:
     path = write_elements(tmp_path / "a.ply", (line + "\n", b""))
     with pytest.raises(InputError, match="line 4"):
@@ -266,7 +320,9 @@ def test_fourth_degree_is_cut_to_the_third_and_counted(tmp_path: Path) -> None:
     names = [*NAMES, *(f"f_rest_{i}" for i in range(72))]
     rows = np.zeros((2, len(names)))
     rows[:, names.index("rot_0")] = 1
-    cloud, report = read_gaussians(write_elements(tmp_path / "a.ply", element("vertex", names, rows)))
+    cloud, report = read_gaussians(
+        write_elements(tmp_path / "a.ply", element("vertex", names, rows))
+    )
     assert cloud.sh.shape == (2, 16, 3)
     assert report.repaired["colour harmonics beyond 16 coefficients left out"] == 2
 
@@ -277,9 +333,15 @@ def test_broken_gaussians_are_dropped_and_counted(tmp_path: Path) -> None:
     rows[0, 0] = np.nan
     rows[1, NAMES.index("rot_0")] = 0
     rows[2, NAMES.index("scale_1")] = 90
-    cloud, report = read_gaussians(write_elements(tmp_path / "a.ply", element("vertex", NAMES, rows)))
+    cloud, report = read_gaussians(
+        write_elements(tmp_path / "a.ply", element("vertex", NAMES, rows))
+    )
     assert len(cloud) == 1
-    assert {k: v for k, v in report.dropped.items() if v} == {"non-finite mean": 1, "zero quaternion": 1, "overflowing scale": 1}
+    assert {k: v for k, v in report.dropped.items() if v} == {
+        "non-finite mean": 1,
+        "zero quaternion": 1,
+        "overflowing scale": 1,
+    }
 
 
 def test_unfinished_file_never_bears_the_name(tmp_path: Path) -> None:

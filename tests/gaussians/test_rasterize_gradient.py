@@ -1,4 +1,6 @@
-"""Check the compiled backward pass on hard cases, against finite differences of the reference and autograd of the torch twin."""
+"""Check the compiled backward pass on hard cases, against finite differences of the reference and
+autograd of the torch twin.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,11 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
 from alpasim_plugin.gaussians.raster.gradient_types import Splats
 from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
-from alpasim_plugin.gaussians.raster.rasterize_reference import composite_reference, project_gaussians, rasterize_reference
+from alpasim_plugin.gaussians.raster.rasterize_reference import (
+    composite_reference,
+    project_gaussians,
+    rasterize_reference,
+)
 from alpasim_plugin.gaussians.sample_scene import driving_camera, driving_like_scene
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 from tests.gaussians.gaussian_scenes import camera, random_cloud, random_rigid
@@ -31,7 +37,9 @@ from tests.gaussians.gradient_scenes import (
 pytestmark = pytest.mark.slow
 
 SMALL = camera(24, 18, 20.0)
-TOLERANCE = 5e-4  # of the largest gradient of a Gaussian in a field; float32 sums of terms that cancel
+TOLERANCE = (
+    5e-4  # of the largest gradient of a Gaussian in a field; float32 sums of terms that cancel
+)
 
 
 def overlapping() -> Scene:
@@ -60,7 +68,12 @@ def opaque_stack() -> Scene:
 
 
 def smaller_than_the_low_pass() -> Scene:
-    return scene([[0.1, 0.1, 4.0], [-0.5, 0.2, 5.0], [0.0, -0.3, 6.0]], [[0.01, 0.02, 0.005]], SMALL, opacities=0.9)
+    return scene(
+        [[0.1, 0.1, 4.0], [-0.5, 0.2, 5.0], [0.0, -0.3, 6.0]],
+        [[0.01, 0.02, 0.005]],
+        SMALL,
+        opacities=0.9,
+    )
 
 
 def behind_and_before_the_near_plane() -> Scene:
@@ -69,19 +82,34 @@ def behind_and_before_the_near_plane() -> Scene:
 
 def colours_clamped_at_zero() -> Scene:
     sh = np.zeros((3, 4, 3))
-    sh[:, 0] = [dc_from_rgb([-0.4, 0.5, 0.2]), dc_from_rgb([0.3, -0.2, -0.6]), dc_from_rgb([-0.5, -0.5, -0.5])]
+    sh[:, 0] = [
+        dc_from_rgb([-0.4, 0.5, 0.2]),
+        dc_from_rgb([0.3, -0.2, -0.6]),
+        dc_from_rgb([-0.5, -0.5, -0.5]),
+    ]
     sh[:, 1:] = np.random.default_rng(0).normal(size=(3, 3, 3)) * 0.1
-    return scene([[0.0, 0.1, 2.0], [0.2, 0.0, 2.5], [-0.3, 0.0, 3.0]], [[0.4, 0.3, 0.2]], SMALL, sh=sh)
+    return scene(
+        [[0.0, 0.1, 2.0], [0.2, 0.0, 2.5], [-0.3, 0.0, 3.0]], [[0.4, 0.3, 0.2]], SMALL, sh=sh
+    )
 
 
 def principal_point_beyond_the_corner() -> Scene:
     K = np.array([[22.0, 0, -5.0], [0, 19.0, 25.0], [0, 0, 1]])
-    return scene([[1.2, -1.0, 2.0], [2.5, -2.5, 3.5], [0.1, -0.5, 1.5]], [[0.4, 0.3, 0.2]], PinholeCamera(24, 18, K, np.eye(4)))
+    return scene(
+        [[1.2, -1.0, 2.0], [2.5, -2.5, 3.5], [0.1, -0.5, 1.5]],
+        [[0.4, 0.3, 0.2]],
+        PinholeCamera(24, 18, K, np.eye(4)),
+    )
 
 
 def quaternions_of_any_length() -> Scene:
     quaternions = np.random.default_rng(1).normal(size=(3, 4)) * [[1e-2], [1.0], [30.0]]
-    return scene([[0.0, 0.1, 2.0], [0.2, 0.0, 2.5], [-0.3, 0.0, 3.0]], [[0.4, 0.1, 0.05]], SMALL, quaternions=quaternions)
+    return scene(
+        [[0.0, 0.1, 2.0], [0.2, 0.0, 2.5], [-0.3, 0.0, 3.0]],
+        [[0.4, 0.1, 0.05]],
+        SMALL,
+        quaternions=quaternions,
+    )
 
 
 def turned_camera_and_harmonics_of_degree_three() -> Scene:
@@ -140,11 +168,18 @@ def test_scenes_are_as_hard_as_their_names_say():
 
 
 def test_what_lies_behind_the_stop_gets_no_gradient_and_the_clamp_keeps_colours_moving():
-    s = scene([[0.0, 0.0, 2.0], [0.0, 0.0, 3.0], [0.0, 0.0, 4.0]], [[5.0, 5.0, 5.0]], camera(4, 4, 20.0), opacities=0.9999)
+    s = scene(
+        [[0.0, 0.0, 2.0], [0.0, 0.0, 3.0], [0.0, 0.0, 4.0]],
+        [[5.0, 5.0, 5.0]],
+        camera(4, 4, 20.0),
+        opacities=0.9999,
+    )
     found, out = kernel_gradients(s)
     assert np.allclose(out.alpha.detach(), 0.99, atol=1e-6)
     for name in FIELDS:
-        assert (found[name][1:] == 0).all(), name  # the second layer would cross the stop: it ends the pixel
+        assert (found[name][1:] == 0).all(), (
+            name
+        )  # the second layer would cross the stop: it ends the pixel
     assert (found["logit_opacities"] == 0).all()  # alpha is at its largest everywhere
     assert (found["log_scales"] == 0).all()
     assert np.abs(found["sh"][0]).max() > 0.1
@@ -157,7 +192,11 @@ def test_equal_depths_are_drawn_and_differentiated_in_the_order_given():
     assert_close(found, torch_gradients(s), TOLERANCE)
     # Moving along x and y, and every other parameter, leaves the depths equal.
     numeric = numeric_gradients(s)
-    assert_close({**found, "means": found["means"][:, :2]}, {**numeric, "means": numeric["means"][:, :2]}, TOLERANCE)
+    assert_close(
+        {**found, "means": found["means"][:, :2]},
+        {**numeric, "means": numeric["means"][:, :2]},
+        TOLERANCE,
+    )
     order = [2, 1, 0]
     turned = Scene(*(a[order] for a in s.arrays().values()), s.camera, s.background)
     assert np.abs((kernel_gradients(turned)[1].rgb - out.rgb).detach().numpy()).max() > 0.01
@@ -171,7 +210,11 @@ def test_image_equals_the_reference_without_its_clamp():
     projected = project_gaussians(cloud_of(splats), cam)
     colour, alpha, depth, _ = composite_reference(projected, cam, np.array([[[0.3, 0.2, 0.1]]]))
     assert colour.max() > 1.2
-    for found, wanted, atol in ((out.rgb, colour, 1e-4), (out.alpha, alpha, 2e-5), (out.depth * out.alpha, depth * alpha, 1e-3)):
+    for found, wanted, atol in (
+        (out.rgb, colour, 1e-4),
+        (out.alpha, alpha, 2e-5),
+        (out.depth * out.alpha, depth * alpha, 1e-3),
+    ):
         assert np.mean(np.abs(found.numpy() - wanted) > atol) < 1e-3
     on_screen = project_gaussians(cloud_of(splats), cam, on_screen_only=True)
     radii = np.zeros(len(cloud))
@@ -181,12 +224,23 @@ def test_image_equals_the_reference_without_its_clamp():
 
 
 def test_many_random_splats_agree_with_the_torch_twin():
-    """Pixels that meet the alpha cut or the stop within rounding may differ: few, hence the norm."""
+    """Pixels that meet the alpha cut or the stop within rounding may differ: few, hence the
+    norm.
+    """
     cloud = random_cloud(120, 12)
-    s = scene(cloud.means, cloud.scales, camera(), opacities=np.clip(cloud.opacities, 0.01, 0.99), quaternions=cloud.quats, sh=cloud.sh)
+    s = scene(
+        cloud.means,
+        cloud.scales,
+        camera(),
+        opacities=np.clip(cloud.opacities, 0.01, 0.99),
+        quaternions=cloud.quats,
+        sh=cloud.sh,
+    )
     found, wanted = kernel_gradients(s)[0], torch_gradients(s)
     for name in (*FIELDS, "background"):
-        assert np.linalg.norm(found[name] - wanted[name]) < 1e-3 * np.linalg.norm(wanted[name]), name
+        assert np.linalg.norm(found[name] - wanted[name]) < 1e-3 * np.linalg.norm(wanted[name]), (
+            name
+        )
 
 
 def test_gradient_on_the_screen_is_that_of_the_projected_mean():
@@ -196,8 +250,17 @@ def test_gradient_on_the_screen_is_that_of_the_projected_mean():
     projected = project_gaussians(cloud, s.camera)
 
     def loss() -> float:
-        colour, alpha, depth, _ = composite_reference(projected, s.camera, np.array(s.background).reshape(1, 1, 3))
-        return float((np.concatenate([colour, alpha[..., None], s.depth_weight * depth[..., None]], axis=2) * weights_of(s.camera)).sum())
+        colour, alpha, depth, _ = composite_reference(
+            projected, s.camera, np.array(s.background).reshape(1, 1, 3)
+        )
+        return float(
+            (
+                np.concatenate(
+                    [colour, alpha[..., None], s.depth_weight * depth[..., None]], axis=2
+                )
+                * weights_of(s.camera)
+            ).sum()
+        )
 
     numeric = np.linalg.norm(central_differences(loss, projected.uv, 1e-6), axis=1)
     assert np.allclose(out.screen.gradient_norm[projected.index], numeric, rtol=1e-3)
@@ -212,7 +275,15 @@ def test_image_and_gradients_do_not_depend_on_threads(threads):
         leaves = [getattr(splats, name).requires_grad_(True) for name in FIELDS]
         out = rasterize_gradient(splats, cam, threads=count)
         (out.rgb.square().sum() + out.alpha.sum() + 0.1 * out.depth.sum()).backward()
-        runs.append([out.rgb.detach(), out.alpha.detach(), out.depth.detach(), out.screen.gradient_norm, *(leaf.grad for leaf in leaves)])
+        runs.append(
+            [
+                out.rgb.detach(),
+                out.alpha.detach(),
+                out.depth.detach(),
+                out.screen.gradient_norm,
+                *(leaf.grad for leaf in leaves),
+            ]
+        )
     assert int((out.screen.radii > 0).sum()) > 5000
     for one, other in zip(*runs, strict=True):
         assert one.abs().max() > 0
@@ -236,7 +307,9 @@ def test_large_coordinates_in_float64_change_nothing():
     offset = np.array([4.5e5, 5.4e6, 100.0])
     T = np.eye(4)
     T[:3, 3] = -offset
-    far = Scene(s.means + offset, *(s.arrays()[name] for name in FIELDS[1:]), camera(24, 18, 20.0, T))
+    far = Scene(
+        s.means + offset, *(s.arrays()[name] for name in FIELDS[1:]), camera(24, 18, 20.0, T)
+    )
     assert_close(kernel_gradients(far, dtype=torch.float64)[0], kernel_gradients(s)[0], 1e-5)
 
 
@@ -253,12 +326,18 @@ def test_a_background_image_gets_its_gradient_through_what_is_transparent():
     image = torch.rand(18, 24, 3, generator=torch.Generator().manual_seed(0)).requires_grad_(True)
     out = rasterize_gradient(splats, s.camera, background=image)
     weighted(out, s).backward()
-    assert torch.allclose(image.grad, (1 - out.alpha)[..., None] * torch.tensor(weights_of(s.camera)[..., :3]).float(), atol=1e-6)
+    assert torch.allclose(
+        image.grad,
+        (1 - out.alpha)[..., None] * torch.tensor(weights_of(s.camera)[..., :3]).float(),
+        atol=1e-6,
+    )
 
 
 def test_a_second_backward_pass_through_a_kept_graph_repeats_the_first():
     s = overlapping()
-    splats = Splats(*(torch.tensor(a, dtype=torch.float32).requires_grad_(True) for a in s.arrays().values()))
+    splats = Splats(
+        *(torch.tensor(a, dtype=torch.float32).requires_grad_(True) for a in s.arrays().values())
+    )
     loss = weighted(rasterize_gradient(splats, s.camera), s)
     first = torch.autograd.grad(loss, splats.means, retain_graph=True)[0]
     assert torch.equal(first, torch.autograd.grad(loss, splats.means)[0])

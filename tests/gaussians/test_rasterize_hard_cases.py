@@ -1,4 +1,6 @@
-"""Meet the cases in which splatting breaks: near plane, far off-axis, needles, saturation, huge and countless splats, bad numbers."""
+"""Meet the cases in which splatting breaks: near plane, far off-axis, needles, saturation, huge and
+countless splats, bad numbers.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +15,28 @@ from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
 from alpasim_plugin.gaussians.cloud import quat_multiply
 from alpasim_plugin.gaussians.constants import ALPHA_MAX
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
-from tests.gaussians.gaussian_scenes import LSB, assert_same_image, camera, random_cloud, random_rigid, splats
+from tests.gaussians.gaussian_scenes import (
+    LSB,
+    assert_same_image,
+    camera,
+    random_cloud,
+    random_rigid,
+    splats,
+)
 
 FAST = ("cpu", "torch")
 
 
-def wall(z: float, n: int = 12, opacity: float = 0.9, rgb=(0.8, 0.3, 0.1), spread: float = 1.0) -> GaussianCloud:
+def wall(
+    z: float, n: int = 12, opacity: float = 0.9, rgb=(0.8, 0.3, 0.1), spread: float = 1.0
+) -> GaussianCloud:
     x, y = np.meshgrid(np.linspace(-spread, spread, n), np.linspace(-spread, spread, n))
-    return splats(np.column_stack([x.ravel(), y.ravel(), np.full(n * n, z)]), [spread / n, spread / n, 0.01], opacity, rgb)
+    return splats(
+        np.column_stack([x.ravel(), y.ravel(), np.full(n * n, z)]),
+        [spread / n, spread / n, 0.01],
+        opacity,
+        rgb,
+    )
 
 
 @cache
@@ -68,13 +84,27 @@ def test_centre_behind_the_camera_is_not_drawn_even_where_the_body_reaches_in_fr
 @pytest.mark.parametrize("backend", FAST)
 def test_ten_splats_of_a_kilometre_are_exact(backend):
     rng = np.random.default_rng(0)
-    cloud = splats(rng.uniform(-500, 500, (10, 3)) + np.array([0, 0, 600]), 1000.0, 0.3, rng.uniform(0, 1, (10, 3)))
-    assert_same_image(rasterize(cloud, camera(), backend=backend), rasterize_reference(cloud, camera(), brute=True), 5e-5)
+    cloud = splats(
+        rng.uniform(-500, 500, (10, 3)) + np.array([0, 0, 600]),
+        1000.0,
+        0.3,
+        rng.uniform(0, 1, (10, 3)),
+    )
+    assert_same_image(
+        rasterize(cloud, camera(), backend=backend),
+        rasterize_reference(cloud, camera(), brute=True),
+        5e-5,
+    )
 
 
 def test_ten_splats_of_a_kilometre_take_bounded_time():
     rng = np.random.default_rng(0)
-    cloud = splats(rng.uniform(-500, 500, (10, 3)) + np.array([0, 0, 600]), 1000.0, 0.3, rng.uniform(0, 1, (10, 3)))
+    cloud = splats(
+        rng.uniform(-500, 500, (10, 3)) + np.array([0, 0, 600]),
+        1000.0,
+        0.3,
+        rng.uniform(0, 1, (10, 3)),
+    )
     cam = camera(960, 544, 700.0)
     rasterize(cloud, cam)
     begin = time.perf_counter()
@@ -94,12 +124,19 @@ def test_needles_at_every_angle_match_float64(backend, length_px):
         cloud = splats([0.1, -0.05, 2.0], [[s, 0.02, 0.003]], 0.9, quats=quat)
         want = rasterize_reference(cloud, cam, brute=True)
         assert want.alpha.max() > 0.8
-        assert_same_image(rasterize(cloud, cam, backend=backend), want, 1e-3 if length_px > 10_000 else 1e-4, odd_share=2e-3)
+        assert_same_image(
+            rasterize(cloud, cam, backend=backend),
+            want,
+            1e-3 if length_px > 10_000 else 1e-4,
+            odd_share=2e-3,
+        )
 
 
 @pytest.mark.parametrize("backend", FAST)
 def test_needle_whose_centre_is_far_outside_still_crosses_the_image_exactly(backend):
-    cloud = splats([30.0, 0.0, 2.0], [[40.0, 0.01, 0.01]], 0.9, quats=[np.cos(0.005), 0, 0, np.sin(0.005)])
+    cloud = splats(
+        [30.0, 0.0, 2.0], [[40.0, 0.01, 0.01]], 0.9, quats=[np.cos(0.005), 0, 0, np.sin(0.005)]
+    )
     want = rasterize_reference(cloud, camera(), brute=True)
     assert want.alpha.max() > 0.5
     assert_same_image(rasterize(cloud, camera(), backend=backend), want, 0.5 * LSB, odd_share=1e-3)
@@ -118,10 +155,21 @@ def test_zero_scale_draws_a_dot(backend):
 @pytest.mark.parametrize("bad", ["mean", "opacity", "colour", "scale", "quaternion"])
 def test_numbers_that_cannot_be_drawn_are_an_error_that_names_the_cure(backend, bad):
     cloud = random_cloud(5)
-    field = {"mean": "means", "opacity": "opacities", "colour": "sh", "scale": "scales", "quaternion": "quats"}[bad]
+    field = {
+        "mean": "means",
+        "opacity": "opacities",
+        "colour": "sh",
+        "scale": "scales",
+        "quaternion": "quats",
+    }[bad]
     value = getattr(cloud, field).copy()
     value[3] = 0.0 if bad == "quaternion" else np.inf if bad == "scale" else np.nan
-    broken = GaussianCloud(**{**{f: getattr(cloud, f) for f in ("means", "quats", "scales", "opacities", "sh")}, field: value})
+    broken = GaussianCloud(
+        **{
+            **{f: getattr(cloud, f) for f in ("means", "quats", "scales", "opacities", "sh")},
+            field: value,
+        }
+    )
     with pytest.raises(InputError, match=r"the first at index 3[\s\S]*GaussianCloud.cleaned"):
         rasterize(broken, camera(), backend=backend)
 
@@ -129,9 +177,12 @@ def test_numbers_that_cannot_be_drawn_are_an_error_that_names_the_cure(backend, 
 @pytest.mark.parametrize("backend", FAST)
 def test_largest_scale_that_loading_admits_gives_no_nan(backend):
     cloud, report = GaussianCloud.cleaned(
-        [[0, 0, 5.0], [0, 0, 6.0], [0, 0, 7.0]], [[1, 0, 0, 0]] * 3, [[np.exp(90), 1, 1], [np.exp(19.9), 1e-30, 1.0], [1, 1, 1]],
-        [0.5, 0.5, 0.5], np.zeros((3, 1, 3)),
-    )  # fmt: skip
+        [[0, 0, 5.0], [0, 0, 6.0], [0, 0, 7.0]],
+        [[1, 0, 0, 0]] * 3,
+        [[np.exp(90), 1, 1], [np.exp(19.9), 1e-30, 1.0], [1, 1, 1]],
+        [0.5, 0.5, 0.5],
+        np.zeros((3, 1, 3)),
+    )
     assert report.dropped["overflowing scale"] == 1
     out = rasterize(cloud, camera(), backend=backend)
     assert_same_image(out, rasterize_reference(cloud, camera(), brute=True), 1e-4, odd_share=0.02)
@@ -141,12 +192,19 @@ def test_largest_scale_that_loading_admits_gives_no_nan(backend):
 def test_length_of_a_quaternion_does_not_matter(backend):
     cloud = random_cloud(150, 3)
     scaled = GaussianCloud(cloud.means, cloud.quats * 7.0, cloud.scales, cloud.opacities, cloud.sh)
-    assert_same_image(rasterize(scaled, camera(), backend=backend), rasterize(cloud, camera(), backend=backend), 1e-5, odd_share=2e-4)
+    assert_same_image(
+        rasterize(scaled, camera(), backend=backend),
+        rasterize(cloud, camera(), backend=backend),
+        1e-5,
+        odd_share=2e-4,
+    )
 
 
 @pytest.mark.parametrize("backend", ["reference", *FAST])
 def test_stack_of_opaque_walls_ends_at_099_because_the_second_layer_is_left_out(backend):
-    cloud = GaussianCloud.concatenate([splats([0, 0, z], 50.0, 1.0, (1.0, 0.5, 0.0)) for z in np.linspace(4, 9, 10)])
+    cloud = GaussianCloud.concatenate(
+        [splats([0, 0, z], 50.0, 1.0, (1.0, 0.5, 0.0)) for z in np.linspace(4, 9, 10)]
+    )
     out = rasterize(cloud, camera(), (0.0, 0.0, 1.0), backend)
     assert out.alpha.max() == pytest.approx(ALPHA_MAX, abs=1e-6)
     assert out.alpha.min() == pytest.approx(ALPHA_MAX, abs=1e-6)
@@ -157,25 +215,38 @@ def test_stack_of_opaque_walls_ends_at_099_because_the_second_layer_is_left_out(
 @pytest.mark.parametrize("backend", FAST)
 def test_layers_just_below_saturation_stop_where_the_definition_stops(backend):
     for opacity in (0.5, 0.8, 0.9, 0.95, 0.985):
-        cloud = GaussianCloud.concatenate([splats([0, 0, z], 50.0, opacity, (1.0, z / 30, 0.0)) for z in np.linspace(4, 25, 30)])
+        cloud = GaussianCloud.concatenate(
+            [splats([0, 0, z], 50.0, opacity, (1.0, z / 30, 0.0)) for z in np.linspace(4, 25, 30)]
+        )
         want = rasterize_reference(cloud, camera(), brute=True)
-        # Four layers of 0.9 leave 1e-4, the stop itself: there rounding decides, by less than 1e-3 of full scale.
-        assert_same_image(rasterize(cloud, camera(), backend=backend), want, 1e-3 if opacity == 0.9 else 2e-5)
+        # Four layers of 0.9 leave 1e-4, the stop itself: there rounding decides, by less than 1e-3
+        # of full scale.
+        assert_same_image(
+            rasterize(cloud, camera(), backend=backend), want, 1e-3 if opacity == 0.9 else 2e-5
+        )
 
 
 @pytest.mark.parametrize("backend", FAST)
 def test_opacity_below_the_cut_draws_nothing_and_is_not_carried_along(backend):
     cloud = random_cloud(200, 5)
     faint = GaussianCloud(cloud.means, cloud.quats, cloud.scales, np.full(200, 0.0039), cloud.sh)
-    assert_same_image(rasterize(GaussianCloud.concatenate([cloud, faint]), camera(), backend=backend), rasterize_reference(cloud, camera()))
+    assert_same_image(
+        rasterize(GaussianCloud.concatenate([cloud, faint]), camera(), backend=backend),
+        rasterize_reference(cloud, camera()),
+    )
     assert rasterize(faint, camera()).stats["visible"] == 0
 
 
 @pytest.mark.parametrize("backend", FAST)
 def test_splats_at_the_cut_agree_with_the_definition(backend):
     cloud = random_cloud(400, 6)
-    thin = GaussianCloud(cloud.means, cloud.quats, cloud.scales, np.linspace(0.0039, 0.02, 400), cloud.sh)
-    found, want = rasterize(thin, camera(), backend=backend), rasterize_reference(thin, camera(), brute=True)
+    thin = GaussianCloud(
+        cloud.means, cloud.quats, cloud.scales, np.linspace(0.0039, 0.02, 400), cloud.sh
+    )
+    found, want = (
+        rasterize(thin, camera(), backend=backend),
+        rasterize_reference(thin, camera(), brute=True),
+    )
     assert np.abs(found.rgb - want.rgb).max() <= LSB
     assert np.mean(np.abs(found.alpha - want.alpha) > 1e-5) < 0.01
 
@@ -188,7 +259,13 @@ def test_equal_depths_keep_input_order(backend):
         cloud = splats(np.column_stack([xy, np.full(n, 3.0)]), 0.2, 0.7, rng.uniform(0, 1, (n, 3)))
         out = rasterize(cloud, camera(), backend=backend)
         # Nudging the depths apart in input order must not change who is in front.
-        apart = GaussianCloud(cloud.means + np.arange(n)[:, None] * [0, 0, 1e-5], cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
+        apart = GaussianCloud(
+            cloud.means + np.arange(n)[:, None] * [0, 0, 1e-5],
+            cloud.quats,
+            cloud.scales,
+            cloud.opacities,
+            cloud.sh,
+        )
         assert np.abs(out.rgb - rasterize(apart, camera(), backend="reference").rgb).max() < 0.01
         backwards = rasterize(cloud.take(np.arange(n)[::-1]), camera(), backend=backend)
         assert np.abs(out.rgb - backwards.rgb).max() > 0.05
@@ -212,11 +289,15 @@ def test_utm_coordinates_give_the_local_image(backend):
     cloud = random_cloud(400, 10)
     T = random_rigid(10)
     offset = np.array([4.5e5, 5.4e6, 120.0])
-    local = rasterize_reference(cloud.transformed(T), camera(T_camera_world=np.linalg.inv(T)), brute=True)
+    local = rasterize_reference(
+        cloud.transformed(T), camera(T_camera_world=np.linalg.inv(T)), brute=True
+    )
     there = T.copy()
     there[:3, 3] += offset
     moved = cloud.transformed(T)
-    moved = GaussianCloud(moved.means + offset, moved.quats, moved.scales, moved.opacities, moved.sh)
+    moved = GaussianCloud(
+        moved.means + offset, moved.quats, moved.scales, moved.opacities, moved.sh
+    )
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = there[:3, :3].T, -there[:3, :3].T @ there[:3, 3]
     out = rasterize(moved, camera(T_camera_world=pose), backend=backend)
@@ -227,7 +308,12 @@ def test_utm_coordinates_give_the_local_image(backend):
 def test_countless_opaque_splats_in_one_tile_take_bounded_time():
     rng = np.random.default_rng(2)
     n = 100_000
-    cloud = splats(np.column_stack([rng.uniform(-0.02, 0.02, (n, 2)), rng.uniform(2, 9, n)]), 0.5, 0.99, rng.uniform(0, 1, (n, 3)))
+    cloud = splats(
+        np.column_stack([rng.uniform(-0.02, 0.02, (n, 2)), rng.uniform(2, 9, n)]),
+        0.5,
+        0.99,
+        rng.uniform(0, 1, (n, 3)),
+    )
     cam = PinholeCamera(16, 16, np.array([[40.0, 0, 8], [0, 40, 8], [0, 0, 1]]), np.eye(4))
     out = rasterize(cloud, cam)
     # Every pixel is finished after a handful of splats, and then the tile is left.
@@ -241,7 +327,11 @@ def test_countless_opaque_splats_in_one_tile_take_bounded_time():
 
 
 @pytest.mark.parametrize("backend", ["reference", *FAST])
-@pytest.mark.parametrize("cloud", [GaussianCloud.empty(), splats([0, 0, -5.0]), splats([500.0, 0, 5.0])], ids=["none", "behind", "aside"])
+@pytest.mark.parametrize(
+    "cloud",
+    [GaussianCloud.empty(), splats([0, 0, -5.0]), splats([500.0, 0, 5.0])],
+    ids=["none", "behind", "aside"],
+)
 def test_empty_view_is_the_background(backend, cloud):
     out = rasterize(cloud, camera(), (0.25, 0.5, 0.75), backend)
     assert np.all(out.rgb == np.float32([0.25, 0.5, 0.75]))
@@ -263,9 +353,24 @@ def test_colours_above_one_are_clamped_after_compositing(backend):
 def test_near_and_far_splats_in_one_view_keep_precision(backend):
     rng = np.random.default_rng(3)
     z = np.exp(rng.uniform(np.log(0.11), np.log(3000), 300))
-    cloud = splats(np.column_stack([rng.uniform(-0.5, 0.5, (300, 2)) * z[:, None], z]), (0.03 * z)[:, None] * [1, 0.5, 0.2], 0.6)
-    cloud = GaussianCloud(cloud.means, rng.normal(size=(300, 4)), cloud.scales, cloud.opacities, rng.normal(size=(300, 9, 3)) * 0.3)
-    assert_same_image(rasterize(cloud, camera(), backend=backend), rasterize_reference(cloud, camera(), brute=True), 3e-5, odd_share=5e-4)
+    cloud = splats(
+        np.column_stack([rng.uniform(-0.5, 0.5, (300, 2)) * z[:, None], z]),
+        (0.03 * z)[:, None] * [1, 0.5, 0.2],
+        0.6,
+    )
+    cloud = GaussianCloud(
+        cloud.means,
+        rng.normal(size=(300, 4)),
+        cloud.scales,
+        cloud.opacities,
+        rng.normal(size=(300, 9, 3)) * 0.3,
+    )
+    assert_same_image(
+        rasterize(cloud, camera(), backend=backend),
+        rasterize_reference(cloud, camera(), brute=True),
+        3e-5,
+        odd_share=5e-4,
+    )
 
 
 def test_quaternion_product_is_the_product_of_rotations():

@@ -1,4 +1,6 @@
-"""Hold every CPU-capable backend against closed forms, symmetries and the brute-force definition."""
+"""Hold every CPU-capable backend against closed forms, symmetries and the brute-force
+definition.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,13 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
 from tests.examples import examples
-from tests.gaussians.gaussian_scenes import assert_same_image, camera, random_cloud, random_rigid, splats
+from tests.gaussians.gaussian_scenes import (
+    assert_same_image,
+    camera,
+    random_cloud,
+    random_rigid,
+    splats,
+)
 
 BACKENDS = ("reference", "cpu", "torch")
 
@@ -19,7 +27,10 @@ BACKENDS = ("reference", "cpu", "torch")
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_one_isotropic_splat_on_axis_is_its_analytic_bell(backend):
     cam = camera()
-    z, s, o, f = 4.0, 0.35, 0.7, 80.0
+    z = 4.0
+    s = 0.35
+    o = 0.7
+    f = 80.0
     out = rasterize(splats([0, 0, z], s, o, (0.9, 0.5, 0.2)), cam, backend=backend)
     x, y = np.meshgrid(np.arange(96) + 0.5 - cam.cx, np.arange(64) + 0.5 - cam.cy)
     alpha = o * np.exp(-(x * x + y * y) / (2 * (f * f * s * s / (z * z) + 0.3)))
@@ -59,21 +70,27 @@ def test_reference_boxes_change_nothing_against_all_pixels():
 
 @pytest.mark.parametrize("backend", ["cpu", "torch"])
 @settings(max_examples=examples(12), deadline=None)
-@given(seed=st.integers(0, 10_000), degree=st.integers(0, 3), near_m=st.sampled_from([0.1, 1.0, 3.0]))
+@given(
+    seed=st.integers(0, 10_000), degree=st.integers(0, 3), near_m=st.sampled_from([0.1, 1.0, 3.0])
+)
 def test_random_scenes_equal_brute_force(backend, seed, degree, near_m):
     cloud, T = random_cloud(200, seed, degree), random_rigid(seed)
     cam = camera(T_camera_world=np.linalg.inv(T))
     cloud = cloud.transformed(T)
     want = rasterize_reference(cloud, cam, (0.2, 0.6, 0.9), near_m=near_m, brute=True)
     # A pixel may sit on the alpha cut or the stop: one in five thousand.
-    assert_same_image(rasterize(cloud, cam, (0.2, 0.6, 0.9), backend, near_m=near_m), want, 2e-5, odd_share=2e-4)
+    assert_same_image(
+        rasterize(cloud, cam, (0.2, 0.6, 0.9), backend, near_m=near_m), want, 2e-5, odd_share=2e-4
+    )
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_moving_scene_and_camera_together_changes_nothing(backend):
     cloud, T = random_cloud(300, 7), random_rigid(3, 40.0)
     here = rasterize(cloud, camera(), backend=backend)
-    there = rasterize(cloud.transformed(T), camera(T_camera_world=np.linalg.inv(T)), backend=backend)
+    there = rasterize(
+        cloud.transformed(T), camera(T_camera_world=np.linalg.inv(T)), backend=backend
+    )
     assert_same_image(there, here, 5e-5)
 
 
@@ -81,7 +98,10 @@ def test_moving_scene_and_camera_together_changes_nothing(backend):
 def test_scaling_scene_and_distances_together_changes_nothing(backend):
     cloud = random_cloud(300, 8)
     big = GaussianCloud(cloud.means * 7, cloud.quats, cloud.scales * 7, cloud.opacities, cloud.sh)
-    one, seven = rasterize(cloud, camera(), backend=backend), rasterize(big, camera(), backend=backend, near_m=0.7)
+    one, seven = (
+        rasterize(cloud, camera(), backend=backend),
+        rasterize(big, camera(), backend=backend, near_m=0.7),
+    )
     assert np.abs(one.rgb - seven.rgb).max() < 2e-5
     assert np.abs(7 * one.depth - seven.depth).max() < 1e-3
 
@@ -89,7 +109,9 @@ def test_scaling_scene_and_distances_together_changes_nothing(backend):
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_black_and_white_backgrounds_differ_by_the_transmittance(backend):
     cloud = random_cloud(300, 9, degree=0)
-    dim = GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, np.clip(cloud.sh, -1.7, 0.0))
+    dim = GaussianCloud(
+        cloud.means, cloud.quats, cloud.scales, cloud.opacities, np.clip(cloud.sh, -1.7, 0.0)
+    )
     black, white = (rasterize(dim, camera(), (c, c, c), backend=backend) for c in (0.0, 1.0))
     assert np.abs(white.rgb - black.rgb - (1 - black.alpha)[..., None]).max() < 1e-6
     assert black.alpha.min() >= 0
@@ -102,7 +124,10 @@ def test_background_image_shows_through(backend):
     out = rasterize(random_cloud(50, 2), camera(), image, backend=backend)
     want = rasterize_reference(random_cloud(50, 2), camera(), image, brute=True)
     assert_same_image(out, want)
-    assert np.array_equal(rasterize(GaussianCloud.empty(), camera(), image, backend=backend).rgb, image.astype(np.float32))
+    assert np.array_equal(
+        rasterize(GaussianCloud.empty(), camera(), image, backend=backend).rgb,
+        image.astype(np.float32),
+    )
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

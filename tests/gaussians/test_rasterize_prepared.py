@@ -17,12 +17,20 @@ from alpasim_plugin.gaussians.raster.binning import depth_order
 from alpasim_plugin.gaussians.raster.raster_kernels import CUT, P0, P1, P2, P3, P4, P5, raster_tiles
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
 from alpasim_plugin.gaussians.sample_scene import driving_camera, driving_like_scene
-from tests.gaussians.gaussian_scenes import assert_same_image, camera, random_cloud, random_rigid, splats
+from tests.gaussians.gaussian_scenes import (
+    assert_same_image,
+    camera,
+    random_cloud,
+    random_rigid,
+    splats,
+)
 
 
 def small_object(seed: int, n: int = 150) -> GaussianCloud:
     cloud = random_cloud(n, seed)
-    return GaussianCloud((cloud.means - [0, 0, 6]) * 0.2, cloud.quats, cloud.scales * 0.3, cloud.opacities, cloud.sh)
+    return GaussianCloud(
+        (cloud.means - [0, 0, 6]) * 0.2, cloud.quats, cloud.scales * 0.3, cloud.opacities, cloud.sh
+    )
 
 
 @pytest.mark.parametrize("sh_frame", ["object", "world"])
@@ -35,7 +43,12 @@ def test_nodes_at_poses_equal_one_cloud_moved_there(sh_frame):
         nodes.append((prepare(small_object(seed), sh_frame=sh_frame), T))
         clouds.append(small_object(seed).transformed(T, rotate_colour=sh_frame == "object"))
     found = rasterize_prepared(nodes, camera(), (0.2, 0.3, 0.4))
-    assert_same_image(found, rasterize_reference(GaussianCloud.concatenate(clouds), camera(), (0.2, 0.3, 0.4)), 3e-5, odd_share=5e-4)
+    assert_same_image(
+        found,
+        rasterize_reference(GaussianCloud.concatenate(clouds), camera(), (0.2, 0.3, 0.4)),
+        3e-5,
+        odd_share=5e-4,
+    )
 
 
 def test_actor_at_the_identity_equals_the_same_gaussians_in_the_background():
@@ -48,7 +61,10 @@ def test_actor_at_the_identity_equals_the_same_gaussians_in_the_background():
 
 
 def test_equal_depths_are_drawn_in_node_order():
-    red, green = prepare(splats([0, 0, 4.0], 3.0, 0.9, (1, 0, 0))), prepare(splats([0, 0, 4.0], 3.0, 0.9, (0, 1, 0)))
+    red, green = (
+        prepare(splats([0, 0, 4.0], 3.0, 0.9, (1, 0, 0))),
+        prepare(splats([0, 0, 4.0], 3.0, 0.9, (0, 1, 0))),
+    )
     first = rasterize_prepared([(red, None), (green, np.eye(4))], camera()).rgb[32, 48]
     second = rasterize_prepared([(green, np.eye(4)), (red, None)], camera()).rgb[32, 48]
     assert first == pytest.approx([0.9, 0.09, 0], abs=2e-3)
@@ -58,14 +74,23 @@ def test_equal_depths_are_drawn_in_node_order():
 def test_long_runs_of_equal_depth_keep_input_order_on_any_number_of_threads():
     rng = np.random.default_rng(0)
     n = 6000
-    cloud = splats(np.column_stack([rng.uniform(-2, 2, (n, 2)), np.full(n, 4.0)]), 0.05, 0.8, rng.uniform(0, 1, (n, 3)))
+    cloud = splats(
+        np.column_stack([rng.uniform(-2, 2, (n, 2)), np.full(n, 4.0)]),
+        0.05,
+        0.8,
+        rng.uniform(0, 1, (n, 3)),
+    )
     one = rasterize_prepared([(prepare(cloud), None)], camera(), threads=1)
-    assert np.array_equal(one.rgb, rasterize_prepared([(prepare(cloud), None)], camera(), threads=3).rgb)
+    assert np.array_equal(
+        one.rgb, rasterize_prepared([(prepare(cloud), None)], camera(), threads=3).rgb
+    )
     assert_same_image(one, rasterize_reference(cloud, camera()), 2e-5, odd_share=5e-4)
 
 
 def test_culling_bundles_and_nodes_never_changes_the_image():
-    """Nothing that the per-splat rule would draw is lost to a bounding sphere, from any direction."""
+    """Nothing that the per-splat rule would draw is lost to a bounding sphere, from any
+    direction.
+    """
     scene = driving_like_scene(3000, seed=4)
     parts = [prepare(scene.take(np.flatnonzero(np.arange(3000) % 7 == k))) for k in range(7)]
     for seed in range(6):
@@ -79,26 +104,50 @@ def test_culling_bundles_and_nodes_never_changes_the_image():
 
 
 def test_many_parts_of_all_kinds_in_one_call_equal_the_reference_and_their_copies_from_another_process():
-    """Empty ones, single splats, several bundles, every degree of colours, both colour frames, at rest and moved, in view and behind."""
-    rng, nodes, clouds = np.random.default_rng(5), [], []
+    """Empty ones, single splats, several bundles, every degree of colours, both colour frames, at
+    rest and moved, in view and behind.
+    """
+    rng = np.random.default_rng(5)
+    nodes = []
+    clouds = []
     for i in range(90):
         n, degree = int(rng.choice([0, 1, 17, 40, 300])), int(rng.integers(0, 4))
         cloud = small_object(i, n) if n else GaussianCloud.empty()
-        cloud = GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities * rng.uniform(), cloud.sh[:, : (degree + 1) ** 2])
+        cloud = GaussianCloud(
+            cloud.means,
+            cloud.quats,
+            cloud.scales,
+            cloud.opacities * rng.uniform(),
+            cloud.sh[:, : (degree + 1) ** 2],
+        )
         T = None if i % 3 == 0 else random_rigid(i, 3.0)
         if T is not None:
             T[2, 3] += 4.0
         sh_frame = "object" if i % 2 else "world"
         nodes.append((prepare(cloud, sh_frame=sh_frame), T))
-        clouds.append(cloud if T is None else cloud.transformed(T, rotate_colour=sh_frame == "object"))
+        clouds.append(
+            cloud if T is None else cloud.transformed(T, rotate_colour=sh_frame == "object")
+        )
     found = rasterize_prepared(nodes, camera(), threads=1)
     size = max(cloud.sh.shape[1] for cloud in clouds)
     whole = GaussianCloud.concatenate(
-        [GaussianCloud(c.means, c.quats, c.scales, c.opacities, np.pad(c.sh, ((0, 0), (0, size - c.sh.shape[1]), (0, 0)))) for c in clouds]
+        [
+            GaussianCloud(
+                c.means,
+                c.quats,
+                c.scales,
+                c.opacities,
+                np.pad(c.sh, ((0, 0), (0, size - c.sh.shape[1]), (0, 0))),
+            )
+            for c in clouds
+        ]
     )
     assert_same_image(found, rasterize_reference(whole, camera()), 3e-5, odd_share=5e-4)
     sent = pickle.loads(pickle.dumps(nodes))
-    for again in (rasterize_prepared(nodes, camera(), threads=3), rasterize_prepared(sent, camera(), threads=1)):
+    for again in (
+        rasterize_prepared(nodes, camera(), threads=3),
+        rasterize_prepared(sent, camera(), threads=1),
+    ):
         assert np.array_equal(found.rgb, again.rgb)
         assert np.array_equal(found.depth, again.depth)
         assert found.stats == again.stats
@@ -113,7 +162,11 @@ def test_a_node_out_of_view_costs_nothing_and_one_in_view_is_kept():
 
 
 def test_no_nodes_and_empty_nodes_are_the_background():
-    for nodes in ([], [(prepare(GaussianCloud.empty()), None)], [(prepare(splats([0, 0, 3.0], opacities=0.001)), np.eye(4))]):
+    for nodes in (
+        [],
+        [(prepare(GaussianCloud.empty()), None)],
+        [(prepare(splats([0, 0, 3.0], opacities=0.001)), np.eye(4))],
+    ):
         out = rasterize_prepared(nodes, camera(), (0.1, 0.2, 0.3))
         assert np.all(out.rgb == np.float32([0.1, 0.2, 0.3]))
 
@@ -136,10 +189,15 @@ def test_a_pose_that_is_not_rigid_is_an_error(fault):
 def test_level_of_detail_leaves_out_what_the_reference_leaves_out():
     cloud = random_cloud(500, 11)
     for lod_px in (0.5, 2.0, 8.0):
-        found, want = rasterize(cloud, camera(), lod_px=lod_px), rasterize(cloud, camera(), backend="reference", lod_px=lod_px)
+        found, want = (
+            rasterize(cloud, camera(), lod_px=lod_px),
+            rasterize(cloud, camera(), backend="reference", lod_px=lod_px),
+        )
         assert_same_image(found, want, 2e-5, odd_share=5e-4)
         assert found.stats["visible"] < rasterize(cloud, camera()).stats["visible"]
-        assert_same_image(rasterize(cloud, camera(), backend="torch", lod_px=lod_px), want, 2e-5, odd_share=5e-4)
+        assert_same_image(
+            rasterize(cloud, camera(), backend="torch", lod_px=lod_px), want, 2e-5, odd_share=5e-4
+        )
 
 
 @pytest.mark.parametrize("n", [2_000, 30_000])
@@ -161,7 +219,10 @@ def test_two_python_threads_may_render_at_once():
     found: list[bool] = []
 
     def work() -> None:
-        found.extend(np.array_equal(want, rasterize_prepared([(scene, None)], cam, threads=2).rgb) for _ in range(10))
+        found.extend(
+            np.array_equal(want, rasterize_prepared([(scene, None)], cam, threads=2).rgb)
+            for _ in range(10)
+        )
 
     workers = [threading.Thread(target=work) for _ in range(3)]
     for worker in workers:
@@ -193,9 +254,16 @@ def test_read_only_and_strided_inputs_meet_the_kernels_that_are_already_compiled
     cloud = random_cloud(50)
     rasterize(cloud, camera())
     compiled = len(raster_tiles.signatures)
-    locked = GaussianCloud(cloud.means[::2], cloud.quats[::2], cloud.scales[::2], cloud.opacities[::2], cloud.sh[::2])
-    assert_same_image(rasterize(locked, camera(), image), rasterize_reference(locked, camera(), image))
-    assert_same_image(rasterize(locked, camera(), np.asfortranarray(image)), rasterize_reference(locked, camera(), image))
+    locked = GaussianCloud(
+        cloud.means[::2], cloud.quats[::2], cloud.scales[::2], cloud.opacities[::2], cloud.sh[::2]
+    )
+    assert_same_image(
+        rasterize(locked, camera(), image), rasterize_reference(locked, camera(), image)
+    )
+    assert_same_image(
+        rasterize(locked, camera(), np.asfortranarray(image)),
+        rasterize_reference(locked, camera(), image),
+    )
     assert len(raster_tiles.signatures) == compiled
 
 
@@ -214,7 +282,9 @@ def test_fewer_than_one_thread_is_an_error():
 
 
 def test_tiles_and_blocks_change_no_bit_against_every_splat_on_every_pixel(monkeypatch):
-    """Same arithmetic with all culling switched off: what the tiles and blocks skip is exactly what the alpha cut would skip."""
+    """Same arithmetic with all culling switched off: what the tiles and blocks skip is exactly what
+    the alpha cut would skip.
+    """
     scene, cam = prepare(driving_like_scene(2500, seed=3)), driving_camera(90, 50)
     tiled = rasterize_prepared([(scene, None)], cam, threads=1)
     seen = {}
@@ -225,7 +295,17 @@ def test_tiles_and_blocks_change_no_bit_against_every_splat_on_every_pixel(monke
         table[:, [RADIUS_X, RADIUS_Y, BLOCK_REACH]] = 1e30
         n_tiles = len(starts) - 1
         full = np.tile((seen["order"][:count] & 0xFFFFFFFF).astype(np.int32), n_tiles)
-        raster_tiles(cursor, tiles_x, np.arange(n_tiles + 1) * count, full, table.reshape(-1), background, rgb, alpha, depth)
+        raster_tiles(
+            cursor,
+            tiles_x,
+            np.arange(n_tiles + 1) * count,
+            full,
+            table.reshape(-1),
+            background,
+            rgb,
+            alpha,
+            depth,
+        )
 
     def counted(count, *args):
         seen["count"] = count
@@ -242,7 +322,10 @@ def test_tiles_and_blocks_change_no_bit_against_every_splat_on_every_pixel(monke
 
 def test_street_scene_stays_within_one_grey_level_of_float64():
     cloud, cam = driving_like_scene(8_000), driving_camera(160, 90)
-    found, want = rasterize(cloud, cam, (0.5, 0.6, 0.8)), rasterize_reference(cloud, cam, (0.5, 0.6, 0.8))
+    found, want = (
+        rasterize(cloud, cam, (0.5, 0.6, 0.8)),
+        rasterize_reference(cloud, cam, (0.5, 0.6, 0.8)),
+    )
     error = np.abs(found.rgb - want.rgb).max(axis=2)
     assert np.mean(error > 1e-4) < 5e-4
     assert error.max() <= 1 / 255

@@ -7,7 +7,12 @@ import pytest
 import torch
 
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
-from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, rasterize_tensors, rasterize_torch, sh_colours_torch
+from alpasim_plugin.gaussians.raster.rasterize_torch import (
+    GaussianTensors,
+    rasterize_tensors,
+    rasterize_torch,
+    sh_colours_torch,
+)
 from alpasim_plugin.gaussians.sh import sh_colours
 from tests.gaussians.gaussian_scenes import assert_same_image, camera, random_cloud, random_rigid
 
@@ -15,7 +20,9 @@ FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
 
 def smooth_scene(n: int = 4) -> GaussianTensors:
-    """Wide translucent splats over a small image: no pixel near the alpha cut or the stop, so the image is differentiable."""
+    """Wide translucent splats over a small image: no pixel near the alpha cut or the stop, so the
+    image is differentiable.
+    """
     rng = np.random.default_rng(5)
     return GaussianTensors(
         *(
@@ -33,7 +40,9 @@ def smooth_scene(n: int = 4) -> GaussianTensors:
 
 def loss_of(tensors: GaussianTensors, pose: torch.Tensor | None = None) -> torch.Tensor:
     cam = camera(9, 7, 6.0)
-    out = rasterize_tensors(tensors, cam, torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64), T_camera_world=pose)
+    out = rasterize_tensors(
+        tensors, cam, torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64), T_camera_world=pose
+    )
     weights = torch.tensor(np.random.default_rng(1).normal(size=(7, 9, 5)))
     return (torch.cat([out.rgb, out.alpha[..., None], out.depth[..., None]], dim=2) * weights).sum()
 
@@ -120,7 +129,9 @@ def test_given_pose_replaces_that_of_the_camera():
     T = np.eye(4)
     T[:3, 3] = [0.1, 0.2, 0.3]
     by_camera = rasterize_tensors(scene, camera(T_camera_world=T)).rgb
-    assert torch.equal(by_camera, rasterize_tensors(scene, camera(), T_camera_world=torch.tensor(T)).rgb)
+    assert torch.equal(
+        by_camera, rasterize_tensors(scene, camera(), T_camera_world=torch.tensor(T)).rgb
+    )
 
 
 @pytest.mark.parametrize("size", [1, 4, 9, 16])
@@ -129,4 +140,9 @@ def test_harmonics_equal_the_numpy_twin(size):
     d = rng.normal(size=(40, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     sh = rng.normal(size=(40, size, 3))
-    assert np.abs(sh_colours_torch(torch.tensor(sh), torch.tensor(d)).numpy() - sh_colours(sh, d)).max() < 1e-12
+    assert (
+        np.abs(
+            sh_colours_torch(torch.tensor(sh), torch.tensor(d)).numpy() - sh_colours(sh, d)
+        ).max()
+        < 1e-12
+    )

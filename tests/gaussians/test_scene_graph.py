@@ -11,7 +11,13 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
-from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneNode, in_view, split_by_tile
+from alpasim_plugin.gaussians.scene.scene_graph import (
+    Level,
+    SceneGraph,
+    SceneNode,
+    in_view,
+    split_by_tile,
+)
 from alpasim_plugin.gaussians.scene.sky import make_sky
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 from tests.examples import examples
@@ -20,12 +26,21 @@ from tests.gaussians.scene_maps import camera_spec, straight
 SKY = make_sky("clear", stream("t", 0, "sky"))
 
 
-def camera(width: int = 64, height: int = 48, T_world_rig: np.ndarray | None = None) -> PinholeCamera:
+def camera(
+    width: int = 64, height: int = 48, T_world_rig: np.ndarray | None = None
+) -> PinholeCamera:
     spec = camera_spec(width, height)
-    return PinholeCamera.from_pose(width, height, spec.K, (np.eye(4) if T_world_rig is None else T_world_rig) @ spec.T_rig_camera)
+    return PinholeCamera.from_pose(
+        width,
+        height,
+        spec.K,
+        (np.eye(4) if T_world_rig is None else T_world_rig) @ spec.T_rig_camera,
+    )
 
 
-def blobs(centre: tuple[float, float, float], n: int = 40, seed: int = 0, sheen: bool = False) -> GaussianCloud:
+def blobs(
+    centre: tuple[float, float, float], n: int = 40, seed: int = 0, sheen: bool = False
+) -> GaussianCloud:
     rng = np.random.default_rng(seed)
     sh = np.zeros((n, 4, 3)) if sheen else np.zeros((n, 1, 3))
     sh[:, 0] = dc_from_rgb(rng.random((n, 3)))
@@ -35,13 +50,17 @@ def blobs(centre: tuple[float, float, float], n: int = 40, seed: int = 0, sheen:
     return GaussianCloud(means, quats, 0.3 * rng.random((n, 3)), np.full(n, 0.8), sh)
 
 
-def node(name: str, cloud: GaussianCloud, kind: str = "background", far_m: float = 1e9) -> SceneNode:
+def node(
+    name: str, cloud: GaussianCloud, kind: str = "background", far_m: float = 1e9
+) -> SceneNode:
     return SceneNode(name, kind, (Level(0.1, cloud),), far_m)
 
 
 def test_nodes_rendered_in_one_pass_equal_the_reference_of_their_joined_cloud() -> None:
     background = [node(f"b{i}", blobs((8 + 4 * i, 3 - 2 * i, 1.0), n=12, seed=i)) for i in range(4)]
-    graph = SceneGraph(background, [node("car", blobs((0, 0, 0), n=12, seed=9, sheen=True), "actor")], SKY)
+    graph = SceneGraph(
+        background, [node("car", blobs((0, 0, 0), n=12, seed=9, sheen=True), "actor")], SKY
+    )
     poses = {"car": se2(9.0, -0.5, 0.7, 1.2)}
     view = camera()
     fast = graph.render(view, poses)
@@ -73,14 +92,21 @@ def test_camera_and_actor_turned_together_see_the_same_image() -> None:
 def test_world_frame_colours_stay_while_the_actor_turns() -> None:
     sheen = blobs((0, 0, 0.5), sheen=True)
     turned = {"a": se2(8, 0, np.pi)}
-    in_object = SceneGraph([], [node("a", sheen, "actor")], SKY, "object").render(camera(), turned).rgb
-    in_world = SceneGraph([], [node("a", sheen, "actor")], SKY, "world").render(camera(), turned).rgb
+    in_object = (
+        SceneGraph([], [node("a", sheen, "actor")], SKY, "object").render(camera(), turned).rgb
+    )
+    in_world = (
+        SceneGraph([], [node("a", sheen, "actor")], SKY, "world").render(camera(), turned).rgb
+    )
     assert np.abs(in_object - in_world).max() > 0.05
 
 
 def test_node_out_of_view_is_not_drawn_and_does_not_change_the_image() -> None:
     ahead, behind = node("ahead", blobs((10, 0, 1))), node("behind", blobs((-30, 0, 1), seed=3))
-    both, one = SceneGraph([ahead, behind], [], SKY).render(camera(), {}), SceneGraph([ahead], [], SKY).render(camera(), {})
+    both, one = (
+        SceneGraph([ahead, behind], [], SKY).render(camera(), {}),
+        SceneGraph([ahead], [], SKY).render(camera(), {}),
+    )
     np.testing.assert_array_equal(both.rgb, one.rgb)
     assert both.stats["nodes"] == 1
     assert both.stats["nodes_total"] == 2
@@ -92,21 +118,37 @@ def test_node_beyond_its_far_limit_is_not_drawn() -> None:
 
 
 @settings(deadline=None, max_examples=examples(200))
-@given(st.tuples(*[st.floats(-30, 30)] * 3), st.floats(0.0, 5.0), st.tuples(*[st.floats(-1, 1)] * 3), st.floats(-np.pi, np.pi))
+@given(
+    st.tuples(*[st.floats(-30, 30)] * 3),
+    st.floats(0.0, 5.0),
+    st.tuples(*[st.floats(-1, 1)] * 3),
+    st.floats(-np.pi, np.pi),
+)
 def test_sphere_with_a_visible_point_is_always_in_view(
-    centre: tuple[float, float, float], radius: float, inside: tuple[float, float, float], yaw: float
+    centre: tuple[float, float, float],
+    radius: float,
+    inside: tuple[float, float, float],
+    yaw: float,
 ) -> None:
     view = camera(T_world_rig=se2(1.0, -2.0, yaw))
     point = np.array(centre) + radius * np.array(inside) / max(1.0, float(np.linalg.norm(inside)))
     x, y, z = view.T_camera_world[:3, :3] @ point + view.T_camera_world[:3, 3]
-    visible = z > 0.1 and 0 <= view.fx * x / z + view.cx <= view.width and 0 <= view.fy * y / z + view.cy <= view.height
+    visible = (
+        z > 0.1
+        and 0 <= view.fx * x / z + view.cx <= view.width
+        and 0 <= view.fy * y / z + view.cy <= view.height
+    )
     assert not visible or bool(in_view(view, np.array([centre]), np.array([radius]))[0])
 
 
 def test_farther_nodes_use_coarser_levels() -> None:
-    levels = tuple(Level(cell, blobs((0, 0, 0.5), n=n)) for cell, n in ((0.1, 64), (0.4, 16), (1.6, 4)))
+    levels = tuple(
+        Level(cell, blobs((0, 0, 0.5), n=n)) for cell, n in ((0.1, 64), (0.4, 16), (1.6, 4))
+    )
     graph = SceneGraph([], [SceneNode("a", "actor", levels)], SKY)
-    drawn = [graph.render(camera(), {"a": se2(x, 0, 0)}).stats["gaussians"] for x in (6.0, 20.0, 400.0)]
+    drawn = [
+        graph.render(camera(), {"a": se2(x, 0, 0)}).stats["gaussians"] for x in (6.0, 20.0, 400.0)
+    ]
     assert drawn == [64, 16, 4]
 
 
@@ -126,7 +168,10 @@ def test_sky_is_not_in_alpha_unless_asked_for() -> None:
 
 
 def test_sky_has_no_seam_where_the_azimuth_wraps() -> None:
-    for yaw in (0.0, np.pi):  # the panorama's first column, and the jump of arctan2, lie at the image's centre
+    for yaw in (
+        0.0,
+        np.pi,
+    ):  # the panorama's first column, and the jump of arctan2, lie at the image's centre
         step = np.abs(np.diff(SKY.image(camera(256, 96, se2(0, 0, yaw))), axis=1)).max(axis=(0, 2))
         assert step[124:131].max() < 1.5 * np.delete(step, slice(124, 131)).max() + 0.01
 
@@ -134,7 +179,9 @@ def test_sky_has_no_seam_where_the_azimuth_wraps() -> None:
 def test_same_sky_seen_while_turning_moves_across_the_image() -> None:
     a, b = SKY.image(camera(256, 96)), SKY.image(camera(256, 96, se2(0, 0, 0.2)))
     assert np.abs(a - b).max() > 0.02  # clouds and hills moved
-    np.testing.assert_array_equal(SKY.image(camera(256, 96, se2(50, 9, 0.2))), b)  # and do not depend on where one stands
+    np.testing.assert_array_equal(
+        SKY.image(camera(256, 96, se2(50, 9, 0.2))), b
+    )  # and do not depend on where one stands
 
 
 def test_splitting_by_tile_loses_nothing() -> None:

@@ -8,7 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import sph_harm_y
 
-from alpasim_plugin.gaussians.sh import C0, dc_from_rgb, rotate_sh, sh_basis, sh_colours, sh_rotation
+from alpasim_plugin.gaussians.sh import (
+    C0,
+    dc_from_rgb,
+    rotate_sh,
+    sh_basis,
+    sh_colours,
+    sh_rotation,
+)
 from tests.examples import examples
 from tests.gaussians.gaussian_scenes import random_rigid
 
@@ -19,7 +26,8 @@ def directions(n: int = 200, seed: int = 0) -> np.ndarray:
 
 
 def test_basis_is_orthonormal_over_the_sphere():
-    # Gauss-Legendre in z and a uniform rule in azimuth integrate polynomials of this degree exactly.
+    # Gauss-Legendre in z and a uniform rule in azimuth integrate polynomials of this degree
+    # exactly.
     z, w = np.polynomial.legendre.leggauss(8)
     phi = np.arange(16) * 2 * np.pi / 16
     zz, pp = np.meshgrid(z, phi, indexing="ij")
@@ -36,7 +44,9 @@ def test_basis_equals_real_harmonics_of_scipy_with_the_3dgs_signs():
     basis = sh_basis(d)
     for degree in range(4):
         for m in range(-degree, degree + 1):
-            y = sph_harm_y(degree, abs(m), theta, phi)  # with the Condon-Shortley phase, whose sign 3DGS keeps
+            y = sph_harm_y(
+                degree, abs(m), theta, phi
+            )  # with the Condon-Shortley phase, whose sign 3DGS keeps
             real = y.real if m == 0 else np.sqrt(2) * (y.imag if m < 0 else y.real)
             assert np.abs(basis[:, degree * degree + degree + m] - real).max() < 1e-12, (degree, m)
 

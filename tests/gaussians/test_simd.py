@@ -28,7 +28,14 @@ def _floats(x, out):
 @njit
 def _masks(x):
     a, b = v.load(x, 0), v.load(x, 16)
-    return v.bits(a < b), v.bits(a <= b), v.bits(a > b), v.bits(a >= b), v.bits((a < b) | (a > b)), v.lowest_bit(np.int64(40))
+    return (
+        v.bits(a < b),
+        v.bits(a <= b),
+        v.bits(a > b),
+        v.bits(a >= b),
+        v.bits((a < b) | (a > b)),
+        v.lowest_bit(np.int64(40)),
+    )
 
 
 @njit
@@ -51,14 +58,27 @@ def test_float_operations_equal_numpy_lane_by_lane():
     a, b = x[:16], x[16:]
     out = np.zeros(192, np.float32)
     _floats(x, out)
-    exact = [a + b, a - b, a * b, a / b, None, None, np.sqrt(np.abs(a)), -a, np.minimum(a, b), np.maximum(a, b)]
+    exact = [
+        a + b,
+        a - b,
+        a * b,
+        a / b,
+        None,
+        None,
+        np.sqrt(np.abs(a)),
+        -a,
+        np.minimum(a, b),
+        np.maximum(a, b),
+    ]
     for i, want in enumerate(exact):
         if want is not None:
             assert np.array_equal(out[i * 16 : i * 16 + 16], want), i
     assert np.allclose(out[64:80], a * b + a, rtol=1e-5, atol=1e-6)
     assert np.allclose(out[80:96], a - a * b, rtol=1e-5, atol=1e-6)
     assert np.array_equal(out[160:176], np.where((a < b) & (a > -0.5), a, b))
-    assert np.array_equal(out[176:], (np.arange(16) % 4 + 10 * (np.arange(16) // 4)).astype(np.float32))
+    assert np.array_equal(
+        out[176:], (np.arange(16) % 4 + 10 * (np.arange(16) // 4)).astype(np.float32)
+    )
 
 
 def test_comparisons_with_nan_are_false_and_bits_follow_the_lanes():
@@ -86,7 +106,9 @@ def test_doubles_round_once_on_the_way_to_single_precision():
 def test_bits_of_integers_are_found_lane_by_lane():
     x = np.random.default_rng(2).integers(-(2**31), 2**31, 16).astype(np.int32)
     for position in (0, 5, 31):
-        assert _lanes_with_bit(x, position) == ((1 << np.arange(16))[(x >> position) & 1 == 1]).sum()
+        assert (
+            _lanes_with_bit(x, position) == ((1 << np.arange(16))[(x >> position) & 1 == 1]).sum()
+        )
 
 
 def test_counter_returns_what_it_held():

@@ -17,7 +17,9 @@ def camera(width: int, height: int, yaw_rad: float = 0.0, x_m: float = 0.0) -> P
 
 
 def view(alpha: np.ndarray, **pose: float) -> LogView:
-    return LogView(camera(alpha.shape[1], alpha.shape[0], **pose), np.ones(alpha.shape, np.float32), alpha)
+    return LogView(
+        camera(alpha.shape[1], alpha.shape[0], **pose), np.ones(alpha.shape, np.float32), alpha
+    )
 
 
 def test_same_pose_at_twice_the_size_repeats_what_the_view_saw() -> None:
@@ -39,7 +41,9 @@ def test_turning_left_moves_the_skyline_to_the_right() -> None:
 
 def test_nearest_view_that_looks_the_same_way_is_taken() -> None:
     clear, hidden = np.zeros((18, 32), np.float32), np.ones((18, 32), np.float32)
-    mask = SkyMask([view(clear, x_m=0.0), view(hidden, x_m=10.0), view(clear, x_m=9.0, yaw_rad=np.pi)])
+    mask = SkyMask(
+        [view(clear, x_m=0.0), view(hidden, x_m=10.0), view(clear, x_m=9.0, yaw_rad=np.pi)]
+    )
     assert mask.share(camera(32, 18, x_m=1.0)).min() == 1.0
     assert mask.share(camera(32, 18, x_m=9.0)).max() == 0.0
 
@@ -52,5 +56,7 @@ def test_directions_between_corners_are_those_at_the_middles_of_pixels() -> None
     height, width = 2 * STEP_PX + 3, 3 * STEP_PX + 5
     grid = np.random.default_rng(0).uniform(-1e3, 1e3, (4, 5))
     rows, columns = np.indices((height, width), dtype=np.float32)
-    plain = cv2.remap(grid.astype(np.float32), (columns + 0.5) / STEP_PX, (rows + 0.5) / STEP_PX, cv2.INTER_LINEAR)
+    plain = cv2.remap(
+        grid.astype(np.float32), (columns + 0.5) / STEP_PX, (rows + 0.5) / STEP_PX, cv2.INTER_LINEAR
+    )
     np.testing.assert_allclose(_upsample(grid, height, width), plain, rtol=1e-6, atol=2e-4)

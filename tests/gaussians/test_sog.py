@@ -1,4 +1,6 @@
-"""SOG: what a writer quantised comes back, from a folder and from a zip; real models; and what cannot be is said."""
+"""SOG: what a writer quantised comes back, from a folder and from a zip; real models; and what
+cannot be is said.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ def write_sog(folder: Path) -> dict[str, np.ndarray]:
     quats = rng.normal(0, 1, (N, 4))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     codebook = np.sort(rng.uniform(-6, 0, 256))
-    scales, colours, alphas = (rng.integers(0, 256, shape).astype(np.uint8) for shape in ((N, 3), (N, 3), N))
+    scales, colours, alphas = (
+        rng.integers(0, 256, shape).astype(np.uint8) for shape in ((N, 3), (N, 3), N)
+    )
     bands, palette = rng.integers(0, 256, (64, 3, 3)).astype(np.uint8), rng.integers(0, 64, N)
     logs = np.sign(means) * np.log1p(np.abs(means))
     low, high = logs.min(axis=0), logs.max(axis=0)
@@ -52,14 +56,32 @@ def write_sog(folder: Path) -> dict[str, np.ndarray]:
     save("shN_centroids.webp", bands.reshape(-1, 3), (1, 64 * 3))
     save("shN_labels.webp", np.column_stack([palette, 0 * palette]))
     meta = {
-        "version": 2, "count": N, "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
-        "scales": {"codebook": codebook.tolist(), "files": ["scales.webp"]}, "quats": {"files": ["quats.webp"]},
+        "version": 2,
+        "count": N,
+        "means": {
+            "mins": low.tolist(),
+            "maxs": high.tolist(),
+            "files": ["means_l.webp", "means_u.webp"],
+        },
+        "scales": {"codebook": codebook.tolist(), "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": codebook.tolist(), "files": ["sh0.webp"]},
-        "shN": {"count": 64, "bands": 1, "codebook": codebook.tolist(), "files": ["shN_centroids.webp", "shN_labels.webp"]},
-    }  # fmt: skip
+        "shN": {
+            "count": 64,
+            "bands": 1,
+            "codebook": codebook.tolist(),
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+        },
+    }
     (folder / "meta.json").write_text(json.dumps(meta))
     sh = np.concatenate([codebook[colours][:, None], codebook[bands][palette]], axis=1)
-    return {"means": means, "quats": quats, "scales": np.exp(codebook[scales]), "opacities": np.maximum(alphas, 1) / 255, "sh": sh}
+    return {
+        "means": means,
+        "quats": quats,
+        "scales": np.exp(codebook[scales]),
+        "opacities": np.maximum(alphas, 1) / 255,
+        "sh": sh,
+    }
 
 
 @pytest.mark.parametrize("zipped", [False, True], ids=["folder", "zip"])
@@ -95,11 +117,26 @@ def test_three_levels_of_a_real_model_agree(data_set: Callable[[str], Path]) -> 
         (lambda f: (f / "quats.webp").unlink(), "quats.webp"),
         (lambda f: (f / "sh0.webp").write_bytes((f / "sh0.webp").read_bytes()[:40]), "sh0.webp"),
         (lambda f: (f / "scales.webp").write_bytes(b"\x89PNG"), "no WebP"),
-        (lambda f: (f / "meta.json").write_text((f / "meta.json").read_text().replace('"version": 2', '"version": 1')), "version 1"),
-        (lambda f: (f / "meta.json").write_text((f / "meta.json").read_text().replace('"count": 90', '"count": 101')), "100 pixels"),
-        (lambda f: (f / "meta.json").write_text((f / "meta.json").read_text().replace('"count": 90', '"count": 30000000')), "30,000,000"),
+        (
+            lambda f: (f / "meta.json").write_text(
+                (f / "meta.json").read_text().replace('"version": 2', '"version": 1')
+            ),
+            "version 1",
+        ),
+        (
+            lambda f: (f / "meta.json").write_text(
+                (f / "meta.json").read_text().replace('"count": 90', '"count": 101')
+            ),
+            "100 pixels",
+        ),
+        (
+            lambda f: (f / "meta.json").write_text(
+                (f / "meta.json").read_text().replace('"count": 90', '"count": 30000000')
+            ),
+            "30,000,000",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_a_model_is_said(tmp_path: Path, change: object, says: str) -> None:
     write_sog(tmp_path / "model")
     change(tmp_path / "model")  # type: ignore[operator]

@@ -1,4 +1,6 @@
-"""The Gymnasium environments: the API's own check, the same rollout as a run, the same scores, and how episodes end."""
+"""The Gymnasium environments: the API's own check, the same rollout as a run, the same scores, and
+how episodes end.
+"""
 
 from __future__ import annotations
 
@@ -38,8 +40,12 @@ STRAIGHT = "road.segments=[{kind: straight, length_m: 220}]"
 STRAIGHT_ON = np.zeros(2, np.float32)
 
 
-def finish(env: DriveEnv, action: Any = STRAIGHT_ON) -> tuple[float, bool, bool, dict[str, Any], int]:
-    """Repeat an action to the end of the episode; return the last reward, flags and info, and the number of steps."""
+def finish(
+    env: DriveEnv, action: Any = STRAIGHT_ON
+) -> tuple[float, bool, bool, dict[str, Any], int]:
+    """Repeat an action to the end of the episode; return the last reward, flags and info, and the
+    number of steps.
+    """
     for n in range(1, 200):
         _, worth, terminated, truncated, info = env.step(action)
         if terminated or truncated:
@@ -47,10 +53,15 @@ def finish(env: DriveEnv, action: Any = STRAIGHT_ON) -> tuple[float, bool, bool,
     raise AssertionError("the episode does not end")
 
 
-@pytest.mark.parametrize(("name", "camera"), [pytest.param(doors.DRIVE, "front", marks=pytest.mark.slow), (doors.PLAN, "")])
+@pytest.mark.parametrize(
+    ("name", "camera"),
+    [pytest.param(doors.DRIVE, "front", marks=pytest.mark.slow), (doors.PLAN, "")],
+)
 @pytest.mark.filterwarnings("error::UserWarning")
 def test_gymnasiums_own_check_finds_nothing(name: str, camera: str) -> None:
-    env = gymnasium.make(name, overrides=(SMALL, *SHORT), camera=camera, render_mode="rgb_array" if camera else None)
+    env = gymnasium.make(
+        name, overrides=(SMALL, *SHORT), camera=camera, render_mode="rgb_array" if camera else None
+    )
     check_env(env.unwrapped, skip_close_check=True)
     if camera:
         assert env.unwrapped.render().shape == (36, 64, 3)
@@ -59,7 +70,12 @@ def test_gymnasiums_own_check_finds_nothing(name: str, camera: str) -> None:
 
 def test_stepping_with_a_policys_plans_is_the_rollout_of_a_run() -> None:
     env = DriveEnv(
-        "smoke/lead_car", "trajectory", camera="", horizon_us=5_000_000, step_us=100_000, overrides=("timing.duration_us=2500000",)
+        "smoke/lead_car",
+        "trajectory",
+        camera="",
+        horizon_us=5_000_000,
+        step_us=100_000,
+        overrides=("timing.duration_us=2500000",),
     )
     _, info = env.reset(seed=3)
     policy = make_policy("pure-pursuit", env.scenario)
@@ -73,7 +89,9 @@ def test_stepping_with_a_policys_plans_is_the_rollout_of_a_run() -> None:
     stepped = read_asl(Path(env._folder.name) / LOG_NAME)  # type: ignore[union-attr]
 
     class Recorded(Policy):
-        """The same policy as the environment lets it drive: with a straight plan while the recording is forced."""
+        """The same policy as the environment lets it drive: with a straight plan while the
+        recording is forced.
+        """
 
         sensors = env._sensors
 
@@ -85,16 +103,31 @@ def test_stepping_with_a_policys_plans_is_the_rollout_of_a_run() -> None:
             if observation.t_us < env.scenario.start_us + env.scenario.warmup_us:
                 return forced(observation)
             plan = self.own.act(observation)
-            return Plan(plan.t_us, plan.times_us, np.vstack([np.zeros(2), plan.xy[1:]]), np.r_[0.0, plan.yaw[1:]])
+            return Plan(
+                plan.t_us,
+                plan.times_us,
+                np.vstack([np.zeros(2), plan.xy[1:]]),
+                np.r_[0.0, plan.yaw[1:]],
+            )
 
     def forced(observation: Observation) -> Plan:
         times = observation.t_us + np.arange(0, 2_000_001, 100_000)
-        xy = np.column_stack([observation.ego.speed_mps * (times - times[0]) * 1e-6, np.zeros(len(times))])
+        xy = np.column_stack(
+            [observation.ego.speed_mps * (times - times[0]) * 1e-6, np.zeros(len(times))]
+        )
         return Plan(observation.t_us, times, xy, np.zeros(len(times)))
 
     with Recorder(env.scenario, stepped.seed, images="none") as recorder:
-        run_rollout(env.scenario, make_renderer("clean", env.scenario, stepped.seed, threads=1), Recorded(), stepped.seed, recorder)
-    assert (Path(env._folder.name) / LOG_NAME).read_bytes() == (recorder.folder / LOG_NAME).read_bytes()  # type: ignore[union-attr]
+        run_rollout(
+            env.scenario,
+            make_renderer("clean", env.scenario, stepped.seed, threads=1),
+            Recorded(),
+            stepped.seed,
+            recorder,
+        )
+    assert (Path(env._folder.name) / LOG_NAME).read_bytes() == (
+        recorder.folder / LOG_NAME
+    ).read_bytes()  # type: ignore[union-attr]
     assert info["ended"] == "path_end"
     env.close()
 
@@ -115,10 +148,16 @@ def test_the_reward_is_that_of_the_evaluators_and_leaving_the_road_ends_the_epis
     found = {one.name: one for one in score(log, env.scenario.scene, "paper")}
     at = np.searchsorted(log.ego.t_us, [one["t_us"] for one in facts])
     for name in ("lateral_distance_m", "progress"):
-        np.testing.assert_allclose([one[name] for one in facts], found[name].value[at], atol=1e-5)  # poses in the log are float32
+        np.testing.assert_allclose(
+            [one[name] for one in facts], found[name].value[at], atol=1e-5
+        )  # poses in the log are float32
     assert np.flatnonzero(found["offroad"].value).tolist() == [len(log.ego.t_us) - 1]
     lateral, share = found["lateral_distance_m"].value[at], found["progress"].value[at]
-    wanted = 0.1 * (share[-1] - share[0]) * found["gt_dist_traveled_m"].value[0] - 0.5 * 0.1 * lateral[1:].sum() - 5.0
+    wanted = (
+        0.1 * (share[-1] - share[0]) * found["gt_dist_traveled_m"].value[0]
+        - 0.5 * 0.1 * lateral[1:].sum()
+        - 5.0
+    )
     assert total == pytest.approx(wanted, abs=1e-4)
     with pytest.raises(InputError, match=r"call reset\(\) first"):
         env.step(STRAIGHT_ON)
@@ -127,7 +166,9 @@ def test_the_reward_is_that_of_the_evaluators_and_leaving_the_road_ends_the_epis
 
 @pytest.mark.slow
 def test_a_contact_ends_the_episode() -> None:
-    env = DriveEnv("smoke/lead_car", camera="", overrides=(STRAIGHT,), reward=doors.Reward(collision=7.0))
+    env = DriveEnv(
+        "smoke/lead_car", camera="", overrides=(STRAIGHT,), reward=doors.Reward(collision=7.0)
+    )
     env.reset(seed=0)
     worth, terminated, _, info, _ = finish(env, np.array([0.0, 1.0], np.float32))
     assert (terminated, info["ended"], info["metrics"]["collision_any"]) == (True, "collision", 1.0)
@@ -161,7 +202,9 @@ def test_wheel_and_pedals_do_what_they_say() -> None:
     speeds = [float(env.step(np.array([0.0, -1.0], np.float32))[0]["speed"][0]) for _ in range(3)]
     assert speeds[0] > speeds[1] > speeds[2]
     plan = env._actions.plan(np.array([0.0, 1.0]), env.observation)
-    assert plan.xy[-1, 0] > 2.0 * env.observation.ego.speed_mps, "the plan in the log is where the command leads"
+    assert plan.xy[-1, 0] > 2.0 * env.observation.ego.speed_mps, (
+        "the plan in the log is where the command leads"
+    )
     env.close()
 
 
@@ -210,7 +253,9 @@ def test_the_training_script_of_the_page_runs(tmp_path: Path) -> None:
     repo = Path(__file__).resolve().parents[2]
     environment = os.environ | {"PYTHONPATH": str(repo)}
     words = [sys.executable, "train_ppo.py", "0.05"]
-    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
     assert re.search(r"^\d+ steps in 0\.\d minutes$", done.stdout, re.M)
     assert (tmp_path / "ppo_curve.zip").exists()
 
@@ -218,7 +263,13 @@ def test_the_training_script_of_the_page_runs(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_environments_run_in_processes_and_agree_with_one_in_this_process() -> None:
     settings = {"camera": "", "overrides": SHORT}
-    several = gymnasium.make_vec(doors.DRIVE, num_envs=2, vectorization_mode="async", vector_kwargs={"context": "spawn"}, **settings)
+    several = gymnasium.make_vec(
+        doors.DRIVE,
+        num_envs=2,
+        vectorization_mode="async",
+        vector_kwargs={"context": "spawn"},
+        **settings,
+    )
     seen, _ = several.reset(seed=[4, 5])
     one = DriveEnv(**settings)  # type: ignore[arg-type]
     own, _ = one.reset(seed=5)

@@ -14,14 +14,23 @@ from tests.fuzz.uses import Target, one_of
 
 
 def toy_training(folder: Path) -> Any:
-    """Return a trainer of one small layer, four updates long, that continues what the folder holds."""
+    """Return a trainer of one small layer, four updates long, that continues what the folder
+    holds.
+    """
     import torch
 
     from alpasim_plugin.lab.training.trainer import Schedule, Trainer
 
     torch.manual_seed(0)
     net = torch.nn.Linear(2, 2)
-    return Trainer(net, folder, Schedule(4, 1e-3, 0), lambda i: torch.ones(1, 2) * i, lambda x, i: (net(x).square().mean(), {}), {"toy": 1})
+    return Trainer(
+        net,
+        folder,
+        Schedule(4, 1e-3, 0),
+        lambda i: torch.ones(1, 2) * i,
+        lambda x, i: (net(x).square().mean(), {}),
+        {"toy": 1},
+    )
 
 
 def make_training_run(folder: Path) -> None:
@@ -63,11 +72,22 @@ def pairs_header(shape: tuple[int, ...]) -> Make:
         sequence.mkdir(parents=True)
         (sequence / "sequence.json").write_text("{}")
         for name, axes, dtype in (
-            ("rgb_input", 4, "|u1"), ("rgb_gt", 4, "|u1"), ("opacity", 3, "|u1"), ("sdmap", 4, "|u1"), ("T_world_camera", 3, "<f8"),
+            ("rgb_input", 4, "|u1"),
+            ("rgb_gt", 4, "|u1"),
+            ("opacity", 3, "|u1"),
+            ("sdmap", 4, "|u1"),
+            ("T_world_camera", 3, "<f8"),
             ("t_us", 1, "<i8"),
-        ):  # fmt: skip
-            head = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape[:axes]!r}, }}".ljust(117) + "\n"
-            (sequence / f"{name}.npy").write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head.encode() + b"\0" * 64)
+        ):
+            head = (
+                f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape[:axes]!r}, }}".ljust(
+                    117
+                )
+                + "\n"
+            )
+            (sequence / f"{name}.npy").write_bytes(
+                b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head.encode() + b"\0" * 64
+            )
         return ["train", "pairs-sheet", str(folder / "pairs"), "--out", str(folder / "sheet.png")]
 
     return make

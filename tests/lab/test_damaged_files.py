@@ -1,4 +1,6 @@
-"""Nothing that a file of the laboratory holds makes its reader hang, swell or show its internals."""
+"""Nothing that a file of the laboratory holds makes its reader hang, swell or show its
+internals.
+"""
 
 from __future__ import annotations
 
@@ -17,4 +19,7 @@ from tests.lab.fuzz_targets import TARGETS
 def test_damaged_files_are_refused_or_usable(target: Target) -> None:
     with workplace() as folder:
         for number in range(SLICE):
-            assert check(target, inputs(target, random.Random(f"suite/{number}")), folder) in ("refused", "accepted")
+            assert check(target, inputs(target, random.Random(f"suite/{number}")), folder) in (
+                "refused",
+                "accepted",
+            )

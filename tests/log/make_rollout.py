@@ -7,7 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.geometry import quat_from_yaw, se2, se3
-from alpasim_plugin.core.types import Actor, Box, CameraSpec, EgoState, Frame, RenderRequest, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    Actor,
+    Box,
+    CameraSpec,
+    EgoState,
+    Frame,
+    RenderRequest,
+    Trajectory,
+    Vehicle,
+)
 from alpasim_plugin.log import AslWriter, RolloutHeader
 
 T0_US = 1_689_697_803_493_732  # a Unix-epoch time: too large for any float
@@ -22,7 +31,9 @@ CAMERA = CameraSpec(
 )
 
 
-def straight(n: int, speed_mps: float = 10.0, first_us: int = T0_US, y_m: float = 0.0, yaw_rad: float = 0.3) -> Trajectory:
+def straight(
+    n: int, speed_mps: float = 10.0, first_us: int = T0_US, y_m: float = 0.0, yaw_rad: float = 0.3
+) -> Trajectory:
     t_us = first_us + STEP_US * np.arange(n, dtype=np.int64)
     s = speed_mps * (t_us - first_us) / 1e6
     xyz = np.column_stack([s * np.cos(yaw_rad), y_m + s * np.sin(yaw_rad), np.full(n, 0.25)])
@@ -31,7 +42,12 @@ def straight(n: int, speed_mps: float = 10.0, first_us: int = T0_US, y_m: float 
 
 ACTORS = (
     Actor("7", "automobile", Box(4.6, 1.9, 1.6), straight(12, 8.0, y_m=3.5)),
-    Actor("late", "person", Box(0.6, 0.7, 1.8), straight(5, 1.0, first_us=T0_US + 4 * STEP_US, y_m=-4.0)),
+    Actor(
+        "late",
+        "person",
+        Box(0.6, 0.7, 1.8),
+        straight(5, 1.0, first_us=T0_US + 4 * STEP_US, y_m=-4.0),
+    ),
     Actor("wall", "other", Box(9.0, 0.4, 1.0), straight(12, 0.0, y_m=-8.0), is_static=True),
 )
 HEADER = RolloutHeader(
@@ -60,7 +76,13 @@ def present(t_us: int) -> dict[str, np.ndarray]:
 
 def ego_at(step: int) -> EgoState:
     log = HEADER.ego_log
-    return EgoState(int(log.t_us[step]), se3(log.xyz[step], log.quat[step]), 10.0, accel_mps2=0.5, yaw_rate_radps=0.1)
+    return EgoState(
+        int(log.t_us[step]),
+        se3(log.xyz[step], log.quat[step]),
+        10.0,
+        accel_mps2=0.5,
+        yaw_rate_radps=0.1,
+    )
 
 
 def picture(step: int) -> np.ndarray:
@@ -70,21 +92,32 @@ def picture(step: int) -> np.ndarray:
 
 def plan_at(step: int) -> Trajectory:
     log = HEADER.ego_log
-    return Trajectory(log.t_us[step : step + 6], log.xyz[step : step + 6], log.quat[step : step + 6])
+    return Trajectory(
+        log.t_us[step : step + 6], log.xyz[step : step + 6], log.quat[step : step + 6]
+    )
 
 
 def write_rollout(path: Path, encoding: str = "png") -> Path:
     """Write four steps in the order of AlpaSim's runtime; the driver's first answer is empty."""
     with AslWriter(path, HEADER) as log:
         log.begin([CAMERA])
-        log.actor_poses(HEADER.render_start_us, ego_at(1).T_world_rig, present(HEADER.render_start_us))
+        log.actor_poses(
+            HEADER.render_start_us, ego_at(1).T_world_rig, present(HEADER.render_start_us)
+        )
         for step in range(1, 5):
             state, following = ego_at(step), ego_at(step + 1)
             _frame(log, state, encoding)
             log.ego_trajectory([ego_at(0), state] if step == 1 else [state])
-            log.route(state.t_us, np.concatenate([np.arange(54.0).reshape(18, 3), np.full((2, 3), np.nan)]))
+            log.route(
+                state.t_us,
+                np.concatenate([np.arange(54.0).reshape(18, 3), np.full((2, 3), np.nan)]),
+            )
             log.driver_request(state.t_us, following.t_us)
-            plan = plan_at(step) if step > 1 else Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
+            plan = (
+                plan_at(step)
+                if step > 1
+                else Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
+            )
             log.driver_return(plan, [plan, plan_at(step)] if step > 2 else [])
             log.controller_request(state, plan, following.t_us, forced=step < 3)
             log.controller_return(following)
@@ -96,6 +129,8 @@ def write_rollout(path: Path, encoding: str = "png") -> Path:
 def _frame(log: AslWriter, state: EgoState, encoding: str) -> None:
     T = state.T_world_rig @ CAMERA.T_rig_camera
     T_start = state.T_world_rig @ se2(-0.3, 0, 0) @ CAMERA.T_rig_camera
-    log.render_request([RenderRequest(state.t_us, CAMERA, np.stack([T_start, T]), present(state.t_us))], encoding)
+    log.render_request(
+        [RenderRequest(state.t_us, CAMERA, np.stack([T_start, T]), present(state.t_us))], encoding
+    )
     step = int((state.t_us - T0_US) // STEP_US)
     log.camera_image(Frame(state.t_us, CAMERA.name, picture(step)), encoding, CAMERA.shutter_us)

@@ -30,7 +30,11 @@ def test_every_log_written_by_alpasim_is_read(shared_data: Path) -> None:
         assert log.warnings == ()
         assert (log.session_uuid, log.scene_id) == (path.parent.name, path.parent.parent.name)
         counts = log.info["entries"]
-        assert len(log.plans) + log.info["empty_plans"] == counts["driver_return"] == counts["driver_request"]
+        assert (
+            len(log.plans) + log.info["empty_plans"]
+            == counts["driver_return"]
+            == counts["driver_request"]
+        )
         assert len(log.images) == counts["driver_camera_image"]
         assert len(log.ego) == counts["actor_poses"]
         assert log.ego.t_us[0] == log.start_us == log.ego_log.t_us[0] == 1_689_697_803_493_732
@@ -70,7 +74,9 @@ def test_every_log_written_by_alpasim_is_read(shared_data: Path) -> None:
         ("synthetic-vru-offset-a", 100_000, 1_700_000, 4),
     ],
 )
-def test_golden_headers(shared_data: Path, scene: str, control_us: int, force_gt_us: int, n_actors: int | None) -> None:
+def test_golden_headers(
+    shared_data: Path, scene: str, control_us: int, force_gt_us: int, n_actors: int | None
+) -> None:
     for path in sorted((shared_data / "alpasim-golden" / "rollouts" / scene).rglob("*.asl")):
         log = read_log(path)
         assert (log.control_us, log.force_gt_us) == (control_us, force_gt_us)
@@ -84,7 +90,10 @@ def test_golden_ego_size_comes_from_the_first_definition(shared_data: Path) -> N
 
 
 def test_golden_plans_rollout_has_empty_and_sampled_answers(shared_data: Path) -> None:
-    logs = [read_asl(p) for p in sorted((shared_data / "alpasim-golden/rollouts/synthetic-plans-a").rglob("*.asl"))]
+    logs = [
+        read_asl(p)
+        for p in sorted((shared_data / "alpasim-golden/rollouts/synthetic-plans-a").rglob("*.asl"))
+    ]
     assert [log.info["empty_plans"] for log in logs] == [0, 11]
     assert {len(plan.samples) for plan in logs[1].plans} == set(range(8))
 

@@ -1,4 +1,6 @@
-"""A clock that was set back or forward: folders from the future, and times that no clock shows, are read as others are."""
+"""A clock that was set back or forward: folders from the future, and times that no clock shows, are
+read as others are.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +16,21 @@ from tests.core.checksum_files import vouch_for
 
 
 @pytest.mark.parametrize("time_s", [-(10**6), 0, 2**33])
-def test_a_folder_of_another_time_is_whole_and_read(tmp_path: Path, usual_run: Path, time_s: int) -> None:
+def test_a_folder_of_another_time_is_whole_and_read(
+    tmp_path: Path, usual_run: Path, time_s: int
+) -> None:
     run = shutil.copytree(usual_run, tmp_path / "run")
-    (run / "run.json").write_text(json.dumps(json.loads((run / "run.json").read_text()) | {"started_at": "2131-01-01T00:00:00+00:00"}))
+    (run / "run.json").write_text(
+        json.dumps(
+            json.loads((run / "run.json").read_text()) | {"started_at": "2131-01-01T00:00:00+00:00"}
+        )
+    )
     vouch_for(run)
     for path in (run, *run.rglob("*")):
         os.utime(path, (time_s, time_s))
-    for words in (["check", str(run)], ["compare", str(run)], ["runs", str(tmp_path), "--since", "1d"]):
+    for words in (
+        ["check", str(run)],
+        ["compare", str(run)],
+        ["runs", str(tmp_path), "--since", "1d"],
+    ):
         assert run_command(words) == 0

@@ -52,7 +52,13 @@ def edited(path: Path, change: object) -> Path:
 
 
 def test_log_of_the_five_scored_kinds_is_enough(path: Path, log: RolloutLog) -> None:
-    needed = {"rollout_metadata", "actor_poses", "driver_request", "driver_return", "driver_camera_image"}
+    needed = {
+        "rollout_metadata",
+        "actor_poses",
+        "driver_request",
+        "driver_return",
+        "driver_camera_image",
+    }
     bare = read_asl(edited(path, lambda i, e: e if e.WhichOneof("log_entry") in needed else None))
     np.testing.assert_array_equal(bare.ego.xyz, log.ego.xyz)
     assert len(bare.plans) == len(log.plans)

@@ -35,7 +35,13 @@ def test_views_that_are_not_contiguous_are_encoded_as_seen() -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [np.zeros((4, 4, 3)), np.zeros((4, 4), np.uint8), np.zeros((4, 4, 4), np.uint8), np.zeros((0, 4, 3), np.uint8)]
+    "bad",
+    [
+        np.zeros((4, 4, 3)),
+        np.zeros((4, 4), np.uint8),
+        np.zeros((4, 4, 4), np.uint8),
+        np.zeros((0, 4, 3), np.uint8),
+    ],
 )
 def test_other_arrays_are_refused(bad: np.ndarray) -> None:
     with pytest.raises(InputError, match=r"not \(H, W, 3\) uint8"):
@@ -49,14 +55,26 @@ def test_bytes_that_are_no_image_are_refused(data: bytes) -> None:
 
 
 def test_facts_come_back_as_given(tmp_path: Path) -> None:
-    rows = [{"t_us": 1_689_697_803_493_732, "camera": "front", "alpha_mean": 0.98, "events": "", "late": False, "none": None}, {}]
+    rows = [
+        {
+            "t_us": 1_689_697_803_493_732,
+            "camera": "front",
+            "alpha_mean": 0.98,
+            "events": "",
+            "late": False,
+            "none": None,
+        },
+        {},
+    ]
     write_facts(tmp_path / "frames.jsonl", rows)
     assert read_facts(tmp_path / "frames.jsonl") == rows
     assert [p.name for p in tmp_path.iterdir()] == ["frames.jsonl"]
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), object()])
-def test_facts_that_json_cannot_hold_are_refused_and_leave_no_file(tmp_path: Path, value: object) -> None:
+def test_facts_that_json_cannot_hold_are_refused_and_leave_no_file(
+    tmp_path: Path, value: object
+) -> None:
     with pytest.raises(InputError, match="writing facts"):
         write_facts(tmp_path / "frames.jsonl", [{"a": value}])  # type: ignore[dict-item]
     assert list(tmp_path.iterdir()) == []

@@ -20,7 +20,9 @@ def logs(shared_data: Path) -> list[Path]:
 
 
 def test_alpasims_own_logs_are_copied_byte_by_byte(logs: list[Path], tmp_path: Path) -> None:
-    whole = [log for log in logs if log.parent == min(log.parent.parent.iterdir())][::4]  # complete logs, of a few scenes
+    whole = [log for log in logs if log.parent == min(log.parent.parent.iterdir())][
+        ::4
+    ]  # complete logs, of a few scenes
     assert len(whole) > 4
     for log in whole:
         copy_log(log, tmp_path / "copy.asl", Renaming())
@@ -35,7 +37,10 @@ def test_a_renamed_log_differs_in_its_names_alone(logs: list[Path], tmp_path: Pa
     assert old.encode() not in target.read_bytes()
     assert camera.encode() not in target.read_bytes()
     log = read_asl(target)
-    assert (log.session_uuid, {image.camera for image in log.images}) == (new, {"other_camera_of_24_bytes"})
+    assert (log.session_uuid, {image.camera for image in log.images}) == (
+        new,
+        {"other_camera_of_24_bytes"},
+    )
     copy_log(target, tmp_path / "back.asl", Renaming(old, {"other_camera_of_24_bytes": camera}))
     assert (tmp_path / "back.asl").read_bytes() == source.read_bytes()
 
@@ -52,7 +57,9 @@ def test_stages_follow_one_another(logs: list[Path], tmp_path: Path) -> None:
     assert count == 2 * sum(1 for _ in AslReader(logs[0]))
 
 
-@given(st.lists(st.integers(0, 2**63 - 1), min_size=2, max_size=8, unique=True), st.text(), st.text())
+@given(
+    st.lists(st.integers(0, 2**63 - 1), min_size=2, max_size=8, unique=True), st.text(), st.text()
+)
 def test_session_ids_sort_as_their_seeds(seeds: list[int], one: str, other: str) -> None:
     ids = {seed: session_uuid(seed, one if i % 2 else other) for i, seed in enumerate(seeds)}
     assert sorted(seeds) == sorted(seeds, key=ids.__getitem__)

@@ -1,4 +1,6 @@
-"""Rollout logs that we write: order, times and numbers of every entry, and what the reader makes of them."""
+"""Rollout logs that we write: order, times and numbers of every entry, and what the reader makes of
+them.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,18 @@ from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import AslWriter, decode_image, read_asl
 from alpasim_plugin.log.asl import AslReader
-from tests.log.make_rollout import ACTORS, CAMERA, HEADER, STEP_US, T0_US, ego_at, picture, plan_at, present, write_rollout
+from tests.log.make_rollout import (
+    ACTORS,
+    CAMERA,
+    HEADER,
+    STEP_US,
+    T0_US,
+    ego_at,
+    picture,
+    plan_at,
+    present,
+    write_rollout,
+)
 
 
 def test_entries_stand_in_the_order_of_alpasims_runtime(path: Path) -> None:
@@ -28,13 +41,29 @@ def test_ego_is_first_in_definitions_and_last_in_poses(path: Path) -> None:
     definitions = entries[0].rollout_metadata.actor_definitions.actor_aabb
     assert [d.actor_id for d in definitions] == ["EGO", "7", "late", "wall"]
     assert [d.actor_label for d in definitions] == ["", "automobile", "person", "other"]
-    assert all(e.actor_poses.actor_poses[-1].actor_id == "EGO" for e in entries if e.HasField("actor_poses"))
-    objects = next(e for e in entries if e.HasField("traffic_session_request")).traffic_session_request.logged_object_trajectories
-    assert [(o.object_id, o.is_static) for o in objects] == [("EGO", False), ("7", False), ("late", False), ("wall", True)]
+    assert all(
+        e.actor_poses.actor_poses[-1].actor_id == "EGO"
+        for e in entries
+        if e.HasField("actor_poses")
+    )
+    objects = next(
+        e for e in entries if e.HasField("traffic_session_request")
+    ).traffic_session_request.logged_object_trajectories
+    assert [(o.object_id, o.is_static) for o in objects] == [
+        ("EGO", False),
+        ("7", False),
+        ("late", False),
+        ("wall", True),
+    ]
 
 
 def test_times_and_sizes_are_exact(log: RolloutLog) -> None:
-    assert (log.start_us, log.render_start_us, log.force_gt_us, log.control_us) == (T0_US, T0_US + STEP_US, 3 * STEP_US, STEP_US)
+    assert (log.start_us, log.render_start_us, log.force_gt_us, log.control_us) == (
+        T0_US,
+        T0_US + STEP_US,
+        3 * STEP_US,
+        STEP_US,
+    )
     assert log.ego.t_us.tolist() == [T0_US + i * STEP_US for i in range(6)]
     assert log.ego_box == HEADER.vehicle.box
     assert {i: a.box for i, a in log.actors.items()} == {a.actor_id: a.box for a in ACTORS}
@@ -45,7 +74,9 @@ def test_times_and_sizes_are_exact(log: RolloutLog) -> None:
 def test_ego_in_the_log_is_the_box_centre(log: RolloutLog) -> None:
     yaw, offset = 0.3, HEADER.vehicle.rear_axle_to_centre_m
     rig = HEADER.ego_log.xyz[:6]
-    expected = rig + np.array([offset * np.cos(yaw), offset * np.sin(yaw), HEADER.vehicle.box.height_m / 2])
+    expected = rig + np.array(
+        [offset * np.cos(yaw), offset * np.sin(yaw), HEADER.vehicle.box.height_m / 2]
+    )
     np.testing.assert_allclose(log.ego.xyz, expected, atol=1e-6)
     np.testing.assert_allclose(yaw_from_quat(log.ego.quat), yaw, atol=1e-7)
     np.testing.assert_allclose(log.T_rig_box[:3, 3], [offset, 0, 0.8], atol=1e-6)
@@ -60,7 +91,9 @@ def test_actor_is_there_only_while_it_was_present(log: RolloutLog) -> None:
 
 
 def test_plans_are_absolute_and_empty_answers_are_counted_not_kept(log: RolloutLog) -> None:
-    assert [(p.now_us, p.query_us) for p in log.plans] == [(T0_US + i * STEP_US, T0_US + (i + 1) * STEP_US) for i in (2, 3, 4)]
+    assert [(p.now_us, p.query_us) for p in log.plans] == [
+        (T0_US + i * STEP_US, T0_US + (i + 1) * STEP_US) for i in (2, 3, 4)
+    ]
     assert log.info["empty_plans"] == 1
     for step, plan in zip((2, 3, 4), log.plans, strict=True):
         assert plan.trajectory.t_us[0] == plan.now_us
@@ -70,7 +103,9 @@ def test_plans_are_absolute_and_empty_answers_are_counted_not_kept(log: RolloutL
 
 def test_png_images_come_back_pixel_for_pixel_in_time_order(log: RolloutLog) -> None:
     assert [i.end_us for i in log.images] == [T0_US + s * STEP_US for s in range(1, 6)]
-    assert all(i.end_us - i.start_us == CAMERA.shutter_us and i.camera == CAMERA.name for i in log.images)
+    assert all(
+        i.end_us - i.start_us == CAMERA.shutter_us and i.camera == CAMERA.name for i in log.images
+    )
     for step, image in enumerate(log.images, start=1):
         np.testing.assert_array_equal(decode_image(image.data), picture(step))
 
@@ -122,18 +157,28 @@ def test_route_keeps_its_missing_end(path: Path) -> None:
 
 
 def test_render_request_tells_both_shutter_ends(path: Path) -> None:
-    item = next(e.batch_render_request for e in AslReader(path) if e.HasField("batch_render_request")).items[0]
+    item = next(
+        e.batch_render_request for e in AslReader(path) if e.HasField("batch_render_request")
+    ).items[0]
     request = item.request
-    assert (item.camera_name, request.frame_end_us - request.frame_start_us) == (CAMERA.name, 30_000)
+    assert (item.camera_name, request.frame_end_us - request.frame_start_us) == (
+        CAMERA.name,
+        30_000,
+    )
     assert (request.resolution_h, request.resolution_w) == (40, 64)
     ends = request.sensor_pose
-    moved = np.hypot(ends.end_pose.vec.x - ends.start_pose.vec.x, ends.end_pose.vec.y - ends.start_pose.vec.y)
+    moved = np.hypot(
+        ends.end_pose.vec.x - ends.start_pose.vec.x, ends.end_pose.vec.y - ends.start_pose.vec.y
+    )
     assert moved == pytest.approx(0.3, abs=1e-5)
     assert [o.track_id for o in request.dynamic_objects] == ["7", "wall"]
 
 
 def test_two_writes_give_the_same_bytes(tmp_path: Path) -> None:
-    assert write_rollout(tmp_path / "a.asl").read_bytes() == write_rollout(tmp_path / "b.asl").read_bytes()
+    assert (
+        write_rollout(tmp_path / "a.asl").read_bytes()
+        == write_rollout(tmp_path / "b.asl").read_bytes()
+    )
 
 
 def test_log_without_context_before_the_first_frame_has_no_double_time(tmp_path: Path) -> None:

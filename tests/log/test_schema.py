@@ -1,4 +1,6 @@
-"""The tables and files of a run folder are what the schema says: in the writer, in the reader, and on the pages."""
+"""The tables and files of a run folder are what the schema says: in the writer, in the reader, and
+on the pages.
+"""
 
 from __future__ import annotations
 
@@ -30,13 +32,33 @@ from evaluators.opening import read_run, read_so_far
 from tests.core.checksum_files import vouch_for
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-ROW = {"renderer": "clean", "policy": "p", "scene": "s", "seed": 0, "status": "ok", "path": "rollouts/x", "wall_s": 1.0, "frames": 3}
+ROW = {
+    "renderer": "clean",
+    "policy": "p",
+    "scene": "s",
+    "seed": 0,
+    "status": "ok",
+    "path": "rollouts/x",
+    "wall_s": 1.0,
+    "frames": 3,
+}
 ROWS = [ROW | {"offroad": 0.0, "offroad_valid": True, "seed": seed} for seed in range(3)]
-STEP = {"renderer": "clean", "policy": "p", "scene": "s", "seed": 0, "t_us": 5, "metric": "offroad", "value": 0.0, "valid": True}
+STEP = {
+    "renderer": "clean",
+    "policy": "p",
+    "scene": "s",
+    "seed": 0,
+    "t_us": 5,
+    "metric": "offroad",
+    "value": 0.0,
+    "valid": True,
+}
 
 
 def changed(column: str, value: Any) -> pa.Table:
-    """Return the rows with another value of a column in the last one, or with another column where ``value`` is a list."""
+    """Return the rows with another value of a column in the last one, or with another column where
+    ``value`` is a list.
+    """
     table = pa.Table.from_pylist(ROWS)
     values = value if isinstance(value, list) else [*table[column].to_pylist()[:-1], value]
     return table.set_column(table.column_names.index(column), column, pa.array(values))
@@ -78,22 +100,30 @@ def test_a_table_that_is_not_as_the_schema_says_is_refused_by_file_column_and_ro
 
 
 @pytest.mark.parametrize("value", [-1e14, 1.5])
-def test_a_rate_outside_its_range_is_refused_by_row(tmp_path: Path, usual_run: Path, value: float) -> None:
+def test_a_rate_outside_its_range_is_refused_by_row(
+    tmp_path: Path, usual_run: Path, value: float
+) -> None:
     run = shutil.copytree(usual_run, tmp_path / "run")
     pq.write_table(changed("offroad", value), run / "rollouts.parquet")
     vouch_for(run)
     for read in (read_run, lambda folder: aggregate_runs([folder])):
-        with pytest.raises(InputError, match=r"column 'offroad': a value (below 0|above 1)") as caught:
+        with pytest.raises(
+            InputError, match=r"column 'offroad': a value (below 0|above 1)"
+        ) as caught:
             read(run)
         assert caught.value.with_what == f"{run / 'rollouts.parquet'}, row 2"
 
 
-def test_an_unfinished_run_with_manifests_that_make_no_table_is_refused(tmp_path: Path, usual_run: Path) -> None:
+def test_an_unfinished_run_with_manifests_that_make_no_table_is_refused(
+    tmp_path: Path, usual_run: Path
+) -> None:
     run = vouch_for(shutil.copytree(usual_run, tmp_path / "run"))
     (run / "contents.json").unlink()
     for path in run.rglob("manifest.json"):
         held = json.loads(path.read_text())
-        write_manifest(path.parent, {key: value for key, value in held.items() if key not in (SEAL, "wall_s")})
+        write_manifest(
+            path.parent, {key: value for key, value in held.items() if key not in (SEAL, "wall_s")}
+        )
     with pytest.raises(InputError, match="manifests from which no table can be made"):
         read_so_far(run)
 
@@ -115,7 +145,9 @@ def test_what_the_schema_writes_it_also_reads(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("table", [ROLLOUTS_TABLE, STEPS_TABLE])
-def test_the_page_of_tables_names_every_column_in_its_order_with_its_type(table: TableSchema) -> None:
+def test_the_page_of_tables_names_every_column_in_its_order_with_its_type(
+    table: TableSchema,
+) -> None:
     page = (DOCS / "tables.md").read_text()
     (line,) = [line for line in page.splitlines() if line.startswith(f"| `{table.name}` |")]
     assert "`rollout`" in page
@@ -142,7 +174,9 @@ def test_the_page_of_the_architecture_names_every_file_and_no_other() -> None:
     top = {re.sub(r"/.*", "/", name) for name in named}
     assert top == {file.name for file in RUN_FILES}
     inside = next(line for line in table.splitlines() if "rollouts/RENDERER" in line).split("|")[2]
-    assert {name for name in re.findall(r"`([^`]+)`", inside)} == {file.name for file in ROLLOUT_FILES}
+    assert {name for name in re.findall(r"`([^`]+)`", inside)} == {
+        file.name for file in ROLLOUT_FILES
+    }
 
 
 def test_a_rollout_has_one_folder_and_one_name() -> None:

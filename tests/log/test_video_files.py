@@ -14,7 +14,12 @@ from alpasim_plugin.log import read_mp4, write_mp4
 
 def frames(n: int, height: int = 144, width: int = 256) -> list[np.ndarray]:
     y, x = np.mgrid[:height, :width]
-    return [np.stack([x * 200 // width, y * 200 // height, np.full_like(x, 7 * i)], axis=-1).astype(np.uint8) for i in range(n)]
+    return [
+        np.stack([x * 200 // width, y * 200 // height, np.full_like(x, 7 * i)], axis=-1).astype(
+            np.uint8
+        )
+        for i in range(n)
+    ]
 
 
 @pytest.mark.parametrize("fps", [10, 30, 7.5, 29.97, Fraction(30000, 1001), Fraction(10, 3), 1])
@@ -63,7 +68,9 @@ def test_frames_may_come_from_a_generator(tmp_path: Path) -> None:
         ([np.zeros((8, 8), np.uint8)], "frame 0: "),
     ],
 )
-def test_unusable_frames_are_refused_and_leave_no_file(tmp_path: Path, bad: list[np.ndarray], found: str) -> None:
+def test_unusable_frames_are_refused_and_leave_no_file(
+    tmp_path: Path, bad: list[np.ndarray], found: str
+) -> None:
     with pytest.raises(InputError, match=found):
         write_mp4(tmp_path / "a.mp4", bad, 10)
     assert list(tmp_path.iterdir()) == []

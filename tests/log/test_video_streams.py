@@ -1,4 +1,6 @@
-"""Video frame by frame, as real files come: variable rates, late starts, rotated, cut short, damaged, without pictures."""
+"""Video frame by frame, as real files come: variable rates, late starts, rotated, cut short,
+damaged, without pictures.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ def picture(value: int = 120, height: int = 32, width: int = 48) -> U8:
     return np.full((height, width, 3), value, np.uint8)
 
 
-def write(path: Path, times: list[int], time_base: Fraction, durations: list[int] | None = None) -> Path:
+def write(
+    path: Path, times: list[int], time_base: Fraction, durations: list[int] | None = None
+) -> Path:
     with VideoWriter(path, time_base, Fraction(10)) as video:
         for i, time in enumerate(times):
             video.write(picture(20 * i % 200), time, durations[i] if durations else 1)
@@ -47,7 +51,9 @@ def test_times_are_kept_exactly(tmp_path: Path, times: list[int], base: Fraction
 def test_colours_follow_the_stated_matrix(tmp_path: Path, matrix: int) -> None:
     image = picture()
     image[:] = (200, 40, 90)
-    with VideoWriter(tmp_path / "a.mp4", Fraction(1, 10), Fraction(10), colour=(matrix, 1, 1), crf=1) as video:
+    with VideoWriter(
+        tmp_path / "a.mp4", Fraction(1, 10), Fraction(10), colour=(matrix, 1, 1), crf=1
+    ) as video:
         video.write(image, 0)
     with VideoReader(tmp_path / "a.mp4") as back:
         assert back.format.colour == (matrix, 1, 1)
@@ -63,7 +69,9 @@ def test_brightness_does_not_drift_over_generations(tmp_path: Path) -> None:
             video.write(image, 0)
         with VideoReader(tmp_path / "a.mp4") as back:
             image = next(iter(back)).image
-    assert abs(float(image.mean()) - float(given.mean())) < 0.5  # the default scaler loses a grey level each time
+    assert (
+        abs(float(image.mean()) - float(given.mean())) < 0.5
+    )  # the default scaler loses a grey level each time
 
 
 def test_a_rotated_video_is_read_upright(tmp_path: Path) -> None:
@@ -83,7 +91,9 @@ def test_a_rotated_video_is_read_upright(tmp_path: Path) -> None:
 
 
 def test_pixel_aspect_is_kept(tmp_path: Path) -> None:
-    with VideoWriter(tmp_path / "a.mp4", Fraction(1, 10), Fraction(10), pixel_aspect=Fraction(4, 3)) as video:
+    with VideoWriter(
+        tmp_path / "a.mp4", Fraction(1, 10), Fraction(10), pixel_aspect=Fraction(4, 3)
+    ) as video:
         video.write(picture(), 0)
     with VideoReader(tmp_path / "a.mp4") as back:
         assert back.format.pixel_aspect == Fraction(4, 3)
@@ -97,7 +107,11 @@ def cut_short(folder: Path) -> Path:
         stream = container.add_stream("libx264", rate=10, options={"crf": "1"})
         stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
         for _ in range(40):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(rng.integers(0, 255, (32, 48, 3), dtype=np.uint8))))
+            container.mux(
+                stream.encode(
+                    av.VideoFrame.from_ndarray(rng.integers(0, 255, (32, 48, 3), dtype=np.uint8))
+                )
+            )
         container.mux(stream.encode())
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     return path
@@ -116,7 +130,9 @@ def sound_only(folder: Path) -> Path:
     path = folder / "sound.wav"
     with av.open(str(path), "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
-        frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
+        frame = av.AudioFrame.from_ndarray(
+            np.zeros((1, 800), np.int16), format="s16", layout="mono"
+        )
         frame.rate = 8000
         container.mux(stream.encode(frame))
         container.mux(stream.encode())
@@ -148,7 +164,9 @@ def empty(folder: Path) -> Path:
         (lambda folder: folder / "absent.mp4", "no such file"),
     ],
 )
-def test_broken_files_are_refused_with_what_was_found(tmp_path: Path, make: object, found: str) -> None:
+def test_broken_files_are_refused_with_what_was_found(
+    tmp_path: Path, make: object, found: str
+) -> None:
     assert callable(make)
     with pytest.raises(InputError, match=found), VideoReader(make(tmp_path)) as video:
         list(video)

@@ -24,7 +24,9 @@ from tests.log.make_rollout import ACTORS, HEADER, T0_US, straight
 @settings(max_examples=examples(200), deadline=None)
 @given(
     xyz=st.lists(st.floats(-9e4, 9e4), min_size=3, max_size=3),
-    quat=st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 1e-3),
+    quat=st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(
+        lambda q: np.linalg.norm(q) > 1e-3
+    ),
 )
 def test_any_pose_survives_within_float32(xyz: list[float], quat: list[float]) -> None:
     messages = wire_poses(np.array([xyz]), np.array([quat]), "a test")
@@ -37,13 +39,18 @@ def test_any_pose_survives_within_float32(xyz: list[float], quat: list[float]) -
 
 @settings(max_examples=examples(50), deadline=None)
 @given(n=st.integers(0, 6), seed=st.integers(0, 1000), zeros=st.booleans())
-def test_trajectory_laid_out_by_arrays_equals_one_built_message_by_message(n: int, seed: int, zeros: bool) -> None:
+def test_trajectory_laid_out_by_arrays_equals_one_built_message_by_message(
+    n: int, seed: int, zeros: bool
+) -> None:
     rng = np.random.default_rng(seed)
     xyz = np.zeros((n, 3)) if zeros else rng.normal(size=(n, 3)) * 1000
     trajectory = Trajectory(T0_US + np.arange(n, dtype=np.int64), xyz, rng.normal(size=(n, 4)))
     poses = wire_poses(trajectory.xyz, trajectory.quat, "a test")
     slow = common_pb2.Trajectory(
-        poses=[common_pb2.PoseAtTime(pose=p, timestamp_us=t) for p, t in zip(poses, trajectory.t_us.tolist(), strict=True)]
+        poses=[
+            common_pb2.PoseAtTime(pose=p, timestamp_us=t)
+            for p, t in zip(poses, trajectory.t_us.tolist(), strict=True)
+        ]
     )
     fast = wire_trajectory(trajectory, "a test")
     assert fast == slow
@@ -54,8 +61,13 @@ def test_one_pose_without_arrays_is_as_one_of_many_and_refuses_as_much() -> None
     rng = np.random.default_rng(0)
     for _ in range(200):
         pose = se3(rng.normal(size=3) * 1000, rng.normal(size=4))  # no rotation: it is made one
-        assert wire_pose(pose, "a test") == wire_poses(pose[None, :3, 3], quat_from_matrix(pose[None, :3, :3]), "a test")[0]
-    for place, value in itertools.product(((0, 3), (1, 3), (2, 3), (0, 0), (1, 2)), (np.nan, np.inf)):
+        assert (
+            wire_pose(pose, "a test")
+            == wire_poses(pose[None, :3, 3], quat_from_matrix(pose[None, :3, :3]), "a test")[0]
+        )
+    for place, value in itertools.product(
+        ((0, 3), (1, 3), (2, 3), (0, 0), (1, 2)), (np.nan, np.inf)
+    ):
         pose = np.eye(4)
         pose[place] = value
         with pytest.raises(InputError, match="a test"):
@@ -63,7 +75,10 @@ def test_one_pose_without_arrays_is_as_one_of_many_and_refuses_as_much() -> None
 
 
 def test_coordinates_too_large_for_float32_are_refused_at_writing(tmp_path: Path) -> None:
-    with AslWriter(tmp_path / "a.asl", HEADER) as log, pytest.raises(InputError, match=r"position .*500001\.4") as caught:
+    with (
+        AslWriter(tmp_path / "a.asl", HEADER) as log,
+        pytest.raises(InputError, match=r"position .*500001\.4") as caught,
+    ):
         log.actor_poses(T0_US, se2(500_000, 0, 0), {})
     assert "local origin" in caught.value.do_this
 
@@ -79,9 +94,14 @@ def test_heading_of_half_a_turn_survives() -> None:
     np.testing.assert_allclose(np.abs(yaw_from_quat(back)), np.pi, atol=1e-6)
 
 
-@pytest.mark.parametrize(("scale", "fine"), [(1.0, True), (1 + 4.9e-5, True), (1 - 4.9e-5, True), (1 + 6e-5, False), (0.0, False)])
+@pytest.mark.parametrize(
+    ("scale", "fine"),
+    [(1.0, True), (1 + 4.9e-5, True), (1 - 4.9e-5, True), (1 + 6e-5, False), (0.0, False)],
+)
 def test_quaternion_norm_rule(scale: float, fine: bool) -> None:
-    pose = common_pb2.Pose(vec=common_pb2.Vec3(), quat=common_pb2.Quat(w=0.6 * scale, z=0.8 * scale))
+    pose = common_pb2.Pose(
+        vec=common_pb2.Vec3(), quat=common_pb2.Quat(w=0.6 * scale, z=0.8 * scale)
+    )
     if fine:
         np.testing.assert_allclose(read_poses([pose], "a test")[1], [[0.6, 0, 0, 0.8]], atol=1e-7)
     else:

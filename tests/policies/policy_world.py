@@ -8,9 +8,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from alpasim_plugin.control import make_controller
-from alpasim_plugin.core.geometry import inverse, quat_from_yaw, trajectory_from_poses, transform_points, yaw_of
+from alpasim_plugin.core.geometry import (
+    inverse,
+    quat_from_yaw,
+    trajectory_from_poses,
+    transform_points,
+    yaw_of,
+)
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.types import F64, U8, CameraSpec, EgoState, Frame, Observation, Plan, Route, Scenario, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    F64,
+    U8,
+    CameraSpec,
+    EgoState,
+    Frame,
+    Observation,
+    Plan,
+    Route,
+    Scenario,
+    Trajectory,
+    Vehicle,
+)
 from policies.conformance import canned_scenario
 from policies.painted_road import PaintedRoad, pinhole_camera
 
@@ -29,17 +47,40 @@ def route_of(road: PaintedRoad, T_world_rig: F64, off_m: float = 0.0) -> F64:
 
 
 def observe(
-    rgb: U8, ego: EgoState, route_rig: F64 = NO_ROUTE, history: Trajectory | None = None, camera: CameraSpec = CAMERA, age_us: int = 0
+    rgb: U8,
+    ego: EgoState,
+    route_rig: F64 = NO_ROUTE,
+    history: Trajectory | None = None,
+    camera: CameraSpec = CAMERA,
+    age_us: int = 0,
 ) -> Observation:
     past = history or trajectory_from_poses([ego.t_us], ego.T_world_rig[None])
-    return Observation(ego.t_us, {camera.name: Frame(ego.t_us - age_us, camera.name, rgb)}, {camera.name: camera}, ego, past, route_rig)
+    return Observation(
+        ego.t_us,
+        {camera.name: Frame(ego.t_us - age_us, camera.name, rgb)},
+        {camera.name: camera},
+        ego,
+        past,
+        route_rig,
+    )
 
 
-def look(policy: Policy, rgb: U8, speed_mps: float = 10.0, route_rig: F64 = NO_ROUTE, times: int = 6, camera: CameraSpec = CAMERA) -> Plan:
-    """Show a still picture for a while to a policy that is told it stands still at that speed's plan, and return the last plan."""
+def look(
+    policy: Policy,
+    rgb: U8,
+    speed_mps: float = 10.0,
+    route_rig: F64 = NO_ROUTE,
+    times: int = 6,
+    camera: CameraSpec = CAMERA,
+) -> Plan:
+    """Show a still picture for a while to a policy that is told it stands still at that speed's
+    plan, and return the last plan.
+    """
     policy.reset(0, Route(np.zeros((2, 3))))
     for k in range(times):
-        plan = policy.act(observe(rgb, EgoState(k * 100_000, np.eye(4), speed_mps), route_rig, camera=camera))
+        plan = policy.act(
+            observe(rgb, EgoState(k * 100_000, np.eye(4), speed_mps), route_rig, camera=camera)
+        )
     return plan
 
 
@@ -75,9 +116,13 @@ def close_loop(
     for k in range(round(seconds * 10)):
         here = road_at(k * 0.1)
         seen.append(ego)
-        history = trajectory_from_poses([e.t_us for e in seen], np.array([e.T_world_rig for e in seen]))
+        history = trajectory_from_poses(
+            [e.t_us for e in seen], np.array([e.T_world_rig for e in seen])
+        )
         route = route_of(here, ego.T_world_rig, route_off_m) if with_route else NO_ROUTE
-        plan = policy.act(observe(here.image(camera, ego.T_world_rig, seed=k), ego, route, history, camera))
+        plan = policy.act(
+            observe(here.image(camera, ego.T_world_rig, seed=k), ego, route, history, camera)
+        )
         plans.append(plan)
         ego = controller.advance(ego, to_world(plan, ego.T_world_rig), ego.t_us + 100_000)
     coordinates = [first.coordinates(e.T_world_rig[0, 3], e.T_world_rig[1, 3]) for e in seen]

@@ -1,4 +1,6 @@
-"""The conformance check on good policies and on ones that are broken on purpose: each fault has its sentence."""
+"""The conformance check on good policies and on ones that are broken on purpose: each fault has its
+sentence.
+"""
 
 from __future__ import annotations
 
@@ -158,7 +160,9 @@ class Random(Honest):
 
     def spoil(self, plan: Plan, observation: Observation) -> Plan:
         self.count += 1  # survives the reset
-        return replace(plan, xy=plan.xy + 0.01 * self.count * np.linspace(0, 1, len(plan.xy))[:, None])
+        return replace(
+            plan, xy=plan.xy + 0.01 * self.count * np.linspace(0, 1, len(plan.xy))[:, None]
+        )
 
 
 class Remembers(Honest):
@@ -208,11 +212,15 @@ class OtherCamera(Honest):
 def test_shipped_policy_conforms(name: str) -> None:
     report = check_policy(name, latency_limit_ms=1000.0)
     assert report.ok, str(report)
-    assert {"sensors", "values", "times", "frame", "units", "determinism", "reset", "latency"} <= {c.name for c in report.checks}
+    assert {"sensors", "values", "times", "frame", "units", "determinism", "reset", "latency"} <= {
+        c.name for c in report.checks
+    }
 
 
 def test_every_shipped_policy_is_checked_above() -> None:
-    assert {"log-replay", "constant-velocity", "pure-pursuit", "lane-camera"} <= set(names("policy"))
+    assert {"log-replay", "constant-velocity", "pure-pursuit", "lane-camera"} <= set(
+        names("policy")
+    )
 
 
 @pytest.mark.parametrize(
@@ -234,7 +242,10 @@ def test_every_shipped_policy_is_checked_above() -> None:
         (Short, "the plan ends 1.000 s ahead"),
         (Sparse, "up to 1.00 s apart"),
         (WrongShape, "yaw (50,)"),
-        (Transposed, "xy (2, 51), yaw (51,); needed are (T,), (T, 2), (T,) with T >= 2; xy looks transposed"),
+        (
+            Transposed,
+            "xy (2, 51), yaw (51,); needed are (T,), (T, 2), (T,) with T >= 2; xy looks transposed",
+        ),
         (BareArray, "act returned a ndarray of shape (51, 2), not a Plan"),
         (Nothing, "act returned nothing, not a Plan"),
         (ListOfPoses, "xy is a list, not a numpy array"),
@@ -244,7 +255,10 @@ def test_every_shipped_policy_is_checked_above() -> None:
         (Remembers, "a reset forgets the drive before: plans differ by up to"),
         (Raises, "raised ZeroDivisionError: speed"),
         (Scribbles, "read-only"),
-        (NeedsFreshFrames, "in the situation 'old frame' the policy raised ValueError: the frame is old"),
+        (
+            NeedsFreshFrames,
+            "in the situation 'old frame' the policy raised ValueError: the frame is old",
+        ),
         (OtherCamera, "asks for cameras ['roof']; the scenario has ['front']"),
     ],
 )

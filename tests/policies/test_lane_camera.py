@@ -28,7 +28,7 @@ def lateral(plan: object, index: int = 20) -> float:
     return float(plan.xy[index, 1])  # type: ignore[attr-defined]
 
 
-# --- the plan depends on the pixels -----------------------------------------------------------------------------------
+# --- the plan depends on the pixels
 
 
 def test_plan_steers_back_to_the_lane_that_the_picture_shows() -> None:
@@ -48,7 +48,9 @@ def test_shifted_picture_shifts_the_plan_although_everything_else_is_the_same() 
     route = route_of(SYMMETRIC, SYMMETRIC.pose(0.0))
     plain = look(policy(), picture, route_rig=route)
     shifted = look(policy(), np.roll(picture, 8, axis=1), route_rig=route)
-    assert shifted.debug["lane_heading_rad"] - plain.debug["lane_heading_rad"] == pytest.approx(-8 / CAMERA.K[0, 0], abs=0.01)
+    assert shifted.debug["lane_heading_rad"] - plain.debug["lane_heading_rad"] == pytest.approx(
+        -8 / CAMERA.K[0, 0], abs=0.01
+    )
     assert lateral(shifted) < lateral(plain) - 0.3
 
 
@@ -84,7 +86,11 @@ def test_lane_is_remembered_over_frames_without_paint() -> None:
     modes, sure = [], 0.0
     for k in range(30):
         pose = ROAD.pose(k * 0.8, 0.4)
-        picture = ROAD.image(CAMERA, pose, seed=k) if k < 12 else np.full((CAMERA.height, CAMERA.width, 3), 90, np.uint8)
+        picture = (
+            ROAD.image(CAMERA, pose, seed=k)
+            if k < 12
+            else np.full((CAMERA.height, CAMERA.width, 3), 90, np.uint8)
+        )
         plan = one.act(observe(picture, EgoState(k * 100_000, pose, 8.0)))
         modes.append(plan.debug["mode"])
         sure = plan.debug["lane_sigma_m"] if k == 11 else sure
@@ -96,10 +102,12 @@ def test_lane_is_remembered_over_frames_without_paint() -> None:
     assert modes[-1] == "straight", "forgotten after 25 m"
 
 
-# --- closed loop ------------------------------------------------------------------------------------------------------
+# --- closed loop
 
 
-@pytest.mark.parametrize(("curvature", "speed"), first_rows_of([(-1 / 40, 8.0), (0.0, 14.0), (1 / 100, 12.0)]))
+@pytest.mark.parametrize(
+    ("curvature", "speed"), first_rows_of([(-1 / 40, 8.0), (0.0, 14.0), (1 / 100, 12.0)])
+)
 def test_lane_is_kept_without_any_route(curvature: float, speed: float) -> None:
     drive = close_loop(policy(), PaintedRoad(curvature_1pm=curvature), speed, 5.0, with_route=False)
     assert np.abs(drive.offset_m).max() < 0.6
@@ -122,7 +130,12 @@ def test_car_ahead_is_stopped_for_and_the_car_stays_standing() -> None:
 
 @pytest.mark.slow
 def test_slower_car_is_followed_at_a_distance() -> None:
-    drive = close_loop(policy(), lambda t: PaintedRoad(blocks=(Block(30.0 + 6.0 * t, colour=(210, 210, 215)),)), 10.0, 7.0)
+    drive = close_loop(
+        policy(),
+        lambda t: PaintedRoad(blocks=(Block(30.0 + 6.0 * t, colour=(210, 210, 215)),)),
+        10.0,
+        7.0,
+    )
     gap = 30.0 + 6.0 * 6.9 - 2.25 - (drive.s_m[-1] + 1.4 + 4.855 / 2)
     assert gap > 4.0
     assert drive.speed_mps[-1] == pytest.approx(6.0, abs=1.5)
@@ -132,7 +145,9 @@ def test_slower_car_is_followed_at_a_distance() -> None:
     "flat",
     first_of(
         [
-            tuple(Patch((30.0, 33.0), (-3.0 + i, -2.5 + i), (225, 225, 225)) for i in range(9)),  # a crosswalk
+            tuple(
+                Patch((30.0, 33.0), (-3.0 + i, -2.5 + i), (225, 225, 225)) for i in range(9)
+            ),  # a crosswalk
             (Patch((30.0, 30.5), (-1.7, 1.7), (230, 230, 230)),),  # a stop line
             (Patch((28.0, 34.0), (-3.0, 6.5), (45, 45, 48)),),  # a shadow
         ]
@@ -147,11 +162,13 @@ def test_flat_things_on_the_road_are_not_braked_for(flat: tuple[Patch, ...]) -> 
 
 @pytest.mark.slow
 def test_car_in_the_next_lane_is_passed() -> None:
-    drive = close_loop(policy(), PaintedRoad(blocks=(Block(40.0, 3.5), Block(55.0, 3.5))), 10.0, 5.0)
+    drive = close_loop(
+        policy(), PaintedRoad(blocks=(Block(40.0, 3.5), Block(55.0, 3.5))), 10.0, 5.0
+    )
     assert drive.speed_mps.min() > 8.5
 
 
-# --- the contract -----------------------------------------------------------------------------------------------------
+# --- the contract
 
 
 def test_samples_carry_the_noise_of_the_seed_and_the_same_seed_repeats() -> None:
@@ -175,7 +192,9 @@ def test_frame_that_is_late_is_read_for_where_the_car_was_then() -> None:
         poses = np.array([curve.pose(k * 0.8 + 4.0 - 0.8 * j) for j in (3, 2, 1, 0)])
         history = trajectory_from_poses(times, poses)
         ego = EgoState(1_000_000 + k * 100_000, pose, 8.0)
-        plan = one.act(observe(curve.image(CAMERA, then, seed=k), ego, history=history, age_us=300_000))
+        plan = one.act(
+            observe(curve.image(CAMERA, then, seed=k), ego, history=history, age_us=300_000)
+        )
     assert plan.debug["lane_offset_m"] == pytest.approx(0.0, abs=0.15)
     assert plan.debug["lane_heading_rad"] == pytest.approx(0.0, abs=0.03)
 
@@ -185,7 +204,9 @@ def test_missing_or_misshapen_frame_is_a_policy_error() -> None:
     with pytest.raises(PolicyError, match="planning by camera") as caught:
         one.act(observe(np.zeros((10, 10, 3), np.uint8), EgoState(0, np.eye(4), 5.0)))
     assert "(10, 10, 3)" in caught.value.found
-    without = replace(observe(np.zeros((144, 256, 3), np.uint8), EgoState(0, np.eye(4), 5.0)), frames={})
+    without = replace(
+        observe(np.zeros((144, 256, 3), np.uint8), EgoState(0, np.eye(4), 5.0)), frames={}
+    )
     with pytest.raises(PolicyError, match="frames of \\[\\]"):
         one.act(without)
 
@@ -205,7 +226,11 @@ def test_camera_that_sees_no_road_is_refused() -> None:
 
 @pytest.mark.parametrize(
     "camera",
-    [pinhole_camera(width=480, height=272), pinhole_camera(pitch_deg=6.0), pinhole_camera(hfov_deg=100.0, mount_m=(2.0, 0.2, 1.3))],
+    [
+        pinhole_camera(width=480, height=272),
+        pinhole_camera(pitch_deg=6.0),
+        pinhole_camera(hfov_deg=100.0, mount_m=(2.0, 0.2, 1.3)),
+    ],
 )
 def test_other_cameras_see_the_same_lane(camera: object) -> None:
     one = LaneCamera(scenario_with(camera))  # type: ignore[arg-type]
@@ -231,4 +256,6 @@ def test_frame_is_read_in_a_few_milliseconds() -> None:
         began = time.thread_time()
         one.act(observe(pictures[k % 5], EgoState(k * 100_000, ROAD.pose(k * 1.0), 10.0)))
         times.append(time.thread_time() - began)
-    assert np.median(times) < 0.03, "some 4 ms of a core's time, which others that use the machine do not lengthen"
+    assert np.median(times) < 0.03, (
+        "some 4 ms of a core's time, which others that use the machine do not lengthen"
+    )

@@ -1,4 +1,6 @@
-"""The learned policy: its image input, its command input, and that its plan depends on the image."""
+"""The learned policy: its image input, its command input, and that its plan depends on the
+image.
+"""
 
 from __future__ import annotations
 
@@ -15,31 +17,57 @@ from alpasim_plugin.core.types import EgoState, Observation
 from policies import check_policy, make_policy
 from policies.conformance import STRAIGHT, observations
 from policies.learned import WEIGHTS, Learned
-from policies.learned_input import FOCAL_PX, HEIGHT, HORIZON_ROW, WIDTH, level_view, route_command, view_homography
-from policies.learned_net import KNOTS_M, LearnedNet, integrate_path, knot_weights, load_net, path_grid, save_net
+from policies.learned_input import (
+    FOCAL_PX,
+    HEIGHT,
+    HORIZON_ROW,
+    WIDTH,
+    level_view,
+    route_command,
+    view_homography,
+)
+from policies.learned_net import (
+    KNOTS_M,
+    LearnedNet,
+    integrate_path,
+    knot_weights,
+    load_net,
+    path_grid,
+    save_net,
+)
 from policies.painted_road import Line, PaintedRoad, pinhole_camera
 from tests.policies.policy_world import CAMERA, observe, scenario_with
 
 ROAD = PaintedRoad()
 
 
-# --- the view ---------------------------------------------------------------------------------------------------------
+# --- the view
 
 
 def test_point_of_the_world_has_its_place_in_the_view_whatever_the_camera() -> None:
     point = np.array([20.0, -3.0, 0.4])
-    for camera in (pinhole_camera(), pinhole_camera(hfov_deg=50.0, pitch_deg=6.0), pinhole_camera(width=1280, height=720)):
+    for camera in (
+        pinhole_camera(),
+        pinhole_camera(hfov_deg=50.0, pitch_deg=6.0),
+        pinhole_camera(width=1280, height=720),
+    ):
         for turn in (-0.1, 0.0, 0.1):
             in_camera = transform_points(inverse(camera.T_rig_camera), point[None])[0]
             pixel = camera.K @ in_camera
             view = np.linalg.inv(view_homography(camera, turn)) @ pixel
             ahead = se2(0.0, 0.0, turn)[:3, :3].T @ (point - camera.T_rig_camera[:3, 3])
-            wanted = [WIDTH / 2 - FOCAL_PX * ahead[1] / ahead[0], HORIZON_ROW - FOCAL_PX * ahead[2] / ahead[0]]
+            wanted = [
+                WIDTH / 2 - FOCAL_PX * ahead[1] / ahead[0],
+                HORIZON_ROW - FOCAL_PX * ahead[2] / ahead[0],
+            ]
             np.testing.assert_allclose(view[:2] / view[2], wanted, atol=1e-9)
 
 
 def test_cameras_of_other_size_and_pitch_show_nearly_the_same_view() -> None:
-    road, pose = PaintedRoad(lines=(Line(1.75), Line(-1.75)), road_m=(-4.0, 4.0)), ROAD.pose(0.0, 0.4)
+    road, pose = (
+        PaintedRoad(lines=(Line(1.75), Line(-1.75)), road_m=(-4.0, 4.0)),
+        ROAD.pose(0.0, 0.4),
+    )
     views = []
     sizes = ({}, {"pitch_deg": 5.0}, {"width": 1024, "height": 576})
     for camera in (pinhole_camera(hfov_deg=80.0, **size) for size in sizes):
@@ -50,10 +78,12 @@ def test_cameras_of_other_size_and_pitch_show_nearly_the_same_view() -> None:
         assert np.corrcoef(other.ravel(), views[0].ravel())[0, 1] > 0.95
 
 
-# --- the command ------------------------------------------------------------------------------------------------------
+# --- the command
 
 
-def route_with_turn(after_m: float, radius_m: float, left: bool, lateral_m: float = 0.0) -> np.ndarray:
+def route_with_turn(
+    after_m: float, radius_m: float, left: bool, lateral_m: float = 0.0
+) -> np.ndarray:
     s = 80 / 19 * np.arange(20)
     arc = np.clip((s - after_m) / radius_m, 0.0, np.pi / 2)
     beyond = np.maximum(s - after_m - radius_m * np.pi / 2, 0.0)
@@ -77,7 +107,10 @@ def test_bend_of_the_road_itself_is_no_turn(radius_m: float) -> None:
 
 def test_command_says_nothing_about_the_place_in_the_lane() -> None:
     for after_m in (3.0, 25.0):
-        words = {route_command(route_with_turn(after_m, 12.0, True, lateral_m)) for lateral_m in (-1.5, -0.3, 0.0, 1.5)}
+        words = {
+            route_command(route_with_turn(after_m, 12.0, True, lateral_m))
+            for lateral_m in (-1.5, -0.3, 0.0, 1.5)
+        }
         assert len(words) == 1
 
 
@@ -88,7 +121,7 @@ def test_route_that_is_over_or_absent_gives_keep() -> None:
     assert route_command(np.full((20, 3), np.nan)) == "keep"
 
 
-# --- the network ------------------------------------------------------------------------------------------------------
+# --- the network
 
 
 def test_headings_of_a_circle_lay_out_the_circle() -> None:
@@ -96,7 +129,11 @@ def test_headings_of_a_circle_lay_out_the_circle() -> None:
     points, yaw = integrate_path(heading, torch.from_numpy(knot_weights()))
     s = path_grid()
     np.testing.assert_allclose(yaw[0].numpy(), s / 40.0, atol=1e-12)
-    np.testing.assert_allclose(points[0].numpy(), 40.0 * np.stack([np.sin(s / 40.0), 1 - np.cos(s / 40.0)], axis=1), atol=2e-3)
+    np.testing.assert_allclose(
+        points[0].numpy(),
+        40.0 * np.stack([np.sin(s / 40.0), 1 - np.cos(s / 40.0)], axis=1),
+        atol=2e-3,
+    )
 
 
 def test_weights_survive_the_disk_and_foreign_ones_are_refused(tmp_path: Path) -> None:
@@ -116,7 +153,7 @@ def test_weights_survive_the_disk_and_foreign_ones_are_refused(tmp_path: Path) -
         Learned(scenario_with(), weights=path)
 
 
-# --- the policy -------------------------------------------------------------------------------------------------------
+# --- the policy
 
 
 def drive(policy: Learned, seed: int = 0) -> list[np.ndarray]:
@@ -139,7 +176,9 @@ def test_it_keeps_the_contract() -> None:
 
 def test_seeds_drive_differently_and_a_seed_alike() -> None:
     policy = Learned(scenario_with())
-    first, again, other = drive(policy, 1), drive(policy, 1), drive(policy, 2)
+    first = drive(policy, 1)
+    again = drive(policy, 1)
+    other = drive(policy, 2)
     for a, b in zip(first, again, strict=True):
         np.testing.assert_array_equal(a, b)
     apart = max(np.abs(a - b).max() for a, b in zip(first, other, strict=True))
@@ -180,10 +219,15 @@ def test_plan_follows_the_pixels_and_not_the_route() -> None:
     policy = Learned(scenario_with(), temperature=0.0)
     observation = seen()[0]
     plan = policy.act(observation)
-    beside = Observation(**{**observation.__dict__, "route_rig": observation.route_rig + np.array([0.0, 0.9, 0.0])})
+    beside = Observation(
+        **{**observation.__dict__, "route_rig": observation.route_rig + np.array([0.0, 0.9, 0.0])}
+    )
     policy.reset(0, policy_route())
     np.testing.assert_array_equal(plan.xy, policy.act(beside).xy)
-    shifted = observe(np.roll(observation.frames[CAMERA.name].rgb, 16, axis=1), EgoState(observation.t_us, np.eye(4), 10.0))
+    shifted = observe(
+        np.roll(observation.frames[CAMERA.name].rgb, 16, axis=1),
+        EgoState(observation.t_us, np.eye(4), 10.0),
+    )
     policy.reset(0, policy_route())
     assert policy.act(shifted).xy[20, 1] < plan.xy[20, 1] - 0.3
 

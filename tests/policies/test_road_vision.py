@@ -1,4 +1,6 @@
-"""The parts of the camera policy, each against something simpler: grid, ridges, lane filter, obstacles."""
+"""The parts of the camera policy, each against something simpler: grid, ridges, lane filter,
+obstacles.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,14 @@ from policies.base import _targets
 from policies.lane_filter import LaneState, predict, search, shift, start, update
 from policies.obstacle_vision import anomaly, find_foot, learn_road, track_obstacle
 from policies.painted_road import Block, Line, PaintedRoad, pinhole_camera
-from policies.road_vision import PaintPoints, RidgeFilter, _windows, brightness, find_paint, make_grid
+from policies.road_vision import (
+    PaintPoints,
+    RidgeFilter,
+    _windows,
+    brightness,
+    find_paint,
+    make_grid,
+)
 from tests.examples import examples
 
 CAMERA = pinhole_camera()
@@ -21,10 +30,13 @@ GRID = make_grid(CAMERA)
 RIDGES = RidgeFilter(GRID)
 
 
-# --- grid -------------------------------------------------------------------------------------------------------------
+# --- grid
 
 
-@pytest.mark.parametrize("camera", [CAMERA, pinhole_camera(pitch_deg=8.0), pinhole_camera(mount_m=(2.2, -0.3, 1.2), hfov_deg=100)])
+@pytest.mark.parametrize(
+    "camera",
+    [CAMERA, pinhole_camera(pitch_deg=8.0), pinhole_camera(mount_m=(2.2, -0.3, 1.2), hfov_deg=100)],
+)
 def test_every_grid_cell_falls_where_a_plain_projection_puts_it(camera: object) -> None:
     grid = make_grid(camera)  # type: ignore[arg-type]
     K, T = camera.K, inverse(camera.T_rig_camera)  # type: ignore[attr-defined]
@@ -45,7 +57,7 @@ def test_column_lookup_inverts_the_axis() -> None:
     assert np.allclose(GRID.column_of(GRID.y_m), np.arange(len(GRID.y_m)))
 
 
-# --- ridges -----------------------------------------------------------------------------------------------------------
+# --- ridges
 
 
 def slow_ridge(value: np.ndarray, row: int, column: int) -> float:
@@ -57,7 +69,9 @@ def slow_ridge(value: np.ndarray, row: int, column: int) -> float:
         cells = [float(value[row, c]) for c in range(column + a, column + b + 1) if 0 <= c < n]
         return sum(cells) / len(cells) if cells else 0.0
 
-    centre, left, right = mean(-half, half), mean(-gap - flank, -gap), mean(gap, gap + flank)
+    centre = mean(-half, half)
+    left = mean(-gap - flank, -gap)
+    right = mean(gap, gap + flank)
     return max(min(centre - left, centre - right), 0.0)
 
 
@@ -68,7 +82,9 @@ def test_ridge_response_equals_plain_window_means() -> None:
         reach = int((_windows(GRID)[1] + _windows(GRID)[2])[row])
         seen = np.flatnonzero(GRID.inside[row])
         for column in range(seen[0] + reach, seen[-1] - reach, 23):
-            assert fast[row, column] == pytest.approx(slow_ridge(value, row, column), rel=1e-6, abs=1e-4)
+            assert fast[row, column] == pytest.approx(
+                slow_ridge(value, row, column), rel=1e-6, abs=1e-4
+            )
 
 
 def test_step_edge_is_no_paint_but_a_stroke_is() -> None:
@@ -107,15 +123,28 @@ def test_bars_of_a_crosswalk_are_not_taken_for_lines() -> None:
     assert (~inside).sum() > 0.8 * np.sum((plain.x_m < 9.1) | (plain.x_m > 11.9))
 
 
-# --- lane filter ------------------------------------------------------------------------------------------------------
+# --- lane filter
 
 
-def paint_of(offset: float, heading: float, curvature: float, width: float, seed: int = 0, sides: tuple[int, ...] = (-1, 1)) -> PaintPoints:
+def paint_of(
+    offset: float,
+    heading: float,
+    curvature: float,
+    width: float,
+    seed: int = 0,
+    sides: tuple[int, ...] = (-1, 1),
+) -> PaintPoints:
     random = np.random.default_rng(seed)
     x = np.repeat(np.arange(6.0, 30.0, 1.0), len(sides))
     side = np.tile(sides, len(x) // len(sides))
     slope = heading + curvature * x
-    y = offset + heading * x + curvature * x**2 / 2 + side * width / 2 * np.sqrt(1 + slope**2) + random.normal(0, 0.04, len(x))
+    y = (
+        offset
+        + heading * x
+        + curvature * x**2 / 2
+        + side * width / 2 * np.sqrt(1 + slope**2)
+        + random.normal(0, 0.04, len(x))
+    )
     return PaintPoints(x, y, np.full(len(x), 3.0), np.full(len(x), 0.06))
 
 
@@ -126,8 +155,15 @@ def settled(points: PaintPoints, lane: LaneState) -> LaneState:
 
 
 @settings(deadline=None, max_examples=examples(25))
-@given(offset=st.floats(-0.6, 0.6), heading=st.floats(-0.08, 0.08), curvature=st.floats(-0.015, 0.015), width=st.floats(3.0, 4.0))
-def test_lane_is_recovered_from_its_paint(offset: float, heading: float, curvature: float, width: float) -> None:
+@given(
+    offset=st.floats(-0.6, 0.6),
+    heading=st.floats(-0.08, 0.08),
+    curvature=st.floats(-0.015, 0.015),
+    width=st.floats(3.0, 4.0),
+)
+def test_lane_is_recovered_from_its_paint(
+    offset: float, heading: float, curvature: float, width: float
+) -> None:
     points = paint_of(offset, heading, curvature, width)
     found = search(points, np.ones(48), 0.0, 0.0, 0.0)
     assert found is not None
@@ -147,7 +183,9 @@ def test_outliers_beside_the_lane_do_not_pull_it() -> None:
         np.full(len(good.x_m) + 30, 3.0),
         np.full(len(good.x_m) + 30, 0.06),
     )
-    assert settled(stray, start(0.0, 0.0, 0.0)).mean[0] == pytest.approx(settled(good, start(0.0, 0.0, 0.0)).mean[0], abs=0.08)
+    assert settled(stray, start(0.0, 0.0, 0.0)).mean[0] == pytest.approx(
+        settled(good, start(0.0, 0.0, 0.0)).mean[0], abs=0.08
+    )
 
 
 def test_more_paint_makes_the_estimate_surer_and_none_makes_it_less_sure() -> None:
@@ -167,7 +205,12 @@ def test_prediction_sees_the_lane_that_a_moved_ego_would_see() -> None:
     road = PaintedRoad(curvature_1pm=1 / 80)
     before, after = road.pose(0.0, -0.3), road.pose(3.0, 0.1, 0.05)
     step = inverse(before) @ after
-    lane = predict(start(0.3, 0.0, 1 / 80), float(step[0, 3]), float(step[1, 3]), float(np.arctan2(step[1, 0], step[0, 0])))
+    lane = predict(
+        start(0.3, 0.0, 1 / 80),
+        float(step[0, 3]),
+        float(step[1, 3]),
+        float(np.arctan2(step[1, 0], step[0, 0])),
+    )
     for ahead in (4.0, 9.0):
         x, y = (inverse(after) @ road.pose(3.0 + ahead))[:2, 3]
         assert lane.centre(np.array([x]))[0] == pytest.approx(y, abs=0.05)
@@ -175,13 +218,20 @@ def test_prediction_sees_the_lane_that_a_moved_ego_would_see() -> None:
 
 def test_search_finds_the_lane_from_a_rough_guess_and_prefers_the_guessed_one_of_two() -> None:
     left, right = paint_of(0.4, 0.05, 0.01, 3.4), paint_of(-3.0, 0.05, 0.01, 3.4)
-    both = PaintPoints(*(np.concatenate([getattr(left, f), getattr(right, f)]) for f in ("x_m", "y_m", "strength", "sigma_m")))
+    both = PaintPoints(
+        *(
+            np.concatenate([getattr(left, f), getattr(right, f)])
+            for f in ("x_m", "y_m", "strength", "sigma_m")
+        )
+    )
     ones = np.ones(len(both.x_m))
     for guess, truth in ((0.0, 0.4), (-3.2, -3.0)):
         found = search(both, ones, guess, 0.0, 0.0)
         assert found is not None
         x = np.array([6.0, 10.0, 18.0])
-        assert np.allclose(settled(both, found).centre(x), truth + 0.05 * x + 0.01 * x**2 / 2, atol=0.1)
+        assert np.allclose(
+            settled(both, found).centre(x), truth + 0.05 * x + 0.01 * x**2 / 2, atol=0.1
+        )
 
 
 def test_search_without_enough_paint_finds_nothing() -> None:
@@ -192,12 +242,14 @@ def test_neighbouring_lane_is_one_width_away() -> None:
     assert shift(start(0.2, 0.0, 0.0, 3.4), 1).mean[0] == pytest.approx(3.6)
 
 
-# --- obstacles --------------------------------------------------------------------------------------------------------
+# --- obstacles
 
 
 def foot_in(road: PaintedRoad, seed: int = 0) -> tuple[float, float] | None:
     centre = np.zeros(len(GRID.x_m))
-    empty = cv2.cvtColor(GRID.warp(PaintedRoad().image(CAMERA, np.eye(4), seed=9)), cv2.COLOR_RGB2LAB)
+    empty = cv2.cvtColor(
+        GRID.warp(PaintedRoad().image(CAMERA, np.eye(4), seed=9)), cv2.COLOR_RGB2LAB
+    )
     colour = learn_road(None, empty, GRID, centre, np.inf)
     assert colour is not None
     lab = cv2.cvtColor(GRID.warp(road.image(CAMERA, np.eye(4), seed)), cv2.COLOR_RGB2LAB)
@@ -224,7 +276,9 @@ def test_free_road_has_no_foot() -> None:
 
 
 def test_low_kerb_stone_is_not_taken_for_a_car() -> None:
-    assert foot_in(PaintedRoad(blocks=(Block(20.0, 0.0, (0.5, 1.8, 0.15), (200, 200, 200)),))) is None
+    assert (
+        foot_in(PaintedRoad(blocks=(Block(20.0, 0.0, (0.5, 1.8, 0.15), (200, 200, 200)),))) is None
+    )
 
 
 def test_road_colour_is_not_learned_from_the_car_in_front() -> None:
@@ -271,18 +325,33 @@ def test_thing_nearer_than_the_image_reaches_keeps_its_distance() -> None:
     assert track.distance_m < 5.5
 
 
-# --- lines ------------------------------------------------------------------------------------------------------------
+# --- lines
 
 
 @settings(deadline=None, max_examples=examples(40))
-@given(seed=st.integers(0, 2**32 - 1), points=st.integers(2, 60), turn=st.sampled_from([0.02, 0.4, 2.0]))
-def test_lengths_and_targets_are_those_of_the_plain_arithmetic_to_the_bit(seed: int, points: int, turn: float) -> None:
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    points=st.integers(2, 60),
+    turn=st.sampled_from([0.02, 0.4, 2.0]),
+)
+def test_lengths_and_targets_are_those_of_the_plain_arithmetic_to_the_bit(
+    seed: int, points: int, turn: float
+) -> None:
     random = np.random.default_rng(seed)
     angle = np.cumsum(random.normal(0.0, turn, points))
-    line = np.cumsum(random.uniform(0.0, 2.0, (points, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1), axis=0)
-    assert np.array_equal(arc_lengths(line), np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]))
+    line = np.cumsum(
+        random.uniform(0.0, 2.0, (points, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1),
+        axis=0,
+    )
+    assert np.array_equal(
+        arc_lengths(line),
+        np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]),
+    )
     (x, y), start = random.normal(0.0, 5.0, 2), int(random.integers(points))
     distance = (line[:, 0] - x) ** 2 + (line[:, 1] - y) ** 2
     nearest = start + int(np.argmin(distance[start : start + 8]))
     far = np.flatnonzero(distance[nearest:] >= 9.0)
-    assert _targets(line.tolist(), float(x), float(y), start, 9.0) == (nearest, nearest + int(far[0]) if len(far) else points - 1)
+    assert _targets(line.tolist(), float(x), float(y), start, 9.0) == (
+        nearest,
+        nearest + int(far[0]) if len(far) else points - 1,
+    )

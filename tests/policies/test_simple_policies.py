@@ -20,7 +20,9 @@ SCENARIO = canned_scenario()
 
 
 def blind(ego: EgoState, route: np.ndarray = NO_ROUTE) -> Observation:
-    return Observation(ego.t_us, {}, {}, ego, trajectory_from_poses([ego.t_us], ego.T_world_rig[None]), route)
+    return Observation(
+        ego.t_us, {}, {}, ego, trajectory_from_poses([ego.t_us], ego.T_world_rig[None]), route
+    )
 
 
 def curved_log() -> Scenario:
@@ -46,7 +48,9 @@ def test_log_replay_with_the_perfect_controller_is_the_log() -> None:
 def test_log_replay_ends_its_plan_with_the_log() -> None:
     scenario = curved_log()
     last = int(scenario.ego_log.t_us[-1])
-    plan = make_policy("log-replay", scenario).act(blind(EgoState(last - 1_000_000, np.eye(4), 8.0)))
+    plan = make_policy("log-replay", scenario).act(
+        blind(EgoState(last - 1_000_000, np.eye(4), 8.0))
+    )
     assert plan.times_us[-1] <= last
     assert len(plan.times_us) == 11
 
@@ -58,14 +62,18 @@ def test_log_replay_outside_its_log_is_an_error_and_not_a_guess() -> None:
 
 @pytest.mark.parametrize("speed", [0.0, 13.0, -2.0])
 def test_constant_velocity_goes_straight_on(speed: float) -> None:
-    plan = make_policy("constant-velocity", SCENARIO).act(blind(EgoState(START_US, se2(5, 5, 2.0), speed)))
+    plan = make_policy("constant-velocity", SCENARIO).act(
+        blind(EgoState(START_US, se2(5, 5, 2.0), speed))
+    )
     assert plan.xy[10] == pytest.approx([speed, 0.0])
     assert not plan.yaw.any()
 
 
 def arc_route(radius: float, offset: float = 0.0) -> np.ndarray:
     a = np.arange(20) * 80 / 19 / abs(radius)
-    return np.column_stack([abs(radius) * np.sin(a), np.sign(radius) * abs(radius) * (1 - np.cos(a)) + offset, 0 * a])
+    return np.column_stack(
+        [abs(radius) * np.sin(a), np.sign(radius) * abs(radius) * (1 - np.cos(a)) + offset, 0 * a]
+    )
 
 
 def pursue(route: np.ndarray, speed: float) -> Plan:
@@ -98,7 +106,12 @@ def test_pure_pursuit_sets_off_from_standstill_and_keeps_its_first_speed_as_crui
     policy.reset(0, Route(np.zeros((2, 3))))
     plan = policy.act(blind(EgoState(START_US, np.eye(4), 0.0), arc_route(1e6)))
     assert plan.xy[-1, 0] > 8.0
-    assert policy.act(blind(EgoState(START_US + 100_000, np.eye(4), 9.0), arc_route(1e6))).debug["cruise_mps"] == 6.0
+    assert (
+        policy.act(blind(EgoState(START_US + 100_000, np.eye(4), 9.0), arc_route(1e6))).debug[
+            "cruise_mps"
+        ]
+        == 6.0
+    )
 
 
 @pytest.mark.parametrize("route", [NO_ROUTE, np.where(np.arange(20)[:, None] < 1, 0.0, NO_ROUTE)])
@@ -115,7 +128,7 @@ def test_route_of_two_points_ahead_is_enough() -> None:
     assert plan.xy[-1, 1] == pytest.approx(1.0, abs=0.1)
 
 
-# --- names ------------------------------------------------------------------------------------------------------------
+# --- names
 
 
 class Bare:
@@ -126,7 +139,12 @@ class Bare:
     def reset(self, seed: int, route: Route) -> None: ...
 
     def act(self, observation: Observation) -> Plan:
-        return Plan(observation.t_us, observation.t_us + 100_000 * np.arange(30), np.zeros((30, 2)), np.zeros(30))
+        return Plan(
+            observation.t_us,
+            observation.t_us + 100_000 * np.arange(30),
+            np.zeros((30, 2)),
+            np.zeros(30),
+        )
 
 
 class WithScenario(Bare):

@@ -1,4 +1,6 @@
-"""An imported drive made by hand: a road of grey Gaussians under a bright sky, with photographs of it in files."""
+"""An imported drive made by hand: a road of grey Gaussians under a bright sky, with photographs of
+it in files.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +24,13 @@ WIDE, HIGH = 64, 48
 
 
 def recorded_drive(folder: Path, count: int = 9) -> Scenario:
-    """Write a model and photographs every 0.2 s, the fourth held out, and of a right camera 0.5 m beside; return the scenario."""
-    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-5.0, 60.0, 0.5), np.arange(-10.0, 10.0, 0.5)))
+    """Write a model and photographs every 0.2 s, the fourth held out, and of a right camera 0.5 m
+    beside; return the scenario.
+    """
+    x, y = (
+        axis.ravel()
+        for axis in np.meshgrid(np.arange(-5.0, 60.0, 0.5), np.arange(-10.0, 10.0, 0.5))
+    )
     n = len(x)
     means, flat = np.column_stack([x, y, np.zeros(n)]), np.tile([0.3, 0.3, 0.02], (n, 1))
     colours = dc_from_rgb(np.full((n, 3), 0.4))[:, None, :]
@@ -35,19 +42,33 @@ def recorded_drive(folder: Path, count: int = 9) -> Scenario:
         _photograph(scenario, folder, camera, i, aside)
         for camera, aside in (("front", 0.0), ("right", -0.5))
         for i in range(count)
-    )  # fmt: skip
+    )
     return replace(scenario, model=str(folder / "model"), recording=shots)
 
 
-def _photograph(scenario: Scenario, folder: Path, camera: str, i: int, aside_m: float) -> Photograph:
+def _photograph(
+    scenario: Scenario, folder: Path, camera: str, i: int, aside_m: float
+) -> Photograph:
     spec, t_us = scenario.cameras[0], int(scenario.ego_log.t_us[0]) + 200_000 * i
     shift = np.eye(4)
     shift[1, 3] = aside_m
-    picture = np.full((2 * HIGH, 2 * WIDE, 3), 122, np.uint8)  # the road, 0.4, in the photographs' exposure
+    picture = np.full(
+        (2 * HIGH, 2 * WIDE, 3), 122, np.uint8
+    )  # the road, 0.4, in the photographs' exposure
     picture[:HIGH] = min(255, round(SKY_LEVEL * EXPOSURE))
     path = folder / f"{camera}-{i}.png"
     cv2.imwrite(str(path), picture)
     use = "never-fitted" if camera == "right" else "held-out" if i == 4 else "fitted"
     T = interpolate(scenario.ego_log, t_us) @ shift @ spec.T_rig_camera
     K = np.diag([2.0, 2.0, 1.0]) @ spec.K
-    return Photograph(t_us, camera, 2 * WIDE, 2 * HIGH, K, T, str(path), use, (EXPOSURE,) * 3 if use == "fitted" else (1.0,) * 3)  # type: ignore[arg-type]
+    return Photograph(
+        t_us,
+        camera,
+        2 * WIDE,
+        2 * HIGH,
+        K,
+        T,
+        str(path),
+        use,
+        (EXPOSURE,) * 3 if use == "fitted" else (1.0,) * 3,
+    )  # type: ignore[arg-type]

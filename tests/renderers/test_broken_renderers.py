@@ -28,12 +28,19 @@ LATE_FRAMES = 5  # a second of these requests, which follow the log's 5 Hz
 def requests(scenario: Scenario, n: int) -> list[RenderRequest]:
     out = []
     for i in range(5, 5 + n):
-        T = se3(scenario.ego_log.xyz[i], scenario.ego_log.quat[i]) @ scenario.cameras[0].T_rig_camera
-        out.append(RenderRequest(int(scenario.ego_log.t_us[i]), scenario.cameras[0], np.stack([T, T]), {}))
+        T = (
+            se3(scenario.ego_log.xyz[i], scenario.ego_log.quat[i])
+            @ scenario.cameras[0].T_rig_camera
+        )
+        out.append(
+            RenderRequest(int(scenario.ego_log.t_us[i]), scenario.cameras[0], np.stack([T, T]), {})
+        )
     return out
 
 
-def test_every_broken_renderer_differs_from_clean_and_keeps_the_contract(scenario: Scenario) -> None:
+def test_every_broken_renderer_differs_from_clean_and_keeps_the_contract(
+    scenario: Scenario,
+) -> None:
     names = [name for name in known("renderer") if name.startswith("broken-")]
     assert len(names) == 6
     views = requests(scenario, LATE_FRAMES + 2)
@@ -49,7 +56,9 @@ def test_every_broken_renderer_differs_from_clean_and_keeps_the_contract(scenari
         assert np.mean(np.abs(bad.rgb.astype(int) - good.rgb)) > 2, name
 
 
-def test_frozen_repeats_the_first_picture_and_late_the_one_some_frames_ago(scenario: Scenario) -> None:
+def test_frozen_repeats_the_first_picture_and_late_the_one_some_frames_ago(
+    scenario: Scenario,
+) -> None:
     views = requests(scenario, LATE_FRAMES + 3)
     clean = [make_renderer("clean", scenario).render(r).rgb for r in views]
     frozen, late = make_renderer("broken-frozen", scenario), make_renderer("broken-late", scenario)
@@ -58,17 +67,25 @@ def test_frozen_repeats_the_first_picture_and_late_the_one_some_frames_ago(scena
         np.testing.assert_array_equal(late.render(r).rgb, clean[max(0, i - LATE_FRAMES)])
 
 
-def test_mirrored_swaps_left_and_right_and_shifted_sees_from_half_a_metre_to_the_right(scenario: Scenario) -> None:
+def test_mirrored_swaps_left_and_right_and_shifted_sees_from_half_a_metre_to_the_right(
+    scenario: Scenario,
+) -> None:
     r = requests(scenario, 1)[0]
     clean = make_renderer("clean", scenario)
-    np.testing.assert_array_equal(make_renderer("broken-mirrored", scenario).render(r).rgb, clean.render(r).rgb[:, ::-1])
-    beside = r.T_world_camera @ np.array([[1.0, 0, 0, SHIFT_M], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    np.testing.assert_array_equal(
+        make_renderer("broken-mirrored", scenario).render(r).rgb, clean.render(r).rgb[:, ::-1]
+    )
+    beside = r.T_world_camera @ np.array(
+        [[1.0, 0, 0, SHIFT_M], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    )
     found = make_renderer("broken-shifted", scenario).render(r)
     np.testing.assert_array_equal(found.rgb, clean.render(replace(r, T_world_camera=beside)).rgb)
     assert SHIFT_M == 0.5
 
 
-def test_late_shows_the_newest_picture_that_is_a_second_old_at_any_frame_rate(scenario: Scenario) -> None:
+def test_late_shows_the_newest_picture_that_is_a_second_old_at_any_frame_rate(
+    scenario: Scenario,
+) -> None:
     views = requests(scenario, 21)[::3]
     t_us = [r.t_us for r in views]
     assert LATE_US % (t_us[1] - t_us[0])  # a second falls between two frames

@@ -10,7 +10,15 @@ import pytest
 from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.geometry import quat_from_yaw, se3
 from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.types import BackgroundFile, Behaviour, Degradation, Frame, RenderRequest, Scenario, Trajectory
+from alpasim_plugin.core.types import (
+    BackgroundFile,
+    Behaviour,
+    Degradation,
+    Frame,
+    RenderRequest,
+    Scenario,
+    Trajectory,
+)
 from alpasim_plugin.gaussians import write_ply
 from alpasim_plugin.gaussians.scene.degrade import GHOST
 from alpasim_plugin.renderers import make_renderer
@@ -24,18 +32,32 @@ OFFSETS_M = (0.0, 0.5, 1.0, 2.0, 3.0)
 def scenario() -> Iterator[Scenario]:
     moving = parked("moving", 30.0, -5.4)
     t = np.array([0, 10_000_000])
-    drive = Trajectory(t, np.array([[30.0, -5.4, 0.75], [90.0, -5.4, 0.75]]), np.tile(quat_from_yaw(0.0), (2, 1)))
-    yield straight(actors=(parked("car", 40.0, -1.8), replace(moving, track=drive, is_static=False, behaviour=Behaviour())))
+    drive = Trajectory(
+        t, np.array([[30.0, -5.4, 0.75], [90.0, -5.4, 0.75]]), np.tile(quat_from_yaw(0.0), (2, 1))
+    )
+    yield straight(
+        actors=(
+            parked("car", 40.0, -1.8),
+            replace(moving, track=drive, is_static=False, behaviour=Behaviour()),
+        )
+    )
     clear_cache()
 
 
-def request(scenario: Scenario, index: int = 8, left_m: float = 0.0, t_us: int | None = None) -> RenderRequest:
+def request(
+    scenario: Scenario, index: int = 8, left_m: float = 0.0, t_us: int | None = None
+) -> RenderRequest:
     T = se3(scenario.ego_log.xyz[index], scenario.ego_log.quat[index])
     T[:3, 3] += left_m * T[:3, 1]
     camera = scenario.cameras[0]
     pose = T @ camera.T_rig_camera
     actors = {a.actor_id: se3(a.track.xyz[0], a.track.quat[0]) for a in scenario.actors}
-    return RenderRequest(int(scenario.ego_log.t_us[index]) if t_us is None else t_us, camera, np.stack([pose, pose]), actors)
+    return RenderRequest(
+        int(scenario.ego_log.t_us[index]) if t_us is None else t_us,
+        camera,
+        np.stack([pose, pose]),
+        actors,
+    )
 
 
 def psnr(a: Frame, b: Frame) -> float:
@@ -75,30 +97,48 @@ def test_depth_of_the_road_is_that_of_the_plane(scenario: Scenario) -> None:
 def test_error_of_3dgs_grows_with_the_distance_from_the_logged_path(scenario: Scenario) -> None:
     clean, bad = make_renderer("clean", scenario), make_renderer("3dgs", scenario)
     frames = range(4, 36, 8)
-    curve = [np.mean([psnr(clean.render(r), bad.render(r)) for r in (request(scenario, i, d) for i in frames)]) for d in OFFSETS_M]
-    assert all(a > b + 0.2 for a, b in pairwise(curve)), curve  # slower beyond full_m, where parallax alone goes on
+    curve = [
+        np.mean(
+            [
+                psnr(clean.render(r), bad.render(r))
+                for r in (request(scenario, i, d) for i in frames)
+            ]
+        )
+        for d in OFFSETS_M
+    ]
+    assert all(a > b + 0.2 for a, b in pairwise(curve)), (
+        curve
+    )  # slower beyond full_m, where parallax alone goes on
     assert 22 < curve[0] < 34, curve  # mildly soft on the path
     assert curve[-1] < curve[0] - 5, curve
 
 
 def test_both_sides_of_the_path_are_bad(scenario: Scenario) -> None:
     clean, bad = make_renderer("clean", scenario), make_renderer("3dgs", scenario)
-    left, right = (psnr(clean.render(r), bad.render(r)) for r in (request(scenario, 8, d) for d in (2.5, -2.5)))
-    assert max(left, right) < psnr(clean.render(request(scenario)), bad.render(request(scenario))) - 3
+    left, right = (
+        psnr(clean.render(r), bad.render(r)) for r in (request(scenario, 8, d) for d in (2.5, -2.5))
+    )
+    assert (
+        max(left, right) < psnr(clean.render(request(scenario)), bad.render(request(scenario))) - 3
+    )
 
 
 def test_severity_zero_and_kind_none_render_the_clean_scene(scenario: Scenario) -> None:
     clean = make_renderer("clean", scenario).render(request(scenario, left_m=2.0))
     for degradation in (Degradation("surrogate", severity=0.0), Degradation(kind="none")):
         other = replace(scenario, degradation=degradation)
-        np.testing.assert_array_equal(make_renderer("3dgs", other).render(request(scenario, left_m=2.0)).rgb, clean.rgb)
+        np.testing.assert_array_equal(
+            make_renderer("3dgs", other).render(request(scenario, left_m=2.0)).rgb, clean.rgb
+        )
 
 
 @pytest.mark.slow
 def test_higher_severity_is_worse(scenario: Scenario) -> None:
     clean = make_renderer("clean", scenario)
     r = request(scenario, left_m=1.5)
-    worse = [replace(scenario, degradation=Degradation("surrogate", severity=s)) for s in (0.3, 1.0, 2.0)]
+    worse = [
+        replace(scenario, degradation=Degradation("surrogate", severity=s)) for s in (0.3, 1.0, 2.0)
+    ]
     values = [psnr(clean.render(r), make_renderer("3dgs", w).render(r)) for w in worse]
     assert values == sorted(values, reverse=True)
 
@@ -108,14 +148,20 @@ def test_same_request_gives_the_same_frame_whatever_came_before(scenario: Scenar
         a, b = make_renderer(name, scenario, seed=3), make_renderer(name, scenario, seed=3)
         for i in (30, 5, 17):
             a.render(request(scenario, i, 1.7))
-        first, second = a.render(request(scenario, left_m=0.9)), b.render(request(scenario, left_m=0.9))
+        first, second = (
+            a.render(request(scenario, left_m=0.9)),
+            b.render(request(scenario, left_m=0.9)),
+        )
         np.testing.assert_array_equal(first.rgb, second.rgb)
         np.testing.assert_array_equal(first.alpha, second.alpha)
 
 
 def test_frame_does_not_depend_on_the_thread_count(scenario: Scenario) -> None:
     for name in ("clean", "3dgs"):
-        one, two = (make_renderer(name, scenario, threads=n).render(request(scenario, left_m=1.0)) for n in (1, 2))
+        one, two = (
+            make_renderer(name, scenario, threads=n).render(request(scenario, left_m=1.0))
+            for n in (1, 2)
+        )
         np.testing.assert_array_equal(one.rgb, two.rgb)
 
 
@@ -123,7 +169,9 @@ def test_frame_does_not_depend_on_the_thread_count(scenario: Scenario) -> None:
 def test_frame_does_not_depend_on_whether_the_scene_was_cached(scenario: Scenario) -> None:
     before = make_renderer("3dgs", scenario).render(request(scenario, left_m=1.0))
     clear_cache()
-    np.testing.assert_array_equal(make_renderer("3dgs", scenario).render(request(scenario, left_m=1.0)).rgb, before.rgb)
+    np.testing.assert_array_equal(
+        make_renderer("3dgs", scenario).render(request(scenario, left_m=1.0)).rgb, before.rgb
+    )
 
 
 def test_rollout_seed_changes_what_wanders_but_not_the_scene(scenario: Scenario) -> None:
@@ -136,7 +184,9 @@ def test_rollout_seed_changes_what_wanders_but_not_the_scene(scenario: Scenario)
 
 
 def test_renderers_of_one_scenario_share_the_scene(scenario: Scenario) -> None:
-    assert scene_of(scenario) is scene_of(replace(scenario, degradation=Degradation("surrogate", severity=0.2)))
+    assert scene_of(scenario) is scene_of(
+        replace(scenario, degradation=Degradation("surrogate", severity=0.2))
+    )
     assert scene_key(scenario) != scene_key(replace(scenario, seed=1))
     assert scene_key(scenario) != scene_key(replace(scenario, actors=()))
 
@@ -160,7 +210,9 @@ def test_only_moving_actors_have_ghosts(scenario: Scenario) -> None:
 
 def test_clean_frame_is_taken_at_the_end_of_the_shutter(scenario: Scenario) -> None:
     r = request(scenario)
-    moved = replace(r, T_world_camera=np.stack([request(scenario, 2).T_world_camera[0], r.T_world_camera[1]]))
+    moved = replace(
+        r, T_world_camera=np.stack([request(scenario, 2).T_world_camera[0], r.T_world_camera[1]])
+    )
     renderer = make_renderer("clean", scenario)
     np.testing.assert_array_equal(renderer.render(r).rgb, renderer.render(moved).rgb)
 
@@ -186,7 +238,9 @@ def test_actor_unknown_to_the_scene_is_an_error(scenario: Scenario) -> None:
             make_renderer(name, scenario).render(replace(r, actors={"nobody": np.eye(4)}))
 
 
-def test_file_background_replaces_the_street_and_keeps_actors_and_sky(scenario: Scenario, tmp_path: object) -> None:
+def test_file_background_replaces_the_street_and_keeps_actors_and_sky(
+    scenario: Scenario, tmp_path: object
+) -> None:
     wall = scene_of(scenario).actors["car"].levels[0].cloud
     path = f"{tmp_path}/model.ply"
     write_ply(path, wall)
@@ -207,4 +261,6 @@ def test_file_background_replaces_the_street_and_keeps_actors_and_sky(scenario: 
 
 def test_missing_background_file_is_a_clear_error(scenario: Scenario) -> None:
     with pytest.raises(InputError, match=r"nowhere\.ply"):
-        make_renderer("clean", replace(scenario, background=BackgroundFile("nowhere.ply", np.eye(4))))
+        make_renderer(
+            "clean", replace(scenario, background=BackgroundFile("nowhere.ply", np.eye(4)))
+        )

@@ -1,4 +1,6 @@
-"""The renderer 3dgs of an imported drive: its own model, sky as an opaque layer without depth, the recording's exposure and frames."""
+"""The renderer 3dgs of an imported drive: its own model, sky as an opaque layer without depth, the
+recording's exposure and frames.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
 def frame(drive: Scenario) -> Frame:
     camera, t_us = drive.cameras[0], int(drive.ego_log.t_us[0]) + 400_000
     T = interpolate(drive.ego_log, t_us) @ camera.T_rig_camera
-    return make_renderer("3dgs", drive, threads=1).render(RenderRequest(t_us, camera, np.stack([T, T]), log_actors(drive, t_us)))
+    return make_renderer("3dgs", drive, threads=1).render(
+        RenderRequest(t_us, camera, np.stack([T, T]), log_actors(drive, t_us))
+    )
 
 
 def test_3dgs_of_an_imported_drive_is_its_model(drive: Scenario, frame: Frame) -> None:
@@ -50,7 +54,9 @@ def test_a_hole_below_the_horizon_stays_a_hole(drive: Scenario) -> None:
     camera, t_us = drive.cameras[0], int(drive.ego_log.t_us[0])
     T = interpolate(drive.ego_log, t_us) @ camera.T_rig_camera
     T[:3, 3] += [0.0, 200.0, 0.0]  # far beside the road, where there is nothing
-    shown = make_renderer("3dgs", drive, threads=1).render(RenderRequest(t_us, camera, np.stack([T, T]), {}))
+    shown = make_renderer("3dgs", drive, threads=1).render(
+        RenderRequest(t_us, camera, np.stack([T, T]), {})
+    )
     assert shown.alpha is not None
     assert shown.alpha[-1].max() < 0.5
     assert shown.alpha[0].min() == 1
@@ -98,6 +104,10 @@ def test_exposure_follows_the_place_and_the_camera(drive: Scenario) -> None:
     recording = (replace(one, exposure=(1.0, 1.0, 1.0)), replace(other, exposure=(2.0, 1.0, 0.5)))
     exposures = Exposures.of(recording)
     assert np.allclose(exposures.near("front", one.T_world_camera[:3, 3]), 1.0, atol=1e-2)
-    assert np.allclose(exposures.near("front", other.T_world_camera[:3, 3]), [2.0, 1.0, 0.5], atol=1e-2)
-    assert np.allclose(exposures.near("roof", other.T_world_camera[:3, 3]), [2.0, 1.0, 0.5], atol=1e-2)
+    assert np.allclose(
+        exposures.near("front", other.T_world_camera[:3, 3]), [2.0, 1.0, 0.5], atol=1e-2
+    )
+    assert np.allclose(
+        exposures.near("roof", other.T_world_camera[:3, 3]), [2.0, 1.0, 0.5], atol=1e-2
+    )
     assert np.allclose(Exposures.of(()).near("front", np.zeros(3)), 1.0)

@@ -1,4 +1,6 @@
-"""The renderer 3dgs on a model fitted to the logged drive: tiny fits of a street, 64 x 36 pixels."""
+"""The renderer 3dgs on a model fitted to the logged drive: tiny fits of a street, 64 x 36
+pixels.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +15,30 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.types import BackgroundFile, Behaviour, Degradation, Environment, Latency, Scenario
+from alpasim_plugin.core.types import (
+    BackgroundFile,
+    Behaviour,
+    Degradation,
+    Environment,
+    Latency,
+    Scenario,
+)
 from alpasim_plugin.gaussians.fit.views import logged_views
 from alpasim_plugin.renderers import make_renderer, recorded
-from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, clear_cache, scene_of
+from alpasim_plugin.renderers.gaussian import (
+    CleanRenderer,
+    SurrogateRenderer,
+    clear_cache,
+    scene_of,
+)
 from alpasim_plugin.renderers.reconstruction import KIND, ReconstructionRenderer, ensure
 from alpasim_plugin.renderers.reconstruction_build import misplaced
-from alpasim_plugin.renderers.reconstruction_key import HASHES, read_model, recipe_of, reconstruction_key
+from alpasim_plugin.renderers.reconstruction_key import (
+    HASHES,
+    read_model,
+    recipe_of,
+    reconstruction_key,
+)
 from tests.gaussians.scene_maps import line, parked, road_lanes, straight, with_camera
 from tests.renderers.test_gaussian_renderers import psnr, request
 
@@ -31,9 +50,13 @@ DAMAGE = {"views_per_s": 20.0, "depth_error": 0.3, "pose_error_m": 0.1}
 def street(degradation: Degradation = FITTED) -> Scenario:
     """Give 1.4 s along a straight street with one actor in view and one behind the camera."""
     around = Environment(buildings=0.0, trees_per_100m=5.0, poles_spacing_m=0.0)
-    scenario = with_camera(straight(actors=ACTORS, environment=around, degradation=degradation), 64, 36)
+    scenario = with_camera(
+        straight(actors=ACTORS, environment=around, degradation=degradation), 64, 36
+    )
     log = scenario.ego_log
-    return replace(scenario, ego_log=replace(log, t_us=log.t_us[:8], xyz=log.xyz[:8], quat=log.quat[:8]))
+    return replace(
+        scenario, ego_log=replace(log, t_us=log.t_us[:8], xyz=log.xyz[:8], quat=log.quat[:8])
+    )
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +82,9 @@ def error_db(renderer: ReconstructionRenderer, left_m: float) -> float:
     return float(np.mean([psnr(clean.render(r), renderer.render(r)) for r in requests]))
 
 
-def test_frame_has_the_shapes_types_and_ranges_of_the_contract(fitted: ReconstructionRenderer) -> None:
+def test_frame_has_the_shapes_types_and_ranges_of_the_contract(
+    fitted: ReconstructionRenderer,
+) -> None:
     frame = fitted.render(request(fitted.scenario, 4))
     assert frame.rgb.shape == (36, 64, 3)
     assert frame.rgb.dtype == np.uint8
@@ -72,7 +97,9 @@ def test_frame_has_the_shapes_types_and_ranges_of_the_contract(fitted: Reconstru
     assert 2.0 < frame.depth[-1, 32] < 9.0
 
 
-def test_it_shows_the_scene_well_on_the_path_and_worse_beside_it(fitted: ReconstructionRenderer) -> None:
+def test_it_shows_the_scene_well_on_the_path_and_worse_beside_it(
+    fitted: ReconstructionRenderer,
+) -> None:
     on_path, beside = error_db(fitted, 0.0), error_db(fitted, 3.0)
     assert on_path > 19
     assert on_path > beside + 1
@@ -84,7 +111,9 @@ def test_a_larger_share_of_the_schedule_fits_better(fitted: ReconstructionRender
     assert error_db(fitted, 0.0) > error_db(hasty, 0.0) + 1
 
 
-def test_frames_do_not_depend_on_what_came_before_nor_on_threads(fitted: ReconstructionRenderer) -> None:
+def test_frames_do_not_depend_on_what_came_before_nor_on_threads(
+    fitted: ReconstructionRenderer,
+) -> None:
     r = request(fitted.scenario, 4, 0.7)
     fitted.render(request(fitted.scenario, 7))
     first = fitted.render(r)
@@ -95,17 +124,25 @@ def test_frames_do_not_depend_on_what_came_before_nor_on_threads(fitted: Reconst
         np.testing.assert_array_equal(first.alpha, again.alpha)
 
 
-def test_the_drives_of_a_process_share_a_recording_and_what_was_read_of_it(fitted: ReconstructionRenderer) -> None:
-    (first, other), again = (make_renderer("3dgs", fitted.scenario).recorded()[:2] for _ in range(2))
+def test_the_drives_of_a_process_share_a_recording_and_what_was_read_of_it(
+    fitted: ReconstructionRenderer,
+) -> None:
+    (first, other), again = (
+        make_renderer("3dgs", fitted.scenario).recorded()[:2] for _ in range(2)
+    )
     assert (first, other) == tuple(again)
     assert again[0].read() is first.read()
     assert other.read() is not first.read()
 
 
-def test_a_recording_keeps_so_many_pictures_as_its_memory_holds(fitted: ReconstructionRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_keeps_so_many_pictures_as_its_memory_holds(
+    fitted: ReconstructionRenderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(recorded, "KEPT_BYTES", 2 * 64 * 36 * recorded.BYTES_PER_PX)
     scene, model = scene_of(fitted.scenario), fitted.model.graph.render
-    first, second, third = recorded.built_recording(fitted.scenario, scene, model, recipe_of(fitted.scenario))[:3]
+    first, second, third = recorded.built_recording(
+        fitted.scenario, scene, model, recipe_of(fitted.scenario)
+    )[:3]
     was = first.read()
     second.read()
     assert first.read() is was
@@ -116,12 +153,17 @@ def test_a_recording_keeps_so_many_pictures_as_its_memory_holds(fitted: Reconstr
     np.testing.assert_array_equal(again[0], was[0])
 
 
-def test_actor_that_was_seen_is_fitted_and_one_never_seen_is_spliced_in(fitted: ReconstructionRenderer) -> None:
+def test_actor_that_was_seen_is_fitted_and_one_never_seen_is_spliced_in(
+    fitted: ReconstructionRenderer,
+) -> None:
     actors = fitted.model.graph.actors
     assert len(actors["ahead"].levels) == 1
     own = make_renderer("clean", fitted.scenario)
     assert isinstance(own, CleanRenderer)
-    np.testing.assert_array_equal(actors["never-seen"].levels[0].cloud.means, own.scene.actors["never-seen"].levels[0].cloud.means)
+    np.testing.assert_array_equal(
+        actors["never-seen"].levels[0].cloud.means,
+        own.scene.actors["never-seen"].levels[0].cloud.means,
+    )
     r = request(fitted.scenario, 4)
     for name in actors:
         pose = np.eye(4)
@@ -142,7 +184,13 @@ def test_damaged_file_is_noticed_and_the_same_model_made_again_by_more_threads(
     scenario = fitted.scenario
     folder = cache / KIND / reconstruction_key(scenario, recipe_of(scenario))
     before = json.loads((folder / HASHES).read_text())
-    assert set(before) == {"background.ply", "actors/000.ply", "reconstruction.json", "sky.png", "sky_views.npz"}
+    assert set(before) == {
+        "background.ply",
+        "actors/000.ply",
+        "reconstruction.json",
+        "sky.png",
+        "sky_views.npz",
+    }
     data = bytearray((folder / "background.ply").read_bytes())
     data[-10] ^= 255
     (folder / "background.ply").write_bytes(data)
@@ -196,7 +244,10 @@ def test_key_follows_what_is_seen_and_how_it_is_fitted_and_nothing_else() -> Non
         replace(scenario, lane_map=replace(scenario.lane_map, lanes=other_lanes)),
         replace(scenario, environment=replace(scenario.environment, buildings=0.4)),
         replace(scenario, degradation=replace(FITTED, share=0.5)),
-        *(replace(scenario, degradation=replace(FITTED, **{key: value})) for key, value in DAMAGE.items()),
+        *(
+            replace(scenario, degradation=replace(FITTED, **{key: value}))
+            for key, value in DAMAGE.items()
+        ),
         replace(scenario, degradation=Degradation("cycle", share=0.4)),
         with_camera(scenario, 96, 54),
     ]
@@ -229,7 +280,10 @@ def test_scene_without_a_camera_cannot_be_fitted(cache: Path) -> None:
 
 def test_longer_logs_and_more_cameras_get_more_views_points_and_steps() -> None:
     short, scenario = recipe_of(street()).splat, straight(degradation=FITTED)
-    long, two = recipe_of(scenario).splat, recipe_of(replace(scenario, cameras=scenario.cameras * 2)).splat
+    long, two = (
+        recipe_of(scenario).splat,
+        recipe_of(replace(scenario, cameras=scenario.cameras * 2)).splat,
+    )
     for name in ("views", "points", "steps"):
         assert getattr(short, name) < getattr(long, name) < getattr(two, name)
 
@@ -247,10 +301,20 @@ def test_views_are_misplaced_smoothly_by_the_pose_error_and_not_at_all_by_none()
     many = [replace(views[0], name=str(i)) for i in range(400)]
     assert all(a is b for a, b in zip(misplaced(many, 0.0, "s", 0), many, strict=True))
     moved = misplaced(many, 0.1, "s", 0)
-    errors = np.array([a.camera.T_camera_world @ inverse(b.camera.T_camera_world) for a, b in zip(moved, many, strict=True)])
+    errors = np.array(
+        [
+            a.camera.T_camera_world @ inverse(b.camera.T_camera_world)
+            for a, b in zip(moved, many, strict=True)
+        ]
+    )
     assert 0.06 < errors[:, :3, 3].std() < 0.12
-    turned_deg = np.degrees(np.arccos(np.clip((np.trace(errors[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    turned_deg = np.degrees(
+        np.arccos(np.clip((np.trace(errors[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
+    )
     assert 0.2 < turned_deg.mean() < 0.6
     assert np.abs(np.diff(errors[:, :3, 3], axis=0)).mean() < 0.5 * errors[:, :3, 3].std()
     again = misplaced(many, 0.1, "s", 0)
-    assert all(np.array_equal(a.camera.T_camera_world, b.camera.T_camera_world) for a, b in zip(moved, again, strict=True))
+    assert all(
+        np.array_equal(a.camera.T_camera_world, b.camera.T_camera_world)
+        for a, b in zip(moved, again, strict=True)
+    )

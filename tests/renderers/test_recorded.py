@@ -1,4 +1,6 @@
-"""What a renderer declares of the recorded drive: the built scene's own frames, where the reconstruction believes that they were taken."""
+"""What a renderer declares of the recorded drive: the built scene's own frames, where the
+reconstruction believes that they were taken.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ def street(degradation: Degradation) -> Scenario:
     return with_camera(straight(degradation=degradation), 64, 36)
 
 
-def test_a_built_scene_has_a_frame_of_every_camera_twice_a_second_never_at_the_time_of_a_rendered_one() -> None:
+def test_a_built_scene_has_a_frame_of_every_camera_twice_a_second_never_at_the_time_of_a_rendered_one() -> (
+    None
+):
     scenario = street(Degradation("surrogate"))
     frames = make_renderer("3dgs", scenario).recorded()
     times = [frame.t_us for frame in frames]
@@ -45,7 +49,10 @@ def test_a_recorded_frame_is_believed_where_registration_put_the_views_beside_it
     recipe = recipe_of(scenario)
     views = logged_views(scenario, scene_of(scenario), recipe.splat.views, 32)
     moved = misplaced(views, recipe.pose_error_m, scenario.scene_id, recipe.splat.seed)
-    errors = [b.camera.T_camera_world @ inverse(a.camera.T_camera_world) for a, b in zip(views, moved, strict=True)]
+    errors = [
+        b.camera.T_camera_world @ inverse(a.camera.T_camera_world)
+        for a, b in zip(views, moved, strict=True)
+    ]
     log = scenario.ego_log.t_us
     for frame in built_recording(scenario, scene_of(scenario), scene_of(scenario).render, recipe):
         true = inverse(interpolate(scenario.ego_log, frame.t_us) @ scenario.cameras[0].T_rig_camera)

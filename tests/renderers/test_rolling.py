@@ -1,4 +1,6 @@
-"""A rolling shutter in bands against the definition, row by row, where it is hardest: a turning rig, a passing car."""
+"""A rolling shutter in bands against the definition, row by row, where it is hardest: a turning
+rig, a passing car.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ STANDS = se2(20.0, -1.8, 0.0)
 
 @pytest.fixture(scope="module")
 def scenario() -> Iterator[Scenario]:
-    yield straight(actors=(replace(parked("car", 27.0, 1.8), is_static=False, behaviour=Behaviour()),))
+    yield straight(
+        actors=(replace(parked("car", 27.0, 1.8), is_static=False, behaviour=Behaviour()),)
+    )
     clear_cache()
 
 
@@ -38,7 +42,9 @@ def draw(scenario: Scenario) -> Draw:
     return drawn
 
 
-def case(scenario: Scenario, speed_mps: float = 0.0, turn_rad_s: float = 0.0, car_mps: float = 0.0) -> RenderRequest:
+def case(
+    scenario: Scenario, speed_mps: float = 0.0, turn_rad_s: float = 0.0, car_mps: float = 0.0
+) -> RenderRequest:
     """A frame of a moving rig beside a car that drives along x."""
     spec, start = scenario.cameras[0], STANDS
     end = STANDS @ se2(speed_mps * SHUTTER_S, 0.0, turn_rad_s * SHUTTER_S)
@@ -62,7 +68,9 @@ HARD = {
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_bands_are_the_rows_to_rounding_where_the_end_pose_is_far_off(scenario: Scenario, draw: Draw, name: str) -> None:
+def test_bands_are_the_rows_to_rounding_where_the_end_pose_is_far_off(
+    scenario: Scenario, draw: Draw, name: str
+) -> None:
     request = case(scenario, **HARD[name])
     truth, in_bands = plain_draw_request(request, draw), draw_request(request, draw, "cpu")
     at_end = draw_request(replace(request, exposure=None), draw, "cpu")
@@ -79,15 +87,23 @@ def test_the_error_falls_as_bands_grow_in_number_and_ends_at_rounding(
     request = case(scenario, **HARD["all"])
     truth, errors = plain_draw_request(request, draw), []
     for count in (1, 4, 16, request.camera.height):
-        monkeypatch.setattr("alpasim_plugin.renderers.rolling.bands", partial(lambda r, n: list(bands_of(r, n)), n=count))
+        monkeypatch.setattr(
+            "alpasim_plugin.renderers.rolling.bands",
+            partial(lambda r, n: list(bands_of(r, n)), n=count),
+        )
         errors.append(psnr(draw_request(request, draw, "cpu"), truth))
     assert all(later > earlier + 6 for earlier, later in pairwise(errors)), errors
-    assert errors[-1] > 90  # windows begin at other places than the picture, so sums round otherwise
+    assert (
+        errors[-1] > 90
+    )  # windows begin at other places than the picture, so sums round otherwise
 
 
 def test_a_rig_that_stands_shows_what_a_global_shutter_does(scenario: Scenario, draw: Draw) -> None:
     request = case(scenario)
-    np.testing.assert_array_equal(draw_request(request, draw, "cpu").rgb, draw_request(replace(request, exposure=None), draw, "cpu").rgb)
+    np.testing.assert_array_equal(
+        draw_request(request, draw, "cpu").rgb,
+        draw_request(replace(request, exposure=None), draw, "cpu").rgb,
+    )
 
 
 def test_a_backend_without_windows_gives_the_same_picture(scenario: Scenario, draw: Draw) -> None:
@@ -103,7 +119,10 @@ def test_a_window_shows_what_the_whole_picture_does(scenario: Scenario, draw: Dr
     rows, columns = slice(100, 107), slice(60, 200)
     part = draw(camera.window(rows, columns), {})
     assert np.abs(part.rgb - whole.rgb[rows, columns]).max() < 2e-3
-    assert camera.window(rows, columns).window(slice(0, 2), slice(3, 9)).slope_limits() == camera.slope_limits()
+    assert (
+        camera.window(rows, columns).window(slice(0, 2), slice(3, 9)).slope_limits()
+        == camera.slope_limits()
+    )
 
 
 @pytest.mark.parametrize("name", ["clean", "3dgs"])
@@ -112,7 +131,10 @@ def test_renderers_roll_when_the_request_does(scenario: Scenario, name: str) -> 
     request = case(scenario, **HARD["all"])
     rolled, still = renderer.render(request), renderer.render(replace(request, exposure=None))
     assert (rolled.rgb != still.rgb).mean() > 0.2
-    assert np.abs(rolled.rgb[-1].astype(int) - still.rgb[-1]).mean() < np.abs(rolled.rgb[80].astype(int) - still.rgb[80]).mean()
+    assert (
+        np.abs(rolled.rgb[-1].astype(int) - still.rgb[-1]).mean()
+        < np.abs(rolled.rgb[80].astype(int) - still.rgb[80]).mean()
+    )
     assert rolled.depth is not None
     assert rolled.depth.shape == rolled.rgb.shape[:2]
     assert renderer.render(request).rgb.tobytes() == rolled.rgb.tobytes()

@@ -30,7 +30,8 @@ FLAGS = (
     "--remote-debugging-pipe",
 )
 PATIENCE_S = 60.0
-# The browser reads commands from descriptor 3 and answers on 4; the pipes may themselves have those numbers, so they move up first.
+# The browser reads commands from descriptor 3 and answers on 4; the pipes may themselves have those
+# numbers, so they move up first.
 LAUNCH = (
     "import fcntl, os, sys; r, w = (fcntl.fcntl(int(a), fcntl.F_DUPFD, 10) for a in sys.argv[1:3]); "
     "os.dup2(r, 3); os.dup2(w, 4); os.execv(sys.argv[3], sys.argv[3:])"
@@ -46,7 +47,9 @@ class Browser:
     """One page in a fresh profile; everything that the page requests, logs or throws is kept."""
 
     def __init__(self, executable: str) -> None:
-        self._profile = tempfile.TemporaryDirectory(prefix="simrun-chromium-", ignore_cleanup_errors=True)
+        self._profile = tempfile.TemporaryDirectory(
+            prefix="simrun-chromium-", ignore_cleanup_errors=True
+        )
         to_browser, self._write = os.pipe()
         self._read, from_browser = os.pipe()
 
@@ -67,14 +70,21 @@ class Browser:
         self.complaints: list[str] = []
         targets = self._call("Target.getTargets", session=None)["targetInfos"]
         page = next(t["targetId"] for t in targets if t["type"] == "page")
-        self._session = self._call("Target.attachToTarget", session=None, targetId=page, flatten=True)["sessionId"]
+        self._session = self._call(
+            "Target.attachToTarget", session=None, targetId=page, flatten=True
+        )["sessionId"]
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
 
     def __enter__(self) -> Browser:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         os.killpg(self._process.pid, signal.SIGTERM)
         try:
             self._process.wait(10)
@@ -95,18 +105,32 @@ class Browser:
 
     def visit(self, url: str, width: int = 1400, height: int = 900, dark: bool = False) -> None:
         """Open an address and wait until it is loaded."""
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600)
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=width < 600,
+        )
         scheme = "dark" if dark else "light"
-        self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        self.call(
+            "Emulation.setEmulatedMedia",
+            features=[{"name": "prefers-color-scheme", "value": scheme}],
+        )
         self.call("Page.navigate", url=url)
         deadline = time.monotonic() + PATIENCE_S
-        while self.evaluate("document.readyState") != "complete" or self.evaluate("location.href.split('#')[0]") != url.split("#")[0]:
+        while (
+            self.evaluate("document.readyState") != "complete"
+            or self.evaluate("location.href.split('#')[0]") != url.split("#")[0]
+        ):
             if time.monotonic() > deadline:
                 raise TimeoutError(f"{url} did not load in {PATIENCE_S} s")
             time.sleep(0.05)
 
     def press(self, key: str, code: int = 0, shift: bool = False) -> None:
-        """Press and release a key as a person does, with what the page's element in focus makes of it."""
+        """Press and release a key as a person does, with what the page's element in focus makes of
+        it.
+        """
         stroke = {"key": key, "modifiers": 8 if shift else 0, "windowsVirtualKeyCode": code}
         text = {"text": key} if len(key) == 1 else {}
         self.call("Input.dispatchKeyEvent", type="keyDown", **stroke, **text)
@@ -114,7 +138,9 @@ class Browser:
 
     def evaluate(self, expression: str) -> Any:
         """Evaluate JavaScript in the page and return its value."""
-        answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        answer = self.call(
+            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+        )
         if "exceptionDetails" in answer:
             raise RuntimeError(f"{expression}: {answer['exceptionDetails']}")
         return answer["result"].get("value")
@@ -125,7 +151,9 @@ class Browser:
             size = self.call("Page.getLayoutMetrics")["cssContentSize"]
             clip = (0, 0, size["width"], size["height"])
         box = dict(zip(("x", "y", "width", "height"), clip, strict=True)) | {"scale": 1}
-        data = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=box)["data"]
+        data = self.call(
+            "Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=box
+        )["data"]
         path.write_bytes(base64.b64decode(data))
 
     def _call(self, method: str, session: str | None, **params: Any) -> dict[str, Any]:
@@ -157,7 +185,11 @@ class Browser:
             self.requests.append(params["request"]["url"])
         elif method == "Runtime.exceptionThrown":
             self.complaints.append(str(params["exceptionDetails"]))
-        elif method == "Runtime.consoleAPICalled" and params["type"] in ("error", "warning", "assert"):
+        elif method == "Runtime.consoleAPICalled" and params["type"] in (
+            "error",
+            "warning",
+            "assert",
+        ):
             self.complaints.append(str(params["args"]))
         elif method == "Log.entryAdded" and params["entry"]["level"] in ("error", "warning"):
             self.complaints.append(str(params["entry"]))

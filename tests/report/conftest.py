@@ -11,9 +11,14 @@ HOSTILE = "<img src=x onerror=alert(1)>\"'&|{{7*7}}"
 
 @pytest.fixture(scope="session")
 def usual_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make three renderers x two policies x four scenes x three seeds, two failures, one metric invalid in one scene."""
+    """Make three renderers x two policies x four scenes x three seeds, two failures, one metric
+    invalid in one scene.
+    """
     fail = [("3dgs", "urban/left-turn", 1), ("onefixer", "USA_US101-3_3_T-1", 2)]
-    return make_run(tmp_path_factory.mktemp("usual"), Plan(policies=("lane-camera", "pure-pursuit"), fail=fail, flip_frames=True))
+    return make_run(
+        tmp_path_factory.mktemp("usual"),
+        Plan(policies=("lane-camera", "pure-pursuit"), fail=fail, flip_frames=True),
+    )
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,6 @@
-"""Make run folders as the runtime writes them, with drives and pictures made up from a seed, so that the report can be tested alone."""
+"""Make run folders as the runtime writes them, with drives and pictures made up from a seed, so
+that the report can be tested alone.
+"""
 
 from __future__ import annotations
 
@@ -47,18 +49,27 @@ class Plan:
 
     renderers: Sequence[str] = ("clean", "3dgs", "onefixer")
     policies: Sequence[str] = ("lane-camera",)
-    scenes: Sequence[str] = ("smoke/straight", "urban/left-turn", "hard/narrow-gap-with-parked-cars", "USA_US101-3_3_T-1")
+    scenes: Sequence[str] = (
+        "smoke/straight",
+        "urban/left-turn",
+        "hard/narrow-gap-with-parked-cars",
+        "USA_US101-3_3_T-1",
+    )
     seeds: Sequence[int] = (0, 1, 2)
     steps: int = 120
     fail: Sequence[tuple[str, str, int]] = ()  # (renderer, scene, seed)
     failure: str = "1204 NaN pixels <b>&\nat t = 3.400000 s"
-    invalid: Sequence[str] = ("min_distance_to_obstacle_m",)  # metrics that are invalid in the first scene
+    invalid: Sequence[str] = (
+        "min_distance_to_obstacle_m",
+    )  # metrics that are invalid in the first scene
     pictures: bool = True
     clips: bool = True
     flip_frames: bool = False
     certificate: str = "equal"  # equal | different | skipped
     picture_px: tuple[int, int] = (256, 144)
-    harm: dict[str, float] = field(default_factory=lambda: {"clean": 0.15, "3dgs": 2.6, "onefixer": 0.45})
+    harm: dict[str, float] = field(
+        default_factory=lambda: {"clean": 0.15, "3dgs": 2.6, "onefixer": 0.45}
+    )
     rng_seed: int = 7
 
 
@@ -76,7 +87,9 @@ def make_run(folder: Path, plan: Plan | None = None) -> Path:
             wander = _smooth(rng, plan.steps) * 0.3  # shared by the renderers: pairs are sharp
             for renderer in plan.renderers:
                 for policy in plan.policies:
-                    row, series = _rollout(renderer, policy, scene, seed, content, wander, plan, rng)
+                    row, series = _rollout(
+                        renderer, policy, scene, seed, content, wander, plan, rng
+                    )
                     rows.append(row)
                     steps += series
                     _files(folder, row, content, plan)
@@ -90,22 +103,48 @@ def make_run(folder: Path, plan: Plan | None = None) -> Path:
 
 
 def _write_flips(folder: Path, plan: Plan) -> None:
-    """Write when plans parted for every flip, as the runtime does from the logs; the second one has no answer."""
+    """Write when plans parted for every flip, as the runtime does from the logs; the second one has
+    no answer.
+    """
     flips, compared = find_flips(read_run(folder))
     cells = []
     for number, flip in enumerate(flips):
-        key = dict(zip(("renderer", "policy", "scene", "seed", "against"), flip.key, strict=True)) | {"baseline": flip.base.renderer}
+        key = dict(
+            zip(("renderer", "policy", "scene", "seed", "against"), flip.key, strict=True)
+        ) | {"baseline": flip.base.renderer}
         if number == 1:
-            cells.append(key | {"t_us": None, "reason": "the plans never diverge by more than 0.5 m"})
+            cells.append(
+                key | {"t_us": None, "reason": "the plans never diverge by more than 0.5 m"}
+            )
             continue
         frames = {}
-        for side, (name, rollout) in enumerate(zip(flip.sides, (flip.base, flip.other), strict=True)):
+        for side, (name, rollout) in enumerate(
+            zip(flip.sides, (flip.base, flip.other), strict=True)
+        ):
             frames[name] = f"flips/{number:03d}-{side}.jpg"
             (folder / "flips").mkdir(exist_ok=True)
             cv2.imwrite(str(folder / frames[name]), _picture(rollout.renderer, 2, *plan.picture_px))
         part_us = 1_000_000 + 100_000 * number
-        cells.append(key | {"t_us": part_us, "after_us": part_us, "gap_m": 0.5 + 0.01 * number, "source": "logs", "frames": frames})
-    _json(folder / "flips.json", {"threshold_m": 0.5, "horizon_s": 3.0, "n_flips": len(flips), "n_pairs": compared, "cells": cells})
+        cells.append(
+            key
+            | {
+                "t_us": part_us,
+                "after_us": part_us,
+                "gap_m": 0.5 + 0.01 * number,
+                "source": "logs",
+                "frames": frames,
+            }
+        )
+    _json(
+        folder / "flips.json",
+        {
+            "threshold_m": 0.5,
+            "horizon_s": 3.0,
+            "n_flips": len(flips),
+            "n_pairs": compared,
+            "cells": cells,
+        },
+    )
 
 
 def _slug(name: str) -> str:
@@ -123,7 +162,9 @@ def _scene(scene: str, index: int, plan: Plan) -> dict[str, Any]:
     bend = (0.0, 0.014, -0.006, 0.003)[index % 4]
     yaw = bend * np.clip(s - 30, 0, 90)
     ds = np.diff(s, prepend=s[0])
-    centre = np.stack([np.cumsum(np.cos(yaw) * ds) + 1000.0 * index, np.cumsum(np.sin(yaw) * ds) - 400.0], 1)
+    centre = np.stack(
+        [np.cumsum(np.cos(yaw) * ds) + 1000.0 * index, np.cumsum(np.sin(yaw) * ds) - 400.0], 1
+    )
     normal = np.stack([-np.sin(yaw), np.cos(yaw)], 1)
     lanes = []
     for lane in range(3):
@@ -142,8 +183,12 @@ def _scene(scene: str, index: int, plan: Plan) -> dict[str, Any]:
     edges = [np.round(mid - normal * 2.1, 2).tolist(), np.round(mid + normal * 9.4, 2).tolist()]
     at = mid[60]
     ahead = np.array([math.cos(yaw[60]), math.sin(yaw[60])])
-    ring = [(at + normal[60] * a + ahead * b).tolist() for a, b in ((-2, 0), (9, 0), (9, 3), (-2, 3))]
-    drive = np.stack([np.interp(np.linspace(0, length_m, plan.steps), s, mid[:, k]) for k in (0, 1)], 1)
+    ring = [
+        (at + normal[60] * a + ahead * b).tolist() for a, b in ((-2, 0), (9, 0), (9, 3), (-2, 3))
+    ]
+    drive = np.stack(
+        [np.interp(np.linspace(0, length_m, plan.steps), s, mid[:, k]) for k in (0, 1)], 1
+    )
     return {
         "scene_id": scene,
         "source": "commonroad" if scene.startswith("USA") else "yaml",
@@ -186,12 +231,20 @@ def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type
         "failure": None,
     }
     if (renderer, scene, seed) in plan.fail:
-        row |= {"status": "failed", "failure_class": "renderer", "failure": plan.failure, "frames": 34, "steps": 34}
+        row |= {
+            "status": "failed",
+            "failure_class": "renderer",
+            "failure": plan.failure,
+            "frames": 34,
+            "steps": 34,
+        }
         row |= {m: None for m in METRICS} | {f"{m}_valid": False for m in METRICS}
         return row, []
     harm = plan.harm.get(renderer, 0.8) * (1.6 if "hard" in scene else 1.0)
     t = np.arange(plan.steps)
-    offset = (wander * (0.6 + harm) + _smooth(rng, plan.steps) * 0.12 * harm) * np.clip((t - 5) / 25, 0, 1)
+    offset = (wander * (0.6 + harm) + _smooth(rng, plan.steps) * 0.12 * harm) * np.clip(
+        (t - 5) / 25, 0, 1
+    )
     xy = np.stack([content["ego_log"]["x_m"], content["ego_log"]["y_m"]], 1)
     tangent = np.gradient(xy, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -237,14 +290,34 @@ def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type
     if scene == plan.scenes[0]:
         values |= dict.fromkeys(plan.invalid)
         steps += [
-            key | {"t_us": 0, "metric": m, "value": None, "valid": False, "reason": "no other road user within 50 m"} for m in plan.invalid
+            key
+            | {
+                "t_us": 0,
+                "metric": m,
+                "value": None,
+                "valid": False,
+                "reason": "no other road user within 50 m",
+            }
+            for m in plan.invalid
         ]
     steps += [
-        key | {"t_us": 0, "metric": m, "value": None, "valid": False, "reason": "the policy gives no plan of 1.0 s"}
+        key
+        | {
+            "t_us": 0,
+            "metric": m,
+            "value": None,
+            "valid": False,
+            "reason": "the policy gives no plan of 1.0 s",
+        }
         for m in ("min_ade@1.0s(gt)",)
         if values[m] is None
     ]
-    row["censored"] = {"dropped": "", "steps_total": plan.steps, "steps_warmup": 5, "steps_after_event": plan.steps - end}
+    row["censored"] = {
+        "dropped": "",
+        "steps_total": plan.steps,
+        "steps_warmup": 5,
+        "steps_after_event": plan.steps - end,
+    }
     row["censored"] |= {"steps_after_drift": 0, "steps_scored": end - 5}
     row |= {f"{m}_reason": "no other road user within 50 m" for m in plan.invalid}
     row |= {"min_ade@1.0s(gt)_reason": "the policy gives no plan of 1.0 s"}
@@ -256,11 +329,16 @@ def _files(folder: Path, row: dict[str, Any], content: dict[str, Any], plan: Pla
     place = folder / row["path"]
     place.mkdir(parents=True, exist_ok=True)
     times = [int(k * plan.steps * DT_US / 4) for k in range(4)]
-    _json(place / "manifest.json", {"status": row["status"], "path": row["path"], "strip_t_us": times, "events": []})
+    _json(
+        place / "manifest.json",
+        {"status": row["status"], "path": row["path"], "strip_t_us": times, "events": []},
+    )
     if plan.pictures and row["status"] == "ok":
         width, height = plan.picture_px
         frames = [_picture(row["renderer"], k, width, height) for k in range(4)]
-        cv2.imwrite(str(place / "strip.jpg"), np.concatenate(frames, 1), [cv2.IMWRITE_JPEG_QUALITY, 85])
+        cv2.imwrite(
+            str(place / "strip.jpg"), np.concatenate(frames, 1), [cv2.IMWRITE_JPEG_QUALITY, 85]
+        )
     if plan.clips and row["status"] == "ok" and row["seed"] == plan.seeds[0]:
         (place / "front.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42")
 
@@ -272,12 +350,31 @@ def _picture(renderer: str, k: int, width: int, height: int) -> np.ndarray:
     image[horizon:] = (98, 96, 94)
     vanish = np.array([width * (0.5 + 0.01 * k), horizon])
     for x, colour in ((-0.1, (235, 235, 235)), (0.62, (235, 235, 235)), (1.3, (120, 150, 120))):
-        cv2.line(image, vanish.astype(int).tolist(), (int(x * width), height), colour, max(1, width // 120), cv2.LINE_AA)
+        cv2.line(
+            image,
+            vanish.astype(int).tolist(),
+            (int(x * width), height),
+            colour,
+            max(1, width // 120),
+            cv2.LINE_AA,
+        )
     for side, tone in ((-1, (120, 140, 165)), (1, (140, 130, 120))):
         x = int(width * (0.5 + side * 0.36))
-        cv2.rectangle(image, (x - width // 9, horizon - height // 3), (x + width // 9, horizon + height // 12), tone, -1)
+        cv2.rectangle(
+            image,
+            (x - width // 9, horizon - height // 3),
+            (x + width // 9, horizon + height // 12),
+            tone,
+            -1,
+        )
     car = width // 14 + k * width // 60
-    cv2.rectangle(image, (int(vanish[0]) - car, horizon), (int(vanish[0]) + car, horizon + car), (60, 40, 130), -1)
+    cv2.rectangle(
+        image,
+        (int(vanish[0]) - car, horizon),
+        (int(vanish[0]) + car, horizon + car),
+        (60, 40, 130),
+        -1,
+    )
     if renderer == "3dgs":
         image = cv2.GaussianBlur(image, (0, 0), 1.5 + 1.2 * k)
     elif renderer == "onefixer":
@@ -286,8 +383,19 @@ def _picture(renderer: str, k: int, width: int, height: int) -> np.ndarray:
 
 
 def _write_rows(folder: Path, rows: list[dict[str, Any]]) -> None:
-    fields = [("renderer", pa.string()), ("policy", pa.string()), ("scene", pa.string()), ("seed", pa.int64()), ("status", pa.string())]
-    fields += [("failure_class", pa.string()), ("failure", pa.string()), ("path", pa.string()), ("wall_s", pa.float64())]
+    fields = [
+        ("renderer", pa.string()),
+        ("policy", pa.string()),
+        ("scene", pa.string()),
+        ("seed", pa.int64()),
+        ("status", pa.string()),
+    ]
+    fields += [
+        ("failure_class", pa.string()),
+        ("failure", pa.string()),
+        ("path", pa.string()),
+        ("wall_s", pa.float64()),
+    ]
     fields += [("frames", pa.int64()), ("steps", pa.int64())]
     for name in METRICS:
         fields += [(name, pa.float64()), (f"{name}_valid", pa.bool_())]
@@ -296,10 +404,23 @@ def _write_rows(folder: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def _write_steps(folder: Path, steps: list[dict[str, Any]]) -> None:
-    fields = [("renderer", pa.string()), ("policy", pa.string()), ("scene", pa.string()), ("seed", pa.int64()), ("t_us", pa.int64())]
-    fields += [("metric", pa.string()), ("value", pa.float64()), ("valid", pa.bool_()), ("reason", pa.string())]
+    fields = [
+        ("renderer", pa.string()),
+        ("policy", pa.string()),
+        ("scene", pa.string()),
+        ("seed", pa.int64()),
+        ("t_us", pa.int64()),
+    ]
+    fields += [
+        ("metric", pa.string()),
+        ("value", pa.float64()),
+        ("valid", pa.bool_()),
+        ("reason", pa.string()),
+    ]
     schema = pa.schema(fields)
-    pq.write_table(pa.Table.from_pylist(steps, schema=schema), folder / "steps.parquet", compression="zstd")
+    pq.write_table(
+        pa.Table.from_pylist(steps, schema=schema), folder / "steps.parquet", compression="zstd"
+    )
 
 
 def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
@@ -315,7 +436,11 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
             "frames_per_s": 1000 / (15.0 + 9.5 * k),
             "first_frame_ms": 310.0 + 80 * k,
             "stages": {
-                s: {"p50_ms": round(share * (14.0 + 9 * k), 3), "p95_ms": round(share * (19.0 + 13 * k), 3), "share": share}
+                s: {
+                    "p50_ms": round(share * (14.0 + 9 * k), 3),
+                    "p95_ms": round(share * (19.0 + 13 * k), 3),
+                    "share": share,
+                }
                 for s, share in STAGES.items()
                 if share
             },
@@ -327,7 +452,9 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
         "preset": "paper",
         "metrics": aggregate(rows),
         "paired": paired(rows, baseline) if len(ran) > 1 else {},
-        "paired_with_base": base_pairs(by_renderer(rows), metric_names(rows), baseline, {"onefixer": "3dgs"}),
+        "paired_with_base": base_pairs(
+            by_renderer(rows), metric_names(rows), baseline, {"onefixer": "3dgs"}
+        ),
         "censoring": censoring(rows),
         "failures": {
             "n_failed": len(failed),
@@ -337,16 +464,30 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
         },
         "speed": speed,
         "determinism": _certificate(plan),
-        "pool": {"workers": 2, "threads_per_worker": 1, "frames_per_s_total": 41.2, "wall_s": sum(r["wall_s"] for r in rows) / 2},
+        "pool": {
+            "workers": 2,
+            "threads_per_worker": 1,
+            "frames_per_s_total": 41.2,
+            "wall_s": sum(r["wall_s"] for r in rows) / 2,
+        },
     }
 
 
 def _certificate(plan: Plan) -> dict[str, Any]:
     if plan.certificate == "skipped":
         return {"status": "skipped", "reason": "no rollout finished"}
-    digests = {name: f"{k}a" * 32 for k, name in enumerate(("ego", "actors", "frames", "plans", "scores"))}
+    digests = {
+        name: f"{k}a" * 32 for k, name in enumerate(("ego", "actors", "frames", "plans", "scores"))
+    }
     cell = {"renderer": "clean", "policy": "lane-camera", "scene": "smoke/straight", "seed": 0}
-    entry = {"status": plan.certificate, "cell": cell, "path": "rollouts/x", "steps": 120, "digests": digests, "wall_s": 3.2}
+    entry = {
+        "status": plan.certificate,
+        "cell": cell,
+        "path": "rollouts/x",
+        "steps": 120,
+        "digests": digests,
+        "wall_s": 3.2,
+    }
     if plan.certificate == "equal":
         return entry | {"repeated": digests, "first_difference": None}
     first = {"component": "frames", "t_us": 400_000, "step": 4, "what": "camera <b>front</b>"}
@@ -354,7 +495,12 @@ def _certificate(plan: Plan) -> dict[str, Any]:
 
 
 def _failed(row: dict[str, Any]) -> dict[str, Any]:
-    error = {"doing": "rendering a frame", "with": "camera front <script>", "found": row["failure"], "do": "run with --set guard=off"}
+    error = {
+        "doing": "rendering a frame",
+        "with": "camera front <script>",
+        "found": row["failure"],
+        "do": "run with --set guard=off",
+    }
     return {k: row[k] for k in ("renderer", "policy", "scene", "seed", "path")} | {"error": error}
 
 
@@ -376,11 +522,17 @@ def _run_json(plan: Plan, maps: dict[str, Any]) -> dict[str, Any]:
         "started_at": "2025-03-04T09:12:44+00:00",
         "preset": "paper",
         "config": {"preset": "paper", "images": "jpeg", "video": "none", "workers": 2},
-        "scenes": {s: {"source": m["source"], "content_hash": m["content_hash"], "notes": m["notes"]} for s, m in maps.items()},
+        "scenes": {
+            s: {"source": m["source"], "content_hash": m["content_hash"], "notes": m["notes"]}
+            for s, m in maps.items()
+        },
         "renderers": list(plan.renderers),
         "policies": list(plan.policies),
         "seeds": list(plan.seeds),
         "hardware": {"cpu": "Example CPU @ 2.6 GHz", "cores": 2, "memory_gib": 16.0, "gpu": None},
         "versions": {"python": "3.11.9", "numpy": "2.1.0", "torch": "2.11.0"},
-        "left_out": ["cameras: side-left, side-right (no policy takes them)", "actors: 14 never seen by a camera"],
+        "left_out": [
+            "cameras: side-left, side-right (no policy takes them)",
+            "actors: 14 never seen by a camera",
+        ],
     }

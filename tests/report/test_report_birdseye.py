@@ -29,7 +29,12 @@ def decode(d: str) -> np.ndarray:
 def scene(x: list[float], y: list[float], **more: Any) -> dict[str, Any]:
     t_us = [k * 100_000 for k in range(len(x))]
     vehicle = {"length_m": 4.8, "width_m": 1.9, "rear_axle_to_centre_m": 1.4}
-    return {"scene_id": "s", "ego_log": {"t_us": t_us, "x_m": x, "y_m": y}, "vehicle": vehicle, "lanes": []} | more
+    return {
+        "scene_id": "s",
+        "ego_log": {"t_us": t_us, "x_m": x, "y_m": y},
+        "vehicle": vehicle,
+        "lanes": [],
+    } | more
 
 
 def series_of(x: list[float], y: list[float], **more: list[float]) -> dict[str, Any]:
@@ -38,7 +43,9 @@ def series_of(x: list[float], y: list[float], **more: list[float]) -> dict[str, 
     return {name: (t_us, np.array(values, float)) for name, values in names.items()}
 
 
-coordinates = st.lists(st.tuples(st.floats(-3000, 3000), st.floats(-3000, 3000)), min_size=2, max_size=30)
+coordinates = st.lists(
+    st.tuples(st.floats(-3000, 3000), st.floats(-3000, 3000)), min_size=2, max_size=30
+)
 
 
 @given(coordinates)
@@ -48,13 +55,18 @@ def test_path_data_stays_near_the_line(points: list[tuple[float, float]]) -> Non
     d = path_data(line, tolerance=1.5)
     if d:
         back = shapely.linestrings(decode(d))
-        assert all(back.distance(shapely.Point(p)) <= 1.5 + 1.5 for p in line)  # tolerance and rounding of two coordinates
+        assert all(
+            back.distance(shapely.Point(p)) <= 1.5 + 1.5 for p in line
+        )  # tolerance and rounding of two coordinates
     else:
         assert float(np.ptp(line, axis=0).max()) <= 3.0  # all in one pixel
 
 
 def test_path_data_writes_signs_and_joins() -> None:
-    assert path_data(np.array([[0.0, 0.0], [10.0, -5.0], [0.0, 20.0]]), tolerance=0.0) == "M0 0l10 -5 -10 25"
+    assert (
+        path_data(np.array([[0.0, 0.0], [10.0, -5.0], [0.0, 20.0]]), tolerance=0.0)
+        == "M0 0l10 -5 -10 25"
+    )
     assert path_data(np.array([[1.0, 1.0]])) == ""
     assert path_data(np.zeros((5, 2))) == ""
 
@@ -65,7 +77,13 @@ def test_log_runs_from_left_to_right_and_left_of_it_is_up(yaw: float) -> None:
     x, y = np.cos(yaw) * s, np.sin(yaw) * s
     left = (x - 2.0 * np.sin(yaw), y + 2.0 * np.cos(yaw))
     rollout = Rollout("a", "p", "s", 0, "ok")
-    view = scene_view("s", scene(x.tolist(), y.tolist()), [rollout], {rollout.cell: series_of(*(v.tolist() for v in left))}, VARIANTS)
+    view = scene_view(
+        "s",
+        scene(x.tolist(), y.tolist()),
+        [rollout],
+        {rollout.cell: series_of(*(v.tolist() for v in left))},
+        VARIANTS,
+    )
     assert view is not None
     log, track = decode(view.log), decode(view.tracks[0].d)
     assert log[-1, 0] > log[0, 0]
@@ -83,7 +101,9 @@ def test_far_from_the_origin_costs_no_precision() -> None:
     views = []
     for offset in (0.0, 5_412_345.25):
         x, y = (s + offset).tolist(), (0.05 * s + offset).tolist()
-        views.append(scene_view("s", scene(x, y), [rollout], {rollout.cell: series_of(x, y)}, VARIANTS))
+        views.append(
+            scene_view("s", scene(x, y), [rollout], {rollout.cell: series_of(x, y)}, VARIANTS)
+        )
     assert views[0] == views[1]
 
 
@@ -112,13 +132,23 @@ def test_overlapping_lanes_of_both_directions_do_not_cut_holes() -> None:
     back = {"left": [[100, -3], [0, -3]], "right": [[100, 1], [0, 1]]}
     view = scene_view("s", scene([0.0, 100.0], [0.0, 0.0], lanes=[there, back]), [], {}, VARIANTS)
     assert view is not None
-    areas = [np.sign(shapely.LinearRing(decode(part)).is_ccw - 0.5) for part in view.lanes.split("z") if part]
+    areas = [
+        np.sign(shapely.LinearRing(decode(part)).is_ccw - 0.5)
+        for part in view.lanes.split("z")
+        if part
+    ]
     assert len(areas) == 2
     assert areas[0] == areas[1]
 
 
 def test_lane_without_an_edge_gives_its_line_and_no_area() -> None:
-    view = scene_view("s", scene([0.0, 100.0], [0.0, 0.0], lanes=[{"left": [[0, 2], [100, 2]], "right": None}]), [], {}, VARIANTS)
+    view = scene_view(
+        "s",
+        scene([0.0, 100.0], [0.0, 0.0], lanes=[{"left": [[0, 2], [100, 2]], "right": None}]),
+        [],
+        {},
+        VARIANTS,
+    )
     assert view is not None
     assert view.lanes == ""
     assert view.lines.count("M") == 1
@@ -126,13 +156,26 @@ def test_lane_without_an_edge_gives_its_line_and_no_area() -> None:
 
 def test_event_is_marked_where_and_when_it_happened() -> None:
     x = np.linspace(0, 50, 51).tolist()
-    rollout = Rollout("a", "p", "s", 3, "ok", metrics={"collision_any": 1.0, "collision_front": 1.0, "offroad": 0.0})
+    rollout = Rollout(
+        "a",
+        "p",
+        "s",
+        3,
+        "ok",
+        metrics={"collision_any": 1.0, "collision_front": 1.0, "offroad": 0.0},
+    )
     hit = [0.0] * 20 + [1.0] * 31
-    series = {rollout.cell: series_of(x, [0.0] * 51, collision_any=hit, collision_front=hit, offroad=[1.0] * 51)}
+    series = {
+        rollout.cell: series_of(
+            x, [0.0] * 51, collision_any=hit, collision_front=hit, offroad=[1.0] * 51
+        )
+    }
     view = scene_view("s", scene(x, [0.0] * 51), [rollout], series, VARIANTS)
     assert view is not None
     (mark,) = view.marks  # off-road steps that the rollout's metric does not count are not marked
-    assert mark.text == "a \u00b7 seed 3: collision (front) at 2.0\u00a0s, x 21.4, y 0.0\u00a0m"  # the box's centre
+    assert (
+        mark.text == "a \u00b7 seed 3: collision (front) at 2.0\u00a0s, x 21.4, y 0.0\u00a0m"
+    )  # the box's centre
     assert mark.x == pytest.approx((21.4 + 10.0) * view.unit_per_m, abs=1)
     assert mark.footprint.endswith("z")
 
@@ -155,7 +198,11 @@ def test_event_that_no_step_shows_is_listed_without_a_place() -> None:
 
 
 def test_edge_without_paint_gives_no_line() -> None:
-    lane = {"left": [[0, 2], [100, 2]], "right": [[0, -2], [100, -2]], "paint": ["none", "solid_white"]}
+    lane = {
+        "left": [[0, 2], [100, 2]],
+        "right": [[0, -2], [100, -2]],
+        "paint": ["none", "solid_white"],
+    }
     view = scene_view("s", scene([0.0, 100.0], [0.0, 0.0], lanes=[lane]), [], {}, VARIANTS)
     assert view is not None
     assert view.lines.count("M") == 1
@@ -165,7 +212,10 @@ def test_edge_without_paint_gives_no_line() -> None:
 def test_one_far_rollout_does_not_flatten_the_offsets_of_the_others() -> None:
     x = np.linspace(0, 50, 51).tolist()
     near, far = Rollout("a", "p", "s", 0, "ok"), Rollout("a", "p", "s", 1, "ok")
-    series = {r.cell: series_of(x, [0.0] * 51, lateral_bias_m=[d] * 51) for r, d in ((near, 1.0), (far, 300.0))}
+    series = {
+        r.cell: series_of(x, [0.0] * 51, lateral_bias_m=[d] * 51)
+        for r, d in ((near, 1.0), (far, 300.0))
+    }
     view = scene_view("s", scene(x, [0.0] * 51), [near, far], series, VARIANTS)
     assert view is not None
     assert view.offset is not None
@@ -174,7 +224,11 @@ def test_one_far_rollout_does_not_flatten_the_offsets_of_the_others() -> None:
 
 
 def test_offset_chart_keeps_the_worst_rollout_inside(tmp_path: Path) -> None:
-    run: Run = read_run(make_run(tmp_path, Plan(scenes=("hard/x",), harm={"3dgs": 1.0}, pictures=False, clips=False)))
+    run: Run = read_run(
+        make_run(
+            tmp_path, Plan(scenes=("hard/x",), harm={"3dgs": 1.0}, pictures=False, clips=False)
+        )
+    )
     content = run.scene_data("hard/x")
     assert content is not None
     variants = {(name, "lane-camera"): (i, 0) for i, name in enumerate(run.renderers)}

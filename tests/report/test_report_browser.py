@@ -14,12 +14,18 @@ pytestmark = pytest.mark.slow
 
 def column(browser: Browser, table: str, index: int) -> list[str]:
     rows = f"[...document.getElementById('{table}').tBodies[0].rows]"
-    return list(browser.evaluate(f"{rows}.filter(r => !r.hidden).map(r => r.children[{index}].textContent.trim())"))
+    return list(
+        browser.evaluate(
+            f"{rows}.filter(r => !r.hidden).map(r => r.children[{index}].textContent.trim())"
+        )
+    )
 
 
 @pytest.mark.parametrize("name", ["usual_run", "hostile_run"])
 @pytest.mark.parametrize(("width", "dark"), [(1400, False), (390, True)])
-def test_no_complaint_and_no_outside_request(browser: Browser, request: pytest.FixtureRequest, name: str, width: int, dark: bool) -> None:
+def test_no_complaint_and_no_outside_request(
+    browser: Browser, request: pytest.FixtureRequest, name: str, width: int, dark: bool
+) -> None:
     report = write_report(request.getfixturevalue(name))
     browser.requests.clear()
     browser.complaints.clear()
@@ -28,11 +34,18 @@ def test_no_complaint_and_no_outside_request(browser: Browser, request: pytest.F
     for _ in range(2):
         browser.evaluate("document.querySelectorAll('button').forEach(b => b.click())")
     assert browser.complaints == []
-    assert all(address == report.resolve().as_uri() or address.startswith("data:") for address in browser.requests)
-    assert browser.evaluate("document.documentElement.scrollWidth") <= width  # tables scroll, the page does not
+    assert all(
+        address == report.resolve().as_uri() or address.startswith("data:")
+        for address in browser.requests
+    )
+    assert (
+        browser.evaluate("document.documentElement.scrollWidth") <= width
+    )  # tables scroll, the page does not
 
 
-def test_clicking_a_head_sorts_by_value_and_again_turns_it_round(browser: Browser, usual_run: Path) -> None:
+def test_clicking_a_head_sorts_by_value_and_again_turns_it_round(
+    browser: Browser, usual_run: Path
+) -> None:
     browser.open(write_report(usual_run))
     click = "document.querySelectorAll('#table-scenes th .sort')[{}].click()"
     distance = 6
@@ -41,7 +54,9 @@ def test_clicking_a_head_sorts_by_value_and_again_turns_it_round(browser: Browse
     assert rising == sorted(rising)
     assert len(set(rising)) > 5
     browser.evaluate(click.format(distance - 1))
-    assert [float(text.split()[0]) for text in column(browser, "table-scenes", distance)] == rising[::-1]
+    assert [float(text.split()[0]) for text in column(browser, "table-scenes", distance)] == rising[
+        ::-1
+    ]
     assert browser.evaluate("document.querySelectorAll('#table-scenes th[aria-sort]').length") == 1
 
 
@@ -52,15 +67,21 @@ def test_changed_outcomes_lead_to_their_frames(browser: Browser, usual_run: Path
     assert not browser.evaluate(opened)[-1]
     browser.evaluate("[...document.querySelectorAll('#table-flips a.to-flip')].at(-1).click()")
     assert browser.evaluate(opened)[-1]
-    assert browser.evaluate("location.hash") == "#" + browser.evaluate("[...document.querySelectorAll('.flip-card')].at(-1).id")
+    assert browser.evaluate("location.hash") == "#" + browser.evaluate(
+        "[...document.querySelectorAll('.flip-card')].at(-1).id"
+    )
     shown = "[...document.querySelectorAll('.flip-card[open] img')].every(i => i.complete && i.naturalWidth > 0)"
     assert browser.evaluate(shown)
-    links = browser.evaluate("[...document.querySelectorAll('#table-flips td.all a:not(.to-flip)')].map(a => a.getAttribute('href'))")
+    links = browser.evaluate(
+        "[...document.querySelectorAll('#table-flips td.all a:not(.to-flip)')].map(a => a.getAttribute('href'))"
+    )
     assert links
     assert all((usual_run / link).exists() for link in links)
 
 
-def test_flips_sort_by_when_the_plans_parted_with_unknown_ones_last(browser: Browser, usual_run: Path) -> None:
+def test_flips_sort_by_when_the_plans_parted_with_unknown_ones_last(
+    browser: Browser, usual_run: Path
+) -> None:
     browser.open(write_report(usual_run))
     head = "[...document.querySelectorAll('#table-flips th .sort')].find(b => b.textContent.startsWith('Plans part')).click()"
     for _ in range(2):
@@ -76,7 +97,9 @@ def test_folds_open_and_close(browser: Browser, usual_run: Path) -> None:
     table = "document.getElementById('table-strata-0').checkVisibility()"
     assert not browser.evaluate(table)
     for seen in (True, False):
-        browser.evaluate("document.getElementById('table-strata-0').closest('details').querySelector('summary').click()")
+        browser.evaluate(
+            "document.getElementById('table-strata-0').closest('details').querySelector('summary').click()"
+        )
         assert browser.evaluate(table) is seen
 
 
@@ -91,7 +114,9 @@ def test_missing_values_stay_last_both_ways(browser: Browser, usual_run: Path) -
 def test_filter_keeps_rows_with_every_word(browser: Browser, usual_run: Path) -> None:
     browser.open(write_report(usual_run))
     browser.evaluate("document.querySelector('input[type=search]').value = '3DGS urban'")
-    browser.evaluate("document.querySelector('input[type=search]').dispatchEvent(new Event('input'))")
+    browser.evaluate(
+        "document.querySelector('input[type=search]').dispatchEvent(new Event('input'))"
+    )
     assert column(browser, "table-scenes", 0) == ["urban/left-turn"] * 2
     assert {text.strip() for text in column(browser, "table-scenes", 1)} == {"3dgs"}
 

@@ -34,14 +34,24 @@ def test_a_run_ends_with_verdict_differences_cost_and_the_next_command(usual_run
     verdict, *pairs, cost = lines[at:]
     assert verdict == f"verdict  {find(run).title}"
     heads = [re.match(r" {9}(\S+ \u2212 \S+): ", line) for line in pairs]
-    assert [head[1] for head in heads if head] == ["3dgs \u2212 clean", "onefixer \u2212 clean", "onefixer \u2212 3dgs"]
+    assert [head[1] for head in heads if head] == [
+        "3dgs \u2212 clean",
+        "onefixer \u2212 clean",
+        "onefixer \u2212 3dgs",
+    ]
     assert all("95 % interval" in line for line in pairs)
-    assert re.fullmatch(r"cost     clean [\d.]+ ms, 3dgs [\d.]+ ms, onefixer [\d.]+ ms a frame, the whole loop \(mean\)", cost)
+    assert re.fullmatch(
+        r"cost     clean [\d.]+ ms, 3dgs [\d.]+ ms, onefixer [\d.]+ ms a frame, the whole loop \(mean\)",
+        cost,
+    )
     assert next_line(run).startswith("next     simrun ")
 
 
 def test_the_cost_is_the_mean_and_not_the_median() -> None:
-    speed = {"onefixer": {"ms_per_frame_p50": 1.0, "ms_per_frame_mean": 176.2}, "clean": {"ms_per_frame_mean": None}}
+    speed = {
+        "onefixer": {"ms_per_frame_p50": 1.0, "ms_per_frame_mean": 176.2},
+        "clean": {"ms_per_frame_mean": None},
+    }
     assert cost_text({"speed": speed}) == "onefixer 176 ms a frame, the whole loop (mean)"
     assert cost_text({}) == ""
 
@@ -49,11 +59,15 @@ def test_the_cost_is_the_mean_and_not_the_median() -> None:
 def test_a_drive_that_ended_with_an_event_leads_to_its_cause(usual_run: Path) -> None:
     run = read_run(usual_run)
     assert words_of(run)[1] == "check"  # some rollouts failed: that comes first
-    run = dataclasses.replace(run, rollouts=tuple(rollout for rollout in run.rollouts if rollout.ok))
+    run = dataclasses.replace(
+        run, rollouts=tuple(rollout for rollout in run.rollouts if rollout.ok)
+    )
     words = words_of(run)
     assert words[1] == "why"
     renderer, policy, *scene, seed = words[2].removeprefix(f"{run.folder}/").split("/")
-    (ended,) = (one for one in run.rollouts if one.cell == (renderer, policy, "/".join(scene), int(seed)))
+    (ended,) = (
+        one for one in run.rollouts if one.cell == (renderer, policy, "/".join(scene), int(seed))
+    )
     assert outcomes_of(ended)
 
 
@@ -68,47 +82,113 @@ def test_every_next_command_of_any_set_of_arms_can_be_given(tmp_path: Path) -> N
             (("onefixer",), ("lane-camera",), 0.4),
         ]
     ):
-        plan = Plan(renderers, policies, seeds=(0,), steps=30, harm=dict.fromkeys(renderers, harm), pictures=False, clips=False)
+        plan = Plan(
+            renderers,
+            policies,
+            seeds=(0,),
+            steps=30,
+            harm=dict.fromkeys(renderers, harm),
+            pictures=False,
+            clips=False,
+        )
         run = read_run(make_run(tmp_path / str(number), plan))
         words = words_of(run)
-        for flag, known in (("--renderers", run.renderers), ("--policy", [*run.policies, "lane-camera"])):
+        for flag, known in (
+            ("--renderers", run.renderers),
+            ("--policy", [*run.policies, "lane-camera"]),
+        ):
             if flag in words and words[1] in ("probe", "fork"):
                 assert {*words[words.index(flag) + 1].split(",")} <= {*known}
         if "--cell" in words:
-            assert words[words.index("--cell") + 1] in {"/".join(map(str, rollout.cell)) for rollout in run.rollouts}
+            assert words[words.index("--cell") + 1] in {
+                "/".join(map(str, rollout.cell)) for rollout in run.rollouts
+            }
         if len(renderers) == 1 and len(policies) > 1:
             assert words[1] in ("why", "fork", "view", "--renderer")
 
 
-def test_one_renderer_leads_to_a_comparison_and_a_failing_policy_to_its_check(tmp_path: Path) -> None:
+def test_one_renderer_leads_to_a_comparison_and_a_failing_policy_to_its_check(
+    tmp_path: Path,
+) -> None:
     alone = read_run(make_run(tmp_path / "a", Plan(renderers=("clean",), seeds=(0,), steps=30)))
-    alone = dataclasses.replace(alone, rollouts=tuple(one for one in alone.rollouts if not outcomes_of(one)))
+    alone = dataclasses.replace(
+        alone, rollouts=tuple(one for one in alone.rollouts if not outcomes_of(one))
+    )
     assert words_of(alone)[:3] == ["simrun", "--renderer", "clean,3dgs"]
-    broken = [dataclasses.replace(r, status="failed", failure_class="policy") for r in alone.rollouts]
-    assert words_of(dataclasses.replace(alone, rollouts=tuple(broken))) == ["simrun", "check-policy", alone.policies[0]]
+    broken = [
+        dataclasses.replace(r, status="failed", failure_class="policy") for r in alone.rollouts
+    ]
+    assert words_of(dataclasses.replace(alone, rollouts=tuple(broken))) == [
+        "simrun",
+        "check-policy",
+        alone.policies[0],
+    ]
 
 
 @pytest.mark.parametrize("renderers", [("clean", "3dgs")])
 def test_what_is_undecided_leads_to_more_scenes(tmp_path: Path, renderers: tuple[str, ...]) -> None:
-    run = read_run(make_run(tmp_path, Plan(renderers=renderers, scenes=("a",), seeds=(0,), steps=20, harm={"clean": 0.1, "3dgs": 0.1})))
-    run = dataclasses.replace(run, rollouts=tuple(one for one in run.rollouts if not outcomes_of(one)))
+    run = read_run(
+        make_run(
+            tmp_path,
+            Plan(
+                renderers=renderers,
+                scenes=("a",),
+                seeds=(0,),
+                steps=20,
+                harm={"clean": 0.1, "3dgs": 0.1},
+            ),
+        )
+    )
+    run = dataclasses.replace(
+        run, rollouts=tuple(one for one in run.rollouts if not outcomes_of(one))
+    )
     if run.rollouts and find(run).tone == "unclear":
         assert words_of(run)[-1] == "suites/urban"
 
 
 def test_the_next_command_keeps_scenes_settings_and_preset(tmp_path: Path) -> None:
-    run = read_run(make_run(tmp_path, Plan(renderers=("clean",), seeds=(0,), steps=20, pictures=False, clips=False)))
-    run = dataclasses.replace(run, rollouts=tuple(one for one in run.rollouts if not outcomes_of(one)))
-    given = ["simrun", "--set", "timing.duration_us=600000", "--set=actors=[]", "--preset", "strict", "suites/smoke"]
+    run = read_run(
+        make_run(
+            tmp_path, Plan(renderers=("clean",), seeds=(0,), steps=20, pictures=False, clips=False)
+        )
+    )
+    run = dataclasses.replace(
+        run, rollouts=tuple(one for one in run.rollouts if not outcomes_of(one))
+    )
+    given = [
+        "simrun",
+        "--set",
+        "timing.duration_us=600000",
+        "--set=actors=[]",
+        "--preset",
+        "strict",
+        "suites/smoke",
+    ]
     run = dataclasses.replace(run, info={**run.info, "command": given, "asked": ["suites/smoke"]})
-    assert words_of(run)[7:] == ["--set", "timing.duration_us=600000", "--set", "actors=[]", "--preset", "strict", "suites/smoke"]
+    assert words_of(run)[7:] == [
+        "--set",
+        "timing.duration_us=600000",
+        "--set",
+        "actors=[]",
+        "--preset",
+        "strict",
+        "suites/smoke",
+    ]
     elsewhere = words_of(dataclasses.replace(run, info={**run.info, "asked": []}))
-    assert elsewhere[7:] == ["--set", "timing.duration_us=600000", "--preset", "strict", "suites/urban"]
+    assert elsewhere[7:] == [
+        "--set",
+        "timing.duration_us=600000",
+        "--preset",
+        "strict",
+        "suites/urban",
+    ]
 
 
 def test_a_policy_without_a_camera_leads_to_one_that_looks(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path, Plan(renderers=("clean",), seeds=(0,), steps=20)))
-    blind = dataclasses.replace(run, rollouts=tuple(dataclasses.replace(r, frames=0) for r in run.rollouts if r.ok))
+    blind = dataclasses.replace(
+        run, rollouts=tuple(dataclasses.replace(r, frames=0) for r in run.rollouts if r.ok)
+    )
     words = words_of(blind)
     assert words[words.index("--policy") + 1] == "lane-camera"
     assert words[words.index("--renderer") + 1] == "clean,3dgs"

@@ -15,16 +15,28 @@ DRAFTED = {
     "redrafts": 18,
     "shown_error": {"camera_m": 0.019},
 }
-BLOCKS = {"label": "onefixer-s, trained", "trained": True, "mode": "chunk", "frames": 69, "blocks": 9}
+BLOCKS = {
+    "label": "onefixer-s, trained",
+    "trained": True,
+    "mode": "chunk",
+    "frames": 69,
+    "blocks": 9,
+}
 SUMMARY = {
     "fixers": {"onefixer": DRAFTED, "onefixer-s": BLOCKS},
-    "censoring": {"onefixer-s": {"frame_events": {"fixer-nan": 3, "fixer-black": 1, "black": 7}}, "onefixer": {"frame_events": {}}},
+    "censoring": {
+        "onefixer-s": {"frame_events": {"fixer-nan": 3, "fixer-black": 1, "black": 7}},
+        "onefixer": {"frame_events": {}},
+    },
 }
 
 
 def test_untrained_weights_and_refused_frames_are_cautions() -> None:
     untrained, refused = fixer_cautions(SUMMARY)
-    assert untrained == "onefixer is onefixer-tiny, untrained (identity): its results say nothing about a trained fixer."
+    assert (
+        untrained
+        == "onefixer is onefixer-tiny, untrained (identity): its results say nothing about a trained fixer."
+    )
     assert refused.replace("\u00a0", " ") == (
         "onefixer-s: the fixer failed on 4 frames of 69 (black 1, nan 3); the raw frames were passed on."
     )
@@ -37,7 +49,12 @@ def test_a_frame_that_the_render_itself_had_black_is_not_the_fixers_failure() ->
 
 def test_what_only_drafts_have_is_a_dash_for_whole_blocks() -> None:
     drafted, blocks = fixer_rows(SUMMARY)
-    assert [cell.text.replace("\u00a0", " ") for cell in drafted.cells[3:]] == ["75.0 %", "2.00", "0.0190 m", "0"]
+    assert [cell.text.replace("\u00a0", " ") for cell in drafted.cells[3:]] == [
+        "75.0 %",
+        "2.00",
+        "0.0190 m",
+        "0",
+    ]
     assert [cell.text for cell in blocks.cells[3:6]] == [DASH] * 3
     assert blocks.cells[6].text == "4"
     assert len(drafted.cells) == len(COLUMNS)
@@ -46,7 +63,10 @@ def test_what_only_drafts_have_is_a_dash_for_whole_blocks() -> None:
 def test_the_terminal_line_says_label_mode_and_rate() -> None:
     first, second = fixer_lines(SUMMARY)
     assert first == "onefixer: onefixer-tiny, untrained (identity), speculative, hit rate 75.0 %"
-    assert second.replace("\u00a0", " ") == "onefixer-s: onefixer-s, trained, chunk, 4 frames refused by its guard"
+    assert (
+        second.replace("\u00a0", " ")
+        == "onefixer-s: onefixer-s, trained, chunk, 4 frames refused by its guard"
+    )
 
 
 def test_a_run_without_fixers_says_nothing() -> None:

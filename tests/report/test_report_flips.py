@@ -26,13 +26,30 @@ def run_of(*rollouts: Rollout) -> Run:
     ("was", "now", "tone", "words"),
     [
         ({}, {"offroad": 1.0}, "worse", ("no event", "off-road")),
-        ({"collision_any": 1.0}, {"collision_any": 1.0, "collision_at_fault": 1.0}, "worse", ("collision", "at-fault collision")),
-        ({"collision_any": 1.0, "collision_at_fault": 1.0}, {}, "better", ("at-fault collision", "no event")),
+        (
+            {"collision_any": 1.0},
+            {"collision_any": 1.0, "collision_at_fault": 1.0},
+            "worse",
+            ("collision", "at-fault collision"),
+        ),
+        (
+            {"collision_any": 1.0, "collision_at_fault": 1.0},
+            {},
+            "better",
+            ("at-fault collision", "no event"),
+        ),
         ({"offroad": 1.0}, {"collision_any": 1.0}, "mixed", ("off-road", "collision")),
-        ({"offroad": 1.0}, {"offroad": 1.0, "collision_any": 1.0}, "worse", ("off-road", "collision and off-road")),
+        (
+            {"offroad": 1.0},
+            {"offroad": 1.0, "collision_any": 1.0},
+            "worse",
+            ("off-road", "collision and off-road"),
+        ),
     ],
 )
-def test_a_flip_has_a_side_and_words(was: dict[str, float], now: dict[str, float], tone: str, words: tuple[str, str]) -> None:
+def test_a_flip_has_a_side_and_words(
+    was: dict[str, float], now: dict[str, float], tone: str, words: tuple[str, str]
+) -> None:
     flips, compared = find_flips(run_of(rollout("clean", **was), rollout("3dgs", **now)))
     assert compared == 1
     (flip,) = flips
@@ -53,23 +70,31 @@ def test_events_name_the_gravest_word_only() -> None:
 
 def test_rows_show_both_frames_the_time_and_both_clips(usual_run: Path) -> None:
     rows, more, compared = flip_rows(read_run(usual_run), 10**7)
-    assert (more, compared) == (0, 44 + 34)  # 48 pairs of renderers, 36 of policies; two cells failed with both policies
+    assert (more, compared) == (
+        0,
+        44 + 34,
+    )  # 48 pairs of renderers, 36 of policies; two cells failed with both policies
     assert len(rows) > 3
     assert [name for name, *_ in rows[0].pictures] == list(rows[0].flip.sides)
     assert rows[0].time.text == "1.0\u00a0s"
     assert rows[0].gap.text == "0.500\u00a0m"
     assert rows[1].time.missing
     assert rows[1].why_not == "the plans never diverge by more than 0.5 m"
-    assert [tone for tone in ("worse", "mixed", "better") if any(r.flip.tone == tone for r in rows)] == list(
-        dict.fromkeys(row.flip.tone for row in rows)
-    )
+    assert [
+        tone for tone in ("worse", "mixed", "better") if any(r.flip.tone == tone for r in rows)
+    ] == list(dict.fromkeys(row.flip.tone for row in rows))
     with_clip = next(row for row in rows if row.flip.other.seed == 0)
     assert all(clip is not None and clip.endswith("front.mp4") for _, _, clip, _ in with_clip.links)
 
 
 def test_policies_behind_one_renderer_flip_as_renderers_do() -> None:
-    rollouts = [Rollout("clean", policy, "s", 0, "ok", metrics={"offroad": value}) for policy, value in (("a", 0.0), ("b", 1.0))]
-    (flip,), compared = find_flips(Run(Path(), {"renderers": ["clean"], "policies": ["a", "b"]}, {}, rollouts, ()))
+    rollouts = [
+        Rollout("clean", policy, "s", 0, "ok", metrics={"offroad": value})
+        for policy, value in (("a", 0.0), ("b", 1.0))
+    ]
+    (flip,), compared = find_flips(
+        Run(Path(), {"renderers": ["clean"], "policies": ["a", "b"]}, {}, rollouts, ())
+    )
     assert (compared, flip.sides, flip.was, flip.now) == (1, ("a", "b"), "no event", "off-road")
     assert flip.key == ("clean", "b", "s", 0, "clean/a")
 
@@ -87,7 +112,9 @@ def test_pictures_stop_at_the_budget_and_say_so(usual_run: Path) -> None:
     assert "flips/" in rows[2].why_not
 
 
-def test_a_run_without_logs_lists_flips_with_the_reason_why_nothing_is_known(usual_run: Path, tmp_path: Path) -> None:
+def test_a_run_without_logs_lists_flips_with_the_reason_why_nothing_is_known(
+    usual_run: Path, tmp_path: Path
+) -> None:
     for name in ("run.json", "summary.json", "rollouts.parquet"):
         shutil.copy(usual_run / name, tmp_path / name)
     rows, _, _ = flip_rows(read_run(tmp_path), 10**7)
@@ -107,15 +134,22 @@ def test_frames_outside_the_run_folder_are_not_read(usual_run: Path, tmp_path: P
 
 
 def test_a_run_whose_pairs_all_end_alike_says_so(tmp_path: Path) -> None:
-    plan = Plan(renderers=("clean", "same"), harm={"clean": 0.0, "same": 0.0}, scenes=("a",), seeds=(0,))
+    plan = Plan(
+        renderers=("clean", "same"), harm={"clean": 0.0, "same": 0.0}, scenes=("a",), seeds=(0,)
+    )
     folder = make_run(tmp_path, plan)
     flips: tuple[list[Flip], int] = find_flips(read_run(folder))
     assert flips == ([], 1)
-    assert "None: all 1\u00a0pair of rollouts end as they do with clean." in write_report(folder).read_text()
+    assert (
+        "None: all 1\u00a0pair of rollouts end as they do with clean."
+        in write_report(folder).read_text()
+    )
 
 
 @pytest.mark.slow
-def test_a_changed_outcome_links_to_its_replay_where_there_is_one(usual_run: Path, tmp_path: Path) -> None:
+def test_a_changed_outcome_links_to_its_replay_where_there_is_one(
+    usual_run: Path, tmp_path: Path
+) -> None:
     folder = Path(shutil.copytree(usual_run, tmp_path / "run"))
     flips, _ = find_flips(read_run(folder))
     text = write_report(folder, {flips[0].key: 'flips.html#scene=a&seed="0"'}).read_text()

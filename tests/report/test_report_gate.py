@@ -15,7 +15,9 @@ from evaluators.statistics.baselines import rows_of_run
 from evaluators.statistics.gate import judge, load_gate
 
 
-def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(usual_run: Path, tmp_path: Path) -> None:
+def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(
+    usual_run: Path, tmp_path: Path
+) -> None:
     root = tmp_path / "run"
     shutil.copytree(usual_run, root)
     run = read_run(root)
@@ -39,7 +41,9 @@ def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(usu
     assert gate_section(read_run(root)) is None
 
 
-def test_what_breaks_a_limit_stands_before_what_is_undecided_and_once(usual_run: Path, tmp_path: Path) -> None:
+def test_what_breaks_a_limit_stands_before_what_is_undecided_and_once(
+    usual_run: Path, tmp_path: Path
+) -> None:
     run = read_run(usual_run)
     rows = rows_of_run(run)
     stored = [dict(row) | {"collision_any": 0.0, "lateral_distance_m": 0.0} for row in rows]
@@ -48,12 +52,17 @@ def test_what_breaks_a_limit_stands_before_what_is_undecided_and_once(usual_run:
     spec, _ = load_gate(str(tmp_path / "gate.yaml"), run.table)
     verdict = judge(rows, spec, stored, "before.json", run.table)
     worst = worst_of(run, verdict, stored)
-    keys = [(pair["metric"], pair["renderer"], pair["policy"], pair["scene"], pair["seed"]) for pair in worst]
+    keys = [
+        (pair["metric"], pair["renderer"], pair["policy"], pair["scene"], pair["seed"])
+        for pair in worst
+    ]
     assert worst[0]["metric"] == "collision_any"
     assert worst[0]["was"] == 0.0  # its limit has no baseline, its margin has
     assert len(set(keys)) == len(keys)
     assert {"collision_any", "lateral_distance_m"} == {pair["metric"] for pair in worst}
-    assert all(" of before.json" in check.text for check in verdict.checks if check.kind == "margin")
+    assert all(
+        " of before.json" in check.text for check in verdict.checks if check.kind == "margin"
+    )
 
 
 def test_three_pictures_stand_under_the_verdict(usual_run: Path) -> None:

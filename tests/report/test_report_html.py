@@ -78,7 +78,9 @@ def usual_page(usual_run: Path) -> Page:
     return page_of(usual_run)
 
 
-def test_report_is_one_well_formed_file_without_outside_addresses(usual_run: Path, usual_page: Page) -> None:
+def test_report_is_one_well_formed_file_without_outside_addresses(
+    usual_run: Path, usual_page: Page
+) -> None:
     page = usual_page
     assert all(LOCAL.match(address) for address in page.addresses)
     assert len(page.ids) == len(set(page.ids))
@@ -89,7 +91,9 @@ def test_report_is_one_well_formed_file_without_outside_addresses(usual_run: Pat
     assert "@import" not in text
 
 
-def test_every_link_leads_to_a_file_or_a_place_in_the_page(usual_run: Path, usual_page: Page) -> None:
+def test_every_link_leads_to_a_file_or_a_place_in_the_page(
+    usual_run: Path, usual_page: Page
+) -> None:
     page = usual_page
     for address in page.addresses:
         if address.startswith("#"):
@@ -100,8 +104,15 @@ def test_every_link_leads_to_a_file_or_a_place_in_the_page(usual_run: Path, usua
 
 def test_the_bar_names_few_parts_by_their_headings(usual_run: Path, usual_page: Page) -> None:
     text = (usual_run / "report.html").read_text()
-    bar = dict(re.findall(r'<a href="#([a-z]+)">([^<(]+?)(?: \(\d+\))?</a>', text[text.index("<nav") : text.index("</nav>")]))
-    headings = dict(re.findall(r'<section id="([a-z]+)">\s*<h2>([^<]+)</h2>', text)) | {"frames": "Pictures"}
+    bar = dict(
+        re.findall(
+            r'<a href="#([a-z]+)">([^<(]+?)(?: \(\d+\))?</a>',
+            text[text.index("<nav") : text.index("</nav>")],
+        )
+    )
+    headings = dict(re.findall(r'<section id="([a-z]+)">\s*<h2>([^<]+)</h2>', text)) | {
+        "frames": "Pictures"
+    }
     assert bar.items() <= headings.items()
     assert 4 <= len(bar) <= 7
 
@@ -109,19 +120,41 @@ def test_the_bar_names_few_parts_by_their_headings(usual_run: Path, usual_page: 
 @pytest.mark.slow
 def test_hashes_have_the_width_of_their_column(usual_run: Path) -> None:
     run = read_run(usual_run)
-    text = html.render_report(dataclasses.replace(run, info={**run.info, "weights": {"/a/long/path/to/generator.safetensors": "ab" * 32}}))
+    text = html.render_report(
+        dataclasses.replace(
+            run, info={**run.info, "weights": {"/a/long/path/to/generator.safetensors": "ab" * 32}}
+        )
+    )
     weights = text[text.index("<h3>Weights</h3>") :]
-    assert weights.startswith('<h3>Weights</h3><dl class="stacked">')  # name above hash: a long path leaves the hash no column
+    assert weights.startswith(
+        '<h3>Weights</h3><dl class="stacked">'
+    )  # name above hash: a long path leaves the hash no column
     assert ".columns dl.stacked { grid-template-columns: minmax(0, 1fr); }" in text
 
 
 def test_verdict_comes_first(usual_run: Path, usual_page: Page) -> None:
     page = usual_page
-    heads = ["Results", "Paired differences", "Changed outcomes", "Over time", "What the camera saw", "From above", "Scene by scene"]
-    heads += ["Every rollout", "By distance and by opacity", "Speed", "Failures", "What the numbers leave out"]
+    heads = [
+        "Results",
+        "Paired differences",
+        "Changed outcomes",
+        "Over time",
+        "What the camera saw",
+        "From above",
+        "Scene by scene",
+    ]
+    heads += [
+        "Every rollout",
+        "By distance and by opacity",
+        "Speed",
+        "Failures",
+        "What the numbers leave out",
+    ]
     heads += ["Repeatability", "Provenance"]
     assert re.findall(r"<h2>([^<]*)</h2>", (usual_run / "report.html").read_text()) == heads
-    assert page.text.index("No difference shown between 3dgs and clean") < page.text.index("One value per rollout")
+    assert page.text.index("No difference shown between 3dgs and clean") < page.text.index(
+        "One value per rollout"
+    )
     assert page.tags.index("h1") < page.tags.index("table")
 
 
@@ -137,7 +170,9 @@ def test_hostile_names_stay_text(hostile_run: Path) -> None:
             assert (hostile_run / unquote(address)).resolve().is_relative_to(hostile_run.resolve())
 
 
-def test_numbers_that_are_missing_are_dashes_with_a_reason(usual_run: Path, usual_page: Page) -> None:
+def test_numbers_that_are_missing_are_dashes_with_a_reason(
+    usual_run: Path, usual_page: Page
+) -> None:
     text = (usual_run / "report.html").read_text()
     reasons = re.findall(r'<span class="missing" title="([^"]*)"[^>]*>([^<]*)</span>', text)
     assert reasons
@@ -152,13 +187,20 @@ def test_run_without_rollouts_has_a_report(tmp_path: Path) -> None:
 
 
 def test_run_of_one_rollout_has_a_report(tmp_path: Path) -> None:
-    page = page_of(make_run(tmp_path, Plan(renderers=("3dgs",), scenes=("a",), seeds=(0,), steps=3)))
+    page = page_of(
+        make_run(tmp_path, Plan(renderers=("3dgs",), scenes=("a",), seeds=(0,), steps=3))
+    )
     assert "One scene only" in page.text
     assert "of 1" in page.text
 
 
 def test_run_whose_every_rollout_failed_has_a_report(tmp_path: Path) -> None:
-    page = page_of(make_run(tmp_path, Plan(renderers=("3dgs",), scenes=("a",), seeds=(0,), steps=3, fail=[("3dgs", "a", 0)])))
+    page = page_of(
+        make_run(
+            tmp_path,
+            Plan(renderers=("3dgs",), scenes=("a",), seeds=(0,), steps=3, fail=[("3dgs", "a", 0)]),
+        )
+    )
     assert "Nothing could be scored" in page.text
     assert "1204 NaN pixels <b>&" in page.text
 
@@ -177,7 +219,17 @@ def test_bare_tables_are_enough(usual_run: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_many_scenes_are_capped_and_the_rest_is_named(tmp_path: Path) -> None:
     scenes = tuple(f"city/block-{k:03d}" for k in range(40))
-    folder = make_run(tmp_path, Plan(renderers=("clean", "3dgs"), scenes=scenes, seeds=(0,), steps=30, picture_px=(64, 36), clips=False))
+    folder = make_run(
+        tmp_path,
+        Plan(
+            renderers=("clean", "3dgs"),
+            scenes=scenes,
+            seeds=(0,),
+            steps=30,
+            picture_px=(64, 36),
+            clips=False,
+        ),
+    )
     text = write_report(folder).read_text()
     assert text.count('<article class="card pad view') == html.MAX_SCENE_PLOTS
     assert "16 more scenes not drawn here" in text
@@ -191,14 +243,22 @@ def test_many_scenes_are_capped_and_the_rest_is_named(tmp_path: Path) -> None:
 
 
 def test_large_strips_are_made_smaller(tmp_path: Path) -> None:
-    folder = make_run(tmp_path, Plan(renderers=("clean",), scenes=("a",), seeds=(0,), steps=5, picture_px=(960, 544)))
-    (data,) = re.findall(r'<img src="data:image/jpeg;base64,([^"]*)" width="(\d+)" height="(\d+)"', write_report(folder).read_text())
+    folder = make_run(
+        tmp_path,
+        Plan(renderers=("clean",), scenes=("a",), seeds=(0,), steps=5, picture_px=(960, 544)),
+    )
+    (data,) = re.findall(
+        r'<img src="data:image/jpeg;base64,([^"]*)" width="(\d+)" height="(\d+)"',
+        write_report(folder).read_text(),
+    )
     assert (int(data[1]), int(data[2])) == (1600, 227)
     assert len(data[0]) < 150_000
 
 
 def test_unreadable_strip_is_left_out_and_said(usual_run: Path, tmp_path: Path) -> None:
-    folder = make_run(tmp_path, Plan(renderers=("clean", "3dgs"), scenes=("a",), seeds=(0,), steps=5))
+    folder = make_run(
+        tmp_path, Plan(renderers=("clean", "3dgs"), scenes=("a",), seeds=(0,), steps=5)
+    )
     (folder / "rollouts/3dgs/lane-camera/a/0/strip.jpg").write_bytes(b"not a picture")
     assert "No frames from 3dgs in this cell." in page_of(folder).text
 
@@ -210,14 +270,18 @@ def test_same_folder_gives_the_same_bytes(usual_run: Path, usual_page: Page) -> 
 
 def test_charts_take_their_colours_from_the_page() -> None:
     x = np.linspace(0, 1, 5)
-    first, second = (line_chart([Curve("<a>", i, 0, x, x, x, x + i)], "s", "m & more") for i in (0, 1))
+    first, second = (
+        line_chart([Curve("<a>", i, 0, x, x, x, x + i)], "s", "m & more") for i in (0, 1)
+    )
     assert "var(--variant-0)" in first
     assert "var(--variant-1)" in second
     assert "m &amp; more" in first
     assert not re.search(r'#[0-9a-f]{3}|\bid="', first + second)
 
 
-def test_disk_that_refuses_is_a_four_part_error_and_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_disk_that_refuses_is_a_four_part_error_and_keeps_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = make_run(tmp_path, Plan(renderers=("clean",), scenes=("a",), seeds=(0,), steps=3))
     before = write_report(folder).read_bytes()
 
@@ -235,9 +299,14 @@ def test_disk_that_refuses_is_a_four_part_error_and_keeps_the_old_file(tmp_path:
 
 def test_charts_do_not_magnify_what_nobody_can_see() -> None:
     entry = {"direction": "lower", "unit": "m", "margin": 0.0, "diff": 1e-6, "ci95": [-1e-6, 3e-6]}
-    run = SimpleNamespace(summary={"paired": {"3dgs": {"lateral_distance_m": entry}}}, table=METRICS)
+    run = SimpleNamespace(
+        summary={"paired": {"3dgs": {"lateral_distance_m": entry}}}, table=METRICS
+    )
     (chart,) = forest(run, {"3dgs": 0})  # type: ignore[arg-type]
-    ticks = [float(text.replace("\u2212", "-")) for text in re.findall(r"text-anchor:middle\">([\u2212\d.]+)<", chart.svg)]
+    ticks = [
+        float(text.replace("\u2212", "-"))
+        for text in re.findall(r"text-anchor:middle\">([\u2212\d.]+)<", chart.svg)
+    ]
     assert max(ticks) - min(ticks) >= 0.06
 
 
@@ -249,7 +318,9 @@ def test_a_gap_interrupts_a_line_and_a_band() -> None:
     assert [part.count("L") for part in line.split("M")[1:]] == [1, 1]
 
 
-@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-3e-7, 2e-7), (-1234.5, 99999.0), (0.98, 1.02)])
+@pytest.mark.parametrize(
+    ("low", "high"), [(0.0, 1.0), (-3e-7, 2e-7), (-1234.5, 99999.0), (0.98, 1.02)]
+)
 def test_ticks_are_round_few_and_inside(low: float, high: float) -> None:
     axes = Axes()
     axes.limits = [(low, high), (low, high)]
@@ -257,15 +328,24 @@ def test_ticks_are_round_few_and_inside(low: float, high: float) -> None:
         ticks = axes._ticks(axis)  # type: ignore[arg-type]
         assert 2 <= len(ticks) <= 10
         assert all(low - 1e-12 <= value <= high + 1e-12 for value, _ in ticks)
-        assert all(float(text.replace("\u2212", "-")) == pytest.approx(value, abs=1e-12) for value, text in ticks)
+        assert all(
+            float(text.replace("\u2212", "-")) == pytest.approx(value, abs=1e-12)
+            for value, text in ticks
+        )
 
 
-def test_a_template_is_compiled_once_and_again_where_its_file_is_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_template_is_compiled_once_and_again_where_its_file_is_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(html.CompiledBeside, "folder", tmp_path)
     monkeypatch.setattr(sys, "dont_write_bytecode", False)
     compiled: list[str] = []
     real = Environment.compile
-    monkeypatch.setattr(Environment, "compile", lambda self, source, name, *rest: compiled.append(name) or real(self, source, name, *rest))
+    monkeypatch.setattr(
+        Environment,
+        "compile",
+        lambda self, source, name, *rest: compiled.append(name) or real(self, source, name, *rest),
+    )
 
     def rendered() -> str:
         html.environment_of.cache_clear()

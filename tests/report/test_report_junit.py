@@ -21,7 +21,11 @@ def test_one_case_per_rollout_and_an_error_per_failure(usual_run: Path) -> None:
     assert len({(c.attrib["classname"], c.attrib["name"]) for c in cases}) == 72
     assert sum(c.find("error") is not None for c in cases) == int(suite.attrib["errors"]) == 4
     assert sum(c.find("failure") is not None for c in cases) == int(suite.attrib["failures"]) > 0
-    case = next(c for c in cases if (c.attrib["classname"], c.attrib["name"]) == ("urban/left-turn", "3dgs/lane-camera/1"))
+    case = next(
+        c
+        for c in cases
+        if (c.attrib["classname"], c.attrib["name"]) == ("urban/left-turn", "3dgs/lane-camera/1")
+    )
     error = case.find("error")
     assert error is not None
     assert error.attrib["type"] == "renderer"
@@ -30,22 +34,39 @@ def test_one_case_per_rollout_and_an_error_per_failure(usual_run: Path) -> None:
 
 def test_metric_values_are_properties_and_invalid_ones_say_so(usual_run: Path) -> None:
     root = ET.parse(write_junit(usual_run)).getroot()
-    case = next(c for c in root.iter("testcase") if c.attrib["classname"] == "smoke/straight" and c.find("error") is None)
+    case = next(
+        c
+        for c in root.iter("testcase")
+        if c.attrib["classname"] == "smoke/straight" and c.find("error") is None
+    )
     values = {p.attrib["name"]: p.attrib["value"] for p in case.iter("property")}
     assert values["min_distance_to_obstacle_m"] == "invalid"
     assert float(values["lateral_distance_m"]) > 0
     assert values["path"].startswith("rollouts/")
 
 
-def test_an_outcome_is_a_failed_case_of_the_run_and_a_property_of_the_case_in_a_gate(usual_run: Path) -> None:
-    for root, fails in ((junit(read_run(usual_run)), True), (junit(read_run(usual_run), outcomes_fail=False), False)):
-        cases = [c for c in root.iter("testcase") if any(p.attrib == {"name": "collision_any", "value": "1.0"} for p in c.iter("property"))]
+def test_an_outcome_is_a_failed_case_of_the_run_and_a_property_of_the_case_in_a_gate(
+    usual_run: Path,
+) -> None:
+    for root, fails in (
+        (junit(read_run(usual_run)), True),
+        (junit(read_run(usual_run), outcomes_fail=False), False),
+    ):
+        cases = [
+            c
+            for c in root.iter("testcase")
+            if any(
+                p.attrib == {"name": "collision_any", "value": "1.0"} for p in c.iter("property")
+            )
+        ]
         assert cases
         for case in cases:
             failure = case.find("failure")
             assert (failure is not None) == fails
             assert failure is None or "at-fault collision" in failure.attrib["message"]
-            (said,) = [p.attrib["value"] for p in case.iter("property") if p.attrib["name"] == "outcome"]
+            (said,) = [
+                p.attrib["value"] for p in case.iter("property") if p.attrib["name"] == "outcome"
+            ]
             assert said.startswith("at-fault collision")
         assert (root.attrib["failures"] == "0") != fails
 
@@ -58,7 +79,11 @@ def test_hostile_names_and_control_characters_give_readable_xml(hostile_run: Pat
 
 
 def test_empty_run_is_an_empty_suite(tmp_path: Path) -> None:
-    suite = ET.parse(write_junit(make_run(tmp_path / "empty-run", Plan(renderers=(), scenes=())))).getroot().find("testsuite")
+    suite = (
+        ET.parse(write_junit(make_run(tmp_path / "empty-run", Plan(renderers=(), scenes=()))))
+        .getroot()
+        .find("testsuite")
+    )
     assert suite is not None
     assert (suite.attrib["name"], suite.attrib["tests"]) == ("empty-run", "0")
 

@@ -6,7 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluators.report.numbers import DASH, count_of, decimals, duration, finite, fixed, interval, short
+from evaluators.report.numbers import (
+    DASH,
+    count_of,
+    decimals,
+    duration,
+    finite,
+    fixed,
+    interval,
+    short,
+)
 
 
 @pytest.mark.parametrize(

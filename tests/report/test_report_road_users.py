@@ -23,15 +23,28 @@ def users_of(scenario: Scenario, at_us: int) -> dict[str, tuple[str, str]]:
 def test_a_leader_is_where_it_is_at_that_time_and_leaves_its_way() -> None:
     scenario = load_scenario("smoke/lead_car")
     (lead,) = [actor for actor in scenario.actors if actor.actor_id == "lead"]
-    early, late = (users_of(scenario, t)[f"{lead.label} {lead.actor_id}"] for t in (scenario.start_us, scenario.end_us))
+    early, late = (
+        users_of(scenario, t)[f"{lead.label} {lead.actor_id}"]
+        for t in (scenario.start_us, scenario.end_us)
+    )
     for (body, way), t_us in ((early, scenario.start_us), (late, scenario.end_us)):
-        corners = np.array([[float(v) for v in pair.split(",")] for pair in body.rstrip("z").split()])
+        corners = np.array(
+            [[float(v) for v in pair.split(",")] for pair in body.rstrip("z").split()]
+        )
         k = int(np.searchsorted(lead.track.t_us, t_us))
-        assert np.hypot(*(corners.mean(axis=0) - lead.track.xyz[min(k, len(lead.track) - 1), :2])) < 3.0  # drawn every quarter of a second
+        assert (
+            np.hypot(*(corners.mean(axis=0) - lead.track.xyz[min(k, len(lead.track) - 1), :2]))
+            < 3.0
+        )  # drawn every quarter of a second
         assert np.isclose(np.hypot(*(corners[1] - corners[2])), lead.box.width_m, atol=0.15)
         assert len(way.split()) > 10
     assert early[0] != late[0]
 
 
 def test_scene_files_of_earlier_versions_have_no_road_users() -> None:
-    assert road_users({"actors": [{"id": "a", "label": "car", "static": False}]}, 0, np.zeros((2, 2)), write) == []
+    assert (
+        road_users(
+            {"actors": [{"id": "a", "label": "car", "static": False}]}, 0, np.zeros((2, 2)), write
+        )
+        == []
+    )

@@ -37,7 +37,9 @@ def test_summary_key_with_policy_stands_for_that_policy_only(usual_run: Path) ->
     run = read_run(usual_run)
     assert len(run.rollouts_of("3dgs")) == 24
     assert {r.policy for r in run.rollouts_of("3dgs/lane-camera")} == {"lane-camera"}
-    assert len(run.rollouts_of("3dgs | lane-camera")) == 0  # an unknown way of joining matches nothing rather than something
+    assert (
+        len(run.rollouts_of("3dgs | lane-camera")) == 0
+    )  # an unknown way of joining matches nothing rather than something
 
 
 def test_scene_file_is_found_by_the_id_inside_it(usual_run: Path) -> None:
@@ -49,13 +51,17 @@ def test_scene_file_is_found_by_the_id_inside_it(usual_run: Path) -> None:
 
 
 @pytest.mark.parametrize("path", ["../outside", "/etc", "rollouts/../../outside", ""])
-def test_paths_that_leave_the_run_folder_are_not_followed(tmp_path: Path, usual_run: Path, path: str) -> None:
+def test_paths_that_leave_the_run_folder_are_not_followed(
+    tmp_path: Path, usual_run: Path, path: str
+) -> None:
     (tmp_path / "outside").mkdir()
     (tmp_path / "outside" / "strip.jpg").write_bytes(b"secret")
     shutil.copytree(usual_run, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts"))
     (tmp_path / "run" / "rollouts").mkdir()
     table = pq.read_table(usual_run / "rollouts.parquet")
-    table = table.set_column(table.column_names.index("path"), "path", pa.array([path] * table.num_rows))
+    table = table.set_column(
+        table.column_names.index("path"), "path", pa.array([path] * table.num_rows)
+    )
     pq.write_table(table, tmp_path / "run" / "rollouts.parquet")
     run = read_run(tmp_path / "run")
     assert run.file_of(run.rollouts[0], "strip.jpg") is None
@@ -70,10 +76,15 @@ def test_paths_that_leave_the_run_folder_are_not_followed(tmp_path: Path, usual_
         (lambda run: (run / "summary.json").write_text("[1]"), "the document: a list of 1"),
         (lambda run: (run / "rollouts.parquet").unlink(), "no such file"),
         (lambda run: (run / "rollouts.parquet").write_bytes(b"PAR1"), "no readable parquet"),
-        (lambda run: pq.write_table(pa.table({"renderer": ["a"]}), run / "rollouts.parquet"), "no column 'policy'"),
+        (
+            lambda run: pq.write_table(pa.table({"renderer": ["a"]}), run / "rollouts.parquet"),
+            "no column 'policy'",
+        ),
     ],
 )
-def test_broken_folder_is_a_four_part_error(tmp_path: Path, usual_run: Path, break_it, found: str) -> None:  # type: ignore[no-untyped-def]
+def test_broken_folder_is_a_four_part_error(
+    tmp_path: Path, usual_run: Path, break_it, found: str
+) -> None:  # type: ignore[no-untyped-def]
     shutil.copytree(usual_run, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts"))
     break_it(tmp_path / "run")
     with pytest.raises(InputError) as caught:
@@ -90,7 +101,9 @@ def test_run_without_steps_has_no_series(tmp_path: Path, usual_run: Path) -> Non
     assert series_by_cell(read_run(tmp_path / "run").steps(["ego_x_m"])) == {}
 
 
-def test_reasons_come_from_the_steps_where_the_summary_has_no_ledger(tmp_path: Path, usual_run: Path) -> None:
+def test_reasons_come_from_the_steps_where_the_summary_has_no_ledger(
+    tmp_path: Path, usual_run: Path
+) -> None:
     shutil.copytree(usual_run, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts"))
     summary = json.loads((usual_run / "summary.json").read_text())
     (tmp_path / "run" / "summary.json").write_text(json.dumps(summary | {"censoring": {}}))
@@ -113,7 +126,14 @@ rows = st.lists(
         }
     ),
     max_size=40,
-    unique_by=lambda row: (row["renderer"], row["policy"], row["scene"], row["seed"], row["metric"], row["t_us"]),
+    unique_by=lambda row: (
+        row["renderer"],
+        row["policy"],
+        row["scene"],
+        row["seed"],
+        row["metric"],
+        row["t_us"],
+    ),
 )
 
 
@@ -124,15 +144,22 @@ def test_series_agree_with_a_plain_loop(made: list[dict], coded: bool) -> None: 
     for row in sorted(made, key=lambda r: r["t_us"]):
         if row["valid"]:
             cell = (row["renderer"], row["policy"], row["scene"], row["seed"])
-            slow.setdefault(cell, {}).setdefault(row["metric"], []).append((row["t_us"], row["value"]))
+            slow.setdefault(cell, {}).setdefault(row["metric"], []).append(
+                (row["t_us"], row["value"])
+            )
     names = ["renderer", "policy", "scene", "seed", "metric", "t_us", "value", "valid"]
     types = [pa.string()] * 3 + [pa.int64(), pa.string(), pa.int64(), pa.float64(), pa.bool_()]
     table = pa.Table.from_pylist(made, schema=pa.schema(list(zip(names, types, strict=True))))
     if coded:
         for name in ("renderer", "policy", "scene", "metric"):
-            table = table.set_column(table.column_names.index(name), name, table[name].dictionary_encode())
+            table = table.set_column(
+                table.column_names.index(name), name, table[name].dictionary_encode()
+            )
     fast = {
-        cell: {metric: list(zip(t.tolist(), v.tolist(), strict=True)) for metric, (t, v) in series.items()}
+        cell: {
+            metric: list(zip(t.tolist(), v.tolist(), strict=True))
+            for metric, (t, v) in series.items()
+        }
         for cell, series in series_by_cell(table).items()
     }
     assert fast == slow

@@ -20,7 +20,11 @@ from tests.report.make_run import Plan, make_run
 STEP_US = 100_000
 
 
-def run_of(folder: Path, rollouts: dict[str, dict[str, list[float]]], flags: dict[str, dict[str, float]] | None = None) -> Run:
+def run_of(
+    folder: Path,
+    rollouts: dict[str, dict[str, list[float]]],
+    flags: dict[str, dict[str, float]] | None = None,
+) -> Run:
     """Write ``steps.parquet`` of hand-made rollouts, one a scene."""
     rows = []
     for scene, series in rollouts.items():
@@ -28,16 +32,27 @@ def run_of(folder: Path, rollouts: dict[str, dict[str, list[float]]], flags: dic
         for metric, values in series.items():
             for k, value in enumerate(values):
                 valid = np.isfinite(value)
-                row = {"t_us": k * STEP_US, "metric": metric, "value": value if valid else None, "valid": bool(valid), "reason": ""}
+                row = {
+                    "t_us": k * STEP_US,
+                    "metric": metric,
+                    "value": value if valid else None,
+                    "valid": bool(valid),
+                    "reason": "",
+                }
                 rows.append(key | row)
     pq.write_table(pa.Table.from_pylist(rows), folder / "steps.parquet")
-    made = tuple(Rollout("clean", "p", scene, 0, "ok", metrics=(flags or {}).get(scene, {})) for scene in rollouts)
+    made = tuple(
+        Rollout("clean", "p", scene, 0, "ok", metrics=(flags or {}).get(scene, {}))
+        for scene in rollouts
+    )
     return Run(folder, {"renderers": ["clean"]}, {}, made, ())
 
 
 def test_steps_are_counted_in_the_range_they_lie_in(tmp_path: Path) -> None:
     offset = [0.0, 0.24, -0.26, 0.49, -0.99, 1.0, 3.0, np.nan]
-    (found,) = strata(run_of(tmp_path, {"a": {"lateral_bias_m": offset, "eval_relevant": [1.0] * 8}}))
+    (found,) = strata(
+        run_of(tmp_path, {"a": {"lateral_bias_m": offset, "eval_relevant": [1.0] * 8}})
+    )
     seconds = {s.label: round(s.bins[0].seconds, 6) for s in found.strata}
     assert seconds == {
         "below 0.25\u00a0m": 0.2,
@@ -49,28 +64,45 @@ def test_steps_are_counted_in_the_range_they_lie_in(tmp_path: Path) -> None:
     }
 
 
-def test_warm_up_and_what_follows_an_event_do_not_count_and_the_event_counts_where_it_began(tmp_path: Path) -> None:
+def test_warm_up_and_what_follows_an_event_do_not_count_and_the_event_counts_where_it_began(
+    tmp_path: Path,
+) -> None:
     series = {
         "lateral_bias_m": [0.0, 0.0, 0.0, 0.3, 0.6, 0.6, 0.6],
         "eval_relevant": [0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0],
         "offroad": [1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0],
     }
     (found,) = strata(run_of(tmp_path, {"a": series}, {"a": {"offroad": 1.0}}))
-    assert {s.label: (round(s.bins[0].seconds, 6), s.bins[0].events["offroad"]) for s in found.strata} == {
+    assert {
+        s.label: (round(s.bins[0].seconds, 6), s.bins[0].events["offroad"]) for s in found.strata
+    } == {
         "below 0.25\u00a0m": (0.1, 0),
         "0.25 to 0.5\u00a0m": (0.1, 0),
         "0.5 to 1\u00a0m": (0.1, 1),
     }
 
 
-def test_opacity_is_split_at_the_runs_own_quartiles_and_cameras_are_averaged(tmp_path: Path) -> None:
+def test_opacity_is_split_at_the_runs_own_quartiles_and_cameras_are_averaged(
+    tmp_path: Path,
+) -> None:
     n = 41
     opacity = np.linspace(0.6, 1.0, n)
-    run = run_of(tmp_path, {"a": {"lateral_bias_m": [0.0] * n, "opacity_mean": opacity.tolist(), "eval_relevant": [1.0] * n}})
+    run = run_of(
+        tmp_path,
+        {
+            "a": {
+                "lateral_bias_m": [0.0] * n,
+                "opacity_mean": opacity.tolist(),
+                "eval_relevant": [1.0] * n,
+            }
+        },
+    )
     _, found = strata(run)
     assert sorted(round(s.bins[0].seconds, 6) for s in found.strata) == [1.0, 1.0, 1.0, 1.1]
     table = pq.read_table(tmp_path / "steps.parquet").to_pylist()
-    second = [row | {"value": row["value"] - 0.2} for row in table if row["metric"] == "opacity_mean"]  # another camera of the same times
+    second = [
+        row | {"value": row["value"] - 0.2} for row in table if row["metric"] == "opacity_mean"
+    ]  # another camera of the same times
     pq.write_table(pa.Table.from_pylist(table + second), tmp_path / "steps.parquet")
     _, both = strata(run)
     assert [s.label for s in both.strata] != [s.label for s in found.strata]
@@ -79,11 +111,19 @@ def test_opacity_is_split_at_the_runs_own_quartiles_and_cameras_are_averaged(tmp
 
 def test_means_are_over_scenes_and_have_an_interval_from_three_scenes_on(tmp_path: Path) -> None:
     def drive(value: float, n: int) -> dict[str, list[float]]:
-        return {"lateral_bias_m": [0.1] * n, "eval_relevant": [1.0] * n, "plan_deviation": [value] * n}
+        return {
+            "lateral_bias_m": [0.1] * n,
+            "eval_relevant": [1.0] * n,
+            "plan_deviation": [value] * n,
+        }
 
     two = strata(run_of(tmp_path, {"a": drive(0.1, 10), "b": drive(0.4, 30)}))[0].strata[0].bins[0]
     assert two.means["plan_deviation"] == (pytest.approx(0.25), None, None)
-    three = strata(run_of(tmp_path, {"a": drive(0.1, 10), "b": drive(0.4, 30), "c": drive(0.1, 20)}))[0].strata[0].bins[0]
+    three = (
+        strata(run_of(tmp_path, {"a": drive(0.1, 10), "b": drive(0.4, 30), "c": drive(0.1, 20)}))[0]
+        .strata[0]
+        .bins[0]
+    )
     mean, low, high = three.means["plan_deviation"]
     assert mean == pytest.approx(0.2)
     assert low == 0.0  # the t interval reaches below zero
@@ -92,21 +132,37 @@ def test_means_are_over_scenes_and_have_an_interval_from_three_scenes_on(tmp_pat
 
 
 def test_few_steps_give_a_dash_with_its_reason(tmp_path: Path) -> None:
-    run = run_of(tmp_path, {"a": {"lateral_bias_m": [0.1] * 9, "eval_relevant": [1.0] * 9, "plan_deviation": [0.1] * 9}})
+    run = run_of(
+        tmp_path,
+        {
+            "a": {
+                "lateral_bias_m": [0.1] * 9,
+                "eval_relevant": [1.0] * 9,
+                "plan_deviation": [0.1] * 9,
+            }
+        },
+    )
     row = stratum_rows(strata(run)[0])[0]
     assert row.cells[3].missing
     assert row.cells[3].note == "fewer than 10 steps here have it"
 
 
 def test_a_run_without_steps_has_no_strata(tmp_path: Path) -> None:
-    assert strata(Run(tmp_path, {"renderers": ["clean"]}, {}, (Rollout("clean", "p", "a", 0, "ok"),), ())) == []
+    assert (
+        strata(
+            Run(tmp_path, {"renderers": ["clean"]}, {}, (Rollout("clean", "p", "a", 0, "ok"),), ())
+        )
+        == []
+    )
 
 
 def test_charts_compare_renderers_only_where_there_are_two(usual_run: Path, tmp_path: Path) -> None:
     run = read_run(usual_run)
     variants = {variant: i for i, variant in enumerate(run.variants)}
     assert [chart.title for chart in forest(run, variants)] == [
-        f"{kind}, against {base}" for base in ("clean", "3dgs") for kind in ("Rates and shares", "Distances")
+        f"{kind}, against {base}"
+        for base in ("clean", "3dgs")
+        for kind in ("Rates and shares", "Distances")
     ]
     assert {chart.title for chart in speed_against_error(run, variants)} >= {"lateral distance"}
     alone = read_run(make_run(tmp_path, Plan(renderers=("clean",), seeds=(0,), steps=30)))
@@ -122,7 +178,9 @@ def test_the_forest_turns_metrics_so_that_right_is_worse() -> None:
     assert "worse than the baseline" in chart.svg
     _, better = _line(METRICS["progress"], 1, pairs["progress"])  # type: ignore[misc]
     _, worse = _line(METRICS["offroad"], 1, pairs["offroad"])  # type: ignore[misc]
-    assert (better.centre, better.low, better.high, better.margin) == pytest.approx((-10.0, -15.0, -5.0, 2.0))
+    assert (better.centre, better.low, better.high, better.margin) == pytest.approx(
+        (-10.0, -15.0, -5.0, 2.0)
+    )
     assert (worse.centre, worse.low, worse.high) == pytest.approx((10.0, 5.0, 15.0))
 
 
@@ -137,17 +195,27 @@ def test_chart_labels_keep_their_digits(usual_run: Path) -> None:
     ("status", "word", "said"),
     [
         ("equal", "equal", "is the same to the bit"),
-        ("different", "different", "differs first in frames at step 4 (camera &lt;b&gt;front&lt;/b&gt;)"),
+        (
+            "different",
+            "different",
+            "differs first in frames at step 4 (camera &lt;b&gt;front&lt;/b&gt;)",
+        ),
         ("skipped", "not made", "No rollout was repeated: no rollout finished."),
     ],
 )
-def test_the_certificate_is_shown_and_a_difference_stands_at_the_head(tmp_path: Path, status: str, word: str, said: str) -> None:
-    folder = make_run(tmp_path, Plan(renderers=("clean",), scenes=("a",), seeds=(0,), steps=5, certificate=status))
+def test_the_certificate_is_shown_and_a_difference_stands_at_the_head(
+    tmp_path: Path, status: str, word: str, said: str
+) -> None:
+    folder = make_run(
+        tmp_path, Plan(renderers=("clean",), scenes=("a",), seeds=(0,), steps=5, certificate=status)
+    )
     run = read_run(folder)
     assert certificate(run).word == word
     text = write_report(folder).read_text()
     assert said in text
-    assert any("not deterministic" in caution for caution in find(run).cautions) == (status == "different")
+    assert any("not deterministic" in caution for caution in find(run).cautions) == (
+        status == "different"
+    )
 
 
 def test_a_run_without_a_certificate_says_so(tmp_path: Path) -> None:

@@ -17,7 +17,13 @@ def test_summary_has_finding_tables_failures_and_command(usual_run: Path) -> Non
     head, *lines = text.splitlines()
     assert head.startswith("## clean/lane-camera: ")  # how the drives ended comes first
     assert any(line.startswith("**No difference shown between 3dgs") for line in lines)
-    for part in ("### Results, preset paper", "### Paired differences from clean", "### Speed", "### Failures", "simrun run --renderer"):
+    for part in (
+        "### Results, preset paper",
+        "### Paired differences from clean",
+        "### Speed",
+        "### Failures",
+        "simrun run --renderer",
+    ):
         assert part in text
     assert "\u2014 (the policy gives no plan of 1.0 s)" in text
 
@@ -32,11 +38,16 @@ def test_every_table_row_has_as_many_cells_as_its_head(hostile_run: Path) -> Non
                 widths.append(cells)
             assert cells == widths[-1], line
     assert len(widths) >= 3
-    assert not any("<img" in line or "<script" in line for line in lines if not line.startswith("simrun"))
+    assert not any(
+        "<img" in line or "<script" in line for line in lines if not line.startswith("simrun")
+    )
 
 
 def test_table_escapes_columns_and_new_lines() -> None:
-    assert table(["a|b"], [["one\ntwo"], ["<i>"]]) == "| a\\|b |\n| --- |\n| one two |\n| &lt;i&gt; |\n"
+    assert (
+        table(["a|b"], [["one\ntwo"], ["<i>"]])
+        == "| a\\|b |\n| --- |\n| one two |\n| &lt;i&gt; |\n"
+    )
     assert escape("*x*_y_`z`") == "\\*x\\*\\_y\\_\\`z\\`"
 
 
@@ -64,4 +75,8 @@ def test_huge_summary_is_cut_with_a_note(usual_run: Path, tmp_path: Path) -> Non
 
 
 def test_empty_run_has_a_summary(tmp_path: Path) -> None:
-    assert write_summary_md(make_run(tmp_path, Plan(renderers=(), scenes=()))).read_text().startswith("## Nothing was run")
+    assert (
+        write_summary_md(make_run(tmp_path, Plan(renderers=(), scenes=())))
+        .read_text()
+        .startswith("## Nothing was run")
+    )

@@ -17,7 +17,13 @@ from tests.report.make_run import Plan, make_run
 
 
 def entry(mean: float | None, **more: Any) -> dict[str, Any]:
-    base = {"mean": mean, "ci95": 0.0192, "ci95_clustered": [0.01, 0.05], "n_rollouts": 300, "n_scenes": 60}
+    base = {
+        "mean": mean,
+        "ci95": 0.0192,
+        "ci95_clustered": [0.01, 0.05],
+        "n_rollouts": 300,
+        "n_scenes": 60,
+    }
     return base | {"unit": "", "direction": "lower"} | more
 
 
@@ -31,7 +37,10 @@ def test_rate_is_percent_with_its_count_and_one_interval() -> None:
 
 def test_missing_mean_is_a_dash_with_its_reason_never_zero() -> None:
     summary = {
-        "metrics": {"a": {"offroad": entry(None, reason="valid in none of 4 rollouts")}, "b": {"lateral_distance_m": entry(0.0, unit="m")}}
+        "metrics": {
+            "a": {"offroad": entry(None, reason="valid in none of 4 rollouts")},
+            "b": {"lateral_distance_m": entry(0.0, unit="m")},
+        }
     }
     offroad, distance = metric_rows(summary, {("a", "offroad"): "the map has no edges"})
     assert offroad.cells[0].text == DASH
@@ -44,7 +53,15 @@ def test_missing_mean_is_a_dash_with_its_reason_never_zero() -> None:
 
 
 def test_one_rollout_has_a_mean_and_says_why_it_has_no_interval() -> None:
-    one = entry(0.4, unit="m", ci95=None, ci95_clustered=None, n_rollouts=1, n_scenes=1, ci95_reason="one rollout has no spread")
+    one = entry(
+        0.4,
+        unit="m",
+        ci95=None,
+        ci95_clustered=None,
+        n_rollouts=1,
+        n_scenes=1,
+        ci95_reason="one rollout has no spread",
+    )
     (row,) = metric_rows({"metrics": {"a": {"lateral_distance_m": one}}})
     assert row.cells[0].text == "0.400"
     assert row.cells[0].detail == DASH
@@ -52,7 +69,9 @@ def test_one_rollout_has_a_mean_and_says_why_it_has_no_interval() -> None:
 
 
 def test_metric_of_a_third_party_is_shown_without_help() -> None:
-    (row,) = metric_rows({"metrics": {"a": {"my_metric": entry(3.25, unit="jerk", direction="none")}}})
+    (row,) = metric_rows(
+        {"metrics": {"a": {"my_metric": entry(3.25, unit="jerk", direction="none")}}}
+    )
     assert (row.name, row.unit, row.arrow, row.meaning) == ("my_metric", "jerk", "", "")
     assert row.cells[0].text == "3.250"
 
@@ -66,7 +85,13 @@ def test_no_event_says_which_rates_are_excluded_and_which_not() -> None:
 
 @pytest.mark.parametrize("mean", [0.0, 1e-7, 5e6])
 def test_bars_stay_on_their_axis(mean: float) -> None:
-    rows = metric_rows({"metrics": {"a": {"lateral_distance_m": entry(mean, unit="m", ci95_clustered=[-1.0, 3.0])}}})
+    rows = metric_rows(
+        {
+            "metrics": {
+                "a": {"lateral_distance_m": entry(mean, unit="m", ci95_clustered=[-1.0, 3.0])}
+            }
+        }
+    )
     (span,) = rows[0].spans
     assert span is not None
     for value in (span.centre, span.low, span.high, span.zero):
@@ -110,14 +135,22 @@ def test_paired_zero_lies_in_the_middle() -> None:
 
 
 def test_columns_count_done_and_failed(usual_run: Path) -> None:
-    assert [(c.n_rollouts, c.n_failed, c.n_scenes) for c in columns(read_run(usual_run))] == [(24, 0, 4), (22, 2, 4), (22, 2, 4)]
+    assert [(c.n_rollouts, c.n_failed, c.n_scenes) for c in columns(read_run(usual_run))] == [
+        (24, 0, 4),
+        (22, 2, 4),
+        (22, 2, 4),
+    ]
 
 
 def test_scene_rows_count_only_what_ran(usual_run: Path) -> None:
     rows, more = scene_rows(read_run(usual_run))
     assert more == 0
     assert len(rows) == 4 * 3 * 2
-    row = next(r for r in rows if (r.scene, r.renderer, r.policy) == ("urban/left-turn", "3dgs", "lane-camera"))
+    row = next(
+        r
+        for r in rows
+        if (r.scene, r.renderer, r.policy) == ("urban/left-turn", "3dgs", "lane-camera")
+    )
     assert [chip.state for chip in row.chips][1] == "failed"
     assert row.collisions.text.endswith("of 2")
     assert row.chips[0].clip == "rollouts/3dgs/lane-camera/urban-left-turn/0/front.mp4"
@@ -125,7 +158,12 @@ def test_scene_rows_count_only_what_ran(usual_run: Path) -> None:
 
 
 def test_scene_without_a_finished_rollout_has_dashes(tmp_path: Path) -> None:
-    run = read_run(make_run(tmp_path, Plan(renderers=("3dgs",), scenes=("a",), seeds=(0,), steps=10, fail=[("3dgs", "a", 0)])))
+    run = read_run(
+        make_run(
+            tmp_path,
+            Plan(renderers=("3dgs",), scenes=("a",), seeds=(0,), steps=10, fail=[("3dgs", "a", 0)]),
+        )
+    )
     (row,), _ = scene_rows(run)
     assert row.collisions.missing
     assert row.values[0].note == "no rollout finished"
@@ -142,13 +180,23 @@ def test_speed_keeps_stages_that_only_some_renderers_have(usual_run: Path) -> No
     table = speed(run)
     assert table.stages == ("render", "policy", "log", "control", "actors")
     assert sum(segment.width for segment in table.rows[-1].bar) == pytest.approx(100.0, abs=0.1)
-    assert table.pool.startswith("2\u00a0workers with 1\u00a0thread each, 41.2 camera frames/s in total")
+    assert table.pool.startswith(
+        "2\u00a0workers with 1\u00a0thread each, 41.2 camera frames/s in total"
+    )
 
 
 def test_renderer_without_frames_has_no_speed() -> None:
     from alpasim_plugin.log.run_folder.reader import Run
 
-    nothing = dict.fromkeys(("ms_per_frame_p50", "ms_per_frame_mean", "ms_per_frame_p95", "frames_per_s", "first_frame_ms"))
+    nothing = dict.fromkeys(
+        (
+            "ms_per_frame_p50",
+            "ms_per_frame_mean",
+            "ms_per_frame_p95",
+            "frames_per_s",
+            "first_frame_ms",
+        )
+    )
     speeds = {"a": nothing | {"stages": {}}}
     table = speed(Run(Path(), {}, {"speed": speeds}, (), ()))
     assert all(cell.missing for cell in table.rows[0].cells)
@@ -167,7 +215,16 @@ def test_terminal_table_prints_means_intervals_and_counts(usual_run: Path) -> No
     console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     console.print(render_table(json.loads((usual_run / "summary.json").read_text())))
     text = console.export_text()
-    parts = ("offroad % \u2193", "24 rollouts", "4 scenes", "/22 (", "lateral_distance_m m \u2193", "preset paper", "\u202f%", DASH)
+    parts = (
+        "offroad % \u2193",
+        "24 rollouts",
+        "4 scenes",
+        "/22 (",
+        "lateral_distance_m m \u2193",
+        "preset paper",
+        "\u202f%",
+        DASH,
+    )
     for part in (*parts, "at logged instants only", "at steps of 100 ms"):
         assert part.replace("\u00a0", " ") in text.replace("\u00a0", " ")
 
@@ -181,7 +238,15 @@ def test_terminal_table_can_be_short(usual_run: Path) -> None:
 
 
 def test_terminal_table_says_what_a_dash_means_where_there_is_one() -> None:
-    alone = {"mean": 0.1, "ci95": None, "ci95_clustered": None, "n_rollouts": 1, "n_scenes": 1, "unit": "m", "direction": "lower"}
+    alone = {
+        "mean": 0.1,
+        "ci95": None,
+        "ci95_clustered": None,
+        "n_rollouts": 1,
+        "n_scenes": 1,
+        "unit": "m",
+        "direction": "lower",
+    }
     many = alone | {"ci95": 0.02, "ci95_clustered": [0.05, 0.2], "n_rollouts": 9, "n_scenes": 3}
     for entry, explained in ((alone, True), (many, False)):
         table = render_table({"metrics": {"clean": {"lateral_distance_m": entry}}})

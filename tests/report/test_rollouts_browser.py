@@ -1,4 +1,6 @@
-"""The table of every rollout in a real browser, small and with 100,000 rows. Slow: needs an installed Chromium."""
+"""The table of every rollout in a real browser, small and with 100,000 rows. Slow: needs an
+installed Chromium.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ def opened(browser: Browser, page: Path, width: int = 1400) -> float:
     browser.complaints.clear()
     began = time.monotonic()
     browser.open(page, width=width)
-    until(lambda: browser.evaluate("document.getElementById('rollouts-box').dataset.ready === 'yes'"))
+    until(
+        lambda: browser.evaluate("document.getElementById('rollouts-box').dataset.ready === 'yes'")
+    )
     return time.monotonic() - began
 
 
@@ -43,11 +47,15 @@ def column(browser: Browser, head: str) -> list[str]:
 
 
 def sort(browser: Browser, head: str) -> None:
-    browser.evaluate(f"[...document.querySelectorAll('#table-rollouts thead .sort')].find(b => b.textContent === '{head}').click()")
+    browser.evaluate(
+        f"[...document.querySelectorAll('#table-rollouts thead .sort')].find(b => b.textContent === '{head}').click()"
+    )
 
 
 def choose(browser: Browser, element: str, value: str, event: str) -> None:
-    browser.evaluate(f"(e => {{ e.value = '{value}'; e.dispatchEvent(new Event('{event}')); }})(document.getElementById('{element}'))")
+    browser.evaluate(
+        f"(e => {{ e.value = '{value}'; e.dispatchEvent(new Event('{event}')); }})(document.getElementById('{element}'))"
+    )
 
 
 def count(browser: Browser) -> str:
@@ -65,10 +73,14 @@ def test_rows_sort_filter_and_open(browser: Browser, usual_run: Path) -> None:
     opened(browser, write_report(usual_run))
     assert count(browser) == "72 rollouts"
     sort(browser, "lateral_distance_m")
-    rising = [float(text.split()[0]) for text in column(browser, "lateral_distance_m") if text != "\u2014"]
+    rising = [
+        float(text.split()[0]) for text in column(browser, "lateral_distance_m") if text != "\u2014"
+    ]
     assert rising == sorted(rising)
     sort(browser, "lateral_distance_m")
-    falling = [float(text.split()[0]) for text in column(browser, "lateral_distance_m") if text != "\u2014"]
+    falling = [
+        float(text.split()[0]) for text in column(browser, "lateral_distance_m") if text != "\u2014"
+    ]
     assert falling == sorted(falling, reverse=True)
     assert falling[0] == rising[-1] or len(falling) < 72  # only the rows near the top are drawn
     choose(browser, "rollouts-words", "3DGS urban", "input")
@@ -88,7 +100,10 @@ def test_rows_sort_filter_and_open(browser: Browser, usual_run: Path) -> None:
     choose(browser, "rollouts-words", "", "input")
     choose(browser, "rollouts-state", "0", "change")
     browser.evaluate(f"{ROWS}.at(-1).click()")
-    assert (usual_run / browser.evaluate("document.querySelector('#rollouts-picked a').getAttribute('href')")).is_dir()
+    assert (
+        usual_run
+        / browser.evaluate("document.querySelector('#rollouts-picked a').getAttribute('href')")
+    ).is_dir()
     assert browser.complaints == []
 
 
@@ -127,10 +142,15 @@ def test_a_hundred_thousand_rollouts_load_scroll_sort_and_open(
     took["filter"] = time.monotonic() - began
     assert count(browser) == "10 of 100000 rollouts"
     browser.evaluate(f"{ROWS}[3].click()")
-    assert "drawn-001234, 3dgs" in browser.evaluate("document.querySelector('#rollouts-picked h3').textContent")
+    assert "drawn-001234, 3dgs" in browser.evaluate(
+        "document.querySelector('#rollouts-picked h3').textContent"
+    )
     choose(browser, "rollouts-words", "", "input")
     choose(browser, "rollouts-state", "4", "change")
     assert 300 < int(count(browser).split()[0]) < 700  # half a percent failed
     assert browser.complaints == []
     with capsys.disabled():
-        print(f"\n{size / 1e6:.1f} MB; " + ", ".join(f"{name} {seconds:.2f} s" for name, seconds in took.items()))
+        print(
+            f"\n{size / 1e6:.1f} MB; "
+            + ", ".join(f"{name} {seconds:.2f} s" for name, seconds in took.items())
+        )

@@ -38,7 +38,9 @@ class MissesItsWeights(Raises):
 
 
 class RemembersEarlierRollouts(Raises):
-    """Drives a little to the left after half a second, by how many rollouts its process has seen: no rollout can be repeated."""
+    """Drives a little to the left after half a second, by how many rollouts its process has seen:
+    no rollout can be repeated.
+    """
 
     lives = 0
 
@@ -50,5 +52,14 @@ class RemembersEarlierRollouts(Raises):
         self.start_us = observation.t_us if self.start_us is None else self.start_us
         times = observation.t_us + np.arange(0, 2_000_001, 500_000, dtype=np.int64)
         seconds = (times - observation.t_us) * 1e-6
-        left = 0.01 * self.lives * seconds if observation.t_us >= self.start_us + 500_000 else 0.0 * seconds
-        return Plan(observation.t_us, times, np.stack([observation.ego.speed_mps * seconds, left], axis=1), np.zeros(len(times)))
+        left = (
+            0.01 * self.lives * seconds
+            if observation.t_us >= self.start_us + 500_000
+            else 0.0 * seconds
+        )
+        return Plan(
+            observation.t_us,
+            times,
+            np.stack([observation.ego.speed_mps * seconds, left], axis=1),
+            np.zeros(len(times)),
+        )

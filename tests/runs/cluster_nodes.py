@@ -8,16 +8,23 @@ from typing import Any
 
 from alpasim_plugin.runs.executors.choice import Executor
 
-# Set before Ray is imported. Otherwise a driver that finds a cluster by itself asks it for the token of an earlier one (~/.ray/auth_token).
+# Set before Ray is imported. Otherwise a driver that finds a cluster by itself asks it for the
+# token of an earlier one (~/.ray/auth_token).
 os.environ["RAY_AUTH_MODE"] = "disabled"
 
 LIGHT = {"include_log_monitor": False}  # fewer processes of Ray's own
 LIGHT_HEAD = {"include_dashboard": False, "no_monitor": True, **LIGHT}
-SYSTEM = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_failure_threshold": 4}
+SYSTEM = {
+    "health_check_initial_delay_ms": 0,
+    "health_check_period_ms": 500,
+    "health_check_failure_threshold": 4,
+}
 
 
 def patiently(start: Callable[[], Any], times: int = 4) -> Any:
-    """Start a node of Ray, which gives it 30 s to come up; on a busy machine it is started again."""
+    """Start a node of Ray, which gives it 30 s to come up; on a busy machine it is started
+    again.
+    """
     for left in reversed(range(times)):
         try:
             return start()

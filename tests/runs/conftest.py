@@ -1,4 +1,6 @@
-"""A scene small enough for tests of the loop: a straight two-lane road, one car ahead, one on the shoulder."""
+"""A scene small enough for tests of the loop: a straight two-lane road, one car ahead, one on the
+shoulder.
+"""
 
 from __future__ import annotations
 
@@ -34,11 +36,23 @@ from tests.report.make_run import Plan
 from tests.viewer.make_watched import make_watched
 
 SMALL = Plan(
-    renderers=("clean", "3dgs"), scenes=("urban-left_turn",), seeds=(0, 1), steps=8, pictures=False, fail=[("3dgs", "urban-left_turn", 1)]
+    renderers=("clean", "3dgs"),
+    scenes=("urban-left_turn",),
+    seeds=(0, 1),
+    steps=8,
+    pictures=False,
+    fail=[("3dgs", "urban-left_turn", 1)],
 )
 
 
-def straight_track(x0_m: float, y_m: float, z_m: float, speed_mps: float, duration_s: float, period_us: int = 10_000) -> Trajectory:
+def straight_track(
+    x0_m: float,
+    y_m: float,
+    z_m: float,
+    speed_mps: float,
+    duration_s: float,
+    period_us: int = 10_000,
+) -> Trajectory:
     """Return a track along x at constant speed."""
     t_us = np.arange(0, int(duration_s * 1e6) + 1, period_us, dtype=np.int64)
     x = x0_m + speed_mps * t_us * 1e-6
@@ -55,8 +69,22 @@ def straight_road() -> Scenario:
         return np.stack([x, np.full_like(x, y_m), np.zeros_like(x)], axis=1)
 
     lanes = {
-        "right": Lane("right", line(0.0), line(1.75), line(-1.75), left_neighbour="left", left_paint="dashed_white"),
-        "left": Lane("left", line(3.5), line(5.25), line(1.75), right_neighbour="right", left_paint="solid_white"),
+        "right": Lane(
+            "right",
+            line(0.0),
+            line(1.75),
+            line(-1.75),
+            left_neighbour="left",
+            left_paint="dashed_white",
+        ),
+        "left": Lane(
+            "left",
+            line(3.5),
+            line(5.25),
+            line(1.75),
+            right_neighbour="right",
+            left_paint="solid_white",
+        ),
     }
     camera = CameraSpec(
         "front",
@@ -76,7 +104,13 @@ def straight_road() -> Scenario:
         route=Route(line(0.0), ("right",)),
         actors=(
             Actor("ahead", "car", Box(4.5, 1.8, 1.5), straight_track(30.0, 0.0, 0.75, 10.0, 3.0)),
-            Actor("parked", "car", Box(4.5, 1.8, 1.5), straight_track(20.0, 3.5, 0.75, 0.0, 3.0), is_static=True),
+            Actor(
+                "parked",
+                "car",
+                Box(4.5, 1.8, 1.5),
+                straight_track(20.0, 3.5, 0.75, 0.0, 3.0),
+                is_static=True,
+            ),
         ),
         cameras=(camera,),
         rates=Rates(),
@@ -92,21 +126,35 @@ def straight_road() -> Scenario:
 
 @dataclass
 class Watched:
-    """A small run with logs: two renderers, one scene, two seeds (3dgs failed in the second), eight steps, two cameras."""
+    """A small run with logs: two renderers, one scene, two seeds (3dgs failed in the second), eight
+    steps, two cameras.
+    """
 
     folder: Path
     run: Run
 
     def log(self, renderer: str) -> RolloutLog:
-        return read_asl(self.folder / "rollouts" / renderer / "lane-camera" / "urban-left_turn" / "0" / "rollout.asl")
+        return read_asl(
+            self.folder
+            / "rollouts"
+            / renderer
+            / "lane-camera"
+            / "urban-left_turn"
+            / "0"
+            / "rollout.asl"
+        )
 
     def metrics(self, renderer: str) -> dict[str, list[tuple[int, float]]]:
         (rollout,) = (r for r in self.run.rollouts if (r.renderer, r.seed) == (renderer, 0))
         (own,) = series_by_cell(self.run.steps_of(rollout)).values()
-        return {name: list(zip(t.tolist(), v.tolist(), strict=True)) for name, (t, v) in own.items()}
+        return {
+            name: list(zip(t.tolist(), v.tolist(), strict=True)) for name, (t, v) in own.items()
+        }
 
 
 @pytest.fixture(scope="session")
 def watched(tmp_path_factory: pytest.TempPathFactory) -> Watched:
-    folder = make_watched(tmp_path_factory.mktemp("recorded"), SMALL, actors=4, cameras=("front", "side"))
+    folder = make_watched(
+        tmp_path_factory.mktemp("recorded"), SMALL, actors=4, cameras=("front", "side")
+    )
     return Watched(vouch_for(folder), read_run(folder))

@@ -1,4 +1,6 @@
-"""A renderer that costs nothing: for runs whose subject is what happens to rollouts, not what they show."""
+"""A renderer that costs nothing: for runs whose subject is what happens to rollouts, not what they
+show.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Make run folders in numbers: sealed and with real tables, their values drawn from a seed, without logs or pictures."""
+"""Make run folders in numbers: sealed and with real tables, their values drawn from a seed, without
+logs or pictures.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,10 @@ from evaluators import aggregate
 
 COMMITS = ("3f2a9c1d" * 5, "8b07ee42" * 5, "c51d9a60" * 5)
 METRICS = ("offroad", "lateral_distance_m", "progress")
-SCENES = {f"smoke-{name}": f"{k:02d}" * 32 for k, name in enumerate(("curve", "lead_car", "straight", "s_curve", "narrow", "merge"))}
+SCENES = {
+    f"smoke-{name}": f"{k:02d}" * 32
+    for k, name in enumerate(("curve", "lead_car", "straight", "s_curve", "narrow", "merge"))
+}
 
 
 @dataclass
@@ -52,27 +57,55 @@ def make_one(root: Path, one: Many) -> Path:
     metrics: dict[str, Any] = {}
     for policy in one.policies:
         found = aggregate([row for row in rows if row["policy"] == policy])
-        metrics |= found if len(one.policies) == 1 else {f"{renderer}/{policy}": table for renderer, table in found.items()}
-    summary = {"preset": one.preset, "metrics": metrics, "failures": {"n_rollouts": len(rows), "n_failed": 0, "by_class": {}, "cells": []}}
+        metrics |= (
+            found
+            if len(one.policies) == 1
+            else {f"{renderer}/{policy}": table for renderer, table in found.items()}
+        )
+    summary = {
+        "preset": one.preset,
+        "metrics": metrics,
+        "failures": {"n_rollouts": len(rows), "n_failed": 0, "by_class": {}, "cells": []},
+    }
     write_json(folder / "summary.json", summary)
     write_contents(folder, {})
     return folder
 
 
 def rows_of(one: Many) -> list[dict[str, Any]]:
-    """Draw the rollouts: a cell's own part is the same in all runs and behind all renderers, so that pairs are sharp."""
+    """Draw the rollouts: a cell's own part is the same in all runs and behind all renderers, so
+    that pairs are sharp.
+    """
     rows = []
     for renderer in one.renderers:
         for policy in one.policies:
             for k, scene in enumerate(one.scenes):
                 for seed in one.seeds:
                     shared = np.random.default_rng([k, seed]).uniform(0.2, 0.6)
-                    own = np.random.default_rng([k, seed, *one.name.encode()]).normal(0.0, one.noise_m) if one.noise_m else 0.0
+                    own = (
+                        np.random.default_rng([k, seed, *one.name.encode()]).normal(
+                            0.0, one.noise_m
+                        )
+                        if one.noise_m
+                        else 0.0
+                    )
                     lateral = shared + one.shift_m.get(renderer, 0.0) + own
-                    values = {"offroad": float(lateral > 0.9), "lateral_distance_m": lateral, "progress": 1.0 - 0.1 * shared}
-                    key = {"renderer": renderer, "policy": policy, "scene": scene, "seed": seed, "status": "ok"}
+                    values = {
+                        "offroad": float(lateral > 0.9),
+                        "lateral_distance_m": lateral,
+                        "progress": 1.0 - 0.1 * shared,
+                    }
+                    key = {
+                        "renderer": renderer,
+                        "policy": policy,
+                        "scene": scene,
+                        "seed": seed,
+                        "status": "ok",
+                    }
                     path = f"rollouts/{renderer}/{policy}/{scene}/{seed}"
-                    rows.append(key | {"path": path} | values | {f"{name}_valid": True for name in values})
+                    rows.append(
+                        key | {"path": path} | values | {f"{name}_valid": True for name in values}
+                    )
     return rows
 
 
@@ -92,20 +125,43 @@ def info_of(one: Many) -> dict[str, Any]:
         "files": {bundle: one.weights},
         "settings": {"steps": [1000.0], "weights": {"bundle": bundle}},
     }
-    policies = {f"policy {name}": {"name": name, "digest": one.code, "files": {}, "settings": None} for name in one.policies}
-    renderers = {f"renderer {name}": {"name": name, "digest": "d" * 64, "files": {}, "settings": None} for name in ("clean", "3dgs")}
+    policies = {
+        f"policy {name}": {"name": name, "digest": one.code, "files": {}, "settings": None}
+        for name in one.policies
+    }
+    renderers = {
+        f"renderer {name}": {"name": name, "digest": "d" * 64, "files": {}, "settings": None}
+        for name in ("clean", "3dgs")
+    }
     info = {
-        "schema_version": 1, "key": f"key-{one.name}", "content": f"content-{one.name}", "command": ["simrun", *one.asked],
+        "schema_version": 1,
+        "key": f"key-{one.name}",
+        "content": f"content-{one.name}",
+        "command": ["simrun", *one.asked],
         "version": "0.1.0",
-        "started_at": one.started_at, "project": project, "asked": list(one.asked), "config": {"images": "jpeg", "workers": 2},
-        "preset": one.preset, "renderers": list(one.renderers), "policies": list(one.policies), "seeds": list(one.seeds),
-        "scenes": {name: {"content_hash": digest, "ref": {"path": f"/x/{name}.yaml"}} for name, digest in one.scenes.items()},
-        "bases": {"onefixer": "3dgs"}, "fixers": {"onefixer": fixer} if "onefixer" in one.renderers else {},
-        "parts": policies | renderers | ({"fixer onefixer": fixer} if "onefixer" in one.renderers else {}),
-        "code": {"loop": "1" * 12, "scoring": "2" * 12}, "metrics": {},
+        "started_at": one.started_at,
+        "project": project,
+        "asked": list(one.asked),
+        "config": {"images": "jpeg", "workers": 2},
+        "preset": one.preset,
+        "renderers": list(one.renderers),
+        "policies": list(one.policies),
+        "seeds": list(one.seeds),
+        "scenes": {
+            name: {"content_hash": digest, "ref": {"path": f"/x/{name}.yaml"}}
+            for name, digest in one.scenes.items()
+        },
+        "bases": {"onefixer": "3dgs"},
+        "fixers": {"onefixer": fixer} if "onefixer" in one.renderers else {},
+        "parts": policies
+        | renderers
+        | ({"fixer onefixer": fixer} if "onefixer" in one.renderers else {}),
+        "code": {"loop": "1" * 12, "scoring": "2" * 12},
+        "metrics": {},
         "weights": {bundle: one.weights} if "onefixer" in one.renderers else {},
-        "hardware": {"cpu": "x", "cores": 2}, "versions": {"torch": "2.13.0"},
-    }  # fmt: skip
+        "hardware": {"cpu": "x", "cores": 2},
+        "versions": {"torch": "2.13.0"},
+    }
     return info | dict(one.more)
 
 

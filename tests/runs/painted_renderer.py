@@ -1,4 +1,6 @@
-"""A renderer that paints a road of the recorded drive's curvature: a few milliseconds a frame, and enough to see a lane by."""
+"""A renderer that paints a road of the recorded drive's curvature: a few milliseconds a frame, and
+enough to see a lane by.
+"""
 
 from __future__ import annotations
 
@@ -27,10 +29,18 @@ class Painted:
         turned = float(np.ptp(np.unwrap(yaw_from_quat(log.quat))))
         k = turned / float(arc_lengths(log.xyz[:, :2])[-1])
         self.first = inverse(interpolate(log, [log.t_us[0]])[0])
-        lines = (Line(1.8, dashed=True, colour=YELLOW), Line(-1.8, colour=WHITE), Line(5.4, colour=WHITE))
+        lines = (
+            Line(1.8, dashed=True, colour=YELLOW),
+            Line(-1.8, colour=WHITE),
+            Line(5.4, colour=WHITE),
+        )
         self.road = PaintedRoad(k, lines, (-2.3, 5.9))
 
     def render(self, request: RenderRequest) -> Frame:
         camera = request.camera
         rig = self.first @ request.T_world_camera[1] @ inverse(camera.T_rig_camera)
-        return Frame(request.t_us, camera.name, self.road.image(camera, rig, seed=request.t_us, supersample=1))
+        return Frame(
+            request.t_us,
+            camera.name,
+            self.road.image(camera, rig, seed=request.t_us, supersample=1),
+        )

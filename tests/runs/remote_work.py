@@ -16,9 +16,11 @@ DAY_S = 86_400
 
 @dataclass(frozen=True)
 class Scripted:
-    """Do what the item says, and note in a folder that all nodes see which node did it, and which day it is there.
+    """Do what the item says, and note in a folder that all nodes see which node did it, and which
+    day it is there.
 
-    Items: ``sleep S``, ``die``, ``die once``, ``raise``, ``fetch SHA256``, ``late S`` (slow only the first time), ``hold`` (until
+    Items: ``sleep S``, ``die``, ``die once``, ``raise``, ``fetch SHA256``, ``late S`` (slow only
+        the first time), ``hold`` (until
     there is a note ``go``).
     """
 
@@ -28,7 +30,9 @@ class Scripted:
     def __call__(self, job: str, node: Node) -> Any:
         name = job.replace(" ", "-")[:60]
         seen = len(list(self.notes.glob(f"{name}.*")))
-        (self.notes / f"{name}.{os.getpid()}.{time.monotonic_ns()}").write_text(f"{node.name} {int(time.time() // DAY_S)}")
+        (self.notes / f"{name}.{os.getpid()}.{time.monotonic_ns()}").write_text(
+            f"{node.name} {int(time.time() // DAY_S)}"
+        )
         words = job.split("#")[0].split()
         if words[0] == "sleep" or (words[0] == "late" and seen == 0):
             time.sleep(float(words[1]))

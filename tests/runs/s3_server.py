@@ -53,20 +53,30 @@ class Line:
 
 @contextmanager
 def s3_line() -> Iterator[Line]:
-    """Give a line to moto's S3 server with a bucket ``runs``; the environment of this process, and of those it starts, names it."""
+    """Give a line to moto's S3 server with a bucket ``runs``; the environment of this process, and
+    of those it starts, names it.
+    """
     pytest.importorskip("s3fs", reason="the extra [s3] is not installed")
-    server_of = pytest.importorskip("moto.server", reason="moto[server] is not installed").ThreadedMotoServer
+    server_of = pytest.importorskip(
+        "moto.server", reason="moto[server] is not installed"
+    ).ThreadedMotoServer
     server = server_of(port=0)
     server.start()
     line = Line(server.get_host_and_port()[1])
-    known = {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{line.port}", "AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b"}
+    known = {
+        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{line.port}",
+        "AWS_ACCESS_KEY_ID": "a",
+        "AWS_SECRET_ACCESS_KEY": "b",
+    }
     with pytest.MonkeyPatch.context() as environment:
         for name, value in {**known, "AWS_DEFAULT_REGION": "us-east-1"}.items():
             environment.setenv(name, value)
         import s3fs
 
         s3fs.S3FileSystem.clear_instance_cache()
-        if not s3fs.S3FileSystem().exists("runs"):  # moto's servers of one process share their buckets
+        if not s3fs.S3FileSystem().exists(
+            "runs"
+        ):  # moto's servers of one process share their buckets
             s3fs.S3FileSystem().mkdir("runs")
         yield line
     server.stop()

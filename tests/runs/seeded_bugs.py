@@ -1,4 +1,6 @@
-"""Twelve drivers with a fault each, to be named by the page of causes: `LaneCamera`, `Learned` or `ByYellow` with one thing wrong."""
+"""Twelve drivers with a fault each, to be named by the page of causes: `LaneCamera`, `Learned` or
+`ByYellow` with one thing wrong.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,10 @@ from policies.learned import Learned
 
 
 def _shown(observation: Observation, change) -> Observation:  # type: ignore[no-untyped-def]
-    return replace(observation, frames={name: replace(f, rgb=change(f.rgb)) for name, f in observation.frames.items()})
+    return replace(
+        observation,
+        frames={name: replace(f, rgb=change(f.rgb)) for name, f in observation.frames.items()},
+    )
 
 
 def _wrong_camera(scenario: Scenario, change) -> Scenario:  # type: ignore[no-untyped-def]
@@ -41,7 +46,9 @@ class Latency(LaneCamera):
     def act(self, observation: Observation) -> Plan:
         self.waiting = [*self.waiting, observation][-1 - self.PERIODS :]
         late = self.waiting[0]
-        shown = {name: replace(f, t_us=observation.frames[name].t_us) for name, f in late.frames.items()}
+        shown = {
+            name: replace(f, t_us=observation.frames[name].t_us) for name, f in late.frames.items()
+        }
         return super().act(replace(observation, frames=shown, route_rig=late.route_rig))
 
 
@@ -54,13 +61,24 @@ class ByYellow(LaneCamera):
         c = self.camera
         p = np.linalg.inv(c.T_rig_camera) @ [self.AHEAD_M, 0.0, 0.0, 1.0]
         row = round(float(c.K[1, 1] * p[1] / p[2] + c.K[1, 2]))
-        red, _, blue = observation.frames[c.name].rgb[row - 2 : row + 3].astype(float).mean(axis=0).T
+        red, _, blue = (
+            observation.frames[c.name].rgb[row - 2 : row + 3].astype(float).mean(axis=0).T
+        )
         columns = np.flatnonzero(red - blue > 45)
-        left_m = -(columns.mean() - c.K[0, 2]) * p[2] / c.K[0, 0] - self.BESIDE_M if len(columns) else 0.0
+        left_m = (
+            -(columns.mean() - c.K[0, 2]) * p[2] / c.K[0, 0] - self.BESIDE_M
+            if len(columns)
+            else 0.0
+        )
         t = 1e-6 * 100_000 * np.arange(41)
         bend = 2 * left_m / self.AHEAD_M**2
         x = observation.ego.speed_mps * t
-        return Plan(observation.t_us, observation.t_us + (1e6 * t).astype(np.int64), np.stack([x, bend * x**2 / 2], axis=1), bend * x)
+        return Plan(
+            observation.t_us,
+            observation.t_us + (1e6 * t).astype(np.int64),
+            np.stack([x, bend * x**2 / 2], axis=1),
+            bend * x,
+        )
 
 
 class SwappedChannels(ByYellow):
@@ -74,7 +92,12 @@ class WrongFocalLength(ByYellow):
     """The focal length is believed to be 1.25 times what it is."""
 
     def __init__(self, scenario: Scenario) -> None:
-        super().__init__(_wrong_camera(scenario, lambda c: replace(c, K=c.K * np.array([[1.25, 1, 1], [1, 1.25, 1], [1, 1, 1]]))))
+        super().__init__(
+            _wrong_camera(
+                scenario,
+                lambda c: replace(c, K=c.K * np.array([[1.25, 1, 1], [1, 1.25, 1], [1, 1, 1]])),
+            )
+        )
 
 
 class FrozenFrame(LaneCamera):
@@ -88,8 +111,14 @@ class FrozenFrame(LaneCamera):
         self.queries += 1
         if self.queries <= 20:
             self.kept = dict(observation.frames)
-        frozen = {name: replace(self.kept[name], t_us=f.t_us) for name, f in observation.frames.items()}
-        return super().act(replace(observation, frames=frozen, route_rig=np.full_like(observation.route_rig, np.nan)))
+        frozen = {
+            name: replace(self.kept[name], t_us=f.t_us) for name, f in observation.frames.items()
+        }
+        return super().act(
+            replace(
+                observation, frames=frozen, route_rig=np.full_like(observation.route_rig, np.nan)
+            )
+        )
 
 
 class MirroredPicture(Learned):
@@ -103,7 +132,11 @@ class WrongUnit(LaneCamera):
     """The speed is taken for km/h."""
 
     def act(self, observation: Observation) -> Plan:
-        return super().act(replace(observation, ego=replace(observation.ego, speed_mps=observation.ego.speed_mps / 3.6)))
+        return super().act(
+            replace(
+                observation, ego=replace(observation.ego, speed_mps=observation.ego.speed_mps / 3.6)
+            )
+        )
 
 
 class WorldAxes(LaneCamera):
@@ -112,7 +145,9 @@ class WorldAxes(LaneCamera):
     def act(self, observation: Observation) -> Plan:
         plan, yaw = super().act(observation), yaw_of(observation.ego.T_world_rig)
         c, s = np.cos(yaw), np.sin(yaw)
-        return replace(plan, xy=plan.xy @ np.array([[c, s], [-s, c]]), yaw=plan.yaw + yaw, samples=())
+        return replace(
+            plan, xy=plan.xy @ np.array([[c, s], [-s, c]]), yaw=plan.yaw + yaw, samples=()
+        )
 
 
 class WrongPitch(ByYellow):
@@ -120,8 +155,17 @@ class WrongPitch(ByYellow):
 
     def __init__(self, scenario: Scenario) -> None:
         a = np.deg2rad(-6.0)
-        pitch = np.array([[1, 0, 0, 0], [0, np.cos(a), -np.sin(a), 0], [0, np.sin(a), np.cos(a), 0], [0, 0, 0, 1.0]])
-        super().__init__(_wrong_camera(scenario, lambda c: replace(c, T_rig_camera=c.T_rig_camera @ pitch)))
+        pitch = np.array(
+            [
+                [1, 0, 0, 0],
+                [0, np.cos(a), -np.sin(a), 0],
+                [0, np.sin(a), np.cos(a), 0],
+                [0, 0, 0, 1.0],
+            ]
+        )
+        super().__init__(
+            _wrong_camera(scenario, lambda c: replace(c, T_rig_camera=c.T_rig_camera @ pitch))
+        )
 
 
 class TimeStep(LaneCamera):

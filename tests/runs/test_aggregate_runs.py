@@ -25,29 +25,46 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make_one(root, whole)
     table, names = pq.read_table(root / "whole" / "rollouts.parquet"), list(SCENES)
     for name, mine in (("part-1", names[:3]), ("part-2", names[3:])):
-        part = make_one(root, replace(whole, name=name, scenes={scene: SCENES[scene] for scene in mine}))
+        part = make_one(
+            root, replace(whole, name=name, scenes={scene: SCENES[scene] for scene in mine})
+        )
         pq.write_table(table.filter(pc.field("scene").isin(mine)), part / "rollouts.parquet")
         write_contents(part, {})
     return root
 
 
-def test_the_parts_of_a_night_give_the_numbers_of_the_whole(night: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_the_parts_of_a_night_give_the_numbers_of_the_whole(
+    night: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     whole = aggregate_runs([night / "whole"])
     # All six scenes differ by exactly 0.4 m: there is no spread to go by.
     assert whole["paired"]["onefixer"]["lateral_distance_m"]["verdict"] == "undecided"
     out = tmp_path / "night.json"
-    assert run_command(["aggregate", str(night / "part-1"), str(night / "part-2"), "--json", "--out", str(out)]) == 0
+    assert (
+        run_command(
+            ["aggregate", str(night / "part-1"), str(night / "part-2"), "--json", "--out", str(out)]
+        )
+        == 0
+    )
     parts = json.loads(capsys.readouterr().out)
     assert json.loads(out.read_text()) == parts
     for block in ("preset", "paired", "failures"):
         assert parts[block] == whole[block]
-    stored = json.loads((night / "whole" / "summary.json").read_text())["metrics"]  # as a run of all rollouts wrote it
+    stored = json.loads((night / "whole" / "summary.json").read_text())[
+        "metrics"
+    ]  # as a run of all rollouts wrote it
     assert parts["metrics"] == whole["metrics"] == stored
 
 
-def test_the_verdicts_are_printed_one_a_line(night: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_verdicts_are_printed_one_a_line(
+    night: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(["aggregate", str(night / "part-1"), str(night / "part-2")]) == 0
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("onefixer minus clean: lateral_distance_m")]
+    lines = [
+        line
+        for line in capsys.readouterr().out.splitlines()
+        if line.startswith("onefixer minus clean: lateral_distance_m")
+    ]
     assert len(lines) == 1
     assert lines[0].endswith(": undecided")
 

@@ -1,4 +1,6 @@
-"""A driver that ignores pixels fails every shipped suite: what a suite passes has looked (docs/experiments/power.md)."""
+"""A driver that ignores pixels fails every shipped suite: what a suite passes has looked
+(docs/experiments/power.md).
+"""
 
 from __future__ import annotations
 
@@ -25,13 +27,23 @@ NEEDS_EYES = {
 @pytest.mark.parametrize(("suite", "scene"), NEEDS_EYES.items())
 def test_a_driver_that_follows_the_route_and_sees_nothing_collides(suite: str, scene: str) -> None:
     folder, stem = scene.split("/")
-    ref = next(one for one in expand(f"suites/{suite}") if Path(one.path).parts[-2:] == (folder, f"{stem}.yaml"))
-    scenario = load_scenario(ref.path, ref.seed, [*ref.overrides, "cameras=[{width: 32, height: 18}]"])
-    recorder = run_rollout(scenario, make_renderer(GREY, scenario), make_policy("pure-pursuit", scenario), seed=0)
+    ref = next(
+        one
+        for one in expand(f"suites/{suite}")
+        if Path(one.path).parts[-2:] == (folder, f"{stem}.yaml")
+    )
+    scenario = load_scenario(
+        ref.path, ref.seed, [*ref.overrides, "cameras=[{width: 32, height: 18}]"]
+    )
+    recorder = run_rollout(
+        scenario, make_renderer(GREY, scenario), make_policy("pure-pursuit", scenario), seed=0
+    )
     values = reduce_rollout(score(recorder.log(), scenario.scene), "paper").as_dict()
     assert values["collision_at_fault"]["value"] == 1.0
 
 
 def test_every_shipped_suite_is_listed() -> None:
-    shipped = {path.stem for path in (Path(__file__).parents[2] / "scenarios" / "suites").glob("*.yaml")}
+    shipped = {
+        path.stem for path in (Path(__file__).parents[2] / "scenarios" / "suites").glob("*.yaml")
+    }
     assert shipped - {"all"} == set(NEEDS_EYES)  # `all` is the union of the others

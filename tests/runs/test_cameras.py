@@ -19,7 +19,9 @@ def rendered_steps(scenario: Scenario, rates: Rates, sensors: list[SensorSpec]) 
     clock = Clock(scenario.start_us, scenario.end_us, rates)
     rig = CameraRig(scenario, sensors, clock)
     state = LoopState.at_start(scenario, clock.n_steps)
-    return [tick.step for tick in clock.ticks() if rig.requests(tick, replace_end(state, tick.t_us), {})]
+    return [
+        tick.step for tick in clock.ticks() if rig.requests(tick, replace_end(state, tick.t_us), {})
+    ]
 
 
 def replace_end(state: LoopState, t_us: int):  # type: ignore[no-untyped-def]

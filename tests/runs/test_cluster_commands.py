@@ -1,4 +1,5 @@
-"""Whole commands over a Ray cluster and over jobs, with a store: the same files, tables and verdicts as on this machine alone.
+"""Whole commands over a Ray cluster and over jobs, with a store: the same files, tables and
+verdicts as on this machine alone.
 
 `pytest -m slow tests/runs/test_cluster_commands.py`, about four minutes on two free cores.
 """
@@ -28,13 +29,35 @@ from tests.runs.test_runs import SHORT, comparable
 
 pytest.importorskip("ray", reason="the extra [ray] is not installed")
 pytest.importorskip("submitit", reason="the extra [slurm] is not installed")
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]  # most of the time goes by while processes start
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(1200),
+]  # most of the time goes by while processes start
 
 DARKER = GREY.replace("Grey", "Darker")
 SCENES = ("smoke/straight", "smoke/lead_car")
 SET = [word for text in SHORT for word in ("--set", text)]
-RUN = ["--renderer", GREY, "--policy", "constant-velocity,pure-pursuit", *SET, "--no-report", "--quiet", *SCENES]
-PAIR = ["--renderer", f"{GREY},{DARKER}", "--policy", BY_GREY, *SET, "--images", "none", "--alpha", "0.4"]
+RUN = [
+    "--renderer",
+    GREY,
+    "--policy",
+    "constant-velocity,pure-pursuit",
+    *SET,
+    "--no-report",
+    "--quiet",
+    *SCENES,
+]
+PAIR = [
+    "--renderer",
+    f"{GREY},{DARKER}",
+    "--policy",
+    BY_GREY,
+    *SET,
+    "--images",
+    "none",
+    "--alpha",
+    "0.4",
+]
 
 
 @pytest.fixture(scope="module")
@@ -74,21 +97,78 @@ def test_a_command_gives_the_same_files_and_another_machine_takes_them_from_the_
     tmp_path: Path, where: str, bucket: str, plain: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     store = f"{bucket}/{where.partition(':')[0]}"
-    assert run_command([*RUN, "--executor", where, "--workers", "2", "--store", store, "--out", str(tmp_path / "far")]) == 0
-    assert "equal to the bit" in capsys.readouterr().out  # a rollout of a node, and its repetition here
+    assert (
+        run_command(
+            [
+                *RUN,
+                "--executor",
+                where,
+                "--workers",
+                "2",
+                "--store",
+                store,
+                "--out",
+                str(tmp_path / "far"),
+            ]
+        )
+        == 0
+    )
+    assert (
+        "equal to the bit" in capsys.readouterr().out
+    )  # a rollout of a node, and its repetition here
     assert comparable(tmp_path / "far") == comparable(plain)
     told = json.loads((tmp_path / "far" / "run.json").read_text())["pool"]
     assert (told["executor"], told["store"]) == (where, store)
-    assert run_command([*RUN, "--workers", "1", "--store", store, "--out", str(tmp_path / "near"), "--certify", "none"]) == 0
+    assert (
+        run_command(
+            [
+                *RUN,
+                "--workers",
+                "1",
+                "--store",
+                store,
+                "--out",
+                str(tmp_path / "near"),
+                "--certify",
+                "none",
+            ]
+        )
+        == 0
+    )
     assert rows(tmp_path / "near") == rows(tmp_path / "far"), "wall_s too: it is the same drive"
     assert rows(tmp_path / "far") != rows(plain)
 
 
 @both
 def test_a_decision_is_the_same(tmp_path: Path, where: str) -> None:
-    words = ["decide", *PAIR, "--metric", "offroad=0.6", "--look-every", "1", "--certify", "none", "--no-report", "--quiet", *SCENES]
+    words = [
+        "decide",
+        *PAIR,
+        "--metric",
+        "offroad=0.6",
+        "--look-every",
+        "1",
+        "--certify",
+        "none",
+        "--no-report",
+        "--quiet",
+        *SCENES,
+    ]
     assert run_command([*words, "--out", str(tmp_path / "near"), "--workers", "1"]) == 0
-    assert run_command([*words, "--out", str(tmp_path / "far"), "--executor", where, "--store", str(tmp_path / "store")]) == 0
+    assert (
+        run_command(
+            [
+                *words,
+                "--out",
+                str(tmp_path / "far"),
+                "--executor",
+                where,
+                "--store",
+                str(tmp_path / "store"),
+            ]
+        )
+        == 0
+    )
     decided = read_decision(tmp_path / "far")
     assert decided is not None
     assert decided == read_decision(tmp_path / "near")
@@ -98,10 +178,21 @@ def test_a_decision_is_the_same(tmp_path: Path, where: str) -> None:
 
 
 @both
-def test_a_gate_drives_until_it_is_decided(tmp_path: Path, where: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_gate_drives_until_it_is_decided(
+    tmp_path: Path, where: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     gate = tmp_path / "gate.yaml"
     gate.write_text("version: 1\nmetrics:\n  offroad: {margin: 0.6}\n")
-    words = ["gate", str(tmp_path / "run"), "--until-decided", "--gate", str(gate), *PAIR, "--executor", where]
+    words = [
+        "gate",
+        str(tmp_path / "run"),
+        "--until-decided",
+        "--gate",
+        str(gate),
+        *PAIR,
+        "--executor",
+        where,
+    ]
     words += [word for scene in SCENES for word in ("--scenes", scene)]
     assert run_command(words) == 0
     assert "non-inferior after 2 scenes" in capsys.readouterr().out
@@ -121,7 +212,19 @@ def at_work(mark: bytes) -> list[int]:
 def test_ctrl_c_leaves_no_worker_and_the_same_command_goes_on(
     tmp_path: Path, where: str, repo: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = [*RUN, "--seeds", "4", "--executor", where, "--workers", "2", "--certify", "none", "--out", str(tmp_path / "run")]
+    words = [
+        *RUN,
+        "--seeds",
+        "4",
+        "--executor",
+        where,
+        "--workers",
+        "2",
+        "--certify",
+        "none",
+        "--out",
+        str(tmp_path / "run"),
+    ]
     monkeypatch.setenv("SIMRUN_SLURM", str(private := tmp_path / "private"))
     environment = {**os.environ, "PYTHONPATH": str(repo)}
     command = [sys.executable, "-m", "alpasim_plugin.cli.main", *words]

@@ -53,7 +53,9 @@ def test_a_name_is_a_renderer_or_a_fixer_over_one(name: str, meant: str) -> None
         ("onefixer+", "no renderer has that name", "known"),
     ],
 )
-def test_a_name_that_stands_for_nothing_is_refused_with_the_nearest(name: str, found: str, do: str) -> None:
+def test_a_name_that_stands_for_nothing_is_refused_with_the_nearest(
+    name: str, found: str, do: str
+) -> None:
     with pytest.raises(InputError, match=found) as caught:
         resolve_renderer(name)
     assert re.search(do, caught.value.do_this)
@@ -61,7 +63,9 @@ def test_a_name_that_stands_for_nothing_is_refused_with_the_nearest(name: str, f
 
 def test_the_mode_decides_the_kind_of_session(straight_road: Scenario) -> None:
     assert isinstance(make_renderer("identity+clean", straight_road), SpeculativeRenderer)
-    assert isinstance(make_renderer("identity+clean", straight_road, overrides=("mode=chunk",)), ChunkRenderer)
+    assert isinstance(
+        make_renderer("identity+clean", straight_road, overrides=("mode=chunk",)), ChunkRenderer
+    )
 
 
 def test_resolving_a_renderer_or_a_fixer_does_not_load_torch() -> None:
@@ -69,7 +73,12 @@ def test_resolving_a_renderer_or_a_fixer_does_not_load_torch() -> None:
         "import sys; from alpasim_plugin.core.parts import resolve_renderer;"
         "resolve_renderer('3dgs'); resolve_renderer('onefixer'); print('torch' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "False"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        == "False"
+    )
 
 
 def plan(renderers: tuple[str, ...], fixer: tuple[str, ...] = ()) -> RunPlan:
@@ -86,14 +95,22 @@ def test_settings_of_a_fixer_enter_its_rollouts_key_and_no_other() -> None:
     plain_too, changed = keys(("3dgs", "onefixer-dit-tiny"), ("tolerance_m=0.5",))
     assert plain == plain_too
     assert fixed != changed
-    assert keys(("onefixer-dit-tiny",), ("tolerance_m=0.02", "tolerance_deg=0.1")) == [fixed]  # the defaults, said aloud
+    assert keys(("onefixer-dit-tiny",), ("tolerance_m=0.02", "tolerance_deg=0.1")) == [
+        fixed
+    ]  # the defaults, said aloud
 
 
-def test_the_code_of_a_renderer_enters_the_keys_of_its_rollouts_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_code_of_a_renderer_enters_the_keys_of_its_rollouts_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     before = keys(("clean", "3dgs", "identity", "identity+clean"))
     digest = spec.code_digest
     monkeypatch.setattr(
-        spec, "code_digest", lambda file: digest(file) + ("edited" if str(file).endswith("renderers/reconstruction.py") else "")
+        spec,
+        "code_digest",
+        lambda file: (
+            digest(file) + ("edited" if str(file).endswith("renderers/reconstruction.py") else "")
+        ),
     )
     after = keys(("clean", "3dgs", "identity", "identity+clean"))
     assert [a == b for a, b in zip(before, after, strict=True)] == [True, False, False, True]
@@ -128,13 +145,24 @@ def test_settings_for_a_fixer_that_is_not_there_are_refused() -> None:
 
 def test_a_setting_for_one_renderer_is_that_of_its_fixer_alone() -> None:
     names = ("identity+clean", "identity")
-    settings = [spec.fixer.settings for spec in plan(names, ("tolerance_m=0.5", "identity+clean:mode=chunk")).renderers if spec.fixer]
-    assert [(of.mode, of.tolerance_m) for of in settings if isinstance(of, FixerSettings)] == [("chunk", 0.5), ("speculative", 0.5)]
+    settings = [
+        spec.fixer.settings
+        for spec in plan(names, ("tolerance_m=0.5", "identity+clean:mode=chunk")).renderers
+        if spec.fixer
+    ]
+    assert [(of.mode, of.tolerance_m) for of in settings if isinstance(of, FixerSettings)] == [
+        ("chunk", 0.5),
+        ("speculative", 0.5),
+    ]
 
 
 @pytest.mark.parametrize(
     ("override", "found", "do"),
-    [("tolerance_n=1", "tolerance_n", "did you mean 'tolerance_m'"), ("mode=chunks", "chunks", "chunk"), ("window=0", "0", "")],
+    [
+        ("tolerance_n=1", "tolerance_n", "did you mean 'tolerance_m'"),
+        ("mode=chunks", "chunks", "chunk"),
+        ("window=0", "0", ""),
+    ],
 )
 def test_a_bad_setting_is_named_with_the_nearest(override: str, found: str, do: str) -> None:
     with pytest.raises(InputError) as caught:

@@ -1,4 +1,6 @@
-"""Closed loop behind a fixer: drafts along the plan, whole blocks, and the history of true frames."""
+"""Closed loop behind a fixer: drafts along the plan, whole blocks, and the history of true
+frames.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,18 @@ import pytest
 from alpasim_plugin import make_policy, run_rollout
 from alpasim_plugin.core.errors import FixerError, InputError, RendererError
 from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.types import CameraSpec, Frame, Latency, Observation, Plan, Rates, RenderRequest, Route, Scenario, SensorSpec
+from alpasim_plugin.core.types import (
+    CameraSpec,
+    Frame,
+    Latency,
+    Observation,
+    Plan,
+    Rates,
+    RenderRequest,
+    Route,
+    Scenario,
+    SensorSpec,
+)
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.loop import fixed_renderer
 from alpasim_plugin.fixers.settings import FixerSettings
@@ -21,7 +34,15 @@ from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runs.recorder import Recorder
 from policies.simple import LogReplay
 from tests.examples import first_of
-from tests.fixers.block_fixers import Blend, GivesFloats, GuardSteps, LosesAFrame, Raises, ShiftsTime, fixed_offline
+from tests.fixers.block_fixers import (
+    Blend,
+    GivesFloats,
+    GuardSteps,
+    LosesAFrame,
+    Raises,
+    ShiftsTime,
+    fixed_offline,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -66,7 +87,12 @@ class Drive:
     calls: list[list[RenderRequest]]
 
 
-def drive(scenario: Scenario, policy: type[Watching] = Watching, fixer: Callable[[], Blend] = Blend, **settings: object) -> Drive:
+def drive(
+    scenario: Scenario,
+    policy: type[Watching] = Watching,
+    fixer: Callable[[], Blend] = Blend,
+    **settings: object,
+) -> Drive:
     fixers: list[Blend] = []
 
     def make() -> Blend:
@@ -105,14 +131,18 @@ def assert_same_pictures(one: Sequence[Frame], other: Sequence[Frame]) -> None:
     assert all(np.array_equal(a.rgb, b.rgb) for a, b in zip(one, other, strict=True))
 
 
-# --- speculative ----------------------------------------------------------------------------------------------------
+# --- speculative
 
 
 @pytest.mark.slow
-def test_where_every_forecast_is_right_the_drafts_are_the_offline_result(straight_road: Scenario) -> None:
+def test_where_every_forecast_is_right_the_drafts_are_the_offline_result(
+    straight_road: Scenario,
+) -> None:
     run = drive(straight_road)
     facts = run.session.facts()
-    assert facts["hits"] == facts["predicted"] == 30 - 5  # all but the first frame of each of five blocks
+    assert (
+        facts["hits"] == facts["predicted"] == 30 - 5
+    )  # all but the first frame of each of five blocks
     assert facts["redrafts"] == 0
     assert facts["exact"] >= 4  # while the log is forced forecasts are equal to the last bit
     assert_same_pictures(run.frames, fixed_offline(Blend(), rendered(straight_road, run.requests)))
@@ -120,32 +150,45 @@ def test_where_every_forecast_is_right_the_drafts_are_the_offline_result(straigh
 
 
 @pytest.mark.parametrize("mode", first_of(["chunk", "speculative"]))
-def test_the_streaming_network_has_the_history_of_the_true_frames(straight_road: Scenario, mode: str) -> None:
+def test_the_streaming_network_has_the_history_of_the_true_frames(
+    straight_road: Scenario, mode: str
+) -> None:
     sizes = ("dit.width=32", "dit.blocks=1", "dit.head_width=16", "dit.mlp_width=32")
     small = ("weights.bundle=null", *sizes, "untrained=random", "uses_map=false")
 
     def network() -> Blend:
-        return make_fixer("onefixer-dit-tiny", fixer_settings("onefixer-dit-tiny", small), scene_id="straight-road", threads=1)  # type: ignore[return-value]
+        return make_fixer(
+            "onefixer-dit-tiny",
+            fixer_settings("onefixer-dit-tiny", small),
+            scene_id="straight-road",
+            threads=1,
+        )  # type: ignore[return-value]
 
     scenario = replace(straight_road, end_us=2_000_000)
     run = drive(scenario, Zigzag, network, mode=mode, tolerance_m=0.01)
     if mode == "speculative":
         assert run.session.facts()["redrafts"] > 0
     offline = fixed_offline(network(), rendered(scenario, run.requests))
-    shown = range(13) if mode == "chunk" else (4, 12)  # in speculative mode a block's last frame is of the true block
+    shown = (
+        range(13) if mode == "chunk" else (4, 12)
+    )  # in speculative mode a block's last frame is of the true block
     for i in shown:
         assert_same_pictures(run.frames[i : i + 1], offline[i : i + 1])
 
 
 @pytest.mark.parametrize("tolerance_m", first_of([0.02, 0.0, 100.0]))
-def test_the_history_is_of_true_frames_whatever_the_forecasts_were(straight_road: Scenario, tolerance_m: float) -> None:
+def test_the_history_is_of_true_frames_whatever_the_forecasts_were(
+    straight_road: Scenario, tolerance_m: float
+) -> None:
     run = drive(straight_road, Zigzag, tolerance_m=tolerance_m, tolerance_deg=180.0)
     facts = run.session.facts()
     assert facts["forecast_error"]["camera_m"]["max"] > 0.05
     assert (facts["redrafts"] > 0) == (tolerance_m < 100.0)
     true = rendered(straight_road, run.requests)
     (fixer,) = run.fixers
-    assert_same_pictures([frame for block in fixer.taken for frame in block], true[:29])  # 5 + 8 + 8 + 8 of 30
+    assert_same_pictures(
+        [frame for block in fixer.taken for frame in block], true[:29]
+    )  # 5 + 8 + 8 + 8 of 30
     offline = fixed_offline(Blend(), true)
     for last in (4, 12, 20, 28):  # a block's last frame comes from the block of true frames
         assert_same_pictures(run.frames[last : last + 1], offline[last : last + 1])
@@ -171,7 +214,9 @@ def test_the_shown_frame_of_a_hit_is_the_one_of_the_foretold_pose(straight_road:
 
 
 @pytest.mark.slow
-def test_without_tolerance_a_fixer_that_changes_nothing_leaves_no_trace_in_the_log(straight_road: Scenario) -> None:
+def test_without_tolerance_a_fixer_that_changes_nothing_leaves_no_trace_in_the_log(
+    straight_road: Scenario,
+) -> None:
     def digest(renderer: object) -> str:
         recorder = Recorder(straight_road, 0)
         run_rollout(straight_road, renderer, make_policy("lane-camera", straight_road), 0, recorder)  # type: ignore[arg-type]
@@ -201,7 +246,9 @@ def test_two_rollouts_in_turns_are_each_as_alone(straight_road: Scenario) -> Non
 @pytest.mark.slow
 def test_a_reactive_actor_that_brakes_unforeseen_makes_a_new_draft(straight_road: Scenario) -> None:
     ahead, parked = straight_road.actors
-    idm = replace(ahead, behaviour=replace(ahead.behaviour, kind="idm", params={"desired_speed_mps": 3.0}))
+    idm = replace(
+        ahead, behaviour=replace(ahead.behaviour, kind="idm", params={"desired_speed_mps": 3.0})
+    )
     facts = drive(replace(straight_road, actors=(idm, parked))).session.facts()
     assert facts["forecast_error"]["actor_m"]["max"] > 0.02
     assert facts["forecast_error"]["camera_m"]["max"] < 1e-6
@@ -212,17 +259,32 @@ def test_a_reactive_actor_that_brakes_unforeseen_makes_a_new_draft(straight_road
 def test_an_actor_that_appears_by_its_track_is_foretold(straight_road: Scenario) -> None:
     ahead, parked = straight_road.actors
     late = slice(160, None)  # from 1.6 s on, in the middle of a block
-    track = replace(ahead.track, t_us=ahead.track.t_us[late], xyz=ahead.track.xyz[late], quat=ahead.track.quat[late])
-    facts = drive(replace(straight_road, actors=(replace(ahead, track=track), parked))).session.facts()
+    track = replace(
+        ahead.track,
+        t_us=ahead.track.t_us[late],
+        xyz=ahead.track.xyz[late],
+        quat=ahead.track.quat[late],
+    )
+    facts = drive(
+        replace(straight_road, actors=(replace(ahead, track=track), parked))
+    ).session.facts()
     assert facts["hits"] == facts["predicted"]
 
 
-def test_a_delayed_plan_is_predicted_until_the_next_query_takes_effect(straight_road: Scenario) -> None:
+def test_a_delayed_plan_is_predicted_until_the_next_query_takes_effect(
+    straight_road: Scenario,
+) -> None:
     scenario = replace(straight_road, warmup_us=0, latency=Latency("fixed", 400_000))
     run = drive(scenario, Zigzag, tolerance_m=100.0, tolerance_deg=180.0)
     errors = [frame.facts.get("forecast_error_m") for frame in run.frames]
-    assert errors[1:5] == [0.0, 0.0, 0.0, 0.0]  # nothing is in force yet: the vehicle coasts, and the first plan is not predicted
-    # The block from 0.5 s on knows the plans of 0.1 to 0.4 s, the last of which takes effect at 0.8 s.
+    assert errors[1:5] == [
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    ]  # nothing is in force yet: the vehicle coasts, and the first plan is not predicted
+    # The block from 0.5 s on knows the plans of 0.1 to 0.4 s, the last of which takes effect at 0.8
+    # s.
     assert max(errors[6:10]) < 1e-9 < min(errors[10:13])
 
 
@@ -251,7 +313,9 @@ class BothWays(Watching):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["chunk", "speculative"])
-def test_cameras_in_step_share_a_fixer_and_not_their_histories(straight_road: Scenario, mode: str) -> None:
+def test_cameras_in_step_share_a_fixer_and_not_their_histories(
+    straight_road: Scenario, mode: str
+) -> None:
     scenario = with_rear_camera(straight_road)
     run = drive(scenario, BothWays, mode=mode)
     assert len(run.fixers) == 1
@@ -276,25 +340,33 @@ def test_cameras_of_different_periods_have_fixers_of_their_own(straight_road: Sc
         assert_same_pictures([frame for frame in run.frames if frame.camera == camera], offline)
 
 
-def test_the_session_of_a_finished_rollout_is_not_taken_for_another(straight_road: Scenario) -> None:
+def test_the_session_of_a_finished_rollout_is_not_taken_for_another(
+    straight_road: Scenario,
+) -> None:
     run = drive(straight_road)
     with pytest.raises(RendererError, match="the last frame was of 2900000 us"):
         run.session.render_batch(run.calls[0])
 
 
-# --- chunk ----------------------------------------------------------------------------------------------------------
+# --- chunk
 
 
 @pytest.mark.parametrize("policy", first_of([Zigzag, Watching]))
-def test_whole_blocks_of_true_frames_equal_the_offline_result(straight_road: Scenario, policy: type[Watching]) -> None:
+def test_whole_blocks_of_true_frames_equal_the_offline_result(
+    straight_road: Scenario, policy: type[Watching]
+) -> None:
     run = drive(straight_road, policy, mode="chunk")
     assert [len(call) for call in run.calls] == [5, 8, 8, 8]
     assert_same_pictures(run.frames, fixed_offline(Blend(), rendered(straight_road, run.requests)))
     assert run.policy.asked == [400_000, 1_200_000, 2_000_000, 2_800_000]
-    assert run.recorder.facts()["frames"] == 29  # the block that the end cuts off is not made: nobody would look
+    assert (
+        run.recorder.facts()["frames"] == 29
+    )  # the block that the end cuts off is not made: nobody would look
 
 
-def test_in_whole_blocks_one_plan_is_in_force_from_question_to_question(straight_road: Scenario) -> None:
+def test_in_whole_blocks_one_plan_is_in_force_from_question_to_question(
+    straight_road: Scenario,
+) -> None:
     log = drive(straight_road, Zigzag, mode="chunk").recorder.log()
     assert [plan.now_us for plan in log.plans] == [400_000, 1_200_000, 2_000_000, 2_800_000]
     assert len(log.images) == 29
@@ -311,7 +383,9 @@ def test_blocks_of_a_slower_camera_last_longer(straight_road: Scenario) -> None:
 
 
 def test_a_warm_up_shorter_than_the_first_block_is_refused(straight_road: Scenario) -> None:
-    with pytest.raises(InputError, match="ends after 400000 us, the warm-up after 300000 us") as caught:
+    with pytest.raises(
+        InputError, match="ends after 400000 us, the warm-up after 300000 us"
+    ) as caught:
         drive(replace(straight_road, warmup_us=300_000), mode="chunk")
     assert "--set timing.warmup_us=400000" in caught.value.do_this
 
@@ -344,7 +418,7 @@ def test_single_frames_are_refused_in_whole_blocks(straight_road: Scenario) -> N
         run.session.render(run.requests[0])
 
 
-# --- faults and facts -----------------------------------------------------------------------------------------------
+# --- faults and facts
 
 
 @pytest.mark.parametrize("mode", ["speculative", "chunk"])
@@ -357,7 +431,9 @@ def test_single_frames_are_refused_in_whole_blocks(straight_road: Scenario) -> N
         (GivesFloats, r"rgb came back as float32 \(64, 96, 3\), not uint8"),
     ],
 )
-def test_a_fixer_that_breaks_its_contract_is_named(straight_road: Scenario, mode: str, fixer: type[Blend], found: str) -> None:
+def test_a_fixer_that_breaks_its_contract_is_named(
+    straight_road: Scenario, mode: str, fixer: type[Blend], found: str
+) -> None:
     with pytest.raises(FixerError, match=found) as caught:
         drive(straight_road, fixer=fixer, mode=mode)
     assert caught.value.failure_class == "fixer"
@@ -365,14 +441,20 @@ def test_a_fixer_that_breaks_its_contract_is_named(straight_road: Scenario, mode
 
 
 @pytest.mark.parametrize(("mode", "refused"), [("speculative", 12), ("chunk", 11)])
-def test_frames_that_the_guard_refused_are_counted_and_the_rollout_goes_on(straight_road: Scenario, mode: str, refused: int) -> None:
+def test_frames_that_the_guard_refused_are_counted_and_the_rollout_goes_on(
+    straight_road: Scenario, mode: str, refused: int
+) -> None:
     facts = drive(straight_road, fixer=GuardSteps, mode=mode).recorder.facts()
     assert facts["steps"] == 30
-    assert facts["frame_events"] == {"fixer-nan": refused}  # frames 0, 3 of five and 0, 3, 6 of eight, once each
+    assert facts["frame_events"] == {
+        "fixer-nan": refused
+    }  # frames 0, 3 of five and 0, 3, 6 of eight, once each
 
 
 @pytest.mark.parametrize("mode", ["speculative", "chunk"])
-def test_stages_are_told_apart_and_shared_by_the_frames_of_a_call(straight_road: Scenario, mode: str) -> None:
+def test_stages_are_told_apart_and_shared_by_the_frames_of_a_call(
+    straight_road: Scenario, mode: str
+) -> None:
     run = drive(straight_road, mode=mode, uses_map=True)
     facts = run.recorder.facts()
     frames = facts["frames"]
@@ -380,7 +462,9 @@ def test_stages_are_told_apart_and_shared_by_the_frames_of_a_call(straight_road:
     assert len(facts["stage_ms"]["render"]) == frames
     assert set(facts["stage_ms"]) >= {"render", "map", "fix"}
     assert len(facts["stage_ms"]["map"]) == len(facts["stage_ms"]["fix"]) == frames
-    assert facts["stage_ms"]["fix"].count(0.0) == (0 if mode == "chunk" else 30 - 5 - 4)  # five drafts, four whole blocks
+    assert facts["stage_ms"]["fix"].count(0.0) == (
+        0 if mode == "chunk" else 30 - 5 - 4
+    )  # five drafts, four whole blocks
     assert all(ms >= 0 for stage in ("render", "map", "fix") for ms in facts["stage_ms"][stage])
 
 

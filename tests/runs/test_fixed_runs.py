@@ -1,4 +1,6 @@
-"""Whole runs with fixers: any number of workers, resume, and what every table says of an untrained fixer."""
+"""Whole runs with fixers: any number of workers, resume, and what every table says of an untrained
+fixer.
+"""
 
 from __future__ import annotations
 
@@ -22,16 +24,27 @@ from tests.runs.test_runs import Announced, comparable
 
 pytestmark = pytest.mark.slow
 
-SMALL_NET = ("weights.bundle=null", "dit.width=32", "dit.blocks=1", "dit.head_width=16", "dit.mlp_width=32", "untrained=random")
+SMALL_NET = (
+    "weights.bundle=null",
+    "dit.width=32",
+    "dit.blocks=1",
+    "dit.head_width=16",
+    "dit.mlp_width=32",
+    "untrained=random",
+)
 SCENE = ("timing.duration_us=1500000", "cameras=[{name: front, width: 96, height: 64}]")
 
 
 def plan_of(fixer: tuple[str, ...] = SMALL_NET) -> RunPlan:
     refs = expand("smoke/straight", SCENE)
-    return make_plan(refs, ("clean", "onefixer-dit-tiny+clean"), ("lane-camera",), (0,), RunOptions(fixer=fixer))
+    return make_plan(
+        refs, ("clean", "onefixer-dit-tiny+clean"), ("lane-camera",), (0,), RunOptions(fixer=fixer)
+    )
 
 
-def run(plan: RunPlan, root: Path, workers: int = 1, resume: bool = False, report: bool = False) -> list[tuple[str, bool]]:
+def run(
+    plan: RunPlan, root: Path, workers: int = 1, resume: bool = False, report: bool = False
+) -> list[tuple[str, bool]]:
     announced = Announced()
     execute_run(plan, root, workers, ["simrun"], announced, resume, "none", report)
     return announced.results
@@ -58,7 +71,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_one_and_two_workers_give_the_same_frames_and_scores(finished: Path, tmp_path: Path) -> None:
+def test_one_and_two_workers_give_the_same_frames_and_scores(
+    finished: Path, tmp_path: Path
+) -> None:
     run(plan_of(), tmp_path, workers=2)
     assert comparable(tmp_path) == comparable(finished)
     for path in finished.rglob("frames.jsonl"):
@@ -66,7 +81,9 @@ def test_one_and_two_workers_give_the_same_frames_and_scores(finished: Path, tmp
 
 
 @pytest.mark.slow
-def test_the_same_command_continues_and_another_setting_does_not_reuse(finished: Path, tmp_path: Path) -> None:
+def test_the_same_command_continues_and_another_setting_does_not_reuse(
+    finished: Path, tmp_path: Path
+) -> None:
     plan = plan_of()
     root = tmp_path / "run"
     shutil.copytree(finished, root)
@@ -94,13 +111,17 @@ def test_an_untrained_fixer_is_called_so_everywhere(finished: Path) -> None:
     assert said in entry["label"]
     assert entry["trained"] is False
     assert list(summary["fixers"]) == ["onefixer-dit-tiny+clean"]
-    manifest = json.loads(next(finished.glob("rollouts/onefixer-dit-tiny+clean/**/manifest.json")).read_text())
+    manifest = json.loads(
+        next(finished.glob("rollouts/onefixer-dit-tiny+clean/**/manifest.json")).read_text()
+    )
     assert said in manifest["fixer"]["label"]
     assert said in (finished / "summary.md").read_text().replace("\\", "")
     page = (finished / "report.html").read_text()
     assert '<div class="caution">onefixer-dit-tiny+clean is' in page
     assert 'id="table-fixers"' in page
-    log = read_asl(next(finished.glob("rollouts/onefixer-dit-tiny+clean/**/rollout.asl")), images=False)
+    log = read_asl(
+        next(finished.glob("rollouts/onefixer-dit-tiny+clean/**/rollout.asl")), images=False
+    )
     assert said in log.info["versions"]["sensorsim"]
 
 
@@ -112,7 +133,15 @@ def test_hits_and_pose_errors_are_in_the_tables(finished: Path) -> None:
     assert 0 < entry["hits"] <= entry["predicted"]
     assert entry["hit_rate"] == pytest.approx(entry["hits"] / entry["predicted"], abs=1e-4)
     stages = summary["speed"]["onefixer-dit-tiny+clean"]["stages"]
-    assert {"render", "map", "fix", "fix: encode", "fix: dit", "fix: decode", "fix: cache write"} <= set(stages)
+    assert {
+        "render",
+        "map",
+        "fix",
+        "fix: encode",
+        "fix: dit",
+        "fix: decode",
+        "fix: cache write",
+    } <= set(stages)
     assert sum(stage["share"] for stage in stages.values()) == pytest.approx(1.0, abs=0.001)
     steps = pq.read_table(finished / "steps.parquet").to_pylist()
     shown = [row["value"] for row in steps if row["metric"] == "pose_error_m"]
@@ -122,14 +151,29 @@ def test_hits_and_pose_errors_are_in_the_tables(finished: Path) -> None:
 
 
 def test_a_plain_run_knows_nothing_of_fixers(tmp_path: Path) -> None:
-    plan = make_plan(expand("smoke/straight", SCENE), ("clean",), ("constant-velocity",), (0,), RunOptions())
+    plan = make_plan(
+        expand("smoke/straight", SCENE), ("clean",), ("constant-velocity",), (0,), RunOptions()
+    )
     run(plan, tmp_path, report=True)
     assert json.loads((tmp_path / "summary.json").read_text())["fixers"] == {}
     assert 'id="fixers"' not in (tmp_path / "report.html").read_text()
 
 
-def test_the_terminal_names_the_fixer_before_and_after(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["--renderer", "identity+clean", "--policy", "lane-camera", "--workers", "1", "--certify", "none", "--out", str(tmp_path)]
+def test_the_terminal_names_the_fixer_before_and_after(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [
+        "--renderer",
+        "identity+clean",
+        "--policy",
+        "lane-camera",
+        "--workers",
+        "1",
+        "--certify",
+        "none",
+        "--out",
+        str(tmp_path),
+    ]
     for text in (*SCENE, "fixer.mode=chunk"):
         command += ["--set", text]
     assert run_command([*command, "smoke/straight"]) == 0
@@ -154,7 +198,12 @@ def test_time_is_counted_where_it_was_spent() -> None:
     assert told["first_frame_ms"] == 39.0
     assert told["ms_per_frame_p50"] == 2.0
     assert told["ms_per_frame_mean"] == pytest.approx(42.0 / 5)
-    assert told["stages"]["fix"] == {"p50_ms": 12.0, "p95_ms": 12.0, "share": round(24 / 42, 4), "per_frame_ms": 4.8}
+    assert told["stages"]["fix"] == {
+        "p50_ms": 12.0,
+        "p95_ms": 12.0,
+        "share": round(24 / 42, 4),
+        "per_frame_ms": 4.8,
+    }
 
 
 def test_the_frames_of_a_block_share_its_time_and_the_first_block_stands_apart() -> None:

@@ -1,4 +1,6 @@
-"""Going back into a logged rollout: continue it, or ask at its poses what another renderer would have done."""
+"""Going back into a logged rollout: continue it, or ask at its poses what another renderer would
+have done.
+"""
 
 from __future__ import annotations
 
@@ -31,16 +33,29 @@ from tests.runs.test_runs import Announced
 
 pytestmark = pytest.mark.slow
 
-SHORT = ("timing.duration_us=1200000", "timing.warmup_us=200000", "degradation.kind=surrogate", *BARE)
+SHORT = (
+    "timing.duration_us=1200000",
+    "timing.warmup_us=200000",
+    "degradation.kind=surrogate",
+    *BARE,
+)
 CELL = "clean/lane-camera/smoke-lead_car/0"
 AT_US = 600_000
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a run of a scene with a reactive car ahead behind two renderers, one of which makes the policy lose its lane."""
+    """Make a run of a scene with a reactive car ahead behind two renderers, one of which makes the
+    policy lose its lane.
+    """
     folder = tmp_path_factory.mktemp("run")
-    plan = make_plan(expand("smoke/lead_car", SHORT), ("clean", "broken-frozen"), ("lane-camera",), (0,), RunOptions())
+    plan = make_plan(
+        expand("smoke/lead_car", SHORT),
+        ("clean", "broken-frozen"),
+        ("lane-camera",),
+        (0,),
+        RunOptions(),
+    )
     execute_run(plan, folder, 1, ["simrun"], Announced(), certificate="none", report=False)
     return folder
 
@@ -66,12 +81,19 @@ def forked(root: Path) -> Path:
     return next(path.parent for path in root.rglob("manifest.json") if "fork" in read_json(path))
 
 
-def test_an_untouched_continuation_is_the_log_to_the_byte(past: LoggedRollout, tmp_path: Path) -> None:
+def test_an_untouched_continuation_is_the_log_to_the_byte(
+    past: LoggedRollout, tmp_path: Path
+) -> None:
     go(past, tmp_path)
     told = read_json(tmp_path / "run.json")["fork"]
     assert (told["of"], told["replay"], told["continuation"]) == (CELL, "equal", "equal")
-    assert (forked(tmp_path) / "rollout.asl").read_bytes() == (past.folder / "rollout.asl").read_bytes()
-    one, other = rollout_trace(past.folder, past.manifest), rollout_trace(forked(tmp_path), read_json(forked(tmp_path) / "manifest.json"))
+    assert (forked(tmp_path) / "rollout.asl").read_bytes() == (
+        past.folder / "rollout.asl"
+    ).read_bytes()
+    one, other = (
+        rollout_trace(past.folder, past.manifest),
+        rollout_trace(forked(tmp_path), read_json(forked(tmp_path) / "manifest.json")),
+    )
     assert one == other
 
 
@@ -88,10 +110,15 @@ def test_a_change_takes_effect_at_its_instant_and_not_before(
 ) -> None:
     if change:
         go(past, tmp_path, **change)
-    one, other = (read_asl(folder / "rollout.asl") for folder in (past.folder, forked(tmp_path if change else changed)))
+    one, other = (
+        read_asl(folder / "rollout.asl")
+        for folder in (past.folder, forked(tmp_path if change else changed))
+    )
     at_us = past.scenario.start_us + AT_US
     plans = {plan.now_us: plan.trajectory.xyz for plan in other.plans}
-    same = {plan.now_us: np.array_equal(plan.trajectory.xyz, plans[plan.now_us]) for plan in one.plans}
+    same = {
+        plan.now_us: np.array_equal(plan.trajectory.xyz, plans[plan.now_us]) for plan in one.plans
+    }
     assert all(equal for t_us, equal in same.items() if t_us < at_us)
     assert not any(equal for t_us, equal in same.items() if t_us > at_us)
     before = one.ego.t_us <= at_us
@@ -99,15 +126,21 @@ def test_a_change_takes_effect_at_its_instant_and_not_before(
     assert not np.array_equal(one.ego.xyz[~before], other.ego.xyz[~before])
 
 
-def test_a_frozen_renderer_that_takes_over_has_been_frozen_since_the_first_frame(past: LoggedRollout, changed: Path) -> None:
-    pixels = {fact["t_us"]: fact["rgb_sha256"] for fact in read_facts(forked(changed) / "frames.jsonl")}
+def test_a_frozen_renderer_that_takes_over_has_been_frozen_since_the_first_frame(
+    past: LoggedRollout, changed: Path
+) -> None:
+    pixels = {
+        fact["t_us"]: fact["rgb_sha256"] for fact in read_facts(forked(changed) / "frames.jsonl")
+    }
     first = pixels[past.scenario.start_us]
-    assert [t_us for t_us, digest in pixels.items() if digest == first and t_us > past.scenario.start_us] == [
-        t_us for t_us in pixels if t_us >= past.scenario.start_us + AT_US
-    ]
+    assert [
+        t_us for t_us, digest in pixels.items() if digest == first and t_us > past.scenario.start_us
+    ] == [t_us for t_us in pixels if t_us >= past.scenario.start_us + AT_US]
 
 
-def test_the_run_folder_pairs_the_continuation_with_the_original(past: LoggedRollout, changed: Path) -> None:
+def test_the_run_folder_pairs_the_continuation_with_the_original(
+    past: LoggedRollout, changed: Path
+) -> None:
     rows = pq.read_table(changed / "rollouts.parquet").to_pylist()
     assert [row["renderer"] for row in rows] == ["clean", "broken-frozen from 0.6 s"]
     here, there = (read_json(folder / "summary.json") for folder in (changed, past.root))
@@ -117,7 +150,9 @@ def test_the_run_folder_pairs_the_continuation_with_the_original(past: LoggedRol
     assert "broken-frozen from 0.6 s" in (changed / "report.html").read_text()
 
 
-def test_a_replay_that_leaves_the_log_names_component_and_step(past: LoggedRollout, tmp_path: Path) -> None:
+def test_a_replay_that_leaves_the_log_names_component_and_step(
+    past: LoggedRollout, tmp_path: Path
+) -> None:
     copy = tmp_path / "copy" / str(past.manifest["path"])
     copy.mkdir(parents=True)
     for file in past.folder.iterdir():
@@ -133,7 +168,9 @@ def test_a_replay_that_leaves_the_log_names_component_and_step(past: LoggedRollo
         probe_rollout(moved, ["clean", "3dgs"])
 
 
-def test_instants_outside_and_folders_in_use_are_refused(past: LoggedRollout, root: Path, tmp_path: Path) -> None:
+def test_instants_outside_and_folders_in_use_are_refused(
+    past: LoggedRollout, root: Path, tmp_path: Path
+) -> None:
     for after_us in (-1, 1_200_000, 10**12):
         with pytest.raises(InputError, match=r"the rollout lasts 1\.2 s"):
             fork_rollout(past, Change(after_us), tmp_path, "none", [])
@@ -141,14 +178,18 @@ def test_instants_outside_and_folders_in_use_are_refused(past: LoggedRollout, ro
         fork_rollout(past, Change(AT_US), root, "none", [])
 
 
-def test_rollouts_are_found_by_name_or_folder_and_near_names_are_offered(root: Path, past: LoggedRollout) -> None:
+def test_rollouts_are_found_by_name_or_folder_and_near_names_are_offered(
+    root: Path, past: LoggedRollout
+) -> None:
     assert find_rollout(root, str(past.manifest["path"])).cell == past.cell
     with pytest.raises(InputError, match="no such rollout among its 2") as caught:
         find_rollout(root, "claen/lane-camera/smoke-lead_car/0")
     assert CELL in caught.value.do_this
 
 
-def test_a_scenario_that_has_changed_is_refused(root: Path, past: LoggedRollout, tmp_path: Path) -> None:
+def test_a_scenario_that_has_changed_is_refused(
+    root: Path, past: LoggedRollout, tmp_path: Path
+) -> None:
     info = read_json(root / "run.json")
     info["scenes"]["smoke-lead_car"]["ref"]["overrides"][0] = "timing.duration_us=1100000"
     for name in ("rollouts.parquet", str(past.manifest["path"])):
@@ -161,7 +202,9 @@ def test_a_scenario_that_has_changed_is_refused(root: Path, past: LoggedRollout,
 
 
 @pytest.mark.slow
-def test_a_probe_of_one_renderer_against_itself_finds_nothing_and_against_another_something(past: LoggedRollout, root: Path) -> None:
+def test_a_probe_of_one_renderer_against_itself_finds_nothing_and_against_another_something(
+    past: LoggedRollout, root: Path
+) -> None:
     probe = probe_rollout(past, ["clean", "broken-frozen", "3dgs"])
     frozen, surrogate = probe.pairs
     assert len(probe.queries) == 12
@@ -174,7 +217,9 @@ def test_a_probe_of_one_renderer_against_itself_finds_nothing_and_against_anothe
     told = read_json(folder / "probe.json")
     table = pq.read_table(folder / "probe.parquet").to_pylist()
     assert [row["gap_1s_m"] for row in table[:12]] == frozen.gap_m[:, 0].tolist()
-    assert told["pairs"][0]["gap_1s_m"]["max"] == pytest.approx(np.nanmax(frozen.gap_m[:, 0]), abs=1e-4)
+    assert told["pairs"][0]["gap_1s_m"]["max"] == pytest.approx(
+        np.nanmax(frozen.gap_m[:, 0]), abs=1e-4
+    )
     assert (folder / "probe.png").stat().st_size > 10_000
     backwards = probe_rollout(past, ["broken-frozen", "clean"]).pairs[0]
     np.testing.assert_array_equal(backwards.gap_m, frozen.gap_m)
@@ -190,8 +235,15 @@ def test_a_probe_needs_a_policy_that_sees_and_two_renderers(past: LoggedRollout)
 
 
 def test_two_policies_share_a_camera_at_the_shorter_period() -> None:
-    first, then = (SensorSpec("front"), SensorSpec("left", 200_000)), (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear"))
-    assert merge_sensors(first, then, 100_000) == (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear"))
+    first, then = (
+        (SensorSpec("front"), SensorSpec("left", 200_000)),
+        (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear")),
+    )
+    assert merge_sensors(first, then, 100_000) == (
+        SensorSpec("front", 50_000),
+        SensorSpec("left"),
+        SensorSpec("rear"),
+    )
 
 
 def test_flips_are_written_for_a_run_without_any(root: Path) -> None:

@@ -30,24 +30,31 @@ def plan_of(*renderers: str, scene: str = "smoke/straight") -> RunPlan:
         (("nre://localhost:1",), []),
     ],
 )
-def test_a_run_compiles_what_its_renderers_call(renderers: tuple[str, ...], subjects: list[str]) -> None:
+def test_a_run_compiles_what_its_renderers_call(
+    renderers: tuple[str, ...], subjects: list[str]
+) -> None:
     plan = plan_of(*renderers)
     assert needed(plan.cells, plan.scenarios) == subjects
 
 
-def test_one_worker_compiles_while_it_drives_and_two_beforehand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_worker_compiles_while_it_drives_and_two_beforehand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path))
     plan = plan_of("clean")
     compile_for(plan.cells, plan.scenarios, 1)
     assert not (cache_root() / KERNELS).exists()
     compile_kernels("rasteriser")
-    assert [path.name.split("-")[0] for path in (cache_root() / KERNELS).iterdir() if path.is_dir()] == ["rasteriser"]
+    assert [
+        path.name.split("-")[0] for path in (cache_root() / KERNELS).iterdir() if path.is_dir()
+    ] == ["rasteriser"]
     before = sys.modules.copy()
     compile_for(plan.cells, plan.scenarios, 2)  # nothing is left to do: no process is started
     assert sys.modules.keys() == before.keys()
 
 
-# Run in a process of its own with an empty cache: counts what numba compiles for the subjects, and during a drive afterwards.
+# Run in a process of its own with an empty cache: counts what numba compiles for the subjects, and
+# during a drive afterwards.
 COMPILED_LATER = """
 import sys
 from numba.core import event
@@ -79,8 +86,11 @@ print("compiled later:", Compiled.names)
 def test_a_drive_compiles_nothing_that_its_subjects_did_not(tmp_path: Path) -> None:
     caches = {"NUMBA_CACHE_DIR": str(tmp_path / "numba"), "SIMRUN_CACHE": str(tmp_path / "simrun")}
     command = [sys.executable, "-c", COMPILED_LATER, str(tmp_path / "run")]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ | caches)
-    # An array that is assigned to a part of another costs two seconds: numba's error for wrong shapes is text.
+    done = subprocess.run(
+        command, check=True, capture_output=True, text=True, env=os.environ | caches
+    )
+    # An array that is assigned to a part of another costs two seconds: numba's error for wrong
+    # shapes is text.
     assert "text: []" in done.stdout.splitlines()
     assert done.stdout.splitlines()[-1] == "compiled later: []"
     assert done.stderr.count("once on this machine:") == len(SUBJECTS)

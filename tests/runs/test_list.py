@@ -1,4 +1,6 @@
-"""``simrun runs``: which folders are runs, what is said of each, and which of them a filter takes."""
+"""``simrun runs``: which folders are runs, what is said of each, and which of them a filter
+takes.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +16,26 @@ from alpasim_plugin.core.lock import one_writer
 from alpasim_plugin.core.processes import this_process
 from tests.runs.make_many import COMMITS, Many, make_one, unfinish
 
-OLD, MIDDLE, NEW = "2026-01-10T08:00:00+00:00", "2026-02-10T08:00:00+00:00", "2026-03-10T08:00:00+00:00"
+OLD = "2026-01-10T08:00:00+00:00"
+MIDDLE = "2026-02-10T08:00:00+00:00"
+NEW = "2026-03-10T08:00:00+00:00"
 RUNS = (
-    Many("old", OLD, COMMITS[0], renderers=("clean",), asked=("smoke/curve",), scenes={"smoke-curve": "0" * 64}),
     Many(
-        "team/middle", MIDDLE, COMMITS[1], dirty=True, renderers=("clean", "3dgs"), preset="strict", policies=("lane-camera", "mine:Policy")
+        "old",
+        OLD,
+        COMMITS[0],
+        renderers=("clean",),
+        asked=("smoke/curve",),
+        scenes={"smoke-curve": "0" * 64},
+    ),
+    Many(
+        "team/middle",
+        MIDDLE,
+        COMMITS[1],
+        dirty=True,
+        renderers=("clean", "3dgs"),
+        preset="strict",
+        policies=("lane-camera", "mine:Policy"),
     ),
     Many("team/new", NEW, None, weights="abc123" + "f" * 58, shift_m={"onefixer": 0.5}),
 )
@@ -36,15 +53,29 @@ def listed(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, dict[st
     """Return name -> run of a list, in its order."""
     capsys.readouterr()
     assert run_command(["runs", *words, "--json"]) == 0
-    return {Path(str(one["folder"])).name: one for one in json.loads(capsys.readouterr().out)["runs"]}
+    return {
+        Path(str(one["folder"])).name: one for one in json.loads(capsys.readouterr().out)["runs"]
+    }
 
 
-def test_runs_are_found_at_any_depth_and_the_newest_comes_first(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_runs_are_found_at_any_depth_and_the_newest_comes_first(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     found = listed(capsys, str(root))
     assert list(found) == ["new", "middle", "old"]
     assert [one["rollouts"] for one in found.values()] == [24, 48, 2]
-    assert found["middle"]["project"] == {"commit": COMMITS[1], "committed_at": None, "branch": "main", "dirty": True, "reason": ""}
-    assert list(listed(capsys, str(root / "old"), str(root))) == ["new", "middle", "old"]  # named twice, listed once
+    assert found["middle"]["project"] == {
+        "commit": COMMITS[1],
+        "committed_at": None,
+        "branch": "main",
+        "dirty": True,
+        "reason": "",
+    }
+    assert list(listed(capsys, str(root / "old"), str(root))) == [
+        "new",
+        "middle",
+        "old",
+    ]  # named twice, listed once
     assert list(listed(capsys, str(root), "--last", "1")) == ["new"]
 
 
@@ -67,13 +98,19 @@ def test_runs_are_found_at_any_depth_and_the_newest_comes_first(root: Path, caps
         (("--state", "unfinished"), []),
     ],
 )
-def test_a_filter_takes(root: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], names: list[str]) -> None:
+def test_a_filter_takes(
+    root: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], names: list[str]
+) -> None:
     assert list(listed(capsys, str(root), *words)) == names
 
 
-def test_what_cannot_be_read_is_listed_as_such(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_read_is_listed_as_such(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     stopped = unfinish(make_one(tmp_path, Many("stopped")))
-    killed = replace(this_process("2026-03-01"), pid=2**22 + 1)  # no process of this machine has the number
+    killed = replace(
+        this_process("2026-03-01"), pid=2**22 + 1
+    )  # no process of this machine has the number
     (stopped / ".simrun.lock").write_text(json.dumps(killed.as_dict()))
     os.truncate(make_one(tmp_path, Many("cut")) / "run.json", 300)
     (make_one(tmp_path, Many("holed")) / "summary.json").unlink()
@@ -86,7 +123,9 @@ def test_what_cannot_be_read_is_listed_as_such(tmp_path: Path, capsys: pytest.Ca
     with one_writer(written / ".simrun.lock", "writing", "a run"):
         found = listed(capsys, str(tmp_path))
         assert list(listed(capsys, str(tmp_path), "--state", "running")) == ["written"]
-    said = {name: (one["state"], str(one["problem"]).partition(",")[0]) for name, one in found.items()}
+    said = {
+        name: (one["state"], str(one["problem"]).partition(",")[0]) for name, one in found.items()
+    }
     assert said == {
         "stopped": ("unfinished", ""),
         "written": ("running", ""),
@@ -103,18 +142,29 @@ def test_what_cannot_be_read_is_listed_as_such(tmp_path: Path, capsys: pytest.Ca
     assert run_command(["runs", str(tmp_path), "--preset", "paper"]) == 0
     out, err = capsys.readouterr()
     assert "cut" in out
-    assert sorted(Path(line.split(": ")[1]).name for line in err.splitlines()) == ["alien", "locked-only"]
+    assert sorted(Path(line.split(": ")[1]).name for line in err.splitlines()) == [
+        "alien",
+        "locked-only",
+    ]
 
 
 def test_the_table_shows_metrics_beside_their_renderers(
     root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "200")
-    assert run_command(["runs", str(root), "--metric", "offroad", "--metric", "lateral_distance_m"]) == 0
+    assert (
+        run_command(["runs", str(root), "--metric", "offroad", "--metric", "lateral_distance_m"])
+        == 0
+    )
     lines = capsys.readouterr().out.splitlines()
     (first,) = (k for k, line in enumerate(lines) if "team/new" in line)
-    row = json.loads((root / "team" / "new" / "summary.json").read_text())["metrics"]["onefixer"]["offroad"]
-    assert f"{100 * row['mean']:.1f} % ({100 * row['ci95_clustered'][0]:.1f} to {100 * row['ci95_clustered'][1]:.1f})" in lines[first + 1]
+    row = json.loads((root / "team" / "new" / "summary.json").read_text())["metrics"]["onefixer"][
+        "offroad"
+    ]
+    assert (
+        f"{100 * row['mean']:.1f} % ({100 * row['ci95_clustered'][0]:.1f} to {100 * row['ci95_clustered'][1]:.1f})"
+        in lines[first + 1]
+    )
     assert "onefixer" in lines[first + 1]
     assert "paper" not in lines[first]
     assert run_command(["runs", str(root)]) == 0

@@ -1,4 +1,6 @@
-"""``simrun export --mcap``, read again by the format's own library and compared with the rollout's log."""
+"""``simrun export --mcap``, read again by the format's own library and compared with the rollout's
+log.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ Messages = dict[str, list[tuple[int, dict[str, Any]]]]  # topic -> time in nanos
 
 
 def read(path: Path) -> tuple[Messages, dict[str, str], dict[str, str]]:
-    """Return messages, topic -> schema, and the metadata, after the reader has checked every CRC."""
+    """Return messages, topic -> schema, and the metadata, after the reader has checked every
+    CRC.
+    """
     found: Messages = defaultdict(list)
     schemas, before = {}, 0
     with path.open("rb") as stream:
@@ -45,7 +49,9 @@ def read(path: Path) -> tuple[Messages, dict[str, str], dict[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def recorded(watched: Watched, tmp_path_factory: pytest.TempPathFactory) -> tuple[Messages, dict[str, str], dict[str, str]]:
+def recorded(
+    watched: Watched, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Messages, dict[str, str], dict[str, str]]:
     path = tmp_path_factory.mktemp("mcap") / "cell.mcap"
     assert run_command(["export", str(watched.folder), *CELL, "--mcap", str(path)]) == 0
     return read(path)
@@ -59,17 +65,35 @@ def nanoseconds(time: dict[str, int]) -> int:
     return time["sec"] * 10**9 + time["nsec"]
 
 
-def test_channels_have_foxgloves_schemas(recorded: tuple[Messages, dict[str, str], dict[str, str]]) -> None:
+def test_channels_have_foxgloves_schemas(
+    recorded: tuple[Messages, dict[str, str], dict[str, str]],
+) -> None:
     _, schemas, metadata = recorded
-    own = {"boxes": "SceneUpdate", "path": "SceneUpdate", "plan": "SceneUpdate", "front": "CompressedImage", "side": "CompressedImage"}
+    own = {
+        "boxes": "SceneUpdate",
+        "path": "SceneUpdate",
+        "plan": "SceneUpdate",
+        "front": "CompressedImage",
+        "side": "CompressedImage",
+    }
     own |= {f"{camera}/calibration": "CameraCalibration" for camera in ("front", "side")}
-    wanted = {f"/{r}/{name}": f"foxglove.{schema}" for r in ("clean", "3dgs") for name, schema in own.items()}
+    wanted = {
+        f"/{r}/{name}": f"foxglove.{schema}"
+        for r in ("clean", "3dgs")
+        for name, schema in own.items()
+    }
     wanted |= {f"/{r}/metrics": "simrun.Metrics" for r in ("clean", "3dgs")} | {
         "/map": "foxglove.SceneUpdate",
         "/tf": "foxglove.FrameTransform",
     }
-    assert {topic: name for topic, name in schemas.items() if not topic.endswith("/events")} == wanted
-    assert (metadata["scene"], metadata["policy"], metadata["seed"]) == ("urban-left_turn", "lane-camera", "0")
+    assert {
+        topic: name for topic, name in schemas.items() if not topic.endswith("/events")
+    } == wanted
+    assert (metadata["scene"], metadata["policy"], metadata["seed"]) == (
+        "urban-left_turn",
+        "lane-camera",
+        "0",
+    )
 
 
 @pytest.mark.parametrize("renderer", ["clean", "3dgs"])
@@ -79,7 +103,9 @@ def test_what_is_recorded_is_what_the_log_holds(
     found, log = recorded[0], watched.log(renderer)
     for camera in ("front", "side"):
         kept = [(1000 * image.end_us, image.data) for image in log.images if image.camera == camera]
-        assert [(t, base64.b64decode(body["data"])) for t, body in found[f"/{renderer}/{camera}"]] == kept
+        assert [
+            (t, base64.b64decode(body["data"])) for t, body in found[f"/{renderer}/{camera}"]
+        ] == kept
         assert {body["format"] for _, body in found[f"/{renderer}/{camera}"]} == {"png"}
     boxes = found[f"/{renderer}/boxes"]
     assert [t for t, _ in boxes] == (1000 * log.ego.t_us).tolist()
@@ -88,12 +114,20 @@ def test_what_is_recorded_is_what_the_log_holds(
         cubes = {one["id"]: one["cubes"][0] for one in body["entities"]}
         assert set(cubes) == {"ego", *(f"user {name}" for name in log.actors)}
         assert xyz(cubes["ego"]["pose"]["position"]) == log.ego.xyz[k].tolist()
-        assert xyz(cubes["ego"]["size"]) == [log.ego_box.length_m, log.ego_box.width_m, log.ego_box.height_m]
+        assert xyz(cubes["ego"]["size"]) == [
+            log.ego_box.length_m,
+            log.ego_box.width_m,
+            log.ego_box.height_m,
+        ]
         for name, actor in log.actors.items():
             turn = cubes[f"user {name}"]["pose"]["orientation"]
             assert [turn[axis] for axis in "wxyz"] == actor.track.quat[k].tolist()
     rig = offset_trajectory(log.ego, inverse(log.T_rig_box))
-    moves = [xyz(body["translation"]) for _, body in found["/tf"] if body["child_frame_id"] == f"{renderer}/rig"]
+    moves = [
+        xyz(body["translation"])
+        for _, body in found["/tf"]
+        if body["child_frame_id"] == f"{renderer}/rig"
+    ]
     assert np.allclose(moves, rig.xyz, atol=1e-12)
     plans = found[f"/{renderer}/plan"]
     assert [t for t, _ in plans] == [1000 * plan.now_us for plan in log.plans]
@@ -102,7 +136,9 @@ def test_what_is_recorded_is_what_the_log_holds(
         assert [xyz(point) for point in lines[0]["points"]] == plan.trajectory.xyz.tolist()
         assert len(lines) == 1 + len(plan.samples)
     ((_, path),) = found[f"/{renderer}/path"]
-    assert np.allclose([xyz(point) for point in path["entities"][0]["lines"][0]["points"]], rig.xyz, atol=1e-12)
+    assert np.allclose(
+        [xyz(point) for point in path["entities"][0]["lines"][0]["points"]], rig.xyz, atol=1e-12
+    )
 
 
 def test_metrics_have_the_values_of_the_table_and_none_where_they_are_not_valid(
@@ -129,27 +165,48 @@ def test_the_map_lies_at_the_height_of_the_recorded_drive(
     assert {one["id"] for one in body["entities"]} >= {"lane border", "road edge", "recorded drive"}
 
 
-def test_a_failed_rollout_and_missing_frames_are_said(watched: Watched, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failed_rollout_and_missing_frames_are_said(
+    watched: Watched, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = Path(shutil.copytree(watched.folder, tmp_path / "run"))
     log = folder / "rollouts" / "clean" / "lane-camera" / "urban-left_turn" / "1" / "rollout.asl"
     log.write_bytes(without_images(log))
     vouch_for(folder)
-    assert run_command(["export", str(folder), "--seed", "1", "--mcap", str(tmp_path / "a.mcap"), "--json"]) == 0
+    assert (
+        run_command(
+            ["export", str(folder), "--seed", "1", "--mcap", str(tmp_path / "a.mcap"), "--json"]
+        )
+        == 0
+    )
     printed = json.loads(capsys.readouterr().out)
     assert [note.split(":")[0] for note in printed["notes"]] == ["3dgs", "clean"]
     assert "failed (renderer)" in printed["notes"][0]
     assert "No camera frames were kept" in printed["notes"][1]
-    assert set(read(tmp_path / "a.mcap")[0]) == {"/map", "/tf", "/clean/boxes", "/clean/path", "/clean/plan", "/clean/metrics"}
+    assert set(read(tmp_path / "a.mcap")[0]) == {
+        "/map",
+        "/tf",
+        "/clean/boxes",
+        "/clean/path",
+        "/clean/plan",
+        "/clean/metrics",
+    }
 
 
 def without_images(log: Path) -> bytes:
     """Return a log's bytes without its camera frames."""
-    kept = [entry.SerializeToString() for entry in AslReader(log) if entry.WhichOneof("log_entry") != "driver_camera_image"]
+    kept = [
+        entry.SerializeToString()
+        for entry in AslReader(log)
+        if entry.WhichOneof("log_entry") != "driver_camera_image"
+    ]
     return b"".join(len(entry).to_bytes(4, "big") + entry for entry in kept)
 
 
 def test_refusals_say_what_to_do(
-    watched: Watched, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    watched: Watched,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     run, out = str(watched.folder), tmp_path / "a.mcap"
     (tmp_path / "there.mcap").touch()
@@ -158,8 +215,14 @@ def test_refusals_say_what_to_do(
         (("export", run, "--mcap", str(out)), "2 cells of scene, policy and seed"),
         (("export", run, *CELL), "nothing to write"),
         (("export", run, *CELL, "--mcap", str(tmp_path / "there.mcap")), "pass --overwrite"),
-        (("export", run, "--alpasim", str(tmp_path), "--mcap", str(out)), "--alpasim beside --mcap"),
-        (("export", run, "--alpasim", str(tmp_path / "x"), "--seed", "0"), "a run is exported whole"),
+        (
+            ("export", run, "--alpasim", str(tmp_path), "--mcap", str(out)),
+            "--alpasim beside --mcap",
+        ),
+        (
+            ("export", run, "--alpasim", str(tmp_path / "x"), "--seed", "0"),
+            "a run is exported whole",
+        ),
         (("export", str(tmp_path), "--mcap", str(out)), "no run.json"),
         (("export", run, "--seed", "1", "--renderer", "3dgs", "--mcap", str(out)), "3dgs: failed"),
         (("export", run, rollout, "--mcap", str(out)), "several items"),

@@ -1,4 +1,6 @@
-"""What a run says about its metrics travels with its folder: words may change between two runs, the quantity may not."""
+"""What a run says about its metrics travels with its folder: words may change between two runs, the
+quantity may not.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json, write_contents, write_run_json
+from alpasim_plugin.log.run_folder.manifests import (
+    read_manifest,
+    read_run_json,
+    write_contents,
+    write_run_json,
+)
 from evaluators import resolve_evaluators
 from evaluators.metrics import table_of
 from evaluators.opening import read_run
@@ -30,32 +37,69 @@ class Height:
 """
 # Series that stand for one quantity on purpose, and why.
 ALIKE = {
-    frozenset(("dist_to_gt_trajectory", "route_distance_m")): "AlpaSim's name reduced by max, the paper's by mean",
-    frozenset(("dist_to_gt_trajectory", "lateral_distance_m")): "they part beyond the ends of the recorded path",
-    frozenset(("lateral_distance_m", "route_distance_m")): "they part beyond the ends of the recorded path",
-    frozenset(("dist_traveled_m", "ego_x_m")): "the recorded path leads east for most of this drive",
+    frozenset(
+        ("dist_to_gt_trajectory", "route_distance_m")
+    ): "AlpaSim's name reduced by max, the paper's by mean",
+    frozenset(
+        ("dist_to_gt_trajectory", "lateral_distance_m")
+    ): "they part beyond the ends of the recorded path",
+    frozenset(
+        ("lateral_distance_m", "route_distance_m")
+    ): "they part beyond the ends of the recorded path",
+    frozenset(
+        ("dist_traveled_m", "ego_x_m")
+    ): "the recorded path leads east for most of this drive",
 }
 LEAST_STEPS = 20
-SAME = 0.25  # standard deviation of what one series leaves unexplained of the other, as a share of the other's
+# standard deviation of what one series leaves unexplained of the other, as a share of the other's
+SAME = 0.25
 ONLY = ("--images", "none", "--no-report", "--certify", "none", "--workers", "1", "smoke/curve")
 
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Drive a rollout with a metric of a plug-in, and make runs of it whose plug-in says something else about the metric."""
+    """Drive a rollout with a metric of a plug-in, and make runs of it whose plug-in says something
+    else about the metric.
+    """
     root = tmp_path_factory.mktemp("runs")
-    for name, unit, text in (("first", "m", "height"), ("words", "m", "height of the roof"), ("unit", "ft", "height")):
+    for name, unit, text in (
+        ("first", "m", "height"),
+        ("words", "m", "height of the roof"),
+        ("unit", "ft", "height"),
+    ):
         plugin = root / f"{name}.py"
         plugin.write_text(PLUGIN.replace("UNIT", unit).replace("HELP", text))
         if name == "first":
-            command = ["run", "--renderer", "clean", "--policy", "log-replay", *ONLY, "--evaluator", f"{plugin}:Height"]
-            assert run_command([*command, "--out", str(root / name), "--set", "timing.duration_us=1000000", "--json"]) == 0
+            command = [
+                "run",
+                "--renderer",
+                "clean",
+                "--policy",
+                "log-replay",
+                *ONLY,
+                "--evaluator",
+                f"{plugin}:Height",
+            ]
+            assert (
+                run_command(
+                    [
+                        *command,
+                        "--out",
+                        str(root / name),
+                        "--set",
+                        "timing.duration_us=1000000",
+                        "--json",
+                    ]
+                )
+                == 0
+            )
             continue
         shutil.copytree(root / "first", root / name)
         table = table_of(resolve_evaluators([f"{plugin}:Height"]))
         write_run_json(root / name, read_run_json(root / "first") | {"metrics": table.as_dict()})
         manifests = {
-            one.parent.relative_to(root / name).as_posix(): read_manifest(one.parent)[1] for one in (root / name).rglob("manifest.json")
+            one.parent.relative_to(root / name).as_posix(): read_manifest(one.parent)[1]
+            for one in (root / name).rglob("manifest.json")
         }
         write_contents(root / name, manifests)
     return root
@@ -78,18 +122,29 @@ def test_the_same_metric_in_other_words_can_be_compared_aggregated_and_followed(
     assert read_run(words).table["height_m"].help == "height of the roof"
 
 
-def test_another_unit_under_the_same_name_is_refused(places: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_unit_under_the_same_name_is_refused(
+    places: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     first, unit = str(places / "first"), str(places / "unit")
-    for command in (["compare", first, unit], ["aggregate", first, unit], ["runs", str(places), "--steps", "--metric", "height_m"]):
+    for command in (
+        ["compare", first, unit],
+        ["aggregate", first, unit],
+        ["runs", str(places), "--steps", "--metric", "height_m"],
+    ):
         assert run_command(command) == 2
         assert "metric 'height_m'" in capsys.readouterr().err
 
 
-def test_what_a_plugin_says_about_its_metric_reaches_the_numbers(places: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_a_plugin_says_about_its_metric_reaches_the_numbers(
+    places: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = read_run(places / "first")
     assert run_command(["compare", str(run.folder), str(places / "words"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["paired"]["clean"]["height_m"]["margin"] == 0.3
-    assert (run.table["height_m"].words, run.table["height_m"].value_range) == ("ride height", (0.0, np.inf))
+    assert (run.table["height_m"].words, run.table["height_m"].value_range) == (
+        "ride height",
+        (0.0, np.inf),
+    )
     assert run_command(["list", "metrics"]) == 0
     assert "height_m" not in capsys.readouterr().out  # nothing of a run stays behind in the process
 
@@ -120,12 +175,18 @@ def test_no_two_series_of_a_run_measure_the_same_quantity_under_two_names(tmp_pa
         if row["valid"]:
             series.setdefault(row["metric"], {})[row["t_us"]] = row["value"]
     assert "lateral_bias_m" in series
-    alike = {frozenset(pair) for pair in itertools.combinations(series, 2) if _is_same(*(series[name] for name in pair))}
+    alike = {
+        frozenset(pair)
+        for pair in itertools.combinations(series, 2)
+        if _is_same(*(series[name] for name in pair))
+    }
     assert alike == set(ALIKE), "give one quantity one name, or say here why it has two"
 
 
 def _is_same(one: dict[int, float], other: dict[int, float]) -> bool:
-    """Tell whether two series are equal up to a constant or the sign, on the times that both have."""
+    """Tell whether two series are equal up to a constant or the sign, on the times that both
+    have.
+    """
     times = sorted(set(one) & set(other))
     a, b = (np.array([values[t] for t in times]) for values in (one, other))
     if len(times) < LEAST_STEPS or min(a.std(), b.std()) < 1e-9:

@@ -24,7 +24,9 @@ def left_over(folder: Path, pid: int) -> Path:
     return path
 
 
-def test_only_what_gone_processes_of_this_machine_have_left_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_what_gone_processes_of_this_machine_have_left_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("SIMRUN_SCRATCH", str(tmp_path))
     gone, running = left_over(scratch_root(), NO_PROCESS), left_over(scratch_root(), os.getpid())
     monkeypatch.setattr(socket, "gethostname", lambda: "another")
@@ -37,7 +39,9 @@ def test_only_what_gone_processes_of_this_machine_have_left_is_removed(tmp_path:
     assert of_another.exists()
 
 
-def test_measurements_and_scratch_are_in_a_folder_of_this_user_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_measurements_and_scratch_are_in_a_folder_of_this_user_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("SIMRUN_SCRATCH", str(tmp_path))
     monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path))
     folder = measured_folder("run")

@@ -1,4 +1,6 @@
-"""Runs in a notebook: what docs/notebook.md shows works as it stands, and what is shown is what the files hold."""
+"""Runs in a notebook: what docs/notebook.md shows works as it stands, and what is shown is what the
+files hold.
+"""
 
 from __future__ import annotations
 
@@ -21,14 +23,33 @@ pytestmark = pytest.mark.slow
 pytest.importorskip("pandas")
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "notebook.md"
-SHORT = ("--set", "timing.duration_us=600000", "--set", "degradation.kind=surrogate", "--certify", "none", "--no-report", "--json")
+SHORT = (
+    "--set",
+    "timing.duration_us=600000",
+    "--set",
+    "degradation.kind=surrogate",
+    "--certify",
+    "none",
+    "--no-report",
+    "--json",
+)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Give the working folder of the page, with its run."""
     folder = tmp_path_factory.mktemp("notebook")
-    words = ["--renderer", "clean,3dgs", "--policy", "lane-camera", "--seeds", "2", "--out", str(folder / "runs" / "mine"), "smoke/curve"]
+    words = [
+        "--renderer",
+        "clean,3dgs",
+        "--policy",
+        "lane-camera",
+        "--seeds",
+        "2",
+        "--out",
+        str(folder / "runs" / "mine"),
+        "smoke/curve",
+    ]
     assert run_command([*words, *SHORT, "--workers", "1"]) == 0
     return folder
 
@@ -57,11 +78,15 @@ class Tags(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_the_cells_of_the_page_run(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_cells_of_the_page_run(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(folder)
     monkeypatch.setenv("MPLBACKEND", "agg")
     space: dict[str, Any] = {}
-    *cells, of_polars = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
+    *cells, of_polars = re.findall(
+        r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S
+    )
     for cell in cells:
         exec(compile(cell, str(PAGE), "exec"), space)
     assert isinstance(space["rollout"], OpenRollout)
@@ -80,7 +105,9 @@ def test_tables_hold_what_the_files_hold(run: OpenRun) -> None:
     assert undefined, "a short drive alone on the road has metrics without a value"
     assert all(np.isnan(row[name]) and not row[f"{name}_valid"] for name in undefined)
     mean = run.summary.query("renderer == '3dgs' and metric == 'progress'")["mean"].item()
-    assert mean == pytest.approx(np.mean([r.metrics["progress"] for r in run if r.renderer == "3dgs"]))
+    assert mean == pytest.approx(
+        np.mean([r.metrics["progress"] for r in run if r.renderer == "3dgs"])
+    )
     assert set(run.paired["baseline"]) == {"clean"}
     steps = one.steps
     assert list(steps.index) == sorted(steps.index)
@@ -91,10 +118,15 @@ def test_tables_hold_what_the_files_hold(run: OpenRun) -> None:
 def test_polars_frames_equal_those_of_pandas(run: OpenRun) -> None:
     pytest.importorskip("polars")
     other = open_run(run.folder, frames="polars")
-    assert other.rollouts.drop("failure", "failure_class").to_pandas()["progress"].tolist() == run.rollouts["progress"].tolist()
+    assert (
+        other.rollouts.drop("failure", "failure_class").to_pandas()["progress"].tolist()
+        == run.rollouts["progress"].tolist()
+    )
     assert other.steps.height == len(run.steps)
     mine, theirs = run.rollout("clean", seed=0).steps, other.rollout("clean", seed=0).steps
-    np.testing.assert_array_equal(mine["lateral_distance_m"].to_numpy(), theirs["lateral_distance_m"].to_numpy())
+    np.testing.assert_array_equal(
+        mine["lateral_distance_m"].to_numpy(), theirs["lateral_distance_m"].to_numpy()
+    )
 
 
 def test_a_run_and_a_rollout_show_themselves(run: OpenRun) -> None:
@@ -120,7 +152,9 @@ def test_names_of_a_run_do_not_become_markup(run: OpenRun) -> None:
         object.__setattr__(one._rollout, "scene", "smoke-curve")
 
 
-def test_a_choice_that_is_none_and_a_missing_library_are_said(run: OpenRun, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_choice_that_is_none_and_a_missing_library_are_said(
+    run: OpenRun, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     with pytest.raises(InputError, match="2 rollouts fit"):
         run.rollout("3dgs")
     with pytest.raises(InputError, match="0 rollouts fit"):

@@ -1,4 +1,6 @@
-"""Where a rollout ends: at the end of the recorded path, unless the car stands there, or scenario or preset say no."""
+"""Where a rollout ends: at the end of the recorded path, unless the car stands there, or scenario
+or preset say no.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ class Fast:
 
 
 def shortened(scenario: Scenario, keep_m: float, stands: bool) -> Scenario:
-    """Cut the recording after some metres; it ends there in motion, or stands there for the rest of the time."""
+    """Cut the recording after some metres; it ends there in motion, or stands there for the rest of
+    the time.
+    """
     log = scenario.ego_log
     x = np.minimum(log.xyz[:, 0], keep_m) if stands else log.xyz[:, 0] * keep_m / log.xyz[-1, 0]
     xyz = np.column_stack([x, log.xyz[:, 1:]])
@@ -62,25 +66,36 @@ def test_a_rollout_ends_where_a_moving_recording_ends(straight_road: Scenario) -
     assert rollout.facts()["passed_path_end"]
 
 
-def test_a_score_takes_a_log_that_ends_there_and_refuses_one_cut_before_or_later(straight_road: Scenario) -> None:
+def test_a_score_takes_a_log_that_ends_there_and_refuses_one_cut_before_or_later(
+    straight_road: Scenario,
+) -> None:
     log = run_rollout(shortened(straight_road, 25.0, stands=False), Grey(), Fast(), 0).log()
     check_complete(Path("rollout.asl"), log)
     ego = log.ego
     shorter = Trajectory(ego.t_us[:-1], ego.xyz[:-1], ego.quat[:-1])
     later = Trajectory(
-        np.append(ego.t_us, ego.t_us[-1] + 100_000), np.vstack([ego.xyz, ego.xyz[-1] + [1, 0, 0]]), ego.quat[[*range(len(ego)), -1]]
+        np.append(ego.t_us, ego.t_us[-1] + 100_000),
+        np.vstack([ego.xyz, ego.xyz[-1] + [1, 0, 0]]),
+        ego.quat[[*range(len(ego)), -1]],
     )
     for other in (shorter, later):
         with pytest.raises(InfrastructureError, match="control steps"):
             check_complete(Path("rollout.asl"), replace(log, ego=other))
 
 
-def test_it_goes_on_where_the_recorded_car_stands_or_the_scenario_says_so(straight_road: Scenario) -> None:
+def test_it_goes_on_where_the_recorded_car_stands_or_the_scenario_says_so(
+    straight_road: Scenario,
+) -> None:
     assert last_us(shortened(straight_road, 20.0, stands=True)) == straight_road.end_us
-    assert last_us(replace(shortened(straight_road, 25.0, stands=False), stop_at_path_end=False)) == straight_road.end_us
+    assert (
+        last_us(replace(shortened(straight_road, 25.0, stands=False), stop_at_path_end=False))
+        == straight_road.end_us
+    )
 
 
-def test_a_path_that_comes_back_beside_its_own_end_has_not_been_passed(straight_road: Scenario) -> None:
+def test_a_path_that_comes_back_beside_its_own_end_has_not_been_passed(
+    straight_road: Scenario,
+) -> None:
     angle = np.linspace(0.0, 2 * np.pi - 0.3, 301)
     xyz = np.stack([30 * np.sin(angle), 30 - 30 * np.cos(angle), 0 * angle], axis=1)
     log = Trajectory(np.linspace(0, 3_000_000, 301).astype(np.int64), xyz, quat_from_yaw(angle))
@@ -89,15 +104,21 @@ def test_a_path_that_comes_back_beside_its_own_end_has_not_been_passed(straight_
     assert end.ends_rollout((xyz[-1] + 3.0 * (xyz[-1] - xyz[-2]))[:2])
 
 
-def test_alpasims_preset_drives_on_and_only_what_passed_the_end_is_driven_again(tmp_path: Path) -> None:
+def test_alpasims_preset_drives_on_and_only_what_passed_the_end_is_driven_again(
+    tmp_path: Path,
+) -> None:
     def plan(preset: str) -> RunPlan:
         refs = expand("smoke/straight", ("timing.duration_us=2000000", "degradation.kind=none"))
         return make_plan(refs, (GREY,), ("constant-velocity", FAST), (0,), RunOptions(preset))
 
     scene = load_scenario("smoke/straight", overrides=("timing.duration_us=2000000",))
     assert scene.stop_at_path_end
-    execute_run(plan("paper"), tmp_path, 1, ["simrun"], Announced(), certificate="none", report=False)
-    remedies = {cell.policy.name: find_rollout_state(cell, tmp_path)[0] for cell in plan("alpasim").cells}
+    execute_run(
+        plan("paper"), tmp_path, 1, ["simrun"], Announced(), certificate="none", report=False
+    )
+    remedies = {
+        cell.policy.name: find_rollout_state(cell, tmp_path)[0] for cell in plan("alpasim").cells
+    }
     assert remedies == {"constant-velocity": "score", FAST: "drive"}
     assert {find_rollout_state(cell, tmp_path)[0] for cell in plan("strict").cells} == {"score"}
 

@@ -1,4 +1,6 @@
-"""Closed loop behind a per-frame fixer: every frame is of its true pose, fixed once, and equal to fixing the same frames afterwards."""
+"""Closed loop behind a per-frame fixer: every frame is of its true pose, fixed once, and equal to
+fixing the same frames afterwards.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,13 @@ def test_a_drive_sees_every_frame_fixed_once_at_its_true_pose(straight_road: Sce
     assert isinstance(session, PerFrameRenderer)
     assert session.lookahead == 0
     assert not any(request.ahead for request in run.requests)
-    expected = {"label": session.fixer.label, "trained": False, "mode": "frame", "frames": len(run.frames), "chosen": session.fixer.chosen}
+    expected = {
+        "label": session.fixer.label,
+        "trained": False,
+        "mode": "frame",
+        "frames": len(run.frames),
+        "chosen": session.fixer.chosen,
+    }
     assert session.facts() == expected
     assert session.fixer.chosen["threads"]["number"] == 1
     assert "times as fast as float32" in session.fixer.chosen["precision"]["why"]
@@ -49,14 +57,19 @@ def test_cameras_of_different_rates_share_a_session(straight_road: Scenario) -> 
     scenario = replace(straight_road, end_us=800_000, cameras=(front, slow))
 
     class Both(Watching):
-        sensors = (replace(Watching.sensors[0]), replace(Watching.sensors[0], camera="slow", interval_us=200_000))
+        sensors = (
+            replace(Watching.sensors[0]),
+            replace(Watching.sensors[0], camera="slow", interval_us=200_000),
+        )
 
     run = drive(scenario, Both, network)  # type: ignore[arg-type]
     frames = rendered(scenario, run.requests)
     assert {frame.camera for frame in frames} == {"front", "slow"}
     for camera in ("front", "slow"):
         mine = [frame for frame in frames if frame.camera == camera]
-        assert_same_pictures([frame for frame in run.frames if frame.camera == camera], offline(mine))
+        assert_same_pictures(
+            [frame for frame in run.frames if frame.camera == camera], offline(mine)
+        )
 
 
 def test_the_fixers_time_delays_plans_where_latency_says_so(straight_road: Scenario) -> None:

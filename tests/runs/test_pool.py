@@ -1,4 +1,6 @@
-"""The policy of a pool's driver, on workers whose fate is written down and a clock that is moved by hand."""
+"""The policy of a pool's driver, on workers whose fate is written down and a clock that is moved by
+hand.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +19,11 @@ STEP_S = 1.0
 
 
 class Stage:
-    """Workers on nodes; an item takes the seconds that its text begins with, or does what the text says.
+    """Workers on nodes; an item takes the seconds that its text begins with, or does what the text
+    says.
 
-    ``dies`` kills its worker, ``raises`` fails, ``hangs@a`` never ends on node a, ``bad@a`` is faulty on node a.
+    ``dies`` kills its worker, ``raises`` fails, ``hangs@a`` never ends on node a, ``bad@a`` is
+    faulty on node a.
     """
 
     rules = Rules(chunk_s=10.0)
@@ -44,7 +48,9 @@ class Stage:
     def start(self, worker: int, items: Sequence[str]) -> None:
         node = self.workers[worker]
         self.handed.append((node, tuple(items)))
-        takes_s = sum(float("inf") if item == f"hangs@{node}" else self._takes_s(item) for item in items)
+        takes_s = sum(
+            float("inf") if item == f"hangs@{node}" else self._takes_s(item) for item in items
+        )
         self.busy[worker] = self.now_s + takes_s, items
 
     def wait(self, timeout_s: float) -> list[Event]:
@@ -79,7 +85,11 @@ class Stage:
     def _answer(self, item: str, node: str) -> Any:
         if item.startswith("raises"):
             return ValueError("no")
-        return Faulty(f"{item} failed", "disk full") if item.startswith(f"bad@{node}") else item.upper()
+        return (
+            Faulty(f"{item} failed", "disk full")
+            if item.startswith(f"bad@{node}")
+            else item.upper()
+        )
 
 
 def drive(stage: Stage, items: list[str], limit_s: float | None = None) -> dict[str, Any]:
@@ -172,7 +182,12 @@ def test_a_job_waits_for_those_that_it_depends_on_and_holds_up_no_other() -> Non
     items = ["20s first", "1s", "1s after the first", "1s free"]
     found = dict(run_jobs(stage, items, lambda text: None, None, lambda: stage.now_s, {2: [0]}))
     assert found == {item: item.upper() for item in items}
-    assert [handed for _, (handed,) in stage.handed] == ["20s first", "1s", "1s free", "1s after the first"]
+    assert [handed for _, (handed,) in stage.handed] == [
+        "20s first",
+        "1s",
+        "1s free",
+        "1s after the first",
+    ]
 
 
 def test_a_backend_without_second_tries_gives_up_what_died_and_copies_nothing() -> None:
@@ -203,7 +218,18 @@ def test_the_text_of_the_option_is_understood() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["dask", "local:a", "local?cores=2", "", "ray?cores=0", "ray?cores=1.5", "slurm?gpus=nan", "ray?memory=0", "ray?nodes=2"]
+    "text",
+    [
+        "dask",
+        "local:a",
+        "local?cores=2",
+        "",
+        "ray?cores=0",
+        "ray?cores=1.5",
+        "slurm?gpus=nan",
+        "ray?memory=0",
+        "ray?nodes=2",
+    ],
 )
 def test_an_executor_that_is_not_there_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="choosing an executor"):
@@ -213,7 +239,9 @@ def test_an_executor_that_is_not_there_is_refused(text: str) -> None:
 def test_a_node_is_compared_by_name() -> None:
     own = identity_of(())
     assert differences(own, own) == []
-    assert differences(own, {**own, "numpy": "0.1"}) == [f"numpy is 0.1, the driver has {own['numpy']}"]
+    assert differences(own, {**own, "numpy": "0.1"}) == [
+        f"numpy is 0.1, the driver has {own['numpy']}"
+    ]
     assert {"python", "torch", "code of simrun"} <= own.keys()
     assert targets_of(()) == ()
     assert identity_of(("no_such_module", "/no/such/file.py")) == own | {

@@ -13,7 +13,9 @@ WHO = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false"
 
 
 def git(folder: Path, *words: str) -> str:
-    return subprocess.run(["git", *WHO, *words], cwd=folder, check=True, capture_output=True, text=True).stdout.strip()
+    return subprocess.run(
+        ["git", *WHO, *words], cwd=folder, check=True, capture_output=True, text=True
+    ).stdout.strip()
 
 
 @pytest.fixture(autouse=True)
@@ -58,16 +60,39 @@ def test_a_program_that_the_repository_names_is_not_run(tmp_path: Path) -> None:
         "\n\n", "\ngpgsig -----BEGIN PGP SIGNATURE-----\n \n -----END PGP SIGNATURE-----\n\n", 1
     )
     (tmp_path / "commit").write_text(signed + "\n")
-    git(own, "update-ref", "HEAD", git(own, "hash-object", "-t", "commit", "-w", str(tmp_path / "commit")))
+    git(
+        own,
+        "update-ref",
+        "HEAD",
+        git(own, "hash-object", "-t", "commit", "-w", str(tmp_path / "commit")),
+    )
     (own / ".gitattributes").write_text("* filter=x\n")
-    for name in ("core.fsmonitor", "core.sshCommand", "gpg.program", "filter.x.clean", "filter.x.process", "core.alternateRefsCommand"):
+    for name in (
+        "core.fsmonitor",
+        "core.sshCommand",
+        "gpg.program",
+        "filter.x.clean",
+        "filter.x.process",
+        "core.alternateRefsCommand",
+    ):
         git(own, "config", name, str(spy))
-    for name, value in (("log.showSignature", "true"), ("filter.x.required", "true"), ("protocol.ext.allow", "always")):
+    for name, value in (
+        ("log.showSignature", "true"),
+        ("filter.x.required", "true"),
+        ("protocol.ext.allow", "always"),
+    ):
         git(own, "config", name, value)
     (own / "a").write_text("b")
     found = project(own)
-    assert (found["commit"], found["dirty"]) == (git(own, "-c", "log.showSignature=false", "rev-parse", "HEAD"), True)
-    for name, value in (("remote.o.url", f"ext::{spy}"), ("remote.o.promisor", "true"), ("extensions.partialClone", "o")):
+    assert (found["commit"], found["dirty"]) == (
+        git(own, "-c", "log.showSignature=false", "rev-parse", "HEAD"),
+        True,
+    )
+    for name, value in (
+        ("remote.o.url", f"ext::{spy}"),
+        ("remote.o.promisor", "true"),
+        ("extensions.partialClone", "o"),
+    ):
         git(own, "config", name, value)
     git(own, "config", "core.repositoryFormatVersion", "1")
     for path in (own / ".git" / "objects").glob("??/*"):  # what is missing would be fetched
@@ -78,7 +103,9 @@ def test_a_program_that_the_repository_names_is_not_run(tmp_path: Path) -> None:
     assert not (tmp_path / "was-run").exists(), (tmp_path / "was-run").read_text()
 
 
-def test_without_a_repository_or_without_git_it_is_said_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_repository_or_without_git_it_is_said_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert "not a git repository" in project(tmp_path)["reason"]
     monkeypatch.setenv("SIMRUN_COMMIT", "3F2A9C1")
     assert project(tmp_path)["commit"] == "3f2a9c1"

@@ -30,7 +30,10 @@ from tests.runs.remote_work import Scripted
 from tests.runs.test_runs import SHORT, Announced, cheap_plan, comparable, plan_of
 
 pytest.importorskip("ray", reason="the extra [ray] is not installed")
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]  # most of the time goes by while processes start
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(1200),
+]  # most of the time goes by while processes start
 
 GIB = 2**30
 PATIENCE_S = 30.0  # for workers that do start, on a busy machine
@@ -65,11 +68,21 @@ def three() -> Iterator[Nodes]:
 @pytest.fixture(scope="module")
 def by_local(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("local")
-    execute_run(plan_of(scenes=("smoke/straight", "smoke/lead_car")), root, 1, ["simrun"], Announced(), certificate="none", report=False)
+    execute_run(
+        plan_of(scenes=("smoke/straight", "smoke/lead_car")),
+        root,
+        1,
+        ["simrun"],
+        Announced(),
+        certificate="none",
+        report=False,
+    )
     return root
 
 
-def test_one_and_three_nodes_give_the_run_of_one_process(tmp_path: Path, three: Nodes, by_local: Path) -> None:
+def test_one_and_three_nodes_give_the_run_of_one_process(
+    tmp_path: Path, three: Nodes, by_local: Path
+) -> None:
     plan = plan_of(scenes=("smoke/straight", "smoke/lead_car"))
     one = Nodes(1)
     try:
@@ -82,7 +95,9 @@ def test_one_and_three_nodes_give_the_run_of_one_process(tmp_path: Path, three: 
     assert comparable(tmp_path / "one") == comparable(tmp_path / "three") == comparable(by_local)
 
 
-def test_a_second_run_reuses_what_nodes_have_driven_without_them(tmp_path: Path, three: Nodes) -> None:
+def test_a_second_run_reuses_what_nodes_have_driven_without_them(
+    tmp_path: Path, three: Nodes
+) -> None:
     run(cheap_plan(), tmp_path, on(three))
     _, announced = run(cheap_plan(), tmp_path, Executor())
     assert announced.results == [("ok", True)] * 4
@@ -118,9 +133,15 @@ def test_a_raylet_that_is_killed_loses_nothing(tmp_path: Path, three: Nodes) -> 
     with pool_on(three, Scripted(tmp_path)) as pool:
         for item, got in run_jobs(pool, items, print):
             found[item] = got
-            if len(found) >= 4 and raylet and any(doomed.node_id[:8] in name for name in pool.nodes()):
+            if (
+                len(found) >= 4
+                and raylet
+                and any(doomed.node_id[:8] in name for name in pool.nodes())
+            ):
                 os.kill(raylet, signal.SIGKILL)
-                process.wait()  # a worker of Ray ends when its raylet's process is gone, which one that nobody waited for is not
+                # a worker of Ray ends when its raylet's process is gone, which one that nobody
+                # waited for is not
+                process.wait()
                 raylet = 0
     three.cluster.worker_nodes.discard(doomed)
     assert raylet == 0, "the node was never used"
@@ -128,7 +149,9 @@ def test_a_raylet_that_is_killed_loses_nothing(tmp_path: Path, three: Nodes) -> 
     wait_until(lambda: not serving(), "a worker outlives its node")
 
 
-def test_a_node_with_another_version_is_refused_by_name(tmp_path: Path, three: Nodes, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_node_with_another_version_is_refused_by_name(
+    tmp_path: Path, three: Nodes, capsys: pytest.CaptureFixture[str]
+) -> None:
     fake = tmp_path / "site" / "scipy-0.0.1.dist-info"
     fake.mkdir(parents=True)
     (fake / "METADATA").write_text("Metadata-Version: 2.1\nName: scipy\nVersion: 0.0.1\n")
@@ -145,7 +168,10 @@ def test_a_node_with_another_version_is_refused_by_name(tmp_path: Path, three: N
 def test_no_node_of_the_right_version_is_an_error_that_names_it(tmp_path: Path) -> None:
     with (
         pool_on(None, Scripted(tmp_path), expected={**identity_of(()), "scipy": "0.0.1"}) as pool,
-        pytest.raises(InfrastructureError, match=r"no node takes the work: .*scipy is .*, the driver has 0\.0\.1"),
+        pytest.raises(
+            InfrastructureError,
+            match=r"no node takes the work: .*scipy is .*, the driver has 0\.0\.1",
+        ),
     ):
         dict(run_jobs(pool, ["a"], print))
 
@@ -160,7 +186,11 @@ def test_a_straggler_is_done_again_on_another_node(tmp_path: Path, three: Nodes)
 
 def test_workers_go_where_what_they_declare_is(tmp_path: Path, three: Nodes) -> None:
     large = three.add(num_cpus=4, num_gpus=1, memory=3 * GIB)
-    for resources, workers in ((Resources(1, gpus=0.5), 2), (Resources(1, memory_gib=1.0, gpus=0.1), 3), (Resources(2), 2)):
+    for resources, workers in (
+        (Resources(1, gpus=0.5), 2),
+        (Resources(1, memory_gib=1.0, gpus=0.1), 3),
+        (Resources(2), 2),
+    ):
         with pool_on(three, Scripted(tmp_path), resources=resources) as pool:
             until = time.monotonic() + 120
             while len(pool.free(workers)) < workers:
@@ -176,7 +206,10 @@ def test_workers_go_where_what_they_declare_is(tmp_path: Path, three: Nodes) -> 
 
 
 def test_more_than_any_node_has_is_an_error_that_says_so(tmp_path: Path, three: Nodes) -> None:
-    with pool_on(three, Scripted(tmp_path), resources=Resources(64)) as pool, pytest.raises(InfrastructureError) as caught:
+    with (
+        pool_on(three, Scripted(tmp_path), resources=Resources(64)) as pool,
+        pytest.raises(InfrastructureError) as caught,
+    ):
         dict(run_jobs(pool, ["a"], print))
     assert "cores=64" in caught.value.with_what
     assert "no node has that much" in caught.value.found
@@ -194,7 +227,10 @@ def test_a_node_that_starts_no_process_is_set_aside_and_others_do_its_work(
 ) -> None:
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(HANGING)
-    stuck = three.add(num_cpus=2, env_vars={"PYTHONPATH": f"{tmp_path / 'site'}:{os.environ.get('PYTHONPATH', '')}"})
+    stuck = three.add(
+        num_cpus=2,
+        env_vars={"PYTHONPATH": f"{tmp_path / 'site'}:{os.environ.get('PYTHONPATH', '')}"},
+    )
     (tmp_path / "notes").mkdir()
     items = [f"sleep 0.5 #{i}" for i in range(12)]
     with pool_on(three, Scripted(tmp_path / "notes"), start_s=PATIENCE_S) as pool:
@@ -209,26 +245,41 @@ def test_a_node_that_starts_no_process_is_set_aside_and_others_do_its_work(
     three.cluster.remove_node(stuck)
     aside = [line for line in said.splitlines() if "set aside" in line]
     assert len(aside) == 1
-    assert f"/{stuck.node_id[:8]} is set aside: no process has started there within {PATIENCE_S:g} s" in aside[0]
+    assert (
+        f"/{stuck.node_id[:8]} is set aside: no process has started there within {PATIENCE_S:g} s"
+        in aside[0]
+    )
 
 
 def test_an_only_node_whose_worker_is_never_ready_is_an_error_that_names_it(tmp_path: Path) -> None:
     versions = tmp_path / "site" / "scipy-0.0.1.dist-info"
     versions.mkdir(parents=True)
-    os.mkfifo(versions / "METADATA")  # reading it never ends, as on a file system that does not answer
-    one = Nodes(1, env_vars={"PYTHONPATH": f"{tmp_path / 'site'}:{os.environ.get('PYTHONPATH', '')}"})
+    os.mkfifo(
+        versions / "METADATA"
+    )  # reading it never ends, as on a file system that does not answer
+    one = Nodes(
+        1, env_vars={"PYTHONPATH": f"{tmp_path / 'site'}:{os.environ.get('PYTHONPATH', '')}"}
+    )
     head = str(one.cluster.head_node.node_id)
     try:
-        with pool_on(one, Scripted(tmp_path), start_s=PATIENCE_S) as pool, pytest.raises(InfrastructureError) as caught:
+        with (
+            pool_on(one, Scripted(tmp_path), start_s=PATIENCE_S) as pool,
+            pytest.raises(InfrastructureError) as caught,
+        ):
             dict(run_jobs(pool, ["a"], print))
     finally:
         one.close()
     assert caught.value.doing == "working on a Ray cluster"
-    assert f"/{head[:8]}: its worker has started, but was not ready within {PATIENCE_S:g} s" in caught.value.found
+    assert (
+        f"/{head[:8]}: its worker has started, but was not ready within {PATIENCE_S:g} s"
+        in caught.value.found
+    )
     assert "file systems of these nodes" in caught.value.do_this
 
 
-def test_a_node_whose_core_another_driver_holds_is_waited_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_node_whose_core_another_driver_holds_is_waited_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     import ray
 
     one = Nodes(1)
@@ -284,7 +335,9 @@ execute_run(cheap_plan((0, 1, 2)), Path(sys.argv[1]), None, ["simrun"], Announce
 """
 
 
-def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(tmp_path: Path, three: Nodes, repo: Path) -> None:
+def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(
+    tmp_path: Path, three: Nodes, repo: Path
+) -> None:
     command = [sys.executable, "-c", DRIVER, str(tmp_path / "run"), three.address]
     driver = subprocess.Popen(command, cwd=repo, env={**os.environ, "PYTHONPATH": str(repo)})
     until = time.monotonic() + 200
@@ -323,14 +376,20 @@ def tiny_disk(tmp_path: Path) -> Iterator[Path]:
     """Give a file system of 64 KiB, less than a rollout takes."""
     disk = tmp_path / "tiny"
     disk.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(disk)], check=False, capture_output=True)
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(disk)],
+        check=False,
+        capture_output=True,
+    )
     if mounted.returncode:
         pytest.skip(f"cannot mount a tiny disk: {mounted.stderr.decode().strip()}")
     yield disk
     subprocess.run(["umount", "--lazy", str(disk)], check=True)
 
 
-def test_a_node_whose_disk_is_full_is_set_aside(tmp_path: Path, three: Nodes, tiny_disk: Path) -> None:
+def test_a_node_whose_disk_is_full_is_set_aside(
+    tmp_path: Path, three: Nodes, tiny_disk: Path
+) -> None:
     full = three.add(env_vars={"SIMRUN_SCRATCH": str(tiny_disk)})
     result, announced = run(cheap_plan((0, 1, 2)), tmp_path / "run", on(three))
     three.cluster.remove_node(full)

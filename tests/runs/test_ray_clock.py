@@ -52,20 +52,29 @@ if os.environ.get("LD_PRELOAD") != {library!r}:  # Ray takes the variable from i
 """
 
 
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler to put a node's clock ahead")
+@pytest.mark.skipif(
+    shutil.which("gcc") is None, reason="needs a C compiler to put a node's clock ahead"
+)
 def test_a_node_whose_clock_is_a_day_ahead_gives_the_same_run(tmp_path: Path, three: Nodes) -> None:
     (tmp_path / "ahead.c").write_text(AHEAD)
     library = tmp_path / "ahead.so"
-    subprocess.run(["gcc", "-shared", "-fPIC", "-o", str(library), str(tmp_path / "ahead.c"), "-ldl"], check=True)
+    subprocess.run(
+        ["gcc", "-shared", "-fPIC", "-o", str(library), str(tmp_path / "ahead.c"), "-ldl"],
+        check=True,
+    )
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(BEGIN_AHEAD.format(library=str(library)))
-    ahead = three.add(env_vars={"PYTHONPATH": f"{tmp_path / 'site'}:{os.environ.get('PYTHONPATH', '')}"})
+    ahead = three.add(
+        env_vars={"PYTHONPATH": f"{tmp_path / 'site'}:{os.environ.get('PYTHONPATH', '')}"}
+    )
     (tmp_path / "notes").mkdir()
     scripted(three, Scripted(tmp_path / "notes"), [f"sleep 0.5 #{i}" for i in range(24)])
     _, announced = run(cheap_plan((0, 1)), tmp_path / "run", on(three))
     three.cluster.remove_node(ahead)
     days = dict(note.read_text().split() for note in (tmp_path / "notes").iterdir())
-    assert int(days.pop(next(name for name in days if ahead.node_id[:8] in name))) > max(map(int, days.values()))
+    assert int(days.pop(next(name for name in days if ahead.node_id[:8] in name))) > max(
+        map(int, days.values())
+    )
     assert announced.results == [("ok", False)] * 8
     run(cheap_plan((0, 1)), tmp_path / "here", Executor())
     assert comparable(tmp_path / "run") == comparable(tmp_path / "here")

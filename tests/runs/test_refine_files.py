@@ -1,4 +1,6 @@
-"""Refining video files: times kept, blocks of the fixer's rule, inputs that do not belong together, memory that does not grow."""
+"""Refining video files: times kept, blocks of the fixer's rule, inputs that do not belong together,
+memory that does not grow.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ RATE = Fraction(10)
 
 
 class Inverting:
-    """Returns negatives and remembers what it was given; where the opacity is low it puts the map."""
+    """Returns negatives and remembers what it was given; where the opacity is low it puts the
+    map.
+    """
 
     trained, label = True, "inverting"
 
@@ -45,17 +49,25 @@ class Inverting:
             image = 255 - frame.rgb
             if frame.alpha is not None and maps:
                 image = np.where(frame.alpha[..., None] < 0.5, maps[i], image)
-            out.append(replace(frame, rgb=image, events=("fixer-black",) if frame.rgb.max() < 3 else ()))
+            out.append(
+                replace(frame, rgb=image, events=("fixer-black",) if frame.rgb.max() < 3 else ())
+            )
         return out
 
 
 def pictures(n: int, width: int = 64, height: int = 36) -> list[U8]:
     x = np.linspace(0, 200, width, dtype=np.float32)
-    return [np.repeat(np.tile(x + i, (height, 1))[..., None], 3, 2).astype(np.uint8) for i in range(n)]
+    return [
+        np.repeat(np.tile(x + i, (height, 1))[..., None], 3, 2).astype(np.uint8) for i in range(n)
+    ]
 
 
 def video(
-    path: Path, frames: Sequence[U8], rate: Fraction = RATE, times: Sequence[int] | None = None, base: Fraction | None = None
+    path: Path,
+    frames: Sequence[U8],
+    rate: Fraction = RATE,
+    times: Sequence[int] | None = None,
+    base: Fraction | None = None,
 ) -> Path:
     with VideoWriter(path, base or 1 / rate, rate, crf=2) as writer:
         for i, image in enumerate(frames):
@@ -66,16 +78,22 @@ def video(
 def read(path: Path) -> tuple[list[Fraction], U8]:
     with VideoReader(path) as reader:
         frames = list(reader)
-        return [f.time * reader.format.time_base for f in frames], np.stack([f.image for f in frames])
+        return [f.time * reader.format.time_base for f in frames], np.stack(
+            [f.image for f in frames]
+        )
 
 
 @pytest.mark.parametrize(("n", "sizes"), [(1, [1]), (5, [5]), (6, [5, 1]), (22, [5, 8, 8, 1])])
-def test_every_length_is_cut_into_the_fixers_blocks(tmp_path: Path, n: int, sizes: list[int]) -> None:
+def test_every_length_is_cut_into_the_fixers_blocks(
+    tmp_path: Path, n: int, sizes: list[int]
+) -> None:
     fixer = Inverting()
     given = pictures(n)
     files = RefineFiles(video(tmp_path / "in.mp4", given), tmp_path / "out.mp4")
     done: list[tuple[int, int | None]] = []
-    summary = refine_video(files, lambda: fixer, lambda frames, claimed: done.append((frames, claimed)))
+    summary = refine_video(
+        files, lambda: fixer, lambda frames, claimed: done.append((frames, claimed))
+    )
     times, images = read(files.out)
     assert fixer.sizes == sizes
     assert done == [(sum(sizes[: i + 1]), n) for i in range(len(sizes))]
@@ -121,14 +139,18 @@ def test_opacity_and_map_reach_the_fixer_frame_by_frame(tmp_path: Path) -> None:
 
 def test_without_opacity_the_video_counts_as_opaque(tmp_path: Path) -> None:
     fixer = Inverting()
-    refine_video(RefineFiles(video(tmp_path / "in.mp4", pictures(3)), tmp_path / "out.mp4"), lambda: fixer)
+    refine_video(
+        RefineFiles(video(tmp_path / "in.mp4", pictures(3)), tmp_path / "out.mp4"), lambda: fixer
+    )
     assert all(frame.alpha is None for frame in fixer.seen)
 
 
 def test_guard_events_are_counted(tmp_path: Path) -> None:
     given = pictures(6)
     given[2] = np.zeros_like(given[2])
-    summary = refine_video(RefineFiles(video(tmp_path / "in.mp4", given), tmp_path / "out.mp4"), Inverting)
+    summary = refine_video(
+        RefineFiles(video(tmp_path / "in.mp4", given), tmp_path / "out.mp4"), Inverting
+    )
     assert summary.events == {"fixer-black": 1}
 
 
@@ -169,20 +191,47 @@ def misfits(folder: Path) -> dict[str, tuple[RefineFiles, str]]:
         "coloured": video(folder / "colour.mp4", coloured),
     }
     return {
-        "shorter opacity": (RefineFiles(source, out, side["shorter"]), "opacity has 8 frames, the input 9"),
-        "longer map": (RefineFiles(source, out, None, side["longer"]), "sdmap has 10 frames, the input 9"),
-        "larger map": (RefineFiles(source, out, None, side["larger"]), "sdmap is 80x48, the input 64x36"),
-        "faster opacity": (RefineFiles(source, out, side["faster"]), "12.000 frames per second, the input 10.000"),
-        "one frame late": (RefineFiles(source, out, None, side["late"]), "frames per second|frame 8 of the sdmap"),
+        "shorter opacity": (
+            RefineFiles(source, out, side["shorter"]),
+            "opacity has 8 frames, the input 9",
+        ),
+        "longer map": (
+            RefineFiles(source, out, None, side["longer"]),
+            "sdmap has 10 frames, the input 9",
+        ),
+        "larger map": (
+            RefineFiles(source, out, None, side["larger"]),
+            "sdmap is 80x48, the input 64x36",
+        ),
+        "faster opacity": (
+            RefineFiles(source, out, side["faster"]),
+            "12.000 frames per second, the input 10.000",
+        ),
+        "one frame late": (
+            RefineFiles(source, out, None, side["late"]),
+            "frames per second|frame 8 of the sdmap",
+        ),
         "coloured opacity": (RefineFiles(source, out, side["coloured"]), "opacity is coloured"),
         "no such input": (RefineFiles(folder / "none.mp4", out), "no such file"),
         "no such opacity": (RefineFiles(source, out, folder / "none.mp4"), "no such file"),
         "output exists": (RefineFiles(source, taken), "output exists already"),
         "comparison exists": (RefineFiles(source, out, compare=taken), "compare exists already"),
-        "output is the input": (RefineFiles(source, source, overwrite=True), "written over the input"),
-        "output is the input by another name": (RefineFiles(source, folder / "link.mp4", overwrite=True), "written over the input"),
-        "output is the map": (RefineFiles(source, taken, None, taken, overwrite=True), "written over the sdmap"),
-        "comparison is the output": (RefineFiles(source, out, compare=out), "written over the output"),
+        "output is the input": (
+            RefineFiles(source, source, overwrite=True),
+            "written over the input",
+        ),
+        "output is the input by another name": (
+            RefineFiles(source, folder / "link.mp4", overwrite=True),
+            "written over the input",
+        ),
+        "output is the map": (
+            RefineFiles(source, taken, None, taken, overwrite=True),
+            "written over the sdmap",
+        ),
+        "comparison is the output": (
+            RefineFiles(source, out, compare=out),
+            "written over the output",
+        ),
         "no folder": (RefineFiles(source, folder / "a" / "out.mp4"), "no folder"),
         "a folder": (RefineFiles(source, folder / "folder.mp4", overwrite=True), "is a folder"),
         "no MP4": (RefineFiles(source, folder / "out.avi"), "suffix '.avi'"),
@@ -211,16 +260,24 @@ SITUATIONS = (
 
 
 @pytest.mark.parametrize("situation", SITUATIONS)
-def test_files_that_do_not_belong_together_are_refused_and_nothing_is_written(tmp_path: Path, situation: str) -> None:
+def test_files_that_do_not_belong_together_are_refused_and_nothing_is_written(
+    tmp_path: Path, situation: str
+) -> None:
     files, found = misfits(tmp_path)[situation]
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
     with pytest.raises(InputError, match=found):
         refine_video(files, Inverting)
-    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert {
+        path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()
+    } == before
 
 
 def test_an_interrupted_video_leaves_nothing_and_the_same_call_completes_it(tmp_path: Path) -> None:
-    files = RefineFiles(video(tmp_path / "in.mp4", pictures(20)), tmp_path / "out.mp4", compare=tmp_path / "side.mp4")
+    files = RefineFiles(
+        video(tmp_path / "in.mp4", pictures(20)),
+        tmp_path / "out.mp4",
+        compare=tmp_path / "side.mp4",
+    )
 
     def stop(frames: int, claimed: int | None) -> None:
         if frames > 5:
@@ -245,5 +302,11 @@ def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
     def look(frames: int, claimed: int | None) -> None:
         held_mb.append(int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6)
 
-    refine_video(RefineFiles(source, tmp_path / "out.mp4"), lambda: make_fixer("identity", scene_id="video"), look)
-    assert held_mb[-1] - held_mb[len(held_mb) // 4] < 15  # holding the 180 frames between would take 31 MB
+    refine_video(
+        RefineFiles(source, tmp_path / "out.mp4"),
+        lambda: make_fixer("identity", scene_id="video"),
+        look,
+    )
+    assert (
+        held_mb[-1] - held_mb[len(held_mb) // 4] < 15
+    )  # holding the 180 frames between would take 31 MB

@@ -1,4 +1,6 @@
-"""Real driving videos through the fixer: a freeway at its own rate, a street with the map video of the same camera beside it."""
+"""Real driving videos through the fixer: a freeway at its own rate, a street with the map video of
+the same camera beside it.
+"""
 
 from __future__ import annotations
 
@@ -20,15 +22,24 @@ STREET = "cosmos-transfer/posttrain/{}/ftheta_camera_front_wide_120fov/av_002b81
 
 def small(source: Path, to: Path, size: tuple[int, int], frames: int) -> Path:
     """Copy the first frames at a smaller size, times and colours kept."""
-    with VideoReader(source) as video, VideoWriter(to, video.format.time_base, Fraction(25), video.format.colour) as out:
+    with (
+        VideoReader(source) as video,
+        VideoWriter(to, video.format.time_base, Fraction(25), video.format.colour) as out,
+    ):
         for timed, _ in zip(video, range(frames), strict=False):
-            out.write(np.asarray(cv2.resize(timed.image, size, interpolation=cv2.INTER_AREA)), timed.time, timed.duration)
+            out.write(
+                np.asarray(cv2.resize(timed.image, size, interpolation=cv2.INTER_AREA)),
+                timed.time,
+                timed.duration,
+            )
     return to
 
 
 def refine(capsys: pytest.CaptureFixture[str], *arguments: Path | str) -> dict[str, object]:
     untrained = ["--set", "fixer.weights.bundle=null", "--set", "fixer.holes=render"]
-    assert run_command(["refine", *map(str, arguments), *untrained, "--threads", "1", "--json"]) == 0
+    assert (
+        run_command(["refine", *map(str, arguments), *untrained, "--threads", "1", "--json"]) == 0
+    )
     document: dict[str, object] = json.loads(capsys.readouterr().out)
     return document
 
@@ -36,12 +47,18 @@ def refine(capsys: pytest.CaptureFixture[str], *arguments: Path | str) -> dict[s
 def times_and_images(path: Path) -> tuple[list[Fraction], U8]:
     with VideoReader(path) as video:
         frames = list(video)
-        return [frame.time * video.format.time_base for frame in frames], np.stack([frame.image for frame in frames])
+        return [frame.time * video.format.time_base for frame in frames], np.stack(
+            [frame.image for frame in frames]
+        )
 
 
 @pytest.mark.slow
-def test_a_freeway_of_an_odd_size_keeps_times_and_picture(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source = small(shared_data / FREEWAY, tmp_path / "in.mp4", (150, 84), 15)  # neither side a multiple of 16
+def test_a_freeway_of_an_odd_size_keeps_times_and_picture(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = small(
+        shared_data / FREEWAY, tmp_path / "in.mp4", (150, 84), 15
+    )  # neither side a multiple of 16
     summary = refine(capsys, source, "-o", tmp_path / "out.mp4")
     assert (summary["frames"], summary["fps"], summary["events"]) == (15, 25.0, {})
     before, after = times_and_images(source), times_and_images(tmp_path / "out.mp4")
@@ -49,9 +66,13 @@ def test_a_freeway_of_an_odd_size_keeps_times_and_picture(shared_data: Path, tmp
     assert np.abs(after[1].astype(int) - before[1]).mean() < 3  # an identity, then H.264
 
 
-def test_a_street_with_its_map_video(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_street_with_its_map_video(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     source = small(shared_data / STREET.format("videos"), tmp_path / "in.mp4", (128, 72), 13)
-    maps = small(shared_data / STREET.format("control_input_hdmap_bbox"), tmp_path / "map.mp4", (128, 72), 13)
+    maps = small(
+        shared_data / STREET.format("control_input_hdmap_bbox"), tmp_path / "map.mp4", (128, 72), 13
+    )
     options = ("--set", "fixer.untrained=random")  # an identity does not look at the map
     with_map = refine(capsys, source, "--sdmap", maps, "-o", tmp_path / "with.mp4", *options)
     without = refine(capsys, source, "-o", tmp_path / "without.mp4", *options)
@@ -62,17 +83,31 @@ def test_a_street_with_its_map_video(shared_data: Path, tmp_path: Path, capsys: 
 def test_the_map_video_as_published_has_another_size_and_is_refused(
     shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["refine", str(shared_data / STREET.format("videos")), "-o", str(tmp_path / "out.mp4")]
-    assert run_command([*command, "--sdmap", str(shared_data / STREET.format("control_input_hdmap_bbox"))]) == 2
+    command = [
+        "refine",
+        str(shared_data / STREET.format("videos")),
+        "-o",
+        str(tmp_path / "out.mp4"),
+    ]
+    assert (
+        run_command(
+            [*command, "--sdmap", str(shared_data / STREET.format("control_input_hdmap_bbox"))]
+        )
+        == 2
+    )
     assert "the sdmap is 1276x720, the input 1920x1080" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_the_whole_freeway_at_its_own_size(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_whole_freeway_at_its_own_size(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     summary = refine(capsys, shared_data / FREEWAY, "-o", tmp_path / "out.mp4")
     assert (summary["frames"], summary["width"], summary["height"]) == (221, 960, 540)
     assert summary["events"] == {}
     assert summary["audio_left_out"] is True
     with VideoReader(shared_data / FREEWAY) as before, VideoReader(tmp_path / "out.mp4") as after:
-        assert [f.time * before.format.time_base for f in before] == [f.time * after.format.time_base for f in after]
+        assert [f.time * before.format.time_base for f in before] == [
+            f.time * after.format.time_base for f in after
+        ]
         assert before.format.colour == after.format.colour

@@ -12,15 +12,28 @@ import pytest
 from alpasim_plugin import make_policy, make_renderer, run_rollout
 from alpasim_plugin.core.errors import InputError, PolicyError, RendererError
 from alpasim_plugin.core.geometry import interpolate, inverse, offset_trajectory
-from alpasim_plugin.core.types import Frame, Latency, Observation, Plan, RenderRequest, Route, Scenario, SensorSpec
+from alpasim_plugin.core.types import (
+    Frame,
+    Latency,
+    Observation,
+    Plan,
+    RenderRequest,
+    Route,
+    Scenario,
+    SensorSpec,
+)
 from alpasim_plugin.log.run_folder.schema import LOG_NAME
 from alpasim_plugin.runs.recorder import Recorder
 from tests.examples import first_of
 
 
-def drive(scenario: Scenario, policy: str, renderer: str = "clean", threads: int = 1, seed: int = 0) -> Recorder:
+def drive(
+    scenario: Scenario, policy: str, renderer: str = "clean", threads: int = 1, seed: int = 0
+) -> Recorder:
     session = make_renderer(renderer, scenario, seed, threads=threads)
-    return run_rollout(scenario, session, make_policy(policy, scenario), seed, Recorder(scenario, seed))
+    return run_rollout(
+        scenario, session, make_policy(policy, scenario), seed, Recorder(scenario, seed)
+    )
 
 
 def digest(recorder: Recorder) -> str:
@@ -31,7 +44,9 @@ def test_log_replay_reproduces_the_recorded_poses(straight_road: Scenario) -> No
     log = drive(straight_road, "log-replay").log()
     rig = offset_trajectory(log.ego, inverse(log.T_rig_box))
     recorded = interpolate(straight_road.ego_log, rig.t_us)
-    np.testing.assert_allclose(rig.xyz, recorded[:, :3, 3], atol=1e-4)  # poses are float32 in the log
+    np.testing.assert_allclose(
+        rig.xyz, recorded[:, :3, 3], atol=1e-4
+    )  # poses are float32 in the log
 
 
 def test_a_policy_without_cameras_renders_nothing(straight_road: Scenario) -> None:
@@ -40,7 +55,9 @@ def test_a_policy_without_cameras_renders_nothing(straight_road: Scenario) -> No
     assert "render" not in recorder.facts()["stage_ms"]
 
 
-def test_the_log_has_one_more_instant_than_steps_and_a_plan_for_each_step(straight_road: Scenario) -> None:
+def test_the_log_has_one_more_instant_than_steps_and_a_plan_for_each_step(
+    straight_road: Scenario,
+) -> None:
     recorder = drive(straight_road, "lane-camera")
     log = recorder.log()
     assert len(log.ego) == 31
@@ -51,14 +68,18 @@ def test_the_log_has_one_more_instant_than_steps_and_a_plan_for_each_step(straig
 
 def test_the_recorded_pose_is_forced_during_the_warm_up_only(straight_road: Scenario) -> None:
     log = drive(straight_road, "constant-velocity").log()
-    braking = run_rollout(straight_road, make_renderer("clean", straight_road), StandStill(), 0).log()
+    braking = run_rollout(
+        straight_road, make_renderer("clean", straight_road), StandStill(), 0
+    ).log()
     warm = log.ego.t_us <= 1_000_000
     np.testing.assert_allclose(braking.ego.xyz[warm], log.ego.xyz[warm], atol=1e-4)
     assert braking.ego.xyz[-1, 0] < log.ego.xyz[-1, 0] - 2.0
 
 
 @pytest.mark.parametrize("renderer", first_of(["3dgs", "clean"]))
-def test_the_same_rollout_twice_is_equal_to_the_byte_for_any_number_of_threads(straight_road: Scenario, renderer: str) -> None:
+def test_the_same_rollout_twice_is_equal_to_the_byte_for_any_number_of_threads(
+    straight_road: Scenario, renderer: str
+) -> None:
     once = digest(drive(straight_road, "lane-camera", renderer, threads=1))
     assert digest(drive(straight_road, "lane-camera", renderer, threads=2)) == once
 
@@ -142,7 +163,9 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("policy", "found"), BROKEN)
-def test_a_broken_policy_is_named_and_not_driven(straight_road: Scenario, policy: type[StandStill], found: str) -> None:
+def test_a_broken_policy_is_named_and_not_driven(
+    straight_road: Scenario, policy: type[StandStill], found: str
+) -> None:
     with pytest.raises(PolicyError, match=found):
         run_rollout(straight_road, make_renderer("clean", straight_road), policy(), 0)
 
@@ -161,8 +184,13 @@ class Breaks:
         raise RuntimeError("out of memory")
 
 
-@pytest.mark.parametrize(("renderer", "found"), [(WrongSize, r"uint8 \(2, 2, 3\), not uint8 \(64, 96, 3\)"), (Breaks, "out of memory")])
-def test_a_broken_renderer_is_named_and_its_frame_not_used(straight_road: Scenario, renderer: type, found: str) -> None:
+@pytest.mark.parametrize(
+    ("renderer", "found"),
+    [(WrongSize, r"uint8 \(2, 2, 3\), not uint8 \(64, 96, 3\)"), (Breaks, "out of memory")],
+)
+def test_a_broken_renderer_is_named_and_its_frame_not_used(
+    straight_road: Scenario, renderer: type, found: str
+) -> None:
     with pytest.raises(RendererError, match=found):
         run_rollout(straight_road, renderer(), StandStill(), 0)
 
@@ -171,7 +199,11 @@ class Black:
     """Gives black frames of the right form."""
 
     def render(self, request: RenderRequest) -> Frame:
-        return Frame(request.t_us, request.camera.name, np.zeros((request.camera.height, request.camera.width, 3), np.uint8))
+        return Frame(
+            request.t_us,
+            request.camera.name,
+            np.zeros((request.camera.height, request.camera.width, 3), np.uint8),
+        )
 
 
 def test_black_frames_are_counted_not_dropped(straight_road: Scenario) -> None:
@@ -184,7 +216,9 @@ def test_a_one_frame_scenario_is_refused(straight_road: Scenario) -> None:
         drive(replace(straight_road, end_us=straight_road.start_us), "log-replay")
 
 
-def test_a_policy_without_cameras_can_be_watched_and_nothing_else_changes(straight_road: Scenario, tmp_path: Path) -> None:
+def test_a_policy_without_cameras_can_be_watched_and_nothing_else_changes(
+    straight_road: Scenario, tmp_path: Path
+) -> None:
     logs, facts = [], []
     for keep in (False, True):
         folder = tmp_path / str(keep)
@@ -194,7 +228,13 @@ def test_a_policy_without_cameras_can_be_watched_and_nothing_else_changes(straig
         run_rollout(straight_road, make_renderer("clean", straight_road), policy, 0, recorder)
         recorder.save_pictures(video=keep)
         logs.append((folder / LOG_NAME).read_bytes())
-        facts.append({key: value for key, value in recorder.facts().items() if key not in ("stage_ms", "strip_t_us")})
+        facts.append(
+            {
+                key: value
+                for key, value in recorder.facts().items()
+                if key not in ("stage_ms", "strip_t_us")
+            }
+        )
     assert (tmp_path / "True" / "front.mp4").stat().st_size > 1000
     assert not (tmp_path / "False" / "front.mp4").exists()
     assert logs[0] == logs[1]

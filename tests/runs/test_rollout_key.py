@@ -1,4 +1,6 @@
-"""A rollout's key knows what its policy and its fixer load: other weights are another rollout, the same ones elsewhere are not."""
+"""A rollout's key knows what its policy and its fixer load: other weights are another rollout, the
+same ones elsewhere are not.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ def keys() -> list[str]:
     return [cell.rollout_key for cell in plan.cells]
 
 
-def test_other_weights_are_another_rollout_of_that_policy_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_weights_are_another_rollout_of_that_policy_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     blind, seeing = keys()
     assert keys() == [blind, seeing]
     monkeypatch.setattr(Learned, "files", (tmp_path / "other.safetensors",))
@@ -34,7 +38,17 @@ def test_other_weights_are_another_rollout_of_that_policy_alone(tmp_path: Path, 
 
 def fixed_key(*overrides: str) -> str:
     refs = expand("smoke/straight", ("timing.duration_us=1200000",))
-    return make_plan(refs, ("onefixer-dit-tiny",), ("pure-pursuit",), (0,), RunOptions(images="none", fixer=overrides)).cells[0].rollout_key
+    return (
+        make_plan(
+            refs,
+            ("onefixer-dit-tiny",),
+            ("pure-pursuit",),
+            (0,),
+            RunOptions(images="none", fixer=overrides),
+        )
+        .cells[0]
+        .rollout_key
+    )
 
 
 def test_a_fixers_weights_count_by_their_bytes_and_not_by_their_place(tmp_path: Path) -> None:

@@ -1,4 +1,6 @@
-"""What a node does for a run, here: it drives a cell from what it is sent, and shares what it measures with the run's other workers."""
+"""What a node does for a run, here: it drives a cell from what it is sent, and shares what it
+measures with the run's other workers.
+"""
 
 from __future__ import annotations
 
@@ -36,10 +38,20 @@ def test_workers_of_a_run_on_a_node_share_their_measurements(tmp_path: Path, mon
 def test_the_record_of_a_run_says_what_was_chosen_on_each_node() -> None:
     def manifest(node: str | None, precision: str) -> dict:
         facts = {"precision": {"name": precision}, "threads": {"number": 1}}
-        return {"renderer": "onefixer", "fixer": {"chosen": facts}} | ({"node": node} if node else {})
+        return {"renderer": "onefixer", "fixer": {"chosen": facts}} | (
+            {"node": node} if node else {}
+        )
 
-    found = chosen([manifest("a", "bf16"), manifest("b", "fp32"), manifest("a", "bf16"), manifest(None, "bf16"), {"renderer": "clean"}])
-    assert [(one["node"], one["precision"]["name"], one["rollouts"]) for one in found["onefixer"]] == [
-        ("a", "bf16", 2), ("b", "fp32", 1), (None, "bf16", 1)
-    ]  # fmt: skip
+    found = chosen(
+        [
+            manifest("a", "bf16"),
+            manifest("b", "fp32"),
+            manifest("a", "bf16"),
+            manifest(None, "bf16"),
+            {"renderer": "clean"},
+        ]
+    )
+    assert [
+        (one["node"], one["precision"]["name"], one["rollouts"]) for one in found["onefixer"]
+    ] == [("a", "bf16", 2), ("b", "fp32", 1), (None, "bf16", 1)]
     assert list(found) == ["onefixer"]

@@ -1,4 +1,6 @@
-"""A damaged run folder: damage is reported, only the damaged part is made again, and the tables are as before."""
+"""A damaged run folder: damage is reported, only the damaged part is made again, and the tables are
+as before.
+"""
 
 from __future__ import annotations
 
@@ -27,12 +29,22 @@ CELL = "rollouts/clean/constant-velocity/smoke-straight/0"
 
 def plan_of(seeds: tuple[int, ...] = (0, 1)) -> RunPlan:
     refs = expand("smoke/straight", ("timing.duration_us=600000",))
-    return make_plan(refs, ("clean", "broken-black"), ("constant-velocity",), seeds, RunOptions(images="none"))
+    return make_plan(
+        refs, ("clean", "broken-black"), ("constant-velocity",), seeds, RunOptions(images="none")
+    )
 
 
 def run(root: Path, plan: RunPlan | None = None) -> Announced:
     announced = Announced()
-    execute_run(plan or plan_of(), root, 1, ["simrun", "--seeds", "2"], announced, certificate="none", report=False)
+    execute_run(
+        plan or plan_of(),
+        root,
+        1,
+        ["simrun", "--seeds", "2"],
+        announced,
+        certificate="none",
+        report=False,
+    )
     return announced
 
 
@@ -68,7 +80,9 @@ def becomes(text: str) -> Callable[[Path], None]:
     return lambda path: path.write_text(text) and None  # type: ignore[return-value]
 
 
-DRIVE, SCORE, TABLES = "driving again", "scoring again", "writing it again"
+DRIVE = "driving again"
+SCORE = "scoring again"
+TABLES = "writing it again"
 DAMAGES = {
     "log removed": (f"{CELL}/rollout.asl", remove, DRIVE),
     "log cut": (f"{CELL}/rollout.asl", cut, DRIVE),
@@ -89,7 +103,10 @@ DAMAGES = {
 QUICK = ("log changed", "manifest a list", "steps cut", "run.json a list", "summary changed")
 of_damage = pytest.mark.parametrize(
     ("file", "damage", "remedy"),
-    [pytest.param(*case, id=name, marks=[] if name in QUICK else pytest.mark.slow) for name, case in DAMAGES.items()],
+    [
+        pytest.param(*case, id=name, marks=[] if name in QUICK else pytest.mark.slow)
+        for name, case in DAMAGES.items()
+    ],
 )
 
 
@@ -110,7 +127,12 @@ def test_the_next_run_tells_what_is_damaged_and_makes_only_that_again(
 
 @of_damage
 def test_check_finds_the_damage_and_its_repair_is_one(
-    made: Path, root: Path, file: str, damage: Callable[[Path], None], remedy: str, capsys: pytest.CaptureFixture[str]
+    made: Path,
+    root: Path,
+    file: str,
+    damage: Callable[[Path], None],
+    remedy: str,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     damage(root / file)
     assert run_command(["check", str(root), "--json"]) == 1
@@ -119,14 +141,25 @@ def test_check_finds_the_damage_and_its_repair_is_one(
     assert (found["whole"], found["damage"][0]["done"]) == (False, None)
     assert run_command(["check", str(root), "--repair", "--workers", "1", "--json"]) == 0
     done = json.loads(capsys.readouterr().out)["damage"][0]["done"]
-    assert done in ({DRIVE: ("run again",), SCORE: ("scored again",), TABLES: ("written again", "restored")}[remedy])
+    assert (
+        done
+        in (
+            {
+                DRIVE: ("run again",),
+                SCORE: ("scored again",),
+                TABLES: ("written again", "restored"),
+            }[remedy]
+        )
+    )
     assert run_command(["check", str(root)]) == 0
     assert "4 rollouts, 0 findings: whole" in capsys.readouterr().out
     assert comparable(root) == comparable(made)
 
 
 @pytest.mark.slow
-def test_readers_make_damaged_tables_again_and_name_damaged_rollouts(made: Path, root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_readers_make_damaged_tables_again_and_name_damaged_rollouts(
+    made: Path, root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(["compare", str(made)]) == 0
     wanted, told = capsys.readouterr()
     assert told == ""
@@ -140,7 +173,10 @@ def test_readers_make_damaged_tables_again_and_name_damaged_rollouts(made: Path,
     assert run_command(["compare", str(root)]) == 0
     shown, told = capsys.readouterr()
     assert shown == wanted
-    assert told == f"warning: damaged: {root}/{CELL}/rollout.asl: missing; the tables are whole; simrun check {root} --repair\n"
+    assert (
+        told
+        == f"warning: damaged: {root}/{CELL}/rollout.asl: missing; the tables are whole; simrun check {root} --repair\n"
+    )
     remove(root / "summary.json")
     assert run_command(["compare", str(root)]) == 2
     told = capsys.readouterr().err
@@ -158,7 +194,9 @@ def test_a_fork_and_a_scoring_need_the_log_itself(root: Path) -> None:
     assert f"simrun check {root} --repair" in caught.value.do_this
 
 
-def test_a_run_that_was_stopped_is_not_read_until_it_is_finished(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_that_was_stopped_is_not_read_until_it_is_finished(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (root / "contents.json").unlink()
     shutil.rmtree(root / CELL)
     assert run_command(["gate", str(root)]) == 2
@@ -169,22 +207,31 @@ def test_a_run_that_was_stopped_is_not_read_until_it_is_finished(root: Path, cap
     assert inspect_run(root).whole
 
 
-def test_what_has_neither_run_nor_contents_can_only_be_run_again(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_has_neither_run_nor_contents_can_only_be_run_again(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     becomes("{")(root / "run.json")
     becomes("[1]")(root / "contents.json")
     assert run_command(["check", str(root), "--repair"]) == 2
-    assert f"give the command of the run again: finished rollouts are kept (with --out {root})" in capsys.readouterr().err
+    assert (
+        f"give the command of the run again: finished rollouts are kept (with --out {root})"
+        in capsys.readouterr().err
+    )
     assert run(root).results == [("ok", True)] * 4
     assert inspect_run(root).whole
 
 
-def test_tables_that_were_copied_without_their_rollouts_can_be_read(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tables_that_were_copied_without_their_rollouts_can_be_read(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     shutil.rmtree(root / "rollouts")
     assert run_command(["compare", str(root)]) == 0
     assert "has no rollouts, only tables" in capsys.readouterr().err
 
 
-def test_a_read_only_folder_is_read_and_a_finished_run_in_it_is_its_own_result(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_read_only_folder_is_read_and_a_finished_run_in_it_is_its_own_result(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     inspect_run(root)  # sets the copy's times
     before = {path: path.stat().st_mtime_ns for path in root.rglob("*")}
     monkeypatch.setattr("alpasim_plugin.runs.run.os.access", lambda path, mode: False)
@@ -199,7 +246,12 @@ def test_left_overs_of_killed_writers_are_removed_and_nothing_else(root: Path) -
         return at / temporary_path(Path("a.json")).name.replace(f".{os.getpid()}.", f".{pid}.")
 
     gone = [named(2**22 + 1), named(2**22 + 2, root), named(2**22 + 3, root)]
-    kept = [named(os.getppid()), root / CELL / ".a.json.12.tmp", root / CELL / "note.tmp", root / "forks" / "f" / named(2**22 + 1).name]
+    kept = [
+        named(os.getppid()),
+        root / CELL / ".a.json.12.tmp",
+        root / CELL / "note.tmp",
+        root / "forks" / "f" / named(2**22 + 1).name,
+    ]
     kept[-1].parent.mkdir(parents=True)
     (root / "forks" / "f" / ".simrun.lock").touch()  # a run folder of its own
     for path in [*gone[:2], *kept]:

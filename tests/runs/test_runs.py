@@ -1,4 +1,6 @@
-"""Whole runs: workers, resume, failures, exit codes. Real parts throughout, on the shortest scenes."""
+"""Whole runs: workers, resume, failures, exit codes. Real parts throughout, on the shortest
+scenes.
+"""
 
 from __future__ import annotations
 
@@ -43,20 +45,28 @@ class Announced:
         self.notices.append(text)
 
 
-def plan_of(policies: tuple[str, ...] = ("lane-camera",), scenes: tuple[str, ...] = ("smoke/straight",)) -> RunPlan:
+def plan_of(
+    policies: tuple[str, ...] = ("lane-camera",), scenes: tuple[str, ...] = ("smoke/straight",)
+) -> RunPlan:
     refs = [ref for name in scenes for ref in expand(name, SHORT)]
     return make_plan(refs, ("clean", "3dgs"), policies, (0,), RunOptions())
 
 
 def cheap_plan(seeds: tuple[int, ...] = (0,)) -> RunPlan:
-    """Plan four rollouts a seed that render next to nothing: what is reused does not depend on the renderer."""
+    """Plan four rollouts a seed that render next to nothing: what is reused does not depend on the
+    renderer.
+    """
     refs = [ref for name in ("smoke/straight", "smoke/lead_car") for ref in expand(name, SHORT)]
     return make_plan(refs, (GREY,), ("constant-velocity", "pure-pursuit"), seeds, RunOptions())
 
 
-def run(plan: RunPlan, root: Path, workers: int = 1, resume: bool = False) -> tuple[RunResult, Announced]:
+def run(
+    plan: RunPlan, root: Path, workers: int = 1, resume: bool = False
+) -> tuple[RunResult, Announced]:
     announced = Announced()
-    return execute_run(plan, root, workers, ["simrun"], announced, resume, certificate="none", report=False), announced
+    return execute_run(
+        plan, root, workers, ["simrun"], announced, resume, certificate="none", report=False
+    ), announced
 
 
 def comparable(root: Path) -> dict[str, object]:
@@ -64,11 +74,21 @@ def comparable(root: Path) -> dict[str, object]:
     rows = pq.read_table(root / "rollouts.parquet").drop_columns(["wall_s"]).to_pylist()
     logs = {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("rollout.asl"))}
     steps = pq.read_table(root / "steps.parquet").to_pylist()
-    summary = {k: v for k, v in json.loads((root / "summary.json").read_text()).items() if k not in ("speed", "pool", "determinism")}
+    summary = {
+        k: v
+        for k, v in json.loads((root / "summary.json").read_text()).items()
+        if k not in ("speed", "pool", "determinism")
+    }
     return {"rows": repr(rows), "logs": logs, "steps": repr(steps), "summary": summary}
 
 
-@pytest.mark.parametrize("scenes", [("smoke/straight",), pytest.param(("smoke/straight", "smoke/lead_car"), marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "scenes",
+    [
+        ("smoke/straight",),
+        pytest.param(("smoke/straight", "smoke/lead_car"), marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.slow
 def test_one_and_two_workers_give_the_same_run(tmp_path: Path, scenes: tuple[str, ...]) -> None:
     _, one = run(plan_of(scenes=scenes), tmp_path / "one", workers=1)
@@ -89,7 +109,9 @@ def test_the_same_command_reuses_every_finished_rollout_and_runs_the_rest(tmp_pa
 
 
 @pytest.mark.slow
-def test_rollouts_driven_without_the_video_that_is_asked_for_are_driven_again(tmp_path: Path) -> None:
+def test_rollouts_driven_without_the_video_that_is_asked_for_are_driven_again(
+    tmp_path: Path,
+) -> None:
     def plan(video: str) -> RunPlan:
         refs = expand("smoke/straight", ("timing.duration_us=900000",))
         return make_plan(refs, (GREY,), ("log-replay",), (0,), RunOptions(video=video))  # type: ignore[arg-type]
@@ -98,7 +120,9 @@ def test_rollouts_driven_without_the_video_that_is_asked_for_are_driven_again(tm
     assert run(plan("all"), tmp_path, resume=True)[1].results == [("ok", False)]
     assert len(list(tmp_path.rglob("front.mp4"))) == 1
     assert run(plan("all"), tmp_path)[1].results == [("ok", True)]
-    assert run(plan("failures"), tmp_path, resume=True)[1].results == [("ok", True)]  # no event: nothing is asked for
+    assert run(plan("failures"), tmp_path, resume=True)[1].results == [
+        ("ok", True)
+    ]  # no event: nothing is asked for
 
 
 def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path: Path) -> None:
@@ -113,7 +137,13 @@ def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path: Path) -> 
 
 def test_a_failing_policy_is_the_policys_fault_and_not_driven_again_unasked(tmp_path: Path) -> None:
     broken = "tests.runs.broken_policies:Raises"
-    plan = make_plan(expand("smoke/straight", SHORT), (GREY,), ("constant-velocity", broken), (0, 1), RunOptions())
+    plan = make_plan(
+        expand("smoke/straight", SHORT),
+        (GREY,),
+        ("constant-velocity", broken),
+        (0, 1),
+        RunOptions(),
+    )
     result, _ = run(plan, tmp_path)
     assert (result.n_rollouts, result.n_failed, result.exit_code) == (4, 2, 2)
     assert result.summary["failures"]["by_class"] == {"policy": 2}
@@ -121,14 +151,32 @@ def test_a_failing_policy_is_the_policys_fault_and_not_driven_again_unasked(tmp_
     assert {row["failure_class"] for row in rows if row["policy"] == broken} == {"policy"}
     assert all(row["collision_any"] is None for row in rows if row["policy"] == broken)
     _, announced = run(plan, tmp_path)
-    assert sorted(announced.results) == [("failed", True), ("failed", True), ("ok", True), ("ok", True)]
+    assert sorted(announced.results) == [
+        ("failed", True),
+        ("failed", True),
+        ("ok", True),
+        ("ok", True),
+    ]
     announced = Announced()
-    execute_run(plan, tmp_path, 1, ["simrun"], announced, certificate="none", report=False, retry=True)
-    assert sorted(announced.results) == [("failed", False), ("failed", False), ("ok", True), ("ok", True)]
+    execute_run(
+        plan, tmp_path, 1, ["simrun"], announced, certificate="none", report=False, retry=True
+    )
+    assert sorted(announced.results) == [
+        ("failed", False),
+        ("failed", False),
+        ("ok", True),
+        ("ok", True),
+    ]
 
 
 def test_a_policy_without_its_file_is_tried_again(tmp_path: Path) -> None:
-    plan = make_plan(expand("smoke/straight", SHORT), (GREY,), ("tests.runs.broken_policies:MissesItsWeights",), (0,), RunOptions())
+    plan = make_plan(
+        expand("smoke/straight", SHORT),
+        (GREY,),
+        ("tests.runs.broken_policies:MissesItsWeights",),
+        (0,),
+        RunOptions(),
+    )
     result, _ = run(plan, tmp_path)
     assert result.summary["failures"]["cells"][0]["error"]["failure_class"] == "policy"
     assert run(plan, tmp_path)[1].results == [("failed", False)]  # the file may be there now
@@ -136,10 +184,14 @@ def test_a_policy_without_its_file_is_tried_again(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", [(0,), pytest.param((0, 1), marks=pytest.mark.slow)], ids=str)
-def test_a_worker_that_dies_takes_only_its_own_rollout(tmp_path: Path, seeds: tuple[int, ...]) -> None:
+def test_a_worker_that_dies_takes_only_its_own_rollout(
+    tmp_path: Path, seeds: tuple[int, ...]
+) -> None:
     refs = expand("smoke/straight", SHORT)
     killer = "tests.runs.broken_policies:KillsItsProcess"
-    plan = make_plan(refs, (GREY,), ("constant-velocity", killer, "pure-pursuit"), seeds, RunOptions())
+    plan = make_plan(
+        refs, (GREY,), ("constant-velocity", killer, "pure-pursuit"), seeds, RunOptions()
+    )
     result, _ = run(plan, tmp_path, workers=2)
     assert result.n_failed == len(seeds)
     assert {cell["policy"] for cell in result.summary["failures"]["cells"]} == {killer}
@@ -148,11 +200,38 @@ def test_a_worker_that_dies_takes_only_its_own_rollout(tmp_path: Path, seeds: tu
 
 @pytest.mark.slow
 def test_a_killed_run_loses_no_finished_rollout(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "alpasim_plugin.cli.main", "--renderer", "clean", "--policy", "lane-camera", "--seeds", "3"]
-    command += ["--set", SHORT[0], "--workers", "1", "--certify", "none", "--no-report", "--out", str(tmp_path), "smoke/straight"]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
+    command = [
+        sys.executable,
+        "-m",
+        "alpasim_plugin.cli.main",
+        "--renderer",
+        "clean",
+        "--policy",
+        "lane-camera",
+        "--seeds",
+        "3",
+    ]
+    command += [
+        "--set",
+        SHORT[0],
+        "--workers",
+        "1",
+        "--certify",
+        "none",
+        "--no-report",
+        "--out",
+        str(tmp_path),
+        "smoke/straight",
+    ]
+    process = subprocess.Popen(
+        command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True
+    )
     give_up = time.monotonic() + 90
-    while len(list(tmp_path.rglob(MANIFEST))) < 1 and time.monotonic() < give_up and process.poll() is None:
+    while (
+        len(list(tmp_path.rglob(MANIFEST))) < 1
+        and time.monotonic() < give_up
+        and process.poll() is None
+    ):
         time.sleep(0.02)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
@@ -166,7 +245,9 @@ def test_a_killed_run_loses_no_finished_rollout(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_full_disk_fails_the_rollout_and_keeps_the_finished_ones(tmp_path: Path) -> None:
-    """A file-size limit stands in for a full disk: the system refuses the same writes with an error of the same kind."""
+    """A file-size limit stands in for a full disk: the system refuses the same writes with an error
+    of the same kind.
+    """
     code = (
         "import resource, sys\n"
         "from alpasim_plugin.cli.main import run_command\n"
@@ -174,13 +255,33 @@ def test_a_full_disk_fails_the_rollout_and_keeps_the_finished_ones(tmp_path: Pat
         "resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))\n"
         "sys.exit(run_command(sys.argv[2:]))\n"
     )
-    common = ["--renderer", "clean", "--policy", "lane-camera", "--workers", "1", "--set", SHORT[0], "--certify", "none", "--resume"]
+    common = [
+        "--renderer",
+        "clean",
+        "--policy",
+        "lane-camera",
+        "--workers",
+        "1",
+        "--set",
+        SHORT[0],
+        "--certify",
+        "none",
+        "--resume",
+    ]
     common += ["--out", str(tmp_path)]
     base = [sys.executable, "-c", code]
-    fine = subprocess.run([*base, str(10**9), "--seeds", "0,1", *common, "smoke/straight"], capture_output=True, text=True)
+    fine = subprocess.run(
+        [*base, str(10**9), "--seeds", "0,1", *common, "smoke/straight"],
+        capture_output=True,
+        text=True,
+    )
     assert fine.returncode == 0, fine.stderr
     kept = {p: p.read_bytes() for p in tmp_path.rglob("rollout.asl")}
-    full = subprocess.run([*base, "20000", "--seeds", "0,1,2", *common, "smoke/straight"], capture_output=True, text=True)
+    full = subprocess.run(
+        [*base, "20000", "--seeds", "0,1,2", *common, "smoke/straight"],
+        capture_output=True,
+        text=True,
+    )
     assert full.returncode == 4, full.stderr
     assert "free disk space" in full.stderr or "File too large" in full.stderr
     assert {p: p.read_bytes() for p in kept} == kept
@@ -200,7 +301,10 @@ def test_what_two_suites_list_is_driven_once_and_another_scenario_of_its_id_is_r
     refs = [*expand("suites/smoke"), *expand("suites/hard")]  # both list hard/hard_brake
     plan = make_plan(refs, ("clean",), ("log-replay",), (0,), RunOptions())
     assert len(refs) == len(plan.cells) + 1
-    refs = [*expand("smoke/straight"), replace(expand("smoke/straight")[0], overrides=("timing.duration_us=2000000",))]
+    refs = [
+        *expand("smoke/straight"),
+        replace(expand("smoke/straight")[0], overrides=("timing.duration_us=2000000",)),
+    ]
     with pytest.raises(InputError, match="both have the scene id"):
         make_plan(refs, ("clean",), ("log-replay",), (0,), RunOptions())
 

@@ -1,4 +1,6 @@
-"""Scores of finished rollouts are made again when the evaluators have changed, and only then; nothing is driven again."""
+"""Scores of finished rollouts are made again when the evaluators have changed, and only then;
+nothing is driven again.
+"""
 
 from __future__ import annotations
 
@@ -28,13 +30,17 @@ def run(of: RunPlan, root: Path) -> list[tuple[str, bool]]:
     return announced.results
 
 
-def test_rollouts_are_scored_again_when_the_evaluators_changed_and_only_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rollouts_are_scored_again_when_the_evaluators_changed_and_only_then(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     old = one_rollout()
     run(old, tmp_path)
     folder = tmp_path / old.cells[0].folder
     scored = read_json(folder / MANIFEST)
     driven = (folder / LOG_NAME).stat().st_mtime_ns
-    older = scored["metrics"] | {"progress": scored["metrics"]["progress"] | {"value": -7.0}}  # as if other evaluators had made it
+    older = scored["metrics"] | {
+        "progress": scored["metrics"]["progress"] | {"value": -7.0}
+    }  # as if other evaluators had made it
     del scored[SEAL]
     write_manifest(folder, scored | {"metrics": older})
 
@@ -42,7 +48,11 @@ def test_rollouts_are_scored_again_when_the_evaluators_changed_and_only_then(tmp
     assert read_json(folder / MANIFEST)["metrics"] == older
 
     own = plan.own_code_digest
-    monkeypatch.setattr(plan, "own_code_digest", lambda module: own(module) + ("edited" if module.endswith("scoring") else ""))
+    monkeypatch.setattr(
+        plan,
+        "own_code_digest",
+        lambda module: own(module) + ("edited" if module.endswith("scoring") else ""),
+    )
     new = one_rollout()
     assert new.command_key == old.command_key  # the same folder
     assert run(new, tmp_path) == [("ok", True)]

@@ -33,12 +33,16 @@ NAMED = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bug", NAMED)
-def test_the_page_names_the_fault(bug: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_names_the_fault(
+    bug: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("alpasim_plugin.runs.trials.MOST_S", math.inf)  # on a busy machine too
     (tmp_path / "bend.yaml").write_text(BEND)
     policy = f"tests.runs.seeded_bugs:{bug}"
     plan = make_plan(expand(str(tmp_path / "bend.yaml")), (PAINTED,), (policy,), (0,), RunOptions())
-    execute_run(plan, tmp_path / "run", 1, ["simrun"], Announced(), certificate="none", report=False)
+    execute_run(
+        plan, tmp_path / "run", 1, ["simrun"], Announced(), certificate="none", report=False
+    )
     (folder,) = (path.parent for path in (tmp_path / "run").glob("rollouts/*/*/*/*/manifest.json"))
     capsys.readouterr()
     assert run_command(["why", str(folder), "--json"]) == 0

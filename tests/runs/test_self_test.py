@@ -1,4 +1,6 @@
-"""The gate's self-test: right only where every broken renderer is caught and the healthy control is not."""
+"""The gate's self-test: right only where every broken renderer is caught and the healthy control is
+not.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ def trial(spec: GateSpec, is_broken: bool, **candidate: float) -> Trial:
 
 
 def test_a_sensitive_gate_is_right_about_both() -> None:
-    spec = load_gate("default")[0].model_copy(update={"metrics": {"route_distance_m": MetricRule(margin=0.1)}})
+    spec = load_gate("default")[0].model_copy(
+        update={"metrics": {"route_distance_m": MetricRule(margin=0.1)}}
+    )
     assert spec.min_scenes > 12  # the self-test asks for no more scenes than its suite has
     caught = trial(spec, True, shift=0.5)
     assert (caught.is_right, caught.caught_by) == (True, ["route_distance_m"])
@@ -43,11 +47,15 @@ def test_undecided_is_not_caught() -> None:
 
 def test_the_suite_and_the_faults_are_the_documented_ones() -> None:
     assert len(load_suite(SUITE)) == 12
-    assert sorted(broken_renderers()) == [f"broken-{n}" for n in ("black", "blurred", "frozen", "late", "mirrored", "shifted")]
+    assert sorted(broken_renderers()) == [
+        f"broken-{n}" for n in ("black", "blurred", "frozen", "late", "mirrored", "shifted")
+    ]
 
 
 @pytest.mark.slow
-def test_the_default_gate_catches_every_broken_renderer_in_closed_loop(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_default_gate_catches_every_broken_renderer_in_closed_loop(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(["gate", "--self-test", "--out", str(tmp_path / "self")]) == 0
     out = capsys.readouterr().out
     assert out.count("caught by") == 6

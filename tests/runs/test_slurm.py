@@ -1,4 +1,5 @@
-"""Jobs through submitit's local executor: processes of this machine, but all of the way that jobs of Slurm take.
+"""Jobs through submitit's local executor: processes of this machine, but all of the way that jobs
+of Slurm take.
 
 `pytest -m slow tests/runs/test_slurm.py`, about a minute.
 """
@@ -25,7 +26,10 @@ from tests.runs.remote_work import Scripted
 from tests.runs.test_runs import Announced, cheap_plan, comparable
 
 pytest.importorskip("submitit", reason="the extra [slurm] is not installed")
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]  # most of the time goes by while processes start
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(1200),
+]  # most of the time goes by while processes start
 
 
 @pytest.fixture(autouse=True)
@@ -38,12 +42,18 @@ def private(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monkey
 
 
 def scripted(
-    work: Scripted, items: list[str], folder: Path, expected: dict[str, str] | None = None, contents: Contents | None = None
+    work: Scripted,
+    items: list[str],
+    folder: Path,
+    expected: dict[str, str] | None = None,
+    contents: Contents | None = None,
 ) -> dict:
     from alpasim_plugin.runs.executors.slurm_backend import SlurmBackend
 
     given = assignment_as_here(work, contents or Contents(), (), Resources(), 2, print)
-    pool: SlurmBackend[str] = SlurmBackend(given if expected is None else replace(given, expected=expected), "@local", folder)
+    pool: SlurmBackend[str] = SlurmBackend(
+        given if expected is None else replace(given, expected=expected), "@local", folder
+    )
     try:
         return dict(run_jobs(pool, items, print))
     finally:
@@ -53,9 +63,20 @@ def scripted(
 def test_jobs_give_the_run_of_one_process(tmp_path: Path, private: Path) -> None:
     announced = Announced()
     plan = cheap_plan()
-    execute_run(plan, tmp_path / "here", 1, ["simrun"], Announced(), certificate="none", report=False)
+    execute_run(
+        plan, tmp_path / "here", 1, ["simrun"], Announced(), certificate="none", report=False
+    )
     executor = Executor("slurm", "@local")
-    execute_run(plan, tmp_path / "jobs", 2, ["simrun"], announced, certificate="none", report=False, executor=executor)
+    execute_run(
+        plan,
+        tmp_path / "jobs",
+        2,
+        ["simrun"],
+        announced,
+        certificate="none",
+        report=False,
+        executor=executor,
+    )
     assert announced.results == [("ok", False)] * 4
     assert comparable(tmp_path / "jobs") == comparable(tmp_path / "here")
     assert list(private.iterdir()) == []
@@ -65,7 +86,9 @@ def test_every_item_has_a_result_though_jobs_die(tmp_path: Path) -> None:
     (notes := tmp_path / "notes").mkdir()
     contents = Contents()
     sha256 = contents.add_bytes(bytes(1000))
-    found = scripted(Scripted(notes), ["a", "die", "die once", f"fetch {sha256}"], tmp_path, contents=contents)
+    found = scripted(
+        Scripted(notes), ["a", "die", "die once", f"fetch {sha256}"], tmp_path, contents=contents
+    )
     lost = found.pop("die")
     assert isinstance(lost, Lost)
     assert "3 workers died of it" in lost.found
@@ -74,7 +97,9 @@ def test_every_item_has_a_result_though_jobs_die(tmp_path: Path) -> None:
 
 
 def test_a_node_of_another_version_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(InfrastructureError, match=r"no node takes the work: .*scipy is .*, the driver has 0\.0\.1"):
+    with pytest.raises(
+        InfrastructureError, match=r"no node takes the work: .*scipy is .*, the driver has 0\.0\.1"
+    ):
         scripted(Scripted(tmp_path), ["a"], tmp_path, {**identity_of(()), "scipy": "0.0.1"})
 
 
@@ -92,7 +117,9 @@ def test_a_killed_driver_leaves_results_that_the_next_one_takes_over(
 ) -> None:
     (notes := tmp_path / "notes").mkdir()
     driver = subprocess.Popen(
-        [sys.executable, "-c", DRIVER, str(notes), str(tmp_path)], cwd=repo, env={**os.environ, "PYTHONPATH": str(repo)}
+        [sys.executable, "-c", DRIVER, str(notes), str(tmp_path)],
+        cwd=repo,
+        env={**os.environ, "PYTHONPATH": str(repo)},
     )
 
     def until(there: Callable[[], object], what: str) -> None:
@@ -107,7 +134,9 @@ def test_a_killed_driver_leaves_results_that_the_next_one_takes_over(
     driver.wait()
     assert Path("/proc", str(job)).exists(), "a job of Slurm outlives its driver"
     (notes / "go").touch()
-    until(lambda: list(private.glob("*/*/*_result.pkl")), "the job that was let go leaves its result")
+    until(
+        lambda: list(private.glob("*/*/*_result.pkl")), "the job that was let go leaves its result"
+    )
     found = scripted(Scripted(notes), ["hold", "c"], tmp_path)
     assert found == {"hold": "HOLD", "c": "C"}
     assert len(list(notes.glob("hold.*"))) == 1, "it was done once, by the job of the killed driver"

@@ -1,4 +1,6 @@
-"""Work and results of Slurm's jobs are pickles: they are read from a folder of this user alone, never from a run folder."""
+"""Work and results of Slurm's jobs are pickles: they are read from a folder of this user alone,
+never from a run folder.
+"""
 
 from __future__ import annotations
 
@@ -32,13 +34,21 @@ def no_cluster(**settings: object) -> None:
 
 
 def open_in(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Open the jobs of a run as far as it goes without submitit and Slurm: what an earlier driver has left was taken over before."""
-    monkeypatch.setattr(slurm_backend, "require_library", lambda *words: SimpleNamespace(AutoExecutor=no_cluster))
+    """Open the jobs of a run as far as it goes without submitit and Slurm: what an earlier driver
+    has left was taken over before.
+    """
+    monkeypatch.setattr(
+        slurm_backend, "require_library", lambda *words: SimpleNamespace(AutoExecutor=no_cluster)
+    )
     with pytest.raises(InfrastructureError, match="no sbatch here"):
-        SlurmBackend(assignment_as_here(Scripted(run), Contents(), (), Resources(), 1, print), "", run)
+        SlurmBackend(
+            assignment_as_here(Scripted(run), Contents(), (), Resources(), 1, print), "", run
+        )
 
 
-def test_a_pickle_that_came_with_a_run_folder_does_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pickle_that_came_with_a_run_folder_does_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("SIMRUN_SLURM", str(tmp_path / "private"))
     run, made = tmp_path / "run", tmp_path / "made"
     for session in (run / ".slurm" / "1.abc", run / "slurm" / "1.abc", run):
@@ -49,7 +59,9 @@ def test_a_pickle_that_came_with_a_run_folder_does_not_run(tmp_path: Path, monke
     assert not made.exists()
 
 
-def test_a_session_of_this_user_is_taken_over_from_outside_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_session_of_this_user_is_taken_over_from_outside_of_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("SIMRUN_SLURM", str(tmp_path / "private"))
     (run := tmp_path / "run").mkdir()
     sessions = sessions_folder(run)
@@ -62,8 +74,16 @@ def test_a_session_of_this_user_is_taken_over_from_outside_of_the_run(tmp_path: 
     assert not (sessions / "1.abc").exists()
 
 
-@pytest.mark.parametrize("spoil", [lambda path: path.chmod(0o770), lambda path: path.rename(path.with_name("x")) and path.symlink_to("x")])
-def test_a_folder_that_another_user_could_write_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoil) -> None:
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda path: path.chmod(0o770),
+        lambda path: path.rename(path.with_name("x")) and path.symlink_to("x"),
+    ],
+)
+def test_a_folder_that_another_user_could_write_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoil
+) -> None:
     monkeypatch.setenv("SIMRUN_SLURM", str(tmp_path / "private"))
     (sessions := sessions_folder(tmp_path / "run")).rmdir()
     spoil(sessions.parent)

@@ -1,4 +1,5 @@
-"""Stores by URL: each rollout committed once, whoever drives it, and a store that goes away and comes back.
+"""Stores by URL: each rollout committed once, whoever drives it, and a store that goes away and
+comes back.
 
 `pytest -m "" tests/runs/test_stores.py` also talks to moto's S3 server, about a minute and a half.
 """
@@ -18,7 +19,15 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.runs.commits import Commits, FolderObjects, Index, Objects, RemoteObjects, RolloutResult, open_objects
+from alpasim_plugin.runs.commits import (
+    Commits,
+    FolderObjects,
+    Index,
+    Objects,
+    RemoteObjects,
+    RolloutResult,
+    open_objects,
+)
 from alpasim_plugin.runs.executors.base import Node
 from alpasim_plugin.runs.run import execute_run
 from tests.runs.s3_server import Line, s3_line
@@ -28,7 +37,10 @@ from tests.runs.test_runs import Announced, cheap_plan, comparable
 def result(text: str) -> RolloutResult:
     data = text.encode()
     facts = {"bytes": len(data), "mtime_ns": 0, "sha256": hashlib.sha256(data).hexdigest()}
-    return RolloutResult({"path": "rollouts/a/b/c/0", "status": "ok", "files": {"rollout.asl": facts}}, {"rollout.asl": data})
+    return RolloutResult(
+        {"path": "rollouts/a/b/c/0", "status": "ok", "files": {"rollout.asl": facts}},
+        {"rollout.asl": data},
+    )
 
 
 def check_objects(objects: Objects) -> None:
@@ -90,7 +102,10 @@ def test_two_drivers_write_one_index(tmp_path: Path) -> None:
     later = Index(FolderObjects(tmp_path))
     later.load()
     assert later.keys == other.keys == {"a", "b", "c"}
-    assert sorted(path.name for path in (tmp_path / "index").iterdir()) == ["000000.json", "000001.json"]
+    assert sorted(path.name for path in (tmp_path / "index").iterdir()) == [
+        "000000.json",
+        "000001.json",
+    ]
 
 
 def test_a_full_part_of_the_index_is_written_at_once(tmp_path: Path) -> None:
@@ -121,16 +136,28 @@ def test_the_answer_to_a_commit_that_was_lost_is_no_second_rollout(tmp_path: Pat
 def test_a_run_with_a_store_is_taken_from_it_into_an_empty_folder(tmp_path: Path) -> None:
     plan, store = cheap_plan(), str(tmp_path / "store")
     first, again = Announced(), Announced()
-    execute_run(plan, tmp_path / "plain", 1, ["simrun"], Announced(), certificate="none", report=False)
-    execute_run(plan, tmp_path / "one", 1, ["simrun"], first, certificate="none", report=False, store=store)
-    execute_run(plan, tmp_path / "two", 1, ["simrun"], again, certificate="none", report=False, store=store)
+    execute_run(
+        plan, tmp_path / "plain", 1, ["simrun"], Announced(), certificate="none", report=False
+    )
+    execute_run(
+        plan, tmp_path / "one", 1, ["simrun"], first, certificate="none", report=False, store=store
+    )
+    execute_run(
+        plan, tmp_path / "two", 1, ["simrun"], again, certificate="none", report=False, store=store
+    )
     assert first.results == [("ok", False)] * 4
     assert again.results == [("ok", True)] * 4
-    assert comparable(tmp_path / "one") == comparable(tmp_path / "two") == comparable(tmp_path / "plain")
+    assert (
+        comparable(tmp_path / "one")
+        == comparable(tmp_path / "two")
+        == comparable(tmp_path / "plain")
+    )
     one, two = (pq.read_table(tmp_path / name / "rollouts.parquet") for name in ("one", "two"))
     assert one == two, "wall_s too: it is the same drive"
     latest = tmp_path / "store" / (tmp_path / "store" / "latest").read_text()
-    assert (latest / "rollouts.parquet").read_bytes() == (tmp_path / "two" / "rollouts.parquet").read_bytes()
+    assert (latest / "rollouts.parquet").read_bytes() == (
+        tmp_path / "two" / "rollouts.parquet"
+    ).read_bytes()
 
 
 DRIVER = """
@@ -145,7 +172,9 @@ execute_run(cheap_plan((0, 1)), Path(sys.argv[1]), 1, ["simrun"], Announced(), c
 
 def driver(repo: Path, root: Path, store: str, **environment: str) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-c", DRIVER, str(root), store]
-    return subprocess.Popen(command, cwd=repo, env={**os.environ, "PYTHONPATH": str(repo), **environment})
+    return subprocess.Popen(
+        command, cwd=repo, env={**os.environ, "PYTHONPATH": str(repo), **environment}
+    )
 
 
 @pytest.mark.slow
@@ -170,9 +199,28 @@ def test_a_killed_driver_goes_on_from_another_folder(tmp_path: Path, repo: Path)
     first.wait()
     kept = {path.name: path.read_bytes() for path in store.glob("commits/*/*.json")}
     announced = Announced()
-    execute_run(cheap_plan((0, 1)), tmp_path / "two", 1, ["simrun"], announced, certificate="none", report=False, store=str(store))
-    assert all((store / "commits" / name[:2] / name).read_bytes() == data for name, data in kept.items())
-    execute_run(cheap_plan((0, 1)), tmp_path / "plain", 1, ["simrun"], Announced(), certificate="none", report=False)
+    execute_run(
+        cheap_plan((0, 1)),
+        tmp_path / "two",
+        1,
+        ["simrun"],
+        announced,
+        certificate="none",
+        report=False,
+        store=str(store),
+    )
+    assert all(
+        (store / "commits" / name[:2] / name).read_bytes() == data for name, data in kept.items()
+    )
+    execute_run(
+        cheap_plan((0, 1)),
+        tmp_path / "plain",
+        1,
+        ["simrun"],
+        Announced(),
+        certificate="none",
+        report=False,
+    )
     assert comparable(tmp_path / "two") == comparable(tmp_path / "plain")
 
 
@@ -194,7 +242,9 @@ def test_a_bucket_keeps_the_same_promises(s3: Line) -> None:
 
 
 @pytest.mark.slow
-def test_a_store_that_is_away_for_30_s_costs_time_and_nothing_else(tmp_path: Path, repo: Path, s3: Line) -> None:
+def test_a_store_that_is_away_for_30_s_costs_time_and_nothing_else(
+    tmp_path: Path, repo: Path, s3: Line
+) -> None:
     away_s = 30.0
     one = driver(repo, tmp_path / "one", "s3://runs/away")
     objects = open_objects("s3://runs/away")
@@ -212,7 +262,15 @@ def test_a_store_that_is_away_for_30_s_costs_time_and_nothing_else(tmp_path: Pat
     index = Index(objects)
     index.load()
     assert len(index.keys) == 8
-    execute_run(cheap_plan((0, 1)), tmp_path / "plain", 1, ["simrun"], Announced(), certificate="none", report=False)
+    execute_run(
+        cheap_plan((0, 1)),
+        tmp_path / "plain",
+        1,
+        ["simrun"],
+        Announced(),
+        certificate="none",
+        report=False,
+    )
     assert comparable(tmp_path / "one") == comparable(tmp_path / "plain")
 
 
@@ -226,7 +284,9 @@ def test_a_store_that_stays_away_is_an_error_that_names_it(s3: Line) -> None:
         RemoteObjects(system, root, "s3://runs/gone", patience_s=1.0).read("a")
 
 
-def test_a_node_fetches_a_content_once_and_refuses_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_node_fetches_a_content_once_and_refuses_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from alpasim_plugin.runs.executors.assignment import place
 
     monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path))

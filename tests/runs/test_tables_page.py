@@ -1,4 +1,6 @@
-"""The queries of docs/tables.md, run as they stand there and compared with the run's own statistics."""
+"""The queries of docs/tables.md, run as they stand there and compared with the run's own
+statistics.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,13 @@ FAILED = ("3dgs", "smoke-straight", 1)
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Give a folder with ``runs/mine`` and ``runs/other``; one rollout of the first failed."""
     root = tmp_path_factory.mktemp("tables")
-    small: dict[str, Any] = {"scenes": SCENES, "seeds": (0, 1), "steps": 20, "pictures": False, "clips": False}
+    small: dict[str, Any] = {
+        "scenes": SCENES,
+        "seeds": (0, 1),
+        "steps": 20,
+        "pictures": False,
+        "clips": False,
+    }
     make_run(root / "runs" / "mine", Plan(renderers=("clean", "3dgs"), fail=[FAILED], **small))
     make_run(root / "runs" / "other", Plan(renderers=("clean",), rng_seed=8, **small))
     return root
@@ -35,7 +43,11 @@ def run(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
 
 
 def blocks(repo: Path, language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", (repo / "docs" / "tables.md").read_text(encoding="utf-8"), re.S | re.M)
+    return re.findall(
+        rf"^```{language}\n(.*?)^```",
+        (repo / "docs" / "tables.md").read_text(encoding="utf-8"),
+        re.S | re.M,
+    )
 
 
 def rows(repo: Path, number: int) -> list[dict[str, Any]]:
@@ -63,9 +75,15 @@ def test_means_of_many_runs_are_those_of_their_summaries(repo: Path, run: Run) -
 def test_paired_differences_are_those_of_the_summary(repo: Path, run: Run) -> None:
     found = {row["scene"]: row for row in rows(repo, 1)}
     stated = run.summary["paired"]["3dgs"]["lateral_distance_m"]
-    assert {scene: row["pairs"] for scene, row in found.items()} == {scene: 1 if scene == FAILED[1] else 2 for scene in SCENES}
-    assert sum(row["worse_by_m"] for row in found.values()) / len(found) == pytest.approx(stated["diff"], rel=1e-12)
-    assert [row["worse_by_m"] for row in found.values()] == sorted((row["worse_by_m"] for row in found.values()), reverse=True)
+    assert {scene: row["pairs"] for scene, row in found.items()} == {
+        scene: 1 if scene == FAILED[1] else 2 for scene in SCENES
+    }
+    assert sum(row["worse_by_m"] for row in found.values()) / len(found) == pytest.approx(
+        stated["diff"], rel=1e-12
+    )
+    assert [row["worse_by_m"] for row in found.values()] == sorted(
+        (row["worse_by_m"] for row in found.values()), reverse=True
+    )
 
 
 def test_the_farthest_instant_is_that_of_the_series(repo: Path, run: Run) -> None:
@@ -73,7 +91,9 @@ def test_the_farthest_instant_is_that_of_the_series(repo: Path, run: Run) -> Non
     found = rows(repo, 2)
     assert len(found) == min(10, len(series))
     for row in found:
-        t_us, value = series[row["renderer"], "lane-camera", row["scene"], row["seed"]]["lateral_bias_m"]
+        t_us, value = series[row["renderer"], "lane-camera", row["scene"], row["seed"]][
+            "lateral_bias_m"
+        ]
         at = abs(value).argmax()
         assert (row["most_m"], row["at_s"]) == pytest.approx((abs(value[at]), 1e-6 * t_us[at]))
 
@@ -84,6 +104,12 @@ def test_the_page_in_pandas_gives_the_same(repo: Path, run: Run) -> None:
     exec(block, names)
     means, worse = names["means"], names["worse_by_m"]
     assert isinstance(means, pd.DataFrame)
-    assert means.loc[("clean", "lane-camera"), "offroad"] == pytest.approx(run.summary["metrics"]["clean"]["offroad"]["mean"])
-    assert worse.mean() == pytest.approx(run.summary["paired"]["3dgs"]["lateral_distance_m"]["diff"])
-    assert {scene: pytest.approx(value) for scene, value in worse.items()} == {row["scene"]: row["worse_by_m"] for row in rows(repo, 1)}
+    assert means.loc[("clean", "lane-camera"), "offroad"] == pytest.approx(
+        run.summary["metrics"]["clean"]["offroad"]["mean"]
+    )
+    assert worse.mean() == pytest.approx(
+        run.summary["paired"]["3dgs"]["lateral_distance_m"]["diff"]
+    )
+    assert {scene: pytest.approx(value) for scene, value in worse.items()} == {
+        row["scene"]: row["worse_by_m"] for row in rows(repo, 1)
+    }

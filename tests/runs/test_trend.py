@@ -23,9 +23,35 @@ BETTER, WORSE = {"onefixer": -0.1}, {"onefixer": 0.3}
 OTHER_SCENE = {**SCENES, "smoke-curve": "ff" * 32}
 NIGHTS = (
     Many("a", DAYS[0], COMMITS[0], committed_at=DAYS[0], noise_m=0.01),
-    Many("b", DAYS[1], COMMITS[1], committed_at=DAYS[1], noise_m=0.01, shift_m=BETTER, weights="abc123" + "0" * 58),
-    Many("c", DAYS[2], COMMITS[2], committed_at=DAYS[2], noise_m=0.01, shift_m=WORSE, weights="abc123" + "0" * 58, code="b" * 64),
-    Many("d", DAYS[3], COMMITS[2], committed_at=DAYS[2], noise_m=0.01, shift_m=WORSE, renderers=("onefixer",), code="b" * 64),
+    Many(
+        "b",
+        DAYS[1],
+        COMMITS[1],
+        committed_at=DAYS[1],
+        noise_m=0.01,
+        shift_m=BETTER,
+        weights="abc123" + "0" * 58,
+    ),
+    Many(
+        "c",
+        DAYS[2],
+        COMMITS[2],
+        committed_at=DAYS[2],
+        noise_m=0.01,
+        shift_m=WORSE,
+        weights="abc123" + "0" * 58,
+        code="b" * 64,
+    ),
+    Many(
+        "d",
+        DAYS[3],
+        COMMITS[2],
+        committed_at=DAYS[2],
+        noise_m=0.01,
+        shift_m=WORSE,
+        renderers=("onefixer",),
+        code="b" * 64,
+    ),
     Many("other-scene", DAYS[4], scenes=OTHER_SCENE),
     Many("other-seeds", DAYS[4], seeds=(0, 1, 2)),
     Many("other-preset", DAYS[4], preset="strict"),
@@ -52,36 +78,62 @@ def test_only_comparable_runs_are_joined_and_the_others_are_named(found: Trend) 
     (series,) = found.series
     assert [run.folder.name for run in series.runs] == ["a", "b", "c", "d"]
     assert found.by_commit  # "d" has the commit of "c" and was begun later
-    lines = {(line.metric, line.renderer): [run.folder.name for run in line.runs] for line in series.lines}
+    lines = {
+        (line.metric, line.renderer): [run.folder.name for run in line.runs]
+        for line in series.lines
+    }
     assert lines["lateral_distance_m", "clean"] == ["a", "b", "c"]  # "d" did not drive clean
     assert lines["lateral_distance_m", "onefixer"] == ["a", "b", "c", "d"]
     alone = "no other run has its scenes, seeds, policy and preset"
     reasons = {entry.folder.name: why for entry, why in found.left_out}
-    assert reasons == {f"other-{what}": alone for what in ("scene", "seeds", "preset", "policy")} | {
+    assert reasons == {
+        f"other-{what}": alone for what in ("scene", "seeds", "preset", "policy")
+    } | {
         "forked": "a fork of one rollout",
         "killed": "unfinished",
     }
 
 
 def test_a_step_has_the_numbers_of_simrun_compare(root: Path, found: Trend) -> None:
-    (line,) = (line for line in found.series[0].lines if (line.metric, line.renderer) == ("lateral_distance_m", "onefixer"))
+    (line,) = (
+        line
+        for line in found.series[0].lines
+        if (line.metric, line.renderer) == ("lateral_distance_m", "onefixer")
+    )
     for step in (*line.steps, line.whole):
-        other = compare_runs(read_run(step.before.folder), read_run(step.after.folder)).paired["onefixer"]["lateral_distance_m"]
+        other = compare_runs(read_run(step.before.folder), read_run(step.after.folder)).paired[
+            "onefixer"
+        ]["lateral_distance_m"]
         same = ("diff", "ci95", "p_value", "verdict", "difference", "n_cells", "n_scenes")
         assert {key: step.entry[key] for key in same} == {key: other[key] for key in same}
-    assert {step.entry["difference"] for step in line.steps} == {"none shown"}, "of scenes that were not drawn little is known"
+    assert {step.entry["difference"] for step in line.steps} == {"none shown"}, (
+        "of scenes that were not drawn little is known"
+    )
     assert [step.moved for step in line.steps] == [True, True, False]
     assert (line.whole.before.folder.name, line.whole.after.folder.name) == ("a", "d")
     assert line.whole.moved
 
 
 def test_each_step_names_what_could_have_moved_it(found: Trend) -> None:
-    (line,) = (line for line in found.series[0].lines if (line.metric, line.renderer) == ("lateral_distance_m", "onefixer"))
+    (line,) = (
+        line
+        for line in found.series[0].lines
+        if (line.metric, line.renderer) == ("lateral_distance_m", "onefixer")
+    )
     said = [[change.what for change in step.changes] for step in line.steps]
-    assert said[:2] == [["weights onefixer.safetensors", "commit"], ["policy lane-camera: code", "commit"]]
+    assert said[:2] == [
+        ["weights onefixer.safetensors", "commit"],
+        ["policy lane-camera: code", "commit"],
+    ]
     assert said[2] == ["weights onefixer.safetensors"]  # back to the first ones
-    (clean,) = (line for line in found.series[0].lines if (line.metric, line.renderer) == ("lateral_distance_m", "clean"))
-    assert [change.what for change in clean.steps[0].changes] == ["commit"]  # the fixer's weights are no part of clean
+    (clean,) = (
+        line
+        for line in found.series[0].lines
+        if (line.metric, line.renderer) == ("lateral_distance_m", "clean")
+    )
+    assert [change.what for change in clean.steps[0].changes] == [
+        "commit"
+    ]  # the fixer's weights are no part of clean
 
 
 def entry_of(**facts: Any) -> RunEntry:
@@ -98,20 +150,41 @@ def settings_of(**values: Any) -> Mapping[str, Any]:
     ("before", "after", "named"),
     [
         (entry_of(), entry_of(), []),
-        (entry_of(), entry_of(more={"started_at": DAYS[6], "config": {"images": "jpeg", "workers": 8, "video": "all"}}), []),
+        (
+            entry_of(),
+            entry_of(
+                more={
+                    "started_at": DAYS[6],
+                    "config": {"images": "jpeg", "workers": 8, "video": "all"},
+                }
+            ),
+            [],
+        ),
         (entry_of(), entry_of(dirty=True), ["commit 3f2a9c1 → 3f2a9c1+"]),
         (entry_of(), entry_of(more={"config": {"images": "png"}}), ["--images jpeg → png"]),
-        (entry_of(), entry_of(more={"versions": {"torch": "2.14.0"}}), ["version of torch 2.13.0 → 2.14.0"]),
+        (
+            entry_of(),
+            entry_of(more={"versions": {"torch": "2.14.0"}}),
+            ["version of torch 2.13.0 → 2.14.0"],
+        ),
         (entry_of(), entry_of(more={"hardware": {"cpu": "y", "cores": 2}}), ["machine: cpu x → y"]),
-        (entry_of(), entry_of(more={"code": {"loop": "3" * 12, "scoring": "2" * 12}}), [f"code of the loop {'1' * 12} → {'3' * 12}"]),
+        (
+            entry_of(),
+            entry_of(more={"code": {"loop": "3" * 12, "scoring": "2" * 12}}),
+            [f"code of the loop {'1' * 12} → {'3' * 12}"],
+        ),
         (
             entry_of(more=settings_of(steps=[1000.0])),
             entry_of(more=settings_of(steps=[500.0])),
             ["fixer onefixer: steps [1000.0] → [500.0]"],
         ),
         (
-            entry_of(more={"scenes": {"s": {"content_hash": "a" * 64, "reconstruction": "1" * 32}}}),
-            entry_of(more={"scenes": {"s": {"content_hash": "a" * 64, "reconstruction": "2" * 32}}}),
+            entry_of(
+                more={"scenes": {"s": {"content_hash": "a" * 64, "reconstruction": "1" * 32}}}
+            ),
+            entry_of(
+                more={"scenes": {"s": {"content_hash": "a" * 64, "reconstruction": "2" * 32}}}
+            ),
             [f"reconstruction of s {'1' * 12} → {'2' * 12}"],
         ),
     ],
@@ -127,16 +200,24 @@ def test_rollouts_that_differ_without_a_cause_are_listed(tmp_path: Path) -> None
     ((step,),) = (line.steps for line in series.lines)
     assert step.changes == ()
     assert step.unexplained
-    assert "nothing that run.json keeps" in render_trend(trend(find_runs([tmp_path], True), ["lateral_distance_m"]), [tmp_path], tmp_path)
+    assert "nothing that run.json keeps" in render_trend(
+        trend(find_runs([tmp_path], True), ["lateral_distance_m"]), [tmp_path], tmp_path
+    )
 
 
 def test_the_page_holds_its_numbers_as_text_and_asks_for_nothing(root: Path, found: Trend) -> None:
     page = render_trend(found, [root], root.parent)
     assert re.search(r"default-src 'none'.*script-src 'sha256-[A-Za-z0-9+/=]+'", page)
-    assert not re.findall(r"(?:src|href)=\"(?!#|data:)[^\"]*\"", page)  # none of these runs has a report to link to
+    assert not re.findall(
+        r"(?:src|href)=\"(?!#|data:)[^\"]*\"", page
+    )  # none of these runs has a report to link to
     assert page.count('role="img"') == page.count('role="img" aria-label="') == 2
     assert "2 steps of 10 moved a metric" in page.replace("\u00a0", " ")
-    (line,) = (line for line in found.series[0].lines if (line.metric, line.renderer) == ("lateral_distance_m", "onefixer"))
+    (line,) = (
+        line
+        for line in found.series[0].lines
+        if (line.metric, line.renderer) == ("lateral_distance_m", "onefixer")
+    )
     for run in line.runs:
         mean = run.metric("lateral_distance_m", "onefixer", "lane-camera")["mean"]
         assert f">{mean:.3f} m (" in page
@@ -146,7 +227,19 @@ def test_the_page_holds_its_numbers_as_text_and_asks_for_nothing(root: Path, fou
 def test_the_page_links_to_reports_beside_it(tmp_path: Path) -> None:
     for k, name in enumerate("ab"):
         (make_one(tmp_path / "my runs", Many(name, DAYS[k])) / "report.html").touch()
-    assert run_command(["runs", str(tmp_path / "my runs"), "--trend", str(tmp_path / "t.html"), "--metric", "progress"]) == 0
+    assert (
+        run_command(
+            [
+                "runs",
+                str(tmp_path / "my runs"),
+                "--trend",
+                str(tmp_path / "t.html"),
+                "--metric",
+                "progress",
+            ]
+        )
+        == 0
+    )
     assert 'href="my%20runs/b/report.html"' in (tmp_path / "t.html").read_text()
 
 
@@ -164,8 +257,10 @@ def test_the_command_prints_the_steps(
     (series,) = json.loads(capsys.readouterr().out)["series"]
     assert [len(line["steps"]) for line in series["lines"]] == [2, 3]
     assert series["lines"][1]["steps"][0]["changes"][0] == {
-        "what": "weights onefixer.safetensors", "before": "99bf50000000", "after": "abc123000000",
-    }  # fmt: skip
+        "what": "weights onefixer.safetensors",
+        "before": "99bf50000000",
+        "after": "abc123000000",
+    }
     (tmp_path / "t.html").touch()
     for words, said in (
         (("--scene", "smoke-curve", "--preset", "strict", "--steps"), "none to compare"),

@@ -10,8 +10,28 @@ import pytest
 
 from alpasim_plugin.core.geometry import quat_from_yaw, se2, yaw_of
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.types import CameraSpec, EgoState, Frame, Observation, Plan, Route, SensorSpec, Trajectory
-from alpasim_plugin.runs.trials import Changed, Trial, error_m, investigate, later, moved, pictures, speed, trials, warped
+from alpasim_plugin.core.types import (
+    CameraSpec,
+    EgoState,
+    Frame,
+    Observation,
+    Plan,
+    Route,
+    SensorSpec,
+    Trajectory,
+)
+from alpasim_plugin.runs.trials import (
+    Changed,
+    Trial,
+    error_m,
+    investigate,
+    later,
+    moved,
+    pictures,
+    speed,
+    trials,
+    warped,
+)
 
 CAMERA = CameraSpec("front", 64, 36, np.array([[40.0, 0, 32], [0, 40, 18], [0, 0, 1]]), np.eye(4))
 ROUTE = Route(np.zeros((2, 3)))
@@ -19,13 +39,24 @@ TIMES = np.arange(0, 4_000_001, 100_000, dtype=np.int64)
 
 
 def observed(t_us: int, left: float, yaw: float = 0.3) -> Observation:
-    """Return an observation at a heading whose picture is bright on the left by as much as the path goes there."""
+    """Return an observation at a heading whose picture is bright on the left by as much as the path
+    goes there.
+    """
     rgb = np.full((36, 64, 3), 100, dtype=np.uint8)
     rgb[:, :32] += np.uint8(round(50 * max(left, 0.0)))
     rgb[:, 32:] += np.uint8(round(50 * max(-left, 0.0)))
     ego = EgoState(t_us, se2(1e-6 * t_us * 8.0, 0.0, yaw), 8.0)
-    track = Trajectory(np.array([t_us]), ego.T_world_rig[None, :3, 3], quat_from_yaw(np.array([yaw])))
-    return Observation(t_us, {"front": Frame(t_us, "front", rgb)}, {"front": CAMERA}, ego, track, np.full((20, 3), np.nan))
+    track = Trajectory(
+        np.array([t_us]), ego.T_world_rig[None, :3, 3], quat_from_yaw(np.array([yaw]))
+    )
+    return Observation(
+        t_us,
+        {"front": Frame(t_us, "front", rgb)},
+        {"front": CAMERA},
+        ego,
+        track,
+        np.full((20, 3), np.nan),
+    )
 
 
 class ToTheBright(Policy):
@@ -44,7 +75,12 @@ class ToTheBright(Policy):
         rgb = looked_at.frames["front"].rgb.astype(float)
         left = (rgb[:, :32].mean() - rgb[:, 32:].mean()) / 50
         t = 1e-6 * TIMES
-        return Plan(observation.t_us, observation.t_us + TIMES, np.stack([8.0 * t, 0.5 * left * t**2], axis=1), left * t / 8)
+        return Plan(
+            observation.t_us,
+            observation.t_us + TIMES,
+            np.stack([8.0 * t, 0.5 * left * t**2], axis=1),
+            left * t / 8,
+        )
 
 
 class Late(ToTheBright):
@@ -73,7 +109,9 @@ class WrongSign(ToTheBright):
 
 DRIVE = [observed(100_000 * k, 0.6 + 0.3 * np.sin(k), yaw=0.0) for k in range(20)]
 RECORDED = Trajectory(
-    TIMES * 2, np.stack([16e-6 * TIMES, 0.12 * (1e-6 * TIMES) ** 2, 0.0 * TIMES], axis=1), quat_from_yaw(np.zeros(len(TIMES)))
+    TIMES * 2,
+    np.stack([16e-6 * TIMES, 0.12 * (1e-6 * TIMES) ** 2, 0.0 * TIMES], axis=1),
+    quat_from_yaw(np.zeros(len(TIMES))),
 )
 
 
@@ -81,7 +119,9 @@ def found(make: Callable[[], Policy]):  # type: ignore[no-untyped-def]
     """Investigate a policy along `DRIVE`."""
     policy = make()
     policy.reset(0, ROUTE)
-    return investigate(make, [policy.act(one) for one in DRIVE], DRIVE, RECORDED, seed=0, its_route=ROUTE)
+    return investigate(
+        make, [policy.act(one) for one in DRIVE], DRIVE, RECORDED, seed=0, its_route=ROUTE
+    )
 
 
 def named(name: str) -> Trial:
@@ -92,13 +132,23 @@ def named(name: str) -> Trial:
 def test_a_wrong_sign_is_what_a_mirrored_plan_mends() -> None:
     findings = found(WrongSign)
     assert "plan mirrored" in [one.trial.name for one in findings.promising(3)]
-    assert findings.own_error_m > min(one.error_m for one in findings.tried if one.error_m is not None)
+    assert findings.own_error_m > min(
+        one.error_m for one in findings.tried if one.error_m is not None
+    )
 
 
 def test_a_plan_that_is_right_has_nothing_to_mend() -> None:
     findings = found(ToTheBright)
-    assert not [one.trial.name for one in findings.promising(3) if one.trial.name.startswith("plan mirrored")]
-    assert {one.what.split(",")[0]: one.is_used for one in findings.depends} == {"pictures": True, "route": False, "speed": False}
+    assert not [
+        one.trial.name
+        for one in findings.promising(3)
+        if one.trial.name.startswith("plan mirrored")
+    ]
+    assert {one.what.split(",")[0]: one.is_used for one in findings.depends} == {
+        "pictures": True,
+        "route": False,
+        "speed": False,
+    }
     assert {one.after_us for one in findings.pulses} == {0}
 
 
@@ -137,9 +187,13 @@ def turned_to_world(plan: Plan, observation: Observation) -> Plan:
 FAULTS = {
     "plan mirrored": Trial("", "", answer=moved(lambda p, a, _: (p * [1, -1], -a))),
     "plan scaled by 3.6": Trial("", "", answer=moved(lambda p, a, _: (p / 3.6, a))),
-    "plan in 0.5 times the time": Trial("", "", answer=lambda p, _: replace(p, times_us=p.t_us + 2 * (p.times_us - p.t_us))),
+    "plan in 0.5 times the time": Trial(
+        "", "", answer=lambda p, _: replace(p, times_us=p.t_us + 2 * (p.times_us - p.t_us))
+    ),
     "plan turned into the rig": Trial("", "", answer=turned_to_world),
-    "x and y of the plan exchanged": Trial("", "", answer=moved(lambda p, a, _: (p[:, ::-1], np.pi / 2 - a))),
+    "x and y of the plan exchanged": Trial(
+        "", "", answer=moved(lambda p, a, _: (p[:, ::-1], np.pi / 2 - a))
+    ),
     "plan counted from the camera": Trial("", "", answer=moved(lambda p, a, _: (p - [1.5, 0], a))),
     "colours exchanged": Trial("", "", pictures(lambda rgb, _: rgb[..., ::-1].copy())),
     "picture mirrored": Trial("", "", pictures(lambda rgb, _: rgb[:, ::-1].copy())),
@@ -164,7 +218,11 @@ class Asked(ToTheBright):
 def test_a_change_undoes_the_fault_that_it_names(name: str) -> None:
     rgb = np.random.default_rng(0).integers(0, 256, (36, 64, 3)).astype(np.uint8)
     seen = observed(0, 0.0)
-    seen = replace(seen, frames={"front": replace(seen.frames["front"], rgb=rgb)}, route_rig=np.arange(60.0).reshape(20, 3))
+    seen = replace(
+        seen,
+        frames={"front": replace(seen.frames["front"], rgb=rgb)},
+        route_rig=np.arange(60.0).reshape(20, 3),
+    )
     broken, right = Changed(Asked(), FAULTS[name]), Asked()
     corrected = Changed(broken, named(name))
     for policy in (corrected, right):
@@ -176,21 +234,34 @@ def test_a_change_undoes_the_fault_that_it_names(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "expected"), [(warped(zoom=1.5), (32 + 15, 18 + 7.5)), (warped(down_rad=0.1), (42, 23 - 40 * np.tan(0.1)))]
+    ("change", "expected"),
+    [(warped(zoom=1.5), (32 + 15, 18 + 7.5)), (warped(down_rad=0.1), (42, 23 - 40 * np.tan(0.1)))],
 )
-def test_a_picture_is_seen_as_the_camera_that_was_believed_would(change, expected: tuple[float, float]) -> None:  # type: ignore[no-untyped-def]
+def test_a_picture_is_seen_as_the_camera_that_was_believed_would(
+    change, expected: tuple[float, float]
+) -> None:  # type: ignore[no-untyped-def]
     rgb = np.zeros((36, 64, 3), dtype=np.uint8)
     rgb[22:25, 41:44] = 255
     seen = observed(0, 0.0)
-    shown = change(replace(seen, frames={"front": replace(seen.frames["front"], rgb=rgb)})).frames["front"].rgb
+    shown = (
+        change(replace(seen, frames={"front": replace(seen.frames["front"], rgb=rgb)}))
+        .frames["front"]
+        .rgb
+    )
     y, x = np.nonzero(shown[..., 0] > 100)
     assert np.allclose((x.mean(), y.mean()), expected, atol=0.6)
 
 
 def test_a_plan_along_the_recording_has_no_error_and_one_beside_it_its_distance() -> None:
-    straight = Trajectory(TIMES * 2, np.stack([16e-6 * TIMES, 0 * TIMES, 0 * TIMES], axis=1), quat_from_yaw(np.zeros(len(TIMES))))
+    straight = Trajectory(
+        TIMES * 2,
+        np.stack([16e-6 * TIMES, 0 * TIMES, 0 * TIMES], axis=1),
+        quat_from_yaw(np.zeros(len(TIMES))),
+    )
     seen, t = observed(0, 0.0, yaw=0.0), 1e-6 * TIMES
     plan = Plan(0, TIMES, np.stack([8.0 * t, 0 * t], axis=1), 0 * t)
     assert error_m([plan], [seen], straight) == pytest.approx(0.0, abs=1e-9)
-    assert error_m([replace(plan, xy=plan.xy + np.array([0, 2.0]))], [seen], straight) == pytest.approx(2.0)
+    assert error_m(
+        [replace(plan, xy=plan.xy + np.array([0, 2.0]))], [seen], straight
+    ) == pytest.approx(2.0)
     assert error_m([later(plan, 0.5)], [seen], straight) > 5.0

@@ -50,7 +50,9 @@ class ByRoute:
             "heat": observation.frames["front"].rgb[::4, ::4, 0].astype(float),
             "boxes_car": np.array([[4, 5, 20, 15]]),
         }
-        return Plan(observation.t_us, times, xy, np.arctan2(*np.gradient(xy, axis=0).T[::-1]), debug=debug)
+        return Plan(
+            observation.t_us, times, xy, np.arctan2(*np.gradient(xy, axis=0).T[::-1]), debug=debug
+        )
 
 
 class Blind(ByRoute):
@@ -75,7 +77,11 @@ class ByContrast(Right):
 
     def act(self, observation: Observation) -> Plan:
         plan = super().act(observation)
-        return plan if np.ptp(observation.frames["front"].rgb) > 9 else replace(plan, xy=plan.xy * [1.0, -1.0], yaw=-plan.yaw)
+        return (
+            plan
+            if np.ptp(observation.frames["front"].rgb) > 9
+            else replace(plan, xy=plan.xy * [1.0, -1.0], yaw=-plan.yaw)
+        )
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +90,11 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("why")
     (folder / "bend.yaml").write_text(BEND)
     plan = make_plan(
-        expand(str(folder / "bend.yaml")), (GREY,), tuple(f"{HERE}:{one}" for one in ("ByRoute", "Blind", "Right")), (0,), RunOptions()
+        expand(str(folder / "bend.yaml")),
+        (GREY,),
+        tuple(f"{HERE}:{one}" for one in ("ByRoute", "Blind", "Right")),
+        (0,),
+        RunOptions(),
     )
     execute_run(plan, folder / "run", 1, ["simrun"], Announced(), certificate="none")
     return folder / "run"
@@ -93,31 +103,49 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def rollout(run: Path, policy: str) -> Path:
     """Return the folder of a policy's drive."""
     return next(
-        path.parent for path in run.glob("rollouts/*/*/*/*/manifest.json") if json.loads(path.read_text())["policy"] == f"{HERE}:{policy}"
+        path.parent
+        for path in run.glob("rollouts/*/*/*/*/manifest.json")
+        if json.loads(path.read_text())["policy"] == f"{HERE}:{policy}"
     )
 
 
 @pytest.mark.parametrize(
-    ("policy", "words"), [("ByRoute", "left and right are exchanged"), ("Blind", "its plans do not depend on the pictures")]
+    ("policy", "words"),
+    [
+        ("ByRoute", "left and right are exchanged"),
+        ("Blind", "its plans do not depend on the pictures"),
+    ],
 )
-def test_a_seeded_fault_is_named(run: Path, policy: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_seeded_fault_is_named(
+    run: Path, policy: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(["why", str(rollout(run, policy)), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert any(one["how"] == "shown" and words in one["text"].lower() for one in found["found"]), found
+    assert any(one["how"] == "shown" and words in one["text"].lower() for one in found["found"]), (
+        found
+    )
     assert "not found" not in [one["how"] for one in found["found"]]
     page = Path(found["page"]).read_text()
     assert "http" not in page.replace("http://www.w3.org/2000/svg", "").replace("http-equiv", "")
     assert words in page.lower()
     assert 'data-key="f"' in page
     assert 'data-key="w"' not in page  # what was tried is not offered again
-    assert page.count('class="card scroll"') == page.count('class="card scroll" tabindex="0" role="region"')
+    assert page.count('class="card scroll"') == page.count(
+        'class="card scroll" tabindex="0" role="region"'
+    )
 
 
 def test_where_a_drive_ends_well_behind_another_renderer_the_pictures_are_named_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "bend.yaml").write_text(BEND)
-    plan = make_plan(expand(str(tmp_path / "bend.yaml")), (GREY, "clean"), (f"{HERE}:ByContrast",), (0,), RunOptions())
+    plan = make_plan(
+        expand(str(tmp_path / "bend.yaml")),
+        (GREY, "clean"),
+        (f"{HERE}:ByContrast",),
+        (0,),
+        RunOptions(),
+    )
     execute_run(plan, tmp_path / "run", 1, ["simrun"], Announced(), certificate="none")
     failed = next((tmp_path / "run").glob("rollouts/*/*/*/*/why.html")).parent
     words = f"Behind clean the same drive ends without an event: the pictures of {GREY} make the difference."
@@ -135,24 +163,37 @@ def test_the_run_writes_a_page_for_what_failed_and_links_it(run: Path) -> None:
     assert page in (run / "report.html").read_text()
 
 
-def test_a_cell_outside_a_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cell_outside_a_run_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(["why", str(tmp_path / "clean/x/y/0")]) == 2
     assert "no run folder above it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("side", ["front", "lateral", "rear"])
 def test_a_contact_at_any_side_is_when_a_drive_failed(side: str) -> None:
-    events = [{"metric": "offroad", "t_us": 7}, {"metric": f"collision_{side}", "t_us": 5}, {"metric": "img_is_black", "t_us": 1}]
+    events = [
+        {"metric": "offroad", "t_us": 7},
+        {"metric": f"collision_{side}", "t_us": 5},
+        {"metric": "img_is_black", "t_us": 1},
+    ]
     assert failed_at({"events": events}) == 5
     assert failed_at({"events": events[2:]}) is None
 
 
 def test_what_a_policy_says_is_sorted_by_what_it_is() -> None:
     debug = {
-        "picture": np.zeros((8, 8, 3), np.uint8), "heat": np.eye(6), "boxes_cars": np.array([[0, 0, 10, 20]]),
+        "picture": np.zeros((8, 8, 3), np.uint8),
+        "heat": np.eye(6),
+        "boxes_cars": np.array([[0, 0, 10, 20]]),
         "line_left": np.zeros((5, 2)),
-        "speed": 7.25, "mode": "lane", "weights": [0.1, 0.2], "net": object(), "flat": np.ones((5, 5)), "gaps": np.full((4, 4), np.nan),
-    }  # fmt: skip
+        "speed": 7.25,
+        "mode": "lane",
+        "weights": [0.1, 0.2],
+        "net": object(),
+        "flat": np.ones((5, 5)),
+        "gaps": np.full((4, 4), np.nan),
+    }
     shown = said(debug, 0.5, lambda xy: xy.tolist())
     assert [one[0] for one in shown["images"]] == ["picture"]
     assert [one[0] for one in shown["heat"]] == ["heat", "flat"]

@@ -1,4 +1,6 @@
-"""Projection by an f-theta lens as its publishers define it: what the camera fit and the map drawing are held to."""
+"""Projection by an f-theta lens as its publishers define it: what the camera fit and the map
+drawing are held to.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +11,11 @@ from scenarios.cosmos_camera import RecordedLens
 
 
 def project_ftheta(camera: RecordedLens, points: F64) -> F64:
-    """Project camera-frame points ``(N, 3)`` to pixels ``(N, 2)`` of the recorded image; NaN beyond the lens's largest angle.
+    """Project camera-frame points ``(N, 3)`` to pixels ``(N, 2)`` of the recorded image; NaN beyond
+    the lens's largest angle.
 
-    The radius comes from the forward polynomial, refined by Newton steps on the backward one where that is the calibrated side.
+    The radius comes from the forward polynomial, refined by Newton steps on the backward one where
+    that is the calibrated side.
     """
     across = np.hypot(points[:, 0], points[:, 1])
     theta = np.arctan2(across, points[:, 2])

@@ -1,4 +1,6 @@
-"""Writes small CommonRoad documents: two parallel lanelets with a successor each, and cars that drive along them."""
+"""Writes small CommonRoad documents: two parallel lanelets with a successor each, and cars that
+drive along them.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ RECTANGLE = "<rectangle><length>4.4</length><width>1.8</width></rectangle>"
 def body(states, shape=RECTANGLE, kind="car"):
     first, *rest = states
     path = f"<trajectory>{''.join(rest)}</trajectory>" if rest else ""
-    return f"<type>{kind}</type><shape>{shape}</shape>{first.replace('state>', 'initialState>')}{path}"
+    return (
+        f"<type>{kind}</type><shape>{shape}</shape>{first.replace('state>', 'initialState>')}{path}"
+    )
 
 
 def drive(x0, y, speed=10.0, steps=range(21)):
@@ -45,14 +49,26 @@ def obstacle(number, states, shape=RECTANGLE, kind="car", version="2018b", stati
 
 
 LANES = (
-    lanelet(1, 0, 60, 0, '<successor ref="2"/><adjacentLeft ref="3" drivingDir="same"/><speedLimit>13.5</speedLimit>')
+    lanelet(
+        1,
+        0,
+        60,
+        0,
+        '<successor ref="2"/><adjacentLeft ref="3" drivingDir="same"/><speedLimit>13.5</speedLimit>',
+    )
     + lanelet(2, 60, 200, 0, '<predecessor ref="1"/>')
     + lanelet(3, 0, 200, 4, '<adjacentRight ref="1" drivingDir="same"/>')
 )
-TRAFFIC = obstacle(11, drive(20, 0)) + obstacle(12, drive(45, 4, speed=8.0)) + obstacle(13, drive(60, 0, speed=12.0, steps=range(11)))
+TRAFFIC = (
+    obstacle(11, drive(20, 0))
+    + obstacle(12, drive(45, 4, speed=8.0))
+    + obstacle(13, drive(60, 0, speed=12.0, steps=range(11)))
+)
 
 
-def document(lanes=LANES, traffic=TRAFFIC, version="2018b", dt="0.1", name="ZAM_Test-1_1_T-1", more=""):
+def document(
+    lanes=LANES, traffic=TRAFFIC, version="2018b", dt="0.1", name="ZAM_Test-1_1_T-1", more=""
+):
     head = f'<commonRoad commonRoadVersion="{version}" timeStepSize="{dt}" benchmarkID="{name}">'
     return f'<?xml version="1.0" encoding="utf-8"?>\n{head}{lanes}{traffic}{more}</commonRoad>'
 

@@ -40,10 +40,25 @@ def tables(as_struct: bool = False) -> dict[str, bytes]:
         return {"key": key(f"L{i}"), "lane": {"left_rail": left, "right_rail": right}}
 
     lanes = [lane(i, y) for i, y in enumerate((0.0, LANE_M))]
-    links = [{"key": key("a", kind="LEFT_LANE"), "association": {"subjects": "L0", "objects": ["L1"]}}]
-    edges = [{"key": key(f"E{i}"), "road_boundary": {"location": rail(y)}} for i, y in enumerate((-LANE_M / 2, 1.5 * LANE_M))]
-    sign = [{"key": key("s"), "traffic_sign": {"center": {"x": 50.0, "y": -3.0, "z": 2.0}, "category": "STOP"}}]
-    wait = [{"key": key("w-L0"), "wait_line": {"location": rail(0.0, 2), "category": "STOP", "is_implicit": False}}]
+    links = [
+        {"key": key("a", kind="LEFT_LANE"), "association": {"subjects": "L0", "objects": ["L1"]}}
+    ]
+    edges = [
+        {"key": key(f"E{i}"), "road_boundary": {"location": rail(y)}}
+        for i, y in enumerate((-LANE_M / 2, 1.5 * LANE_M))
+    ]
+    sign = [
+        {
+            "key": key("s"),
+            "traffic_sign": {"center": {"x": 50.0, "y": -3.0, "z": 2.0}, "category": "STOP"},
+        }
+    ]
+    wait = [
+        {
+            "key": key("w-L0"),
+            "wait_line": {"location": rail(0.0, 2), "category": "STOP", "is_implicit": False},
+        }
+    ]
     rows = {
         "lane": lanes,
         "association": links,
@@ -57,16 +72,27 @@ def tables(as_struct: bool = False) -> dict[str, bytes]:
 
 def rig(n: int = 60, **more: Any) -> dict:
     t_us = [START_US + 100_000 * i for i in range(n)]
-    poses = [[[1.0, 0, 0, 8.0 * 0.1 * i], [0, 1.0, 0, 0.0], [0, 0, 1.0, 0.0], [0, 0, 0, 1.0]] for i in range(n)]
+    poses = [
+        [[1.0, 0, 0, 8.0 * 0.1 * i], [0, 1.0, 0, 0.0], [0, 0, 1.0, 0.0], [0, 0, 0, 1.0]]
+        for i in range(n)
+    ]
     box = {"centroid": [1.4, 0.0, 0.75], "dim": [4.6, 1.9, 1.5], "rot": [0, 0, 0]}
-    own = {"sequence_id": "s", "T_rig_world_timestamps_us": t_us, "T_rig_worlds": poses, "rig_bbox": box}
+    own = {
+        "sequence_id": "s",
+        "T_rig_world_timestamps_us": t_us,
+        "T_rig_worlds": poses,
+        "rig_bbox": box,
+    }
     return {"T_world_base": np.eye(4).tolist(), "rig_trajectories": [own]} | more
 
 
 def sequence() -> dict:
     t_us = [START_US, START_US + 4_000_000]
     parked = [[40.0, LANE_M, 0.75, 0, 0, 0, 1.0], [40.0, LANE_M, 0.75, 0, 0, 0, 1.0]]
-    moving = [[20.0, 0.0, 0.75, 0, 0, 0, 1.0], [60.0, 0.0, 0.75, 0, 0, 1.0, 0.0]]  # turns to face back
+    moving = [
+        [20.0, 0.0, 0.75, 0, 0, 0, 1.0],
+        [60.0, 0.0, 0.75, 0, 0, 1.0, 0.0],
+    ]  # turns to face back
     tracks = {
         "tracks_id": ["p", "m"],
         "tracks_label_class": ["heavy_truck", "person"],
@@ -74,7 +100,12 @@ def sequence() -> dict:
         "tracks_timestamps_us": [t_us, t_us],
         "tracks_poses": [parked, moving],
     }
-    return {"s": {"tracks_data": tracks, "cuboidtracks_data": {"cuboids_dims": [[8.0, 2.5, 3.0], [0.6, 0.6, 1.8]]}}}
+    return {
+        "s": {
+            "tracks_data": tracks,
+            "cuboidtracks_data": {"cuboids_dims": [[8.0, 2.5, 3.0], [0.6, 0.6, 1.8]]},
+        }
+    }
 
 
 def members(scene_id: str = "small") -> dict[str, bytes]:

@@ -18,31 +18,43 @@ def rectangles(centres, yaw, length, width):
 
 
 def footprint(poses, vehicle, size=None):
-    """Plan-view footprints of rig poses (T, 4, 4), centred below the box centre; ``size``: length and width other than the vehicle's."""
+    """Plan-view footprints of rig poses (T, 4, 4), centred below the box centre; ``size``: length
+    and width other than the vehicle's.
+    """
     centres = poses @ np.array([vehicle.rear_axle_to_centre_m, 0.0, vehicle.box.height_m / 2, 1.0])
     length, width = size or (vehicle.box.length_m, vehicle.box.width_m)
     return rectangles(centres, np.arctan2(poses[:, 1, 0], poses[:, 0, 0]), length, width)
 
 
 def boxes_at(actors, t_us, frame=None):
-    """Footprints of the actors present at a time, in the world's plane or in that of ``frame`` (T_world_frame)."""
+    """Footprints of the actors present at a time, in the world's plane or in that of ``frame``
+    (T_world_frame).
+    """
     here = [a for a in actors if a.track.t_us[0] <= t_us <= a.track.t_us[-1]]
     poses = np.array([interpolate(a.track, t_us) for a in here])
     if frame is not None:
         poses = inverse(frame) @ poses
     yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
-    shapes = [rectangles(poses[i : i + 1, :3, 3], yaw[i : i + 1], a.box.length_m, a.box.width_m)[0] for i, a in enumerate(here)]
+    shapes = [
+        rectangles(poses[i : i + 1, :3, 3], yaw[i : i + 1], a.box.length_m, a.box.width_m)[0]
+        for i, a in enumerate(here)
+    ]
     return np.array(shapes, dtype=object)
 
 
 def ruling(log, times, size=(4.855, 1.88), radius_m=6.0):
-    """The off-road rule of the paper step by step: (held by one lane, held by the union, neither, neither and touching an edge)."""
+    """The off-road rule of the paper step by step: (held by one lane, held by the union, neither,
+    neither and touching an edge).
+    """
     index = LaneIndex(log.lane_map)
     area = dict(zip(index.ids, index.polygons, strict=True))
     edges = [shapely.linestrings(e[:, :2]) for e in log.lane_map.road_edges]
     poses = interpolate(log.ego_log, times)
     lift = np.array([log.vehicle.rear_axle_to_centre_m, 0.0, log.vehicle.box.height_m / 2, 1.0])
-    one, union, neither, off = [], [], [], []
+    one = []
+    union = []
+    neither = []
+    off = []
     for k, (pose, shape) in enumerate(zip(poses, footprint(poses, log.vehicle, size), strict=True)):
         near = [area[i] for i in index.within((pose @ lift)[:3], radius_m)]
         if any(shapely.contains(a, shape) for a in near):

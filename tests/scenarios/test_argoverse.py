@@ -31,7 +31,9 @@ def log(tmp_path):
 
 def test_world_is_local_and_keeps_centimetres_of_utm_sized_coordinates(log):
     assert log.world_origin == tuple(ORIGIN)
-    np.testing.assert_allclose(log.ego_log.xyz, np.column_stack([np.arange(21.0), np.zeros(21), np.zeros(21)]), atol=2e-9)
+    np.testing.assert_allclose(
+        log.ego_log.xyz, np.column_stack([np.arange(21.0), np.zeros(21), np.zeros(21)]), atol=2e-9
+    )
     np.testing.assert_allclose(log.lane_map.lanes["1"].left, [[-20, 2, 0], [40, 2, 0]], atol=2e-9)
 
 
@@ -43,7 +45,9 @@ def test_time_is_whole_microseconds(log):
 
 def test_cuboids_of_a_moving_ego_frame_stand_still_in_the_world(log):
     parked, walker = log.actors
-    np.testing.assert_allclose(parked.track.xyz, np.broadcast_to([30.0, -6.0, 0.75], (21, 3)), atol=1e-8)
+    np.testing.assert_allclose(
+        parked.track.xyz, np.broadcast_to([30.0, -6.0, 0.75], (21, 3)), atol=1e-8
+    )
     assert (parked.label, parked.is_static, parked.box.length_m) == ("car", True, 4.5)
     assert (walker.label, walker.is_static, len(walker.track)) == ("pedestrian", False, 11)
     assert walker.track.t_us[0] == (T0_NS + 5 * STEP_NS) // 1000
@@ -63,7 +67,9 @@ def test_cuboids_turn_with_the_ego(tmp_path):
 
 def test_rows_of_the_ego_are_no_actor(tmp_path):
     rows = cuboids([*TRACKS, ("ego", "EGO_VEHICLE", (4.877, 2.0, 1.473), range(21), ORIGIN)])
-    assert [a.actor_id for a in read_argoverse(write_argoverse(tmp_path / "x", annotations=rows)).actors] == ["parked", "walker"]
+    assert [
+        a.actor_id for a in read_argoverse(write_argoverse(tmp_path / "x", annotations=rows)).actors
+    ] == ["parked", "walker"]
 
 
 def test_track_with_a_hole_becomes_two_actors(tmp_path):
@@ -118,9 +124,25 @@ def test_hole_in_the_drivable_area_is_an_edge_of_its_own(tmp_path):
 
 
 def test_every_mark_type_and_category_has_its_place():
-    assert set(PAINTS.values()) <= {"none", "solid_white", "dashed_white", "solid_yellow", "dashed_yellow", "double_yellow", "unknown"}
+    assert set(PAINTS.values()) <= {
+        "none",
+        "solid_white",
+        "dashed_white",
+        "solid_yellow",
+        "dashed_yellow",
+        "double_yellow",
+        "unknown",
+    }
     assert len(PAINTS) == 15
-    assert set(LABELS.values()) == {"car", "truck", "bus", "pedestrian", "cyclist", "motorcycle", "other"}
+    assert set(LABELS.values()) == {
+        "car",
+        "truck",
+        "bus",
+        "pedestrian",
+        "cyclist",
+        "motorcycle",
+        "other",
+    }
     assert len(LABELS) == 30
 
 
@@ -144,8 +166,15 @@ def test_same_bytes_give_the_same_hash_and_other_bytes_another(tmp_path):
 def test_opposite_neighbour_is_no_neighbour(tmp_path):
     document = vector_map()
     back = lane(4, 200, -20, -4, left_neighbor_id=1)
-    back["left_lane_boundary"], back["right_lane_boundary"] = line((200, -6), (-20, -6)), line((200, -2), (-20, -2))
+    back["left_lane_boundary"], back["right_lane_boundary"] = (
+        line((200, -6), (-20, -6)),
+        line((200, -2), (-20, -2)),
+    )
     document["lane_segments"]["4"] = back
     document["lane_segments"]["1"] |= {"right_neighbor_id": 4, "left_neighbor_id": 3}
     lanes = read_argoverse(write_argoverse(tmp_path / "x", document=document)).lane_map.lanes
-    assert (lanes["1"].left_neighbour, lanes["1"].right_neighbour, lanes["4"].left_neighbour) == ("3", None, None)
+    assert (lanes["1"].left_neighbour, lanes["1"].right_neighbour, lanes["4"].left_neighbour) == (
+        "3",
+        None,
+        None,
+    )

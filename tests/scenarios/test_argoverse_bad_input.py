@@ -36,7 +36,13 @@ def test_folder_that_is_not_there(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["city_SE3_egovehicle.feather", "annotations.feather", "map/log_map_archive_x____PIT_city_1.json", "map/x___img_Sim2_city.json"]
+    "name",
+    [
+        "city_SE3_egovehicle.feather",
+        "annotations.feather",
+        "map/log_map_archive_x____PIT_city_1.json",
+        "map/x___img_Sim2_city.json",
+    ],
 )
 def test_missing_file_is_named_by_its_pattern(tmp_path, name):
     folder = write_argoverse(tmp_path / "x")
@@ -81,24 +87,44 @@ def test_text_that_is_no_utf_8_in_a_feather(tmp_path):
     assert "no readable Arrow IPC file" in error.found
 
 
-@pytest.mark.parametrize("header", [b"{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999999,), }", b"{'descr': (((", b"[]"])
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999999,), }",
+        b"{'descr': (((",
+        b"[]",
+    ],
+)
 def test_raster_with_a_broken_header(tmp_path, header):
     folder = write_argoverse(tmp_path / "x")
     path = next(folder.glob("map/*.npy"))
-    path.write_bytes(b"\x93NUMPY\x01\x00" + (len(header) + 1).to_bytes(2, "little") + header + b"\n")
+    path.write_bytes(
+        b"\x93NUMPY\x01\x00" + (len(header) + 1).to_bytes(2, "little") + header + b"\n"
+    )
     error = refused(folder)
     assert error.with_what == str(path)
     assert "no readable NumPy array" in error.found
 
 
 def test_one_point_on_another_continent(tmp_path):
-    error = refused(write_argoverse(tmp_path / "x", document=vector_map() | {"lane_segments": {"1": lane(1, 0, 4e6, 0)}}))
+    error = refused(
+        write_argoverse(
+            tmp_path / "x", document=vector_map() | {"lane_segments": {"1": lane(1, 0, 4e6, 0)}}
+        )
+    )
     assert error.found == "a point 4000.0 km from the drive"
     assert "lane 1" in error.with_what
 
 
 def test_drive_that_jumps_across_the_world(tmp_path):
-    assert "km from the drive" in refused(write_argoverse(tmp_path / "x", ego=bad_poses("tx_m", 4, 9e6), annotations=cuboids(TRACKS))).found
+    assert (
+        "km from the drive"
+        in refused(
+            write_argoverse(
+                tmp_path / "x", ego=bad_poses("tx_m", 4, 9e6), annotations=cuboids(TRACKS)
+            )
+        ).found
+    )
 
 
 def test_two_maps_are_ambiguous(tmp_path):
@@ -120,11 +146,21 @@ def without(document, layer, key=None):
     [
         (without(vector_map(), "lane_segments"), "a map without lanes"),
         (without(vector_map(), "drivable_areas"), "without road edges"),
-        (without(vector_map(), "lane_segments", "left_lane_boundary"), "no usable left_lane_boundary"),
+        (
+            without(vector_map(), "lane_segments", "left_lane_boundary"),
+            "no usable left_lane_boundary",
+        ),
         ({"lane_segments": {}}, "no object 'drivable_areas'"),
         ([], "no object 'lane_segments'"),
-        (vector_map() | {"lane_segments": {"1": lane(1, 0, 10, 0, lane_type="RIVER")}}, "lane type 'RIVER'"),
-        (vector_map() | {"lane_segments": {"1": lane(1, 0, 10, 0, left_lane_boundary=line((0, 2)))}}, "boundary with 1 finite points"),
+        (
+            vector_map() | {"lane_segments": {"1": lane(1, 0, 10, 0, lane_type="RIVER")}},
+            "lane type 'RIVER'",
+        ),
+        (
+            vector_map()
+            | {"lane_segments": {"1": lane(1, 0, 10, 0, left_lane_boundary=line((0, 2)))}},
+            "boundary with 1 finite points",
+        ),
         (vector_map() | {"lane_segments": {"1": lane(1, 0, float("nan"), 0)}}, "the number nan"),
     ],
 )
@@ -142,7 +178,10 @@ def test_log_without_cuboids(tmp_path):
 
 
 def test_log_of_one_pose(tmp_path):
-    assert refused(write_argoverse(tmp_path / "x", ego=poses(1), annotations=cuboids(TRACKS))).found == "1 pose"
+    assert (
+        refused(write_argoverse(tmp_path / "x", ego=poses(1), annotations=cuboids(TRACKS))).found
+        == "1 pose"
+    )
 
 
 def bad_poses(name, row, value):
@@ -159,7 +198,10 @@ def bad_poses(name, row, value):
         (bad_poses("qw", 3, 0.0), "a quaternion of length 0 in row 3"),
         (bad_poses("qw", 3, 2.0), "a quaternion of length 2 in row 3"),
         (bad_poses("tx_m", 4, np.nan), "positions that are not finite, first in row 4"),
-        (poses() | {"timestamp_ns": poses()["timestamp_ns"].astype(float)}, "column 'timestamp_ns' of double"),
+        (
+            poses() | {"timestamp_ns": poses()["timestamp_ns"].astype(float)},
+            "column 'timestamp_ns' of double",
+        ),
         ({k: v for k, v in poses().items() if k != "qz"}, "no column 'qz'"),
     ],
 )

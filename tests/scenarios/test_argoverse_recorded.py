@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 import shapely
 
-from alpasim_plugin.core.geometry import interpolate, matrix_from_quat, se3, wrap_angle, yaw_from_quat
+from alpasim_plugin.core.geometry import (
+    interpolate,
+    matrix_from_quat,
+    se3,
+    wrap_angle,
+    yaw_from_quat,
+)
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import Vehicle
 from alpasim_plugin.world.ground import height_at
@@ -20,24 +26,66 @@ from tests.scenarios.real_drive import boxes_at, footprint, ruling
 
 FACTS = {
     "7fab2350": {
-        "poses": 2706, "duration_s": 15.950, "path_m": 75.04, "tracks": 114, "boxes": 11364, "lanes": 183, "intersection": 73,
-        "crossings": 11, "areas": 13,
-        "gap_m": 0.521, "world_gap_m": 0.521, "gap_s": 11.90, "turn_deg": 62.6, "resolved": 205, "links": 226, "mirrored": 205,
-        "lane_ids": ("38133154", "38133156", "38114426"), "kinds": (163, 20, 0),
+        "poses": 2706,
+        "duration_s": 15.950,
+        "path_m": 75.04,
+        "tracks": 114,
+        "boxes": 11364,
+        "lanes": 183,
+        "intersection": 73,
+        "crossings": 11,
+        "areas": 13,
+        "gap_m": 0.521,
+        "world_gap_m": 0.521,
+        "gap_s": 11.90,
+        "turn_deg": 62.6,
+        "resolved": 205,
+        "links": 226,
+        "mirrored": 205,
+        "lane_ids": ("38133154", "38133156", "38114426"),
+        "kinds": (163, 20, 0),
     },
     "adcf7d18": {
-        "poses": 2637, "duration_s": 15.943, "path_m": 40.41, "tracks": 146, "boxes": 12078, "lanes": 199, "intersection": 61,
-        "crossings": 11, "areas": 8,
-        "gap_m": 0.385, "world_gap_m": 0.388, "gap_s": 4.90, "turn_deg": 0.6, "resolved": 199, "links": 230, "mirrored": 92,
-        "lane_ids": ("42811487", "42811322", "42809424"), "kinds": (166, 19, 14),
+        "poses": 2637,
+        "duration_s": 15.943,
+        "path_m": 40.41,
+        "tracks": 146,
+        "boxes": 12078,
+        "lanes": 199,
+        "intersection": 61,
+        "crossings": 11,
+        "areas": 8,
+        "gap_m": 0.385,
+        "world_gap_m": 0.388,
+        "gap_s": 4.90,
+        "turn_deg": 0.6,
+        "resolved": 199,
+        "links": 230,
+        "mirrored": 92,
+        "lane_ids": ("42811487", "42811322", "42809424"),
+        "kinds": (166, 19, 14),
     },
     "3bffdcff": {
-        "poses": 2692, "duration_s": 15.955, "path_m": 88.43, "tracks": 116, "boxes": 12342, "lanes": 211, "intersection": 67,
-        "crossings": 14, "areas": 15,
-        "gap_m": 0.190, "world_gap_m": 0.177, "gap_s": 14.00, "turn_deg": -50.3, "resolved": 238, "links": 259, "mirrored": 121,
-        "lane_ids": ("56224493", "56225812", "56226203"), "kinds": (173, 37, 1),
+        "poses": 2692,
+        "duration_s": 15.955,
+        "path_m": 88.43,
+        "tracks": 116,
+        "boxes": 12342,
+        "lanes": 211,
+        "intersection": 67,
+        "crossings": 14,
+        "areas": 15,
+        "gap_m": 0.190,
+        "world_gap_m": 0.177,
+        "gap_s": 14.00,
+        "turn_deg": -50.3,
+        "resolved": 238,
+        "links": 259,
+        "mirrored": 121,
+        "lane_ids": ("56224493", "56225812", "56226203"),
+        "kinds": (173, 37, 1),
     },
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module", params=first_of(list(FACTS)))
@@ -57,11 +105,19 @@ def test_real_poses(real):
     facts, _, raw, log = real
     assert len(raw.t_ns) == facts["poses"]
     assert (raw.t_ns[-1] - raw.t_ns[0]) * 1e-9 == pytest.approx(facts["duration_s"], abs=5e-4)
-    assert np.linalg.norm(np.diff(raw.xyz, axis=0), axis=1).sum() == pytest.approx(facts["path_m"], abs=5e-3)
+    assert np.linalg.norm(np.diff(raw.xyz, axis=0), axis=1).sum() == pytest.approx(
+        facts["path_m"], abs=5e-3
+    )
     assert np.median(np.diff(raw.t_ns)) * 1e-6 == pytest.approx(5.07, abs=5e-3)
-    assert np.degrees(wrap_angle(yaw_from_quat(raw.quat[-1]) - yaw_from_quat(raw.quat[0]))) == pytest.approx(facts["turn_deg"], abs=0.05)
-    assert (log.ego_log.t_us[-1] - log.ego_log.t_us[0]) * 1e-6 == pytest.approx(facts["duration_s"], abs=5e-4)
-    assert np.linalg.norm(np.diff(log.ego_log.xyz, axis=0), axis=1).sum() == pytest.approx(facts["path_m"], abs=0.15)  # 0.33 m lower
+    assert np.degrees(
+        wrap_angle(yaw_from_quat(raw.quat[-1]) - yaw_from_quat(raw.quat[0]))
+    ) == pytest.approx(facts["turn_deg"], abs=0.05)
+    assert (log.ego_log.t_us[-1] - log.ego_log.t_us[0]) * 1e-6 == pytest.approx(
+        facts["duration_s"], abs=5e-4
+    )
+    assert np.linalg.norm(np.diff(log.ego_log.xyz, axis=0), axis=1).sum() == pytest.approx(
+        facts["path_m"], abs=0.15
+    )  # 0.33 m lower
 
 
 def test_real_annotations(real):
@@ -76,14 +132,30 @@ def test_real_annotations(real):
 def test_real_map(real):
     facts, folder, _, log = real
     lanes = log.lane_map.lanes
-    assert (len(lanes), sum(k.is_intersection for k in lanes.values())) == (facts["lanes"], facts["intersection"])
-    assert (len(log.lane_map.crosswalks), len(log.lane_map.drivable_areas)) == (facts["crossings"], facts["areas"])
-    assert tuple(sum(k.kind == kind for k in lanes.values()) for kind in ("vehicle", "bike", "bus")) == facts["kinds"]
+    assert (len(lanes), sum(k.is_intersection for k in lanes.values())) == (
+        facts["lanes"],
+        facts["intersection"],
+    )
+    assert (len(log.lane_map.crosswalks), len(log.lane_map.drivable_areas)) == (
+        facts["crossings"],
+        facts["areas"],
+    )
+    assert (
+        tuple(sum(k.kind == kind for k in lanes.values()) for kind in ("vehicle", "bike", "bus"))
+        == facts["kinds"]
+    )
     assert sum(len(k.successors) for k in lanes.values()) == facts["links"]
     assert sum(s in lanes for k in lanes.values() for s in k.successors) == facts["resolved"]
-    assert all(lane_polygon(k).is_valid and lane_polygon(k).geom_type == "Polygon" for k in lanes.values())
+    assert all(
+        lane_polygon(k).is_valid and lane_polygon(k).geom_type == "Polygon" for k in lanes.values()
+    )
     raw = json.loads(next(folder.glob("map/log_map_archive_*.json")).read_bytes())["lane_segments"]
-    mirrored = sum(int(k) in raw[s]["predecessors"] for k, lane in lanes.items() for s in lane.successors if s in raw)
+    mirrored = sum(
+        int(k) in raw[s]["predecessors"]
+        for k, lane in lanes.items()
+        for s in lane.successors
+        if s in raw
+    )
     assert mirrored == facts["mirrored"]
 
 
@@ -101,24 +173,38 @@ def test_real_least_gap_in_the_plane_of_the_ego(real):
     facts, _, _, log = real
     times = sweeps_us(log)
     own = footprint(np.eye(4)[None], log.vehicle)[0]
-    gaps = np.array([shapely.distance(own, boxes_at(log.actors, t, frame=interpolate(log.ego_log, t))).min() for t in times])
+    gaps = np.array(
+        [
+            shapely.distance(own, boxes_at(log.actors, t, frame=interpolate(log.ego_log, t))).min()
+            for t in times
+        ]
+    )
     assert gaps.min() == pytest.approx(facts["gap_m"], abs=5e-4)
     assert (times[gaps.argmin()] - times[0]) * 1e-6 == pytest.approx(facts["gap_s"], abs=0.05)
 
 
 @pytest.mark.slow
 def test_real_least_gap_in_the_world_plane(real):
-    """In the world's xy plane the tilt of the road moves the box centre, half a height above it, by millimetres."""
+    """In the world's xy plane the tilt of the road moves the box centre, half a height above it, by
+    millimetres.
+    """
     facts, _, _, log = real
     times = sweeps_us(log)
     ego = footprint(interpolate(log.ego_log, times), log.vehicle)
-    gaps = np.array([shapely.distance(shape, boxes_at(log.actors, t)).min() for shape, t in zip(ego, times, strict=True)])
+    gaps = np.array(
+        [
+            shapely.distance(shape, boxes_at(log.actors, t)).min()
+            for shape, t in zip(ego, times, strict=True)
+        ]
+    )
     assert gaps.min() == pytest.approx(facts["world_gap_m"], abs=5e-4)
 
 
 def test_real_ego_is_in_a_lane_in_every_frame_and_in_at_most_four(real):
     _, _, _, log = real
-    inside = LaneIndex(log.lane_map).containing_many(interpolate(log.ego_log, sweeps_us(log))[:, :3, 3])
+    inside = LaneIndex(log.lane_map).containing_many(
+        interpolate(log.ego_log, sweeps_us(log))[:, :3, 3]
+    )
     assert min(map(len, inside)) >= 1
     assert max(map(len, inside)) <= 4
 
@@ -128,7 +214,10 @@ def test_real_route_names_the_lanes_passed(real):
     route = route_from_log(log.lane_map, log.ego_log)
     assert route.lane_ids[:3] == facts["lane_ids"]
     lanes = log.lane_map.lanes
-    assert all(b in lanes[a].successors for a, b in zip(route.lane_ids[:-1], route.lane_ids[1:], strict=True))
+    assert all(
+        b in lanes[a].successors
+        for a, b in zip(route.lane_ids[:-1], route.lane_ids[1:], strict=True)
+    )
 
 
 def test_real_wheels_stand_on_the_ground(real):
@@ -146,12 +235,15 @@ def test_real_vehicle_is_the_annotated_one(real):
     assert log.vehicle.wheelbase_m == Vehicle().wheelbase_m
 
 
-# Frames at 10 Hz by the paper's rule: held by one lane, held by the union of nearby lanes, held by neither, off-road.
+# Frames at 10 Hz by the paper's rule: held by one lane, held by the union of nearby lanes, held by
+# neither, off-road.
 RULINGS = {"7fab2350": (62, 88, 10, 0), "adcf7d18": (135, 25, 0, 0), "3bffdcff": (125, 35, 0, 0)}
 
 
 def test_rule_of_the_paper_calls_no_frame_off_road(real):
-    """On leaving its junction 7fab2350 cuts a corner that the turning lanes do not cover: there the road edges, 1.4 m away, decide."""
+    """On leaving its junction 7fab2350 cuts a corner that the turning lanes do not cover: there the
+    road edges, 1.4 m away, decide.
+    """
     _, folder, _, log = real
     times = np.arange(log.ego_log.t_us[0], log.ego_log.t_us[-1], 100_000)
     parts = ruling(log, times)
@@ -166,9 +258,13 @@ def test_real_calibration(shared_data):
     assert len(cameras) == 9
     front = cameras["ring_front_center"]
     assert (front.width, front.height) == (1550, 2048)
-    np.testing.assert_allclose(front.K, [[1776.041484, 0, 777.990573], [0, 1776.041484, 1013.524325], [0, 0, 1]], atol=1e-6)
+    np.testing.assert_allclose(
+        front.K, [[1776.041484, 0, 777.990573], [0, 1776.041484, 1013.524325], [0, 0, 1]], atol=1e-6
+    )
     np.testing.assert_allclose(front.T_rig_camera[:3, 2], [1, 0, 0], atol=0.01)  # looks ahead
-    np.testing.assert_allclose(front.T_rig_camera[:3, 1], [0, 0, -1], atol=0.01)  # image down is world down
+    np.testing.assert_allclose(
+        front.T_rig_camera[:3, 1], [0, 0, -1], atol=0.01
+    )  # image down is world down
     assert front.T_rig_camera[2, 3] == pytest.approx(1.398 + 0.33, abs=1e-3)
     sweep = folder / "sensors" / "lidar" / "315966265259836000.feather"
     assert len(SourceFiles("testing").read_feather(sweep, {"x": "number"})["x"]) == 99229
@@ -178,5 +274,9 @@ def test_rotations_stay_rigid(real):
     _, _, _, log = real
     for actor in log.actors[:20]:
         matrices = se3(actor.track.xyz, actor.track.quat)[:, :3, :3]
-        np.testing.assert_allclose(matrices @ np.swapaxes(matrices, 1, 2), np.broadcast_to(np.eye(3), matrices.shape), atol=1e-12)
+        np.testing.assert_allclose(
+            matrices @ np.swapaxes(matrices, 1, 2),
+            np.broadcast_to(np.eye(3), matrices.shape),
+            atol=1e-12,
+        )
     assert matrix_from_quat(log.ego_log.quat)[:, 2, 2].min() > 0.99

@@ -1,4 +1,6 @@
-"""What is wrong with a scenario file is said with file, line, column, what was found and what to do."""
+"""What is wrong with a scenario file is said with file, line, column, what was found and what to
+do.
+"""
 
 from __future__ import annotations
 
@@ -53,29 +55,99 @@ def test_the_good_file_is_good(tmp_path: Path) -> None:
     ("text", "at", "found", "do"),
     [
         (swap("length_m: 200}", "length_m: 200"), ":5:", "not valid YAML", "correct the syntax"),
-        (swap("length_m: 200", "lenght_m: 200"), ":4:24", "unknown key 'lenght_m'", "did you mean 'length_m'?"),
+        (
+            swap("length_m: 200", "lenght_m: 200"),
+            ":4:24",
+            "unknown key 'lenght_m'",
+            "did you mean 'length_m'?",
+        ),
         (swap("length_m: 200", "length_m: long"), ":4:24", "length_m = 'long' (text)", "number"),
-        (swap("length_m: 200", "length_m: -5"), ":4:24", "length_m = -5", "greater than or equal to 0.1"),
+        (
+            swap("length_m: 200", "length_m: -5"),
+            ":4:24",
+            "length_m = -5",
+            "greater than or equal to 0.1",
+        ),
         (swap("version: 1\n", ""), ":1:1", "no 'version'", "add version"),
         (swap("version: 1", "version: 2"), ":1:1", "2", "valid: 1"),
-        (swap("kind: drive", "kind: drives"), ":6:5", "actors[0].kind is 'drives'", "did you mean 'drive'?"),
+        (
+            swap("kind: drive", "kind: drives"),
+            ":6:5",
+            "actors[0].kind is 'drives'",
+            "did you mean 'drive'?",
+        ),
         (swap("kind: drive, ", ""), ":6:5", "actors[0] has no 'kind'", "crossing_pedestrian"),
         (swap("kind: straight, ", ""), ":4:7", "has no 'kind'", "narrow_gap"),
-        (swap("    - {kind: straight, length_m: 200}", "    []"), ":3:3", "segments = []", "at least 1"),
-        (swap("[[0, 9]]", "[[1, 9], [0, 5]]"), ":6:5", "times of speeds do not increase", "order the rows"),
-        (GOOD + "rates: {camera_us: 150000}\n", ":8:9", "not a positive multiple of rates.control_us", "whole multiples"),
-        (GOOD + "rates: {control_us: 0}\n", ":8:9", "rates.control_us = 0", "greater than or equal to 1000"),
+        (
+            swap("    - {kind: straight, length_m: 200}", "    []"),
+            ":3:3",
+            "segments = []",
+            "at least 1",
+        ),
+        (
+            swap("[[0, 9]]", "[[1, 9], [0, 5]]"),
+            ":6:5",
+            "times of speeds do not increase",
+            "order the rows",
+        ),
+        (
+            GOOD + "rates: {camera_us: 150000}\n",
+            ":8:9",
+            "not a positive multiple of rates.control_us",
+            "whole multiples",
+        ),
+        (
+            GOOD + "rates: {control_us: 0}\n",
+            ":8:9",
+            "rates.control_us = 0",
+            "greater than or equal to 1000",
+        ),
         (swap("6000000", "50000"), ":7:10", "not a single control step fits", "longer log"),
-        (GOOD.replace("6000000}", "600000, warmup_us: 600000}"), ":7:31", "nothing is left to drive", "shorten timing.warmup_us"),
+        (
+            GOOD.replace("6000000}", "600000, warmup_us: 600000}"),
+            ":7:31",
+            "nothing is left to drive",
+            "shorten timing.warmup_us",
+        ),
         (TWICE, ":7:19", "duplicate actor id 'lead'", "another id"),
-        (swap("road:", "log: {commonroad: a.xml}\nroad:"), ":1:1", "exactly one of 'road' and 'log'", "add road"),
+        (
+            swap("road:", "log: {commonroad: a.xml}\nroad:"),
+            ":1:1",
+            "exactly one of 'road' and 'log'",
+            "add road",
+        ),
         (GOOD + "log: {}\n", ":8:1", "0 sources", "give one of argoverse"),
         (GOOD + "cameras: []\n", ":8:1", "cameras = []", "at least 1"),
-        (GOOD + "cameras: [{name: a}, {name: a}]\n", ":8:23", "duplicate camera name 'a'", "another name"),
-        (GOOD + "degradation: {share: 0.5, severity: 2}\n", ":8:1", "severity = 2.0 with kind: reconstruction", "say kind: surrogate, or"),
-        (GOOD + "degradation: {kind: surrogate, onset_m: 4}\n", ":8:1", "full_m = 2.0 is not beyond onset_m = 4.0", "make full_m larger"),
-        (GOOD + "environment: {sky: claer}\n", ":8:15", "environment.sky is 'claer'", "did you mean 'clear'?"),
-        (GOOD + "background: {file: none.ply}\n", ":8:14", "none.ply does not exist", "correct the path"),
+        (
+            GOOD + "cameras: [{name: a}, {name: a}]\n",
+            ":8:23",
+            "duplicate camera name 'a'",
+            "another name",
+        ),
+        (
+            GOOD + "degradation: {share: 0.5, severity: 2}\n",
+            ":8:1",
+            "severity = 2.0 with kind: reconstruction",
+            "say kind: surrogate, or",
+        ),
+        (
+            GOOD + "degradation: {kind: surrogate, onset_m: 4}\n",
+            ":8:1",
+            "full_m = 2.0 is not beyond onset_m = 4.0",
+            "make full_m larger",
+        ),
+        (
+            GOOD + "environment: {sky: claer}\n",
+            ":8:15",
+            "environment.sky is 'claer'",
+            "did you mean 'clear'?",
+        ),
+        (
+            GOOD + "background: {file: none.ply}\n",
+            ":8:14",
+            "none.ply does not exist",
+            "correct the path",
+        ),
         (GOOD + "scene_id: 'a b/c'\n", ":8:1", "scene_id = 'a b/c'", "match"),
         (GOOD + "seed: -1\n", ":8:1", "seed = -1", "greater than or equal to 0"),
         (GOOD + "seed: 1.5\n", ":8:1", "seed = 1.5", "integer"),
@@ -84,7 +156,9 @@ def test_the_good_file_is_good(tmp_path: Path) -> None:
         ("just words\n", ":1:1", "'just words' (text)", "object"),
     ],
 )
-def test_wrong_content_is_placed_and_explained(tmp_path: Path, text: str, at: str, found: str, do: str) -> None:
+def test_wrong_content_is_placed_and_explained(
+    tmp_path: Path, text: str, at: str, found: str, do: str
+) -> None:
     e = fails(tmp_path, text)
     assert f"scene.yaml{at}" in e.with_what
     assert found in e.found
@@ -99,16 +173,41 @@ def test_wrong_content_is_placed_and_explained(tmp_path: Path, text: str, at: st
         (swap("s_m: 60", "s_m: 60, lane: nowhere"), ":6:5", "the road's lanes are s0_f0, s0_b0"),
         (swap("length_m: 200", "length_m: 85"), ":3:3", "the road is 85 m long"),
         (swap("road:\n", "ego: {lane: 1}\nroad:\n"), ":2:1", "no such forward lane"),
-        (swap(STRAIGHT, FOLDED).replace("road:\n", "road:\n  lanes_backward: 3\n"), ":4:3", "would fold"),
-        (swap("length_m: 200}", "length_m: 200}\n    - {kind: intersection}"), ":3:3", "an intersection ends the road"),
-        (swap("    - {kind: straight", "    - {kind: merge}\n    - {kind: straight"), ":3:3", "the first is not a straight"),
-        (swap("kind: drive, id: lead, s_m: 60, speeds: [[0, 9]]", LATE), ":6:5", "the ego's front drives"),
-        (swap("s_m: 60, speeds: [[0, 9]]", "s_m: -15, speeds: [[0, 25]]"), ":6:5", "the gap to the ego is 0.00 m"),
+        (
+            swap(STRAIGHT, FOLDED).replace("road:\n", "road:\n  lanes_backward: 3\n"),
+            ":4:3",
+            "would fold",
+        ),
+        (
+            swap("length_m: 200}", "length_m: 200}\n    - {kind: intersection}"),
+            ":3:3",
+            "an intersection ends the road",
+        ),
+        (
+            swap("    - {kind: straight", "    - {kind: merge}\n    - {kind: straight"),
+            ":3:3",
+            "the first is not a straight",
+        ),
+        (
+            swap("kind: drive, id: lead, s_m: 60, speeds: [[0, 9]]", LATE),
+            ":6:5",
+            "the ego's front drives",
+        ),
+        (
+            swap("s_m: 60, speeds: [[0, 9]]", "s_m: -15, speeds: [[0, 25]]"),
+            ":6:5",
+            "the gap to the ego is 0.00 m",
+        ),
         (GOOD + "ego: {lane_changes: [{at_m: 900, to_lane: 0}]}\n", ":8:1", "the road ends"),
     ],
 )
-def test_scenes_that_cannot_be_built_are_placed_and_explained(tmp_path: Path, text: str, at: str, found: str) -> None:
-    e = fails(tmp_path, text + "jitter: {length: 0, position_m: 0, speed: 0, lane_width: 0, curvature: 0}\n")
+def test_scenes_that_cannot_be_built_are_placed_and_explained(
+    tmp_path: Path, text: str, at: str, found: str
+) -> None:
+    e = fails(
+        tmp_path,
+        text + "jitter: {length: 0, position_m: 0, speed: 0, lane_width: 0, curvature: 0}\n",
+    )
     assert f"scene.yaml{at}" in e.with_what
     assert found in e.found
 
@@ -119,7 +218,10 @@ def test_ego_that_would_leave_its_lane_is_refused(tmp_path: Path) -> None:
 
 
 def test_several_problems_are_all_listed(tmp_path: Path) -> None:
-    e = fails(tmp_path, swap("length_m: 200", "length_m: -5").replace("id: lead", "id: 'a b'") + "sed: 1\n")
+    e = fails(
+        tmp_path,
+        swap("length_m: 200", "length_m: -5").replace("id: lead", "id: 'a b'") + "sed: 1\n",
+    )
     assert ":4:24" in e.with_what
     assert "and 2 more" in e.found
     assert "unknown key 'sed'" in e.found
@@ -127,13 +229,18 @@ def test_several_problems_are_all_listed(tmp_path: Path) -> None:
 
 def test_no_actors_is_a_fine_scene(tmp_path: Path) -> None:
     path = tmp_path / "scene.yaml"
-    path.write_text(swap("actors:\n  - {kind: drive, id: lead, s_m: 60, speeds: [[0, 9]]}\n", "actors: []\n"))
+    path.write_text(
+        swap("actors:\n  - {kind: drive, id: lead, s_m: 60, speeds: [[0, 9]]}\n", "actors: []\n")
+    )
     assert load_scenario(path).actors == ()
 
 
 def test_actors_beside_a_recording_are_refused(tmp_path: Path, repo: Path) -> None:
     xml = repo / "scenarios" / "data" / "USA_US101-3_3_T-1.xml"
-    e = fails(tmp_path, f"version: 1\nlog: {{commonroad: {xml}}}\nactors:\n  - {{kind: parked, id: a, s_m: 3}}\n")
+    e = fails(
+        tmp_path,
+        f"version: 1\nlog: {{commonroad: {xml}}}\nactors:\n  - {{kind: parked, id: a, s_m: 3}}\n",
+    )
     assert ":3:1" in e.with_what
     assert "recorded log" in e.found
 
@@ -184,7 +291,9 @@ def test_usdz_and_unknown_files_are_refused_with_what_can_be_read(tmp_path: Path
 
 def test_a_map_without_lanes_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "empty.xml"
-    path.write_text('<commonRoad timeStepSize="0.1" commonRoadVersion="2018b" benchmarkID="X"></commonRoad>')
+    path.write_text(
+        '<commonRoad timeStepSize="0.1" commonRoadVersion="2018b" benchmarkID="X"></commonRoad>'
+    )
     with pytest.raises(InputError) as e:
         load_scenario(path)
     assert "empty.xml" in e.value.with_what

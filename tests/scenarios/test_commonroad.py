@@ -14,7 +14,18 @@ from alpasim_plugin.world.route import LaneIndex, route_from_log
 from scenarios.commonroad import read_commonroad, read_obstacles
 from scenarios.commonroad_map import read_lanelets
 from scenarios.recorded import SourceFiles
-from tests.scenarios.make_commonroad import LANES, TRAFFIC, bound, document, drive, lanelet, obstacle, points, state, write_commonroad
+from tests.scenarios.make_commonroad import (
+    LANES,
+    TRAFFIC,
+    bound,
+    document,
+    drive,
+    lanelet,
+    obstacle,
+    points,
+    state,
+    write_commonroad,
+)
 from tests.scenarios.real_drive import boxes_at, footprint, ruling
 
 
@@ -39,7 +50,7 @@ def refused(tmp_path, ego=None, text=None, **parts):
     return error
 
 
-# --- what becomes of a file -------------------------------------------------------------------------------------------
+# --- what becomes of a file
 
 
 def test_longest_drive_inside_one_lane_is_the_ego_and_no_actor(log):
@@ -50,7 +61,9 @@ def test_longest_drive_inside_one_lane_is_the_ego_and_no_actor(log):
 def test_rear_axle_lies_behind_the_recorded_centre(log):
     back = log.vehicle.rear_axle_to_centre_m
     assert back == pytest.approx(1.4 * 4.4 / 4.855)
-    np.testing.assert_allclose(log.ego_log.xyz[:, 0], np.linspace(0, 20, 21) - back)  # origin: the first obstacle's place, whole metres
+    np.testing.assert_allclose(
+        log.ego_log.xyz[:, 0], np.linspace(0, 20, 21) - back
+    )  # origin: the first obstacle's place, whole metres
     np.testing.assert_array_equal(log.ego_log.xyz[:, 2], 0.0)
     assert log.world_origin == (20.0, 0.0, 0.0)
     assert (log.vehicle.box.length_m, log.vehicle.box.width_m) == (4.4, 1.8)
@@ -84,7 +97,9 @@ def test_car_that_changes_lanes_is_passed_over(tmp_path):
 
 def test_car_that_leaves_the_lanes_or_touches_another_is_passed_over(tmp_path):
     off = obstacle(20, drive(100, -1.6, speed=15.0))
-    touching = obstacle(21, drive(60, 4, speed=15.0)) + obstacle(22, drive(63, 4, speed=14.0, steps=range(15)))
+    touching = obstacle(21, drive(60, 4, speed=15.0)) + obstacle(
+        22, drive(63, 4, speed=14.0, steps=range(15))
+    )
     assert "car 11" in read(tmp_path, traffic=off + touching + obstacle(11, drive(20, 0))).notes[0]
 
 
@@ -104,11 +119,16 @@ def test_shapes_become_boxes_round_them(tmp_path):
     )
     pair = "<circle><radius>1.0</radius></circle><circle><radius>1.0</radius><center><x>3</x><y>0</y></center></circle>"
     shapes = (circle, polygon, turned, pair)
-    more = "".join(obstacle(40 + i, [state(k, 100.0, 0.0, yaw=np.pi / 2) for k in range(21)], shape) for i, shape in enumerate(shapes))
+    more = "".join(
+        obstacle(40 + i, [state(k, 100.0, 0.0, yaw=np.pi / 2) for k in range(21)], shape)
+        for i, shape in enumerate(shapes)
+    )
     boxes = {a.actor_id: a for a in read(tmp_path, traffic=TRAFFIC + more).actors}
     sizes = {k: (boxes[k].box.length_m, boxes[k].box.width_m) for k in ("40", "41", "42", "43")}
     assert sizes == {"40": (1.0, 1.0), "41": (4.0, 2.0), "42": (4.0, 2.0), "43": (5.0, 2.0)}
-    np.testing.assert_allclose(boxes["41"].track.xyz[0, :2], [80 - 1.0, 2.0], atol=1e-12)  # the polygon's middle, turned by 90 degrees
+    np.testing.assert_allclose(
+        boxes["41"].track.xyz[0, :2], [80 - 1.0, 2.0], atol=1e-12
+    )  # the polygon's middle, turned by 90 degrees
     np.testing.assert_allclose(boxes["42"].track.xyz[0, :2], [80.0, 1.0], atol=1e-12)
     assert abs(yaw_from_quat(boxes["42"].track.quat[0])) == pytest.approx(np.pi)
 
@@ -116,7 +136,11 @@ def test_shapes_become_boxes_round_them(tmp_path):
 def test_lanelet_attributes_arrive(log):
     lanes = log.lane_map.lanes
     assert lanes["1"].successors == ("2",)
-    assert (lanes["1"].left_neighbour, lanes["1"].right_neighbour, lanes["3"].right_neighbour) == ("3", None, "1")
+    assert (lanes["1"].left_neighbour, lanes["1"].right_neighbour, lanes["3"].right_neighbour) == (
+        "3",
+        None,
+        "1",
+    )
     assert (lanes["1"].speed_limit_mps, lanes["2"].speed_limit_mps) == (13.5, None)
     assert {k.left_paint for k in lanes.values()} == {"unknown"}
     assert any("no line markings" in note for note in log.notes)
@@ -125,8 +149,24 @@ def test_lanelet_attributes_arrive(log):
 def test_version_2020a(tmp_path):
     urban = "<laneletType>urban</laneletType>"
     lanes = (
-        lanelet(1, 0, 200, 0, f"{urban}<laneletType>busLane</laneletType><trafficSignRef ref='201'/>", "dashed", "solid")
-        + lanelet(3, 0, 200, 4, "<stopLine><lineMarking>solid</lineMarking></stopLine>", "broad_solid", "curb")
+        lanelet(
+            1,
+            0,
+            200,
+            0,
+            f"{urban}<laneletType>busLane</laneletType><trafficSignRef ref='201'/>",
+            "dashed",
+            "solid",
+        )
+        + lanelet(
+            3,
+            0,
+            200,
+            4,
+            "<stopLine><lineMarking>solid</lineMarking></stopLine>",
+            "broad_solid",
+            "curb",
+        )
         + lanelet(4, 0, 200, 8, "<laneletType>bicycleLane</laneletType>", "weird", "no_marking")
         + lanelet(5, 0, 200, 12, "<laneletType>sidewalk</laneletType>")
         + lanelet(6, 90, 93, 6, "<laneletType>crosswalk</laneletType>")
@@ -135,7 +175,9 @@ def test_version_2020a(tmp_path):
         '<trafficSign id="201"><trafficSignElement><trafficSignID>274</trafficSignID><additionalValue>10</additionalValue>'
         "</trafficSignElement></trafficSign>"
     )
-    cars = obstacle(11, drive(20, 0), version="2020a") + obstacle(12, [state(0, 150, 4)], version="2020a", static=True, kind="pillar")
+    cars = obstacle(11, drive(20, 0), version="2020a") + obstacle(
+        12, [state(0, 150, 4)], version="2020a", static=True, kind="pillar"
+    )
     extra = '<environmentObstacle id="9"><type>building</type></environmentObstacle>'
     log = read(tmp_path, version="2020a", lanes=lanes, traffic=sign + cars + extra)
     lanes_ = log.lane_map.lanes
@@ -154,11 +196,18 @@ def test_version_2020a(tmp_path):
 def test_predicted_and_uncertain_obstacles_are_left_out_with_a_note(tmp_path):
     area = '<dynamicObstacle id="50"><type>car</type><shape><rectangle><length>4</length><width>2</width></rectangle></shape>'
     area += state(0, 100, 4, tag="initialState") + "<occupancySet/></dynamicObstacle>"
-    vague = obstacle(51, drive(100, 4)).replace("<orientation><exact>0.0</exact>", "<orientation><intervalStart>0</intervalStart>")
+    vague = obstacle(51, drive(100, 4)).replace(
+        "<orientation><exact>0.0</exact>", "<orientation><intervalStart>0</intervalStart>"
+    )
     log = read(tmp_path, traffic=TRAFFIC + area + vague)
     assert [a.actor_id for a in log.actors] == ["12", "13"]
-    assert "1 obstacles are predicted as occupied areas, not as states and were left out" in log.notes
-    assert "1 obstacles have states without an exact position and orientation and were left out" in log.notes
+    assert (
+        "1 obstacles are predicted as occupied areas, not as states and were left out" in log.notes
+    )
+    assert (
+        "1 obstacles have states without an exact position and orientation and were left out"
+        in log.notes
+    )
 
 
 def test_points_with_heights_give_a_ground_with_heights(tmp_path):
@@ -182,19 +231,31 @@ def test_seam_between_lanelets_is_no_road_edge_and_a_traffic_island_is(tmp_path)
 
 
 def test_exchanged_bounds_are_put_right(tmp_path):
-    swapped = '<lanelet id="1">' + bound("leftBound", (0, -2), (200, -2)) + bound("rightBound", (0, 2), (200, 2)) + "</lanelet>"
+    swapped = (
+        '<lanelet id="1">'
+        + bound("leftBound", (0, -2), (200, -2))
+        + bound("rightBound", (0, 2), (200, 2))
+        + "</lanelet>"
+    )
     log = read(tmp_path, lanes=swapped, traffic=obstacle(11, drive(20, 0)))
     assert log.lane_map.lanes["1"].left[0, 1] == 2.0
     assert "1 lanelets had left and right bound exchanged and were put right" in log.notes
 
 
 def test_crossing_lanelets_are_an_intersection_and_linked_ones_are_not(tmp_path):
-    across = '<lanelet id="9">' + bound("leftBound", (98, -30), (98, 30)) + bound("rightBound", (102, -30), (102, 30)) + "</lanelet>"
+    across = (
+        '<lanelet id="9">'
+        + bound("leftBound", (98, -30), (98, 30))
+        + bound("rightBound", (102, -30), (102, 30))
+        + "</lanelet>"
+    )
     lanes = read(tmp_path, lanes=LANES + across).lane_map.lanes
-    assert [k for k, lane in lanes.items() if lane.is_intersection] == ["9"]  # the long lanes are crossed by 3 % of their area
+    assert [k for k, lane in lanes.items() if lane.is_intersection] == [
+        "9"
+    ]  # the long lanes are crossed by 3 % of their area
 
 
-# --- bad input --------------------------------------------------------------------------------------------------------
+# --- bad input
 
 
 def test_missing_file(tmp_path):
@@ -233,7 +294,9 @@ def test_doctype_is_refused_before_any_entity_counts(tmp_path, encoding):
 
 
 def test_unknown_encoding(tmp_path):
-    assert "encoding" in refused(tmp_path, text=document().replace("utf-8", "klingon").encode()).found
+    assert (
+        "encoding" in refused(tmp_path, text=document().replace("utf-8", "klingon").encode()).found
+    )
 
 
 @pytest.mark.parametrize(
@@ -249,13 +312,19 @@ def test_unknown_encoding(tmp_path):
         (document(lanes=lanelet(1, "west", 5, 0)).encode(), "x = 'west'"),
         (document(lanes=lanelet(1, "1e999", 5, 0)).encode(), "x = '1e999'"),
         (document(lanes=lanelet(1, 0, 5e6, 0)).encode(), "a point 5000.0 km from the drive"),
-        (document(lanes=lanelet(1, 0, 5, 0, "<laneletType>sidewalk</laneletType>")).encode(), "1 lanelets, none for vehicles"),
+        (
+            document(lanes=lanelet(1, 0, 5, 0, "<laneletType>sidewalk</laneletType>")).encode(),
+            "1 lanelets, none for vehicles",
+        ),
         (document(traffic=obstacle(1, drive(0, 0)) * 2).encode(), "obstacle id 1 twice"),
         (document(traffic=obstacle(1, drive(0, 0), shape="")).encode(), "no shape"),
         (document(traffic=obstacle(1, drive(0, 0), shape="<star/>")).encode(), "shape 'star'"),
         (document().replace("<length>4.4", "<length>0").encode(), "a shape of 0.0 x 1.8 m"),
         (document(traffic=obstacle(1, drive(0, 0, steps=[3]))).encode(), "1 state"),
-        (document(traffic=obstacle(1, drive(0, 80.0))).encode(), "none a car that is present all the time, stays on the lanelets"),
+        (
+            document(traffic=obstacle(1, drive(0, 80.0))).encode(),
+            "none a car that is present all the time, stays on the lanelets",
+        ),
     ],
 )
 def test_documents_that_are_no_scenario(tmp_path, text, found):
@@ -263,7 +332,9 @@ def test_documents_that_are_no_scenario(tmp_path, text, found):
 
 
 def test_times_that_do_not_increase(tmp_path):
-    error = refused(tmp_path, ego="11", traffic=obstacle(11, [state(k, 20 + k, 0) for k in (0, 1, 1, 2)]))
+    error = refused(
+        tmp_path, ego="11", traffic=obstacle(11, [state(k, 20 + k, 0) for k in (0, 1, 1, 2)])
+    )
     assert "time 100000 us after 100000 us in row 2" in error.found
     assert "obstacle 11" in error.with_what
 
@@ -279,18 +350,32 @@ def test_unknown_ego(tmp_path):
     assert error.do_this == "choose the ego among 11, 12, 13"
 
 
-# --- the facts of two recorded files ----------------------------------------------------------------------------------
+# --- the facts of two recorded files
 
 FACTS = {
     "USA_US101-3_3_T-1": {
-        "lanelets": 12, "links": 6, "cars": 12, "states": 384, "last_step": 31, "speeds": (1.98, 17.65), "speed_error": 0.05,
-        "ego": "400", "lane_ids": ("37", "25"),
+        "lanelets": 12,
+        "links": 6,
+        "cars": 12,
+        "states": 384,
+        "last_step": 31,
+        "speeds": (1.98, 17.65),
+        "speed_error": 0.05,
+        "ego": "400",
+        "lane_ids": ("37", "25"),
     },
     "USA_Lanker-1_1_T-1": {
-        "lanelets": 91, "links": 84, "cars": 24, "states": 938, "last_step": 40, "speeds": (0.0, 15.64), "speed_error": 0.27,
-        "ego": "1216", "lane_ids": None,
+        "lanelets": 91,
+        "links": 84,
+        "cars": 24,
+        "states": 938,
+        "last_step": 40,
+        "speeds": (0.0, 15.64),
+        "speed_error": 0.27,
+        "ego": "1216",
+        "lane_ids": None,
     },
-}  # fmt: skip
+}
 
 
 def check_file(path, facts):
@@ -303,21 +388,29 @@ def check_file(path, facts):
     assert len(obstacles) == facts["cars"]
     assert {o.label for o in obstacles} == {"car"}
     assert sum(len(o.steps) for o in obstacles) == facts["states"]
-    assert (min(o.steps[0] for o in obstacles), max(o.steps[-1] for o in obstacles)) == (0, facts["last_step"])
+    assert (min(o.steps[0] for o in obstacles), max(o.steps[-1] for o in obstacles)) == (
+        0,
+        facts["last_step"],
+    )
     speeds = np.concatenate([o.speed_mps for o in obstacles])
     assert (speeds.min(), speeds.max()) == pytest.approx(facts["speeds"], abs=5e-3)
     lane_map, _ = read_lanelets(files, path, root, np.zeros(3))
     assert len(lane_map.lanes) == facts["lanelets"]
     links = [s for lane in lane_map.lanes.values() for s in lane.successors]
     assert (len(links), sum(s in lane_map.lanes for s in links)) == (facts["links"], facts["links"])
-    assert all(lane_polygon(k).is_valid and lane_polygon(k).geom_type == "Polygon" for k in lane_map.lanes.values())
+    assert all(
+        lane_polygon(k).is_valid and lane_polygon(k).geom_type == "Polygon"
+        for k in lane_map.lanes.values()
+    )
     centres = np.concatenate([o.centre for o in obstacles])
     assert min(len(k) for k in LaneIndex(lane_map).containing_many(centres)) >= 1
     return obstacles
 
 
 def check_log(path, facts):
-    """The default ego drives safely under the evaluators' rules, in lanes that follow each other."""
+    """The default ego drives safely under the evaluators' rules, in lanes that follow each
+    other.
+    """
     log = read_commonroad(path)
     assert f"car {facts['ego']}:" in log.notes[0]
     assert len(log.actors) == facts["cars"] - 1
@@ -325,11 +418,20 @@ def check_log(path, facts):
     one, union, neither, off = ruling(log, times)
     assert (len(one) + len(union), neither, off) == (len(times), [], [])
     shapes = footprint(interpolate(log.ego_log, times), log.vehicle, (4.855, 1.88))
-    assert min(shapely.distance(s, boxes_at(log.actors, t)).min() for s, t in zip(shapes, times, strict=True)) > 0.5
+    assert (
+        min(
+            shapely.distance(s, boxes_at(log.actors, t)).min()
+            for s, t in zip(shapes, times, strict=True)
+        )
+        > 0.5
+    )
     assert log.ground.z.tolist() == [[0.0, 0.0], [0.0, 0.0]]
     route = route_from_log(log.lane_map, log.ego_log)
     lanes = log.lane_map.lanes
-    assert all(b in lanes[a].successors for a, b in zip(route.lane_ids[:-1], route.lane_ids[1:], strict=True))
+    assert all(
+        b in lanes[a].successors
+        for a, b in zip(route.lane_ids[:-1], route.lane_ids[1:], strict=True)
+    )
     if facts["lane_ids"]:
         assert route.lane_ids == facts["lane_ids"]
     return log
@@ -340,8 +442,14 @@ def test_real_file(shared_data, name):
     path = shared_data / "commonroad" / f"{name}.xml"
     obstacles = check_file(path, FACTS[name])
     # Speed over each step against the mean of the stored speeds at its ends.
-    errors = [np.linalg.norm(np.diff(o.centre, axis=0), axis=1) / 0.1 - (o.speed_mps[1:] + o.speed_mps[:-1]) / 2 for o in obstacles]
-    assert np.abs(np.concatenate(errors)).mean() == pytest.approx(FACTS[name]["speed_error"], abs=5e-3)
+    errors = [
+        np.linalg.norm(np.diff(o.centre, axis=0), axis=1) / 0.1
+        - (o.speed_mps[1:] + o.speed_mps[:-1]) / 2
+        for o in obstacles
+    ]
+    assert np.abs(np.concatenate(errors)).mean() == pytest.approx(
+        FACTS[name]["speed_error"], abs=5e-3
+    )
     check_log(path, FACTS[name])
 
 
@@ -351,7 +459,9 @@ def test_shipped_file(repo):
     log = check_log(path, FACTS["USA_US101-3_3_T-1"])
     assert log.scene_id == "commonroad-USA_US101-3_3_T-1"
     assert len(log.ego_log) == 32
-    assert np.linalg.norm(np.diff(log.ego_log.xyz, axis=0), axis=1).sum() == pytest.approx(31.9, abs=0.1)
+    assert np.linalg.norm(np.diff(log.ego_log.xyz, axis=0), axis=1).sum() == pytest.approx(
+        31.9, abs=0.1
+    )
     assert (se3(log.ego_log.xyz, log.ego_log.quat)[:, 2, 2] == 1).all()
 
 
@@ -360,33 +470,57 @@ def test_reading_twice_gives_the_same_bytes(shared_data):
     one, two = read_commonroad(path), read_commonroad(path)
     assert one.content_hash == two.content_hash
     np.testing.assert_array_equal(one.ego_log.xyz, two.ego_log.xyz)
-    assert all((a.track.xyz == b.track.xyz).all() for a, b in zip(one.actors, two.actors, strict=True))
+    assert all(
+        (a.track.xyz == b.track.xyz).all() for a, b in zip(one.actors, two.actors, strict=True)
+    )
 
 
-# --- traffic lights ---------------------------------------------------------------------------------------------------
+# --- traffic lights
 
 
 def light(number, *phases, offset="", more=""):
-    parts = "".join(f"<cycleElement><duration>{lasts}</duration><color>{colour}</color></cycleElement>" for colour, lasts in phases)
+    parts = "".join(
+        f"<cycleElement><duration>{lasts}</duration><color>{colour}</color></cycleElement>"
+        for colour, lasts in phases
+    )
     return f'<trafficLight id="{number}"><cycle>{parts}{offset and f"<timeOffset>{offset}</timeOffset>"}</cycle>{more}</trafficLight>'
 
 
-LIT = lanelet(1, 0, 60, 0, '<successor ref="2"/><trafficLightRef ref="7"/><trafficLightRef ref="8"/>') + lanelet(2, 60, 200, 0)
+LIT = lanelet(
+    1, 0, 60, 0, '<successor ref="2"/><trafficLightRef ref="7"/><trafficLightRef ref="8"/>'
+) + lanelet(2, 60, 200, 0)
 
 
-def test_a_light_holds_back_the_lanelet_that_names_it_at_its_end_in_microseconds_of_the_file_s_steps(tmp_path):
+def test_a_light_holds_back_the_lanelet_that_names_it_at_its_end_in_microseconds_of_the_file_s_steps(
+    tmp_path,
+):
     lights = light(7, ("red", 30), ("redYellow", 5), ("green", 40), offset="10")
-    log = read(tmp_path, lanes=LIT, traffic=obstacle(11, drive(20, 0)), version="2020a", more=lights)
+    log = read(
+        tmp_path, lanes=LIT, traffic=obstacle(11, drive(20, 0)), version="2020a", more=lights
+    )
     (one,) = log.lane_map.signals
-    assert one.stop[:, :2].tolist() == [[40.0, 2.0], [40.0, -2.0]]  # the origin is the first car's place, 20 m
+    assert one.stop[:, :2].tolist() == [
+        [40.0, 2.0],
+        [40.0, -2.0],
+    ]  # the origin is the first car's place, 20 m
     assert (one.heading_rad, one.offset_us) == (0.0, 1_000_000)
     assert one.phases == (("red", 3_000_000), ("red_yellow", 500_000), ("green", 4_000_000))
-    assert [one.colour_at(t) for t in (0, 1_000_000, 4_200_000, 4_500_000, 8_500_000)] == ["green", "red", "red_yellow", "green", "red"]
+    assert [one.colour_at(t) for t in (0, 1_000_000, 4_200_000, 4_500_000, 8_500_000)] == [
+        "green",
+        "red",
+        "red_yellow",
+        "green",
+        "red",
+    ]
 
 
-def test_lights_that_are_off_or_for_one_direction_are_noted_and_without_any_nothing_is_known(tmp_path, log):
+def test_lights_that_are_off_or_for_one_direction_are_noted_and_without_any_nothing_is_known(
+    tmp_path, log
+):
     assert log.lane_map.signals is None
-    off = light(7, ("red", 30), more="<active>false</active>") + light(8, ("red", 30), more="<direction>left</direction>")
+    off = light(7, ("red", 30), more="<active>false</active>") + light(
+        8, ("red", 30), more="<direction>left</direction>"
+    )
     found = read(tmp_path, lanes=LIT, traffic=obstacle(11, drive(20, 0)), version="2020a", more=off)
     assert found.lane_map.signals is None
     assert any(note.startswith("2 traffic lights are off") for note in found.notes)

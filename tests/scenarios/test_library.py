@@ -27,12 +27,16 @@ def scenario(name: str) -> Scenario:
 
 
 def rectangle(pose: F64, box: Box, ahead_m: float = 0.0) -> shapely.Polygon:
-    """One footprint by plain trigonometry: the slow reference of the array code in `scenarios.build`."""
+    """One footprint by plain trigonometry: the slow reference of the array code in
+    `scenarios.build`.
+    """
     yaw = yaw_of(pose)
     centre = pose[:2, 3] + ahead_m * np.array([np.cos(yaw), np.sin(yaw)])
     along, aside = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
     l, w = box.length_m / 2, box.width_m / 2  # noqa: E741
-    return shapely.Polygon([centre + a * l * along + b * w * aside for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
+    return shapely.Polygon(
+        [centre + a * l * along + b * w * aside for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
+    )
 
 
 def test_the_library_is_as_large_as_promised() -> None:
@@ -48,8 +52,11 @@ def test_the_library_is_as_large_as_promised() -> None:
 @pytest.mark.parametrize("name", first_of(BUILT, 12))
 def test_expert_stays_on_the_road_and_clear_of_everybody(name: str) -> None:
     s = scenario(name)
-    lanes = [shapely.Polygon(np.concatenate([lane.left, lane.right[::-1]])[:, :2]).buffer(1e-3)  # type: ignore[index]
-             for lane in s.lane_map.lanes.values() if lane.kind == "vehicle"]  # fmt: skip
+    lanes = [
+        shapely.Polygon(np.concatenate([lane.left, lane.right[::-1]])[:, :2]).buffer(1e-3)  # type: ignore[index]
+        for lane in s.lane_map.lanes.values()
+        if lane.kind == "vehicle"
+    ]
     road = shapely.union_all(lanes)
     shapely.prepare(road)
     for t in range(0, s.end_us + 1, 100_000):
@@ -82,7 +89,9 @@ def test_expert_drives_smoothly(name: str) -> None:
 @pytest.mark.parametrize("name", [*BUILT, "real/us101"])
 def test_scenario_is_complete(name: str) -> None:
     s = scenario(name)
-    assert s.ego_log.t_us[0] <= s.start_us < s.start_us + s.warmup_us < s.end_us <= s.ego_log.t_us[-1]
+    assert (
+        s.ego_log.t_us[0] <= s.start_us < s.start_us + s.warmup_us < s.end_us <= s.ego_log.t_us[-1]
+    )
     assert len({a.actor_id for a in s.actors}) == len(s.actors)
     assert s.cameras
     assert len(s.content_hash) == 64
@@ -105,7 +114,9 @@ def test_smoke_scenarios_are_short_and_small(name: str) -> None:
 @pytest.mark.parametrize("name", ["smoke/lead_car", "highway/congestion", "urban/avenue_traffic"])
 @pytest.mark.slow
 def test_traffic_beside_the_expert_drives_as_it_did_at_load(name: str) -> None:
-    """The reactive drivers meet the same ego in the loop as at load, so they come out on their tracks."""
+    """The reactive drivers meet the same ego in the loop as at load, so they come out on their
+    tracks.
+    """
     s = scenario(name)
     actors = make_actors(s)
     for t in range(s.start_us, s.end_us + 1, 50_000):
@@ -123,7 +134,9 @@ def test_scenarios_are_different_from_each_other() -> None:
 
 def test_suites_hold_what_their_folders_hold() -> None:
     for name in ("urban", "highway", "hard"):
-        assert [Path(r.path).stem for r in load_suite(name)] == [n.split("/")[1] for n in BUILT if n.startswith(name)]
+        assert [Path(r.path).stem for r in load_suite(name)] == [
+            n.split("/")[1] for n in BUILT if n.startswith(name)
+        ]
     assert len(load_suite("suites/all")) == len(shipped_names())
     for name in ("smoke", "gate_self_test"):  # a driver that does not look hits the leader
         assert "hard_brake" in [Path(r.path).stem for r in load_suite(f"suites/{name}")]

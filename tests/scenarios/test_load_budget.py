@@ -1,4 +1,6 @@
-"""Files that name one another several times double at every step: what is read for one command is bounded."""
+"""Files that name one another several times double at every step: what is read for one command is
+bounded.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ def test_files_that_extend_the_next_one_four_times_are_refused(tmp_path: Path) -
 
 def test_suites_that_name_the_next_one_four_times_are_refused(tmp_path: Path) -> None:
     for i in range(DEPTH):
-        (tmp_path / f"{i}.yaml").write_text(f"version: 1\nscenarios: [{', '.join([f'{i + 1}.yaml'] * 4)}]\n")
+        (tmp_path / f"{i}.yaml").write_text(
+            f"version: 1\nscenarios: [{', '.join([f'{i + 1}.yaml'] * 4)}]\n"
+        )
     (tmp_path / f"{DEPTH}.yaml").write_text("version: 1\nscenarios: [smoke/curve]\n")
     with pytest.raises(InputError, match=r"more than 256 suites to read"):
         load_suite(tmp_path / "0.yaml")

@@ -1,4 +1,6 @@
-"""OpenDRIVE: every kind of reference line against an independent way to the same curve, lanes and links, AlpaSim's rule, real maps."""
+"""OpenDRIVE: every kind of reference line against an independent way to the same curve, lanes and
+links, AlpaSim's rule, real maps.
+"""
 
 from __future__ import annotations
 
@@ -23,23 +25,41 @@ from scenarios.usdz import alpasim_map
 FILES = SourceFiles("reading OpenDRIVE")
 
 
-def lane(i: int, width: str = '<width sOffset="0" a="3.5" b="0" c="0" d="0"/>', kind: str = "driving", more: str = "") -> str:
+def lane(
+    i: int,
+    width: str = '<width sOffset="0" a="3.5" b="0" c="0" d="0"/>',
+    kind: str = "driving",
+    more: str = "",
+) -> str:
     return f'<lane id="{i}" type="{kind}" level="false">{more}{width}</lane>'
 
 
 def road(
-    left: str = "", right: str = "", view: str = "", i: int = 1, length: float = 40.0, sections: str = "", before: str = "", more: str = ""
+    left: str = "",
+    right: str = "",
+    view: str = "",
+    i: int = 1,
+    length: float = 40.0,
+    sections: str = "",
+    before: str = "",
+    more: str = "",
 ) -> str:
     view = view or f'<geometry s="0" x="0" y="0" hdg="0" length="{length}"><line/></geometry>'
-    sides = "".join(f"<{side}>{content}</{side}>" for side, content in (("left", left), ("right", right)) if content)
+    sides = "".join(
+        f"<{side}>{content}</{side}>"
+        for side, content in (("left", left), ("right", right))
+        if content
+    )
     sections = sections or f'<laneSection s="0">{sides}</laneSection>'
-    return (
-        f'<road id="{i}" length="{length}" junction="-1" {more}>{before}<planView>{view}</planView><lanes>{sections}</lanes></road>'
-    )  # fmt: skip
+    return f'<road id="{i}" length="{length}" junction="-1" {more}>{before}<planView>{view}</planView><lanes>{sections}</lanes></road>'
 
 
 def parsed(*roads: str, header: str = "") -> OdrMap:
-    return parse_map(FILES, "map.xodr", ElementTree.fromstring(f"<OpenDRIVE>{header}{''.join(roads)}</OpenDRIVE>"))
+    return parse_map(
+        FILES,
+        "map.xodr",
+        ElementTree.fromstring(f"<OpenDRIVE>{header}{''.join(roads)}</OpenDRIVE>"),
+    )
 
 
 def lanes_of(*roads: str):
@@ -54,8 +74,12 @@ def test_a_spiral_integrates_its_heading():
 
     for s in (0.0, 1.0, 33.3, 60.0):
         x, y, yaw = spiral.at(np.array([s]))[0]
-        assert x == pytest.approx(3.0 + quad(lambda t: np.cos(heading(t)), 0, s, epsabs=1e-13)[0], abs=1e-11)
-        assert y == pytest.approx(-2.0 + quad(lambda t: np.sin(heading(t)), 0, s, epsabs=1e-13)[0], abs=1e-11)
+        assert x == pytest.approx(
+            3.0 + quad(lambda t: np.cos(heading(t)), 0, s, epsabs=1e-13)[0], abs=1e-11
+        )
+        assert y == pytest.approx(
+            -2.0 + quad(lambda t: np.sin(heading(t)), 0, s, epsabs=1e-13)[0], abs=1e-11
+        )
         assert yaw == pytest.approx(heading(s), abs=1e-12)
 
 
@@ -72,23 +96,33 @@ def test_a_cubic_is_walked_by_its_arc_length():
     cubic = Geometry(0.0, 0.0, 0.0, 0.0, 30.0, "poly3", (0.0, 0.1, 0.02, -0.0005))
     s = np.linspace(0.0, 30.0, 3001)
     at = cubic.at(s)
-    np.testing.assert_allclose(at[:, 1], 0.1 * at[:, 0] + 0.02 * at[:, 0] ** 2 - 0.0005 * at[:, 0] ** 3, atol=1e-9)
+    np.testing.assert_allclose(
+        at[:, 1], 0.1 * at[:, 0] + 0.02 * at[:, 0] ** 2 - 0.0005 * at[:, 0] ** 3, atol=1e-9
+    )
     np.testing.assert_allclose(arc_lengths(at[:, :2]), s, atol=1e-4)  # chords of 1 cm
-    np.testing.assert_allclose(at[1:-1, 2], np.arctan2(*(at[2:, :2] - at[:-2, :2]).T[::-1]), atol=1e-5)
+    np.testing.assert_allclose(
+        at[1:-1, 2], np.arctan2(*(at[2:, :2] - at[:-2, :2]).T[::-1]), atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("normalised", [True, False])
 def test_a_parametric_cubic_by_share_or_by_length(normalised):
     scale = 1.0 if normalised else 20.0
     numbers = (0.0, 20.0 / scale, 0.0, 0.0, 0.0, 0.0, 6.0 / scale**2, -4.0 / scale**3)
-    at = Geometry(0.0, 1.0, 2.0, np.pi / 2, 20.0, "paramPoly3", numbers, normalised).at(np.array([0.0, 10.0, 20.0]))
-    np.testing.assert_allclose(at[:, :2], [[1.0, 2.0], [1.0 - (6 / 4 - 4 / 8), 12.0], [-1.0, 22.0]], atol=1e-12)
+    at = Geometry(0.0, 1.0, 2.0, np.pi / 2, 20.0, "paramPoly3", numbers, normalised).at(
+        np.array([0.0, 10.0, 20.0])
+    )
+    np.testing.assert_allclose(
+        at[:, :2], [[1.0, 2.0], [1.0 - (6 / 4 - 4 / 8), 12.0], [-1.0, 22.0]], atol=1e-12
+    )
     assert at[0, 2] == pytest.approx(np.pi / 2)
 
 
 def test_the_record_in_force_counts():
     records = [Cubic(0.0, 1.0), Cubic(10.0, 5.0, 0.5)]
-    np.testing.assert_allclose(cubics_at(records, np.array([-1.0, 0.0, 9.99, 10.0, 12.0])), [1.0, 1.0, 1.0, 5.0, 6.0])
+    np.testing.assert_allclose(
+        cubics_at(records, np.array([-1.0, 0.0, 9.99, 10.0, 12.0])), [1.0, 1.0, 1.0, 5.0, 6.0]
+    )
     assert cubics_at([], np.array([3.0])).tolist() == [0.0]
 
 
@@ -99,7 +133,9 @@ def test_lanes_of_both_sides_run_against_each_other():
     np.testing.assert_allclose(left.centre[[0, -1]], [[40, 1.75, 0], [0, 1.75, 0]], atol=1e-9)
     for one in (right, left):
         ring = lane_polygon(one)
-        assert not shapely.is_ccw(shapely.linearrings(np.concatenate([one.left[:, :2], one.right[::-1, :2]])))
+        assert not shapely.is_ccw(
+            shapely.linearrings(np.concatenate([one.left[:, :2], one.right[::-1, :2]]))
+        )
         assert ring.area == pytest.approx(140.0)
     assert (right.left_neighbour, right.right_neighbour) == (None, "1.0.-2")
     assert found.lanes["1.0.-2"].kind == "shoulder"
@@ -108,12 +144,17 @@ def test_lanes_of_both_sides_run_against_each_other():
 def test_with_left_hand_traffic_lanes_run_the_other_way():
     found = lanes_of(road(left=lane(1), right=lane(-1), more='rule="LHT"'))
     np.testing.assert_allclose(found.lanes["1.0.-1"].centre[[0, -1], 0], [40, 0], atol=1e-9)
-    np.testing.assert_allclose(found.lanes["1.0.-1"].left[:, 1], -3.5, atol=1e-12)  # its left is the road's outside
+    np.testing.assert_allclose(
+        found.lanes["1.0.-1"].left[:, 1], -3.5, atol=1e-12
+    )  # its left is the road's outside
     np.testing.assert_allclose(found.lanes["1.0.1"].right[:, 1], 0.0, atol=1e-12)
 
 
 def test_widths_offsets_heights_and_borders_follow_the_true_arc_length():
-    taper = lane(-1, '<width sOffset="0" a="3" b="0" c="0" d="0"/><width sOffset="20" a="3" b="0.1" c="0" d="0"/>')
+    taper = lane(
+        -1,
+        '<width sOffset="0" a="3" b="0" c="0" d="0"/><width sOffset="20" a="3" b="0.1" c="0" d="0"/>',
+    )
     border = lane(-2, '<border sOffset="0" a="-9" b="0" c="0" d="0"/>')
     body = f'<laneOffset s="10" a="0.5" b="0" c="0" d="0"/><laneSection s="0"><right>{taper}{border}</right></laneSection>'
     rise = '<elevationProfile><elevation s="0" a="2" b="0.1" c="0" d="0"/></elevationProfile>'
@@ -121,16 +162,29 @@ def test_widths_offsets_heights_and_borders_follow_the_true_arc_length():
     found = lanes_of(road(sections=body, before=rise + bank))
     one = found.lanes["1.0.-1"]
     at_30 = np.argmin(np.abs(one.right[:, 0] - 30.0))
-    np.testing.assert_allclose(one.right[at_30], [30.0, 0.5 - 4.0, 2.0 + 3.0 + (0.5 - 4.0) * np.tan(0.1)], atol=1e-9)
+    np.testing.assert_allclose(
+        one.right[at_30], [30.0, 0.5 - 4.0, 2.0 + 3.0 + (0.5 - 4.0) * np.tan(0.1)], atol=1e-9
+    )
     outer = found.lanes["1.0.-2"].right
     assert outer[np.argmin(np.abs(outer[:, 0] - 30.0)), 1] == pytest.approx(0.5 - 9.0)
 
 
 def test_lanes_are_linked_along_sections_roads_and_junctions():
     next_lane = '<link><successor id="-1"/></link>'
-    halves = "".join(f'<laneSection s="{s}"><right>{lane(-1, more=next_lane)}</right></laneSection>' for s in (0, 20))
-    first = road(sections=halves, i=1, before='<link><successor elementType="junction" elementId="9"/></link>')
-    turn = road(right=lane(-1), i=2).replace('junction="-1"', 'junction="9"').replace('x="0"', 'x="40"')
+    halves = "".join(
+        f'<laneSection s="{s}"><right>{lane(-1, more=next_lane)}</right></laneSection>'
+        for s in (0, 20)
+    )
+    first = road(
+        sections=halves,
+        i=1,
+        before='<link><successor elementType="junction" elementId="9"/></link>',
+    )
+    turn = (
+        road(right=lane(-1), i=2)
+        .replace('junction="-1"', 'junction="9"')
+        .replace('x="0"', 'x="40"')
+    )
     junction = (
         '<junction id="9"><connection id="0" incomingRoad="1" connectingRoad="2" contactPoint="start">'
         '<laneLink from="-1" to="-1"/></connection></junction>'
@@ -143,7 +197,9 @@ def test_lanes_are_linked_along_sections_roads_and_junctions():
 
 def test_paint_of_marks():
     mark = '<roadMark sOffset="0" type="{}" color="{}"/>'
-    middle = f'<center><lane id="0" type="none">{mark.format("solid solid", "yellow")}</lane></center>'
+    middle = (
+        f'<center><lane id="0" type="none">{mark.format("solid solid", "yellow")}</lane></center>'
+    )
     sides = f"{middle}<right>{lane(-1, more=mark.format('broken', 'white'))}</right>"
     one = lanes_of(road(sections=f'<laneSection s="0">{sides}</laneSection>')).lanes["1.0.-1"]
     assert (one.left_paint, one.right_paint) == ("double_yellow", "dashed_white")
@@ -159,7 +215,11 @@ NO_SHAPE = '<geometry s="0" x="0" y="0" hdg="0" length="9"/>'
         ("OpenDRIVE", "", "without roads"),
         ("OpenDRIVE", road(right=lane(-1), length=float("nan")), "length = 'nan'"),
         ("OpenDRIVE", road(right=lane(-1), length=1e308), "length = 1e+308 m, outside"),
-        ("OpenDRIVE", road(right=lane(-1, '<width sOffset="0" a="1e300" b="0" c="0" d="0"/>')), "not finite or not on a road"),
+        (
+            "OpenDRIVE",
+            road(right=lane(-1, '<width sOffset="0" a="1e300" b="0" c="0" d="0"/>')),
+            "not finite or not on a road",
+        ),
         ("OpenDRIVE", road(right=lane(-1)).replace('id="-1"', 'id="x"'), "<lane> with id = 'x'"),
         ("OpenDRIVE", road(right=lane(-1), view=NO_SHAPE), "a <geometry> of []"),
         ("OpenDRIVE", road(right=lane(-1, kind="sidewalk")), "without a lane for vehicles"),
@@ -167,11 +227,16 @@ NO_SHAPE = '<geometry s="0" x="0" y="0" hdg="0" length="9"/>'
 )
 def test_what_is_no_usable_map_is_refused(root, content, found):
     with pytest.raises(InputError) as error:
-        lane_map_of(FILES, "map.xodr", parse_map(FILES, "map.xodr", ElementTree.fromstring(f"<{root}>{content}</{root}>")), np.eye(4))
+        lane_map_of(
+            FILES,
+            "map.xodr",
+            parse_map(FILES, "map.xodr", ElementTree.fromstring(f"<{root}>{content}</{root}>")),
+            np.eye(4),
+        )
     assert found in error.value.found
 
 
-# --- AlpaSim's rule ---------------------------------------------------------------------------------------------------
+# --- AlpaSim's rule
 
 
 def test_alpasims_edges_are_the_outermost_borders_sidewalks_included():
@@ -180,7 +245,10 @@ def test_alpasims_edges_are_the_outermost_borders_sidewalks_included():
     assert set(found.lanes) == {"1_1", "1_-1"}
     assert [round(float(edge[0, 1]), 6) for edge in found.road_edges] == [5.5, -3.5]
     own = lanes_of(road(left=lane(1) + walk, right=lane(-1)))
-    assert shapely.distance(shapely.points(20, 3.5), shapely.linestrings(own.road_edges[0][:, :2])) < 1e-9
+    assert (
+        shapely.distance(shapely.points(20, 3.5), shapely.linestrings(own.road_edges[0][:, :2]))
+        < 1e-9
+    )
 
 
 def test_alpasim_gives_a_one_sided_road_an_edge_beside_its_reference_line():
@@ -193,7 +261,9 @@ def test_alpasim_reads_widths_by_station_number():
     edge = alpasim_map(parsed(road(right=taper, length=40.2)), np.eye(4)).road_edges[0]
     # 81 stations over 40.2 m are 0.5025 m apart, but widths are read every 0.5 m.
     assert edge[-1, 1] == pytest.approx(-(2 + 0.1 * 40.0))
-    assert lanes_of(road(right=taper, length=40.2)).lanes["1.0.-1"].right[-1, 1] == pytest.approx(-(2 + 0.1 * 40.2))
+    assert lanes_of(road(right=taper, length=40.2)).lanes["1.0.-1"].right[-1, 1] == pytest.approx(
+        -(2 + 0.1 * 40.2)
+    )
 
 
 def test_alpasim_passes_over_what_is_neither_line_nor_arc():
@@ -203,19 +273,37 @@ def test_alpasim_passes_over_what_is_neither_line_nor_arc():
     )
     found = alpasim_map(parsed(road(right=lane(-1), view=view, length=30)), np.eye(4))
     assert found.lanes["1_-1"].centre[:, 0].max() == pytest.approx(10.0)
-    assert lanes_of(road(right=lane(-1), view=view, length=30)).lanes["1.0.-1"].centre[:, 0].max() > 29.5
+    assert (
+        lanes_of(road(right=lane(-1), view=view, length=30)).lanes["1.0.-1"].centre[:, 0].max()
+        > 29.5
+    )
 
 
 def test_alpasim_drops_edges_across_lanes_and_twins_of_edges():
-    across = road(right=lane(-1), i=2, view='<geometry s="0" x="20" y="-20" hdg="1.5707963267948966" length="40"><line/></geometry>')
+    across = road(
+        right=lane(-1),
+        i=2,
+        view='<geometry s="0" x="20" y="-20" hdg="1.5707963267948966" length="40"><line/></geometry>',
+    )
     found = alpasim_map(parsed(road(left=lane(1), right=lane(-1)), across), np.eye(4))
     assert found.road_edges == ()  # all of them cross a lane of the other road
-    beside = road(right=lane(-1), i=3, view='<geometry s="0" x="0" y="-3.6" hdg="0" length="40"><line/></geometry>')
-    assert len(alpasim_map(parsed(road(left=lane(1), right=lane(-1)), beside), np.eye(4)).road_edges) == 3
+    beside = road(
+        right=lane(-1),
+        i=3,
+        view='<geometry s="0" x="0" y="-3.6" hdg="0" length="40"><line/></geometry>',
+    )
+    assert (
+        len(alpasim_map(parsed(road(left=lane(1), right=lane(-1)), beside), np.eye(4)).road_edges)
+        == 3
+    )
 
 
 def test_a_map_is_placed_by_its_origin_on_the_earth():
-    assert geographic_origin("+proj=tmerc +lat_0=49 +lon_0=8 +=alt_0=0 +h_0=110") == (49.0, 8.0, 110.0)
+    assert geographic_origin("+proj=tmerc +lat_0=49 +lon_0=8 +=alt_0=0 +h_0=110") == (
+        49.0,
+        8.0,
+        110.0,
+    )
     assert geographic_origin("+proj=utm +zone=32") is None
     assert geographic_origin("+lat_0=x +lon_0=8") is None
     T_earth_local = np.linalg.inv(T_enu_earth(49.0, 8.0, 110.0))
@@ -225,16 +313,22 @@ def test_a_map_is_placed_by_its_origin_on_the_earth():
     np.testing.assert_allclose(place, np.linalg.inv(shift), atol=1e-8)
     np.testing.assert_array_equal(T_local_map("", T_earth_local), np.eye(4))
     x, y, z = np.linalg.inv(T_enu_earth(90.0, 0.0, 0.0))[:3, 3]
-    np.testing.assert_allclose([x, y, z], [0.0, 0.0, 6356752.3142], atol=1e-4)  # the pole: WGS 84's semi-minor axis
+    np.testing.assert_allclose(
+        [x, y, z], [0.0, 0.0, 6356752.3142], atol=1e-4
+    )  # the pole: WGS 84's semi-minor axis
 
 
-# --- real maps --------------------------------------------------------------------------------------------------------
+# --- real maps
 
 REAL = {
     # roads, metres, records by kind: facts of the data sets' notes, counted by other software
     "opendrive-esmini/fabriksgatan.xodr": (16, 687.717, {"paramPoly3": 16, "arc": 8}),
     "opendrive-esmini/e6mini.xodr": (1, 1464.434, {"paramPoly3": 16, "line": 1}),
-    "opendrive-esmini/multi_intersections.xodr": (63, 3507.665, {"line": 95, "spiral": 56, "arc": 32}),
+    "opendrive-esmini/multi_intersections.xodr": (
+        63,
+        3507.665,
+        {"line": 95, "spiral": 56, "arc": 32},
+    ),
     "opendrive-esmini/straight_500m.xodr": (1, 500.0, {"line": 1}),
     "opendrive-carla/Town01.xodr": (98, 3923.072, {"line": 240, "arc": 112}),
     "opendrive-carla/Town03.xodr": (279, 9141.991, {"line": 718, "arc": 358}),
@@ -258,7 +352,9 @@ def test_roads_and_reference_lines_of_real_maps(shared_data, name):
     for one in odr.roads:
         for a, b in zip(one.records[:-1], one.records[1:], strict=True):
             end = a.at(np.array([a.length_m]))[0]
-            assert np.hypot(end[0] - b.x_m, end[1] - b.y_m) < 2e-3  # one record ends where the next begins
+            assert (
+                np.hypot(end[0] - b.x_m, end[1] - b.y_m) < 2e-3
+            )  # one record ends where the next begins
 
 
 BIG = [pytest.param("opendrive-carla/Town03.xodr", marks=pytest.mark.slow)]
@@ -275,12 +371,15 @@ def test_lanes_of_real_maps_are_sound(shared_data, name):
         for after in one.successors:
             follower = found.lanes[after]
             gap = np.hypot(*(one.centre[-1, :2] - follower.centre[0, :2]))
-            # Town03 links shoulders across the tips of two head-on roads that are 8 cm and 96 cm long.
+            # Town03 links shoulders across the tips of two head-on roads that are 8 cm and 96 cm
+            # long.
             assert gap < 0.01 or one.kind == "shoulder", (one.lane_id, after, gap)
 
 
 def test_widths_of_a_real_straight_road(shared_data):
-    found, _ = lane_map_of(FILES, "s", real(shared_data, "opendrive-esmini/straight_500m.xodr"), np.eye(4))
+    found, _ = lane_map_of(
+        FILES, "s", real(shared_data, "opendrive-esmini/straight_500m.xodr"), np.eye(4)
+    )
     for key in ("1.0.-1", "1.0.1"):
         one = found.lanes[key]
         assert np.hypot(*(one.left[0, :2] - one.right[0, :2])) == pytest.approx(3.07)
@@ -288,18 +387,31 @@ def test_widths_of_a_real_straight_road(shared_data):
 
 def test_cars_of_another_simulator_drive_in_the_lanes(shared_data):
     """The trace's car drives through fabriksgatan by esmini's own reading of the map."""
-    found, _ = lane_map_of(FILES, "f", real(shared_data, "opendrive-esmini/fabriksgatan.xodr"), np.eye(4))
+    found, _ = lane_map_of(
+        FILES, "f", real(shared_data, "opendrive-esmini/fabriksgatan.xodr"), np.eye(4)
+    )
     with (shared_data / "opendrive-esmini" / "osi" / "example.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     car = [row for row in rows if float(row["length"]) > 2.0]
     assert len(car) == 434
-    road = shapely.union_all([shapely.buffer(lane_polygon(one), 1e-3) for one in found.lanes.values() if one.kind == "vehicle"])
-    inside = shapely.contains_xy(road, [float(row["x"]) for row in car], [float(row["y"]) for row in car])
+    road = shapely.union_all(
+        [
+            shapely.buffer(lane_polygon(one), 1e-3)
+            for one in found.lanes.values()
+            if one.kind == "vehicle"
+        ]
+    )
+    inside = shapely.contains_xy(
+        road, [float(row["x"]) for row in car], [float(row["y"]) for row in car]
+    )
     assert inside.all()
     best = []
     for row in car[::40]:
         at, yaw = np.array([float(row["x"]), float(row["y"])]), float(row["yaw"])
-        steps = [np.diff(one.centre[:, :2], axis=0)[np.argmin(np.hypot(*(one.centre[:-1, :2] - at).T))] for one in found.lanes.values()]
+        steps = [
+            np.diff(one.centre[:, :2], axis=0)[np.argmin(np.hypot(*(one.centre[:-1, :2] - at).T))]
+            for one in found.lanes.values()
+        ]
         near = [np.min(np.hypot(*(one.centre[:, :2] - at).T)) for one in found.lanes.values()]
         ahead = [abs((np.arctan2(s[1], s[0]) - yaw + np.pi) % (2 * np.pi) - np.pi) for s in steps]
         best.append(min(d for d, a in zip(near, ahead, strict=True) if a < 0.3))

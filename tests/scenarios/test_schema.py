@@ -15,14 +15,20 @@ from scenarios.suite import LIBRARY, shipped_names
 
 
 def test_committed_schema_is_current() -> None:
-    assert SCHEMA_FILE.read_text(encoding="utf-8") == json_schema(), "run python -m scenarios.schema"
+    assert SCHEMA_FILE.read_text(encoding="utf-8") == json_schema(), (
+        "run python -m scenarios.schema"
+    )
 
 
 def test_schema_is_closed_and_versioned() -> None:
     schema = json.loads(json_schema())
     assert schema["properties"]["version"]["const"] == 1
     assert schema["additionalProperties"] is False
-    assert all(d.get("additionalProperties") is False for name, d in schema["$defs"].items() if d.get("type") == "object")
+    assert all(
+        d.get("additionalProperties") is False
+        for name, d in schema["$defs"].items()
+        if d.get("type") == "object"
+    )
 
 
 def test_every_key_has_a_description() -> None:
@@ -35,7 +41,11 @@ def test_every_key_of_the_schema_and_every_limit_stands_on_its_page(repo: Path) 
     missing = []
     for where, model in models().items():
         text = (repo / "docs" / page_of(where)).read_text(encoding="utf-8")
-        missing += [f"{where}.{name}" for name in model.model_fields if f"| `{name}` |" not in text and name != "kind"]
+        missing += [
+            f"{where}.{name}"
+            for name in model.model_fields
+            if f"| `{name}` |" not in text and name != "kind"
+        ]
     limits = (repo / "docs" / LIMITS_PAGE).read_text(encoding="utf-8")
     missing += [row for row in limit_tables().splitlines() if row not in limits]
     assert missing == [], "run python -m scenarios.schema_docs docs"
@@ -43,7 +53,11 @@ def test_every_key_of_the_schema_and_every_limit_stands_on_its_page(repo: Path) 
 
 def test_examples_in_the_docs_load(repo: Path, tmp_path: Path) -> None:
     text = (repo / "docs" / "scenario-files.md").read_text(encoding="utf-8")
-    examples = [block for block in re.findall(r"```yaml\n(.*?)```", text, re.S) if "version: 1" in block and "road:" in block]
+    examples = [
+        block
+        for block in re.findall(r"```yaml\n(.*?)```", text, re.S)
+        if "version: 1" in block and "road:" in block
+    ]
     assert examples
     for i, block in enumerate(examples):
         path = tmp_path / f"example{i}.yaml"
@@ -52,7 +66,9 @@ def test_examples_in_the_docs_load(repo: Path, tmp_path: Path) -> None:
 
 
 def test_shipped_files_use_no_default_spelled_out_wrongly() -> None:
-    """Every shipped file parses with an ordinary YAML reader as well: nothing depends on our own scalar rules."""
+    """Every shipped file parses with an ordinary YAML reader as well: nothing depends on our own
+    scalar rules.
+    """
     for name, file in shipped_names().items():
         assert isinstance(yaml.safe_load(file.read_text()), dict), name
     assert ScenarioSpec.model_fields["version"].is_required()

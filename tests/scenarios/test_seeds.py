@@ -1,4 +1,6 @@
-"""Seeds: the same file and seed give the same bits; another seed gives another scene inside the declared ranges."""
+"""Seeds: the same file and seed give the same bits; another seed gives another scene inside the
+declared ranges.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,9 @@ def bits(value: Any) -> Any:
     return [bits(v) for v in value] if isinstance(value, tuple | list) else value
 
 
-@pytest.mark.parametrize("name", ["smoke/lead_car", "hard/occluded_pedestrian", "urban/junction_left", "real/us101"])
+@pytest.mark.parametrize(
+    "name", ["smoke/lead_car", "hard/occluded_pedestrian", "urban/junction_left", "real/us101"]
+)
 def test_same_file_and_seed_give_a_bit_identical_scenario(name: str) -> None:
     assert bits(load_scenario(name, seed=5)) == bits(load_scenario(name, seed=5))
 
@@ -72,7 +76,11 @@ def measures(s: Scenario) -> dict[str, float]:
     left, right = s.lane_map.lanes["s0_f0"].left, s.lane_map.lanes["s0_f0"].right
     assert left is not None
     assert right is not None
-    return {"length": float(centre[-1, 0]), "width": float(left[0, 1] - right[0, 1]), "place": float(s.actors[0].track.xyz[0, 0]) - 20}
+    return {
+        "length": float(centre[-1, 0]),
+        "width": float(left[0, 1] - right[0, 1]),
+        "place": float(s.actors[0].track.xyz[0, 0]) - 20,
+    }
 
 
 def test_jitter_stays_inside_its_ranges(tmp_path: Path) -> None:
@@ -86,7 +94,9 @@ def test_jitter_stays_inside_its_ranges(tmp_path: Path) -> None:
 
 def test_seed_0_is_the_file_as_written_and_others_say_what_they_changed(tmp_path: Path) -> None:
     scene = load_scenario(write(tmp_path))
-    assert measures(scene) == pytest.approx({"length": 100.0, "width": 3.5, "place": 40.0}, abs=1e-9)
+    assert measures(scene) == pytest.approx(
+        {"length": 100.0, "width": 3.5, "place": 40.0}, abs=1e-9
+    )
     assert scene.varied == {}
     other = load_scenario(tmp_path / "scene.yaml", seed=3)
     assert other.varied["road.lane_width_m"] == (3.5, pytest.approx(measures(other)["width"]))
@@ -101,14 +111,24 @@ def test_a_variations_block_asks_for_it_at_seed_0_too(tmp_path: Path) -> None:
 
 
 def test_jitter_switched_off_gives_the_numbers_in_the_file(tmp_path: Path) -> None:
-    path = write(tmp_path, "jitter: {length: 0, curvature: 0, lane_width: 0, speed: 0, position_m: 0, time_us: 0}\n")
-    assert measures(load_scenario(path, seed=9)) == pytest.approx({"length": 100.0, "width": 3.5, "place": 40.0})
-    assert load_scenario(path, seed=9).ego_log.xyz.tobytes() == load_scenario(path, seed=8).ego_log.xyz.tobytes()
+    path = write(
+        tmp_path,
+        "jitter: {length: 0, curvature: 0, lane_width: 0, speed: 0, position_m: 0, time_us: 0}\n",
+    )
+    assert measures(load_scenario(path, seed=9)) == pytest.approx(
+        {"length": 100.0, "width": 3.5, "place": 40.0}
+    )
+    assert (
+        load_scenario(path, seed=9).ego_log.xyz.tobytes()
+        == load_scenario(path, seed=8).ego_log.xyz.tobytes()
+    )
 
 
 def test_curvature_jitter_keeps_transitions_smooth(tmp_path: Path) -> None:
     s = load_scenario(write(tmp_path), seed=4)
-    centre = np.concatenate([s.lane_map.lanes["s1_f0"].centre, s.lane_map.lanes["s2_f0"].centre[1:]])
+    centre = np.concatenate(
+        [s.lane_map.lanes["s1_f0"].centre, s.lane_map.lanes["s2_f0"].centre[1:]]
+    )
     d = np.diff(centre[:, :2], axis=0)
     turn = np.diff(np.unwrap(np.arctan2(d[:, 1], d[:, 0]))) / np.hypot(*d[1:].T)
     assert np.abs(np.diff(turn)).max() < 1.5e-3
@@ -117,9 +137,15 @@ def test_curvature_jitter_keeps_transitions_smooth(tmp_path: Path) -> None:
 def test_adding_an_actor_does_not_change_the_others(tmp_path: Path) -> None:
     one = load_scenario(write(tmp_path), seed=2)
     path = tmp_path / "scene.yaml"
-    path.write_text(BASE.replace("actors:\n", "actors:\n  - {kind: oncoming, id: new, s_m: 100, speed_mps: 8}\n"))
+    path.write_text(
+        BASE.replace(
+            "actors:\n", "actors:\n  - {kind: oncoming, id: new, s_m: 100, speed_mps: 8}\n"
+        )
+    )
     two = load_scenario(path, seed=2)
-    assert one.lane_map.lanes["s0_f0"].centre.tobytes() == two.lane_map.lanes["s0_f0"].centre.tobytes()
+    assert (
+        one.lane_map.lanes["s0_f0"].centre.tobytes() == two.lane_map.lanes["s0_f0"].centre.tobytes()
+    )
     by_id = {a.actor_id: a for a in two.actors}
     assert one.actors[0].track.xyz.tobytes() == by_id["lead"].track.xyz.tobytes()
 
@@ -135,7 +161,10 @@ def test_ranges_and_choices_are_drawn_with_the_seed(tmp_path: Path) -> None:
 
 
 def test_explicit_samples_go_round(tmp_path: Path) -> None:
-    path = write(tmp_path, "samples:\n  - {actors.lead.s_m: 50}\n  - {actors.lead.s_m: 60, environment.sky: dusk}\n")
+    path = write(
+        tmp_path,
+        "samples:\n  - {actors.lead.s_m: 50}\n  - {actors.lead.s_m: 60, environment.sky: dusk}\n",
+    )
     places = [measures(load_scenario(path, seed=seed))["place"] for seed in range(4)]
     assert places == pytest.approx([50.0, 60.0, 50.0, 60.0])
     assert load_scenario(path, seed=1).environment.sky == "dusk"
@@ -143,7 +172,11 @@ def test_explicit_samples_go_round(tmp_path: Path) -> None:
 
 def test_an_override_wins_over_variation_and_jitter(tmp_path: Path) -> None:
     path = write(tmp_path, "variations: {actors.lead.s_m: {low: 50, high: 60}}\n")
-    s = load_scenario(path, seed=3, overrides=["actors.lead.s_m=44", "road.lane_width_m=3.25", "actors.1.clearance_m=0.9"])
+    s = load_scenario(
+        path,
+        seed=3,
+        overrides=["actors.lead.s_m=44", "road.lane_width_m=3.25", "actors.1.clearance_m=0.9"],
+    )
     assert measures(s)["place"] == pytest.approx(44.0)
     assert measures(s)["width"] == pytest.approx(3.25)
     assert s.content_hash != load_scenario(path, seed=3).content_hash
@@ -158,12 +191,21 @@ def test_a_variation_of_an_unknown_key_names_the_variation(tmp_path: Path) -> No
 
 def test_words_for_people_and_places_of_files_do_not_change_the_hash(tmp_path: Path) -> None:
     plain = load_scenario(write(tmp_path))
-    assert load_scenario(write(tmp_path, "description: Something else.\ntags: [x]\n")).content_hash == plain.content_hash
-    assert load_scenario(write(tmp_path, "environment: {sky: dusk}\n")).content_hash != plain.content_hash
+    assert (
+        load_scenario(write(tmp_path, "description: Something else.\ntags: [x]\n")).content_hash
+        == plain.content_hash
+    )
+    assert (
+        load_scenario(write(tmp_path, "environment: {sky: dusk}\n")).content_hash
+        != plain.content_hash
+    )
     (tmp_path / "one.ply").write_bytes(b"ply")
     (tmp_path / "two.ply").write_bytes(b"ply")
     one = load_scenario(write(tmp_path, "background: {file: one.ply}\n"))
-    assert load_scenario(write(tmp_path, "background: {file: two.ply}\n")).content_hash == one.content_hash
+    assert (
+        load_scenario(write(tmp_path, "background: {file: two.ply}\n")).content_hash
+        == one.content_hash
+    )
 
 
 def test_hash_depends_on_the_bytes_of_data_files(tmp_path: Path) -> None:

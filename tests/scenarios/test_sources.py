@@ -1,4 +1,6 @@
-"""Recordings through the one door: recognised by what they are, the same type as everything else."""
+"""Recordings through the one door: recognised by what they are, the same type as everything
+else.
+"""
 
 from __future__ import annotations
 
@@ -22,14 +24,18 @@ FOLDERS = {
 
 
 def drive_with_the_log(s: Scenario, step_us: int = 100_000) -> dict[str, float]:
-    """Run the actors beside an ego on its log and return how far each reactive one strayed from its track."""
+    """Run the actors beside an ego on its log and return how far each reactive one strayed from its
+    track.
+    """
     actors, strayed = make_actors(s), {}
     tracks = {a.actor_id: a.track for a in s.actors if a.behaviour.kind == "idm"}
     for t in range(s.start_us, s.end_us, step_us):
         for name, pose in actors.step(t, ego_state_from_log(s.ego_log, t, s.vehicle)).items():
             assert np.isfinite(pose).all()
             if name in tracks and tracks[name].t_us[0] <= t <= tracks[name].t_us[-1]:
-                strayed[name] = float(np.linalg.norm(pose[:2, 3] - interpolate(tracks[name], t)[:2, 3]))
+                strayed[name] = float(
+                    np.linalg.norm(pose[:2, 3] - interpolate(tracks[name], t)[:2, 3])
+                )
     return strayed
 
 
@@ -46,15 +52,21 @@ def test_a_recording_is_recognised_and_loaded_as_it_is(shared_data: Path, kind: 
 
 
 @pytest.mark.parametrize("kind", [pytest.param("argoverse", marks=pytest.mark.slow), "commonroad"])
-def test_a_file_can_let_recorded_traffic_react_or_vanish(shared_data: Path, tmp_path: Path, kind: str) -> None:
+def test_a_file_can_let_recorded_traffic_react_or_vanish(
+    shared_data: Path, tmp_path: Path, kind: str
+) -> None:
     path = tmp_path / "scene.yaml"
     source = shared_data / FOLDERS[kind]
-    path.write_text(f"version: 1\nscene_id: mine\nlog: {{{kind}: {source}, actors: idm}}\nenvironment: {{sky: dusk}}\n")
+    path.write_text(
+        f"version: 1\nscene_id: mine\nlog: {{{kind}: {source}, actors: idm}}\nenvironment: {{sky: dusk}}\n"
+    )
     s = load_scenario(path)
     assert (s.scene_id, s.source, s.environment.sky) == ("mine", kind, "dusk")
     reactive = {a.actor_id for a in s.actors if a.behaviour.kind == "idm"}
     assert reactive
-    assert not any(a.is_static or a.label == "pedestrian" for a in s.actors if a.actor_id in reactive)
+    assert not any(
+        a.is_static or a.label == "pedestrian" for a in s.actors if a.actor_id in reactive
+    )
     strayed = drive_with_the_log(s)
     assert strayed
     assert max(strayed.values()) > 0.1, "they drive on their own"
@@ -71,10 +83,14 @@ def test_other_recorded_car_as_ego(shared_data: Path, tmp_path: Path) -> None:
     assert one.content_hash != two.content_hash
 
 
-def test_cameras_of_a_file_replace_those_of_the_recording(shared_data: Path, tmp_path: Path) -> None:
+def test_cameras_of_a_file_replace_those_of_the_recording(
+    shared_data: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "scene.yaml"
     clip = shared_data / FOLDERS["cosmos"]
-    path.write_text(f"version: 1\nlog: {{cosmos: {clip}}}\ncameras: [{{name: wide, width: 320, hfov_deg: 100}}]\n")
+    path.write_text(
+        f"version: 1\nlog: {{cosmos: {clip}}}\ncameras: [{{name: wide, width: 320, hfov_deg: 100}}]\n"
+    )
     camera = load_scenario(path).cameras[0]
     assert (camera.name, camera.width) == ("wide", 320)
     assert camera.K[0, 0] == pytest.approx(160 / np.tan(np.deg2rad(50)))
@@ -83,7 +99,9 @@ def test_cameras_of_a_file_replace_those_of_the_recording(shared_data: Path, tmp
 def test_default_camera_looks_ahead_and_a_little_down() -> None:
     camera = load_scenario("smoke/straight").cameras[0]
     ahead = camera.T_rig_camera[:3, :3] @ np.array([0.0, 0.0, 1.0])
-    np.testing.assert_allclose(ahead, [np.cos(np.deg2rad(4)), 0.0, -np.sin(np.deg2rad(4))], atol=1e-12)
+    np.testing.assert_allclose(
+        ahead, [np.cos(np.deg2rad(4)), 0.0, -np.sin(np.deg2rad(4))], atol=1e-12
+    )
     right = camera.T_rig_camera[:3, :3] @ np.array([1.0, 0.0, 0.0])
     np.testing.assert_allclose(right, [0.0, -1.0, 0.0], atol=1e-12)
     assert np.linalg.det(camera.T_rig_camera[:3, :3]) == pytest.approx(1.0)

@@ -1,4 +1,6 @@
-"""AlpaSim scenes: what is read, how untrusted archives are refused, and that they can be driven in."""
+"""AlpaSim scenes: what is read, how untrusted archives are refused, and that they can be driven
+in.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +18,24 @@ from alpasim_plugin.core.geometry import yaw_from_quat
 from scenarios import usdz_archive
 from scenarios.load import load_scenario
 from scenarios.usdz import read_usdz, read_usdz_scene, usdz_scene_id
-from tests.scenarios.make_usdz import LANE_M, START_US, key, members, parquet, rail, rig, sequence, tables, write
+from tests.scenarios.make_usdz import (
+    LANE_M,
+    START_US,
+    key,
+    members,
+    parquet,
+    rail,
+    rig,
+    sequence,
+    tables,
+    write,
+)
 
 
 def changed(**parts: bytes | None) -> dict[str, bytes]:
-    """The small scene with members replaced, added, or (None) left out; __ stands for the slash, _dot_ for the dot."""
+    """The small scene with members replaced, added, or (None) left out; __ stands for the slash,
+    _dot_ for the dot.
+    """
     out = members()
     for name, data in parts.items():
         member = name.replace("__", "/").replace("_dot_", ".")
@@ -33,7 +48,11 @@ def changed(**parts: bytes | None) -> dict[str, bytes]:
 
 def test_map_drive_traffic_and_vehicle_of_a_scene(tmp_path: Path) -> None:
     log = read_usdz(write(tmp_path / "a.usdz"))
-    assert (log.scene_id, log.source, usdz_scene_id(tmp_path / "a.usdz")) == ("small", "usdz", "small")
+    assert (log.scene_id, log.source, usdz_scene_id(tmp_path / "a.usdz")) == (
+        "small",
+        "usdz",
+        "small",
+    )
     right, left = log.lane_map.lanes["L0"], log.lane_map.lanes["L1"]
     assert right.left_neighbour == "L1"
     assert left.left_neighbour is None
@@ -46,8 +65,15 @@ def test_map_drive_traffic_and_vehicle_of_a_scene(tmp_path: Path) -> None:
     assert log.ego_log.xyz[-1, 0] == pytest.approx(0.8 * 59)
     assert (log.vehicle.box.length_m, log.vehicle.rear_axle_to_centre_m) == (4.6, 1.4)
     parked, moving = log.actors
-    assert (parked.label, parked.is_static, moving.label, moving.is_static) == ("truck", True, "pedestrian", False)
-    assert abs(yaw_from_quat(moving.track.quat)[-1]) == pytest.approx(np.pi)  # JSON quaternions are x, y, z, w
+    assert (parked.label, parked.is_static, moving.label, moving.is_static) == (
+        "truck",
+        True,
+        "pedestrian",
+        False,
+    )
+    assert abs(yaw_from_quat(moving.track.quat)[-1]) == pytest.approx(
+        np.pi
+    )  # JSON quaternions are x, y, z, w
     assert any("no reconstruction" in note for note in log.notes)
 
 
@@ -59,7 +85,9 @@ def test_rails_as_a_struct_of_lists_give_the_same_map(tmp_path: Path) -> None:
 
 def test_a_segment_of_exactly_two_metres_is_split_as_in_alpasims_loader(tmp_path: Path) -> None:
     rows = [{"key": key("L"), "lane": {"left_rail": rail(1.0, 61), "right_rail": rail(-1.0, 61)}}]
-    scene = read_usdz_scene(write(tmp_path / "a.usdz", changed(clipgt__lane_dot_parquet=parquet(rows))))
+    scene = read_usdz_scene(
+        write(tmp_path / "a.usdz", changed(clipgt__lane_dot_parquet=parquet(rows)))
+    )
     assert len(scene.lane_map.lanes["L"].centre) == 121
 
 
@@ -71,7 +99,9 @@ def test_stripped_rails_leave_the_centres(tmp_path: Path) -> None:
 
 
 def test_a_missing_map_is_refused_for_driving_and_left_empty_for_scoring(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.usdz", {k: v for k, v in members().items() if not k.startswith("clipgt")})
+    path = write(
+        tmp_path / "a.usdz", {k: v for k, v in members().items() if not k.startswith("clipgt")}
+    )
     with pytest.raises(InputError, match="a scene without a map"):
         read_usdz(path)
     assert not read_usdz_scene(path).lane_map.lanes
@@ -86,7 +116,9 @@ def test_an_unusable_folder_of_tables_passes_the_turn_to_the_next_source(tmp_pat
 
 
 def test_map_data_comes_before_clipgt(tmp_path: Path) -> None:
-    content = members() | {name.replace("clipgt", "map_data"): data for name, data in tables().items()}
+    content = members() | {
+        name.replace("clipgt", "map_data"): data for name, data in tables().items()
+    }
     rows = [{"key": key("other"), "lane": {"left_rail": rail(1.0), "right_rail": rail(-1.0)}}]
     content["map_data/lane.parquet"] = parquet(rows)
     assert list(read_usdz_scene(write(tmp_path / "a.usdz", content)).lane_map.lanes) == ["other"]
@@ -95,17 +127,45 @@ def test_map_data_comes_before_clipgt(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "found"),
     [
-        (changed(clipgt__lane_dot_parquet=parquet([{"key": key("L"), "lane": {"center_line": rail(0.0)}}])), "lane L without left_rail"),
         (
-            changed(clipgt__lane_dot_parquet=parquet([{"key": key("L"), "lane": {"left_rail": rail(1.0, 4), "right_rail": rail(0.0)}}])),
+            changed(
+                clipgt__lane_dot_parquet=parquet(
+                    [{"key": key("L"), "lane": {"center_line": rail(0.0)}}]
+                )
+            ),
+            "lane L without left_rail",
+        ),
+        (
+            changed(
+                clipgt__lane_dot_parquet=parquet(
+                    [
+                        {
+                            "key": key("L"),
+                            "lane": {"left_rail": rail(1.0, 4), "right_rail": rail(0.0)},
+                        }
+                    ]
+                )
+            ),
             "rails of 4 and 5 points",
         ),
         (changed(clipgt__lane_dot_parquet=b"PAR1 no"), "no readable parquet"),
-        (changed(clipgt__road_boundary_dot_parquet=parquet([{"key": 3.0, "road_boundary": None}])), "that are not structs"),
+        (
+            changed(
+                clipgt__road_boundary_dot_parquet=parquet([{"key": 3.0, "road_boundary": None}])
+            ),
+            "that are not structs",
+        ),
         (
             changed(
                 clipgt__road_boundary_dot_parquet=parquet(
-                    [{"key": key("E"), "road_boundary": {"location": [{"x": 0, "y": 0, "z": 1e300}, {"x": 1, "y": 0, "z": 0}]}}]
+                    [
+                        {
+                            "key": key("E"),
+                            "road_boundary": {
+                                "location": [{"x": 0, "y": 0, "z": 1e300}, {"x": 1, "y": 0, "z": 0}]
+                            },
+                        }
+                    ]
                 )
             ),
             "kilometres apart",
@@ -114,18 +174,33 @@ def test_map_data_comes_before_clipgt(tmp_path: Path) -> None:
         (changed(metadata_dot_yaml=b"version: 1"), "scene_id None"),
         (changed(metadata_dot_yaml=b"!!python/object/apply:os.system ['true']"), "the tag"),
         (changed(rig_trajectories_dot_json=b"{"), "broken JSON"),
-        (changed(rig_trajectories_dot_json=json.dumps(rig() | {"rig_trajectories": []}).encode()), "0 rigs"),
+        (
+            changed(
+                rig_trajectories_dot_json=json.dumps(rig() | {"rig_trajectories": []}).encode()
+            ),
+            "0 rigs",
+        ),
         (changed(rig_trajectories_dot_json=json.dumps(rig(1)).encode()), "1 pose"),
-        (changed(sequence_tracks_dot_json=json.dumps(sequence() | {"t": {}}).encode()), "2 sequences"),
+        (
+            changed(sequence_tracks_dot_json=json.dumps(sequence() | {"t": {}}).encode()),
+            "2 sequences",
+        ),
         (changed(sequence_tracks_dot_json=None), "no such member"),
         (
-            changed(sequence_tracks_dot_json=json.dumps(sequence()).replace('"CONTROLLABLE"', "7").encode().replace(b"[7]", b"7")),
+            changed(
+                sequence_tracks_dot_json=json.dumps(sequence())
+                .replace('"CONTROLLABLE"', "7")
+                .encode()
+                .replace(b"[7]", b"7")
+            ),
             "and flags 7",
         ),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_damaged_content_is_refused_with_its_place(tmp_path: Path, content: dict[str, bytes], found: str) -> None:
+def test_damaged_content_is_refused_with_its_place(
+    tmp_path: Path, content: dict[str, bytes], found: str
+) -> None:
     with pytest.raises(InputError) as error:
         read_usdz(write(tmp_path / "a.usdz", content))
     assert found in error.value.found
@@ -148,14 +223,20 @@ def test_a_member_that_stands_twice_is_refused(tmp_path: Path) -> None:
         read_usdz(path)
 
 
-def test_a_member_that_swells_beyond_the_limit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_member_that_swells_beyond_the_limit_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = write(tmp_path / "a.usdz", changed(rig_trajectories_dot_json=b" " * 300_000))
     assert path.stat().st_size < 20_000
-    monkeypatch.setattr(usdz_archive, "SOURCE_BYTES", replace(usdz_archive.SOURCE_BYTES, high=100_000))
+    monkeypatch.setattr(
+        usdz_archive, "SOURCE_BYTES", replace(usdz_archive.SOURCE_BYTES, high=100_000)
+    )
     with pytest.raises(InputError, match="300000 bytes"):
         read_usdz(path)
     data = bytearray(path.read_bytes())
-    at = data.rindex(b"rig_trajectories.json") - 46  # the central directory's entry: its stated size is a lie
+    at = (
+        data.rindex(b"rig_trajectories.json") - 46
+    )  # the central directory's entry: its stated size is a lie
     data[at + 24 : at + 28] = (1000).to_bytes(4, "little")
     path.write_bytes(bytes(data))
     with pytest.raises(InputError, match=r"more than 100000 bytes|cannot be read"):
@@ -170,7 +251,9 @@ def test_a_cut_archive_is_refused(tmp_path: Path) -> None:
 
 
 def test_checkpoints_are_named_and_never_opened(tmp_path: Path) -> None:
-    log = read_usdz(write(tmp_path / "a.usdz", members() | {"checkpoint.ckpt": b"\x80\x04cos\nsystem\n"}))
+    log = read_usdz(
+        write(tmp_path / "a.usdz", members() | {"checkpoint.ckpt": b"\x80\x04cos\nsystem\n"})
+    )
     assert any("checkpoint.ckpt (13 bytes)" in note and "not read" in note for note in log.notes)
 
 
@@ -178,7 +261,11 @@ def test_the_front_wide_camera_of_a_calibration_table(tmp_path: Path) -> None:
     properties = {"Model": "ftheta", "width": "3848", "height": "2168", "cx": "1924", "cy": "1084"}
     properties |= {"polynomial": "0.0 0.00053 0 0 0", "polynomial-type": "pixeldistance-to-angle"}
     nominal = {"roll-pitch-yaw": [0.0, 0.0, 0.0], "t": [1.7, 0.1, 1.4]}
-    sensor = {"name": "camera:front:wide:120fov", "properties": properties, "nominalSensor2Rig_FLU": nominal}
+    sensor = {
+        "name": "camera:front:wide:120fov",
+        "properties": properties,
+        "nominalSensor2Rig_FLU": nominal,
+    }
     sensor["correction_sensor_R_FLU"] = {"roll-pitch-yaw": [0.0, 0.0, 90.0]}
     row = {"calibration_estimate": {"rig_json": json.dumps({"rig": {"sensors": [sensor]}})}}
     content = members() | {"clipgt/calibration_estimate.parquet": parquet([row])}
@@ -186,7 +273,9 @@ def test_the_front_wide_camera_of_a_calibration_table(tmp_path: Path) -> None:
     assert camera.name == "camera_front_wide_120fov"
     assert camera.ftheta is not None
     np.testing.assert_allclose(camera.T_rig_camera[:3, 3], [1.7, 0.1, 1.4])
-    np.testing.assert_allclose(camera.T_rig_camera[:3, 2], [0.0, 1.0, 0.0], atol=1e-12)  # turned left by the correction: looks along y
+    np.testing.assert_allclose(
+        camera.T_rig_camera[:3, 2], [0.0, 1.0, 0.0], atol=1e-12
+    )  # turned left by the correction: looks along y
 
 
 def test_a_scene_is_a_scenario_and_keeps_its_coordinates(tmp_path: Path) -> None:

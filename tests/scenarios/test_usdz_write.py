@@ -1,4 +1,6 @@
-"""Scenarios written as AlpaSim scenes: what is read back is what AlpaSim's loader would see, for every source."""
+"""Scenarios written as AlpaSim scenes: what is read back is what AlpaSim's loader would see, for
+every source.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ def straight() -> Scenario:
 
 
 @pytest.fixture(scope="module", params=["smoke/lead_car", "real/us101"])
-def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, Path]:
+def written(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Scenario, Path]:
     scenario = load_scenario(request.param)
     path = tmp_path_factory.mktemp("scenes") / "scene.usdz"
     write_usdz(path, scenario)
@@ -45,7 +49,9 @@ def table(path: Path, name: str) -> list[dict]:
         return pq.read_table(io.BytesIO(archive.read(f"clipgt/{name}.parquet"))).to_pylist()
 
 
-def test_what_is_read_back_is_the_map_that_preset_alpasim_scores(written: tuple[Scenario, Path]) -> None:
+def test_what_is_read_back_is_the_map_that_preset_alpasim_scores(
+    written: tuple[Scenario, Path],
+) -> None:
     scenario, path = written
     read, view = read_usdz(path), scenario.alpasim_map
     assert view is not None
@@ -68,7 +74,9 @@ def test_drive_traffic_and_vehicle_come_back(written: tuple[Scenario, Path]) -> 
     scenario, path = written
     read = read_usdz(path)
     assert (read.scene_id, read.vehicle.box) == (scenario.scene_id, scenario.vehicle.box)
-    assert read.vehicle.rear_axle_to_centre_m == pytest.approx(scenario.vehicle.rear_axle_to_centre_m, abs=1e-6)
+    assert read.vehicle.rear_axle_to_centre_m == pytest.approx(
+        scenario.vehicle.rear_axle_to_centre_m, abs=1e-6
+    )
     np.testing.assert_array_equal(read.ego_log.t_us, scenario.ego_log.t_us)
     np.testing.assert_array_equal(read.ego_log.xyz, scenario.ego_log.xyz)
     assert read.first_frame_us == scenario.start_us
@@ -77,7 +85,9 @@ def test_drive_traffic_and_vehicle_come_back(written: tuple[Scenario, Path]) -> 
     ]
     for one, other in zip(read.actors, scenario.actors, strict=True):
         np.testing.assert_array_equal(one.track.xyz, other.track.xyz)
-        np.testing.assert_allclose(np.abs(np.sum(one.track.quat * other.track.quat, axis=1)), 1.0, atol=1e-12)
+        np.testing.assert_allclose(
+            np.abs(np.sum(one.track.quat * other.track.quat, axis=1)), 1.0, atol=1e-12
+        )
 
 
 def test_no_table_is_empty_and_links_go_both_ways(written: tuple[Scenario, Path]) -> None:
@@ -87,7 +97,11 @@ def test_no_table_is_empty_and_links_go_both_ways(written: tuple[Scenario, Path]
     lanes = {row["key"]["map_id"] for row in rows["lane"]}
     clip = rows["clip"][0]["key"]["clip_id"]
     assert all(row["key"]["clip_id"] == clip for name in TABLES for row in rows[name])
-    links = {(r["key"]["kind"], r["association"]["subjects"], o) for r in rows["association"] for o in r["association"]["objects"]}
+    links = {
+        (r["key"]["kind"], r["association"]["subjects"], o)
+        for r in rows["association"]
+        for o in r["association"]["objects"]
+    }
     forward = {(a, b) for kind, a, b in links if kind == "NEXT_LANE"}
     assert forward == {(b, a) for kind, a, b in links if kind == "PREVIOUS_LANE"}
     assert {end for pair in forward for end in pair} <= lanes
@@ -109,7 +123,9 @@ def test_a_lane_with_unequal_edges_keeps_its_area() -> None:
     left = np.column_stack([20 * np.cos(t), 20 * np.sin(t), 0.01 * t])
     right = np.column_stack([24 * np.cos(t), 24 * np.sin(t), 0.01 * t])[[0, 3, 9, 10, 25, 39]]
     lane = Lane("a-1", (left[::13] + left[::13]) / 2, left, right)
-    view = alpasim_view(LaneMap({"a-1": lane, "walk": replace(lane, lane_id="walk", kind="sidewalk")}))
+    view = alpasim_view(
+        LaneMap({"a-1": lane, "walk": replace(lane, lane_id="walk", kind="sidewalk")})
+    )
     assert list(view.lanes) == ["a-1"]
     one, other = rails(lane)
     assert len(one) == len(other) >= 40
@@ -127,22 +143,41 @@ def test_a_lane_without_edges_is_widened() -> None:
 
 def test_a_shoulder_is_a_lane_and_a_single_pose_lasts(straight: Scenario, tmp_path: Path) -> None:
     first = next(iter(straight.lane_map.lanes.values()))
-    shoulder = replace(first, lane_id="shoulder", kind="shoulder", successors=(), left_neighbour=None, right_neighbour=None)
+    shoulder = replace(
+        first,
+        lane_id="shoulder",
+        kind="shoulder",
+        successors=(),
+        left_neighbour=None,
+        right_neighbour=None,
+    )
     pose = Trajectory(np.array([100_000]), np.array([[5.0, 1.0, 0.8]]), np.array([[1.0, 0, 0, 0]]))
     cone = Actor("cone", "other", Box(0.4, 0.4, 0.8), pose, is_static=True)
-    scenario = replace(straight, lane_map=LaneMap({**straight.lane_map.lanes, "shoulder": shoulder}), actors=(cone,))
+    scenario = replace(
+        straight,
+        lane_map=LaneMap({**straight.lane_map.lanes, "shoulder": shoulder}),
+        actors=(cone,),
+    )
     write_usdz(tmp_path / "s.usdz", scenario)
     read = read_usdz(tmp_path / "s.usdz")
     assert "shoulder" in read.lane_map.lanes
     assert read.lane_map.road_edges == ()  # an empty table of borders, as AlpaSim accepts it
     (actor,) = read.actors
     assert actor.is_static
-    assert actor.track.t_us.tolist() == [int(scenario.ego_log.t_us[0]), int(scenario.ego_log.t_us[-1])]
+    assert actor.track.t_us.tolist() == [
+        int(scenario.ego_log.t_us[0]),
+        int(scenario.ego_log.t_us[-1]),
+    ]
 
 
-def test_the_main_camera_is_called_as_alpasim_expects_and_its_lens_is_the_pinhole(straight: Scenario, tmp_path: Path) -> None:
+def test_the_main_camera_is_called_as_alpasim_expects_and_its_lens_is_the_pinhole(
+    straight: Scenario, tmp_path: Path
+) -> None:
     (camera,) = straight.cameras
-    assert list(alpasim_cameras((replace(camera, name="left"), camera))) == ["left", "camera_front_wide_120fov"]
+    assert list(alpasim_cameras((replace(camera, name="left"), camera))) == [
+        "left",
+        "camera_front_wide_120fov",
+    ]
     assert list(alpasim_cameras((replace(camera, name="left"),))) == ["camera_front_wide_120fov"]
     radius = np.linspace(0, np.hypot(camera.width, camera.height) / 2, 50)
     angle = np.polynomial.polynomial.polyval(radius, pixel_to_angle(camera))
@@ -157,7 +192,9 @@ def test_the_main_camera_is_called_as_alpasim_expects_and_its_lens_is_the_pinhol
     frames = rig["cameras_frame_timestamps_us"]["camera_front_wide_120fov@0"]
     assert frames[0] == [straight.start_us - 30_000, straight.start_us]
     assert all(end - start == 30_000 for start, end in frames)
-    assert mesh.startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex 4\n")  # level ground: two triangles
+    assert mesh.startswith(
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 4\n"
+    )  # level ground: two triangles
 
 
 def test_a_scene_that_alpasim_cannot_drive_is_refused(straight: Scenario, tmp_path: Path) -> None:
@@ -178,10 +215,14 @@ def test_vertices_are_put_in_and_rounded_as_alpasims_loader_does():
     for a, b in itertools.pairwise(line):
         inner = int(np.linalg.norm(b - a) // 2.0)
         want += [a + (b - a) / (inner + 1) * k for k in range(1, inner + 1)] + [b]
-    np.testing.assert_array_equal(with_vertices(line), want)  # to the bit: it decides whether a union of lanes has cracks
+    np.testing.assert_array_equal(
+        with_vertices(line), want
+    )  # to the bit: it decides whether a union of lanes has cracks
 
 
-def test_the_time_line_of_alpasim_starts_at_the_first_frame_and_an_offset_later(straight: Scenario, tmp_path: Path):
+def test_the_time_line_of_alpasim_starts_at_the_first_frame_and_an_offset_later(
+    straight: Scenario, tmp_path: Path
+):
     path = tmp_path / "scene.usdz"
     write_usdz(path, straight)
     alpasim = ["timing.timeline=alpasim"]
@@ -189,7 +230,10 @@ def test_the_time_line_of_alpasim_starts_at_the_first_frame_and_an_offset_later(
     assert (plain.start_us, plain.warmup_us) == (straight.start_us, 1_700_000)
     later = load_scenario(path, overrides=[*alpasim, "timing.start_time_offset_us=1500000"])
     assert (later.start_us - plain.start_us, later.end_us) == (1_500_000, plain.end_us)
-    built = [load_scenario("smoke/straight", overrides=[*alpasim, f"timing.start_time_offset_us={us}"]) for us in (0, 700_000)]
+    built = [
+        load_scenario("smoke/straight", overrides=[*alpasim, f"timing.start_time_offset_us={us}"])
+        for us in (0, 700_000)
+    ]
     assert built[1].start_us - built[0].start_us == 700_000
     with pytest.raises(InputError, match="timeline: alpasim"):
         load_scenario("smoke/straight", overrides=["timing.start_time_offset_us=700000"])

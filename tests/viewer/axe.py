@@ -1,4 +1,6 @@
-"""Run axe-core, the accessibility checker, in the page of a browser. It is not part of this project: npm install axe-core."""
+"""Run axe-core, the accessibility checker, in the page of a browser. It is not part of this
+project: npm install axe-core.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,12 @@ def find_axe() -> Path | None:
 
 
 def findings(browser: Browser, script: Path) -> list[dict[str, Any]]:
-    """Check the page as it stands and return what axe-core objects to: rule, impact, and the elements."""
+    """Check the page as it stands and return what axe-core objects to: rule, impact, and the
+    elements.
+    """
     browser.evaluate(script.read_text() + "; 0")
     short = "({ rule: v.id, impact: v.impact, nodes: v.nodes.map(n => n.html.slice(0, 160)) })"
-    found: list[dict[str, Any]] = browser.evaluate(f"axe.run(document).then(r => r.violations.map(v => {short}))")
+    found: list[dict[str, Any]] = browser.evaluate(
+        f"axe.run(document).then(r => r.violations.map(v => {short}))"
+    )
     return found

@@ -1,4 +1,6 @@
-"""Make a run folder with real logs that can be watched: made-up drives whose camera frames carry their own time."""
+"""Make a run folder with real logs that can be watched: made-up drives whose camera frames carry
+their own time.
+"""
 
 from __future__ import annotations
 
@@ -26,11 +28,19 @@ CAMERA = CameraSpec("front", 64, 36, np.array([[40.0, 0, 32], [0, 40, 18], [0, 0
 BARS = 8  # a frame's index is written as eight bars, black or white, the highest bit on the left
 KINDS = ("car", "truck", "pedestrian", "cyclist")
 HARM = {"clean": 0.15, "3dgs": 6.0, "onefixer": 0.3}
-WATCHED = Plan(scenes=("urban-left_turn", "smoke-straight"), seeds=(0, 1), steps=24, flip_frames=True, harm=HARM)
+WATCHED = Plan(
+    scenes=("urban-left_turn", "smoke-straight"),
+    seeds=(0, 1),
+    steps=24,
+    flip_frames=True,
+    harm=HARM,
+)
 POSES = ("ego_x_m", "ego_y_m", "ego_yaw_rad")
 
 
-def make_watched(folder: Path, plan: Plan = WATCHED, actors: int = 6, cameras: Sequence[str] = ("front",)) -> Path:
+def make_watched(
+    folder: Path, plan: Plan = WATCHED, actors: int = 6, cameras: Sequence[str] = ("front",)
+) -> Path:
     """Write a run folder whose finished rollouts have logs, and return it.
 
     Args:
@@ -48,7 +58,9 @@ def make_watched(folder: Path, plan: Plan = WATCHED, actors: int = 6, cameras: S
             content = run.scene_data(rollout.scene)
             assert content is not None
             keys = zip(("renderer", "policy", "scene", "seed"), rollout.cell, strict=True)
-            own = steps.filter(reduce(operator.and_, (pc.field(name) == value for name, value in keys)))
+            own = steps.filter(
+                reduce(operator.and_, (pc.field(name) == value for name, value in keys))
+            )
             pq.write_table(own, place / "steps.parquet")
             write_log(place, rollout, content, ego_of(own), actors, cameras)
     return folder
@@ -57,12 +69,21 @@ def make_watched(folder: Path, plan: Plan = WATCHED, actors: int = 6, cameras: S
 def ego_of(steps: Any) -> Trajectory:
     """Return the rig poses in a rollout's table of steps."""
     rows = steps.to_pylist()
-    x, y, yaw = (np.array([row["value"] for row in rows if row["metric"] == name]) for name in POSES)
+    x, y, yaw = (
+        np.array([row["value"] for row in rows if row["metric"] == name]) for name in POSES
+    )
     t_us = np.array([row["t_us"] for row in rows if row["metric"] == POSES[0]], dtype=np.int64)
     return Trajectory(t_us, np.column_stack([x, y, np.zeros_like(x)]), quat_from_yaw(yaw))
 
 
-def write_log(place: Path, rollout: Rollout, content: Mapping[str, Any], ego: Trajectory, actors: int, cameras: Sequence[str]) -> None:
+def write_log(
+    place: Path,
+    rollout: Rollout,
+    content: Mapping[str, Any],
+    ego: Trajectory,
+    actors: int,
+    cameras: Sequence[str],
+) -> None:
     """Write ``rollout.asl`` and ``frames.jsonl``."""
     header = RolloutHeader(
         scene_id=rollout.scene,
@@ -79,7 +100,14 @@ def write_log(place: Path, rollout: Rollout, content: Mapping[str, Any], ego: Tr
         log.begin([replace(CAMERA, name=name) for name in cameras])
         for k, t_us in enumerate(ego.t_us.tolist()):
             pose = se3(ego.xyz[k], ego.quat[k])
-            log.actor_poses(t_us, pose, {actor.actor_id: se3(actor.track.xyz[k], actor.track.quat[k]) for actor in header.actors})
+            log.actor_poses(
+                t_us,
+                pose,
+                {
+                    actor.actor_id: se3(actor.track.xyz[k], actor.track.quat[k])
+                    for actor in header.actors
+                },
+            )
             for number, name in enumerate(cameras):
                 log.camera_image(Frame(t_us, name, picture(k + 100 * number)), "png")
             if k + 1 < len(ego):
@@ -87,15 +115,27 @@ def write_log(place: Path, rollout: Rollout, content: Mapping[str, Any], ego: Tr
                 log.driver_request(t_us, t_us + DT_US)
                 ahead = slice(k, k + 11)
                 plan = Trajectory(ego.t_us[ahead], ego.xyz[ahead], ego.quat[ahead])
-                log.driver_return(plan, [Trajectory(plan.t_us, plan.xyz + np.array([0.0, side, 0.0]), plan.quat) for side in (-1.0, 1.0)])
+                log.driver_return(
+                    plan,
+                    [
+                        Trajectory(plan.t_us, plan.xyz + np.array([0.0, side, 0.0]), plan.quat)
+                        for side in (-1.0, 1.0)
+                    ],
+                )
     events = {len(ego) // 3: "replaced"}
     write_facts(
-        place / "frames.jsonl", [{"t_us": t, "camera": CAMERA.name, "events": events.get(k, "")} for k, t in enumerate(ego.t_us.tolist())]
+        place / "frames.jsonl",
+        [
+            {"t_us": t, "camera": CAMERA.name, "events": events.get(k, "")}
+            for k, t in enumerate(ego.t_us.tolist())
+        ],
     )
 
 
 def road_users(content: Mapping[str, Any], t_us: Any, count: int, salt: int) -> Sequence[Actor]:
-    """Make road users beside the recorded drive; every third one goes its own way behind every renderer."""
+    """Make road users beside the recorded drive; every third one goes its own way behind every
+    renderer.
+    """
     log = np.column_stack([content["ego_log"]["x_m"], content["ego_log"]["y_m"]])
     out = []
     for i in range(count):
@@ -103,10 +143,19 @@ def road_users(content: Mapping[str, Any], t_us: Any, count: int, salt: int) -> 
         at = log[(7 * i) % len(log)] + [0.0, 4.0 + (i % 5)]
         seconds = (t_us - t_us[0]) * 1e-6
         speed = 0.0 if i % 4 == 3 else 2.0 + i % 3 + own
-        xyz = np.column_stack([at[0] + speed * seconds, np.full(len(t_us), at[1]), np.zeros(len(t_us))])
+        xyz = np.column_stack(
+            [at[0] + speed * seconds, np.full(len(t_us), at[1]), np.zeros(len(t_us))]
+        )
         kind = KINDS[i % len(KINDS)]
         box = Box(0.6, 0.6, 1.7) if kind == "pedestrian" else Box(4.5, 1.9, 1.6)
-        out.append(Actor(f"user-{i}", kind, box, Trajectory(t_us, xyz, np.tile(quat_from_yaw(0.1), (len(t_us), 1)))))
+        out.append(
+            Actor(
+                f"user-{i}",
+                kind,
+                box,
+                Trajectory(t_us, xyz, np.tile(quat_from_yaw(0.1), (len(t_us), 1))),
+            )
+        )
     return out
 
 
@@ -118,19 +167,30 @@ def picture(k: int) -> np.ndarray:
 
 
 def write_sealed_manifests(folder: Path) -> None:
-    """Give every rollout the manifest that a run writes, as far as readers of a running run need it."""
+    """Give every rollout the manifest that a run writes, as far as readers of a running run need
+    it.
+    """
     run = read_run(folder)
     for rollout in run.rollouts:
         place = folder / rollout.path
-        metrics = {name: {"value": value, "valid": value is not None, "reason": "", "unit": ""} for name, value in rollout.metrics.items()}
+        metrics = {
+            name: {"value": value, "valid": value is not None, "reason": "", "unit": ""}
+            for name, value in rollout.metrics.items()
+        }
         error = {"failure_class": rollout.failure_class, "found": rollout.failure}
-        manifest = {key: getattr(rollout, key) for key in ("renderer", "policy", "scene", "seed", "path", "status", "frames", "steps")}
-        manifest |= {"wall_s": 1.0, "metrics": metrics, "contacts": []} | ({} if rollout.ok else {"error": error})
+        manifest = {
+            key: getattr(rollout, key)
+            for key in ("renderer", "policy", "scene", "seed", "path", "status", "frames", "steps")
+        }
+        manifest |= {"wall_s": 1.0, "metrics": metrics, "contacts": []} | (
+            {} if rollout.ok else {"error": error}
+        )
         write_manifest(place, manifest)
 
 
 def unfinished(folder: Path, without: Sequence[str]) -> dict[str, bytes]:
-    """Turn a run folder into one that is still written: no tables, and these rollouts have no manifest yet.
+    """Turn a run folder into one that is still written: no tables, and these rollouts have no
+    manifest yet.
 
     Returns:
         Path of such a rollout -> the manifest that it gets when it finishes.

@@ -1,4 +1,6 @@
-"""The replay page in a real browser, from disk and from its server. Slow: needs an installed Chromium."""
+"""The replay page in a real browser, from disk and from its server. Slow: needs an installed
+Chromium.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ def page(watched_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def settled(browser: Browser) -> None:
     """Wait until the cell that was chosen is shown, with its frames."""
-    browser.evaluate("(async () => { await Promise.resolve(); await player.drawn; await new Promise(requestAnimationFrame); })()")
+    browser.evaluate(
+        "(async () => { await Promise.resolve(); await player.drawn; await new Promise(requestAnimationFrame); })()"
+    )
 
 
 def seek(browser: Browser, ms: float) -> None:
@@ -49,7 +53,9 @@ def seek(browser: Browser, ms: float) -> None:
 
 
 @pytest.mark.parametrize(("width", "dark"), [(1400, False), (390, True), (820, False)])
-def test_no_complaint_no_request_and_nothing_wider_than_the_screen(browser: Browser, page: Path, width: int, dark: bool) -> None:
+def test_no_complaint_no_request_and_nothing_wider_than_the_screen(
+    browser: Browser, page: Path, width: int, dark: bool
+) -> None:
     browser.requests.clear()
     browser.complaints.clear()
     browser.open(page, width=width, dark=dark)
@@ -60,7 +66,10 @@ def test_no_complaint_no_request_and_nothing_wider_than_the_screen(browser: Brow
         browser.evaluate(f"player.open('{cell}')")
         settled(browser)
     assert browser.complaints == []
-    assert all(address == page.resolve().as_uri() or address.startswith(("data:", "blob:")) for address in browser.requests)
+    assert all(
+        address == page.resolve().as_uri() or address.startswith(("data:", "blob:"))
+        for address in browser.requests
+    )
     assert browser.evaluate("document.documentElement.scrollWidth") <= width
     assert browser.evaluate("document.getElementById('birdseye').clientHeight") >= 150
 
@@ -71,11 +80,15 @@ def test_all_cameras_show_the_frame_of_the_scrubbers_time(browser: Browser, page
     for ms, frame in ((0, 0), (1000, 10), (1049, 10), (1090, 10), (1100, 11), (300, 3), (2200, 22)):
         browser.evaluate(f"document.getElementById('scrub').value = {ms}")
         browser.evaluate("document.getElementById('scrub').dispatchEvent(new Event('input'))")
-        shown = int(browser.evaluate("document.getElementById('scrub').value")) // 100  # the scrubber has steps of its own
+        shown = (
+            int(browser.evaluate("document.getElementById('scrub').value")) // 100
+        )  # the scrubber has steps of its own
         browser.evaluate("player.drawn")
         assert browser.evaluate(SEEN) == [shown] * 3
         assert abs(shown - frame) <= 1
-        assert browser.evaluate("document.getElementById('scrub').getAttribute('aria-valuetext')").endswith("seconds")
+        assert browser.evaluate(
+            "document.getElementById('scrub').getAttribute('aria-valuetext')"
+        ).endswith("seconds")
 
 
 def test_cameras_stay_together_while_it_plays(browser: Browser, page: Path) -> None:
@@ -84,7 +97,9 @@ def test_cameras_stay_together_while_it_plays(browser: Browser, page: Path) -> N
     browser.evaluate("player.play(true)")
     for _ in range(5):
         time.sleep(0.15)
-        numbers, now = browser.evaluate(f"(async () => {{ await player.drawn; const t = player.t; return [{SEEN}, t]; }})()")
+        numbers, now = browser.evaluate(
+            f"(async () => {{ await player.drawn; const t = player.t; return [{SEEN}, t]; }})()"
+        )
         assert len(set(numbers)) == 1
         assert abs(numbers[0] - now / 100) <= 2.5
     browser.evaluate("player.play(false)")
@@ -121,9 +136,14 @@ def test_the_keyboard_does_everything(browser: Browser, page: Path) -> None:
     settled(browser)
     assert browser.evaluate("player.cell.id") == first
     browser.press("2", 50)
-    assert browser.evaluate("document.querySelectorAll('.focus')[1].getAttribute('aria-pressed')") == "true"
+    assert (
+        browser.evaluate("document.querySelectorAll('.focus')[1].getAttribute('aria-pressed')")
+        == "true"
+    )
     browser.press("f", 70)
-    assert browser.evaluate("document.getElementById('whole').getAttribute('aria-pressed')") == "true"
+    assert (
+        browser.evaluate("document.getElementById('whole').getAttribute('aria-pressed')") == "true"
+    )
     browser.press("?", 191, shift=True)
     assert browser.evaluate("document.getElementById('keys').open")
     browser.press("Escape", 27)
@@ -158,27 +178,42 @@ def test_changed_outcomes_lead_to_their_rollouts(browser: Browser, page: Path) -
         browser.evaluate(f"document.querySelectorAll('#flips button')[{i}].click()")
         settled(browser)
         entry = browser.evaluate("(e => [e.scene, String(e.seed)])(player.entry(player.cell.id))")
-        assert browser.evaluate("['scene', 'seed'].map(k => document.getElementById(k).value)") == entry
+        assert (
+            browser.evaluate("['scene', 'seed'].map(k => document.getElementById(k).value)")
+            == entry
+        )
         assert browser.evaluate("player.cell.drives[player.focus].renderer") == "3dgs"
-        assert browser.evaluate("document.querySelector('.camera.focused .outcome').textContent") != "no event"
+        assert (
+            browser.evaluate("document.querySelector('.camera.focused .outcome').textContent")
+            != "no event"
+        )
 
 
 def test_scene_and_seed_are_chosen(browser: Browser, page: Path) -> None:
     browser.open(page)
     settled(browser)
-    for key, value in (("scene", "smoke-straight"), ("seed", "1"), ("scene", "urban-left_turn"), ("seed", "0")):
+    for key, value in (
+        ("scene", "smoke-straight"),
+        ("seed", "1"),
+        ("scene", "urban-left_turn"),
+        ("seed", "0"),
+    ):
         browser.evaluate(f"document.getElementById('{key}').value = '{value}'")
         browser.evaluate(f"document.getElementById('{key}').dispatchEvent(new Event('change'))")
         settled(browser)
         assert str(browser.evaluate(f"player.entry(player.cell.id).{key}")) == value
-    assert browser.evaluate("[player.entry(player.cell.id).scene, player.entry(player.cell.id).seed]") == ["urban-left_turn", 0]
+    assert browser.evaluate(
+        "[player.entry(player.cell.id).scene, player.entry(player.cell.id).seed]"
+    ) == ["urban-left_turn", 0]
 
 
 def test_an_address_opens_a_rollout_at_a_time(browser: Browser, page: Path) -> None:
     where = f"#scene={quote('smoke-straight')}&policy=lane-camera&seed=1&renderer=onefixer&t=1.2"
     browser.visit(page.resolve().as_uri() + where)
     settled(browser)
-    assert browser.evaluate("[player.entry(player.cell.id).scene, player.entry(player.cell.id).seed, player.t]") == [
+    assert browser.evaluate(
+        "[player.entry(player.cell.id).scene, player.entry(player.cell.id).seed, player.t]"
+    ) == [
         "smoke-straight",
         1,
         1200,
@@ -208,14 +243,18 @@ def test_a_renderer_can_be_hidden(browser: Browser, page: Path) -> None:
     assert browser.evaluate(ink) == whole
 
 
-def test_curves_show_where_no_value_is_valid_and_what_is_not_chosen_is_gone(browser: Browser, page: Path) -> None:
+def test_curves_show_where_no_value_is_valid_and_what_is_not_chosen_is_gone(
+    browser: Browser, page: Path
+) -> None:
     browser.open(page)
     settled(browser)
     browser.evaluate("player.open(player.index.cells.find(c => c.scene === 'urban-left_turn').id)")
     settled(browser)
     names = "[...document.querySelectorAll('#curves h3')].map(h => h.firstChild.textContent === '' ? '' : h.textContent)"
     assert any("min_distance_to_obstacle" in name for name in browser.evaluate(names))
-    assert "no other road user" in browser.evaluate("document.querySelector('#curves .why').textContent")
+    assert "no other road user" in browser.evaluate(
+        "document.querySelector('#curves .why').textContent"
+    )
     assert browser.evaluate("document.querySelectorAll('#curves .invalid').length") >= 3
     chosen = browser.evaluate("document.querySelectorAll('#curves .curve').length")
     browser.evaluate("document.querySelector('#chooser input:checked').click()")
@@ -236,10 +275,19 @@ def test_another_camera_is_chosen_for_all_renderers(browser: Browser, tmp_path: 
 
 
 def test_a_page_without_frames_says_so(browser: Browser, tmp_path: Path) -> None:
-    root = make_watched(tmp_path / "run", Plan(renderers=("clean", "3dgs"), scenes=("smoke-straight",), seeds=(0,), steps=8), cameras=())
+    root = make_watched(
+        tmp_path / "run",
+        Plan(renderers=("clean", "3dgs"), scenes=("smoke-straight",), seeds=(0,), steps=8),
+        cameras=(),
+    )
     browser.open(write_page(read_run(root), tmp_path / "view.html", Wanted(), Options(), None).path)
     settled(browser)
-    assert browser.evaluate("[...document.querySelectorAll('.stage .none')].filter(p => p.textContent.includes('--video all')).length") == 2
+    assert (
+        browser.evaluate(
+            "[...document.querySelectorAll('.stage .none')].filter(p => p.textContent.includes('--video all')).length"
+        )
+        == 2
+    )
 
 
 def test_a_running_run_fills_up(browser: Browser, watched_run: Path, tmp_path: Path) -> None:
@@ -253,7 +301,10 @@ def test_a_running_run_fills_up(browser: Browser, watched_run: Path, tmp_path: P
         browser.visit(server.url)
         said = "document.getElementById('live').textContent"
         assert browser.evaluate(said) == f"Live: 0 of {len(every)} rollouts"
-        assert browser.evaluate("document.getElementById('empty').textContent") == "Waiting for the first rollout to finish."
+        assert (
+            browser.evaluate("document.getElementById('empty').textContent")
+            == "Waiting for the first rollout to finish."
+        )
         for path in (every[0], *every[1:]):
             (root / path / "manifest.json").write_bytes(later[path])
             if path == every[0]:
@@ -276,7 +327,11 @@ def wait(browser: Browser, condition: str) -> None:
 
 def test_two_hundred_road_users_are_drawn_fast(browser: Browser, tmp_path: Path) -> None:
     root = make_watched(
-        tmp_path / "run", Plan(renderers=("clean", "3dgs", "onefixer"), scenes=("urban-crowd",), seeds=(0,), steps=40), ACTORS
+        tmp_path / "run",
+        Plan(
+            renderers=("clean", "3dgs", "onefixer"), scenes=("urban-crowd",), seeds=(0,), steps=40
+        ),
+        ACTORS,
     )
     browser.open(write_page(read_run(root), tmp_path / "view.html", Wanted(), Options(), None).path)
     settled(browser)
@@ -304,8 +359,12 @@ def test_two_hundred_road_users_are_drawn_fast(browser: Browser, tmp_path: Path)
     assert measured["page_ms"] < 50.0  # the aim is 16.7; a busy machine may be slow
 
 
-@pytest.mark.parametrize(("width", "dark"), [(1400, False), (1400, True), (390, False), (390, True)])
-def test_axe_finds_nothing_serious(browser: Browser, page: Path, usual_report: Path, width: int, dark: bool) -> None:
+@pytest.mark.parametrize(
+    ("width", "dark"), [(1400, False), (1400, True), (390, False), (390, True)]
+)
+def test_axe_finds_nothing_serious(
+    browser: Browser, page: Path, usual_report: Path, width: int, dark: bool
+) -> None:
     script = find_axe()
     if script is None:
         pytest.skip(MISSING)

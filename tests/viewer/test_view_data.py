@@ -1,4 +1,6 @@
-"""What a page is told of a run: poses, frames, road users, curves and events are those of the logs and tables."""
+"""What a page is told of a run: poses, frames, road users, curves and events are those of the logs
+and tables.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,15 @@ from alpasim_plugin.log import read_asl, read_facts, write_facts, write_mp4
 from alpasim_plugin.log.run_folder.rows import series_by_cell
 from evaluators.opening import read_run
 from evaluators.report.rollouts import SERIES, clock_zero_us, events_of
-from evaluators.viewer.cells import Wanted, cell_data, cells_of, check_wanted, index_data, read_logs, shown_by_default
+from evaluators.viewer.cells import (
+    Wanted,
+    cell_data,
+    cells_of,
+    check_wanted,
+    index_data,
+    read_logs,
+    shown_by_default,
+)
 from evaluators.viewer.page import FLIPS_PAGE, Options, make_page, write_flips_page, write_page
 from evaluators.viewer.pictures import Fineness
 from tests.report.make_run import DT_US, Plan
@@ -41,7 +51,11 @@ def number_of(jpeg: str) -> int:
     """Read which frame a picture is."""
     grey = cv2.imdecode(np.frombuffer(base64.b64decode(jpeg), np.uint8), cv2.IMREAD_GRAYSCALE)
     wide = grey.shape[1] // BARS
-    return sum(1 << (BARS - 1 - bit) for bit in range(BARS) if grey[4:-4, bit * wide + 2 : (bit + 1) * wide - 2].mean() > 127)
+    return sum(
+        1 << (BARS - 1 - bit)
+        for bit in range(BARS)
+        if grey[4:-4, bit * wide + 2 : (bit + 1) * wide - 2].mean() > 127
+    )
 
 
 @pytest.fixture(scope="module")
@@ -69,14 +83,20 @@ def test_poses_are_those_of_the_log(watched_run: Path) -> None:
         assert drive["ego"]["t"] == (log.ego.t_us // 1000).tolist()
         plan = np.column_stack(drive["plans"][3]["lines"][0]) / 100 + origin
         assert drive["plans"][3]["t"] == 300
-        assert np.abs(plan - log.plans[3].trajectory.xyz[::5, :2]).max() < 0.006  # one point every half second
+        assert (
+            np.abs(plan - log.plans[3].trajectory.xyz[::5, :2]).max() < 0.006
+        )  # one point every half second
         assert len(drive["plans"][3]["lines"]) == 3  # the plan and two samples
 
 
 def test_every_frame_comes_with_its_own_time(small_run: Path) -> None:
     for drive in only_cell(small_run)["drives"]:
         (camera,) = drive["cameras"]
-        assert [number_of(jpeg) for jpeg in camera["jpeg"]] == [t // (DT_US // 1000) for t in camera["t"]] == list(range(SMALL.steps))
+        assert (
+            [number_of(jpeg) for jpeg in camera["jpeg"]]
+            == [t // (DT_US // 1000) for t in camera["t"]]
+            == list(range(SMALL.steps))
+        )
     thinned = only_cell(small_run, Fineness(stride=3))["drives"][1]["cameras"][0]
     assert [number_of(jpeg) for jpeg in thinned["jpeg"]] == [0, 3, 6, 9]
     assert thinned["t"] == [0, 300, 600, 900]
@@ -85,10 +105,16 @@ def test_every_frame_comes_with_its_own_time(small_run: Path) -> None:
 def test_every_camera_is_kept_or_the_one_that_was_asked_for(tmp_path: Path) -> None:
     run = read_run(make_watched(tmp_path, SMALL, cameras=("front", "left")))
     (cell,) = cells_of(run)
-    for camera, kept in ((None, [("front", 5), ("left", 105)]), ("left", [("left", 105)]), ("nobody", [])):
+    for camera, kept in (
+        (None, [("front", 5), ("left", 105)]),
+        ("left", [("left", 105)]),
+        ("nobody", []),
+    ):
         for drive in cell_data(run, cell, read_logs(run, cell), Fineness(), camera)["drives"]:
             assert [(one["name"], number_of(one["jpeg"][5])) for one in drive["cameras"]] == kept
-            assert drive["no_frames"] == ("" if kept else "This rollout has no frames of a camera nobody.")
+            assert drive["no_frames"] == (
+                "" if kept else "This rollout has no frames of a camera nobody."
+            )
 
 
 def test_wide_frames_are_made_smaller_and_keep_their_shape(small_run: Path) -> None:
@@ -98,13 +124,17 @@ def test_wide_frames_are_made_smaller_and_keep_their_shape(small_run: Path) -> N
 
 def test_times_count_from_the_first_frame_or_from_the_first_pose_where_that_is_not_known() -> None:
     assert clock_zero_us({"start_us": 500_000}, 0) == 500_000
-    assert clock_zero_us({"start_us": 0}, 1_689_697_803_493_732) == 1_689_697_803_493_732  # a scored log of AlpaSim
+    assert (
+        clock_zero_us({"start_us": 0}, 1_689_697_803_493_732) == 1_689_697_803_493_732
+    )  # a scored log of AlpaSim
     assert clock_zero_us({}, 70) == 70
 
 
 def test_two_logs_of_one_cell_are_two_cells(small_run: Path) -> None:
     run = read_run(small_run)
-    twice = replace(run, rollouts=(*run.rollouts, *(replace(one, path=f"{one.path}-2") for one in run.rollouts)))
+    twice = replace(
+        run, rollouts=(*run.rollouts, *(replace(one, path=f"{one.path}-2") for one in run.rollouts))
+    )
     first, second = cells_of(twice)
     assert (first.take, second.take) == (0, 1)
     assert [rollout.renderer for rollout in second.rollouts] == ["clean", "3dgs"]
@@ -130,15 +160,23 @@ def test_events_are_at_the_times_that_the_report_states(watched_run: Path) -> No
         data = cell_data(run, cell, read_logs(run, cell), None)
         series = series_by_cell(run.steps(SERIES, [cell.scene]))
         for rollout, drive in zip(cell.rollouts, data["drives"], strict=True):
-            stated = [(event.kind, round(event.t_s * 1000)) for event in events_of(rollout, series) if event.t_s is not None]
-            assert [(one["kind"], one["t"]) for one in drive["moments"] if one["kind"] != "frame"] == stated
+            stated = [
+                (event.kind, round(event.t_s * 1000))
+                for event in events_of(rollout, series)
+                if event.t_s is not None
+            ]
+            assert [
+                (one["kind"], one["t"]) for one in drive["moments"] if one["kind"] != "frame"
+            ] == stated
             frames = [(one["text"], one["t"]) for one in drive["moments"] if one["kind"] == "frame"]
             assert frames == [("frame: replaced", 100 * (WATCHED.steps // 3))]
             seen += len(stated)
     assert seen >= 3
 
 
-def test_where_pictures_come_from_is_shown_and_said_before_an_event(watched_run: Path, tmp_path: Path) -> None:
+def test_where_pictures_come_from_is_shown_and_said_before_an_event(
+    watched_run: Path, tmp_path: Path
+) -> None:
     root = Path(shutil.copytree(watched_run, tmp_path / "run"))
     run = read_run(root)
     cell = next(one for one in cells_of(run) if one.flips)
@@ -147,13 +185,23 @@ def test_where_pictures_come_from_is_shown_and_said_before_an_event(watched_run:
         path = root / rollout.path / "frames.jsonl"
         cells = [f"1x1:{i % 10}f" for i, _ in enumerate(read_facts(path))]
         own = {"recorded_share": 0.75, "guessed_share": 0.125}
-        write_facts(path, [row | own | {"trust_cells": text} for row, text in zip(read_facts(path), cells, strict=True)])
+        write_facts(
+            path,
+            [
+                row | own | {"trust_cells": text}
+                for row, text in zip(read_facts(path), cells, strict=True)
+            ],
+        )
         told.append(cells)
     drives = cell_data(run, cell, read_logs(run, cell), Fineness())["drives"]
     assert [drive["cameras"][0]["trust"] for drive in drives] == told
     words = [one["text"] for drive in drives for one in drive["moments"] if one["kind"] != "frame"]
     assert words
-    assert all("12 % of what it saw in the second before was made up by the fixer, 75 % was recorded" in text for text in words)
+    assert all(
+        "12 % of what it saw in the second before was made up by the fixer, 75 % was recorded"
+        in text
+        for text in words
+    )
 
 
 def test_what_is_not_valid_has_no_value_and_a_reason(small_run: Path) -> None:
@@ -172,7 +220,9 @@ def test_without_frames_the_page_says_how_to_get_them_or_takes_the_video(tmp_pat
         assert "--video all" in drive["no_frames"]
     run = read_run(root)
     for rollout in run.rollouts:
-        write_mp4(root / rollout.path / "front.mp4", [picture(k) for k in range(SMALL.steps)], 10, crf=12)
+        write_mp4(
+            root / rollout.path / "front.mp4", [picture(k) for k in range(SMALL.steps)], 10, crf=12
+        )
     for drive in only_cell(root)["drives"]:
         assert [number_of(jpeg) for jpeg in drive["cameras"][0]["jpeg"]] == list(range(SMALL.steps))
         assert drive["cameras"][0]["t"] == [100 * k for k in range(SMALL.steps)]
@@ -191,7 +241,9 @@ def test_without_a_log_the_table_of_steps_gives_the_way(small_run: Path, tmp_pat
         assert np.abs(np.subtract(with_log["ego"]["y"], without["ego"]["y"])).max() <= 1
 
 
-def test_a_damaged_log_is_told_in_its_place_and_the_others_are_shown(small_run: Path, tmp_path: Path) -> None:
+def test_a_damaged_log_is_told_in_its_place_and_the_others_are_shown(
+    small_run: Path, tmp_path: Path
+) -> None:
     root = Path(shutil.copytree(small_run, tmp_path / "run"))
     (root / read_run(root).rollouts[0].path / "rollout.asl").write_bytes(b"no log")
     damaged, whole = only_cell(root)["drives"]
@@ -204,13 +256,21 @@ def test_changed_outcomes_come_first_and_quiet_cells_are_few(watched_run: Path) 
     cells = cells_of(run)
     assert [cell.interest for cell in cells] == ["flip", "flip", "flip", "quiet"]
     many = [*cells, *(replace(cells[-1], seed=seed) for seed in range(10, 20))]
-    assert [cell.seed for cell in shown_by_default(many, Wanted(), None)] == [*(cell.seed for cell in cells), 10, 11]
+    assert [cell.seed for cell in shown_by_default(many, Wanted(), None)] == [
+        *(cell.seed for cell in cells),
+        10,
+        11,
+    ]
     assert len(shown_by_default(many, Wanted(scenes=("smoke-straight",)), None)) == 14
     assert len(shown_by_default(many, Wanted(), 2)) == 2
-    (chosen,) = cells_of(run, Wanted(scenes=("smoke/straight",), seeds=(1,), renderers=("clean", "3dgs")))
+    (chosen,) = cells_of(
+        run, Wanted(scenes=("smoke/straight",), seeds=(1,), renderers=("clean", "3dgs"))
+    )
     assert [rollout.renderer for rollout in chosen.rollouts] == ["clean", "3dgs"]
     far = replace(cells[-1].rollouts[0], metrics={"dist_traveled_m": 90.0})
-    near = replace(cells[-1].rollouts[1], metrics={"dist_traveled_m": 20.0, "lateral_distance_m": 3.0})
+    near = replace(
+        cells[-1].rollouts[1], metrics={"dist_traveled_m": 20.0, "lateral_distance_m": 3.0}
+    )
     assert replace(cells[-1], rollouts=(far, near)).apart_m == 73.0
     with pytest.raises(InputError, match=r"(?s)--renderer nobody.*clean, 3dgs, onefixer") as caught:
         check_wanted(run, Wanted(renderers=("nobody",)))
@@ -251,7 +311,9 @@ def test_a_page_keeps_its_size_and_says_what_it_leaves_out(watched_run: Path) ->
 
 def test_names_cannot_leave_their_place(tmp_path: Path) -> None:
     hostile = "</script><script>alert(1)</script><!--"
-    root = make_watched(tmp_path, Plan(renderers=("clean", hostile), scenes=(hostile,), seeds=(0,), steps=6))
+    root = make_watched(
+        tmp_path, Plan(renderers=("clean", hostile), scenes=(hostile,), seeds=(0,), steps=6)
+    )
     made = write_page(read_run(root), tmp_path / "view.html", Wanted(), Options(), None)
     html = made.path.read_text()
     assert "alert(1)</script>" not in html
@@ -259,7 +321,9 @@ def test_names_cannot_leave_their_place(tmp_path: Path) -> None:
     assert documents(html)["index"]["cells"][0]["scene"] == hostile
 
 
-def test_a_run_links_its_changed_outcomes_to_a_small_page(watched_run: Path, tmp_path: Path) -> None:
+def test_a_run_links_its_changed_outcomes_to_a_small_page(
+    watched_run: Path, tmp_path: Path
+) -> None:
     root = Path(shutil.copytree(watched_run, tmp_path / "run"))
     links = write_flips_page(root)
     assert len(links) == 3
@@ -268,7 +332,10 @@ def test_a_run_links_its_changed_outcomes_to_a_small_page(watched_run: Path, tmp
     index = documents((root / FLIPS_PAGE).read_text())["index"]
     assert [cell["interest"] for cell in index["cells"]] == ["flip"] * 3
     table = pq.read_table(root / "rollouts.parquet")
-    rows = [row | {"offroad": 0.0, "collision_any": 0.0, "collision_at_fault": 0.0} for row in table.to_pylist()]
+    rows = [
+        row | {"offroad": 0.0, "collision_any": 0.0, "collision_at_fault": 0.0}
+        for row in table.to_pylist()
+    ]
     pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), root / "rollouts.parquet")
     assert write_flips_page(root) == {}
     assert not (root / FLIPS_PAGE).exists()
@@ -279,7 +346,13 @@ def test_the_whole_drive_of_the_fixture_is_watched(watched_run: Path) -> None:
 
 
 def test_policies_stand_side_by_side_where_there_is_one_renderer(tmp_path: Path) -> None:
-    plan = Plan(renderers=("clean",), policies=("one", "two"), scenes=("urban-left_turn",), seeds=(0,), steps=12)
+    plan = Plan(
+        renderers=("clean",),
+        policies=("one", "two"),
+        scenes=("urban-left_turn",),
+        seeds=(0,),
+        steps=12,
+    )
     run = read_run(make_watched(tmp_path / "run", plan, actors=0))
     (cell,) = cells_of(run, arms=True)
     assert [cell.side(one) for one in cell.rollouts] == ["one", "two"] == list(cell.outcomes())
@@ -293,5 +366,8 @@ def test_a_camera_says_how_the_road_is_projected_into_its_pictures(small_run: Pa
     run = read_run(small_run)
     cell = cells_of(run)[0]
     drive = cell_data(run, cell, read_logs(run, cell), Fineness(width_px=32))["drives"][0]
-    assert drive["cameras"][0]["lens"] == {"k": [20.0, 20.0, 16.0, 9.0], "T": np.eye(4)[:3].ravel().tolist()}
+    assert drive["cameras"][0]["lens"] == {
+        "k": [20.0, 20.0, 16.0, 9.0],
+        "T": np.eye(4)[:3].ravel().tolist(),
+    }
     assert drive["rear"] == round(100 * Vehicle().rear_axle_to_centre_m)

@@ -1,4 +1,6 @@
-"""The server of a running run: what finishes is picked up, and nothing but files of the run is given, to nobody else."""
+"""The server of a running run: what finishes is picked up, and nothing but files of the run is
+given, to nobody else.
+"""
 
 from __future__ import annotations
 
@@ -47,10 +49,14 @@ def running(made: Path, tmp_path: Path) -> tuple[Path, dict[str, bytes]]:
 
 
 @pytest.fixture
-def server(running: tuple[Path, dict[str, bytes]], monkeypatch: pytest.MonkeyPatch) -> Iterator[RunServer]:
+def server(
+    running: tuple[Path, dict[str, bytes]], monkeypatch: pytest.MonkeyPatch
+) -> Iterator[RunServer]:
     monkeypatch.setattr(serve, "LEAST_AGE_S", 0.0)
     monkeypatch.setattr(serve, "MOST_SHARE", math.inf)
-    with RunServer(("127.0.0.1", 0), lambda: read_so_far(running[0]), Wanted(), Options()) as opened:
+    with RunServer(
+        ("127.0.0.1", 0), lambda: read_so_far(running[0]), Wanted(), Options()
+    ) as opened:
         thread = threading.Thread(target=opened.serve_forever, args=(0.02,), daemon=True)
         thread.start()
         yield opened
@@ -58,7 +64,9 @@ def server(running: tuple[Path, dict[str, bytes]], monkeypatch: pytest.MonkeyPat
         thread.join()
 
 
-def ask(server: RunServer, path: str, method: str = "GET", host: str | None = "") -> tuple[int, dict[str, str], bytes]:
+def ask(
+    server: RunServer, path: str, method: str = "GET", host: str | None = ""
+) -> tuple[int, dict[str, str], bytes]:
     """Send one request as it stands: no part of the path is tidied up on the way."""
     connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=20)
     connection.putrequest(method, path, skip_host=True)
@@ -77,13 +85,22 @@ def get_json(server: RunServer, path: str) -> Any:
     return json.loads(body)
 
 
-def test_what_finishes_is_picked_up(server: RunServer, running: tuple[Path, dict[str, bytes]]) -> None:
+def test_what_finishes_is_picked_up(
+    server: RunServer, running: tuple[Path, dict[str, bytes]]
+) -> None:
     root, later = running
     index = get_json(server, "/index.json")
-    assert (index["done"], index["planned"], index["finished"], index["live"]) == (1, 4, False, True)
+    assert (index["done"], index["planned"], index["finished"], index["live"]) == (
+        1,
+        4,
+        False,
+        True,
+    )
     (cell,) = index["cells"]
     assert list(cell["outcomes"]) == ["clean"]
-    assert [drive["renderer"] for drive in get_json(server, f"/cells/{cell['id']}.json")["drives"]] == ["clean"]
+    assert [
+        drive["renderer"] for drive in get_json(server, f"/cells/{cell['id']}.json")["drives"]
+    ] == ["clean"]
     for path, manifest in later.items():
         (root / path / "manifest.json").write_bytes(manifest)
         index = get_json(server, "/index.json")
@@ -91,10 +108,15 @@ def test_what_finishes_is_picked_up(server: RunServer, running: tuple[Path, dict
     same = next(one for one in index["cells"] if one["id"] == cell["id"])
     assert list(same["outcomes"]) == ["clean", "3dgs"]
     drives = get_json(server, f"/cells/{cell['id']}.json")["drives"]
-    assert [(drive["renderer"], len(drive["cameras"][0]["t"])) for drive in drives] == [("clean", 12), ("3dgs", 12)]
+    assert [(drive["renderer"], len(drive["cameras"][0]["t"])) for drive in drives] == [
+        ("clean", 12),
+        ("3dgs", 12),
+    ]
 
 
-def test_a_rollout_whose_files_changed_after_its_manifest_is_named_and_not_shown(server: RunServer, running: tuple[Path, Any]) -> None:
+def test_a_rollout_whose_files_changed_after_its_manifest_is_named_and_not_shown(
+    server: RunServer, running: tuple[Path, Any]
+) -> None:
     log = running[0] / "rollouts/clean/lane-camera/smoke-straight/0/rollout.asl"
     log.write_bytes(log.read_bytes()[:-100])
     index = get_json(server, "/index.json")
@@ -114,14 +136,30 @@ def test_the_page_may_ask_its_own_server_and_nobody_else(server: RunServer) -> N
     assert "access-control-allow-origin" not in headers
 
 
-@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "HEAD", "OPTIONS", "PATCH", "TRACE", "CONNECT"])
+@pytest.mark.parametrize(
+    "method", ["POST", "PUT", "DELETE", "HEAD", "OPTIONS", "PATCH", "TRACE", "CONNECT"]
+)
 def test_only_get_is_answered(server: RunServer, method: str) -> None:
     assert ask(server, "/index.json", method)[0] == 405
 
 
-@pytest.mark.parametrize("host", [None, "evil.example", "127.0.0.1:1", "localhost", "127.0.0.1.evil.example:{port}", "x@127.0.0.1:{port}"])
+@pytest.mark.parametrize(
+    "host",
+    [
+        None,
+        "evil.example",
+        "127.0.0.1:1",
+        "localhost",
+        "127.0.0.1.evil.example:{port}",
+        "x@127.0.0.1:{port}",
+    ],
+)
 def test_a_page_of_another_name_gets_nothing(server: RunServer, host: str | None) -> None:
-    status, _, body = ask(server, "/index.json", host=None if host is None else host.format(port=server.server_address[1]))
+    status, _, body = ask(
+        server,
+        "/index.json",
+        host=None if host is None else host.format(port=server.server_address[1]),
+    )
     assert status == 403
     assert b"cells" not in body
 
@@ -132,16 +170,38 @@ def test_its_own_names_are_answered(server: RunServer) -> None:
 
 
 OUTSIDE = (
-    "/run/../secret.json", "/run/%2e%2e/secret.json", "/run/..%2fsecret.json", "/run/rollouts/../../secret.json", "/run//etc/passwd",
-    "/run/%2fetc/hostname.json", "/run/..%5csecret.json", "/run/C:%5csecret.json", "/run/link.json", "/run/folder/secret.json",
-    "/run/.hidden.json", "/run/.simrun.lock", "/run/run.json%00.html", "/run/", "/run/rollouts", "/run/rollouts/", "/run/notes.py",
-    "/../secret.json", "/secret.json", "/cells/../index.json", "/cells/nobody.json", "/cells/", "//etc/passwd", "/run/%ff%fe.json",
+    "/run/../secret.json",
+    "/run/%2e%2e/secret.json",
+    "/run/..%2fsecret.json",
+    "/run/rollouts/../../secret.json",
+    "/run//etc/passwd",
+    "/run/%2fetc/hostname.json",
+    "/run/..%5csecret.json",
+    "/run/C:%5csecret.json",
+    "/run/link.json",
+    "/run/folder/secret.json",
+    "/run/.hidden.json",
+    "/run/.simrun.lock",
+    "/run/run.json%00.html",
+    "/run/",
+    "/run/rollouts",
+    "/run/rollouts/",
+    "/run/notes.py",
+    "/../secret.json",
+    "/secret.json",
+    "/cells/../index.json",
+    "/cells/nobody.json",
+    "/cells/",
+    "//etc/passwd",
+    "/run/%ff%fe.json",
     "/index.json/..",
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("path", OUTSIDE)
-def test_nothing_but_files_of_the_run_is_given(server: RunServer, running: tuple[Path, Any], path: str) -> None:
+def test_nothing_but_files_of_the_run_is_given(
+    server: RunServer, running: tuple[Path, Any], path: str
+) -> None:
     root = running[0]
     (root.parent / "secret.json").write_text('"secret"')
     (root / ".hidden.json").write_text('"secret"')
@@ -155,13 +215,19 @@ def test_nothing_but_files_of_the_run_is_given(server: RunServer, running: tuple
 
 
 def test_files_of_the_run_are_given(server: RunServer, running: tuple[Path, Any]) -> None:
-    status, headers, body = ask(server, "/run/rollouts/clean/lane-camera/smoke-straight/0/strip.jpg")
+    status, headers, body = ask(
+        server, "/run/rollouts/clean/lane-camera/smoke-straight/0/strip.jpg"
+    )
     assert (status, headers["content-type"]) == (200, "image/jpeg")
-    assert body == (running[0] / "rollouts/clean/lane-camera/smoke-straight/0/strip.jpg").read_bytes()
+    assert (
+        body == (running[0] / "rollouts/clean/lane-camera/smoke-straight/0/strip.jpg").read_bytes()
+    )
     assert file_below(running[0], "run.json") == running[0] / "run.json"
 
 
-def test_a_page_of_the_run_is_an_origin_of_its_own_that_may_ask_nobody(server: RunServer, running: tuple[Path, Any]) -> None:
+def test_a_page_of_the_run_is_an_origin_of_its_own_that_may_ask_nobody(
+    server: RunServer, running: tuple[Path, Any]
+) -> None:
     (running[0] / "sent.html").write_text("<script>fetch('/index.json')</script>")
     status, headers, _ = ask(server, "/run/sent.html")
     policy = headers["content-security-policy"]
@@ -172,12 +238,18 @@ def test_a_page_of_the_run_is_an_origin_of_its_own_that_may_ask_nobody(server: R
     assert "connect-src" not in policy
 
 
-def test_a_client_that_wants_the_connection_closed_gets_it_closed_after_a_file(server: RunServer) -> None:
+def test_a_client_that_wants_the_connection_closed_gets_it_closed_after_a_file(
+    server: RunServer,
+) -> None:
     with socket.create_connection(("127.0.0.1", server.server_address[1]), timeout=20) as wire:
         host = f"127.0.0.1:{server.server_address[1]}"
-        wire.sendall(f"GET /run/run.json HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode())
+        wire.sendall(
+            f"GET /run/run.json HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode()
+        )
         answer = b""
-        while piece := wire.recv(65536):  # ends when the server closes; otherwise the time limit ends it with an error
+        while piece := wire.recv(
+            65536
+        ):  # ends when the server closes; otherwise the time limit ends it with an error
             answer += piece
     assert answer.startswith(b"HTTP/1.1 200")
 
@@ -210,6 +282,13 @@ def test_addresses_of_this_machine_alone() -> None:
             loopback(refused)
 
 
-def test_a_port_that_is_taken_is_an_error_of_the_machine(server: RunServer, running: tuple[Path, Any]) -> None:
+def test_a_port_that_is_taken_is_an_error_of_the_machine(
+    server: RunServer, running: tuple[Path, Any]
+) -> None:
     with pytest.raises(InfrastructureError, match="choose another port"):
-        RunServer(("127.0.0.1", server.server_address[1]), lambda: read_so_far(running[0]), Wanted(), Options())
+        RunServer(
+            ("127.0.0.1", server.server_address[1]),
+            lambda: read_so_far(running[0]),
+            Wanted(),
+            Options(),
+        )

@@ -21,11 +21,23 @@ def arc(lane_id, radius, degrees, start=(0.0, 0.0), turn=1.0, **more):
 
     def line(offset):
         r = radius - turn * offset
-        return np.column_stack([start[0] + r * np.sin(a), start[1] + turn * (radius - r * np.cos(a)), np.zeros_like(a)])
+        return np.column_stack(
+            [start[0] + r * np.sin(a), start[1] + turn * (radius - r * np.cos(a)), np.zeros_like(a)]
+        )
 
     return Lane(lane_id, centre_line(line(1.75), line(-1.75)), line(1.75), line(-1.75), **more)
 
 
 def make(*lanes, shift=0.0):
-    moved = [Lane(**{**vars(k), "centre": k.centre + shift, "left": k.left + shift, "right": k.right + shift}) for k in lanes]
+    moved = [
+        Lane(
+            **{
+                **vars(k),
+                "centre": k.centre + shift,
+                "left": k.left + shift,
+                "right": k.right + shift,
+            }
+        )
+        for k in lanes
+    ]
     return LaneMap({k.lane_id: k for k in moved})

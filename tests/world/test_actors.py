@@ -1,4 +1,6 @@
-"""Actors in a rollout: replay inside the track's time, and drivers that react once the loop is closed."""
+"""Actors in a rollout: replay inside the track's time, and drivers that react once the loop is
+closed.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,16 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, quat_from_yaw, se2
-from alpasim_plugin.core.types import Actor, Behaviour, Box, EgoState, Lane, LaneMap, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    Actor,
+    Behaviour,
+    Box,
+    EgoState,
+    Lane,
+    LaneMap,
+    Trajectory,
+    Vehicle,
+)
 from alpasim_plugin.world.actors import Actors
 from alpasim_plugin.world.ground import flat
 
@@ -16,10 +27,21 @@ FAR_AWAY = EgoState(0, se2(0.0, 500.0, 0.0), 0.0)
 T0 = 1_600_000_000_000_000  # epoch microseconds: too large for float arithmetic
 
 
-def line_track(x0: float, speed: float, seconds: float = 10.0, y: float = 0.0, t0: int = 0, step_us: int = 100_000) -> Trajectory:
+def line_track(
+    x0: float,
+    speed: float,
+    seconds: float = 10.0,
+    y: float = 0.0,
+    t0: int = 0,
+    step_us: int = 100_000,
+) -> Trajectory:
     t = t0 + np.arange(0, round(seconds * 1e6) + 1, step_us, dtype=np.int64)
     x = x0 + speed * (t - t0) * 1e-6
-    return Trajectory(t, np.column_stack([x, np.full(len(t), y), np.full(len(t), 0.75)]), quat_from_yaw(np.zeros(len(t))))
+    return Trajectory(
+        t,
+        np.column_stack([x, np.full(len(t), y), np.full(len(t), 0.75)]),
+        quat_from_yaw(np.zeros(len(t))),
+    )
 
 
 def idm(actor_id: str, x0: float, speed: float, **params: float) -> Actor:
@@ -31,7 +53,9 @@ def ego_at(x: float, speed: float = 0.0) -> EgoState:
     return EgoState(0, se2(x, 0.0, 0.0), speed)
 
 
-def run(actors: Actors, ego: EgoState, end_us: int, step_us: int = 100_000) -> dict[str, list[float]]:
+def run(
+    actors: Actors, ego: EgoState, end_us: int, step_us: int = 100_000
+) -> dict[str, list[float]]:
     out: dict[str, list[float]] = {}
     for t in range(0, end_us + 1, step_us):
         for name, pose in actors.step(t, ego).items():
@@ -55,7 +79,9 @@ def test_batched_replay_agrees_with_interpolating_track_by_track() -> None:
         assert set(poses) == present
         for actor in actors:
             if actor.actor_id in present:
-                np.testing.assert_allclose(poses[actor.actor_id], interpolate(actor.track, t), atol=1e-9)
+                np.testing.assert_allclose(
+                    poses[actor.actor_id], interpolate(actor.track, t), atol=1e-9
+                )
 
 
 def test_replay_is_present_exactly_from_its_first_to_its_last_pose() -> None:
@@ -65,7 +91,9 @@ def test_replay_is_present_exactly_from_its_first_to_its_last_pose() -> None:
 
 
 def test_one_pose_track_is_there_at_its_instant() -> None:
-    one = Trajectory(np.array([200_000]), np.array([[1.0, 2.0, 0.75]]), quat_from_yaw(np.array([0.3])))
+    one = Trajectory(
+        np.array([200_000]), np.array([[1.0, 2.0, 0.75]]), quat_from_yaw(np.array([0.3]))
+    )
     actors = Actors([Actor("a", "car", BOX, one)], Vehicle(), 0)
     assert actors.step(100_000, FAR_AWAY) == {}
     np.testing.assert_allclose(actors.step(200_000, FAR_AWAY)["a"][:3, 3], [1.0, 2.0, 0.75])
@@ -86,7 +114,9 @@ def test_time_must_go_forwards_until_a_reset() -> None:
 
 def test_reactive_driver_follows_its_track_while_the_log_is_forced() -> None:
     actors = Actors([idm("a", 0, 8)], Vehicle(), 2_000_000, ground=flat())
-    x = run(actors, ego_at(40.0), 2_000_000)["a"]  # the ego stands in its way, but the loop is not closed yet
+    x = run(actors, ego_at(40.0), 2_000_000)[
+        "a"
+    ]  # the ego stands in its way, but the loop is not closed yet
     np.testing.assert_allclose(x, 8.0 * np.arange(21) * 0.1, atol=1e-9)
 
 
@@ -108,8 +138,12 @@ def test_reactive_driver_keeps_a_speed_on_a_free_road() -> None:
 
 def test_reactive_driver_follows_a_replayed_leader_that_stops() -> None:
     t = np.array([0, 3_000_000, 10_000_000])
-    stop = Trajectory(t, np.array([[30.0, 0, 0.75], [45, 0, 0.75], [45, 0, 0.75]]), quat_from_yaw(np.zeros(3)))
-    actors = Actors([idm("a", 0, 10), Actor("leader", "car", BOX, stop)], Vehicle(), 500_000, ground=flat())
+    stop = Trajectory(
+        t, np.array([[30.0, 0, 0.75], [45, 0, 0.75], [45, 0, 0.75]]), quat_from_yaw(np.zeros(3))
+    )
+    actors = Actors(
+        [idm("a", 0, 10), Actor("leader", "car", BOX, stop)], Vehicle(), 500_000, ground=flat()
+    )
     x = run(actors, FAR_AWAY, 10_000_000)["a"]
     assert x[-1] + BOX.length_m / 2 < 45 - BOX.length_m / 2 - 0.5
 
@@ -120,9 +154,17 @@ def test_reactive_driver_stops_behind_a_parked_car_only_while_it_is_there() -> N
         track = Trajectory(t, np.array([[50.0, 0.5, 0.75]] * 2), quat_from_yaw(np.zeros(2)))
         return Actor("parked", "car", BOX, track, is_static=True)
 
-    stays = run(Actors([idm("a", 0, 10), parked(20_000_000)], Vehicle(), 500_000, ground=flat()), FAR_AWAY, 9_000_000)["a"]
+    stays = run(
+        Actors([idm("a", 0, 10), parked(20_000_000)], Vehicle(), 500_000, ground=flat()),
+        FAR_AWAY,
+        9_000_000,
+    )["a"]
     assert stays[-1] + BOX.length_m / 2 < 50 - BOX.length_m / 2 - 0.5
-    leaves = run(Actors([idm("a", 0, 10), parked(1_000_000)], Vehicle(), 500_000, ground=flat()), FAR_AWAY, 9_000_000)["a"]
+    leaves = run(
+        Actors([idm("a", 0, 10), parked(1_000_000)], Vehicle(), 500_000, ground=flat()),
+        FAR_AWAY,
+        9_000_000,
+    )["a"]
     assert leaves[-1] > 60
 
 
@@ -135,12 +177,24 @@ def test_a_column_of_reactive_drivers_stays_in_order() -> None:
 
 
 def test_reactive_driver_goes_on_along_the_lanes_where_its_track_ends() -> None:
-    bend = np.column_stack([15 + 20 * np.sin(np.linspace(0, 1.5, 40)), 20 - 20 * np.cos(np.linspace(0, 1.5, 40)), np.zeros(40)])
+    bend = np.column_stack(
+        [
+            15 + 20 * np.sin(np.linspace(0, 1.5, 40)),
+            20 - 20 * np.cos(np.linspace(0, 1.5, 40)),
+            np.zeros(40),
+        ]
+    )
     lanes = {
         "a": Lane("a", np.array([[-5.0, 0, 0], [15, 0, 0]]), None, None, successors=("b",)),
         "b": Lane("b", bend, None, None),
     }
-    short = Actor("a", "car", BOX, line_track(0, 10, 1.0, y=0.4), behaviour=Behaviour("idm", {"desired_speed_mps": 10}))
+    short = Actor(
+        "a",
+        "car",
+        BOX,
+        line_track(0, 10, 1.0, y=0.4),
+        behaviour=Behaviour("idm", {"desired_speed_mps": 10}),
+    )
     actors = Actors([short], Vehicle(), 500_000, LaneMap(lanes), flat())
     poses = [actors.step(t, FAR_AWAY) for t in range(0, 6_000_001, 100_000)]
     at = np.array([p["a"][:2, 3] for p in poses if "a" in p])
@@ -158,7 +212,13 @@ def test_reactive_driver_with_a_track_that_goes_nowhere_stays_on_it() -> None:
 
 
 def test_a_track_that_begins_late_reacts_from_then_on() -> None:
-    late = Actor("a", "car", BOX, line_track(0, 8, 10.0, t0=2_000_000), behaviour=Behaviour("idm", {"desired_speed_mps": 8}))
+    late = Actor(
+        "a",
+        "car",
+        BOX,
+        line_track(0, 8, 10.0, t0=2_000_000),
+        behaviour=Behaviour("idm", {"desired_speed_mps": 8}),
+    )
     actors = Actors([late], Vehicle(), 500_000, ground=flat())
     seen = {t: actors.step(t, ego_at(30.0)) for t in range(0, 10_000_001, 100_000)}
     assert not any(seen[t] for t in range(0, 2_000_000, 100_000))
@@ -189,12 +249,20 @@ def test_an_outlook_stays_as_it_is_while_the_actors_move_on() -> None:
     for t, poses in expected.items():
         for name, pose in poses.items():
             np.testing.assert_array_equal(forecast.at(t)[name], pose)
-    assert expected[1_000_000]["driver"][0, 3] - expected[500_000]["driver"][0, 3] == pytest.approx(5.0, abs=0.1)
+    assert expected[1_000_000]["driver"][0, 3] - expected[500_000]["driver"][0, 3] == pytest.approx(
+        5.0, abs=0.1
+    )
 
 
 def test_an_outlook_ends_with_the_track_and_with_the_drivers_way() -> None:
     replayed = Actor("replayed", "car", BOX, line_track(40.0, 7.0, seconds=1.0, y=3.5))
-    short = Actor("driver", "car", BOX, line_track(0.0, 10.0, seconds=1.0), behaviour=Behaviour("idm", {"desired_speed_mps": 10.0}))
+    short = Actor(
+        "driver",
+        "car",
+        BOX,
+        line_track(0.0, 10.0, seconds=1.0),
+        behaviour=Behaviour("idm", {"desired_speed_mps": 10.0}),
+    )
     actors = Actors([replayed, short], Vehicle(), 0)
     for t in (0, 100_000):
         actors.step(t, FAR_AWAY)

@@ -27,8 +27,12 @@ ROAD = polyline_path(np.column_stack([np.linspace(0, 200, 201), np.zeros(201), n
 INF = float("inf")
 
 
-def car(x: float, y: float, yaw: float = 0.0, speed: float = 0.0, box: Box = Box(4.6, 1.85, 1.5)) -> Bodies:
-    return bodies_from(np.array([x, y]), np.array([yaw]), [box], speed * np.array([np.cos(yaw), np.sin(yaw)]))
+def car(
+    x: float, y: float, yaw: float = 0.0, speed: float = 0.0, box: Box = Box(4.6, 1.85, 1.5)
+) -> Bodies:
+    return bodies_from(
+        np.array([x, y]), np.array([yaw]), [box], speed * np.array([np.cos(yaw), np.sin(yaw)])
+    )
 
 
 def test_free_road_follows_the_power_law() -> None:
@@ -53,11 +57,17 @@ def test_closing_in_brakes_harder_and_is_cut_off_at_what_the_vehicle_can_do() ->
 
 @settings(deadline=None)
 @given(st.floats(0, 40), st.floats(0.1, 200), st.floats(-20, 40), st.floats(0.5, 100))
-def test_a_larger_gap_never_brakes_harder(speed: float, gap: float, closing: float, more: float) -> None:
-    assert idm_acceleration(speed, gap + more, closing, P) >= idm_acceleration(speed, gap, closing, P)
+def test_a_larger_gap_never_brakes_harder(
+    speed: float, gap: float, closing: float, more: float
+) -> None:
+    assert idm_acceleration(speed, gap + more, closing, P) >= idm_acceleration(
+        speed, gap, closing, P
+    )
 
 
-@pytest.mark.parametrize("params", [{"headway": 1.0}, {"headway_s": 0.0}, {"accel_mps2": float("nan")}])
+@pytest.mark.parametrize(
+    "params", [{"headway": 1.0}, {"headway_s": 0.0}, {"accel_mps2": float("nan")}]
+)
 def test_unknown_or_senseless_parameters_are_refused(params: dict[str, float]) -> None:
     with pytest.raises(InputError, match="use positive desired_speed_mps, headway_s"):
         IdmParams.from_mapping(params)
@@ -66,7 +76,10 @@ def test_unknown_or_senseless_parameters_are_refused(params: dict[str, float]) -
 def test_a_platoon_behind_a_stopped_car_stops_without_contact() -> None:
     x, v = np.array([80.0, 40.0, 0.0]), np.array([0.0, 15.0, 15.0])
     for _ in range(6000):
-        a = [idm_acceleration(v[i], x[i - 1] - 5.0 - x[i], v[i] - v[i - 1], P) if i else 0.0 for i in range(3)]
+        a = [
+            idm_acceleration(v[i], x[i - 1] - 5.0 - x[i], v[i] - v[i - 1], P) if i else 0.0
+            for i in range(3)
+        ]
         v = np.maximum(0.0, v + 0.01 * np.array(a))
         x = x + 0.01 * v
         assert (x[:-1] - 5.0 - x[1:] > 0).all()
@@ -76,7 +89,9 @@ def test_a_platoon_behind_a_stopped_car_stops_without_contact() -> None:
 
 
 def test_the_nearest_body_in_the_corridor_leads() -> None:
-    leader = find_leader(ROAD, 10.0, 0.95, concatenate([car(60, 0, speed=5), car(40, 0, speed=7), car(30, 3.5)]))
+    leader = find_leader(
+        ROAD, 10.0, 0.95, concatenate([car(60, 0, speed=5), car(40, 0, speed=7), car(30, 3.5)])
+    )
     assert leader.index == 1
     assert leader.gap_m == pytest.approx(40 - 2.3 - 10, abs=1e-6)
     assert leader.speed_mps == pytest.approx(7.0)
@@ -84,7 +99,9 @@ def test_the_nearest_body_in_the_corridor_leads() -> None:
 
 @pytest.mark.parametrize(("y", "leads"), [(0.0, True), (2.0, True), (2.2, False), (-2.2, False)])
 def test_corridor_is_as_wide_as_the_car_and_a_margin(y: float, leads: bool) -> None:
-    assert (find_leader(ROAD, 10.0, 0.95, car(40, y)).index == 0) == leads  # 0.95 + 0.2 + 1.85 / 2 = 2.075
+    assert (
+        find_leader(ROAD, 10.0, 0.95, car(40, y)).index == 0
+    ) == leads  # 0.95 + 0.2 + 1.85 / 2 = 2.075
 
 
 def test_a_body_behind_is_no_leader_and_a_touching_one_is() -> None:
@@ -96,7 +113,9 @@ def test_a_body_behind_is_no_leader_and_a_touching_one_is() -> None:
 
 def test_a_crossing_truck_blocks_with_its_length() -> None:
     truck = Box(10.0, 2.5, 3.0)
-    assert find_leader(ROAD, 10.0, 0.95, car(40, 5.0, np.pi / 2, 3.0, truck)).gap_m == pytest.approx(40 - 1.25 - 10)
+    assert find_leader(
+        ROAD, 10.0, 0.95, car(40, 5.0, np.pi / 2, 3.0, truck)
+    ).gap_m == pytest.approx(40 - 1.25 - 10)
     assert find_leader(ROAD, 10.0, 0.95, car(40, 5.0, 0.0, 3.0, truck)).index == -1
 
 

@@ -23,7 +23,9 @@ BOX = Box(4.0, 1.8, 1.5)
 
 
 def straight(y: float) -> object:
-    return polyline_path(np.column_stack([np.linspace(0, 150, 151), np.full(151, y), np.zeros(151)]))
+    return polyline_path(
+        np.column_stack([np.linspace(0, 150, 151), np.full(151, y), np.zeros(151)])
+    )
 
 
 def test_grid_ends_exactly_at_the_end() -> None:

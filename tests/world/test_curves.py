@@ -9,12 +9,21 @@ from hypothesis import strategies as st
 from scipy.special import fresnel
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.world.path import connect, offset_line, polyline_path, sample_clothoid, smooth_path, smoothstep
+from alpasim_plugin.world.path import (
+    connect,
+    offset_line,
+    polyline_path,
+    sample_clothoid,
+    smooth_path,
+    smoothstep,
+)
 from tests.examples import examples
 
 
 def clothoid_by_fresnel(s: np.ndarray, rate: float) -> np.ndarray:
-    """Points of a clothoid from the origin with zero start curvature: x + iy = sqrt(pi/rate) (C + iS)(s sqrt(rate/pi))."""
+    """Points of a clothoid from the origin with zero start curvature: x + iy = sqrt(pi/rate) (C +
+    iS)(s sqrt(rate/pi)).
+    """
     scale = np.sqrt(np.pi / abs(rate))
     sine, cosine = fresnel(s / scale)
     return np.stack([scale * cosine, np.sign(rate) * scale * sine], axis=1)
@@ -26,7 +35,9 @@ def test_clothoid_agrees_with_fresnel_integrals(end_curvature: float, step_m: fl
     length = 60.0
     curve = sample_clothoid((0.0, 0.0, 0.0), length, 0.0, end_curvature, step_m)
     s = np.linspace(0.0, length, len(curve))
-    np.testing.assert_allclose(curve[:, :2], clothoid_by_fresnel(s, end_curvature / length), atol=1e-11)
+    np.testing.assert_allclose(
+        curve[:, :2], clothoid_by_fresnel(s, end_curvature / length), atol=1e-11
+    )
 
 
 def test_arc_with_positive_curvature_turns_left_on_its_circle() -> None:
@@ -48,7 +59,9 @@ def test_no_length_is_refused() -> None:
 
 @settings(deadline=None, max_examples=examples(40))
 @given(st.floats(8, 40), st.floats(8, 40), st.sampled_from([np.pi / 2, -np.pi / 2, 0.0]))
-def test_connector_meets_both_poses_exactly_and_never_bends_backwards(ahead: float, aside: float, turn: float) -> None:
+def test_connector_meets_both_poses_exactly_and_never_bends_backwards(
+    ahead: float, aside: float, turn: float
+) -> None:
     p0 = np.array([1.0, 2.0, 0.0])
     p1 = p0 + np.array([ahead, np.sign(turn) * aside, 0.0])
     curve = connect(p0, 0.0, p1, turn)
@@ -95,7 +108,9 @@ def test_windowed_projection_agrees_with_the_whole_search() -> None:
     curve = sample_clothoid((0, 0, 0), 80.0, 0.0, 0.05)
     path = smooth_path(np.column_stack([curve[:, :2], np.zeros(len(curve))]))
     points, _ = path.at(np.linspace(20, 40, 9), np.linspace(-3, 3, 9))
-    np.testing.assert_array_equal(path.project(points[:, :2], (10.0, 50.0)), path.project(points[:, :2]))
+    np.testing.assert_array_equal(
+        path.project(points[:, :2], (10.0, 50.0)), path.project(points[:, :2])
+    )
     assert path.coarser(4).length_m == path.length_m
 
 

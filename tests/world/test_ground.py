@@ -20,7 +20,9 @@ def slow_height(field, x, y):
     i, j = min(int(u), nx - 2), min(int(v), ny - 2)
     a, b = u - i, v - j
     z = field.z
-    return (1 - b) * ((1 - a) * z[j, i] + a * z[j, i + 1]) + b * ((1 - a) * z[j + 1, i] + a * z[j + 1, i + 1])
+    return (1 - b) * ((1 - a) * z[j, i] + a * z[j, i + 1]) + b * (
+        (1 - a) * z[j + 1, i] + a * z[j + 1, i + 1]
+    )
 
 
 FIELD = HeightField(-3.0, 7.0, 0.5, np.random.default_rng(5).normal(size=(9, 13)))
@@ -44,7 +46,12 @@ def test_one_cell_grid_is_level():
     np.testing.assert_array_equal(height_at(field, np.array([[0.0, 0.0], [9.0, -9.0]])), [4.0, 4.0])
 
 
-@given(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-50, 50), st.sampled_from([0.0, 5_000.0, 4_512_345.0]))
+@given(
+    st.floats(-0.2, 0.2),
+    st.floats(-0.2, 0.2),
+    st.floats(-50, 50),
+    st.sampled_from([0.0, 5_000.0, 4_512_345.0]),
+)
 @settings(deadline=None, max_examples=examples(25))
 def test_points_of_a_plane_give_back_the_plane_wherever_it_lies(slope_x, slope_y, height, shift):
     rng = np.random.default_rng(0)
@@ -52,7 +59,9 @@ def test_points_of_a_plane_give_back_the_plane_wherever_it_lies(slope_x, slope_y
     points = np.column_stack([xy + shift, height + xy @ [slope_x, slope_y]])
     field = from_points(points, 2.0)
     inside = rng.uniform(-25, 25, (50, 2))
-    np.testing.assert_allclose(height_at(field, inside + shift), height + inside @ [slope_x, slope_y], atol=1e-6)
+    np.testing.assert_allclose(
+        height_at(field, inside + shift), height + inside @ [slope_x, slope_y], atol=1e-6
+    )
 
 
 def test_points_in_any_order_give_the_same_ground():
@@ -62,13 +71,18 @@ def test_points_in_any_order_give_the_same_ground():
     np.testing.assert_allclose(one.z, two.z, atol=1e-9)
 
 
-@pytest.mark.parametrize("points", [[[1.0, 2.0, 3.0]], [[0.0, 0.0, 3.0], [10.0, 0.0, 3.0], [20.0, 0.0, 3.0]]])
+@pytest.mark.parametrize(
+    "points", [[[1.0, 2.0, 3.0]], [[0.0, 0.0, 3.0], [10.0, 0.0, 3.0], [20.0, 0.0, 3.0]]]
+)
 def test_one_point_or_a_line_of_points_is_ground_enough(points):
     field = from_points(np.array(points))
     np.testing.assert_allclose(height_at(field, np.array([[0.0, 0.0], [11.0, 5.0]])), 3.0)
 
 
-UNUSABLE = [(np.zeros((0, 3)), "no points"), (np.array([[0.0, 0.0, np.nan]]), "1 points that are not finite")]
+UNUSABLE = [
+    (np.zeros((0, 3)), "no points"),
+    (np.array([[0.0, 0.0, np.nan]]), "1 points that are not finite"),
+]
 
 
 @pytest.mark.parametrize(("points", "found"), UNUSABLE)
@@ -84,7 +98,9 @@ def test_ground_of_a_continent_is_refused_before_memory_is_taken():
 
 
 def test_level_ground_leaves_a_planar_pose():
-    np.testing.assert_allclose(ground_pose(flat(2.0), 3.0, -4.0, 0.7), se2(3.0, -4.0, 0.7, 2.0), atol=1e-15)
+    np.testing.assert_allclose(
+        ground_pose(flat(2.0), 3.0, -4.0, 0.7), se2(3.0, -4.0, 0.7, 2.0), atol=1e-15
+    )
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7, np.pi / 2, 3.0, -2.4])
@@ -103,5 +119,9 @@ def test_pose_on_a_slope_keeps_its_heading_and_stands_upright_on_the_surface(yaw
 def test_uphill_lifts_the_nose():
     x = np.repeat(np.arange(0.0, 30), 5)
     points = np.column_stack([x, np.tile(np.arange(5.0), 30), 0.1 * x])
-    assert ground_pose(from_points(points, 1.0), 15.0, 2.0, 0.0)[2, 0] == pytest.approx(0.1 / np.hypot(1, 0.1))
-    assert ground_pose(from_points(points, 1.0), 15.0, 2.0, np.pi)[2, 0] == pytest.approx(-0.1 / np.hypot(1, 0.1))
+    assert ground_pose(from_points(points, 1.0), 15.0, 2.0, 0.0)[2, 0] == pytest.approx(
+        0.1 / np.hypot(1, 0.1)
+    )
+    assert ground_pose(from_points(points, 1.0), 15.0, 2.0, np.pi)[2, 0] == pytest.approx(
+        -0.1 / np.hypot(1, 0.1)
+    )

@@ -14,11 +14,18 @@ from alpasim_plugin.world.route import LaneIndex
 from tests.examples import examples
 from tests.world.small_maps import FAR, arc, make, straight
 
-GRID = make(*(straight(f"{i}{j}", 20.0 * i, 20.0 * i + 20, 3.5 * j) for i in range(4) for j in range(4)), arc("turn", 15.0, 90.0))
+GRID = make(
+    *(straight(f"{i}{j}", 20.0 * i, 20.0 * i + 20, 3.5 * j) for i in range(4) for j in range(4)),
+    arc("turn", 15.0, 90.0),
+)
 
 
 def slow_containing(lane_map, point):
-    return tuple(k for k, lane in lane_map.lanes.items() if lane_polygon(lane).intersects(shapely.Point(point[:2])))
+    return tuple(
+        k
+        for k, lane in lane_map.lanes.items()
+        if lane_polygon(lane).intersects(shapely.Point(point[:2]))
+    )
 
 
 @given(st.lists(st.tuples(st.floats(-5, 85), st.floats(-5, 20)), min_size=1, max_size=30))
@@ -41,11 +48,15 @@ def test_answers_do_not_depend_on_where_the_map_lies():
     assert far.containing_many(points + FAR[:2]) == near.containing_many(points)
     for p in points[:40]:
         assert far.within(np.append(p, 0.0) + FAR, 6.0) == near.within(np.append(p, 0.0), 6.0)
-        assert far.heading_rad("turn", p + FAR[:2]) == pytest.approx(near.heading_rad("turn", p), abs=1e-7)
+        assert far.heading_rad("turn", p + FAR[:2]) == pytest.approx(
+            near.heading_rad("turn", p), abs=1e-7
+        )
 
 
 def test_lane_without_edges_is_its_centre_buffered_by_half_a_width():
-    lane = Lane("a", np.array([[0.0, 0, 0], [10.0, 0, 0]]), None, np.array([[0.0, -1, 0], [10.0, -1, 0]]))
+    lane = Lane(
+        "a", np.array([[0.0, 0, 0], [10.0, 0, 0]]), None, np.array([[0.0, -1, 0], [10.0, -1, 0]])
+    )
     index = LaneIndex(LaneMap({"a": lane}))
     assert index.containing(np.array([5.0, 1.849])) == ("a",)
     assert index.containing(np.array([5.0, 1.851])) == ()
@@ -54,7 +65,9 @@ def test_lane_without_edges_is_its_centre_buffered_by_half_a_width():
 
 
 def test_lane_of_one_centre_point_is_a_disc():
-    assert lane_polygon(Lane("a", np.zeros((1, 3)), None, None)).area == pytest.approx(np.pi * 1.85**2, rel=0.01)
+    assert lane_polygon(Lane("a", np.zeros((1, 3)), None, None)).area == pytest.approx(
+        np.pi * 1.85**2, rel=0.01
+    )
 
 
 def test_edges_that_cross_keep_both_areal_parts():
@@ -86,7 +99,10 @@ def test_edges_on_top_of_each_other_contain_nothing():
     line = np.array([[0.0, 0, 0], [10.0, 0, 0]])
     shape = lane_polygon(Lane("a", line, line, line))
     assert shape.area == 0
-    assert LaneIndex(LaneMap({"a": Lane("a", line, line, line)})).containing(np.array([5.0, 1.0])) == ()
+    assert (
+        LaneIndex(LaneMap({"a": Lane("a", line, line, line)})).containing(np.array([5.0, 1.0]))
+        == ()
+    )
 
 
 def test_bridge_does_not_answer_for_the_road_below():
@@ -148,8 +164,15 @@ def test_path_ends_with_the_map():
 
 def test_path_round_a_ring_road_comes_to_an_end():
     half = arc("two", 20.0, 180.0, successors=("one",))
-    back = Lane(**{**vars(half), **{k: getattr(half, k) * (-1, -1, 1) + (0, 40, 0) for k in ("centre", "left", "right")}})
-    path = LaneIndex(make(arc("one", 20.0, 180.0, successors=("two",)), back)).path_ahead("one", 300.0)
+    back = Lane(
+        **{
+            **vars(half),
+            **{k: getattr(half, k) * (-1, -1, 1) + (0, 40, 0) for k in ("centre", "left", "right")},
+        }
+    )
+    path = LaneIndex(make(arc("one", 20.0, 180.0, successors=("two",)), back)).path_ahead(
+        "one", 300.0
+    )
     np.testing.assert_allclose(np.hypot(path.xyz[:, 0], path.xyz[:, 1] - 20), 20.0, atol=0.15)
     assert arc_lengths(path.xyz)[-1] == pytest.approx(300.0)
     assert path.lane_ids[:3] == ("one", "two", "one")

@@ -49,10 +49,20 @@ def assert_sound(lane_map: LaneMap) -> None:
         for successor in lane.successors:
             after = lane_map.lanes[successor]
             for name in ("centre", "left", "right"):
-                assert (getattr(lane, name)[-1] == getattr(after, name)[0]).all(), (lane.lane_id, successor, name)
-        for mine, theirs, neighbour in (("left", "right", lane.left_neighbour), ("right", "left", lane.right_neighbour)):
+                assert (getattr(lane, name)[-1] == getattr(after, name)[0]).all(), (
+                    lane.lane_id,
+                    successor,
+                    name,
+                )
+        for mine, theirs, neighbour in (
+            ("left", "right", lane.left_neighbour),
+            ("right", "left", lane.right_neighbour),
+        ):
             if neighbour is not None:
-                assert getattr(lane, mine) is getattr(lane_map.lanes[neighbour], theirs), (lane.lane_id, neighbour)
+                assert getattr(lane, mine) is getattr(lane_map.lanes[neighbour], theirs), (
+                    lane.lane_id,
+                    neighbour,
+                )
     for area in lane_map.drivable_areas:
         assert shapely.Polygon(area[:, :2]).is_valid
 
@@ -60,7 +70,13 @@ def assert_sound(lane_map: LaneMap) -> None:
 @pytest.mark.parametrize("name", PROFILES)
 @pytest.mark.parametrize("turn", ["left", "straight", "right"])
 def test_lanes_are_valid_and_meet_exactly_for_every_profile_and_turn(name: str, turn: str) -> None:
-    elements = [Curve(40), Curve(20, 0, 0.015), Curve(30, 0.015, 0.0), Intersection(turn, cross_lanes=2), Curve(40)]
+    elements = [
+        Curve(40),
+        Curve(20, 0, 0.015),
+        Curve(30, 0.015, 0.0),
+        Intersection(turn, cross_lanes=2),
+        Curve(40),
+    ]
     road = build_road(elements, PROFILES[name])
     assert_sound(road.lane_map)
     chain = road.forward_chain(PROFILES[name].forward - 1 if turn == "right" else 0)
@@ -70,20 +86,26 @@ def test_lanes_are_valid_and_meet_exactly_for_every_profile_and_turn(name: str, 
 def test_a_town_with_merge_split_and_two_junctions_is_sound() -> None:
     road = build_road(TOWN, Profile(2, 1, shoulder_m=0.5))
     assert_sound(road.lane_map)
-    assert len(road.forward_chain(0)) == 10, "lane 0 goes straight on at the second junction, the road turns right"
+    assert len(road.forward_chain(0)) == 10, (
+        "lane 0 goes straight on at the second junction, the road turns right"
+    )
     assert [lane for lane, _ in road.forward_chain(1)][4:6] == ["s4_merge", "s5_f0"]
     assert len(road.backward_chain(0)) == len(TOWN)
 
 
 def test_every_lane_is_drivable_ground() -> None:
     road = build_road(TOWN, Profile(2, 1, shoulder_m=0.5))
-    ground = shapely.union_all([shapely.Polygon(a[:, :2]).buffer(1e-6) for a in road.lane_map.drivable_areas])
+    ground = shapely.union_all(
+        [shapely.Polygon(a[:, :2]).buffer(1e-6) for a in road.lane_map.drivable_areas]
+    )
     for lane in road.lane_map.lanes.values():
         assert polygon(lane).difference(ground).area < 0.05, lane.lane_id
 
 
 def test_no_seam_between_consecutive_stretches() -> None:
-    road = build_road([Curve(30), Curve(25, 0, 0.03), Curve(25, 0.03, -0.03), Curve(30, -0.03, 0)], Profile(2, 2))
+    road = build_road(
+        [Curve(30), Curve(25, 0, 0.03), Curve(25, 0.03, -0.03), Curve(30, -0.03, 0)], Profile(2, 2)
+    )
     whole = shapely.union_all([polygon(lane) for lane in road.lane_map.lanes.values()])
     assert whole.geom_type == "Polygon"
     assert len(whole.interiors) == 0
@@ -95,7 +117,9 @@ def test_no_seam_between_consecutive_stretches() -> None:
 
 def test_road_edges_never_cross_the_main_roads_lanes() -> None:
     road = build_road(TOWN, Profile(2, 1, shoulder_m=0.5))
-    middle = shapely.LineString(polyline(road.lane_map, [i for i, _ in road.forward_chain(1)])[:, :2])
+    middle = shapely.LineString(
+        polyline(road.lane_map, [i for i, _ in road.forward_chain(1)])[:, :2]
+    )
     for edge in road.lane_map.road_edges:
         assert not middle.crosses(shapely.LineString(edge[:, :2]))
 
@@ -117,19 +141,33 @@ def test_oncoming_lane_runs_the_other_way_on_the_left() -> None:
 
 
 def test_left_turn_leads_from_inner_to_inner_lane_and_right_turn_from_outer_to_outer() -> None:
-    road = build_road([Curve(40), Intersection("straight", cross_lanes=2), Curve(40)], Profile(2, 2))
+    road = build_road(
+        [Curve(40), Intersection("straight", cross_lanes=2), Curve(40)], Profile(2, 2)
+    )
     ids = set(road.lane_map.lanes)
-    assert {"s1_entry0_left0", "s1_entry1_right1", "s1_entry0_straight0", "s1_entry1_straight1"} <= ids
+    assert {
+        "s1_entry0_left0",
+        "s1_entry1_right1",
+        "s1_entry0_straight0",
+        "s1_entry1_straight1",
+    } <= ids
     assert "s1_entry1_left1" not in ids
-    assert set(road.lane_map.lanes["s0_f0"].successors) == {"s1_entry0_left0", "s1_entry0_straight0"}
+    assert set(road.lane_map.lanes["s0_f0"].successors) == {
+        "s1_entry0_left0",
+        "s1_entry0_straight0",
+    }
 
 
 def test_stop_lines_and_crosswalks_lie_across_their_arms() -> None:
-    lane_map = build_road([Curve(60), Intersection("straight"), Curve(60)], Profile(1, 1, shoulder_m=0.5)).lane_map
+    lane_map = build_road(
+        [Curve(60), Intersection("straight"), Curve(60)], Profile(1, 1, shoulder_m=0.5)
+    ).lane_map
     assert len(lane_map.crosswalks) == 4
     assert len(lane_map.stop_lines) == 4
     first = min(lane_map.stop_lines, key=lambda line: float(np.hypot(*line[0, :2])))
-    assert first[:, 0] == pytest.approx([55.0, 55.0])  # 1 m behind the crosswalk, which begins 1 m from the border at 60 m
+    assert first[:, 0] == pytest.approx(
+        [55.0, 55.0]
+    )  # 1 m behind the crosswalk, which begins 1 m from the border at 60 m
     assert sorted(first[:, 1]) == pytest.approx([-3.5, 0.0])  # across the arriving lane only
     ring = lane_map.crosswalks[0]
     assert (ring[0] == ring[-1]).all()
@@ -137,7 +175,9 @@ def test_stop_lines_and_crosswalks_lie_across_their_arms() -> None:
 
 
 def test_t_junction_closes_the_missing_side() -> None:
-    road = build_road([Curve(40), Intersection("left", ("left", "right")), Curve(40)], Profile(1, 1))
+    road = build_road(
+        [Curve(40), Intersection("left", ("left", "right")), Curve(40)], Profile(1, 1)
+    )
     assert not any("straight" in i for i in road.lane_map.lanes)
     assert_sound(road.lane_map)
     borders = shapely.union_all([shapely.LineString(e[:, :2]) for e in road.lane_map.road_edges])
@@ -164,7 +204,11 @@ def test_merging_lane_ends_exactly_on_its_neighbour() -> None:
         ([Curve(30), Intersection(), Intersection(), Curve(9)], Profile(), "two intersections"),
         ([Curve(30), LaneTaper("merge", 30)], Profile(1, 1), "a merge needs two forward lanes"),
         ([Curve(30, 0.14, 0.14)], Profile(2, 2), "its inner edge would fold"),
-        ([Curve(30), Intersection("left", ("right",)), Curve(9)], Profile(), "turn: left, but the arms are right"),
+        (
+            [Curve(30), Intersection("left", ("right",)), Curve(9)],
+            Profile(),
+            "turn: left, but the arms are right",
+        ),
     ],
 )
 def test_impossible_roads_are_refused(elements: list, profile: Profile, text: str) -> None:  # type: ignore[type-arg]
@@ -181,7 +225,9 @@ def test_impossible_roads_are_refused(elements: list, profile: Profile, text: st
     st.floats(0, 3),
     st.floats(-3.0, 3.0),
 )
-def test_any_winding_road_is_sound(bends: list[tuple[float, float]], forward: int, backward: int, shoulder: float, heading: float) -> None:
+def test_any_winding_road_is_sound(
+    bends: list[tuple[float, float]], forward: int, backward: int, shoulder: float, heading: float
+) -> None:
     elements, before = [], 0.0
     for length, curvature in bends:
         elements.append(Curve(length, before, curvature))
@@ -193,4 +239,6 @@ def test_any_winding_road_is_sound(bends: list[tuple[float, float]], forward: in
     for lane in road.lane_map.lanes.values():
         for successor in lane.successors:
             assert (lane.centre[-1] == road.lane_map.lanes[successor].centre[0]).all()
-        assert polygon(lane).is_valid or not polygon(lane).is_simple  # a lane may cross itself after a full turn
+        assert (
+            polygon(lane).is_valid or not polygon(lane).is_simple
+        )  # a lane may cross itself after a full turn

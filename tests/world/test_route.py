@@ -8,7 +8,14 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, project, quat_from_yaw, se2, se3
 from alpasim_plugin.core.types import LaneMap, Route, Trajectory
-from alpasim_plugin.world.route import LaneIndex, _change_cost, _local_costs, match_lanes, route_from_log, route_in_rig
+from alpasim_plugin.world.route import (
+    LaneIndex,
+    _change_cost,
+    _local_costs,
+    match_lanes,
+    route_from_log,
+    route_in_rig,
+)
 from tests.world.small_maps import FAR, arc, make, straight
 
 
@@ -55,21 +62,29 @@ def test_lateral_lane_change_is_named_in_order():
 
 def test_overlapping_lanes_of_an_intersection_are_told_apart_by_the_whole_drive():
     turn = ROAD.lanes["turn"].centre
-    log = drive(np.concatenate([np.arange(45.0, 80), turn[:, 0]]), np.concatenate([np.zeros(35), turn[:, 1]]))
+    log = drive(
+        np.concatenate([np.arange(45.0, 80), turn[:, 0]]),
+        np.concatenate([np.zeros(35), turn[:, 1]]),
+    )
     assert route_from_log(ROAD, log).lane_ids == ("b", "turn")
     straight_on = drive(np.arange(45.0, 100.0))
     assert route_from_log(ROAD, straight_on).lane_ids == ("b", "c")
 
 
 def test_matching_agrees_with_trying_every_assignment():
-    """The shortest path over samples is the best of all assignments of lanes to samples, here tried one by one."""
+    """The shortest path over samples is the best of all assignments of lanes to samples, here tried
+    one by one.
+    """
     index = LaneIndex(ROAD)
     path = np.column_stack([np.linspace(77, 84, 8), np.linspace(0, 0.4, 8), np.zeros(8)])
     heading = np.arctan2(0.4, 7)
     costs = [_local_costs(index, p, heading, index.containing(p)) for p in path]
     best = min(
         product(*costs),
-        key=lambda names: sum(c[n] for c, n in zip(costs, names, strict=True)) + sum(_change_cost(index, a, b) for a, b in pairwise(names)),
+        key=lambda names: (
+            sum(c[n] for c, n in zip(costs, names, strict=True))
+            + sum(_change_cost(index, a, b) for a, b in pairwise(names))
+        ),
     )
     assert match_lanes(index, path, heading) == tuple(dict.fromkeys(best))
 
@@ -91,8 +106,12 @@ def test_map_without_lanes_still_gives_the_recorded_path():
 
 
 def test_car_at_rest_gets_the_lane_ahead():
-    jitter = np.column_stack([5.0 + 0.01 * np.random.default_rng(1).normal(size=50), np.zeros((50, 2))])
-    route = route_from_log(ROAD, Trajectory(np.arange(50) * 100_000, jitter, quat_from_yaw(np.zeros(50))))
+    jitter = np.column_stack(
+        [5.0 + 0.01 * np.random.default_rng(1).normal(size=50), np.zeros((50, 2))]
+    )
+    route = route_from_log(
+        ROAD, Trajectory(np.arange(50) * 100_000, jitter, quat_from_yaw(np.zeros(50)))
+    )
     assert route.lane_ids == ("a", "b", "c")
     assert arc_lengths(route.xyz)[-1] == pytest.approx(120.0, abs=0.2)
     assert (np.diff(route.xyz[:, 0]) > 0).all()
@@ -121,7 +140,10 @@ def test_far_maps_give_the_same_route():
     x = np.arange(5.0, 60.0, 0.5)
     log = drive(x, 0.3 * np.sin(x / 10))
     moved = Trajectory(log.t_us, log.xyz + FAR, log.quat)
-    near, far = route_from_log(ROAD, log), route_from_log(make(*ROAD.lanes.values(), shift=FAR), moved)
+    near, far = (
+        route_from_log(ROAD, log),
+        route_from_log(make(*ROAD.lanes.values(), shift=FAR), moved),
+    )
     assert near.lane_ids == far.lane_ids
     np.testing.assert_allclose(far.xyz - FAR, near.xyz, atol=1e-6)
 
@@ -135,14 +157,18 @@ def test_way_points_start_at_the_projection_and_are_evenly_spaced():
 
 
 def test_rows_behind_the_end_are_nan_and_only_those():
-    seen = route_in_rig(Route(np.array([[0.0, 0, 0], [30.0, 0, 0]])), se2(10.0, 0.0, 0.0), n=10, spacing_m=4.0)
+    seen = route_in_rig(
+        Route(np.array([[0.0, 0, 0], [30.0, 0, 0]])), se2(10.0, 0.0, 0.0), n=10, spacing_m=4.0
+    )
     assert np.isfinite(seen[:6]).all()
     assert np.isnan(seen[6:]).all()
 
 
 def test_way_points_lie_level_in_a_pitched_rig():
     pitch = np.array([np.cos(0.05), 0.0, -np.sin(0.05), 0.0])
-    seen = route_in_rig(Route(np.array([[0.0, 0, 0], [200.0, 0, 20.0]])), se3([10.0, 0.0, 1.0], pitch))
+    seen = route_in_rig(
+        Route(np.array([[0.0, 0, 0], [200.0, 0, 20.0]])), se3([10.0, 0.0, 1.0], pitch)
+    )
     assert (seen[:, 2] == 0).all()
 
 

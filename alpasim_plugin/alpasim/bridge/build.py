@@ -1,7 +1,8 @@
-"""Build the wheel of ``alpasim-onefixer-bridge`` from this checkout: ``python -m alpasim_plugin.alpasim.bridge.build DIST``.
+"""Build the wheel of ``alpasim-onefixer-bridge`` from this checkout: ``python -m
+alpasim_plugin.alpasim.bridge.build DIST``.
 
-The wire messages, the client and the presets are copied under the distribution's own package name, so that it can be installed where this
-project is not, beside AlpaSim's packages.
+The wire messages, the client and the presets are copied under the distribution's own package name,
+so that it can be installed where this project is not, beside AlpaSim's packages.
 """
 
 from __future__ import annotations
@@ -51,7 +52,9 @@ def stage(target: Path) -> None:
         for path in sorted(source.rglob("*")):
             if path.suffix in SUFFIXES and path.name != "compile.py":
                 copy(path, package / name / path.relative_to(source))
-    client = (HERE / "client.py").read_text().replace("from ...log.wire", "from .wire")  # there the messages lie two folders nearer
+    client = (
+        (HERE / "client.py").read_text().replace("from ...log.wire", "from .wire")
+    )  # there the messages lie two folders nearer
     (package / "client.py").write_text(client)
     (package / "__init__.py").write_text(INIT)
     (target / "pyproject.toml").write_text(PROJECT)
@@ -71,7 +74,10 @@ def build(dist: Path) -> Path:
     """
     with tempfile.TemporaryDirectory() as scratch:
         stage(Path(scratch))
-        subprocess.run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(dist), scratch], check=True)
+        subprocess.run(
+            [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(dist), scratch],
+            check=True,
+        )
     return sorted(dist.glob(f"{PACKAGE}-*.whl"))[-1]
 
 

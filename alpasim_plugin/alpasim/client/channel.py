@@ -41,12 +41,19 @@ class Address:
         """
         target, _, query = text.partition("?")
         host, _, port = target.rpartition(":")
-        options = {key: values[-1] for key, values in parse_qs(query, keep_blank_values=True).items()}
+        options = {
+            key: values[-1] for key, values in parse_qs(query, keep_blank_values=True).items()
+        }
         unknown = sorted(set(options) - set(known))
         if not host or not port.isdigit() or unknown:
             found = f"no option {unknown[0]!r}" if unknown else "no HOST:PORT"
             shown = f"[?{'&'.join(f'{name}=...' for name in known)}]" if known else ""
-            raise InputError("reading a service's address", f"{scheme}://{text}", found, f"write {scheme}://HOST:PORT{shown}")
+            raise InputError(
+                "reading a service's address",
+                f"{scheme}://{text}",
+                found,
+                f"write {scheme}://HOST:PORT{shown}",
+            )
         return cls(target, options)
 
 
@@ -59,7 +66,12 @@ def encoding_of(address: str, given: str) -> ImageEncoding:
     known: dict[str, ImageEncoding] = {"jpeg": "jpeg", "png": "png"}
     if given in known:
         return known[given]
-    raise InputError("reading a service's address", address, f"encoding {given!r}", "write encoding=jpeg or encoding=png")
+    raise InputError(
+        "reading a service's address",
+        address,
+        f"encoding {given!r}",
+        "write encoding=jpeg or encoding=png",
+    )
 
 
 class Service:
@@ -68,8 +80,10 @@ class Service:
     Args:
         name: Name of the service, as in `alpasim_plugin.log.wire.SERVICE_PATHS`.
         target: ``HOST:PORT``.
-        error: Class of the errors that a failing call raises; a lost connection is no policy's fault: `InfrastructureError`.
-        retries: Whether a call that may pass is made again, as AlpaSim does with renders and not with drivers.
+        error: Class of the errors that a failing call raises; a lost connection is no policy's
+            fault: `InfrastructureError`.
+        retries: Whether a call that may pass is made again, as AlpaSim does with renders and not
+            with drivers.
     """
 
     def __init__(self, name: str, target: str, error: type[SimrunError], retries: bool) -> None:
@@ -87,9 +101,16 @@ class Service:
             grpc.channel_ready_future(self._channel).result(timeout=timeout_s)
         except grpc.FutureTimeoutError as error:
             found = f"nothing answers at {self.target} within {timeout_s:g} s"
-            raise InfrastructureError(f"calling {self.name}", self.target, found, "start the service, or correct the address") from error
+            raise InfrastructureError(
+                f"calling {self.name}",
+                self.target,
+                found,
+                "start the service, or correct the address",
+            ) from error
 
-    def call(self, method: str, request: Any, timeout_s: float = CALL_S, at_us: int | None = None) -> Any:
+    def call(
+        self, method: str, request: Any, timeout_s: float = CALL_S, at_us: int | None = None
+    ) -> Any:
         """Make one call and return its answer.
 
         Args:
@@ -99,8 +120,10 @@ class Service:
             at_us: Simulated time, for messages.
 
         Raises:
-            SimrunError: Of the class that the constructor was given: the service answered with an error status, or not in time.
-            InfrastructureError: Nobody listens there any more, or the connection was lost before the answer.
+            SimrunError: Of the class that the constructor was given: the service answered with an
+                error status, or not in time.
+            InfrastructureError: Nobody listens there any more, or the connection was lost before
+                the answer.
         """
         ask: Callable[..., Any] = getattr(self.stub, method)
         for wait_s in (*(RETRY_S if self._retries else ()), None):
@@ -108,7 +131,9 @@ class Service:
                 return ask(request, timeout=timeout_s, wait_for_ready=False)
             except grpc.RpcError as error:
                 code, text = error.code(), error.details() or ""
-                passing = code == grpc.StatusCode.UNAVAILABLE or any(phrase in text for phrase in PASSING_TEXTS)
+                passing = code == grpc.StatusCode.UNAVAILABLE or any(
+                    phrase in text for phrase in PASSING_TEXTS
+                )
                 if wait_s is None or not passing:
                     raise self._failure(error, method, at_us) from error
                 time.sleep(wait_s)
@@ -116,10 +141,18 @@ class Service:
 
     def _failure(self, error: Any, method: str, at_us: int | None) -> SimrunError:
         where = self.target if at_us is None else f"{self.target}, at {at_us} us of simulated time"
-        doing, found = f"calling {self.name}.{method}", f"{error.code().name}: {error.details() or ''}"
+        doing, found = (
+            f"calling {self.name}.{method}",
+            f"{error.code().name}: {error.details() or ''}",
+        )
         if not is_lost_connection(error) or issubclass(self._error, InfrastructureError):
             return self._error(doing, where, found, "see the service's own log")
-        return InfrastructureError(doing, where, found, "see the service's own log, and drive the rollout again with --resume")
+        return InfrastructureError(
+            doing,
+            where,
+            found,
+            "see the service's own log, and drive the rollout again with --resume",
+        )
 
     def version(self) -> common_pb2.VersionId:
         """Return the service's version triple, once it is ready."""

@@ -1,8 +1,9 @@
-"""``--policy "exec:COMMAND"``: a policy in another Python environment or a container, started here and driven over a local socket.
+"""``--policy "exec:COMMAND"``: a policy in another Python environment or a container, started here
+and driven over a local socket.
 
-The command serves AlpaSim's EgodriverService (`alpasim_plugin.serve_policy` does, so does AlpaSim's own driver) at the address in the
-environment variable ``SIMRUN_POLICY_ADDRESS``. It is started once in each process that drives, for all of its rollouts, and ended with the
-run.
+The command serves AlpaSim's EgodriverService (`alpasim_plugin.serve_policy` does, so does AlpaSim's
+own driver) at the address in the environment variable ``SIMRUN_POLICY_ADDRESS``. It is started once
+in each process that drives, for all of its rollouts, and ended with the run.
 """
 
 from __future__ import annotations
@@ -67,11 +68,18 @@ class SocketFile:
         if len(str(path)) > MAX_PATH:
             shutil.rmtree(folder)
             found = f"{path} is longer than {MAX_PATH} characters"
-            raise InputError("choosing a socket", "the folder for temporary files", found, "set TMPDIR=/tmp, or name {port} in the command")
+            raise InputError(
+                "choosing a socket",
+                "the folder for temporary files",
+                found,
+                "set TMPDIR=/tmp, or name {port} in the command",
+            )
         self._path, self.address = path, f"unix:{path}"
 
     def filled_in(self, word: str) -> str:
-        """Replace ``{address}`` and ``{folder}``, the socket's folder, which a container must mount."""
+        """Replace ``{address}`` and ``{folder}``, the socket's folder, which a container must
+        mount.
+        """
         return word.replace("{address}", self.address).replace("{folder}", str(self._folder))
 
     def is_open(self) -> bool:
@@ -89,7 +97,8 @@ class SocketFile:
 class LoopbackPort:
     """A free port, kept from other processes of ours by a datagram socket of the same number.
 
-    gRPC lets two servers share a port, and between our choice and the child's listening another of us might choose the same.
+    gRPC lets two servers share a port, and between our choice and the child's listening another of
+    us might choose the same.
     """
 
     def __init__(self) -> None:
@@ -128,7 +137,8 @@ class Command:
 
     Attributes:
         text: As it was given.
-        words: Program and arguments; ``{address}``, ``{port}`` and ``{folder}`` stand for where the policy shall listen.
+        words: Program and arguments; ``{address}``, ``{port}`` and ``{folder}`` stand for where the
+            policy shall listen.
         options: Those of `alpasim_plugin.alpasim.client.driver`, and ``ready_s``.
     """
 
@@ -149,22 +159,38 @@ class Command:
         """
         doing, whole = "reading a policy's command", f"exec:{text}"
         head, _, rest = text.partition(" ") if text.startswith("?") else ("", "", text)
-        options = {key: values[-1] for key, values in parse_qs(head[1:], keep_blank_values=True).items()}
+        options = {
+            key: values[-1] for key, values in parse_qs(head[1:], keep_blank_values=True).items()
+        }
         known = (*OPTIONS, "ready_s")
         unknown = sorted(set(options) - set(known))
         if unknown:
-            raise InputError(doing, whole, f"no option {unknown[0]!r}", f"the options are {', '.join(known)}")
+            raise InputError(
+                doing, whole, f"no option {unknown[0]!r}", f"the options are {', '.join(known)}"
+            )
         for key in ("ready_s", "timeout_s"):
             if not re.fullmatch(r"\d+(\.\d+)?", options.get(key, "1")):
-                raise InputError(doing, whole, f"{key}={options[key]!r}", "write seconds as a number")
+                raise InputError(
+                    doing, whole, f"{key}={options[key]!r}", "write seconds as a number"
+                )
         try:
             words = tuple(shlex.split(rest))
         except ValueError as error:
             raise InputError(doing, whole, str(error), "close the quotes") from error
         if not words:
-            raise InputError(doing, whole, "no program", "write exec:PROGRAM ARGUMENT..., such as 'exec:python my_policy.py'")
+            raise InputError(
+                doing,
+                whole,
+                "no program",
+                "write exec:PROGRAM ARGUMENT..., such as 'exec:python my_policy.py'",
+            )
         if shutil.which(words[0]) is None:
-            raise InputError(doing, whole, f"no program {words[0]!r}", "install it, or write its path; a shell is not asked")
+            raise InputError(
+                doing,
+                whole,
+                f"no program {words[0]!r}",
+                "install it, or write its path; a shell is not asked",
+            )
         return cls(text, words, options)
 
 
@@ -178,7 +204,11 @@ class Served:
     def __init__(self, command: Command) -> None:
         self.command = command
         in_text = " ".join(command.words)
-        self._place = LoopbackPort() if "{port}" in in_text else SocketFile(Path(tempfile.mkdtemp(prefix="simrun-policy-")))
+        self._place = (
+            LoopbackPort()
+            if "{port}" in in_text
+            else SocketFile(Path(tempfile.mkdtemp(prefix="simrun-policy-")))
+        )
         words = [self._place.filled_in(word) for word in command.words]
         self._child = Child(words, {VARIABLE: self._place.address}, say, self._place.close)
         self.address = self._place.address
@@ -189,7 +219,12 @@ class Served:
             if time.monotonic() > end_s:
                 self.stop()
                 found = f"nothing listens at {self.address} after {limit_s:g} s{self._said()}"
-                raise PolicyError(DOING, self._name, found, f"let it serve at the address in {VARIABLE}, or give it longer: ?ready_s=N")
+                raise PolicyError(
+                    DOING,
+                    self._name,
+                    found,
+                    f"let it serve at the address in {VARIABLE}, or give it longer: ?ready_s=N",
+                )
             time.sleep(POLL_S)
         self.require_running()
 
@@ -202,7 +237,12 @@ class Served:
         code = self._child.end_within(wait_s)
         if code is not None:
             self.stop()
-            raise PolicyError(DRIVING, self._name, f"it ended with {exit_reason(code)}{self._said()}", "see output.log of the rollout")
+            raise PolicyError(
+                DRIVING,
+                self._name,
+                f"it ended with {exit_reason(code)}{self._said()}",
+                "see output.log of the rollout",
+            )
 
     def is_running(self) -> bool:
         """Tell whether the command still runs."""
@@ -243,8 +283,9 @@ class CommandPolicy(DriverPolicy):
 
     Args:
         scenario: Gives cameras, periods and the warm-up.
-        address: The command, as `Command.parse` reads it. Frames are sent as PNG unless it says otherwise, and the main camera under its
-            own name: the policy sees what it would see in this process.
+        address: The command, as `Command.parse` reads it. Frames are sent as PNG unless it says
+            otherwise, and the main camera under its own name: the policy sees what it would see in
+            this process.
 
     Raises:
         InputError: As `Command.parse`.
@@ -255,7 +296,11 @@ class CommandPolicy(DriverPolicy):
         command = Command.parse(address)
         self._served = served_by(command)
         try:
-            super().__init__(scenario, Address(self._served.address, {"encoding": "png", **command.options}), None)
+            super().__init__(
+                scenario,
+                Address(self._served.address, {"encoding": "png", **command.options}),
+                None,
+            )
         except SimrunError:
             self._served.require_running(REAP_S)
             raise
@@ -269,7 +314,9 @@ class CommandPolicy(DriverPolicy):
     def _call(self, method: str, request: Any) -> Any:
         try:
             return super()._call(method, request)
-        except SimrunError as error:  # a connection is lost, too, where the command has ended: that is its own fault
+        except (
+            SimrunError
+        ) as error:  # a connection is lost, too, where the command has ended: that is its own fault
             self._served.require_running(0.0 if isinstance(error, PolicyError) else REAP_S)
             if "DEADLINE_EXCEEDED" in error.found:  # it hangs: the next rollout gets a new one
                 self._served.stop()

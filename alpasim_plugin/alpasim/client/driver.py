@@ -1,10 +1,12 @@
-"""``--policy alpasim://HOST:PORT``: any AlpaSim driver drives, called in exactly the order of AlpaSim's runtime.
+"""``--policy alpasim://HOST:PORT``: any AlpaSim driver drives, called in exactly the order of
+AlpaSim's runtime.
 
-    start_session; then at each query submit_image_observation (one a camera), submit_egomotion_observation, submit_route, drive; at the end
-    the last frames, and close_session.
+    start_session; then at each query submit_image_observation (one a camera),
+    submit_egomotion_observation, submit_route, drive; at the end the last frames, and
+    close_session.
 
-The first egomotion message carries the whole recorded context, with true speeds, where AlpaSim's own runtime sends zeros until it hands
-over.
+The first egomotion message carries the whole recorded context, with true speeds, where AlpaSim's
+own runtime sends zeros until it hands over.
 """
 
 from __future__ import annotations
@@ -21,14 +23,34 @@ from alpasim_plugin.alpasim.client.channel import Address, Service, encoding_of
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import interpolate, inverse, se3, wrap_angle, yaw_of
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.types import F64, I64, CameraSpec, EgoState, Frame, Observation, Plan, Route, Scenario, SensorSpec, Trajectory
+from alpasim_plugin.core.types import (
+    F64,
+    I64,
+    CameraSpec,
+    EgoState,
+    Frame,
+    Observation,
+    Plan,
+    Route,
+    Scenario,
+    SensorSpec,
+    Trajectory,
+)
 from alpasim_plugin.log.images import encode_image
-from alpasim_plugin.log.schema import read_trajectory, wire_camera, wire_dynamics, wire_image, wire_trajectory
+from alpasim_plugin.log.schema import (
+    read_trajectory,
+    wire_camera,
+    wire_dynamics,
+    wire_image,
+    wire_trajectory,
+)
 from alpasim_plugin.log.wire import FRONT_WIDE, common_pb2, egodriver_pb2
 
 OPTIONS = ("cameras", "encoding", "timeout_s")
 HOLD_US = 5_000_000  # length of the straight plan that stands in for an empty answer in the warm-up
-_SESSIONS = itertools.count()  # sessions of several rollouts of one scene and seed may be open at one driver
+_SESSIONS = (
+    itertools.count()
+)  # sessions of several rollouts of one scene and seed may be open at one driver
 
 
 class DriverPolicy(Policy):
@@ -37,7 +59,8 @@ class DriverPolicy(Policy):
     Args:
         scenario: Gives cameras, periods and the warm-up.
         place: Where it listens, with the options `OPTIONS`.
-        main: Under which name the scenario's main camera is sent where no option ``cameras`` says it; None: its own.
+        main: Under which name the scenario's main camera is sent where no option ``cameras`` says
+            it; None: its own.
     """
 
     is_remote = True
@@ -45,7 +68,9 @@ class DriverPolicy(Policy):
     def __init__(self, scenario: Scenario, place: Address, main: str | None) -> None:
         self._scenario = scenario
         self._cameras = cameras_of(scenario, place.options.get("cameras"), main)
-        self.sensors: Sequence[SensorSpec] = tuple(SensorSpec(camera.name) for camera in self._cameras.values())
+        self.sensors: Sequence[SensorSpec] = tuple(
+            SensorSpec(camera.name) for camera in self._cameras.values()
+        )
         self._encoding = encoding_of(place.target, place.options.get("encoding", "jpeg"))
         self._timeout_s = float(place.options.get("timeout_s", "300"))
         self.service = Service("EgodriverService", place.target, PolicyError, retries=False)
@@ -57,7 +82,12 @@ class DriverPolicy(Policy):
     def reset(self, seed: int, route: Route) -> None:
         """Open a session for a new rollout."""
         self._end_session()
-        self._session = str(uuid.uuid5(uuid.NAMESPACE_URL, f"{self._scenario.scene_id}/{seed}/{os.getpid()}/{next(_SESSIONS)}"))
+        self._session = str(
+            uuid.uuid5(
+                uuid.NAMESPACE_URL,
+                f"{self._scenario.scene_id}/{seed}/{os.getpid()}/{next(_SESSIONS)}",
+            )
+        )
         self._now_us = None
         self._sent_us, self._image_us = -1, dict.fromkeys(self._cameras, -1)
         self._facts |= {"empty_plans": 0, "shortest_plan_s": None, "samples_cut": 0, "calls": 0}
@@ -69,7 +99,9 @@ class DriverPolicy(Policy):
                 session_uuid=self._session,
                 random_seed=seed & 0xFFFFFFFF,
                 debug_info=request.DebugInfo(scene_id=self._scenario.scene_id),
-                rollout_spec=request.RolloutSpec(vehicle=request.RolloutSpec.VehicleDefinition(available_cameras=listed)),
+                rollout_spec=request.RolloutSpec(
+                    vehicle=request.RolloutSpec.VehicleDefinition(available_cameras=listed)
+                ),
             ),
         )
 
@@ -77,7 +109,8 @@ class DriverPolicy(Policy):
         """Send what is new and return the driver's plan.
 
         Raises:
-            PolicyError: A call fails or takes too long, the driver ends the session, its answer is no plan, or empty after the warm-up.
+            PolicyError: A call fails or takes too long, the driver ends the session, its answer is
+                no plan, or empty after the warm-up.
             InfrastructureError: The connection is lost.
         """
         now = self._now_us = observation.t_us
@@ -85,13 +118,21 @@ class DriverPolicy(Policy):
         self._send_motion(observation)
         points = [common_pb2.Vec3(x=x, y=y, z=0.0) for x, y, _ in observation.route_rig.tolist()]
         route = egodriver_pb2.Route(waypoints=points, timestamp_us=now)
-        self._call("submit_route", egodriver_pb2.RouteRequest(session_uuid=self._session, route=route))
-        query = egodriver_pb2.DriveRequest(session_uuid=self._session, time_now_us=now, time_query_us=now + self._scenario.rates.control_us)
+        self._call(
+            "submit_route", egodriver_pb2.RouteRequest(session_uuid=self._session, route=route)
+        )
+        query = egodriver_pb2.DriveRequest(
+            session_uuid=self._session,
+            time_now_us=now,
+            time_query_us=now + self._scenario.rates.control_us,
+        )
         answer = self._call("drive", query)
         return self._plan(answer, observation)
 
     def end(self, frames: Mapping[str, Frame]) -> None:
-        """Send the last frames, which no query follows, as AlpaSim's runtime does, and close the session."""
+        """Send the last frames, which no query follows, as AlpaSim's runtime does, and close the
+        session.
+        """
         self._send_images(frames)
         self._end_session()
 
@@ -109,7 +150,9 @@ class DriverPolicy(Policy):
     def _end_session(self) -> None:
         if self._session:
             session, self._session = self._session, ""
-            self._call("close_session", egodriver_pb2.DriveSessionCloseRequest(session_uuid=session))
+            self._call(
+                "close_session", egodriver_pb2.DriveSessionCloseRequest(session_uuid=session)
+            )
 
     def facts(self) -> Mapping[str, Any]:
         """Return what the driver is and how its plans were, for the rollout's manifest."""
@@ -122,7 +165,9 @@ class DriverPolicy(Policy):
                 continue
             self._image_us[name] = frame.t_us
             data = encode_image(frame.rgb, self._encoding)
-            message = wire_image(self._session, name, frame.t_us - camera.shutter_us, frame.t_us, data)
+            message = wire_image(
+                self._session, name, frame.t_us - camera.shutter_us, frame.t_us, data
+            )
             self._call("submit_image_observation", message)
 
     def _send_motion(self, observation: Observation) -> None:
@@ -141,7 +186,12 @@ class DriverPolicy(Policy):
 
     def _plan(self, answer: egodriver_pb2.DriveResponse, observation: Observation) -> Plan:
         if answer.terminate_session:
-            raise PolicyError("asking an AlpaSim driver", self.service.target, "it ends the session", "see the driver's own log")
+            raise PolicyError(
+                "asking an AlpaSim driver",
+                self.service.target,
+                "it ends the session",
+                "see the driver's own log",
+            )
         now = observation.t_us
         if not answer.trajectory.poses:
             self._facts["empty_plans"] += 1
@@ -160,7 +210,9 @@ class DriverPolicy(Policy):
             if len(sample) and int(sample.t_us[-1]) >= int(times[-1]):
                 samples.append(in_rig(sample, observation, times)[1])
             else:
-                self._facts["samples_cut"] += 1  # a sample that ends before the plan has no place at the plan's last times
+                self._facts["samples_cut"] += (
+                    1  # a sample that ends before the plan has no place at the plan's last times
+                )
         return Plan(now, times, rows[:, :2], rows[:, 2], tuple(samples))
 
     def _read(self, message: common_pb2.Trajectory, what: str) -> Trajectory:
@@ -170,7 +222,9 @@ class DriverPolicy(Policy):
         except InputError as error:
             found = f"{error.with_what}: {error.found}"
             do_this = "send strictly increasing times, finite positions and unit quaternions"
-            raise PolicyError("asking an AlpaSim driver", self.service.target, found, do_this) from error
+            raise PolicyError(
+                "asking an AlpaSim driver", self.service.target, found, do_this
+            ) from error
 
     def _call(self, method: str, request: Any) -> Any:
         self._facts["calls"] = self._facts.get("calls", 0) + 1
@@ -178,7 +232,8 @@ class DriverPolicy(Policy):
 
 
 class AlpasimPolicy(DriverPolicy):
-    """``alpasim://HOST:PORT[?cameras=THEIRS:OURS,...&encoding=jpeg|png&timeout_s=N]``: a driver that runs already.
+    """``alpasim://HOST:PORT[?cameras=THEIRS:OURS,...&encoding=jpeg|png&timeout_s=N]``: a driver
+    that runs already.
 
     Without ``cameras`` the scenario's main camera is sent under AlpaSim's name for it.
     """
@@ -192,12 +247,15 @@ class AlpasimPolicy(DriverPolicy):
         Address.parse("alpasim", address, OPTIONS)
 
 
-def cameras_of(scenario: Scenario, text: str | None, main_name: str | None = FRONT_WIDE) -> dict[str, CameraSpec]:
+def cameras_of(
+    scenario: Scenario, text: str | None, main_name: str | None = FRONT_WIDE
+) -> dict[str, CameraSpec]:
     """Return the scenario's cameras to send, by the driver's names for them.
 
     Args:
         scenario: Has the cameras.
-        text: ``THEIRS:OURS,...``, or ``OURS,...`` where the names are the same; None: the main camera alone.
+        text: ``THEIRS:OURS,...``, or ``OURS,...`` where the names are the same; None: the main
+            camera alone.
         main_name: What that is called; None: by its own name.
 
     Raises:
@@ -205,16 +263,27 @@ def cameras_of(scenario: Scenario, text: str | None, main_name: str | None = FRO
     """
     own = {camera.name: camera for camera in scenario.cameras}
     main = next((name for name in (FRONT_WIDE, "front") if name in own), next(iter(own), ""))
-    pairs = [(main_name or main, main)] if text is None else [(a, b or a) for a, _, b in (part.partition(":") for part in text.split(","))]
+    pairs = (
+        [(main_name or main, main)]
+        if text is None
+        else [(a, b or a) for a, _, b in (part.partition(":") for part in text.split(","))]
+    )
     missing = [b for _, b in pairs if b not in own]
     if missing or not pairs:
         found = f"no camera {missing[0]!r} among {sorted(own)}" if missing else "no camera"
-        raise InputError("connecting a driver to its cameras", f"scene {scenario.scene_id!r}", found, "write ?cameras=THEIRS:OURS,...")
+        raise InputError(
+            "connecting a driver to its cameras",
+            f"scene {scenario.scene_id!r}",
+            found,
+            "write ?cameras=THEIRS:OURS,...",
+        )
     return {a: own[b] for a, b in pairs}
 
 
 def motion_states(history: Trajectory, ego: EgoState) -> list[EgoState]:
-    """Return the state at every pose of a history ``(T,)``: speeds by differences, the last one as it is known."""
+    """Return the state at every pose of a history ``(T,)``: speeds by differences, the last one as
+    it is known.
+    """
     poses, t_s = se3(history.xyz, history.quat), (history.t_us - history.t_us[0]) * 1e-6
     if len(history) == 1:
         return [ego]
@@ -230,10 +299,12 @@ def motion_states(history: Trajectory, ego: EgoState) -> list[EgoState]:
 
 
 def in_rig(plan: Trajectory, observation: Observation, times: I64 | None = None) -> tuple[I64, F64]:
-    """Return times ``(T,)`` and rows x, y, yaw ``(T, 3)`` in the rig frame of a plan with absolute poses.
+    """Return times ``(T,)`` and rows x, y, yaw ``(T, 3)`` in the rig frame of a plan with absolute
+    poses.
 
     Args:
-        plan: What the driver sent; poses before now are left out, and the present pose comes first where it has none.
+        plan: What the driver sent; poses before now are left out, and the present pose comes first
+            where it has none.
         observation: Of the query.
         times: At these times, instead of the plan's own.
     """
@@ -246,11 +317,15 @@ def in_rig(plan: Trajectory, observation: Observation, times: I64 | None = None)
         poses[inside] = interpolate(plan, wanted[inside])
     poses[~inside] = observation.ego.T_world_rig
     local = inverse(observation.ego.T_world_rig) @ poses
-    return wanted, np.column_stack([local[:, :2, 3], wrap_angle(np.array([yaw_of(pose) for pose in local]))])
+    return wanted, np.column_stack(
+        [local[:, :2, 3], wrap_angle(np.array([yaw_of(pose) for pose in local]))]
+    )
 
 
 def straight_on(now_us: int, speed_mps: float) -> Plan:
-    """Return a plan straight on at the present speed, for the warm-up, in which it is not driven."""
+    """Return a plan straight on at the present speed, for the warm-up, in which it is not
+    driven.
+    """
     times = now_us + np.arange(0, HOLD_US + 1, 100_000, dtype=np.int64)
     xy = np.column_stack([speed_mps * (times - now_us) * 1e-6, np.zeros(len(times))])
     return Plan(now_us, times, xy, np.zeros(len(times)), debug={"empty": True})

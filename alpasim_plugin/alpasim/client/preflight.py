@@ -1,6 +1,8 @@
-"""The pre-flight check of an AlpaSim driver: what the challenge and AlpaSim's runtime ask of it, tried over its socket.
+"""The pre-flight check of an AlpaSim driver: what the challenge and AlpaSim's runtime ask of it,
+tried over its socket.
 
-Each check gives a line: passed, failed, or not visible from outside. The session that is driven is a real rollout of ours.
+Each check gives a line: passed, failed, or not visible from outside. The session that is driven is
+a real rollout of ours.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ class Finding:
 
 @dataclass
 class DriveTimes:
-    """Measures the drive calls of a service and looks at its raw answers, beside whoever makes them.
+    """Measures the drive calls of a service and looks at its raw answers, beside whoever makes
+    them.
 
     Attributes:
         seconds: Of each drive call.
@@ -56,7 +59,9 @@ class DriveTimes:
         """Measure every drive call of a service from now on."""
         made: Callable[..., Any] = service.stub.drive
 
-        def drive(request: egodriver_pb2.DriveRequest, **options: Any) -> egodriver_pb2.DriveResponse:
+        def drive(
+            request: egodriver_pb2.DriveRequest, **options: Any
+        ) -> egodriver_pb2.DriveResponse:
             began = time.perf_counter()
             answer: egodriver_pb2.DriveResponse = made(request, **options)
             self.seconds.append(time.perf_counter() - began)
@@ -65,7 +70,9 @@ class DriveTimes:
 
         setattr(service.stub, "drive", drive)  # noqa: B010  # the stub makes its methods when it is made
 
-    def look(self, request: egodriver_pb2.DriveRequest, answer: egodriver_pb2.DriveResponse) -> None:
+    def look(
+        self, request: egodriver_pb2.DriveRequest, answer: egodriver_pb2.DriveResponse
+    ) -> None:
         """Look at one answer as it came."""
         poses = answer.trajectory.poses
         if not poses:
@@ -73,21 +80,31 @@ class DriveTimes:
             return
         now, t_us = int(request.time_now_us), [int(pose.timestamp_us) for pose in poses]
         if t_us[0] != now:
-            self.problems.setdefault("the first pose is not at time_now", f"{t_us[0] - now:+d} us at {now}")
+            self.problems.setdefault(
+                "the first pose is not at time_now", f"{t_us[0] - now:+d} us at {now}"
+            )
         if any(b <= a for a, b in pairwise(t_us)):
             self.problems.setdefault("times do not increase strictly", f"at {now}")
         squares = [sum(getattr(pose.pose.quat, axis) ** 2 for axis in "wxyz") for pose in poses]
         if any(abs(square - 1) > 1e-4 for square in squares):
-            self.problems.setdefault("a quaternion is no unit quaternion", f"|q|^2 = {min(squares):.5f} at {now}")
-        if not all(np.isfinite([pose.pose.vec.x, pose.pose.vec.y, pose.pose.vec.z]).all() for pose in poses):
+            self.problems.setdefault(
+                "a quaternion is no unit quaternion", f"|q|^2 = {min(squares):.5f} at {now}"
+            )
+        if not all(
+            np.isfinite([pose.pose.vec.x, pose.pose.vec.y, pose.pose.vec.z]).all() for pose in poses
+        ):
             self.problems.setdefault("a position is not finite", f"at {now}")
-        self.reach_us = min(t_us[-1] - now, self.reach_us if self.reach_us is not None else t_us[-1] - now)
+        self.reach_us = min(
+            t_us[-1] - now, self.reach_us if self.reach_us is not None else t_us[-1] - now
+        )
         for sample in answer.debug_info.sampled_trajectories:
             reach = int(sample.poses[-1].timestamp_us) - now if sample.poses else 0
             self.samples_us = min(reach, self.samples_us if self.samples_us is not None else reach)
 
 
-def findings(times: DriveTimes, failed: SimrunError | None, warmup_steps: int, limit_s: float = LIMIT_S) -> list[Finding]:
+def findings(
+    times: DriveTimes, failed: SimrunError | None, warmup_steps: int, limit_s: float = LIMIT_S
+) -> list[Finding]:
     """Return what a driven session showed.
 
     Args:
@@ -97,58 +114,103 @@ def findings(times: DriveTimes, failed: SimrunError | None, warmup_steps: int, l
         limit_s: Of a drive call.
     """
     out = [
-        Finding("a session from start to close", "failed" if failed else "passed", str(failed.found) if failed else "answered throughout")
+        Finding(
+            "a session from start to close",
+            "failed" if failed else "passed",
+            str(failed.found) if failed else "answered throughout",
+        )
     ]
     if times.seconds:
         ms = np.array(times.seconds) * 1000
         over = int((ms > limit_s * 1000).sum())
-        text = (
-            f"p50 {np.percentile(ms, 50):.1f} ms, p95 {np.percentile(ms, 95):.1f} ms, longest {ms.max():.1f} ms; {over} of {len(ms)} over"
+        text = f"p50 {np.percentile(ms, 50):.1f} ms, p95 {np.percentile(ms, 95):.1f} ms, longest {ms.max():.1f} ms; {over} of {len(ms)} over"
+        out.append(
+            Finding(
+                f"a drive call within {limit_s * 1000:.0f} ms", "failed" if over else "passed", text
+            )
         )
-        out.append(Finding(f"a drive call within {limit_s * 1000:.0f} ms", "failed" if over else "passed", text))
     text = "; ".join(f"{kind} ({example})" for kind, example in times.problems.items())
-    out.append(Finding("the shape of plans", "failed" if text else "passed", text or "first pose now, times increase, unit quaternions"))
+    out.append(
+        Finding(
+            "the shape of plans",
+            "failed" if text else "passed",
+            text or "first pose now, times increase, unit quaternions",
+        )
+    )
     too_many = times.empty > warmup_steps
-    out.append(Finding("empty plans in the warm-up only", "failed" if too_many else "passed", f"{times.empty} of {len(times.seconds)}"))
+    out.append(
+        Finding(
+            "empty plans in the warm-up only",
+            "failed" if too_many else "passed",
+            f"{times.empty} of {len(times.seconds)}",
+        )
+    )
     if times.reach_us is not None:
         short = times.reach_us < HORIZON_US
         text = f"the shortest reaches {times.reach_us * 1e-6:g} s; where a plan ends the car brakes"
         out.append(Finding("plans of at least 2 s", "failed" if short else "passed", text))
     if times.samples_us is None:
-        out.append(Finding("samples for minADE", "noted", "no sampled_trajectories: AlpaSim's tables will hold no minADE"))
+        out.append(
+            Finding(
+                "samples for minADE",
+                "noted",
+                "no sampled_trajectories: AlpaSim's tables will hold no minADE",
+            )
+        )
     else:
         short = times.samples_us < MINADE_US
-        text = f"the shortest reaches {times.samples_us * 1e-6:g} s" + ("; one below 5 s loses all minADE metrics of its rollout" * short)
+        text = f"the shortest reaches {times.samples_us * 1e-6:g} s" + (
+            "; one below 5 s loses all minADE metrics of its rollout" * short
+        )
         out.append(Finding("samples for minADE", "failed" if short else "passed", text))
     return out
 
 
 def tolerances(service: Service, scene_id: str) -> list[Finding]:
-    """Try calls that AlpaSim's runtime makes after failures, in a scene that the driver has driven."""
+    """Try calls that AlpaSim's runtime makes after failures, in a scene that the driver has
+    driven.
+    """
     out = []
     name = str(uuid.uuid5(uuid.NAMESPACE_URL, "simrun check-driver"))
-    out.append(_tried("close_session before any step", lambda: _open_and_close(service, name, scene_id)))
+    out.append(
+        _tried("close_session before any step", lambda: _open_and_close(service, name, scene_id))
+    )
     close = egodriver_pb2.DriveSessionCloseRequest(session_uuid=name)
-    out.append(_tried("close_session of a session that is not open", lambda: service.call("close_session", close, 10.0)))
+    out.append(
+        _tried(
+            "close_session of a session that is not open",
+            lambda: service.call("close_session", close, 10.0),
+        )
+    )
     return out
 
 
 def resident_mib(target: str) -> float | None:
-    """Return the memory in MiB of the process that listens at ``HOST:PORT``; None where it is not on this machine, or cannot be read.
+    """Return the memory in MiB of the process that listens at ``HOST:PORT``; None where it is not
+    on this machine, or cannot be read.
 
-    It is looked for in Linux' /proc. Children of the process do not count, nor does memory of a GPU.
+    It is looked for in Linux' /proc. Children of the process do not count, nor does memory of a
+    GPU.
     """
     host, _, port = target.rpartition(":")
     if host not in ("127.0.0.1", "localhost", "[::1]"):
         return None
     try:
-        rows = [line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]]
+        rows = [
+            line.split()
+            for name in ("tcp", "tcp6")
+            for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]
+        ]
         sockets = {
-            f"socket:[{row[9]}]" for row in rows if row[3] == "0A" and int(row[1].rpartition(":")[2], 16) == int(port)
+            f"socket:[{row[9]}]"
+            for row in rows
+            if row[3] == "0A" and int(row[1].rpartition(":")[2], 16) == int(port)
         }  # 0A: listens
         for process in Path("/proc").glob("[0-9]*"):
             if any(name in sockets for name in _open_files(process)):
-                status = dict(line.split(":", 1) for line in (process / "status").read_text().splitlines())
+                status = dict(
+                    line.split(":", 1) for line in (process / "status").read_text().splitlines()
+                )
                 return int(status["VmRSS"].split()[0]) / 1024
     except (OSError, KeyError):  # no /proc, or the process has just ended
         return None
@@ -172,7 +234,11 @@ def outside_view() -> Sequence[Finding]:
 
 def _open_and_close(service: Service, name: str, scene_id: str) -> None:
     debug = egodriver_pb2.DriveSessionRequest.DebugInfo(scene_id=scene_id)
-    service.call("start_session", egodriver_pb2.DriveSessionRequest(session_uuid=name, debug_info=debug), 10.0)
+    service.call(
+        "start_session",
+        egodriver_pb2.DriveSessionRequest(session_uuid=name, debug_info=debug),
+        10.0,
+    )
     service.call("close_session", egodriver_pb2.DriveSessionCloseRequest(session_uuid=name), 10.0)
 
 

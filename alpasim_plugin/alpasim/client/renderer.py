@@ -1,4 +1,5 @@
-"""``--renderer nre://HOST:PORT``: any service behind AlpaSim's SensorsimService renders; ``onefixer+nre://...`` fixes what it sends.
+"""``--renderer nre://HOST:PORT``: any service behind AlpaSim's SensorsimService renders;
+``onefixer+nre://...`` fixes what it sends.
 
 The wire has no opacity and no depth, so a fixer takes every pixel as seen.
 """
@@ -22,10 +23,12 @@ DOING = "asking a renderer service"
 
 
 class NreRenderer(Renderer):
-    """A renderer behind AlpaSim's SensorsimService. All cameras of an instant go in one batch, as AlpaSim sends them.
+    """A renderer behind AlpaSim's SensorsimService. All cameras of an instant go in one batch, as
+    AlpaSim sends them.
 
     Args:
-        scenario: What is rendered; the service must have a scene of its id, or of the id in ``scene``.
+        scenario: What is rendered; the service must have a scene of its id, or of the id in
+            ``scene``.
         address: ``HOST:PORT[?scene=ID&cameras=THEIRS:OURS,...&encoding=png|jpeg]``.
     """
 
@@ -57,38 +60,84 @@ class NreRenderer(Renderer):
             name = self._names.get(request.camera.name, request.camera.name)
             message = wire_render_request(self._scene, request, self._encoding, name)
             items.append(sensorsim_pb2.BatchRGBRenderRequestItem(camera_name=name, request=message))
-        answer = self._service.call("batch_render_rgb", sensorsim_pb2.BatchRGBRenderRequest(items=items), at_us=requests[0].t_us)
+        answer = self._service.call(
+            "batch_render_rgb",
+            sensorsim_pb2.BatchRGBRenderRequest(items=items),
+            at_us=requests[0].t_us,
+        )
         got = {item.camera_name: item for item in answer.items}
         wanted = [item.camera_name for item in items]
         if sorted(got) != sorted(wanted) or len(answer.items) != len(wanted):
             found = f"cameras {[item.camera_name for item in answer.items]} for {wanted}"
-            raise RendererError(DOING, self._service.target, found, "make the service answer each camera of a batch once")
-        return [self._frame(got[name], request) for name, request in zip(wanted, requests, strict=True)]
+            raise RendererError(
+                DOING,
+                self._service.target,
+                found,
+                "make the service answer each camera of a batch once",
+            )
+        return [
+            self._frame(got[name], request) for name, request in zip(wanted, requests, strict=True)
+        ]
 
     def facts(self) -> Mapping[str, Any]:
         """Return what the service is, for the rollout's manifest."""
-        return {"service": f"{self._version.version_id} at {self._service.target}", "git_hash": self._version.git_hash}
+        return {
+            "service": f"{self._version.version_id} at {self._service.target}",
+            "git_hash": self._version.git_hash,
+        }
 
     def _frame(self, item: sensorsim_pb2.BatchRGBRenderReturnItem, request: RenderRequest) -> Frame:
         if not item.success:
-            raise RendererError(DOING, self._service.target, f"camera {item.camera_name!r}: {item.error_message}", "see the service's log")
+            raise RendererError(
+                DOING,
+                self._service.target,
+                f"camera {item.camera_name!r}: {item.error_message}",
+                "see the service's log",
+            )
         try:
-            rgb = decode_image(item.result.image_bytes, f"camera {item.camera_name!r} at {request.t_us} us")
+            rgb = decode_image(
+                item.result.image_bytes, f"camera {item.camera_name!r} at {request.t_us} us"
+            )
         except InputError as error:
-            raise RendererError(DOING, self._service.target, f"{error.with_what}: {error.found}", "see the service's log") from error
+            raise RendererError(
+                DOING,
+                self._service.target,
+                f"{error.with_what}: {error.found}",
+                "see the service's log",
+            ) from error
         return Frame(request.t_us, request.camera.name, rgb)
 
     def _check_scene(self) -> None:
         scenes = self._service.call("get_available_scenes", common_pb2.Empty(), READY_S).scene_ids
         if "*" not in scenes and self._scene not in scenes:
-            found = f"no scene {self._scene!r} among its {len(scenes)}: {', '.join(sorted(scenes)[:5])}"
-            raise InputError(DOING, self._service.target, found, "give the service that scene, or name one of its own with ?scene=ID")
+            found = (
+                f"no scene {self._scene!r} among its {len(scenes)}: {', '.join(sorted(scenes)[:5])}"
+            )
+            raise InputError(
+                DOING,
+                self._service.target,
+                found,
+                "give the service that scene, or name one of its own with ?scene=ID",
+            )
 
     def _camera_names(self, scenario: Scenario, text: str | None) -> dict[str, str]:
         """Return the service's name of each of the scenario's cameras."""
         if text is not None:
             return {camera.name: theirs for theirs, camera in cameras_of(scenario, text).items()}
         request = sensorsim_pb2.AvailableCamerasRequest(scene_id=self._scene)
-        known = {camera.logical_id for camera in self._service.call("get_available_cameras", request, READY_S).available_cameras}
+        known = {
+            camera.logical_id
+            for camera in self._service.call(
+                "get_available_cameras", request, READY_S
+            ).available_cameras
+        }
         own = {camera.name for camera in scenario.cameras}
-        return {} if own <= known else {camera.name: theirs for theirs, camera in cameras_of(scenario, None).items() if theirs in known}
+        return (
+            {}
+            if own <= known
+            else {
+                camera.name: theirs
+                for theirs, camera in cameras_of(scenario, None).items()
+                if theirs in known
+            }
+        )

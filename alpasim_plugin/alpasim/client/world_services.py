@@ -1,13 +1,17 @@
-"""AlpaSim's services that move the world in our loop: a vehicle, the ground, and the other road users.
+"""AlpaSim's services that move the world in our loop: a vehicle, the ground, and the other road
+users.
 
-``--controller vdc://HOST:PORT``: AlpaSim's controller and vehicle model move the ego, and its physics may set it on the ground. The service
-integrates a vehicle of its own from the first state that a session gives it, so only the pose is sent back corrected, as AlpaSim's runtime
-does after physics. The first call of a session begins at the hand-over with the true speed; AlpaSim's runtime calls from the start, throws
-the answers away until the hand-over, and forces the recorded speed on the vehicle meanwhile.
+``--controller vdc://HOST:PORT``: AlpaSim's controller and vehicle model move the ego, and its
+physics may set it on the ground. The service integrates a vehicle of its own from the first state
+that a session gives it, so only the pose is sent back corrected, as AlpaSim's runtime does after
+physics. The first call of a session begins at the hand-over with the true speed; AlpaSim's runtime
+calls from the start, throws the answers away until the hand-over, and forces the recorded speed on
+the vehicle meanwhile.
 
-``--traffic HOST:PORT``: the road users that move are driven by AlpaSim's TrafficService; those that stand stay where they are. The session
-gets the ego and every track, and the time of the hand-over. Each request holds the ego's pose; the reply holds the poses of all other road
-users at that time, and a road user without a pose is absent.
+``--traffic HOST:PORT``: the road users that move are driven by AlpaSim's TrafficService; those that
+stand stay where they are. The session gets the ego and every track, and the time of the hand-over.
+Each request holds the ego's pose; the reply holds the poses of all other road users at that time,
+and a road user without a pose is absent.
 """
 
 from __future__ import annotations
@@ -23,7 +27,12 @@ import numpy as np
 from alpasim_plugin.alpasim.client.channel import Address, Service
 from alpasim_plugin.control.tracker import check_interval, check_plan, coast_to_stop
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.core.geometry import interpolate, inverse, offset_trajectory, trajectory_from_poses
+from alpasim_plugin.core.geometry import (
+    interpolate,
+    inverse,
+    offset_trajectory,
+    trajectory_from_poses,
+)
 from alpasim_plugin.core.interfaces import Controller
 from alpasim_plugin.core.types import F64, EgoState, Scenario, Trajectory, Vehicle
 from alpasim_plugin.log.schema import (
@@ -48,14 +57,17 @@ ASKING_TRAFFIC = "asking an AlpaSim traffic service"
 
 
 class VdcController(Controller):
-    """A vehicle behind AlpaSim's VDCService, and the ground behind its PhysicsService if one is named.
+    """A vehicle behind AlpaSim's VDCService, and the ground behind its PhysicsService if one is
+    named.
 
     Args:
         vehicle: Gives the ego's box to the physics service, and the brake while there is no plan.
         address: ``HOST:PORT[?physics=HOST:PORT&scene=ID&timeout_s=N]``.
-        scene_id: By which the physics service knows the ground, unless the address names another one.
+        scene_id: By which the physics service knows the ground, unless the address names another
+            one.
 
-    A state that does not follow the last answer, such as that of a predicted future, opens a session of its own.
+    A state that does not follow the last answer, such as that of a predicted future, opens a
+    session of its own.
     """
 
     is_remote = True
@@ -68,7 +80,9 @@ class VdcController(Controller):
         self._service.version()
         self._physics: Physics | None = None
         if "physics" in place.options:
-            self._physics = Physics(place.options["physics"], place.options.get("scene", scene_id), vehicle)
+            self._physics = Physics(
+                place.options["physics"], place.options.get("scene", scene_id), vehicle
+            )
         self.grounds = self._physics is not None
         self._session, self._expected_us = "", -1
 
@@ -84,14 +98,20 @@ class VdcController(Controller):
         check_plan(plan)
         if state.t_us != self._expected_us:
             self._open()
-        pose = common_pb2.StateAtTime(timestamp_us=state.t_us, pose=wire_pose(state.T_world_rig, "the ego"), state=wire_dynamics(state))
+        pose = common_pb2.StateAtTime(
+            timestamp_us=state.t_us,
+            pose=wire_pose(state.T_world_rig, "the ego"),
+            state=wire_dynamics(state),
+        )
         request = controller_pb2.RunControllerAndVehicleModelRequest(
             session_uuid=self._session,
             state=pose,
             planned_trajectory_in_rig=wire_trajectory(plan_in_rig(plan, state), "the plan"),
             future_time_us=to_us,
         )
-        answer = self._service.call("run_controller_and_vehicle", request, self._timeout_s, state.t_us)
+        answer = self._service.call(
+            "run_controller_and_vehicle", request, self._timeout_s, state.t_us
+        )
         after = self._state(answer, to_us, state)
         self._expected_us = to_us
         return after if self._physics is None else self._physics.placed(state, after)
@@ -107,26 +127,58 @@ class VdcController(Controller):
 
     def _open(self) -> None:
         self._close_session()
-        self._session = str(uuid.uuid5(uuid.NAMESPACE_URL, f"{self._service.target}/{os.getpid()}/{next(_SESSIONS)}"))
-        self._service.call("start_session", controller_pb2.VDCSessionRequest(session_uuid=self._session), self._timeout_s)
+        self._session = str(
+            uuid.uuid5(
+                uuid.NAMESPACE_URL, f"{self._service.target}/{os.getpid()}/{next(_SESSIONS)}"
+            )
+        )
+        self._service.call(
+            "start_session",
+            controller_pb2.VDCSessionRequest(session_uuid=self._session),
+            self._timeout_s,
+        )
 
     def _close_session(self) -> None:
         if self._session:
             session, self._session, self._expected_us = self._session, "", -1
-            self._service.call("close_session", controller_pb2.VDCSessionCloseRequest(session_uuid=session), self._timeout_s)
+            self._service.call(
+                "close_session",
+                controller_pb2.VDCSessionCloseRequest(session_uuid=session),
+                self._timeout_s,
+            )
 
-    def _state(self, answer: controller_pb2.RunControllerAndVehicleModelResponse, to_us: int, before: EgoState) -> EgoState:
-        """Return the answer's last state; services before wire 0.50 fill the deprecated fields instead."""
+    def _state(
+        self,
+        answer: controller_pb2.RunControllerAndVehicleModelResponse,
+        to_us: int,
+        before: EgoState,
+    ) -> EgoState:
+        """Return the answer's last state; services before wire 0.50 fill the deprecated fields
+        instead.
+        """
         if answer.states:
             last = answer.states[-1]
-            t_us, pose, moving = int(last.timestamp_us), last.pose_local_to_rig, last.dynamic_state
+            t_us = int(last.timestamp_us)
+            pose = last.pose_local_to_rig
+            moving = last.dynamic_state
         else:
-            t_us, pose, moving = int(answer.pose_local_to_rig.timestamp_us), answer.pose_local_to_rig.pose, answer.dynamic_state
+            t_us = int(answer.pose_local_to_rig.timestamp_us)
+            pose = answer.pose_local_to_rig.pose
+            moving = answer.dynamic_state
         if t_us != to_us:
             found = f"a state at {t_us} us for {to_us} us"
-            raise InfrastructureError(DOING, self._service.target, found, "make the service answer with the state at future_time_us")
+            raise InfrastructureError(
+                DOING,
+                self._service.target,
+                found,
+                "make the service answer with the state at future_time_us",
+            )
         speed, turn = float(moving.linear_velocity.x), float(moving.angular_velocity.z)
-        steer = float(np.arctan(self._vehicle.wheelbase_m * turn / speed)) if abs(speed) > STEERED_MPS else before.steer_rad
+        steer = (
+            float(np.arctan(self._vehicle.wheelbase_m * turn / speed))
+            if abs(speed) > STEERED_MPS
+            else before.steer_rad
+        )
         T_world_rig = _sent(pose, "the controller's state", self._service)
         return EgoState(to_us, T_world_rig, speed, float(moving.linear_acceleration.x), turn, steer)
 
@@ -145,29 +197,59 @@ class Physics:
 
     def __init__(self, address: str, scene_id: str, vehicle: Vehicle) -> None:
         self._scene = scene_id
-        self._service = Service("PhysicsService", Address.parse("physics", address, ()).target, InfrastructureError, retries=False)
+        self._service = Service(
+            "PhysicsService",
+            Address.parse("physics", address, ()).target,
+            InfrastructureError,
+            retries=False,
+        )
         self._service.version()
         known = self._service.call("get_available_scenes", common_pb2.Empty()).scene_ids
         if "*" not in known and self._scene not in known:
-            found = f"no scene {self._scene!r} among its {len(known)}: {', '.join(sorted(known)[:5])}"
-            raise InputError("setting the ego on the ground", self._service.target, found, "name one of its own with &scene=ID")
+            found = (
+                f"no scene {self._scene!r} among its {len(known)}: {', '.join(sorted(known)[:5])}"
+            )
+            raise InputError(
+                "setting the ego on the ground",
+                self._service.target,
+                found,
+                "name one of its own with &scene=ID",
+            )
         self._aabb = wire_box(vehicle.box)
         self._T_rig_box = T_rig_box(vehicle)
 
     def placed(self, before: EgoState, after: EgoState) -> EgoState:
-        """Return the state on the service's ground; where it finds none the pose stays, as in AlpaSim."""
-        poses = trajectory_from_poses([before.t_us, after.t_us], np.stack([before.T_world_rig, after.T_world_rig]))
+        """Return the state on the service's ground; where it finds none the pose stays, as in
+        AlpaSim.
+        """
+        poses = trajectory_from_poses(
+            [before.t_us, after.t_us], np.stack([before.T_world_rig, after.T_world_rig])
+        )
         boxes = wire_trajectory(offset_trajectory(poses, self._T_rig_box), "the ego's box")
-        ego = physics_pb2.PhysicsGroundIntersectionRequest.EgoData(aabb=self._aabb, ego_trajectory_aabb=boxes)
-        request = physics_pb2.PhysicsGroundIntersectionRequest(scene_id=self._scene, now_us=before.t_us, future_us=after.t_us, ego_data=ego)
+        ego = physics_pb2.PhysicsGroundIntersectionRequest.EgoData(
+            aabb=self._aabb, ego_trajectory_aabb=boxes
+        )
+        request = physics_pb2.PhysicsGroundIntersectionRequest(
+            scene_id=self._scene, now_us=before.t_us, future_us=after.t_us, ego_data=ego
+        )
         answer = self._service.call("ground_intersection", request, at_us=after.t_us)
         there = {int(one.timestamp_us): one.pose for one in answer.ego_trajectory_aabb.poses}
         if after.t_us not in there:
             found = f"poses at {sorted(there)} us, none at {after.t_us} us"
-            raise InfrastructureError("setting the ego on the ground", self._service.target, found, "see the service's own log")
+            raise InfrastructureError(
+                "setting the ego on the ground",
+                self._service.target,
+                found,
+                "see the service's own log",
+            )
         box = _sent(there[after.t_us], "the box on the ground", self._service)
         return EgoState(
-            after.t_us, box @ inverse(self._T_rig_box), after.speed_mps, after.accel_mps2, after.yaw_rate_radps, after.steer_rad
+            after.t_us,
+            box @ inverse(self._T_rig_box),
+            after.speed_mps,
+            after.accel_mps2,
+            after.yaw_rate_radps,
+            after.steer_rad,
         )
 
     def close(self) -> None:
@@ -176,14 +258,20 @@ class Physics:
 
 
 def plan_in_rig(plan: Trajectory, state: EgoState) -> Trajectory:
-    """Return a plan from now on in the rig's frame of now: its first pose is where it wants the ego now.
+    """Return a plan from now on in the rig's frame of now: its first pose is where it wants the ego
+    now.
 
-    AlpaSim's controller looks its first time up in its own past, so a plan that is older than the session must not be sent from its start.
+    AlpaSim's controller looks its first time up in its own past, so a plan that is older than the
+    session must not be sent from its start.
     """
     now = min(max(state.t_us, int(plan.t_us[0])), int(plan.t_us[-1]))
     later = plan.t_us > state.t_us
-    poses = np.concatenate([interpolate(plan, np.array([now])), interpolate(plan, plan.t_us[later])])
-    return trajectory_from_poses(np.concatenate([[state.t_us], plan.t_us[later]]), inverse(state.T_world_rig) @ poses)
+    poses = np.concatenate(
+        [interpolate(plan, np.array([now])), interpolate(plan, plan.t_us[later])]
+    )
+    return trajectory_from_poses(
+        np.concatenate([[state.t_us], plan.t_us[later]]), inverse(state.T_world_rig) @ poses
+    )
 
 
 def _sent(pose: Any, what: str, service: Service) -> F64:
@@ -191,11 +279,14 @@ def _sent(pose: Any, what: str, service: Service) -> F64:
     try:
         return read_transform(pose, what)
     except InputError as error:
-        raise InfrastructureError(DOING, service.target, f"{error.with_what}: {error.found}", "see the service's own log") from error
+        raise InfrastructureError(
+            DOING, service.target, f"{error.with_what}: {error.found}", "see the service's own log"
+        ) from error
 
 
 class RemoteActors(Actors):
-    """Road users of one rollout behind a traffic service. Forecasts, which blocks of frames need, follow the recorded tracks.
+    """Road users of one rollout behind a traffic service. Forecasts, which blocks of frames need,
+    follow the recorded tracks.
 
     Args:
         scenario: What is driven; its reactive drivers are left to the service.
@@ -203,7 +294,8 @@ class RemoteActors(Actors):
         seed: The rollout's.
 
     Raises:
-        InputError: The service does not have the scene, or needs a longer past than the scenario gives it.
+        InputError: The service does not have the scene, or needs a longer past than the scenario
+            gives it.
         InfrastructureError: Nothing answers there, or a call fails.
     """
 
@@ -211,29 +303,48 @@ class RemoteActors(Actors):
         super().__init__(scenario.actors, scenario.vehicle, scenario.end_us)
         self._start_us, self._T_rig_box = scenario.start_us, T_rig_box(scenario.vehicle)
         self._moving = {actor.actor_id for actor in scenario.actors if not actor.is_static}
-        self.service = Service("TrafficService", Address.parse("traffic", address, ()).target, InfrastructureError, retries=False)
+        self.service = Service(
+            "TrafficService",
+            Address.parse("traffic", address, ()).target,
+            InfrastructureError,
+            retries=False,
+        )
         self.service.wait_ready()
         self._check(scenario)
-        self._session = str(uuid.uuid5(uuid.NAMESPACE_URL, f"{scenario.scene_id}/{seed}/{os.getpid()}/{next(_SESSIONS)}"))
+        self._session = str(
+            uuid.uuid5(
+                uuid.NAMESPACE_URL, f"{scenario.scene_id}/{seed}/{os.getpid()}/{next(_SESSIONS)}"
+            )
+        )
         header = header_from_scenario(scenario, self._session, seed & 0xFFFFFFFF, 0)
         self.service.call("start_session", wire_traffic_session(header))
 
     def step(self, t_us: int, ego: EgoState) -> Mapping[str, F64]:
-        """Tell the service where the ego is and return everybody's pose at ``t_us``; the first step is that of the tracks."""
+        """Tell the service where the ego is and return everybody's pose at ``t_us``; the first step
+        is that of the tracks.
+        """
         poses = dict(super().step(t_us, ego))
         if t_us == self._start_us:
             return poses
         here = trajectory_from_poses([t_us], (ego.T_world_rig @ self._T_rig_box)[None])
-        update = traffic_pb2.ObjectTrajectoryUpdate(object_id=EGO, trajectory=wire_trajectory(here, "the ego's box"))
-        request = traffic_pb2.TrafficRequest(session_uuid=self._session, time_query_us=t_us, object_trajectory_updates=[update])
+        update = traffic_pb2.ObjectTrajectoryUpdate(
+            object_id=EGO, trajectory=wire_trajectory(here, "the ego's box")
+        )
+        request = traffic_pb2.TrafficRequest(
+            session_uuid=self._session, time_query_us=t_us, object_trajectory_updates=[update]
+        )
         answer = self.service.call("simulate", request, at_us=t_us)
-        standing = {actor_id: pose for actor_id, pose in poses.items() if actor_id not in self._moving}
+        standing = {
+            actor_id: pose for actor_id, pose in poses.items() if actor_id not in self._moving
+        }
         return standing | self._moved(answer, t_us)
 
     def close(self) -> None:
         """Close the session and the channel."""
         try:
-            self.service.call("close_session", traffic_pb2.TrafficSessionCloseRequest(session_uuid=self._session))
+            self.service.call(
+                "close_session", traffic_pb2.TrafficSessionCloseRequest(session_uuid=self._session)
+            )
         finally:
             self.service.close()
 
@@ -241,17 +352,24 @@ class RemoteActors(Actors):
         facts = self.service.call("get_metadata", common_pb2.Empty())
         past_us = scenario.start_us + scenario.warmup_us - int(scenario.ego_log.t_us[0])
         if facts.minimum_history_length_us > past_us:
-            found = (
-                f"it needs {facts.minimum_history_length_us * 1e-6:g} s of the past, the scenario has {past_us * 1e-6:g} s at the hand-over"
+            found = f"it needs {facts.minimum_history_length_us * 1e-6:g} s of the past, the scenario has {past_us * 1e-6:g} s at the hand-over"
+            raise InputError(
+                ASKING_TRAFFIC,
+                self.service.target,
+                found,
+                "lengthen timing.warmup_us, or start later in the recording",
             )
-            raise InputError(ASKING_TRAFFIC, self.service.target, found, "lengthen timing.warmup_us, or start later in the recording")
         known = self.service.call("get_available_scenes", common_pb2.Empty()).scene_ids
         if "*" not in known and scenario.scene_id not in known:
             found = f"no scene {scenario.scene_id!r} among its {len(known)}: {', '.join(sorted(known)[:5])}"
-            raise InputError(ASKING_TRAFFIC, self.service.target, found, "give the service that scene")
+            raise InputError(
+                ASKING_TRAFFIC, self.service.target, found, "give the service that scene"
+            )
 
     def _moved(self, answer: traffic_pb2.TrafficReturn, t_us: int) -> dict[str, F64]:
-        """Return the poses at exactly ``t_us``; later ones are a forecast, which nobody here uses."""
+        """Return the poses at exactly ``t_us``; later ones are a forecast, which nobody here
+        uses.
+        """
         out: dict[str, F64] = {}
         for update in answer.object_trajectory_updates:
             if update.object_id == EGO:
@@ -259,12 +377,20 @@ class RemoteActors(Actors):
             now = [one.pose for one in update.trajectory.poses if int(one.timestamp_us) == t_us]
             if update.object_id not in self._moving or not now:
                 found = f"track {update.object_id!r} " + (
-                    f"without a pose at {t_us} us" if update.object_id in self._moving else "is unknown"
+                    f"without a pose at {t_us} us"
+                    if update.object_id in self._moving
+                    else "is unknown"
                 )
-                raise InfrastructureError(ASKING_TRAFFIC, self.service.target, found, "see the service's own log")
+                raise InfrastructureError(
+                    ASKING_TRAFFIC, self.service.target, found, "see the service's own log"
+                )
             try:
-                out[update.object_id] = read_transform(now[0], f"track {update.object_id!r} at {t_us} us")
+                out[update.object_id] = read_transform(
+                    now[0], f"track {update.object_id!r} at {t_us} us"
+                )
             except InputError as error:
                 found = f"{error.with_what}: {error.found}"
-                raise InfrastructureError(ASKING_TRAFFIC, self.service.target, found, "see the service's own log") from error
+                raise InfrastructureError(
+                    ASKING_TRAFFIC, self.service.target, found, "see the service's own log"
+                ) from error
         return out

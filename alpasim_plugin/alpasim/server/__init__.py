@@ -1,1 +1,3 @@
-"""Services that AlpaSim's runtime calls: the renderer's (`sensorsim`) and the video model's (`world_model`)."""
+"""Services that AlpaSim's runtime calls: the renderer's (`sensorsim`) and the video model's
+(`world_model`).
+"""

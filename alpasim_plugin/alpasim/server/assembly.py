@@ -19,7 +19,12 @@ from alpasim_plugin.alpasim.server.history import HistoryTree
 from alpasim_plugin.alpasim.server.hosting import read_pem, read_token
 from alpasim_plugin.alpasim.server.sensorsim import Sensorsim
 from alpasim_plugin.alpasim.server.shutters import Shutter
-from alpasim_plugin.alpasim.server.sources import FrameSource, LocalSource, UpstreamSource, read_masks
+from alpasim_plugin.alpasim.server.sources import (
+    FrameSource,
+    LocalSource,
+    UpstreamSource,
+    read_masks,
+)
 from alpasim_plugin.alpasim.server.world_model import WorldModel
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import RendererSpec
@@ -28,10 +33,16 @@ from alpasim_plugin.log.wire import api_version, common_pb2
 from alpasim_plugin.log.wire.services import OPTIONS, Stub
 
 DOING = "setting up a renderer service"
-RECONNECT = (("grpc.min_reconnect_backoff_ms", 200), ("grpc.initial_reconnect_backoff_ms", 200), ("grpc.max_reconnect_backoff_ms", 2000))
+RECONNECT = (
+    ("grpc.min_reconnect_backoff_ms", 200),
+    ("grpc.initial_reconnect_backoff_ms", 200),
+    ("grpc.max_reconnect_backoff_ms", 2000),
+)
 
 
-def version_of(spec: RendererSpec, settings: dict[str, Any], upstream: common_pb2.VersionId | None = None) -> common_pb2.VersionId:
+def version_of(
+    spec: RendererSpec, settings: dict[str, Any], upstream: common_pb2.VersionId | None = None
+) -> common_pb2.VersionId:
     """Return the triple of a service.
 
     Args:
@@ -40,7 +51,8 @@ def version_of(spec: RendererSpec, settings: dict[str, Any], upstream: common_pb
         upstream: The upstream's own triple.
 
     Returns:
-        ``version_id``: the product, then digests of weights, settings and code, then the upstream's id; ``git_hash``: one digest of all
+        ``version_id``: the product, then digests of weights, settings and code, then the upstream's
+            id; ``git_hash``: one digest of all
         of it, followed by the upstream's; the wire version is the upstream's where there is one.
     """
     part = spec.base if spec.fixer is None else spec.fixer
@@ -87,9 +99,15 @@ class Upstream:
         address, _, query = text.partition("?")
         given = dict(parse_qsl(query, keep_blank_values=True))
         known = {"ca", "token_file", "image"}
-        if not address or not set(given) <= known or given.get("image", "png") not in ("png", "as-asked"):
+        if (
+            not address
+            or not set(given) <= known
+            or given.get("image", "png") not in ("png", "as-asked")
+        ):
             do_this = "write HOST:PORT[?ca=FILE&token_file=FILE&image=png|as-asked]"
-            raise InputError(DOING, f"--upstream {text}", "no address, or an option that is unknown", do_this)
+            raise InputError(
+                DOING, f"--upstream {text}", "no address, or an option that is unknown", do_this
+            )
         ca, token = (Path(given[key]) if key in given else None for key in ("ca", "token_file"))
         return cls(address, ca, read_token(token), given.get("image") != "as-asked")
 
@@ -98,11 +116,18 @@ class Upstream:
         options = [*OPTIONS, *RECONNECT]
         if self.ca is None:
             if self.token is not None:
-                raise InputError(DOING, f"upstream {self.address}", "a token over plain text", "give ?ca=FILE as well")
+                raise InputError(
+                    DOING,
+                    f"upstream {self.address}",
+                    "a token over plain text",
+                    "give ?ca=FILE as well",
+                )
             return grpc.insecure_channel(self.address, options)
         credentials = grpc.ssl_channel_credentials(read_pem(self.ca))
         if self.token is not None:
-            credentials = grpc.composite_channel_credentials(credentials, grpc.access_token_call_credentials(self.token))
+            credentials = grpc.composite_channel_credentials(
+                credentials, grpc.access_token_call_credentials(self.token)
+            )
         return grpc.secure_channel(self.address, credentials, options)
 
 
@@ -111,17 +136,20 @@ class Settings:
     """Options of `simrun serve`.
 
     Attributes:
-        renderer: ``onefixer``, ``identity``, ``3dgs``, ``onefixer+clean``, ...; over an upstream only the fixer counts.
+        renderer: ``onefixer``, ``identity``, ``3dgs``, ``onefixer+clean``, ...; over an upstream
+            only the fixer counts.
         overrides: ``KEY=VALUE`` of the fixer's settings.
         scenes: Folders, files or shipped names.
         upstream: None: render here.
         device, threads: For renderer and fixer.
         history_bytes, expiry_s: Bounds of the histories.
-        reliability: Fixed trust in an upstream's frames; None: from the distance to the recorded path.
+        reliability: Fixed trust in an upstream's frames; None: from the distance to the recorded
+            path.
         masks: Grey masks by camera.
         kept_scenes: Scenes that stay loaded.
         shutter: Which shutters roll; see `shutters.exposure_of`.
-        render_width: Pixels; wider pictures are made at this width and enlarged. None: all are made as asked.
+        render_width: Pixels; wider pictures are made at this width and enlarged. None: all are made
+            as asked.
         says_costs: Log what a size costs before its first frame.
     """
 
@@ -161,7 +189,9 @@ class Assembled:
         return {name: service for name, service in both.items() if service is not None}
 
     def close(self) -> None:
-        """Close the channel to the upstream: its threads must be gone before the interpreter ends, which otherwise may abort."""
+        """Close the channel to the upstream: its threads must be gone before the interpreter ends,
+        which otherwise may abort.
+        """
         if self.channel is not None:
             self.channel.close()
 
@@ -176,25 +206,53 @@ def assemble(settings: Settings) -> Assembled:
     """Build the renderer service.
 
     Raises:
-        InputError: Settings that do not fit together, an unknown renderer, or scenes that cannot be found.
+        InputError: Settings that do not fit together, an unknown renderer, or scenes that cannot be
+            found.
     """
     spec = resolve_served(settings.renderer, settings.overrides)
     if settings.upstream is None and not settings.scenes:
-        raise InputError(DOING, "the command", "neither --scenes nor --upstream", "say what to render, or who renders")
+        raise InputError(
+            DOING,
+            "the command",
+            "neither --scenes nor --upstream",
+            "say what to render, or who renders",
+        )
     if settings.upstream is not None and spec.fixer is None and settings.renderer != "identity":
         found = f"{settings.renderer!r} renders itself"
-        raise InputError(DOING, f"--upstream {settings.upstream.address}", found, "give a fixer (onefixer), identity, or no --upstream")
+        raise InputError(
+            DOING,
+            f"--upstream {settings.upstream.address}",
+            found,
+            "give a fixer (onefixer), identity, or no --upstream",
+        )
     if settings.upstream is None and (settings.masks or settings.reliability is not None):
-        raise InputError(DOING, "--reliability, --mask", "our own renderer states its opacity", "use them with --upstream")
+        raise InputError(
+            DOING,
+            "--reliability, --mask",
+            "our own renderer states its opacity",
+            "use them with --upstream",
+        )
     if settings.upstream is not None and settings.render_width is not None:
-        raise InputError(DOING, "--render-width", "the upstream chooses the size of its pictures", "use it without --upstream")
+        raise InputError(
+            DOING,
+            "--render-width",
+            "the upstream chooses the size of its pictures",
+            "use it without --upstream",
+        )
     busy = threading.Lock()
     fixers = None if spec.fixer is None else FixerCache(spec, settings.device, settings.threads)
     needs_map = fixers is not None and fixers.needs_map
     own = spec if settings.upstream is None else None
     scenes = None
     if settings.scenes:
-        scenes = SceneCache(settings.scenes, own, needs_map, settings.device, settings.threads, kept=settings.kept_scenes)
+        scenes = SceneCache(
+            settings.scenes,
+            own,
+            needs_map,
+            settings.device,
+            settings.threads,
+            kept=settings.kept_scenes,
+        )
     channel = stub = None
     source: FrameSource
     if settings.upstream is None:
@@ -204,20 +262,41 @@ def assemble(settings: Settings) -> Assembled:
         channel = settings.upstream.channel()
         stub = Stub(channel, "SensorsimService")
         masks = read_masks(settings.masks)
-        source = UpstreamSource(stub, scenes, settings.reliability, masks, settings.upstream.as_png, settings.threads, settings.shutter)
+        source = UpstreamSource(
+            stub,
+            scenes,
+            settings.reliability,
+            masks,
+            settings.upstream.as_png,
+            settings.threads,
+            settings.shutter,
+        )
     tree: HistoryTree[Answered] = HistoryTree(settings.history_bytes, settings.expiry_s)
-    costs = Announced(settings.render_width is None) if settings.says_costs and settings.upstream is None else None
+    costs = (
+        Announced(settings.render_width is None)
+        if settings.says_costs and settings.upstream is None
+        else None
+    )
     frames = FrameServer(source, fixers, tree, busy, settings.render_width, costs)
     shaping = {
         "device": settings.device,
         "reliability": settings.reliability,
-        "masks": {camera: file_digest(path, f"mask of {camera}") for camera, path in settings.masks.items()},
+        "masks": {
+            camera: file_digest(path, f"mask of {camera}")
+            for camera, path in settings.masks.items()
+        },
         "upstream_png": settings.upstream is None or settings.upstream.as_png,
         "maps": needs_map and scenes is not None,
         "shutter": settings.shutter,
         "render_width": settings.render_width,
     }
-    service = Sensorsim(frames, partial(version_of, spec, shaping), scenes, stub, verbatim=stub is not None and fixers is None)
+    service = Sensorsim(
+        frames,
+        partial(version_of, spec, shaping),
+        scenes,
+        stub,
+        verbatim=stub is not None and fixers is None,
+    )
     world_model = None
     if stub is None:
         assert scenes is not None

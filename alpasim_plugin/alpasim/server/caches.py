@@ -34,17 +34,22 @@ FILES = (".usdz", ".yaml", ".yml", ".xml")
 
 
 class CausalFixer(Protocol):
-    """Fix one frame at a time with an explicit past, as `alpasim_plugin.fixers.pixel_fixer.PixelFixer` does."""
+    """Fix one frame at a time with an explicit past, as
+    `alpasim_plugin.fixers.pixel_fixer.PixelFixer` does.
+    """
 
     def advance(self, frame: Frame, sdmap: U8 | None, past: Any) -> tuple[Frame, Any]:
-        """Return the frame fixed and what the next frame's call is given as ``past``; a past is never written to."""
+        """Return the frame fixed and what the next frame's call is given as ``past``; a past is
+        never written to.
+        """
 
 
 def resolve_served(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
     """Resolve a renderer for serving: noise is keyed by content, and ``identity`` is no fixer.
 
     Raises:
-        InputError: An unknown name, a bad setting, or a fixer that needs frames ahead of the present.
+        InputError: An unknown name, a bad setting, or a fixer that needs frames ahead of the
+            present.
     """
     spec = resolve_renderer(name, overrides)
     if spec.fixer is None:
@@ -54,10 +59,17 @@ def resolve_served(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
     if spec.fixer.name == "identity":
         return RendererSpec(spec.name, spec.base)
     settings: Any = spec.fixer.settings
-    found = f"{spec.fixer.name} works on blocks of frames, whose poses are not part of a render request"
+    found = (
+        f"{spec.fixer.name} works on blocks of frames, whose poses are not part of a render request"
+    )
     if settings.loop_mode == "frame by frame":
         found = f"{spec.fixer.name} has one history a camera, and requests of several drives come over one connection"
-    raise InputError(CHOOSING, f"renderer {name!r}", found, "serve a fixer with an explicit past, such as onefixer")
+    raise InputError(
+        CHOOSING,
+        f"renderer {name!r}",
+        found,
+        "serve a fixer with an explicit past, such as onefixer",
+    )
 
 
 class FixerCache:
@@ -87,7 +99,12 @@ class FixerCache:
             fixer = build(self._spec, scene_id=scene_id, seed=seed, **self._session)
             if fixer.blocks != BlockRule(1, 1) or not hasattr(fixer, "advance"):
                 found = f"{type(fixer).__name__} has no advance(frame, map, past)"
-                raise InputError(CHOOSING, f"fixer {self._spec.name!r}", found, "serve a fixer of single frames, such as onefixer")
+                raise InputError(
+                    CHOOSING,
+                    f"fixer {self._spec.name!r}",
+                    found,
+                    "serve a fixer of single frames, such as onefixer",
+                )
             self._made[key] = fixer
         return self._made[key]
 
@@ -107,7 +124,9 @@ def size_of(value: Any) -> int:
 
 @dataclass(frozen=True)
 class SceneEntry:
-    """A loaded scene: the scenario, its prepared map, its renderer where the server renders itself, and its recorded frames, if any."""
+    """A loaded scene: the scenario, its prepared map, its renderer where the server renders itself,
+    and its recorded frames, if any.
+    """
 
     scenario: Scenario
     scene_map: PreparedMap | None
@@ -118,15 +137,21 @@ class SceneEntry:
         """Render a frame with its references, which depend on the request alone."""
         assert self.renderer is not None, "scenes without a renderer are for maps only"
         frame = checked_frames(self.renderer, [request])[0]
-        return frame if self.references is None else replace(frame, references=self.references.of(request, frame))
+        return (
+            frame
+            if self.references is None
+            else replace(frame, references=self.references.of(request, frame))
+        )
 
 
 class SceneCache:
     """Scenes by id.
 
     Args:
-        places: Folders with ``*.usdz`` and scenario files (searched for files, not deeper), single files, recorded logs, or shipped names.
-        spec: The renderer to build for a scene; None: scenes are only needed for their maps and paths.
+        places: Folders with ``*.usdz`` and scenario files (searched for files, not deeper), single
+            files, recorded logs, or shipped names.
+        spec: The renderer to build for a scene; None: scenes are only needed for their maps and
+            paths.
         needs_map: Whether the fixer takes semantic maps.
         device, threads, seed: For the renderer.
         kept: Scenes that stay loaded, the least recently used going first.
@@ -165,7 +190,8 @@ class SceneCache:
         return list(self._loaded)
 
     def get(self, scene_id: str, left: CallTime = CallTime()) -> SceneEntry:
-        """Return a scene, loaded if it is not. One is loaded at a time, and whoever asks for a loaded one does not wait for that.
+        """Return a scene, loaded if it is not. One is loaded at a time, and whoever asks for a
+        loaded one does not wait for that.
 
         Raises:
             UnknownScene: No scene has that id.
@@ -194,7 +220,10 @@ class SceneCache:
         if scene_id not in self._sources:
             some = ", ".join(self.ids[:5]) + (" ..." if len(self._sources) > 5 else "")
             raise UnknownScene(
-                DOING, f"scene {scene_id!r}", f"it is none of the {len(self._sources)} known: {some}", "add its file to --scenes"
+                DOING,
+                f"scene {scene_id!r}",
+                f"it is none of the {len(self._sources)} known: {some}",
+                "add its file to --scenes",
             )
         return None
 
@@ -202,24 +231,53 @@ class SceneCache:
         scenario = load_scenario(source)
         renderer, references = None, None
         if self._spec is not None:
-            renderer = complete(build(self._spec.base, scenario=scenario, **self._session), Renderer)
+            renderer = complete(
+                build(self._spec.base, scenario=scenario, **self._session), Renderer
+            )
             settings = self._spec.fixer and self._spec.fixer.settings
-            recorded = renderer.recorded() if isinstance(settings, FixerSettings) and settings.references else ()
+            recorded = (
+                renderer.recorded()
+                if isinstance(settings, FixerSettings) and settings.references
+                else ()
+            )
             if recorded:
                 assert isinstance(settings, FixerSettings)
-                of = recorded, scenario.actors, scenario.ego_log, settings.references, settings.recording
-                references = ReferenceSession(*of, hysteresis=False, threads=thread_count(self._threads))
-        return SceneEntry(scenario, prepare_map(scenario.lane_map) if self._needs_map else None, renderer, references)
+                of = (
+                    recorded,
+                    scenario.actors,
+                    scenario.ego_log,
+                    settings.references,
+                    settings.recording,
+                )
+                references = ReferenceSession(
+                    *of, hysteresis=False, threads=thread_count(self._threads)
+                )
+        return SceneEntry(
+            scenario,
+            prepare_map(scenario.lane_map) if self._needs_map else None,
+            renderer,
+            references,
+        )
 
     def _enter(self, source: str | Path) -> None:
-        scene_id = usdz_scene_id(source) if str(source).endswith(".usdz") else load_scenario(source).scene_id
+        scene_id = (
+            usdz_scene_id(source)
+            if str(source).endswith(".usdz")
+            else load_scenario(source).scene_id
+        )
         if scene_id in self._sources:
-            raise InputError(DOING, f"scene {scene_id!r}", f"both {self._sources[scene_id]} and {source} have this id", "remove one")
+            raise InputError(
+                DOING,
+                f"scene {scene_id!r}",
+                f"both {self._sources[scene_id]} and {source} have this id",
+                "remove one",
+            )
         self._sources[scene_id] = source
 
 
 def sources_in(place: str | Path) -> list[str | Path]:
-    """Return the scene files of a folder, or the place itself where it is a file, a recorded log or a shipped name.
+    """Return the scene files of a folder, or the place itself where it is a file, a recorded log or
+    a shipped name.
 
     Raises:
         InputError: A folder without a scene.
@@ -227,7 +285,9 @@ def sources_in(place: str | Path) -> list[str | Path]:
     folder = Path(place)
     if not folder.is_dir():
         return [place]
-    files: list[str | Path] = [path for path in sorted(folder.iterdir()) if path.suffix in FILES and path.is_file()]
+    files: list[str | Path] = [
+        path for path in sorted(folder.iterdir()) if path.suffix in FILES and path.is_file()
+    ]
     if files:
         return files
     logs: list[str | Path] = [path for path in sorted(folder.iterdir()) if path.is_dir()]
@@ -238,7 +298,9 @@ def sources_in(place: str | Path) -> list[str | Path]:
 
 
 def advertised(scenario: Scenario) -> list[sensorsim_pb2.AvailableCamerasReturn.AvailableCamera]:
-    """Return a scene's cameras; a single camera also under the name that AlpaSim's presets use for the front one."""
+    """Return a scene's cameras; a single camera also under the name that AlpaSim's presets use for
+    the front one.
+    """
     cameras = [wire_camera(camera) for camera in scenario.cameras]
     if cameras and all(camera.logical_id != FRONT_WIDE for camera in cameras):
         front = next((camera for camera in cameras if camera.logical_id == "front"), cameras[0])

@@ -1,11 +1,13 @@
-"""AlpaSim's EgodriverService in front of a policy of ours: sessions, what was submitted in each, and the plan that follows from it.
+"""AlpaSim's EgodriverService in front of a policy of ours: sessions, what was submitted in each,
+and the plan that follows from it.
 
-Submissions may come in any order and from several threads. A query before every camera has a frame, or before any motion, is answered with
-an empty plan, which AlpaSim accepts in its warm-up.
+Submissions may come in any order and from several threads. A query before every camera has a frame,
+or before any motion, is answered with an empty plan, which AlpaSim accepts in its warm-up.
 
-`serve_policy` serves a policy in a Python environment of its own, which `simrun --policy "exec:..."` starts and drives. Of this project
-only light modules are imported here, and of other packages numpy, grpc, protobuf and OpenCV: the environment needs neither torch nor the
-rest. A test holds it to that.
+`serve_policy` serves a policy in a Python environment of its own, which `simrun --policy
+"exec:..."` starts and drives. Of this project only light modules are imported here, and of other
+packages numpy, grpc, protobuf and OpenCV: the environment needs neither torch nor the rest. A test
+holds it to that.
 """
 
 from __future__ import annotations
@@ -31,7 +33,17 @@ from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import quat_from_yaw, se3, transform_points, wrap_angle, yaw_of
 from alpasim_plugin.core.interfaces import Policy, complete
 from alpasim_plugin.core.plan_check import blank_scenario, plan_problem, sensors_problem
-from alpasim_plugin.core.types import F64, CameraSpec, EgoState, Frame, Observation, Plan, Route, Scenario, Trajectory
+from alpasim_plugin.core.types import (
+    F64,
+    CameraSpec,
+    EgoState,
+    Frame,
+    Observation,
+    Plan,
+    Route,
+    Scenario,
+    Trajectory,
+)
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import increasing_times, read_poses, read_transform, wire_trajectory
 from alpasim_plugin.log.wire import api_version, common_pb2, egodriver_pb2, sensorsim_pb2
@@ -39,7 +51,8 @@ from alpasim_plugin.log.wire import api_version, common_pb2, egodriver_pb2, sens
 DOING = "driving for AlpaSim"
 ADDRESS = "SIMRUN_POLICY_ADDRESS"
 ROUTE_POINTS = 20
-MOVING_MPS = 0.3  # AlpaSim sends zero speeds until it hands over; faster motion than this is believed against them
+# AlpaSim sends zero speeds until it hands over; faster motion than this is believed against them
+MOVING_MPS = 0.3
 SPEED_WINDOW_US = 200_000
 MOST_POSES = 8192  # of a session's motion; the oldest are forgotten
 MOST_CAMERAS = 64  # of a session
@@ -84,10 +97,16 @@ class DriverService:
     def get_version(self, request: common_pb2.Empty, context: Any) -> common_pb2.VersionId:
         """Name the policy and the digest of its code and weights."""
         digest = (self._digest or "undigested")[:40]
-        return common_pb2.VersionId(version_id=f"simrun-{__version__}+{self._name}", git_hash=digest, grpc_api_version=api_version())
+        return common_pb2.VersionId(
+            version_id=f"simrun-{__version__}+{self._name}",
+            git_hash=digest,
+            grpc_api_version=api_version(),
+        )
 
     @answering
-    def start_session(self, request: egodriver_pb2.DriveSessionRequest, context: Any) -> common_pb2.SessionRequestStatus:
+    def start_session(
+        self, request: egodriver_pb2.DriveSessionRequest, context: Any
+    ) -> common_pb2.SessionRequestStatus:
         """Open a session."""
         self.counts["start_session"] += 1
         scenario = self._scenario_of(request.debug_info.scene_id)
@@ -95,19 +114,27 @@ class DriverService:
         return common_pb2.SessionRequestStatus()
 
     @answering
-    def close_session(self, request: egodriver_pb2.DriveSessionCloseRequest, context: Any) -> common_pb2.Empty:
-        """Close a session; one that is not open is no error, since AlpaSim closes after failures too."""
+    def close_session(
+        self, request: egodriver_pb2.DriveSessionCloseRequest, context: Any
+    ) -> common_pb2.Empty:
+        """Close a session; one that is not open is no error, since AlpaSim closes after failures
+        too.
+        """
         self.sessions.close(request.session_uuid)
         return common_pb2.Empty()
 
     @answering
-    def submit_image_observation(self, request: egodriver_pb2.RolloutCameraImage, context: Any) -> common_pb2.Empty:
+    def submit_image_observation(
+        self, request: egodriver_pb2.RolloutCameraImage, context: Any
+    ) -> common_pb2.Empty:
         """Take a frame."""
         self._session(request.session_uuid).take_image(request.camera_image)
         return common_pb2.Empty()
 
     @answering
-    def submit_egomotion_observation(self, request: egodriver_pb2.RolloutEgoTrajectory, context: Any) -> common_pb2.Empty:
+    def submit_egomotion_observation(
+        self, request: egodriver_pb2.RolloutEgoTrajectory, context: Any
+    ) -> common_pb2.Empty:
         """Take motion."""
         self._session(request.session_uuid).take_motion(request)
         return common_pb2.Empty()
@@ -119,13 +146,17 @@ class DriverService:
         return common_pb2.Empty()
 
     @answering
-    def submit_recording_ground_truth(self, request: egodriver_pb2.GroundTruthRequest, context: Any) -> common_pb2.Empty:
+    def submit_recording_ground_truth(
+        self, request: egodriver_pb2.GroundTruthRequest, context: Any
+    ) -> common_pb2.Empty:
         """Take no notice: a policy under test has no use for the recorded future."""
         self._session(request.session_uuid)
         return common_pb2.Empty()
 
     @answering
-    def drive(self, request: egodriver_pb2.DriveRequest, context: Any) -> egodriver_pb2.DriveResponse:
+    def drive(
+        self, request: egodriver_pb2.DriveRequest, context: Any
+    ) -> egodriver_pb2.DriveResponse:
         """Answer with a plan, or with an empty one while the policy lacks frames."""
         began = time.perf_counter()
         answer = self._session(request.session_uuid).drive(int(request.time_now_us))
@@ -140,12 +171,18 @@ class DriverService:
     def _session(self, name: str) -> Driving:
         session = self.sessions.get(name)
         if session is None:
-            raise InputError("serving a policy", f"session {name!r}", "it is not open, or has expired", "call start_session first")
+            raise InputError(
+                "serving a policy",
+                f"session {name!r}",
+                "it is not open, or has expired",
+                "call start_session first",
+            )
         return session
 
 
 class Driving:
-    """A session. What it keeps is bounded: the newest frame of each camera, and the newest `MOST_POSES` of the motion.
+    """A session. What it keeps is bounded: the newest frame of each camera, and the newest
+    `MOST_POSES` of the motion.
 
     Args:
         request: That opened it.
@@ -153,7 +190,12 @@ class Driving:
         make: Makes the policy for a scenario.
     """
 
-    def __init__(self, request: egodriver_pb2.DriveSessionRequest, scenario: Scenario, make: Callable[[Scenario], Policy]) -> None:
+    def __init__(
+        self,
+        request: egodriver_pb2.DriveSessionRequest,
+        scenario: Scenario,
+        make: Callable[[Scenario], Policy],
+    ) -> None:
         self._seed, self._scenario, self._make = int(request.random_seed), scenario, make
         self._native = _native(request.rollout_spec.vehicle.available_cameras)
         self._lock = threading.Lock()
@@ -169,17 +211,29 @@ class Driving:
         """Keep a camera's newest frame, as the pinhole sees it that policies compute with.
 
         Raises:
-            InputError: The session has no such camera, or it is no image, or one of another size than those before.
+            InputError: The session has no such camera, or it is no image, or one of another size
+                than those before.
         """
         if image.logical_id not in self._native:
-            found = f"an image of camera {image.logical_id!r}; the session has {sorted(self._native)}"
-            raise InputError(DOING, "submit_image_observation", found, "send only the cameras of the session")
+            found = (
+                f"an image of camera {image.logical_id!r}; the session has {sorted(self._native)}"
+            )
+            raise InputError(
+                DOING, "submit_image_observation", found, "send only the cameras of the session"
+            )
         check_time(image.frame_end_us, "submit_image_observation")
-        rgb = decode_image(image.image_bytes, f"camera {image.logical_id!r} at {image.frame_end_us} us")
+        rgb = decode_image(
+            image.image_bytes, f"camera {image.logical_id!r} at {image.frame_end_us} us"
+        )
         height, width = rgb.shape[:2]
         if (held := self._sizes.setdefault(image.logical_id, (width, height))) != (width, height):
             found = f"{width} x {height} pixels after {held[0]} x {held[1]}"
-            raise InputError(DOING, f"camera {image.logical_id!r}", found, "send all images of a camera in one size")
+            raise InputError(
+                DOING,
+                f"camera {image.logical_id!r}",
+                found,
+                "send all images of a camera in one size",
+            )
         lens = straight_of(self._native[image.logical_id].intrinsics, width, height)
         frame = Frame(int(image.frame_end_us), image.logical_id, lens.image(rgb))
         with self._lock:
@@ -206,7 +260,9 @@ class Driving:
 
     def take_route(self, route: egodriver_pb2.Route) -> None:
         """Keep the newest route; a row of NaN ends it."""
-        rows = np.array([(p.x, p.y, p.z) for p in route.waypoints[:ROUTE_POINTS]], dtype=np.float64).reshape(-1, 3)
+        rows = np.array(
+            [(p.x, p.y, p.z) for p in route.waypoints[:ROUTE_POINTS]], dtype=np.float64
+        ).reshape(-1, 3)
         with self._lock:
             self._route_rig = np.full((ROUTE_POINTS, 3), np.nan)
             self._route_rig[: len(rows)] = rows
@@ -224,12 +280,26 @@ class Driving:
                 return egodriver_pb2.DriveResponse()
             ego, history = self._ego(), self._history
             policy = self._policy = self._policy or self._started(ego)
-            shown = {name: frame for name, (frame, _) in self._frames.items() if name in self._cameras}
-            observation = Observation(now_us, shown, self._cameras, replace(ego, t_us=now_us), history, self._route_rig.copy())
+            shown = {
+                name: frame for name, (frame, _) in self._frames.items() if name in self._cameras
+            }
+            observation = Observation(
+                now_us,
+                shown,
+                self._cameras,
+                replace(ego, t_us=now_us),
+                history,
+                self._route_rig.copy(),
+            )
             plan = policy.act(observation)
             problem = plan_problem(plan, now_us)
             if problem:
-                raise PolicyError(DOING, type(policy).__name__, problem, "simrun check-policy finds all faults of a policy")
+                raise PolicyError(
+                    DOING,
+                    type(policy).__name__,
+                    problem,
+                    "simrun check-policy finds all faults of a policy",
+                )
             return self._answer(plan, ego.T_world_rig)
 
     def close(self) -> None:
@@ -239,20 +309,34 @@ class Driving:
                 self._policy.close()
 
     def _started(self, ego: EgoState) -> Policy:
-        """Make the policy for the cameras as they come: an image may have another size than its calibration."""
+        """Make the policy for the cameras as they come: an image may have another size than its
+        calibration.
+        """
         cameras = []
         for name, camera in self._native.items():
-            lens, mounting = self._frames[name][1], read_transform(camera.rig_to_camera, f"mounting of camera {name!r}")
+            lens, mounting = (
+                self._frames[name][1],
+                read_transform(camera.rig_to_camera, f"mounting of camera {name!r}"),
+            )
             cameras.append(CameraSpec(name, *lens.size, lens.K, mounting))
         known = self._route_rig[np.isfinite(self._route_rig).all(axis=1)]
-        route = Route(transform_points(ego.T_world_rig, known) if len(known) else ego.T_world_rig[None, :3, 3])
+        route = Route(
+            transform_points(ego.T_world_rig, known) if len(known) else ego.T_world_rig[None, :3, 3]
+        )
         policy = self._make(replace(self._scenario, cameras=tuple(cameras), route=route))
         found = sensors_problem(policy.sensors)
         wanted = [] if found else [sensor.camera for sensor in policy.sensors]
         missing = sorted(set(wanted) - set(self._native))
         if found or missing:
-            found = found or f"it asks for cameras {missing}; the session has {sorted(self._native)}"
-            raise PolicyError(DOING, type(policy).__name__, found, "name the session's cameras as the policy does: ?cameras=NAME,...")
+            found = (
+                found or f"it asks for cameras {missing}; the session has {sorted(self._native)}"
+            )
+            raise PolicyError(
+                DOING,
+                type(policy).__name__,
+                found,
+                "name the session's cameras as the policy does: ?cameras=NAME,...",
+            )
         self._cameras = {camera.name: camera for camera in cameras if camera.name in wanted}
         policy.reset(self._seed, route)
         return policy
@@ -260,7 +344,9 @@ class Driving:
     def _ego(self) -> EgoState:
         known, now = self._history, int(self._history.t_us[-1])
         pose = se3(known.xyz[-1], known.quat[-1])
-        stated, turn, accel = (0.0, 0.0, 0.0)
+        stated = 0.0
+        turn = 0.0
+        accel = 0.0
         if self._state is not None:
             stated, turn = self._state.linear_velocity.x, self._state.angular_velocity.z
             accel = self._state.linear_acceleration.x
@@ -274,7 +360,10 @@ class Driving:
         return EgoState(now, pose, float(stated), float(accel), float(turn))
 
     def _answer(self, plan: Plan, T_world_rig: F64) -> egodriver_pb2.DriveResponse:
-        wires = [_absolute(plan, xy_yaw, T_world_rig) for xy_yaw in (np.column_stack([plan.xy, plan.yaw]), *plan.samples)]
+        wires = [
+            _absolute(plan, xy_yaw, T_world_rig)
+            for xy_yaw in (np.column_stack([plan.xy, plan.yaw]), *plan.samples)
+        ]
         debug = egodriver_pb2.DriveResponse.DebugInfo(sampled_trajectories=wires[1:])
         return egodriver_pb2.DriveResponse(trajectory=wires[0], debug_info=debug)
 
@@ -290,7 +379,9 @@ def _absolute(plan: Plan, rows: F64, T_world_rig: F64) -> Any:
     c, s = np.cos(yaw0), np.sin(yaw0)
     xy = rows[:, :2] @ np.array([[c, s], [-s, c]]) + origin[:2]
     xyz = np.column_stack([xy, np.full(len(rows), origin[2])])
-    return wire_trajectory(Trajectory(plan.times_us, xyz, quat_from_yaw(wrap_angle(rows[:, 2] + yaw0))), "the plan")
+    return wire_trajectory(
+        Trajectory(plan.times_us, xyz, quat_from_yaw(wrap_angle(rows[:, 2] + yaw0))), "the plan"
+    )
 
 
 def _native(listed: Any) -> dict[str, sensorsim_pb2.AvailableCamerasReturn.AvailableCamera]:
@@ -300,13 +391,19 @@ def _native(listed: Any) -> dict[str, sensorsim_pb2.AvailableCamerasReturn.Avail
         InputError: An invalid lens or camera pose, or too many cameras.
     """
     if len(listed) > MOST_CAMERAS:
-        raise InputError(DOING, "start_session", f"{len(listed)} cameras", f"name at most {MOST_CAMERAS}")
+        raise InputError(
+            DOING, "start_session", f"{len(listed)} cameras", f"name at most {MOST_CAMERAS}"
+        )
     for camera in listed:
         try:
-            straight_of(camera.intrinsics, camera.intrinsics.resolution_w, camera.intrinsics.resolution_h)
+            straight_of(
+                camera.intrinsics, camera.intrinsics.resolution_w, camera.intrinsics.resolution_h
+            )
         except InputError as error:
             do_this = "give the driver a pinhole view of it: runtime.extra_cameras in AlpaSim, or a renderer that serves pinholes"
-            raise InputError(DOING, f"camera {camera.logical_id!r}", error.found, do_this) from error
+            raise InputError(
+                DOING, f"camera {camera.logical_id!r}", error.found, do_this
+            ) from error
         read_transform(camera.rig_to_camera, f"mounting of camera {camera.logical_id!r}")
     return {camera.logical_id: camera for camera in listed}
 
@@ -315,9 +412,11 @@ def serve_policy(factory: Callable[..., Any], address: str | None = None) -> Non
     """Serve a policy as AlpaSim's EgodriverService until the process is ended.
 
     Args:
-        factory: The policy's class, or a function that makes one; called for every rollout, with the scenario if it has a parameter of that
-            name. Of the scenario only the cameras are true. What is costly to load belongs outside of it.
-        address: ``HOST:PORT`` or ``unix:PATH``; by default what the environment variable ``SIMRUN_POLICY_ADDRESS`` says.
+        factory: The policy's class, or a function that makes one; called for every rollout, with
+            the scenario if it has a parameter of that name. Of the scenario only the cameras are
+            true. What is costly to load belongs outside of it.
+        address: ``HOST:PORT`` or ``unix:PATH``; by default what the environment variable
+            ``SIMRUN_POLICY_ADDRESS`` says.
 
     Raises:
         InputError: There is no address.
@@ -329,12 +428,16 @@ def serve_policy(factory: Callable[..., Any], address: str | None = None) -> Non
     place = address or os.environ.get(ADDRESS, "")
     if not place:
         do_this = f"start the script by simrun --policy 'exec:python SCRIPT.py', or set {ADDRESS}=127.0.0.1:6000"
-        raise InputError("serving a policy", f"environment variable {ADDRESS}", "it is not set", do_this)
+        raise InputError(
+            "serving a policy", f"environment variable {ADDRESS}", "it is not set", do_this
+        )
     takes_scenario = "scenario" in inspect.signature(factory).parameters
     name = getattr(factory, "__name__", type(factory).__name__)
 
     def make(scenario: Scenario) -> Policy:
-        made: Policy = complete(factory(scenario=scenario) if takes_scenario else factory(), Policy, f"policy {name!r}")
+        made: Policy = complete(
+            factory(scenario=scenario) if takes_scenario else factory(), Policy, f"policy {name!r}"
+        )
         return made
 
     service = _Serving(name, _file_digest(factory), make, _unknown_scene)

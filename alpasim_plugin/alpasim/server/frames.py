@@ -26,17 +26,28 @@ from alpasim_plugin.log.wire import sensorsim_pb2
 
 DOING = "answering a render request"
 ENCODINGS: dict[int, ImageEncoding] = {sensorsim_pb2.PNG: "png", sensorsim_pb2.JPEG: "jpeg"}
-NODE_BYTES, OBJECT_BYTES = 4096, 512  # what a frame and each of its objects hold beside pictures and tensors, roughly
-MOST_PIXELS = 2 * MAX_PIXELS  # of all frames of a call: four cameras of 3840 x 2160, which are held until the last is done
+NODE_BYTES, OBJECT_BYTES = (
+    4096,
+    512,
+)  # what a frame and each of its objects hold beside pictures and tensors, roughly
+MOST_PIXELS = (
+    2 * MAX_PIXELS
+)  # of all frames of a call: four cameras of 3840 x 2160, which are held until the last is done
 QUALITY = 95.0  # where a request leaves it unset; AlpaSim always asks for it
-SHARES = (8, 4)  # of a frame's sides, on which its time is measured: the first is so small that its time is the constant part
-SLOW_S = 0.5  # longer than this per frame is a warning: five times as long as the loop's time between frames
+SHARES = (
+    8,
+    4,
+)  # of a frame's sides, on which its time is measured: the first is so small that its time is the constant part
+# longer than this per frame is a warning: five times as long as the loop's time between frames
+SLOW_S = 0.5
 log = logging.getLogger("simrun.serve")
 
 
 @dataclass(frozen=True)
 class Answered:
-    """What the tree keeps of a frame: the picture that was given, and the fixer's past for the next one."""
+    """What the tree keeps of a frame: the picture that was given, and the fixer's past for the next
+    one.
+    """
 
     image: U8
     past: Any
@@ -50,7 +61,8 @@ class FrameServer:
         fixers: Fixes; None: frames are given as rendered, and no history is kept.
         tree: Histories.
         busy: Held while something is computed.
-        width: Wider pictures are made at this width and enlarged to the size asked for; None: all are made as asked.
+        width: Wider pictures are made at this width and enlarged to the size asked for; None: all
+            are made as asked.
         costs: Says what a size costs before its first frame; None: nothing is said.
     """
 
@@ -78,18 +90,31 @@ class FrameServer:
         forms = [image_form(request) for request in requests]
         views = [read_view(request) for request in requests]
         if (pixels := sum(view.width * view.height for view in views)) > MOST_PIXELS:
-            raise InputError(DOING, f"{len(views)} frames", f"{pixels} pixels", f"ask for at most {MOST_PIXELS} in one call")
+            raise InputError(
+                DOING,
+                f"{len(views)} frames",
+                f"{pixels} pixels",
+                f"ask for at most {MOST_PIXELS} in one call",
+            )
         sizes = [(view.width, view.height) for view in views]
         if self._width is not None:
-            views = [scaled(view, self._width) if view.width > self._width else view for view in views]
+            views = [
+                scaled(view, self._width) if view.width > self._width else view for view in views
+            ]
         if self._costs is not None:
             for request, view in zip(requests, views, strict=True):
                 self._costs.before(view, partial(self._thrown_away, request, left))
         if self._fixers is None:
             rendered = self.source.render(requests, views, left)
-            return [encode(self._sized(item.frame.rgb, size), form) for item, size, form in zip(rendered, sizes, forms, strict=True)]
+            return [
+                encode(self._sized(item.frame.rgb, size), form)
+                for item, size, form in zip(rendered, sizes, forms, strict=True)
+            ]
         nodes = self._nodes(requests, views, left)
-        return [self._encoded(nodes[view.key], size, form) for view, size, form in zip(views, sizes, forms, strict=True)]
+        return [
+            self._encoded(nodes[view.key], size, form)
+            for view, size, form in zip(views, sizes, forms, strict=True)
+        ]
 
     def _thrown_away(self, request: Request, left: CallTime, view: View) -> None:
         """Make a frame that nobody gets, and that is no part of a history."""
@@ -98,10 +123,16 @@ class FrameServer:
             with left.holding(self._busy):
                 self._fixers.of(view.scene_id).advance(item.frame, item.sdmap, None)
 
-    def _nodes(self, requests: Sequence[Request], views: Sequence[View], left: CallTime) -> dict[bytes, Node[Answered]]:
-        """Return the frame of every view. A frame that another call is working on is waited for, after this call's own are done."""
+    def _nodes(
+        self, requests: Sequence[Request], views: Sequence[View], left: CallTime
+    ) -> dict[bytes, Node[Answered]]:
+        """Return the frame of every view. A frame that another call is working on is waited for,
+        after this call's own are done.
+        """
         nodes: dict[bytes, Node[Answered]] = {}
-        missing = dict(zip((view.key for view in views), zip(requests, views, strict=True), strict=True))
+        missing = dict(
+            zip((view.key for view in views), zip(requests, views, strict=True), strict=True)
+        )
         while missing:
             for key, (_, view) in list(missing.items()):
                 known = self.tree.find(view)
@@ -124,11 +155,17 @@ class FrameServer:
     def _fixed(self, item: Rendered, view: View, left: CallTime) -> Node[Answered]:
         assert self._fixers is not None
         with left.holding(self._busy):
-            # Under the lock: which frames there are does not change between the look at the tree and the entry.
+            # Under the lock: which frames there are does not change between the look at the tree
+            # and the entry.
             parent = self.tree.parent_of(view)
             if parent is not None and parent.state.image.shape != item.frame.rgb.shape:
                 found = f"a picture of {item.frame.rgb.shape[:2]} after {parent.state.image.shape[:2]} (height, width)"
-                raise UpstreamFault(DOING, f"scene {view.scene_id!r}, camera {view.camera!r}", found, "see the upstream's log")
+                raise UpstreamFault(
+                    DOING,
+                    f"scene {view.scene_id!r}, camera {view.camera!r}",
+                    found,
+                    "see the upstream's log",
+                )
             past = None if parent is None else parent.state.past
             frame, after = self._fixers.of(view.scene_id).advance(item.frame, item.sdmap, past)
             self.events.update(frame.events)
@@ -136,7 +173,9 @@ class FrameServer:
             size = size_of(answered) + NODE_BYTES + OBJECT_BYTES * len(view.objects)
             return self.tree.add(view, answered, size, parent)
 
-    def _encoded(self, node: Node[Answered], size: tuple[int, int], form: tuple[int, float]) -> bytes:
+    def _encoded(
+        self, node: Node[Answered], size: tuple[int, int], form: tuple[int, float]
+    ) -> bytes:
         known = node.answers.get(form)
         if known is None:
             known = encode(self._sized(node.state.image, size), form)
@@ -144,11 +183,15 @@ class FrameServer:
         return known
 
     def _sized(self, image: U8, size: tuple[int, int]) -> U8:
-        """Return a picture at the size asked for, where it was made smaller; an upstream's picture has the size that the upstream chose."""
+        """Return a picture at the size asked for, where it was made smaller; an upstream's picture
+        has the size that the upstream chose.
+        """
         return image if self._width is None else enlarged(image, size)
 
     def _claim(self, keys: Sequence[bytes]) -> tuple[list[bytes], list[threading.Event]]:
-        """Take the keys that nobody works on; return them and what to wait for instead of the others."""
+        """Take the keys that nobody works on; return them and what to wait for instead of the
+        others.
+        """
         with self._in_work_lock:
             others = [self._in_work[key] for key in keys if key in self._in_work]
             own = [key for key in keys if key not in self._in_work]
@@ -170,15 +213,23 @@ def image_form(request: Request) -> tuple[int, float]:
     """
     quality = request.image_quality or QUALITY
     if request.image_format not in ENCODINGS:
-        name = sensorsim_pb2.ImageFormat.Name(request.image_format) if request.image_format < 7 else str(request.image_format)
-        raise InputError(DOING, f"image_format {name}", "no format that is made here", "ask for PNG or JPEG")
+        name = (
+            sensorsim_pb2.ImageFormat.Name(request.image_format)
+            if request.image_format < 7
+            else str(request.image_format)
+        )
+        raise InputError(
+            DOING, f"image_format {name}", "no format that is made here", "ask for PNG or JPEG"
+        )
     if not 1 <= quality <= 100:
         raise InputError(DOING, f"image_quality {quality}", "not between 1 and 100", "ask for 95")
     return request.image_format, quality if request.image_format == sensorsim_pb2.JPEG else 0.0
 
 
 def enlarged(image: U8, size: tuple[int, int]) -> U8:
-    """Return a picture at a size (width, height), between pixels bicubically; as it is where it has that size."""
+    """Return a picture at a size (width, height), between pixels bicubically; as it is where it has
+    that size.
+    """
     if image.shape[1::-1] == size:
         return image
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), np.uint8)
@@ -189,8 +240,11 @@ def encode(image: U8, form: tuple[int, float]) -> bytes:
     return encode_image(image, ENCODINGS[form[0]], round(form[1]))
 
 
-def cost_s(make: Callable[[View], object], view: View, clock: Callable[[], float] = time.perf_counter) -> float:
-    """Return the expected seconds of one frame, from two smaller ones of the same view, which take a tenth of that.
+def cost_s(
+    make: Callable[[View], object], view: View, clock: Callable[[], float] = time.perf_counter
+) -> float:
+    """Return the expected seconds of one frame, from two smaller ones of the same view, which take
+    a tenth of that.
 
     A frame's time is nearly a constant plus a part that grows with its pixels.
 
@@ -232,7 +286,5 @@ class Announced:
         text = f"camera {view.camera!r} at {view.width} x {view.height}: about {expected:.2g} s a frame on this machine"
         half = scaled(view, view.width // 2)
         if expected > SLOW_S and self._may_shrink:
-            text += (
-                f"; --render-width {half.width} makes frames of {half.width} x {half.height} and enlarges them, in about a quarter of that"
-            )
+            text += f"; --render-width {half.width} makes frames of {half.width} x {half.height} and enlarges them, in about a quarter of that"
         log.log(logging.WARNING if expected > SLOW_S else logging.INFO, text)

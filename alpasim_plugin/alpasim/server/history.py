@@ -1,19 +1,22 @@
 """Histories without sessions: a tree of frames per scene, camera and lens.
 
-AlpaSim's render requests carry no session. Several rollouts of one scene come over one connection, interleaved, and with a deterministic
-driver their requests are equal byte for byte. So a frame's past is found by content:
+AlpaSim's render requests carry no session. Several rollouts of one scene come over one connection,
+interleaved, and with a deterministic driver their requests are equal byte for byte. So a frame's
+past is found by content:
 
 - A request that is equal to an earlier one *is* that frame, and has its answer.
-- Otherwise its parent is the frame before it on the same drive. With the shutter pair (start, end) of the request, the camera was at
-  ``end - (end - start) dt / shutter`` a time ``dt`` earlier (AlpaSim interpolates poses linearly over a control step, so this is nearly
-  exact); dynamic objects are taken back in the same way. With a shutter of 0, the parent's own motion is continued instead; the first
-  frame of a drive has none, so its nearest pose counts.
+- Otherwise its parent is the frame before it on the same drive. With the shutter pair (start, end)
+  of the request, the camera was at ``end - (end - start) dt / shutter`` a time ``dt`` earlier
+  (AlpaSim interpolates poses linearly over a control step, so this is nearly exact); dynamic
+  objects are taken back in the same way. With a shutter of 0, the parent's own motion is continued
+  instead; the first frame of a drive has none, so its nearest pose counts.
 - A frame with no parent within reach starts a history.
 
-Two drives that differ thus have their own branches from where they part, and what one is given does not depend on the other.
+Two drives that differ thus have their own branches from where they part, and what one is given does
+not depend on the other.
 
-Memory is bounded: what nobody used for `expiry_s` goes; beyond `max_bytes`, first frames that have a successor, the longest unused first,
-then the ends of branches, the longest unused first.
+Memory is bounded: what nobody used for `expiry_s` goes; beyond `max_bytes`, first frames that have
+a successor, the longest unused first, then the ends of branches, the longest unused first.
 """
 
 from __future__ import annotations
@@ -33,15 +36,20 @@ from alpasim_plugin.alpasim.server.views import View
 from alpasim_plugin.core.types import F64
 
 SLACK_M = 0.1  # error of a predicted pose that is always allowed ...
-ACCEL_MPS2 = 10.0  # ... plus this times dt^2: twice the error of a constant speed under hard braking
-SPEED_MPS = 70.0  # where there is no motion to continue, farther than this times dt is another place
+ACCEL_MPS2 = (
+    10.0  # ... plus this times dt^2: twice the error of a constant speed under hard braking
+)
+SPEED_MPS = (
+    70.0  # where there is no motion to continue, farther than this times dt is another place
+)
 LEVER_M = 2.0  # a turn by one radian counts as this distance
 S = TypeVar("S")
 GAP_US = 2_000_000  # longest time between two frames of a drive
 
 
 def distance(view: View, before: View, T_before: tuple[F64, int] | None) -> tuple[float, float]:
-    """Return how far a frame is from where a view's drive was at its time, in metres, and how far it may be.
+    """Return how far a frame is from where a view's drive was at its time, in metres, and how far
+    it may be.
 
     Args:
         view: The later frame.
@@ -62,7 +70,8 @@ def distance(view: View, before: View, T_before: tuple[F64, int] | None) -> tupl
 
 
 def on_line(a: F64, b: F64, s: float) -> F64:
-    """Return the pose ``(4, 4)`` at ``s`` on the steady motion through ``a`` at 0 and ``b`` at 1; ``s`` may lie outside.
+    """Return the pose ``(4, 4)`` at ``s`` on the steady motion through ``a`` at 0 and ``b`` at 1;
+    ``s`` may lie outside.
 
     Example:
         >>> a, b = np.eye(4), np.eye(4)
@@ -84,7 +93,9 @@ def apart(a: F64, b: F64) -> float:
 
 
 def _objects_apart(view: View, before: View, back: float) -> float:
-    """Return the mean distance of the dynamic objects that both frames show: it tells drives apart whose traffic differs."""
+    """Return the mean distance of the dynamic objects that both frames show: it tells drives apart
+    whose traffic differs.
+    """
     shared = [track for track in view.objects if track in before.objects]
     if not shared:
         return 0.0
@@ -138,11 +149,15 @@ class HistoryTree(Generic[S]):
         clock: Monotonic seconds.
     """
 
-    def __init__(self, max_bytes: int, expiry_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, max_bytes: int, expiry_s: float, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self.max_bytes, self.expiry_s, self._clock = max_bytes, expiry_s, clock
         self.bytes, self.counts = 0, Counts()
         self._nodes: OrderedDict[bytes, Node[S]] = OrderedDict()  # the longest unused first
-        self._times: dict[tuple[str, str, bytes], list[tuple[int, bytes]]] = defaultdict(list)  # sorted by time
+        self._times: dict[tuple[str, str, bytes], list[tuple[int, bytes]]] = defaultdict(
+            list
+        )  # sorted by time
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -162,13 +177,22 @@ class HistoryTree(Generic[S]):
             return None if node is None else self._touch(node.view.key)
 
     def add(self, view: View, state: S, size: int, parent: Node[S] | None) -> Node[S]:
-        """Enter an answered frame; if an equal one was entered meanwhile, that one stays and is returned."""
+        """Enter an answered frame; if an equal one was entered meanwhile, that one stays and is
+        returned.
+        """
         with self._lock:
             known = self._touch(view.key)
             if known is not None:
                 return known
             before = None if parent is None else (parent.view.T_world_camera[1], parent.view.t_us)
-            node = Node(view, state, size, before, None if parent is None else parent.view.key, self._clock())
+            node = Node(
+                view,
+                state,
+                size,
+                before,
+                None if parent is None else parent.view.key,
+                self._clock(),
+            )
             self._nodes[view.key] = node
             insort(self._times[_group(view)], (view.t_us, view.key))
             self.bytes += size

@@ -1,6 +1,8 @@
-"""How every server of this package is reached, by whom, and how much of it a caller may take: one policy, for `serve` and `serve-policy`.
+"""How every server of this package is reached, by whom, and how much of it a caller may take: one
+policy, for `serve` and `serve-policy`.
 
-A caller may be hostile. So whatever lasts is bounded and ends: sessions here, messages that do not come and streams in `gate`.
+A caller may be hostile. So whatever lasts is bounded and ends: sessions here, messages that do not
+come and streams in `gate`.
 """
 
 from __future__ import annotations
@@ -47,9 +49,13 @@ class HostPolicy:
 
     tls_cert: Annotated[Path | None, Flag("PEM certificate of this server.")] = None
     tls_key: Annotated[Path | None, Flag("PEM key of this server.")] = None
-    tls_client_ca: Annotated[Path | None, Flag("Callers must show a certificate signed by it.")] = None
+    tls_client_ca: Annotated[Path | None, Flag("Callers must show a certificate signed by it.")] = (
+        None
+    )
     token_file: Annotated[Path | None, Flag("File with the token that callers must send.")] = None
-    expiry_s: Annotated[float, Flag("Sessions and histories unused for so long are forgotten.", min=1.0)] = 900.0
+    expiry_s: Annotated[
+        float, Flag("Sessions and histories unused for so long are forgotten.", min=1.0)
+    ] = 900.0
     drain_s: Annotated[float, Flag("At the end, wait so long for running calls.", min=0.0)] = 30.0
 
     def credentials(self) -> Any:
@@ -61,15 +67,22 @@ class HostPolicy:
         if self.tls_cert is None and self.tls_key is None and self.tls_client_ca is None:
             return None
         if self.tls_cert is None or self.tls_key is None:
-            raise InputError(DOING, "TLS", "one of certificate and key", "give --tls-cert and --tls-key")
+            raise InputError(
+                DOING, "TLS", "one of certificate and key", "give --tls-cert and --tls-key"
+            )
         ca = None if self.tls_client_ca is None else read_pem(self.tls_client_ca)
         pair = read_pem(self.tls_key), read_pem(self.tls_cert)
-        return grpc.ssl_server_credentials([pair], root_certificates=ca, require_client_auth=ca is not None)
+        return grpc.ssl_server_credentials(
+            [pair], root_certificates=ca, require_client_auth=ca is not None
+        )
 
     def warn(self, address: str) -> None:
         """Log a warning if whoever can reach an address is served."""
         if self.token_file is None and self.tls_client_ca is None and not is_local(address):
-            log.warning("%s is open to everybody who can reach it; see --token-file and --tls-client-ca", address)
+            log.warning(
+                "%s is open to everybody who can reach it; see --token-file and --tls-client-ca",
+                address,
+            )
 
 
 def read_pem(path: Path) -> bytes:
@@ -77,7 +90,9 @@ def read_pem(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InputError(DOING, str(path), error.strerror or str(error), "name a PEM file") from error
+        raise InputError(
+            DOING, str(path), error.strerror or str(error), "name a PEM file"
+        ) from error
 
 
 def read_token(path: Path | None) -> str | None:
@@ -91,7 +106,9 @@ def read_token(path: Path | None) -> str | None:
     try:
         token = path.read_text().strip()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError("reading a token", str(path), f"{error}", "name a readable text file") from error
+        raise InputError(
+            "reading a token", str(path), f"{error}", "name a readable text file"
+        ) from error
     if not token:
         raise InputError("reading a token", str(path), "an empty file", "write the token into it")
     return token
@@ -147,10 +164,17 @@ class Sessions(Generic[S]):
         self.expire()
         with self._lock:
             if name in self._open:
-                raise InputError("opening a session", f"session {name!r}", "it is open already", "close it first")
+                raise InputError(
+                    "opening a session", f"session {name!r}", "it is open already", "close it first"
+                )
             if len(self._open) >= self._most:
                 do_this = f"close sessions that are over; abandoned ones end after {self._expiry_s:g} s (--expiry-s)"
-                raise Full("opening a session", f"session {name!r}", f"{self._most} sessions are open", do_this)
+                raise Full(
+                    "opening a session",
+                    f"session {name!r}",
+                    f"{self._most} sessions are open",
+                    do_this,
+                )
             self._open[name] = session, self._clock()
 
     def get(self, name: str) -> S | None:
@@ -172,7 +196,11 @@ class Sessions(Generic[S]):
     def expire(self) -> None:
         """Close the sessions that nobody used for long."""
         with self._lock:
-            old = [name for name, (_, used_s) in self._open.items() if self._clock() - used_s > self._expiry_s]
+            old = [
+                name
+                for name, (_, used_s) in self._open.items()
+                if self._clock() - used_s > self._expiry_s
+            ]
         for name in old:
             self.close(name)
 
@@ -201,21 +229,42 @@ class Host:
         every: Callable[[], None] = lambda: None,
     ) -> None:
         self.health, self._gate = Health(services), Gate(read_token(policy.token_file), workers)
-        # No maximum_concurrent_rpcs: beyond it gRPC answers RESOURCE_EXHAUSTED, which AlpaSim does not retry. Calls wait instead.
-        limits = ("grpc.max_concurrent_streams", STREAMS), ("grpc.server_handshake_timeout_ms", round(1000 * HANDSHAKE_S))
+        # No maximum_concurrent_rpcs: beyond it gRPC answers RESOURCE_EXHAUSTED, which AlpaSim does
+        # not retry. Calls wait instead.
+        limits = (
+            ("grpc.max_concurrent_streams", STREAMS),
+            ("grpc.server_handshake_timeout_ms", round(1000 * HANDSHAKE_S)),
+        )
         options = [*OPTIONS, ("grpc.so_reuseport", 0), *limits]
-        self._server = grpc.server(ThreadPoolExecutor(CALLS, thread_name_prefix="serve"), options=options, interceptors=(self._gate,))
+        self._server = grpc.server(
+            ThreadPoolExecutor(CALLS, thread_name_prefix="serve"),
+            options=options,
+            interceptors=(self._gate,),
+        )
         made = [handlers(name, service) for name, service in services.items()]
-        self._server.add_generic_rpc_handlers((*made, handlers("Health", self.health), *Reflection([*services, "Health"]).handlers()))
+        self._server.add_generic_rpc_handlers(
+            (*made, handlers("Health", self.health), *Reflection([*services, "Health"]).handlers())
+        )
         host, _, port = listen.rpartition(":")
         is_socket = listen.startswith("unix:")
         credentials = policy.credentials()
         try:
             if not is_socket and (not host or not port.isdigit()):
-                raise InputError(DOING, f"--listen {listen}", "no HOST:PORT", "write for example 127.0.0.1:50051, or unix:PATH")
-            add = self._server.add_insecure_port(listen) if credentials is None else self._server.add_secure_port(listen, credentials)
+                raise InputError(
+                    DOING,
+                    f"--listen {listen}",
+                    "no HOST:PORT",
+                    "write for example 127.0.0.1:50051, or unix:PATH",
+                )
+            add = (
+                self._server.add_insecure_port(listen)
+                if credentials is None
+                else self._server.add_secure_port(listen, credentials)
+            )
         except RuntimeError as error:
-            raise InfrastructureError(DOING, listen, str(error), "choose a free port and an address of this machine") from error
+            raise InfrastructureError(
+                DOING, listen, str(error), "choose a free port and an address of this machine"
+            ) from error
         self.address = listen if is_socket else f"{host}:{add}"
         policy.warn(self.address)
         self._ended, self._every = threading.Event(), every
@@ -233,7 +282,9 @@ class Host:
             pass
 
     def stop(self, drain_s: float = 30.0) -> None:
-        """Refuse new calls (UNAVAILABLE), let running ones finish within ``drain_s``, and close the port."""
+        """Refuse new calls (UNAVAILABLE), let running ones finish within ``drain_s``, and close the
+        port.
+        """
         self.health.stop()
         self._server.stop(drain_s).wait()
         self._gate.close()

@@ -1,14 +1,19 @@
-"""The truth gate: does the map belong to the picture? A fixer paints what a map draws, and a wrong map would have it paint a wrong road.
+"""The truth gate: does the map belong to the picture? A fixer paints what a map draws, and a wrong
+map would have it paint a wrong road.
 
-Paint is brighter than the road on both sides of it. So the lines of the drawn map are laid over the picture, and each piece of a line in a
-row of pixels is compared with equal pieces beside it: how often is it the brighter one, by `top hat`, which leaves what is narrower than
-`PAINT_SHARE` of the width? Half of the time by chance, nearly always where the line is there. That number is the *agreement* of a map.
+Paint is brighter than the road on both sides of it. So the lines of the drawn map are laid over the
+picture, and each piece of a line in a row of pixels is compared with equal pieces beside it: how
+often is it the brighter one, by `top hat`, which leaves what is narrower than `PAINT_SHARE` of the
+width? Half of the time by chance, nearly always where the line is there. That number is the
+*agreement* of a map.
 
-A picture may show no paint at all: an unmarked street, glare, a poor reconstruction. That is no evidence against the map. A map is
-contradicted where its lines are not found where it has them (agreement below `DOUBT`) and the same lines are found to one side of it
-(`FITS` or more at one of `ASIDE_M`): then the picture shows paint, and somewhere else. A map of another street whose lines fit nowhere is
-not told from a street without paint. A poor reconstruction, seen from beside the recorded path, leaves paint where the recording shows it:
-lines that are aside by as much as the camera is (within `UNMOVED_M`) are no evidence either.
+A picture may show no paint at all: an unmarked street, glare, a poor reconstruction. That is no
+evidence against the map. A map is contradicted where its lines are not found where it has them
+(agreement below `DOUBT`) and the same lines are found to one side of it (`FITS` or more at one of
+`ASIDE_M`): then the picture shows paint, and somewhere else. A map of another street whose lines
+fit nowhere is not told from a street without paint. A poor reconstruction, seen from beside the
+recorded path, leaves paint where the recording shows it: lines that are aside by as much as the
+camera is (within `UNMOVED_M`) are no evidence either.
 """
 
 from __future__ import annotations
@@ -26,7 +31,8 @@ from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, PreparedMap, pr
 
 WIDTH_PX = 480  # pictures are compared at this width
 PAINT_SHARE = 0.035  # of the width: what is broader is no paint
-WIDEST_SHARE = 0.08  # of the width: a run of line colour that is broader is a line across the view, without sides
+# of the width: a run of line colour that is broader is a line across the view, without sides
+WIDEST_SHARE = 0.08
 BESIDE = (-4, -3, -2, 2, 3, 4)  # pieces beside a line, in its own widths
 LEAST_PIECES = 40  # of lines in rows; fewer say nothing
 DOUBT, FITS = 0.56, 0.64
@@ -37,7 +43,9 @@ UNMOVED_M = 0.45
 
 @dataclass(frozen=True)
 class Pieces:
-    """Where lines of a drawn map cross rows of pixels: row, first column and one past the last, ``(N,)`` each."""
+    """Where lines of a drawn map cross rows of pixels: row, first column and one past the last,
+    ``(N,)`` each.
+    """
 
     row: np.ndarray
     first: np.ndarray
@@ -84,27 +92,45 @@ def contradiction(
 
     def found(aside_m: float) -> float | None:
         T = T_world_camera.copy()
-        T[:3, 3] -= aside_m * leftwards(T_world_camera)  # who stands to the right sees the lines to the left
-        return agreement(pieces_of(line_pixels(draw_map(scene_map, small, T, threads=threads)) & open_road), paint)
+        T[:3, 3] -= aside_m * leftwards(
+            T_world_camera
+        )  # who stands to the right sees the lines to the left
+        return agreement(
+            pieces_of(line_pixels(draw_map(scene_map, small, T, threads=threads)) & open_road),
+            paint,
+        )
 
     return decided(found, beside_m)
 
 
 def decided(found: Callable[[float], float | None], beside_m: float) -> Contradiction | None:
-    """Decide from the agreement of a map's lines, moved to the left by some metres, and where the camera stands."""
+    """Decide from the agreement of a map's lines, moved to the left by some metres, and where the
+    camera stands.
+    """
     here = found(0.0)
     if here is None or here >= DOUBT:
         return None
-    best, aside_m = max((found(aside_m) or 0.0, aside_m) for aside_m in ASIDE_M if abs(aside_m - beside_m) > UNMOVED_M)
+    best, aside_m = max(
+        (found(aside_m) or 0.0, aside_m)
+        for aside_m in ASIDE_M
+        if abs(aside_m - beside_m) > UNMOVED_M
+    )
     return Contradiction(here, best, aside_m) if best >= FITS else None
 
 
 def shrunk(camera: CameraSpec) -> CameraSpec:
-    """Return the camera of a picture `WIDTH_PX` wide, or of the picture itself where it is no wider."""
+    """Return the camera of a picture `WIDTH_PX` wide, or of the picture itself where it is no
+    wider.
+    """
     if camera.width <= WIDTH_PX:
         return camera
     size = WIDTH_PX, max(round(camera.height * WIDTH_PX / camera.width), 1)
-    return replace(camera, width=size[0], height=size[1], K=np.diag([size[0] / camera.width, size[1] / camera.height, 1.0]) @ camera.K)
+    return replace(
+        camera,
+        width=size[0],
+        height=size[1],
+        K=np.diag([size[0] / camera.width, size[1] / camera.height, 1.0]) @ camera.K,
+    )
 
 
 def leftwards(T_world_camera: F64) -> F64:
@@ -115,7 +141,8 @@ def leftwards(T_world_camera: F64) -> F64:
 
 
 def beside(path: F64, T_world_rig: F64, T_world_camera: F64) -> float:
-    """Return how far a rig stands beside the recorded path ``(N, 2+)``, metres along the camera's left.
+    """Return how far a rig stands beside the recorded path ``(N, 2+)``, metres along the camera's
+    left.
 
     Example:
         >>> ahead = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -127,7 +154,9 @@ def beside(path: F64, T_world_rig: F64, T_world_camera: F64) -> float:
 
 
 def line_pixels(drawn: U8) -> Bool:
-    """Return the pixels ``(H, W)`` of a drawn map that are paint: white or yellow, however faded."""
+    """Return the pixels ``(H, W)`` of a drawn map that are paint: white or yellow, however
+    faded.
+    """
     red, green, blue = (drawn[..., c].astype(np.int16) for c in range(3))
     top = np.maximum(np.maximum(red, green), blue)
     both = (top >= 60) & (red * 10 >= top * 9) & (green * 10 >= top * 9)
@@ -135,7 +164,9 @@ def line_pixels(drawn: U8) -> Bool:
 
 
 def top_hat(rgb: U8) -> U8:
-    """Return how much brighter ``(H, W)`` each pixel is than what lies on both sides of it in its row."""
+    """Return how much brighter ``(H, W)`` each pixel is than what lies on both sides of it in its
+    row.
+    """
     side = max(5, int(rgb.shape[1] * PAINT_SHARE) | 1)
     bright = np.ascontiguousarray(rgb[..., :2].max(axis=2))  # white and yellow paint alike
     return np.asarray(cv2.morphologyEx(bright, cv2.MORPH_TOPHAT, np.ones((1, side), np.uint8)))
@@ -150,7 +181,8 @@ def pieces_of(lines: Bool) -> Pieces:
 
 
 def agreement(pieces: Pieces, paint: U8) -> float | None:
-    """Return how often a piece of a line is brighter than a piece beside it, 0 to 1; ties count half. None: too few pieces.
+    """Return how often a piece of a line is brighter than a piece beside it, 0 to 1; ties count
+    half. None: too few pieces.
 
     Example:
         >>> paint = np.zeros((60, 90), np.uint8)

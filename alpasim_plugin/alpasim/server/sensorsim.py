@@ -1,4 +1,6 @@
-"""AlpaSim's renderer service, ``SensorsimService``: every call of it, over our renderer or over an upstream's."""
+"""AlpaSim's renderer service, ``SensorsimService``: every call of it, over our renderer or over an
+upstream's.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ DOING = "serving AlpaSim's renderer service"
 SCAN_PX = 900, 604  # of a picture of a quarter of the horizon: 0.13 degrees a pixel in its middle
 SCAN_MOST_M = 200.0
 ONE_SURFACE = 0.05  # neighbouring depths that differ by a smaller share are of one surface,
-EVEN_STEP = 1.5  # as are those whose step is at most so many times the smaller one beside it: a plane far away has even steps
+# as are those whose step is at most so many times the smaller one beside it: a plane far away has
+# even steps
+EVEN_STEP = 1.5
 T = TypeVar("T")
 
 
@@ -35,7 +39,8 @@ class Sensorsim(Failures):
         version: Returns the triple to report, given the upstream's.
         scenes: The scenes; None: all questions about scenes go to the upstream.
         upstream: Stub of the upstream's service; None: there is none.
-        verbatim: Hand every call on as it came, without a fixer in between: images come back bit by bit.
+        verbatim: Hand every call on as it came, without a fixer in between: images come back bit by
+            bit.
     """
 
     def __init__(
@@ -47,10 +52,18 @@ class Sensorsim(Failures):
         verbatim: bool = False,
     ) -> None:
         super().__init__()
-        self.frames, self._version, self._scenes, self._upstream, self._verbatim = frames, version, scenes, upstream, verbatim
+        self.frames, self._version, self._scenes, self._upstream, self._verbatim = (
+            frames,
+            version,
+            scenes,
+            upstream,
+            verbatim,
+        )
 
     @answering
-    def render_rgb(self, request: sensorsim_pb2.RGBRenderRequest, context: Any) -> sensorsim_pb2.RGBRenderReturn:
+    def render_rgb(
+        self, request: sensorsim_pb2.RGBRenderRequest, context: Any
+    ) -> sensorsim_pb2.RGBRenderReturn:
         """Render one frame."""
         left = CallTime(context)
         if self._verbatim:
@@ -58,94 +71,156 @@ class Sensorsim(Failures):
         return sensorsim_pb2.RGBRenderReturn(image_bytes=self.frames.answers([request], left)[0])
 
     @answering
-    def batch_render_rgb(self, request: sensorsim_pb2.BatchRGBRenderRequest, context: Any) -> sensorsim_pb2.BatchRGBRenderReturn:
+    def batch_render_rgb(
+        self, request: sensorsim_pb2.BatchRGBRenderRequest, context: Any
+    ) -> sensorsim_pb2.BatchRGBRenderReturn:
         """Render one frame of several cameras: one item each, under the names of the request."""
         left = CallTime(context)
         names = [item.camera_name for item in request.items]
         if len(set(names)) < len(names):
-            raise InputError(DOING, f"a batch of {names}", "a camera name twice", "send one item a camera")
+            raise InputError(
+                DOING, f"a batch of {names}", "a camera name twice", "send one item a camera"
+            )
         if self._verbatim:
-            return self._pass("batch_render_rgb", request, context, sensorsim_pb2.BatchRGBRenderReturn)
+            return self._pass(
+                "batch_render_rgb", request, context, sensorsim_pb2.BatchRGBRenderReturn
+            )
         images = self.frames.answers([item.request for item in request.items], left)
         item, result = sensorsim_pb2.BatchRGBRenderReturnItem, sensorsim_pb2.RGBRenderReturn
-        made = [item(camera_name=n, result=result(image_bytes=i), success=True) for n, i in zip(names, images, strict=True)]
+        made = [
+            item(camera_name=n, result=result(image_bytes=i), success=True)
+            for n, i in zip(names, images, strict=True)
+        ]
         return sensorsim_pb2.BatchRGBRenderReturn(items=made)
 
     @answering
-    def render_aggregated(self, request: sensorsim_pb2.AggregatedRenderRequest, context: Any) -> sensorsim_pb2.AggregatedRenderReturn:
-        """Render frames and lidar spins together; over an upstream lidar and its data for the driver are handed on."""
+    def render_aggregated(
+        self, request: sensorsim_pb2.AggregatedRenderRequest, context: Any
+    ) -> sensorsim_pb2.AggregatedRenderReturn:
+        """Render frames and lidar spins together; over an upstream lidar and its data for the
+        driver are handed on.
+        """
         left = CallTime(context)
         if self._verbatim:
-            return self._pass("render_aggregated", request, context, sensorsim_pb2.AggregatedRenderReturn)
+            return self._pass(
+                "render_aggregated", request, context, sensorsim_pb2.AggregatedRenderReturn
+            )
         if self._upstream is None:
             scans = [self._scan(one, left) for one in request.lidar_requests]
-            return sensorsim_pb2.AggregatedRenderReturn(rgb_returns=self._returns(request, left), lidar_returns=scans)
-        reply = self._pass("render_aggregated", request, context, sensorsim_pb2.AggregatedRenderReturn)
+            return sensorsim_pb2.AggregatedRenderReturn(
+                rgb_returns=self._returns(request, left), lidar_returns=scans
+            )
+        reply = self._pass(
+            "render_aggregated", request, context, sensorsim_pb2.AggregatedRenderReturn
+        )
         if request.rgb_requests:
             del reply.rgb_returns[:]
             reply.rgb_returns.extend(self._returns(request, left))
         return reply
 
-    def _returns(self, request: sensorsim_pb2.AggregatedRenderRequest, left: CallTime) -> list[sensorsim_pb2.RGBRenderReturn]:
-        return [sensorsim_pb2.RGBRenderReturn(image_bytes=i) for i in self.frames.answers(list(request.rgb_requests), left)]
+    def _returns(
+        self, request: sensorsim_pb2.AggregatedRenderRequest, left: CallTime
+    ) -> list[sensorsim_pb2.RGBRenderReturn]:
+        return [
+            sensorsim_pb2.RGBRenderReturn(image_bytes=i)
+            for i in self.frames.answers(list(request.rgb_requests), left)
+        ]
 
     @answering
-    def render_lidar(self, request: sensorsim_pb2.LidarRenderRequest, context: Any) -> sensorsim_pb2.LidarRenderReturn:
+    def render_lidar(
+        self, request: sensorsim_pb2.LidarRenderRequest, context: Any
+    ) -> sensorsim_pb2.LidarRenderReturn:
         """Return a lidar's points: from the depth of our renderer, or as the upstream answers."""
         if self._upstream is None:
             return self._scan(request, CallTime(context))
         return self._pass("render_lidar", request, context, sensorsim_pb2.LidarRenderReturn)
 
-    def _scan(self, request: sensorsim_pb2.LidarRenderRequest, left: CallTime) -> sensorsim_pb2.LidarRenderReturn:
-        if request.lidar_config.lidar_type not in LIDARS or not isinstance(self.frames.source, LocalSource):
+    def _scan(
+        self, request: sensorsim_pb2.LidarRenderRequest, left: CallTime
+    ) -> sensorsim_pb2.LidarRenderReturn:
+        if request.lidar_config.lidar_type not in LIDARS or not isinstance(
+            self.frames.source, LocalSource
+        ):
             raise NotHere(f"lidar of type {request.lidar_config.lidar_type}")
         lidar = LIDARS[request.lidar_config.lidar_type]
         cameras = lidar.cameras()
         view = read_view(
             sensorsim_pb2.RGBRenderRequest(
-                scene_id=request.scene_id, resolution_w=SCAN_PX[0], resolution_h=SCAN_PX[1], frame_start_us=request.frame_start_us,
-                frame_end_us=request.frame_end_us, sensor_pose=request.sensor_pose, dynamic_objects=request.dynamic_objects,
+                scene_id=request.scene_id,
+                resolution_w=SCAN_PX[0],
+                resolution_h=SCAN_PX[1],
+                frame_start_us=request.frame_start_us,
+                frame_end_us=request.frame_end_us,
+                sensor_pose=request.sensor_pose,
+                dynamic_objects=request.dynamic_objects,
             )
-        )  # fmt: skip
+        )
         frames = self.frames.source.scan(view, cameras, left)
         depths = [frame.depth for frame in frames if frame.depth is not None]
         if len(depths) < len(frames):
             raise NotHere("lidar of a renderer without depth")
         xyz, brightness = points_of(lidar.rays(), cameras, depths, [frame.rgb for frame in frames])
         return sensorsim_pb2.LidarRenderReturn(
-            num_points=len(xyz), point_xyzs_buffer=xyz.astype("<f4").tobytes(), point_intensities_buffer=brightness.astype("<f4").tobytes()
+            num_points=len(xyz),
+            point_xyzs_buffer=xyz.astype("<f4").tobytes(),
+            point_intensities_buffer=brightness.astype("<f4").tobytes(),
         )
 
     @answering
     def get_version(self, request: common_pb2.Empty, context: Any) -> common_pb2.VersionId:
         """Return the triple."""
-        return self._version(None if self._upstream is None else self._pass("get_version", request, context, common_pb2.VersionId))
+        return self._version(
+            None
+            if self._upstream is None
+            else self._pass("get_version", request, context, common_pb2.VersionId)
+        )
 
     @answering
-    def get_available_scenes(self, request: common_pb2.Empty, context: Any) -> common_pb2.AvailableScenesReturn:
-        """Return the scene ids: those of ``--scenes``, and only those that the upstream has as well."""
+    def get_available_scenes(
+        self, request: common_pb2.Empty, context: Any
+    ) -> common_pb2.AvailableScenesReturn:
+        """Return the scene ids: those of ``--scenes``, and only those that the upstream has as
+        well.
+        """
         if self._upstream is None:
             assert self._scenes is not None
             return common_pb2.AvailableScenesReturn(scene_ids=self._scenes.ids)
-        theirs = self._pass("get_available_scenes", request, context, common_pb2.AvailableScenesReturn)
+        theirs = self._pass(
+            "get_available_scenes", request, context, common_pb2.AvailableScenesReturn
+        )
         if self._scenes is None or self._verbatim:
             return theirs
         known = set(theirs.scene_ids)
-        return common_pb2.AvailableScenesReturn(scene_ids=[i for i in self._scenes.ids if i in known or "*" in known])
+        return common_pb2.AvailableScenesReturn(
+            scene_ids=[i for i in self._scenes.ids if i in known or "*" in known]
+        )
 
     @answering
-    def get_loaded_scenes(self, request: common_pb2.Empty, context: Any) -> sensorsim_pb2.LoadedScenesReturn:
+    def get_loaded_scenes(
+        self, request: common_pb2.Empty, context: Any
+    ) -> sensorsim_pb2.LoadedScenesReturn:
         """Return the scenes in memory; each serves any number of rollouts."""
         if self._upstream is not None:
-            return self._pass("get_loaded_scenes", request, context, sensorsim_pb2.LoadedScenesReturn)
+            return self._pass(
+                "get_loaded_scenes", request, context, sensorsim_pb2.LoadedScenesReturn
+            )
         assert self._scenes is not None
         entry = sensorsim_pb2.LoadedSceneEntry
-        scenes = [entry(scene_id=name, loaded_instance_count=1, reusable_instance_count=1) for name in self._scenes.loaded]
-        return sensorsim_pb2.LoadedScenesReturn(scenes=scenes, loaded_instance_capacity=self._scenes.kept)
+        scenes = [
+            entry(scene_id=name, loaded_instance_count=1, reusable_instance_count=1)
+            for name in self._scenes.loaded
+        ]
+        return sensorsim_pb2.LoadedScenesReturn(
+            scenes=scenes, loaded_instance_capacity=self._scenes.kept
+        )
 
     @answering
-    def prefetch_scene(self, request: sensorsim_pb2.ScenePrefetchRequest, context: Any) -> common_pb2.Empty:
-        """Load and build a scene before its first frame is asked for; the call is forwarded to an upstream that implements it."""
+    def prefetch_scene(
+        self, request: sensorsim_pb2.ScenePrefetchRequest, context: Any
+    ) -> common_pb2.Empty:
+        """Load and build a scene before its first frame is asked for; the call is forwarded to an
+        upstream that implements it.
+        """
         if self._scenes is not None:
             self._scenes.get(request.scene_id, CallTime(context))
         if self._upstream is not None:
@@ -157,10 +232,14 @@ class Sensorsim(Failures):
         return common_pb2.Empty()
 
     @answering
-    def get_available_cameras(self, request: sensorsim_pb2.AvailableCamerasRequest, context: Any) -> sensorsim_pb2.AvailableCamerasReturn:
+    def get_available_cameras(
+        self, request: sensorsim_pb2.AvailableCamerasRequest, context: Any
+    ) -> sensorsim_pb2.AvailableCamerasReturn:
         """Return a scene's cameras."""
         if self._upstream is not None:
-            return self._pass("get_available_cameras", request, context, sensorsim_pb2.AvailableCamerasReturn)
+            return self._pass(
+                "get_available_cameras", request, context, sensorsim_pb2.AvailableCamerasReturn
+            )
         assert self._scenes is not None
         entry = self._scenes.get(request.scene_id, CallTime(context))
         return sensorsim_pb2.AvailableCamerasReturn(available_cameras=advertised(entry.scenario))
@@ -171,18 +250,29 @@ class Sensorsim(Failures):
     ) -> sensorsim_pb2.AvailableTrajectoriesReturn:
         """Return a scene's recorded ego path, local to rig."""
         if self._upstream is not None:
-            return self._pass("get_available_trajectories", request, context, sensorsim_pb2.AvailableTrajectoriesReturn)
+            return self._pass(
+                "get_available_trajectories",
+                request,
+                context,
+                sensorsim_pb2.AvailableTrajectoriesReturn,
+            )
         assert self._scenes is not None
         entry = self._scenes.get(request.scene_id, CallTime(context))
-        recorded = wire_trajectory(entry.scenario.ego_log, f"recorded path of scene {request.scene_id!r}")
+        recorded = wire_trajectory(
+            entry.scenario.ego_log, f"recorded path of scene {request.scene_id!r}"
+        )
         listed = sensorsim_pb2.AvailableTrajectoriesReturn.AvailableTrajectory(trajectory=recorded)
         return sensorsim_pb2.AvailableTrajectoriesReturn(available_trajectories=[listed])
 
     @answering
-    def get_available_ego_masks(self, request: common_pb2.Empty, context: Any) -> sensorsim_pb2.AvailableEgoMasksReturn:
+    def get_available_ego_masks(
+        self, request: common_pb2.Empty, context: Any
+    ) -> sensorsim_pb2.AvailableEgoMasksReturn:
         """Return the ego masks: the upstream's; our own renderer shows no part of the ego."""
         if self._upstream is not None:
-            return self._pass("get_available_ego_masks", request, context, sensorsim_pb2.AvailableEgoMasksReturn)
+            return self._pass(
+                "get_available_ego_masks", request, context, sensorsim_pb2.AvailableEgoMasksReturn
+            )
         return sensorsim_pb2.AvailableEgoMasksReturn()
 
     def _pass(self, name: str, request: Any, context: Any, reply: type[T]) -> T:
@@ -195,7 +285,8 @@ class Sensorsim(Failures):
 
 @dataclass(frozen=True)
 class Lidar:
-    """Where a lidar looks: every row at every azimuth. Rows are those of the data sheet as far as it is even, not a device's calibration.
+    """Where a lidar looks: every row at every azimuth. Rows are those of the data sheet as far as
+    it is even, not a device's calibration.
 
     Attributes:
         rows_deg: Elevations.
@@ -209,7 +300,10 @@ class Lidar:
 
     def rays(self) -> F64:
         """Return directions ``(N, 3)``: x forwards, y left, z up."""
-        up, left = (np.deg2rad(one).ravel() for one in np.meshgrid(self.rows_deg, self.azimuths_deg, indexing="ij"))
+        up, left = (
+            np.deg2rad(one).ravel()
+            for one in np.meshgrid(self.rows_deg, self.azimuths_deg, indexing="ij")
+        )
         return np.stack([np.cos(up) * np.cos(left), np.cos(up) * np.sin(left), np.sin(up)], axis=1)
 
     def cameras(self) -> list[CameraSpec]:
@@ -218,7 +312,9 @@ class Lidar:
         K = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1.0]])
         out: list[CameraSpec] = []
         for look in np.deg2rad(self.looks_deg):
-            T, c, s = np.eye(4), np.cos(look), np.sin(look)
+            T = np.eye(4)
+            c = np.cos(look)
+            s = np.sin(look)
             T[:3, :3] = np.array([[s, 0, c], [-c, 0, s], [0, -1, 0]])
             out.append(CameraSpec(f"scan{len(out)}", width, height, K, T))
         return out
@@ -230,15 +326,21 @@ LIDARS = {
         np.arange(-180, 180, 0.2),
         (0.0, 90.0, 180.0, 270.0),
     ),
-    sensorsim_pb2.AT128: Lidar(np.linspace(-12.5, 12.9, 128), np.arange(-60, 60, 0.1), (-30.0, 30.0)),
+    sensorsim_pb2.AT128: Lidar(
+        np.linspace(-12.5, 12.9, 128), np.arange(-60, 60, 0.1), (-30.0, 30.0)
+    ),
 }
 
 
-def points_of(rays: F64, cameras: Sequence[CameraSpec], depths: Sequence[F32], pictures: Sequence[U8]) -> tuple[F64, F64]:
-    """Return where rays meet the surfaces of depth pictures, ``(P, 3)`` metres in the sensor's frame, and how bright it is there ``(P,)``.
+def points_of(
+    rays: F64, cameras: Sequence[CameraSpec], depths: Sequence[F32], pictures: Sequence[U8]
+) -> tuple[F64, F64]:
+    """Return where rays meet the surfaces of depth pictures, ``(P, 3)`` metres in the sensor's
+    frame, and how bright it is there ``(P,)``.
 
-    Inverse depth is linear in a picture of a plane, so it is interpolated between the four pixels around a ray where they are of one
-    surface; elsewhere the nearest pixel counts. Rays without a surface, or beyond `SCAN_MOST_M`, give no point.
+    Inverse depth is linear in a picture of a plane, so it is interpolated between the four pixels
+    around a ray where they are of one surface; elsewhere the nearest pixel counts. Rays without a
+    surface, or beyond `SCAN_MOST_M`, give no point.
 
     Args:
         rays: ``(N, 3)`` of length 1.
@@ -252,12 +354,19 @@ def points_of(rays: F64, cameras: Sequence[CameraSpec], depths: Sequence[F32], p
     for index, (camera, depth, picture) in enumerate(zip(cameras, depths, pictures, strict=True)):
         mine = rays[nearest == index]
         p = mine @ camera.T_rig_camera[:3, :3]
-        u, v = (camera.K[i, i] * p[:, i] / p[:, 2] + camera.K[i, 2] - 0.5 for i in (0, 1))  # pixel centres lie at halves
-        column, row = (np.clip(np.floor(x).astype(np.int64), 0, n - 2) for x, n in ((u, camera.width), (v, camera.height)))
+        u, v = (
+            camera.K[i, i] * p[:, i] / p[:, 2] + camera.K[i, 2] - 0.5 for i in (0, 1)
+        )  # pixel centres lie at halves
+        column, row = (
+            np.clip(np.floor(x).astype(np.int64), 0, n - 2)
+            for x, n in ((u, camera.width), (v, camera.height))
+        )
         a, b = np.clip(u - column, 0, 1), np.clip(v - row, 0, 1)
         inverse = np.divide(1.0, depth, out=np.full(depth.shape, np.nan), where=depth > 0)
         down, right = _is_one_surface(inverse), _is_one_surface(inverse.T).T
-        smooth = down[row, column] & down[row, column + 1] & right[row, column] & right[row + 1, column]
+        smooth = (
+            down[row, column] & down[row, column + 1] & right[row, column] & right[row + 1, column]
+        )
         around = np.stack([inverse[row + i, column + j] for i in (0, 1) for j in (0, 1)])
         weights = np.stack([(1 - b) * (1 - a), (1 - b) * a, b * (1 - a), b * a])
         single = np.take_along_axis(around, weights.argmax(axis=0)[None], axis=0)[0]
@@ -270,7 +379,9 @@ def points_of(rays: F64, cameras: Sequence[CameraSpec], depths: Sequence[F32], p
 
 
 def _is_one_surface(inverse: F64) -> Bool:
-    """Tell ``(H - 1, W)`` which neighbours down a picture of inverse depth are of one surface: alike, or in even steps."""
+    """Tell ``(H - 1, W)`` which neighbours down a picture of inverse depth are of one surface:
+    alike, or in even steps.
+    """
     step = np.abs(np.diff(inverse, axis=0))
     beside = np.pad(step, ((1, 1), (0, 0)), constant_values=np.nan)
     alike = step <= ONE_SURFACE * np.fmax(inverse[1:], inverse[:-1])

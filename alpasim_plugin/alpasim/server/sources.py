@@ -1,9 +1,11 @@
-"""Where frames come from before they are fixed: our own renderer, or any server of AlpaSim's renderer service.
+"""Where frames come from before they are fixed: our own renderer, or any server of AlpaSim's
+renderer service.
 
-An upstream's images come without opacity, which the fixer reads as trust: from 0.98 on an opaque pixel is kept against a large change
-without support, below 0.9 the generator is free, below 0.5 noise enters. So the estimate of a whole frame falls linearly from 1 to `FAR`
-while the rig moves away from the recorded path, from `NEAR_M` to `FAR_M` (a reconstruction knows what the recording saw), and a mask lowers
-it further where it is dark:
+An upstream's images come without opacity, which the fixer reads as trust: from 0.98 on an opaque
+pixel is kept against a large change without support, below 0.9 the generator is free, below 0.5
+noise enters. So the estimate of a whole frame falls linearly from 1 to `FAR` while the rig moves
+away from the recorded path, from `NEAR_M` to `FAR_M` (a reconstruction knows what the recording
+saw), and a mask lowers it further where it is dark:
 
     opacity(pixel) = min(path(distance), mask(pixel) / 255)
 """
@@ -37,7 +39,10 @@ from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import read_trajectory, read_transform
 from alpasim_plugin.log.wire import sensorsim_pb2
 
-NEAR_M, FAR_M = 0.25, 3.0  # distance from the recorded path where trust begins to fall, and where it has fallen
+NEAR_M, FAR_M = (
+    0.25,
+    3.0,
+)  # distance from the recorded path where trust begins to fall, and where it has fallen
 FAR = 0.6  # above 0.5: a hole is never invented
 ESTIMATING = "estimating the reliability of an upstream's frame"
 DOING = "rendering a requested frame"
@@ -47,7 +52,8 @@ MOST_NAMES = 4096  # scenes and cameras of an upstream that are remembered
 
 
 def path_reliability(path_xy: F64, xy: F64) -> float:
-    """Return the trust in a frame seen from ``xy`` ``(2,)`` beside the recorded path ``(N, 2)``, metres.
+    """Return the trust in a frame seen from ``xy`` ``(2,)`` beside the recorded path ``(N, 2)``,
+    metres.
 
     Example:
         >>> path = np.array([[0.0, 0.0], [100.0, 0.0]])
@@ -65,7 +71,10 @@ def read_masks(named: Mapping[str, Path]) -> dict[str, U8]:
     Raises:
         InputError: A file that is no picture.
     """
-    return {camera: np.asarray(read_image(path, ESTIMATING, flag=cv2.IMREAD_GRAYSCALE)) for camera, path in named.items()}
+    return {
+        camera: np.asarray(read_image(path, ESTIMATING, flag=cv2.IMREAD_GRAYSCALE))
+        for camera, path in named.items()
+    }
 
 
 def trusted_opacity(trust: float, mask: U8 | None, height: int, width: int) -> F32:
@@ -74,7 +83,11 @@ def trusted_opacity(trust: float, mask: U8 | None, height: int, width: int) -> F
         raise InputError(ESTIMATING, "the reliability", f"{trust}", "give a number from 0 to 1")
     out = np.full((height, width), trust, dtype=np.float32)
     if mask is not None:
-        out = np.minimum(out, cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0)
+        out = np.minimum(
+            out,
+            cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+            / 255.0,
+        )
     return out
 
 
@@ -92,12 +105,15 @@ class Rendered:
 class FrameSource(Protocol):
     """Gives frames for requests."""
 
-    def render(self, requests: Sequence[Request], views: Sequence[View], left: CallTime) -> list[Rendered]:
+    def render(
+        self, requests: Sequence[Request], views: Sequence[View], left: CallTime
+    ) -> list[Rendered]:
         """Return one frame a request, in order."""
 
 
 def boxes_at(entry: SceneEntry, view: View) -> dict[str, F64]:
-    """Return every road user's box pose at shutter end: those of the request, and the scene's static ones, which requests leave out.
+    """Return every road user's box pose at shutter end: those of the request, and the scene's
+    static ones, which requests leave out.
 
     Raises:
         InputError: A track that the scene does not have.
@@ -105,17 +121,25 @@ def boxes_at(entry: SceneEntry, view: View) -> dict[str, F64]:
     known = {actor.actor_id: actor for actor in entry.scenario.actors}
     foreign = sorted(set(view.objects) - set(known))
     if foreign:
-        found = f"track {foreign[0]!r}" + (f" and {len(foreign) - 1} more" if len(foreign) > 1 else "")
+        found = f"track {foreign[0]!r}" + (
+            f" and {len(foreign) - 1} more" if len(foreign) > 1 else ""
+        )
         do = "render with the scene file that the runtime uses"
         raise InputError(DOING, f"scene {view.scene_id!r}", f"{found}, not in the scene", do)
     poses = {}
     for actor_id, actor in known.items():
-        if actor.is_static and actor_id not in view.objects and actor.track.t_us[0] <= view.t_us <= actor.track.t_us[-1]:
+        if (
+            actor.is_static
+            and actor_id not in view.objects
+            and actor.track.t_us[0] <= view.t_us <= actor.track.t_us[-1]
+        ):
             poses[actor_id] = interpolate(actor.track, view.t_us)
     return poses | {track: pair[1] for track, pair in view.objects.items()}
 
 
-def asked_of(entry: SceneEntry, request: Request, view: View, camera: CameraSpec, shutter: Shutter) -> RenderRequest:
+def asked_of(
+    entry: SceneEntry, request: Request, view: View, camera: CameraSpec, shutter: Shutter
+) -> RenderRequest:
     """Return what is to be drawn by the pinhole that covers the request's lens.
 
     Raises:
@@ -126,20 +150,37 @@ def asked_of(entry: SceneEntry, request: Request, view: View, camera: CameraSpec
     return RenderRequest(view.t_us, camera, view.T_world_camera, actors, exposure=exposure)
 
 
-def drawn_map(entry: SceneEntry, asked: RenderRequest, lens: Lens, threads: int | None) -> U8 | None:
+def drawn_map(
+    entry: SceneEntry, asked: RenderRequest, lens: Lens, threads: int | None
+) -> U8 | None:
     """Return the semantic map as the lens sees it; None where the fixer takes none."""
     if entry.scene_map is None:
         return None
     out: U8 = np.zeros((asked.camera.height, asked.camera.width, 3), np.uint8)
     for band in bands(asked):
         boxes = actor_boxes(band.actors, entry.scenario.actors)
-        part = draw_map(entry.scene_map, asked.camera, band.T_world_camera, boxes, threads=threads, rows=band.rows)
+        part = draw_map(
+            entry.scene_map,
+            asked.camera,
+            band.T_world_camera,
+            boxes,
+            threads=threads,
+            rows=band.rows,
+        )
         band.put(out, part[:, band.columns])
     return lens.image(out)
 
 
-def gated(rendered: Rendered, entry: SceneEntry, asked: RenderRequest, shown: U8, view: View, threads: int | None) -> Rendered:
-    """Take the map away from a frame that contradicts it, with an event ``map-off`` and a line in the log.
+def gated(
+    rendered: Rendered,
+    entry: SceneEntry,
+    asked: RenderRequest,
+    shown: U8,
+    view: View,
+    threads: int | None,
+) -> Rendered:
+    """Take the map away from a frame that contradicts it, with an event ``map-off`` and a line in
+    the log.
 
     Args:
         rendered: With a map.
@@ -150,14 +191,34 @@ def gated(rendered: Rendered, entry: SceneEntry, asked: RenderRequest, shown: U8
         threads: Of the map rasteriser.
     """
     assert entry.scene_map is not None, "a frame with a map is of a scene with one"
-    T, actors = at_share(asked, 0.5) if asked.exposure is not None else (asked.T_world_camera[1], asked.actors)
+    T, actors = (
+        at_share(asked, 0.5)
+        if asked.exposure is not None
+        else (asked.T_world_camera[1], asked.actors)
+    )
     beside_m = beside(entry.scenario.ego_log.xyz, T @ inverse(mount_of(entry, view)), T)
-    found = contradiction(entry.scene_map, asked.camera, T, actor_boxes(actors, entry.scenario.actors), shown, beside_m, threads)
+    found = contradiction(
+        entry.scene_map,
+        asked.camera,
+        T,
+        actor_boxes(actors, entry.scenario.actors),
+        shown,
+        beside_m,
+        threads,
+    )
     if found is None:
         return rendered
     what = f"scene {view.scene_id!r}, camera {view.camera!r} at {view.t_us} us"
-    found_at = f"{abs(found.aside_m)} m {'left' if found.aside_m > 0 else 'right'} of where the map has it"
-    log.warning("%s: the map is off: paint agrees %.2f with the map and %.2f %s", what, found.here, found.there, found_at)
+    found_at = (
+        f"{abs(found.aside_m)} m {'left' if found.aside_m > 0 else 'right'} of where the map has it"
+    )
+    log.warning(
+        "%s: the map is off: paint agrees %.2f with the map and %.2f %s",
+        what,
+        found.here,
+        found.there,
+        found_at,
+    )
     return Rendered(replace(rendered.frame, events=(*rendered.frame.events, MAP_OFF)), None)
 
 
@@ -171,17 +232,27 @@ class LocalSource:
         shutter: Which shutters roll; see `shutters.exposure_of`.
     """
 
-    def __init__(self, scenes: SceneCache, busy: threading.Lock, threads: int | None = None, shutter: Shutter = "asked") -> None:
+    def __init__(
+        self,
+        scenes: SceneCache,
+        busy: threading.Lock,
+        threads: int | None = None,
+        shutter: Shutter = "asked",
+    ) -> None:
         self._scenes, self._busy, self._threads, self._shutter = scenes, busy, threads, shutter
 
-    def render(self, requests: Sequence[Request], views: Sequence[View], left: CallTime) -> list[Rendered]:
+    def render(
+        self, requests: Sequence[Request], views: Sequence[View], left: CallTime
+    ) -> list[Rendered]:
         """Return one frame a request, in order.
 
         Raises:
             InputError: A lens or a track that cannot be rendered; an unknown scene.
             RendererError: The renderer broke its contract.
         """
-        return [self._render(request, view, left) for request, view in zip(requests, views, strict=True)]
+        return [
+            self._render(request, view, left) for request, view in zip(requests, views, strict=True)
+        ]
 
     def _render(self, request: Request, view: View, left: CallTime) -> Rendered:
         lens = read_lens(request.camera_intrinsics, view.width, view.height)
@@ -193,7 +264,11 @@ class LocalSource:
             left.left_s()  # a caller that has gone meanwhile holds nobody up any longer
             sdmap = drawn_map(entry, asked, lens, self._threads)
         rendered = Rendered(lens.frame(frame), sdmap)
-        return rendered if sdmap is None else gated(rendered, entry, asked, frame.rgb, view, self._threads)
+        return (
+            rendered
+            if sdmap is None
+            else gated(rendered, entry, asked, frame.rgb, view, self._threads)
+        )
 
     def scan(self, view: View, cameras: Sequence[CameraSpec], left: CallTime) -> list[Frame]:
         """Return frames with depth of several cameras at the view's place, at its shutter end.
@@ -211,7 +286,13 @@ class LocalSource:
         boxes, out = boxes_at(entry, view), []
         for camera in cameras:
             with left.holding(self._busy):
-                out.append(entry.render(RenderRequest(view.t_us, camera, view.T_world_camera @ camera.T_rig_camera, boxes)))
+                out.append(
+                    entry.render(
+                        RenderRequest(
+                            view.t_us, camera, view.T_world_camera @ camera.T_rig_camera, boxes
+                        )
+                    )
+                )
             left.left_s()
         return out
 
@@ -221,10 +302,13 @@ class UpstreamSource:
 
     Args:
         stub: Of ``SensorsimService`` at the upstream.
-        scenes: Scenes for maps and recorded paths; None: no map, and the path is asked of the upstream.
-        trust: A fixed reliability from 0 to 1; None: from the distance to the recorded path (`reliability`).
+        scenes: Scenes for maps and recorded paths; None: no map, and the path is asked of the
+            upstream.
+        trust: A fixed reliability from 0 to 1; None: from the distance to the recorded path
+            (`reliability`).
         masks: Grey masks by camera.
-        as_png: Ask for PNG whatever the caller asked for, so that the picture is not compressed twice.
+        as_png: Ask for PNG whatever the caller asked for, so that the picture is not compressed
+            twice.
         threads: Threads of the map rasteriser.
         shutter: Which shutters roll, for the map; see `shutters.exposure_of`.
     """
@@ -245,7 +329,9 @@ class UpstreamSource:
         self._paths: dict[str, F64] = {}
         self._mounts: dict[tuple[str, str], F64] = {}
 
-    def render(self, requests: Sequence[Request], views: Sequence[View], left: CallTime) -> list[Rendered]:
+    def render(
+        self, requests: Sequence[Request], views: Sequence[View], left: CallTime
+    ) -> list[Rendered]:
         """Return one frame a request, in order.
 
         Raises:
@@ -254,9 +340,14 @@ class UpstreamSource:
             InputError: An unknown scene, or no recorded path to estimate the reliability from.
         """
         cameras = [view.camera for view in views]
-        names = cameras if len(set(cameras)) == len(cameras) else [str(i) for i in range(len(cameras))]
+        names = (
+            cameras if len(set(cameras)) == len(cameras) else [str(i) for i in range(len(cameras))]
+        )
         images = self._images([self._asked(request) for request in requests], names, left)
-        return [self._rendered(request, view, data, left) for request, view, data in zip(requests, views, images, strict=True)]
+        return [
+            self._rendered(request, view, data, left)
+            for request, view, data in zip(requests, views, images, strict=True)
+        ]
 
     def _asked(self, request: Request) -> Request:
         if not self._as_png:
@@ -266,7 +357,9 @@ class UpstreamSource:
         asked.image_format = sensorsim_pb2.PNG
         return asked
 
-    def _images(self, requests: Sequence[Request], names: Sequence[str], left: CallTime) -> list[bytes]:
+    def _images(
+        self, requests: Sequence[Request], names: Sequence[str], left: CallTime
+    ) -> list[bytes]:
         if len(requests) > 1 and self._has_batch:
             item = sensorsim_pb2.BatchRGBRenderRequestItem
             batch = sensorsim_pb2.BatchRGBRenderRequest(
@@ -280,24 +373,41 @@ class UpstreamSource:
                 self._has_batch = False  # older servers have render_rgb alone
             else:
                 return batch_images(reply, names)
-        return [self._stub.render_rgb(request, timeout=left.left_s()).image_bytes for request in requests]
+        return [
+            self._stub.render_rgb(request, timeout=left.left_s()).image_bytes
+            for request in requests
+        ]
 
     def _rendered(self, request: Request, view: View, data: bytes, left: CallTime) -> Rendered:
         rgb = decoded(data, f"scene {view.scene_id!r}, camera {view.camera!r} at {view.t_us} us")
         height, width = rgb.shape[:2]
-        alpha = trusted_opacity(self._trust_in(view, left), self._masks.get(view.camera), height, width)
+        alpha = trusted_opacity(
+            self._trust_in(view, left), self._masks.get(view.camera), height, width
+        )
         rendered = Rendered(Frame(view.t_us, view.camera, rgb, alpha), None)
         if self._scenes is not None:
             entry = self._scenes.get(view.scene_id, left)
             seen = Request(camera_intrinsics=without_windshield(request.camera_intrinsics))
-            lens, sized = read_lens(seen.camera_intrinsics, width, height), replace(view, width=width, height=height)
+            lens, sized = (
+                read_lens(seen.camera_intrinsics, width, height),
+                replace(view, width=width, height=height),
+            )
             asked = asked_of(entry, seen, sized, lens.spec(view.camera, np.eye(4)), self._shutter)
             sdmap = drawn_map(entry, asked, lens, self._threads)
             if sdmap is not None:
                 straight = straight_of(seen.camera_intrinsics, width, height)
-                camera = CameraSpec(view.camera, *straight.size, straight.K, asked.camera.T_rig_camera)
+                camera = CameraSpec(
+                    view.camera, *straight.size, straight.K, asked.camera.T_rig_camera
+                )
                 shown = straight.image(rgb)
-                rendered = gated(replace(rendered, sdmap=sdmap), entry, replace(asked, camera=camera), shown, view, self._threads)
+                rendered = gated(
+                    replace(rendered, sdmap=sdmap),
+                    entry,
+                    replace(asked, camera=camera),
+                    shown,
+                    view,
+                    self._threads,
+                )
         return rendered
 
     def _trust_in(self, view: View, left: CallTime) -> float:
@@ -313,11 +423,20 @@ class UpstreamSource:
                 path = self._scenes.get(view.scene_id, left).scenario.ego_log.xyz
             else:
                 asked = sensorsim_pb2.AvailableTrajectoriesRequest(scene_id=view.scene_id)
-                listed = self._stub.get_available_trajectories(asked, timeout=left.left_s()).available_trajectories
+                listed = self._stub.get_available_trajectories(
+                    asked, timeout=left.left_s()
+                ).available_trajectories
                 if not listed or len(listed[0].trajectory.poses) < 2:
                     do = "give --scenes with the scene's file, or a fixed --reliability"
-                    raise InputError(ESTIMATING, f"scene {view.scene_id!r}", "the upstream lists no recorded path", do)
-                path = read_trajectory(listed[0].trajectory, f"recorded path of scene {view.scene_id!r}").xyz
+                    raise InputError(
+                        ESTIMATING,
+                        f"scene {view.scene_id!r}",
+                        "the upstream lists no recorded path",
+                        do,
+                    )
+                path = read_trajectory(
+                    listed[0].trajectory, f"recorded path of scene {view.scene_id!r}"
+                ).xyz
             self._paths[view.scene_id] = path[:, :2]
         return self._paths[view.scene_id]
 
@@ -326,9 +445,15 @@ class UpstreamSource:
         if key not in self._mounts:
             forget_if_many(self._mounts)
             asked = sensorsim_pb2.AvailableCamerasRequest(scene_id=view.scene_id)
-            for camera in self._stub.get_available_cameras(asked, timeout=left.left_s()).available_cameras:
-                self._mounts[view.scene_id, camera.logical_id] = read_transform(camera.rig_to_camera, f"mount of {camera.logical_id!r}")
-            self._mounts.setdefault(key, np.eye(4))  # a camera of the runtime's own: its place counts instead of the rig's
+            for camera in self._stub.get_available_cameras(
+                asked, timeout=left.left_s()
+            ).available_cameras:
+                self._mounts[view.scene_id, camera.logical_id] = read_transform(
+                    camera.rig_to_camera, f"mount of {camera.logical_id!r}"
+                )
+            self._mounts.setdefault(
+                key, np.eye(4)
+            )  # a camera of the runtime's own: its place counts instead of the rig's
         return self._mounts[key]
 
 
@@ -339,7 +464,9 @@ def forget_if_many(known: dict[Any, Any]) -> None:
 
 
 def mount_of(entry: SceneEntry, view: View) -> F64:
-    """Return the mounting of a scene's camera of that name, else of its first: renderers that follow the recorded path want the rig."""
+    """Return the mounting of a scene's camera of that name, else of its first: renderers that
+    follow the recorded path want the rig.
+    """
     cameras = {camera.name: camera for camera in entry.scenario.cameras}
     return cameras.get(view.camera, entry.scenario.cameras[0]).T_rig_camera
 
@@ -351,7 +478,11 @@ def batch_images(reply: sensorsim_pb2.BatchRGBRenderReturn, names: Sequence[str]
         UpstreamFault: A picture is missing, there twice, or marked as failed.
     """
     found = {item.camera_name: item for item in reply.items}
-    bad = [item.error_message or f"item {item.camera_name!r} has success = false" for item in reply.items if not item.success]
+    bad = [
+        item.error_message or f"item {item.camera_name!r} has success = false"
+        for item in reply.items
+        if not item.success
+    ]
     if bad or len(reply.items) != len(names) or set(found) != set(names):
         what = bad[0] if bad else f"{len(reply.items)} items for {len(names)}"
         raise UpstreamFault(DOING, "the upstream's batch", what, "see the upstream's log")
@@ -364,13 +495,24 @@ def decoded(data: bytes, what: str) -> U8:
     Raises:
         UpstreamFault: It is not whole.
     """
-    whole = data.rstrip(b"\0").endswith(b"\xff\xd9") if data[:2] == b"\xff\xd8" else b"IEND" in data[-16:]
+    whole = (
+        data.rstrip(b"\0").endswith(b"\xff\xd9")
+        if data[:2] == b"\xff\xd8"
+        else b"IEND" in data[-16:]
+    )
     try:
         if not whole:
-            raise InputError(DOING, what, f"{len(data)} bytes that are no whole PNG or JPEG", "see the upstream's log")
+            raise InputError(
+                DOING,
+                what,
+                f"{len(data)} bytes that are no whole PNG or JPEG",
+                "see the upstream's log",
+            )
         return decode_image(data, what)
     except SimrunError as error:
-        raise UpstreamFault(DOING, what, f"the upstream's picture: {error.found}", "see the upstream's log") from error
+        raise UpstreamFault(
+            DOING, what, f"the upstream's picture: {error.found}", "see the upstream's log"
+        ) from error
 
 
 def without_windshield(spec: sensorsim_pb2.CameraSpec) -> sensorsim_pb2.CameraSpec:

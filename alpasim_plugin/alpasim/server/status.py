@@ -1,7 +1,8 @@
 """Errors as gRPC statuses that AlpaSim's runtime treats rightly, and the time a call has left.
 
-The runtime retries a render on UNAVAILABLE, and on a text with "Stopped waiting for backend"; anything else fails the rollout. So what
-may pass (an upstream that is away, busy, or sent a broken picture) is UNAVAILABLE, and what would fail again is not.
+The runtime retries a render on UNAVAILABLE, and on a text with "Stopped waiting for backend";
+anything else fails the rollout. So what may pass (an upstream that is away, busy, or sent a broken
+picture) is UNAVAILABLE, and what would fail again is not.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from alpasim_plugin.log.wire.services import is_lost_connection
 
 Code = grpc.StatusCode
 BACKEND = "Stopped waiting for backend"
-#: Statuses of an upstream that a second attempt may not meet again, beside those of a lost connection.
+#: Statuses of an upstream that a second attempt may not meet again, beside those of a lost
+#: connection.
 PASSING = (Code.RESOURCE_EXHAUSTED, Code.ABORTED, Code.DEADLINE_EXCEEDED)
 log = logging.getLogger("simrun.serve")
 POLL_S = 0.1
@@ -95,7 +97,9 @@ def status_of(error: Exception) -> tuple[Any, str]:
         code, text = error.code(), error.details() or ""
         if BACKEND in text:
             return code, text
-        return (Code.UNAVAILABLE if code in PASSING or is_lost_connection(error) else code), f"upstream: {code.name}: {text}"
+        return (
+            Code.UNAVAILABLE if code in PASSING or is_lost_connection(error) else code
+        ), f"upstream: {code.name}: {text}"
     if isinstance(error, Late):
         return Code.CANCELLED, str(error)
     if isinstance(error, UnknownScene):
@@ -117,7 +121,9 @@ def one_line(error: SimrunError) -> str:
 
 
 def answering(call: Callable[[Any, Any, Any], Any]) -> Callable[[Any, Any, Any], Any]:
-    """Make a service's method answer errors as statuses; every one is handed to the service's ``failed``."""
+    """Make a service's method answer errors as statuses; every one is handed to the service's
+    ``failed``.
+    """
 
     @wraps(call)
     def answer(self: Any, request: Any, context: Any) -> Any:

@@ -1,11 +1,14 @@
-"""AlpaSim's video-model service, ``WorldModelService``: whole chunks of frames, by the renderer and the fixer of `simrun serve`.
+"""AlpaSim's video-model service, ``WorldModelService``: whole chunks of frames, by the renderer and
+the fixer of `simrun serve`.
 
-A session receives the map and the cameras, then for each chunk the rig's poses and the road users. The scene is found by the clip's id in
-the names of the map's tables; our renderer draws it, and the fixer goes over the frames one after another, so that chunks of any length
-give the same frames. The first chunk has 5 frames (1 + 4 k), every later one 8 (4 k): one frame for each pose.
+A session receives the map and the cameras, then for each chunk the rig's poses and the road users.
+The scene is found by the clip's id in the names of the map's tables; our renderer draws it, and the
+fixer goes over the frames one after another, so that chunks of any length give the same frames. The
+first chunk has 5 frames (1 + 4 k), every later one 8 (4 k): one frame for each pose.
 
-Extrinsics are in sensor axes here (x forward, y left, z up), unlike in the renderer service. The recorded first frame and the prompts are
-checked and not used: what is drawn is the scene of the renderer, not a continuation of the recording.
+Extrinsics are in sensor axes here (x forward, y left, z up), unlike in the renderer service. The
+recorded first frame and the prompts are checked and not used: what is drawn is the scene of the
+renderer, not a continuation of the recording.
 """
 
 from __future__ import annotations
@@ -36,7 +39,9 @@ from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.log.wire import common_pb2, video_model_pb2
 
 DOING = "serving AlpaSim's video-model service"
-FLU_FROM_CAMERA = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+FLU_FROM_CAMERA = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
 SAME_SIZE_M = 2e-3  # sizes of boxes come in float32
 MAX_FRAMES, MAX_MEMBERS = 64, 256
 
@@ -89,7 +94,13 @@ class WorldModel(Failures):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__()
-        self._scenes, self._fixers, self._busy, self._version, self._threads = scenes, fixers, busy, version, threads
+        self._scenes, self._fixers, self._busy, self._version, self._threads = (
+            scenes,
+            fixers,
+            busy,
+            version,
+            threads,
+        )
         self.sessions: Sessions[Session] = Sessions(expiry_s, clock=clock)
 
     @answering
@@ -98,23 +109,39 @@ class WorldModel(Failures):
         return self._version
 
     @answering
-    def start_session(self, request: video_model_pb2.SessionRequest, context: Any) -> video_model_pb2.SessionId:
-        """Begin a rollout; a seed of 0 is a seed like any other, so that the same session gives the same frames."""
-        specs, mounts, frames = request.camera_specs, request.rig_to_camera, request.initial_frames
+    def start_session(
+        self, request: video_model_pb2.SessionRequest, context: Any
+    ) -> video_model_pb2.SessionId:
+        """Begin a rollout; a seed of 0 is a seed like any other, so that the same session gives the
+        same frames.
+        """
+        specs = request.camera_specs
+        mounts = request.rig_to_camera
+        frames = request.initial_frames
         if not specs or not len(specs) == len(mounts) == len(frames):
             found = f"{len(specs)} camera_specs, {len(mounts)} rig_to_camera, {len(frames)} initial_frames"
             raise InputError(DOING, "a session request", found, "send one of each for every view")
         names = [spec.logical_id for spec in specs]
         if len(set(names)) < len(names):
-            raise InputError(DOING, "a session request", f"cameras {names}", "give every view its own logical_id")
+            raise InputError(
+                DOING, "a session request", f"cameras {names}", "give every view its own logical_id"
+            )
         scene_id = self._scene_of(clip_of(request.static_world_map.hdmap_parquets))
         cameras = []
         for spec, mount, frame in zip(specs, mounts, frames, strict=True):
             what = f"camera {spec.logical_id!r}"
             check_image(frame.data, f"{what}, its initial frame", DOING)
             lens = read_lens(spec, spec.resolution_w, spec.resolution_h)
-            cameras.append((spec.logical_id, lens, lens.spec(spec.logical_id, read_pose(mount, what) @ FLU_FROM_CAMERA)))
-        self._scenes.get(scene_id, CallTime(context))  # built now: a chunk has no deadline, but a rollout waits for it
+            cameras.append(
+                (
+                    spec.logical_id,
+                    lens,
+                    lens.spec(spec.logical_id, read_pose(mount, what) @ FLU_FROM_CAMERA),
+                )
+            )
+        self._scenes.get(
+            scene_id, CallTime(context)
+        )  # built now: a chunk has no deadline, but a rollout waits for it
         session = Session(
             scene_id,
             request.random_seed,
@@ -127,32 +154,47 @@ class WorldModel(Failures):
         return video_model_pb2.SessionId(session_id=name)
 
     @answering
-    def close_session(self, request: video_model_pb2.SessionCloseRequest, context: Any) -> common_pb2.Empty:
+    def close_session(
+        self, request: video_model_pb2.SessionCloseRequest, context: Any
+    ) -> common_pb2.Empty:
         """End a rollout; a session that is unknown or closed is fine."""
         self.sessions.close(request.session_id)
         return common_pb2.Empty()
 
     @answering
-    def render_video_chunk(self, request: video_model_pb2.VideoChunkRequest, context: Any) -> video_model_pb2.VideoChunkReturn:
+    def render_video_chunk(
+        self, request: video_model_pb2.VideoChunkRequest, context: Any
+    ) -> video_model_pb2.VideoChunkReturn:
         """Return one frame for every pose, of every camera."""
         left = CallTime(context)
         session = self.sessions.get(request.session_id.session_id)
         if session is None:
             found = "it is unknown, closed or expired"
-            raise UnknownScene(DOING, f"session {request.session_id.session_id!r}", found, "start a session first")
+            raise UnknownScene(
+                DOING, f"session {request.session_id.session_id!r}", found, "start a session first"
+            )
         with left.holding(session.lock):
             data = request.SerializeToString(deterministic=True)
             if session.last is None or session.last[0] != data:
                 session.last = data, self._chunk(session, request, left)
             return session.last[1]
 
-    def _chunk(self, session: Session, request: video_model_pb2.VideoChunkRequest, left: CallTime) -> video_model_pb2.VideoChunkReturn:
+    def _chunk(
+        self, session: Session, request: video_model_pb2.VideoChunkRequest, left: CallTime
+    ) -> video_model_pb2.VideoChunkReturn:
         poses = request.rig_trajectory.poses
         check_length(len(poses), session.end_us is None)
         times = [pose.timestamp_us for pose in poses]
         before = [*([] if session.end_us is None else [session.end_us]), *times[:-1]]
-        if any(b >= t for b, t in zip(before, times[-len(before) :] if before else [], strict=True)):
-            raise InputError(DOING, f"session of {session.scene_id!r}", f"times {times} after {session.end_us}", "give times that increase")
+        if any(
+            b >= t for b, t in zip(before, times[-len(before) :] if before else [], strict=True)
+        ):
+            raise InputError(
+                DOING,
+                f"session of {session.scene_id!r}",
+                f"times {times} after {session.end_us}",
+                "give times that increase",
+            )
         entry = self._scenes.get(session.scene_id, left)
         rig = [read_pose(pose.pose, f"rig pose at {pose.timestamp_us} us") for pose in poses]
         boxes = boxes_by_time(entry, request.dynamic_state.actors, times)
@@ -167,7 +209,10 @@ class WorldModel(Failures):
                 if session.with_map:
                     output.hdmap_condition_frames.append(as_jpeg(sdmap))
             outputs.append(output)
-        session.past, session.end_us = past, times[-1]  # only when all went well: a failed chunk can be asked for again
+        session.past, session.end_us = (
+            past,
+            times[-1],
+        )  # only when all went well: a failed chunk can be asked for again
         return video_model_pb2.VideoChunkReturn(camera_outputs=outputs)
 
     def _frame(
@@ -186,10 +231,20 @@ class WorldModel(Failures):
         sdmap: U8 = np.zeros((lens.height, lens.width, 3), np.uint8)
         if needs_map or session.with_map:
             scene_map = entry.scene_map or prepare_map(entry.scenario.lane_map)
-            sdmap = lens.image(draw_map(scene_map, pinhole, pose, actor_boxes(boxes, entry.scenario.actors), threads=self._threads))
+            sdmap = lens.image(
+                draw_map(
+                    scene_map,
+                    pinhole,
+                    pose,
+                    actor_boxes(boxes, entry.scenario.actors),
+                    threads=self._threads,
+                )
+            )
         if not session.with_rgb:
             return sdmap, sdmap
-        frame = lens.frame(entry.render(RenderRequest(t_us, pinhole, np.stack([pose, pose]), boxes)))
+        frame = lens.frame(
+            entry.render(RenderRequest(t_us, pinhole, np.stack([pose, pose]), boxes))
+        )
         if self._fixers is None:
             return frame.rgb, sdmap
         fixer = self._fixers.of(session.scene_id, session.seed)
@@ -212,42 +267,77 @@ def clip_of(archive: bytes) -> str:
         InputError: No ZIP, or names that are not those of one clip.
     """
     what = f"{len(archive)} bytes that are no ZIP"
-    with parsing(DOING, "the map of a session", "send zipped parquet tables", what), zipfile.ZipFile(BytesIO(archive)) as zipped:
+    with (
+        parsing(DOING, "the map of a session", "send zipped parquet tables", what),
+        zipfile.ZipFile(BytesIO(archive)) as zipped,
+    ):
         names = zipped.namelist()[:MAX_MEMBERS]
-    clips = {name.removesuffix(".parquet").rpartition(".")[0] for name in names if name.endswith(".parquet")}
+    clips = {
+        name.removesuffix(".parquet").rpartition(".")[0]
+        for name in names
+        if name.endswith(".parquet")
+    }
     if len(clips) != 1 or "" in clips:
         found = f"{len(names)} members of clips {sorted(clips)[:3]}"
-        raise InputError(DOING, "the map of a session", found, "send members named CLIP.TABLE.parquet, all of one clip")
+        raise InputError(
+            DOING,
+            "the map of a session",
+            found,
+            "send members named CLIP.TABLE.parquet, all of one clip",
+        )
     return clips.pop()
 
 
 def check_length(frames: int, first: bool) -> None:
-    """Raise `InputError` unless a chunk has 5, 9, 13, ... frames at first and 4, 8, 12, ... later."""
+    """Raise `InputError` unless a chunk has 5, 9, 13, ... frames at first and 4, 8, 12, ...
+    later.
+    """
     if not 0 < frames <= MAX_FRAMES or frames % 4 != (1 if first else 0):
-        rule = "1 + 4 k in the first chunk (5, 9, 13)" if first else "4 k in a later chunk (8, 12, 16)"
-        raise InputError(DOING, "a chunk", f"{frames} poses", f"ask for {rule}, at most {MAX_FRAMES}")
+        rule = (
+            "1 + 4 k in the first chunk (5, 9, 13)" if first else "4 k in a later chunk (8, 12, 16)"
+        )
+        raise InputError(
+            DOING, "a chunk", f"{frames} poses", f"ask for {rule}, at most {MAX_FRAMES}"
+        )
 
 
-def boxes_by_time(entry: SceneEntry, actors: Sequence[Any], times: Sequence[int]) -> list[dict[str, F64]]:
-    """Return the box poses by actor at every frame's time. The wire has no ids: a road user is the scene's of its size, the nearest first.
+def boxes_by_time(
+    entry: SceneEntry, actors: Sequence[Any], times: Sequence[int]
+) -> list[dict[str, F64]]:
+    """Return the box poses by actor at every frame's time. The wire has no ids: a road user is the
+    scene's of its size, the nearest first.
 
     Raises:
         InputError: A road user of a size that the scene does not have, or more of them.
     """
     free = {actor.actor_id: actor for actor in entry.scenario.actors if not actor.is_static}
     out: list[dict[str, F64]] = [
-        {a.actor_id: interpolate(a.track, t) for a in entry.scenario.actors if a.is_static and a.track.t_us[0] <= t <= a.track.t_us[-1]}
+        {
+            a.actor_id: interpolate(a.track, t)
+            for a in entry.scenario.actors
+            if a.is_static and a.track.t_us[0] <= t <= a.track.t_us[-1]
+        }
         for t in times
     ]
     for index, given in enumerate(actors):
-        poses = {p.timestamp_us: read_pose(p.pose, f"actor {index} at {p.timestamp_us} us") for p in given.trajectory.poses}
+        poses = {
+            p.timestamp_us: read_pose(p.pose, f"actor {index} at {p.timestamp_us} us")
+            for p in given.trajectory.poses
+        }
         if not poses:
             continue
         size = np.array([given.bbox_dims.size_x, given.bbox_dims.size_y, given.bbox_dims.size_z])
-        alike = [actor for actor in free.values() if np.abs(sizes(actor) - size).max() < SAME_SIZE_M]
+        alike = [
+            actor for actor in free.values() if np.abs(sizes(actor) - size).max() < SAME_SIZE_M
+        ]
         if not alike:
             found = f"road user {index} of {np.round(size, 3).tolist()} m"
-            raise InputError(DOING, f"scene {entry.scenario.scene_id!r}", found, "render with the scene file that the runtime uses")
+            raise InputError(
+                DOING,
+                f"scene {entry.scenario.scene_id!r}",
+                found,
+                "render with the scene file that the runtime uses",
+            )
         t_us, pose = next(iter(poses.items()))
         one = min(alike, key=lambda actor: (away(actor, t_us, pose), actor.actor_id))
         del free[one.actor_id]
@@ -263,7 +353,9 @@ def sizes(actor: Actor) -> F64:
 
 
 def away(actor: Actor, t_us: int, pose: F64) -> float:
-    """Return the distance, in the plane, from where an actor's track is at a time; its nearest end where it is not there then."""
+    """Return the distance, in the plane, from where an actor's track is at a time; its nearest end
+    where it is not there then.
+    """
     t = int(np.clip(t_us, actor.track.t_us[0], actor.track.t_us[-1]))
     return float(np.linalg.norm(interpolate(actor.track, t)[:2, 3] - pose[:2, 3]))
 

@@ -1,4 +1,6 @@
-"""What can be named, found the same way in every process, and from a name on the command line to a resolved part."""
+"""What can be named, found the same way in every process, and from a name on the command line to a
+resolved part.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,25 @@ from alpasim_plugin.core.config import apply_overrides, validate
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Declaration
 from alpasim_plugin.core.lazy import installed, installed_names
-from alpasim_plugin.core.parts.source import absolute_target, code_digest, file_of, is_target, load, require_unedited, split_address
-from alpasim_plugin.core.parts.spec import BUILTIN, KINDS, MODES, KindName, PartSpec, digest, file_digest, part_digest
+from alpasim_plugin.core.parts.source import (
+    absolute_target,
+    code_digest,
+    file_of,
+    is_target,
+    load,
+    require_unedited,
+    split_address,
+)
+from alpasim_plugin.core.parts.spec import (
+    BUILTIN,
+    KINDS,
+    MODES,
+    KindName,
+    PartSpec,
+    digest,
+    file_digest,
+    part_digest,
+)
 from alpasim_plugin.core.yaml_positions import Document
 
 
@@ -42,7 +61,9 @@ def entries(kind: KindName) -> Mapping[str, Entry]:
     Raises:
         InputError: Two packages claim one name.
     """
-    found = {name: Entry(name, target, help_text) for name, (target, help_text) in BUILTIN[kind].items()}
+    found = {
+        name: Entry(name, target, help_text) for name, (target, help_text) in BUILTIN[kind].items()
+    }
     taken = {name: entry.target for name, entry in found.items()}
     others = installed_names(KINDS[kind].group, taken, kind)
     return found | {name: Entry(name, target, f"from {target}") for name, target in others.items()}
@@ -65,7 +86,11 @@ def find(kind: KindName, name: str) -> Entry:
 
 BASE = "3dgs"  # the renderer below a fixer where nothing else is said
 DOING = "choosing a renderer"
-PLAIN_KINDS = ("renderer", "evaluator", "controller")  # whose shipped parts declare nothing; a test holds them to it
+PLAIN_KINDS = (
+    "renderer",
+    "evaluator",
+    "controller",
+)  # whose shipped parts declare nothing; a test holds them to it
 
 
 @dataclass(frozen=True)
@@ -96,20 +121,28 @@ def resolve(kind: KindName, name: str, overrides: Sequence[str] = ()) -> PartSpe
 
     Args:
         kind: Its kind.
-        name: A registered name (a fixer also as ``NAME@STEPS``), ``package.module:Class``, ``path/file.py:Class``, ``scheme://address``
-            where a part is registered as ``scheme://``, or ``exec:COMMAND``.
+        name: A registered name (a fixer also as ``NAME@STEPS``), ``package.module:Class``,
+            ``path/file.py:Class``, ``scheme://address`` where a part is registered as
+            ``scheme://``, or ``exec:COMMAND``.
         overrides: ``KEY=VALUE`` of its settings.
 
     Raises:
-        InputError: Unknown name (with the nearest), a failing import, a bad setting or address, or a declared file that cannot be read.
+        InputError: Unknown name (with the nearest), a failing import, a bad setting or address, or
+            a declared file that cannot be read.
     """
     spec = unidentified(kind, name, overrides)
-    return _described(spec, None if _declares_nothing(kind, spec.target) else load(spec.target, kind))
+    return _described(
+        spec, None if _declares_nothing(kind, spec.target) else load(spec.target, kind)
+    )
 
 
 def unidentified(kind: KindName, name: str, overrides: Sequence[str] = ()) -> PartSpec:
-    """Resolve a name as far as building the part needs it: no file is read, and there is no digest. See `resolve`."""
-    plain, steps, address = name, None, None
+    """Resolve a name as far as building the part needs it: no file is read, and there is no digest.
+    See `resolve`.
+    """
+    plain = name
+    steps = None
+    address = None
     if is_target(name):
         target = absolute_target(name)
     else:
@@ -130,16 +163,18 @@ def unidentified(kind: KindName, name: str, overrides: Sequence[str] = ()) -> Pa
 
 
 def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
-    """Resolve ``RENDERER``, ``FIXER`` (over `BASE`) or ``FIXER+RENDERER``; ``@STEPS`` and ``[KEY=VALUE,...]`` belong to the fixer.
+    """Resolve ``RENDERER``, ``FIXER`` (over `BASE`) or ``FIXER+RENDERER``; ``@STEPS`` and
+    ``[KEY=VALUE,...]`` belong to the fixer.
 
     Args:
-        name: Renderer and fixer as `resolve` takes them: ``clean``, ``onefixer@2``, ``onefixer[references=0]``,
-            ``onefixer+my.module:MyRenderer``.
-        overrides: ``KEY=VALUE`` of the fixer's settings, ignored where there is none; ``RENDERER:KEY=VALUE`` counts for the renderer of
-            that name alone.
+        name: Renderer and fixer as `resolve` takes them: ``clean``, ``onefixer@2``,
+            ``onefixer[references=0]``, ``onefixer+my.module:MyRenderer``.
+        overrides: ``KEY=VALUE`` of the fixer's settings, ignored where there is none;
+            ``RENDERER:KEY=VALUE`` counts for the renderer of that name alone.
 
     Raises:
-        InputError: As `resolve`; a step count without a fixer; a fixer of whole clips, or one without the weights that it needs.
+        InputError: As `resolve`; a step count without a fixer; a fixer of whole clips, or one
+            without the weights that it needs.
     """
     plain, own = split_settings(name)
     overrides = (*overrides_of(name, overrides), *own)
@@ -147,8 +182,17 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
     if not plus:
         if own and front in entries("renderer"):
             do = "leave the brackets out, or name a fixer: onefixer[references=0]"
-            raise InputError(DOING, f"renderer {name!r}", f"{front!r} is no fixer: it has no settings for brackets", do)
-        if front in entries("renderer") or "://" in front or (is_target(front) and not _is_fixer(front)):
+            raise InputError(
+                DOING,
+                f"renderer {name!r}",
+                f"{front!r} is no fixer: it has no settings for brackets",
+                do,
+            )
+        if (
+            front in entries("renderer")
+            or "://" in front
+            or (is_target(front) and not _is_fixer(front))
+        ):
             return RendererSpec(name, resolve("renderer", front))
         base = BASE
     else:
@@ -156,7 +200,11 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
     if not is_target(front):
         _require_fixer(plain, front, bool(plus))
     fixer = _in_the_loop(resolve("fixer", front, overrides))
-    return RendererSpec(name, resolve("renderer", base), replace(fixer, name=f"{fixer.name}[{','.join(own)}]") if own else fixer)
+    return RendererSpec(
+        name,
+        resolve("renderer", base),
+        replace(fixer, name=f"{fixer.name}[{','.join(own)}]") if own else fixer,
+    )
 
 
 def split_settings(name: str) -> tuple[str, tuple[str, ...]]:
@@ -174,7 +222,12 @@ def split_settings(name: str) -> tuple[str, tuple[str, ...]]:
     match = re.fullmatch(r"([^\[\]]+)\[([^\[\]]+)\]([^\[\]]*)", name)
     settings = tuple(text.strip() for text in match[2].split(",")) if match else ()
     if match is None or not all(re.fullmatch(r"[\w.]+=.+", text) for text in settings):
-        raise InputError(DOING, f"renderer {name!r}", "no settings in its brackets", "write FIXER[KEY=VALUE,...]: onefixer[references=0]")
+        raise InputError(
+            DOING,
+            f"renderer {name!r}",
+            "no settings in its brackets",
+            "write FIXER[KEY=VALUE,...]: onefixer[references=0]",
+        )
     return match[1] + match[3], settings
 
 
@@ -210,12 +263,15 @@ def split_steps(name: str) -> tuple[str, int | None]:
     plain, at, count = name.partition("@")
     if at and not re.fullmatch("[1-9][0-9]?", count):
         found = f"{count!r} after @ is no step count"
-        raise InputError("choosing a fixer", f"name {name!r}", found, "write NAME@STEPS, such as onefixer@2")
+        raise InputError(
+            "choosing a fixer", f"name {name!r}", found, "write NAME@STEPS, such as onefixer@2"
+        )
     return plain, int(count) if at else None
 
 
 def declaration_of(factory: Any, settings: BaseModel | None, folder: Path) -> Declaration:
-    """Return what a factory declares: the result of its ``describe(settings)``, or its attributes of the same names as `Declaration`'s.
+    """Return what a factory declares: the result of its ``describe(settings)``, or its attributes
+    of the same names as `Declaration`'s.
 
     Relative files start at the folder of the factory's module.
     """
@@ -227,16 +283,25 @@ def declaration_of(factory: Any, settings: BaseModel | None, folder: Path) -> De
         given = getattr(factory, "files", {})
         files = given if isinstance(given, Mapping) else {str(path): Path(path) for path in given}
         attributes = ("trained", "note", "is_remote", "missing")
-        declared = Declaration(**{key: getattr(factory, key) for key in attributes if isinstance(getattr(factory, key, None), bool | str)})
+        declared = Declaration(
+            **{
+                key: getattr(factory, key)
+                for key in attributes
+                if isinstance(getattr(factory, key, None), bool | str)
+            }
+        )
     return replace(declared, files={key: folder / path for key, path in files.items()})
 
 
 def _declares_nothing(kind: KindName, target: str) -> bool:
-    """Tell whether a factory need not be imported before it is used: shipped parts of some kinds have nothing to declare.
+    """Tell whether a factory need not be imported before it is used: shipped parts of some kinds
+    have nothing to declare.
 
     Those behind an address have: they are remote.
     """
-    return kind in PLAIN_KINDS and any(target == shipped for name, (shipped, _) in BUILTIN[kind].items() if "://" not in name)
+    return kind in PLAIN_KINDS and any(
+        target == shipped for name, (shipped, _) in BUILTIN[kind].items() if "://" not in name
+    )
 
 
 def note_of(spec: PartSpec, declared: Declaration) -> str:
@@ -248,16 +313,23 @@ def note_of(spec: PartSpec, declared: Declaration) -> str:
 def _described(spec: PartSpec, factory: Any) -> PartSpec:
     module = file_of(spec.target)
     modules = [] if module is None else [module]
-    if inspect.isclass(factory) or inspect.isfunction(factory):  # a package may only pass on what another module defines
+    if inspect.isclass(factory) or inspect.isfunction(
+        factory
+    ):  # a package may only pass on what another module defines
         home = getattr(sys.modules.get(factory.__module__), "__file__", None)
         modules += [Path(home)] if home is not None and Path(home) not in modules else []
     mode = installed(MODES).get(str(getattr(spec.settings, "loop_mode", "")))
-    if mode is not None:  # what calls a fixer of blocks shapes its frames, and no import leads there
+    if (
+        mode is not None
+    ):  # what calls a fixer of blocks shapes its frames, and no import leads there
         modules += [file for file in [file_of(mode.value)] if file is not None]
     for file in modules if factory is not None else ():
         require_unedited(file, code_digest(file))
     declared = declaration_of(factory, spec.settings, module.parent if module else Path())
-    shas = {key: file_digest(path, f"{spec.kind} {spec.name!r}, {key}") for key, path in declared.files.items()}
+    shas = {
+        key: file_digest(path, f"{spec.kind} {spec.name!r}, {key}")
+        for key, path in declared.files.items()
+    }
     attribute = spec.target.rpartition(":")[2]
     return PartSpec(
         spec.kind,
@@ -275,8 +347,12 @@ def _described(spec: PartSpec, factory: Any) -> PartSpec:
     )
 
 
-def _settings(kind: KindName, name: str, factory: Any, overrides: Sequence[str]) -> BaseModel | None:
-    """Return a part's validated settings: its defaults (for a fixer ``configs/fixers/NAME.yaml``) with the overrides on top."""
+def _settings(
+    kind: KindName, name: str, factory: Any, overrides: Sequence[str]
+) -> BaseModel | None:
+    """Return a part's validated settings: its defaults (for a fixer ``configs/fixers/NAME.yaml``)
+    with the overrides on top.
+    """
     model: Any = getattr(factory, "settings_model", None)
     if model is None and kind == "fixer":
         model = load("alpasim_plugin.fixers.settings:FixerSettings", kind)
@@ -286,7 +362,9 @@ def _settings(kind: KindName, name: str, factory: Any, overrides: Sequence[str])
         settings: BaseModel = model.load(name, overrides)
         return settings
     doing = f"reading the settings of a {kind}"
-    validated: BaseModel = validate(model, apply_overrides(Document({}, {}, f"the defaults of {name}"), overrides, doing), doing)
+    validated: BaseModel = validate(
+        model, apply_overrides(Document({}, {}, f"the defaults of {name}"), overrides, doing), doing
+    )
     return validated
 
 
@@ -297,12 +375,16 @@ def _steps_to_front(front: str, base: str) -> tuple[str, str]:
 
 
 def _in_the_loop(fixer: PartSpec) -> PartSpec:
-    """Refuse a fixer without weights, and one that needs frames which a closed loop has not rendered yet."""
+    """Refuse a fixer without weights, and one that needs frames which a closed loop has not
+    rendered yet.
+    """
     doing, named = "choosing a renderer for a closed loop", f"fixer {fixer.name!r}"
     settings: Any = fixer.settings
     if getattr(settings, "is_offline", False):
         ahead = settings.unit.lookahead_frames
-        found = f"its first frame needs {ahead} frames after it, which a closed loop has not driven yet"
+        found = (
+            f"its first frame needs {ahead} frames after it, which a closed loop has not driven yet"
+        )
         do = f"fix recorded clips with it: simrun refine --fixer {fixer.name}, simrun bench quality --fixer {fixer.name}"
         raise InputError(doing, named, found, do)
     if fixer.missing:
@@ -321,7 +403,12 @@ def _require_fixer(name: str, front: str, is_composite: bool) -> None:
     if plain in fixers:
         return
     if steps is not None and plain in renderers:
-        raise InputError(DOING, f"renderer {name!r}", f"{plain!r} has no step count", f"write {plain}, or FIXER@STEPS")
+        raise InputError(
+            DOING,
+            f"renderer {name!r}",
+            f"{plain!r} has no step count",
+            f"write {plain}, or FIXER@STEPS",
+        )
     near = difflib.get_close_matches(plain, [*renderers, *fixers], n=1)
     raise InputError(
         DOING,

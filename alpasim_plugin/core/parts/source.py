@@ -1,7 +1,9 @@
-"""The code of a part: imported from what a target names (``package.module:attribute`` or ``path/to/file.py:attribute``), and its digest.
+"""The code of a part: imported from what a target names (``package.module:attribute`` or
+``path/to/file.py:attribute``), and its digest.
 
-A folder that is not installed is never on Python's path. A finder of its own (`_NamedFolders`) serves the file that was named and what
-its import statements reach in its folder; nothing else there can be imported, whoever asks for it.
+A folder that is not installed is never on Python's path. A finder of its own (`_NamedFolders`)
+serves the file that was named and what its import statements reach in its folder; nothing else
+there can be imported, whoever asks for it.
 """
 
 from __future__ import annotations
@@ -27,9 +29,11 @@ OWN_ROOT = str(Path(__file__).resolve().parents[3])
 PARTS = os.path.join(OWN_ROOT, "alpasim_plugin", "plugins", "parts") + os.sep
 INSTALLED = {"site-packages", "dist-packages"}  # folders that hold packages of many distributions
 
-# Import statements wherever they stand: at the top, inside functions, under conditions. A line of a docstring that looks like one only
-# adds a file. Imports for type checkers alone do not run.
-_FROM = re.compile(rb"^[ \t]*from[ \t]+(\.*[\w.]*)[ \t]+import[ \t]+(\([^)]*\)|[^\n#]+)", re.MULTILINE)
+# Import statements wherever they stand: at the top, inside functions, under conditions. A line of a
+# docstring that looks like one only adds a file. Imports for type checkers alone do not run.
+_FROM = re.compile(
+    rb"^[ \t]*from[ \t]+(\.*[\w.]*)[ \t]+import[ \t]+(\([^)]*\)|[^\n#]+)", re.MULTILINE
+)
 _IMPORT = re.compile(rb"^[ \t]*import[ \t]+([^\n#]+)", re.MULTILINE)
 _TYPES_ONLY = re.compile(rb"^if (?:typing\.)?TYPE_CHECKING:\n(?:[ \t]+[^\n]*\n|\n)+", re.MULTILINE)
 _COMMENT = re.compile(rb"#[^\n]*")
@@ -39,8 +43,9 @@ PACKAGE = os.sep + "__init__.py"  # the file of a package, in its folder
 def code_digest(file: str | Path) -> str:
     """Return a SHA-256 over a module and all modules that it reaches by imports.
 
-    Followed are imports of modules in the part's own top-level package, in simrun's packages, and, for code that is not installed, of files
-    beside it. Installed third-party libraries and the standard library are not: ``run.json`` lists the versions of those that matter.
+    Followed are imports of modules in the part's own top-level package, in simrun's packages, and,
+    for code that is not installed, of files beside it. Installed third-party libraries and the
+    standard library are not: ``run.json`` lists the versions of those that matter.
 
     Args:
         file: Source file of the part's module.
@@ -50,7 +55,9 @@ def code_digest(file: str | Path) -> str:
 
 
 def own_code_digest(module: str) -> str:
-    """Return the `code_digest` of one of simrun's own modules, by its dotted name. Nothing is imported."""
+    """Return the `code_digest` of one of simrun's own modules, by its dotted name. Nothing is
+    imported.
+    """
     file = _own_file(tuple(module.split(".")))
     assert file is not None, module
     return code_digest(file)
@@ -59,7 +66,8 @@ def own_code_digest(module: str) -> str:
 def code_files(file: str | Path) -> set[str]:
     """Return the paths of the files that `code_digest` covers.
 
-    Code of other people that reaches `alpasim_plugin.core.parts` may name any of our parts by a string, so all of ours counts for it.
+    Code of other people that reaches `alpasim_plugin.core.parts` may name any of our parts by a
+    string, so all of ours counts for it.
     """
     found = reached(file)
     is_ours = os.path.realpath(file) in _own_sources()
@@ -98,7 +106,9 @@ def top_folder(file: str) -> str:
 class _Source(NamedTuple):
     digest: str  # SHA-256 of the text
     imports: tuple[str, ...]  # dotted names
-    lazy: dict[str, str]  # public name -> module, of a package that imports its names on first use (`alpasim_plugin.core.lazy`)
+    lazy: dict[
+        str, str
+    ]  # public name -> module, of a package that imports its names on first use (`alpasim_plugin.core.lazy`)
 
 
 def _read(path: str) -> _Source:
@@ -111,13 +121,24 @@ def _parsed(path: str, mtime_ns: int, size: int) -> _Source:
     with open(path, "rb") as file:
         text = file.read()
     lazy: dict[str, str] = {}
-    for match in _FROM.finditer(b"".join(_TYPES_ONLY.findall(text)) if b"lazy_names(" in text else b""):
-        lazy |= {item.split(" as ")[0].strip(): match[1].decode() for item in match[2].decode().strip("()").split(",")}
-    return _Source(hashlib.sha256(text).hexdigest(), tuple(dict.fromkeys(_names(_TYPES_ONLY.sub(b"", text)))), lazy)
+    for match in _FROM.finditer(
+        b"".join(_TYPES_ONLY.findall(text)) if b"lazy_names(" in text else b""
+    ):
+        lazy |= {
+            item.split(" as ")[0].strip(): match[1].decode()
+            for item in match[2].decode().strip("()").split(",")
+        }
+    return _Source(
+        hashlib.sha256(text).hexdigest(),
+        tuple(dict.fromkeys(_names(_TYPES_ONLY.sub(b"", text)))),
+        lazy,
+    )
 
 
 def _names(text: bytes) -> Iterator[str]:
-    """Give every dotted name that a module may import; ``from a import b`` gives ``a`` and ``a.b``."""
+    """Give every dotted name that a module may import; ``from a import b`` gives ``a`` and
+    ``a.b``.
+    """
     for match in _FROM.finditer(text):
         module = match[1].decode()
         yield module
@@ -131,7 +152,9 @@ def _names(text: bytes) -> Iterator[str]:
 
 
 def imported_files(path: str, root: str) -> Iterable[str]:
-    """Return the files that a module imports; of our own modules once, because our files do not come and go while a process runs."""
+    """Return the files that a module imports; of our own modules once, because our files do not
+    come and go while a process runs.
+    """
     if root != OWN_ROOT:
         return _find_imported(path, root)
     stat = os.stat(path)
@@ -151,7 +174,11 @@ def _find_imported(path: str, root: str) -> Iterator[str]:
     for dotted in _read(path).imports:
         dots = len(dotted) - len(dotted.lstrip("."))
         rest = [part for part in dotted[dots:].split(".") if part]
-        parts = [*(part for part in here[: len(here) - dots + 1] if part != "."), *rest] if dots else rest
+        parts = (
+            [*(part for part in here[: len(here) - dots + 1] if part != "."), *rest]
+            if dots
+            else rest
+        )
         own = bool(parts) and parts[0] in OWN_PACKAGES
         if not parts or not (own or parts[0] == top or not is_shared):
             continue
@@ -160,7 +187,8 @@ def _find_imported(path: str, root: str) -> Iterator[str]:
             if found is not None:
                 yield found
                 if not found.endswith(PACKAGE):
-                    break  # what is in a file is no module: two looks at the disk less for most names
+                    # what is in a file is no module: two looks at the disk less for most names
+                    break
         face = _own_file(tuple(parts[:-1])) if own and len(parts) > 1 else None
         home = None if face is None else _read(face).lazy.get(parts[-1])
         found = None if home is None else _own_file(tuple(home.split(".")))
@@ -174,7 +202,9 @@ def _own_file(parts: tuple[str, ...]) -> str | None:
 
 
 def module_file(root: str, parts: Sequence[str]) -> str | None:
-    """Return the file of a module below a folder, ``__init__.py`` of a package; None where there is none."""
+    """Return the file of a module below a folder, ``__init__.py`` of a package; None where there is
+    none.
+    """
     path = os.path.join(root, *parts)
     package = path + PACKAGE
     if os.path.isfile(package):
@@ -184,11 +214,14 @@ def module_file(root: str, parts: Sequence[str]) -> str | None:
 
 COMMAND = "exec:"  # what follows is a command line
 DO_THIS = "write package.module:Class with the package installed or in the working directory, or file.py:Class"
-_imported_code: dict[Path, str] = {}  # file of a module -> its code digest when a part of it was first resolved
+_imported_code: dict[
+    Path, str
+] = {}  # file of a module -> its code digest when a part of it was first resolved
 
 
 class _NamedFolders:
-    """Find modules of folders in which a user has named one; installed modules come first, since this is the last finder.
+    """Find modules of folders in which a user has named one; installed modules come first, since
+    this is the last finder.
 
     Attributes:
         files: Name of a module without dots -> its file, ``__init__.py`` of a package.
@@ -198,18 +231,23 @@ class _NamedFolders:
 
     @classmethod
     def find_spec(cls, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        """Return the spec of a module that is served; parts of a package are found by the package itself."""
+        """Return the spec of a module that is served; parts of a package are found by the package
+        itself.
+        """
         file = cls.files.get(name)
         return None if file is None else importlib.util.spec_from_file_location(name, file)
 
 
 def is_target(name: str) -> bool:
-    """Tell whether a name is a target and not a registered name, an address (``scheme://``) or a command (``exec:``)."""
+    """Tell whether a name is a target and not a registered name, an address (``scheme://``) or a
+    command (``exec:``).
+    """
     return ":" in name and not split_address(name)[0]
 
 
 def split_address(name: str) -> tuple[str, str]:
-    """Return the registered name and the address of a part that lies behind one; empty where the name has none.
+    """Return the registered name and the address of a part that lies behind one; empty where the
+    name has none.
 
     Example:
         >>> split_address("nre://host:50051"), split_address("exec:python drive.py http://a"), split_address("clean")
@@ -222,11 +260,12 @@ def split_address(name: str) -> tuple[str, str]:
 
 
 def absolute_target(target: str) -> str:
-    """Return a target that means the same in every process: an installed module's dotted name, or an absolute path.
+    """Return a target that means the same in every process: an installed module's dotted name, or
+    an absolute path.
 
-    A module that is not installed is looked for in the working directory. A folder there may bear the name of one of our packages
-    (``policies/mine.py``). Ours is the importable one, so a module that ours does not have, or that differs from ours, is taken from the
-    file.
+    A module that is not installed is looked for in the working directory. A folder there may bear
+    the name of one of our packages (``policies/mine.py``). Ours is the importable one, so a module
+    that ours does not have, or that differs from ours, is taken from the file.
     """
     module, _, attribute = target.rpartition(":")
     if module.endswith(".py"):
@@ -236,7 +275,10 @@ def absolute_target(target: str) -> str:
     if not is_own and _is_installed(parts[0]):
         return target
     file = module_file(os.getcwd(), parts)
-    if file is None or (is_own and (os.path.realpath(file) == module_file(OWN_ROOT, parts) or file.endswith("__init__.py"))):
+    if file is None or (
+        is_own
+        and (os.path.realpath(file) == module_file(OWN_ROOT, parts) or file.endswith("__init__.py"))
+    ):
         return target
     return f"{file}:{attribute}"
 
@@ -256,13 +298,17 @@ def load(target: str, kind: str) -> Any:
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # whatever a user's module raises while it is imported
-        raise InputError(f"importing a {kind}", f"{kind} {target!r}", f"{type(error).__name__}: {error}", DO_THIS) from error
+        raise InputError(
+            f"importing a {kind}", f"{kind} {target!r}", f"{type(error).__name__}: {error}", DO_THIS
+        ) from error
 
 
 def make_importable(target: str) -> str:
-    """Let the modules that a target names and reaches be imported in this process, and return the name of the first one.
+    """Let the modules that a target names and reaches be imported in this process, and return the
+    name of the first one.
 
-    Nothing is run. A process that receives objects of such a module calls this before it unpickles them.
+    Nothing is run. A process that receives objects of such a module calls this before it unpickles
+    them.
 
     Args:
         target: As `absolute_target` returns it.
@@ -277,7 +323,9 @@ def make_importable(target: str) -> str:
     if INSTALLED.isdisjoint(Path(root).parts):
         _serve_reached(name, root)
     in_package = within[:-1] if within[-1] == "__init__" else within
-    if len(within) > 1 and _NamedFolders.files.get(in_package[0]) == module_file(root, in_package[:1]):
+    if len(within) > 1 and _NamedFolders.files.get(in_package[0]) == module_file(
+        root, in_package[:1]
+    ):
         return ".".join(in_package)
     own = f"simrun_file_{hashlib.sha256(name.encode()).hexdigest()[:12]}"
     _NamedFolders.files[own] = name
@@ -285,12 +333,18 @@ def make_importable(target: str) -> str:
 
 
 def file_of(target: str) -> Path | None:
-    """Return the source file of a target's module, which need not have been imported; None where it has none."""
+    """Return the source file of a target's module, which need not have been imported; None where it
+    has none.
+    """
     name, _, _ = target.rpartition(":")
     if name.endswith(".py"):
         return Path(name)
     spec = importlib.util.find_spec(name)
-    return Path(spec.origin) if spec is not None and spec.has_location and spec.origin is not None else None
+    return (
+        Path(spec.origin)
+        if spec is not None and spec.has_location and spec.origin is not None
+        else None
+    )
 
 
 def require_unedited(file: Path, digest: str) -> None:
@@ -305,7 +359,12 @@ def require_unedited(file: Path, digest: str) -> None:
     """
     if _imported_code.setdefault(file, digest) != digest:
         found = "it, or a module that it imports, was edited after this process had imported it"
-        raise InputError("resolving a part", str(file), found, "start a new process (in a notebook: restart the kernel)")
+        raise InputError(
+            "resolving a part",
+            str(file),
+            found,
+            "start a new process (in a notebook: restart the kernel)",
+        )
 
 
 def _from_file(file: Path) -> ModuleType:
@@ -315,7 +374,9 @@ def _from_file(file: Path) -> ModuleType:
 
 
 def _serve_reached(file: str, root: str) -> None:
-    """Serve the modules of a folder that a file's import statements reach, as far as nothing installed bears their names."""
+    """Serve the modules of a folder that a file's import statements reach, as far as nothing
+    installed bears their names.
+    """
     seen, todo = set[str](), [file]
     while todo:
         path = todo.pop()

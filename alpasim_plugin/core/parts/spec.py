@@ -1,4 +1,6 @@
-"""The kinds of parts, and what a run knows of a part: enough to build it anywhere, and to tell whether it is still the same."""
+"""The kinds of parts, and what a run knows of a part: enough to build it anywhere, and to tell
+whether it is still the same.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +16,20 @@ from typing import Any, Literal
 from pydantic import BaseModel
 
 from alpasim_plugin.core import interfaces
-from alpasim_plugin.core.errors import EvaluatorError, FixerError, InputError, PolicyError, RendererError, SimrunError
+from alpasim_plugin.core.errors import (
+    EvaluatorError,
+    FixerError,
+    InputError,
+    PolicyError,
+    RendererError,
+    SimrunError,
+)
 from alpasim_plugin.core.interfaces import complete, contract_error
 from alpasim_plugin.core.metric_types import MetricInfo
 from alpasim_plugin.core.parts.source import code_digest, load, make_importable
 
-MODES = "simrun.fixer_modes"  # entry points of what calls a fixer of blocks: (runner, make_fixer, settings, first) -> Renderer
+# entry points of what calls a fixer of blocks: (runner, make_fixer, settings, first) -> Renderer
+MODES = "simrun.fixer_modes"
 KindName = Literal["renderer", "fixer", "policy", "controller", "evaluator", "source"]
 
 
@@ -44,10 +54,17 @@ SESSION = ("seed", "device", "threads")
 KINDS: dict[str, Kind] = {
     kind.name: kind
     for kind in (
-        Kind("renderer", "simrun.renderers", interfaces.Renderer, ("scenario", *SESSION, "address")),
+        Kind(
+            "renderer", "simrun.renderers", interfaces.Renderer, ("scenario", *SESSION, "address")
+        ),
         Kind("fixer", "simrun.fixers", interfaces.Fixer, ("settings", "scene_id", *SESSION)),
         Kind("policy", "simrun.policies", interfaces.Policy, ("scenario", "address")),
-        Kind("controller", "simrun.controllers", interfaces.Controller, ("vehicle", "address", "scene_id")),
+        Kind(
+            "controller",
+            "simrun.controllers",
+            interfaces.Controller,
+            ("vehicle", "address", "scene_id"),
+        ),
         Kind("evaluator", "simrun.evaluators", interfaces.Evaluator, ("preset",)),
         Kind("source", "simrun.sources", interfaces.Source, ()),
     )
@@ -63,7 +80,8 @@ class PartSpec:
         name: As a user named it, with everything that was left out filled in: ``onefixer@2``.
         target: ``package.module:attribute`` or ``/path/file.py:attribute`` of its factory.
         settings: Validated settings; None where the part takes none.
-        digest: SHA-256 of its code, settings and files. None: its behaviour is decided elsewhere, so nothing it did may be reused.
+        digest: SHA-256 of its code, settings and files. None: its behaviour is decided elsewhere,
+            so nothing it did may be reused.
         note: What it is in a few words: "trained", "untrained (identity)".
         trained: Whether its weights were learned; None where it has none.
         files: SHA-256 of every file that it declares, by path.
@@ -105,7 +123,9 @@ class PartSpec:
         }
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the target before the rest: settings may be objects of a module that only `make_importable` lets be found."""
+        """Pickle the target before the rest: settings may be objects of a module that only
+        `make_importable` lets be found.
+        """
         return _restored, (self.target, pickle.dumps(dict(vars(self))))
 
 
@@ -130,17 +150,26 @@ def file_digest(path: Path, what: str) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         do = "correct the path, or install the part again with its files"
-        raise InputError("reading a file that a part declares", f"{what}: {path}", error.strerror or str(error), do) from error
+        raise InputError(
+            "reading a file that a part declares",
+            f"{what}: {path}",
+            error.strerror or str(error),
+            do,
+        ) from error
 
 
-def part_digest(modules: Sequence[Path], attribute: str, settings: BaseModel | None, files: Mapping[str, str]) -> str:
+def part_digest(
+    modules: Sequence[Path], attribute: str, settings: BaseModel | None, files: Mapping[str, str]
+) -> str:
     """Return the digest of a part.
 
     Args:
-        modules: Source files of the module that was named and of the one that defines the factory; none for an extension module.
+        modules: Source files of the module that was named and of the one that defines the factory;
+            none for an extension module.
         attribute: The factory in the module.
         settings: Its settings.
-        files: SHA-256 by name; a name that is a dotted key of the settings takes the place of the path that stands there.
+        files: SHA-256 by name; a name that is a dotted key of the settings takes the place of the
+            path that stands there.
     """
     content = None if settings is None else settings.model_dump(mode="json")
     for name in files:
@@ -168,41 +197,60 @@ def build(spec: PartSpec, **known: Any) -> Any:
 
     Args:
         spec: The resolved part.
-        known: What the factory may ask for by naming a parameter so; `alpasim_plugin.core.parts.spec` lists the names by kind.
+        known: What the factory may ask for by naming a parameter so;
+            `alpasim_plugin.core.parts.spec` lists the names by kind.
 
     Raises:
-        InputError: The import fails, the factory asks for something else, or what it makes lacks a required member; for a policy the
-            last two are a `PolicyError`.
+        InputError: The import fails, the factory asks for something else, or what it makes lacks a
+            required member; for a policy the last two are a `PolicyError`.
         SimrunError: The factory raised; the error class is that of the part's kind.
     """
     kind = KINDS[spec.kind]
     known = {"settings": spec.settings, "address": spec.address} | known
     factory = load(spec.target, spec.kind)
-    wanted = _arguments(factory, spec, {key: value for key, value in known.items() if key in kind.arguments})
+    wanted = _arguments(
+        factory, spec, {key: value for key, value in known.items() if key in kind.arguments}
+    )
     try:
         part = factory(**wanted)
     except SimrunError:
         raise
     except Exception as error:  # a part of any origin: the cause is chained
         raise ERRORS.get(spec.kind, InputError)(
-            f"making a {spec.kind}", f"{spec.kind} {spec.name!r}", f"{type(error).__name__}: {error}", "run with --debug for the traceback"
+            f"making a {spec.kind}",
+            f"{spec.kind} {spec.name!r}",
+            f"{type(error).__name__}: {error}",
+            "run with --debug for the traceback",
         ) from error
     return complete(part, kind.interface, f"{spec.kind} {spec.name!r}")
 
 
-def _arguments(factory: Callable[..., Any], spec: PartSpec, known: dict[str, Any]) -> dict[str, Any]:
+def _arguments(
+    factory: Callable[..., Any], spec: PartSpec, known: dict[str, Any]
+) -> dict[str, Any]:
     """Choose what a factory asks for by the names of its parameters.
 
     Raises:
-        InputError: It has a required parameter that is not one of them (of a policy: `PolicyError`).
+        InputError: It has a required parameter that is not one of them (of a policy:
+            `PolicyError`).
     """
     try:
         parameters = inspect.signature(factory).parameters.values()
     except ValueError:  # some built-in callables have no signature
         return {}
-    named = [p for p in parameters if p.kind in (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)]
-    positional = [p.name for p in parameters if p.kind is inspect.Parameter.POSITIONAL_ONLY and p.default is inspect.Parameter.empty]
-    unknown = positional + [p.name for p in named if p.name not in known and p.default is inspect.Parameter.empty]
+    named = [
+        p
+        for p in parameters
+        if p.kind in (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    ]
+    positional = [
+        p.name
+        for p in parameters
+        if p.kind is inspect.Parameter.POSITIONAL_ONLY and p.default is inspect.Parameter.empty
+    ]
+    unknown = positional + [
+        p.name for p in named if p.name not in known and p.default is inspect.Parameter.empty
+    ]
     if unknown:
         raise contract_error(spec.kind)(
             f"making a {spec.kind}",
@@ -223,23 +271,47 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
             "alpasim_plugin.renderers.reconstruction:reconstruction_renderer",
             "a reconstruction of the logged drive: error grows with the distance from its path",
         ),
-        "nre://": ("alpasim_plugin.alpasim.client.renderer:NreRenderer", "an AlpaSim renderer service: nre://HOST:PORT[?scene=ID]"),
+        "nre://": (
+            "alpasim_plugin.alpasim.client.renderer:NreRenderer",
+            "an AlpaSim renderer service: nre://HOST:PORT[?scene=ID]",
+        ),
         "broken-black": (f"{_BROKEN}black_renderer", "deliberate fault: black frames"),
-        "broken-mirrored": (f"{_BROKEN}mirrored_renderer", "deliberate fault: left and right swapped"),
+        "broken-mirrored": (
+            f"{_BROKEN}mirrored_renderer",
+            "deliberate fault: left and right swapped",
+        ),
         "broken-blurred": (f"{_BROKEN}blurred_renderer", "deliberate fault: strong blur"),
-        "broken-shifted": (f"{_BROKEN}shifted_renderer", "deliberate fault: seen from 0.5 m to the right"),
-        "broken-frozen": (f"{_BROKEN}frozen_renderer", "deliberate fault: the first frame for ever"),
+        "broken-shifted": (
+            f"{_BROKEN}shifted_renderer",
+            "deliberate fault: seen from 0.5 m to the right",
+        ),
+        "broken-frozen": (
+            f"{_BROKEN}frozen_renderer",
+            "deliberate fault: the first frame for ever",
+        ),
         "broken-late": (f"{_BROKEN}late_renderer", "deliberate fault: images 1 s old"),
     },
     "fixer": {
         "onefixer": (_PER_FRAME, "one-step causal generator in pixels, frame by frame, for a CPU"),
-        "nearest": ("alpasim_plugin.fixers.nearest:NearestFixer", "the nearest recorded frame, warped into the view, without a network"),
+        "nearest": (
+            "alpasim_plugin.fixers.nearest:NearestFixer",
+            "the nearest recorded frame, warped into the view, without a network",
+        ),
         "identity": ("alpasim_plugin.fixers.identity:IdentityFixer", "passes frames on unchanged"),
     },
     "policy": {
-        "log-replay": ("policies.simple:LogReplay", "the recorded ego poses, exactly; takes no camera"),
-        "constant-velocity": ("policies.simple:ConstantVelocity", "straight on at the present speed; takes no camera"),
-        "pure-pursuit": ("policies.simple:PurePursuit", "along the route at the initial speed, slower in curves; takes no camera"),
+        "log-replay": (
+            "policies.simple:LogReplay",
+            "the recorded ego poses, exactly; takes no camera",
+        ),
+        "constant-velocity": (
+            "policies.simple:ConstantVelocity",
+            "straight on at the present speed; takes no camera",
+        ),
+        "pure-pursuit": (
+            "policies.simple:PurePursuit",
+            "along the route at the initial speed, slower in curves; takes no camera",
+        ),
         "lane-camera": (
             "policies.lane_camera:LaneCamera",
             "lane paint and obstacles from one front camera, by OpenCV; the route is a weak prior",
@@ -260,7 +332,10 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
             "alpasim_plugin.control.can_policy:CanPolicy",
             "a control unit on a CAN bus: can://[INTERFACE:]CHANNEL[?map=NAME&dbc=FILE]",
         ),
-        "learned-mean": ("policies.learned:LearnedMean", "the same network, driven by its mean prediction: every seed drives alike"),
+        "learned-mean": (
+            "policies.learned:LearnedMean",
+            "the same network, driven by its mean prediction: every seed drives alike",
+        ),
     },
     "controller": {
         "bicycle": (
@@ -271,17 +346,44 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
             "alpasim_plugin.alpasim.client.world_services:VdcController",
             "an AlpaSim controller, and physics: vdc://HOST:PORT[?physics=HOST:PORT&scene=ID]",
         ),
-        "perfect": ("alpasim_plugin.control.tracker:PerfectController", "the ego is exactly where its plan says"),
+        "perfect": (
+            "alpasim_plugin.control.tracker:PerfectController",
+            "the ego is exactly where its plan says",
+        ),
     },
     "evaluator": {
-        "collision": ("evaluators.metrics.collision:FACTORY", "contact with other actors by class, and the distance to them"),
-        "offroad": ("evaluators.metrics.offroad:FACTORY", "off-road, wrong lane and the distance to the lanes' border"),
-        "route": ("evaluators.metrics.route:FACTORY", "distance from the recorded drive, progress and distance driven"),
-        "outcomes": ("evaluators.metrics.outcomes:FACTORY", "standstill and braking without a cause, and leaving the route"),
-        "motion": ("evaluators.metrics.motion:FACTORY", "comfort, hard braking, time to collision, safe distance, wrong way and red light"),
-        "protocols": ("evaluators.scores.protocols:FACTORY", "scores of nuPlan, NAVSIM, HUGSIM and NeuroNCAP"),
-        "plan": ("evaluators.metrics.plan:FACTORY", "plan deviation, open-loop collision and minADE of the plans"),
-        "image_health": ("evaluators.metrics.image_health:FACTORY", "black and frozen camera images"),
+        "collision": (
+            "evaluators.metrics.collision:FACTORY",
+            "contact with other actors by class, and the distance to them",
+        ),
+        "offroad": (
+            "evaluators.metrics.offroad:FACTORY",
+            "off-road, wrong lane and the distance to the lanes' border",
+        ),
+        "route": (
+            "evaluators.metrics.route:FACTORY",
+            "distance from the recorded drive, progress and distance driven",
+        ),
+        "outcomes": (
+            "evaluators.metrics.outcomes:FACTORY",
+            "standstill and braking without a cause, and leaving the route",
+        ),
+        "motion": (
+            "evaluators.metrics.motion:FACTORY",
+            "comfort, hard braking, time to collision, safe distance, wrong way and red light",
+        ),
+        "protocols": (
+            "evaluators.scores.protocols:FACTORY",
+            "scores of nuPlan, NAVSIM, HUGSIM and NeuroNCAP",
+        ),
+        "plan": (
+            "evaluators.metrics.plan:FACTORY",
+            "plan deviation, open-loop collision and minADE of the plans",
+        ),
+        "image_health": (
+            "evaluators.metrics.image_health:FACTORY",
+            "black and frozen camera images",
+        ),
     },
     "source": {
         "argoverse": ("scenarios.sources:Argoverse", "Argoverse 2 log folder"),

@@ -1,19 +1,23 @@
-"""One way to read a file: regular files only, capped in size before a byte is read, and every failure a four-part error.
+"""One way to read a file: regular files only, capped in size before a byte is read, and every
+failure a four-part error.
 
-Anything that a parser raises becomes an `InputError` that names the file (`parsing`). Which module reads what:
+Anything that a parser raises becomes an `InputError` that names the file (`parsing`). Which module
+reads what:
 
-- `files`: bytes, text, JSON (with limits, and of a stated shape), XML, the check of a path that a library opens itself, and gzip, zstd
-  and zip, decompressed to a stated size at most.
-- `arrays`: NumPy files, by their header against the file's size, and headers and checkpoints of weights.
+- `files`: bytes, text, JSON (with limits, and of a stated shape), XML, the check of a path that a
+  library opens itself, and gzip, zstd and zip, decompressed to a stated size at most.
+- `arrays`: NumPy files, by their header against the file's size, and headers and checkpoints of
+  weights.
 - `images`: pictures, by their header before they are decoded.
 - `tables`: parquet and Arrow tables with typed columns.
 
-Light modules only are imported here; `arrays`, `images` and `tables` are imported where they are used.
+Light modules only are imported here; `arrays`, `images` and `tables` are imported where they are
+used.
 """
 
 from __future__ import annotations
 
-from alpasim_plugin.core.reading.files import (  # fmt: skip
+from alpasim_plugin.core.reading.files import (
     check_regular,
     exists,
     parse_json,
@@ -27,6 +31,14 @@ from alpasim_plugin.core.reading.files import (  # fmt: skip
 )
 
 __all__ = [
-    "check_regular", "exists", "parse_json", "parsing", "read_bytes", "read_json", "read_json_as", "read_json_lines", "read_json_object",
+    "check_regular",
+    "exists",
+    "parse_json",
+    "parsing",
+    "read_bytes",
+    "read_json",
+    "read_json_as",
+    "read_json_lines",
+    "read_json_object",
     "read_text",
-]  # fmt: skip
+]

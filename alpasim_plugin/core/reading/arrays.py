@@ -1,4 +1,6 @@
-"""Arrays: NumPy files, whose header is compared with their size before memory is taken (pickles are never read), and files of weights."""
+"""Arrays: NumPy files, whose header is compared with their size before memory is taken (pickles are
+never read), and files of weights.
+"""
 
 from __future__ import annotations
 
@@ -34,28 +36,42 @@ def parse_npy(data: bytes, where: Path | str, doing: str, do_this: str = FETCH_A
         return np.asarray(np.load(stream, allow_pickle=False))
 
 
-def open_npy(path: Path | str, doing: str, do_this: str = FETCH_AGAIN, bound: Bound = FILE_BYTES) -> Array:
+def open_npy(
+    path: Path | str, doing: str, do_this: str = FETCH_AGAIN, bound: Bound = FILE_BYTES
+) -> Array:
     """Return a ``.npy`` file as a read-only memory map; see `parse_npy` for what is refused."""
-    with open_regular(path, doing, bound, do_this) as stream, parsing(doing, path, do_this, "no readable NumPy array"):
+    with (
+        open_regular(path, doing, bound, do_this) as stream,
+        parsing(doing, path, do_this, "no readable NumPy array"),
+    ):
         size = stream.seek(0, io.SEEK_END)
         stream.seek(0)
-        # A header may claim any length; a file gives the memory for it before it looks how much there is.
+        # A header may claim any length; a file gives the memory for it before it looks how much
+        # there is.
         _check_header(io.BytesIO(stream.read(LONGEST_HEADER)), size, path, doing, do_this)
     with parsing(doing, path, do_this, "no readable NumPy array"):
         array: Array = np.load(path, mmap_mode="r", allow_pickle=False)
         return array
 
 
-def _check_header(stream: IO[bytes], size: int, where: Path | str, doing: str, do_this: str) -> None:
+def _check_header(
+    stream: IO[bytes], size: int, where: Path | str, doing: str, do_this: str
+) -> None:
     version = npy_format.read_magic(stream)
-    read = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
+    read = (
+        npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
+    )
     shape, _, dtype = read(stream)
     need = dtype.itemsize
     for side in shape:  # Python integers, which do not overflow
         need *= int(side)
     present = size - stream.tell()
     if dtype.hasobject or min(shape, default=0) < 0 or need > present:
-        found = "an array of Python objects" if dtype.hasobject else f"{present} bytes for {dtype} {shape} of {need}"
+        found = (
+            "an array of Python objects"
+            if dtype.hasobject
+            else f"{present} bytes for {dtype} {shape} of {need}"
+        )
         raise InputError(doing, str(where), f"no readable NumPy array: {found}", do_this)
 
 
@@ -82,7 +98,9 @@ def read_checkpoint(path: Path, doing: str, facts: str) -> tuple[dict[str, str],
             meta = dict(file.metadata() or {})
         begun = meta["facts"]
     if begun != facts:
-        raise InputError(doing, str(path), f"it was begun as {begun}, this is {facts}", "choose another folder")
+        raise InputError(
+            doing, str(path), f"it was begun as {begun}, this is {facts}", "choose another folder"
+        )
     with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
         return meta, load_file(str(path))
 

@@ -1,4 +1,5 @@
-"""A file's bytes, text, JSON and XML: a regular file, capped in size, with limits on depth and numbers, or a four-part error.
+"""A file's bytes, text, JSON and XML: a regular file, capped in size, with limits on depth and
+numbers, or a four-part error.
 
 Packed data are unpacked to a stated size at most: a few bytes can claim to be terabytes.
 """
@@ -19,20 +20,33 @@ from xml.etree import ElementTree
 from xml.parsers import expat
 
 from alpasim_plugin.core.errors import InputError, SimrunError
-from alpasim_plugin.core.limits import DEPTH, FILE_BYTES, JSON_BYTES, MEMBERS, UNPACKED_BYTES, XML_ELEMENTS, Bound
+from alpasim_plugin.core.limits import (
+    DEPTH,
+    FILE_BYTES,
+    JSON_BYTES,
+    MEMBERS,
+    UNPACKED_BYTES,
+    XML_ELEMENTS,
+    Bound,
+)
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
 FETCH_AGAIN = "fetch or write the file again; it may be damaged"
 _KINDS = (
-    (stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"), (stat.S_ISCHR, "a device"),
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
-)  # fmt: skip
+)
 
 
 @contextmanager
-def open_regular(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None) -> Iterator[BinaryIO]:
+def open_regular(
+    path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None
+) -> Iterator[BinaryIO]:
     """Open a regular file for reading, after checking its kind and size on the open file itself.
 
     A pipe, socket or device is refused without waiting for its other end.
@@ -48,12 +62,23 @@ def open_regular(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_thi
     """
     try:
         # Without O_NONBLOCK the open of a pipe waits for a writer, for ever.
-        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0))
+        handle = os.open(
+            path,
+            os.O_RDONLY
+            | getattr(os, "O_NONBLOCK", 0)
+            | getattr(os, "O_CLOEXEC", 0)
+            | getattr(os, "O_BINARY", 0),
+        )
     except FileNotFoundError as error:
         raise InputError(doing, str(path), "no such file", do_this or "check the path") from error
     except (OSError, ValueError) as error:  # ValueError: a null character in the name
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
-        raise InputError(doing, str(path), f"it cannot be opened: {reason}", do_this or "check the path and its permissions") from error
+        raise InputError(
+            doing,
+            str(path),
+            f"it cannot be opened: {reason}",
+            do_this or "check the path and its permissions",
+        ) from error
     facts = os.fstat(handle)
     if not stat.S_ISREG(facts.st_mode):
         os.close(handle)
@@ -66,11 +91,18 @@ def open_regular(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_thi
         try:
             yield stream
         except OSError as error:
-            raise InputError(doing, str(path), f"it cannot be read: {error.strerror or error}", do_this or FETCH_AGAIN) from error
+            raise InputError(
+                doing,
+                str(path),
+                f"it cannot be read: {error.strerror or error}",
+                do_this or FETCH_AGAIN,
+            ) from error
 
 
 def exists(path: Path | str) -> bool:
-    """Return whether something is at a path; a name that no file can have (too long, a null character) is at none."""
+    """Return whether something is at a path; a name that no file can have (too long, a null
+    character) is at none.
+    """
     try:
         os.stat(path)
     except (OSError, ValueError):
@@ -78,7 +110,9 @@ def exists(path: Path | str) -> bool:
     return True
 
 
-def read_bytes(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None) -> bytes:
+def read_bytes(
+    path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None
+) -> bytes:
     """Return a file's bytes; see `open_regular`.
 
     Raises:
@@ -86,16 +120,24 @@ def read_bytes(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this:
     """
     parts: list[bytes] = []
     with open_regular(path, doing, bound, do_this) as stream:
-        # As much as the file holds, not as the bound allows: a read takes the memory that it is asked for at once.
+        # As much as the file holds, not as the bound allows: a read takes the memory that it is
+        # asked for at once.
         size = os.fstat(stream.fileno()).st_size + 1
         while part := stream.read(size):
             parts.append(part)
             if sum(map(len, parts)) > bound.high:
-                raise InputError(doing, str(path), f"more than {bound.high:.0f} bytes ({bound.name})", "give a smaller file")
+                raise InputError(
+                    doing,
+                    str(path),
+                    f"more than {bound.high:.0f} bytes ({bound.name})",
+                    "give a smaller file",
+                )
     return b"".join(parts)
 
 
-def read_text(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None) -> str:
+def read_text(
+    path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None
+) -> str:
     """Return a file's text, UTF-8; see `read_bytes`.
 
     Raises:
@@ -105,17 +147,28 @@ def read_text(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: 
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(doing, str(path), f"byte {error.start} is not UTF-8", do_this or "save the file as UTF-8 text") from error
+        raise InputError(
+            doing,
+            str(path),
+            f"byte {error.start} is not UTF-8",
+            do_this or "save the file as UTF-8 text",
+        ) from error
 
 
-def check_regular(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None) -> int:
-    """Check a file that a library will open by its path; return its size in bytes. See `open_regular`."""
+def check_regular(
+    path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None
+) -> int:
+    """Check a file that a library will open by its path; return its size in bytes. See
+    `open_regular`.
+    """
     with open_regular(path, doing, bound, do_this) as stream:
         return os.fstat(stream.fileno()).st_size
 
 
 @contextmanager
-def parsing(doing: str, where: Path | str, do_this: str = FETCH_AGAIN, what: str = "it cannot be used") -> Iterator[None]:
+def parsing(
+    doing: str, where: Path | str, do_this: str = FETCH_AGAIN, what: str = "it cannot be used"
+) -> Iterator[None]:
     """Turn whatever a parser raises into the four-part error of the file that it parses.
 
     The original stays the cause, so ``--debug`` shows where it was raised.
@@ -135,7 +188,11 @@ def parsing(doing: str, where: Path | str, do_this: str = FETCH_AGAIN, what: str
         raise
     except Exception as error:
         lines = str(error).strip().splitlines()
-        reason = lines[0] if lines and not isinstance(error, KeyError) else f"{type(error).__name__} {error}"
+        reason = (
+            lines[0]
+            if lines and not isinstance(error, KeyError)
+            else f"{type(error).__name__} {error}"
+        )
         raise InputError(doing, str(where), f"{what}: {reason}", do_this) from error
 
 
@@ -152,22 +209,30 @@ def parse_json(data: bytes | str, where: Path | str, doing: str, do_this: str | 
         do_this: Last part of the errors.
 
     Raises:
-        InputError: Not JSON, nested deeper than the bound, or a number that is not finite (JSON has no NaN).
+        InputError: Not JSON, nested deeper than the bound, or a number that is not finite (JSON has
+            no NaN).
     """
     do_this = do_this or FETCH_AGAIN
-    # Besides the parser's own errors: bytes that are not UTF-8, nesting beyond the stack, integers of more than 4300 digits.
+    # Besides the parser's own errors: bytes that are not UTF-8, nesting beyond the stack, integers
+    # of more than 4300 digits.
     with parsing(doing, where, do_this, "broken JSON"):
         value = json.loads(data)
     _check(value, where, doing, do_this)
     return value
 
 
-def read_json(path: Path | str, doing: str, bound: Bound = JSON_BYTES, do_this: str | None = None) -> Any:
-    """Return the plain data of a JSON file; see `parse_json` and `alpasim_plugin.core.reading.files.read_bytes` for what is refused."""
+def read_json(
+    path: Path | str, doing: str, bound: Bound = JSON_BYTES, do_this: str | None = None
+) -> Any:
+    """Return the plain data of a JSON file; see `parse_json` and
+    `alpasim_plugin.core.reading.files.read_bytes` for what is refused.
+    """
     return parse_json(read_bytes(path, doing, bound, do_this), path, doing, do_this)
 
 
-def read_json_object(path: Path | str, doing: str, bound: Bound = JSON_BYTES, do_this: str | None = None) -> dict[str, Any]:
+def read_json_object(
+    path: Path | str, doing: str, bound: Bound = JSON_BYTES, do_this: str | None = None
+) -> dict[str, Any]:
     """Return a JSON file's object; see `read_json`.
 
     Raises:
@@ -175,16 +240,26 @@ def read_json_object(path: Path | str, doing: str, bound: Bound = JSON_BYTES, do
     """
     value = read_json(path, doing, bound, do_this)
     if not isinstance(value, dict):
-        raise InputError(doing, str(path), f"{kind_of(value)}, not an object", do_this or FETCH_AGAIN)
+        raise InputError(
+            doing, str(path), f"{kind_of(value)}, not an object", do_this or FETCH_AGAIN
+        )
     return value
 
 
-def read_json_as(shape: type[T], path: Path | str, doing: str, bound: Bound = JSON_BYTES, do_this: str | None = None) -> T:
+def read_json_as(
+    shape: type[T],
+    path: Path | str,
+    doing: str,
+    bound: Bound = JSON_BYTES,
+    do_this: str | None = None,
+) -> T:
     """Return a JSON file's content after checking that it has a shape; see `as_shape`."""
     return as_shape(shape, read_json(path, doing, bound, do_this), path, doing, do_this)
 
 
-def read_json_lines(path: Path | str, doing: str, bound: Bound = JSON_BYTES, do_this: str | None = None) -> list[dict[str, Any]]:
+def read_json_lines(
+    path: Path | str, doing: str, bound: Bound = JSON_BYTES, do_this: str | None = None
+) -> list[dict[str, Any]]:
     """Return the objects of a file with one JSON object a line; empty lines are skipped.
 
     Raises:
@@ -196,17 +271,22 @@ def read_json_lines(path: Path | str, doing: str, bound: Bound = JSON_BYTES, do_
             continue
         value = parse_json(line, f"{path}:{n}", doing, do_this)
         if not isinstance(value, dict):
-            raise InputError(doing, f"{path}:{n}", f"{kind_of(value)}, not an object", do_this or FETCH_AGAIN)
+            raise InputError(
+                doing, f"{path}:{n}", f"{kind_of(value)}, not an object", do_this or FETCH_AGAIN
+            )
         rows.append(value)
     return rows
 
 
-def as_shape(shape: type[T], value: Any, where: Path | str, doing: str, do_this: str | None = None) -> T:
+def as_shape(
+    shape: type[T], value: Any, where: Path | str, doing: str, do_this: str | None = None
+) -> T:
     """Return plain data, as it is, after checking that it has a shape.
 
     Args:
-        shape: A ``typing_extensions.TypedDict`` (``total=False`` for members that may be absent), or a type such as ``dict[str, str]``.
-            Types are strict: no text for a number, no list for an object. Members that it does not name are not looked at.
+        shape: A ``typing_extensions.TypedDict`` (``total=False`` for members that may be absent),
+            or a type such as ``dict[str, str]``. Types are strict: no text for a number, no list
+            for an object. Members that it does not name are not looked at.
         value: Plain data.
         where: Its file, for messages.
         doing: What the caller is doing, for messages.
@@ -252,17 +332,23 @@ def kind_of(value: Any) -> str:
 
 
 def _check(document: Any, where: Path | str, doing: str, do_this: str) -> None:
-    """Refuse depth beyond the bound, numbers that are not finite and broken text; level by level, so that depth costs no stack."""
+    """Refuse depth beyond the bound, numbers that are not finite and broken text; level by level,
+    so that depth costs no stack.
+    """
     level, depth = [document], 0
     while level:
         depth += 1
         if depth > DEPTH.high:
-            raise InputError(doing, str(where), f"nested deeper than {DEPTH.high:.0f} levels", do_this)
+            raise InputError(
+                doing, str(where), f"nested deeper than {DEPTH.high:.0f} levels", do_this
+            )
         below: list[Any] = []
         for node in level:
             if type(node) is dict and not all(map(str.isascii, node)):
                 _check_text("".join(node), where, doing, do_this)
-            for child in node.values() if type(node) is dict else node if type(node) is list else (node,):
+            for child in (
+                node.values() if type(node) is dict else node if type(node) is list else (node,)
+            ):
                 kind = type(child)
                 if kind is dict or kind is list:
                     if child is not node:
@@ -270,7 +356,9 @@ def _check(document: Any, where: Path | str, doing: str, do_this: str) -> None:
                 elif kind is str and not child.isascii():
                     _check_text(child, where, doing, do_this)
                 elif kind is float and not math.isfinite(child):
-                    raise InputError(doing, str(where), f"the number {child}, which JSON does not have", do_this)
+                    raise InputError(
+                        doing, str(where), f"the number {child}, which JSON does not have", do_this
+                    )
         level = below
 
 
@@ -284,49 +372,77 @@ def _check_text(text: str, where: Path | str, doing: str, do_this: str) -> None:
 
 
 def parse_xml(data: bytes, where: Path | str, doing: str) -> ElementTree.Element:
-    """Return the root of an XML document; a DOCTYPE is refused, so no entity can be defined or expanded.
+    """Return the root of an XML document; a DOCTYPE is refused, so no entity can be defined or
+    expanded.
 
     Raises:
-        InputError: Malformed or truncated, a DOCTYPE, an unreadable encoding, or nested deeper or larger than the bounds.
+        InputError: Malformed or truncated, a DOCTYPE, an unreadable encoding, or nested deeper or
+            larger than the bounds.
     """
     depth = count = 0
 
     def refuse(*_: Any) -> None:
-        raise InputError(doing, str(where), "a DOCTYPE declaration", "remove it: entities are not accepted in scenario files")
+        raise InputError(
+            doing,
+            str(where),
+            "a DOCTYPE declaration",
+            "remove it: entities are not accepted in scenario files",
+        )
 
     def begin(*_: Any) -> None:
         nonlocal depth, count
         depth, count = depth + 1, count + 1
         if depth > DEPTH.high:
-            raise InputError(doing, str(where), f"nested deeper than {DEPTH.high:.0f} levels", FETCH_AGAIN)
+            raise InputError(
+                doing, str(where), f"nested deeper than {DEPTH.high:.0f} levels", FETCH_AGAIN
+            )
         if count > XML_ELEMENTS.high:
-            raise InputError(doing, str(where), f"more than {XML_ELEMENTS.high:.0f} elements", "give a smaller map")
+            raise InputError(
+                doing,
+                str(where),
+                f"more than {XML_ELEMENTS.high:.0f} elements",
+                "give a smaller map",
+            )
 
     def end(*_: Any) -> None:
         nonlocal depth
         depth -= 1
 
     scout = expat.ParserCreate()
-    scout.StartDoctypeDeclHandler, scout.StartElementHandler, scout.EndElementHandler = refuse, begin, end
+    scout.StartDoctypeDeclHandler, scout.StartElementHandler, scout.EndElementHandler = (
+        refuse,
+        begin,
+        end,
+    )
     try:
         with parsing(doing, where, FETCH_AGAIN, "malformed XML"):
             scout.Parse(data, True)
             return ElementTree.fromstring(data)
     except InputError as error:
-        if isinstance(error.__cause__, ValueError | LookupError) and not isinstance(error.__cause__, ElementTree.ParseError):
-            raise InputError(doing, str(where), f"an unreadable text encoding: {error.__cause__}", "save the file as UTF-8") from error
+        if isinstance(error.__cause__, ValueError | LookupError) and not isinstance(
+            error.__cause__, ElementTree.ParseError
+        ):
+            raise InputError(
+                doing,
+                str(where),
+                f"an unreadable text encoding: {error.__cause__}",
+                "save the file as UTF-8",
+            ) from error
         raise
 
 
 GZIP = 16 + zlib.MAX_WBITS
 
 
-def gunzip(data: bytes, most: int, where: Path | str, doing: str, do_this: str = FETCH_AGAIN) -> bytes:
+def gunzip(
+    data: bytes, most: int, where: Path | str, doing: str, do_this: str = FETCH_AGAIN
+) -> bytes:
     """Unpack gzip data.
 
     Args:
         data: One gzip member; what follows it is ignored.
-        most: Bytes that the caller can use; `alpasim_plugin.core.limits.UNPACKED_BYTES` holds in any case.
+        most: Bytes that the caller can use; `alpasim_plugin.core.limits.UNPACKED_BYTES` holds in
+            any case.
         where: The file, for messages.
         doing: What the caller is doing, for messages.
         do_this: Last part of the errors.
@@ -345,7 +461,9 @@ def gunzip(data: bytes, most: int, where: Path | str, doing: str, do_this: str =
     return out
 
 
-def unzstd(data: bytes, expected: int, where: Path | str, doing: str, do_this: str = FETCH_AGAIN) -> bytes:
+def unzstd(
+    data: bytes, expected: int, where: Path | str, doing: str, do_this: str = FETCH_AGAIN
+) -> bytes:
     """Unpack a zstd frame of a size that is known; see `gunzip`.
 
     Raises:
@@ -355,15 +473,26 @@ def unzstd(data: bytes, expected: int, where: Path | str, doing: str, do_this: s
 
     UNPACKED_BYTES.check(expected, doing, where)
     with parsing(doing, where, do_this, "damaged zstd data"):
-        out = zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data).read(expected + 1) if expected else b""
+        out = (
+            zstandard.ZstdDecompressor(max_window_size=1 << 27)
+            .stream_reader(data)
+            .read(expected + 1)
+            if expected
+            else b""
+        )
     if len(out) != expected:
-        found = f"more than {expected} bytes" if len(out) > expected else f"{len(out)} of {expected} bytes"
+        found = (
+            f"more than {expected} bytes"
+            if len(out) > expected
+            else f"{len(out)} of {expected} bytes"
+        )
         raise InputError(doing, str(where), f"zstd data of {found}", do_this)
     return out
 
 
 def check_names(names: list[str], where: Path | str, doing: str, bound: Bound = MEMBERS) -> None:
-    """Refuse the members of an archive if one could leave it, two share a name, or there are too many.
+    """Refuse the members of an archive if one could leave it, two share a name, or there are too
+    many.
 
     Raises:
         InputError: They do.
@@ -373,7 +502,12 @@ def check_names(names: list[str], where: Path | str, doing: str, bound: Bound = 
     for name in names:
         parts = name.replace("\\", "/").split("/")
         if name.startswith("/") or "\\" in name or ".." in parts or "\0" in name:
-            raise InputError(doing, str(where), f"a member named {name!r}, outside the archive", "do not use this file")
+            raise InputError(
+                doing,
+                str(where),
+                f"a member named {name!r}, outside the archive",
+                "do not use this file",
+            )
         if name in seen:
             raise InputError(doing, str(where), f"member {name!r} twice", "write the archive again")
         seen.add(name)

@@ -1,4 +1,6 @@
-"""Pictures: PNG and JPEG, by their header before they are decoded, since a few bytes can claim billions of pixels."""
+"""Pictures: PNG and JPEG, by their header before they are decoded, since a few bytes can claim
+billions of pixels.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +17,33 @@ from alpasim_plugin.core.reading.files import parsing, read_bytes
 
 GIVE = "give a whole PNG or JPEG image"
 PNG = b"\x89PNG\r\n\x1a\n"
-_FRAMES = (0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF)  # JPEG markers that carry the size
-_BARE = (0x01, 0xD0, 0xD1, 0xD2, 0xD3, 0xD4, 0xD5, 0xD6, 0xD7, 0xD8)  # JPEG markers without a length
+_FRAMES = (
+    0xC0,
+    0xC1,
+    0xC2,
+    0xC3,
+    0xC5,
+    0xC6,
+    0xC7,
+    0xC9,
+    0xCA,
+    0xCB,
+    0xCD,
+    0xCE,
+    0xCF,
+)  # JPEG markers that carry the size
+_BARE = (
+    0x01,
+    0xD0,
+    0xD1,
+    0xD2,
+    0xD3,
+    0xD4,
+    0xD5,
+    0xD6,
+    0xD7,
+    0xD8,
+)  # JPEG markers without a length
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
@@ -25,7 +52,11 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     Source: PNG (ISO/IEC 15948) 11.2.2; JPEG (ITU-T T.81) B.2.2.
     """
     if data.startswith(PNG):
-        return struct.unpack(">II", data[16:24]) if data[12:16] == b"IHDR" and len(data) >= 24 else None
+        return (
+            struct.unpack(">II", data[16:24])
+            if data[12:16] == b"IHDR" and len(data) >= 24
+            else None
+        )
     if not data.startswith(b"\xff\xd8"):
         return None
     frame = next((at for at in _segments(data) if data[at + 1] in _FRAMES), None)
@@ -36,12 +67,16 @@ def image_size(data: bytes) -> tuple[int, int] | None:
 
 
 def picture_fault(data: bytes) -> str | None:
-    """Return what makes a picture of a good header useless as a photograph: cut off before its end, or printed colours; None if nothing.
+    """Return what makes a picture of a good header useless as a photograph: cut off before its end,
+    or printed colours; None if nothing.
 
-    Decoders fill the missing rest of a JPEG with grey, and turn CMYK into RGB by guess, without a word.
+    Decoders fill the missing rest of a JPEG with grey, and turn CMYK into RGB by guess, without a
+    word.
     """
     if data.startswith(PNG):
-        return None if b"IEND" in data[-16:] else "it ends before its last chunk: the file is cut off"
+        return (
+            None if b"IEND" in data[-16:] else "it ends before its last chunk: the file is cut off"
+        )
     if b"\xff\xd9" not in data[-4096:]:  # some cameras write a few bytes after it
         return "it ends without an end marker: the file is cut off"
     at = next((i for i in _segments(data) if data[i + 1] in _FRAMES), None)
@@ -58,7 +93,13 @@ def _segments(data: bytes) -> Iterator[int]:
         yield at
         if marker in _FRAMES:
             return
-        at += 1 if marker == 0xFF else 2 if marker in _BARE else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        at += (
+            1
+            if marker == 0xFF
+            else 2
+            if marker in _BARE
+            else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        )
 
 
 def check_image(data: bytes, where: Path | str, doing: str, do_this: str = GIVE) -> tuple[int, int]:
@@ -69,14 +110,18 @@ def check_image(data: bytes, where: Path | str, doing: str, do_this: str = GIVE)
     """
     size = image_size(data)
     if size is None:
-        raise InputError(doing, str(where), f"{len(data)} bytes beginning {data[:4]!r}, no PNG or JPEG", do_this)
+        raise InputError(
+            doing, str(where), f"{len(data)} bytes beginning {data[:4]!r}, no PNG or JPEG", do_this
+        )
     PICTURE_SIDE_PX.check(max(size), doing, where)
     PICTURE_SIDE_PX.check(min(size), doing, where)
     PICTURE_PIXELS.check(size[0] * size[1], doing, where)
     return size
 
 
-def decode_image(data: bytes, where: Path | str, doing: str, do_this: str = GIVE, flag: int = 1) -> Any:
+def decode_image(
+    data: bytes, where: Path | str, doing: str, do_this: str = GIVE, flag: int = 1
+) -> Any:
     """Decode a PNG or JPEG as OpenCV does.
 
     Args:

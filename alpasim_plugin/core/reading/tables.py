@@ -15,7 +15,11 @@ Kind = Literal["text", "integer", "number", "flag"]
 
 
 def read_parquet(
-    path: Path | str, doing: str, columns: Mapping[str, Kind] | None = None, do_this: str = FETCH_AGAIN, only: bool = False
+    path: Path | str,
+    doing: str,
+    columns: Mapping[str, Kind] | None = None,
+    do_this: str = FETCH_AGAIN,
+    only: bool = False,
 ) -> Any:
     """Return a parquet file as an Arrow table.
 
@@ -27,18 +31,31 @@ def read_parquet(
         only: Read these columns alone.
 
     Raises:
-        InputError: Unreadable or no parquet, more rows or bytes than the bounds, a column missing or of another type.
+        InputError: Unreadable or no parquet, more rows or bytes than the bounds, a column missing
+            or of another type.
     """
     check_regular(path, doing, FILE_BYTES, do_this)
     return _read(str(path), path, doing, columns, do_this, only)
 
 
-def parse_parquet(data: bytes, where: Path | str, doing: str, columns: Mapping[str, Kind] | None = None, do_this: str = FETCH_AGAIN) -> Any:
+def parse_parquet(
+    data: bytes,
+    where: Path | str,
+    doing: str,
+    columns: Mapping[str, Kind] | None = None,
+    do_this: str = FETCH_AGAIN,
+) -> Any:
     """Return a parquet document as an Arrow table; see `read_parquet`."""
     return _read(io.BytesIO(data), where, doing, columns, do_this, False)
 
 
-def check_columns(table: Any, columns: Mapping[str, Kind], where: Path | str, doing: str, do_this: str = FETCH_AGAIN) -> None:
+def check_columns(
+    table: Any,
+    columns: Mapping[str, Kind],
+    where: Path | str,
+    doing: str,
+    do_this: str = FETCH_AGAIN,
+) -> None:
     """Refuse a table that lacks a column or has one of another type.
 
     Raises:
@@ -48,11 +65,17 @@ def check_columns(table: Any, columns: Mapping[str, Kind], where: Path | str, do
     for name, kind in columns.items():
         if names.count(name) != 1:
             shown = ", ".join(names[:12])
-            found = f"no column {name!r}, only {shown}" if name not in names else f"column {name!r} {names.count(name)} times"
+            found = (
+                f"no column {name!r}, only {shown}"
+                if name not in names
+                else f"column {name!r} {names.count(name)} times"
+            )
             raise InputError(doing, str(where), found, do_this)
         type_ = table.schema.field(name).type
         if not _is(type_, kind):
-            raise InputError(doing, str(where), f"column {name!r} of {type_}, wanted {kind}", do_this)
+            raise InputError(
+                doing, str(where), f"column {name!r} of {type_}, wanted {kind}", do_this
+            )
 
 
 def _is(type_: Any, kind: Kind) -> bool:
@@ -73,8 +96,12 @@ def _is(type_: Any, kind: Kind) -> bool:
     return bool(t.is_boolean(type_))
 
 
-def check_parquet(path: Path | str, doing: str, columns: Mapping[str, Kind], do_this: str = FETCH_AGAIN) -> list[str]:
-    """Check the header of a parquet file that is read in parts later, and return its columns; see `read_parquet` for what is refused."""
+def check_parquet(
+    path: Path | str, doing: str, columns: Mapping[str, Kind], do_this: str = FETCH_AGAIN
+) -> list[str]:
+    """Check the header of a parquet file that is read in parts later, and return its columns; see
+    `read_parquet` for what is refused.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -87,7 +114,14 @@ def check_parquet(path: Path | str, doing: str, columns: Mapping[str, Kind], do_
     return list(empty.column_names)
 
 
-def _read(source: Any, where: Path | str, doing: str, columns: Mapping[str, Kind] | None, do_this: str, only: bool) -> Any:
+def _read(
+    source: Any,
+    where: Path | str,
+    doing: str,
+    columns: Mapping[str, Kind] | None,
+    do_this: str,
+    only: bool,
+) -> Any:
     import pyarrow.parquet as pq
 
     _check_size(source, where, doing, do_this)
@@ -109,6 +143,14 @@ def _check_size(source: Any, where: Path | str, doing: str, do_this: str) -> Non
         facts = pq.read_metadata(source)
         TABLE_ROWS.check(facts.num_rows, doing, where)
         TABLE_COLUMNS.check(facts.num_columns, doing, where)
-        chunks = [facts.row_group(i).column(j) for i in range(facts.num_row_groups) for j in range(facts.num_columns)]
+        chunks = [
+            facts.row_group(i).column(j)
+            for i in range(facts.num_row_groups)
+            for j in range(facts.num_columns)
+        ]
         # Runs of equal values take no space in the file: what they become in memory counts.
-        TABLE_BYTES.check(sum(max(chunk.total_uncompressed_size, 8 * chunk.num_values) for chunk in chunks), doing, where)
+        TABLE_BYTES.check(
+            sum(max(chunk.total_uncompressed_size, 8 * chunk.num_values) for chunk in chunks),
+            doing,
+            where,
+        )

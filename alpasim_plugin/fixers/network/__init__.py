@@ -1,7 +1,7 @@
 """Networks of the fixers, and reading their weights.
 
-The networks of the block generators can be imported from here by name. The package that holds them registers them in the entry-point group
-``simrun.networks``; they are loaded on first use.
+The networks of the block generators can be imported from here by name. The package that holds them
+registers them in the entry-point group ``simrun.networks``; they are loaded on first use.
 """
 
 from __future__ import annotations

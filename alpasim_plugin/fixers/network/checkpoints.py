@@ -21,17 +21,27 @@ from alpasim_plugin.core.reading import check_regular, parsing
 
 StateDict = dict[str, Tensor]
 WRAPPERS = ("model", "state_dict")
-RECOMPUTED = ("pos_embedder.seq", "pos_embedder.dim_spatial_range", "pos_embedder.dim_temporal_range")
+RECOMPUTED = (
+    "pos_embedder.seq",
+    "pos_embedder.dim_spatial_range",
+    "pos_embedder.dim_temporal_range",
+)
 CHECKPOINT_INFIX = "_checkpoint_wrapped_module."
 LISTED = 8  # keys named in one error message; the rest is counted
 ZIP_MAGIC, PICKLE_MAGIC = b"PK\x03\x04", b"\x80"
 
 
-def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str = "cpu", sha256: str | None = None) -> StateDict:
+def load_weights(
+    path: str | Path,
+    dtype: torch.dtype | None = None,
+    device: str = "cpu",
+    sha256: str | None = None,
+) -> StateDict:
     """Read a checkpoint file.
 
     Args:
-        path: A ``.safetensors`` file, or a torch file that loads with ``weights_only`` (only tensors and plain containers).
+        path: A ``.safetensors`` file, or a torch file that loads with ``weights_only`` (only
+            tensors and plain containers).
         dtype: Precision for floating tensors; None keeps each as stored.
         device: Where the tensors go.
         sha256: Expected digest, in hexadecimal; checked before anything is read.
@@ -40,7 +50,8 @@ def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str
         Tensors by key, taken out of an outer ``{"model": ...}`` or ``{"state_dict": ...}``.
 
     Raises:
-        InputError: No file, wrong digest, truncated or foreign file, or a pickle with other objects than tensors.
+        InputError: No file, wrong digest, truncated or foreign file, or a pickle with other objects
+            than tensors.
     """
     path = Path(path)
     doing = "reading network weights"
@@ -50,11 +61,15 @@ def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str
         raise InputError(doing, str(path), f"sha256 {found}, not {sha256.lower()}", do)
     with path.open("rb") as file:
         head = file.read(9)
-    # A safetensors file begins with a length of 8 bytes and a JSON object; the length may look like the start of a pickle.
+    # A safetensors file begins with a length of 8 bytes and a JSON object; the length may look like
+    # the start of a pickle.
     if not head.endswith(b"{") and head.startswith((ZIP_MAGIC, PICKLE_MAGIC)):
         content = _load_pickle(path, device)
     else:
-        what, do = f"not a complete safetensors file of {path.stat().st_size} bytes", "download or copy the file again"
+        what, do = (
+            f"not a complete safetensors file of {path.stat().st_size} bytes",
+            "download or copy the file again",
+        )
         with parsing(doing, path, f"{do}; it is truncated or of another format", what):
             content = load_file(path, device=device)
     tensors = unwrap(content, str(path))
@@ -73,13 +88,19 @@ def unwrap(content: object, source: str) -> StateDict:
     """Take the tensors out of an outer dictionary; entries of the training framework are dropped.
 
     Raises:
-        InputError: No dictionary, no tensors, or something else under a key that should hold a tensor.
+        InputError: No dictionary, no tensors, or something else under a key that should hold a
+            tensor.
     """
     for wrapper in WRAPPERS:
         if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
             content = content[wrapper]
-    doing, do = "reading network weights", "give a dictionary of tensors, alone or under the key 'model' or 'state_dict'"
-    if not isinstance(content, Mapping) or not any(isinstance(value, Tensor) for value in content.values()):
+    doing, do = (
+        "reading network weights",
+        "give a dictionary of tensors, alone or under the key 'model' or 'state_dict'",
+    )
+    if not isinstance(content, Mapping) or not any(
+        isinstance(value, Tensor) for value in content.values()
+    ):
         raise InputError(doing, source, f"a {type(content).__name__} without tensors", do)
     tensors = {str(key): value for key, value in content.items() if not _is_bookkeeping(str(key))}
     for key, value in tensors.items():
@@ -91,8 +112,9 @@ def unwrap(content: object, source: str) -> StateDict:
 def clean(tensors: Mapping[str, Tensor]) -> StateDict:
     """Return the network's own tensors under their plain keys.
 
-    A prefix ``net.`` is stripped; where it is used, everything without it (averaged weights, optimiser) is dropped. Also dropped:
-    rotary buffers (recomputed), training counters, transformer-engine states, the infix of activation checkpointing.
+    A prefix ``net.`` is stripped; where it is used, everything without it (averaged weights,
+    optimiser) is dropped. Also dropped: rotary buffers (recomputed), training counters,
+    transformer-engine states, the infix of activation checkpointing.
     """
     prefixed = any(key.startswith("net.") for key in tensors)
     out: StateDict = {}
@@ -116,7 +138,9 @@ def convert(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
     out = value.detach().to(dtype, copy=True)
     if value.device.type != "meta" and bool((~out.isfinite() & value.isfinite()).any()):
         found = f"{key} holds {float(value.abs().max()):.4g}, beyond {dtype}"
-        raise InputError("converting network weights", source, found, "use torch.bfloat16 or torch.float32")
+        raise InputError(
+            "converting network weights", source, found, "use torch.bfloat16 or torch.float32"
+        )
     return out
 
 
@@ -128,7 +152,12 @@ def weight(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
     """
     doing = "loading network weights"
     if not value.is_floating_point():
-        raise InputError(doing, source, f"{key} holds {value.dtype}", "give floating-point weights; quantise after loading")
+        raise InputError(
+            doing,
+            source,
+            f"{key} holds {value.dtype}",
+            "give floating-point weights; quantise after loading",
+        )
     if value.device.type != "meta" and not bool(value.isfinite().all()):
         found = f"{key} holds {int((~value.isfinite()).sum())} values that are not finite, of {value.numel()}"
         raise InputError(doing, source, found, "use a checkpoint from before training diverged")
@@ -147,13 +176,23 @@ def _is_bookkeeping(key: str) -> bool:
 
 def _load_pickle(path: Path, device: str) -> object:
     try:
-        # Pass an open file, since torch chooses its reader by the suffix. Byte buffers hold transformer-engine states, which are dropped.
+        # Pass an open file, since torch chooses its reader by the suffix. Byte buffers hold
+        # transformer-engine states, which are dropped.
         with path.open("rb") as file, torch.serialization.safe_globals([io.BytesIO]):
             return torch.load(file, map_location=device, weights_only=True)
     except pickle.UnpicklingError as error:
-        reason = str(error).split("WeightsUnpickler error:")[-1].strip().split(". ")[0].split("\n")[0]
+        reason = (
+            str(error).split("WeightsUnpickler error:")[-1].strip().split(". ")[0].split("\n")[0]
+        )
         found = f"a pickle that holds more than tensors ({reason}); loading it could run code"
-        raise InputError("reading network weights", str(path), found, "save the tensors alone, best as safetensors") from error
+        raise InputError(
+            "reading network weights",
+            str(path),
+            found,
+            "save the tensors alone, best as safetensors",
+        ) from error
     except Exception as error:  # whatever the unpickler raises on damaged bytes
         found = f"a truncated or damaged torch file: {(str(error).splitlines() or [type(error).__name__])[0]}"
-        raise InputError("reading network weights", str(path), found, "download or copy the file again") from error
+        raise InputError(
+            "reading network weights", str(path), found, "download or copy the file again"
+        ) from error

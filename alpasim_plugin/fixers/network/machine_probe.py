@@ -1,8 +1,10 @@
-"""What this machine computes quickly, asked of the machine: a convolution as the generators have them, timed in a few milliseconds.
+"""What this machine computes quickly, asked of the machine: a convolution as the generators have
+them, timed in a few milliseconds.
 
-Instruction sets alone do not tell: bfloat16 is several times as fast as float32 where the processor multiplies matrices of it, about as
-fast where it only converts, and several times slower where it is emulated; and a second thread that shares a core may cost more than it
-brings. Within a run each node is asked once, for all of its workers (`alpasim_plugin.core.cache`).
+Instruction sets alone do not tell: bfloat16 is several times as fast as float32 where the processor
+multiplies matrices of it, about as fast where it only converts, and several times slower where it
+is emulated; and a second thread that shares a core may cost more than it brings. Within a run each
+node is asked once, for all of its workers (`alpasim_plugin.core.cache`).
 
 Where a fixer computes.
 """
@@ -22,8 +24,11 @@ from alpasim_plugin.core.errors import FixerError
 
 REPEATS = 5
 LONG_ENOUGH_S = 0.1  # no further turn after this: what takes so long has lost
-CHANNELS, HEIGHT, WIDTH = 48, 36, 64
-WORTH = 1.5  # so much faster bfloat16 must be to be taken: a probe on a busy machine may be off by some tenths
+CHANNELS = 48
+HEIGHT = 36
+WIDTH = 64
+# so much faster bfloat16 must be to be taken: a probe on a busy machine may be off by some tenths
+WORTH = 1.5
 WORTH_A_THREAD = 1.1
 
 
@@ -32,8 +37,9 @@ class Probe:
     """One convolution at two precisions.
 
     Attributes:
-        fp32_ms, bf16_ms: Least processor time of several runs that took turns; that of all threads. Other load on the machine, which wall
-            time would show, must not decide: another precision is another picture.
+        fp32_ms, bf16_ms: Least processor time of several runs that took turns; that of all threads.
+            Other load on the machine, which wall time would show, must not decide: another
+            precision is another picture.
         fp32_error, bf16_error: Distance of the result from float64, relative in the Euclidean norm.
     """
 
@@ -53,11 +59,17 @@ class Threads:
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for a record."""
-        return {"number": self.number, "why": self.why, "ms": {str(n): round(ms, 3) for n, ms in self.ms.items()}}
+        return {
+            "number": self.number,
+            "why": self.why,
+            "ms": {str(n): round(ms, 3) for n, ms in self.ms.items()},
+        }
 
 
 def probe_precision() -> Probe:
-    """Time the convolution in float32 and bfloat16 with torch's present number of threads, unless the run has done so on this node."""
+    """Time the convolution in float32 and bfloat16 with torch's present number of threads, unless
+    the run has done so on this node.
+    """
     return Probe(**measured("precision", lambda: asdict(_time_precisions())))
 
 
@@ -67,7 +79,9 @@ def _time_precisions() -> Probe:
     ms = dict.fromkeys(operands, float("inf"))
     error = {}
     for dtype, pair in operands.items():
-        error[dtype] = float((_convolve(*pair).double() - exact).norm() / exact.norm())  # the first run, which also sets up kernels
+        error[dtype] = float(
+            (_convolve(*pair).double() - exact).norm() / exact.norm()
+        )  # the first run, which also sets up kernels
     began = time.perf_counter()
     for turn in range(REPEATS):
         if turn and time.perf_counter() - began > LONG_ENOUGH_S:
@@ -78,9 +92,11 @@ def _time_precisions() -> Probe:
 
 
 def choose_threads(most: int) -> Threads:
-    """Return the number of torch threads that pays, at most ``most``, as it was found on this node by the run's first process.
+    """Return the number of torch threads that pays, at most ``most``, as it was found on this node
+    by the run's first process.
 
-    One thread is taken unless all of them together are faster by a tenth. Torch's own setting is as before afterwards.
+    One thread is taken unless all of them together are faster by a tenth. Torch's own setting is as
+    before afterwards.
 
     Example:
         >>> choose_threads(1)
@@ -103,18 +119,29 @@ def _time_threads(most: int) -> Threads:
             for number in ms:
                 torch.set_num_threads(number)
                 took = _ms(*pair)
-                ms[number] = min(ms[number], took) if turn else ms[number]  # the first turn sets up kernels and threads
+                ms[number] = (
+                    min(ms[number], took) if turn else ms[number]
+                )  # the first turn sets up kernels and threads
     finally:
         torch.set_num_threads(before)
     gain = ms[1] / ms[most]
-    return Threads(most if gain > WORTH_A_THREAD else 1, f"{most} threads are {gain:.2g} times as fast as one", ms)
+    return Threads(
+        most if gain > WORTH_A_THREAD else 1,
+        f"{most} threads are {gain:.2g} times as fast as one",
+        ms,
+    )
 
 
 def _operands(dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     seeded = torch.Generator().manual_seed(0)
     image = torch.randn(1, CHANNELS, HEIGHT, WIDTH, generator=seeded, dtype=torch.float64)
-    kernel = torch.randn(CHANNELS, CHANNELS, 3, 3, generator=seeded, dtype=torch.float64) / (9 * CHANNELS) ** 0.5
-    return image.to(dtype).contiguous(memory_format=torch.channels_last), kernel.to(dtype).contiguous(memory_format=torch.channels_last)
+    kernel = (
+        torch.randn(CHANNELS, CHANNELS, 3, 3, generator=seeded, dtype=torch.float64)
+        / (9 * CHANNELS) ** 0.5
+    )
+    return image.to(dtype).contiguous(memory_format=torch.channels_last), kernel.to(
+        dtype
+    ).contiguous(memory_format=torch.channels_last)
 
 
 @torch.inference_mode()
@@ -140,15 +167,22 @@ class Choice:
         """Return it for a record, with the measured error of one convolution at this precision."""
         out: dict[str, Any] = {"name": self.name, "why": self.why}
         if self.probe is not None:
-            out |= {"error": self.probe.bf16_error if self.name == "bf16" else self.probe.fp32_error, "probe": asdict(self.probe)}
+            out |= {
+                "error": self.probe.bf16_error if self.name == "bf16" else self.probe.fp32_error,
+                "probe": asdict(self.probe),
+            }
         return out
 
 
-def choose_precision(wanted: Literal["auto", "fp32", "bf16"] = "auto", device: str = "cpu") -> Choice:
+def choose_precision(
+    wanted: Literal["auto", "fp32", "bf16"] = "auto", device: str = "cpu"
+) -> Choice:
     """Return the precision of convolutions that pays on this machine.
 
-    ``auto`` is bfloat16 on a GPU, and on a processor on which a convolution in bfloat16 takes at most two thirds of the time that it takes
-    in float32 (`alpasim_plugin.fixers.network.machine_probe`). Where bfloat16 is emulated it takes several times as long.
+    ``auto`` is bfloat16 on a GPU, and on a processor on which a convolution in bfloat16 takes at
+    most two thirds of the time that it takes in float32
+    (`alpasim_plugin.fixers.network.machine_probe`). Where bfloat16 is emulated it takes several
+    times as long.
 
     Example:
         >>> choose_precision("fp32")
@@ -160,7 +194,11 @@ def choose_precision(wanted: Literal["auto", "fp32", "bf16"] = "auto", device: s
         return Choice("bf16", "a GPU")
     probe = probe_precision()
     gain = probe.fp32_ms / probe.bf16_ms
-    return Choice("bf16" if gain >= WORTH else "fp32", f"bfloat16 is {gain:.2g} times as fast as float32 on this processor", probe)
+    return Choice(
+        "bf16" if gain >= WORTH else "fp32",
+        f"bfloat16 is {gain:.2g} times as fast as float32 on this processor",
+        probe,
+    )
 
 
 def require_device(device: str, doing: str) -> None:
@@ -170,7 +208,9 @@ def require_device(device: str, doing: str) -> None:
         FixerError: torch sees no such device.
     """
     if device.split(":")[0] == "cuda" and not torch.cuda.is_available():
-        raise FixerError(doing, f"device {device!r}", "torch sees no CUDA device", "use --device cpu")
+        raise FixerError(
+            doing, f"device {device!r}", "torch sees no CUDA device", "use --device cpu"
+        )
 
 
 def take_threads(threads: int | None) -> dict[str, Any]:
@@ -180,7 +220,8 @@ def take_threads(threads: int | None) -> dict[str, Any]:
         threads: That this process may use; None leaves their number.
 
     Returns:
-        The choice with its measurements, under ``threads``, for a fixer's ``chosen``; empty where nothing was chosen.
+        The choice with its measurements, under ``threads``, for a fixer's ``chosen``; empty where
+        nothing was chosen.
     """
     if threads is None:
         return {}

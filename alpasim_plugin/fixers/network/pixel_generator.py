@@ -1,14 +1,16 @@
-"""A causal generator in pixels, one frame at a time: a recurrent U-Net that predicts the clean frame from the render.
+"""A causal generator in pixels, one frame at a time: a recurrent U-Net that predicts the clean
+frame from the render.
 
     z_1 = m r + (1 - m) eps                          source (OneFixer, Eq. 1), m = 1 above half opacity
     z_t = (1 - t) x_0 + t z_1                        interpolant; deployed at t = 1
     x_0 = r + G(r, z_t - r, opacity, map, state)     prediction of the clean frame, from the render
     v   = (z_t - x_0) / t                            velocity; the one step z_1 - v (Eq. 2) is x_0
 
-The state is what the generator itself made of the past: its last output, the render that this was made from, and recurrent channels at a
-quarter of the resolution. The network works at 1/4, 1/8 and 1/16; a detail path at 1/2 reads render, opacity and last output again and
-writes the result, so that fine texture does not pass through the U-Net. Every value of the noise in the source is a function of rollout,
-camera, frame, step and pixel.
+The state is what the generator itself made of the past: its last output, the render that this was
+made from, and recurrent channels at a quarter of the resolution. The network works at 1/4, 1/8 and
+1/16; a detail path at 1/2 reads render, opacity and last output again and writes the result, so
+that fine texture does not pass through the U-Net. Every value of the noise in the source is a
+function of rollout, camera, frame, step and pixel.
 """
 
 from __future__ import annotations
@@ -55,21 +57,28 @@ from alpasim_plugin.fixers.network.reference_blend import (
 
 HOLE = 0.5  # opacity below which noise enters the source
 ODD = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Steele et al., 2014, SplitMix64)
-MIX = ((np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)), (np.uint64(27), np.uint64(0x94D049BB133111EB)))
+MIX = (
+    (np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)),
+    (np.uint64(27), np.uint64(0x94D049BB133111EB)),
+)
 LAST = np.uint64(31)
 CHANNELS = 3
 
 
 def hole_mask(opacity: Tensor) -> Tensor:
-    """Return the mask m of Eq. 1, hardened: 1 above half opacity, falling to 0 where nothing is drawn.
+    """Return the mask m of Eq. 1, hardened: 1 above half opacity, falling to 0 where nothing is
+    drawn.
 
-    With m = opacity, noise would enter the half of a picture that is nearly opaque, and a small network would have to take it out again.
+    With m = opacity, noise would enter the half of a picture that is nearly opaque, and a small
+    network would have to take it out again.
     """
     return (opacity / HOLE).clamp(max=1)
 
 
 def pixel_source(render: Tensor, opacity: Tensor, eps: Tensor) -> Tensor:
-    """Return z_1 = m r + (1 - m) eps (Eq. 1) for images ``(..., C)`` and an opacity of one channel."""
+    """Return z_1 = m r + (1 - m) eps (Eq. 1) for images ``(..., C)`` and an opacity of one
+    channel.
+    """
     m = hole_mask(opacity)
     return m * render + (1 - m) * eps
 
@@ -80,7 +89,8 @@ def sparse_source(render: Tensor, opacity: Tensor, draw: Callable[[int, I64], F3
     Args:
         render: ``(B, H, W, 3)``.
         opacity: ``(B, H, W, 1)``.
-        draw: Called per image that has a hole with its place in the batch and row-major indices ``(N,)``; returns ``(N, 3)``.
+        draw: Called per image that has a hole with its place in the batch and row-major indices
+            ``(N,)``; returns ``(N, 3)``.
     """
     source = render
     for b, alpha in enumerate(opacity[..., 0].flatten(1)):
@@ -95,7 +105,8 @@ def sparse_source(render: Tensor, opacity: Tensor, draw: Callable[[int, I64], F3
 
 
 def pixel_noise(scene_id: str, seed: int, camera: str, draw: int, frame: int, pixels: I64) -> F32:
-    """Draw standard normal values for some pixels of a frame; a pixel's values do not depend on which others are asked for.
+    """Draw standard normal values for some pixels of a frame; a pixel's values do not depend on
+    which others are asked for.
 
     Drawing whole frames would take longer than the network: holes are about one pixel in a hundred.
 
@@ -117,13 +128,20 @@ def pixel_noise(scene_id: str, seed: int, camera: str, draw: int, frame: int, pi
     index = (pixels[:, None] * CHANNELS + np.arange(CHANNELS)).astype(np.uint64) * np.uint64(2)
     with np.errstate(over="ignore"):  # arithmetic modulo 2^64
         u, v = (_uniform(key + (index + np.uint64(i + 1)) * ODD) for i in range(2))
-    normal: F32 = (np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)).astype(np.float32)  # Box and Muller, 1958
+    normal: F32 = (np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)).astype(
+        np.float32
+    )  # Box and Muller, 1958
     return normal
 
 
 def content_key(t_us: int, rgb: U8) -> int:
-    """Return a frame's number as its content gives it: the same render at the same time has the same noise in every rollout."""
-    return int.from_bytes(hashlib.blake2b(rgb.tobytes(), digest_size=8, salt=t_us.to_bytes(8, "little")).digest(), "little")
+    """Return a frame's number as its content gives it: the same render at the same time has the
+    same noise in every rollout.
+    """
+    return int.from_bytes(
+        hashlib.blake2b(rgb.tobytes(), digest_size=8, salt=t_us.to_bytes(8, "little")).digest(),
+        "little",
+    )
 
 
 def _uniform(x: np.ndarray) -> np.ndarray:
@@ -150,7 +168,8 @@ class PixelSizes:
         detail: Channels of the detail path at 1/2.
         hidden: Recurrent channels at 1/4; 0: none.
         memory: Past frames that are attended to at 1/16 (`nets.pixel_layers`); 0: none.
-        blend: Channels of the head that blends references with the picture (`nets.reference_blend`); 0: references are not read.
+        blend: Channels of the head that blends references with the picture
+            (`nets.reference_blend`); 0: references are not read.
     """
 
     widths: tuple[int, int, int] = (48, 80, 160)
@@ -178,7 +197,9 @@ class PixelState(NamedTuple):
     def restarted(self, fresh: Tensor, start: PixelState) -> PixelState:
         """Return the state with the clips that ``fresh`` ``(B,)`` marks taken from ``start``."""
         at = fresh[:, None, None, None]
-        return PixelState(*(torch.where(at, new, old) for new, old in zip(start, self, strict=True)))
+        return PixelState(
+            *(torch.where(at, new, old) for new, old in zip(start, self, strict=True))
+        )
 
 
 class BeforeBlend(NamedTuple):
@@ -198,11 +219,15 @@ class GatheredCells(NamedTuple):
     fine: Tensor  # (B, H / 2, W / 2, 4 * DETAIL_IMAGES)
 
 
-def gather_cells(render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor | None = None) -> GatheredCells:
-    """Put what the network reads side by side; arguments as in `PixelGenerator.forward`, result in float32.
+def gather_cells(
+    render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor | None = None
+) -> GatheredCells:
+    """Put what the network reads side by side; arguments as in `PixelGenerator.forward`, result in
+    float32.
 
-    ``coarse`` holds per cell the `cells` of render, 2 opacity - 1, map, last output, last render and source minus render, then the
-    recurrent channels; ``fine`` those of render, 2 opacity - 1 and last output.
+    ``coarse`` holds per cell the `cells` of render, 2 opacity - 1, map, last output, last render
+    and source minus render, then the recurrent channels; ``fine`` those of render, 2 opacity - 1
+    and last output.
     """
     cover = 2 * opacity - 1
     noise = torch.zeros_like(render) if source is None else source - render
@@ -255,7 +280,9 @@ class PixelGenerator(nn.Module):
 
     @classmethod
     def random(cls, sizes: PixelSizes, seed: int) -> Self:
-        """Return an untrained network: its weights are a function of the seed, and torch's own random state stays as it was."""
+        """Return an untrained network: its weights are a function of the seed, and torch's own
+        random state stays as it was.
+        """
         with fork_rng(devices=[]):
             torch.manual_seed(seed % 2**63)
             return cls(sizes)
@@ -290,10 +317,12 @@ class PixelGenerator(nn.Module):
             opacity: ``(B, H, W, 1)``, 0 to 1.
             sdmap: ``(B, H, W, 3)`` in [-1, 1]; black (-1) where there is no map.
             state: From `start` or the last call.
-            source: ``(B, H, W, 3)`` z_t; None is the render, which is z_1 where nothing is transparent.
+            source: ``(B, H, W, 3)`` z_t; None is the render, which is z_1 where nothing is
+                transparent.
             t: ``(B,)`` flow time; None is 1, the deployed step.
-            references: ``(B, K, H, W, 4)`` recorded frames in this view, colour in [-1, 1] and where it holds, 0 to 1; None: there is none.
-                A network without a blending head does not read them.
+            references: ``(B, K, H, W, 4)`` recorded frames in this view, colour in [-1, 1] and
+                where it holds, 0 to 1; None: there is none. A network without a blending head does
+                not read them.
 
         Returns:
             ``(B, H, W, 3)`` the clean frame x_0, float32, not clipped, and the state after it.
@@ -311,20 +340,37 @@ class PixelGenerator(nn.Module):
         t: Tensor | None = None,
         references: Tensor | None = None,
     ) -> tuple[Tensor, PixelState, Sources | None]:
-        """Predict the clean frame and say what it was blended of; None without references. See `forward`."""
+        """Predict the clean frame and say what it was blended of; None without references. See
+        `forward`.
+        """
         gathered = gather_cells(render, opacity, sdmap, state, source)
-        beside = None if self.blend is None or references is None else gather_beside(references, render)
+        beside = (
+            None if self.blend is None or references is None else gather_beside(references, render)
+        )
         made = self.before_blend(gathered, render, state, t, beside)
-        out, recorded, sources = made.repaired, torch.zeros_like(render[..., :1]), None
+        out = made.repaired
+        recorded = torch.zeros_like(render[..., :1])
+        sources = None
         if made.heads is not None and references is not None:
             sources = sources_of(made.repaired, references, made.heads)
             out, recorded = mix(sources)
-        return out, PixelState(out.clamp(-1, 1), render, made.hidden, made.kept, made.frames, recorded), sources
+        return (
+            out,
+            PixelState(out.clamp(-1, 1), render, made.hidden, made.kept, made.frames, recorded),
+            sources,
+        )
 
     def before_blend(
-        self, gathered: GatheredCells, render: Tensor, state: PixelState, t: Tensor | None = None, beside: BesideCells | None = None
+        self,
+        gathered: GatheredCells,
+        render: Tensor,
+        state: PixelState,
+        t: Tensor | None = None,
+        beside: BesideCells | None = None,
     ) -> BeforeBlend:
-        """Run the network up to the blend of its picture with the references, which `gather_beside` gathered; see `forward`."""
+        """Run the network up to the blend of its picture with the references, which `gather_beside`
+        gathered; see `forward`.
+        """
         dtype = self.stem.weight.dtype
         stem, read = self.stem(gathered.coarse.to(dtype)), self.read(gathered.fine.to(dtype))
         if self.blend is not None and beside is not None:
@@ -333,7 +379,10 @@ class PixelGenerator(nn.Module):
         x4 = self.encode4(self.mix(activation(stem, inplace=True)))
         x8 = self.down8(activation(x4))
         if t is not None:
-            x8 = x8 + self.time(torch.stack([1 - t, (1 - t).square()], dim=-1).to(dtype))[:, None, None]
+            x8 = (
+                x8
+                + self.time(torch.stack([1 - t, (1 - t).square()], dim=-1).to(dtype))[:, None, None]
+            )
         x8 = self.encode8(x8)
         y = self.middle(self.down16(activation(x8)))
         kept, frames = state.kept, state.frames
@@ -344,8 +393,12 @@ class PixelGenerator(nn.Module):
         hidden = state.hidden if self.remember is None else torch.tanh(self.remember(y)).float()
         fine = activation(read.add_(self.up2(y)), inplace=True)
         fine = self.refine(fine, activated=True)
-        heads = self.blend(y, fine, beside) if self.blend is not None and beside is not None else None
-        return BeforeBlend(pixels(self.write(fine), DETAIL).float() + render, hidden, kept, frames, heads)
+        heads = (
+            self.blend(y, fine, beside) if self.blend is not None and beside is not None else None
+        )
+        return BeforeBlend(
+            pixels(self.write(fine), DETAIL).float() + render, hidden, kept, frames, heads
+        )
 
     @classmethod
     def from_state_dict(cls, tensors: Mapping[str, Tensor], source: str = "weights") -> Self:
@@ -356,13 +409,32 @@ class PixelGenerator(nn.Module):
         """
         net = cls(_sizes_of(tensors, source))
         mine = net.state_dict()
-        missing, unknown = sorted(mine.keys() - tensors.keys()), sorted(tensors.keys() - mine.keys())
-        wrong = [f"{key} {list(tensors[key].shape)} for {list(mine[key].shape)}" for key in mine.keys() & tensors.keys()
-                 if tensors[key].shape != mine[key].shape]  # fmt: skip
-        found = "; ".join(filter(None, (listed("missing", missing), listed("unknown", unknown), listed("shape", sorted(wrong)))))
+        missing, unknown = (
+            sorted(mine.keys() - tensors.keys()),
+            sorted(tensors.keys() - mine.keys()),
+        )
+        wrong = [
+            f"{key} {list(tensors[key].shape)} for {list(mine[key].shape)}"
+            for key in mine.keys() & tensors.keys()
+            if tensors[key].shape != mine[key].shape
+        ]
+        found = "; ".join(
+            filter(
+                None,
+                (
+                    listed("missing", missing),
+                    listed("unknown", unknown),
+                    listed("shape", sorted(wrong)),
+                ),
+            )
+        )
         if found:
-            raise InputError(DOING, source, found, "give the weights of one generator in pixels, all of them")
-        net.load_state_dict({key: weight(key, value, torch.float32, source) for key, value in tensors.items()})
+            raise InputError(
+                DOING, source, found, "give the weights of one generator in pixels, all of them"
+            )
+        net.load_state_dict(
+            {key: weight(key, value, torch.float32, source) for key, value in tensors.items()}
+        )
         return net
 
     @property
@@ -378,7 +450,9 @@ def _blocks(channels: int, count: int) -> nn.Sequential:
 def _sizes_of(tensors: Mapping[str, Tensor], source: str) -> PixelSizes:
     def width(key: str) -> int:
         if key not in tensors or tensors[key].ndim < 2:
-            raise InputError(DOING, source, f"no kernel {key}", "give the weights of a generator in pixels")
+            raise InputError(
+                DOING, source, f"no kernel {key}", "give the weights of a generator in pixels"
+            )
         return int(tensors[key].shape[0])
 
     def depth(stage: str) -> int:
@@ -386,7 +460,13 @@ def _sizes_of(tensors: Mapping[str, Tensor], source: str) -> PixelSizes:
 
     hidden = width("remember.weight") if "remember.weight" in tensors else 0
     widths = (width("stem.weight"), width("down8.weight"), width("down16.weight"))
-    blocks = (depth("encode4"), depth("encode8"), depth("middle"), depth("decode8"), depth("decode4"))
+    blocks = (
+        depth("encode4"),
+        depth("encode8"),
+        depth("middle"),
+        depth("decode8"),
+        depth("decode4"),
+    )
     memory = width("memory.age") if "memory.age" in tensors else 0
     blend = width("blend.head.weight") if "blend.head.weight" in tensors else 0
     return PixelSizes(widths, blocks, width("refine.weight"), hidden, memory, blend)

@@ -1,12 +1,14 @@
-"""Layers of a generator in pixels: cells of pixels as channels, residual blocks, upsampling that begins as a copy of each pixel.
+"""Layers of a generator in pixels: cells of pixels as channels, residual blocks, upsampling that
+begins as a copy of each pixel.
 
-Images are ``(B, H, W, C)``: 2D convolutions of a CPU are fastest on them, a 1x1 convolution is a matrix product, and a cell of pixels
-becomes channels by copying contiguous runs.
+Images are ``(B, H, W, C)``: 2D convolutions of a CPU are fastest on them, a 1x1 convolution is a
+matrix product, and a cell of pixels becomes channels by copying contiguous runs.
 
 Causal attention over past frames at 1/16 of the resolution: an option of the generator in pixels.
 
-Every `STRIDE`-th frame leaves the keys and values of its cells; a later frame attends to those of the last ``slots`` such frames. Keys and
-values are kept as they were made, so a frame is never computed again.
+Every `STRIDE`-th frame leaves the keys and values of its cells; a later frame attends to those of
+the last ``slots`` such frames. Keys and values are kept as they were made, so a frame is never
+computed again.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ def activation(x: Tensor, inplace: bool = False) -> Tensor:
 def cpu_operator(schema: str) -> Callable[[Callable[..., Tensor]], Callable[..., Tensor]]:
     """Make a function on the CPU an operator, which a recording of the network calls.
 
-    ``torch.library.custom_op`` would do the same, and load the compiler of graphs at the first call: a second of every worker.
+    ``torch.library.custom_op`` would do the same, and load the compiler of graphs at the first
+    call: a second of every worker.
     """
 
     def make(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
@@ -49,7 +52,8 @@ def cpu_operator(schema: str) -> Callable[[Callable[..., Tensor]], Callable[...,
 
 
 def cells(x: Tensor, side: int) -> Tensor:
-    """Turn cells of ``side x side`` pixels into channels: ``(B, H, W, C)`` to ``(B, H / side, W / side, side * side * C)``.
+    """Turn cells of ``side x side`` pixels into channels: ``(B, H, W, C)`` to ``(B, H / side, W /
+    side, side * side * C)``.
 
     Channels are ordered by row, column and channel of the pixel.
     """
@@ -76,10 +80,14 @@ class Conv3(nn.Conv2d):
         self.register_buffer("packed", None, persistent=False)
 
     def forward(self, input: Tensor, activated: bool = False) -> Tensor:
-        """Map ``(B, H, W, inputs)`` to ``(B, H, W, outputs)``; ``activated`` by the leaky rectifier as well."""
+        """Map ``(B, H, W, inputs)`` to ``(B, H, W, outputs)``; ``activated`` by the leaky rectifier
+        as well.
+        """
         image = input.permute(0, 3, 1, 2)
         if self.packed is not None:
-            made: Tensor = _recordable(_packed_convolution)(image, self.packed, self.bias, "leaky_relu" if activated else "none", SLOPE)
+            made: Tensor = _recordable(_packed_convolution)(
+                image, self.packed, self.bias, "leaky_relu" if activated else "none", SLOPE
+            )
             return made.permute(0, 2, 3, 1)
         out = F.conv2d(image, self.weight, self.bias, padding=1).permute(0, 2, 3, 1)
         return activation(out, inplace=True) if activated else out
@@ -103,10 +111,12 @@ class Dense(nn.Linear):
 
 
 def pack(net: nn.Module) -> None:
-    """Lay the weights of a network out as oneDNN's kernels read them, once instead of at every call; it has no gradient any more.
+    """Lay the weights of a network out as oneDNN's kernels read them, once instead of at every
+    call; it has no gradient any more.
 
-    Layers then add their bias and apply their activation before they round, in the pass that multiplies. With less than AVX-512 the kernel
-    of a convolution depends on the size of the picture, and the layout with it: those weights stay as they are, as do those in bfloat16.
+    Layers then add their bias and apply their activation before they round, in the pass that
+    multiplies. With less than AVX-512 the kernel of a convolution depends on the size of the
+    picture, and the layout with it: those weights stay as they are, as do those in bfloat16.
     """
     wide = "AVX512" in torch.backends.cpu.get_cpu_capability()
     for layer in net.modules():
@@ -115,21 +125,31 @@ def pack(net: nn.Module) -> None:
             if isinstance(layer, Dense):
                 layer.packed = torch.ops.mkldnn._reorder_linear_weight(weight)
             else:
-                layer.packed = torch.ops.mkldnn._reorder_convolution_weight(weight, [1, 1], [1, 1], [1, 1], 1) if wide else weight
+                layer.packed = (
+                    torch.ops.mkldnn._reorder_convolution_weight(weight, [1, 1], [1, 1], [1, 1], 1)
+                    if wide
+                    else weight
+                )
 
 
 @cache
 def _recordable(operation: Callable[..., Tensor]) -> Any:
-    """Compile an operation whose list of optional numbers torch's tracer cannot record by itself."""
+    """Compile an operation whose list of optional numbers torch's tracer cannot record by
+    itself.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         return torch.jit.script(operation)
 
 
-def _packed_convolution(image: Tensor, weight: Tensor, bias: Tensor | None, then: str, slope: float) -> Tensor:
+def _packed_convolution(
+    image: Tensor, weight: Tensor, bias: Tensor | None, then: str, slope: float
+) -> Tensor:
     slopes: list[int | float | complex | None] = [slope]
     one = [1, 1]
-    out: Tensor = torch.ops.mkldnn._convolution_pointwise(image, weight, bias, one, one, one, 1, then, slopes, "")
+    out: Tensor = torch.ops.mkldnn._convolution_pointwise(
+        image, weight, bias, one, one, one, 1, then, slopes, ""
+    )
     return out
 
 
@@ -174,7 +194,8 @@ class Downsample(Dense):
 class Upsample(Dense):
     """Double the resolution: a linear layer, then `pixels`.
 
-    The four pixels of a cell start with equal weights (Aitken et al., 2017, ICNR), so that no pattern of the cell is there to be unlearned.
+    The four pixels of a cell start with equal weights (Aitken et al., 2017, ICNR), so that no
+    pattern of the cell is there to be unlearned.
 
     Args:
         inputs, outputs: Channels before and after.
@@ -203,7 +224,11 @@ def repeat_per_pixel(layer: Conv3 | nn.Linear, side: int) -> None:
     with torch.no_grad():
         assert layer.bias is not None
         for value in (layer.weight, layer.bias):
-            value.copy_(value[: value.shape[0] // (side * side)].repeat(side * side, *(1,) * (value.ndim - 1)))
+            value.copy_(
+                value[: value.shape[0] // (side * side)].repeat(
+                    side * side, *(1,) * (value.ndim - 1)
+                )
+            )
 
 
 class MemoryState(NamedTuple):
@@ -226,7 +251,9 @@ class FrameMemory(nn.Module):
         super().__init__()
         self.slots, self.width = slots, width
         self.query, self.key_value = nn.Linear(channels, width), nn.Linear(channels, 2 * width)
-        self.place = nn.Linear(4 * WAVES, width, bias=False)  # where a cell is, added to queries and keys
+        self.place = nn.Linear(
+            4 * WAVES, width, bias=False
+        )  # where a cell is, added to queries and keys
         self.age = nn.Parameter(torch.zeros(slots, width))  # how long ago, added to keys
         self.out = nn.Linear(width, channels)
         nn.init.zeros_(self.out.weight)  # the network begins as the one without a memory
@@ -235,21 +262,34 @@ class FrameMemory(nn.Module):
     def start(self, like: Tensor, cells: int) -> MemoryState:
         """Return the state before a rollout; ``like`` gives the batch and the device."""
         b = len(like)
-        return MemoryState(like.new_zeros(b, self.slots, cells, 2 * self.width), like.new_zeros(b, 1, 1, 1))
+        return MemoryState(
+            like.new_zeros(b, self.slots, cells, 2 * self.width), like.new_zeros(b, 1, 1, 1)
+        )
 
     def forward(self, x: Tensor, state: MemoryState) -> tuple[Tensor, MemoryState]:
-        """Add to ``x`` ``(B, h, w, channels)`` what past frames hold; return it and the state after the frame."""
+        """Add to ``x`` ``(B, h, w, channels)`` what past frames hold; return it and the state after
+        the frame.
+        """
         b, h, w, _ = x.shape
         place = self.place(_waves(h, w, x))  # (h w, width)
         flat = x.flatten(1, 2)
         key, value = self.key_value(flat).chunk(2, dim=-1)
-        count = torch.div(state.frames + STRIDE - 1, STRIDE, rounding_mode="floor")  # frames that are kept so far
+        count = torch.div(
+            state.frames + STRIDE - 1, STRIDE, rounding_mode="floor"
+        )  # frames that are kept so far
         slot = torch.arange(self.slots, device=x.device, dtype=count.dtype)
         known = (slot < count[:, 0, 0]).repeat_interleave(h * w, dim=1)  # (B, slots cells)
         past = state.kept.to(x.dtype)
         keys = (past[..., : self.width] + self.age[:, None]).flatten(1, 2)
         values = past[..., self.width :].flatten(1, 2)
-        q, k, v = (_heads(part) for part in (self.query(flat) + place, torch.cat([keys, key + place], 1), torch.cat([values, value], 1)))
+        q, k, v = (
+            _heads(part)
+            for part in (
+                self.query(flat) + place,
+                torch.cat([keys, key + place], 1),
+                torch.cat([values, value], 1),
+            )
+        )
         mask = torch.cat([known, known.new_ones(b, h * w)], dim=1)[:, None, None]
         found = F.scaled_dot_product_attention(q, k, v, attn_mask=mask).transpose(1, 2).flatten(2)
         out = x + self.out(found).view_as(x)
@@ -265,7 +305,9 @@ def _heads(x: Tensor) -> Tensor:
 
 
 def _waves(h: int, w: int, like: Tensor) -> Tensor:
-    """Return sines and cosines of the cells' places ``(h w, 4 WAVES)``; places are shares of the picture."""
+    """Return sines and cosines of the cells' places ``(h w, 4 WAVES)``; places are shares of the
+    picture.
+    """
     rows = (torch.arange(h, device=like.device) + 0.5) / h
     columns = (torch.arange(w, device=like.device) + 0.5) / w
     rates = math.pi * 2.0 ** torch.arange(WAVES, device=like.device)

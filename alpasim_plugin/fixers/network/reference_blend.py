@@ -1,8 +1,10 @@
-"""What a generator in pixels does with references: recorded frames that were warped into the view (`alpasim_plugin.fixers.references`).
+"""What a generator in pixels does with references: recorded frames that were warped into the view
+(`alpasim_plugin.fixers.references`).
 
     s_k       = act(y + C_k)                                        C_k: what reference k shows beside the render, at 1/4; y: the U-Net
     m_k(p, q) = <Q y(p), N s_k(p + q)>, |q| <= 2 cells              how alike the picture here and the reference there are
-                                                                    (cost volume; Sun et al., 2018, PWC-Net, Sec. 3)
+                                                                    (cost volume; Sun et al., 2018,
+                                                                    PWC-Net, Sec. 3)
     a_k       = A (s_k, m_k)
     f_k       = act(H (fine + E_k + U a_k))                         E_k: the same at 1/2; fine: the detail path
     w, d, c   = W f_k                                               weight of each pixel, offset of each cell, correction of each pixel
@@ -11,8 +13,9 @@
     p_0..p_K  = softmax(0, w_k + log v_k(p + o_k))                  v_k: where reference k holds
     x         = p_0 (render + residual) + sum_k p_k x_k
 
-All references share one set of weights, so their number and order are free; without any, p_0 is 1 and the generator is the one without
-references. A warp that is wrong costs nothing where the network gives it no weight.
+All references share one set of weights, so their number and order are free; without any, p_0 is 1
+and the generator is the one without references. A warp that is wrong costs nothing where the
+network gives it no weight.
 """
 
 from __future__ import annotations
@@ -24,18 +27,31 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from alpasim_plugin.fixers.network.pixel_layers import Conv3, Dense, Upsample, activation, cells, pixels
+from alpasim_plugin.fixers.network.pixel_layers import (
+    Conv3,
+    Dense,
+    Upsample,
+    activation,
+    cells,
+    pixels,
+)
 
 CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail path
-CHANNELS = 4  # of a reference: colour minus that of the render where the reference holds, and where it holds
+# of a reference: colour minus that of the render where the reference holds, and where it holds
+CHANNELS = 4
 OFFSET_PX = 8.0  # largest learned offset
 NOWHERE = 1e-6  # the share of a pixel that holds, at least, so that its logarithm is finite
-MATCH_CELLS, MATCH_CHANNELS = 2, 16  # how far a reference is compared with the picture, in cells; of the features compared
+MATCH_CELLS, MATCH_CHANNELS = (
+    2,
+    16,
+)  # how far a reference is compared with the picture, in cells; of the features compared
 DOUBT = -2.5  # initial logarithm of a reference's weight over that of the render
 
 
 class BesideCells(NamedTuple):
-    """What references show beside the render, ``(ref - render) v`` and ``v``, as `cells`; float32."""
+    """What references show beside the render, ``(ref - render) v`` and ``v``, as `cells`;
+    float32.
+    """
 
     mean4: Tensor  # (B, H / 4, W / 4, 64) the mean over the references
     mean2: Tensor  # (B, H / 2, W / 2, 16)
@@ -46,9 +62,13 @@ class BesideCells(NamedTuple):
 class BlendHeads(NamedTuple):
     """How references enter the picture, at half its resolution; offsets in float32."""
 
-    weight: Tensor  # (B, K, H / 2, W / 2, 4) logarithm of each pixel's weight over that of the repaired render, `cells` of one channel
+    # (B, K, H / 2, W / 2, 4) logarithm of each pixel's weight over that of the repaired render,
+    # `cells` of one channel
+    weight: Tensor
     offset_px: Tensor  # (B, K, H / 2, W / 2, 2) x and y of where it is looked up
-    correction: Tensor  # (B, K, H / 2, W / 2, 12) what is added to its colour, `cells` of three channels
+    correction: (
+        Tensor  # (B, K, H / 2, W / 2, 12) what is added to its colour, `cells` of three channels
+    )
 
 
 class ReferenceBlend(nn.Module):
@@ -86,7 +106,9 @@ class ReferenceBlend(nn.Module):
             self.write.bias[: DETAIL**2] = DOUBT
 
     def features(self, beside: BesideCells) -> tuple[Tensor, Tensor]:
-        """Return what the references add to the first layers: ``(B, H / 4, W / 4, coarse)`` and ``(B, H / 2, W / 2, detail)``."""
+        """Return what the references add to the first layers: ``(B, H / 4, W / 4, coarse)`` and
+        ``(B, H / 2, W / 2, detail)``.
+        """
         dtype = self.stem.weight.dtype
         return self.stem(beside.mean4.to(dtype)), self.read(beside.mean2.to(dtype))
 
@@ -106,8 +128,14 @@ class ReferenceBlend(nn.Module):
         at4 = self.align[1](at4, activated=True)
         joined = _added(self.own(beside.each2.to(fine.dtype)).add_(self.up(at4)), fine)
         said = self.write(self.head(activation(joined, inplace=True), activated=True))
-        weight, offset, correction = said.view(b, k, *said.shape[1:]).split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
-        return BlendHeads(weight, self.offsets(offset.flatten(0, 1), self.shift(at4)).view(offset.shape), correction)
+        weight, offset, correction = said.view(b, k, *said.shape[1:]).split(
+            [DETAIL**2, 2, DETAIL**2 * 3], dim=-1
+        )
+        return BlendHeads(
+            weight,
+            self.offsets(offset.flatten(0, 1), self.shift(at4)).view(offset.shape),
+            correction,
+        )
 
 
 def likeness(sought: Tensor, shown: Tensor) -> Tensor:
@@ -124,13 +152,26 @@ def likeness(sought: Tensor, shown: Tensor) -> Tensor:
     reach = 2 * MATCH_CELLS + 1
     around = F.pad(shown, (0, 0, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS))
     each = sought[:, None].expand(-1, len(shown) // len(sought), -1, -1, -1).flatten(0, 1)
-    mean = sought.new_full((sought.shape[-1], 1), 1 / sought.shape[-1])  # as a product: a sum over few channels is slow on a CPU
-    return torch.cat([(each * around[:, i : i + h, j : j + w]) @ mean for i in range(reach) for j in range(reach)], dim=-1)
+    mean = sought.new_full(
+        (sought.shape[-1], 1), 1 / sought.shape[-1]
+    )  # as a product: a sum over few channels is slow on a CPU
+    return torch.cat(
+        [
+            (each * around[:, i : i + h, j : j + w]) @ mean
+            for i in range(reach)
+            for j in range(reach)
+        ],
+        dim=-1,
+    )
 
 
 def offsets(at2: Tensor, at4: Tensor) -> Tensor:
-    """Return the offsets ``(N, H / 2, W / 2, 2)`` in pixels that are said at half the resolution and, coarser, at a quarter of it."""
-    finer = F.interpolate(at4.float().permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False)
+    """Return the offsets ``(N, H / 2, W / 2, 2)`` in pixels that are said at half the resolution
+    and, coarser, at a quarter of it.
+    """
+    finer = F.interpolate(
+        at4.float().permute(0, 3, 1, 2), scale_factor=2, mode="bilinear", align_corners=False
+    )
     return torch.tanh(at2.float() + finer.permute(0, 2, 3, 1)) * OFFSET_PX
 
 
@@ -148,12 +189,15 @@ def sources_of(repaired: Tensor, references: Tensor, heads: BlendHeads, scale: i
     Args:
         repaired: ``(B, H, W, 3)`` render plus change, in [-1, 1].
         references: ``(B, K, H, W, 4)`` colour in [-1, 1], and where it holds, 0 to 1.
-        heads: Of the same, or of pictures ``scale`` times smaller; what they say is then interpolated, and offsets are as much longer.
+        heads: Of the same, or of pictures ``scale`` times smaller; what they say is then
+            interpolated, and offsets are as much longer.
         scale: How many times.
     """
     b, k, h, w, _ = references.shape
     weight, offset_px, correction = (part.flatten(0, 1) for part in heads)
-    weight, correction = (enlarged(pixels(part, DETAIL).to(repaired.dtype), scale) for part in (weight, correction))
+    weight, correction = (
+        enlarged(pixels(part, DETAIL).to(repaired.dtype), scale) for part in (weight, correction)
+    )
     moved = _sampled(references.flatten(0, 1), scale * offset_px)
     colour = (moved[..., :3] + correction).view(b, k, h, w, 3)
     holds = moved[..., 3:].clamp(min=NOWHERE, max=1)
@@ -170,7 +214,9 @@ def enlarged(x: Tensor, scale: int) -> Tensor:
     """Enlarge pictures ``(B, H, W, C)`` bilinearly, a whole number of times."""
     if scale == 1:
         return x
-    return F.interpolate(x.permute(0, 3, 1, 2), scale_factor=scale, mode="bilinear", align_corners=False).permute(0, 2, 3, 1)
+    return F.interpolate(
+        x.permute(0, 3, 1, 2), scale_factor=scale, mode="bilinear", align_corners=False
+    ).permute(0, 2, 3, 1)
 
 
 def mix(sources: Sources) -> tuple[Tensor, Tensor]:
@@ -193,7 +239,9 @@ def gather_beside(references: Tensor, render: Tensor) -> BesideCells:
     holds = references[..., 3:]
     each = torch.cat([(references[..., :3] - render[:, None]) * holds, holds], dim=-1)
     mean, flat = each.mean(dim=1), each.flatten(0, 1)
-    return BesideCells(cells(mean, CELL), cells(mean, DETAIL), cells(flat, CELL), cells(flat, DETAIL))
+    return BesideCells(
+        cells(mean, CELL), cells(mean, DETAIL), cells(flat, CELL), cells(flat, DETAIL)
+    )
 
 
 def _added(each: Tensor, one: Tensor) -> Tensor:
@@ -203,11 +251,23 @@ def _added(each: Tensor, one: Tensor) -> Tensor:
 
 
 def _sampled(images: Tensor, offset: Tensor) -> Tensor:
-    """Look images ``(N, H, W, 4)`` up at offsets in their pixels, x and y, of a coarser grid; beyond the border the outermost go on."""
+    """Look images ``(N, H, W, 4)`` up at offsets in their pixels, x and y, of a coarser grid;
+    beyond the border the outermost go on.
+    """
     h, w = images.shape[1:3]
-    full = F.interpolate(offset.permute(0, 3, 1, 2), size=(h, w), mode="bilinear", align_corners=False)
+    full = F.interpolate(
+        offset.permute(0, 3, 1, 2), size=(h, w), mode="bilinear", align_corners=False
+    )
     columns = torch.arange(w, device=images.device) + 0.5
     rows = torch.arange(h, device=images.device)[:, None] + 0.5
-    grid = torch.stack([(columns + full[:, 0]) * (2 / w) - 1, (rows + full[:, 1]) * (2 / h) - 1], dim=-1)
-    sampled = F.grid_sample(images.permute(0, 3, 1, 2), grid, mode="bilinear", padding_mode="border", align_corners=False)
+    grid = torch.stack(
+        [(columns + full[:, 0]) * (2 / w) - 1, (rows + full[:, 1]) * (2 / h) - 1], dim=-1
+    )
+    sampled = F.grid_sample(
+        images.permute(0, 3, 1, 2),
+        grid,
+        mode="bilinear",
+        padding_mode="border",
+        align_corners=False,
+    )
     return sampled.permute(0, 2, 3, 1)

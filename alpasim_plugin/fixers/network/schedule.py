@@ -1,8 +1,9 @@
 """The noise schedule: time steps of a sampler and their noise levels.
 
-With shift 5, ``sigma(u) = 5 u / (1 + 4 u)`` for ``u`` in (0, 1], tabulated at 1000 points; the network takes ``1000 sigma``. A *named*
-step, as in "1000, 750, 500, 250", is ``1000 u``, before the shift. The cache write at 128 is after the shift: it is the network's time
-input, and its noise level is that of the nearest entry in the table (0.12993).
+With shift 5, ``sigma(u) = 5 u / (1 + 4 u)`` for ``u`` in (0, 1], tabulated at 1000 points; the
+network takes ``1000 sigma``. A *named* step, as in "1000, 750, 500, 250", is ``1000 u``, before the
+shift. The cache write at 128 is after the shift: it is the network's time input, and its noise
+level is that of the nearest entry in the table (0.12993).
 
 Source: OmniDreams' flow-matching scheduler and self-forcing sampler.
 """
@@ -48,7 +49,12 @@ def named(step: float) -> NoiseLevel:
         InputError: A step outside that range.
     """
     if not 0 < step <= TABLE:
-        raise InputError("choosing denoising steps", "named step", f"{step:g}", f"use steps above 0 and up to {TABLE}")
+        raise InputError(
+            "choosing denoising steps",
+            "named step",
+            f"{step:g}",
+            f"use steps above 0 and up to {TABLE}",
+        )
     sigma = shifted(step / TABLE)
     return NoiseLevel(TABLE * sigma, sigma)
 
@@ -61,7 +67,9 @@ def names(count: int) -> tuple[float, ...]:
         ((1000.0,), (1000.0, 500.0), (1000.0, 750.0, 500.0, 250.0))
     """
     if count < 1:
-        raise InputError("choosing denoising steps", "step count", str(count), "take at least one step")
+        raise InputError(
+            "choosing denoising steps", "step count", str(count), "take at least one step"
+        )
     return tuple(TABLE * (count - i) / count for i in range(count))
 
 
@@ -77,10 +85,17 @@ def from_names(names: Sequence[float]) -> tuple[NoiseLevel, ...]:
         InputError: An empty or not strictly falling list, or a step out of range.
     """
     if not names or any(b >= a for a, b in pairwise(names)):
-        raise InputError("choosing denoising steps", "named steps", str(list(names)), "give at least one step, strictly falling from 1000")
+        raise InputError(
+            "choosing denoising steps",
+            "named steps",
+            str(list(names)),
+            "give at least one step, strictly falling from 1000",
+        )
     return tuple(named(step) for step in names)
 
 
 def interpolant(z_0: Tensor, z_1: Tensor, t: Tensor | float) -> Tensor:
-    """Return ``z_t = (1 - t) z_0 + t z_1``, the straight path from the clean latents to the source."""
+    """Return ``z_t = (1 - t) z_0 + t z_1``, the straight path from the clean latents to the
+    source.
+    """
     return (1 - t) * z_0 + t * z_1

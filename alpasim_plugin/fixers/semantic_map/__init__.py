@@ -1,1 +1,3 @@
-"""The semantic map that conditions a fixer: its layers, prepared once per scene and drawn once per frame."""
+"""The semantic map that conditions a fixer: its layers, prepared once per scene and drawn once per
+frame.
+"""

@@ -1,7 +1,8 @@
 """Draw strokes and shapes into an image with a depth buffer, band by band, several samples a pixel.
 
-The rules are those of `tests/fixers/draw_reference.py`; here pixels that cannot be covered are skipped. A band of rows is drawn by
-one thread in the order of the lists, so the image does not depend on the number of threads.
+The rules are those of `tests/fixers/draw_reference.py`; here pixels that cannot be covered are
+skipped. A band of rows is drawn by one thread in the order of the lists, so the image does not
+depend on the number of threads.
 """
 
 # Numba's decorators are untyped.
@@ -44,16 +45,29 @@ def rows_of(strokes, n_strokes, shapes, n_shapes, stretch, height, stroke_rows, 
     """Write the first and last image row that each stroke and shape can touch."""
     for i in range(n_strokes):
         reach = strokes[i, HALF] / stretch
-        low, high = min(strokes[i, Y0], strokes[i, Y1]) - reach, max(strokes[i, Y0], strokes[i, Y1]) + reach
-        stroke_rows[i, 0], stroke_rows[i, 1] = int(max(low - 1.0, 0.0)), int(min(high + 1.0, height))
+        low, high = (
+            min(strokes[i, Y0], strokes[i, Y1]) - reach,
+            max(strokes[i, Y0], strokes[i, Y1]) + reach,
+        )
+        stroke_rows[i, 0], stroke_rows[i, 1] = (
+            int(max(low - 1.0, 0.0)),
+            int(min(high + 1.0, height)),
+        )
     for i in range(n_shapes):
-        low, high = min(shapes[i, 1], shapes[i, 5], shapes[i, 9]), max(shapes[i, 1], shapes[i, 5], shapes[i, 9])
+        low, high = (
+            min(shapes[i, 1], shapes[i, 5], shapes[i, 9]),
+            max(shapes[i, 1], shapes[i, 5], shapes[i, 9]),
+        )
         shape_rows[i, 0], shape_rows[i, 1] = int(max(low - 1.0, 0.0)), int(min(high + 1.0, height))
 
 
 @njit(cache=True, nogil=True)
 def _pack(red, green, blue, fade):
-    return np.uint32(np.uint32(red * fade + 0.5) | (np.uint32(green * fade + 0.5) << 8) | (np.uint32(blue * fade + 0.5) << 16))
+    return np.uint32(
+        np.uint32(red * fade + 0.5)
+        | (np.uint32(green * fade + 0.5) << 8)
+        | (np.uint32(blue * fade + 0.5) << 16)
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -66,10 +80,26 @@ def _write(depth, colour, at, n_samples, mask, inverse, packed):
 
 
 @njit(cache=True, nogil=True)
-def _draw_stroke(stroke, first_row, last_row, band_row, width, stretch, depth_max, samples, depth, colour, touched):
+def _draw_stroke(
+    stroke,
+    first_row,
+    last_row,
+    band_row,
+    width,
+    stretch,
+    depth_max,
+    samples,
+    depth,
+    colour,
+    touched,
+):
     n_samples = samples.shape[0]
-    x0, y0, i0 = stroke[X0], stroke[Y0], stroke[I0]
-    dx, dy, di = stroke[X1] - x0, stroke[Y1] - y0, stroke[I1] - i0
+    x0 = stroke[X0]
+    y0 = stroke[Y0]
+    i0 = stroke[I0]
+    dx = stroke[X1] - x0
+    dy = stroke[Y1] - y0
+    di = stroke[I1] - i0
     sy = dy * stretch
     length2 = dx * dx + sy * sy
     over = 1.0 / length2 if length2 > 0.0 else 0.0
@@ -120,7 +150,15 @@ def _draw_stroke(stroke, first_row, last_row, band_row, width, stretch, depth_ma
             if stroke[BIAS] != 0.0:
                 inverse = inverse / max(1.0 - stroke[BIAS] * inverse, 1e-3)
             packed = _pack(stroke[RED], stroke[GREEN], stroke[BLUE], fade)
-            _write(depth, colour, ((row - band_row) * width + column) * n_samples, n_samples, mask, np.float32(inverse), packed)
+            _write(
+                depth,
+                colour,
+                ((row - band_row) * width + column) * n_samples,
+                n_samples,
+                mask,
+                np.float32(inverse),
+                packed,
+            )
             begin, end = min(begin, column), column
         if end >= 0:
             touched[row - band_row, 0] = min(touched[row - band_row, 0], begin)
@@ -128,9 +166,16 @@ def _draw_stroke(stroke, first_row, last_row, band_row, width, stretch, depth_ma
 
 
 @njit(cache=True, nogil=True)
-def _draw_shape(shape, first_row, last_row, band_row, width, depth_max, samples, depth, colour, touched):
+def _draw_shape(
+    shape, first_row, last_row, band_row, width, depth_max, samples, depth, colour, touched
+):
     n_samples = samples.shape[0]
-    x0, y0, x1, y1, x2, y2 = shape[0], shape[1], shape[4], shape[5], shape[8], shape[9]
+    x0 = shape[0]
+    y0 = shape[1]
+    x1 = shape[4]
+    y1 = shape[5]
+    x2 = shape[8]
+    y2 = shape[9]
     area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
     if area == 0.0:
         return
@@ -140,21 +185,41 @@ def _draw_shape(shape, first_row, last_row, band_row, width, depth_max, samples,
     a1, c1 = (y2 - y0) * turn, (x0 - x2) * turn
     a2, c2 = (y0 - y1) * turn, (x1 - x0) * turn
     slack = 0.0 if n_samples == 1 else 0.4
-    m0, m1, m2 = slack * (abs(a0) + abs(c0)), slack * (abs(a1) + abs(c1)), slack * (abs(a2) + abs(c2))
+    m0 = slack * (abs(a0) + abs(c0))
+    m1 = slack * (abs(a1) + abs(c1))
+    m2 = slack * (abs(a2) + abs(c2))
     # 1/depth and shade/depth are planes over the image as well.
-    ix, iy = a0 * shape[2] + a1 * shape[6] + a2 * shape[10], c0 * shape[2] + c1 * shape[6] + c2 * shape[10]
-    sx, sy = a0 * shape[3] + a1 * shape[7] + a2 * shape[11], c0 * shape[3] + c1 * shape[7] + c2 * shape[11]
+    ix, iy = (
+        a0 * shape[2] + a1 * shape[6] + a2 * shape[10],
+        c0 * shape[2] + c1 * shape[6] + c2 * shape[10],
+    )
+    sx, sy = (
+        a0 * shape[3] + a1 * shape[7] + a2 * shape[11],
+        c0 * shape[3] + c1 * shape[7] + c2 * shape[11],
+    )
     far, near = shape[FARTHEST], shape[NEAREST]
     bias = shape[S_BIAS]
     for row in range(first_row, last_row + 1):
         yc = row + 0.5
         low, high = max(min(x0, x1, x2) - 1.0, 0.0), min(max(x0, x1, x2) + 1.0, np.float64(width))
         for k in range(3):  # cut the row at each edge, a little outside
-            a, c, m, xk, yk = a0, c0, m0, x1, y1
+            a = a0
+            c = c0
+            m = m0
+            xk = x1
+            yk = y1
             if k == 1:
-                a, c, m, xk, yk = a1, c1, m1, x2, y2
+                a = a1
+                c = c1
+                m = m1
+                xk = x2
+                yk = y2
             elif k == 2:
-                a, c, m, xk, yk = a2, c2, m2, x0, y0
+                a = a2
+                c = c2
+                m = m2
+                xk = x0
+                yk = y0
             rest = c * (yc - yk) + m
             if a > 0.0:
                 low = max(low, xk - rest / a - 1.0)
@@ -163,11 +228,15 @@ def _draw_shape(shape, first_row, last_row, band_row, width, depth_max, samples,
             elif rest < 0.0:
                 high = -1.0
         begin, end = width, -1
-        r0, r1, r2 = c0 * (yc - y1) - a0 * x1, c1 * (yc - y2) - a1 * x2, c2 * (yc - y0) - a2 * x0
+        r0 = c0 * (yc - y1) - a0 * x1
+        r1 = c1 * (yc - y2) - a1 * x2
+        r2 = c2 * (yc - y0) - a2 * x0
         ir, sr = shape[2] + iy * (yc - y0) - ix * x0, shape[3] + sy * (yc - y0) - sx * x0
         for column in range(int(low), min(int(high) + 1, width)):
             xc = column + 0.5
-            b0, b1, b2 = a0 * xc + r0, a1 * xc + r1, a2 * xc + r2
+            b0 = a0 * xc + r0
+            b1 = a1 * xc + r1
+            b2 = a2 * xc + r2
             if b0 < -m0 or b1 < -m1 or b2 < -m2:
                 continue
             whole = b0 >= m0 and b1 >= m1 and b2 >= m2
@@ -176,7 +245,11 @@ def _draw_shape(shape, first_row, last_row, band_row, width, depth_max, samples,
             mask = 0
             for s in range(n_samples):
                 ox, oy = samples[s, 0], samples[s, 1]
-                if whole or (b0 + a0 * ox + c0 * oy >= 0.0 and b1 + a1 * ox + c1 * oy >= 0.0 and b2 + a2 * ox + c2 * oy >= 0.0):
+                if whole or (
+                    b0 + a0 * ox + c0 * oy >= 0.0
+                    and b1 + a1 * ox + c1 * oy >= 0.0
+                    and b2 + a2 * ox + c2 * oy >= 0.0
+                ):
                     here = min(max(centre + ix * ox + iy * oy, far), near)
                     if bias != 0.0:
                         here = here / max(1.0 - bias * here, 1e-3)
@@ -203,9 +276,22 @@ def _draw_shape(shape, first_row, last_row, band_row, width, depth_max, samples,
 
 @njit(cache=True, nogil=True)
 def draw_bands(
-    cursor, strokes, n_first, n_strokes, stroke_rows, shapes, n_shapes, shape_rows, stretch, depth_max, samples, image
-):  # fmt: skip
-    """Draw bands of rows until none is left: strokes before ``n_first``, all shapes, the other strokes."""
+    cursor,
+    strokes,
+    n_first,
+    n_strokes,
+    stroke_rows,
+    shapes,
+    n_shapes,
+    shape_rows,
+    stretch,
+    depth_max,
+    samples,
+    image,
+):
+    """Draw bands of rows until none is left: strokes before ``n_first``, all shapes, the other
+    strokes.
+    """
     height, width = image.shape[0], image.shape[1]
     n_samples = samples.shape[0]
     depth = np.zeros(BAND * width * n_samples, np.float32)
@@ -221,13 +307,36 @@ def draw_bands(
             for i in range(0 if phase == 0 else n_first, n_first if phase == 0 else n_strokes):
                 if stroke_rows[i, 0] <= end_row and stroke_rows[i, 1] >= band_row:
                     first, last = max(stroke_rows[i, 0], band_row), min(stroke_rows[i, 1], end_row)
-                    _draw_stroke(strokes[i], first, last, band_row, width, stretch, depth_max, samples, depth, colour, touched)
+                    _draw_stroke(
+                        strokes[i],
+                        first,
+                        last,
+                        band_row,
+                        width,
+                        stretch,
+                        depth_max,
+                        samples,
+                        depth,
+                        colour,
+                        touched,
+                    )
             if phase == 1:
                 break
             for i in range(n_shapes):
                 if shape_rows[i, 0] <= end_row and shape_rows[i, 1] >= band_row:
                     first, last = max(shape_rows[i, 0], band_row), min(shape_rows[i, 1], end_row)
-                    _draw_shape(shapes[i], first, last, band_row, width, depth_max, samples, depth, colour, touched)
+                    _draw_shape(
+                        shapes[i],
+                        first,
+                        last,
+                        band_row,
+                        width,
+                        depth_max,
+                        samples,
+                        depth,
+                        colour,
+                        touched,
+                    )
         _resolve(band_row, end_row, n_samples, depth, colour, touched, image)
 
 
@@ -246,14 +355,18 @@ def _resolve(band_row, end_row, n_samples, depth, colour, touched, image):
             same = True
             for s in range(1, n_samples):
                 same = same and colour[at + s] == packed
-            red, green, blue = packed & 255, (packed >> 8) & 255, (packed >> 16) & 255
+            red = packed & 255
+            green = (packed >> 8) & 255
+            blue = (packed >> 16) & 255
             if not same:
                 for s in range(1, n_samples):
                     packed = colour[at + s]
                     red += packed & 255
                     green += (packed >> 8) & 255
                     blue += (packed >> 16) & 255
-                red, green, blue = (red + half) // n_samples, (green + half) // n_samples, (blue + half) // n_samples
+                red = (red + half) // n_samples
+                green = (green + half) // n_samples
+                blue = (blue + half) // n_samples
             image[row, column, 0], image[row, column, 1], image[row, column, 2] = red, green, blue
         if left < right:
             depth[first + left * n_samples : first + right * n_samples] = 0.0

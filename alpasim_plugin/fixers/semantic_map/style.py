@@ -1,8 +1,8 @@
 """How the semantic map is drawn: colours, widths in pixels, dash patterns, fade.
 
-The colours and sizes are those of the conditioning videos of NVIDIA's world-scenario renderers: cosmos-transfer2.5 (an OpenGL program that
-documents the rules, `OPENGL`) and FlashDreams (a CUDA one that feeds OmniDreams at run time, `LUDUS`). Widths are defined at 1280 pixels of
-image width.
+The colours and sizes are those of the conditioning videos of NVIDIA's world-scenario renderers:
+cosmos-transfer2.5 (an OpenGL program that documents the rules, `OPENGL`) and FlashDreams (a CUDA
+one that feeds OmniDreams at run time, `LUDUS`). Widths are defined at 1280 pixels of image width.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from typing import Literal
 
 Rgb = tuple[int, int, int]
 LineColour = Literal["untyped", "white", "yellow", "other"]
-Pattern = Literal["solid", "long_dashed", "short_dashed", "dotted", "dotted_1_9", "dot_dashed", "other"]
+Pattern = Literal[
+    "solid", "long_dashed", "short_dashed", "dotted", "dotted_1_9", "dot_dashed", "other"
+]
 LightState = Literal["unknown", "red", "yellow", "green"]
 AreaKind = Literal["road_marking", "intersection", "road_island", "buffer_zone"]
 
@@ -51,7 +53,15 @@ BOX_COLOURS: Mapping[str, tuple[Rgb, Rgb]] = {
 
 _LABELS: Mapping[str, tuple[str, ...]] = {
     "car": ("automobile", "car", "vehicle", "other_vehicle"),
-    "truck": ("truck", "heavy_truck", "bus", "trolley_bus", "train_or_tram_car", "trailer", "large_vehicle"),
+    "truck": (
+        "truck",
+        "heavy_truck",
+        "bus",
+        "trolley_bus",
+        "train_or_tram_car",
+        "trailer",
+        "large_vehicle",
+    ),
     "pedestrian": ("person", "pedestrian"),
     "cyclist": ("rider", "cyclist", "bicycle", "motorcycle"),
 }
@@ -65,7 +75,8 @@ _OPENGL_PATTERNS: Mapping[Pattern, tuple[tuple[float, float], ...]] = {
     "short_dashed": ((1.5, 1.5),),
     "dotted": ((0.3, 0.6),),
     "dotted_1_9": ((0.05, 0.45),),
-    "dot_dashed": ((0.05, 0.10),) * 5 + ((0.05, 2.85),),  # a dash of 0.91 m drawn one piece in three, then 2.74 m bare
+    "dot_dashed": ((0.05, 0.10),) * 5
+    + ((0.05, 2.85),),  # a dash of 0.91 m drawn one piece in three, then 2.74 m bare
 }
 _LUDUS_PATTERNS: Mapping[Pattern, tuple[tuple[float, float], ...]] = {
     **_OPENGL_PATTERNS,
@@ -84,21 +95,28 @@ class MapStyle:
     pole_px: float = 5.0
     box_edge_px: float = 4.0
     other_factor: float = 3.0  # lane lines of pattern "other" are this much wider
-    ndc_widths: bool = True  # widths are measured in normalised coordinates: a horizontal line is H / W times as thick as a vertical one
+    # widths are measured in normalised coordinates: a horizontal line is H / W times as thick as a
+    # vertical one
+    ndc_widths: bool = True
     line_width_gain: float = 1.0  # line width is scaled by clamp(gain * (1 - depth / depth_max))
     depth_max_m: float = 200.0  # colours and widths fade to nothing here
     near_m: float = 0.1  # everything nearer along the optical axis is cut off
-    patterns: Mapping[Pattern, tuple[tuple[float, float], ...]] = field(default_factory=lambda: _OPENGL_PATTERNS)
+    patterns: Mapping[Pattern, tuple[tuple[float, float], ...]] = field(
+        default_factory=lambda: _OPENGL_PATTERNS
+    )
     double_offset_m: float = 0.1  # each line of a pair lies this far from the middle
     typed_lines: bool = True  # False: every lane line solid and of the untyped colour
-    edge_bias_m: float = 0.1  # edges of boxes are moved this far towards the camera, so that faces do not swallow them
+    # edges of boxes are moved this far towards the camera, so that faces do not swallow them
+    edge_bias_m: float = 0.1
     samples: Literal[1, 4] = 4  # per pixel
     colours: Mapping[str, Rgb] = field(default_factory=lambda: COLOURS)
     box_colours: Mapping[str, tuple[Rgb, Rgb]] = field(default_factory=lambda: BOX_COLOURS)
 
 
 OPENGL = MapStyle()
-LUDUS = MapStyle("ludus", 7.0, 5.0, 2.0, 1.0, False, 2.0, patterns=_LUDUS_PATTERNS, double_offset_m=0.075)
+LUDUS = MapStyle(
+    "ludus", 7.0, 5.0, 2.0, 1.0, False, 2.0, patterns=_LUDUS_PATTERNS, double_offset_m=0.075
+)
 STYLES: Mapping[str, MapStyle] = {style.name: style for style in (OPENGL, LUDUS)}
 
 

@@ -7,7 +7,12 @@ from pathlib import Path
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading.files import open_regular, parsing
 from alpasim_plugin.gaussians.cloud import CleanReport, GaussianArrays, GaussianCloud, build_cloud
-from alpasim_plugin.gaussians.files.packed import is_compressed_ply, read_compressed_ply, read_splat, read_spz
+from alpasim_plugin.gaussians.files.packed import (
+    is_compressed_ply,
+    read_compressed_ply,
+    read_splat,
+    read_spz,
+)
 from alpasim_plugin.gaussians.files.ply import read_ply_arrays, read_ply_header
 from alpasim_plugin.gaussians.files.sog import is_sog, read_sog
 
@@ -15,11 +20,14 @@ DOING = "reading a Gaussian model"
 SUPPORTED = (".ply", ".compressed.ply", ".splat", ".spz", ".sog (also as a folder with meta.json)")
 
 
-def read_gaussians(path: Path | str, element: str | None = None) -> tuple[GaussianCloud, CleanReport]:
+def read_gaussians(
+    path: Path | str, element: str | None = None
+) -> tuple[GaussianCloud, CleanReport]:
     """Read a Gaussian model in any supported form.
 
-    The first bytes decide between PLY and SPZ; ``.splat`` has no header and is known by its suffix. SPZ models are turned into the
-    axes of a PLY, so the same model lies in the same place in every form.
+    The first bytes decide between PLY and SPZ; ``.splat`` has no header and is known by its suffix.
+    SPZ models are turned into the axes of a PLY, so the same model lies in the same place in every
+    form.
 
     Args:
         path: PLY, compressed PLY, ``.splat`` or ``.spz`` file; SOG as ``.sog`` or as its folder.

@@ -1,8 +1,10 @@
-"""Read the quantised forms of a Gaussian model: SuperSplat's compressed PLY, ``.splat`` and SPZ; write ``.splat``.
+"""Read the quantised forms of a Gaussian model: SuperSplat's compressed PLY, ``.splat`` and SPZ;
+write ``.splat``.
 
-A compressed PLY holds 16 bytes a Gaussian, quantised within chunks of 256. ``.splat`` holds 32 bytes a Gaussian without a header, constant
-colour only. SPZ (versions 2 and 3 by gzip, 4 by zstd streams) has coordinates right-up-back (y up) where those of a 3DGS PLY are
-right-down-front; its reader turns the model into PLY axes by default, so that one model in both files lies in one place.
+A compressed PLY holds 16 bytes a Gaussian, quantised within chunks of 256. ``.splat`` holds 32
+bytes a Gaussian without a header, constant colour only. SPZ (versions 2 and 3 by gzip, 4 by zstd
+streams) has coordinates right-up-back (y up) where those of a 3DGS PLY are right-down-front; its
+reader turns the model into PLY axes by default, so that one model in both files lies in one place.
 """
 
 from __future__ import annotations
@@ -39,7 +41,8 @@ def read_compressed_ply(path: Path | str) -> GaussianArrays:
     """Read a compressed PLY file.
 
     Returns:
-        The Gaussians in the axes of the file, ``N`` rows in file order (Morton order, as the writer sorts them).
+        The Gaussians in the axes of the file, ``N`` rows in file order (Morton order, as the writer
+        sorts them).
 
     Raises:
         InputError: Truncated file, missing properties, or fewer chunks than the Gaussians need.
@@ -73,7 +76,8 @@ def read_compressed_ply(path: Path | str) -> GaussianArrays:
 def unpack_rotation(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
     """Return unit quaternions ``(N, 4)`` wxyz from 2 + 3 x 10 bits.
 
-    The top two bits say which of w, x, y, z is the largest and left out; the others follow in order as ``0.5 + q / sqrt(2)``.
+    The top two bits say which of w, x, y, z is the largest and left out; the others follow in order
+    as ``0.5 + q / sqrt(2)``.
     """
     fractions = np.stack([(packed >> shift) & 1023 for shift in (20, 10, 0)], axis=1) / 1023.0
     others = (fractions - 0.5) * np.sqrt(2.0)
@@ -89,7 +93,10 @@ def unpack_rotation(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
 
 def _unpack_11_10_11(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
     """Return fractions ``(N, 3)`` in 0..1."""
-    return np.stack([(packed >> 21) / 2047.0, ((packed >> 11) & 1023) / 1023.0, (packed & 2047) / 2047.0], axis=1)
+    return np.stack(
+        [(packed >> 21) / 2047.0, ((packed >> 11) & 1023) / 1023.0, (packed & 2047) / 2047.0],
+        axis=1,
+    )
 
 
 def _unpack_8888(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
@@ -98,7 +105,9 @@ def _unpack_8888(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
 
 
 def _read_sh(header: PlyHeader, n: int) -> NDArray[np.float64]:
-    """Return the higher bands ``(N, K - 1, 3)``: bytes at the centres of 256 bins over -4..4, channel-major as in a plain PLY."""
+    """Return the higher bands ``(N, K - 1, 3)``: bytes at the centres of 256 bins over -4..4,
+    channel-major as in a plain PLY.
+    """
     if all(element.name != "sh" for element in header.elements):
         return np.zeros((n, 0, 3))
     rows = read_ply_element(header, "sh")
@@ -118,12 +127,22 @@ def _read_sh(header: PlyHeader, n: int) -> NDArray[np.float64]:
 
 def _check(header: PlyHeader, chunks: NDArray[np.void], rows: NDArray[np.void]) -> None:
     missing = [name for name in _PACKED if name not in (rows.dtype.names or ())]
-    bounds = [f"{end}_{name}" for end in ("min", "max") for name in ("x", "y", "z", "scale_x", "scale_y", "scale_z")]
+    bounds = [
+        f"{end}_{name}"
+        for end in ("min", "max")
+        for name in ("x", "y", "z", "scale_x", "scale_y", "scale_z")
+    ]
     missing += [name for name in bounds if name not in (chunks.dtype.names or ())]
     need = -(-len(rows) // CHUNK)
     if missing or len(chunks) < need:
-        found = f"missing properties {missing}" if missing else f"{len(chunks)} chunks where {need} are needed"
-        raise InputError("reading a compressed PLY file", str(header.path), found, "export the file again")
+        found = (
+            f"missing properties {missing}"
+            if missing
+            else f"{len(chunks)} chunks where {need} are needed"
+        )
+        raise InputError(
+            "reading a compressed PLY file", str(header.path), found, "export the file again"
+        )
 
 
 _ROW = np.dtype(
@@ -159,9 +178,11 @@ def read_splat(path: Path | str) -> GaussianArrays:
 
 
 def write_splat(path: Path | str, cloud: GaussianCloud) -> None:
-    """Write a cloud as ``.splat``; bands above the constant colour are lost and colours are clipped to 0..1.
+    """Write a cloud as ``.splat``; bands above the constant colour are lost and colours are clipped
+    to 0..1.
 
-    Rotations keep 7 bits and sign, colours and opacity 8 bits; positions and scales are exact in float32.
+    Rotations keep 7 bits and sign, colours and opacity 8 bits; positions and scales are exact in
+    float32.
 
     Raises:
         InfrastructureError: The folder is missing or not writable, or the disk is full.
@@ -172,7 +193,9 @@ def write_splat(path: Path | str, cloud: GaussianCloud) -> None:
     rgb = 0.5 + C0 * np.asarray(cloud.sh, dtype=np.float64)[:, 0, :]
     rgba = np.concatenate([rgb, np.asarray(cloud.opacities, dtype=np.float64)[:, None]], axis=1)
     rows["rgba"] = np.rint(np.clip(rgba, 0.0, 1.0) * 255.0)
-    rows["rotation"] = np.clip(np.rint(np.asarray(cloud.quats, dtype=np.float64) * 128.0 + 128.0), 0, 255)
+    rows["rotation"] = np.clip(
+        np.rint(np.asarray(cloud.quats, dtype=np.float64) * 128.0 + 128.0), 0, 255
+    )
     with atomic_file(path, "writing a .splat file") as partial:
         partial.write_bytes(rows.tobytes())
 
@@ -184,8 +207,12 @@ _COLOUR_SCALE = 0.15
 _EXPORT_AGAIN = "copy or export the file again"
 Axes = Literal["rdf", "rub"]
 
-# Sign of each basis function (degree 0 to 4, order of the 3DGS PLY) when y and z change sign: the parity of its y z factor.
-_FLIP_YZ = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1, -1, 1, -1, 1, 1, -1, 1, -1, 1], dtype=np.float32)
+# Sign of each basis function (degree 0 to 4, order of the 3DGS PLY) when y and z change sign: the
+# parity of its y z factor.
+_FLIP_YZ = np.array(
+    [1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1, -1, 1, -1, 1, 1, -1, 1, -1, 1],
+    dtype=np.float32,
+)
 
 
 @dataclass(frozen=True)
@@ -210,25 +237,32 @@ def read_spz(path: Path | str, axes: Axes = "rdf") -> GaussianArrays:
 
     Args:
         path: The file.
-        axes: ``rdf`` turns the model into the axes of a 3DGS PLY, ``(x, y, z) -> (x, -y, -z)``; ``rub`` leaves it as stored.
+        axes: ``rdf`` turns the model into the axes of a 3DGS PLY, ``(x, y, z) -> (x, -y, -z)``;
+            ``rub`` leaves it as stored.
 
     Raises:
-        InputError: Missing or truncated file, wrong magic, unknown version, or sizes that do not fit the count.
+        InputError: Missing or truncated file, wrong magic, unknown version, or sizes that do not
+            fit the count.
     """
     path = Path(path)
     data = read_bytes(path, DOING)
     if data[:2] == _GZIP:
         data = _gunzip(path, data)
     header = _parse_header(path, data)
-    streams = _zstd_streams(path, data, header) if header.version == 4 else _plain_streams(path, data, header)
+    streams = (
+        _zstd_streams(path, data, header)
+        if header.version == 4
+        else _plain_streams(path, data, header)
+    )
     return _decode(header, streams, axes)
 
 
 def unpack_smallest_three(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return unit quaternions ``(N, 4)`` wxyz from the 4 bytes of versions 3 and 4.
 
-    Little-endian word: top two bits name the largest of x, y, z, w, which is left out; the others follow from the highest bits
-    down in order, each a sign bit and nine bits of magnitude over ``1 / sqrt(2)``.
+    Little-endian word: top two bits name the largest of x, y, z, w, which is left out; the others
+    follow from the highest bits down in order, each a sign bit and nine bits of magnitude over ``1
+    / sqrt(2)``.
     """
     words = np.ascontiguousarray(packed).view("<u4").reshape(-1)
     largest = (words >> 30).astype(np.intp)
@@ -250,7 +284,11 @@ def _decode(header: SpzHeader, streams: list[NDArray[np.uint8]], axes: Axes) -> 
     fixed = parts[..., 0] | parts[..., 1] << 8 | parts[..., 2] << 16
     fixed = np.where(fixed & 0x800000, fixed - 0x1000000, fixed)
     means = fixed.astype(np.float64) / (1 << header.fractional_bits)
-    quats = unpack_smallest_three(rotations) if header.version >= 3 else _unpack_xyz(rotations.reshape(n, 3))
+    quats = (
+        unpack_smallest_three(rotations)
+        if header.version >= 3
+        else _unpack_xyz(rotations.reshape(n, 3))
+    )
     dc = (colours.reshape(n, 1, 3) / 255.0 - 0.5) / _COLOUR_SCALE
     rest = (harmonics.reshape(n, k - 1, 3).astype(np.float64) - 128.0) / 128.0
     sh = np.concatenate([dc, rest], axis=1).astype(np.float32)
@@ -268,14 +306,18 @@ def _decode(header: SpzHeader, streams: list[NDArray[np.uint8]], axes: Axes) -> 
 
 
 def _unpack_xyz(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return quaternions ``(N, 4)`` wxyz from the three bytes of version 2; w is what is left to length 1."""
+    """Return quaternions ``(N, 4)`` wxyz from the three bytes of version 2; w is what is left to
+    length 1.
+    """
     xyz = packed / 127.5 - 1.0
     w = np.sqrt(np.maximum(1.0 - np.sum(xyz**2, axis=1, keepdims=True), 0.0))
     return np.concatenate([w, xyz], axis=1)
 
 
 def _gunzip(path: Path, data: bytes) -> bytes:
-    """Unpack versions 2 and 3: the header first, so that the rest is bounded by what it announces."""
+    """Unpack versions 2 and 3: the header first, so that the rest is bounded by what it
+    announces.
+    """
     stream = zlib.decompressobj(wbits=31)
     try:
         head = stream.decompress(data, 16)
@@ -293,10 +335,16 @@ def _parse_header(path: Path, data: bytes) -> SpzHeader:
     if magic != MAGIC:
         raise _failure(path, f"magic {data[:4]!r}, expected b'NGSP'", "give an SPZ file")
     if version not in (2, 3, 4):
-        raise _failure(path, f"version {version}; versions 2, 3 and 4 are known", "export the file as version 3 or 4")
+        raise _failure(
+            path,
+            f"version {version}; versions 2, 3 and 4 are known",
+            "export the file as version 3 or 4",
+        )
     GAUSSIANS.check(count, DOING, path)
     if degree > 4 or bits > 24:
-        raise _failure(path, f"{count} Gaussians of degree {degree} with {bits} fractional bits", _EXPORT_AGAIN)
+        raise _failure(
+            path, f"{count} Gaussians of degree {degree} with {bits} fractional bits", _EXPORT_AGAIN
+        )
     return SpzHeader(version, count, degree, bits, flags)
 
 
@@ -305,7 +353,9 @@ def _plain_streams(path: Path, data: bytes, header: SpzHeader) -> list[NDArray[n
     body = np.frombuffer(data, dtype=np.uint8, offset=16)
     need = sum(header.stream_bytes)
     if len(body) < need:
-        raise _failure(path, f"{len(body)} bytes of data, {header.count} Gaussians need {need}", _EXPORT_AGAIN)
+        raise _failure(
+            path, f"{len(body)} bytes of data, {header.count} Gaussians need {need}", _EXPORT_AGAIN
+        )
     ends = np.cumsum(header.stream_bytes)
     return [body[end - size : end] for size, end in zip(header.stream_bytes, ends, strict=True)]
 
@@ -313,10 +363,14 @@ def _plain_streams(path: Path, data: bytes, header: SpzHeader) -> list[NDArray[n
 def _zstd_streams(path: Path, data: bytes, header: SpzHeader) -> list[NDArray[np.uint8]]:
     """Unpack version 4: a table of (compressed, unpacked) sizes, then one zstd frame a stream."""
     if len(data) < 32:
-        raise _failure(path, f"{len(data)} bytes, shorter than the header of version 4", _EXPORT_AGAIN)
+        raise _failure(
+            path, f"{len(data)} bytes, shorter than the header of version 4", _EXPORT_AGAIN
+        )
     n_streams, table = data[15], struct.unpack_from("<I", data, 16)[0]
     expected = [size for size in header.stream_bytes if size] if header.count else []
-    wanted = [size for size in header.stream_bytes[:5]] + ([header.stream_bytes[5]] if header.sh_degree else [])
+    wanted = [size for size in header.stream_bytes[:5]] + (
+        [header.stream_bytes[5]] if header.sh_degree else []
+    )
     if n_streams < len(wanted) or table < 32 or table + 16 * n_streams > len(data):
         found = f"{n_streams} streams with a table at byte {table} in {len(data)} bytes, {len(expected)} are needed"
         raise _failure(path, found, _EXPORT_AGAIN)
@@ -337,7 +391,9 @@ def _zstd_streams(path: Path, data: bytes, header: SpzHeader) -> list[NDArray[np
 
 
 def _unzstd(path: Path, index: int, packed: bytes, need: int) -> NDArray[np.uint8]:
-    return np.frombuffer(unzstd(packed, need, f"{path}, stream {index}", DOING, _EXPORT_AGAIN), dtype=np.uint8)
+    return np.frombuffer(
+        unzstd(packed, need, f"{path}, stream {index}", DOING, _EXPORT_AGAIN), dtype=np.uint8
+    )
 
 
 def _failure(path: Path, found: str, do_this: str) -> InputError:

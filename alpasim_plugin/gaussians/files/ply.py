@@ -1,8 +1,10 @@
-"""Read and write Gaussians as PLY in the layout of the original 3DGS code, for any spherical harmonics degree.
+"""Read and write Gaussians as PLY in the layout of the original 3DGS code, for any spherical
+harmonics degree.
 
-The container is the Stanford polygon format: an ASCII header that lists elements and their properties, then the rows of each element in
-header order. Everything is found by name. Opacity is stored as logit, scale as natural logarithm, rotation as ``wxyz`` (not normalised) and
-``f_rest`` channel by channel: all red coefficients, then green, then blue.
+The container is the Stanford polygon format: an ASCII header that lists elements and their
+properties, then the rows of each element in header order. Everything is found by name. Opacity is
+stored as logit, scale as natural logarithm, rotation as ``wxyz`` (not normalised) and ``f_rest``
+channel by channel: all red coefficients, then green, then blue.
 """
 
 from __future__ import annotations
@@ -20,28 +22,48 @@ from alpasim_plugin.core.atomic import atomic_file, write_bytes
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import GAUSSIANS
 from alpasim_plugin.core.reading.files import open_regular
-from alpasim_plugin.gaussians.cloud import GaussianArrays, GaussianCloud, build_cloud, logit, sigmoid
+from alpasim_plugin.gaussians.cloud import (
+    GaussianArrays,
+    GaussianCloud,
+    build_cloud,
+    logit,
+    sigmoid,
+)
 
 _REQUIRED = (
-    "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
-    "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
-)  # fmt: skip
+    "x",
+    "y",
+    "z",
+    "f_dc_0",
+    "f_dc_1",
+    "f_dc_2",
+    "opacity",
+    "scale_0",
+    "scale_1",
+    "scale_2",
+    "rot_0",
+    "rot_1",
+    "rot_2",
+    "rot_3",
+)
 Precision = Literal["float32", "float64"]
 
 
 def read_ply(path: Path | str, element: str | None = None) -> GaussianCloud:
-    """Read a Gaussian PLY file; broken Gaussians are dropped (`read_gaussians` also reports how many).
+    """Read a Gaussian PLY file; broken Gaussians are dropped (`read_gaussians` also reports how
+    many).
 
     Args:
         path: The file.
-        element: Which element to read where the file holds several models, as Street Gaussians writes them
-            (``vertex_background``, ``vertex_obj_000``, ...); None takes the only one.
+        element: Which element to read where the file holds several models, as Street Gaussians
+            writes them (``vertex_background``, ``vertex_obj_000``, ...); None takes the only one.
 
     Returns:
         The cloud, in the axes and units of the file.
 
     Raises:
-        InputError: Missing or truncated file, missing properties, ASCII body, or several elements and none named.
+        InputError: Missing or truncated file, missing properties, ASCII body, or several elements
+            and none named.
 
     Example:
         >>> cloud = read_ply("background.ply")  # doctest: +SKIP
@@ -67,8 +89,9 @@ def read_ply_arrays(path: Path | str, element: str | None = None) -> GaussianArr
 def write_ply(path: Path | str, cloud: GaussianCloud, precision: Precision = "float32") -> None:
     """Write a cloud as a binary little-endian PLY that other 3DGS tools read.
 
-    Means, rotations and colours survive a round trip bit for bit. Scales and opacities pass through a logarithm, which float32
-    cannot hold exactly (relative error up to 5e-7); ``precision="float64"`` keeps them exact too, for tools that accept doubles.
+    Means, rotations and colours survive a round trip bit for bit. Scales and opacities pass through
+    a logarithm, which float32 cannot hold exactly (relative error up to 5e-7);
+    ``precision="float64"`` keeps them exact too, for tools that accept doubles.
 
     Args:
         path: The file; it appears under its name only once complete.
@@ -97,7 +120,16 @@ def write_points(path: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -
     for i, name in enumerate(("red", "green", "blue")):
         rows[name] = rgb[:, i]
     names = [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in kinds]
-    header = "\n".join(["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *names, "end_header", ""])
+    header = "\n".join(
+        [
+            "ply",
+            "format binary_little_endian 1.0",
+            f"element vertex {len(rows)}",
+            *names,
+            "end_header",
+            "",
+        ]
+    )
     write_bytes(path, header.encode() + rows.tobytes())
 
 
@@ -117,18 +149,27 @@ def ply_rows(cloud: GaussianCloud, precision: Precision = "float32") -> NDArray[
         ([f"rot_{i}" for i in range(4)], np.asarray(cloud.quats)),
     ]
     names = [name for group, _ in groups for name in group]
-    table = np.concatenate([values for _, values in groups], axis=1).astype("<f4" if precision == "float32" else "<f8")
+    table = np.concatenate([values for _, values in groups], axis=1).astype(
+        "<f4" if precision == "float32" else "<f8"
+    )
     return np.ascontiguousarray(table).view([(name, table.dtype) for name in names]).reshape(n)
 
 
 def _only_gaussian_element(header: PlyHeader) -> PlyElement:
     """Return the only element that may hold Gaussians, or say which there are."""
-    candidates = [e for e in header.elements if "opacity" in e.properties or e.name.startswith("vertex")]
+    candidates = [
+        e for e in header.elements if "opacity" in e.properties or e.name.startswith("vertex")
+    ]
     if len(candidates) == 1:
         return candidates[0]
     names = [e.name for e in header.elements]
     if not candidates:
-        raise InputError("reading Gaussians from a PLY file", str(header.path), f"no vertex element, only {names}", "give a 3DGS PLY")
+        raise InputError(
+            "reading Gaussians from a PLY file",
+            str(header.path),
+            f"no vertex element, only {names}",
+            "give a 3DGS PLY",
+        )
     raise InputError(
         "reading Gaussians from a PLY file",
         str(header.path),
@@ -147,7 +188,9 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> int:
             "reading Gaussians from a PLY file",
             f"{header.path}, element {element.name!r}",
             f"missing properties {missing}" + (" (it is a compressed PLY)" if compressed else ""),
-            "use read_gaussians, which knows compressed PLY" if compressed else "give a 3DGS PLY, not a mesh or points",
+            "use read_gaussians, which knows compressed PLY"
+            if compressed
+            else "give a 3DGS PLY, not a mesh or points",
         )
     time_terms = sorted(name for name in have if name.startswith("f_dc_") and name not in _REQUIRED)
     if time_terms:
@@ -173,7 +216,9 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> int:
 def _columns(rows: NDArray[np.void], names: Sequence[str]) -> NDArray[np.floating]:
     """Return ``(N, len(names))`` of float32, or float64 where the file has doubles."""
     doubles = any(rows.dtype[name].itemsize > 4 for name in names)
-    return np.stack([rows[name].astype(np.float64 if doubles else np.float32) for name in names], axis=1)
+    return np.stack(
+        [rows[name].astype(np.float64 if doubles else np.float32) for name in names], axis=1
+    )
 
 
 def _sh_from_columns(rows: NDArray[np.void], n_rest: int) -> NDArray[np.floating]:
@@ -194,11 +239,23 @@ def _exp(log_scales: NDArray[np.floating]) -> NDArray[np.float64]:
 _MAX_HEADER_BYTES = 1 << 20
 MAX_PROPERTIES = 512  # the highest degree of colour takes 62
 _SCALAR_CODES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
-    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
-    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
 _ENDIAN = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _EXPORT_AGAIN = "export the file again as a binary PLY, or copy it again if the transfer broke off"
 
@@ -211,7 +268,8 @@ class PlyElement:
         name: Element name, such as ``vertex``.
         count: Number of rows.
         dtype: Row layout, or None if the element has list properties (its row size then varies).
-        offset: Byte position of its first row in the file, or None if an element before it has list properties.
+        offset: Byte position of its first row in the file, or None if an element before it has list
+            properties.
     """
 
     name: str
@@ -254,7 +312,8 @@ def read_ply_header(path: Path | str) -> PlyHeader:
     """Read and check the header of a binary PLY file.
 
     Raises:
-        InputError: Missing file, not a PLY, ASCII body, malformed header line, or an impossible count.
+        InputError: Missing file, not a PLY, ASCII body, malformed header line, or an impossible
+            count.
     """
     path = Path(path)
     lines, body_offset = _header_lines(path)
@@ -294,7 +353,9 @@ def read_ply_element(header: PlyHeader, name: str) -> NDArray[np.void]:
         raise InputError(
             "reading a PLY file",
             f"{header.path}, element {name!r}",
-            "list properties, so rows have no fixed size" if element.dtype is None else "it follows list properties",
+            "list properties, so rows have no fixed size"
+            if element.dtype is None
+            else "it follows list properties",
             "give a Gaussian model; meshes with faces are not one",
         )
     have = header.path.stat().st_size - element.offset
@@ -315,11 +376,21 @@ def _header_lines(path: Path) -> tuple[list[str], int]:
     with open_regular(path, "reading a PLY file") as stream:
         head = stream.read(_MAX_HEADER_BYTES)
     if head[:3] != b"ply" or head[3:4] not in (b"\n", b"\r"):
-        raise InputError("reading a PLY file", str(path), f"first bytes {head[:4]!r}, expected b'ply'", "give a PLY file")
+        raise InputError(
+            "reading a PLY file",
+            str(path),
+            f"first bytes {head[:4]!r}, expected b'ply'",
+            "give a PLY file",
+        )
     marker = head.find(b"\nend_header")
     end = head.find(b"\n", marker + 1) if marker >= 0 else -1
     if end < 0:
-        raise InputError("reading a PLY header", str(path), f"no end_header in the first {len(head)} bytes", _EXPORT_AGAIN)
+        raise InputError(
+            "reading a PLY header",
+            str(path),
+            f"no end_header in the first {len(head)} bytes",
+            _EXPORT_AGAIN,
+        )
     return head[:end].decode("ascii", errors="replace").splitlines(), end + 1
 
 
@@ -336,7 +407,12 @@ def _byte_order(path: Path, word: str) -> str:
 
 def _count(path: Path, number: int, word: str) -> int:
     if not (word.isascii() and word.isdigit()):
-        raise InputError("reading a PLY header", f"{path}, line {number}", f"element count {word!r}, not a whole number", _EXPORT_AGAIN)
+        raise InputError(
+            "reading a PLY header",
+            f"{path}, line {number}",
+            f"element count {word!r}, not a whole number",
+            _EXPORT_AGAIN,
+        )
     count = int(word) if len(word) <= 20 else 10**20
     GAUSSIANS.check(count, "reading a PLY header", f"{path}, line {number}", "element count")
     return count
@@ -353,12 +429,19 @@ def _with_property(
     name, count, fields = element
     if words[1] == "list" or fields is None:
         return name, count, None
-    if len(fields) >= MAX_PROPERTIES or words[1] not in _SCALAR_CODES or not byte_order or any(words[2] == known for known, _ in fields):
+    if (
+        len(fields) >= MAX_PROPERTIES
+        or words[1] not in _SCALAR_CODES
+        or not byte_order
+        or any(words[2] == known for known, _ in fields)
+    ):
         raise _bad_line(path, number, " ".join(words))
     return name, count, [*fields, (words[2], byte_order + _SCALAR_CODES[words[1]])]
 
 
-def _place(pending: list[tuple[str, int, list[tuple[str, str]] | None]], body_offset: int) -> tuple[PlyElement, ...]:
+def _place(
+    pending: list[tuple[str, int, list[tuple[str, str]] | None]], body_offset: int
+) -> tuple[PlyElement, ...]:
     """Give each element its row layout and byte position."""
     offset: int | None = body_offset
     elements = []
@@ -370,4 +453,9 @@ def _place(pending: list[tuple[str, int, list[tuple[str, str]] | None]], body_of
 
 
 def _bad_line(path: Path, number: int, line: str) -> InputError:
-    return InputError("reading a PLY header", f"{path}, line {number}", f"a line that means nothing here: {line[:80]!r}", _EXPORT_AGAIN)
+    return InputError(
+        "reading a PLY header",
+        f"{path}, line {number}",
+        f"a line that means nothing here: {line[:80]!r}",
+        _EXPORT_AGAIN,
+    )

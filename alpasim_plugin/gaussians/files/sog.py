@@ -1,7 +1,9 @@
-"""Read SOG (PlayCanvas, version 2): ``meta.json`` and lossless WebP planes, in a folder or zipped as ``.sog``.
+"""Read SOG (PlayCanvas, version 2): ``meta.json`` and lossless WebP planes, in a folder or zipped
+as ``.sog``.
 
-One pixel a Gaussian, row by row. Places are 16 bits an axis on a logarithmic scale; rotations leave out their largest component; scales and
-colours are entries of codebooks of 256; higher harmonics are shared by palette. Axes are those of a PLY.
+One pixel a Gaussian, row by row. Places are 16 bits an axis on a logarithmic scale; rotations leave
+out their largest component; scales and colours are entries of codebooks of 256; higher harmonics
+are shared by palette. Axes are those of a PLY.
 """
 
 from __future__ import annotations
@@ -28,7 +30,12 @@ META = "meta.json"
 DO_THIS = "write it again as SOG of version 2 (splat-transform), or give the PLY"
 BANDS = {1: 3, 2: 8, 3: 15}  # of harmonics above the constant one to coefficients
 PALETTE_WIDTH = 64  # palette entries a row of the centroids' plane
-_LARGEST = ((1, 2, 3, 0), (0, 2, 3, 1), (0, 1, 3, 2), (0, 1, 2, 3))  # where the three stored components and the largest go, wxyz
+_LARGEST = (
+    (1, 2, 3, 0),
+    (0, 2, 3, 1),
+    (0, 1, 3, 2),
+    (0, 1, 2, 3),
+)  # where the three stored components and the largest go, wxyz
 Get = Callable[[str], bytes]
 
 
@@ -58,7 +65,11 @@ class _Meta(TypedDict):
 
 def is_sog(path: Path) -> bool:
     """Return whether a path is a folder with SOG's ``meta.json``, that file, or a zip."""
-    return (path.is_dir() and (path / META).is_file()) or path.name == META or path.suffix.lower() == ".sog"
+    return (
+        (path.is_dir() and (path / META).is_file())
+        or path.name == META
+        or path.suffix.lower() == ".sog"
+    )
 
 
 def read_sog(path: Path) -> GaussianArrays:
@@ -69,10 +80,19 @@ def read_sog(path: Path) -> GaussianArrays:
     """
     if path.is_dir() or path.name == META:
         folder = path if path.is_dir() else path.parent
-        return _read(lambda name: read_bytes(folder / Path(name).name, DOING, SOURCE_BYTES), folder / META)
+        return _read(
+            lambda name: read_bytes(folder / Path(name).name, DOING, SOURCE_BYTES), folder / META
+        )
     data = read_bytes(path, DOING, SOURCE_BYTES)
-    with parsing(DOING, path, DO_THIS, "a damaged zip"), zipfile.ZipFile(io.BytesIO(data)) as archive:
-        names = {Path(info.filename).name: info for info in archive.infolist() if info.file_size <= SOURCE_BYTES.high}
+    with (
+        parsing(DOING, path, DO_THIS, "a damaged zip"),
+        zipfile.ZipFile(io.BytesIO(data)) as archive,
+    ):
+        names = {
+            Path(info.filename).name: info
+            for info in archive.infolist()
+            if info.file_size <= SOURCE_BYTES.high
+        }
         return _read(lambda name: archive.read(names[name]), path)
 
 
@@ -87,26 +107,34 @@ def _read(get: Get, where: Path) -> GaussianArrays:
     def plane(name: str, least: int) -> U8:
         pixels = _plane(get(name), f"{where}, {name}").reshape(-1, 4)
         if len(pixels) < least:
-            raise InputError(DOING, f"{where}, {name}", f"{len(pixels)} pixels for {least} values", DO_THIS)
+            raise InputError(
+                DOING, f"{where}, {name}", f"{len(pixels)} pixels for {least} values", DO_THIS
+            )
         return pixels[:least]
 
     low, high = (plane(name, n)[:, :3].astype(np.float64) for name in meta["means"]["files"])
     mins, maxs = np.array(meta["means"]["mins"]), np.array(meta["means"]["maxs"])
     logs = mins + (low + 256 * high) / 65535 * (maxs - mins)
     means = np.sign(logs) * np.expm1(np.abs(logs))
-    scales = np.exp(np.array(meta["scales"]["codebook"])[plane(meta["scales"]["files"][0], n)[:, :3]])
+    scales = np.exp(
+        np.array(meta["scales"]["codebook"])[plane(meta["scales"]["files"][0], n)[:, :3]]
+    )
     colour = plane(meta["sh0"]["files"][0], n)
     constant = np.array(meta["sh0"]["codebook"])[colour[:, :3]]
     rest = _harmonics(document.get("shN"), plane, n) if document.get("shN") else np.zeros((n, 0, 3))
     sh = np.concatenate([constant[:, None], rest], axis=1)
-    return GaussianArrays(means, _rotations(plane(meta["quats"]["files"][0], n)), scales, colour[:, 3] / 255.0, sh)
+    return GaussianArrays(
+        means, _rotations(plane(meta["quats"]["files"][0], n)), scales, colour[:, 3] / 255.0, sh
+    )
 
 
 def _plane(data: bytes, where: str) -> U8:
     """Return a plane as RGBA ``(H, W, 4)``, after looking at the size that its header claims."""
     size = _webp_size(data)
     if size is None:
-        raise InputError(DOING, where, f"{len(data)} bytes beginning {data[:4]!r}, no WebP", DO_THIS)
+        raise InputError(
+            DOING, where, f"{len(data)} bytes beginning {data[:4]!r}, no WebP", DO_THIS
+        )
     PICTURE_PIXELS.check(size[0] * size[1], DOING, where)
     with parsing(DOING, where, DO_THIS, "no readable WebP"):
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
@@ -125,7 +153,9 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
         return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
     if data[12:16] == b"VP8X":
         return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
-    return int.from_bytes(data[26:28], "little") & 0x3FFF, int.from_bytes(data[28:30], "little") & 0x3FFF
+    return int.from_bytes(data[26:28], "little") & 0x3FFF, int.from_bytes(
+        data[28:30], "little"
+    ) & 0x3FFF
 
 
 def _rotations(pixels: U8) -> F64:

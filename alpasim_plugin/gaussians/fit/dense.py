@@ -1,13 +1,17 @@
-"""Measure what photographs along a way say of every pixel: how far away it is, by optical flow to neighbours, and whether it is sky.
+"""Measure what photographs along a way say of every pixel: how far away it is, by optical flow to
+neighbours, and whether it is sky.
 
-A neighbour is first warped by the depth that tracks give (inverse depth is linear in the picture on every plane, so it is interpolated
-linearly between the tracks' points); flow (dense inverse search, Kroeger et al. 2016) then finds the little that is left, also where the
-road under the bonnet moves by a hundred pixels. The inverse depth of a pixel is the one that explains all neighbours best (Gauss-Newton,
-Huber weights); it is kept where neighbours agree and the parallax is large enough to say.
+A neighbour is first warped by the depth that tracks give (inverse depth is linear in the picture on
+every plane, so it is interpolated linearly between the tracks' points); flow (dense inverse search,
+Kroeger et al. 2016) then finds the little that is left, also where the road under the bonnet moves
+by a hundred pixels. The inverse depth of a pixel is the one that explains all neighbours best
+(Gauss-Newton, Huber weights); it is kept where neighbours agree and the parallax is large enough to
+say.
 
-Sky is smooth, reaches to the top, has no parallax, and is of one colour by direction over the whole drive. No network is needed for a layer
-that a fit must not fill: what is called sky here is sky almost surely; the ring around leaves and wires is left to the fit, which may put
-Gaussians there or not.
+Sky is smooth, reaches to the top, has no parallax, and is of one colour by direction over the whole
+drive. No network is needed for a layer that a fit must not fill: what is called sky here is sky
+almost surely; the ring around leaves and wires is left to the fit, which may put Gaussians there or
+not.
 """
 
 from __future__ import annotations
@@ -39,7 +43,8 @@ AGREE = 0.06  # share by which the depths of two views may differ
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """What one photograph's pixels are known of; pixels between those that are measured are 0 as unknown ones are.
+    """What one photograph's pixels are known of; pixels between those that are measured are 0 as
+    unknown ones are.
 
     Attributes:
         depth: ``(H, W)`` metres along the optical axis; 0 where unknown.
@@ -51,7 +56,8 @@ class DepthMap:
 
 
 def depth_maps(views: Sequence[PosedView], tracks: Tracks, placed: Placed) -> list[DepthMap]:
-    """Return the depth of every view; nothing is known of a view in which tracks place too few points.
+    """Return the depth of every view; nothing is known of a view in which tracks place too few
+    points.
 
     Args:
         views: In the order of the way, of one size.
@@ -64,19 +70,30 @@ def depth_maps(views: Sequence[PosedView], tracks: Tracks, placed: Placed) -> li
     out = []
     for i, view in enumerate(views):
         guess = between_points(view.camera, tracks, placed, i)
-        near = [i + gap for gap in GAPS if 0 <= i + gap < len(views) and views[i + gap].camera.width == view.camera.width]
+        near = [
+            i + gap
+            for gap in GAPS
+            if 0 <= i + gap < len(views) and views[i + gap].camera.width == view.camera.width
+        ]
         if guess is None or len(near) < 2:
             out.append(DepthMap(*(np.zeros(view.rgb.shape[:2], np.float32) for _ in range(2))))
             continue
-        seen = [_Seen.by_flow(view.camera, views[j].camera, greys[i], greys[j], guess, flow) for j in near]
+        seen = [
+            _Seen.by_flow(view.camera, views[j].camera, greys[i], greys[j], guess, flow)
+            for j in near
+        ]
         out.append(_depth(view, seen, guess))
     return [_agreed(views, out, i) for i in range(len(views))]
 
 
 def between_points(camera: PinholeCamera, tracks: Tracks, placed: Placed, i: int) -> F32 | None:
-    """Return inverse depth ``(H, W)`` interpolated between the points that view i shows; None where there are too few."""
+    """Return inverse depth ``(H, W)`` interpolated between the points that view i shows; None where
+    there are too few.
+    """
     rows = np.flatnonzero(tracks.view == i)
-    local = placed.xyz[tracks.point[rows]] @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+    local = (
+        placed.xyz[tracks.point[rows]] @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+    )
     good = (placed.error_px[rows] < 1.5) & (local > NEAR_M)
     if good.sum() < FEWEST_POINTS:
         return None
@@ -85,12 +102,17 @@ def between_points(camera: PinholeCamera, tracks: Tracks, placed: Placed, i: int
     inside = scipy.interpolate.LinearNDInterpolator(at, q)(u, v)
     outside = scipy.interpolate.NearestNDInterpolator(at, q)(u, v)
     coarse = np.where(np.isnan(inside), outside, inside).astype(np.float32)
-    return np.asarray(cv2.resize(coarse, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR), np.float32)
+    return np.asarray(
+        cv2.resize(coarse, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR),
+        np.float32,
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """One neighbour: where it sees each measured pixel, and the terms of ``pi(a + q b)``, where depth 1/q projects to."""
+    """One neighbour: where it sees each measured pixel, and the terms of ``pi(a + q b)``, where
+    depth 1/q projects to.
+    """
 
     a: F32  # (h, w, 3)
     b: F32  # (3,)
@@ -98,20 +120,46 @@ class _Seen:
     ok: Bool  # (h, w)
 
     @classmethod
-    def by_flow(cls, camera: PinholeCamera, other: PinholeCamera, grey: U8, there: U8, guess: F32, flow: cv2.DISOpticalFlow) -> _Seen:
+    def by_flow(
+        cls,
+        camera: PinholeCamera,
+        other: PinholeCamera,
+        grey: U8,
+        there: U8,
+        guess: F32,
+        flow: cv2.DISOpticalFlow,
+    ) -> _Seen:
         """Warp the neighbour by the guess, find the rest by flow."""
         v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float32) + np.float32(0.5)
         T = other.T_camera_world @ np.linalg.inv(camera.T_camera_world)
-        H, b = (other.K @ T[:3, :3] @ np.linalg.inv(camera.K)).astype(np.float32), (other.K @ T[:3, 3]).astype(np.float32)
+        H, b = (
+            (other.K @ T[:3, :3] @ np.linalg.inv(camera.K)).astype(np.float32),
+            (other.K @ T[:3, 3]).astype(np.float32),
+        )
         a = u[..., None] * H[:, 0] + v[..., None] * H[:, 1] + H[:, 2]
         p = a + guess[..., None] * b
         at = p[..., :2] / np.maximum(p[..., 2:], 1e-3)
-        warped = cv2.remap(there, at[..., 0] - 0.5, at[..., 1] - 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        warped = cv2.remap(
+            there,
+            at[..., 0] - 0.5,
+            at[..., 1] - 0.5,
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
         rest = flow.calc(grey, warped, None)
-        x, y = (u - 0.5 + rest[..., 0])[::STRIDE, ::STRIDE], (v - 0.5 + rest[..., 1])[::STRIDE, ::STRIDE]
+        x, y = (
+            (u - 0.5 + rest[..., 0])[::STRIDE, ::STRIDE],
+            (v - 0.5 + rest[..., 1])[::STRIDE, ::STRIDE],
+        )
         at = cv2.remap(at, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         h, w = there.shape[:2]
-        ok = (at[..., 0] >= 0) & (at[..., 1] >= 0) & (at[..., 0] <= w) & (at[..., 1] <= h) & (p[::STRIDE, ::STRIDE, 2] > 0.1)
+        ok = (
+            (at[..., 0] >= 0)
+            & (at[..., 1] >= 0)
+            & (at[..., 0] <= w)
+            & (at[..., 1] <= h)
+            & (p[::STRIDE, ::STRIDE, 2] > 0.1)
+        )
         return cls(a[::STRIDE, ::STRIDE], b, at, np.asarray(ok))
 
     def error(self, q: F32) -> tuple[F32, F32]:
@@ -119,7 +167,9 @@ class _Seen:
         p = self.a + q[..., None] * self.b
         z = np.maximum(p[..., 2:], 1e-3)
         uv = p[..., :2] / z
-        return np.asarray(uv - self.at, np.float32), np.asarray((self.b[:2] - uv * self.b[2]) / z, np.float32)
+        return np.asarray(uv - self.at, np.float32), np.asarray(
+            (self.b[:2] - uv * self.b[2]) / z, np.float32
+        )
 
 
 def _depth(view: PosedView, seen: Sequence[_Seen], guess: F32) -> DepthMap:
@@ -140,30 +190,44 @@ def _depth(view: PosedView, seen: Sequence[_Seen], guess: F32) -> DepthMap:
         support += good
         information += good * (J * J).sum(axis=2)
     sigma = NOISE_PX / np.sqrt(np.maximum(information, 1e-12))  # of the inverse depth
-    known = (support >= min(LEAST_SUPPORT, len(seen) - 1)) & (q > 1 / FAR_M) & (sigma < LARGEST_SPREAD * q)
+    known = (
+        (support >= min(LEAST_SUPPORT, len(seen) - 1))
+        & (q > 1 / FAR_M)
+        & (sigma < LARGEST_SPREAD * q)
+    )
     known &= _textured(view)[::STRIDE, ::STRIDE]
     if view.mask is not None:
         known &= view.mask[::STRIDE, ::STRIDE]
-    depth, spread = np.zeros(view.rgb.shape[:2], np.float32), np.zeros(view.rgb.shape[:2], np.float32)
+    depth, spread = (
+        np.zeros(view.rgb.shape[:2], np.float32),
+        np.zeros(view.rgb.shape[:2], np.float32),
+    )
     depth[::STRIDE, ::STRIDE] = np.where(known, 1 / np.maximum(q, 1e-6), 0)
     spread[::STRIDE, ::STRIDE] = np.where(known, sigma / np.maximum(q, 1e-6), 0)
     return DepthMap(depth, spread)
 
 
 def _textured(view: PosedView) -> Bool:
-    """Return where there is something to follow ``(H, W)``: flow carries the motion of an edge far into a smooth sky or wall beside it."""
+    """Return where there is something to follow ``(H, W)``: flow carries the motion of an edge far
+    into a smooth sky or wall beside it.
+    """
     grey = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
     step = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)) / 8
     return np.asarray(cv2.dilate(step, np.ones((5, 5), np.uint8)) > LEAST_STEP)
 
 
 def _agreed(views: Sequence[PosedView], maps: Sequence[DepthMap], i: int) -> DepthMap:
-    """Keep what the depth map of a neighbour confirms, within `AGREE` and both spreads, or none can look at."""
+    """Keep what the depth map of a neighbour confirms, within `AGREE` and both spreads, or none can
+    look at.
+    """
     depth, spread = maps[i].depth, maps[i].spread
     rows, columns = np.nonzero(depth)
     camera = views[i].camera
     z = depth[rows, columns].astype(np.float64)
-    local = np.stack([(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z], axis=1)
+    local = np.stack(
+        [(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z],
+        axis=1,
+    )
     confirmed, asked = np.zeros(len(z), bool), np.zeros(len(z), bool)
     for gap in GAPS:
         if 0 <= i + gap < len(views):
@@ -175,8 +239,12 @@ def _agreed(views: Sequence[PosedView], maps: Sequence[DepthMap], i: int) -> Dep
     return DepthMap(np.where(keep, depth, 0), np.where(keep, spread, 0))
 
 
-def _confirms(other: PinholeCamera, depth: F32, local: F64, camera: PinholeCamera) -> tuple[Bool, Bool]:
-    """Return which points ``(N, 3)`` of a camera another one's depth map confirms, and which it knows anything of."""
+def _confirms(
+    other: PinholeCamera, depth: F32, local: F64, camera: PinholeCamera
+) -> tuple[Bool, Bool]:
+    """Return which points ``(N, 3)`` of a camera another one's depth map confirms, and which it
+    knows anything of.
+    """
     T = other.T_camera_world @ np.linalg.inv(camera.T_camera_world)
     p = local @ T[:3, :3].T + T[:3, 3]
     z = np.maximum(p[:, 2], 1e-3)
@@ -186,7 +254,9 @@ def _confirms(other: PinholeCamera, depth: F32, local: F64, camera: PinholeCamer
     inside = (p[:, 2] > 0.1) & (x >= 0) & (y >= 0) & (x < small.shape[1]) & (y < small.shape[0])
     found = np.zeros(len(z))
     found[inside] = small[y[inside], x[inside]]
-    return np.asarray((found > 0) & (np.abs(found - p[:, 2]) < AGREE * p[:, 2])), np.asarray(found > 0)
+    return np.asarray((found > 0) & (np.abs(found - p[:, 2]) < AGREE * p[:, 2])), np.asarray(
+        found > 0
+    )
 
 
 I32 = npt.NDArray[np.int32]
@@ -207,7 +277,9 @@ def sky_masks(views: Sequence[PosedView], up: F64 | None = None) -> list[Bool]:
     """
     above = np.array([0.0, 0.0, 1.0]) if up is None else up
     regions = [_regions(view, above) for view in views]
-    seen = [view.rgb[region > 0] for view, region in zip(views, regions, strict=True) if region.any()]
+    seen = [
+        view.rgb[region > 0] for view, region in zip(views, regions, strict=True) if region.any()
+    ]
     if not seen:
         return [region > 0 for region in regions]
     # Every photograph counts alike, so that one wall that fills a picture does not decide.
@@ -217,8 +289,15 @@ def sky_masks(views: Sequence[PosedView], up: F64 | None = None) -> list[Bool]:
 
 def _regions(view: PosedView, up: F64) -> I32:
     """Label smooth regions that reach the top of the picture and are not solid."""
-    grey = cv2.GaussianBlur(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), (3, 3), 0)
-    step = np.maximum(np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0)), np.abs(cv2.Sobel(grey, cv2.CV_32F, 0, 1))) / 4
+    grey = cv2.GaussianBlur(
+        cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), (3, 3), 0
+    )
+    step = (
+        np.maximum(
+            np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0)), np.abs(cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+        )
+        / 4
+    )
     smooth = (step < SMOOTH_LEVELS) & (_elevation(view, up) > LOW_RAD)
     if view.mask is not None:
         smooth &= view.mask
@@ -229,20 +308,28 @@ def _regions(view: PosedView, up: F64) -> I32:
         region = label == i
         # Flow spreads depth over the edges of trees into the sky: the inside of a region decides.
         inside = cv2.erode(region.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-        solid = 0.0 if measured is None or not inside.any() else 4 * float((measured & inside).sum()) / float(inside.sum())
+        solid = (
+            0.0
+            if measured is None or not inside.any()
+            else 4 * float((measured & inside).sum()) / float(inside.sum())
+        )
         if region.mean() > SMALLEST_SHARE and solid < SOLID_SHARE:
             out[region] = i
     return out
 
 
 def _of_colour(view: PosedView, label: I32, usual: F32) -> Bool:
-    """Keep regions whose usual colour is that of the sky; a sky grows brighter towards the horizon, so single pixels may differ more."""
+    """Keep regions whose usual colour is that of the sky; a sky grows brighter towards the horizon,
+    so single pixels may differ more.
+    """
     out = np.zeros(label.shape, np.uint8)
     for i in set(np.unique(label)) - {0}:
         colours = view.rgb[label == i].astype(np.float32)
         middle = np.median(colours, axis=0)
         if np.abs(middle - usual).max() < COLOUR_LEVELS:
-            out |= ((label == i) & (np.abs(view.rgb - middle).max(axis=2) < 1.5 * COLOUR_LEVELS)).astype(np.uint8)
+            out |= (
+                (label == i) & (np.abs(view.rgb - middle).max(axis=2) < 1.5 * COLOUR_LEVELS)
+            ).astype(np.uint8)
     return np.asarray(cv2.morphologyEx(out, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0)
 
 

@@ -1,4 +1,6 @@
-"""Fit the street of a recorded drive: what the photographs say before the fit (depth, sky, exposure), then the fit. See `fit_drive`."""
+"""Fit the street of a recorded drive: what the photographs say before the fit (depth, sky,
+exposure), then the fit. See `fit_drive`.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ from alpasim_plugin.gaussians.fit.views import PosedView
 DOING = "fitting a recorded drive"
 LEAST_WAY_M = 10.0  # a camera that moves less is not driven along a street under a sky
 LEAST_MEASURED = 0.02  # share of the measured pixels that must have a depth for a start from them
-Report = Callable[[str, int, int, Mapping[str, float]], None]  # stage, done, all, numbers of the fit
+Report = Callable[
+    [str, int, int, Mapping[str, float]], None
+]  # stage, done, all, numbers of the fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +37,9 @@ class FittedDrive:
 
     Attributes:
         model: Background, road users and sky, in the drive's own mean exposure.
-        exposures: Name of each view, fitted or kept, to the gains of red, green and blue over the model's; a kept view's are those
-            of its neighbours, because its own pixels are there to judge.
+        exposures: Name of each view, fitted or kept, to the gains of red, green and blue over the
+            model's; a kept view's are those of its neighbours, because its own pixels are there to
+            judge.
     """
 
     model: Reconstruction
@@ -47,7 +52,8 @@ class Prepared:
 
     Attributes:
         views: With depth, sky and gain.
-        guesses: ``(H, W)`` for each view: depth interpolated between the points that tracks place; None where there are too few.
+        guesses: ``(H, W)`` for each view: depth interpolated between the points that tracks place;
+            None where there are too few.
     """
 
     views: tuple[PosedView, ...]
@@ -70,14 +76,16 @@ def fit_drive(
     """Fit a street to the photographs of a drive.
 
     Args:
-        views: To fit to, +z of the world up; names sort them along the way, and up to the last ``-`` they name the camera.
+        views: To fit to, +z of the world up; names sort them along the way, and up to the last
+            ``-`` they name the camera.
         points: Measured or triangulated points; None starts from what the views' own depth gives.
         kept: Held out. The fit never sees their pixels; it only tells how well it shows them.
         boxes: Sizes of the road users that views show, which are fitted as nodes.
         scene_id: Key of the random streams.
         folder: Keeps the fit's state; the same call goes on from it.
         seed: Of the start, the order of views and the splits.
-        report: Called with stage, done and all; while fitting also with loss, psnr_db, gaussians and, now and then, held_out_db.
+        report: Called with stage, done and all; while fitting also with loss, psnr_db, gaussians
+            and, now and then, held_out_db.
         threads: Of the rasteriser.
         recipe: How to fit; None is `SplatRecipe.street`.
 
@@ -87,31 +95,56 @@ def fit_drive(
     """
     tell = report or (lambda stage, done, all, numbers: None)
     if not views:
-        raise InputError(DOING, scene_id, "no photograph", "give at least some ten photographs along the way")
+        raise InputError(
+            DOING, scene_id, "no photograph", "give at least some ten photographs along the way"
+        )
     recipe = replace(recipe or SplatRecipe.street(), seed=seed)
     known = {view.name for view in views}
     prepared = prepared_views([*views, *kept], tell)
     train = [view for view in prepared.views if view.name in known]
-    guesses = [guess for view, guess in zip(prepared.views, prepared.guesses, strict=True) if view.name in known]
-    start = Start(_start(train, guesses, points, recipe, scene_id), _actors(train, boxes or {}, recipe, scene_id))
-    held = [replace(view, gain=_between(train, view)) for view in prepared.views if view.name not in known]
+    guesses = [
+        guess
+        for view, guess in zip(prepared.views, prepared.guesses, strict=True)
+        if view.name in known
+    ]
+    start = Start(
+        _start(train, guesses, points, recipe, scene_id),
+        _actors(train, boxes or {}, recipe, scene_id),
+    )
+    held = [
+        replace(view, gain=_between(train, view))
+        for view in prepared.views
+        if view.name not in known
+    ]
     model = fit(
-        train, start, recipe, scene_id=scene_id, folder=folder, threads=threads, checked=held,
+        train,
+        start,
+        recipe,
+        scene_id=scene_id,
+        folder=folder,
+        threads=threads,
+        checked=held,
         report=lambda step, numbers: tell("fitting", step, recipe.steps, numbers),
-    )  # fmt: skip
+    )
     after = [replace(view, gain=model.gains[i]) for i, view in enumerate(train)]
-    exposures = {view.name: view.gain for view in after} | {view.name: _between(after, view) for view in held}
+    exposures = {view.name: view.gain for view in after} | {
+        view.name: _between(after, view) for view in held
+    }
     return FittedDrive(model, exposures)
 
 
 def prepared_views(views: Sequence[PosedView], tell: Report) -> Prepared:
-    """Measure depth, sky and exposure of photographs, camera by camera, in the order of their names."""
+    """Measure depth, sky and exposure of photographs, camera by camera, in the order of their
+    names.
+    """
     ordered: list[PosedView] = []
     guesses: list[F32 | None] = []
     cameras = {camera_of(view) for view in views}
     for number, camera in enumerate(sorted(cameras)):
         tell("measuring depth, sky and exposure", number, len(cameras), {})
-        mine = sorted((view for view in views if camera_of(view) == camera), key=lambda view: view.name)
+        mine = sorted(
+            (view for view in views if camera_of(view) == camera), key=lambda view: view.name
+        )
         done, guess = _of_one_camera(mine)
         ordered, guesses = [*ordered, *done], [*guesses, *guess]
     tell("measuring depth, sky and exposure", len(cameras), len(cameras), {})
@@ -124,16 +157,31 @@ def camera_of(view: PosedView) -> str:
 
 
 def _of_one_camera(views: Sequence[PosedView]) -> tuple[list[PosedView], list[F32 | None]]:
-    tracks = follow(views) if len({view.rgb.shape for view in views}) == 1 else Tracks(*(np.zeros(0, np.int64),) * 2, np.zeros((0, 2)), 0)
+    tracks = (
+        follow(views)
+        if len({view.rgb.shape for view in views}) == 1
+        else Tracks(*(np.zeros(0, np.int64),) * 2, np.zeros((0, 2)), 0)
+    )
     placed = place(tracks, [view.camera for view in views])
     maps = depth_maps(views, tracks, placed)
-    measured = [view if view.depth is not None else replace(view, depth=one.depth) for view, one in zip(views, maps, strict=True)]
-    way = np.linalg.norm(np.diff([view.camera.centre_world for view in views], axis=0), axis=1).sum() if len(views) > 1 else 0.0
+    measured = [
+        view if view.depth is not None else replace(view, depth=one.depth)
+        for view, one in zip(views, maps, strict=True)
+    ]
+    way = (
+        np.linalg.norm(np.diff([view.camera.centre_world for view in views], axis=0), axis=1).sum()
+        if len(views) > 1
+        else 0.0
+    )
     masks = sky_masks(measured) if way > LEAST_WAY_M else [None] * len(views)
     gains = balances(views, tracks)
-    skies = [mask if view.sky is None else view.sky for view, mask in zip(measured, masks, strict=True)]
+    skies = [
+        mask if view.sky is None else view.sky for view, mask in zip(measured, masks, strict=True)
+    ]
     free = [
-        view.depth if sky is None or view.depth is None else np.where(sky, np.float32(0), view.depth)
+        view.depth
+        if sky is None or view.depth is None
+        else np.where(sky, np.float32(0), view.depth)
         for view, sky in zip(measured, skies, strict=True)
     ]
     done = [
@@ -141,40 +189,80 @@ def _of_one_camera(views: Sequence[PosedView]) -> tuple[list[PosedView], list[F3
         for view, sky, depth, (r, g, b) in zip(measured, skies, free, gains, strict=True)
     ]
     guesses = [between_points(view.camera, tracks, placed, i) for i, view in enumerate(views)]
-    return done, [None if q is None else np.asarray(1 / np.maximum(q, 1e-3), np.float32) for q in guesses]
+    return done, [
+        None if q is None else np.asarray(1 / np.maximum(q, 1e-3), np.float32) for q in guesses
+    ]
 
 
 def _start(
-    views: Sequence[PosedView], guesses: Sequence[F32 | None], points: GaussianCloud | None, recipe: SplatRecipe, scene_id: str
+    views: Sequence[PosedView],
+    guesses: Sequence[F32 | None],
+    points: GaussianCloud | None,
+    recipe: SplatRecipe,
+    scene_id: str,
 ) -> GaussianCloud:
-    """Return Gaussians at measured depth, at guessed depth where nothing was measured, and at the points that were given."""
-    share = float(np.mean([0.0 if view.depth is None else (view.depth > 0).mean() * STRIDE**2 for view in views]))
+    """Return Gaussians at measured depth, at guessed depth where nothing was measured, and at the
+    points that were given.
+    """
+    share = float(
+        np.mean(
+            [0.0 if view.depth is None else (view.depth > 0).mean() * STRIDE**2 for view in views]
+        )
+    )
     given = [] if points is None else [points]
     if share < LEAST_MEASURED:
         if points is None:
             do = "give points (structure from motion or LiDAR), or photographs that overlap, in order along the way, with their own poses"
-            raise InputError(DOING, f"{len(views)} photographs", "nothing whose distance they measure", do)
+            raise InputError(
+                DOING, f"{len(views)} photographs", "nothing whose distance they measure", do
+            )
         return points
     more = [_unmeasured(view, guess) for view, guess in zip(views, guesses, strict=True)]
-    return GaussianCloud.concatenate([start_from_maps(views, more, recipe.points, scene_id, recipe.seed, recipe.start_size), *given])
+    return GaussianCloud.concatenate(
+        [
+            start_from_maps(views, more, recipe.points, scene_id, recipe.seed, recipe.start_size),
+            *given,
+        ]
+    )
 
 
 def _unmeasured(view: PosedView, guess: F32 | None) -> PosedView:
-    """Return a view whose depth is the guess where nothing was measured near by and there is no sky."""
+    """Return a view whose depth is the guess where nothing was measured near by and there is no
+    sky.
+    """
     assert view.depth is not None
-    near = cv2.dilate((view.depth > 0).astype(np.uint8), np.ones((2 * STRIDE + 1,) * 2, np.uint8)) > 0
+    near = (
+        cv2.dilate((view.depth > 0).astype(np.uint8), np.ones((2 * STRIDE + 1,) * 2, np.uint8)) > 0
+    )
     free = ~near & (True if view.sky is None else ~view.sky)
-    return replace(view, depth=np.zeros_like(view.depth) if guess is None else np.where(free, guess, 0).astype(np.float32))
+    return replace(
+        view,
+        depth=np.zeros_like(view.depth)
+        if guess is None
+        else np.where(free, guess, 0).astype(np.float32),
+    )
 
 
-def _actors(views: Sequence[PosedView], boxes: Mapping[str, Box], recipe: SplatRecipe, scene_id: str) -> dict[str, GaussianCloud]:
+def _actors(
+    views: Sequence[PosedView], boxes: Mapping[str, Box], recipe: SplatRecipe, scene_id: str
+) -> dict[str, GaussianCloud]:
     seen = {name for view in views for name in view.actors}
-    return start_in_boxes({name: box for name, box in boxes.items() if name in seen}, recipe.actor_points, scene_id, recipe.seed)
+    return start_in_boxes(
+        {name: box for name, box in boxes.items() if name in seen},
+        recipe.actor_points,
+        scene_id,
+        recipe.seed,
+    )
 
 
 def _between(views: Sequence[PosedView], view: PosedView) -> tuple[float, float, float]:
-    """Return the gain of a view that was not fitted: that of its camera's nearest ones that were."""
+    """Return the gain of a view that was not fitted: that of its camera's nearest ones that
+    were.
+    """
     mine = [other for other in views if camera_of(other) == camera_of(view)] or list(views)
-    centres, gains = np.array([other.camera.centre_world for other in mine]), np.array([other.gain for other in mine])
+    centres, gains = (
+        np.array([other.camera.centre_world for other in mine]),
+        np.array([other.gain for other in mine]),
+    )
     red, green, blue = gain_between(centres, gains, view.camera.centre_world)
     return float(red), float(green), float(blue)

@@ -1,7 +1,9 @@
-"""What the camera did to a photograph: its lens (OpenCV's models, and the pinhole picture without distortion), exposure and balance.
+"""What the camera did to a photograph: its lens (OpenCV's models, and the pinhole picture without
+distortion), exposure and balance.
 
-A camera that meters for itself changes its gain by a tenth from one street corner to the next. A surface keeps its brightness, so the
-logarithm of what a photograph shows of a track's point is the point's plus the photograph's: linear, solved with robust weights.
+A camera that meters for itself changes its gain by a tenth from one street corner to the next. A
+surface keeps its brightness, so the logarithm of what a photograph shows of a track's point is the
+point's plus the photograph's: linear, solved with robust weights.
 """
 
 from __future__ import annotations
@@ -19,7 +21,9 @@ from alpasim_plugin.core.types import F32, F64, I64, U8
 from alpasim_plugin.gaussians.fit.tracks import Tracks
 from alpasim_plugin.gaussians.fit.views import PosedView
 
-FISHEYE_HALF_VIEW_RAD = np.radians(50.0)  # of a fisheye's pinhole picture, from its middle to a side: beyond, pixels are only stretched
+FISHEYE_HALF_VIEW_RAD = np.radians(
+    50.0
+)  # of a fisheye's pinhole picture, from its middle to a side: beyond, pixels are only stretched
 _FROM_CORNER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV counts from pixel centres
 
 
@@ -30,7 +34,8 @@ class Lens:
     Attributes:
         width, height: Of the photograph, pixels.
         K: ``(3, 3)`` pixels; the middle of the first pixel is (0.5, 0.5).
-        distortion: OpenCV's coefficients: k1, k2, p1, p2, k3 and on of ``opencv``, k1 to k4 of ``fisheye``; all zero bends nothing.
+        distortion: OpenCV's coefficients: k1, k2, p1, p2, k3 and on of ``opencv``, k1 to k4 of
+            ``fisheye``; all zero bends nothing.
         model: ``opencv`` is radial and tangential, ``fisheye`` equidistant.
     """
 
@@ -49,7 +54,12 @@ class Lens:
         finite = np.isfinite([*self.K.ravel(), *self.distortion]).all()
         if not finite or min(self.K[0, 0], self.K[1, 1]) <= 0 or min(self.width, self.height) < 1:
             found = f"{self.width} x {self.height} pixels, focal lengths {self.K[0, 0]:g} and {self.K[1, 1]:g}"
-            raise InputError(doing, where, found if finite else "intrinsics that are not finite, or no focal length", do_this)
+            raise InputError(
+                doing,
+                where,
+                found if finite else "intrinsics that are not finite, or no focal length",
+                do_this,
+            )
         return self
 
     @property
@@ -58,12 +68,16 @@ class Lens:
         return self.model == "fisheye" or bool(self.distortion.any())
 
     def straight_K(self) -> F64:
-        """Return the intrinsics of the picture without distortion, of the same size: what it shows is all in the photograph."""
+        """Return the intrinsics of the picture without distortion, of the same size: what it shows
+        is all in the photograph.
+        """
         if not self.bends:
             return self.K
         if self.model == "fisheye":
             return self._fisheye_K()
-        whole, _ = cv2.getOptimalNewCameraMatrix(self.K - _FROM_CORNER, self.distortion, (self.width, self.height), 0.0)
+        whole, _ = cv2.getOptimalNewCameraMatrix(
+            self.K - _FROM_CORNER, self.distortion, (self.width, self.height), 0.0
+        )
         straight: F64 = np.asarray(whole, dtype=np.float64) + _FROM_CORNER
         return straight
 
@@ -72,24 +86,50 @@ class Lens:
         if not self.bends:
             return image
         x, y = (cv2.fisheye if self.model == "fisheye" else cv2).initUndistortRectifyMap(
-            self.K - _FROM_CORNER, self.distortion, np.eye(3), self.straight_K() - _FROM_CORNER, (self.width, self.height), cv2.CV_32FC1
+            self.K - _FROM_CORNER,
+            self.distortion,
+            np.eye(3),
+            self.straight_K() - _FROM_CORNER,
+            (self.width, self.height),
+            cv2.CV_32FC1,
         )
         return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR), dtype=np.uint8)
 
     def resized(self, width: int) -> Lens:
         """Return the lens of the same photograph at another width, pixels."""
         height = round(self.height * width / self.width)
-        return replace(self, width=width, height=height, K=np.diag([width / self.width, height / self.height, 1.0]) @ self.K)
+        return replace(
+            self,
+            width=width,
+            height=height,
+            K=np.diag([width / self.width, height / self.height, 1.0]) @ self.K,
+        )
 
     def _fisheye_K(self) -> F64:
-        """Return a pinhole with the lens's middle whose sides look at most `FISHEYE_HALF_VIEW_RAD` aside and stay in the photograph."""
+        """Return a pinhole with the lens's middle whose sides look at most `FISHEYE_HALF_VIEW_RAD`
+        aside and stay in the photograph.
+        """
         middle = np.array([[[self.K[0, 2] - 0.5, self.K[1, 2] - 0.5]]])
-        ends = [(0.0, middle[0, 0, 1]), (self.width - 1.0, middle[0, 0, 1]), (middle[0, 0, 0], 0.0), (middle[0, 0, 0], self.height - 1.0)]
-        seen = cv2.fisheye.undistortPoints(np.array([ends]), self.K - _FROM_CORNER, self.distortion)[0]  # tangents
+        ends = [
+            (0.0, middle[0, 0, 1]),
+            (self.width - 1.0, middle[0, 0, 1]),
+            (middle[0, 0, 0], 0.0),
+            (middle[0, 0, 0], self.height - 1.0),
+        ]
+        seen = cv2.fisheye.undistortPoints(
+            np.array([ends]), self.K - _FROM_CORNER, self.distortion
+        )[0]  # tangents
         most = np.tan(FISHEYE_HALF_VIEW_RAD)
         sides = np.minimum(np.where(np.isfinite(seen), np.abs(seen), most), most)
-        half = np.array([min(self.K[0, 2], self.width - self.K[0, 2]), min(self.K[1, 2], self.height - self.K[1, 2])])
-        focal = float(max(half[0] / min(sides[0, 0], sides[1, 0]), half[1] / min(sides[2, 1], sides[3, 1])))
+        half = np.array(
+            [
+                min(self.K[0, 2], self.width - self.K[0, 2]),
+                min(self.K[1, 2], self.height - self.K[1, 2]),
+            ]
+        )
+        focal = float(
+            max(half[0] / min(sides[0, 0], sides[1, 0]), half[1] / min(sides[2, 1], sides[3, 1]))
+        )
         return np.array([[focal, 0.0, self.K[0, 2]], [0.0, focal, self.K[1, 2]], [0.0, 0.0, 1.0]])
 
 
@@ -100,22 +140,35 @@ PULL = 1.0  # towards a gain of 1, in observations
 
 
 def balances(views: Sequence[PosedView], tracks: Tracks) -> F64:
-    """Return the gain ``(V, 3)`` of each view's red, green and blue over the drive's; their geometric mean is 1.
+    """Return the gain ``(V, 3)`` of each view's red, green and blue over the drive's; their
+    geometric mean is 1.
 
     A view without points keeps 1.
     """
-    shown = np.array([_patch(views[v].rgb, at) for v, at in zip(tracks.view.tolist(), tracks.at, strict=True)]).reshape(-1, 3)
+    shown = np.array(
+        [_patch(views[v].rgb, at) for v, at in zip(tracks.view.tolist(), tracks.at, strict=True)]
+    ).reshape(-1, 3)
     out = np.ones((len(views), 3))
     for channel in range(3):
         value = shown[:, channel]
         good = (value > DARKEST) & (value < BRIGHTEST)
         if good.any():
-            out[:, channel] = np.exp(_solved(np.log(value[good]), tracks.view[good], tracks.point[good], len(views), tracks.count))
+            out[:, channel] = np.exp(
+                _solved(
+                    np.log(value[good]),
+                    tracks.view[good],
+                    tracks.point[good],
+                    len(views),
+                    tracks.count,
+                )
+            )
     return out
 
 
 def gain_between(centres: F64, gains: F64, place: F64) -> F32:
-    """Return the gain ``(3,)`` at a place, of the two nearest of ``centres (N, 3)``, by inverse distance; 1 where there is none."""
+    """Return the gain ``(3,)`` at a place, of the two nearest of ``centres (N, 3)``, by inverse
+    distance; 1 where there is none.
+    """
     if not len(centres):
         return np.ones(3, np.float32)
     distance = np.linalg.norm(centres - place, axis=1)
@@ -130,14 +183,18 @@ def _patch(rgb: U8, at: F64) -> F64:
 
 
 def _solved(value: F64, view: I64, point: I64, views: int, points: int) -> F64:
-    """Solve value = gain[view] + surface[point] for the gains: surfaces are means of what is left, so only V unknowns remain."""
+    """Solve value = gain[view] + surface[point] for the gains: surfaces are means of what is left,
+    so only V unknowns remain.
+    """
     gain, weight = np.zeros(views), np.ones(len(value))
     for _ in range(ROUNDS):
         total = np.maximum(np.bincount(point, weight, points), 1e-12)
         seen = scipy.sparse.csr_matrix((weight, (view, point)), shape=(views, points))
         shared = seen @ scipy.sparse.diags(1 / total)
         A = np.diag(np.bincount(view, weight, views) + PULL) - (shared @ seen.T).toarray()
-        b = np.bincount(view, weight * value, views) - shared @ np.bincount(point, weight * value, points)
+        b = np.bincount(view, weight * value, views) - shared @ np.bincount(
+            point, weight * value, points
+        )
         gain = np.linalg.solve(A, b)
         gain -= gain.mean()
         surface = np.bincount(point, weight * (value - gain[view]), points) / total

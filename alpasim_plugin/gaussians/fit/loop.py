@@ -1,4 +1,6 @@
-"""Fit Gaussians to posed views: the training loop of 3D Gaussian Splatting, readable from `fit` downwards."""
+"""Fit Gaussians to posed views: the training loop of 3D Gaussian Splatting, readable from `fit`
+downwards.
+"""
 
 from __future__ import annotations
 
@@ -62,12 +64,14 @@ def fit(
 
     Args:
         views: To train on, all of them; see `held_out`.
-        start: Gaussians to begin with: see `start_from_depth` and `cloud_from_points`. A cloud alone is a background without actors.
+        start: Gaussians to begin with: see `start_from_depth` and `cloud_from_points`. A cloud
+            alone is a background without actors.
         recipe: Amounts, rates and schedule.
         scene_id: Key of the random streams, with ``recipe.seed``: order of views and splits.
-        folder: Receives checkpoints; the same call with the same folder continues, and ends with the same bits. None keeps none.
-        report: Called after every update with loss, psnr_db (of the training view just seen), gaussians and, where views are ``checked``,
-            now and then held_out_db.
+        folder: Receives checkpoints; the same call with the same folder continues, and ends with
+            the same bits. None keeps none.
+        report: Called after every update with loss, psnr_db (of the training view just seen),
+            gaussians and, where views are ``checked``, now and then held_out_db.
         device: ``cpu``, or ``cuda`` through gsplat.
         threads: Of the CPU rasteriser; None leaves it as it is.
         checked: Views that are not learned from, to tell on the way how well they are shown.
@@ -76,14 +80,23 @@ def fit(
         Background, actors, the sky that the views saw, and their exposures.
 
     Raises:
-        InputError: No view, nothing to start from, or a folder begun with other views or another recipe.
-        InfrastructureError: The loss or a gradient is not finite; the folder keeps the state before it.
+        InputError: No view, nothing to start from, or a folder begun with other views or another
+            recipe.
+        InfrastructureError: The loss or a gradient is not finite; the folder keeps the state before
+            it.
     """
     if not views:
-        raise InputError("fitting Gaussians", "no view", "nothing to learn from", "give at least one posed view")
+        raise InputError(
+            "fitting Gaussians", "no view", "nothing to learn from", "give at least one posed view"
+        )
     begin = Start(start, {}) if isinstance(start, GaussianCloud) else start
     if len(begin.background) == 0:
-        raise InputError("fitting Gaussians", "a start cloud", "no Gaussian in the background", "start from points that the views see")
+        raise InputError(
+            "fitting Gaussians",
+            "a start cloud",
+            "no Gaussian in the background",
+            "start from points that the views see",
+        )
     run = SplatFit(views, begin, recipe, scene_id, device, threads, folder)
     while run.step < recipe.steps:
         numbers = run.update()
@@ -95,7 +108,9 @@ def fit(
             run.save()
     background, actors = run.model.clouds()
     gains = tuple((float(r), float(g), float(b)) for r, g, b in run.exposure.gains())
-    return Reconstruction(background, actors, run.sky or Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)), gains)
+    return Reconstruction(
+        background, actors, run.sky or Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)), gains
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,19 +145,30 @@ class SplatFit:
         centres = np.array([view.camera.centre_world for view in views])
         origin = np.asarray(centres.mean(axis=0))
         self.recipe, self.scene_id, self.threads, self.folder = recipe, scene_id, threads, folder
-        self.extent_m = max(1.1 * float(np.linalg.norm(centres - origin, axis=1).max()), SMALLEST_EXTENT_M)
+        self.extent_m = max(
+            1.1 * float(np.linalg.norm(centres - origin, axis=1).max()), SMALLEST_EXTENT_M
+        )
         self.sky = sky_of(views)
         self.model = SplatModel.from_start(start, origin, recipe.sh_degree, device)
         self.adam = RowAdam(self.model.params)
         self.gradients = ScreenGradients(len(self.model), device)
         self.step = 0
-        self.targets = [_target(i, view, self.model, self.sky, device, recipe) for i, view in enumerate(views)]
+        self.targets = [
+            _target(i, view, self.model, self.sky, device, recipe) for i, view in enumerate(views)
+        ]
         small = [halved(view) for view in views] if recipe.coarse_share > 0 else []
-        self.coarse = [_target(i, view, self.model, self.sky, device, recipe) for i, view in enumerate(small)]
+        self.coarse = [
+            _target(i, view, self.model, self.sky, device, recipe) for i, view in enumerate(small)
+        ]
         self.exposure = Exposure(np.array([view.gain for view in views]), device)
-        self._facts = json.dumps({"recipe": asdict(recipe), "scene": scene_id, "views": _digest(views, start)}, sort_keys=True)
+        self._facts = json.dumps(
+            {"recipe": asdict(recipe), "scene": scene_id, "views": _digest(views, start)},
+            sort_keys=True,
+        )
         if folder is not None and (folder / STATE_FILE).exists():
-            self.step = load_state(folder, self.model, self.adam, self.gradients, self.exposure, self._facts)
+            self.step = load_state(
+                folder, self.model, self.adam, self.gradients, self.exposure, self._facts
+            )
 
     def update(self) -> dict[str, float]:
         """Learn from one view.
@@ -152,12 +178,16 @@ class SplatFit:
         """
         target, recipe = self._next_view(), self.recipe
         splats, rows = self.model.placed(target.motion, recipe.sh_size_at(self.step))
-        out = rasterize_gradient(splats, target.camera, background=target.behind, threads=self.threads)
+        out = rasterize_gradient(
+            splats, target.camera, background=target.behind, threads=self.threads
+        )
         lit = out.rgb if self.exposure.plain else out.rgb * self.exposure.gain(target.index)
         rgb = lit if target.counts is None else torch.where(target.counts, lit, target.rgb)
         loss = _loss(rgb, out, target, recipe)
         if recipe.needle_weight > 0:
-            loss = loss + recipe.needle_weight * needles(splats.log_scales[out.screen.radii > 0], recipe.needle_ratio)
+            loss = loss + recipe.needle_weight * needles(
+                splats.log_scales[out.screen.radii > 0], recipe.needle_ratio
+            )
         if not torch.isfinite(loss):
             self._stop(target, f"loss {float(loss.detach())}")
         loss.backward()  # type: ignore[no-untyped-call]
@@ -178,32 +208,61 @@ class SplatFit:
         """Return the mean PSNR of views, of the pixels that count, each by its own gain."""
         found = []
         for view in views:
-            target = _target(0, view, self.model, self.sky, str(self.model.node.device), self.recipe)
+            target = _target(
+                0, view, self.model, self.sky, str(self.model.node.device), self.recipe
+            )
             splats, _ = self.model.placed(target.motion, self.recipe.sh_size_at(self.step))
-            out = rasterize_gradient(splats, target.camera, background=target.behind, threads=self.threads)
+            out = rasterize_gradient(
+                splats, target.camera, background=target.behind, threads=self.threads
+            )
             rgb = (out.rgb * torch.tensor(view.gain)).clamp(0, 1)
             shown = rgb if target.counts is None else torch.where(target.counts, rgb, target.rgb)
             share = 1.0 if view.mask is None else max(float(view.mask.mean()), 1e-9)
-            found.append(psnr_db(shown.cpu().numpy(), target.rgb.cpu().numpy(), peak=1.0) + 10 * float(np.log10(share)))
+            found.append(
+                psnr_db(shown.cpu().numpy(), target.rgb.cpu().numpy(), peak=1.0)
+                + 10 * float(np.log10(share))
+            )
         return float(np.mean(found))
 
     def save(self) -> None:
         """Write the checkpoint, whole or not at all."""
         assert self.folder is not None
-        save_state(self.folder, self.model, self.adam, self.gradients, self.exposure, self.step, self._facts)
+        save_state(
+            self.folder,
+            self.model,
+            self.adam,
+            self.gradients,
+            self.exposure,
+            self.step,
+            self._facts,
+        )
 
     def _next_view(self) -> _Target:
         """Return the view of this step: all in a random order, then all in another."""
         turn, i = divmod(self.step, len(self.targets))
-        targets = self.coarse if self.step < self.recipe.coarse_share * self.recipe.steps else self.targets
-        return targets[int(stream(self.scene_id, self.recipe.seed, "fit.order", turn).permutation(len(self.targets))[i])]
+        targets = (
+            self.coarse
+            if self.step < self.recipe.coarse_share * self.recipe.steps
+            else self.targets
+        )
+        return targets[
+            int(
+                stream(self.scene_id, self.recipe.seed, "fit.order", turn).permutation(
+                    len(self.targets)
+                )[i]
+            )
+        ]
 
     def _rates(self) -> dict[str, float]:
         r = self.recipe
         return {
-            "means": r.lr_means_at(self.step) * self.extent_m, "log_scales": r.lr_scales, "quaternions": r.lr_quaternions,
-            "logit_opacities": r.lr_opacities, "sh_dc": r.lr_colour, "sh_rest": r.lr_colour / 20,
-        }  # fmt: skip
+            "means": r.lr_means_at(self.step) * self.extent_m,
+            "log_scales": r.lr_scales,
+            "quaternions": r.lr_quaternions,
+            "logit_opacities": r.lr_opacities,
+            "sh_dc": r.lr_colour,
+            "sh_rest": r.lr_colour / 20,
+        }
 
     def _control_density(self) -> None:
         if self.recipe.densifies_after(self.step):
@@ -217,10 +276,19 @@ class SplatFit:
         if self.folder is not None:
             self.save()
         do = "look at this view and its pose, or lower the recipe's rates; a folder that was given keeps the state before this update"
-        raise InfrastructureError("fitting Gaussians", f"view {target.name!r}, update {self.step}", found, do)
+        raise InfrastructureError(
+            "fitting Gaussians", f"view {target.name!r}, update {self.step}", found, do
+        )
 
 
-def _target(index: int, view: PosedView, model: SplatModel, sky: Sky | None, device: str, recipe: SplatRecipe) -> _Target:
+def _target(
+    index: int,
+    view: PosedView,
+    model: SplatModel,
+    sky: Sky | None,
+    device: str,
+    recipe: SplatRecipe,
+) -> _Target:
     camera = view.camera
     T = camera.T_camera_world.copy()
     T[:3, 3] += T[:3, :3] @ model.origin
@@ -235,13 +303,17 @@ def _target(index: int, view: PosedView, model: SplatModel, sky: Sky | None, dev
         None if view.mask is None else torch.as_tensor(view.mask, device=device)[..., None],
         model.motion(view.actors),
         SsimTarget(rgb),
-        None if view.depth is None or recipe.depth_weight == 0 else torch.as_tensor(view.depth, device=device),
+        None
+        if view.depth is None or recipe.depth_weight == 0
+        else torch.as_tensor(view.depth, device=device),
         index,
     )
 
 
 def _loss(rgb: Tensor, out: GradientOutput, target: _Target, recipe: SplatRecipe) -> Tensor:
-    """Return ``(1 - w) L1 + w (1 - SSIM)`` (Kerbl et al. 2023, Eq. 7), the opacity that stands before the sky, and the error of depth."""
+    """Return ``(1 - w) L1 + w (1 - SSIM)`` (Kerbl et al. 2023, Eq. 7), the opacity that stands
+    before the sky, and the error of depth.
+    """
     w = recipe.ssim_weight
     loss = (1 - w) * (rgb - target.rgb).abs().mean() + w * (1 - target.ssim.ssim(rgb))
     if target.sky is not None:
@@ -252,7 +324,9 @@ def _loss(rgb: Tensor, out: GradientOutput, target: _Target, recipe: SplatRecipe
 
 
 def _depth_error(out: GradientOutput, depth: Tensor) -> Tensor:
-    """Return the mean difference of inverse depths as a share of the true one, over pixels of known depth, at most `DEPTH_CLIP` each."""
+    """Return the mean difference of inverse depths as a share of the true one, over pixels of known
+    depth, at most `DEPTH_CLIP` each.
+    """
     rows, columns = torch.nonzero(depth, as_tuple=True)
     if not len(rows):
         return out.depth.new_zeros(())
@@ -268,7 +342,15 @@ def _digest(views: Sequence[PosedView], start: Start) -> str:
         digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
 
     for view in views:
-        for array in (view.rgb, view.camera.K, view.camera.T_camera_world, view.sky, view.mask, view.depth, np.array(view.gain)):
+        for array in (
+            view.rgb,
+            view.camera.K,
+            view.camera.T_camera_world,
+            view.sky,
+            view.mask,
+            view.depth,
+            np.array(view.gain),
+        ):
             add(array)
         for name, T in sorted(view.actors.items()):
             digest.update(name.encode())
@@ -283,22 +365,49 @@ STATE_FILE = "state.safetensors"
 
 
 def save_state(
-    folder: Path, model: SplatModel, adam: RowAdam, gradients: ScreenGradients, exposure: Exposure, step: int, facts: str
+    folder: Path,
+    model: SplatModel,
+    adam: RowAdam,
+    gradients: ScreenGradients,
+    exposure: Exposure,
+    step: int,
+    facts: str,
 ) -> None:
     """Write everything that later updates depend on; the file appears complete or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
-    tensors = {"node": model.node, "gradients.total": gradients.total, "gradients.count": gradients.count}
+    tensors = {
+        "node": model.node,
+        "gradients.total": gradients.total,
+        "gradients.count": gradients.count,
+    }
     tensors |= {f"exposure.{name}": value for name, value in exposure.state().items()}
     for name in NAMES:
-        tensors |= {f"value.{name}": model.params[name].detach(), f"first.{name}": adam.first[name], f"second.{name}": adam.second[name]}
-    write_safetensors(folder / STATE_FILE, tensors, {"step": str(step), "adam_step": str(adam.step), "facts": facts})
+        tensors |= {
+            f"value.{name}": model.params[name].detach(),
+            f"first.{name}": adam.first[name],
+            f"second.{name}": adam.second[name],
+        }
+    write_safetensors(
+        folder / STATE_FILE,
+        tensors,
+        {"step": str(step), "adam_step": str(adam.step), "facts": facts},
+    )
 
 
-def load_state(folder: Path, model: SplatModel, adam: RowAdam, gradients: ScreenGradients, exposure: Exposure, facts: str) -> int:
-    """Put a saved state into objects made from the same start, and return the number of updates made.
+def load_state(
+    folder: Path,
+    model: SplatModel,
+    adam: RowAdam,
+    gradients: ScreenGradients,
+    exposure: Exposure,
+    facts: str,
+) -> int:
+    """Put a saved state into objects made from the same start, and return the number of updates
+    made.
 
     Raises:
-        InputError: The folder was begun with other views, another start or another recipe, or its file is damaged.
+        InputError: The folder was begun with other views, another start or another recipe, or its
+            file is damaged.
     """
     path, doing = folder / STATE_FILE, "continuing a fit"
     meta, stored = read_checkpoint(path, doing, facts)
@@ -310,6 +419,12 @@ def load_state(folder: Path, model: SplatModel, adam: RowAdam, gradients: Screen
         adam.first = {name: tensors[f"first.{name}"] for name in NAMES}
         adam.second = {name: tensors[f"second.{name}"] for name in NAMES}
         adam.step = int(meta["adam_step"])
-        exposure.restore({name.removeprefix("exposure."): t for name, t in tensors.items() if name.startswith("exposure.")})
+        exposure.restore(
+            {
+                name.removeprefix("exposure."): t
+                for name, t in tensors.items()
+                if name.startswith("exposure.")
+            }
+        )
         gradients.total, gradients.count = tensors["gradients.total"], tensors["gradients.count"]
         return int(meta["step"])

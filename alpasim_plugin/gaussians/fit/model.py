@@ -1,7 +1,8 @@
-"""Hold the Gaussians that are fitted (a background and rigid actors, each in its own frame), with their optimiser and density control.
+"""Hold the Gaussians that are fitted (a background and rigid actors, each in its own frame), with
+their optimiser and density control.
 
-`RowAdam` moves them; `densify` clones, splits and removes them: the adaptive density control of 3D Gaussian Splatting (Kerbl et al. 2023,
-Sec. 5.2).
+`RowAdam` moves them; `densify` clones, splits and removes them: the adaptive density control of 3D
+Gaussian Splatting (Kerbl et al. 2023, Sec. 5.2).
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ NAMES = ("means", "log_scales", "quaternions", "logit_opacities", "sh_dc", "sh_r
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Where the actors of one view are, as tensors by node: row 0 is the background, which stands still.
+    """Where the actors of one view are, as tensors by node: row 0 is the background, which stands
+    still.
 
     Attributes:
         present: ``(M,)`` bool.
@@ -51,18 +53,23 @@ class SplatModel:
 
     Attributes:
         actors: Ids; node i + 1 is the i-th.
-        origin: ``(3,)`` world position that is zero in the fit: float32 means keep their digits wherever the scene lies.
-        params: Name (`NAMES`) to a leaf tensor with N rows: means in the node's frame, logarithms of scales, quaternions, logits of
-            opacity, constant and further colour coefficients.
+        origin: ``(3,)`` world position that is zero in the fit: float32 means keep their digits
+            wherever the scene lies.
+        params: Name (`NAMES`) to a leaf tensor with N rows: means in the node's frame, logarithms
+            of scales, quaternions, logits of opacity, constant and further colour coefficients.
         node: ``(N,)`` the node of each Gaussian, ascending.
     """
 
-    def __init__(self, actors: tuple[str, ...], origin: F64, params: Mapping[str, Tensor], node: Tensor) -> None:
+    def __init__(
+        self, actors: tuple[str, ...], origin: F64, params: Mapping[str, Tensor], node: Tensor
+    ) -> None:
         self.actors, self.origin, self.node = actors, origin, node
         self.params = {name: params[name].detach().requires_grad_() for name in NAMES}
 
     @classmethod
-    def from_start(cls, start: Start, origin: F64, sh_degree: int, device: str = "cpu") -> SplatModel:
+    def from_start(
+        cls, start: Start, origin: F64, sh_degree: int, device: str = "cpu"
+    ) -> SplatModel:
         """Take over a start's Gaussians; their colours are padded or cut to the degree."""
         names = tuple(sorted(start.actors))
         clouds = [start.background, *(start.actors[name] for name in names)]
@@ -72,11 +79,18 @@ class SplatModel:
         have = min(size, joined.sh.shape[1])
         sh[:, :have] = joined.sh[:, :have]
         arrays = {
-            "means": np.concatenate(moved), "log_scales": np.log(joined.scales), "quaternions": joined.quats,
-            "logit_opacities": logit(joined.opacities), "sh_dc": sh[:, :1], "sh_rest": sh[:, 1:],
-        }  # fmt: skip
+            "means": np.concatenate(moved),
+            "log_scales": np.log(joined.scales),
+            "quaternions": joined.quats,
+            "logit_opacities": logit(joined.opacities),
+            "sh_dc": sh[:, :1],
+            "sh_rest": sh[:, 1:],
+        }
         node = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds])
-        tensors = {name: torch.as_tensor(np.array(a, dtype=np.float32), device=device) for name, a in arrays.items()}
+        tensors = {
+            name: torch.as_tensor(np.array(a, dtype=np.float32), device=device)
+            for name, a in arrays.items()
+        }
         return cls(names, origin, tensors, torch.as_tensor(node, device=device))
 
     def __len__(self) -> int:
@@ -93,9 +107,15 @@ class SplatModel:
             if name in poses:
                 present[i], T[i] = True, poses[name]
                 T[i, :3, 3] -= self.origin
-                quat[i], harmonics[i] = _left_product(quat_from_matrix(T[i, :3, :3])), _harmonics(T[i, :3, :3].tobytes(), size)
+                quat[i], harmonics[i] = (
+                    _left_product(quat_from_matrix(T[i, :3, :3])),
+                    _harmonics(T[i, :3, :3].tobytes(), size),
+                )
         device = self.node.device
-        tensors = (torch.as_tensor(a, dtype=torch.float32, device=device) for a in (T[:, :3, :3], T[:, :3, 3], quat, harmonics))
+        tensors = (
+            torch.as_tensor(a, dtype=torch.float32, device=device)
+            for a in (T[:, :3, :3], T[:, :3, 3], quat, harmonics)
+        )
         return Motion(torch.as_tensor(present, device=device), *tensors)
 
     def placed(self, motion: Motion, sh_size: int) -> tuple[Splats, Tensor]:
@@ -106,19 +126,40 @@ class SplatModel:
             sh_size: How many colour coefficients are in use.
 
         Returns:
-            Gaussians in the fit's frame (world minus origin), with graph; and the row of the model that each is, ``(M,)``.
+            Gaussians in the fit's frame (world minus origin), with graph; and the row of the model
+            that each is, ``(M,)``.
         """
         p = self.params
         still = int(torch.searchsorted(self.node, 1))
-        sh = torch.cat([p["sh_dc"], p["sh_rest"][:, : sh_size - 1]], dim=1) if sh_size > 1 else p["sh_dc"]
+        sh = (
+            torch.cat([p["sh_dc"], p["sh_rest"][:, : sh_size - 1]], dim=1)
+            if sh_size > 1
+            else p["sh_dc"]
+        )
         moving = still + torch.nonzero(motion.present[self.node[still:]])[:, 0]
         if not len(moving):
             rows = torch.arange(still, device=self.node.device)
-            return Splats(*(t[:still] for t in (p["means"], p["log_scales"], p["quaternions"], p["logit_opacities"], sh))), rows
+            return Splats(
+                *(
+                    t[:still]
+                    for t in (
+                        p["means"],
+                        p["log_scales"],
+                        p["quaternions"],
+                        p["logit_opacities"],
+                        sh,
+                    )
+                )
+            ), rows
         node = self.node[moving]
-        means = torch.einsum("nij,nj->ni", motion.rotation[node], p["means"][moving]) + motion.shift[node]
+        means = (
+            torch.einsum("nij,nj->ni", motion.rotation[node], p["means"][moving])
+            + motion.shift[node]
+        )
         quats = torch.einsum("nij,nj->ni", motion.quat[node], p["quaternions"][moving])
-        turned = torch.einsum("njk,nkc->njc", motion.harmonics[node, :sh_size, :sh_size], sh[moving])
+        turned = torch.einsum(
+            "njk,nkc->njc", motion.harmonics[node, :sh_size, :sh_size], sh[moving]
+        )
         splats = Splats(
             torch.cat([p["means"][:still], means]),
             torch.cat([p["log_scales"][:still], p["log_scales"][moving]]),
@@ -129,7 +170,9 @@ class SplatModel:
         return splats, torch.cat([torch.arange(still, device=moving.device), moving])
 
     def clouds(self) -> tuple[GaussianCloud, dict[str, GaussianCloud]]:
-        """Return the background in world coordinates and each actor in its box frame, as ordinary clouds; actors without Gaussians too."""
+        """Return the background in world coordinates and each actor in its box frame, as ordinary
+        clouds; actors without Gaussians too.
+        """
         p = {name: t.detach().cpu().double().numpy() for name, t in self.params.items()}
         sh = np.concatenate([p["sh_dc"], p["sh_rest"]], axis=1).astype(np.float32)
         first = np.searchsorted(self.node.cpu().numpy(), np.arange(len(self.actors) + 2))
@@ -139,22 +182,29 @@ class SplatModel:
             opacities = 1 / (1 + np.exp(-p["logit_opacities"][part]))
             shift = 0.0 if out else self.origin
             cloud, _ = GaussianCloud.cleaned(
-                p["means"][part] + shift, p["quaternions"][part], np.exp(p["log_scales"][part]).astype(np.float32),
-                opacities.astype(np.float32), sh[part],
-            )  # fmt: skip
+                p["means"][part] + shift,
+                p["quaternions"][part],
+                np.exp(p["log_scales"][part]).astype(np.float32),
+                opacities.astype(np.float32),
+                sh[part],
+            )
             out.append(cloud)
         return out[0], dict(zip(self.actors, out[1:], strict=True))
 
 
 def _left_product(q: F64) -> F64:
-    """Return the matrix ``(4, 4)`` whose product with a wxyz quaternion is the Hamilton product q times it."""
+    """Return the matrix ``(4, 4)`` whose product with a wxyz quaternion is the Hamilton product q
+    times it.
+    """
     w, x, y, z = q
     return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
 
 
 @lru_cache(maxsize=100_000)
 def _harmonics(rotation: bytes, size: int) -> F64:
-    """Return the block-diagonal matrix ``(size, size)`` that turns colour coefficients; kept, because every view comes again."""
+    """Return the block-diagonal matrix ``(size, size)`` that turns colour coefficients; kept,
+    because every view comes again.
+    """
     R = np.frombuffer(rotation).reshape(3, 3)
     out = np.eye(size)
     for degree in range(1, SH_SIZES.index(size) + 1):
@@ -163,7 +213,11 @@ def _harmonics(rotation: bytes, size: int) -> F64:
     return out
 
 
-BETA1, BETA2, EPS = 0.9, 0.999, 1e-15  # epsilon as in the published 3DGS code: gradients of single Gaussians are tiny
+BETA1, BETA2, EPS = (
+    0.9,
+    0.999,
+    1e-15,
+)  # epsilon as in the published 3DGS code: gradients of single Gaussians are tiny
 
 
 class RowAdam:
@@ -182,7 +236,9 @@ class RowAdam:
 
     @torch.no_grad()
     def update(self, params: Mapping[str, Tensor], rates: Mapping[str, float]) -> None:
-        """Make one update in place from the tensors' gradients, which are cleared; a tensor without gradient stays as it is."""
+        """Make one update in place from the tensors' gradients, which are cleared; a tensor without
+        gradient stays as it is.
+        """
         self.step += 1
         correct1, correct2 = 1 - BETA1**self.step, 1 - BETA2**self.step
         for name, p in params.items():
@@ -212,7 +268,8 @@ EXPOSURE_PULL = 1.0  # towards where a gain began, per update, in rates
 
 
 class Exposure:
-    """The gain of each view's colours over the model's, learned with Adam and held to where it began; it keeps its mean over the views.
+    """The gain of each view's colours over the model's, learned with Adam and held to where it
+    began; it keeps its mean over the views.
 
     Args:
         begin: ``(V, 3)`` of red, green and blue.
@@ -250,19 +307,26 @@ class Exposure:
     def state(self) -> dict[str, Tensor]:
         """Return what `restore` needs."""
         return {
-            "value": self.log_gain.detach(), "first": self._adam.first["log_gain"], "second": self._adam.second["log_gain"],
+            "value": self.log_gain.detach(),
+            "first": self._adam.first["log_gain"],
+            "second": self._adam.second["log_gain"],
             "step": torch.tensor(self._adam.step),
-        }  # fmt: skip
+        }
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Take over a saved state."""
         self.log_gain = state["value"].clone().requires_grad_()
-        self._adam.first, self._adam.second = {"log_gain": state["first"].clone()}, {"log_gain": state["second"].clone()}
+        self._adam.first, self._adam.second = (
+            {"log_gain": state["first"].clone()},
+            {"log_gain": state["second"].clone()},
+        )
         self._adam.step = int(state["step"])
 
 
 def needles(log_scales: Tensor, ratio: float) -> Tensor:
-    """Return by how much, in logarithms, the longest axes of Gaussians ``(N, 3)`` exceed ``ratio`` times the middle ones: the mean."""
+    """Return by how much, in logarithms, the longest axes of Gaussians ``(N, 3)`` exceed ``ratio``
+    times the middle ones: the mean.
+    """
     axes = log_scales.sort(dim=1).values
     return (axes[:, 2] - axes[:, 1] - math.log(ratio)).clamp(min=0).mean()
 
@@ -282,7 +346,9 @@ class ScreenGradients:
         self.total, self.count = torch.zeros(n, device=device), torch.zeros(n, device=device)
 
     def add(self, rows: Tensor, gradient_norm_px: Tensor, radii: Tensor, width_px: int) -> None:
-        """Count one view: its Gaussians' rows ``(M,)``, the norms by pixels ``(M,)`` and the radii ``(M,)``, both 0 where not drawn."""
+        """Count one view: its Gaussians' rows ``(M,)``, the norms by pixels ``(M,)`` and the radii
+        ``(M,)``, both 0 where not drawn.
+        """
         self.total.index_add_(0, rows, gradient_norm_px * (width_px / 2))
         self.count.index_add_(0, rows, (radii > 0).float())
 
@@ -293,12 +359,18 @@ class ScreenGradients:
 
 @torch.no_grad()
 def densify(
-    model: SplatModel, adam: RowAdam, gradients: ScreenGradients, recipe: SplatRecipe, extent_m: float, rng: np.random.Generator
+    model: SplatModel,
+    adam: RowAdam,
+    gradients: ScreenGradients,
+    recipe: SplatRecipe,
+    extent_m: float,
+    rng: np.random.Generator,
 ) -> None:
-    """Clone small and split large Gaussians whose place the loss pulls at, then remove faint and oversized ones; in place.
+    """Clone small and split large Gaussians whose place the loss pulls at, then remove faint and
+    oversized ones; in place.
 
-    A clone starts where its original is. A split one is replaced by two, drawn from it, smaller by 1.6. Where the cap leaves too little
-    room the strongest gradients come first.
+    A clone starts where its original is. A split one is replaced by two, drawn from it, smaller by
+    1.6. Where the cap leaves too little room the strongest gradients come first.
     """
     pull, size = gradients.mean(), model.params["log_scales"].max(dim=1).values
     wanted = torch.nonzero(pull >= recipe.densify_gradient)[:, 0]
@@ -333,7 +405,9 @@ def _take(model: SplatModel, adam: RowAdam, rows: Tensor, fresh: Tensor) -> None
 def _scatter(model: SplatModel, part: slice, rng: np.random.Generator) -> None:
     """Draw new centres from the Gaussians of a part, and shrink them."""
     p = model.params
-    draw = torch.as_tensor(rng.standard_normal(p["means"][part].shape, dtype=np.float32), device=p["means"].device)
+    draw = torch.as_tensor(
+        rng.standard_normal(p["means"][part].shape, dtype=np.float32), device=p["means"].device
+    )
     w, x, y, z = torch.nn.functional.normalize(p["quaternions"][part], dim=1).unbind(1)
     along = draw * p["log_scales"][part].exp()
     # v + 2 u x (u x v + w v) turns v by the quaternion (w, u).

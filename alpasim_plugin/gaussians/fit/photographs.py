@@ -1,18 +1,24 @@
-"""Read and write photographs with poses: a folder of images and a ``transforms.json``. Every reader of photographs undistorts here.
+"""Read and write photographs with poses: a folder of images and a ``transforms.json``. Every reader
+of photographs undistorts here.
 
-The file's keys are those of Instant-NGP and nerfstudio, which many tools write (COLMAP's poses through their converters, for example):
+The file's keys are those of Instant-NGP and nerfstudio, which many tools write (COLMAP's poses
+through their converters, for example):
 
-    {"axes": "opencv", "w": 256, "h": 144, "fl_x": 210.0, "fl_y": 210.0, "cx": 128.0, "cy": 72.0, "k1": -0.1,
+    {"axes": "opencv", "w": 256, "h": 144, "fl_x": 210.0, "fl_y": 210.0, "cx": 128.0, "cy": 72.0,
+    "k1": -0.1,
      "ply_file_path": "points.ply",
-     "frames": [{"file_path": "images/0000.png", "transform_matrix": [[...], [...], [...], [0, 0, 0, 1]],
-                 "t_us": 100000, "camera": "front", "sky_path": "sky/0000.png", "mask_path": "masks/0000.png"}]}
+     "frames": [{"file_path": "images/0000.png", "transform_matrix": [[...], [...], [...], [0, 0, 0,
+         1]], "t_us": 100000, "camera": "front", "sky_path": "sky/0000.png", "mask_path":
+         "masks/0000.png"}]}
 
-``transform_matrix`` maps camera points to the world. ``axes`` says how the camera's axes lie: ``opencv`` is x right, y down, z forward;
-``opengl`` is x right, y up, z back (what Instant-NGP and nerfstudio mean). Sizes, intrinsics and OpenCV's distortion (k1, k2, p1, p2, k3;
-with ``"camera_model": "OPENCV_FISHEYE"`` k1 to k4) may stand in a frame instead; ``camera_angle_x``, radians, may stand for the focal
-length. Pictures are freed of their distortion as they are read. Optional: ``t_us`` places the actors of a scenario; ``camera`` names the
-camera; ``sky_path`` is white where the image shows sky; ``mask_path`` is black where pixels do not count; ``ply_file_path`` names points to
-start from: a binary PLY with x, y, z and, if coloured, red, green, blue (0..255).
+``transform_matrix`` maps camera points to the world. ``axes`` says how the camera's axes lie:
+``opencv`` is x right, y down, z forward; ``opengl`` is x right, y up, z back (what Instant-NGP and
+nerfstudio mean). Sizes, intrinsics and OpenCV's distortion (k1, k2, p1, p2, k3; with
+``"camera_model": "OPENCV_FISHEYE"`` k1 to k4) may stand in a frame instead; ``camera_angle_x``,
+radians, may stand for the focal length. Pictures are freed of their distortion as they are read.
+Optional: ``t_us`` places the actors of a scenario; ``camera`` names the camera; ``sky_path`` is
+white where the image shows sky; ``mask_path`` is black where pixels do not count; ``ply_file_path``
+names points to start from: a binary PLY with x, y, z and, if coloured, red, green, blue (0..255).
 """
 
 from __future__ import annotations
@@ -42,12 +48,21 @@ from alpasim_plugin.gaussians.fit.views import PosedView
 
 FILE = "transforms.json"
 DOING = "reading photographs"
-AXES = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}  # the file's camera axes to ours
+AXES = {
+    "opencv": np.eye(4),
+    "opengl": np.diag([1.0, -1.0, -1.0, 1.0]),
+}  # the file's camera axes to ours
 COEFFICIENTS = {  # of each lens model, in the order of OpenCV
-    "OPENCV": ("k1", "k2", "p1", "p2", "k3"), "PINHOLE": ("k1", "k2", "p1", "p2", "k3"), "SIMPLE_PINHOLE": (), "SIMPLE_RADIAL": ("k1",),
-    "RADIAL": ("k1", "k2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
-}  # fmt: skip
-EXTENT_M = 4.0  # structure from motion has no unit: the camera that is farthest from their middle is put so far from it
+    "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
+    "PINHOLE": ("k1", "k2", "p1", "p2", "k3"),
+    "SIMPLE_PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
+# structure from motion has no unit: the camera that is farthest from their middle is put so far
+# from it
+EXTENT_M = 4.0
 SIDE_PX = 16  # sides are multiples of this, as fixers need
 RIGID = 1e-12  # a rotation this exact is taken as it is written
 
@@ -80,15 +95,22 @@ class Picture:
         """Return the photograph without distortion, ``(H, W, 3)`` uint8 sRGB.
 
         Raises:
-            InputError: The file is missing, damaged, of another size, or in other colours than grey or RGB.
+            InputError: The file is missing, damaged, of another size, or in other colours than grey
+                or RGB.
         """
-        return np.ascontiguousarray(self.lens.straightened(read_photograph(self.file, self.lens, self.where)[..., ::-1]))
+        return np.ascontiguousarray(
+            self.lens.straightened(read_photograph(self.file, self.lens, self.where)[..., ::-1])
+        )
 
     def view(self) -> PosedView:
         """Return it as a view at full size."""
         lens = self.lens
         return PosedView(
-            PinholeCamera.from_pose(lens.width, lens.height, lens.straight_K(), self.T_world_camera), self.rgb(), self.file.stem
+            PinholeCamera.from_pose(
+                lens.width, lens.height, lens.straight_K(), self.T_world_camera
+            ),
+            self.rgb(),
+            self.file.stem,
         )
 
 
@@ -112,13 +134,15 @@ def read_pictures(folder: Path, axes: str | None = None) -> tuple[dict[str, Any]
 
     Args:
         folder: Holds the file.
-        axes: How the camera's axes lie where the file's ``axes`` does not say it; None refuses such a file.
+        axes: How the camera's axes lie where the file's ``axes`` does not say it; None refuses such
+            a file.
 
     Returns:
         The document; its frames as pictures, in the file's order.
 
     Raises:
-        InputError: The file or a key is missing, or something in it cannot be: names the frame and what was found.
+        InputError: The file or a key is missing, or something in it cannot be: names the frame and
+            what was found.
     """
     path = folder / FILE
     document, frames = _frames(path)
@@ -126,21 +150,29 @@ def read_pictures(folder: Path, axes: str | None = None) -> tuple[dict[str, Any]
     if not isinstance(meant, str) or meant not in AXES:
         do = 'write "axes": "opencv" (y down, z forward) or "axes": "opengl" (y up, z back)'
         raise InputError(DOING, f"{path}, key 'axes'", repr(meant), do)
-    return document, [_picture(folder, frame, f"{path}, frame {i}", AXES[meant]) for i, frame in enumerate(frames)]
+    return document, [
+        _picture(folder, frame, f"{path}, frame {i}", AXES[meant]) for i, frame in enumerate(frames)
+    ]
 
 
-def read_views(folder: Path, actors_at: ActorsAt | None = None) -> tuple[list[PosedView], GaussianCloud | None]:
-    """Read a folder of posed images at full size, in metres: ``axes`` must be there, because files of both kinds look alike.
+def read_views(
+    folder: Path, actors_at: ActorsAt | None = None
+) -> tuple[list[PosedView], GaussianCloud | None]:
+    """Read a folder of posed images at full size, in metres: ``axes`` must be there, because files
+    of both kinds look alike.
 
     Args:
         folder: Holds ``transforms.json`` and what it names.
-        actors_at: Poses of the actors at a frame's ``t_us``; None, or a frame without time, has no actors.
+        actors_at: Poses of the actors at a frame's ``t_us``; None, or a frame without time, has no
+            actors.
 
     Returns:
-        The views in the file's order; and the start cloud that its points give, None where it names no points.
+        The views in the file's order; and the start cloud that its points give, None where it names
+        no points.
 
     Raises:
-        InputError: A file or key is missing, or something in them cannot be: names the frame and what was found.
+        InputError: A file or key is missing, or something in them cannot be: names the frame and
+            what was found.
     """
     document, pictures = read_pictures(folder)
     if not pictures:
@@ -148,30 +180,43 @@ def read_views(folder: Path, actors_at: ActorsAt | None = None) -> tuple[list[Po
     views = []
     for picture in pictures:
         sky, mask = (_flags(folder, picture, key) for key in ("sky_path", "mask_path"))
-        actors = actors_at(picture.t_us) if actors_at is not None and picture.t_us is not None else {}
+        actors = (
+            actors_at(picture.t_us) if actors_at is not None and picture.t_us is not None else {}
+        )
         views.append(replace(picture.view(), sky=sky, mask=mask, actors=actors))
     points = document.get("ply_file_path")
     return views, None if points is None else read_points(folder / points)
 
 
 def read_photographs(folder: Path, width: int = 256) -> Photographs:
-    """Read a folder of photographs from structure from motion: axes of OpenGL, an arbitrary unit, and not all images there.
+    """Read a folder of photographs from structure from motion: axes of OpenGL, an arbitrary unit,
+    and not all images there.
 
-    A picture is freed of its distortion at full size, then reduced by averaging, and its height is cut at the middle to a multiple of 16.
+    A picture is freed of its distortion at full size, then reduced by averaging, and its height is
+    cut at the middle to a multiple of 16.
 
     Args:
         folder: Holds ``transforms.json`` and the images that it names.
         width: Pixels across of the views, a multiple of 16.
 
     Raises:
-        InputError: No such file, a key is missing, another lens model than OpenCV's, or fewer than two images exist.
+        InputError: No such file, a key is missing, another lens model than OpenCV's, or fewer than
+            two images exist.
     """
     if width < SIDE_PX or width % SIDE_PX:
-        raise InputError(DOING, f"width {width}", f"not a multiple of {SIDE_PX}", f"choose for example {16 * SIDE_PX}")
+        raise InputError(
+            DOING,
+            f"width {width}",
+            f"not a multiple of {SIDE_PX}",
+            f"choose for example {16 * SIDE_PX}",
+        )
     _, pictures = read_pictures(folder, "opengl")
     there, missing = present(folder, pictures)
     poses = _scaled(np.array([picture.T_world_camera for picture in there]))
-    views = [_cut(replace(one, T_world_camera=pose).view(), width, one.where) for one, pose in zip(there, poses, strict=True)]
+    views = [
+        _cut(replace(one, T_world_camera=pose).view(), width, one.where)
+        for one, pose in zip(there, poses, strict=True)
+    ]
     return Photographs(tuple(views), missing, len(pictures))
 
 
@@ -182,21 +227,38 @@ def present(folder: Path, pictures: Sequence[Picture]) -> tuple[list[Picture], t
         InputError: Fewer than two exist.
     """
     there = [picture for picture in pictures if picture.file.is_file()]
-    missing = tuple(picture.file.relative_to(folder).as_posix() for picture in pictures if not picture.file.is_file())
+    missing = tuple(
+        picture.file.relative_to(folder).as_posix()
+        for picture in pictures
+        if not picture.file.is_file()
+    )
     if len(there) < 2:
-        raise InputError(DOING, str(folder), f"{len(there)} of {len(pictures)} listed images exist", "give the images that the file names")
+        raise InputError(
+            DOING,
+            str(folder),
+            f"{len(there)} of {len(pictures)} listed images exist",
+            "give the images that the file names",
+        )
     return there, missing
 
 
 def write_views(folder: Path, views: Sequence[PosedView]) -> None:
-    """Write views in the form that `read_views` reads: images as PNG, axes of OpenCV; depth and actors are not written."""
+    """Write views in the form that `read_views` reads: images as PNG, axes of OpenCV; depth and
+    actors are not written.
+    """
     frames = []
     for i, view in enumerate(views):
         camera = view.camera
         frame: dict[str, Any] = {
-            "file_path": f"images/{i:04d}.png", "transform_matrix": inverse(camera.T_camera_world).tolist(),
-            "w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy,
-        }  # fmt: skip
+            "file_path": f"images/{i:04d}.png",
+            "transform_matrix": inverse(camera.T_camera_world).tolist(),
+            "w": camera.width,
+            "h": camera.height,
+            "fl_x": camera.fx,
+            "fl_y": camera.fy,
+            "cx": camera.cx,
+            "cy": camera.cy,
+        }
         _write_image(folder / frame["file_path"], view.rgb[..., ::-1])
         for key, image in (("sky", view.sky), ("mask", view.mask)):
             if image is not None:
@@ -215,37 +277,68 @@ def read_points(path: Path) -> GaussianCloud:
     rows = read_ply_element(read_ply_header(path), "vertex")
     names = rows.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
-        raise InputError("reading start points", str(path), f"properties {list(names)}", "give x, y and z")
+        raise InputError(
+            "reading start points", str(path), f"properties {list(names)}", "give x, y and z"
+        )
     points = np.stack([rows[n].astype(np.float64) for n in ("x", "y", "z")], axis=1)
     coloured = {"red", "green", "blue"} <= set(names)
-    rgb = np.stack([rows[n] for n in ("red", "green", "blue")], axis=1) / 255.0 if coloured else np.full(points.shape, 0.5)
+    rgb = (
+        np.stack([rows[n] for n in ("red", "green", "blue")], axis=1) / 255.0
+        if coloured
+        else np.full(points.shape, 0.5)
+    )
     good = np.isfinite(points).all(axis=1)
     if not good.any():
-        raise InputError("reading start points", str(path), f"{len(points)} points, none finite", "give points in metres")
+        raise InputError(
+            "reading start points",
+            str(path),
+            f"{len(points)} points, none finite",
+            "give points in metres",
+        )
     return cloud_from_points(points[good], rgb[good])
 
 
 def resized(view: PosedView, width: int) -> PosedView:
-    """Return a view with another number of pixels, its field of view unchanged; sky, mask and depth are left out."""
+    """Return a view with another number of pixels, its field of view unchanged; sky, mask and depth
+    are left out.
+    """
     camera = view.camera
     height = round(camera.height * width / camera.width)
     K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
     rgb = cv2.resize(view.rgb, (width, height), interpolation=cv2.INTER_AREA)
-    return PosedView(PinholeCamera(width, height, K, camera.T_camera_world), np.asarray(rgb, dtype=np.uint8), view.name)
+    return PosedView(
+        PinholeCamera(width, height, K, camera.T_camera_world),
+        np.asarray(rgb, dtype=np.uint8),
+        view.name,
+    )
 
 
 def _frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Return the document, and its frames with what it says for all of them."""
-    document = read_json_object(path, DOING, do_this=f"give a folder with images and their {FILE} (docs/reconstruction.md)")
-    frames = as_shape(list[dict[str, Any]], document.get("frames") or [], f"{path}, key 'frames'", DOING)
+    document = read_json_object(
+        path, DOING, do_this=f"give a folder with images and their {FILE} (docs/reconstruction.md)"
+    )
+    frames = as_shape(
+        list[dict[str, Any]], document.get("frames") or [], f"{path}, key 'frames'", DOING
+    )
     return document, [{**document, **frame} for frame in frames]
 
 
 def _picture(folder: Path, frame: Mapping[str, Any], where: str, axes: F64) -> Picture:
     file, camera = _file(folder, frame, "file_path", where), frame.get("camera")
-    t_us = None if frame.get("t_us") is None else as_shape(int, frame["t_us"], f"{where}, t_us", DOING)
+    t_us = (
+        None if frame.get("t_us") is None else as_shape(int, frame["t_us"], f"{where}, t_us", DOING)
+    )
     pose = rigid_pose(frame.get("transform_matrix"), f"{where}, transform_matrix") @ axes
-    return Picture(file, _lens(frame, file, where), pose, where, t_us, None if camera is None else str(camera), frame)
+    return Picture(
+        file,
+        _lens(frame, file, where),
+        pose,
+        where,
+        t_us,
+        None if camera is None else str(camera),
+        frame,
+    )
 
 
 def _lens(frame: Mapping[str, Any], file: Path, where: str) -> Lens:
@@ -265,20 +358,32 @@ def _lens(frame: Mapping[str, Any], file: Path, where: str) -> Lens:
         if "fl_x" not in frame and "camera_angle_x" in frame:
             focal = 0.5 * width / np.tan(0.5 * float(frame["camera_angle_x"]))
             frame = {"fl_y": focal, "cx": width / 2, "cy": height / 2, **frame, "fl_x": focal}
-        K = np.array([[frame["fl_x"], 0, frame["cx"]], [0, frame.get("fl_y", frame["fl_x"]), frame["cy"]], [0, 0, 1]], dtype=np.float64)
-        distortion = np.array([float(frame.get(key) or 0.0) for key in COEFFICIENTS[model]] or [0.0])
+        K = np.array(
+            [
+                [frame["fl_x"], 0, frame["cx"]],
+                [0, frame.get("fl_y", frame["fl_x"]), frame["cy"]],
+                [0, 0, 1],
+            ],
+            dtype=np.float64,
+        )
+        distortion = np.array(
+            [float(frame.get(key) or 0.0) for key in COEFFICIENTS[model]] or [0.0]
+        )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(DOING, where, f"{type(error).__name__}: {error}", do) from error
     few = np.zeros(max(0, 4 - len(distortion)))  # OpenCV takes four at least
     fisheye = model == "OPENCV_FISHEYE"
-    return Lens(width, height, K, np.concatenate([distortion, few]), "fisheye" if fisheye else "opencv").check(DOING, where, do)
+    return Lens(
+        width, height, K, np.concatenate([distortion, few]), "fisheye" if fisheye else "opencv"
+    ).check(DOING, where, do)
 
 
 def rigid_pose(value: Any, where: str, doing: str = DOING) -> F64:
     """Return a pose ``(4, 4)`` whose rotation is exact, of a matrix written with a few digits.
 
     Raises:
-        InputError: It is no finite matrix of 4 x 4 (or 3 x 4), or no rotation: scaled, sheared or left-handed.
+        InputError: It is no finite matrix of 4 x 4 (or 3 x 4), or no rotation: scaled, sheared or
+            left-handed.
     """
     T = np.asarray(as_shape(list[list[float]], value, where, doing), dtype=np.float64)
     if T.shape == (3, 4):
@@ -290,11 +395,19 @@ def rigid_pose(value: Any, where: str, doing: str = DOING) -> F64:
     rotation = u @ vt
     if np.linalg.det(rotation) < 0:
         raise InputError(
-            doing, where, "its axes are left-handed (determinant -1)", "mirror one axis of the poses, and say in 'axes' how they lie"
+            doing,
+            where,
+            "its axes are left-handed (determinant -1)",
+            "mirror one axis of the poses, and say in 'axes' how they lie",
         )
     off = np.abs(T[:3, :3] - rotation).max()
     if off > 1e-3:
-        raise InputError(doing, where, f"its first three columns are no rotation (off by {off:.2g})", "give a rigid transform")
+        raise InputError(
+            doing,
+            where,
+            f"its first three columns are no rotation (off by {off:.2g})",
+            "give a rigid transform",
+        )
     if off > RIGID:  # what is written with a few digits is not quite a rotation
         T[:3, :3] = rotation
     return T
@@ -315,7 +428,9 @@ def _cut(view: PosedView, width: int, where: str) -> PosedView:
     height = small.camera.height
     kept = height // SIDE_PX * SIDE_PX
     if kept < SIDE_PX:
-        raise InputError(DOING, where, f"{height} pixels high at {width} across", "choose a larger width")
+        raise InputError(
+            DOING, where, f"{height} pixels high at {width} across", "choose a larger width"
+        )
     top = (height - kept) // 2
     K = small.camera.K.copy()
     K[1, 2] -= top
@@ -326,22 +441,32 @@ def _cut(view: PosedView, width: int, where: str) -> PosedView:
 def _flags(folder: Path, picture: Picture, key: str) -> Bool | None:
     if key not in picture.more:
         return None
-    image = read_photograph(_file(folder, picture.more, key, picture.where), picture.lens, picture.where, cv2.IMREAD_GRAYSCALE)
+    image = read_photograph(
+        _file(folder, picture.more, key, picture.where),
+        picture.lens,
+        picture.where,
+        cv2.IMREAD_GRAYSCALE,
+    )
     return np.asarray(picture.lens.straightened(image) > 127)
 
 
 def _file(folder: Path, frame: Mapping[str, Any], key: str, where: str) -> Path:
     name = frame.get(key)
     if not isinstance(name, str):
-        raise InputError(DOING, f"{where}, {key}", repr(name), "name a file, relative to the folder")
+        raise InputError(
+            DOING, f"{where}, {key}", repr(name), "name a file, relative to the folder"
+        )
     path = folder / name
-    if not path.suffix and (folder / f"{name}.png").is_file():  # NeRF's own scenes leave the ending out
+    if (
+        not path.suffix and (folder / f"{name}.png").is_file()
+    ):  # NeRF's own scenes leave the ending out
         return folder / f"{name}.png"
     return path
 
 
 def whole_photograph(path: Path, lens: Lens, where: str) -> bytes:
-    """Return a photograph's file after checking that it is whole and what its lens says, without decoding it.
+    """Return a photograph's file after checking that it is whole and what its lens says, without
+    decoding it.
 
     Raises:
         InputError: The file is missing, cut off, of another size, too large, or not in grey or RGB.
@@ -354,7 +479,9 @@ def whole_photograph(path: Path, lens: Lens, where: str) -> bytes:
         raise InputError(DOING, f"{where}, {path}", found, "give the photographs as they were")
     fault = picture_fault(data)
     if fault:
-        raise InputError(DOING, f"{where}, {path}", fault, "give a whole PNG or JPEG in grey or RGB")
+        raise InputError(
+            DOING, f"{where}, {path}", fault, "give a whole PNG or JPEG in grey or RGB"
+        )
     return data
 
 
@@ -362,10 +489,18 @@ def read_photograph(path: Path, lens: Lens, where: str, flag: int = cv2.IMREAD_C
     """Read a photograph as it is, BGR or grey; see `whole_photograph`."""
     data = whole_photograph(path, lens, where)
     do = "give a whole PNG or JPEG in grey or RGB"
-    return np.asarray(decode_image(data, f"{where}, {path}", DOING, do, flag | cv2.IMREAD_IGNORE_ORIENTATION), dtype=np.uint8)
+    return np.asarray(
+        decode_image(data, f"{where}, {path}", DOING, do, flag | cv2.IMREAD_IGNORE_ORIENTATION),
+        dtype=np.uint8,
+    )
 
 
 def _write_image(path: Path, image: U8) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     if not cv2.imwrite(str(path), image):
-        raise InputError("writing posed views", str(path), "the image could not be written", "check the folder and the space on the disk")
+        raise InputError(
+            "writing posed views",
+            str(path),
+            "the image could not be written",
+            "check the folder and the space on the disk",
+        )

@@ -1,8 +1,10 @@
-"""Measure how near a model's image is to a view: SSIM as a training loss, PSNR and SSIM of a reconstruction on posed views.
+"""Measure how near a model's image is to a view: SSIM as a training loss, PSNR and SSIM of a
+reconstruction on posed views.
 
-SSIM against a fixed target is differentiable by the image in closed form: the window is separable and symmetric, so with zeros beyond the
-border the blur is its own adjoint, and the gradient is three blurs of closed forms. What depends on the target alone is computed once per
-view. Autograd through convolutions takes ten times as long on the CPU.
+SSIM against a fixed target is differentiable by the image in closed form: the window is separable
+and symmetric, so with zeros beyond the border the blur is its own adjoint, and the gradient is
+three blurs of closed forms. What depends on the target alone is computed once per view. Autograd
+through convolutions takes ten times as long on the CPU.
 """
 
 from __future__ import annotations
@@ -20,7 +22,15 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.image_metrics import C1, C2, SIGMA_PX, WINDOW_PX, gaussian_blur, psnr_db, ssim
+from alpasim_plugin.core.image_metrics import (
+    C1,
+    C2,
+    SIGMA_PX,
+    WINDOW_PX,
+    gaussian_blur,
+    psnr_db,
+    ssim,
+)
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 
@@ -44,7 +54,9 @@ class Comparison:
     ssim: float
 
 
-def compare(model: SceneGraph, views: Sequence[PosedView], threads: int | None = None) -> list[Comparison]:
+def compare(
+    model: SceneGraph, views: Sequence[PosedView], threads: int | None = None
+) -> list[Comparison]:
     """Render a model where views were taken; actors that it lacks are left out."""
     return [_compare(model, view, threads) for view in views]
 
@@ -56,19 +68,29 @@ def summary(rows: Sequence[Comparison]) -> dict[str, Any]:
         InputError: There is none.
     """
     if not rows:
-        raise InputError("measuring a reconstruction", "no view", "nothing to measure", "hold views out, or leave the measurement out")
+        raise InputError(
+            "measuring a reconstruction",
+            "no view",
+            "nothing to measure",
+            "hold views out, or leave the measurement out",
+        )
     by_view = {row.name: round(row.psnr_db, 3) for row in rows}
     return {
-        "views": len(rows), "psnr_db": float(np.mean([r.psnr_db for r in rows])), "ssim": float(np.mean([r.ssim for r in rows])),
+        "views": len(rows),
+        "psnr_db": float(np.mean([r.psnr_db for r in rows])),
+        "ssim": float(np.mean([r.ssim for r in rows])),
         "psnr_db_by_view": by_view,
-    }  # fmt: skip
+    }
 
 
 def write_pictures(folder: Path, rows: Sequence[Comparison]) -> None:
     """Write one PNG a view: truth left, model right."""
     folder.mkdir(parents=True, exist_ok=True)
     for row in rows:
-        cv2.imwrite(str(folder / f"{row.name}.png"), np.concatenate([row.truth, row.shown], axis=1)[..., ::-1])
+        cv2.imwrite(
+            str(folder / f"{row.name}.png"),
+            np.concatenate([row.truth, row.shown], axis=1)[..., ::-1],
+        )
 
 
 def _compare(model: SceneGraph, view: PosedView, threads: int | None) -> Comparison:
@@ -76,11 +98,18 @@ def _compare(model: SceneGraph, view: PosedView, threads: int | None) -> Compari
     shown = model.render(view.camera, known, threads).to_uint8()
     counted = shown if view.mask is None else np.where(view.mask[..., None], shown, view.rgb)
     share = 1.0 if view.mask is None else max(float(view.mask.mean()), 1e-9)
-    return Comparison(view.name, shown, view.rgb, psnr_db(counted, view.rgb) + 10 * float(np.log10(share)), ssim(counted, view.rgb))
+    return Comparison(
+        view.name,
+        shown,
+        view.rgb,
+        psnr_db(counted, view.rgb) + 10 * float(np.log10(share)),
+        ssim(counted, view.rgb),
+    )
 
 
 class SsimTarget:
-    """The image that others are compared with; the value is that of `alpasim_plugin.core.image_metrics.ssim`.
+    """The image that others are compared with; the value is that of
+    `alpasim_plugin.core.image_metrics.ssim`.
 
     Args:
         target: ``(H, W, 3)`` float32, 0..1.
@@ -92,7 +121,9 @@ class SsimTarget:
         self.square = _blur(self.y * self.y)
 
     def ssim(self, image: Tensor) -> Tensor:
-        """Return the mean structural similarity with an image ``(H, W, 3)``, differentiable by the image."""
+        """Return the mean structural similarity with an image ``(H, W, 3)``, differentiable by the
+        image.
+        """
         value: Tensor = _Ssim.apply(image, self)  # type: ignore[no-untyped-call]
         return value
 
@@ -101,7 +132,9 @@ class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: SsimTarget) -> Tensor:
         x, my = image.detach().contiguous(), target.mean
-        mx, mxx, mxy = _blur(x), _blur(x * x), _blur(x * target.y)
+        mx = _blur(x)
+        mxx = _blur(x * x)
+        mxy = _blur(x * target.y)
         a1, a2 = 2 * mx * my + C1, 2 * (mxy - mx * my) + C2
         b1 = mx * mx + my * my + C1
         b2 = mxx - mx * mx + target.square - my * my + C2
@@ -109,7 +142,9 @@ class _Ssim(torch.autograd.Function):
         s = a1 * a2 * over
         if ctx.needs_input_grad[0]:
             by_mean = 2 * (my * (a2 - a1) * over - mx * s * (b1.reciprocal() - b2.reciprocal()))
-            ctx.gradient = (_blur(by_mean) - 2 * x * _blur(s / b2) + target.y * _blur(2 * a1 * over)) / s.numel()
+            ctx.gradient = (
+                _blur(by_mean) - 2 * x * _blur(s / b2) + target.y * _blur(2 * a1 * over)
+            ) / s.numel()
         return s.mean(dtype=torch.float64).float()
 
     @staticmethod
@@ -125,5 +160,9 @@ def _blur(image: Tensor) -> Tensor:
     weight = torch.exp(-(x**2) / (2 * SIGMA_PX**2))
     kernel = (weight / weight.sum()).to(image)
     channels, pad = image.permute(2, 0, 1)[:, None], WINDOW_PX // 2  # (3, 1, H, W)
-    blurred = conv2d(conv2d(channels, kernel[None, None, :, None], padding=(pad, 0)), kernel[None, None, None, :], padding=(0, pad))
+    blurred = conv2d(
+        conv2d(channels, kernel[None, None, :, None], padding=(pad, 0)),
+        kernel[None, None, None, :],
+        padding=(0, pad),
+    )
     return blurred[:, 0].permute(1, 2, 0)

@@ -11,9 +11,10 @@ from alpasim_plugin.core.errors import InputError
 class SplatRecipe:
     """How Gaussians are fitted to posed views.
 
-    What is done is 3D Gaussian Splatting (Kerbl et al. 2023, Sec. 5 and its published code) with its schedule as shares of the steps. A CPU
-    takes hundreds of steps where they take 30,000, so Gaussians start more opaque and smaller, and rates are higher: centres and scales
-    four times (theirs: 1.6e-4 to 1.6e-6 extents, 5e-3), rotations five times, colours twice; see
+    What is done is 3D Gaussian Splatting (Kerbl et al. 2023, Sec. 5 and its published code) with
+    its schedule as shares of the steps. A CPU takes hundreds of steps where they take 30,000, so
+    Gaussians start more opaque and smaller, and rates are higher: centres and scales four times
+    (theirs: 1.6e-4 to 1.6e-6 extents, 5e-3), rotations five times, colours twice; see
     docs/experiments/reconstruction.md.
 
     Attributes:
@@ -23,11 +24,15 @@ class SplatRecipe:
         points: Gaussians of the background at the start, drawn from the views' depth.
         actor_points: Most Gaussians of an actor at the start.
         start_size: Of the Gaussians at the start, in distances to their neighbours.
-        cap: Where densification stops, the largest screen gradients first; a start with more is not cut.
-        hold_out_every: Every such view is kept for measuring (the eighth, as is usual); 0 trains on all.
-        sh_degree: Highest degree of view-dependent colour, reached by one degree every ``sh_share`` of the steps.
+        cap: Where densification stops, the largest screen gradients first; a start with more is not
+            cut.
+        hold_out_every: Every such view is kept for measuring (the eighth, as is usual); 0 trains on
+            all.
+        sh_degree: Highest degree of view-dependent colour, reached by one degree every ``sh_share``
+            of the steps.
         sh_share: See ``sh_degree``.
-        lr_means: Rate of the centres at the start, in scene extents; falls exponentially to ``lr_means_end``.
+        lr_means: Rate of the centres at the start, in scene extents; falls exponentially to
+            ``lr_means_end``.
         lr_means_end: See ``lr_means``.
         lr_scales: Rate of the scales' logarithms.
         lr_quaternions: Rate of the rotations.
@@ -35,20 +40,25 @@ class SplatRecipe:
         lr_colour: Rate of the constant colour; view-dependent coefficients get a twentieth.
         ssim_weight: Share of 1 - SSIM in the image loss, the rest is the mean absolute error.
         sky_weight: Weight of opacity where a view shows sky.
-        coarse_share: Share of the steps, at their beginning, that see views of half the width: a quarter of the work.
-        depth_weight: Weight of the difference between rendered depth and the views' depth, as a share of the latter; 0 does not look at it.
-        needle_weight: Weight of how much longer than ``needle_ratio`` times its middle axis a Gaussian is, by logarithm.
+        coarse_share: Share of the steps, at their beginning, that see views of half the width: a
+            quarter of the work.
+        depth_weight: Weight of the difference between rendered depth and the views' depth, as a
+            share of the latter; 0 does not look at it.
+        needle_weight: Weight of how much longer than ``needle_ratio`` times its middle axis a
+            Gaussian is, by logarithm.
         needle_ratio: See ``needle_weight``.
-        lr_exposure: Rate of the gain by which each view's colours differ from the model's; 0 leaves all at 1.
+        lr_exposure: Rate of the gain by which each view's colours differ from the model's; 0 leaves
+            all at 1.
         densify_from: Share of the steps after which Gaussians are cloned and split.
         densify_until: Share of the steps until which they are.
         densify_every: Steps in between; 0 never densifies or prunes.
-        densify_gradient: Mean norm of the loss's gradient by a Gaussian's place on the screen, in half image widths, above which it is
-            densified.
+        densify_gradient: Mean norm of the loss's gradient by a Gaussian's place on the screen, in
+            half image widths, above which it is densified.
         dense_share: Gaussians larger than this share of the extent are split, others cloned.
         prune_opacity: Gaussians fainter than this are removed whenever Gaussians are densified.
         prune_share: Gaussians larger than this share of the extent are removed as well.
-        reset_every: Share of the steps after which opacities are lowered to ``reset_opacity``, until ``densify_until``; 0 never.
+        reset_every: Share of the steps after which opacities are lowered to ``reset_opacity``,
+            until ``densify_until``; 0 never.
         reset_opacity: See ``reset_every``.
         save_every: Steps between checkpoints.
         seed: Of the start, the order of views and the splits.
@@ -94,15 +104,27 @@ class SplatRecipe:
 
     def __post_init__(self) -> None:
         checks = {
-            "steps": self.steps >= 1, "views": self.views >= 1, "width": self.width >= 16, "points": self.points >= 1,
-            "cap": self.cap >= 1, "hold_out_every": self.hold_out_every == 0 or self.hold_out_every >= 2,
-            "sh_degree": 0 <= self.sh_degree <= 3, "ssim_weight": 0 <= self.ssim_weight <= 1, "save_every": self.save_every >= 1,
-            "densify_every": self.densify_every >= 0, "sh_share": self.sh_share >= 0,
-        }  # fmt: skip
+            "steps": self.steps >= 1,
+            "views": self.views >= 1,
+            "width": self.width >= 16,
+            "points": self.points >= 1,
+            "cap": self.cap >= 1,
+            "hold_out_every": self.hold_out_every == 0 or self.hold_out_every >= 2,
+            "sh_degree": 0 <= self.sh_degree <= 3,
+            "ssim_weight": 0 <= self.ssim_weight <= 1,
+            "save_every": self.save_every >= 1,
+            "densify_every": self.densify_every >= 0,
+            "sh_share": self.sh_share >= 0,
+        }
         for name, good in checks.items():
             if not good:
                 found = f"{name}={getattr(self, name)}"
-                raise InputError("reading a recipe", found, "outside its range", "see SplatRecipe for what it means")
+                raise InputError(
+                    "reading a recipe",
+                    found,
+                    "outside its range",
+                    "see SplatRecipe for what it means",
+                )
 
     @classmethod
     def full(cls) -> SplatRecipe:
@@ -111,20 +133,39 @@ class SplatRecipe:
 
     @classmethod
     def street(cls) -> SplatRecipe:
-        """Return the recipe of a recorded street: what three minutes of two cores allow (docs/experiments/real-fit.md)."""
+        """Return the recipe of a recorded street: what three minutes of two cores allow
+        (docs/experiments/real-fit.md).
+        """
         return cls(
-            steps=1300, points=50_000, cap=80_000, start_size=0.8, coarse_share=0.5, depth_weight=0.05, needle_weight=0.02,
-            lr_exposure=1e-3, sky_weight=0.2,
-        )  # fmt: skip
+            steps=1300,
+            points=50_000,
+            cap=80_000,
+            start_size=0.8,
+            coarse_share=0.5,
+            depth_weight=0.05,
+            needle_weight=0.02,
+            lr_exposure=1e-3,
+            sky_weight=0.2,
+        )
 
     @classmethod
     def under_trained(cls, seed: int = 0) -> SplatRecipe:
-        """Return the recipe of an under-trained reconstruction (paper, App. A): few Gaussians and views, stopped early.
+        """Return the recipe of an under-trained reconstruction (paper, App. A): few Gaussians and
+        views, stopped early.
 
-        Recognisable as the scene on the logged path: soft, without thin things, with floaters; holes and needles beside it.
+        Recognisable as the scene on the logged path: soft, without thin things, with floaters;
+        holes and needles beside it.
         """
         return cls(
-            steps=200, views=60, points=9_000, cap=12_000, hold_out_every=0, sh_degree=1, densify_until=0.8, densify_every=30, seed=seed
+            steps=200,
+            views=60,
+            points=9_000,
+            cap=12_000,
+            hold_out_every=0,
+            sh_degree=1,
+            densify_until=0.8,
+            densify_every=30,
+            seed=seed,
         )
 
     def lr_means_at(self, step: int) -> float:

@@ -1,8 +1,11 @@
-"""Hold a finished reconstruction, keep it in a folder of ordinary files, and put its sky together from the views.
+"""Hold a finished reconstruction, keep it in a folder of ordinary files, and put its sky together
+from the views.
 
-The sky is so far away that where a camera stands does not matter: every sky pixel is one direction. Reconstructions of recorded drives
-learn such an environment map beside the Gaussians (Street Gaussians, OmniRe); its optimum under fixed opacity is the mean of what the views
-saw in each direction, which is computed here at once. Directions that no view saw take their colour from near ones that were seen.
+The sky is so far away that where a camera stands does not matter: every sky pixel is one direction.
+Reconstructions of recorded drives learn such an environment map beside the Gaussians (Street
+Gaussians, OmniRe); its optimum under fixed opacity is the mean of what the views saw in each
+direction, which is computed here at once. Directions that no view saw take their colour from near
+ones that were seen.
 """
 
 from __future__ import annotations
@@ -29,7 +32,9 @@ from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneN
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, HIGH_RAD, LOW_RAD, WIDTH, Sky
 
 DOING = "reading a reconstruction"
-INDEX_FILE, BACKGROUND_FILE, SKY_FILE = "reconstruction.json", "background.ply", "sky.png"
+INDEX_FILE = "reconstruction.json"
+BACKGROUND_FILE = "background.ply"
+SKY_FILE = "sky.png"
 
 
 class _Index(TypedDict):
@@ -44,9 +49,11 @@ class Reconstruction:
 
     Attributes:
         background: World coordinates.
-        actors: Actor id to Gaussians in its box frame; an actor that no view showed well enough is missing.
+        actors: Actor id to Gaussians in its box frame; an actor that no view showed well enough is
+            missing.
         sky: What stands behind everything; black where the views had no sky.
-        gains: Of the views that it was fitted to, in their order: red, green and blue of each over the model's; not written with it.
+        gains: Of the views that it was fitted to, in their order: red, green and blue of each over
+            the model's; not written with it.
     """
 
     background: GaussianCloud
@@ -60,11 +67,14 @@ class Reconstruction:
 
     def graph(self) -> SceneGraph:
         """Return it as a scene to be rendered from anywhere; colours turn with the actors."""
-        actors = [SceneNode(name, "actor", (Level(0.0, cloud),)) for name, cloud in self.actors.items()]
+        actors = [
+            SceneNode(name, "actor", (Level(0.0, cloud),)) for name, cloud in self.actors.items()
+        ]
         return with_background(SceneGraph([], actors, self.sky), self.background, np.eye(4))
 
     def save(self, folder: Path, facts: Mapping[str, Any]) -> None:
-        """Write ``background.ply``, ``actors/*.ply``, ``sky.png`` (8 bits) and, last, ``reconstruction.json`` with ``facts``.
+        """Write ``background.ply``, ``actors/*.ply``, ``sky.png`` (8 bits) and, last,
+        ``reconstruction.json`` with ``facts``.
 
         The PLY files have the layout of the original 3DGS code: any tool for Gaussians reads them.
         """
@@ -73,7 +83,10 @@ class Reconstruction:
         files = {name: f"actors/{i:03d}.ply" for i, name in enumerate(sorted(self.actors))}
         for name, file in files.items():
             write_ply(folder / file, self.actors[name])
-        cv2.imwrite(str(folder / SKY_FILE), np.rint(self.sky.panorama[..., ::-1] * 255).clip(0, 255).astype(np.uint8))
+        cv2.imwrite(
+            str(folder / SKY_FILE),
+            np.rint(self.sky.panorama[..., ::-1] * 255).clip(0, 255).astype(np.uint8),
+        )
         write_json(folder / INDEX_FILE, {"actors": files, "gaussians": len(self), **facts})
 
     @classmethod
@@ -91,9 +104,18 @@ class Reconstruction:
         image = read_image(folder / SKY_FILE, DOING)
         if image.shape != (HEIGHT, WIDTH, 3):
             found = f"an image of shape {image.shape}"
-            raise InputError(DOING, str(folder / SKY_FILE), found, f"give {WIDTH} x {HEIGHT} pixels, or make it again")
+            raise InputError(
+                DOING,
+                str(folder / SKY_FILE),
+                found,
+                f"give {WIDTH} x {HEIGHT} pixels, or make it again",
+            )
         actors = {name: read_ply(folder / file) for name, file in files.items()}
-        return cls(read_ply(folder / BACKGROUND_FILE), actors, Sky(image[..., ::-1].astype(np.float32) / 255))
+        return cls(
+            read_ply(folder / BACKGROUND_FILE),
+            actors,
+            Sky(image[..., ::-1].astype(np.float32) / 255),
+        )
 
 
 def sky_of(views: Sequence[PosedView]) -> Sky | None:
@@ -104,29 +126,56 @@ def sky_of(views: Sequence[PosedView]) -> Sky | None:
             _add(view, total, weight)
     if not weight.any():
         return None
-    return Sky(_spread((total / np.maximum(weight, 1e-9)[..., None]).astype(np.float32), (weight > 0).astype(np.float32)))
+    return Sky(
+        _spread(
+            (total / np.maximum(weight, 1e-9)[..., None]).astype(np.float32),
+            (weight > 0).astype(np.float32),
+        )
+    )
 
 
 def _add(view: PosedView, total: F64, weight: F64) -> None:
-    """Add a view's sky pixels to their directions; pixels at the sky's edge, which mix it with what is in front, are left out."""
+    """Add a view's sky pixels to their directions; pixels at the sky's edge, which mix it with what
+    is in front, are left out.
+    """
     assert view.sky is not None
-    rows, columns = np.nonzero(cv2.erode(view.sky.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1))
+    rows, columns = np.nonzero(
+        cv2.erode(view.sky.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1)
+    )
     camera = view.camera
-    local = np.stack([(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, np.ones(len(rows))], axis=1)
+    local = np.stack(
+        [
+            (columns + 0.5 - camera.cx) / camera.fx,
+            (rows + 0.5 - camera.cy) / camera.fy,
+            np.ones(len(rows)),
+        ],
+        axis=1,
+    )
     x, y, z = (local @ camera.T_camera_world[:3, :3]).T
     column = np.floor(np.arctan2(y, x) * (WIDTH / (2 * np.pi))).astype(np.int64) % WIDTH
-    row = np.rint((HIGH_RAD - np.arctan2(z, np.hypot(x, y))) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD))).astype(np.int64).clip(0, HEIGHT - 1)
+    row = (
+        np.rint((HIGH_RAD - np.arctan2(z, np.hypot(x, y))) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD)))
+        .astype(np.int64)
+        .clip(0, HEIGHT - 1)
+    )
     np.add.at(total, (row, column), view.rgb[rows, columns] / (255.0 * np.array(view.gain)))
     np.add.at(weight, (row, column), 1.0)
 
 
 def _spread(image: F32, known: F32) -> F32:
-    """Fill unknown pixels from known ones near by: means over ever coarser cells, the finest that holds a known pixel (pull and push)."""
+    """Fill unknown pixels from known ones near by: means over ever coarser cells, the finest that
+    holds a known pixel (pull and push).
+    """
     if min(image.shape[:2]) <= 1 or known.all():
         return image
     half = (max(1, image.shape[1] // 2), max(1, image.shape[0] // 2))
     area = cv2.resize(known, half, interpolation=cv2.INTER_AREA)
-    mean = cv2.resize(image * known[..., None], half, interpolation=cv2.INTER_AREA) / np.maximum(area, 1e-9)[..., None]
-    coarse = _spread(np.where(area[..., None] > 0, mean, 0).astype(np.float32), (area > 0).astype(np.float32))
+    mean = (
+        cv2.resize(image * known[..., None], half, interpolation=cv2.INTER_AREA)
+        / np.maximum(area, 1e-9)[..., None]
+    )
+    coarse = _spread(
+        np.where(area[..., None] > 0, mean, 0).astype(np.float32), (area > 0).astype(np.float32)
+    )
     filled = cv2.resize(coarse, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
     return np.asarray(np.where(known[..., None] > 0, image, filled), dtype=np.float32)

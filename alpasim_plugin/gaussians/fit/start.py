@@ -1,8 +1,11 @@
-"""Draw the Gaussians that a fit starts from: sparse, noisy surface points, from depth or from matched photographs.
+"""Draw the Gaussians that a fit starts from: sparse, noisy surface points, from depth or from
+matched photographs.
 
-Published fits start from LiDAR returns (driving) or structure-from-motion points. Rendered views carry depth; points sampled from it,
-evenly over the image, with a range error along the ray, stand for LiDAR returns accumulated over the drive. Returns inside an actor's box
-are carried to the actor's frame and belong to it, as in Street Gaussians. Photographs without depth are matched (SIFT) and triangulated.
+Published fits start from LiDAR returns (driving) or structure-from-motion points. Rendered views
+carry depth; points sampled from it, evenly over the image, with a range error along the ray, stand
+for LiDAR returns accumulated over the drive. Returns inside an actor's box are carried to the
+actor's frame and belong to it, as in Street Gaussians. Photographs without depth are matched (SIFT)
+and triangulated.
 """
 
 from __future__ import annotations
@@ -24,14 +27,28 @@ from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 
-RANGE_ERROR_M, RANGE_ERROR_SHARE = 0.03, 0.004  # spread of a point along its ray: fixed, and by distance
-BOX_MARGIN_M = 0.1  # points this far outside an actor's sides still belong to it; below, its box ends this far above the ground
+RANGE_ERROR_M, RANGE_ERROR_SHARE = (
+    0.03,
+    0.004,
+)  # spread of a point along its ray: fixed, and by distance
+# points this far outside an actor's sides still belong to it; below, its box ends this far above
+# the ground
+BOX_MARGIN_M = 0.1
 START_OPACITY = 0.3
 SMALLEST_M, LARGEST_M = 0.01, 3.0
 FEWEST_POINTS = 4  # an actor seen less often gets no model
-DENSER = 8  # an actor's points are sampled this many times as densely as the background, because they are few and seen from near
-NEIGHBOURS, FEATURES, RATIO = 4, 2500, 0.75  # of the next photographs; SIFT keypoints; Lowe's ratio test
-LARGEST_ERROR_PX, LEAST_ANGLE_DEG = 1.5, 1.5  # of a triangulated point: reprojection, and between its rays
+# an actor's points are sampled this many times as densely as the background, because they are few
+# and seen from near
+DENSER = 8
+NEIGHBOURS, FEATURES, RATIO = (
+    4,
+    2500,
+    0.75,
+)  # of the next photographs; SIFT keypoints; Lowe's ratio test
+LARGEST_ERROR_PX, LEAST_ANGLE_DEG = (
+    1.5,
+    1.5,
+)  # of a triangulated point: reprojection, and between its rays
 
 _Points = tuple[F64, F64]  # (N, 3) places, metres; (N, 3) colours 0..1
 
@@ -96,13 +113,20 @@ def start_from_depth(
 
 
 def start_from_maps(
-    views: Sequence[PosedView], more: Sequence[PosedView], count: int, scene_id: str, seed: int, size: float = 1.0
+    views: Sequence[PosedView],
+    more: Sequence[PosedView],
+    count: int,
+    scene_id: str,
+    seed: int,
+    size: float = 1.0,
 ) -> GaussianCloud:
-    """Draw ``count`` points, the same number from each view, from depth that was measured in photographs.
+    """Draw ``count`` points, the same number from each view, from depth that was measured in
+    photographs.
 
     Args:
         views: With depth where it was measured.
-        more: The same views with depth where it can only be guessed: one point in six comes from there.
+        more: The same views with depth where it can only be guessed: one point in six comes from
+            there.
         count: Points in all.
         scene_id, seed: Key of the sample.
         size: See `cloud_from_points`.
@@ -121,8 +145,12 @@ def _drawn(view: PosedView, count: int, rng: np.random.Generator) -> _Points:
     return points, (rgb / np.array(view.gain)).clip(0, 1)
 
 
-def start_in_boxes(boxes: Mapping[str, Box], count: int, scene_id: str, seed: int) -> dict[str, GaussianCloud]:
-    """Return ``count`` grey Gaussians spread over each actor's box, in its frame: a start where no depth says where its surface is."""
+def start_in_boxes(
+    boxes: Mapping[str, Box], count: int, scene_id: str, seed: int
+) -> dict[str, GaussianCloud]:
+    """Return ``count`` grey Gaussians spread over each actor's box, in its frame: a start where no
+    depth says where its surface is.
+    """
     clouds = {}
     for name, box in boxes.items():
         half = np.array([box.length_m, box.width_m, box.height_m]) / 2
@@ -134,8 +162,9 @@ def start_in_boxes(boxes: Mapping[str, Box], count: int, scene_id: str, seed: in
 def cloud_from_points(points: F64, rgb: F64, size: float = 1.0) -> GaussianCloud:
     """Return round Gaussians at points ``(N, 3)`` of colours ``(N, 3)`` 0..1.
 
-    Their standard deviation is ``size`` times the root mean square distance to three neighbours: 1 is that of 3D Gaussian Splatting, whose
-    opacity of 0.1 is too slow a start for some hundred steps.
+    Their standard deviation is ``size`` times the root mean square distance to three neighbours: 1
+    is that of 3D Gaussian Splatting, whose opacity of 0.1 is too slow a start for some hundred
+    steps.
     """
     n = len(points)
     if n > 1:
@@ -144,7 +173,13 @@ def cloud_from_points(points: F64, rgb: F64, size: float = 1.0) -> GaussianCloud
     else:
         sigma = np.full(n, LARGEST_M / 10)
     quats = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
-    return GaussianCloud(points, quats, np.repeat(sigma[:, None], 3, axis=1), np.full(n, START_OPACITY), dc_from_rgb(rgb)[:, None, :])
+    return GaussianCloud(
+        points,
+        quats,
+        np.repeat(sigma[:, None], 3, axis=1),
+        np.full(n, START_OPACITY),
+        dc_from_rgb(rgb)[:, None, :],
+    )
 
 
 def _sample(view: PosedView, count: int, rng: np.random.Generator, noise: bool = True) -> _Points:
@@ -159,13 +194,18 @@ def _sample(view: PosedView, count: int, rng: np.random.Generator, noise: bool =
     if noise:
         z += rng.standard_normal(len(z)) * (RANGE_ERROR_M + RANGE_ERROR_SHARE * z)
     camera = view.camera
-    local = np.stack([(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z], axis=1)
+    local = np.stack(
+        [(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z],
+        axis=1,
+    )
     return transform_points(inverse(camera.T_camera_world), local), view.rgb[rows, columns] / 255.0
 
 
 def _joined(parts: Sequence[_Points]) -> _Points:
     none = np.zeros((0, 3))
-    return np.concatenate([none, *(points for points, _ in parts)]), np.concatenate([none, *(rgb for _, rgb in parts)])
+    return np.concatenate([none, *(points for points, _ in parts)]), np.concatenate(
+        [none, *(rgb for _, rgb in parts)]
+    )
 
 
 def _thinned(parts: Sequence[_Points], most: int, rng: np.random.Generator) -> _Points:
@@ -181,7 +221,9 @@ def _inside(local: F64, box: Box) -> Bool:
 
 
 class Match(NamedTuple):
-    """A point that two photographs show: their indices, and where, in pixels of their views ``(2,)``."""
+    """A point that two photographs show: their indices, and where, in pixels of their views
+    ``(2,)``.
+    """
 
     first: int
     second: int
@@ -190,7 +232,9 @@ class Match(NamedTuple):
 
 
 def matches(views: Sequence[PosedView]) -> list[Match]:
-    """Return points that a view and one of its next ones show: SIFT, nearest neighbours in both directions, ratio test."""
+    """Return points that a view and one of its next ones show: SIFT, nearest neighbours in both
+    directions, ratio test.
+    """
     sift, matcher = cv2.SIFT_create(FEATURES), cv2.BFMatcher(cv2.NORM_L2)  # type: ignore[attr-defined]
     found = []
     for view in views:
@@ -202,7 +246,9 @@ def matches(views: Sequence[PosedView]) -> list[Match]:
             (at_i, describes_i), (at_j, describes_j) = found[i], found[j]
             if describes_i is None or describes_j is None or len(at_i) < 2 or len(at_j) < 2:
                 continue
-            back = {m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(describes_j, describes_i, k=1)}
+            back = {
+                m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(describes_j, describes_i, k=1)
+            }
             for best, second in matcher.knnMatch(describes_i, describes_j, k=2):
                 if best.distance < RATIO * second.distance and back[best.trainIdx] == best.queryIdx:
                     out.append(Match(i, j, at_i[best.queryIdx], at_j[best.trainIdx]))
@@ -210,7 +256,11 @@ def matches(views: Sequence[PosedView]) -> list[Match]:
 
 
 def triangulated(
-    views: Sequence[PosedView], found: Sequence[Match], used: Sequence[int], most: int, rng: np.random.Generator
+    views: Sequence[PosedView],
+    found: Sequence[Match],
+    used: Sequence[int],
+    most: int,
+    rng: np.random.Generator,
 ) -> GaussianCloud:
     """Return start Gaussians at the points that views place consistently.
 
@@ -238,14 +288,19 @@ def triangulated(
     if count < 10:
         found_text = f"{count} points that two photographs place consistently"
         raise InputError(
-            "starting from photographs", f"{len(used)} photographs", found_text, "give photographs that overlap, in order along the way"
+            "starting from photographs",
+            f"{len(used)} photographs",
+            found_text,
+            "give photographs that overlap, in order along the way",
         )
     kept = rng.permutation(count)[:most]
     return cloud_from_points(points[kept], colours[kept])
 
 
 def _triangulate(first: PinholeCamera, second: PinholeCamera, a: F64, b: F64) -> tuple[F64, Bool]:
-    """Return points ``(N, 3)`` and which are good: before both cameras, near both rays, and seen at an angle."""
+    """Return points ``(N, 3)`` and which are good: before both cameras, near both rays, and seen at
+    an angle.
+    """
     P = [camera.K @ camera.T_camera_world[:3] for camera in (first, second)]
     homogeneous = cv2.triangulatePoints(P[0], P[1], a.T, b.T)
     w = np.where(np.abs(homogeneous[3]) < 1e-12, 1e-12, homogeneous[3])
@@ -254,8 +309,12 @@ def _triangulate(first: PinholeCamera, second: PinholeCamera, a: F64, b: F64) ->
     for camera, at in ((first, a), (second, b)):
         local = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
         pixel = local @ camera.K.T
-        error = np.linalg.norm(pixel[:, :2] / np.where(np.abs(local[:, 2:]) < 1e-9, 1e-9, local[:, 2:]) - at, axis=1)
+        error = np.linalg.norm(
+            pixel[:, :2] / np.where(np.abs(local[:, 2:]) < 1e-9, 1e-9, local[:, 2:]) - at, axis=1
+        )
         good &= (local[:, 2] > 1e-3) & (error < LARGEST_ERROR_PX)
     rays = [points - camera.centre_world for camera in (first, second)]
-    cosine = np.einsum("ij,ij->i", *rays) / np.maximum(np.linalg.norm(rays[0], axis=1) * np.linalg.norm(rays[1], axis=1), 1e-12)
+    cosine = np.einsum("ij,ij->i", *rays) / np.maximum(
+        np.linalg.norm(rays[0], axis=1) * np.linalg.norm(rays[1], axis=1), 1e-12
+    )
     return points, good & (cosine < np.cos(np.radians(LEAST_ANGLE_DEG)))

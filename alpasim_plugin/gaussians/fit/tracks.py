@@ -1,12 +1,16 @@
-"""Follow points through photographs that were taken one after the other, place them, and correct the poses of the photographs by them.
+"""Follow points through photographs that were taken one after the other, place them, and correct
+the poses of the photographs by them.
 
-Corners (Shi and Tomasi 1994) are followed from photograph to photograph by pyramidal Lucas-Kanade and kept where following them back ends
-where they began. A track of several photographs fixes a point far better than a match of two, and its reprojection errors say how far the
-poses can be trusted.
+Corners (Shi and Tomasi 1994) are followed from photograph to photograph by pyramidal Lucas-Kanade
+and kept where following them back ends where they began. A track of several photographs fixes a
+point far better than a match of two, and its reprojection errors say how far the poses can be
+trusted.
 
-Poses of a drive come from satellite positioning and inertial sensors. They are good to centimetres and tenths of a degree, which is more
-than a pixel: a reconstruction fitted to them blurs. `adjust` corrects them by bundle adjustment (Triggs et al. 2000). The correction is
-small, so the given poses stay as a prior: they fix place, direction and scale of the whole, and a photograph without tracks keeps its pose.
+Poses of a drive come from satellite positioning and inertial sensors. They are good to centimetres
+and tenths of a degree, which is more than a pixel: a reconstruction fitted to them blurs. `adjust`
+corrects them by bundle adjustment (Triggs et al. 2000). The correction is small, so the given poses
+stay as a prior: they fix place, direction and scale of the whole, and a photograph without tracks
+keeps its pose.
 """
 
 from __future__ import annotations
@@ -22,13 +26,23 @@ from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.views import PosedView
 
-CORNERS, APART_PX, QUALITY = 1500, 7, 0.003  # of a photograph: most corners, their distance, and their least strength
+CORNERS, APART_PX, QUALITY = (
+    1500,
+    7,
+    0.003,
+)  # of a photograph: most corners, their distance, and their least strength
 BACK_PX = 0.4  # following a point there and back may end so far from where it began
 WINDOW = (15, 15)
-ROUNDS, HUBER_PX = 8, 1.0  # of placing a point: Gauss-Newton steps, and the error from which one counts less
+ROUNDS, HUBER_PX = (
+    8,
+    1.0,
+)  # of placing a point: Gauss-Newton steps, and the error from which one counts less
 ADJUSTING_ROUNDS = 12  # of correcting poses
 SIGMA_M, SIGMA_RAD = 0.05, 0.003  # of a given pose: what correction is likely
-LARGEST_ERROR_PX, LEAST_ANGLE_RAD = 3.0, 0.01  # of observations that adjust poses, and of their points
+LARGEST_ERROR_PX, LEAST_ANGLE_RAD = (
+    3.0,
+    0.01,
+)  # of observations that adjust poses, and of their points
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +62,12 @@ class Tracks:
     count: int
 
     def only(self, keep: Bool) -> Tracks:
-        """Return the observations ``(M,)`` that are kept; points that fewer than two of them show are left out."""
-        view, point, at = self.view[keep], self.point[keep], self.at[keep]
+        """Return the observations ``(M,)`` that are kept; points that fewer than two of them show
+        are left out.
+        """
+        view = self.view[keep]
+        point = self.point[keep]
+        at = self.at[keep]
         times = np.bincount(point, minlength=self.count)
         stay = times[point] >= 2
         ids, number = np.unique(point[stay], return_inverse=True)
@@ -57,10 +75,14 @@ class Tracks:
 
 
 def follow(views: Sequence[PosedView]) -> Tracks:
-    """Follow corners from each photograph to the next; tracks of two observations and more, masked pixels left out."""
+    """Follow corners from each photograph to the next; tracks of two observations and more, masked
+    pixels left out.
+    """
     greys = [cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY) for view in views]
     rows: list[tuple[I64, I64, F64]] = []
-    points, ids, count = np.zeros((0, 2), np.float32), np.zeros(0, np.int64), 0
+    points = np.zeros((0, 2), np.float32)
+    ids = np.zeros(0, np.int64)
+    count = 0
     for i, grey in enumerate(greys):
         fresh = _corners(np.asarray(grey, np.uint8), points, views[i].mask)
         points = np.concatenate([points, fresh])
@@ -68,7 +90,9 @@ def follow(views: Sequence[PosedView]) -> Tracks:
         count += len(fresh)
         rows.append((np.full(len(ids), i, dtype=np.int64), ids, points.astype(np.float64) + 0.5))
         if i + 1 < len(views) and len(points):
-            points, kept = _followed(np.asarray(grey, np.uint8), np.asarray(greys[i + 1], np.uint8), points)
+            points, kept = _followed(
+                np.asarray(grey, np.uint8), np.asarray(greys[i + 1], np.uint8), points
+            )
             points, ids = points[kept], ids[kept]
     view, point, at = (np.concatenate([row[k] for row in rows]) for k in range(3))
     order = np.argsort(point, kind="stable")
@@ -80,8 +104,14 @@ def _corners(grey: U8, taken: F32, mask: Bool | None) -> F32:
     free = np.full(grey.shape, 255, np.uint8) if mask is None else mask.astype(np.uint8) * 255
     for x, y in np.rint(taken).astype(int):
         cv2.circle(free, (int(x), int(y)), APART_PX, 0, -1)
-    found = cv2.goodFeaturesToTrack(grey, max(CORNERS - len(taken), 1), QUALITY, APART_PX, mask=free)
-    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
+    found = cv2.goodFeaturesToTrack(
+        grey, max(CORNERS - len(taken), 1), QUALITY, APART_PX, mask=free
+    )
+    return (
+        np.zeros((0, 2), np.float32)
+        if found is None
+        else np.asarray(found, np.float32).reshape(-1, 2)
+    )
 
 
 def _followed(a: U8, b: U8, points: F32) -> tuple[F32, Bool]:
@@ -89,7 +119,12 @@ def _followed(a: U8, b: U8, points: F32) -> tuple[F32, Bool]:
     back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, winSize=WINDOW, maxLevel=4)
     off = np.linalg.norm(back[:, 0] - points, axis=1)
     moved = there[:, 0]
-    inside = (moved[:, 0] >= 0) & (moved[:, 1] >= 0) & (moved[:, 0] <= a.shape[1] - 1) & (moved[:, 1] <= a.shape[0] - 1)
+    inside = (
+        (moved[:, 0] >= 0)
+        & (moved[:, 1] >= 0)
+        & (moved[:, 0] <= a.shape[1] - 1)
+        & (moved[:, 1] <= a.shape[0] - 1)
+    )
     return moved, np.asarray((ok[:, 0] == 1) & (ok_back[:, 0] == 1) & (off < BACK_PX) & inside)
 
 
@@ -99,8 +134,10 @@ class Placed:
 
     Attributes:
         xyz: ``(P, 3)`` metres, world.
-        error_px: ``(M,)`` distance of each observation from the point's projection; infinite behind the camera.
-        angle_rad: ``(P,)`` between the outermost rays to the point: small means that its distance is not known.
+        error_px: ``(M,)`` distance of each observation from the point's projection; infinite behind
+            the camera.
+        angle_rad: ``(P,)`` between the outermost rays to the point: small means that its distance
+            is not known.
     """
 
     xyz: F64
@@ -109,37 +146,55 @@ class Placed:
 
 
 def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
-    """Triangulate every point: nearest to its rays at first, then by robust reprojection error (Gauss-Newton, Huber weights)."""
+    """Triangulate every point: nearest to its rays at first, then by robust reprojection error
+    (Gauss-Newton, Huber weights).
+    """
     R, t, K = pose_arrays(cameras)
     centre = -np.einsum("nji,nj->ni", R, t)
-    local = np.einsum("nij,nj->ni", np.linalg.inv(K)[tracks.view], np.c_[tracks.at, np.ones(len(tracks.at))])
+    local = np.einsum(
+        "nij,nj->ni", np.linalg.inv(K)[tracks.view], np.c_[tracks.at, np.ones(len(tracks.at))]
+    )
     ray = np.einsum("nji,nj->ni", R[tracks.view], local)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     across = np.eye(3) - ray[:, :, None] * ray[:, None]
-    A, b = (summed(values, tracks.point, tracks.count) for values in (across, np.einsum("nij,nj->ni", across, centre[tracks.view])))
+    A, b = (
+        summed(values, tracks.point, tracks.count)
+        for values in (across, np.einsum("nij,nj->ni", across, centre[tracks.view]))
+    )
     xyz: F64 = np.asarray(np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0], np.float64)
     for _ in range(ROUNDS):
         e, J, _ = residuals(xyz, tracks, R, t, K)
         w = huber(e)
         JT = J.transpose(0, 2, 1) * w[:, None, None]
-        H, g = (summed(values, tracks.point, tracks.count) for values in (JT @ J, (JT @ e[..., None])[..., 0]))
-        step = np.linalg.solve(H + 1e-9 * np.eye(3) * (1 + np.trace(H, axis1=1, axis2=2)[:, None, None]), g[..., None])[..., 0]
+        H, g = (
+            summed(values, tracks.point, tracks.count)
+            for values in (JT @ J, (JT @ e[..., None])[..., 0])
+        )
+        step = np.linalg.solve(
+            H + 1e-9 * np.eye(3) * (1 + np.trace(H, axis1=1, axis2=2)[:, None, None]), g[..., None]
+        )[..., 0]
         length = np.linalg.norm(step, axis=1, keepdims=True)
         away = np.linalg.norm(xyz - centre.mean(axis=0), axis=1, keepdims=True)
-        xyz = np.asarray(xyz - step * np.minimum(1.0, 0.5 * (away + 1.0) / np.maximum(length, 1e-12)), np.float64)
+        xyz = np.asarray(
+            xyz - step * np.minimum(1.0, 0.5 * (away + 1.0) / np.maximum(length, 1e-12)), np.float64
+        )
     e, _, z = residuals(xyz, tracks, R, t, K)
     error = np.where(z > 1e-3, np.linalg.norm(e, axis=1), np.inf)
     return Placed(xyz, error, _angles(xyz, tracks, centre))
 
 
 def pose_arrays(cameras: Sequence[PinholeCamera]) -> tuple[F64, F64, F64]:
-    """Return rotations ``(V, 3, 3)`` and shifts ``(V, 3)`` world to camera, and intrinsics ``(V, 3, 3)``."""
+    """Return rotations ``(V, 3, 3)`` and shifts ``(V, 3)`` world to camera, and intrinsics ``(V, 3,
+    3)``.
+    """
     T = np.array([camera.T_camera_world for camera in cameras])
     return T[:, :3, :3], T[:, :3, 3], np.array([camera.K for camera in cameras])
 
 
 def residuals(xyz: F64, tracks: Tracks, R: F64, t: F64, K: F64) -> tuple[F64, F64, F64]:
-    """Return projection minus observation ``(M, 2)`` in pixels, its derivative by the point ``(M, 2, 3)``, and the depth ``(M,)``."""
+    """Return projection minus observation ``(M, 2)`` in pixels, its derivative by the point ``(M,
+    2, 3)``, and the depth ``(M,)``.
+    """
     local = np.einsum("nij,nj->ni", R[tracks.view], xyz[tracks.point]) + t[tracks.view]
     z = local[:, 2]
     safe = np.where(np.abs(z) < 1e-6, 1e-6, z)
@@ -150,7 +205,9 @@ def residuals(xyz: F64, tracks: Tracks, R: F64, t: F64, K: F64) -> tuple[F64, F6
 
 
 def projection_slope(local: F64, z: F64, f: F64) -> F64:
-    """Return the derivative ``(M, 2, 3)`` of pixels by camera coordinates ``(M, 3)``; ``z (M,)`` their safe depth, ``f (M, 2)`` pixels."""
+    """Return the derivative ``(M, 2, 3)`` of pixels by camera coordinates ``(M, 3)``; ``z (M,)``
+    their safe depth, ``f (M, 2)`` pixels.
+    """
     J = np.zeros((len(local), 2, 3))
     J[:, 0, 0], J[:, 1, 1] = f[:, 0] / z, f[:, 1] / z
     J[:, :, 2] = -f * local[:, :2] / (z**2)[:, None]
@@ -159,13 +216,17 @@ def projection_slope(local: F64, z: F64, f: F64) -> F64:
 
 def summed(values: F64, index: I64, count: int) -> F64:
     """Return the sums ``(count, ...)`` of the ``values (M, ...)`` of each index ``(M,)``."""
-    gather = scipy.sparse.csr_matrix((np.ones(len(index)), (index, np.arange(len(index)))), shape=(count, len(index)))
+    gather = scipy.sparse.csr_matrix(
+        (np.ones(len(index)), (index, np.arange(len(index)))), shape=(count, len(index))
+    )
     flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
     return np.asarray(gather @ flat, np.float64).reshape(count, *values.shape[1:])
 
 
 def huber(e: F64) -> F64:
-    """Return the weights ``(M,)`` of errors ``(M, 2)``: 1 up to `HUBER_PX`, then falling as the error grows."""
+    """Return the weights ``(M,)`` of errors ``(M, 2)``: 1 up to `HUBER_PX`, then falling as the
+    error grows.
+    """
     return np.asarray(HUBER_PX / np.maximum(np.linalg.norm(e, axis=1), HUBER_PX))
 
 
@@ -197,12 +258,15 @@ class Adjusted:
 
 
 def corrected(views: Sequence[PosedView]) -> Adjusted:
-    """Return cameras of views, in the order of the way and of one size, whose poses agree with what the views show."""
+    """Return cameras of views, in the order of the way and of one size, whose poses agree with what
+    the views show.
+    """
     return adjust([view.camera for view in views], follow(views))
 
 
 def adjust(cameras: Sequence[PinholeCamera], tracks: Tracks) -> Adjusted:
-    """Return cameras whose poses agree with the tracks; the same cameras where there are too few tracks to say.
+    """Return cameras whose poses agree with the tracks; the same cameras where there are too few
+    tracks to say.
 
     Args:
         cameras: As given.
@@ -223,11 +287,20 @@ def adjust(cameras: Sequence[PinholeCamera], tracks: Tracks) -> Adjusted:
 
 
 def _good(tracks: Tracks, placed: Placed, error_px: float) -> Bool:
-    return np.asarray((placed.error_px < error_px) & (placed.angle_rad[tracks.point] > LEAST_ANGLE_RAD))
+    return np.asarray(
+        (placed.error_px < error_px) & (placed.angle_rad[tracks.point] > LEAST_ANGLE_RAD)
+    )
 
 
-def _solve(given: Sequence[PinholeCamera], tracks: Tracks, xyz: F64, begin: Sequence[PinholeCamera] | None = None) -> list[PinholeCamera]:
-    """Minimise robust reprojection error and distance from the given poses by Gauss-Newton; points are eliminated (Schur complement)."""
+def _solve(
+    given: Sequence[PinholeCamera],
+    tracks: Tracks,
+    xyz: F64,
+    begin: Sequence[PinholeCamera] | None = None,
+) -> list[PinholeCamera]:
+    """Minimise robust reprojection error and distance from the given poses by Gauss-Newton; points
+    are eliminated (Schur complement).
+    """
     R0, t0, K = pose_arrays(given)
     R, t = (a.copy() for a in pose_arrays(begin or given)[:2])
     for _ in range(ADJUSTING_ROUNDS):
@@ -247,8 +320,12 @@ def _solve(given: Sequence[PinholeCamera], tracks: Tracks, xyz: F64, begin: Sequ
 
 
 def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) -> tuple[F64, F64]:
-    """Return changes of the poses ``(V, 6)`` (turn and shift in the camera's frame) and of the points ``(P, 3)``."""
-    v, p, views = tracks.view, tracks.point, len(R)
+    """Return changes of the poses ``(V, 6)`` (turn and shift in the camera's frame) and of the
+    points ``(P, 3)``.
+    """
+    v = tracks.view
+    p = tracks.point
+    views = len(R)
     local = np.einsum("nij,nj->ni", R[v], xyz[p]) + t[v]
     z = np.where(np.abs(local[:, 2]) < 1e-6, 1e-6, local[:, 2])
     f, c = np.stack([K[v, 0, 0], K[v, 1, 1]], axis=1), np.stack([K[v, 0, 2], K[v, 1, 2]], axis=1)
@@ -277,7 +354,9 @@ def _reduced(U: F64, ga: F64, W: F64, inverse: F64, gb: F64, v: I64, p: I64) -> 
     order = np.argsort(v, kind="stable")
     starts = np.searchsorted(v[order], np.arange(views + 1))
     blocks = scipy.sparse.bsr_matrix((W[order], p[order], starts), shape=(6 * views, 3 * n))
-    middle = scipy.sparse.bsr_matrix((inverse, np.arange(n), np.arange(n + 1)), shape=(3 * n, 3 * n))
+    middle = scipy.sparse.bsr_matrix(
+        (inverse, np.arange(n), np.arange(n + 1)), shape=(3 * n, 3 * n)
+    )
     H = -(blocks @ middle @ blocks.T).toarray()
     for i in range(views):
         H[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += U[i]
@@ -286,14 +365,20 @@ def _reduced(U: F64, ga: F64, W: F64, inverse: F64, gb: F64, v: I64, p: I64) -> 
 
 
 def _cross(a: F64) -> F64:
-    """Return the matrices ``(N, 3, 3)`` that multiply vectors ``(N, 3)`` crosswise from the left."""
+    """Return the matrices ``(N, 3, 3)`` that multiply vectors ``(N, 3)`` crosswise from the
+    left.
+    """
     x, y, z = a.T
     o = np.zeros_like(x)
-    return np.stack([np.stack([o, -z, y], 1), np.stack([z, o, -x], 1), np.stack([-y, x, o], 1)], axis=1)
+    return np.stack(
+        [np.stack([o, -z, y], 1), np.stack([z, o, -x], 1), np.stack([-y, x, o], 1)], axis=1
+    )
 
 
 def _from_given(R: F64, t: F64, R0: F64, t0: F64) -> F64:
-    """Return how far poses are from the given ones ``(V, 6)``: the turn as a rotation vector, and the shift, in the camera's frame."""
+    """Return how far poses are from the given ones ``(V, 6)``: the turn as a rotation vector, and
+    the shift, in the camera's frame.
+    """
     turn = np.array([cv2.Rodrigues(a @ b.T)[0][:, 0] for a, b in zip(R, R0, strict=True)])
     moved = t - np.einsum("nij,njk,nk->ni", R, R0.transpose(0, 2, 1), t0)
     return np.concatenate([turn, moved], axis=1)

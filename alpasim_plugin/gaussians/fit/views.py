@@ -27,9 +27,11 @@ class PosedView:
         name: For messages and file names.
         sky: ``(H, W)`` bool, where the image shows sky; None where that is unknown.
         mask: ``(H, W)`` bool, which pixels count (not the bonnet, say); None counts all.
-        depth: ``(H, W)`` float32, metres along the optical axis, 0 where unknown; a start is drawn from it, and a fit may be held to it.
+        depth: ``(H, W)`` float32, metres along the optical axis, 0 where unknown; a start is drawn
+            from it, and a fit may be held to it.
         actors: Actor id to ``T_world_box (4, 4)`` of the actors present.
-        gain: Of red, green and blue over the model's colours: the photograph's exposure and white balance.
+        gain: Of red, green and blue over the model's colours: the photograph's exposure and white
+            balance.
 
     Raises:
         InputError: An array does not have the camera's size.
@@ -51,9 +53,11 @@ class PosedView:
             value = getattr(self, name)
             if value is not None and value.shape != shape:
                 raise InputError(
-                    "building a posed view", f"{self.name!r}, {name}", f"shape {value.shape}, the camera has {shape}",
+                    "building a posed view",
+                    f"{self.name!r}, {name}",
+                    f"shape {value.shape}, the camera has {shape}",
                     "give images of the camera's size",
-                )  # fmt: skip
+                )
 
 
 def scaled_camera(spec: CameraSpec, T_world_camera: F64, width: int) -> PinholeCamera:
@@ -67,13 +71,24 @@ def scaled_camera(spec: CameraSpec, T_world_camera: F64, width: int) -> PinholeC
 
 
 def view_times(scenario: Scenario, count: int) -> list[int]:
-    """Return at most ``count`` times spread evenly over the log, both ends included: actors move while the ego stands."""
+    """Return at most ``count`` times spread evenly over the log, both ends included: actors move
+    while the ego stands.
+    """
     log = scenario.ego_log.t_us
-    return [int(t) for t in np.unique(np.linspace(log[0], log[-1], max(1, count)).round().astype(np.int64))]
+    return [
+        int(t)
+        for t in np.unique(np.linspace(log[0], log[-1], max(1, count)).round().astype(np.int64))
+    ]
 
 
 def logged_views(
-    scenario: Scenario, scene: SceneGraph, count: int, width: int, *, aside_m: float = 0.0, threads: int | None = None
+    scenario: Scenario,
+    scene: SceneGraph,
+    count: int,
+    width: int,
+    *,
+    aside_m: float = 0.0,
+    threads: int | None = None,
 ) -> list[PosedView]:
     """Render what the scenario's cameras see along its log.
 
@@ -86,28 +101,48 @@ def logged_views(
         threads: Of the rasteriser.
 
     Returns:
-        Views with sky, depth and actors; in order of time, the cameras of an instant together. Where the scene's opacity is below one half
-        the view shows sky, in place of the segmentation that recorded images need.
+        Views with sky, depth and actors; in order of time, the cameras of an instant together.
+        Where the scene's opacity is below one half the view shows sky, in place of the segmentation
+        that recorded images need.
     """
     shift = np.eye(4)
     shift[1, 3] = aside_m
     views = []
     for t_us in view_times(scenario, count // max(1, len(scenario.cameras))):
-        T_world_rig, actors = interpolate(scenario.ego_log, t_us) @ shift, log_actors(scenario, t_us)
+        T_world_rig, actors = (
+            interpolate(scenario.ego_log, t_us) @ shift,
+            log_actors(scenario, t_us),
+        )
         for spec in scenario.cameras:
             camera = scaled_camera(spec, T_world_rig @ spec.T_rig_camera, width)
             views.append(seen_from(camera, scene, actors, f"{spec.name}-{t_us}", threads))
     return views
 
 
-def seen_from(camera: PinholeCamera, scene: SceneGraph, actors: Mapping[str, F64], name: str, threads: int | None = None) -> PosedView:
+def seen_from(
+    camera: PinholeCamera,
+    scene: SceneGraph,
+    actors: Mapping[str, F64],
+    name: str,
+    threads: int | None = None,
+) -> PosedView:
     """Render one view with its sky and depth."""
     out = scene.render(camera, actors, threads)
-    return PosedView(camera, out.to_uint8(), name, out.alpha <= 0.5, None, np.where(out.alpha > 0.5, out.depth, 0), dict(actors))
+    return PosedView(
+        camera,
+        out.to_uint8(),
+        name,
+        out.alpha <= 0.5,
+        None,
+        np.where(out.alpha > 0.5, out.depth, 0),
+        dict(actors),
+    )
 
 
 def halved(view: PosedView) -> PosedView:
-    """Return a view of half the width and height; a pixel of it is sky, or counts, where all its four do, and its depth is the first's."""
+    """Return a view of half the width and height; a pixel of it is sky, or counts, where all its
+    four do, and its depth is the first's.
+    """
     camera = view.camera
     h, w = camera.height // 2, camera.width // 2
     K = camera.K.copy()
@@ -115,15 +150,34 @@ def halved(view: PosedView) -> PosedView:
     rgb = cv2.resize(view.rgb[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_AREA)
 
     def all_four(flags: Bool | None) -> Bool | None:
-        return None if flags is None else np.asarray(flags[: 2 * h, : 2 * w].reshape(h, 2, w, 2).all(axis=(1, 3)), dtype=np.bool_)
+        return (
+            None
+            if flags is None
+            else np.asarray(
+                flags[: 2 * h, : 2 * w].reshape(h, 2, w, 2).all(axis=(1, 3)), dtype=np.bool_
+            )
+        )
 
-    depth = None if view.depth is None else np.ascontiguousarray(view.depth[: 2 * h : 2, : 2 * w : 2])
+    depth = (
+        None if view.depth is None else np.ascontiguousarray(view.depth[: 2 * h : 2, : 2 * w : 2])
+    )
     small = PinholeCamera(w, h, K, camera.T_camera_world)
-    return PosedView(small, np.asarray(rgb, np.uint8), view.name, all_four(view.sky), all_four(view.mask), depth, view.actors, view.gain)
+    return PosedView(
+        small,
+        np.asarray(rgb, np.uint8),
+        view.name,
+        all_four(view.sky),
+        all_four(view.mask),
+        depth,
+        view.actors,
+        view.gain,
+    )
 
 
 def held_out(views: Sequence[PosedView], every: int) -> tuple[list[PosedView], list[PosedView]]:
-    """Split views into those to train on and those to measure with: the middle one of every ``every``; 0 holds none out."""
+    """Split views into those to train on and those to measure with: the middle one of every
+    ``every``; 0 holds none out.
+    """
     if every == 0:
         return list(views), []
     chosen = {i for i in range(len(views)) if i % every == every // 2}

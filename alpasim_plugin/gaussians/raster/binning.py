@@ -1,7 +1,7 @@
 """Sort splats by depth and list them per tile, nearest first.
 
-One stable sort of all visible splats, then a counting sort into tiles that keeps its order: on a CPU this beats the sort of all
-(tile, depth) pairs that GPU rasterisers use.
+One stable sort of all visible splats, then a counting sort into tiles that keeps its order: on a
+CPU this beats the sort of all (tile, depth) pairs that GPU rasterisers use.
 """
 
 # Numba's decorators are untyped.
@@ -12,7 +12,18 @@ from __future__ import annotations
 import numpy as np
 
 from alpasim_plugin.core.kernels import njit
-from alpasim_plugin.gaussians.constants import HALF_WIDTH, RADIUS_X, RADIUS_Y, RECORD, SLOPE, TILE, TOP_Y, U, V, Z
+from alpasim_plugin.gaussians.constants import (
+    HALF_WIDTH,
+    RADIUS_X,
+    RADIUS_Y,
+    RECORD,
+    SLOPE,
+    TILE,
+    TOP_Y,
+    U,
+    V,
+    Z,
+)
 from alpasim_plugin.gaussians.raster import simd as v
 
 _RADIX_BITS = 11
@@ -21,10 +32,12 @@ _LOW = np.int64(0xFFFFFFFF)
 
 @njit(cache=True, nogil=True)
 def depth_order(count, records, ids, depth_bits, pairs, spare):
-    """Return the array (``pairs`` or ``spare``) whose low 32 bits list the records nearest first, equal depths by identity.
+    """Return the array (``pairs`` or ``spare``) whose low 32 bits list the records nearest first,
+    equal depths by identity.
 
-    The key is the bit pattern of the float32 depth: non-negative floats sort as integers. Identities are given in input order, so the
-    result does not depend on the order in which threads wrote the records.
+    The key is the bit pattern of the float32 depth: non-negative floats sort as integers.
+    Identities are given in input order, so the result does not depend on the order in which threads
+    wrote the records.
     """
     if count == 0:
         return pairs
@@ -81,7 +94,10 @@ def _sort_by_identity(pairs, start, end, ids):
         identity = ids[item & _LOW]
         child = 2 * root + 1
         while child < last:
-            if child + 1 < last and ids[pairs[start + child + 1] & _LOW] > ids[pairs[start + child] & _LOW]:
+            if (
+                child + 1 < last
+                and ids[pairs[start + child + 1] & _LOW] > ids[pairs[start + child] & _LOW]
+            ):
                 child += 1
             if ids[pairs[start + child] & _LOW] <= identity:
                 break
@@ -114,9 +130,14 @@ def _order_ties(count, pairs, ids):
 
 @njit(cache=True, nogil=True, inline="always")
 def _tile_span(low, high, n_tiles):
-    """Return the first and one past the last tile whose pixel centres can lie between two coordinates."""
-    # Clamped as floats, since far off-screen bounds do not fit an integer; truncation is rounding down, as nothing is negative.
-    half, per_tile, zero = np.float32(0.5), np.float32(1.0 / TILE), np.float32(0.0)
+    """Return the first and one past the last tile whose pixel centres can lie between two
+    coordinates.
+    """
+    # Clamped as floats, since far off-screen bounds do not fit an integer; truncation is rounding
+    # down, as nothing is negative.
+    half = np.float32(0.5)
+    per_tile = np.float32(1.0 / TILE)
+    zero = np.float32(0.0)
     limit = np.float32(n_tiles)
     first = min(max((low - half) * per_tile, zero), limit)
     last = min(max((high - half) * per_tile + np.float32(1.0), zero), limit)
@@ -125,18 +146,27 @@ def _tile_span(low, high, n_tiles):
 
 @njit(cache=True, nogil=True, inline="always")
 def _ellipse_columns(records, at, row, tiles_x):
-    """Return the first and one past the last tile of a tile row that a splat's ellipse can touch."""
+    """Return the first and one past the last tile of a tile row that a splat's ellipse can
+    touch.
+    """
     centre, radius_y = records[at + V], records[at + RADIUS_Y]
     low = max(np.float32(row * TILE + 0.5) - centre, -radius_y)
     high = min(np.float32(row * TILE + TILE - 0.5) - centre, radius_y)
     left = right = records[at + RADIUS_X]
-    top_y, slope, half_width = records[at + TOP_Y], records[at + SLOPE], records[at + HALF_WIDTH]
-    one, zero, slack = np.float32(1.0), np.float32(0.0), np.float32(0.02)
-    # The rightmost point lies at dy = top_y and the leftmost at -top_y; outside of the band the nearer end of the band counts.
+    top_y = records[at + TOP_Y]
+    slope = records[at + SLOPE]
+    half_width = records[at + HALF_WIDTH]
+    one = np.float32(1.0)
+    zero = np.float32(0.0)
+    slack = np.float32(0.02)
+    # The rightmost point lies at dy = top_y and the leftmost at -top_y; outside of the band the
+    # nearer end of the band counts.
     if top_y < low or top_y > high:
         end = low if top_y < low else high
         share = end / radius_y
-        right = min(right, slope * end + half_width * np.sqrt(max(zero, one - share * share)) + slack)
+        right = min(
+            right, slope * end + half_width * np.sqrt(max(zero, one - share * share)) + slack
+        )
     if -top_y < low or -top_y > high:
         end = low if -top_y < low else high
         share = end / radius_y
@@ -147,14 +177,20 @@ def _ellipse_columns(records, at, row, tiles_x):
 @njit(cache=True, nogil=True, inline="always")
 def _tile_box(records, at, tiles_x, tiles_y):
     """Return the tiles of a splat's box: first and one past the last column, the same for rows."""
-    left, right = _tile_span(records[at + U] - records[at + RADIUS_X], records[at + U] + records[at + RADIUS_X], tiles_x)
-    top, bottom = _tile_span(records[at + V] - records[at + RADIUS_Y], records[at + V] + records[at + RADIUS_Y], tiles_y)
+    left, right = _tile_span(
+        records[at + U] - records[at + RADIUS_X], records[at + U] + records[at + RADIUS_X], tiles_x
+    )
+    top, bottom = _tile_span(
+        records[at + V] - records[at + RADIUS_Y], records[at + V] + records[at + RADIUS_Y], tiles_y
+    )
     return left, right, top, bottom
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _is_large(left, right, top, bottom):
-    """Return whether a box has corners that its ellipse may leave empty: such splats are listed row by row, the others box by box."""
+    """Return whether a box has corners that its ellipse may leave empty: such splats are listed row
+    by row, the others box by box.
+    """
     return bottom - top > 2 and right - left > 2
 
 
@@ -171,7 +207,8 @@ def _count_box(changes, stride, left, right, top, bottom):
 def count_tiles(cursor, count, chunk_size, order, records, tiles_x, tiles_y, boxes, histogram):
     """Count, per chunk of ``chunk_size`` splats in the order of depth, how many meet each tile.
 
-    ``boxes`` takes four int32 per rank, the tiles of the splat's box. A row of ``histogram`` takes changes of the counts from tile to tile.
+    ``boxes`` takes four int32 per rank, the tiles of the splat's box. A row of ``histogram`` takes
+    changes of the counts from tile to tile.
     """
     n_chunks, stride = histogram.shape[0], tiles_x + 1
     while True:
@@ -184,7 +221,12 @@ def count_tiles(cursor, count, chunk_size, order, records, tiles_x, tiles_y, box
             v.prefetch(records, (order[min(rank + 12, count - 1)] & _LOW) * RECORD)
             at = (order[rank] & _LOW) * RECORD
             left, right, top, bottom = _tile_box(records, at, tiles_x, tiles_y)
-            boxes[4 * rank], boxes[4 * rank + 1], boxes[4 * rank + 2], boxes[4 * rank + 3] = left, right, top, bottom
+            boxes[4 * rank], boxes[4 * rank + 1], boxes[4 * rank + 2], boxes[4 * rank + 3] = (
+                left,
+                right,
+                top,
+                bottom,
+            )
             if _is_large(left, right, top, bottom):
                 for row in range(top, bottom):
                     first, end = _ellipse_columns(records, at, row, tiles_x)
@@ -195,9 +237,11 @@ def count_tiles(cursor, count, chunk_size, order, records, tiles_x, tiles_y, box
 
 @njit(cache=True, nogil=True)
 def tile_offsets(histogram, tiles_x, starts):
-    """Turn the changes into each chunk's write positions; fill ``starts`` (tiles + 1); return the number of (splat, tile) pairs.
+    """Turn the changes into each chunk's write positions; fill ``starts`` (tiles + 1); return the
+    number of (splat, tile) pairs.
 
-    A row of ``histogram`` has a column and a row of tiles more than the image; positions lie at the tiles' own places in it.
+    A row of ``histogram`` has a column and a row of tiles more than the image; positions lie at the
+    tiles' own places in it.
     """
     n_chunks, stride = histogram.shape[0], tiles_x + 1
     n_rows = (starts.shape[0] - 1) // tiles_x
@@ -222,14 +266,17 @@ def tile_offsets(histogram, tiles_x, starts):
 
 @njit(cache=True, nogil=True, inline="always")
 def _append(lists, position, tile, record, present, nowhere):
-    """Append a record's number to a tile's list, or write it to ``nowhere``: no branch, since nobody could foresee it."""
+    """Append a record's number to a tile's list, or write it to ``nowhere``: no branch, since
+    nobody could foresee it.
+    """
     lists[position[tile] if present else nowhere] = record
     position[tile] += 1 if present else 0
 
 
 @njit(cache=True, nogil=True)
 def fill_tiles(cursor, count, chunk_size, order, records, boxes, tiles_x, histogram, pairs, lists):
-    """Write each tile's list of records; chunks ascend and so do the ranks in a chunk, hence every list is in depth order.
+    """Write each tile's list of records; chunks ascend and so do the ranks in a chunk, hence every
+    list is in depth order.
 
     ``lists`` has room for one more than there are ``pairs``.
     """
@@ -241,7 +288,10 @@ def fill_tiles(cursor, count, chunk_size, order, records, boxes, tiles_x, histog
         position = histogram[chunk]
         for rank in range(chunk * chunk_size, min((chunk + 1) * chunk_size, count)):
             record = np.int32(order[rank] & _LOW)
-            left, right, top, bottom = boxes[4 * rank], boxes[4 * rank + 1], boxes[4 * rank + 2], boxes[4 * rank + 3]
+            left = boxes[4 * rank]
+            right = boxes[4 * rank + 1]
+            top = boxes[4 * rank + 2]
+            bottom = boxes[4 * rank + 3]
             rows, columns = bottom - top, right - left
             if rows <= 2 and columns <= 2:
                 tile = top * stride + left

@@ -1,15 +1,18 @@
-"""Composite tiles for training and take the image's gradient back to the splats, sixteen pixels at a time.
+"""Composite tiles for training and take the image's gradient back to the splats, sixteen pixels at
+a time.
 
-The forward pass is that of `raster_kernels`; it keeps each pixel's transmittance and the last splat drawn there. The backward pass walks a
-tile's list from the back: with ``T`` the transmittance behind a splat and ``S`` what all splats behind it add to the loss,
+The forward pass is that of `raster_kernels`; it keeps each pixel's transmittance and the last splat
+drawn there. The backward pass walks a tile's list from the back: with ``T`` the transmittance
+behind a splat and ``S`` what all splats behind it add to the loss,
 
     T_before = T / (1 - alpha),    dL/dalpha = T_before q - S / (1 - alpha),    S <- S + T_before alpha q,
 
-where ``q`` is the splat's colour, depth and 1 weighted by the gradients of the pixel's sums. alpha is at most 0.99 and the division undoes
-the multiplication of the forward pass to rounding.
+where ``q`` is the splat's colour, depth and 1 weighted by the gradients of the pixel's sums. alpha
+is at most 0.99 and the division undoes the multiplication of the forward pass to rounding.
 
-Sums over the pixels of a tile go to one row per (splat, tile) pair, so that no two threads write to one place and the order of additions
-is fixed. They are moments of ``h = alpha dL/dalpha`` over the whitened coordinates ``s, t`` of the exponent, which stay small for needles.
+Sums over the pixels of a tile go to one row per (splat, tile) pair, so that no two threads write to
+one place and the order of additions is fixed. They are moments of ``h = alpha dL/dalpha`` over the
+whitened coordinates ``s, t`` of the exponent, which stay small for needles.
 """
 
 # Numba's decorators and vector types are untyped.
@@ -46,13 +49,21 @@ _f = np.float32
 _sh_terms = njit(cache=True, nogil=True, error_model="numpy")(sh_terms)
 _ALPHA_MAX = _f(ALPHA_MAX)
 
-# What the forward pass keeps per block: transmittance and position of the last splat drawn, sixteen pixels each.
+# What the forward pass keeps per block: transmittance and position of the last splat drawn, sixteen
+# pixels each.
 KEPT_T, KEPT_LAST = 0, 16
 KEPT = 32
-# Columns of a block in the backward pass: the above, then the sum S and the gradients of colour, depth sum and alpha.
-_S, _GR, _GG, _GB, _GD, _GA = 32, 48, 64, 80, 96, 112
+# Columns of a block in the backward pass: the above, then the sum S and the gradients of colour,
+# depth sum and alpha.
+_S = 32
+_GR = 48
+_GG = 64
+_GB = 80
+_GD = 96
+_GA = 112
 _BACK = 128
-# One row per (splat, tile) pair: gradients of colour and depth, then the moments of h: 1, s, t, s s, s t, t t.
+# One row per (splat, tile) pair: gradients of colour and depth, then the moments of h: 1, s, t, s
+# s, s t, t t.
 PAIR_R, PAIR_G, PAIR_B, PAIR_Z, PAIR_H, PAIR_S, PAIR_T, PAIR_SS, PAIR_ST, PAIR_TT = range(10)
 PAIR = 10
 
@@ -73,7 +84,9 @@ def composite_tiles(cursor, tiles_x, starts, lists, records, kept, colour, alpha
         depth_sum: float32 output ``(H, W)``, sum of weighted depths, metres.
     """
     state = np.empty(16 * STATE, np.float32)
-    last, near, masks = np.empty(256, np.float32), np.empty(CHUNK * RECORD, np.float32), np.empty(CHUNK, np.int32)
+    last = np.empty(256, np.float32)
+    near = np.empty(CHUNK * RECORD, np.float32)
+    masks = np.empty(CHUNK, np.int32)
     height, width = alpha.shape
     while True:
         tile = v.fetch_add(cursor, 0, 1)
@@ -83,7 +96,9 @@ def composite_tiles(cursor, tiles_x, starts, lists, records, kept, colour, alpha
         x0, y0 = _f(tile_x * TILE) + _f(0.5), _f(tile_y * TILE) + _f(0.5)
         live = start_tile(state, x0, y0, width, height)
         last[:] = _f(-1.0)
-        composite_tile(lists, starts[tile], starts[tile + 1], records, x0, y0, state, live, last, near, masks)
+        composite_tile(
+            lists, starts[tile], starts[tile + 1], records, x0, y0, state, live, last, near, masks
+        )
         for block in range(16):
             at = (tile * 16 + block) * KEPT
             v.store(kept, at + KEPT_T, v.absolute(v.load(state, block * STATE + STATE_T)))
@@ -95,12 +110,18 @@ def composite_tiles(cursor, tiles_x, starts, lists, records, kept, colour, alpha
                 at = place_of(row, column)
                 alpha[y, x] = _f(1.0) - abs(state[at + STATE_T])
                 depth_sum[y, x] = state[at + STATE_D]
-                colour[y, x, 0], colour[y, x, 1], colour[y, x, 2] = state[at + STATE_R], state[at + STATE_G], state[at + STATE_B]
+                colour[y, x, 0], colour[y, x, 1], colour[y, x, 2] = (
+                    state[at + STATE_R],
+                    state[at + STATE_G],
+                    state[at + STATE_B],
+                )
 
 
 @njit(cache=True, nogil=True)
 def _start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_depth):
-    """Load a tile's state; return the bit mask of blocks where anything was drawn and the position behind the last splat drawn."""
+    """Load a tile's state; return the bit mask of blocks where anything was drawn and the position
+    behind the last splat drawn.
+    """
     pixels[:] = _f(0.0)
     live, end = 0, 0
     for block in range(16):
@@ -114,7 +135,11 @@ def _start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_dep
             if last >= _f(0.0):  # pixels outside of the image have none
                 live |= 1 << block
                 end = max(end, int(last) + 1)
-                pixels[here + _GR], pixels[here + _GG], pixels[here + _GB] = g_colour[y, x, 0], g_colour[y, x, 1], g_colour[y, x, 2]
+                pixels[here + _GR], pixels[here + _GG], pixels[here + _GB] = (
+                    g_colour[y, x, 0],
+                    g_colour[y, x, 1],
+                    g_colour[y, x, 2],
+                )
                 pixels[here + _GD], pixels[here + _GA] = g_depth[y, x], g_alpha[y, x]
     return live, end
 
@@ -130,9 +155,20 @@ def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
         if todo == 0:
             continue
         place, peak = v.splat(_f(i)), v.splat(records[at + PEAK])
-        red, green, blue, depth = v.splat(records[at + R]), v.splat(records[at + G]), v.splat(records[at + B]), v.splat(records[at + Z])
-        to_red, to_green, to_blue, to_depth = zero, zero, zero, zero
-        m, m_s, m_t, m_ss, m_st, m_tt = zero, zero, zero, zero, zero, zero
+        red = v.splat(records[at + R])
+        green = v.splat(records[at + G])
+        blue = v.splat(records[at + B])
+        depth = v.splat(records[at + Z])
+        to_red = zero
+        to_green = zero
+        to_blue = zero
+        to_depth = zero
+        m = zero
+        m_s = zero
+        m_t = zero
+        m_ss = zero
+        m_st = zero
+        m_tt = zero
         while todo != 0:
             block = v.lowest_bit(todo)
             todo &= todo - 1
@@ -147,7 +183,9 @@ def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
             alpha = v.minimum(full, v.splat(_ALPHA_MAX))
             inverse = one / (one - alpha)
             before = v.load(pixels, base + KEPT_T) * inverse
-            g_red, g_green, g_blue = v.load(pixels, base + _GR), v.load(pixels, base + _GG), v.load(pixels, base + _GB)
+            g_red = v.load(pixels, base + _GR)
+            g_green = v.load(pixels, base + _GG)
+            g_blue = v.load(pixels, base + _GB)
             g_depth = v.load(pixels, base + _GD)
             q = v.fma(depth, g_depth, v.load(pixels, base + _GA))
             q = v.fma(red, g_red, v.fma(green, g_green, v.fma(blue, g_blue, q)))
@@ -155,23 +193,46 @@ def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
             weight = before * alpha
             v.store(pixels, base + KEPT_T, before)
             v.store(pixels, base + _S, v.fma(weight, q, behind))
-            to_red, to_green, to_blue = v.fma(weight, g_red, to_red), v.fma(weight, g_green, to_green), v.fma(weight, g_blue, to_blue)
+            to_red = v.fma(weight, g_red, to_red)
+            to_green = v.fma(weight, g_green, to_green)
+            to_blue = v.fma(weight, g_blue, to_blue)
             to_depth = v.fma(weight, g_depth, to_depth)
             # The clamp of alpha ends the gradient; colour and depth above still receive theirs.
-            h = v.select(full <= v.splat(_ALPHA_MAX), alpha * v.fnma(behind, inverse, before * q), zero)
+            h = v.select(
+                full <= v.splat(_ALPHA_MAX), alpha * v.fnma(behind, inverse, before * q), zero
+            )
             h_s, h_t = h * s, h * t
-            m, m_s, m_t = m + h, m_s + h_s, m_t + h_t
-            m_ss, m_st, m_tt = v.fma(h_s, s, m_ss), v.fma(h_s, t, m_st), v.fma(h_t, t, m_tt)
+            m = m + h
+            m_s = m_s + h_s
+            m_t = m_t + h_t
+            m_ss = v.fma(h_s, s, m_ss)
+            m_st = v.fma(h_s, t, m_st)
+            m_tt = v.fma(h_t, t, m_tt)
         row = (first + i) * PAIR
-        pairs[row + PAIR_R], pairs[row + PAIR_G], pairs[row + PAIR_B] = v.total(to_red), v.total(to_green), v.total(to_blue)
+        pairs[row + PAIR_R], pairs[row + PAIR_G], pairs[row + PAIR_B] = (
+            v.total(to_red),
+            v.total(to_green),
+            v.total(to_blue),
+        )
         pairs[row + PAIR_Z] = v.total(to_depth)
-        pairs[row + PAIR_H], pairs[row + PAIR_S], pairs[row + PAIR_T] = v.total(m), v.total(m_s), v.total(m_t)
-        pairs[row + PAIR_SS], pairs[row + PAIR_ST], pairs[row + PAIR_TT] = v.total(m_ss), v.total(m_st), v.total(m_tt)
+        pairs[row + PAIR_H], pairs[row + PAIR_S], pairs[row + PAIR_T] = (
+            v.total(m),
+            v.total(m_s),
+            v.total(m_t),
+        )
+        pairs[row + PAIR_SS], pairs[row + PAIR_ST], pairs[row + PAIR_TT] = (
+            v.total(m_ss),
+            v.total(m_st),
+            v.total(m_tt),
+        )
 
 
 @njit(cache=True, nogil=True)
-def tile_gradients(cursor, tiles_x, starts, lists, records, kept, g_colour, g_alpha, g_depth, pairs):
-    """Take the image's gradient to (splat, tile) pairs until no tile is left; called by each thread.
+def tile_gradients(
+    cursor, tiles_x, starts, lists, records, kept, g_colour, g_alpha, g_depth, pairs
+):
+    """Take the image's gradient to (splat, tile) pairs until no tile is left; called by each
+    thread.
 
     Args:
         cursor: int64 ``(1,)``, the next tile; shared by all threads.
@@ -208,22 +269,52 @@ def write_basis(basis, size, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def basis_gradient(weights, size, x, y, z):
-    """Return the gradient with respect to x, y and z of the harmonics' sum weighted by ``weights``."""
-    gx, gy, gz = 0.0, 0.0, 0.0
+    """Return the gradient with respect to x, y and z of the harmonics' sum weighted by
+    ``weights``.
+    """
+    gx = 0.0
+    gy = 0.0
+    gz = 0.0
     w = weights
     if size > 1:
-        gx, gy, gz = -C1 * w[3], -C1 * w[1], C1 * w[2]
+        gx = -C1 * w[3]
+        gy = -C1 * w[1]
+        gz = C1 * w[2]
     if size > 4:
         gx += C2[0] * (y * w[4] - z * w[7]) + 2 * x * (C2[2] * w[8] - C2[1] * w[6])
         gy += C2[0] * (x * w[4] - z * w[5]) - 2 * y * (C2[2] * w[8] + C2[1] * w[6])
         gz += -C2[0] * (y * w[5] + x * w[7]) + 4 * C2[1] * z * w[6]
     if size > 9:
-        xx, yy, zz = x * x, y * y, z * z
-        gx += -6 * C3[0] * x * y * w[9] + C3[1] * y * z * w[10] + 2 * C3[2] * x * y * w[11] - 6 * C3[3] * x * z * w[12]
-        gx += -C3[2] * (4 * zz - 3 * xx - yy) * w[13] + 2 * C3[4] * x * z * w[14] - 3 * C3[0] * (xx - yy) * w[15]
-        gy += -3 * C3[0] * (xx - yy) * w[9] + C3[1] * x * z * w[10] - C3[2] * (4 * zz - xx - 3 * yy) * w[11]
-        gy += -6 * C3[3] * y * z * w[12] + 2 * C3[2] * x * y * w[13] - 2 * C3[4] * y * z * w[14] + 6 * C3[0] * x * y * w[15]
-        gz += C3[1] * x * y * w[10] - 8 * C3[2] * (y * z * w[11] + x * z * w[13]) + C3[3] * (6 * zz - 3 * xx - 3 * yy) * w[12]
+        xx = x * x
+        yy = y * y
+        zz = z * z
+        gx += (
+            -6 * C3[0] * x * y * w[9]
+            + C3[1] * y * z * w[10]
+            + 2 * C3[2] * x * y * w[11]
+            - 6 * C3[3] * x * z * w[12]
+        )
+        gx += (
+            -C3[2] * (4 * zz - 3 * xx - yy) * w[13]
+            + 2 * C3[4] * x * z * w[14]
+            - 3 * C3[0] * (xx - yy) * w[15]
+        )
+        gy += (
+            -3 * C3[0] * (xx - yy) * w[9]
+            + C3[1] * x * z * w[10]
+            - C3[2] * (4 * zz - xx - 3 * yy) * w[11]
+        )
+        gy += (
+            -6 * C3[3] * y * z * w[12]
+            + 2 * C3[2] * x * y * w[13]
+            - 2 * C3[4] * y * z * w[14]
+            + 6 * C3[0] * x * y * w[15]
+        )
+        gz += (
+            C3[1] * x * y * w[10]
+            - 8 * C3[2] * (y * z * w[11] + x * z * w[13])
+            + C3[3] * (6 * zz - 3 * xx - 3 * yy) * w[12]
+        )
         gz += C3[4] * (xx - yy) * w[14]
     return gx, gy, gz
 
@@ -233,7 +324,8 @@ def colour_splats(cursor, chunk_size, count, ids, means, centre, sh, records):
     """Write the colours of projected splats; called by each thread.
 
     Args:
-        cursor: int64 ``(2,)``: the next chunk, and 1 where a colour was not finite; shared by all threads.
+        cursor: int64 ``(2,)``: the next chunk, and 1 where a colour was not finite; shared by all
+            threads.
         chunk_size: Splats taken at once.
         count: Records.
         ids: int64, which Gaussian a record shows.
@@ -250,10 +342,14 @@ def colour_splats(cursor, chunk_size, count, ids, means, centre, sh, records):
             return
         for place in range(first, min(first + chunk_size, count)):
             i = ids[place]
-            x, y, z = means[i, 0] - centre[0], means[i, 1] - centre[1], means[i, 2] - centre[2]
+            x = means[i, 0] - centre[0]
+            y = means[i, 1] - centre[1]
+            z = means[i, 2] - centre[2]
             length = 1.0 / np.sqrt(x * x + y * y + z * z)
             write_basis(basis, size, x * length, y * length, z * length)
-            red, green, blue = 0.5, 0.5, 0.5
+            red = 0.5
+            green = 0.5
+            blue = 0.5
             for k in range(size):
                 red += basis[k] * sh[i, k, 0]
                 green += basis[k] * sh[i, k, 1]
@@ -261,4 +357,8 @@ def colour_splats(cursor, chunk_size, count, ids, means, centre, sh, records):
             if not np.isfinite(red + green + blue):
                 cursor[1] = 1
             at = place * RECORD
-            records[at + R], records[at + G], records[at + B] = max(red, 0.0), max(green, 0.0), max(blue, 0.0)
+            records[at + R], records[at + G], records[at + B] = (
+                max(red, 0.0),
+                max(green, 0.0),
+                max(blue, 0.0),
+            )

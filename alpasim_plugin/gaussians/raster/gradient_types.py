@@ -39,9 +39,22 @@ class Splats:
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim else -1
-        found = {name: tuple(getattr(self, name).shape) for name in ("means", "log_scales", "quaternions", "logit_opacities", "sh")}
-        wanted = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "logit_opacities": (n,)}
-        sh_ok = self.sh.ndim == 3 and self.sh.shape[0] == n and self.sh.shape[1] in SH_SIZES and self.sh.shape[2] == 3
+        found = {
+            name: tuple(getattr(self, name).shape)
+            for name in ("means", "log_scales", "quaternions", "logit_opacities", "sh")
+        }
+        wanted = {
+            "means": (n, 3),
+            "log_scales": (n, 3),
+            "quaternions": (n, 4),
+            "logit_opacities": (n,),
+        }
+        sh_ok = (
+            self.sh.ndim == 3
+            and self.sh.shape[0] == n
+            and self.sh.shape[1] in SH_SIZES
+            and self.sh.shape[2] == 3
+        )
         if n < 0 or any(found[name] != shape for name, shape in wanted.items()) or not sh_ok:
             raise InputError(
                 "building splats for training",
@@ -55,15 +68,20 @@ class Splats:
         return int(self.means.shape[0])
 
     @classmethod
-    def from_cloud(cls, cloud: GaussianCloud, dtype: torch.dtype = torch.float32, device: str = "cpu") -> Splats:
-        """Copy a cloud; scales below ``exp(-20)`` m are raised to it and opacities kept 1e-6 away from 0 and 1.
+    def from_cloud(
+        cls, cloud: GaussianCloud, dtype: torch.dtype = torch.float32, device: str = "cpu"
+    ) -> Splats:
+        """Copy a cloud; scales below ``exp(-20)`` m are raised to it and opacities kept 1e-6 away
+        from 0 and 1.
 
         Raises:
             InputError: The cloud holds Gaussians that cannot be drawn.
         """
         cloud.require_drawable("copying a cloud for training")
         scales = np.log(np.maximum(cloud.scales.astype(np.float64), np.exp(-LOG_SCALE_LIMIT)))
-        logits = logit(np.clip(cloud.opacities.astype(np.float64), _OPACITY_LIMIT, 1 - _OPACITY_LIMIT))
+        logits = logit(
+            np.clip(cloud.opacities.astype(np.float64), _OPACITY_LIMIT, 1 - _OPACITY_LIMIT)
+        )
         arrays = (cloud.means, scales, cloud.quats, logits, cloud.sh)
         return cls(*(torch.as_tensor(np.array(a), dtype=dtype, device=device) for a in arrays))
 
@@ -73,9 +91,10 @@ class ScreenStatistics:
     """What density control needs to know of one view.
 
     Attributes:
-        radii: ``(N,)`` int32, half the longer side of the box around the drawn ellipse, pixels, rounded up; 0 where a Gaussian does not
-            reach the image.
-        gradient_norm: ``(N,)`` float32, length of the gradient of the loss by the mean in pixels; None until the backward pass has run.
+        radii: ``(N,)`` int32, half the longer side of the box around the drawn ellipse, pixels,
+            rounded up; 0 where a Gaussian does not reach the image.
+        gradient_norm: ``(N,)`` float32, length of the gradient of the loss by the mean in pixels;
+            None until the backward pass has run.
     """
 
     radii: Tensor

@@ -22,10 +22,13 @@ class RasterOutput:
 
     Attributes:
         rgb: ``(H, W, 3)`` float32, 0..1, background included, clamped after compositing.
-        alpha: ``(H, W)`` float32, accumulated opacity 1 - T; a wall of opaque splats ends at 0.99, not 1.
-        depth: ``(H, W)`` float32 metres along the optical axis, alpha-weighted mean over the splats of the pixel; 0 where alpha is 0, so
-            read it together with `depth_valid`. At silhouettes it lies between the surfaces.
-        stats: Counts of the frame: ``gaussians``, ``visible`` and, for the tiled backend, ``pairs``.
+        alpha: ``(H, W)`` float32, accumulated opacity 1 - T; a wall of opaque splats ends at 0.99,
+            not 1.
+        depth: ``(H, W)`` float32 metres along the optical axis, alpha-weighted mean over the splats
+            of the pixel; 0 where alpha is 0, so read it together with `depth_valid`. At silhouettes
+            it lies between the surfaces.
+        stats: Counts of the frame: ``gaussians``, ``visible`` and, for the tiled backend,
+            ``pairs``.
     """
 
     rgb: F32
@@ -39,8 +42,12 @@ class RasterOutput:
         return self.alpha > 0
 
     def surface_depth(self) -> F32:
-        """Return ``(H, W)``: the depth where the splats are at least half opaque, 0 where the background shows through."""
-        return np.asarray(cv2.copyTo(self.depth, cv2.compare(self.alpha, 0.5, cv2.CMP_GE)), np.float32)
+        """Return ``(H, W)``: the depth where the splats are at least half opaque, 0 where the
+        background shows through.
+        """
+        return np.asarray(
+            cv2.copyTo(self.depth, cv2.compare(self.alpha, 0.5, cv2.CMP_GE)), np.float32
+        )
 
     def to_uint8(self) -> npt.NDArray[np.uint8]:
         """Return ``(H, W, 3)`` uint8 sRGB, rounded to nearest."""
@@ -64,6 +71,11 @@ def background_image(background: Background, camera: PinholeCamera) -> F32:
             f"give (r, g, b) or an image of shape ({camera.height}, {camera.width}, 3)",
         )
     if not np.isfinite(value).all():
-        raise InputError("reading a background", "its values", "NaN or infinity", "give finite numbers, 0..1 for sRGB")
+        raise InputError(
+            "reading a background",
+            "its values",
+            "NaN or infinity",
+            "give finite numbers, 0..1 for sRGB",
+        )
     # Read-only arrays are another type to compiled code and would be compiled for again.
     return np.require(value, np.float32, ["C_CONTIGUOUS", "WRITEABLE"])

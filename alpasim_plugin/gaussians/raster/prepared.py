@@ -31,14 +31,16 @@ _LANES = 16
 
 @dataclass(frozen=True, eq=False)
 class PreparedCloud:
-    """A cloud ready for repeated rendering. Build it with `prepare`; the arrays are private to the rasteriser (see `constants`).
+    """A cloud ready for repeated rendering. Build it with `prepare`; the arrays are private to the
+    rasteriser (see `constants`).
 
     Attributes:
         n_input: Gaussians of the cloud.
         n_kept: Those of them that can reach the alpha cut.
         sh_frame: Axes in which view directions meet the colour coefficients.
         sh_size: Coefficients per colour.
-        means: float64, groups of 3 x 16 lanes; Gaussians are ordered along a space-filling curve, so that whole bundles leave the view.
+        means: float64, groups of 3 x 16 lanes; Gaussians are ordered along a space-filling curve,
+            so that whole bundles leave the view.
         geometry: float32, groups of GEO_SIZE x 16 lanes.
         sh: float32, groups of sh_size x 3 x 16 lanes.
         index: int64, position of each lane's Gaussian in the cloud given.
@@ -66,7 +68,9 @@ class PreparedCloud:
 
     def __reduce__(self) -> tuple[type[PreparedCloud], tuple[Any, ...]]:
         """Pickle without the row: addresses hold in one process."""
-        return PreparedCloud, tuple(getattr(self, field.name) for field in fields(self) if field.init)
+        return PreparedCloud, tuple(
+            getattr(self, field.name) for field in fields(self) if field.init
+        )
 
     def __len__(self) -> int:
         """Return the number of Gaussians kept."""
@@ -74,20 +78,25 @@ class PreparedCloud:
 
 
 def part_row(arrays: tuple[npt.NDArray[Any], ...], sh_size: int, n_input: int) -> I64:
-    """Return a cloud as the kernels read it, columns ``PART_*``: addresses of its means, geometry, colours, index, spheres and sphere.
+    """Return a cloud as the kernels read it, columns ``PART_*``: addresses of its means, geometry,
+    colours, index, spheres and sphere.
 
     The arrays have the types of `PreparedCloud`, and must live as long as the row is used.
     """
-    return np.array([*(array.ctypes.data for array in arrays), len(arrays[3]) // _LANES, sh_size, n_input])
+    return np.array(
+        [*(array.ctypes.data for array in arrays), len(arrays[3]) // _LANES, sh_size, n_input]
+    )
 
 
 def prepare(cloud: GaussianCloud, *, sh_frame: ShFrame = "object") -> PreparedCloud:
-    """Prepare a cloud for `rasterize_prepared`; costs about as much as drawing a few frames and holds its own copy.
+    """Prepare a cloud for `rasterize_prepared`; costs about as much as drawing a few frames and
+    holds its own copy.
 
     Args:
         cloud: Gaussians in their own frame (the world for a background, the box of an actor).
-        sh_frame: ``object`` turns view-dependent colour with the node, which is right for poses that were not trained; ``world``
-            evaluates world directions, as checkpoints of Street Gaussians, drivestudio and MTGS were optimised.
+        sh_frame: ``object`` turns view-dependent colour with the node, which is right for poses
+            that were not trained; ``world`` evaluates world directions, as checkpoints of Street
+            Gaussians, drivestudio and MTGS were optimised.
 
     Raises:
         InputError: The cloud holds Gaussians that cannot be drawn.
@@ -96,18 +105,33 @@ def prepare(cloud: GaussianCloud, *, sh_frame: ShFrame = "object") -> PreparedCl
     index = np.flatnonzero(cloud.opacities >= ALPHA_MIN)
     index = index[np.argsort(_morton_codes(cloud.means[index]), kind="stable")]
     n, size = len(index), cloud.sh.shape[1]
-    kept = GaussianCloud(cloud.means[index], cloud.quats[index], cloud.scales[index], cloud.opacities[index], np.empty((n, 1, 3)))
+    kept = GaussianCloud(
+        cloud.means[index],
+        cloud.quats[index],
+        cloud.scales[index],
+        cloud.opacities[index],
+        np.empty((n, 1, 3)),
+    )
     sh = np.empty((n + (-n % _LANES)) * size * 3, np.float32)
     coefficients = cloud.sh.reshape(-1).view()
-    coefficients.flags.writeable = False  # as in a fresh cloud, also where this one was unpickled: one type for compiled code
+    coefficients.flags.writeable = (
+        False  # as in a fresh cloud, also where this one was unpickled: one type for compiled code
+    )
     colours_in_lanes(coefficients, size * 3, index, sh)
     opacity = kept.opacities.astype(np.float64)
     geometry = np.zeros((n, GEO_SIZE), np.float32)
-    geometry[:, GEO_FACTOR : GEO_FACTOR + 9] = (kept.rotations() * kept.scales.astype(np.float64)[:, None, :]).reshape(n, 9)
+    geometry[:, GEO_FACTOR : GEO_FACTOR + 9] = (
+        kept.rotations() * kept.scales.astype(np.float64)[:, None, :]
+    ).reshape(n, 9)
     geometry[:, GEO_PEAK] = (np.log2(opacity) + 4.0) / 8.0
-    geometry[:, GEO_EXTENT] = np.minimum(EXTENT_MAX_SIGMA, np.sqrt(2 * np.log(np.maximum(opacity / ALPHA_MIN, 1.0))))
-    geometry[:, GEO_REACH] = np.maximum(np.maximum(*kept.scales[:, :2].T), kept.scales[:, 2])  # numpy is slow along an axis of three
-    # A mean of NaN in the lanes that fill up the last group fails every comparison, so they are never drawn.
+    geometry[:, GEO_EXTENT] = np.minimum(
+        EXTENT_MAX_SIGMA, np.sqrt(2 * np.log(np.maximum(opacity / ALPHA_MIN, 1.0)))
+    )
+    geometry[:, GEO_REACH] = np.maximum(
+        np.maximum(*kept.scales[:, :2].T), kept.scales[:, 2]
+    )  # numpy is slow along an axis of three
+    # A mean of NaN in the lanes that fill up the last group fails every comparison, so they are
+    # never drawn.
     means, reach = kept.means.astype(np.float64), geometry[:, GEO_REACH].astype(np.float64)
     return PreparedCloud(
         len(cloud),
@@ -132,12 +156,16 @@ def _in_lanes(columns: npt.NDArray[np.floating], fill: float) -> npt.NDArray[Any
 
 
 def _bounding_spheres(means: F64, reach: F64, bundle: int) -> F64:
-    """Return centre and radius of the means and the largest scale of each ``bundle`` Gaussians in a row, flat."""
+    """Return centre and radius of the means and the largest scale of each ``bundle`` Gaussians in a
+    row, flat.
+    """
     if len(means) == 0:
         return np.zeros(0)
     starts = np.arange(0, len(means), bundle)
     columns = np.ascontiguousarray(means.T)
-    centre = (np.minimum.reduceat(columns, starts, axis=1) + np.maximum.reduceat(columns, starts, axis=1)) / 2
+    centre = (
+        np.minimum.reduceat(columns, starts, axis=1) + np.maximum.reduceat(columns, starts, axis=1)
+    ) / 2
     x, y, z = columns - centre[:, np.arange(len(means)) // bundle]
     distance = np.sqrt(x * x + y * y + z * z)
     # Slightly enlarged: the radius must also hold after rounding.
@@ -146,13 +174,20 @@ def _bounding_spheres(means: F64, reach: F64, bundle: int) -> F64:
 
 
 def _morton_codes(points: npt.NDArray[np.floating]) -> npt.NDArray[np.uint64]:
-    """Return the positions of points ``(N, 3)`` along a Z-order curve through their bounding box, 16 bits an axis."""
+    """Return the positions of points ``(N, 3)`` along a Z-order curve through their bounding box,
+    16 bits an axis.
+    """
     if len(points) == 0:
         return np.zeros(0, np.uint64)
     columns = np.ascontiguousarray(points.T)
     low = columns.min(axis=1, keepdims=True)
     span = np.maximum(columns.max(axis=1, keepdims=True) - low, 1e-9).max()
     cell = np.minimum((columns - low) / span * 65536.0, 65535.0).astype(np.uint64)
-    for shift, mask in ((16, 0x0000FF0000FF), (8, 0x00F00F00F00F), (4, 0x0C30C30C30C3), (2, 0x249249249249)):
+    for shift, mask in (
+        (16, 0x0000FF0000FF),
+        (8, 0x00F00F00F00F),
+        (4, 0x0C30C30C30C3),
+        (2, 0x249249249249),
+    ):
         cell = (cell | (cell << np.uint64(shift))) & np.uint64(mask)
     return np.asarray(cell[0] | (cell[1] << np.uint64(1)) | (cell[2] << np.uint64(2)))

@@ -1,4 +1,6 @@
-"""Project prepared Gaussians, sixteen at a time; `alpasim_plugin.gaussians.raster.rasterize_reference` is the reference implementation."""
+"""Project prepared Gaussians, sixteen at a time;
+`alpasim_plugin.gaussians.raster.rasterize_reference` is the reference implementation.
+"""
 
 # Numba's decorators and vector types are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
@@ -66,7 +68,9 @@ from alpasim_plugin.gaussians.sh import C0, C1, C2, C3
 
 _f = np.float32
 _EPS = _f(EPS2D_PX2)
-_MARGIN_PX = _f(0.01)  # boxes and culls are grown by this: rounding must never cut a pixel that the alpha test would draw
+_MARGIN_PX = _f(
+    0.01
+)  # boxes and culls are grown by this: rounding must never cut a pixel that the alpha test would draw
 _LOWPASS_REACH_PX = EXTENT_MAX_SIGMA * EPS2D_PX2**0.5 + 0.5
 _CUT = (np.log2(ALPHA_MIN) + 4.0) / 8.0
 _BLOCK_HALF = _f(1.5)
@@ -76,10 +80,13 @@ _BLOCK_HALF = _f(1.5)
 def bundle_is_out_of_view(sphere, at, pose, camera):
     """Return whether no Gaussian of a bundle can touch a pixel; errs only towards False.
 
-    A splat's half width on screen is at most 3.33 (f/z s sqrt(1 + slope^2) + sqrt(0.3)) for its largest scale s and the clamped slope, so
-    "right of the image" is the half space x - z (W - cx + 1.9)/f > 3.33 s sqrt(1 + slope^2), and likewise for the other edges.
+    A splat's half width on screen is at most 3.33 (f/z s sqrt(1 + slope^2) + sqrt(0.3)) for its
+    largest scale s and the clamped slope, so "right of the image" is the half space x - z (W - cx +
+    1.9)/f > 3.33 s sqrt(1 + slope^2), and likewise for the other edges.
     """
-    dx, dy, dz = sphere[at] - pose[POSE_CENTRE], sphere[at + 1] - pose[POSE_CENTRE + 1], sphere[at + 2] - pose[POSE_CENTRE + 2]
+    dx = sphere[at] - pose[POSE_CENTRE]
+    dy = sphere[at + 1] - pose[POSE_CENTRE + 1]
+    dz = sphere[at + 2] - pose[POSE_CENTRE + 2]
     radius, reach = sphere[at + 3], sphere[at + 4] * EXTENT_MAX_SIGMA
     r = POSE_ROTATION
     x = pose[r] * dx + pose[r + 1] * dy + pose[r + 2] * dz
@@ -93,7 +100,10 @@ def bundle_is_out_of_view(sphere, at, pose, camera):
     above = (camera[CAM_CY] + _LOWPASS_REACH_PX) / camera[CAM_FY]
     slope_x = max(abs(camera[CAM_SLOPE_LOW_X]), abs(camera[CAM_SLOPE_HIGH_X]))
     slope_y = max(abs(camera[CAM_SLOPE_LOW_Y]), abs(camera[CAM_SLOPE_HIGH_Y]))
-    reach_x, reach_y = reach * np.sqrt(1.0 + slope_x * slope_x), reach * np.sqrt(1.0 + slope_y * slope_y)
+    reach_x, reach_y = (
+        reach * np.sqrt(1.0 + slope_x * slope_x),
+        reach * np.sqrt(1.0 + slope_y * slope_y),
+    )
     return (
         x - z * right > reach_x + radius * np.sqrt(1.0 + right * right)
         or -x - z * left > reach_x + radius * np.sqrt(1.0 + left * left)
@@ -104,9 +114,11 @@ def bundle_is_out_of_view(sphere, at, pose, camera):
 
 @njit(cache=True, nogil=True)
 def colours_in_lanes(coefficients, width, index, out):
-    """Copy rows of ``width`` coefficients chosen by ``index`` into groups of ``width`` x 16 lanes; lanes left over are zero.
+    """Copy rows of ``width`` coefficients chosen by ``index`` into groups of ``width`` x 16 lanes;
+    lanes left over are zero.
 
-    The colours are most of a cloud's bytes: this passes over them once, where array expressions would pass four times.
+    The colours are most of a cloud's bytes: this passes over them once, where array expressions
+    would pass four times.
     """
     n_groups = out.shape[0] // (width * 16)
     for group in range(n_groups):
@@ -124,11 +136,17 @@ def colours_in_lanes(coefficients, width, index, out):
 
 @njit(cache=True, nogil=True)
 def bundles_in_view(parts, poses, camera):
-    """Return where each part's bundles begin in the row of all that are looked at, and where the last end; none of a part out of view."""
+    """Return where each part's bundles begin in the row of all that are looked at, and where the
+    last end; none of a part out of view.
+    """
     first = np.zeros(parts.shape[0] + 1, np.int64)
     for i in range(parts.shape[0]):
-        seen = not bundle_is_out_of_view(v.array_at(parts[i, PART_SPHERE], np.float64), np.int64(0), poses[i], camera)
-        first[i + 1] = first[i] + ((parts[i, PART_GROUPS] * 16 + BUNDLE - 1) // BUNDLE if seen else 0)
+        seen = not bundle_is_out_of_view(
+            v.array_at(parts[i, PART_SPHERE], np.float64), np.int64(0), poses[i], camera
+        )
+        first[i + 1] = first[i] + (
+            (parts[i, PART_GROUPS] * 16 + BUNDLE - 1) // BUNDLE if seen else 0
+        )
     return first
 
 
@@ -141,7 +159,9 @@ def _write_basis(basis, x, y, z, size):
         v.store(basis, 32, v.splat(_f(C1)) * z)
         v.store(basis, 48, v.splat(_f(-C1)) * x)
     if size > 4:
-        xx, yy, zz = x * x, y * y, z * z
+        xx = x * x
+        yy = y * y
+        zz = z * z
         two_zz = zz + zz
         difference = xx - yy
         v.store(basis, 64, v.splat(_f(C2[0])) * x * y)
@@ -194,16 +214,25 @@ def _jacobian_row(scale, slope, across, ahead):
 def _times(row, rows):
     """Return a row times a matrix of three rows."""
     a, b, c = rows
-    return _dot(row, (a[0], b[0], c[0])), _dot(row, (a[1], b[1], c[1])), _dot(row, (a[2], b[2], c[2]))
+    return (
+        _dot(row, (a[0], b[0], c[0])),
+        _dot(row, (a[1], b[1], c[1])),
+        _dot(row, (a[2], b[2], c[2])),
+    )
 
 
 @njit(cache=True, nogil=True)
 def _project_group(group, means, geometry, sh, sh_size, pose, camera, basis, lanes):
-    """Project sixteen Gaussians into ``lanes`` (RECORD columns of sixteen) and return the bit mask of those that reach the image."""
+    """Project sixteen Gaussians into ``lanes`` (RECORD columns of sixteen) and return the bit mask
+    of those that reach the image.
+    """
     x, y, z = _load3(means, group * 48)
-    dx, dy, dz = x - v.splat(pose[POSE_CENTRE]), y - v.splat(pose[POSE_CENTRE + 1]), z - v.splat(pose[POSE_CENTRE + 2])
+    dx = x - v.splat(pose[POSE_CENTRE])
+    dy = y - v.splat(pose[POSE_CENTRE + 1])
+    dz = z - v.splat(pose[POSE_CENTRE + 2])
     r = POSE_ROTATION
-    # Depth decides the order and is kept in float64 up to here; everything else tolerates float32 relative to the camera.
+    # Depth decides the order and is kept in float64 up to here; everything else tolerates float32
+    # relative to the camera.
     z64 = v.splat(pose[r + 6]) * dx + v.splat(pose[r + 7]) * dy + v.splat(pose[r + 8]) * dz
     mask = (z64 >= v.splat(pose[POSE_NEAR])) & (z64 <= v.splat(pose[POSE_FAR]))
     if v.bits(mask) == 0:
@@ -217,14 +246,22 @@ def _project_group(group, means, geometry, sh, sh_size, pose, camera, basis, lan
 
 @njit(cache=True, nogil=True)
 def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
-    """Write the ellipses of Gaussians at ``d`` from the camera's centre; returns the bit mask of those that reach the image."""
-    right, down, ahead = _row(pose, POSE_ROTATION), _row(pose, POSE_ROTATION + 3), _row(pose, POSE_ROTATION + 6)
+    """Write the ellipses of Gaussians at ``d`` from the camera's centre; returns the bit mask of
+    those that reach the image.
+    """
+    right = _row(pose, POSE_ROTATION)
+    down = _row(pose, POSE_ROTATION + 3)
+    ahead = _row(pose, POSE_ROTATION + 6)
     fx, fy = v.splat(camera[CAM_FX]), v.splat(camera[CAM_FY])
     inverse_z = v.splat(_f(1.0)) / z
     slope_x, slope_y = _dot(right, d) * inverse_z, _dot(down, d) * inverse_z
     u, w = v.fma(fx, slope_x, v.splat(camera[CAM_CX])), v.fma(fy, slope_y, v.splat(camera[CAM_CY]))
-    a = v.minimum(v.maximum(slope_x, v.splat(camera[CAM_SLOPE_LOW_X])), v.splat(camera[CAM_SLOPE_HIGH_X]))
-    b = v.minimum(v.maximum(slope_y, v.splat(camera[CAM_SLOPE_LOW_Y])), v.splat(camera[CAM_SLOPE_HIGH_Y]))
+    a = v.minimum(
+        v.maximum(slope_x, v.splat(camera[CAM_SLOPE_LOW_X])), v.splat(camera[CAM_SLOPE_HIGH_X])
+    )
+    b = v.minimum(
+        v.maximum(slope_y, v.splat(camera[CAM_SLOPE_LOW_Y])), v.splat(camera[CAM_SLOPE_HIGH_Y])
+    )
 
     # Rows m, n of M = J R R_q diag(s).
     geo = group * (GEO_SIZE * 16)
@@ -232,7 +269,9 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     factor = _load3(geometry, f), _load3(geometry, f + 48), _load3(geometry, f + 96)
     m = _times(_jacobian_row(fx * inverse_z, a, right, ahead), factor)
     n = _times(_jacobian_row(fy * inverse_z, b, down, ahead), factor)
-    mm, nn, mn = _dot(m, m), _dot(n, n), _dot(m, n)
+    mm = _dot(m, m)
+    nn = _dot(n, n)
+    mn = _dot(m, n)
     eps = v.splat(_EPS)
     c11, c22 = mm + eps, nn + eps
     extent = v.load(geometry, geo + GEO_EXTENT * 16)
@@ -247,10 +286,13 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     if chosen == 0:
         return 0
 
-    # Variance of x given y, det / C22, from the Cauchy-Binet parts: scaled before squaring, so that it neither cancels nor overflows.
+    # Variance of x given y, det / C22, from the Cauchy-Binet parts: scaled before squaring, so that
+    # it neither cancels nor overflows.
     inverse_c22 = v.splat(_f(1.0)) / c22
     root = v.sqrt(inverse_c22)
-    x01, x02, x12 = v.fnma(m[1], n[0], m[0] * n[1]), v.fnma(m[2], n[0], m[0] * n[2]), v.fnma(m[2], n[1], m[1] * n[2])
+    x01 = v.fnma(m[1], n[0], m[0] * n[1])
+    x02 = v.fnma(m[2], n[0], m[0] * n[2])
+    x12 = v.fnma(m[2], n[1], m[1] * n[2])
     minors = x01 * root, x02 * root, x12 * root
     variance = _dot(minors, minors) + eps * ((c11 + nn) * inverse_c22)
     deviation = v.sqrt(variance)
@@ -262,7 +304,11 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     peak = v.load(geometry, geo + GEO_PEAK * 16)
     block_half = v.splat(_BLOCK_HALF)
     corner_s, corner_t = block_half * (l11 + v.absolute(l12)), block_half * l22
-    block_radius = v.sqrt(peak - v.splat(_f(_CUT))) + v.sqrt(v.fma(corner_s, corner_s, corner_t * corner_t)) + v.splat(_f(1e-3))
+    block_radius = (
+        v.sqrt(peak - v.splat(_f(_CUT)))
+        + v.sqrt(v.fma(corner_s, corner_s, corner_t * corner_t))
+        + v.splat(_f(1e-3))
+    )
 
     v.store(lanes, U * 16, u)
     v.store(lanes, V * 16, w)
@@ -282,18 +328,24 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
 
 @njit(cache=True, nogil=True)
 def _colour_group(group, d, sh, sh_size, pose, basis, lanes):
-    """Write the colours of sixteen Gaussians at ``d`` from the camera's centre, clamped at 0 below."""
+    """Write the colours of sixteen Gaussians at ``d`` from the camera's centre, clamped at 0
+    below.
+    """
     c = POSE_COLOUR
     t = _dot(_row(pose, c), d), _dot(_row(pose, c + 3), d), _dot(_row(pose, c + 6), d)
     length = v.splat(_f(1.0)) / v.sqrt(_dot(t, t))
     _write_basis(basis, t[0] * length, t[1] * length, t[2] * length, sh_size)
     half, zero = v.splat(_f(0.5)), v.splat(_f(0.0))
-    red, green, blue = half, half, half
+    red = half
+    green = half
+    blue = half
     colour = group * sh_size * 48
     for k in range(sh_size):
         value = v.load(basis, k * 16)
         r, g, b = _load3(sh, colour + k * 48)
-        red, green, blue = v.fma(value, r, red), v.fma(value, g, green), v.fma(value, b, blue)
+        red = v.fma(value, r, red)
+        green = v.fma(value, g, green)
+        blue = v.fma(value, b, blue)
     v.store(lanes, R * 16, v.maximum(red, zero))
     v.store(lanes, G * 16, v.maximum(green, zero))
     v.store(lanes, B * 16, v.maximum(blue, zero))
@@ -301,13 +353,16 @@ def _colour_group(group, d, sh, sh_size, pose, basis, lanes):
 
 @njit(cache=True, nogil=True)
 def project_parts(cursor, parts, first_bundles, first_ids, poses, camera, records, ids):
-    """Project the Gaussians of all parts and append those that reach the image; called by each thread until no bundle is left.
+    """Project the Gaussians of all parts and append those that reach the image; called by each
+    thread until no bundle is left.
 
     Args:
-        cursor: int64 ``(2,)``: the next bundle, the number of records written; shared by all threads.
+        cursor: int64 ``(2,)``: the next bundle, the number of records written; shared by all
+            threads.
         parts: int64 ``(N, PART_SIZE)``, see `constants`.
         first_bundles: int64 ``(N + 1,)``, from `bundles_in_view`.
-        first_ids: int64 ``(N,)``, added to a Gaussian's position in its cloud; makes identities unique and ordered by part.
+        first_ids: int64 ``(N,)``, added to a Gaussian's position in its cloud; makes identities
+            unique and ordered by part.
         poses: float64 ``(N, POSE_SIZE)``, see `constants`.
         camera: See `constants`.
         records: float32 output, RECORD per splat.
@@ -326,9 +381,17 @@ def project_parts(cursor, parts, first_bundles, first_ids, poses, camera, record
             i += 1
             while first_bundles[i + 1] <= bundle:
                 i += 1
-            end, pose, sh_size = first_bundles[i + 1], poses[i], parts[i, PART_SH_SIZE]
-            means, spheres = v.array_at(parts[i, PART_MEANS], np.float64), v.array_at(parts[i, PART_SPHERES], np.float64)
-            geometry, sh = v.array_at(parts[i, PART_GEOMETRY], np.float32), v.array_at(parts[i, PART_SH], np.float32)
+            end = first_bundles[i + 1]
+            pose = poses[i]
+            sh_size = parts[i, PART_SH_SIZE]
+            means, spheres = (
+                v.array_at(parts[i, PART_MEANS], np.float64),
+                v.array_at(parts[i, PART_SPHERES], np.float64),
+            )
+            geometry, sh = (
+                v.array_at(parts[i, PART_GEOMETRY], np.float32),
+                v.array_at(parts[i, PART_SH], np.float32),
+            )
             index = v.array_at(parts[i, PART_INDEX], np.int64)
         at = bundle - first_bundles[i]
         if bundle_is_out_of_view(spheres, at * SPHERE_SIZE, pose, camera):
@@ -345,7 +408,9 @@ def project_parts(cursor, parts, first_bundles, first_ids, poses, camera, record
                 kept_ids[count] = index[group * 16 + lane] + first_ids[i]
                 count += 1
         out = v.fetch_add(cursor, 1, count)
-        for j in range(count * RECORD):  # no slices: numba would compile the text of an error about their shapes for seconds
+        for j in range(
+            count * RECORD
+        ):  # no slices: numba would compile the text of an error about their shapes for seconds
             records[out * RECORD + j] = kept[j]
         for j in range(count):
             ids[out + j] = kept_ids[j]

@@ -28,16 +28,19 @@ def rasterize(
         cloud: Gaussians in world coordinates.
         camera: From where.
         background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything, 0..1.
-        backend: ``cpu`` (fast), ``reference`` (float64, slow, the definition), ``torch`` (differentiable) or ``gsplat`` (GPU).
+        backend: ``cpu`` (fast), ``reference`` (float64, slow, the definition), ``torch``
+            (differentiable) or ``gsplat`` (GPU).
         near_m: Gaussians whose centre is nearer are left out.
-        lod_px: Gaussians whose screen radius before the low-pass is smaller are left out; 0 draws all.
+        lod_px: Gaussians whose screen radius before the low-pass is smaller are left out; 0 draws
+            all.
 
     Returns:
         Colour, accumulated alpha and depth.
 
     Raises:
         InputError: Unknown backend, or a cloud or background that cannot be drawn.
-        RendererError: ``gsplat`` is missing or does not work on this machine; there is no silent fallback.
+        RendererError: ``gsplat`` is missing or does not work on this machine; there is no silent
+            fallback.
 
     Example:
         >>> import numpy as np
@@ -63,4 +66,9 @@ def rasterize(
         from alpasim_plugin.gaussians.raster.rasterize_gsplat import rasterize_gsplat
 
         return rasterize_gsplat(cloud, camera, background, near_m=near_m, lod_px=lod_px)
-    raise InputError("rendering Gaussians", f"backend {backend!r}", "no such backend", f"choose one of {', '.join(get_args(Backend))}")
+    raise InputError(
+        "rendering Gaussians",
+        f"backend {backend!r}",
+        "no such backend",
+        f"choose one of {', '.join(get_args(Backend))}",
+    )

@@ -1,7 +1,8 @@
 """Render on the CPU: project, sort, list per tile, composite; each stage on all threads.
 
-Kernels release the interpreter lock and share work through an atomic counter, so the same compiled code serves any number of threads, no
-threading layer spins between frames, nothing is lost by a fork, and one thread costs nothing extra.
+Kernels release the interpreter lock and share work through an atomic counter, so the same compiled
+code serves any number of threads, no threading layer spins between frames, nothing is lost by a
+fork, and one thread costs nothing extra.
 """
 
 from __future__ import annotations
@@ -37,7 +38,12 @@ from alpasim_plugin.gaussians.constants import (
     RECORD,
     TILE,
 )
-from alpasim_plugin.gaussians.raster.binning import count_tiles, depth_order, fill_tiles, tile_offsets
+from alpasim_plugin.gaussians.raster.binning import (
+    count_tiles,
+    depth_order,
+    fill_tiles,
+    tile_offsets,
+)
 from alpasim_plugin.gaussians.raster.output import F32, Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.raster.project_kernels import bundles_in_view, project_parts
@@ -45,7 +51,9 @@ from alpasim_plugin.gaussians.raster.raster_kernels import raster_tiles
 
 
 class Buffers(threading.local):
-    """Arrays kept between frames, one set per calling thread: fresh memory would be paid for page by page in every frame."""
+    """Arrays kept between frames, one set per calling thread: fresh memory would be paid for page
+    by page in every frame.
+    """
 
     def __init__(self) -> None:
         self._arrays: dict[str, npt.NDArray[np.generic]] = {}
@@ -76,13 +84,14 @@ def rasterize_prepared(
     """Render several prepared clouds, each at its rigid pose, in one image.
 
     Args:
-        nodes: ``(prepared, T_world_node)`` pairs; None stands for the identity (a background in world coordinates). Equal depths are
-            drawn in the order of the nodes.
+        nodes: ``(prepared, T_world_node)`` pairs; None stands for the identity (a background in
+            world coordinates). Equal depths are drawn in the order of the nodes.
         camera: From where.
         background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything.
         near_m: Gaussians whose centre is nearer are left out.
         lod_px: Gaussians whose radius before the low-pass is smaller are left out; 0 draws all.
-        threads: How many threads to use; None takes ``numba.get_num_threads()``. The image does not depend on it.
+        threads: How many threads to use; None takes ``numba.get_num_threads()``. The image does not
+            depend on it.
 
     Raises:
         InputError: A transform is not rigid or the background does not fit.
@@ -98,20 +107,44 @@ def rasterize_prepared(
     first_bundles = bundles_in_view(parts, poses, view)
     first_ids = np.cumsum(parts[:, PART_INPUT]) - parts[:, PART_INPUT]
     room = int(first_bundles[-1]) * BUNDLE
-    records, ids = _buffers.get("records", room * RECORD, np.float32), _buffers.get("ids", room, np.int64)
+    records, ids = (
+        _buffers.get("records", room * RECORD, np.float32),
+        _buffers.get("ids", room, np.int64),
+    )
     cursor = np.zeros(2, np.int64)
     workers = threads if room > WORTH_THREADS else 1
-    run_on_threads(workers, project_parts, cursor, parts, first_bundles, first_ids, poses, view, records, ids)
+    run_on_threads(
+        workers, project_parts, cursor, parts, first_bundles, first_ids, poses, view, records, ids
+    )
     count = int(cursor[1])
 
     keys, spare = _buffers.get("keys", count, np.int64), _buffers.get("spare", count, np.int64)
     order = depth_order(count, records, ids, records.view(np.int32), keys, spare)
     tiles = list_per_tile(count, order, records, camera, threads, _buffers)
     shape = (camera.height, camera.width)
-    rgb, alpha, depth = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
+    rgb = np.empty((*shape, 3), np.float32)
+    alpha = np.empty(shape, np.float32)
+    depth = np.empty(shape, np.float32)
     cursor[:] = 0
-    run_on_threads(threads, raster_tiles, cursor, tiles.columns, tiles.starts, tiles.lists, records, behind, rgb, alpha, depth)
-    stats = {"gaussians": int(parts[:, PART_INPUT].sum()), "visible": count, "pairs": tiles.pairs, "pairs_looked_at": int(cursor[1])}
+    run_on_threads(
+        threads,
+        raster_tiles,
+        cursor,
+        tiles.columns,
+        tiles.starts,
+        tiles.lists,
+        records,
+        behind,
+        rgb,
+        alpha,
+        depth,
+    )
+    stats = {
+        "gaussians": int(parts[:, PART_INPUT].sum()),
+        "visible": count,
+        "pairs": tiles.pairs,
+        "pairs_looked_at": int(cursor[1]),
+    }
     return RasterOutput(rgb, alpha, depth, stats)
 
 
@@ -146,34 +179,74 @@ class TileLists:
 
 
 def list_per_tile(
-    count: int, order: npt.NDArray[np.generic], records: npt.NDArray[np.generic], camera: PinholeCamera, threads: int, buffers: Buffers
+    count: int,
+    order: npt.NDArray[np.generic],
+    records: npt.NDArray[np.generic],
+    camera: PinholeCamera,
+    threads: int,
+    buffers: Buffers,
 ) -> TileLists:
-    """List ``count`` projected records per tile; ``order`` is that of `depth_order`. The lists belong to ``buffers``."""
+    """List ``count`` projected records per tile; ``order`` is that of `depth_order`. The lists
+    belong to ``buffers``.
+    """
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    # At most 64 chunks of at least 2048 splats: enough to share out, few enough to keep their tile counts small.
+    # At most 64 chunks of at least 2048 splats: enough to share out, few enough to keep their tile
+    # counts small.
     chunk_size = max(2048, -(-count // 64))
     n_chunks, room = -(-count // chunk_size), (tiles_x + 1) * (tiles_y + 2) + 1
-    histogram = buffers.get("histogram", n_chunks * room, np.int64)[: n_chunks * room].reshape(n_chunks, room)
+    histogram = buffers.get("histogram", n_chunks * room, np.int64)[: n_chunks * room].reshape(
+        n_chunks, room
+    )
     boxes = buffers.get("boxes", 4 * count, np.int32)
     starts = np.empty(tiles_x * tiles_y + 1, np.int64)
     cursor = np.zeros(2, np.int64)
     workers = threads if count > WORTH_THREADS else 1
-    run_on_threads(workers, count_tiles, cursor, count, chunk_size, order, records, tiles_x, tiles_y, boxes, histogram)
+    run_on_threads(
+        workers,
+        count_tiles,
+        cursor,
+        count,
+        chunk_size,
+        order,
+        records,
+        tiles_x,
+        tiles_y,
+        boxes,
+        histogram,
+    )
     pairs = int(tile_offsets(histogram, tiles_x, starts))
     lists = buffers.get("lists", pairs + 1, np.int32)
     cursor[:] = 0
-    run_on_threads(workers, fill_tiles, cursor, count, chunk_size, order, records, boxes, tiles_x, histogram, pairs, lists)
+    run_on_threads(
+        workers,
+        fill_tiles,
+        cursor,
+        count,
+        chunk_size,
+        order,
+        records,
+        boxes,
+        tiles_x,
+        histogram,
+        pairs,
+        lists,
+    )
     return TileLists(tiles_x, starts, lists, pairs)
 
 
 def node_poses(
-    T_world_nodes: Sequence[npt.NDArray[np.floating] | None], turned: npt.NDArray[np.bool_], camera: PinholeCamera, near_m: float
+    T_world_nodes: Sequence[npt.NDArray[np.floating] | None],
+    turned: npt.NDArray[np.bool_],
+    camera: PinholeCamera,
+    near_m: float,
 ) -> F64:
-    """Pack nodes' poses relative to the camera, ``(N, POSE_SIZE)``; all differences of large coordinates happen here, in float64.
+    """Pack nodes' poses relative to the camera, ``(N, POSE_SIZE)``; all differences of large
+    coordinates happen here, in float64.
 
     Args:
         T_world_nodes: Rigid transforms; None is the identity.
-        turned: ``(N,)``, which nodes' colours are seen along world directions instead of the node's own.
+        turned: ``(N,)``, which nodes' colours are seen along world directions instead of the node's
+            own.
         camera: Seen from where.
         near_m: Near plane, metres.
 
@@ -183,17 +256,23 @@ def node_poses(
     given = [_IDENTITY, *(np.asarray(T, dtype=np.float64) for T in T_world_nodes if T is not None)]
     shaped = all(T.shape == (4, 4) for T in given)
     if not shaped or not all_rigid(np.array(given)):
-        for T in given:  # the precise message is composed only where the cheap test of all nodes at once fails
+        for T in (
+            given
+        ):  # the precise message is composed only where the cheap test of all nodes at once fails
             require_rigid(T, "placing a node")
     T_world_node = np.array(given)
     rotation = T_world_node[:, :3, :3]
     placed = np.empty((len(given), POSE_SIZE))
     placed[:, POSE_ROTATION:POSE_CENTRE] = (camera.T_camera_world[:3, :3] @ rotation).reshape(-1, 9)
-    placed[:, POSE_CENTRE:POSE_COLOUR] = np.einsum("nji,nj->ni", rotation, camera.centre_world - T_world_node[:, :3, 3])
+    placed[:, POSE_CENTRE:POSE_COLOUR] = np.einsum(
+        "nji,nj->ni", rotation, camera.centre_world - T_world_node[:, :3, 3]
+    )
     placed[:, POSE_COLOUR:POSE_NEAR] = rotation.reshape(-1, 9)
     placed[:, POSE_NEAR], placed[:, POSE_FAR] = near_m, FAR_M
     moved = np.array([T is not None for T in T_world_nodes], dtype=bool)
-    poses = placed[np.where(moved, np.cumsum(moved), 0)]  # all that stand in the world share the first
+    poses = placed[
+        np.where(moved, np.cumsum(moved), 0)
+    ]  # all that stand in the world share the first
     poses[~turned, POSE_COLOUR:POSE_NEAR] = np.eye(3).reshape(9)
     return poses
 
@@ -209,13 +288,16 @@ def rasterize_cpu(
 ) -> RasterOutput:
     """Render one cloud in world coordinates.
 
-    The prepared form of a cloud is kept as long as the cloud lives, so repeated frames of one cloud are fast. Arrays that a cloud was built
-    from are therefore not to be changed in place (those of the cloud itself are read-only).
+    The prepared form of a cloud is kept as long as the cloud lives, so repeated frames of one cloud
+    are fast. Arrays that a cloud was built from are therefore not to be changed in place (those of
+    the cloud itself are read-only).
     """
     prepared = _prepared.get(cloud)
     if prepared is None:
         prepared = _prepared[cloud] = prepare(cloud)
-    return rasterize_prepared([(prepared, None)], camera, background, near_m=near_m, lod_px=lod_px, threads=threads)
+    return rasterize_prepared(
+        [(prepared, None)], camera, background, near_m=near_m, lod_px=lod_px, threads=threads
+    )
 
 
 _pools: dict[int, ThreadPoolExecutor] = {}
@@ -244,12 +326,18 @@ def thread_count(threads: int | None) -> int:
 
         return int(numba.get_num_threads())
     if threads < 1:
-        raise InputError("rendering Gaussians", f"threads={threads}", "no thread to work with", "give at least 1, or None for the default")
+        raise InputError(
+            "rendering Gaussians",
+            f"threads={threads}",
+            "no thread to work with",
+            "give at least 1, or None for the default",
+        )
     return threads
 
 
 def run_on_threads(threads: int, function: Callable[..., None], *args: Any) -> None:
-    """Call ``function(*args)`` on each of ``threads`` threads, this one included, and return when all have ended.
+    """Call ``function(*args)`` on each of ``threads`` threads, this one included, and return when
+    all have ended.
 
     An exception in any of them is raised here.
     """

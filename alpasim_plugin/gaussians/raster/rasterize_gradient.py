@@ -1,7 +1,8 @@
-"""Render splats for training: one `torch.autograd.Function` whose forward and backward passes are compiled CPU kernels.
+"""Render splats for training: one `torch.autograd.Function` whose forward and backward passes are
+compiled CPU kernels.
 
-On a GPU the same function goes through gsplat (`alpasim_plugin.gaussians.raster.rasterize_gsplat`). `rasterize_torch` is the
-reference implementation.
+On a GPU the same function goes through gsplat (`alpasim_plugin.gaussians.raster.rasterize_gsplat`).
+`rasterize_torch` is the reference implementation.
 """
 
 from __future__ import annotations
@@ -17,9 +18,23 @@ from torch import Tensor
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.constants import BUNDLE, GEO_SIZE, NEAR_M, POSE_CENTRE, RADIUS_X, RADIUS_Y, RECORD
+from alpasim_plugin.gaussians.constants import (
+    BUNDLE,
+    GEO_SIZE,
+    NEAR_M,
+    POSE_CENTRE,
+    RADIUS_X,
+    RADIUS_Y,
+    RECORD,
+)
 from alpasim_plugin.gaussians.raster.binning import depth_order
-from alpasim_plugin.gaussians.raster.gradient_kernels import KEPT, PAIR, colour_splats, composite_tiles, tile_gradients
+from alpasim_plugin.gaussians.raster.gradient_kernels import (
+    KEPT,
+    PAIR,
+    colour_splats,
+    composite_tiles,
+    tile_gradients,
+)
 from alpasim_plugin.gaussians.raster.gradient_project import pack, splat_gradients, sum_pairs
 from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput, ScreenStatistics, Splats
 from alpasim_plugin.gaussians.raster.prepared import part_row
@@ -83,16 +98,22 @@ def _chunk(count: int) -> int:
 
 
 def _project(p: _Parameters, view: _View) -> tuple[TileLists, F32, npt.NDArray[np.int64]]:
-    """Project, sort and list the splats, colours included; returns the lists, the records by rank and which Gaussian each shows."""
+    """Project, sort and list the splats, colours included; returns the lists, the records by rank
+    and which Gaussian each shows.
+    """
     n = len(p.means)
     groups = -(-n // _LANES)
-    lane_means, geometry = np.empty(groups * 3 * _LANES), np.zeros(groups * GEO_SIZE * _LANES, np.float32)
+    lane_means, geometry = (
+        np.empty(groups * 3 * _LANES),
+        np.zeros(groups * GEO_SIZE * _LANES, np.float32),
+    )
     bad = pack(p.means, p.log_scales, p.quaternions, p.logits, lane_means, geometry)
     if bad >= 0:
         _refuse(p, bad)
     buffers = Buffers()
     records, ids = buffers.get("records", n * RECORD, np.float32), buffers.get("ids", n, np.int64)
-    # Colours follow for the visible ones alone, and bundles in the optimiser's order have no bounding spheres worth a test.
+    # Colours follow for the visible ones alone, and bundles in the optimiser's order have no
+    # bounding spheres worth a test.
     plain = np.zeros(groups * 3 * _LANES, np.float32)
     everywhere = np.tile([0.0, 0.0, 0.0, np.inf, 0.0], -(-n // BUNDLE))
     cursor = np.zeros(2, np.int64)
@@ -100,16 +121,32 @@ def _project(p: _Parameters, view: _View) -> tuple[TileLists, F32, npt.NDArray[n
     workers = view.threads if n > WORTH_THREADS else 1
     parts = part_row((lane_means, geometry, plain, index, everywhere, everywhere), 1, n)[None]
     bundles, first = np.array([0, -(-n // BUNDLE)]), np.zeros(1, np.int64)
-    run_on_threads(workers, project_parts, cursor, parts, bundles, first, view.pose[None], view.numbers, records, ids)
+    run_on_threads(
+        workers,
+        project_parts,
+        cursor,
+        parts,
+        bundles,
+        first,
+        view.pose[None],
+        view.numbers,
+        records,
+        ids,
+    )
     count = int(cursor[1])
     cursor[:] = 0
     centre = view.pose[POSE_CENTRE : POSE_CENTRE + 3]
-    run_on_threads(workers, colour_splats, cursor, _chunk(count), count, ids, p.means, centre, p.sh, records)
+    run_on_threads(
+        workers, colour_splats, cursor, _chunk(count), count, ids, p.means, centre, p.sh, records
+    )
     if cursor[1]:
         _refuse(p, -1)
     keys, spare = buffers.get("keys", count, np.int64), buffers.get("spare", count, np.int64)
-    order = depth_order(count, records, ids, records.view(np.int32), keys, spare)[:count] & 0xFFFFFFFF
-    # In the order of depth, so that numbers ascend within a tile and the pairs of a range of splats are found by bisection.
+    order = (
+        depth_order(count, records, ids, records.view(np.int32), keys, spare)[:count] & 0xFFFFFFFF
+    )
+    # In the order of depth, so that numbers ascend within a tile and the pairs of a range of splats
+    # are found by bisection.
     ordered = records[: n * RECORD].reshape(n, RECORD)[order].reshape(-1)
     tiles = list_per_tile(count, np.arange(count), ordered, view.camera, view.threads, buffers)
     return tiles, np.asarray(ordered, np.float32), np.asarray(ids[order], np.int64)
@@ -123,8 +160,16 @@ def _refuse(p: _Parameters, bad: int) -> None:
     """
     cause = "a mean, scale, opacity or quaternion that is not finite, a quaternion of length zero or a scale beyond exp(20) m"
     if bad < 0:
-        bad, cause = int(np.argmin(np.isfinite(p.sh).all(axis=(1, 2)))), "a colour that is not finite"
-    raise InputError(_DOING, f"{len(p.means)} splats", f"number {bad} has {cause}", "lower the learning rate, or drop such splats")
+        bad, cause = (
+            int(np.argmin(np.isfinite(p.sh).all(axis=(1, 2)))),
+            "a colour that is not finite",
+        )
+    raise InputError(
+        _DOING,
+        f"{len(p.means)} splats",
+        f"number {bad} has {cause}",
+        "lower the learning rate, or drop such splats",
+    )
 
 
 class _Rasterize(torch.autograd.Function):
@@ -132,19 +177,40 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, logits: Tensor, sh: Tensor, view: _View, screen: ScreenStatistics
+        ctx: Any,
+        means: Tensor,
+        log_scales: Tensor,
+        quaternions: Tensor,
+        logits: Tensor,
+        sh: Tensor,
+        view: _View,
+        screen: ScreenStatistics,
     ) -> tuple[Tensor, Tensor, Tensor]:
         p = _Parameters.of(means, log_scales, quaternions, logits, sh)
         tiles, records, gaussian = _project(p, view)
         shape = (view.camera.height, view.camera.width)
-        colour, alpha, depth_sum = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
+        colour = np.empty((*shape, 3), np.float32)
+        alpha = np.empty(shape, np.float32)
+        depth_sum = np.empty(shape, np.float32)
         pixels = np.empty((len(tiles.starts) - 1) * _LANES * KEPT, np.float32)
         cursor = np.zeros(1, np.int64)
         run_on_threads(
-            view.threads, composite_tiles, cursor, tiles.columns, tiles.starts, tiles.lists, records, pixels, colour, alpha, depth_sum
+            view.threads,
+            composite_tiles,
+            cursor,
+            tiles.columns,
+            tiles.starts,
+            tiles.lists,
+            records,
+            pixels,
+            colour,
+            alpha,
+            depth_sum,
         )
         boxes = records.reshape(-1, RECORD)[:, [RADIUS_X, RADIUS_Y]]
-        screen.radii[torch.from_numpy(gaussian)] = torch.from_numpy(np.ceil(boxes.max(axis=1, initial=0.0)).astype(np.int32))
+        screen.radii[torch.from_numpy(gaussian)] = torch.from_numpy(
+            np.ceil(boxes.max(axis=1, initial=0.0)).astype(np.int32)
+        )
         ctx.save_for_backward(means, log_scales, quaternions, logits, sh)
         ctx.view, ctx.screen, ctx.kept = view, screen, _Kept(tiles, records, gaussian, pixels)
         return torch.from_numpy(colour), torch.from_numpy(alpha), torch.from_numpy(depth_sum)
@@ -152,54 +218,104 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        view, kept, tensors = ctx.view, ctx.kept, ctx.saved_tensors
+        view = ctx.view
+        kept = ctx.kept
+        tensors = ctx.saved_tensors
         p = _Parameters.of(*tensors)
         tiles = kept.tiles
         g_colour, g_alpha, g_depth = (g.to(torch.float32).contiguous().numpy() for g in gradients)
         pairs = np.zeros(tiles.pairs * PAIR, np.float32)
         cursor = np.zeros(1, np.int64)
         run_on_threads(
-            view.threads, tile_gradients, cursor, tiles.columns, tiles.starts, tiles.lists, kept.records, kept.pixels, g_colour, g_alpha,
-            g_depth, pairs,
-        )  # fmt: skip
-        out = [np.zeros(a.shape, a.dtype) for a in (p.means, p.log_scales, p.quaternions, p.logits, p.sh)]
+            view.threads,
+            tile_gradients,
+            cursor,
+            tiles.columns,
+            tiles.starts,
+            tiles.lists,
+            kept.records,
+            kept.pixels,
+            g_colour,
+            g_alpha,
+            g_depth,
+            pairs,
+        )
+        out = [
+            np.zeros(a.shape, a.dtype)
+            for a in (p.means, p.log_scales, p.quaternions, p.logits, p.sh)
+        ]
         norm = np.zeros(len(p.means), np.float32)
         sums = np.empty(len(p.means) * PAIR, np.float32)
         workers = view.threads if len(kept.gaussian) > WORTH_THREADS else 1
         cursor[:] = 0
         run_on_threads(
-            workers, sum_pairs, cursor, _chunk(len(kept.gaussian)), kept.gaussian, tiles.starts, tiles.lists, pairs, kept.records, sums
+            workers,
+            sum_pairs,
+            cursor,
+            _chunk(len(kept.gaussian)),
+            kept.gaussian,
+            tiles.starts,
+            tiles.lists,
+            pairs,
+            kept.records,
+            sums,
         )
         cursor[:] = 0
         run_on_threads(
-            workers, splat_gradients, cursor, _chunk(len(p.means)), ctx.screen.radii.numpy(), sums, view.pose, view.numbers, p.means,
-            p.log_scales, p.quaternions, p.logits, p.sh, *out, norm,
-        )  # fmt: skip
+            workers,
+            splat_gradients,
+            cursor,
+            _chunk(len(p.means)),
+            ctx.screen.radii.numpy(),
+            sums,
+            view.pose,
+            view.numbers,
+            p.means,
+            p.log_scales,
+            p.quaternions,
+            p.logits,
+            p.sh,
+            *out,
+            norm,
+        )
         ctx.screen.gradient_norm = torch.from_numpy(norm)
-        return (*(torch.from_numpy(g).to(t.dtype) for g, t in zip(out, tensors, strict=True)), None, None)
+        return (
+            *(torch.from_numpy(g).to(t.dtype) for g, t in zip(out, tensors, strict=True)),
+            None,
+            None,
+        )
 
 
 def rasterize_gradient(
-    splats: Splats, camera: PinholeCamera, *, background: Tensor | None = None, near_m: float = NEAR_M, threads: int | None = None
+    splats: Splats,
+    camera: PinholeCamera,
+    *,
+    background: Tensor | None = None,
+    near_m: float = NEAR_M,
+    threads: int | None = None,
 ) -> GradientOutput:
-    """Render splats by the rule of `rasterize_reference`, with gradients of every parameter and of the background.
+    """Render splats by the rule of `rasterize_reference`, with gradients of every parameter and of
+    the background.
 
-    What ends the gradient is what ends the splat's part in the image: the alpha cut, the largest alpha (for opacity and shape, not for
-    colour and depth), the stop, the clamped slope in the covariance's Jacobian, a colour clamped at 0.
+    What ends the gradient is what ends the splat's part in the image: the alpha cut, the largest
+    alpha (for opacity and shape, not for colour and depth), the stop, the clamped slope in the
+    covariance's Jacobian, a colour clamped at 0.
 
     Args:
         splats: What to draw; tensors on the CPU, or on a GPU where gsplat works.
         camera: From where.
         background: ``(3,)`` or ``(H, W, 3)``, 0..1; None is black. May require gradients.
         near_m: Gaussians whose centre is nearer are left out.
-        threads: CPU threads; None takes ``numba.get_num_threads()``. Neither image nor gradients depend on it.
+        threads: CPU threads; None takes ``numba.get_num_threads()``. Neither image nor gradients
+            depend on it.
 
     Returns:
-        The image with its graph. A second backward pass through the same graph needs ``retain_graph=True`` as usual; second derivatives
-        are not available.
+        The image with its graph. A second backward pass through the same graph needs
+        ``retain_graph=True`` as usual; second derivatives are not available.
 
     Raises:
-        InputError: A splat that cannot be drawn, tensors on different devices, or a background that does not fit.
+        InputError: A splat that cannot be drawn, tensors on different devices, or a background that
+            does not fit.
         RendererError: The tensors are on a GPU and gsplat does not work there.
 
     Example:
@@ -223,22 +339,44 @@ def rasterize_gradient(
     view = _View(camera, camera_numbers(camera), pose, thread_count(threads))
     screen = ScreenStatistics(torch.zeros(len(splats), dtype=torch.int32))
     colour, alpha, depth_sum = _Rasterize.apply(
-        splats.means, splats.log_scales, splats.quaternions, splats.logit_opacities, splats.sh, view, screen
+        splats.means,
+        splats.log_scales,
+        splats.quaternions,
+        splats.logit_opacities,
+        splats.sh,
+        view,
+        screen,
     )  # type: ignore[no-untyped-call]
     rgb = colour if behind is None else colour + (1 - alpha)[..., None] * behind
     depth = torch.where(alpha > 0, depth_sum / torch.where(alpha > 0, alpha, 1.0), 0.0)
     return GradientOutput(rgb, alpha, depth, screen)
 
 
-def _checked_background(background: Tensor | None, splats: Splats, camera: PinholeCamera) -> Tensor | None:
+def _checked_background(
+    background: Tensor | None, splats: Splats, camera: PinholeCamera
+) -> Tensor | None:
     """Return the background in the type and on the device of the splats.
 
     Raises:
         InputError: Its shape does not fit, or the splats' tensors lie on different devices.
     """
-    devices = {str(t.device) for t in (splats.means, splats.log_scales, splats.quaternions, splats.logit_opacities, splats.sh)}
+    devices = {
+        str(t.device)
+        for t in (
+            splats.means,
+            splats.log_scales,
+            splats.quaternions,
+            splats.logit_opacities,
+            splats.sh,
+        )
+    }
     if len(devices) > 1:
-        raise InputError(_DOING, f"{len(splats)} splats", f"tensors on {', '.join(sorted(devices))}", "move them all to one device")
+        raise InputError(
+            _DOING,
+            f"{len(splats)} splats",
+            f"tensors on {', '.join(sorted(devices))}",
+            "move them all to one device",
+        )
     if background is None:
         return None
     if background.shape not in ((3,), (camera.height, camera.width, 3)):

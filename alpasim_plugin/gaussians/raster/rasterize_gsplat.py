@@ -1,11 +1,14 @@
-"""Render on a GPU through gsplat, where it works; with gradients for training through its own forward and backward kernels.
+"""Render on a GPU through gsplat, where it works; with gradients for training through its own
+forward and backward kernels.
 
-gsplat compiles CUDA code on first use, so a successful import does not show that it works. The backend first draws one Gaussian and checks
-the result. It never falls back to another backend; the error says what is missing.
+gsplat compiles CUDA code on first use, so a successful import does not show that it works. The
+backend first draws one Gaussian and checks the result. It never falls back to another backend; the
+error says what is missing.
 
-State of testing: arguments, results and gradients have been checked against a stand-in for gsplat on the CPU; the path has not been run on
-a GPU. Differences to the CPU: gsplat up to 1.5.3 saturates alpha at 0.999, this package and gsplat 1.6 at 0.99, and gsplat's kernels sum
-gradients in an order that changes from run to run.
+State of testing: arguments, results and gradients have been checked against a stand-in for gsplat
+on the CPU; the path has not been run on a GPU. Differences to the CPU: gsplat up to 1.5.3 saturates
+alpha at 0.999, this package and gsplat 1.6 at 0.99, and gsplat's kernels sum gradients in an order
+that changes from run to run.
 """
 
 from __future__ import annotations
@@ -31,7 +34,9 @@ _DOING = "rendering Gaussians with gsplat"
 
 
 def view_arguments(camera: PinholeCamera, near_m: float, device: str) -> dict[str, Any]:
-    """Return those keyword arguments of ``gsplat.rasterization`` that describe one view, with the camera at the origin."""
+    """Return those keyword arguments of ``gsplat.rasterization`` that describe one view, with the
+    camera at the origin.
+    """
     view = np.eye(4)
     view[:3, :3] = camera.T_camera_world[:3, :3]
     return {
@@ -50,11 +55,14 @@ def view_arguments(camera: PinholeCamera, near_m: float, device: str) -> dict[st
     }
 
 
-def gsplat_arguments(cloud: GaussianCloud, camera: PinholeCamera, near_m: float, device: str) -> dict[str, Any]:
+def gsplat_arguments(
+    cloud: GaussianCloud, camera: PinholeCamera, near_m: float, device: str
+) -> dict[str, Any]:
     """Return the keyword arguments of ``gsplat.rasterization`` for one view of a cloud.
 
-    Means are given relative to the camera centre, subtracted in float64, and the view matrix only rotates: gsplat computes in float32,
-    where UTM-sized coordinates would move by centimetres. View directions, and so colours, stay those of the world's axes.
+    Means are given relative to the camera centre, subtracted in float64, and the view matrix only
+    rotates: gsplat computes in float32, where UTM-sized coordinates would move by centimetres. View
+    directions, and so colours, stay those of the world's axes.
     """
     quats = cloud.quats.astype(np.float64)
     return {
@@ -72,12 +80,21 @@ def _tensor(array: np.ndarray[Any, Any], device: str) -> torch.Tensor:
     return torch.as_tensor(np.array(array, dtype=np.float32), device=device)
 
 
-def _draw(gsplat: Any, cloud: GaussianCloud, camera: PinholeCamera, background: Background, near_m: float, device: str) -> RasterOutput:
+def _draw(
+    gsplat: Any,
+    cloud: GaussianCloud,
+    camera: PinholeCamera,
+    background: Background,
+    near_m: float,
+    device: str,
+) -> RasterOutput:
     """Call gsplat and put the background behind its image; gsplat takes one colour only."""
     with torch.no_grad():
         colours, alphas, _ = gsplat.rasterization(**gsplat_arguments(cloud, camera, near_m, device))
     image, alpha = colours[0].float().cpu().numpy(), alphas[0, ..., 0].float().cpu().numpy()
-    rgb = np.clip(image[..., :3] + (1 - alpha[..., None]) * background_image(background, camera), 0, 1).astype(np.float32)
+    rgb = np.clip(
+        image[..., :3] + (1 - alpha[..., None]) * background_image(background, camera), 0, 1
+    ).astype(np.float32)
     depth = np.where(alpha > 0, image[..., 3], 0).astype(np.float32)
     return RasterOutput(rgb, alpha, depth, {"gaussians": len(cloud)})
 
@@ -105,22 +122,31 @@ def require_gsplat(device: str = "cuda") -> Any:
             "torch sees no CUDA device",
             "run on a machine with an NVIDIA GPU, or choose --device cpu (backend='cpu' in code)",
         )
-    cloud = GaussianCloud([[0, 0, 5.0]], [[1.0, 0, 0, 0]], [[0.5, 0.5, 0.5]], [0.9], np.zeros((1, 1, 3)))  # type: ignore[arg-type]
+    cloud = GaussianCloud(
+        [[0, 0, 5.0]], [[1.0, 0, 0, 0]], [[0.5, 0.5, 0.5]], [0.9], np.zeros((1, 1, 3))
+    )  # type: ignore[arg-type]
     K = np.array([[20.0, 0, 8.5], [0, 20, 8.5], [0, 0, 1]])
     try:
-        out = _draw(gsplat, cloud, PinholeCamera(17, 17, K, np.eye(4)), (0.0, 0.0, 0.0), NEAR_M, device)
-    # Whatever a compiler, driver or CUDA kernel can raise is reported as one error with its cause attached.
+        out = _draw(
+            gsplat, cloud, PinholeCamera(17, 17, K, np.eye(4)), (0.0, 0.0, 0.0), NEAR_M, device
+        )
+    # Whatever a compiler, driver or CUDA kernel can raise is reported as one error with its cause
+    # attached.
     except Exception as error:
         raise RendererError(
-            _DOING, "a test image of one Gaussian", f"{type(error).__name__}: {error}",
+            _DOING,
+            "a test image of one Gaussian",
+            f"{type(error).__name__}: {error}",
             "check that gsplat's CUDA kernels match torch and the driver, or choose --device cpu (backend='cpu' in code)",
-        ) from error  # fmt: skip
+        ) from error
     centre = (float(out.alpha[8, 8]), float(out.rgb[8, 8, 0]), float(out.depth[8, 8]))
     if not np.allclose(centre, (0.9, 0.45, 5.0), atol=0.01):
         raise RendererError(
-            _DOING, "a test image of one Gaussian", f"alpha, red and depth {centre} at its centre instead of (0.9, 0.45, 5.0)",
+            _DOING,
+            "a test image of one Gaussian",
+            f"alpha, red and depth {centre} at its centre instead of (0.9, 0.45, 5.0)",
             "install a gsplat build that matches this GPU, or choose --device cpu (backend='cpu' in code)",
-        )  # fmt: skip
+        )
     return gsplat
 
 
@@ -136,7 +162,8 @@ def rasterize_gsplat(
     """Render a cloud on the GPU.
 
     Raises:
-        InputError: The cloud cannot be drawn, or ``lod_px`` is given, which gsplat does not support with this meaning.
+        InputError: The cloud cannot be drawn, or ``lod_px`` is given, which gsplat does not support
+            with this meaning.
         RendererError: gsplat does not work here.
     """
     if lod_px:
@@ -150,12 +177,18 @@ def rasterize_gsplat(
     cloud.require_drawable(_DOING)
     if len(cloud) == 0:
         shape = (camera.height, camera.width)
-        rgb = np.broadcast_to(np.clip(background_image(background, camera), 0, 1), (*shape, 3)).copy()
-        return RasterOutput(rgb, np.zeros(shape, np.float32), np.zeros(shape, np.float32), {"gaussians": 0})
+        rgb = np.broadcast_to(
+            np.clip(background_image(background, camera), 0, 1), (*shape, 3)
+        ).copy()
+        return RasterOutput(
+            rgb, np.zeros(shape, np.float32), np.zeros(shape, np.float32), {"gaussians": 0}
+        )
     return _draw(gsplat, cloud, camera, background, near_m, device)
 
 
-def rasterize_gradient_gsplat(splats: Splats, camera: PinholeCamera, background: Tensor | None, near_m: float) -> GradientOutput:
+def rasterize_gradient_gsplat(
+    splats: Splats, camera: PinholeCamera, background: Tensor | None, near_m: float
+) -> GradientOutput:
     """Render splats whose tensors lie on one GPU; see `rasterize_gradient`, which calls this.
 
     Raises:
@@ -176,9 +209,14 @@ def rasterize_gradient_gsplat(splats: Splats, camera: PinholeCamera, background:
         opacities=splats.logit_opacities.sigmoid(),
         colors=splats.sh,
         sh_degree=SH_SIZES.index(splats.sh.shape[1]),
-        **{**view_arguments(camera, near_m, device), "packed": False},  # so that what is returned per Gaussian has N rows
+        **{
+            **view_arguments(camera, near_m, device),
+            "packed": False,
+        },  # so that what is returned per Gaussian has N rows
     )
-    rgb, alpha, depth = image[0, ..., :3], alphas[0, ..., 0], image[0, ..., 3]
+    rgb = image[0, ..., :3]
+    alpha = alphas[0, ..., 0]
+    depth = image[0, ..., 3]
     radii = meta["radii"][0]
     screen = ScreenStatistics((radii if radii.ndim == 1 else radii.amax(dim=1)).int())
     if meta["means2d"].requires_grad:

@@ -1,7 +1,8 @@
-"""Project and composite Gaussians in float64, one after the other: the readable reference implementation for the fast backends.
+"""Project and composite Gaussians in float64, one after the other: the readable reference
+implementation for the fast backends.
 
-Zwicker et al., EWA Splatting (2002), with the first-order projection of Kerbl et al., 3D Gaussian Splatting (2023), and the constants of
-`alpasim_plugin.gaussians.constants`.
+Zwicker et al., EWA Splatting (2002), with the first-order projection of Kerbl et al., 3D Gaussian
+Splatting (2023), and the constants of `alpasim_plugin.gaussians.constants`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,15 @@ import numpy.typing as npt
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.constants import ALPHA_MAX, ALPHA_MIN, EPS2D_PX2, EXTENT_MAX_SIGMA, FAR_M, NEAR_M, TRANSMITTANCE_STOP
+from alpasim_plugin.gaussians.constants import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    EPS2D_PX2,
+    EXTENT_MAX_SIGMA,
+    FAR_M,
+    NEAR_M,
+    TRANSMITTANCE_STOP,
+)
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.sh import sh_colours
 
@@ -53,40 +62,56 @@ class Projection:
 
 
 def project_gaussians(
-    cloud: GaussianCloud, camera: PinholeCamera, near_m: float = NEAR_M, lod_px: float = 0.0, on_screen_only: bool = False
+    cloud: GaussianCloud,
+    camera: PinholeCamera,
+    near_m: float = NEAR_M,
+    lod_px: float = 0.0,
+    on_screen_only: bool = False,
 ) -> Projection:
     """Project a cloud and sort it by depth.
 
-    Dropped: centres nearer than ``near_m`` or beyond 1e10 m, opacities below 1/255, with ``lod_px`` also splats whose radius before the
-    low-pass (`Projection.extent` times the larger of the two axis-aligned deviations) is below it, and with ``on_screen_only`` those
-    whose box misses every pixel centre. Depth order is that of the float32 depths, ties in input order: two surfaces that coincide then
-    keep one order while the camera moves, instead of one decided by rounding.
+    Dropped: centres nearer than ``near_m`` or beyond 1e10 m, opacities below 1/255, with ``lod_px``
+        also splats whose radius before the
+    low-pass (`Projection.extent` times the larger of the two axis-aligned deviations) is below it,
+    and with ``on_screen_only`` those whose box misses every pixel centre. Depth order is that of
+    the float32 depths, ties in input order: two surfaces that coincide then keep one order while
+    the camera moves, instead of one decided by rounding.
 
     Raises:
         InputError: The cloud holds Gaussians that cannot be drawn.
     """
     cloud.require_drawable("projecting Gaussians")
     T = camera.T_camera_world
-    # Subtracting the camera's centre first keeps UTM-sized coordinates exact: the difference is small and rounds once.
+    # Subtracting the camera's centre first keeps UTM-sized coordinates exact: the difference is
+    # small and rounds once.
     relative = cloud.means.astype(np.float64) - camera.centre_world
     p = relative @ T[:3, :3].T
     opacity = cloud.opacities.astype(np.float64)
     index = np.flatnonzero((p[:, 2] >= near_m) & (p[:, 2] <= FAR_M) & (opacity >= ALPHA_MIN))
-    cloud, p, relative, opacity = cloud.take(index), p[index], relative[index], opacity[index]
+    cloud = cloud.take(index)
+    p = p[index]
+    relative = relative[index]
+    opacity = opacity[index]
     x, y, z = p.T
 
     low_x, high_x, low_y, high_y = camera.slope_limits()
     zero = np.zeros_like(z)
     jacobian = np.stack(
         [
-            np.stack([camera.fx / z, zero, -camera.fx * np.clip(x / z, low_x, high_x) / z], axis=-1),
-            np.stack([zero, camera.fy / z, -camera.fy * np.clip(y / z, low_y, high_y) / z], axis=-1),
+            np.stack(
+                [camera.fx / z, zero, -camera.fx * np.clip(x / z, low_x, high_x) / z], axis=-1
+            ),
+            np.stack(
+                [zero, camera.fy / z, -camera.fy * np.clip(y / z, low_y, high_y) / z], axis=-1
+            ),
         ],
         axis=-2,
     )
-    # With rows m, n of M = J R_camera R_q diag(s) the covariance is M M^T and its determinant a sum of squares (Cauchy-Binet), which
-    # cannot cancel for needles as C11 C22 - C12^2 does.
-    m, n = np.moveaxis(jacobian @ T[:3, :3] @ cloud.rotations() * cloud.scales.astype(np.float64)[:, None, :], 1, 0)
+    # With rows m, n of M = J R_camera R_q diag(s) the covariance is M M^T and its determinant a sum
+    # of squares (Cauchy-Binet), which cannot cancel for needles as C11 C22 - C12^2 does.
+    m, n = np.moveaxis(
+        jacobian @ T[:3, :3] @ cloud.rotations() * cloud.scales.astype(np.float64)[:, None, :], 1, 0
+    )
     raw = np.stack([np.sum(m * m, axis=1), np.sum(m * n, axis=1), np.sum(n * n, axis=1)], axis=1)
     cov = raw + np.array([EPS2D_PX2, 0.0, EPS2D_PX2])
     det = np.sum(np.cross(m, n) ** 2, axis=1) + EPS2D_PX2 * (raw[:, 0] + raw[:, 2]) + EPS2D_PX2**2
@@ -96,12 +121,22 @@ def project_gaussians(
     keep = extent * np.sqrt(np.maximum(raw[:, 0], raw[:, 2])) >= lod_px
     if on_screen_only:
         radii = extent[:, None] * np.sqrt(cov[:, [0, 2]])
-        keep &= np.all((uv + radii >= 0.5) & (uv - radii <= np.array([camera.width, camera.height]) - 0.5), axis=1)
+        keep &= np.all(
+            (uv + radii >= 0.5) & (uv - radii <= np.array([camera.width, camera.height]) - 0.5),
+            axis=1,
+        )
     order = np.flatnonzero(keep)
     order = order[np.argsort(z[order].astype(np.float32), kind="stable")]
     direction = relative[order] / np.linalg.norm(relative[order], axis=1, keepdims=True)
     return Projection(
-        index[order], uv[order], z[order], cov[order], det[order], extent[order], opacity[order], sh_colours(cloud.sh[order], direction)
+        index[order],
+        uv[order],
+        z[order],
+        cov[order],
+        det[order],
+        extent[order],
+        opacity[order],
+        sh_colours(cloud.sh[order], direction),
     )
 
 
@@ -122,8 +157,9 @@ def rasterize_reference(
         background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything.
         near_m: Gaussians whose centre is nearer are left out.
         lod_px: Gaussians whose radius before the low-pass is smaller are left out; 0 draws all.
-        brute: Evaluate all pixels of the image for each Gaussian. By default only the box around its ellipse (grown by a pixel) is
-            evaluated; outside of it alpha is below the cut, so the image is the same and large clouds stay affordable.
+        brute: Evaluate all pixels of the image for each Gaussian. By default only the box around
+            its ellipse (grown by a pixel) is evaluated; outside of it alpha is below the cut, so
+            the image is the same and large clouds stay affordable.
 
     Raises:
         InputError: The cloud holds Gaussians that cannot be drawn, or the background does not fit.
@@ -132,10 +168,17 @@ def rasterize_reference(
     behind = background_image(background, camera).astype(np.float64)
     colour, alpha, depth, blends = composite_reference(splats, camera, behind, brute)
     stats = {"gaussians": len(cloud), "visible": len(splats), "blends": blends}
-    return RasterOutput(np.clip(colour, 0, 1).astype(np.float32), alpha.astype(np.float32), depth.astype(np.float32), stats)
+    return RasterOutput(
+        np.clip(colour, 0, 1).astype(np.float32),
+        alpha.astype(np.float32),
+        depth.astype(np.float32),
+        stats,
+    )
 
 
-def composite_reference(splats: Projection, camera: PinholeCamera, behind: F64, brute: bool = False) -> tuple[F64, F64, F64, int]:
+def composite_reference(
+    splats: Projection, camera: PinholeCamera, behind: F64, brute: bool = False
+) -> tuple[F64, F64, F64, int]:
     """Blend projected Gaussians, nearest first, in float64.
 
     Args:
@@ -145,8 +188,8 @@ def composite_reference(splats: Projection, camera: PinholeCamera, behind: F64, 
         brute: See `rasterize_reference`.
 
     Returns:
-        Colour ``(H, W, 3)`` with background, not clamped; alpha ``(H, W)``; depth ``(H, W)``, metres, 0 where alpha is 0; how many splats
-        were blended into a pixel, over all pixels.
+        Colour ``(H, W, 3)`` with background, not clamped; alpha ``(H, W)``; depth ``(H, W)``,
+        metres, 0 where alpha is 0; how many splats were blended into a pixel, over all pixels.
     """
     height, width = camera.height, camera.width
     rows, columns = np.arange(height) + 0.5, np.arange(width) + 0.5
@@ -159,7 +202,11 @@ def composite_reference(splats: Projection, camera: PinholeCamera, behind: F64, 
     last = np.clip(np.ceil(splats.uv + splats.radii()) + 1, 0, [width, height]).astype(int)
 
     for i in range(len(splats)):
-        box = (slice(0, height), slice(0, width)) if brute else (slice(first[i, 1], last[i, 1]), slice(first[i, 0], last[i, 0]))
+        box = (
+            (slice(0, height), slice(0, width))
+            if brute
+            else (slice(first[i, 1], last[i, 1]), slice(first[i, 0], last[i, 0]))
+        )
         dx = columns[None, box[1]] - splats.uv[i, 0]
         dy = rows[box[0], None] - splats.uv[i, 1]
         if dx.size == 0 or dy.size == 0:
@@ -169,7 +216,9 @@ def composite_reference(splats: Projection, camera: PinholeCamera, behind: F64, 
         alpha = np.minimum(ALPHA_MAX, splats.opacity[i] * np.exp(-0.5 * distance2))
         drawn = (alpha >= ALPHA_MIN) & ~finished[box]
         after = transmittance[box] * (1 - alpha)
-        stops = drawn & (after <= TRANSMITTANCE_STOP)  # this splat is left out, and so is everything behind it
+        stops = drawn & (
+            after <= TRANSMITTANCE_STOP
+        )  # this splat is left out, and so is everything behind it
         finished[box] |= stops
         drawn &= ~stops
         blends += int(np.count_nonzero(drawn))

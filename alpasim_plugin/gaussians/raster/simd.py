@@ -1,11 +1,14 @@
-"""Sixteen-lane vectors for numba kernels, so that hot loops use the machine's vector unit without relying on the auto-vectoriser.
+"""Sixteen-lane vectors for numba kernels, so that hot loops use the machine's vector unit without
+relying on the auto-vectoriser.
 
-Numba's automatic vectoriser gives up on loops with many arrays. These types lower to LLVM's portable ``<16 x float>`` (and double, and
-bool) values, which LLVM maps to one AVX-512 register, two AVX2 registers or four NEON registers. Arithmetic follows IEEE rules (no
-fast-math), except that `fma` may round once or twice depending on the machine.
+Numba's automatic vectoriser gives up on loops with many arrays. These types lower to LLVM's
+portable ``<16 x float>`` (and double, and bool) values, which LLVM maps to one AVX-512 register,
+two AVX2 registers or four NEON registers. Arithmetic follows IEEE rules (no fast-math), except that
+`fma` may round once or twice depending on the machine.
 
-Inside a kernel: ``load``/``store`` at a flat index of a one-dimensional contiguous array, ``splat`` a scalar, the operators ``+ - * /``
-on two vectors, comparisons that give masks, ``select``, ``bits`` of a mask.
+Inside a kernel: ``load``/``store`` at a flat index of a one-dimensional contiguous array, ``splat``
+a scalar, the operators ``+ - * /`` on two vectors, comparisons that give masks, ``select``,
+``bits`` of a mask.
 """
 
 # Numba's extension interface is untyped.
@@ -80,7 +83,9 @@ def _broadcast(builder, value):
     vector = ir.VectorType(value.type, LANES)
     undefined = ir.Constant(vector, ir.Undefined)
     first = builder.insert_element(undefined, value, _I32(0))
-    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_I32, LANES), [0] * LANES))
+    return builder.shuffle_vector(
+        first, undefined, ir.Constant(ir.VectorType(_I32, LANES), [0] * LANES)
+    )
 
 
 @intrinsic
@@ -98,7 +103,9 @@ def splat(typingctx, value):
 
 @intrinsic
 def lane_pattern(typingctx, low, high):
-    """Return ``low * (lane % 4) + high * (lane // 4)``: coordinates of a 4 x 4 block of pixels, row by row."""
+    """Return ``low * (lane % 4) + high * (lane // 4)``: coordinates of a 4 x 4 block of pixels, row
+    by row.
+    """
 
     def codegen(context, builder, sig, args):
         vector = _VECTORS["f32"]
@@ -117,11 +124,15 @@ def _element_pointer(context, builder, array_type, array, index, vector):
 
 @intrinsic
 def load(typingctx, array, index):
-    """Return sixteen consecutive elements of a one-dimensional contiguous array, without bounds check."""
+    """Return sixteen consecutive elements of a one-dimensional contiguous array, without bounds
+    check.
+    """
     vector = _vector_of(array.dtype)
 
     def codegen(context, builder, sig, args):
-        pointer = _element_pointer(context, builder, sig.args[0], args[0], args[1], _VECTORS[vector.element])
+        pointer = _element_pointer(
+            context, builder, sig.args[0], args[0], args[1], _VECTORS[vector.element]
+        )
         return builder.load(pointer, align=array.dtype.bitwidth // 8)
 
     return vector(array, types.intp), codegen
@@ -129,10 +140,14 @@ def load(typingctx, array, index):
 
 @intrinsic
 def load_bytes(typingctx, array, index):
-    """Return sixteen consecutive uint8 of a one-dimensional contiguous array as float32, without bounds check."""
+    """Return sixteen consecutive uint8 of a one-dimensional contiguous array as float32, without
+    bounds check.
+    """
 
     def codegen(context, builder, sig, args):
-        pointer = _element_pointer(context, builder, sig.args[0], args[0], args[1], ir.VectorType(ir.IntType(8), LANES))
+        pointer = _element_pointer(
+            context, builder, sig.args[0], args[0], args[1], ir.VectorType(ir.IntType(8), LANES)
+        )
         return builder.uitofp(builder.load(pointer, align=1), _VECTORS["f32"])
 
     return F32X16(array, types.intp), codegen
@@ -148,13 +163,17 @@ def _pointer(typingctx, address, dtype):
 
 @njit(cache=True, nogil=True)
 def array_at(address, dtype):
-    """Return the array that begins at an address, of unknown length; its owner must live as long as it is read."""
+    """Return the array that begins at an address, of unknown length; its owner must live as long as
+    it is read.
+    """
     return carray(_pointer(address, dtype), 1 << 40)
 
 
 @intrinsic
 def store(typingctx, array, index, value):
-    """Write sixteen consecutive elements of a one-dimensional contiguous array, without bounds check."""
+    """Write sixteen consecutive elements of a one-dimensional contiguous array, without bounds
+    check.
+    """
 
     def codegen(context, builder, sig, args):
         pointer = _element_pointer(context, builder, sig.args[0], args[0], args[1], args[2].type)
@@ -182,17 +201,27 @@ _operator(operator.add, _FLOAT_VECTORS, None, lambda builder, a, b: builder.fadd
 _operator(operator.sub, _FLOAT_VECTORS, None, lambda builder, a, b: builder.fsub(a, b))
 _operator(operator.mul, _FLOAT_VECTORS, None, lambda builder, a, b: builder.fmul(a, b))
 _operator(operator.truediv, _FLOAT_VECTORS, None, lambda builder, a, b: builder.fdiv(a, b))
-_operator(operator.lt, _FLOAT_VECTORS, MASK16, lambda builder, a, b: builder.fcmp_ordered("<", a, b))
-_operator(operator.le, _FLOAT_VECTORS, MASK16, lambda builder, a, b: builder.fcmp_ordered("<=", a, b))
-_operator(operator.gt, _FLOAT_VECTORS, MASK16, lambda builder, a, b: builder.fcmp_ordered(">", a, b))
-_operator(operator.ge, _FLOAT_VECTORS, MASK16, lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
+_operator(
+    operator.lt, _FLOAT_VECTORS, MASK16, lambda builder, a, b: builder.fcmp_ordered("<", a, b)
+)
+_operator(
+    operator.le, _FLOAT_VECTORS, MASK16, lambda builder, a, b: builder.fcmp_ordered("<=", a, b)
+)
+_operator(
+    operator.gt, _FLOAT_VECTORS, MASK16, lambda builder, a, b: builder.fcmp_ordered(">", a, b)
+)
+_operator(
+    operator.ge, _FLOAT_VECTORS, MASK16, lambda builder, a, b: builder.fcmp_ordered(">=", a, b)
+)
 _operator(operator.and_, (MASK16,), MASK16, lambda builder, a, b: builder.and_(a, b))
 _operator(operator.or_, (MASK16,), MASK16, lambda builder, a, b: builder.or_(a, b))
 
 
 def _declare(builder, name: str, vector, n_args: int):
     suffix = "f32" if vector == _VECTORS["f32"] else "f64"
-    return cgutils.get_or_insert_function(builder.module, ir.FunctionType(vector, [vector] * n_args), f"llvm.{name}.v{LANES}{suffix}")
+    return cgutils.get_or_insert_function(
+        builder.module, ir.FunctionType(vector, [vector] * n_args), f"llvm.{name}.v{LANES}{suffix}"
+    )
 
 
 def _llvm_function(name: str, n_args: int):
@@ -241,7 +270,9 @@ def negative(typingctx, a):
 
 @intrinsic
 def select(typingctx, mask, yes, no):
-    """Return lanes of ``yes`` where the mask is set, of ``no`` elsewhere; NaN in a lane not chosen is discarded."""
+    """Return lanes of ``yes`` where the mask is set, of ``no`` elsewhere; NaN in a lane not chosen
+    is discarded.
+    """
 
     def codegen(context, builder, sig, args):
         return builder.select(*args)
@@ -288,14 +319,22 @@ def has_bit(typingctx, a, position):
 
 @intrinsic
 def total(typingctx, a):
-    """Return the sum of the lanes: halves are added onto each other, an order that is the same on every machine."""
+    """Return the sum of the lanes: halves are added onto each other, an order that is the same on
+    every machine.
+    """
 
     def codegen(context, builder, sig, args):
         value, lanes = args[0], LANES
         while lanes > 1:
             lanes //= 2
-            low, high = (ir.Constant(ir.VectorType(_I32, lanes), list(range(first, first + lanes))) for first in (0, lanes))
-            value = builder.fadd(builder.shuffle_vector(value, value, low), builder.shuffle_vector(value, value, high))
+            low, high = (
+                ir.Constant(ir.VectorType(_I32, lanes), list(range(first, first + lanes)))
+                for first in (0, lanes)
+            )
+            value = builder.fadd(
+                builder.shuffle_vector(value, value, low),
+                builder.shuffle_vector(value, value, high),
+            )
         return builder.extract_element(value, _I32(0))
 
     return (types.float32 if a is F32X16 else types.float64)(a), codegen
@@ -323,7 +362,9 @@ def lowest_bit(typingctx, value):
 
 @intrinsic
 def fetch_add(typingctx, array, index, value):
-    """Add to an int64 element atomically and return what it held before: hands out work and room to threads."""
+    """Add to an int64 element atomically and return what it held before: hands out work and room to
+    threads.
+    """
 
     def codegen(context, builder, sig, args):
         data = context.make_array(sig.args[0])(context, builder, args[0]).data
@@ -334,14 +375,18 @@ def fetch_add(typingctx, array, index, value):
 
 @intrinsic
 def prefetch(typingctx, array, index):
-    """Ask for the cache line of an element that will be read soon; the index may lie outside of the array."""
+    """Ask for the cache line of an element that will be read soon; the index may lie outside of the
+    array.
+    """
 
     def codegen(context, builder, sig, args):
         data = context.make_array(sig.args[0])(context, builder, args[0]).data
         pointer = builder.bitcast(builder.gep(data, [args[1]]), ir.IntType(8).as_pointer())
         kind = ir.FunctionType(ir.VoidType(), [pointer.type, _I32, _I32, _I32])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        builder.call(function, [pointer, _I32(0), _I32(3), _I32(1)])  # read, keep in all caches, data
+        builder.call(
+            function, [pointer, _I32(0), _I32(3), _I32(1)]
+        )  # read, keep in all caches, data
         return context.get_dummy_value()
 
     return types.void(array, types.intp), codegen

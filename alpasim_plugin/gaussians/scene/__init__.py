@@ -1,1 +1,3 @@
-"""Scenes of Gaussians: a map dressed in clouds, its actors, its sky, and the surrogate degradation."""
+"""Scenes of Gaussians: a map dressed in clouds, its actors, its sky, and the surrogate
+degradation.
+"""

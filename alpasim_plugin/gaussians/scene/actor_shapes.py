@@ -47,7 +47,8 @@ class Loft:
         """Return the skin.
 
         Returns:
-            Corners ``(M, 4, 3)`` as shares of length, width and height (z from the ground), colours ``(M, 3)`` and gloss ``(M,)``.
+            Corners ``(M, 4, 3)`` as shares of length, width and height (z from the ground), colours
+            ``(M, 3)`` and gloss ``(M,)``.
         """
         faces: list[npt.NDArray[np.float64]] = []
         colours: list[F64] = []
@@ -65,33 +66,72 @@ class Loft:
             a, b = self.x[i], self.x[i + 1]
             wa, wb = narrow[i], narrow[i + 1]
             ra, rb = self._roof_half(i, wa), self._roof_half(i + 1, wb)
-            ba, bb, ta, tb = self.belt[i], self.belt[i + 1], self.roof[i], self.roof[i + 1]
+            ba = self.belt[i]
+            bb = self.belt[i + 1]
+            ta = self.roof[i]
+            tb = self.roof[i + 1]
             for side in (1.0, -1.0):
-                lower = [[b, side * wb, low], [a, side * wa, low], [a, side * wa, ba], [b, side * wb, bb]]
-                upper = [[b, side * wb, bb], [a, side * wa, ba], [a, side * ra, ta], [b, side * rb, tb]]
-                sill = [[b, side * wb * 0.98, 0.6 * low], [a, side * wa * 0.98, 0.6 * low], [a, side * wa, low], [b, side * wb, low]]
+                lower = [
+                    [b, side * wb, low],
+                    [a, side * wa, low],
+                    [a, side * wa, ba],
+                    [b, side * wb, bb],
+                ]
+                upper = [
+                    [b, side * wb, bb],
+                    [a, side * wa, ba],
+                    [a, side * ra, ta],
+                    [b, side * rb, tb],
+                ]
+                sill = [
+                    [b, side * wb * 0.98, 0.6 * low],
+                    [a, side * wa * 0.98, 0.6 * low],
+                    [a, side * wa, low],
+                    [b, side * wb, low],
+                ]
                 if side > 0:  # outward must be first edge x second edge on both flanks
                     lower, upper, sill = ([q[1], q[0], q[3], q[2]] for q in (lower, upper, sill))
                 add(lower, body, 0.16)
                 add(sill, 0.35 * body, 0.0)
                 if ta - ba > 0.02 or tb - bb > 0.02:
-                    add(upper, glass if self.side_glass[i] else body, 0.30 if self.side_glass[i] else 0.16)
+                    add(
+                        upper,
+                        glass if self.side_glass[i] else body,
+                        0.30 if self.side_glass[i] else 0.16,
+                    )
             cover = [[b, -rb, tb], [a, -ra, ta], [a, ra, ta], [b, rb, tb]]
             rgb = glass if self.top[i] == "glass" else 0.30 * body if self.top[i] == "bed" else body
             add(cover, rgb, 0.30 if self.top[i] == "glass" else 0.20)
         for i, sign in ((0, 1.0), (n - 1, -1.0)):
-            x, w, t = self.x[i], narrow[i], self.roof[i]
+            x = self.x[i]
+            w = narrow[i]
+            t = self.roof[i]
             belt = min(self.belt[i], t)
-            ring = [[x, -sign * -w, low], [x, -sign * w, low], [x, -sign * w, belt], [x, -sign * -w, belt]]
+            ring = [
+                [x, -sign * -w, low],
+                [x, -sign * w, low],
+                [x, -sign * w, belt],
+                [x, -sign * -w, belt],
+            ]
             # Seen from outside the first edge runs to the left; reversed at the front.
             add([ring[1], ring[0], ring[3], ring[2]], body, 0.12)
             if t - belt > 0.05:
                 r = self._roof_half(i, w)
                 glazed = sign > 0 or self.rear_glass
-                upper = [[x, -sign * w, belt], [x, sign * w, belt], [x, sign * r, t], [x, -sign * r, t]]
+                upper = [
+                    [x, -sign * w, belt],
+                    [x, sign * w, belt],
+                    [x, sign * r, t],
+                    [x, -sign * r, t],
+                ]
                 add(upper, glass if glazed else body, 0.25 if glazed else 0.12)
             b, high = 0.95 * w, 1.6 * low
-            bumper = [[x, -sign * b, 0.6 * low], [x, sign * b, 0.6 * low], [x, sign * w, high], [x, -sign * w, high]]
+            bumper = [
+                [x, -sign * b, 0.6 * low],
+                [x, sign * b, 0.6 * low],
+                [x, sign * w, high],
+                [x, -sign * w, high],
+            ]
             add(bumper, 0.30 * body + 0.04, 0.0)
         return np.stack(faces), np.stack(colours), np.array(gloss)
 

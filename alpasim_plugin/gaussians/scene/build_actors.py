@@ -1,8 +1,10 @@
-"""Build road users as rigid clouds in the frame of their box: origin at the box centre, x length, y width, z height.
+"""Build road users as rigid clouds in the frame of their box: origin at the box centre, x length, y
+width, z height.
 
-A vehicle is lofted: stations along its length give the height of the belt line and the roof and the half widths there; strips between
-stations become body, glass and lights. People are a handful of ellipsoids. Everything is scaled to the actor's box, so that what is seen
-and what is hit are the same size. Colours come from the stream of the actor's id.
+A vehicle is lofted: stations along its length give the height of the belt line and the roof and the
+half widths there; strips between stations become body, glass and lights. People are a handful of
+ellipsoids. Everything is scaled to the actor's box, so that what is seen and what is hit are the
+same size. Colours come from the stream of the actor's id.
 """
 
 from __future__ import annotations
@@ -18,13 +20,25 @@ from alpasim_plugin.core.types import F32, F64, Actor, Box, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.actor_shapes import STATIONS, Loft
 from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneNode
-from alpasim_plugin.gaussians.scene.surfels import IDENTITY, cloud_of, quad_surfels, rods, with_sheen
+from alpasim_plugin.gaussians.scene.surfels import (
+    IDENTITY,
+    cloud_of,
+    quad_surfels,
+    rods,
+    with_sheen,
+)
 from alpasim_plugin.gaussians.sh import C0
 
 CELLS_M = (0.09, 0.22, 0.6)
 BODY_RGB = np.array(
     [
-        *([0.78, 0.78, 0.78], [0.16, 0.16, 0.17], [0.55, 0.56, 0.58], [0.90, 0.90, 0.88], [0.50, 0.10, 0.10]),
+        *(
+            [0.78, 0.78, 0.78],
+            [0.16, 0.16, 0.17],
+            [0.55, 0.56, 0.58],
+            [0.90, 0.90, 0.88],
+            [0.50, 0.10, 0.10],
+        ),
         *([0.13, 0.23, 0.45], [0.32, 0.34, 0.36], [0.20, 0.30, 0.24], [0.62, 0.55, 0.42]),
     ]
 )
@@ -56,7 +70,9 @@ def build_actor(actor: Actor, scene_id: str, seed: int) -> SceneNode:
     levels = []
     coarser = float(np.clip(actor.box.length_m / 5.0, 1.0, 2.0))
     for cell_m in np.array(CELLS_M) * coarser:
-        cloud = GaussianCloud.concatenate([shape(actor.box, draw, noise, float(cell_m)), _shadow(actor.box, actor.label)])
+        cloud = GaussianCloud.concatenate(
+            [shape(actor.box, draw, noise, float(cell_m)), _shadow(actor.box, actor.label)]
+        )
         levels.append(Level(float(cell_m), cloud))
     return SceneNode(actor.actor_id, "actor", tuple(levels))
 
@@ -73,7 +89,9 @@ def _shadow(box: Box, label: str) -> GaussianCloud:
 
 def _lofted(box: Box, draw: F64, noise: F64, cell_m: float, loft: Loft, body: F64) -> GaussianCloud:
     """Cover a loft with Gaussians and add wheels, lights and plates."""
-    length, width, height = box.length_m, box.width_m, box.height_m
+    length = box.length_m
+    width = box.width_m
+    height = box.height_m
     corners, rgb, gloss = loft.quads(body, GLASS_RGB)
     scale = np.array([length, width, height])
     quads = corners * scale + np.array([0.0, 0.0, -height / 2])
@@ -81,7 +99,11 @@ def _lofted(box: Box, draw: F64, noise: F64, cell_m: float, loft: Loft, body: F6
     # Light from above: roofs bright, flanks in between, undersides dark.
     shade = 0.80 + 0.24 * normals[:, 2]
     cloud = replace(cloud, sh=_shaded(cloud.sh, shade[owner]))
-    parts = [with_sheen(cloud, normals[owner], gloss[owner], SKY_RGB), _wheels(box, loft, cell_m), _lights(box, loft, cell_m)]
+    parts = [
+        with_sheen(cloud, normals[owner], gloss[owner], SKY_RGB),
+        _wheels(box, loft, cell_m),
+        _lights(box, loft, cell_m),
+    ]
     return GaussianCloud.concatenate(parts)
 
 
@@ -96,7 +118,9 @@ def _wheels(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
     y = np.tile([1.0, -1.0], 2) * (box.width_m / 2 - 0.02)
     z = np.full(4, radius - box.height_m / 2)
     if len(loft.axles) == 3:
-        x, y, z = np.append(x, [loft.axles[2] * box.length_m] * 2), np.append(y, y[:2]), np.append(z, z[:2])
+        x = np.append(x, [loft.axles[2] * box.length_m] * 2)
+        y = np.append(y, y[:2])
+        z = np.append(z, z[:2])
     n = len(x)
     centre = np.column_stack([x, y, z])
     disc = _blobs(centre, (0.52 * radius, 0.05, 0.52 * radius), TYRE_RGB)
@@ -104,13 +128,17 @@ def _wheels(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
         return disc
     angle = np.linspace(0, 2 * np.pi, 10, endpoint=False)
     rim = np.stack([np.cos(angle), np.zeros(10), np.sin(angle)], axis=1) * 0.74 * radius
-    tyre = _blobs((centre[:, None] + rim[None]).reshape(-1, 3), (0.19 * radius, 0.05, 0.19 * radius), TYRE_RGB)
+    tyre = _blobs(
+        (centre[:, None] + rim[None]).reshape(-1, 3), (0.19 * radius, 0.05, 0.19 * radius), TYRE_RGB
+    )
     outward = np.column_stack([np.zeros(n), 0.05 * np.sign(y), np.zeros(n)])
     hub = _blobs(centre + outward, (0.26 * radius, 0.02, 0.26 * radius), HUB_RGB)
     return GaussianCloud.concatenate([disc, tyre, hub])
 
 
-def _blobs(means: npt.ArrayLike, scales: tuple[float, float, float], rgb: npt.ArrayLike) -> GaussianCloud:
+def _blobs(
+    means: npt.ArrayLike, scales: tuple[float, float, float], rgb: npt.ArrayLike
+) -> GaussianCloud:
     """Return Gaussians of one size, colour and orientation along the box's axes."""
     return cloud_of(np.asarray(means, dtype=np.float64), IDENTITY, scales, rgb)
 
@@ -126,18 +154,32 @@ def _lights(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
         _blobs([[-end, y, z], [-end, -y, z]], (0.02, 0.11, 0.065), (0.80, 0.06, 0.05)),
     ]
     if cell_m < 0.3:
-        parts.append(_blobs([[-end, 0, plate_z], [end, 0, 1.05 * plate_z]], (0.02, 0.14, 0.045), (0.88, 0.88, 0.86)))
+        parts.append(
+            _blobs(
+                [[-end, 0, plate_z], [end, 0, 1.05 * plate_z]],
+                (0.02, 0.14, 0.045),
+                (0.88, 0.88, 0.86),
+            )
+        )
     return GaussianCloud.concatenate(parts)
 
 
 def _car(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
-    kind = "van" if box.height_m > 1.95 else "suv" if box.height_m > 1.65 else ("hatch" if draw[1] < 0.4 else "sedan")
+    kind = (
+        "van"
+        if box.height_m > 1.95
+        else "suv"
+        if box.height_m > 1.65
+        else ("hatch" if draw[1] < 0.4 else "sedan")
+    )
     return _lofted(box, draw, noise, cell_m, STATIONS[kind], BODY_RGB[int(draw[0] * len(BODY_RGB))])
 
 
 def _truck(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
     if box.length_m < 6.0 and box.height_m < 2.3:
-        return _lofted(box, draw, noise, cell_m, STATIONS["pickup"], BODY_RGB[int(draw[0] * len(BODY_RGB))])
+        return _lofted(
+            box, draw, noise, cell_m, STATIONS["pickup"], BODY_RGB[int(draw[0] * len(BODY_RGB))]
+        )
     return _lofted(box, draw, noise, cell_m, STATIONS["truck"], TRUCK_RGB[int(draw[0] * 3)])
 
 
@@ -145,8 +187,18 @@ def _bus(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
     return _lofted(box, draw, noise, cell_m, STATIONS["bus"], BUS_RGB[int(draw[0] * 3)])
 
 
-def _person(height_m: float, width_m: float, draw: F64, stride: float, z0: float, x0: float = 0.0, lean: float = 0.0) -> GaussianCloud:
-    """Return a standing or riding figure with its feet at ``(x0, 0, z0)``; ``lean`` and ``stride`` are shares of its height."""
+def _person(
+    height_m: float,
+    width_m: float,
+    draw: F64,
+    stride: float,
+    z0: float,
+    x0: float = 0.0,
+    lean: float = 0.0,
+) -> GaussianCloud:
+    """Return a standing or riding figure with its feet at ``(x0, 0, z0)``; ``lean`` and ``stride``
+    are shares of its height.
+    """
     h, w = height_m, min(max(width_m, 0.45), 0.75)
     coat = CLOTHES_RGB[int(draw[2] * len(CLOTHES_RGB))]
     legs = CLOTHES_RGB[int(draw[3] * len(CLOTHES_RGB))] * 0.8
@@ -191,10 +243,20 @@ def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) ->
     thick = (0.05 if heavy else 0.022) * (20 / len(angle)) ** 0.5
     tyres = _blobs(at, (2.2 * thick, 1.2 * thick, 2.2 * thick), TYRE_RGB)
     body = BODY_RGB[int(draw[0] * len(BODY_RGB))]
-    seat, bar = np.array([-0.12 * length, 0, bottom + 0.52 * height]), np.array([0.26 * length, 0, bottom + 0.60 * height])
+    seat, bar = (
+        np.array([-0.12 * length, 0, bottom + 0.52 * height]),
+        np.array([0.26 * length, 0, bottom + 0.60 * height]),
+    )
     pedal = np.array([-0.02 * length, 0, bottom + radius])
     grip = np.array([0.0, 0.25, 0.0])
-    pairs = [(seat, centres[1]), (seat, pedal), (bar, pedal), (bar, centres[0]), (seat, bar), (bar + grip, bar - grip)]
+    pairs = [
+        (seat, centres[1]),
+        (seat, pedal),
+        (bar, pedal),
+        (bar, centres[0]),
+        (seat, bar),
+        (bar + grip, bar - grip),
+    ]
     start, end = np.stack([p[0] for p in pairs]), np.stack([p[1] for p in pairs])
     frame = rods(start, end, 0.10 if heavy else 0.03, body, max(cell_m, 0.12))
     rider = _person(0.80 * height, 0.55, draw, 0.06, bottom + 0.22 * height, -0.06 * length, 0.30)
@@ -211,14 +273,18 @@ def _motorcycle(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud
 
 def _other(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
     """Draw a traffic cone where the box is small and slim, else a crate with warning stripes."""
-    length, width, height = box.length_m, box.width_m, box.height_m
+    length = box.length_m
+    width = box.width_m
+    height = box.height_m
     if max(length, width) < 1.0:
         n = 8 if cell_m < 0.3 else 4
         z = (np.arange(n) + 0.5) / n
         radius = 0.30 * min(length, width) * (1.05 - 0.8 * z)
         rgb = np.where(((z > 0.4) & (z < 0.62))[:, None], [0.92, 0.92, 0.90], [0.90, 0.36, 0.08])
         means = np.column_stack([np.zeros(n), np.zeros(n), (z - 0.5) * height])
-        return cloud_of(means, IDENTITY, np.column_stack([radius, radius, np.full(n, 0.55 * height / n)]), rgb)
+        return cloud_of(
+            means, IDENTITY, np.column_stack([radius, radius, np.full(n, 0.55 * height / n)]), rgb
+        )
     return _crate(length / 2, width / 2, height / 2, noise, cell_m)
 
 
@@ -230,7 +296,14 @@ def _crate(x: float, y: float, z: float, noise: F64, cell_m: float) -> GaussianC
             low, high = np.array([0, 0, -z + z * k / 2]), np.array([0, 0, -z + z * (k + 1) / 2])
             side = np.array([-sy * x, sx * y, 0.0])
             middle = np.array([sx * x, sy * y, 0.0])
-            faces.append([middle - side + low, middle + side + low, middle + side + high, middle - side + high])
+            faces.append(
+                [
+                    middle - side + low,
+                    middle + side + low,
+                    middle + side + high,
+                    middle - side + high,
+                ]
+            )
             rgb_rows.append([0.86, 0.84, 0.80] if k % 2 else [0.80, 0.42, 0.14])
     faces.append([np.array(corner) for corner in ((-x, -y, z), (x, -y, z), (x, y, z), (-x, y, z))])
     rgb_rows.append([0.80, 0.60, 0.40])

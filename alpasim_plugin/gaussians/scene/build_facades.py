@@ -1,7 +1,8 @@
 """Build houses along the road: extruded boxes whose walls carry windows, doors and shop fronts.
 
-A wall is a grid of bays and floors, each bay a small pattern of cells; coarser levels use coarser patterns with the same mean look. Windows
-are cells, not holes: what a picture shows of a facade at street distances is colour and rhythm.
+A wall is a grid of bays and floors, each bay a small pattern of cells; coarser levels use coarser
+patterns with the same mean look. Windows are cells, not holes: what a picture shows of a facade at
+street distances is colour and rhythm.
 """
 
 from __future__ import annotations
@@ -25,7 +26,12 @@ FLOOR_M, BAY_M = 3.1, 3.0
 WIDTH_M = (9.0, 19.0)
 DEPTH_M = 9.0
 CLEAR_M = 2.8  # no wall stands nearer to the road
-CELLS = ((12, 0.25), (6, 0.32), (3, 0.9), (1, 2.6))  # cells per bay, and the cell size at which the level is chosen
+CELLS = (
+    (12, 0.25),
+    (6, 0.32),
+    (3, 0.9),
+    (1, 2.6),
+)  # cells per bay, and the cell size at which the level is chosen
 
 WALLS = np.array(
     [
@@ -34,7 +40,15 @@ WALLS = np.array(
     ]
 )
 GLASS = np.array([[0.16, 0.20, 0.26], [0.24, 0.31, 0.38], [0.36, 0.45, 0.52], [0.58, 0.55, 0.42]])
-AWNINGS = np.array([[0.60, 0.14, 0.12], [0.12, 0.32, 0.22], [0.13, 0.22, 0.45], [0.72, 0.60, 0.20], [0.30, 0.28, 0.28]])
+AWNINGS = np.array(
+    [
+        [0.60, 0.14, 0.12],
+        [0.12, 0.32, 0.22],
+        [0.13, 0.22, 0.45],
+        [0.72, 0.60, 0.20],
+        [0.30, 0.28, 0.28],
+    ]
+)
 
 
 class Houses(NamedTuple):
@@ -77,23 +91,31 @@ def build_facades(site: Site) -> tuple[list[SceneNode], Houses]:
     owner = np.tile(np.arange(m), 4)
     is_front = np.arange(4 * m) < m
     base = np.minimum(site.world(starts)[:, 2], site.world(ends)[:, 2])
-    top = (base[:m] + houses.height_m)[owner]  # on a slope the walls differ in height, the roof is level
+    top = (base[:m] + houses.height_m)[
+        owner
+    ]  # on a slope the walls differ in height, the roof is level
     seed = int(rng.integers(1 << 30))
     walls = _Walls(starts, ends, base, top - base, owner, is_front)
     levels = []
     for cells, cell_m in CELLS:
         cloud, wall = _walls(site, walls, style, cells, seed)
         roof, house = _roofs(site, houses, style["wall"], base[:m], 1.0 if cells > 3 else 3.0)
-        levels.append((cell_m, GaussianCloud.concatenate([cloud, roof]), np.concatenate([owner[wall], house])))
+        levels.append(
+            (cell_m, GaussianCloud.concatenate([cloud, roof]), np.concatenate([owner[wall], house]))
+        )
     return nodes_by_tile("house", levels), houses
 
 
 def place_houses(site: Site) -> Houses:
-    """Choose where houses stand: along the line at the setback, clear of the road, of actors and of each other."""
+    """Choose where houses stand: along the line at the setback, clear of the road, of actors and of
+    each other.
+    """
     environment = site.scenario.environment
     rng = site.rng("houses")
     free = ((site.off_road_m > CLEAR_M) & ~site.taken).astype(np.uint8)
-    fronts, aways, heights = [], [], []
+    fronts = []
+    aways = []
+    heights = []
     low_m, high_m = environment.building_height_m
     for line in contours(site, SETBACK_M[site.highway], WITHIN_M):
         length = float(arc_lengths(line)[-1])
@@ -139,8 +161,12 @@ def _claim(free: U8, ring: F64, site: Site) -> bool:
     return True
 
 
-def _walls(site: Site, walls: _Walls, style: dict[str, npt.NDArray[Any]], cells: int, seed: int) -> tuple[GaussianCloud, I64]:
-    """Cover walls with ``cells x cells`` Gaussians per bay and floor; returns the cloud and each Gaussian's wall."""
+def _walls(
+    site: Site, walls: _Walls, style: dict[str, npt.NDArray[Any]], cells: int, seed: int
+) -> tuple[GaussianCloud, I64]:
+    """Cover walls with ``cells x cells`` Gaussians per bay and floor; returns the cloud and each
+    Gaussian's wall.
+    """
     starts, ends, base, height, owner, is_front = walls
     length = np.linalg.norm(ends - starts, axis=1)
     bays = np.maximum(np.round(length / BAY_M), 1).astype(np.int64)
@@ -148,7 +174,10 @@ def _walls(site: Site, walls: _Walls, style: dict[str, npt.NDArray[Any]], cells:
     wall, u, v = grid_cells(bays * cells, floors * cells)
     nu, nv = (bays * cells)[wall], (floors * cells)[wall]
     iu, iv = np.floor(u * nu).astype(np.int64), np.floor(v * nv).astype(np.int64)
-    bay, floor, cu, cv = iu // cells, iv // cells, iu % cells, iv % cells
+    bay = iu // cells
+    floor = iv // cells
+    cu = iu % cells
+    cv = iv % cells
     house = owner[wall]
     # One number per window, the same at every level of detail.
     key = (wall * 7919 + bay * 104_729 + floor * 1_299_709 + seed) % 2_147_483_647
@@ -164,25 +193,41 @@ def _walls(site: Site, walls: _Walls, style: dict[str, npt.NDArray[Any]], cells:
     if cells >= 6:
         share = ((fu > first) & (fu < 0.83) & (fv > 0.33) & (fv < 0.83)).astype(np.float64)
         sill = (fu > first) & (fu < 0.83) & (fv > 0.17) & (fv < 0.33)
-        band, door = shop & (fv > 0.66) & (fv < 0.83), entrance & (fu > 0.33) & (fu < 0.66) & (fv < 0.66)
+        band, door = (
+            shop & (fv > 0.66) & (fv < 0.83),
+            entrance & (fu > 0.33) & (fu < 0.66) & (fv < 0.66),
+        )
         if cells > 6:  # glazing bars and a thinner sill
             bar = (np.abs(fu - (first + 0.83) / 2) < 0.04) | (np.abs(fv - 0.62) < 0.04)
             share *= np.where(bar, 0.55, 1.0)
             sill &= fv > 0.25
     elif cells == 3:
-        share = np.where(cu == 1, np.where(cv == 1, 1.0, np.where(cv == 2, 0.5, 0.0)), np.where(wide & (cv == 1), 0.3, 0.0))
-        sill, band, door = nothing, shop & (cv == 2), entrance & (cu == 1) & (cv <= 1)
+        share = np.where(
+            cu == 1,
+            np.where(cv == 1, 1.0, np.where(cv == 2, 0.5, 0.0)),
+            np.where(wide & (cv == 1), 0.3, 0.0),
+        )
+        sill = nothing
+        band = shop & (cv == 2)
+        door = entrance & (cu == 1) & (cv <= 1)
     else:
         share = np.where(wide, 0.33, 0.25)
-        sill, band, door = nothing, shop, nothing
+        sill = nothing
+        band = shop
+        door = nothing
     # Walls away from the street have fewer windows.
     share = np.where(front, share, 0.6 * share * (bay % 2 == 0))
     shop_share = ((fu > 0.12) & (fv < 0.66)) * 1.0 if cells >= 6 else np.where(cv <= 1, 0.75, 0.0)
     share = np.where(shop, shop_share, share)
     shade = np.where(front, 1.0, 0.80) * (0.86 + 0.14 * np.clip(v * 2.5, 0, 1))
     texture = site.scenario.environment.texture
-    # The same hash by place gives every level the wall's large stains; the fine grain belongs to the finest level.
-    grain = site.rng(f"facade-grain-{cells}").standard_normal(len(wall)) * (0.035 if cells >= 6 else 0.015) * texture
+    # The same hash by place gives every level the wall's large stains; the fine grain belongs to
+    # the finest level.
+    grain = (
+        site.rng(f"facade-grain-{cells}").standard_normal(len(wall))
+        * (0.035 if cells >= 6 else 0.015)
+        * texture
+    )
     rgb = style["wall"][house] * (shade + grain)[:, None]
     trim = sill & front
     rgb[trim] = style["trim"][house[trim]] * shade[trim, None]
@@ -199,11 +244,16 @@ def _walls(site: Site, walls: _Walls, style: dict[str, npt.NDArray[Any]], cells:
     heading = site.frame.to_world(ends) - site.frame.to_world(starts)
     direction = np.column_stack([heading, np.zeros(len(heading))])
     quats = quats_along(direction)
-    scales = np.stack([SPREAD * length[wall] / nu, np.full(len(wall), 0.05), SPREAD * (height[wall] + 0.2) / nv], axis=1)
+    scales = np.stack(
+        [SPREAD * length[wall] / nu, np.full(len(wall), 0.05), SPREAD * (height[wall] + 0.2) / nv],
+        axis=1,
+    )
     return cloud_of(means, quats[wall], scales, rgb), wall
 
 
-def _roofs(site: Site, houses: Houses, wall_rgb: F64, base: F64, cell_m: float) -> tuple[GaussianCloud, I64]:
+def _roofs(
+    site: Site, houses: Houses, wall_rgb: F64, base: F64, cell_m: float
+) -> tuple[GaussianCloud, I64]:
     """Cover the flat roofs, so that a house seen from above or afar is closed."""
     a, b = houses.front[:, 0], houses.front[:, 1]
     length = np.linalg.norm(b - a, axis=1)
@@ -214,6 +264,9 @@ def _roofs(site: Site, houses: Houses, wall_rgb: F64, base: F64, cell_m: float) 
     xy = site.frame.to_world(plan)
     heading = site.frame.to_world(b) - site.frame.to_world(a)
     quats = quats_along(np.column_stack([heading, np.zeros(len(heading))]))
-    scales = np.stack([SPREAD * (length / n_u)[house], SPREAD * DEPTH_M / n_v[house], np.full(len(house), 0.05)], axis=1)
+    scales = np.stack(
+        [SPREAD * (length / n_u)[house], SPREAD * DEPTH_M / n_v[house], np.full(len(house), 0.05)],
+        axis=1,
+    )
     means = np.column_stack([xy, (base + houses.height_m)[house] - 0.05])
     return cloud_of(means, quats[house], scales, 0.55 * wall_rgb[house]), house

@@ -1,11 +1,14 @@
-"""Build the ground: asphalt with its wear, paint, pavements and grass, as flat Gaussians whose size follows what is to be seen there.
+"""Build the ground: asphalt with its wear, paint, pavements and grass, as flat Gaussians whose size
+follows what is to be seen there.
 
-The plan is painted as an image (0.125 m near the path, 0.5 m beyond), and a quadtree over it yields the Gaussians: small at paint and
-kerbs, larger on plain surfaces and far from the path. The same quadtree with larger least cells gives the coarser levels of detail, so a
-level is the average of the finer one. Road paint is drawn a second time as long thin Gaussians `LIFT_M` above the ground: Gaussians are
-composited in the order of their centres, so at a grazing angle ground in front of a line would otherwise wash over it. The lift, and a
-shallow trench in the ground around it, put a line in front of all ground within ``(lift + trench) * distance / camera height``, which grows
-with distance as the cells do.
+The plan is painted as an image (0.125 m near the path, 0.5 m beyond), and a quadtree over it yields
+the Gaussians: small at paint and kerbs, larger on plain surfaces and far from the path. The same
+quadtree with larger least cells gives the coarser levels of detail, so a level is the average of
+the finer one. Road paint is drawn a second time as long thin Gaussians `LIFT_M` above the ground:
+Gaussians are composited in the order of their centres, so at a grazing angle ground in front of a
+line would otherwise wash over it. The lift, and a shallow trench in the ground around it, put a
+line in front of all ground within ``(lift + trench) * distance / camera height``, which grows with
+distance as the cells do.
 """
 
 from __future__ import annotations
@@ -21,7 +24,14 @@ from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.paint import WHITE, YELLOW, Strokes
 from alpasim_plugin.gaussians.scene.scene_graph import SceneNode, nodes_by_tile, tile_numbers
 from alpasim_plugin.gaussians.scene.site import CELL_M, SHIFT_BITS, Site, left_of, to_pixels, unit
-from alpasim_plugin.gaussians.scene.surfels import SPREAD, THICKNESS, cloud_of, grid_cells, quats_along, upright_quats
+from alpasim_plugin.gaussians.scene.surfels import (
+    SPREAD,
+    THICKNESS,
+    cloud_of,
+    grid_cells,
+    quats_along,
+    upright_quats,
+)
 
 PAINT_IMAGE_RGB = {WHITE: (0.86, 0.86, 0.84), YELLOW: (0.84, 0.65, 0.17)}
 ASPHALT = (0.335, 0.335, 0.345)
@@ -30,20 +40,25 @@ GRASS = (0.33, 0.40, 0.22)
 GRAVEL = (0.46, 0.43, 0.38)
 FORECOURT = (0.47, 0.45, 0.42)
 KERB_M = 0.12
-TRENCH_M, TRENCH_DEPTH_M = 0.16, 0.03  # asphalt this near to paint lies this much lower, see build_road
+TRENCH_M, TRENCH_DEPTH_M = (
+    0.16,
+    0.03,
+)  # asphalt this near to paint lies this much lower, see build_road
 PAVEMENT_M = 2.6  # width of the pavement beside the road
 FORECOURT_M = 6.5  # paved or planted strip up to the facades
 
 
 @dataclass(frozen=True)
 class GroundTexture:
-    """The painted ground; cell (i, j) has its centre at ``low + (j + 0.5, i + 0.5) * cell_m`` in ground coordinates.
+    """The painted ground; cell (i, j) has its centre at ``low + (j + 0.5, i + 0.5) * cell_m`` in
+    ground coordinates.
 
     Attributes:
         cell_m: Metres.
         low: ``(2,)`` ground coordinates of the corner.
         rgb: ``(H, W, 3)`` 0..1.
-        height: ``(H, W)`` metres above the road's surface: a kerb's height beside the road, a little below zero around paint.
+        height: ``(H, W)`` metres above the road's surface: a kerb's height beside the road, a
+            little below zero around paint.
         level: ``(H, W)`` the largest square that may stand for the cell is ``cell_m * 2**level``.
     """
 
@@ -54,14 +69,17 @@ class GroundTexture:
     level: I64
 
 
-def paint_ground(site: Site, strokes: Strokes, cell_m: float, window: tuple[int, int, int, int] | None) -> GroundTexture:
+def paint_ground(
+    site: Site, strokes: Strokes, cell_m: float, window: tuple[int, int, int, int] | None
+) -> GroundTexture:
     """Paint the ground.
 
     Args:
         site: What lies where.
         strokes: Road paint.
         cell_m: Cell size of the image.
-        window: (first row, first column, rows, columns) in cells of ``cell_m``; None: the whole site, padded to whole tiles of 32 m.
+        window: (first row, first column, rows, columns) in cells of ``cell_m``; None: the whole
+            site, padded to whole tiles of 32 m.
     """
     if window is None:
         n = round(32.0 / cell_m)
@@ -69,7 +87,10 @@ def paint_ground(site: Site, strokes: Strokes, cell_m: float, window: tuple[int,
         window = (0, 0, rows, columns)
     i0, j0, rows, columns = window
     low = site.low + np.array([j0, i0]) * cell_m
-    off, inside, path = (_sampled(d, site, low, cell_m, (rows, columns)) for d in (site.off_road_m, site.inside_m, site.path_m))
+    off, inside, path = (
+        _sampled(d, site, low, cell_m, (rows, columns))
+        for d in (site.off_road_m, site.inside_m, site.path_m)
+    )
     road = inside > off
     edge = np.abs(inside - off)
     texture = site.scenario.environment.texture
@@ -83,7 +104,10 @@ def paint_ground(site: Site, strokes: Strokes, cell_m: float, window: tuple[int,
     rgb[road] = np.array(ASPHALT, dtype=np.float32) * tone[road][:, None]
     # Cells half covered by a thin line would alias along the crisp strokes laid over them.
     thinnest = 0.3 if cell_m < CELL_M else 0.0
-    covers = [_coverage(strokes, colour, low, cell_m, (rows, columns), thinnest) for colour in (WHITE, YELLOW)]
+    covers = [
+        _coverage(strokes, colour, low, cell_m, (rows, columns), thinnest)
+        for colour in (WHITE, YELLOW)
+    ]
     for colour, cover in zip((WHITE, YELLOW), covers, strict=True):
         on = cover > 0
         worn = cover[on] * (0.95 - 0.12 * texture * np.clip(grain[on], 0, 2))
@@ -94,7 +118,9 @@ def paint_ground(site: Site, strokes: Strokes, cell_m: float, window: tuple[int,
         painted |= _coverage(strokes, colour, low, cell_m, (rows, columns)) > 0.04
     near_paint = np.full_like(edge, 1.0e3)
     if painted.any():
-        near_paint = cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, 5) * np.float32(cell_m)
+        near_paint = cv2.distanceTransform(
+            (~painted).astype(np.uint8), cv2.DIST_L2, 5
+        ) * np.float32(cell_m)
     feature = np.minimum(edge, near_paint)
     if cell_m < CELL_M:
         cap = np.where(road & (path < 2.5), 0.125, np.where(road & (path < 6.0), 0.25, 0.5))
@@ -102,7 +128,9 @@ def paint_ground(site: Site, strokes: Strokes, cell_m: float, window: tuple[int,
         cap = np.clip(0.06 * path, 0.5, 4.0)
     wanted = np.clip(0.6 * feature, cell_m, np.maximum(cap, cell_m))
     level = np.floor(np.log2(wanted / cell_m) + 1e-6).astype(np.int64)
-    trench = (near_paint < TRENCH_M) & (edge > TRENCH_M)  # not at the kerb's foot: a gap would open there
+    trench = (near_paint < TRENCH_M) & (
+        edge > TRENCH_M
+    )  # not at the kerb's foot: a gap would open there
     height = np.where(road, np.where(trench, -TRENCH_DEPTH_M, 0.0), 0.0 if site.highway else KERB_M)
     return GroundTexture(cell_m, low, np.clip(rgb, 0, 1), height.astype(np.float32), level)
 
@@ -113,28 +141,48 @@ def _sampled(raster: F32, site: Site, low: F64, cell_m: float, shape: tuple[int,
     shift = (low - site.low) / CELL_M + 0.5 * scale - 0.5
     matrix = np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(raster.astype(np.float32), matrix, (shape[1], shape[0]), flags=flags, borderMode=cv2.BORDER_REPLICATE))
+    return np.asarray(
+        cv2.warpAffine(
+            raster.astype(np.float32),
+            matrix,
+            (shape[1], shape[0]),
+            flags=flags,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+    )
 
 
 def _noise(site: Site, tag: str, shape: tuple[int, int], cell_m: float) -> F32:
-    """Return smooth noise ``(H, W)`` of about unit spread: octaves from the grain of asphalt to patches of ten metres."""
+    """Return smooth noise ``(H, W)`` of about unit spread: octaves from the grain of asphalt to
+    patches of ten metres.
+    """
     total = np.zeros(shape, dtype=np.float32)
     rng = site.rng(tag)
     for grid_m, weight in ((0.13, 0.6), (0.4, 0.45), (1.2, 0.4), (3.0, 0.4), (12.0, 0.45)):
         step = max(grid_m, cell_m)
-        small = rng.standard_normal((int(shape[0] * cell_m / step) + 3, int(shape[1] * cell_m / step) + 3)).astype(np.float32)
+        small = rng.standard_normal(
+            (int(shape[0] * cell_m / step) + 3, int(shape[1] * cell_m / step) + 3)
+        ).astype(np.float32)
         total += weight * cv2.resize(small, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
     return total
 
 
 def _verge(site: Site, off: F32, grain: F32, texture: float) -> F32:
-    """Colour cells ``(N,)`` of the ground beside the road, ``(N, 3)``: pavement with slabs, then forecourt or grass."""
+    """Colour cells ``(N,)`` of the ground beside the road, ``(N, 3)``: pavement with slabs, then
+    forecourt or grass.
+    """
     sorts = [(GRASS, 0.20), (GRAVEL, 0.08)]
     sort = (off < 1.0).astype(np.intp)
     if not site.highway:
-        sorts[1:] = (FORECOURT, 0.08) if site.scenario.environment.buildings > 0.5 else (GRASS, 0.20), (PAVEMENT, 0.06)
+        sorts[1:] = (
+            (FORECOURT, 0.08) if site.scenario.environment.buildings > 0.5 else (GRASS, 0.20),
+            (PAVEMENT, 0.06),
+        )
         sort = (off < FORECOURT_M).astype(np.intp) + (off < PAVEMENT_M)
-    colours, contrast = (np.array(column, dtype=np.float32) for column in zip(*((c, k * texture) for c, k in sorts), strict=True))
+    colours, contrast = (
+        np.array(column, dtype=np.float32)
+        for column in zip(*((c, k * texture) for c, k in sorts), strict=True)
+    )
     rgb = colours[sort] * (1 + contrast[sort] * grain)[:, None]
     if not site.highway:
         joint = (np.abs(off - 1.3) < 0.07) & (off < PAVEMENT_M)
@@ -143,7 +191,9 @@ def _verge(site: Site, off: F32, grain: F32, texture: float) -> F32:
 
 
 def _wear(site: Site, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
-    """Return what darkens asphalt, 0..1: wheel tracks and the oil line of each lane, patches and cracks near the path."""
+    """Return what darkens asphalt, 0..1: wheel tracks and the oil line of each lane, patches and
+    cracks near the path.
+    """
     dark = np.zeros(shape, dtype=np.uint8)
     high = low + np.array(shape[::-1]) * cell_m
     for lane in site.scenario.lane_map.lanes.values():
@@ -155,8 +205,18 @@ def _wear(site: Site, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
         left = left_of(unit(np.gradient(line, axis=0)))
         for side in (-0.85, 0.85):
             points = to_pixels(line + side * left, low, cell_m)
-            cv2.polylines(dark, [points], False, 26, max(1, round(0.6 / cell_m)), cv2.LINE_8, SHIFT_BITS)
-        cv2.polylines(dark, [to_pixels(line, low, cell_m)], False, 14, max(1, round(0.4 / cell_m)), cv2.LINE_8, SHIFT_BITS)
+            cv2.polylines(
+                dark, [points], False, 26, max(1, round(0.6 / cell_m)), cv2.LINE_8, SHIFT_BITS
+            )
+        cv2.polylines(
+            dark,
+            [to_pixels(line, low, cell_m)],
+            False,
+            14,
+            max(1, round(0.4 / cell_m)),
+            cv2.LINE_8,
+            SHIFT_BITS,
+        )
     soft: U8 = cv2.GaussianBlur(dark, (0, 0), max(0.2 / cell_m, 0.5))
     if cell_m < CELL_M:
         _patches_and_cracks(site, soft, low, cell_m)
@@ -171,30 +231,62 @@ def _patches_and_cracks(site: Site, dark: U8, low: F64, cell_m: float) -> None:
         half = rng.uniform([0.6, 0.4], [2.2, 1.2])
         angle = rng.normal(0.0, 0.05)
         c, s = np.cos(angle), np.sin(angle)
-        ring = centre + (np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half) @ np.array([[c, s], [-s, c]])
-        cv2.fillPoly(dark, [to_pixels(ring, low, cell_m)], int(rng.integers(28, 55)), cv2.LINE_8, SHIFT_BITS)
+        ring = centre + (np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half) @ np.array(
+            [[c, s], [-s, c]]
+        )
+        cv2.fillPoly(
+            dark, [to_pixels(ring, low, cell_m)], int(rng.integers(28, 55)), cv2.LINE_8, SHIFT_BITS
+        )
     for _ in range(max(3, len(path) // 6)):
         start = path[rng.integers(len(path))] + rng.uniform(-6, 6, 2)
         heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0, 0.35, 14))
-        line = start + np.cumsum(0.35 * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
-        cv2.polylines(dark, [to_pixels(line, low, cell_m)], False, int(rng.integers(60, 100)), 1, cv2.LINE_AA, SHIFT_BITS)
+        line = start + np.cumsum(
+            0.35 * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0
+        )
+        cv2.polylines(
+            dark,
+            [to_pixels(line, low, cell_m)],
+            False,
+            int(rng.integers(60, 100)),
+            1,
+            cv2.LINE_AA,
+            SHIFT_BITS,
+        )
 
 
-def _coverage(strokes: Strokes, colour: int, low: F64, cell_m: float, shape: tuple[int, int], thinnest_m: float = 0.0) -> F32:
-    """Return the share ``(H, W)`` of each cell under paint of one colour; strokes thinner than ``thinnest_m`` are left out."""
+def _coverage(
+    strokes: Strokes,
+    colour: int,
+    low: F64,
+    cell_m: float,
+    shape: tuple[int, int],
+    thinnest_m: float = 0.0,
+) -> F32:
+    """Return the share ``(H, W)`` of each cell under paint of one colour; strokes thinner than
+    ``thinnest_m`` are left out.
+    """
     mask = np.zeros(shape, dtype=np.uint8)
     high = low + np.array(shape[::-1]) * cell_m
     near = np.all((strokes.start > low - 5) & (strokes.start < high + 5), axis=1)
     mine = near & (strokes.colour == colour) & (strokes.width_m >= thinnest_m)
-    start, end, width = strokes.start[mine], strokes.end[mine], strokes.width_m[mine]
+    start = strokes.start[mine]
+    end = strokes.end[mine]
+    width = strokes.width_m[mine]
     direction = unit(end - start)
     left = left_of(direction) * (width / 2)[:, None]
     along = direction * 0.02
-    rings = np.stack([start - left - along, end - left + along, end + left + along, start + left - along], axis=1)
-    # Strokes of coarse images are thinner than a pixel: paint at four times the resolution would be exact, area weighting is enough.
+    rings = np.stack(
+        [start - left - along, end - left + along, end + left + along, start + left - along], axis=1
+    )
+    # Strokes of coarse images are thinner than a pixel: paint at four times the resolution would be
+    # exact, area weighting is enough.
     gain = np.minimum(1.0, width / cell_m)
-    for ring, share in zip(to_pixels(rings.reshape(-1, 2), low, cell_m).reshape(-1, 4, 2), gain, strict=True):
-        cv2.fillConvexPoly(mask, ring, int(255 * share), cv2.LINE_AA if share == 1.0 else cv2.LINE_8, SHIFT_BITS)
+    for ring, share in zip(
+        to_pixels(rings.reshape(-1, 2), low, cell_m).reshape(-1, 4, 2), gain, strict=True
+    ):
+        cv2.fillConvexPoly(
+            mask, ring, int(255 * share), cv2.LINE_AA if share == 1.0 else cv2.LINE_8, SHIFT_BITS
+        )
     return np.asarray(mask.astype(np.float32) / 255.0)
 
 
@@ -207,12 +299,16 @@ PAINT_RGB = {WHITE: (0.88, 0.88, 0.86), YELLOW: (0.86, 0.66, 0.16)}
 
 
 def build_road(site: Site, strokes: Strokes) -> list[SceneNode]:
-    """Return the ground's nodes: fine tiles along the path, coarse ones around, and the paint strokes."""
+    """Return the ground's nodes: fine tiles along the path, coarse ones around, and the paint
+    strokes.
+    """
     fine_tiles = _corridor(site)
     fine = paint_ground(site, strokes, FINE_M, _window(site, fine_tiles, FINE_M))
     coarse = paint_ground(site, strokes, COARSE_M, None)
     nodes = _ground_nodes(site, "ground", fine, fine_tiles, TILE_M, (0, 1, 2, 3), keep_inside=True)
-    nodes += _ground_nodes(site, "far-ground", coarse, fine_tiles, FAR_TILE_M, (0, 1, 2), keep_inside=False)
+    nodes += _ground_nodes(
+        site, "far-ground", coarse, fine_tiles, FAR_TILE_M, (0, 1, 2), keep_inside=False
+    )
     return nodes + _stroke_nodes(site, strokes) + _surroundings(site)
 
 
@@ -227,14 +323,27 @@ def _corridor(site: Site) -> Bool:
 
 
 def _window(site: Site, tiles: Bool, cell_m: float) -> tuple[int, int, int, int]:
-    """Return (first row, first column, rows, columns) in cells of ``cell_m`` that hold all fine tiles."""
+    """Return (first row, first column, rows, columns) in cells of ``cell_m`` that hold all fine
+    tiles.
+    """
     rows, columns = np.flatnonzero(tiles.any(axis=1)), np.flatnonzero(tiles.any(axis=0))
     n = round(TILE_M / cell_m)
-    return int(rows[0]) * n, int(columns[0]) * n, int(rows[-1] - rows[0] + 1) * n, int(columns[-1] - columns[0] + 1) * n
+    return (
+        int(rows[0]) * n,
+        int(columns[0]) * n,
+        int(rows[-1] - rows[0] + 1) * n,
+        int(columns[-1] - columns[0] + 1) * n,
+    )
 
 
 def _ground_nodes(
-    site: Site, name: str, image: GroundTexture, fine_tiles: Bool, tile_m: float, floors: tuple[int, ...], keep_inside: bool
+    site: Site,
+    name: str,
+    image: GroundTexture,
+    fine_tiles: Bool,
+    tile_m: float,
+    floors: tuple[int, ...],
+    keep_inside: bool,
 ) -> list[SceneNode]:
     means = _pyramid(image.rgb)
     heights = _pyramid(image.height[:, :, None])
@@ -249,13 +358,25 @@ def _ground_nodes(
             size = image.cell_m * (1 << k)
             plan = image.low + np.stack([(j + 0.5) * size, (i + 0.5) * size], axis=1)
             t = np.floor((plan - site.low) / TILE_M).astype(np.int64)
-            inside = fine_tiles[np.clip(t[:, 1], 0, fine_tiles.shape[0] - 1), np.clip(t[:, 0], 0, fine_tiles.shape[1] - 1)]
+            inside = fine_tiles[
+                np.clip(t[:, 1], 0, fine_tiles.shape[0] - 1),
+                np.clip(t[:, 0], 0, fine_tiles.shape[1] - 1),
+            ]
             keep = inside if keep_inside else ~inside
-            parts.append((plan[keep], np.full(int(keep.sum()), size), means[k][i, j][keep], heights[k][i, j, 0][keep].astype(np.float64)))
+            parts.append(
+                (
+                    plan[keep],
+                    np.full(int(keep.sum()), size),
+                    means[k][i, j][keep],
+                    heights[k][i, j, 0][keep].astype(np.float64),
+                )
+            )
         if not parts:
             continue
         plan, size_m, rgb, above = (np.concatenate(c) for c in zip(*parts, strict=True))
-        cloud = _flat(site, plan, size_m, rgb, np.where(above > KERB_M / 2, KERB_M, np.minimum(above, 0.0)))
+        cloud = _flat(
+            site, plan, size_m, rgb, np.where(above > KERB_M / 2, KERB_M, np.minimum(above, 0.0))
+        )
         levels.append((image.cell_m * (1 << floor), cloud, tile_numbers(plan - site.low, tile_m)))
     return nodes_by_tile(name, levels)
 
@@ -272,12 +393,16 @@ def _pyramid(image: F32) -> list[F32]:
             continue
         rows, below = out[-1][0::2], out[-1][1::2]
         # The same sum in the same order, of whole images: numpy is slow along two axes.
-        out.append(np.float32(0.25) * (rows[:, 0::2] + rows[:, 1::2] + below[:, 0::2] + below[:, 1::2]))
+        out.append(
+            np.float32(0.25) * (rows[:, 0::2] + rows[:, 1::2] + below[:, 0::2] + below[:, 1::2])
+        )
     return out
 
 
 def _leaves(level: I64, floor: int) -> list[Bool | None]:
-    """Return per quadtree level which squares are leaves: the largest ones in which no cell needs a smaller square."""
+    """Return per quadtree level which squares are leaves: the largest ones in which no cell needs a
+    smaller square.
+    """
     can: list[Bool] = []
     least = level
     for k in range(MAX_LEVEL + 1):
@@ -298,16 +423,22 @@ def _leaves(level: I64, floor: int) -> list[Bool | None]:
     return leaves
 
 
-def _flat(site: Site, plan: F64, size_m: F64, rgb: npt.NDArray[np.floating], above_m: F64) -> GaussianCloud:
+def _flat(
+    site: Site, plan: F64, size_m: F64, rgb: npt.NDArray[np.floating], above_m: F64
+) -> GaussianCloud:
     """Lay flat Gaussians on the ground."""
     means, normals = _on_ground(site, plan, above_m)
     quats = upright_quats(normals, site.frame.yaw_rad)
     s = SPREAD * size_m
-    return cloud_of(means, quats, np.stack([s, s, THICKNESS * size_m], axis=1), rgb.astype(np.float64))
+    return cloud_of(
+        means, quats, np.stack([s, s, THICKNESS * size_m], axis=1), rgb.astype(np.float64)
+    )
 
 
 def _on_ground(site: Site, plan: F64, above_m: F64 | float) -> tuple[F64, F64]:
-    """Return world points ``(N, 3)`` above the ground and the ground's normals ``(N, 3)``, slopes taken over 2 m."""
+    """Return world points ``(N, 3)`` above the ground and the ground's normals ``(N, 3)``, slopes
+    taken over 2 m.
+    """
     xy = site.frame.to_world(plan)
     z = site.height_at(xy)
     east, north = np.array([1.0, 0.0]), np.array([0.0, 1.0])
@@ -335,21 +466,38 @@ def _stroke_nodes(site: Site, strokes: Strokes) -> list[SceneNode]:
         owner, u, v = grid_cells(n_u, n_v)
         along = direction[owner]
         left = left_of(along)
-        plan = strokes.start[owner] + along * (u * length[owner])[:, None] + left * ((v - 0.5) * strokes.width_m[owner])[:, None]
+        plan = (
+            strokes.start[owner]
+            + along * (u * length[owner])[:, None]
+            + left * ((v - 0.5) * strokes.width_m[owner])[:, None]
+        )
         means, normals = _on_ground(site, plan, LIFT_M)
         xy = site.frame.to_world(np.concatenate([plan, plan + along]))
         heading = xy[len(plan) :] - xy[: len(plan)]
-        uphill = np.column_stack([heading, -np.sum(heading * normals[:, :2], axis=1) / normals[:, 2]])
+        uphill = np.column_stack(
+            [heading, -np.sum(heading * normals[:, :2], axis=1) / normals[:, 2]]
+        )
         single = (n_v == 1)[owner]
-        # A lone row is half as strong at its own edge (sigma 0.42 of the width); rows side by side must close the gap between them.
+        # A lone row is half as strong at its own edge (sigma 0.42 of the width); rows side by side
+        # must close the gap between them.
         across = np.where(single, 0.42, SPREAD) * (strokes.width_m / n_v)[owner]
-        scales = np.stack([0.75 * (length / n_u)[owner], across, np.full(len(owner), 0.004)], axis=1)
-        levels.append((cell_m, cloud_of(means, quats_along(uphill, normals), scales, rgb[owner], 0.97), tile[owner]))
+        scales = np.stack(
+            [0.75 * (length / n_u)[owner], across, np.full(len(owner), 0.004)], axis=1
+        )
+        levels.append(
+            (
+                cell_m,
+                cloud_of(means, quats_along(uphill, normals), scales, rgb[owner], 0.97),
+                tile[owner],
+            )
+        )
     return nodes_by_tile("paint", levels, far_m=140.0)
 
 
 def _surroundings(site: Site) -> list[SceneNode]:
-    """Lay large Gaussians from the raster's border to the horizon, so that the ground does not end in mid-air."""
+    """Lay large Gaussians from the raster's border to the horizon, so that the ground does not end
+    in mid-air.
+    """
     h, w = site.road.shape
     size = np.array([w, h]) * 0.25
     cell = 12.0
@@ -358,6 +506,8 @@ def _surroundings(site: Site) -> list[SceneNode]:
     plan = site.low - 160.0 + (grid + 0.5) * cell
     outside = np.any((plan < site.low - 0.3 * cell) | (plan > site.low + size + 0.3 * cell), axis=1)
     plan = plan[outside]
-    rgb = np.array([0.36, 0.40, 0.26]) * (1 + 0.08 * site.rng("far-field").standard_normal((len(plan), 1)))
+    rgb = np.array([0.36, 0.40, 0.26]) * (
+        1 + 0.08 * site.rng("far-field").standard_normal((len(plan), 1))
+    )
     cloud = _flat(site, plan, np.full(len(plan), cell), rgb, np.zeros(len(plan)))
     return nodes_by_tile("surroundings", [(cell, cloud, tile_numbers(plan, 120.0))])

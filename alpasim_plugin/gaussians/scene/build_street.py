@@ -13,12 +13,25 @@ from alpasim_plugin.gaussians.scene.build_facades import DEPTH_M, Houses
 from alpasim_plugin.gaussians.scene.build_road import KERB_M
 from alpasim_plugin.gaussians.scene.scene_graph import SceneNode, nodes_by_tile, tile_numbers
 from alpasim_plugin.gaussians.scene.site import CELL_M, Site, contours, places
-from alpasim_plugin.gaussians.scene.surfels import IDENTITY, SPREAD, cloud_of, grid_cells, quad_surfels, quats_along, rods
+from alpasim_plugin.gaussians.scene.surfels import (
+    IDENTITY,
+    SPREAD,
+    cloud_of,
+    grid_cells,
+    quad_surfels,
+    quats_along,
+    rods,
+)
 
 KERB_RGB = (0.66, 0.65, 0.62)
 RAIL_RGB = (0.62, 0.64, 0.66)
-POST_RGB, POLE_RGB, TRUNK_RGB = (0.45, 0.46, 0.47), (0.36, 0.38, 0.38), (0.30, 0.24, 0.19)
-TREE_LINE_M = {False: 1.6, True: 7.0}  # distance of street trees from the road's edge, by highway or not
+POST_RGB = (0.45, 0.46, 0.47)
+POLE_RGB = (0.36, 0.38, 0.38)
+TRUNK_RGB = (0.30, 0.24, 0.19)
+TREE_LINE_M = {
+    False: 1.6,
+    True: 7.0,
+}  # distance of street trees from the road's edge, by highway or not
 TILE_M = 32.0
 LEAVES = np.array([[0.24, 0.38, 0.15], [0.30, 0.43, 0.18], [0.20, 0.33, 0.17], [0.38, 0.43, 0.17]])
 Item = tuple[float, GaussianCloud, F64]  # cell size, cloud, plan position of each Gaussian's owner
@@ -26,7 +39,11 @@ Item = tuple[float, GaussianCloud, F64]  # cell size, cloud, plan position of ea
 
 def build_street(site: Site, houses: Houses) -> list[SceneNode]:
     """Return the nodes of everything beside the road but the houses."""
-    nodes = _nodes(site, "guard-rail" if site.highway else "kerb", _rails(site) if site.highway else _kerbs(site))
+    nodes = _nodes(
+        site,
+        "guard-rail" if site.highway else "kerb",
+        _rails(site) if site.highway else _kerbs(site),
+    )
     nodes += _nodes(site, "tree", _trees(site, houses))
     return nodes + _nodes(site, "pole", _poles(site, houses)) + _nodes(site, "sign", _signs(site))
 
@@ -51,15 +68,20 @@ def _kerbs(site: Site) -> list[Item]:
         rng = site.rng(f"kerb-{step}")
         rgb = np.array(KERB_RGB) * (1 + 0.03 * rng.standard_normal((len(xy), 1)))
         quats = quats_along(site.frame.turned(along))
-        # Contours run through the centres of the first cells off the road: half a cell behind the edge.
+        # Contours run through the centres of the first cells off the road: half a cell behind the
+        # edge.
         xy = xy - 0.5 * CELL_M * away
         face = site.world(xy, 0.4 * KERB_M)
         top = site.world(xy + 0.08 * away, KERB_M)
         n = len(xy)
         size = np.full(n, SPREAD * step)
         clouds = [
-            cloud_of(face, quats, np.column_stack([size, np.full(n, 0.05), np.full(n, 0.08)]), 0.80 * rgb),
-            cloud_of(top, quats, np.column_stack([size, np.full(n, 0.09), np.full(n, 0.015)]), 1.05 * rgb),
+            cloud_of(
+                face, quats, np.column_stack([size, np.full(n, 0.05), np.full(n, 0.08)]), 0.80 * rgb
+            ),
+            cloud_of(
+                top, quats, np.column_stack([size, np.full(n, 0.09), np.full(n, 0.015)]), 1.05 * rgb
+            ),
         ]
         items.append((cell_m, GaussianCloud.concatenate(clouds), np.tile(xy, (2, 1))))
     return items
@@ -79,7 +101,9 @@ def _rails(site: Site) -> list[Item]:
         scales = np.column_stack([np.full(n, SPREAD * step), np.full(n, 0.03), np.full(n, 0.05)])
         clouds, at = [], []
         for height, shade in ((0.56, 0.8), (0.72, 1.0)):
-            clouds.append(cloud_of(site.world(xy, height), quats, scales, np.array(RAIL_RGB) * shade))
+            clouds.append(
+                cloud_of(site.world(xy, height), quats, scales, np.array(RAIL_RGB) * shade)
+            )
             at.append(xy)
         posts = xy[:: max(1, round(4.0 / step))]
         foot = site.world(posts, 0.0)
@@ -122,15 +146,25 @@ def _trees(site: Site, houses: Houses) -> list[Item]:
         top = foot + np.column_stack([np.zeros(m), np.zeros(m), stem + 0.5 * crown])
         trunks = rods(foot, top, 0.13, TRUNK_RGB, 0.5 if count > 100 else 4.0)
         trunk_owner = _nearest(trunks.means.astype(np.float64), foot)
-        items.append((cell_m, GaussianCloud.concatenate([crowns, trunks]), at[np.concatenate([owner, trunk_owner])]))
+        items.append(
+            (
+                cell_m,
+                GaussianCloud.concatenate([crowns, trunks]),
+                at[np.concatenate([owner, trunk_owner])],
+            )
+        )
     return items
 
 
 def _nearest(means: F64, foot: F64) -> I64:
-    return np.asarray(np.argmin(np.linalg.norm(means[:, None, :2] - foot[None, :, :2], axis=2), axis=1))
+    return np.asarray(
+        np.argmin(np.linalg.norm(means[:, None, :2] - foot[None, :, :2], axis=2), axis=1)
+    )
 
 
-def _crowns(site: Site, foot: F64, crown: F64, stem: F64, leaf: F64, count: int) -> tuple[GaussianCloud, I64]:
+def _crowns(
+    site: Site, foot: F64, crown: F64, stem: F64, leaf: F64, count: int
+) -> tuple[GaussianCloud, I64]:
     """Fill crowns with ``count`` blobs each, light above and dark below."""
     rng = site.rng(f"crowns-{count}")
     m = len(foot)
@@ -153,8 +187,12 @@ def _crowns(site: Site, foot: F64, crown: F64, stem: F64, leaf: F64, count: int)
 
 
 def _free(site: Site, houses: Houses, at: F64, clear_m: float) -> Bool:
-    """Return which places are off the road by ``clear_m``, not on actors' ground and outside houses."""
-    free = (site.look_up(site.off_road_m, at).astype(np.float64) >= clear_m) & ~site.look_up(site.taken, at).astype(bool)
+    """Return which places are off the road by ``clear_m``, not on actors' ground and outside
+    houses.
+    """
+    free = (site.look_up(site.off_road_m, at).astype(np.float64) >= clear_m) & ~site.look_up(
+        site.taken, at
+    ).astype(bool)
     for front, away in zip(houses.front, houses.away, strict=True):
         d = at - front.mean(axis=0)
         half = np.linalg.norm(front[1] - front[0]) / 2
@@ -165,7 +203,9 @@ def _free(site: Site, houses: Houses, at: F64, clear_m: float) -> Bool:
 
 
 class LampPosts(NamedTuple):
-    """Lamp posts along the road: feet, tops of the masts and tips of the arms ``(N, 3)``, metres, world; ``plan (N, 2)`` on the ground."""
+    """Lamp posts along the road: feet, tops of the masts and tips of the arms ``(N, 3)``, metres,
+    world; ``plan (N, 2)`` on the ground.
+    """
 
     plan: F64
     foot: F64
@@ -174,7 +214,9 @@ class LampPosts(NamedTuple):
 
 
 def lamp_posts(site: Site, houses: Houses) -> LampPosts:
-    """Return the lamp posts of a scene, a function of the scene alone; the lamps hang at the tips."""
+    """Return the lamp posts of a scene, a function of the scene alone; the lamps hang at the
+    tips.
+    """
     spacing = site.scenario.environment.poles_spacing_m
     feet, arms = [np.zeros((0, 2))], [np.zeros((0, 2))]
     rng = site.rng("poles")
@@ -206,19 +248,30 @@ def _poles(site: Site, houses: Houses) -> list[Item]:
     for cell_m, step in ((0.3, 0.45), (1.2, 1.6)):
         length = np.linalg.norm(end - start, axis=1)
         poles = rods(start, end, 0.085, POLE_RGB, step)
-        piece, _, _ = grid_cells(np.maximum(np.round(length / step), 1).astype(np.int64), np.ones(len(start), dtype=np.int64))
+        piece, _, _ = grid_cells(
+            np.maximum(np.round(length / step), 1).astype(np.int64),
+            np.ones(len(start), dtype=np.int64),
+        )
         lamp = cloud_of(tip, IDENTITY, (0.22, 0.22, 0.07), (0.85, 0.85, 0.80))
-        items.append((cell_m, GaussianCloud.concatenate([poles, lamp]), np.concatenate([owner[piece], at])))
+        items.append(
+            (cell_m, GaussianCloud.concatenate([poles, lamp]), np.concatenate([owner[piece], at]))
+        )
     return items
 
 
 def _signs(site: Site) -> list[Item]:
-    """Place the map's signs: a coloured plate with a pale rim, and a post down to the ground where it is near."""
+    """Place the map's signs: a coloured plate with a pale rim, and a post down to the ground where
+    it is near.
+    """
     signs = site.scenario.lane_map.signs
     if not signs:
         return []
     rng = site.rng("signs")
-    corners, rgbs, feet, tops, at = [], [], [], [], []
+    corners = []
+    rgbs = []
+    feet = []
+    tops = []
+    at = []
     for T, box in signs:
         sizes = np.array([box.length_m, box.width_m])
         thin = int(np.argmin(sizes))
@@ -227,9 +280,17 @@ def _signs(site: Site) -> list[Item]:
         up = np.array([0, 0, max(box.height_m, 0.3) / 2])
         normal = np.zeros(3)
         normal[thin] = 0.03
-        colour = np.array([[0.75, 0.12, 0.10], [0.10, 0.28, 0.62], [0.88, 0.72, 0.12], [0.10, 0.42, 0.26]])[rng.integers(4)]
-        for shift, share, rgb in ((0.0, 1.0, np.array([0.88, 0.88, 0.86])), (1.0, 0.72, colour), (-1.0, 0.72, colour)):
-            local = np.stack([-side - up, side - up, side + up, -side + up]) * share + shift * normal
+        colour = np.array(
+            [[0.75, 0.12, 0.10], [0.10, 0.28, 0.62], [0.88, 0.72, 0.12], [0.10, 0.42, 0.26]]
+        )[rng.integers(4)]
+        for shift, share, rgb in (
+            (0.0, 1.0, np.array([0.88, 0.88, 0.86])),
+            (1.0, 0.72, colour),
+            (-1.0, 0.72, colour),
+        ):
+            local = (
+                np.stack([-side - up, side - up, side + up, -side + up]) * share + shift * normal
+            )
             corners.append(local @ T[:3, :3].T + T[:3, 3])
             rgbs.append(rgb)
             at.append(T[:2, 3])

@@ -14,21 +14,31 @@ from alpasim_plugin.gaussians.scene.build_facades import build_facades, place_ho
 from alpasim_plugin.gaussians.scene.build_road import build_road
 from alpasim_plugin.gaussians.scene.build_street import build_street, lamp_posts
 from alpasim_plugin.gaussians.scene.paint import paint_strokes
-from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, SceneNode, nodes_by_tile, tile_numbers
+from alpasim_plugin.gaussians.scene.scene_graph import (
+    SceneGraph,
+    SceneNode,
+    nodes_by_tile,
+    tile_numbers,
+)
 from alpasim_plugin.gaussians.scene.site import HeightAt, make_site
 from alpasim_plugin.gaussians.scene.sky import make_sky
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 
 FILE_TILE_M = 16.0
-LIGHT = {"clear": (1.0, 1.0, 1.0), "overcast": (0.86, 0.88, 0.91), "dusk": (0.74, 0.63, 0.62)}  # on everything but the sky, by sky
+LIGHT = {
+    "clear": (1.0, 1.0, 1.0),
+    "overcast": (0.86, 0.88, 0.91),
+    "dusk": (0.74, 0.63, 0.62),
+}  # on everything but the sky, by sky
 
 
 def build_scene(scenario: Scenario, height_at: HeightAt) -> SceneGraph:
     """Build the scene of a scenario; the same scenario gives bit-identical Gaussians.
 
     Args:
-        scenario: Map, tracks, environment and seed. Where it names a background file this function draws actors and sky only, and
-            the road if the background keeps it; give the file's Gaussians to `with_background`.
+        scenario: Map, tracks, environment and seed. Where it names a background file this function
+            draws actors and sky only, and the road if the background keeps it; give the file's
+            Gaussians to `with_background`.
         height_at: Ground height under ``(N, 2+)`` world points, ``(N,)`` metres.
     """
     sky = make_sky(scenario.environment.sky, stream(scenario.scene_id, scenario.seed, "scene/sky"))
@@ -41,11 +51,15 @@ def build_scene(scenario: Scenario, height_at: HeightAt) -> SceneGraph:
     if scenario.background is not None:
         return SceneGraph([lit(node, light) for node in nodes], actors, sky)
     facades, houses = build_facades(site)
-    return SceneGraph([lit(node, light) for node in (*nodes, *facades, *build_street(site, houses))], actors, sky)
+    return SceneGraph(
+        [lit(node, light) for node in (*nodes, *facades, *build_street(site, houses))], actors, sky
+    )
 
 
 def street_lights(scenario: Scenario, height_at: HeightAt) -> F64:
-    """Return where a scene's street lights hang ``(N, 3)``, metres, world; none where a background file replaces the street."""
+    """Return where a scene's street lights hang ``(N, 3)``, metres, world; none where a background
+    file replaces the street.
+    """
     if scenario.background is not None:
         return np.zeros((0, 3))
     site = make_site(scenario, height_at)
@@ -53,7 +67,8 @@ def street_lights(scenario: Scenario, height_at: HeightAt) -> F64:
 
 
 def with_background(graph: SceneGraph, cloud: GaussianCloud, T_world_file: F64) -> SceneGraph:
-    """Return the scene with a Gaussian model as its background, cut into blocks that are culled one by one.
+    """Return the scene with a Gaussian model as its background, cut into blocks that are culled one
+    by one.
 
     Args:
         graph: Actors and sky, and a road that is drawn with the model.
@@ -61,8 +76,16 @@ def with_background(graph: SceneGraph, cloud: GaussianCloud, T_world_file: F64) 
         T_world_file: ``(4, 4)`` rotation, translation and one scale for all axes.
     """
     placed = placed_cloud(cloud, T_world_file)
-    nodes = nodes_by_tile("file", [(0.0, placed, tile_numbers(placed.means[:, :2], FILE_TILE_M, 1_000_003))])
-    return SceneGraph([*graph.background, *nodes], list(graph.actors.values()), graph.sky, graph.sh_frame, graph.cell_px)
+    nodes = nodes_by_tile(
+        "file", [(0.0, placed, tile_numbers(placed.means[:, :2], FILE_TILE_M, 1_000_003))]
+    )
+    return SceneGraph(
+        [*graph.background, *nodes],
+        list(graph.actors.values()),
+        graph.sky,
+        graph.sh_frame,
+        graph.cell_px,
+    )
 
 
 def lit(node: SceneNode, light: F64) -> SceneNode:

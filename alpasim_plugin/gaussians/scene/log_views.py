@@ -1,9 +1,11 @@
-"""What the log's cameras saw: which Gaussians a reconstruction could have learned, and where there was sky.
+"""What the log's cameras saw: which Gaussians a reconstruction could have learned, and where there
+was sky.
 
-A transparent pixel of a reconstruction is open sky or a hole; alpha alone cannot tell them apart. Pipelines on recorded drives fill the
-sky from segmented log images (OneFixer, App. A). Here the log views' own alpha is that segmentation. The sky is far away, so a view of
-it is carried to another camera by rotation alone; within half the views' spacing the skyline moves by less than a pixel of the small views
-beyond some 20 m.
+A transparent pixel of a reconstruction is open sky or a hole; alpha alone cannot tell them apart.
+Pipelines on recorded drives fill the sky from segmented log images (OneFixer, App. A). Here the log
+views' own alpha is that segmentation. The sky is far away, so a view of it is carried to another
+camera by rotation alone; within half the views' spacing the skyline moves by less than a pixel of
+the small views beyond some 20 m.
 """
 
 from __future__ import annotations
@@ -19,7 +21,10 @@ from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.core.types import F32, F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 
-TOLERANCE, MARGIN_M = 0.06, 0.3  # a point this share of depth, plus this, behind the surface that was seen still counts as seen
+TOLERANCE, MARGIN_M = (
+    0.06,
+    0.3,
+)  # a point this share of depth, plus this, behind the surface that was seen still counts as seen
 EDGE_SHARE = 0.05  # a Gaussian just outside the image still shows in it
 NEAR_M = 0.2
 
@@ -36,9 +41,12 @@ class LogView:
     def __init__(self, camera: PinholeCamera, depth: F32, alpha: F32) -> None:
         self.camera = camera
         self.sky: F32 = (alpha <= 0.5).astype(np.float32)
-        # The farthest surface of the neighbouring pixels: what shows beside an occluder's edge from a metre on counts as seen.
+        # The farthest surface of the neighbouring pixels: what shows beside an occluder's edge from
+        # a metre on counts as seen.
         farthest = cv2.dilate(depth, np.ones((3, 3), dtype=np.uint8))
-        self.limit: F32 = np.where(alpha > 0.5, farthest * (1 + TOLERANCE) + MARGIN_M, np.inf).astype(np.float32)
+        self.limit: F32 = np.where(
+            alpha > 0.5, farthest * (1 + TOLERANCE) + MARGIN_M, np.inf
+        ).astype(np.float32)
 
 
 class LogViews:
@@ -51,29 +59,44 @@ class LogViews:
         self._K = np.array([[c.fx, c.fy, c.cx, c.cy] for c in cameras]).reshape(-1, 4)
         self._size = np.array([[c.width, c.height] for c in cameras], dtype=np.int64).reshape(-1, 2)
         self._first = np.concatenate([[0], np.cumsum(np.prod(self._size, axis=1))]).astype(np.int64)
-        self._limit = np.concatenate([view.limit.ravel() for view in self.views]) if self.views else np.zeros(0, dtype=np.float32)
+        self._limit = (
+            np.concatenate([view.limit.ravel() for view in self.views])
+            if self.views
+            else np.zeros(0, dtype=np.float32)
+        )
 
     def __len__(self) -> int:
         """Return the number of views."""
         return len(self.views)
 
     def see(self, points: F64, size_m: F64) -> Bool:
-        """Return which points ``(N, 3)`` of radius ``size_m (N,)`` any view saw; all of them where there is no view."""
+        """Return which points ``(N, 3)`` of radius ``size_m (N,)`` any view saw; all of them where
+        there is no view.
+        """
         if not self.views:
             return np.ones(len(points), dtype=bool)
         seen = np.zeros(len(points), dtype=np.bool_)
-        points, size_m = np.ascontiguousarray(points, dtype=np.float64), np.ascontiguousarray(size_m, dtype=np.float64)
+        points, size_m = (
+            np.ascontiguousarray(points, dtype=np.float64),
+            np.ascontiguousarray(size_m, dtype=np.float64),
+        )
         _see(points, size_m, self._T, self._K, self._size, self._first, self._limit, seen)
         return seen
 
 
 @njit(cache=True, nogil=True)
-def _see(points: F64, size_m: F64, T: F64, K: F64, size: I64, first: I64, limit: F32, seen: Bool) -> None:
-    """Test every point against the views in turn, beginning with the one that saw the point before it: neighbours share views."""
+def _see(
+    points: F64, size_m: F64, T: F64, K: F64, size: I64, first: I64, limit: F32, seen: Bool
+) -> None:
+    """Test every point against the views in turn, beginning with the one that saw the point before
+    it: neighbours share views.
+    """
     n_views = T.shape[0]
     latest = 0
     for i in range(points.shape[0]):
-        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        px = points[i, 0]
+        py = points[i, 1]
+        pz = points[i, 2]
         for k in range(n_views):
             j = (latest + k) % n_views
             z = T[j, 2, 0] * px + T[j, 2, 1] * py + T[j, 2, 2] * pz + T[j, 2, 3]
@@ -115,7 +138,9 @@ class SkyMask:
         self._axes, self._eyes = T[:, :3, 2], T[:, :3, 3]  # (V, 3) world
 
     def share(self, camera: PinholeCamera) -> F32:
-        """Return how much of every pixel ``(H, W)`` is sky, 0 to 1; beyond the view's border its outermost pixels go on."""
+        """Return how much of every pixel ``(H, W)`` is sky, 0 to 1; beyond the view's border its
+        outermost pixels go on.
+        """
         if not self._views:
             return np.zeros((camera.height, camera.width), dtype=np.float32)
         T = inverse(camera.T_camera_world)
@@ -123,8 +148,23 @@ class SkyMask:
         turned_away = self._axes @ R[:, 2] < 0.5
         nearest = int(np.argmin(np.linalg.norm(self._eyes - eye, axis=1) + 1e6 * turned_away))
         view = self._views[nearest]
-        half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # the warp counts from pixel centres, cameras from the corner
-        to_view = np.linalg.inv(half) @ view.camera.K @ view.camera.T_camera_world[:3, :3] @ R @ np.linalg.inv(camera.K) @ half
+        half = np.array(
+            [[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]
+        )  # the warp counts from pixel centres, cameras from the corner
+        to_view = (
+            np.linalg.inv(half)
+            @ view.camera.K
+            @ view.camera.T_camera_world[:3, :3]
+            @ R
+            @ np.linalg.inv(camera.K)
+            @ half
+        )
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        warped = cv2.warpPerspective(view.sky, to_view, (camera.width, camera.height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        warped = cv2.warpPerspective(
+            view.sky,
+            to_view,
+            (camera.width, camera.height),
+            flags=flags,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
         return np.asarray(warped, dtype=np.float32)

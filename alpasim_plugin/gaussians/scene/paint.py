@@ -39,7 +39,11 @@ def paint_strokes(site: Site) -> Strokes:
     lane_map = site.scenario.lane_map
     high = site.low + np.array(site.road.shape[::-1]) * CELL_M
     painted = [(site.frame.to_ground(line), paint) for line, paint in painted_lines(lane_map)]
-    lines = [edge for edge in painted if np.all(edge[0].max(axis=0) > site.low) and np.all(edge[0].min(axis=0) < high)]
+    lines = [
+        edge
+        for edge in painted
+        if np.all(edge[0].max(axis=0) > site.low) and np.all(edge[0].min(axis=0) < high)
+    ]
     pieces = [_line_strokes(line, paint, phase) for line, paint, phase in _with_phase(lines)]
     pieces += [_zebra(site.frame.to_ground(ring)) for ring in lane_map.crosswalks]
     for stop in lane_map.stop_lines:
@@ -50,7 +54,10 @@ def paint_strokes(site: Site) -> Strokes:
     if not pieces:
         return Strokes(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64))
     start, end = np.concatenate([p.start for p in pieces]), np.concatenate([p.end for p in pieces])
-    width_m, colour = np.concatenate([p.width_m for p in pieces]), np.concatenate([p.colour for p in pieces])
+    width_m, colour = (
+        np.concatenate([p.width_m for p in pieces]),
+        np.concatenate([p.colour for p in pieces]),
+    )
     inside = np.all((start > site.low) & (start < high), axis=1)
     return Strokes(start[inside], end[inside], width_m[inside], colour[inside])
 
@@ -63,8 +70,15 @@ def _with_phase(lines: list[tuple[F64, Paint]]) -> list[tuple[F64, Paint, float]
     before = [-1] * len(lines)
     for i, (line, paint) in enumerate(lines):
         x, y = _key(line[-1])
-        for j in (j for dx in (-1, 0, 1) for dy in (-1, 0, 1) for j in starts.get((x + dx, y + dy), [])):
-            if j != i and before[j] < 0 and lines[j][1] == paint and np.linalg.norm(lines[j][0][0] - line[-1]) < 0.7:
+        for j in (
+            j for dx in (-1, 0, 1) for dy in (-1, 0, 1) for j in starts.get((x + dx, y + dy), [])
+        ):
+            if (
+                j != i
+                and before[j] < 0
+                and lines[j][1] == paint
+                and np.linalg.norm(lines[j][0][0] - line[-1]) < 0.7
+            ):
                 before[j] = i
     phase: dict[int, float] = {}
 
@@ -105,7 +119,9 @@ def _line_strokes(line: F64, paint: Paint, phase_m: float) -> Strokes:
     if paint != "double_yellow":
         return _strokes(a, b, LINE_WIDTH_M, colour)
     side = DOUBLE_OFFSET_M * left_of(unit(b - a))
-    return _strokes(np.concatenate([a + side, a - side]), np.concatenate([b + side, b - side]), 0.11, colour)
+    return _strokes(
+        np.concatenate([a + side, a - side]), np.concatenate([b + side, b - side]), 0.11, colour
+    )
 
 
 def _zebra(ring: F64) -> Strokes:

@@ -1,12 +1,16 @@
-"""Draw a scene of many parts: cull each part against the view, choose its level of detail, render what is left once.
+"""Draw a scene of many parts: cull each part against the view, choose its level of detail, render
+what is left once.
 
-Nodes are background parts in world coordinates and rigid actors in the frame of their box. Culling and level of detail are decided per
-node, before any Gaussian is touched: a node's sphere must meet the view, and its level is the coarsest whose cells stay below `CELL_PX`
-pixels at the node's nearest point. Order of drawing at equal depth is background nodes in the order given, then actors by id.
+Nodes are background parts in world coordinates and rigid actors in the frame of their box. Culling
+and level of detail are decided per node, before any Gaussian is touched: a node's sphere must meet
+the view, and its level is the coarsest whose cells stay below `CELL_PX` pixels at the node's
+nearest point. Order of drawing at equal depth is background nodes in the order given, then actors
+by id.
 
-The sky is no Gaussian: its image stands behind everything and is blended with what transparency is left. ``alpha`` is therefore the
-accumulated opacity of the scene *without* the sky (0 in the open sky), which is what the paper's opacity-mixed source needs; with
-``sky_in_alpha`` the sky counts as opaque.
+The sky is no Gaussian: its image stands behind everything and is blended with what transparency is
+left. ``alpha`` is therefore the accumulated opacity of the scene *without* the sky (0 in the open
+sky), which is what the paper's opacity-mixed source needs; with ``sky_in_alpha`` the sky counts as
+opaque.
 """
 
 from __future__ import annotations
@@ -43,7 +47,8 @@ class SceneNode:
 
     Attributes:
         name: Unique within the scene; an actor's node bears the actor's id.
-        kind: ``background`` (world coordinates) or ``actor`` (box frame: origin at the box centre, x length, y width, z height).
+        kind: ``background`` (world coordinates) or ``actor`` (box frame: origin at the box centre,
+            x length, y width, z height).
         levels: Finest first.
         far_m: Beyond this distance the node is not drawn.
     """
@@ -72,32 +77,44 @@ def split_by_tile(cloud: GaussianCloud, tile: I64) -> dict[int, GaussianCloud]:
     order = np.argsort(tile, kind="stable")
     ids, first = np.unique(tile[order], return_index=True)
     ordered, ends = cloud.take(order), [*first[1:], len(order)]
-    return {int(i): ordered.part(slice(begin, end)) for i, begin, end in zip(ids, first, ends, strict=True)}
+    return {
+        int(i): ordered.part(slice(begin, end))
+        for i, begin, end in zip(ids, first, ends, strict=True)
+    }
 
 
 def tile_numbers(xy: npt.NDArray[np.floating], size_m: float, row: int = 100_000) -> I64:
-    """Return the number ``(N,)`` of the square tile in which each point ``(N, 2)`` lies; ``row`` more from one row of tiles to the next."""
+    """Return the number ``(N,)`` of the square tile in which each point ``(N, 2)`` lies; ``row``
+    more from one row of tiles to the next.
+    """
     tile = np.floor(xy / size_m).astype(np.int64)
     return np.asarray(tile[:, 1] * row + tile[:, 0])
 
 
-def nodes_by_tile(prefix: str, levels: list[tuple[float, GaussianCloud, I64]], far_m: float = 1.0e9) -> list[SceneNode]:
+def nodes_by_tile(
+    prefix: str, levels: list[tuple[float, GaussianCloud, I64]], far_m: float = 1.0e9
+) -> list[SceneNode]:
     """Group clouds of several levels into one node per tile.
 
     Args:
         prefix: Start of the nodes' names.
-        levels: (cell size, cloud, tile of each Gaussian), finest first. A tile may lack its finest levels, not its coarser ones.
+        levels: (cell size, cloud, tile of each Gaussian), finest first. A tile may lack its finest
+            levels, not its coarser ones.
         far_m: See `SceneNode`.
     """
     by_tile: dict[int, list[Level]] = {}
     for cell_m, cloud, tile in levels:
         for i, part in split_by_tile(cloud, tile).items():
             by_tile.setdefault(i, []).append(Level(cell_m, part))
-    return [SceneNode(f"{prefix}/{i}", "background", tuple(by_tile[i]), far_m) for i in sorted(by_tile)]
+    return [
+        SceneNode(f"{prefix}/{i}", "background", tuple(by_tile[i]), far_m) for i in sorted(by_tile)
+    ]
 
 
 CELL_PX = 3.5
-Change = Callable[[SceneNode, int], GaussianCloud]  # (node, level index) -> the cloud to draw in its place
+Change = Callable[
+    [SceneNode, int], GaussianCloud
+]  # (node, level index) -> the cloud to draw in its place
 
 
 class SceneGraph:
@@ -107,8 +124,8 @@ class SceneGraph:
         background: Nodes in world coordinates.
         actors: Nodes in box frames; the name is the actor's id.
         sky: What stands behind everything.
-        sh_frame: Axes of the actors' view-dependent colour: ``object`` (it turns with the actor; scenes built here) or ``world`` (as
-            reconstructions of recorded drives are optimised).
+        sh_frame: Axes of the actors' view-dependent colour: ``object`` (it turns with the actor;
+            scenes built here) or ``world`` (as reconstructions of recorded drives are optimised).
         cell_px: Larger is faster and coarser.
         change: Replaces a node's cloud at its first use; None draws the nodes as they are.
     """
@@ -152,11 +169,13 @@ class SceneGraph:
             camera: From where.
             actor_poses: Actor id to ``T_world_box (4, 4)`` of the actors present.
             threads: Thread count of the CPU backend; None leaves it as it is.
-            backend: ``cpu`` uses nodes prepared once; any other backend gets all chosen Gaussians as one cloud.
+            backend: ``cpu`` uses nodes prepared once; any other backend gets all chosen Gaussians
+                as one cloud.
             sky_in_alpha: Count the sky as opaque.
 
         Returns:
-            Colour with sky, alpha, depth, and ``stats`` with ``visible``, ``nodes`` (drawn) and ``nodes_total``.
+            Colour with sky, alpha, depth, and ``stats`` with ``visible``, ``nodes`` (drawn) and
+            ``nodes_total``.
 
         Raises:
             RendererError: A pose for an actor that the scene does not hold.
@@ -168,15 +187,31 @@ class SceneGraph:
             out = rasterize_prepared(nodes, camera, behind, threads=threads)
         else:
             out = rasterize(self._joined(chosen), camera, behind, backend)
-        stats = {**out.stats, "nodes": len(chosen), "nodes_total": len(self.background) + len(actor_poses)}
-        return replace(out, alpha=np.ones_like(out.alpha) if sky_in_alpha else out.alpha, stats=stats)
+        stats = {
+            **out.stats,
+            "nodes": len(chosen),
+            "nodes_total": len(self.background) + len(actor_poses),
+        }
+        return replace(
+            out, alpha=np.ones_like(out.alpha) if sky_in_alpha else out.alpha, stats=stats
+        )
 
-    def changed(self, change: Change, more_actors: Sequence[SceneNode], cell_px: float) -> SceneGraph:
+    def changed(
+        self, change: Change, more_actors: Sequence[SceneNode], cell_px: float
+    ) -> SceneGraph:
         """Return a variant of the scene with other clouds in the same nodes, and further actors.
 
-        Culling uses the unchanged nodes' spheres, so a change should move Gaussians little compared with their node.
+        Culling uses the unchanged nodes' spheres, so a change should move Gaussians little compared
+        with their node.
         """
-        return SceneGraph(self.background, [*self.actors.values(), *more_actors], self.sky, self.sh_frame, cell_px, change)
+        return SceneGraph(
+            self.background,
+            [*self.actors.values(), *more_actors],
+            self.sky,
+            self.sh_frame,
+            cell_px,
+            change,
+        )
 
     def _joined(self, chosen: list[tuple[SceneNode, int, F64 | None]]) -> GaussianCloud:
         clouds = []
@@ -185,7 +220,9 @@ class SceneGraph:
             clouds.append(cloud if T is None else cloud.transformed(T, self.sh_frame == "object"))
         return GaussianCloud.concatenate(clouds)
 
-    def _choose(self, camera: PinholeCamera, actor_poses: Mapping[str, F64]) -> list[tuple[SceneNode, int, F64 | None]]:
+    def _choose(
+        self, camera: PinholeCamera, actor_poses: Mapping[str, F64]
+    ) -> list[tuple[SceneNode, int, F64 | None]]:
         unknown = sorted(set(actor_poses) - set(self.actors))
         if unknown:
             raise RendererError(
@@ -205,7 +242,10 @@ class SceneGraph:
         if present:
             index = [self._actor_index[name] for name in present]
             poses = np.stack([np.asarray(actor_poses[name], dtype=np.float64) for name in present])
-            centre = np.einsum("nij,nj->ni", poses[:, :3, :3], self._actor_centre[index]) + poses[:, :3, 3]
+            centre = (
+                np.einsum("nij,nj->ni", poses[:, :3, :3], self._actor_centre[index])
+                + poses[:, :3, 3]
+            )
             radius = self._actor_radius[index]
             distance = np.linalg.norm(centre - eye, axis=1) - radius
             for i in np.flatnonzero(in_view(camera, centre, radius)):
@@ -229,7 +269,9 @@ class SceneGraph:
 
 
 def in_view(camera: PinholeCamera, centre: F64, radius: F64) -> Bool:
-    """Return which spheres ``(N, 3)``, ``(N,)`` in the world meet the camera's view volume (conservative at its corners)."""
+    """Return which spheres ``(N, 3)``, ``(N,)`` in the world meet the camera's view volume
+    (conservative at its corners).
+    """
     p = centre @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
     x, y, z = p.T
     seen = z > -radius
@@ -244,4 +286,6 @@ def in_view(camera: PinholeCamera, centre: F64, radius: F64) -> Bool:
 
 
 def _spheres(nodes: Sequence[SceneNode]) -> tuple[F64, F64]:
-    return np.array([node.sphere[0] for node in nodes]).reshape(-1, 3), np.array([node.sphere[1] for node in nodes])
+    return np.array([node.sphere[0] for node in nodes]).reshape(-1, 3), np.array(
+        [node.sphere[1] for node in nodes]
+    )

@@ -1,8 +1,10 @@
-"""Rasterise a scenario's plan: where is road, how far is it to the road's edge, where have vehicles been.
+"""Rasterise a scenario's plan: where is road, how far is it to the road's edge, where have vehicles
+been.
 
-Maps come with very different content (lane edges or only centres, drivable areas or none), so everything that is built beside or on the
-road is derived from one raster of the plan, in a frame turned along the logged path. Kerbs, trees, poles and facades stand along its level
-lines (`contours`).
+Maps come with very different content (lane edges or only centres, drivable areas or none), so
+everything that is built beside or on the road is derived from one raster of the plan, in a frame
+turned along the logged path. Kerbs, trees, poles and facades stand along its level lines
+(`contours`).
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ HIGHWAY_MPS = 22.0
 
 @dataclass(frozen=True)
 class GroundFrame:
-    """A ground frame: metres along x and y after turning the world by ``-yaw_rad`` about ``origin_xy``."""
+    """A ground frame: metres along x and y after turning the world by ``-yaw_rad`` about
+    ``origin_xy``.
+    """
 
     origin_xy: F64  # (2,) metres, world
     yaw_rad: float
@@ -53,7 +57,9 @@ class GroundFrame:
     def turned(self, plan: F64) -> F64:
         """Turn ground directions ``(N, 2)`` to level world directions ``(N, 3)``."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
-        return np.column_stack([c * plan[:, 0] - s * plan[:, 1], s * plan[:, 0] + c * plan[:, 1], np.zeros(len(plan))])
+        return np.column_stack(
+            [c * plan[:, 0] - s * plan[:, 1], s * plan[:, 0] + c * plan[:, 1], np.zeros(len(plan))]
+        )
 
 
 @dataclass(frozen=True)
@@ -63,9 +69,11 @@ class Site:
     Attributes:
         scenario: What is built.
         height_at: Ground height under world points.
-        frame: Ground frame; cell (row i, column j) of a raster has its centre at ``low + (j + 0.5, i + 0.5) * CELL_M``.
+        frame: Ground frame; cell (row i, column j) of a raster has its centre at ``low + (j + 0.5,
+            i + 0.5) * CELL_M``.
         low: ``(2,)`` ground coordinates of the raster's corner, metres.
-        path: ``(N, 2)`` logged path and what the route adds to it, ground coordinates, points 1 m apart.
+        path: ``(N, 2)`` logged path and what the route adds to it, ground coordinates, points 1 m
+            apart.
         road: ``(H, W)`` bool, paved for vehicles.
         junction: ``(H, W)`` bool, inside an intersection lane.
         taken: ``(H, W)`` bool, ground that actors stand on or drive over at any time.
@@ -108,27 +116,37 @@ class Site:
         return to_pixels(plan, self.low, CELL_M)
 
     def look_up(self, raster: npt.NDArray[np.generic], plan: F64) -> npt.NDArray[np.generic]:
-        """Return the raster's values ``(N,)`` at ground points ``(N, 2)``; points outside take the border's value."""
+        """Return the raster's values ``(N,)`` at ground points ``(N, 2)``; points outside take the
+        border's value.
+        """
         ij = np.floor((plan - self.low) / CELL_M).astype(np.int64)
         h, w = raster.shape
         return raster[np.clip(ij[:, 1], 0, h - 1), np.clip(ij[:, 0], 0, w - 1)]
 
     def world(self, plan: F64, above_m: float | F64 = 0.0) -> F64:
-        """Return world points ``(N, 3)`` standing ``above_m`` over the ground at ground points ``(N, 2)``."""
+        """Return world points ``(N, 3)`` standing ``above_m`` over the ground at ground points
+        ``(N, 2)``.
+        """
         xy = self.frame.to_world(plan)
         return np.column_stack([xy, self.height_at(xy) + above_m])
 
 
 def to_pixels(plan: F64, low: F64, cell_m: float) -> npt.NDArray[np.int32]:
-    """Return ground points as fixed-point pixels with `SHIFT_BITS` fractional bits, pixel centres at integers."""
+    """Return ground points as fixed-point pixels with `SHIFT_BITS` fractional bits, pixel centres
+    at integers.
+    """
     return np.round(((plan - low) / cell_m - 0.5) * (1 << SHIFT_BITS)).astype(np.int32)
 
 
 def distance_m(mask: Bool) -> F32:
-    """Return the distance of each cell to the nearest true cell, metres; far away where there is none."""
+    """Return the distance of each cell to the nearest true cell, metres; far away where there is
+    none.
+    """
     if not mask.any():
         return np.full(mask.shape, 1.0e3, dtype=np.float32)
-    return np.asarray(cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) * np.float32(CELL_M))
+    return np.asarray(
+        cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) * np.float32(CELL_M)
+    )
 
 
 def make_site(scenario: Scenario, height_at: HeightAt) -> Site:
@@ -136,7 +154,11 @@ def make_site(scenario: Scenario, height_at: HeightAt) -> Site:
     path_world = _path(scenario)
     chord = path_world[-1, :2] - path_world[0, :2]
     heading = scenario.ego_log.quat[0]
-    yaw = np.arctan2(chord[1], chord[0]) if np.hypot(*chord) > 5.0 else 2 * np.arctan2(heading[3], heading[0])
+    yaw = (
+        np.arctan2(chord[1], chord[0])
+        if np.hypot(*chord) > 5.0
+        else 2 * np.arctan2(heading[3], heading[0])
+    )
     frame = GroundFrame(path_world[0, :2].astype(np.float64), float(yaw))
     path = frame.to_ground(path_world)
     low = np.floor(path.min(axis=0) - REACH_M)
@@ -152,16 +174,32 @@ def make_site(scenario: Scenario, height_at: HeightAt) -> Site:
     thickness = max(1, round(2 * half / CELL_M))
     cv2.polylines(road, [to_pixels(path, low, CELL_M)], False, 1, thickness, cv2.LINE_8, SHIFT_BITS)
     k = 2 * round(CLOSE_GAP_M / CELL_M) + 1
-    road = cv2.morphologyEx(road, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (k, k)))
+    road = cv2.morphologyEx(
+        road, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (k, k))
+    )
     # A soft edge instead of the raster's staircase: kerbs and grass follow the half-way line.
     road = (cv2.GaussianBlur(road.astype(np.float32), (0, 0), 1.5) > 0.5).astype(np.uint8)
-    junction = _fill(shape, low, frame, _lane_rings([lane for lane in near if lane.is_intersection]))
+    junction = _fill(
+        shape, low, frame, _lane_rings([lane for lane in near if lane.is_intersection])
+    )
     taken = _taken(scenario, frame, low, shape)
-    return Site(scenario, height_at, frame, low, path, road.astype(bool), junction.astype(bool), taken, _is_highway(scenario, near))
+    return Site(
+        scenario,
+        height_at,
+        frame,
+        low,
+        path,
+        road.astype(bool),
+        junction.astype(bool),
+        taken,
+        _is_highway(scenario, near),
+    )
 
 
 def _path(scenario: Scenario) -> F64:
-    """Return the logged path and 40 m of the route behind its end, ``(N, 3)`` world, one point a metre."""
+    """Return the logged path and 40 m of the route behind its end, ``(N, 3)`` world, one point a
+    metre.
+    """
     log = scenario.ego_log.xyz
     length = float(arc_lengths(log)[-1])
     route = scenario.route.xyz
@@ -185,12 +223,18 @@ def _touches(plan: F64, low: F64, high: F64) -> bool:
 def _lane_rings(lanes: Iterable[Lane]) -> list[F64]:
     rings: list[F64] = []
     for lane in lanes:
-        areas = [p for p in shapely.get_parts(lane_polygon(lane)) if shapely.get_dimensions(p) == 2 and not shapely.is_empty(p)]
+        areas = [
+            p
+            for p in shapely.get_parts(lane_polygon(lane))
+            if shapely.get_dimensions(p) == 2 and not shapely.is_empty(p)
+        ]
         rings += [shapely.get_coordinates(shapely.get_exterior_ring(area)) for area in areas]
     return rings
 
 
-def _fill(shape: tuple[int, int], low: F64, frame: GroundFrame, rings: list[F64]) -> npt.NDArray[np.uint8]:
+def _fill(
+    shape: tuple[int, int], low: F64, frame: GroundFrame, rings: list[F64]
+) -> npt.NDArray[np.uint8]:
     mask = np.zeros(shape, dtype=np.uint8)
     _fill_into(mask, low, frame, rings)
     return mask
@@ -199,7 +243,9 @@ def _fill(shape: tuple[int, int], low: F64, frame: GroundFrame, rings: list[F64]
 def _fill_into(mask: npt.NDArray[np.uint8], low: F64, frame: GroundFrame, rings: list[F64]) -> None:
     for ring in rings:
         if len(ring) >= 3:
-            cv2.fillPoly(mask, [to_pixels(frame.to_ground(ring), low, CELL_M)], 1, cv2.LINE_8, SHIFT_BITS)
+            cv2.fillPoly(
+                mask, [to_pixels(frame.to_ground(ring), low, CELL_M)], 1, cv2.LINE_8, SHIFT_BITS
+            )
 
 
 def _taken(scenario: Scenario, frame: GroundFrame, low: F64, shape: tuple[int, int]) -> Bool:
@@ -214,8 +260,14 @@ def _taken(scenario: Scenario, frame: GroundFrame, low: F64, shape: tuple[int, i
 
 
 def _is_highway(scenario: Scenario, near: list[Lane]) -> bool:
-    """Return whether the road is a highway: by speed limits, or without them by four parallel lanes and no crossing."""
-    if scenario.lane_map.crosswalks or any(lane.is_intersection for lane in near) or scenario.lane_map.stop_lines:
+    """Return whether the road is a highway: by speed limits, or without them by four parallel lanes
+    and no crossing.
+    """
+    if (
+        scenario.lane_map.crosswalks
+        or any(lane.is_intersection for lane in near)
+        or scenario.lane_map.stop_lines
+    ):
         return False
     limits = [lane.speed_limit_mps for lane in near if lane.speed_limit_mps is not None]
     if limits:
@@ -246,7 +298,8 @@ class Roadside(NamedTuple):
 
 
 def contours(site: Site, beyond_m: float, within_path_m: float) -> list[F64]:
-    """Return the lines ``(N, 2)`` where the distance to the road is ``beyond_m``, in ground coordinates, the road on their left.
+    """Return the lines ``(N, 2)`` where the distance to the road is ``beyond_m``, in ground
+    coordinates, the road on their left.
 
     Args:
         site: What lies where.
@@ -265,9 +318,16 @@ def contours(site: Site, beyond_m: float, within_path_m: float) -> list[F64]:
         plan = site.low + (pixels + 0.5) * CELL_M
         wrapped = np.concatenate([plan[-SMOOTH:], plan, plan[:SMOOTH]])
         kernel = np.ones(SMOOTH) / SMOOTH
-        smooth = np.stack([np.convolve(wrapped[:, d], kernel, mode="same") for d in range(2)], axis=1)[SMOOTH:-SMOOTH]
+        smooth = np.stack(
+            [np.convolve(wrapped[:, d], kernel, mode="same") for d in range(2)], axis=1
+        )[SMOOTH:-SMOOTH]
         h, w = mask.shape
-        inner = (pixels[:, 0] > 1) & (pixels[:, 0] < w - 2) & (pixels[:, 1] > 1) & (pixels[:, 1] < h - 2)
+        inner = (
+            (pixels[:, 0] > 1)
+            & (pixels[:, 0] < w - 2)
+            & (pixels[:, 1] > 1)
+            & (pixels[:, 1] < h - 2)
+        )
         keep = inner & near[pixels[:, 1], pixels[:, 0]]
         lines += [_road_on_left(site, part) for part in _runs(smooth, keep) if len(part) > 8]
     return lines
@@ -288,7 +348,9 @@ def _road_on_left(site: Site, line: F64) -> F64:
     d = np.gradient(line, axis=0)
     left = left_of(unit(d))
     signed = site.off_road_m - site.inside_m
-    nearer = site.look_up(signed, line + left).astype(np.float64) < site.look_up(signed, line - left).astype(np.float64)
+    nearer = site.look_up(signed, line + left).astype(np.float64) < site.look_up(
+        signed, line - left
+    ).astype(np.float64)
     return line if np.mean(nearer) >= 0.5 else line[::-1].copy()
 
 

@@ -19,9 +19,30 @@ STEP_PX = 8  # directions are computed this often and interpolated in between
 
 # zenith, middle, horizon, what shows below the horizon where the scene has a hole, cloud, hills
 _COLOURS: dict[str, tuple[tuple[float, float, float], ...]] = {
-    "clear": ((0.30, 0.50, 0.80), (0.52, 0.70, 0.90), (0.82, 0.89, 0.94), (0.37, 0.38, 0.34), (0.97, 0.97, 0.97), (0.50, 0.56, 0.56)),
-    "overcast": ((0.62, 0.65, 0.69), (0.70, 0.73, 0.76), (0.80, 0.82, 0.83), (0.34, 0.35, 0.33), (0.86, 0.87, 0.88), (0.52, 0.55, 0.54)),
-    "dusk": ((0.23, 0.28, 0.46), (0.52, 0.46, 0.56), (0.95, 0.70, 0.48), (0.27, 0.24, 0.23), (0.93, 0.62, 0.52), (0.30, 0.29, 0.34)),
+    "clear": (
+        (0.30, 0.50, 0.80),
+        (0.52, 0.70, 0.90),
+        (0.82, 0.89, 0.94),
+        (0.37, 0.38, 0.34),
+        (0.97, 0.97, 0.97),
+        (0.50, 0.56, 0.56),
+    ),
+    "overcast": (
+        (0.62, 0.65, 0.69),
+        (0.70, 0.73, 0.76),
+        (0.80, 0.82, 0.83),
+        (0.34, 0.35, 0.33),
+        (0.86, 0.87, 0.88),
+        (0.52, 0.55, 0.54),
+    ),
+    "dusk": (
+        (0.23, 0.28, 0.46),
+        (0.52, 0.46, 0.56),
+        (0.95, 0.70, 0.48),
+        (0.27, 0.24, 0.23),
+        (0.93, 0.62, 0.52),
+        (0.30, 0.29, 0.34),
+    ),
 }
 _CLOUD_SHARE = {"clear": 0.34, "overcast": 0.85, "dusk": 0.45}
 
@@ -30,8 +51,8 @@ class Sky:
     """A sky as a panorama of directions.
 
     Args:
-        panorama: ``(HEIGHT, WIDTH, 3)`` float32, 0..1; row 0 is the highest elevation, column 0 looks along world +x, columns go left
-            (counter-clockwise seen from above).
+        panorama: ``(HEIGHT, WIDTH, 3)`` float32, 0..1; row 0 is the highest elevation, column 0
+            looks along world +x, columns go left (counter-clockwise seen from above).
     """
 
     def __init__(self, panorama: F32) -> None:
@@ -49,16 +70,25 @@ class Sky:
         u = np.arange(-(-w // STEP_PX) + 1) * STEP_PX
         v = np.arange(-(-h // STEP_PX) + 1) * STEP_PX
         x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-        ray = np.stack([*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((len(v), len(u)))], axis=-1) @ camera.T_camera_world[:3, :3]
+        ray = (
+            np.stack(
+                [*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((len(v), len(u)))], axis=-1
+            )
+            @ camera.T_camera_world[:3, :3]
+        )
         elevation = np.arctan2(ray[..., 2], np.hypot(ray[..., 0], ray[..., 1]))
         # Azimuth relative to the optical axis has no seam inside a view narrower than a half turn.
         forward = camera.T_camera_world[2, :3]
         ahead = np.arctan2(forward[1], forward[0])
         azimuth = ahead + _wrap(np.arctan2(ray[..., 1], ray[..., 0]) - ahead)
         columns = _upsample(azimuth * (WIDTH / (2 * np.pi)), h, w)
-        columns += np.float32(WIDTH) * (columns < 0)  # all lie within a turn of column 0: what % would give, in a tenth of its time
+        columns += np.float32(WIDTH) * (
+            columns < 0
+        )  # all lie within a turn of column 0: what % would give, in a tenth of its time
         rows = _upsample((HIGH_RAD - elevation) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD)), h, w)
-        return np.asarray(cv2.remap(self._panorama, columns, np.clip(rows, 0, HEIGHT - 1), cv2.INTER_LINEAR))
+        return np.asarray(
+            cv2.remap(self._panorama, columns, np.clip(rows, 0, HEIGHT - 1), cv2.INTER_LINEAR)
+        )
 
 
 def _wrap(angle: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
@@ -68,7 +98,9 @@ def _wrap(angle: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
 def _upsample(grid: npt.NDArray[np.floating], height: int, width: int) -> F32:
     """Interpolate values at every `STEP_PX`-th pixel corner to pixel centres."""
     rows, columns = grid.shape
-    finer = cv2.resize(grid.astype(np.float32), (STEP_PX * columns, STEP_PX * rows), interpolation=cv2.INTER_LINEAR)
+    finer = cv2.resize(
+        grid.astype(np.float32), (STEP_PX * columns, STEP_PX * rows), interpolation=cv2.INTER_LINEAR
+    )
     first = STEP_PX // 2  # it takes the values for those of the middles of squares
     return np.asarray(finer[first : first + height, first : first + width])
 
@@ -80,21 +112,33 @@ def make_sky(kind: Kind, rng: np.random.Generator) -> Sky:
     up = np.clip(elevation / HIGH_RAD, 0, 1)
     t = np.clip(up / 0.35, 0, 1)[:, None]
     high = np.clip((up - 0.35) / 0.65, 0, 1)[:, None]
-    column = np.where(up[:, None] < 0.35, horizon * (1 - t) + middle * t, middle + (zenith - middle) * high)
+    column = np.where(
+        up[:, None] < 0.35, horizon * (1 - t) + middle * t, middle + (zenith - middle) * high
+    )
     octaves = ((4, 12, 0.5), (9, 26, 0.3), (20, 60, 0.15), (44, 130, 0.08))
     noise = np.zeros((HEIGHT, WIDTH))
     for rows, columns, weight in octaves:
         noise += weight * _periodic_noise(rng, rows, columns)
     # Clouds are seen flatter towards the horizon and vanish in its haze.
     threshold = np.quantile(noise, 1 - _CLOUD_SHARE[kind])
-    ridge = np.radians(1.2) * (1 + 0.8 * _periodic_noise(rng, 1, 24, 1) + 0.3 * _periodic_noise(rng, 1, 120, 1))
+    ridge = np.radians(1.2) * (
+        1 + 0.8 * _periodic_noise(rng, 1, 24, 1) + 0.3 * _periodic_noise(rng, 1, 120, 1)
+    )
     panorama = np.empty((HEIGHT, WIDTH, 3), dtype=np.float32)
     for first in range(0, HEIGHT, BLOCK):  # a block stays in the processor's cache
         part = slice(first, first + BLOCK)
         image = np.repeat(column[part, None, :], WIDTH, axis=1)
-        cover = np.clip((noise[part] - threshold) / 0.45, 0, 1) * np.clip((up[part, None] - 0.05) / 0.15, 0, 1)
-        image += 0.85 * cover[..., None] * (cloud * (1 - 0.12 * np.clip(noise[part], 0, 1)[..., None]) - image)
-        below = np.clip((np.maximum(ridge, np.radians(0.3)) - elevation[part, None]) / np.radians(0.25), 0, 1)
+        cover = np.clip((noise[part] - threshold) / 0.45, 0, 1) * np.clip(
+            (up[part, None] - 0.05) / 0.15, 0, 1
+        )
+        image += (
+            0.85
+            * cover[..., None]
+            * (cloud * (1 - 0.12 * np.clip(noise[part], 0, 1)[..., None]) - image)
+        )
+        below = np.clip(
+            (np.maximum(ridge, np.radians(0.3)) - elevation[part, None]) / np.radians(0.25), 0, 1
+        )
         image += below[..., None] * (hills - image)
         field = np.clip((np.radians(0.0) - elevation[part]) / np.radians(1.5), 0, 1)[:, None, None]
         image += field * (ground - image)
@@ -102,10 +146,21 @@ def make_sky(kind: Kind, rng: np.random.Generator) -> Sky:
     return Sky(panorama)
 
 
-def _periodic_noise(rng: np.random.Generator, rows: int, columns: int, height: int = HEIGHT) -> npt.NDArray[np.float64]:
-    """Return the first ``height`` rows of smooth noise ``(HEIGHT, WIDTH)`` of about unit spread whose left and right edges meet."""
+def _periodic_noise(
+    rng: np.random.Generator, rows: int, columns: int, height: int = HEIGHT
+) -> npt.NDArray[np.float64]:
+    """Return the first ``height`` rows of smooth noise ``(HEIGHT, WIDTH)`` of about unit spread
+    whose left and right edges meet.
+    """
     small = rng.standard_normal((rows + 2, columns)).astype(np.float32)
     wide = np.concatenate([small[:, -2:], small, small[:, :3]], axis=1)
-    at_x = np.broadcast_to((np.arange(WIDTH, dtype=np.float32) * columns / WIDTH + 2)[None, :], (height, WIDTH))
-    at_y = np.broadcast_to((np.arange(height, dtype=np.float32) * rows / HEIGHT + 0.5)[:, None], (height, WIDTH))
-    return np.asarray(cv2.remap(wide, np.ascontiguousarray(at_x), np.ascontiguousarray(at_y), cv2.INTER_CUBIC), dtype=np.float64)
+    at_x = np.broadcast_to(
+        (np.arange(WIDTH, dtype=np.float32) * columns / WIDTH + 2)[None, :], (height, WIDTH)
+    )
+    at_y = np.broadcast_to(
+        (np.arange(height, dtype=np.float32) * rows / HEIGHT + 0.5)[:, None], (height, WIDTH)
+    )
+    return np.asarray(
+        cv2.remap(wide, np.ascontiguousarray(at_x), np.ascontiguousarray(at_y), cv2.INTER_CUBIC),
+        dtype=np.float64,
+    )

@@ -1,7 +1,8 @@
 """Turn surfaces into flat Gaussians (surfels), of which every built scene consists.
 
-A rectangle is covered by a grid of flat Gaussians with a standard deviation of `SPREAD` cells. At 0.64 cells the weakest point of the grid
-(a cell corner) still accumulates an opacity of about 0.97 while the outline stays within a quarter of a cell of the true edge.
+A rectangle is covered by a grid of flat Gaussians with a standard deviation of `SPREAD` cells. At
+0.64 cells the weakest point of the grid (a cell corner) still accumulates an opacity of about 0.97
+while the outline stays within a quarter of a cell of the true edge.
 """
 
 from __future__ import annotations
@@ -23,7 +24,11 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)  # a quaternion along the axes
 
 
 def cloud_of(
-    means: F64, quats: npt.ArrayLike, scales: npt.ArrayLike, rgb: npt.ArrayLike, opacity: npt.ArrayLike = OPACITY
+    means: F64,
+    quats: npt.ArrayLike,
+    scales: npt.ArrayLike,
+    rgb: npt.ArrayLike,
+    opacity: npt.ArrayLike = OPACITY,
 ) -> GaussianCloud:
     """Return Gaussians of one colour each.
 
@@ -45,10 +50,14 @@ def cloud_of(
     )
 
 
-def with_sheen(cloud: GaussianCloud, normals: F64, strength: F64, sky_rgb: npt.ArrayLike) -> GaussianCloud:
-    """Return the cloud with first-degree colour: surfaces seen at a glancing angle show more of the sky.
+def with_sheen(
+    cloud: GaussianCloud, normals: F64, strength: F64, sky_rgb: npt.ArrayLike
+) -> GaussianCloud:
+    """Return the cloud with first-degree colour: surfaces seen at a glancing angle show more of the
+    sky.
 
-    The share of sky added is ``strength * (1 + d . n)`` for view direction d and normal n, the linear part of what paint and glass do.
+    The share of sky added is ``strength * (1 + d . n)`` for view direction d and normal n, the
+    linear part of what paint and glass do.
 
     Args:
         cloud: Gaussians of constant colour.
@@ -65,7 +74,9 @@ def with_sheen(cloud: GaussianCloud, normals: F64, strength: F64, sky_rgb: npt.A
 
 
 def upright_quats(normals: F64, yaw_rad: npt.ArrayLike) -> F64:
-    """Return ``(N, 4)`` rotations that lay the xy plane across nearly vertical normals ``(N, 3)`` after turning it by a heading."""
+    """Return ``(N, 4)`` rotations that lay the xy plane across nearly vertical normals ``(N, 3)``
+    after turning it by a heading.
+    """
     nx, ny, nz = normals.T
     tilt = np.stack([1 + nz, -ny, nx, np.zeros_like(nz)], axis=-1)
     tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
@@ -73,7 +84,9 @@ def upright_quats(normals: F64, yaw_rad: npt.ArrayLike) -> F64:
 
 
 def quats_along(direction: F64, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> F64:
-    """Return ``(N, 4)`` rotations whose x axis is ``direction (N, 3)`` and whose z axis is as near to ``up`` as can be."""
+    """Return ``(N, 4)`` rotations whose x axis is ``direction (N, 3)`` and whose z axis is as near
+    to ``up`` as can be.
+    """
     x = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
     ups = np.broadcast_to(np.asarray(up, dtype=np.float64), x.shape)
     steep = np.abs(np.sum(x * ups, axis=1, keepdims=True)) > 0.99
@@ -105,14 +118,18 @@ def quad_surfels(
     """Cover quadrilaterals with flat Gaussians.
 
     Args:
-        corners: ``(M, 4, 3)``: start, end of the first edge, opposite corner, end of the second edge; outward is first x second edge.
+        corners: ``(M, 4, 3)``: start, end of the first edge, opposite corner, end of the second
+            edge; outward is first x second edge.
         rgb: ``(M, 3)`` 0..1.
         cell_m: Cell size, one for all or ``(M,)``.
-        noise: Standard normal numbers, reused where they are fewer than Gaussians; brightness varies by 2.5 % of them. None: no variation.
-        spread: Standard deviation per cell; wider closes dark surfaces against bright ones behind, at the price of a softer outline.
+        noise: Standard normal numbers, reused where they are fewer than Gaussians; brightness
+            varies by 2.5 % of them. None: no variation.
+        spread: Standard deviation per cell; wider closes dark surfaces against bright ones behind,
+            at the price of a softer outline.
 
     Returns:
-        The cloud, each Gaussian's quadrilateral ``(N,)``, and each quadrilateral's normal ``(M, 3)``.
+        The cloud, each Gaussian's quadrilateral ``(N,)``, and each quadrilateral's normal ``(M,
+        3)``.
     """
     c = np.asarray(corners, dtype=np.float64).reshape(-1, 4, 3)
     cell = np.broadcast_to(np.asarray(cell_m, dtype=np.float64), (len(c),))
@@ -126,18 +143,24 @@ def quad_surfels(
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     quats = quat_from_matrix(np.stack([x, np.cross(normal, x), normal], axis=-1))
     size_u, size_v = len_u / n_u, len_v / n_v
-    scales = np.stack([spread * size_u, spread * size_v, THICKNESS * np.minimum(size_u, size_v) + 0.004], axis=1)
+    scales = np.stack(
+        [spread * size_u, spread * size_v, THICKNESS * np.minimum(size_u, size_v) + 0.004], axis=1
+    )
     owner, u, v = grid_cells(n_u, n_v)
     u, v = u[:, None], v[:, None]
     corner = c[owner]
-    means = (corner[:, 0] * (1 - u) + corner[:, 1] * u) * (1 - v) + (corner[:, 3] * (1 - u) + corner[:, 2] * u) * v
+    means = (corner[:, 0] * (1 - u) + corner[:, 1] * u) * (1 - v) + (
+        corner[:, 3] * (1 - u) + corner[:, 2] * u
+    ) * v
     colour = np.asarray(rgb, dtype=np.float64)[owner]
     if noise is not None:
         colour = colour * (1 + 0.025 * np.resize(noise, len(owner))[:, None])
     return cloud_of(means, quats[owner], scales[owner], colour), owner, normal
 
 
-def rods(start: F64, end: F64, radius_m: npt.ArrayLike, rgb: npt.ArrayLike, step_m: float) -> GaussianCloud:
+def rods(
+    start: F64, end: F64, radius_m: npt.ArrayLike, rgb: npt.ArrayLike, step_m: float
+) -> GaussianCloud:
     """Draw straight rods as chains of long Gaussians.
 
     Args:

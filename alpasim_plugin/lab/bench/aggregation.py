@@ -1,4 +1,6 @@
-"""How long it takes to aggregate a large table of rollouts, how much memory, and whether the means are right."""
+"""How long it takes to aggregate a large table of rollouts, how much memory, and whether the means
+are right.
+"""
 
 from __future__ import annotations
 
@@ -27,16 +29,21 @@ FAILED, INVALID = 0.01, 0.02  # shares of rollouts that failed, and of values th
 
 @dataclass(frozen=True)
 class TableRow:
-    """One aggregation, in a process of its own, from a ``rollouts.parquet``, in columns as a run does it; CPU seconds."""
+    """One aggregation, in a process of its own, from a ``rollouts.parquet``, in columns as a run
+    does it; CPU seconds.
+    """
 
     rollouts: int
     scenes: int
     metrics: int
     read_s: float
     aggregate_s: float
-    rows_s: float  # the same from rows in memory, the readable reference, in the same process afterwards
+    # the same from rows in memory, the readable reference, in the same process afterwards
+    rows_s: float
     peak_mb: float | None  # of the whole process before that, interpreter and libraries included
-    mean_error: float  # largest difference of a mean from an exactly rounded sum over the same cells, relative to the metric's spread
+    # largest difference of a mean from an exactly rounded sum over the same cells, relative to the
+    # metric's spread
+    mean_error: float
     count_errors: int  # entries whose number of rollouts differs from a plain count
 
 
@@ -48,11 +55,23 @@ def bench_table(rollouts: int = 100_000, scenes: int = 1_000) -> TableRow:
         with spawn_context().Pool(1, end_with_parent) as pool:
             read_s, aggregate_s, rows_s, peak_mb, found = pool.apply(_measured, (path,))
         mean_error, count_errors = compared(found, path)
-    return TableRow(rollouts, scenes, len(METRICS), read_s, aggregate_s, rows_s, peak_mb, mean_error, count_errors)
+    return TableRow(
+        rollouts,
+        scenes,
+        len(METRICS),
+        read_s,
+        aggregate_s,
+        rows_s,
+        peak_mb,
+        mean_error,
+        count_errors,
+    )
 
 
 def write_random_table(path: Path, rollouts: int, scenes: int) -> None:
-    """Write a table as a run does: one row per renderer, scene and seed, each metric with its validity; some rollouts failed."""
+    """Write a table as a run does: one row per renderer, scene and seed, each metric with its
+    validity; some rollouts failed.
+    """
     rng = np.random.Generator(np.random.Philox(2))
     i = np.arange(rollouts)
     cell = i // len(RENDERERS)
@@ -64,13 +83,19 @@ def write_random_table(path: Path, rollouts: int, scenes: int) -> None:
         "status": np.where(rng.random(rollouts) < FAILED, "failed", "ok"),
     }
     for name, facts in METRICS.items():
-        value = (rng.random(rollouts) < 0.1).astype(np.float64) if facts.is_flag else rng.normal(size=rollouts)
+        value = (
+            (rng.random(rollouts) < 0.1).astype(np.float64)
+            if facts.is_flag
+            else rng.normal(size=rollouts)
+        )
         valid = rng.random(rollouts) >= INVALID
         columns[name], columns[f"{name}_valid"] = pa.array(value, mask=~valid), valid
     pq.write_table(pa.table(columns), path, compression="zstd")
 
 
-def _measured(path: Path) -> tuple[float, float, float, float | None, dict[str, dict[str, dict[str, Any]]]]:
+def _measured(
+    path: Path,
+) -> tuple[float, float, float, float | None, dict[str, dict[str, dict[str, Any]]]]:
     began = time.process_time()
     table = RolloutTable.of_files([path])
     read = time.process_time()
@@ -82,7 +107,9 @@ def _measured(path: Path) -> tuple[float, float, float, float | None, dict[str, 
 
 
 def compared(found: Mapping[str, Mapping[str, Mapping[str, Any]]], path: Path) -> tuple[float, int]:
-    """Return the largest error of a mean and the number of wrong counts, against plain sums over the file's columns."""
+    """Return the largest error of a mean and the number of wrong counts, against plain sums over
+    the file's columns.
+    """
     table = pq.read_table(path)
     renderer, ok = table["renderer"].to_numpy(), table["status"].to_numpy() == "ok"
     worst, wrong = 0.0, 0
@@ -93,6 +120,8 @@ def compared(found: Mapping[str, Mapping[str, Mapping[str, Any]]], path: Path) -
             entry = found[one][name]
             wrong += entry["n_rollouts"] != len(mine)
             if mine:
-                error = abs(entry["mean"] - math.fsum(mine) / len(mine)) / (float(np.std(mine)) or 1.0)
+                error = abs(entry["mean"] - math.fsum(mine) / len(mine)) / (
+                    float(np.std(mine)) or 1.0
+                )
                 worst = max(worst, error)
     return worst, wrong

@@ -1,6 +1,8 @@
-"""Choose between trainings of one arm at several learning rates: the lowest `perceptual-syn` on the cycle renders of split ``val``.
+"""Choose between trainings of one arm at several learning rates: the lowest `perceptual-syn` on the
+cycle renders of split ``val``.
 
-PSNR stands beside it, for the distance is also a loss of most arms. The candidates are measured as `simrun bench quality` measures.
+PSNR stands beside it, for the distance is also a loss of most arms. The candidates are measured as
+`simrun bench quality` measures.
 """
 
 from __future__ import annotations
@@ -58,12 +60,17 @@ class Choice:
 
     def facts(self) -> dict[str, object]:
         """Return it for a card."""
-        scores = {f"{rate:g}": {PERCEPTUAL: score.perceptual, PSNR: score.psnr_db} for rate, score in self.scores.items()}
+        scores = {
+            f"{rate:g}": {PERCEPTUAL: score.perceptual, PSNR: score.psnr_db}
+            for rate, score in self.scores.items()
+        }
         how = f"lowest {PERCEPTUAL} on cycle renders of split {SPLIT}"
         return {"rate": self.rate, "by": how, "scores": scores, "clips": list(self.clips)}
 
 
-def choose(candidates: Mapping[float, Path], pairs: Path, out: Path, clips: int | None, seed: int) -> Choice:
+def choose(
+    candidates: Mapping[float, Path], pairs: Path, out: Path, clips: int | None, seed: int
+) -> Choice:
     """Measure an arm's candidates and return the best.
 
     Args:
@@ -83,13 +90,22 @@ def choose(candidates: Mapping[float, Path], pairs: Path, out: Path, clips: int 
         name, settings = bundle_fixer(folder / BUNDLE_FILE)
         variants.append(Variant(labels[rate], resolve("fixer", name, settings)))
     run = QualityRun(sequences, variants, out, seed=seed)
-    rows = [row_of(work) for work, _ in run.finished([work for work in run.works() if work.variant.spec is not None])]
+    rows = [
+        row_of(work)
+        for work, _ in run.finished([work for work in run.works() if work.variant.spec is not None])
+    ]
 
     def mean(label: str, metric: str) -> float:
         return float(np.mean([row["values"][metric] for row in rows if row["arm"] == label]))
 
-    scores = {rate: Score(mean(label, PERCEPTUAL), mean(label, PSNR)) for rate, label in labels.items()}
-    return Choice(min(scores, key=lambda rate: scores[rate].perceptual), scores, tuple(sequence.name for sequence in sequences))
+    scores = {
+        rate: Score(mean(label, PERCEPTUAL), mean(label, PSNR)) for rate, label in labels.items()
+    }
+    return Choice(
+        min(scores, key=lambda rate: scores[rate].perceptual),
+        scores,
+        tuple(sequence.name for sequence in sequences),
+    )
 
 
 def cycle_renders(pairs: Path, clips: int | None) -> list[PairSequence]:
@@ -98,14 +114,22 @@ def cycle_renders(pairs: Path, clips: int | None) -> list[PairSequence]:
     Raises:
         InputError: There is none.
     """
-    found = [s for s in PairDataset(pairs, SPLIT).sequences if s.info["degradation"]["kind"] == "cycle"]
+    found = [
+        s for s in PairDataset(pairs, SPLIT).sequences if s.info["degradation"]["kind"] == "cycle"
+    ]
     if not found:
-        raise InputError(DOING, f"{pairs}, split {SPLIT}", "no cycle render", "make such pairs: 'simrun train pairs SCENES --split val'")
+        raise InputError(
+            DOING,
+            f"{pairs}, split {SPLIT}",
+            "no cycle render",
+            "make such pairs: 'simrun train pairs SCENES --split val'",
+        )
     return evenly(found, clips)
 
 
 def take(candidate: Path, arm: Path, choice: Choice) -> None:
-    """Make the best candidate the arm: its bundle and snapshots by hard links, its log, and its card with the choice.
+    """Make the best candidate the arm: its bundle and snapshots by hard links, its log, and its
+    card with the choice.
 
     Raises:
         InputError: The arm's folder was trained in itself.

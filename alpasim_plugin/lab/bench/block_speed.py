@@ -1,4 +1,6 @@
-"""Time steady blocks of a fixer on a device with random weights, to be compared with the floors of `roofline`."""
+"""Time steady blocks of a fixer on a device with random weights, to be compared with the floors of
+`roofline`.
+"""
 
 from __future__ import annotations
 
@@ -92,7 +94,9 @@ def measure_blocks(
             for name, ms in clock.take().items():
                 stages.setdefault(name, []).append(ms)
     peak = torch.cuda.max_memory_allocated(device) / 1e6 if on_gpu else None
-    return BlockTimes(first, all_in, stages, calls, peak, torch.cuda.get_device_name(device) if on_gpu else "cpu")
+    return BlockTimes(
+        first, all_in, stages, calls, peak, torch.cuda.get_device_name(device) if on_gpu else "cpu"
+    )
 
 
 def require_memory(settings: OneFixerSettings, work: BlockWork, device: str) -> None:
@@ -100,7 +104,9 @@ def require_memory(settings: OneFixerSettings, work: BlockWork, device: str) -> 
     doing = f"measuring {settings.name}"
     if not torch.cuda.is_available():
         do = "run it on a machine with a GPU and a CUDA build of torch, or use --device cpu with a smaller fixer"
-        raise FixerError(doing, f"device {device!r}", f"torch {torch.__version__} sees no CUDA device", do)
+        raise FixerError(
+            doing, f"device {device!r}", f"torch {torch.__version__} sees no CUDA device", do
+        )
     free, total = torch.cuda.mem_get_info(device)
     need = work.memory_bytes + CONTEXT_BYTES
     if need > free:

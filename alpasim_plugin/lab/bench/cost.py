@@ -1,4 +1,6 @@
-"""Quality against core-minutes of training: snapshots of our method and of the distilled arms, with the stages that they need."""
+"""Quality against core-minutes of training: snapshots of our method and of the distilled arms, with
+the stages that they need.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +31,15 @@ ARMS = (OURS, *DISTILLED)
 def cost_curves(folders: Sequence[Path]) -> tuple[list[Curve], list[Variant]]:
     """Return the curve of each arm that was trained, and the snapshots to measure, each once.
 
-    The snapshots of a stage that is no causal generator of short blocks, such as a teacher, are left out; its time counts.
+    The snapshots of a stage that is no causal generator of short blocks, such as a teacher, are
+    left out; its time counts.
 
     Args:
         folders: Of trained arms, each with a seed of its own; claims are judged by the first.
 
     Raises:
-        InputError: A folder without any of the arms, an arm twice with one seed, or one without snapshots or processor times.
+        InputError: A folder without any of the arms, an arm twice with one seed, or one without
+            snapshots or processor times.
     """
     curves, variants = list[Curve](), dict[str, Variant]()
     for arms in folders:
@@ -43,27 +47,47 @@ def cost_curves(folders: Sequence[Path]) -> tuple[list[Curve], list[Variant]]:
         chosen = [arm for arm in ARMS if arm in trained]
         if not chosen:
             found = f"none of {', '.join(ARMS)}"
-            raise InputError(DOING, str(arms), found, "train them: 'simrun train arms --only V9,self-forcing,one-forcing'")
+            raise InputError(
+                DOING,
+                str(arms),
+                found,
+                "train them: 'simrun train arms --only V9,self-forcing,one-forcing'",
+            )
         for arm in chosen:
             seed = _seed(arms / arm)
             if any((curve.arm, curve.seed) == (arm, seed) for curve in curves):
                 found = f"{arm} of seed {seed}, which another folder has too"
-                raise InputError(DOING, str(arms), found, "train it with another --seed, or name one of the folders")
-            curve, snapshots = _curve(arms, arm, trained[arm], seed, "" if arms == folders[0] else f", seed {seed}")
+                raise InputError(
+                    DOING,
+                    str(arms),
+                    found,
+                    "train it with another --seed, or name one of the folders",
+                )
+            curve, snapshots = _curve(
+                arms, arm, trained[arm], seed, "" if arms == folders[0] else f", seed {seed}"
+            )
             curves.append(curve)
             variants |= snapshots
     return curves, list(variants.values())
 
 
 def _seed(training: Path) -> int:
-    path, do = (training / BUNDLE_FILE).with_suffix(".card.json"), "train the arm again with 'simrun train arms'"
+    path, do = (
+        (training / BUNDLE_FILE).with_suffix(".card.json"),
+        "train the arm again with 'simrun train arms'",
+    )
     card = read_json_object(path, DOING, do_this=do)
     with parsing(DOING, path, do, "no card of a training"):
         return int(card["training"]["batches"]["seed"])
 
 
-def _curve(arms: Path, arm: str, stages: Sequence[str], seed: int, suffix: str) -> tuple[Curve, dict[str, Variant]]:
-    points, variants, ends, before_s = list[Point](), dict[str, Variant](), dict[str, float](), 0.0
+def _curve(
+    arms: Path, arm: str, stages: Sequence[str], seed: int, suffix: str
+) -> tuple[Curve, dict[str, Variant]]:
+    points = list[Point]()
+    variants = dict[str, Variant]()
+    ends = dict[str, float]()
+    before_s = 0.0
     for stage in stages:
         for label, variant, step, core_s in _snapshots(arms, stage, suffix):
             points.append(Point(stage, step, (before_s + core_s) / 60, label))
@@ -83,18 +107,31 @@ def _snapshots(arms: Path, stage: str, suffix: str) -> Iterator[tuple[str, Varia
         yield label, Variant(label, spec), snapshot.step, snapshot.core_s
 
 
-def cost_clips(pairs: Path, clips: int | None, frames: int | None) -> tuple[list[PairSequence], int, str]:
+def cost_clips(
+    pairs: Path, clips: int | None, frames: int | None
+) -> tuple[list[PairSequence], int, str]:
     """Return the clips of split ``val``, their common number of frames, and what they are in words.
 
     Raises:
         InputError: Fewer than two cycle renders.
     """
-    sequences = [s for s in PairDataset(pairs, SPLIT).sequences if s.info["degradation"]["kind"] == "cycle"]
+    sequences = [
+        s for s in PairDataset(pairs, SPLIT).sequences if s.info["degradation"]["kind"] == "cycle"
+    ]
     chosen = evenly(sequences, clips or CLIPS)
     if len(chosen) < 2:
         found = f"{len(chosen)} cycle renders, two are needed"
-        raise InputError(DOING, f"{pairs}, split {SPLIT}", found, "make such pairs: 'simrun train pairs SCENES --split val'")
+        raise InputError(
+            DOING,
+            f"{pairs}, split {SPLIT}",
+            found,
+            "make such pairs: 'simrun train pairs SCENES --split val'",
+        )
     shortest = min(len(sequence.clip) for sequence in chosen)
     used = min(frames or FRAMES, shortest)
-    why = "" if used == (frames or FRAMES) else f" (the shortest clip has no more; the paper's have {FRAMES})"
+    why = (
+        ""
+        if used == (frames or FRAMES)
+        else f" (the shortest clip has no more; the paper's have {FRAMES})"
+    )
     return chosen, used, f"{len(chosen)} cycle renders of split {SPLIT}, {used} frames each{why}."

@@ -20,15 +20,16 @@ DOING = "reading drives behind the arms"
 def read_drives(folders: Iterable[Path], arms: Path) -> dict[str, Driven]:
     """Read run folders: PROTOCOL -> the rollouts of one policy behind the arms.
 
-    A renderer over ``3dgs`` whose fixer has the weights of an arm is that arm, whatever it is called in the run.
+    A renderer over ``3dgs`` whose fixer has the weights of an arm is that arm, whatever it is
+    called in the run.
 
     Args:
         folders: Finished runs; the rollouts of a policy are in one of them.
         arms: Folder with ``NAME/fixer.safetensors`` for every trained arm.
 
     Raises:
-        InputError: No finished run, one without ``3dgs``, a policy that is in two of them, or a renderer that is called like an arm and
-            has other weights.
+        InputError: No finished run, one without ``3dgs``, a policy that is in two of them, or a
+            renderer that is called like an arm and has other weights.
     """
     bundles = {sha256_of(path): path.parent.name for path in sorted(arms.glob(f"*/{BUNDLE_FILE}"))}
     out: dict[str, Driven] = {}
@@ -36,16 +37,33 @@ def read_drives(folders: Iterable[Path], arms: Path) -> dict[str, Driven]:
         run = read_run(folder)
         if BASELINE not in run.renderers:
             found = f"renderers {', '.join(run.renderers)}"
-            raise InputError(DOING, f"--drives {folder}", found, f"drive {BASELINE} too: it is what the arms are compared with")
+            raise InputError(
+                DOING,
+                f"--drives {folder}",
+                found,
+                f"drive {BASELINE} too: it is what the arms are compared with",
+            )
         names = {renderer: _arm(renderer, run, bundles) for renderer in run.renderers}
-        if twice := sorted({name for name in names.values() if list(names.values()).count(name) > 1}):
+        if twice := sorted(
+            {name for name in names.values() if list(names.values()).count(name) > 1}
+        ):
             same = ", ".join(renderer for renderer, name in names.items() if name in twice)
-            raise InputError(DOING, f"--drives {folder}", f"{same} have the same weights", "drive each arm behind one renderer")
+            raise InputError(
+                DOING,
+                f"--drives {folder}",
+                f"{same} have the same weights",
+                "drive each arm behind one renderer",
+            )
         for policy in run.policies:
-            driven = Driven(policy, [_row(one, names[one.renderer]) for one in run.rollouts if one.policy == policy])
+            driven = Driven(
+                policy,
+                [_row(one, names[one.renderer]) for one in run.rollouts if one.policy == policy],
+            )
             if driven.protocol in out:
                 found = f"policy {policy} drove in a folder before it"
-                raise InputError(DOING, f"--drives {folder}", found, "name one folder for each policy")
+                raise InputError(
+                    DOING, f"--drives {folder}", found, "name one folder for each policy"
+                )
             out[driven.protocol] = driven
     return out
 
@@ -61,16 +79,26 @@ def _arm(renderer: str, run: Run, bundles: Mapping[str, str]) -> str:
     name = renderer.partition("@")[0]
     if name in bundles.values():
         raise InputError(
-            DOING, f"--drives {run.folder}", f"{renderer} drove with weights that are not those of {name} in --arms",
+            DOING,
+            f"--drives {run.folder}",
+            f"{renderer} drove with weights that are not those of {name} in --arms",
             f"drive with --set {renderer}:fixer.weights.bundle=ARMS/{name}/{BUNDLE_FILE}, or name the folder whose arms drove",
-        )  # fmt: skip
+        )
     return renderer
 
 
 def _row(rollout: Rollout, arm: str) -> dict[str, Any]:
     values = {name: rollout.metrics.get(name) for name in METRICS}
-    metrics = {name: {"value": value, "valid": value is not None, "reason": ""} for name, value in values.items()}
+    metrics = {
+        name: {"value": value, "valid": value is not None, "reason": ""}
+        for name, value in values.items()
+    }
     return {
-        "renderer": arm, "policy": rollout.policy, "scene": rollout.scene, "seed": rollout.seed, "status": rollout.status,
-        "failure_class": rollout.failure_class, "metrics": metrics,
-    }  # fmt: skip
+        "renderer": arm,
+        "policy": rollout.policy,
+        "scene": rollout.scene,
+        "seed": rollout.seed,
+        "status": rollout.status,
+        "failure_class": rollout.failure_class,
+        "metrics": metrics,
+    }

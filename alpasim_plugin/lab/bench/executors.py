@@ -1,7 +1,8 @@
-"""What the way over other nodes costs: rollouts that only sleep, so that their time is known whatever the processor does.
+"""What the way over other nodes costs: rollouts that only sleep, so that their time is known
+whatever the processor does.
 
-Everything else is as in a run: workers are actors of Ray that compare versions first, a result is as large as a rollout, travels to the
-driver, is checked and written to a folder with its manifest.
+Everything else is as in a run: workers are actors of Ray that compare versions first, a result is
+as large as a rollout, travels to the driver, is checked and written to a folder with its manifest.
 """
 
 from __future__ import annotations
@@ -68,7 +69,10 @@ class Sleeping:
         time.sleep(self.seconds)
         data = os.urandom(self.result_bytes)
         facts = {"bytes": len(data), "mtime_ns": 0, "sha256": hashlib.sha256(data).hexdigest()}
-        return RolloutResult({"path": f"rollouts/{job}", "status": "ok", "node": node.name, "files": {LOG: facts}}, {LOG: data})
+        return RolloutResult(
+            {"path": f"rollouts/{job}", "status": "ok", "node": node.name, "files": {LOG: facts}},
+            {LOG: data},
+        )
 
     def key(self, job: int) -> str:
         """Return the rollout's number."""
@@ -80,7 +84,8 @@ class Sleeping:
 
 
 def patiently(start: Callable[[], Any]) -> Any:
-    """Start a node of Ray, which gives it 30 s to come up; on a busy machine it is started again, `STARTS` times in all.
+    """Start a node of Ray, which gives it 30 s to come up; on a busy machine it is started again,
+    `STARTS` times in all.
 
     Raises:
         InfrastructureError: It never came up in time.
@@ -92,16 +97,22 @@ def patiently(start: Callable[[], Any]) -> Any:
             if "timed out during startup" not in str(error):
                 raise
             last = error
-    raise InfrastructureError("starting a Ray node", "this machine", str(last), "try again when the machine is less busy") from last
+    raise InfrastructureError(
+        "starting a Ray node", "this machine", str(last), "try again when the machine is less busy"
+    ) from last
 
 
 @contextmanager
 def local_nodes(nodes: int, cores: int) -> Iterator[Executor]:
-    """Start a Ray cluster on this machine, whose nodes say that they have so many cores each, for the block."""
+    """Start a Ray cluster on this machine, whose nodes say that they have so many cores each, for
+    the block.
+    """
     require_library("ray", DOING, f"--nodes {nodes}", "pip install 'alpasim-onefixer[ray]'")
     from ray.cluster_utils import Cluster
 
-    cluster = patiently(lambda: Cluster(initialize_head=True, head_node_args={"num_cpus": cores, **LIGHT_HEAD}))
+    cluster = patiently(
+        lambda: Cluster(initialize_head=True, head_node_args={"num_cpus": cores, **LIGHT_HEAD})
+    )
     try:
         for _ in range(nodes - 1):
             patiently(lambda: cluster.add_node(num_cpus=cores, **LIGHT))
@@ -111,7 +122,11 @@ def local_nodes(nodes: int, cores: int) -> Iterator[Executor]:
 
 
 def bench_executor(
-    executor: Executor, counts: Sequence[int], rollouts: int, seconds: float, result_bytes: int = RESULT_BYTES
+    executor: Executor,
+    counts: Sequence[int],
+    rollouts: int,
+    seconds: float,
+    result_bytes: int = RESULT_BYTES,
 ) -> Iterator[ExecutorRow]:
     """Yield one row for each number of workers.
 
@@ -127,13 +142,26 @@ def bench_executor(
         InfrastructureError: The cluster has fewer cores, or its workers do not start.
     """
     if executor.kind != "ray":
-        raise InputError(DOING, f"--executor {executor}", "its workers cannot be started before the clock", "measure --executor ray")
+        raise InputError(
+            DOING,
+            f"--executor {executor}",
+            "its workers cannot be started before the clock",
+            "measure --executor ray",
+        )
     with kept_open(executor), TemporaryDirectory(prefix="simrun-bench-") as scratch:
         for count in counts:
-            yield _row(executor, count, list(range(count * rollouts)), Sleeping(seconds, result_bytes), Path(scratch, str(count)))
+            yield _row(
+                executor,
+                count,
+                list(range(count * rollouts)),
+                Sleeping(seconds, result_bytes),
+                Path(scratch, str(count)),
+            )
 
 
-def _row(executor: Executor, count: int, items: Sequence[int], work: Sleeping, root: Path) -> ExecutorRow:
+def _row(
+    executor: Executor, count: int, items: Sequence[int], work: Sleeping, root: Path
+) -> ExecutorRow:
     noticed: list[str] = []
     given = assignment_as_here(work, Contents(), (), Resources(), count, noticed.append)
     asked_s = time.perf_counter()
@@ -142,11 +170,15 @@ def _row(executor: Executor, count: int, items: Sequence[int], work: Sleeping, r
         began_s, began_cpu_s = time.perf_counter(), time.process_time()
         for item, got in run_jobs(backend, items, noticed.append):
             if isinstance(got, Lost):
-                raise InfrastructureError(DOING, f"rollout {item}", got.found, "look at the nodes, then measure again")
+                raise InfrastructureError(
+                    DOING, f"rollout {item}", got.found, "look at the nodes, then measure again"
+                )
             unpack(got, root)
         wall_s, cpu_s = time.perf_counter() - began_s, time.process_time() - began_cpu_s
     efficiency = len(items) * work.seconds / (count * wall_s)
-    return ExecutorRow(count, len(items), began_s - asked_s, wall_s, efficiency, cpu_s, 1e3 * cpu_s / len(items))
+    return ExecutorRow(
+        count, len(items), began_s - asked_s, wall_s, efficiency, cpu_s, 1e3 * cpu_s / len(items)
+    )
 
 
 def _all_ready(backend: Backend[Any], count: int, noticed: Sequence[str]) -> None:
@@ -154,5 +186,10 @@ def _all_ready(backend: Backend[Any], count: int, noticed: Sequence[str]) -> Non
     while (ready := len(backend.free(count))) < count:
         if time.perf_counter() > until_s:
             found = "; ".join([f"{ready} were ready after {READY_S:g} s", *noticed])
-            raise InfrastructureError(DOING, f"{count} workers", found, "ask for no more workers than the cluster has cores")
+            raise InfrastructureError(
+                DOING,
+                f"{count} workers",
+                found,
+                "ask for no more workers than the cluster has cores",
+            )
         backend.wait(0.1)

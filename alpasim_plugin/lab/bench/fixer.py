@@ -2,12 +2,13 @@
 
 Every row has two errors, both in grey levels of the fixed images at the same noise:
 
-- *rounding*: against the float32 whole-clip run of the same setting (window, history, decoder). The cost of precision, streaming, caching
-  and folding.
-- *model*: against the float32 whole-clip run of the base setting with a window over the whole clip. The effect of the setting itself; a
-  network trained with the setting may be as good with it.
+- *rounding*: against the float32 whole-clip run of the same setting (window, history, decoder). The
+  cost of precision, streaming, caching and folding.
+- *model*: against the float32 whole-clip run of the base setting with a window over the whole clip.
+  The effect of the setting itself; a network trained with the setting may be as good with it.
 
-Settings run on a clip from a recorded drive; both modes of the closed loop run on drives of their own.
+Settings run on a clip from a recorded drive; both modes of the closed loop run on drives of their
+own.
 """
 
 from __future__ import annotations
@@ -29,7 +30,17 @@ from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.bench import pixel_fixer
 from alpasim_plugin.lab.bench.fixer_drive import drive
-from alpasim_plugin.lab.bench.fixer_rows import DRIVEN, SCENE, Bench, BenchOptions, Case, Row, difference, in_own_process, p50_p95
+from alpasim_plugin.lab.bench.fixer_rows import (
+    DRIVEN,
+    SCENE,
+    Bench,
+    BenchOptions,
+    Case,
+    Row,
+    difference,
+    in_own_process,
+    p50_p95,
+)
 from alpasim_plugin.lab.bench.fixer_speed import Timing, measure
 from alpasim_plugin.runs.provenance import hardware, versions
 
@@ -43,7 +54,12 @@ BASE = Case("precision", "float32")
 LOOPS = (
     Case("mode", "chunk", ("mode=chunk",), "identity"),
     Case("mode", "speculative", ("mode=speculative",), "identity"),
-    Case("mode", "speculative, exact poses", ("mode=speculative", "tolerance_m=0", "tolerance_deg=0"), "identity"),
+    Case(
+        "mode",
+        "speculative, exact poses",
+        ("mode=speculative", "tolerance_m=0", "tolerance_deg=0"),
+        "identity",
+    ),
 )
 
 
@@ -70,12 +86,21 @@ def cases(latents: int) -> tuple[Case, ...]:
         Case("decoder", "latent and render", ("decoder.kind=render",)),
         Case("decoder", "latent only", ("decoder.kind=latent",)),
         Case("decoder", "LightVAE", (*LIGHT, "decoder.kind=latent"), "random", slow=True),
-        Case("decoder", "LightVAE, TAEHV decoder", (*LIGHT, "decoder.kind=taehv"), "random", slow=True),
+        Case(
+            "decoder",
+            "LightVAE, TAEHV decoder",
+            (*LIGHT, "decoder.kind=taehv"),
+            "random",
+            slow=True,
+        ),
     )
 
 
 def bench_fixer(
-    options: BenchOptions, sizes: list[tuple[int, int]], frames: int, on_row: Callable[[Row], None] = lambda row: None
+    options: BenchOptions,
+    sizes: list[tuple[int, int]],
+    frames: int,
+    on_row: Callable[[Row], None] = lambda row: None,
 ) -> Bench:
     """Measure a fixer at every size.
 
@@ -95,8 +120,12 @@ def bench_fixer(
         with tempfile.TemporaryDirectory(prefix="simrun-bench-") as folder:
             chosen = fixer_settings(options.name, options.overrides)
             per_frame = chosen if isinstance(chosen, PixelFixerSettings) else None
-            settings = None if per_frame else CaseSettings(options, Path(folder))  # refuses bad settings before anything is driven
-            clip = drive(DRIVEN, frames, size, recorded, SCENE, seed=options.seed, threads=options.threads).clip
+            settings = (
+                None if per_frame else CaseSettings(options, Path(folder))
+            )  # refuses bad settings before anything is driven
+            clip = drive(
+                DRIVEN, frames, size, recorded, SCENE, seed=options.seed, threads=options.threads
+            ).clip
             if per_frame is not None:
                 rows += pixel_fixer.bench_clip(options, per_frame, clip, on_row)
             if settings is None:
@@ -121,17 +150,24 @@ def bench_fixer(
     return Bench(rows, facts)
 
 
-def bench_clip(options: BenchOptions, clip: Clip, on_row: Callable[[Row], None] = lambda row: None, own_process: bool = True) -> list[Row]:
+def bench_clip(
+    options: BenchOptions,
+    clip: Clip,
+    on_row: Callable[[Row], None] = lambda row: None,
+    own_process: bool = True,
+) -> list[Row]:
     """Measure every setting on one clip.
 
     Args:
         options: How.
         clip: Frames and maps of a rollout, in whole blocks.
         on_row: Called with every finished row.
-        own_process: Measure every row in a fresh process, so that memory and first calls are its own.
+        own_process: Measure every row in a fresh process, so that memory and first calls are its
+            own.
 
     Returns:
-        One row per setting. A setting that these weights or this machine cannot run has the reason as ``problem``.
+        One row per setting. A setting that these weights or this machine cannot run has the reason
+        as ``problem``.
     """
     rows: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="simrun-bench-") as folder:
@@ -139,7 +175,11 @@ def bench_clip(options: BenchOptions, clip: Clip, on_row: Callable[[Row], None] 
         latents = 1 + (len(clip.t_us) - 1) // 4
         base = whole_clip(settings.over_all(BASE, latents), clip, SCENE, options.seed)
         for case in filter(options.includes, cases(latents)):
-            rows.append(_row(settings, case, clip, base if case.weights == "stand-in" else None, own_process))
+            rows.append(
+                _row(
+                    settings, case, clip, base if case.weights == "stand-in" else None, own_process
+                )
+            )
             on_row(rows[-1])
     return rows
 
@@ -165,7 +205,9 @@ class CaseSettings:
         return self._read((*case.overrides, f"weights.bundle={path}"))
 
     def over_all(self, case: Case, latents: int) -> OneFixerSettings:
-        """Return the base settings with a case's weights and a window over a whole clip: the reference of model errors."""
+        """Return the base settings with a case's weights and a window over a whole clip: the
+        reference of model errors.
+        """
         return self.of(replace(case, overrides=(f"window={latents}",)))
 
     def row(self, case: Case, size: tuple[int, int]) -> Row:
@@ -176,7 +218,12 @@ class CaseSettings:
     def _read(self, overrides: Sequence[str]) -> OneFixerSettings:
         settings = fixer_settings(self.options.name, (*self.options.overrides, *overrides))
         if not isinstance(settings, OneFixerSettings):
-            raise InputError("measuring a fixer", self.options.name, "it has no networks", "name one of the onefixer family")
+            raise InputError(
+                "measuring a fixer",
+                self.options.name,
+                "it has no networks",
+                "name one of the onefixer family",
+            )
         return settings
 
 
@@ -208,7 +255,16 @@ def _loop_row(of: CaseSettings, case: Case, frames: int, size: tuple[int, int]) 
     row, options = of.row(case, size), of.options
     try:
         settings = of.of(case)
-        sample = drive(DRIVEN, frames, size, settings, SCENE, seed=options.seed, device=options.device, threads=options.threads)
+        sample = drive(
+            DRIVEN,
+            frames,
+            size,
+            settings,
+            SCENE,
+            seed=options.seed,
+            device=options.device,
+            threads=options.threads,
+        )
         exact = whole_clip(settings, sample.clip, SCENE, options.seed)
         whole = whole_clip(of.over_all(case, 1 + len(exact) // 4), sample.clip, SCENE, options.seed)
     except SimrunError as error:
@@ -225,7 +281,19 @@ def _loop_row(of: CaseSettings, case: Case, frames: int, size: tuple[int, int]) 
     )
 
 
-def measured(options: BenchOptions, settings: OneFixerSettings, clip: Clip, own_process: bool) -> Timing:
+def measured(
+    options: BenchOptions, settings: OneFixerSettings, clip: Clip, own_process: bool
+) -> Timing:
     """Time a setting over a clip, in a fresh process if asked."""
-    arguments = (settings, clip, SCENE, options.seed, options.device, options.threads, options.passes)
-    return in_own_process(settings.name, measure, *arguments) if own_process else measure(*arguments)
+    arguments = (
+        settings,
+        clip,
+        SCENE,
+        options.seed,
+        options.device,
+        options.threads,
+        options.passes,
+    )
+    return (
+        in_own_process(settings.name, measure, *arguments) if own_process else measure(*arguments)
+    )

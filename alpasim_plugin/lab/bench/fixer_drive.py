@@ -1,4 +1,6 @@
-"""Drive a scene behind a fixer and record its input and its output: the closed-loop part of the fixer's bench."""
+"""Drive a scene behind a fixer and record its input and its output: the closed-loop part of the
+fixer's bench.
+"""
 
 from __future__ import annotations
 
@@ -72,10 +74,16 @@ def drive(
         device, threads: Where the fixer computes, and with how many threads.
     """
     loaded = load_scenario(scene)
-    loaded = load_scenario(scene, overrides=[f"timing.duration_us={(frames + SPARE) * loaded.rates.camera_us}"])
+    loaded = load_scenario(
+        scene, overrides=[f"timing.duration_us={(frames + SPARE) * loaded.rates.camera_us}"]
+    )
     scenario = replace(loaded, cameras=(resized(loaded.cameras[0], *size),))
     base = make_renderer(renderer, scenario, seed, "cpu", threads)
-    fixer = _RecordingFixer(make_fixer(settings.name, settings, scene_id=scene_id, seed=seed, device=device, threads=threads))
+    fixer = _RecordingFixer(
+        make_fixer(
+            settings.name, settings, scene_id=scene_id, seed=seed, device=device, threads=threads
+        )
+    )
     fixed = fixed_renderer(base.render, lambda: fixer, settings, scenario, threads)
     recording = RecordingRenderer(fixed)
     with Recorder(scenario, seed, images="none") as recorder:
@@ -86,10 +94,20 @@ def drive(
     ends = np.cumsum([0, *(len(block) for block in fixer.given)])
     per_block = [recording.ms[begin:end] for begin, end in pairwise(ends)]
     names = sorted({name for ms in recording.ms for name in ms} - {"map"})
-    series = {name: [float(np.mean([ms.get(name, 0.0) for ms in block])) for block in per_block] for name in names}
+    series = {
+        name: [float(np.mean([ms.get(name, 0.0) for ms in block])) for block in per_block]
+        for name in names
+    }
     all_in = [sum(parts) for parts in zip(*series.values(), strict=True)]
     stages = {name.removeprefix("fix: "): ms[1:] for name, ms in series.items() if name != "fix"}
-    return DriveSample(Clip.of(given, maps), shown, all_in[1:], stages, all_in[0] * len(fixer.given[0]), fixed.facts())
+    return DriveSample(
+        Clip.of(given, maps),
+        shown,
+        all_in[1:],
+        stages,
+        all_in[0] * len(fixer.given[0]),
+        fixed.facts(),
+    )
 
 
 def resized(camera: CameraSpec, width: int, height: int) -> CameraSpec:
@@ -107,7 +125,11 @@ class _RecordingFixer(Fixer):
     maps: list[Sequence[U8]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.blocks, self.trained, self.label = self.fixer.blocks, self.fixer.trained, self.fixer.label
+        self.blocks, self.trained, self.label = (
+            self.fixer.blocks,
+            self.fixer.trained,
+            self.fixer.label,
+        )
 
     @property
     def stage_ms(self) -> Mapping[str, float]:  # type: ignore[override]  # computed when it is read

@@ -1,4 +1,6 @@
-"""What the fixers' benches have in common: settings to measure, rows of results, errors of images, a process of their own."""
+"""What the fixers' benches have in common: settings to measure, rows of results, errors of images,
+a process of their own.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,8 @@ class Case:
         group: What it varies: precision, window, history, decoder.
         name: The setting.
         overrides: Settings on top of the base, ``key=value``.
-        weights: ``stand-in``: the fixer's own, or random ones where it has none; ``identity``, ``random``: an untrained fixer's.
+        weights: ``stand-in``: the fixer's own, or random ones where it has none; ``identity``,
+            ``random``: an untrained fixer's.
         slow: Left out of a quick run, and measured over fewer frames.
     """
 
@@ -49,12 +52,14 @@ class Row:
         weights: Which weights.
         size: Width and height, pixels.
         frames: Frames of the clip.
-        ms: By stage, ``all-in`` and its processor time ``cpu``: median and 95th percentile over blocks after the first, milliseconds per
-            frame.
+        ms: By stage, ``all-in`` and its processor time ``cpu``: median and 95th percentile over
+            blocks after the first, milliseconds per frame.
         first_ms: First block, whole, all-in.
         load_ms: Networks from nothing to ready.
-        peak_mb: Largest memory beyond an empty process, 1e6 bytes; None where the system does not tell.
-        rounding: Mean, largest and PSNR (None: equal) against the same setting in float32 over the whole clip; None where there is none.
+        peak_mb: Largest memory beyond an empty process, 1e6 bytes; None where the system does not
+            tell.
+        rounding: Mean, largest and PSNR (None: equal) against the same setting in float32 over the
+            whole clip; None where there is none.
         model: The same against the base over the whole clip; None where the networks are others.
         hit_rate: Share of the predicted frames that were shown; None where nothing is predicted.
         guarded: Frames that the guard replaced by the raw ones; they are left out of the errors.
@@ -119,7 +124,9 @@ class Bench:
 
 
 def difference(images: U8, reference: U8) -> tuple[float, int, float | None] | None:
-    """Return mean and largest difference in grey levels, and PSNR in dB, None for equal clips; None for no images at all."""
+    """Return mean and largest difference in grey levels, and PSNR in dB, None for equal clips; None
+    for no images at all.
+    """
     if not len(images):
         return None
     total = Difference()
@@ -135,11 +142,16 @@ def p50_p95(series: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, flo
         >>> p50_p95({"dit": [1.0, 3.0, 2.0], "encode": []})
         {'dit': (2.0, 2.9)}
     """
-    return {name: (float(np.median(ms)), float(np.percentile(ms, 95))) for name, ms in series.items() if len(ms)}
+    return {
+        name: (float(np.median(ms)), float(np.percentile(ms, 95)))
+        for name, ms in series.items()
+        if len(ms)
+    }
 
 
 def in_own_process(name: str, run: Callable[..., Timing], *arguments: object) -> Timing:
-    """Call a measurement in a fresh process: no kernel is warm there, and the memory is this setting's alone.
+    """Call a measurement in a fresh process: no kernel is warm there, and the memory is this
+    setting's alone.
 
     Raises:
         FixerError: The process ended early.

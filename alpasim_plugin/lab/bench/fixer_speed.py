@@ -1,6 +1,7 @@
 """Time a fixer stage by stage over a recorded clip, with the memory it takes.
 
-Passes without any clock give the all-in times, further passes with a clock at every stage give the stages.
+Passes without any clock give the all-in times, further passes with a clock at every stage give the
+stages.
 """
 
 from __future__ import annotations
@@ -29,10 +30,11 @@ class Timing:
         load_ms: Networks from nothing to ready.
         first_ms: Very first block, all-in, whole: buffers are made and kernels chosen.
         all_in: Blocks after the first, frames in to frames out.
-        cpu: Processor time of the same, all threads together: what remains comparable on a busy machine, best with one thread.
+        cpu: Processor time of the same, all threads together: what remains comparable on a busy
+            machine, best with one thread.
         stages: By stage, from a pass of its own.
-        peak_mb: Largest resident memory (device memory on an accelerator) beyond what the process held before the networks; None where
-            the system does not tell.
+        peak_mb: Largest resident memory (device memory on an accelerator) beyond what the process
+            held before the networks; None where the system does not tell.
         images: ``(T, H, W, 3)`` uint8 output of the first pass.
         guarded: ``(T,)`` whether the guard passed the raw frame on instead.
     """
@@ -48,7 +50,13 @@ class Timing:
 
 
 def measure(
-    settings: OneFixerSettings, clip: Clip, scene_id: str, seed: int = 0, device: str = "cpu", threads: int | None = None, passes: int = 2
+    settings: OneFixerSettings,
+    clip: Clip,
+    scene_id: str,
+    seed: int = 0,
+    device: str = "cpu",
+    threads: int | None = None,
+    passes: int = 2,
 ) -> Timing:
     """Run a fixer over a clip and time it.
 
@@ -57,7 +65,8 @@ def measure(
         clip: What it is given, block by block.
         scene_id, seed: Key of the noise.
         device, threads: Where, and with how many threads.
-        passes: Runs over the clip without and with clocks at the stages, each. The first block counts once, in the first pass.
+        passes: Runs over the clip without and with clocks at the stages, each. The first block
+            counts once, in the first pass.
 
     Returns:
         Times, memory and the first pass's images.
@@ -76,7 +85,9 @@ def measure(
         for index, (frames, maps) in enumerate(clip.blocks(fixer.blocks.frames)):
             begin, used = clock.now(), time.process_time()
             fixed = fixer.step(frames, maps)
-            ms, cpu_ms, taken = (clock.now() - begin) * 1e3, (time.process_time() - used) * 1e3, clock.take()
+            ms = (clock.now() - begin) * 1e3
+            cpu_ms = (time.process_time() - used) * 1e3
+            taken = clock.take()
             if index and stages:
                 for name in timing.stages:
                     timing.stages[name].append(taken[name] / len(frames))
@@ -89,7 +100,11 @@ def measure(
                 images += [frame.rgb for frame in fixed]
                 guarded += [bool(frame.events) for frame in fixed]
         if run == passes - 1:
-            peak_mb = resident_mb("VmHWM") if device == "cpu" else torch.cuda.max_memory_allocated(device) / MB
+            peak_mb = (
+                resident_mb("VmHWM")
+                if device == "cpu"
+                else torch.cuda.max_memory_allocated(device) / MB
+            )
             timing.peak_mb = None if peak_mb is None or before_mb is None else peak_mb - before_mb
     timing.images, timing.guarded = np.stack(images), np.array(guarded)
     return timing

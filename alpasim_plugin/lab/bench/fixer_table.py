@@ -15,18 +15,37 @@ from alpasim_plugin.block_fixers.pipeline import TIMED
 from alpasim_plugin.lab.bench.fixer_rows import Row
 
 HEAD = (
-    "setting", "weights", *(f"{stage} ms" for stage in TIMED), "all-in ms", "CPU ms", "first block ms", "peak MB",
-    "rounding: mean, max, PSNR", "model: mean, max, PSNR", "hits",
-)  # fmt: skip
+    "setting",
+    "weights",
+    *(f"{stage} ms" for stage in TIMED),
+    "all-in ms",
+    "CPU ms",
+    "first block ms",
+    "peak MB",
+    "rounding: mean, max, PSNR",
+    "model: mean, max, PSNR",
+    "hits",
+)
 NEAR = 0.15  # decades between points that share a label
 FEW = 3  # up to so many names are written to the right of their points, more to the left
 FLOOR = 1e-4  # grey levels; where the plot puts errors that are zero
-MARKERS = {"precision": "o", "window": "s", "history": "^", "decoder": "D", "mode": "P", "guard": "v", "source": "<", "cameras": ">"}
+MARKERS = {
+    "precision": "o",
+    "window": "s",
+    "history": "^",
+    "decoder": "D",
+    "mode": "P",
+    "guard": "v",
+    "source": "<",
+    "cameras": ">",
+}
 MARK = "<!-- bench: {} -->"
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """Return one table per size; times are median / 95th percentile per frame, errors grey levels and dB."""
+    """Return one table per size; times are median / 95th percentile per frame, errors grey levels
+    and dB.
+    """
     parts = []
     for size in dict.fromkeys(row.size for row in rows):
         mine = [row for row in rows if row.size == size]
@@ -50,7 +69,8 @@ def cells(row: Row) -> list[str]:
         *(_times(row, stage) for stage in (*TIMED, "all-in", "cpu")),
         _number(row.first_ms, ".0f"),
         _number(row.peak_mb, ".0f"),
-        _error(row.rounding) + (f" (guard: {row.guarded} of {row.frames} frames unfixed)" if row.guarded else ""),
+        _error(row.rounding)
+        + (f" (guard: {row.guarded} of {row.frames} frames unfixed)" if row.guarded else ""),
         _error(row.model),
         "" if row.hit_rate is None else f"{row.hit_rate:.0%}",
     ]
@@ -80,12 +100,20 @@ def plot(rows: Sequence[Row], path: str | Path) -> None:
     sizes = list(dict.fromkeys(row.size for row in rows))
     figure = Figure(figsize=(14, 6.2 * len(sizes)), layout="constrained")
     axes = figure.subplots(len(sizes), 2, squeeze=False)
-    titles = {"rounding": "rounding: the same setting", "model": "model: the base with a window over the whole clip"}
+    titles = {
+        "rounding": "rounding: the same setting",
+        "model": "model: the base with a window over the whole clip",
+    }
     for line, size in zip(axes, sizes, strict=True):
         mine = [row for row in rows if row.size == size and not row.problem]
         for ax, (kind, title) in zip(line, titles.items(), strict=True):
-            _panel(ax, [(row, error[0]) for row in mine if (error := getattr(row, kind)) is not None])
-            ax.set_title(f"{size[0]}x{size[1]}, against the float32 whole clip of {title.partition(': ')[2]} ({kind})", fontsize=9)
+            _panel(
+                ax, [(row, error[0]) for row in mine if (error := getattr(row, kind)) is not None]
+            )
+            ax.set_title(
+                f"{size[0]}x{size[1]}, against the float32 whole clip of {title.partition(': ')[2]} ({kind})",
+                fontsize=9,
+            )
     figure.savefig(path, dpi=100)
 
 
@@ -96,7 +124,15 @@ def _panel(ax: Any, errors: Sequence[tuple[Row, float]]) -> None:
     for (left, right), y, names in _clusters(points):
         side = "bottom" if y <= FLOOR else "top"
         at, shift, align = (left, -7, "right") if len(names) > FEW else (right, 7, "left")
-        ax.annotate("\n".join(names), (at, y), xytext=(shift, 4), textcoords="offset points", fontsize=7, va=side, ha=align)
+        ax.annotate(
+            "\n".join(names),
+            (at, y),
+            xytext=(shift, 4),
+            textcoords="offset points",
+            fontsize=7,
+            va=side,
+            ha=align,
+        )
     for group, marker in MARKERS.items():
         ax.plot([], [], marker, color=f"C{list(MARKERS).index(group)}", label=group)
     ax.legend(fontsize=8, loc="center right")
@@ -111,8 +147,12 @@ def _panel(ax: Any, errors: Sequence[tuple[Row, float]]) -> None:
     ax.grid(visible=True, which="both", alpha=0.25)
 
 
-def _clusters(points: Sequence[tuple[Row, float, float]]) -> list[tuple[tuple[float, float], float, list[str]]]:
-    """Join the names of points whose labels would lie on each other: leftmost and rightmost of them, their height, names."""
+def _clusters(
+    points: Sequence[tuple[Row, float, float]],
+) -> list[tuple[tuple[float, float], float, list[str]]]:
+    """Join the names of points whose labels would lie on each other: leftmost and rightmost of
+    them, their height, names.
+    """
     out: list[tuple[tuple[float, float], float, list[str]]] = []
     for row, x, y in sorted(points, key=lambda point: (point[2], point[1])):
         for i, ((left, right), height, names) in enumerate(out):
@@ -125,7 +165,8 @@ def _clusters(points: Sequence[tuple[Row, float, float]]) -> list[tuple[tuple[fl
 
 
 def put_between_marks(page: str, name: str, text: str) -> str:
-    """Replace the text of a page between ``<!-- bench: NAME -->`` and ``<!-- bench: end of NAME -->``.
+    """Replace the text of a page between ``<!-- bench: NAME -->`` and ``<!-- bench: end of NAME
+    -->``.
 
     Raises:
         ValueError: When the page has no such marks.

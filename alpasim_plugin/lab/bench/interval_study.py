@@ -1,8 +1,9 @@
 """Monte-Carlo study of the intervals: coverage and power on synthetic rollouts.
 
-The model: a rollout has the event if scene effect + run noise, both normal, falls below the threshold that gives the wanted rate. The
-scene's share of the variance is the within-scene correlation. Two renderers share 90 % of the scene effect, and the run noise with
-correlation 0.8 where they meet the same random numbers.
+The model: a rollout has the event if scene effect + run noise, both normal, falls below the
+threshold that gives the wanted rate. The scene's share of the variance is the within-scene
+correlation. Two renderers share 90 % of the scene effect, and the run noise with correlation 0.8
+where they meet the same random numbers.
 """
 
 from __future__ import annotations
@@ -39,17 +40,34 @@ class Design:
 def flags(design: Design, repeats: int, generator: np.random.Generator) -> F64:
     """Return outcomes ``(repeats, scenes, seeds)``, 0 or 1, under the probit model."""
     shape = (repeats, design.n_scenes, design.n_seeds)
-    latent = _latent(generator.standard_normal((*shape[:2], 1)), generator.standard_normal(shape), design.correlation)
+    latent = _latent(
+        generator.standard_normal((*shape[:2], 1)),
+        generator.standard_normal(shape),
+        design.correlation,
+    )
     return np.asarray(latent < stats.norm.ppf(design.rate), dtype=np.float64)
 
 
-def pairs(design: Design, other_rate: float, shared_noise: float, repeats: int, generator: np.random.Generator) -> tuple[F64, F64]:
-    """Return outcomes ``(repeats, scenes, seeds)`` of two renderers with rates ``design.rate`` and ``other_rate``."""
+def pairs(
+    design: Design,
+    other_rate: float,
+    shared_noise: float,
+    repeats: int,
+    generator: np.random.Generator,
+) -> tuple[F64, F64]:
+    """Return outcomes ``(repeats, scenes, seeds)`` of two renderers with rates ``design.rate`` and
+    ``other_rate``.
+    """
     shape = (repeats, design.n_scenes, design.n_seeds)
     scenes = _correlated(generator, (*shape[:2], 1), SHARED_SCENE)
     noises = _correlated(generator, shape, shared_noise)
-    latents = [_latent(scene, noise, design.correlation) for scene, noise in zip(scenes, noises, strict=True)]
-    first, second = (x < stats.norm.ppf(rate) for x, rate in zip(latents, (design.rate, other_rate), strict=True))
+    latents = [
+        _latent(scene, noise, design.correlation)
+        for scene, noise in zip(scenes, noises, strict=True)
+    ]
+    first, second = (
+        x < stats.norm.ppf(rate) for x, rate in zip(latents, (design.rate, other_rate), strict=True)
+    )
     return first.astype(np.float64), second.astype(np.float64)
 
 
@@ -82,7 +100,9 @@ def wilson(values: F64) -> Bounds:
 def bootstrap(values: F64, generator: np.random.Generator, draws: int = 400) -> Bounds:
     """Return percentile bounds of the cluster bootstrap."""
     means = values.mean(axis=2)
-    ends = np.array([np.quantile(resampled_means(row, generator, draws), [TAIL, 1 - TAIL]) for row in means])
+    ends = np.array(
+        [np.quantile(resampled_means(row, generator, draws), [TAIL, 1 - TAIL]) for row in means]
+    )
     return ends[:, 0], ends[:, 1]
 
 
@@ -92,7 +112,9 @@ def coverage(bounds: Bounds, truth: float) -> float:
 
 
 def power(first: F64, second: F64, is_paired: bool) -> float:
-    """Return how often a 95 % interval on the difference leaves out 0, scenes as unit, paired by scene or not."""
+    """Return how often a 95 % interval on the difference leaves out 0, scenes as unit, paired by
+    scene or not.
+    """
     here, there = first.mean(axis=2), second.mean(axis=2)
     if is_paired:
         low, high = t_bounds(here - there)
@@ -105,19 +127,31 @@ def power(first: F64, second: F64, is_paired: bool) -> float:
     return float(np.mean((low > 0) | (high < 0)))
 
 
-def in_blocks(measure: Callable[[int, np.random.Generator], Sequence[float]], repeats: int, key: str, block: int = 2000) -> list[float]:
-    """Average a measurement over blocks of repeats, each from its own stream, so that memory stays small."""
+def in_blocks(
+    measure: Callable[[int, np.random.Generator], Sequence[float]],
+    repeats: int,
+    key: str,
+    block: int = 2000,
+) -> list[float]:
+    """Average a measurement over blocks of repeats, each from its own stream, so that memory stays
+    small.
+    """
     sizes = [min(block, repeats - start) for start in range(0, repeats, block)]
     parts = [measure(size, stream(key, 0, "aggregate/study", i)) for i, size in enumerate(sizes)]
     return [float(v) for v in np.average(np.array(parts), axis=0, weights=sizes)]
 
 
 def coverage_of(design: Design, repeats: int) -> list[float]:
-    """Return the coverage of `naive`, `wilson`, `by_scene_t` and `by_scene` in one cell of the grid."""
+    """Return the coverage of `naive`, `wilson`, `by_scene_t` and `by_scene` in one cell of the
+    grid.
+    """
 
     def measure(n: int, generator: np.random.Generator) -> list[float]:
         values = flags(design, n, generator)
-        return [coverage(method(values), design.rate) for method in (naive, wilson, by_scene_t, by_scene)]
+        return [
+            coverage(method(values), design.rate)
+            for method in (naive, wilson, by_scene_t, by_scene)
+        ]
 
     return in_blocks(measure, repeats, repr(design))
 
@@ -143,12 +177,18 @@ def paired_coverage(design: Design, other_rate: float, repeats: int) -> float:
 
 
 def power_of(design: Design, other_rate: float, repeats: int) -> list[float]:
-    """Return the power unpaired, paired by scene, and paired by scene with shared random numbers."""
+    """Return the power unpaired, paired by scene, and paired by scene with shared random
+    numbers.
+    """
 
     def measure(n: int, generator: np.random.Generator) -> list[float]:
         alone = pairs(design, other_rate, 0.0, n, generator)
         shared = pairs(design, other_rate, SHARED_NOISE, n, generator)
-        return [power(*alone, is_paired=False), power(*alone, is_paired=True), power(*shared, is_paired=True)]
+        return [
+            power(*alone, is_paired=False),
+            power(*alone, is_paired=True),
+            power(*shared, is_paired=True),
+        ]
 
     return in_blocks(measure, repeats, f"power {design!r}")
 
@@ -157,7 +197,12 @@ def _latent(scene: F64, noise: F64, correlation: float) -> F64:
     return np.asarray(np.sqrt(correlation) * scene + np.sqrt(1 - correlation) * noise)
 
 
-def _correlated(generator: np.random.Generator, shape: tuple[int, ...], correlation: float) -> list[F64]:
+def _correlated(
+    generator: np.random.Generator, shape: tuple[int, ...], correlation: float
+) -> list[F64]:
     """Return two standard normal arrays with the wanted correlation."""
     common = generator.standard_normal(shape)
-    return [np.sqrt(correlation) * common + np.sqrt(1 - correlation) * generator.standard_normal(shape) for _ in range(2)]
+    return [
+        np.sqrt(correlation) * common + np.sqrt(1 - correlation) * generator.standard_normal(shape)
+        for _ in range(2)
+    ]

@@ -1,4 +1,6 @@
-"""How blunt a judge is: its detections against simulator truth on clean frames, and whether its metric worsens with every damage."""
+"""How blunt a judge is: its detections against simulator truth on clean frames, and whether its
+metric worsens with every damage.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,15 @@ from alpasim_plugin.core.types import F64, U8, CameraSpec
 from alpasim_plugin.lab.learned_metrics.clip import cuboid_values, lane_values
 from alpasim_plugin.lab.learned_metrics.cuboids import cuboid_f1
 from alpasim_plugin.lab.learned_metrics.damage import STRENGTHS, Kind, damaged, in_order
-from alpasim_plugin.lab.learned_metrics.facts import CUBOID_F1, FD_16, FVMD_LK, LANE_F1, LANE_F1_30, LANE_XERR, LANE_XERR_30
+from alpasim_plugin.lab.learned_metrics.facts import (
+    CUBOID_F1,
+    FD_16,
+    FVMD_LK,
+    LANE_F1,
+    LANE_F1_30,
+    LANE_XERR,
+    LANE_XERR_30,
+)
 from alpasim_plugin.lab.learned_metrics.frechet import frechet_distance, halves
 from alpasim_plugin.lab.learned_metrics.fvmd import fvmd_lk, motion_features
 from alpasim_plugin.lab.learned_metrics.lanes import LaneScore, score_clip, up_to
@@ -63,32 +73,61 @@ class CheckClip:
 
 
 def lane_card(net: nn.Module, clips: Sequence[CheckClip]) -> dict[str, Any]:
-    """Return F1 and x-error of the lane judge against the map's painted lines, and how far its lines are supported."""
+    """Return F1 and x-error of the lane judge against the map's painted lines, and how far its
+    lines are supported.
+    """
     far = near = LaneScore()
     rows: list[list[Lane3D]] = []
     for clip in clips:
         made = find_lanes(net, clip.frames[clip.labels.frames], clip.camera)
         truth = [clip.labels.lanes_of(i) for i in range(len(made))]
         far, rows = far + score_clip(made, truth), rows + made
-        near = near + score_clip([up_to(m, NEAR_M) for m in made], [up_to(t, NEAR_M) for t in truth])
+        near = near + score_clip(
+            [up_to(m, NEAR_M) for m in made], [up_to(t, NEAR_M) for t in truth]
+        )
     reach = {f"frames_with_a_line_at_{at}_m": _reach(rows, at) for at in (20, 40)}
-    return {"frames": len(rows), "to_59_m": _lane_numbers(far), "to_30_m": _lane_numbers(near), **reach}
+    return {
+        "frames": len(rows),
+        "to_59_m": _lane_numbers(far),
+        "to_30_m": _lane_numbers(near),
+        **reach,
+    }
 
 
 def _lane_numbers(score: LaneScore) -> dict[str, float | int | None]:
     precision, recall = (score.matched / n if n else None for n in (score.made, score.reference))
-    return {"f1": score.f1, "precision": precision, "recall": recall, "xerr_m": score.xerr_m, "xerr_near_m": score.xerr_near_m,
-            "xerr_far_m": score.xerr_far_m, "lanes_made": score.made, "lanes_true": score.reference}  # fmt: skip
+    return {
+        "f1": score.f1,
+        "precision": precision,
+        "recall": recall,
+        "xerr_m": score.xerr_m,
+        "xerr_near_m": score.xerr_near_m,
+        "xerr_far_m": score.xerr_far_m,
+        "lanes_made": score.made,
+        "lanes_true": score.reference,
+    }
 
 
 def _reach(rows: Sequence[Sequence[Lane3D]], at_m: float) -> float:
     row = int((at_m - 3) // 2)
-    return float(np.mean([any(np.isfinite(lane.lateral_m[row : row + 2]).all() for lane in lanes) for lanes in rows]))
+    return float(
+        np.mean(
+            [
+                any(np.isfinite(lane.lateral_m[row : row + 2]).all() for lane in lanes)
+                for lanes in rows
+            ]
+        )
+    )
 
 
 def cuboid_card(net: nn.Module, clips: Sequence[CheckClip]) -> dict[str, Any]:
-    """Return what the cuboid judge finds of the vehicles in view: Dice of outlines, middles within 15 % of depth, and their errors."""
-    scores, found, wanted, surplus = [], 0, 0, 0
+    """Return what the cuboid judge finds of the vehicles in view: Dice of outlines, middles within
+    15 % of depth, and their errors.
+    """
+    scores = []
+    found = 0
+    wanted = 0
+    surplus = 0
     depth: list[float] = []
     aside: list[float] = []
     turned: list[float] = []
@@ -99,22 +138,34 @@ def cuboid_card(net: nn.Module, clips: Sequence[CheckClip]) -> dict[str, Any]:
         for m, t in zip(made, truth, strict=True):
             sure = [c for c in m if c.score >= 0.3]
             links = _nearest(sure, t)
-            found, wanted, surplus = found + len(links), wanted + len(t), surplus + len(sure) - len(links)
+            found = found + len(links)
+            wanted = wanted + len(t)
+            surplus = surplus + len(sure) - len(links)
             for a, b in links:
                 depth.append(abs(a.z_m - b.z_m) / b.z_m)
                 aside.append(abs(a.x_m - b.x_m))
                 turned.append(abs(np.angle(np.exp(2j * (a.yaw_rad - b.yaw_rad)))) / 2)
     defined = [s for s in scores if s is not None]
     return {
-        "clips": len(clips), "clips_without_vehicles": len(scores) - len(defined), "outline_f1": _mean(defined),
-        "vehicles": wanted, "recall": _share(found, wanted), "precision": _share(found, found + surplus),
-        "depth_error_median": _median(depth), "aside_error_median_m": _median(aside), "yaw_error_median_rad": _median(turned),
-    }  # fmt: skip
+        "clips": len(clips),
+        "clips_without_vehicles": len(scores) - len(defined),
+        "outline_f1": _mean(defined),
+        "vehicles": wanted,
+        "recall": _share(found, wanted),
+        "precision": _share(found, found + surplus),
+        "depth_error_median": _median(depth),
+        "aside_error_median_m": _median(aside),
+        "yaw_error_median_rad": _median(turned),
+    }
 
 
 def _nearest(made: Sequence[Cuboid], truth: Sequence[Cuboid]) -> list[tuple[Cuboid, Cuboid]]:
     """Pair boxes greedily by distance: at most 15 % of the depth or 1.5 m apart."""
-    order = sorted((float(np.hypot(a.x_m - b.x_m, a.z_m - b.z_m)), i, j) for i, a in enumerate(made) for j, b in enumerate(truth))
+    order = sorted(
+        (float(np.hypot(a.x_m - b.x_m, a.z_m - b.z_m)), i, j)
+        for i, a in enumerate(made)
+        for j, b in enumerate(truth)
+    )
     used_a: set[int] = set()
     used_b: set[int] = set()
     out = []
@@ -139,7 +190,9 @@ def _median(values: Sequence[float]) -> float | None:
 
 
 def style_card(net: StyleNet, frames: U8) -> dict[str, Any]:
-    """Return the style judge's confusion on frames in all styles ``(S, N, H, W, 3)``, and its probability as a style fades in."""
+    """Return the style judge's confusion on frames in all styles ``(S, N, H, W, 3)``, and its
+    probability as a style fades in.
+    """
     confusion = {}
     for i, style in enumerate(STYLES):
         said = style_probabilities(net, frames[i]).argmax(axis=1)
@@ -161,8 +214,11 @@ def _faded(net: StyleNet, clear: U8, target: U8, share: float, style: int) -> fl
     return float(style_probabilities(net, mixed)[:, style].mean())
 
 
-def sweep(name: JudgeName | str, net: nn.Module | None, clips: Sequence[CheckClip]) -> dict[str, Any]:
-    """Return a judge's metrics under rising damage: the mean over clips (a set metric: one value), and whether each step is worse.
+def sweep(
+    name: JudgeName | str, net: nn.Module | None, clips: Sequence[CheckClip]
+) -> dict[str, Any]:
+    """Return a judge's metrics under rising damage: the mean over clips (a set metric: one value),
+    and whether each step is worse.
 
     Args:
         name: ``lane``, ``cuboid``, ``video``, or ``fvmd_lk``, which has no network.
@@ -180,13 +236,23 @@ def sweep(name: JudgeName | str, net: nn.Module | None, clips: Sequence[CheckCli
     for kind in DAMAGES[name]:
         rows = [measure[name](references, references, clips)]
         for strength in STRENGTHS[kind]:
-            made = [_detect(name, net, clip, damaged(clip.frames, kind, strength)) for clip in clips]
+            made = [
+                _detect(name, net, clip, damaged(clip.frames, kind, strength)) for clip in clips
+            ]
             rows.append(measure[name](made, references, clips))
         for metric in rows[0]:
             values = [row[metric] for row in rows]
             known = [v for v in values if v is not None]
-            ordered = in_order(known, LOWER[metric]) if metric in LOWER and len(known) == len(values) else None
-            out.setdefault(metric, {})[kind] = {"strengths": [0.0, *STRENGTHS[kind]], "values": values, "in_order": ordered}
+            ordered = (
+                in_order(known, LOWER[metric])
+                if metric in LOWER and len(known) == len(values)
+                else None
+            )
+            out.setdefault(metric, {})[kind] = {
+                "strengths": [0.0, *STRENGTHS[kind]],
+                "values": values,
+                "in_order": ordered,
+            }
     return out
 
 
@@ -207,28 +273,40 @@ def _net(net: nn.Module | None) -> nn.Module:
     return net
 
 
-def _lanes(made: Sequence[Any], references: Sequence[Any], clips: Sequence[CheckClip]) -> Mapping[str, float | None]:
+def _lanes(
+    made: Sequence[Any], references: Sequence[Any], clips: Sequence[CheckClip]
+) -> Mapping[str, float | None]:
     del clips
     return _means([lane_values(m, r) for m, r in zip(made, references, strict=True)])
 
 
-def _cuboids(made: Sequence[Any], references: Sequence[Any], clips: Sequence[CheckClip]) -> Mapping[str, float | None]:
+def _cuboids(
+    made: Sequence[Any], references: Sequence[Any], clips: Sequence[CheckClip]
+) -> Mapping[str, float | None]:
     rows = zip(made, references, clips, strict=True)
-    return _means([cuboid_values(m, r, c.camera.K, (c.camera.height, c.camera.width)) for m, r, c in rows])
+    return _means(
+        [cuboid_values(m, r, c.camera.K, (c.camera.height, c.camera.width)) for m, r, c in rows]
+    )
 
 
-def _video(made: Sequence[F64], references: Sequence[F64], clips: Sequence[CheckClip]) -> Mapping[str, float | None]:
+def _video(
+    made: Sequence[F64], references: Sequence[F64], clips: Sequence[CheckClip]
+) -> Mapping[str, float | None]:
     del clips
     return {FD_16: frechet_distance(np.concatenate(made), np.concatenate(references))}
 
 
-def _motion(made: Sequence[F64], references: Sequence[F64], clips: Sequence[CheckClip]) -> Mapping[str, float | None]:
+def _motion(
+    made: Sequence[F64], references: Sequence[F64], clips: Sequence[CheckClip]
+) -> Mapping[str, float | None]:
     del clips
     return {FVMD_LK: fvmd_lk(made, references)}
 
 
 def oracle(name: str, net: nn.Module | None, clips: Sequence[CheckClip]) -> float | None:
-    """Return the distance of one half of the clean clips from the other: below this a set metric says nothing about unpaired sets."""
+    """Return the distance of one half of the clean clips from the other: below this a set metric
+    says nothing about unpaired sets.
+    """
     return halves([_detect(name, net, clip, clip.frames) for clip in clips])
 
 

@@ -1,12 +1,15 @@
 """Lane paint in pictures: which pixels are painted, and how much of it was invented or lost.
 
-A pixel is paint where the road is seen and it is brighter than the road on both its sides along the row, which must be alike: the
-symmetrical local threshold, best of the comparison by Veit et al. (ITSC 2008), here with medians. Brightness is the mean of red and green,
-so that white and yellow count alike. The width of the sides follows from the distance: paint is at most `WIDEST_M` wide. The detector is
-simple on purpose and the same for the photograph and for what is measured: a kerb's bright edge is paint in both.
+A pixel is paint where the road is seen and it is brighter than the road on both its sides along the
+row, which must be alike: the symmetrical local threshold, best of the comparison by Veit et al.
+(ITSC 2008), here with medians. Brightness is the mean of red and green, so that white and yellow
+count alike. The width of the sides follows from the distance: paint is at most `WIDEST_M` wide. The
+detector is simple on purpose and the same for the photograph and for what is measured: a kerb's
+bright edge is paint in both.
 
-Precision is the share of the painted pixels of a picture that lie within `TOLERANCE_PX` of a painted pixel of the photograph; recall is the
-share of the photograph's that lie so near to one of the picture. Paint that is nowhere in the photograph is invented: 1 - precision.
+Precision is the share of the painted pixels of a picture that lie within `TOLERANCE_PX` of a
+painted pixel of the photograph; recall is the share of the photograph's that lie so near to one of
+the picture. Paint that is nowhere in the photograph is invented: 1 - precision.
 """
 
 from __future__ import annotations
@@ -47,7 +50,10 @@ class PaintCounts:
 
     def __add__(self, other: PaintCounts) -> PaintCounts:
         return PaintCounts(
-            self.made + other.made, self.made_true + other.made_true, self.true + other.true, self.true_made + other.true_made
+            self.made + other.made,
+            self.made_true + other.made_true,
+            self.true + other.true,
+            self.true_made + other.true_made,
         )
 
     @property
@@ -67,7 +73,8 @@ class Road:
 
     Attributes:
         seen: ``(H, W)`` bool.
-        side_px: ``(H,)`` how far, in each row, the road beside a painted pixel is looked at; 0 where the row shows no road.
+        side_px: ``(H,)`` how far, in each row, the road beside a painted pixel is looked at; 0
+            where the row shows no road.
     """
 
     seen: Bool
@@ -83,7 +90,12 @@ def road_of(camera: PinholeCamera, ground: HeightField, path: F64) -> Road:
         path: ``(N, 2+)`` metres, world.
     """
     v, u = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
-    ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=2) @ camera.T_camera_world[:3, :3]
+    ray = (
+        np.stack(
+            [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=2
+        )
+        @ camera.T_camera_world[:3, :3]
+    )
     eye = camera.centre_world
     z = np.full(u.shape, float(height_at(ground, eye[None])[0]))
     down = ray[..., 2] < -1e-3
@@ -92,11 +104,19 @@ def road_of(camera: PinholeCamera, ground: HeightField, path: F64) -> Road:
         at = eye[:2] + np.where(np.isfinite(depth), depth, 0.0)[..., None] * ray[..., :2]
         z = height_at(ground, at.reshape(-1, 2)).reshape(u.shape)
     steps = np.concatenate(
-        [np.linspace(a, b, 8, endpoint=False) for a, b in zip(path[:-1, :2], path[1:, :2], strict=True)] + [path[-1:, :2]]
+        [
+            np.linspace(a, b, 8, endpoint=False)
+            for a, b in zip(path[:-1, :2], path[1:, :2], strict=True)
+        ]
+        + [path[-1:, :2]]
     )
     seen = down & (depth > NEAREST_M) & (depth < FARTHEST_M)
-    seen[seen] = scipy.spatial.KDTree(steps).query(at[seen], distance_upper_bound=ASIDE_M)[0] < ASIDE_M
-    usual = np.array([np.median(row[ok]) if ok.any() else np.inf for row, ok in zip(depth, seen, strict=True)])
+    seen[seen] = (
+        scipy.spatial.KDTree(steps).query(at[seen], distance_upper_bound=ASIDE_M)[0] < ASIDE_M
+    )
+    usual = np.array(
+        [np.median(row[ok]) if ok.any() else np.inf for row, ok in zip(depth, seen, strict=True)]
+    )
     side = np.where(np.isfinite(usual), np.maximum(np.round(camera.fx * WIDEST_M / usual), 2), 0)
     return Road(np.asarray(seen), np.asarray(side, np.float64))
 
@@ -113,9 +133,11 @@ def paint_of(rgb: U8, road: Road) -> Bool:
 
 
 def _brighter(row: F64, side: int) -> Bool:
-    """Return where a row is brighter than its surroundings ``side`` to ``2 side`` pixels to the left and to the right, which are alike.
+    """Return where a row is brighter than its surroundings ``side`` to ``2 side`` pixels to the
+    left and to the right, which are alike.
 
-    The surroundings' brightness is a median: the other line of a double one lies there and must not count as road.
+    The surroundings' brightness is a median: the other line of a double one lies there and must not
+    count as road.
     """
     wide = np.pad(row, 2 * side, mode="edge")
     middle = np.median(np.lib.stride_tricks.sliding_window_view(wide, side), axis=1)

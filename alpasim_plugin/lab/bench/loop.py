@@ -1,7 +1,9 @@
-"""One frame of the closed loop by stage with its error, what a user waits for around it, and a fixed piece of work to compare machines by.
+"""One frame of the closed loop by stage with its error, what a user waits for around it, and a
+fixed piece of work to compare machines by.
 
-Every ratio is a time over that of the reference work of the same run: of two machines, or two loads of one, ratios can be compared where
-milliseconds cannot. Drives are repeated, equal to the bit; each pass through a stage counts with its least processor time.
+Every ratio is a time over that of the reference work of the same run: of two machines, or two loads
+of one, ratios can be compared where milliseconds cannot. Drives are repeated, equal to the bit;
+each pass through a stage counts with its least processor time.
 """
 
 from __future__ import annotations
@@ -52,9 +54,12 @@ class FrameCost:
         renderer: Its name.
         size: Width and height of the camera's picture, pixels.
         frames: How many the means are over.
-        ms: Mean processor time by stage, on one thread; each pass through a stage with its least time of the repeats.
-        psnr_db: Of the frames that the policy saw, against the scene as built from the same poses; 100 for equal ones.
-        raster_levels: Largest difference of an 8-bit value of one frame from the float64 reference; None behind a fixer.
+        ms: Mean processor time by stage, on one thread; each pass through a stage with its least
+            time of the repeats.
+        psnr_db: Of the frames that the policy saw, against the scene as built from the same poses;
+            100 for equal ones.
+        raster_levels: Largest difference of an 8-bit value of one frame from the float64 reference;
+            None behind a fixer.
     """
 
     renderer: str
@@ -72,7 +77,9 @@ class FrameCost:
 
 @dataclass(frozen=True)
 class CommandCost:
-    """A command: processor time of all its processes, and the time that passed, of its fastest repeat."""
+    """A command: processor time of all its processes, and the time that passed, of its fastest
+    repeat.
+    """
 
     command: str
     processor_s: float
@@ -88,7 +95,8 @@ def bench_loop(renderers: Sequence[str], repeats: int = 3, seconds: float = 6.0)
         seconds: Of each drive.
 
     Returns:
-        ``machine``, ``versions``, ``scene``, ``repeats``, ``reference_ms``; ``frames`` and ``commands``, each time with its ``ratio``.
+        ``machine``, ``versions``, ``scene``, ``repeats``, ``reference_ms``; ``frames`` and
+        ``commands``, each time with its ``ratio``.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -106,21 +114,29 @@ def bench_loop(renderers: Sequence[str], repeats: int = 3, seconds: float = 6.0)
     finally:
         torch.set_num_threads(before)
     return {
-        "machine": hardware(), "versions": versions(), "scene": scenario.scene_id, "repeats": repeats, "reference_ms": min(reference),
+        "machine": hardware(),
+        "versions": versions(),
+        "scene": scenario.scene_id,
+        "repeats": repeats,
+        "reference_ms": min(reference),
         "frames": [_frame_row(cost, min(reference)) for cost in frames],
         "commands": [_command_row(cost, min(reference)) for cost in commands],
-    }  # fmt: skip
+    }
 
 
 def scene(size: tuple[int, int], seconds: float) -> Scenario:
     """Load the scene that is driven, with one camera of a size."""
     ref = expand(SUITE)[SCENE]
-    loaded = load_scenario(ref.path, ref.seed, [*ref.overrides, "cameras=[{{width: {}, height: {}}}]".format(*size)])
+    loaded = load_scenario(
+        ref.path, ref.seed, [*ref.overrides, "cameras=[{{width: {}, height: {}}}]".format(*size)]
+    )
     return replace(loaded, end_us=min(loaded.end_us, loaded.start_us + int(1e6 * seconds)))
 
 
 def reference_ms(times: int = 7) -> float:
-    """Return the least processor time of a product of two matrices on one thread: work that no change of ours makes faster."""
+    """Return the least processor time of a product of two matrices on one thread: work that no
+    change of ours makes faster.
+    """
     a = torch.linspace(-1.0, 1.0, REFERENCE_SIDE**2).reshape(REFERENCE_SIDE, REFERENCE_SIDE)
     spent = []
     for _ in range(times):
@@ -131,13 +147,19 @@ def reference_ms(times: int = 7) -> float:
 
 
 def frame_cost(renderer: str, scenario: Scenario, repeats: int) -> FrameCost:
-    """Drive a scene several times behind a renderer, on one thread, and judge what the policy saw."""
+    """Drive a scene several times behind a renderer, on one thread, and judge what the policy
+    saw.
+    """
     drives: list[dict[str, list[float]]] = []
     for _ in range(repeats):
         clear_cache("recording:")  # each drive reads its photographs, as the first of a scene does
         recording = RecordingRenderer(make_renderer(renderer, scenario, threads=1))
-        # On a busy machine the time that passes is others' too: the stages' clock is this process's own.
-        with patch.object(time, "perf_counter", time.process_time), Recorder(scenario, images="png") as recorder:
+        # On a busy machine the time that passes is others' too: the stages' clock is this process's
+        # own.
+        with (
+            patch.object(time, "perf_counter", time.process_time),
+            Recorder(scenario, images="png") as recorder,
+        ):
             run_rollout(scenario, recording, make_policy(POLICY, scenario), recorder=recorder)
             drives.append(recorder.facts()["stage_ms"])
     count = len(recording.frames)
@@ -147,7 +169,10 @@ def frame_cost(renderer: str, scenario: Scenario, repeats: int) -> FrameCost:
         renderer,
         (clean.shape[2], clean.shape[1]),
         count,
-        {stage: sum(fastest(drives, stage)) / count for stage in dict.fromkeys(name for drive in drives for name in drive)},
+        {
+            stage: sum(fastest(drives, stage)) / count
+            for stage in dict.fromkeys(name for drive in drives for name in drive)
+        },
         psnr_db(np.stack([frame.rgb for frame in recording.frames]), clean),
         raster_levels(renderer, scenario, recording),
     )
@@ -163,7 +188,9 @@ def fastest(drives: Sequence[Mapping[str, Sequence[float]]], stage: str) -> list
 
 
 def raster_levels(renderer: str, scenario: Scenario, recording: RecordingRenderer) -> int | None:
-    """Return the largest error of the middle frame's rasteriser, grey levels; None where a fixer stands behind it."""
+    """Return the largest error of the middle frame's rasteriser, grey levels; None where a fixer
+    stands behind it.
+    """
     exact: Any = make_renderer(renderer, scenario, threads=1)
     if not hasattr(exact, "backend"):
         return None
@@ -185,7 +212,13 @@ def command_cost(name: str, folder: Path, repeats: int) -> CommandCost:
         run = folder / ("run-0" if name == "report" else f"run-{repeat}")
         words = [word.format(run=run) for word in COMMANDS[name]]
         before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        command = [sys.executable, "-P", "-c", "from alpasim_plugin.cli.main import main; main()", *words]
+        command = [
+            sys.executable,
+            "-P",
+            "-c",
+            "from alpasim_plugin.cli.main import main; main()",
+            *words,
+        ]
         subprocess.run(command, check=True, capture_output=True)
         wall_s, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
         costs.append((after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, wall_s))
@@ -196,31 +229,61 @@ def _frame_row(cost: FrameCost, reference: float) -> dict[str, Any]:
     odd = set(cost.ms) - set(STAGES)
     stages = {stage: cost.ms[stage] for stage in (*STAGES, *sorted(odd)) if stage in cost.ms}
     return {
-        "renderer": cost.renderer, "size": "x".join(map(str, cost.size)), "frames": cost.frames,
-        "ms": cost.total_ms, "ratio": cost.total_ms / reference,
+        "renderer": cost.renderer,
+        "size": "x".join(map(str, cost.size)),
+        "frames": cost.frames,
+        "ms": cost.total_ms,
+        "ratio": cost.total_ms / reference,
         "stages": {stage: {"ms": ms, "ratio": ms / reference} for stage, ms in stages.items()},
-        "psnr_db": cost.psnr_db, "raster_levels": cost.raster_levels,
-    }  # fmt: skip
+        "psnr_db": cost.psnr_db,
+        "raster_levels": cost.raster_levels,
+    }
 
 
 def _command_row(cost: CommandCost, reference: float) -> dict[str, Any]:
-    return {"command": cost.command, "processor_s": cost.processor_s, "wall_s": cost.wall_s, "ratio": 1e3 * cost.processor_s / reference}
+    return {
+        "command": cost.command,
+        "processor_s": cost.processor_s,
+        "wall_s": cost.wall_s,
+        "ratio": 1e3 * cost.processor_s / reference,
+    }
 
 
 def markdown(record: Mapping[str, Any]) -> str:
     """Return the tables of a record, and the line that says where they come from."""
-    head = ["frame behind", "size", "all, processor ms", "x reference", *STAGES, "PSNR, dB", "raster, levels"]
+    head = [
+        "frame behind",
+        "size",
+        "all, processor ms",
+        "x reference",
+        *STAGES,
+        "PSNR, dB",
+        "raster, levels",
+    ]
     lines = [f"| {' | '.join(head)} |", f"|---|{'---:|' * (len(head) - 1)}"]
     for row in record["frames"]:
-        stages = [f"{row['stages'][stage]['ms']:.1f}" if stage in row["stages"] else "" for stage in STAGES]
+        stages = [
+            f"{row['stages'][stage]['ms']:.1f}" if stage in row["stages"] else ""
+            for stage in STAGES
+        ]
         error = [
             "equal" if row["psnr_db"] >= 100 else f"{row['psnr_db']:.1f}",
             "" if row["raster_levels"] is None else row["raster_levels"],
         ]
-        cells = [f"`{row['renderer']}`", row["size"], f"{row['ms']:.1f}", f"{row['ratio']:.2f}", *stages, *error]
+        cells = [
+            f"`{row['renderer']}`",
+            row["size"],
+            f"{row['ms']:.1f}",
+            f"{row['ratio']:.2f}",
+            *stages,
+            *error,
+        ]
         lines.append(f"| {' | '.join(map(str, cells))} |")
     lines += ["", "| command | processor, s | passed, s | x reference |", "|---|---:|---:|---:|"]
-    lines += [f"| {row['command']} | {row['processor_s']:.2f} | {row['wall_s']:.2f} | {row['ratio']:.0f} |" for row in record["commands"]]
+    lines += [
+        f"| {row['command']} | {row['processor_s']:.2f} | {row['wall_s']:.2f} | {row['ratio']:.0f} |"
+        for row in record["commands"]
+    ]
     where, used = record["machine"], record["versions"]
     lines += [
         "",

@@ -1,7 +1,9 @@
-"""A semantic map that is wrong by a constant: lanes moved aside, boxes moved, the render and the truth left as they are.
+"""A semantic map that is wrong by a constant: lanes moved aside, boxes moved, the render and the
+truth left as they are.
 
-The paper's 45 configurations (its robustness figure): lanes by -0.5 to 0.5 m, boxes by (dx, dy) in {-0.25, 0, 0.25}^2 m. The paper does not
-say along which axes; here lanes move along the vehicle's left axis, boxes along its front and left axes, the same over a whole clip.
+The paper's 45 configurations (its robustness figure): lanes by -0.5 to 0.5 m, boxes by (dx, dy) in
+{-0.25, 0, 0.25}^2 m. The paper does not say along which axes; here lanes move along the vehicle's
+left axis, boxes along its front and left axes, the same over a whole clip.
 """
 
 from __future__ import annotations
@@ -45,13 +47,23 @@ class MapShift:
         return f"l{self.lanes_left_m:+.2f}x{self.boxes_ahead_m:+.2f}y{self.boxes_left_m:+.2f}"
 
 
-CONFIGURATIONS = tuple(MapShift(lanes, ahead, left) for lanes, ahead, left in product(LANES_M, BOXES_M, BOXES_M))
+CONFIGURATIONS = tuple(
+    MapShift(lanes, ahead, left) for lanes, ahead, left in product(LANES_M, BOXES_M, BOXES_M)
+)
 
 
-def shifted_maps(scenario: Scenario, camera: CameraSpec, T_world_camera: F64, t_us: I64, shift: MapShift, threads: int = 1) -> U8:
+def shifted_maps(
+    scenario: Scenario,
+    camera: CameraSpec,
+    T_world_camera: F64,
+    t_us: I64,
+    shift: MapShift,
+    threads: int = 1,
+) -> U8:
     """Draw the map of every frame, off by a constant.
 
-    Moving the road by d is drawing it from a camera moved by -d; boxes then move by their own shift and -d.
+    Moving the road by d is drawing it from a camera moved by -d; boxes then move by their own shift
+    and -d.
 
     Args:
         scenario: Whose road and logged road users are drawn.
@@ -71,7 +83,15 @@ def shifted_maps(scenario: Scenario, camera: CameraSpec, T_world_camera: F64, t_
         road = shift.lanes_left_m * axes[:, 1]
         boxes = shift.boxes_ahead_m * axes[:, 0] + shift.boxes_left_m * axes[:, 1]
         actors = actor_boxes(log_actors(scenario, t), scenario.actors)
-        frames.append(draw_map(layers, camera, _moved(T, -road), [_box_moved(a, boxes - road) for a in actors], threads=threads))
+        frames.append(
+            draw_map(
+                layers,
+                camera,
+                _moved(T, -road),
+                [_box_moved(a, boxes - road) for a in actors],
+                threads=threads,
+            )
+        )
     return np.stack(frames)
 
 

@@ -1,7 +1,9 @@
-"""Count the operations of network code: floating-point work, memory traffic, peak memory; also on the ``meta`` device, without numbers.
+"""Count the operations of network code: floating-point work, memory traffic, peak memory; also on
+the ``meta`` device, without numbers.
 
-FLOPs are those of `torch.utils.flop_counter`. Traffic is what each operation reads and writes when it runs alone, as unfused kernels do.
-Views cost nothing. Attention is one operation that reads queries, keys and values and writes its result, as fused kernels do.
+FLOPs are those of `torch.utils.flop_counter`. Traffic is what each operation reads and writes when
+it runs alone, as unfused kernels do. Views cost nothing. Attention is one operation that reads
+queries, keys and values and writes its result, as fused kernels do.
 """
 
 from __future__ import annotations
@@ -20,7 +22,17 @@ from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 ATTENTION = torch.ops.aten.scaled_dot_product_attention
 # Operations that run no kernel: allocation, aliases, shape queries.
-FREE = {"empty", "empty_like", "new_empty", "empty_strided", "detach", "alias", "lift_fresh", "_local_scalar_dense", "is_same_size"}
+FREE = {
+    "empty",
+    "empty_like",
+    "new_empty",
+    "empty_strided",
+    "detach",
+    "alias",
+    "lift_fresh",
+    "_local_scalar_dense",
+    "is_same_size",
+}
 
 
 @dataclass(frozen=True)
@@ -36,7 +48,8 @@ class Op:
 class OpCounter(TorchDispatchMode):
     """Record every operation that runs inside ``with counter:``; may be entered again to add more.
 
-    Run the code under `torch.inference_mode`: elsewhere attention is expanded before it can be counted as one operation.
+    Run the code under `torch.inference_mode`: elsewhere attention is expanded before it can be
+    counted as one operation.
 
     Attributes:
         ops: What ran, in order.
@@ -65,11 +78,19 @@ class OpCounter(TorchDispatchMode):
         """Bytes read and written, every operation alone."""
         return sum(op.bytes for op in self.ops)
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None) -> Any:
+    def __torch_dispatch__(
+        self,
+        func: Any,
+        types: Any,
+        args: tuple[Any, ...] = (),
+        kwargs: Mapping[str, Any] | None = None,
+    ) -> Any:
         kwargs = kwargs or {}
         name = func._schema.name.removeprefix("aten::")
         if func._overloadpacket is ATTENTION:
-            out = torch.empty_like(args[0]) if args[0].is_meta else func(*args, **kwargs)  # meta would expand the scores
+            out = (
+                torch.empty_like(args[0]) if args[0].is_meta else func(*args, **kwargs)
+            )  # meta would expand the scores
             flops = sdpa_flop_count(*(x.shape for x in args[:3]))  # type: ignore[no-untyped-call]
         else:
             with FlopCounterMode(display=False) as counter:
@@ -82,7 +103,9 @@ class OpCounter(TorchDispatchMode):
         return out
 
     def _track(self, made: Any, given: Any) -> None:
-        """Note which storages are new and which are gone; a result in the storage of an argument is not new."""
+        """Note which storages are new and which are gone; a result in the storage of an argument is
+        not new.
+        """
         old = {x.untyped_storage()._cdata for x in tree_leaves(given) if _is_strided(x)}
         for x in tree_leaves(made):
             if _is_strided(x) and (storage := x.untyped_storage())._cdata not in old:
@@ -91,8 +114,13 @@ class OpCounter(TorchDispatchMode):
         self.peak_bytes = max(self.peak_bytes, sum(size for _, size in self._alive.values()))
 
 
-def _moved(name: str, args: tuple[Any, ...], kwargs: Mapping[str, Any], results: list[Tensor]) -> int:
-    if name in {"index_copy_", "index_copy"}:  # touches the rows it writes, not the buffer around them
+def _moved(
+    name: str, args: tuple[Any, ...], kwargs: Mapping[str, Any], results: list[Tensor]
+) -> int:
+    if name in {
+        "index_copy_",
+        "index_copy",
+    }:  # touches the rows it writes, not the buffer around them
         return 2 * _bytes(args[3]) + _bytes(args[2])
     return sum(_bytes(x) for x in tree_leaves((args, kwargs, results)) if isinstance(x, Tensor))
 
@@ -101,7 +129,10 @@ def _bytes(x: Tensor) -> int:
     """Return the bytes that a tensor covers; a broadcast dimension is stored once."""
     if x.layout != torch.strided:
         return x.numel() * x.element_size()
-    return math.prod(n for n, step in zip(x.shape, x.stride(), strict=True) if step or n == 0) * x.element_size()
+    return (
+        math.prod(n for n, step in zip(x.shape, x.stride(), strict=True) if step or n == 0)
+        * x.element_size()
+    )
 
 
 def _is_strided(x: Any) -> bool:
@@ -110,4 +141,6 @@ def _is_strided(x: Any) -> bool:
 
 def _is_view(func: Any) -> bool:
     returned = func._schema.returns
-    return bool(returned) and all(r.alias_info is not None and not r.alias_info.is_write for r in returned)
+    return bool(returned) and all(
+        r.alias_info is not None and not r.alias_info.is_write for r in returned
+    )

@@ -16,7 +16,15 @@ from alpasim_plugin.core.types import U8
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.pixel_fixer import PixelFixer
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
-from alpasim_plugin.lab.bench.fixer_rows import SCENE, BenchOptions, Case, Row, difference, in_own_process, p50_p95
+from alpasim_plugin.lab.bench.fixer_rows import (
+    SCENE,
+    BenchOptions,
+    Case,
+    Row,
+    difference,
+    in_own_process,
+    p50_p95,
+)
 from alpasim_plugin.lab.bench.fixer_speed import MB, Timing
 
 CASES = (
@@ -44,10 +52,12 @@ def bench_clip(
         settings: Of the base; each case changes its own.
         clip: Frames and maps of a rollout.
         on_row: Called with every finished row.
-        own_process: Measure every row in a fresh process, so that memory and first calls are its own.
+        own_process: Measure every row in a fresh process, so that memory and first calls are its
+            own.
 
     Returns:
-        One row per setting. ``rounding`` is the error against the same setting in float32, ``model`` against the base.
+        One row per setting. ``rounding`` is the error against the same setting in float32,
+        ``model`` against the base.
     """
     rows: list[Row] = []
     weights = settings.untrained if settings.weights.bundle is None else "given"
@@ -59,10 +69,24 @@ def bench_clip(
             plain = mine.model_copy(update={"precision": "fp32"})
             for needed in (plain, base := _changed(options, settings, BASE)):
                 if needed not in exact:
-                    exact[needed] = measure(needed, clip, options.seed, "cpu", options.threads, 1).images
+                    exact[needed] = measure(
+                        needed, clip, options.seed, "cpu", options.threads, 1
+                    ).images
             cameras = TOGETHER if case.group == "cameras" else 1
-            arguments = (mine, clip, options.seed, options.device, options.threads, options.passes, cameras)
-            timing = in_own_process(settings.name, measure, *arguments) if own_process else measure(*arguments)
+            arguments = (
+                mine,
+                clip,
+                options.seed,
+                options.device,
+                options.threads,
+                options.passes,
+                cameras,
+            )
+            timing = (
+                in_own_process(settings.name, measure, *arguments)
+                if own_process
+                else measure(*arguments)
+            )
         except SimrunError as error:
             rows.append(replace(row, problem=error.found))
         else:
@@ -127,7 +151,9 @@ def measure(
             if not run:
                 images.append(fixed[0].rgb)
                 guarded.append(bool(fixed[0].events))
-    peak_mb = resident_mb("VmHWM") if device == "cpu" else torch.cuda.max_memory_allocated(device) / MB
+    peak_mb = (
+        resident_mb("VmHWM") if device == "cpu" else torch.cuda.max_memory_allocated(device) / MB
+    )
     timing.peak_mb = None if peak_mb is None or before_mb is None else peak_mb - before_mb
     timing.images, timing.guarded = np.stack(images), np.array(guarded)
     return timing

@@ -1,7 +1,8 @@
 """Where the processor time of the four hot parts goes, by function of ours.
 
-Time in libraries (numpy, shapely, pyarrow) counts for the function of ours that called them. Compiled kernels are invisible to the
-interpreter's profiler; those of the rasteriser are timed one by one, on one thread.
+Time in libraries (numpy, shapely, pyarrow) counts for the function of ours that called them.
+Compiled kernels are invisible to the interpreter's profiler; those of the rasteriser are timed one
+by one, on one thread.
 """
 
 from __future__ import annotations
@@ -35,7 +36,10 @@ from scenarios.suite import expand
 
 Part = Literal["raster", "loop", "evaluators", "aggregation"]
 PARTS: tuple[Part, ...] = get_args(Part)
-OURS = tuple(str(Path(__file__).resolve().parents[3] / name) for name in ("alpasim_plugin", "evaluators", "policies", "scenarios"))
+OURS = tuple(
+    str(Path(__file__).resolve().parents[3] / name)
+    for name in ("alpasim_plugin", "evaluators", "policies", "scenarios")
+)
 FURTHEST = 40  # calls from a library's function up to one of ours
 SCENE = "urban/avenue_traffic"
 Function = tuple[str, int, str]  # file, line, name, as in pstats
@@ -59,12 +63,14 @@ class Share:
 
 
 def profile(part: Part, passes: int = 3) -> list[Share]:
-    """Run a part several times after a first, which warms caches, and return its functions, the largest first.
+    """Run a part several times after a first, which warms caches, and return its functions, the
+    largest first.
 
     Args:
-        part: ``raster``: a frame of 100,000 Gaussians at 480x272 on one thread. ``loop``: a rollout of `SCENE` for two seconds behind
-            ``3dgs``, driven by ``lane-camera``, scored and written. ``evaluators``: scoring 900 steps among 40 others. ``aggregation``: a
-            table of 20,000 rollouts.
+        part: ``raster``: a frame of 100,000 Gaussians at 480x272 on one thread. ``loop``: a rollout
+            of `SCENE` for two seconds behind ``3dgs``, driven by ``lane-camera``, scored and
+            written. ``evaluators``: scoring 900 steps among 40 others. ``aggregation``: a table of
+            20,000 rollouts.
         passes: How often.
 
     Raises:
@@ -106,7 +112,11 @@ def shares(part: str, stats: pstats.Stats, passes: int) -> list[Share]:
 
 def _name(function: Function) -> str:
     file = Path(function[0])
-    return f"{file.parent.name}/{file.stem}.{function[2]}" if function[0].startswith(OURS) else "outside"
+    return (
+        f"{file.parent.name}/{file.stem}.{function[2]}"
+        if function[0].startswith(OURS)
+        else "outside"
+    )
 
 
 def _kernels(run: Callable[[], object], passes: int) -> list[Share]:
@@ -117,7 +127,10 @@ def _kernels(run: Callable[[], object], passes: int) -> list[Share]:
             run()
         total = time.process_time() - began
     spent["outside kernels"] = total - sum(spent.values())
-    return sorted((Share("raster", name, 1e3 * s / passes, s / total) for name, s in spent.items()), key=lambda row: -row.ms)
+    return sorted(
+        (Share("raster", name, 1e3 * s / passes, s / total) for name, s in spent.items()),
+        key=lambda row: -row.ms,
+    )
 
 
 @contextmanager
@@ -154,7 +167,12 @@ def _loop(folder: Path) -> Callable[[], object]:
     def run() -> None:
         manifest = run_cell(plan.cells[0], plan.options, folder, 1)
         if manifest["status"] != "ok":
-            raise InfrastructureError("profiling the loop", SCENE, str(manifest["error"]), "see the traceback in its manifest")
+            raise InfrastructureError(
+                "profiling the loop",
+                SCENE,
+                str(manifest["error"]),
+                "see the traceback in its manifest",
+            )
 
     return run
 

@@ -1,4 +1,6 @@
-"""Open-loop quality: a fixer over a recorded clip, block by block as in the closed loop, compared with the ground truth."""
+"""Open-loop quality: a fixer over a recorded clip, block by block as in the closed loop, compared
+with the ground truth.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ JOD_EVERY = 20  # frames: the metric takes ten times as long as a fixer
 
 @dataclass(frozen=True)
 class QualityClip:
-    """A degraded render with the other inputs of a fixer, and the ground truth; ``T`` frames of one camera."""
+    """A degraded render with the other inputs of a fixer, and the ground truth; ``T`` frames of one
+    camera.
+    """
 
     name: str
     identity: Mapping[str, Any]  # distinguishes this clip from others of the same name
@@ -48,7 +52,13 @@ class QualityClip:
 
     def first(self, frames: int) -> QualityClip:
         """Return the clip's first frames, all of them where it has fewer."""
-        return replace(self, **{name: getattr(self, name)[:frames] for name in ("render", "truth", "opacity", "sdmap", "t_us")})
+        return replace(
+            self,
+            **{
+                name: getattr(self, name)[:frames]
+                for name in ("render", "truth", "opacity", "sdmap", "t_us")
+            },
+        )
 
     def references(self, count: int, past: bool = False) -> Iterator[tuple[U8, ...]]:
         """Yield the references of every frame, at most ``count`` each."""
@@ -92,7 +102,9 @@ class VariantResult:
     events: Mapping[str, int]
 
 
-def row_key(clip: QualityClip, variant: Variant, seed: int, device: str, networks: Mapping[str, str]) -> str:
+def row_key(
+    clip: QualityClip, variant: Variant, seed: int, device: str, networks: Mapping[str, str]
+) -> str:
     """Return the digest of everything that determines a row, except the speed of the machine.
 
     Args:
@@ -102,7 +114,16 @@ def row_key(clip: QualityClip, variant: Variant, seed: int, device: str, network
         device: Where the fixer computes.
         networks: Perceptual distances by name, each with what identifies its weights.
     """
-    facts = [VERSION, clip.name, len(clip.t_us), dict(clip.identity), variant.content(), seed, device, dict(networks)]
+    facts = [
+        VERSION,
+        clip.name,
+        len(clip.t_us),
+        dict(clip.identity),
+        variant.content(),
+        seed,
+        device,
+        dict(networks),
+    ]
     return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()
 
 
@@ -124,8 +145,14 @@ def run_variant(clip: QualityClip, variant: Variant, fixer: Fixer | None) -> Var
             "a missing or superfluous fixer",
             "give a session exactly for a fixer's variant",
         )
-    if fixer is None or variant.spec is None or not isinstance(variant.spec.settings, FixerSettings):
-        return VariantResult(np.array(clip.truth if variant.label == TRUTH else clip.render), (), {})
+    if (
+        fixer is None
+        or variant.spec is None
+        or not isinstance(variant.spec.settings, FixerSettings)
+    ):
+        return VariantResult(
+            np.array(clip.truth if variant.label == TRUTH else clip.render), (), {}
+        )
     tally, frames = StreamStats(), []
     for block in refine_frames(fixer_input(clip, variant.spec.settings), fixer):
         tally.add(block)
@@ -141,8 +168,12 @@ def measure(
     networks: Mapping[str, ImageDistance],
     vdp: ColourVideoVDP | None = None,
 ) -> dict[str, Any]:
-    """Return the row of one clip under one variant, as `alpasim_plugin.lab.video_metrics.summary` takes it."""
-    found = clip_quality(result.video, None if variant.label == TRUTH else clip.truth, networks, clip.sdmap)
+    """Return the row of one clip under one variant, as `alpasim_plugin.lab.video_metrics.summary`
+    takes it.
+    """
+    found = clip_quality(
+        result.video, None if variant.label == TRUTH else clip.truth, networks, clip.sdmap
+    )
     values = dict(found.means)
     if vdp is not None and variant.label != TRUTH:
         values[JOD] = float(vdp.jod(result.video[::JOD_EVERY], clip.truth[::JOD_EVERY]).mean())
@@ -157,7 +188,10 @@ def measure(
         "events": dict(result.events),
         # The first block is shorter and opens the history; where there are more, it does not count.
         "ms_per_frame": [round(ms, 4) for ms in result.ms_per_frame[1:] or result.ms_per_frame],
-        "series": {name: [float(f"{v:.{DIGITS}g}") for v in values] for name, values in found.series.items()},
+        "series": {
+            name: [float(f"{v:.{DIGITS}g}") for v in values]
+            for name, values in found.series.items()
+        },
     }
 
 

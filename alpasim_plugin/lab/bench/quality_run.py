@@ -1,4 +1,6 @@
-"""Run variants over sequences of pairs and keep the row of every clip: what `simrun bench quality` and `simrun bench paper` share."""
+"""Run variants over sequences of pairs and keep the row of every clip: what `simrun bench quality`
+and `simrun bench paper` share.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,13 @@ from alpasim_plugin.lab.training.seen_scene import scene_of
 from alpasim_plugin.lab.video_metrics.charts import plot_by_frame, plot_speed
 from alpasim_plugin.lab.video_metrics.dists import HEADS_SHA256 as DISTS_HEADS
 from alpasim_plugin.lab.video_metrics.facts import JOD
-from alpasim_plugin.lab.video_metrics.image_distance import DISTS, ImageDistance, available, load_distance, weights_folder
+from alpasim_plugin.lab.video_metrics.image_distance import (
+    DISTS,
+    ImageDistance,
+    available,
+    load_distance,
+    weights_folder,
+)
 from alpasim_plugin.lab.video_metrics.lpips import TRUNKS
 from alpasim_plugin.lab.video_metrics.perceptual_net import NAME, shipped_weights
 from alpasim_plugin.lab.video_metrics.sheet import sheet
@@ -62,7 +70,9 @@ class Work:
     seed: int
     device: str
     threads: int
-    networks: tuple[tuple[str, str], ...]  # perceptual distances, each with what identifies its weights
+    networks: tuple[
+        tuple[str, str], ...
+    ]  # perceptual distances, each with what identifies its weights
     weights: Path | None
     out: Path
     pictured: bool
@@ -86,13 +96,19 @@ class Work:
 
     @property
     def film_file(self) -> Path:
-        """Where all frames of a filmed clip are kept: JPEGs in an archive of arrays, ``0000`` and so on."""
+        """Where all frames of a filmed clip are kept: JPEGs in an archive of arrays, ``0000`` and
+        so on.
+        """
         return self.out / "films" / self.variant.label / f"{self.folder.name}.npz"
 
     @property
     def complete(self) -> bool:
         """Whether everything but pictures is on disk."""
-        wanted = [self.row_file, *([self.features_file] if self.judging else []), *([self.film_file] if self.filmed else [])]
+        wanted = [
+            self.row_file,
+            *([self.features_file] if self.judging else []),
+            *([self.film_file] if self.filmed else []),
+        ]
         return all(path.is_file() for path in wanted)
 
 
@@ -136,7 +152,11 @@ class QualityRun:
     def networks(self) -> tuple[tuple[str, str], ...]:
         """Perceptual distances that there are weights for, each with what identifies them."""
         by_weights = tuple((name, identity(name, self.weights)) for name in available(self.weights))
-        return by_weights if colour_video_vdp() is None else (*by_weights, (JOD, f"cvvdp {version('cvvdp')} {DISPLAY}"))
+        return (
+            by_weights
+            if colour_video_vdp() is None
+            else (*by_weights, (JOD, f"cvvdp {version('cvvdp')} {DISPLAY}"))
+        )
 
     @property
     def used_threads(self) -> int:
@@ -148,19 +168,34 @@ class QualityRun:
         networks = self.networks
         return [
             Work(
-                s.folder, self.given, variant, self.frames, self.seed, self.device, self.used_threads, networks, self.weights,
-                self.out, s.name in self.shown, s.name in self.filmed, self.judging, self.scenes,
+                s.folder,
+                self.given,
+                variant,
+                self.frames,
+                self.seed,
+                self.device,
+                self.used_threads,
+                networks,
+                self.weights,
+                self.out,
+                s.name in self.shown,
+                s.name in self.filmed,
+                self.judging,
+                self.scenes,
             )
             for s in self.sequences
             for variant in (*self.variants, Variant(TRUTH))
-        ]  # fmt: skip
+        ]
 
     def finished(self, works: Sequence[Work]) -> Iterator[tuple[Work, dict[str, Any]]]:
-        """Yield every work with its row as it is finished; rows that are up to date come from disk."""
+        """Yield every work with its row as it is finished; rows that are up to date come from
+        disk.
+        """
         yield from map_jobs(finish, works, self.jobs)
 
     def measure(self, baseline: str, told: Told) -> tuple[dict[str, Any], list[Work]]:
-        """Measure what is not measured yet and return the summary over all, and the works that it is about.
+        """Measure what is not measured yet and return the summary over all, and the works that it
+        is about.
 
         Args:
             baseline: Variant that the others are compared with.
@@ -177,16 +212,27 @@ class QualityRun:
     def facts(self) -> dict[str, Any]:
         """Return what a summary says of how it was made."""
         return {
-            "input": self.given, "frames": self.frames, "seed": self.seed, "device": self.device, "jobs": self.jobs,
+            "input": self.given,
+            "frames": self.frames,
+            "seed": self.seed,
+            "device": self.device,
+            "jobs": self.jobs,
             "threads": self.used_threads,
-            "fixers": {variant.label: variant.spec and variant.spec.as_dict() for variant in self.variants},
-            "units": {variant.label: unit_of(variant) for variant in self.variants}, "networks": dict(self.networks),
-            "load": os.getloadavg()[0], "hardware": hardware(), "versions": versions(),
-        }  # fmt: skip
+            "fixers": {
+                variant.label: variant.spec and variant.spec.as_dict() for variant in self.variants
+            },
+            "units": {variant.label: unit_of(variant) for variant in self.variants},
+            "networks": dict(self.networks),
+            "load": os.getloadavg()[0],
+            "hardware": hardware(),
+            "versions": versions(),
+        }
 
 
 def unit_of(variant: Variant) -> dict[str, Any] | None:
-    """Return what a fixer makes at a time and what that costs; None for the render, and where a fixer does not say."""
+    """Return what a fixer makes at a time and what that costs; None for the render, and where a
+    fixer does not say.
+    """
     unit = getattr(variant.spec and variant.spec.settings, "unit", None)
     return unit and {**asdict(unit), "calls_per_frame": unit.calls_per_frame}
 
@@ -203,17 +249,28 @@ def features_of(work: Work) -> dict[str, Any]:
         InputError: They are not whole.
     """
     do = "remove the clip's row and start the command again"
-    with parsing(DOING, work.features_file, do, "not whole features"), np.load(work.features_file) as stored:
+    with (
+        parsing(DOING, work.features_file, do, "not whole features"),
+        np.load(work.features_file) as stored,
+    ):
         return {key: stored[key] for key in stored.files}
 
 
-def judged(summary: dict[str, Any], todo: Sequence[Work], judging: Judging, baseline: str) -> dict[str, Any]:
-    """Return ``judges`` (the frozen digests), ``sets`` (metrics of whole sets) and ``paper`` (its names: null without the user's means)."""
+def judged(
+    summary: dict[str, Any], todo: Sequence[Work], judging: Judging, baseline: str
+) -> dict[str, Any]:
+    """Return ``judges`` (the frozen digests), ``sets`` (metrics of whole sets) and ``paper`` (its
+    names: null without the user's means).
+    """
     features: dict[str, list[dict[str, Any]]] = {}
     for work in todo:
         features.setdefault(work.variant.label, []).append(features_of(work))
     sets = judge_sets(features, baseline)
-    cells = {name: paper_row(means, sets, name) for name, means in summary["arms"].items() if name != TRUTH}
+    cells = {
+        name: paper_row(means, sets, name)
+        for name, means in summary["arms"].items()
+        if name != TRUTH
+    }
     return {"judges": judging.identity["judges"], "sets": sets, "paper": cells}
 
 
@@ -225,7 +282,9 @@ def evenly(sequences: Sequence[PairSequence], count: int | None) -> list[PairSeq
 
 
 def identity(name: str, folder: Path | None) -> str:
-    """Return what identifies the weights of a perceptual distance: the file's digest, or LPIPS's published ones, checked on loading."""
+    """Return what identifies the weights of a perceptual distance: the file's digest, or LPIPS's
+    published ones, checked on loading.
+    """
     if name == NAME:
         return file_sha256(shipped_weights())
     plan = TRUNKS["alex" if name == "lpips_alex" else "vgg"]
@@ -249,24 +308,38 @@ def finish(work: Work) -> dict[str, Any]:
     fixer = None
     if spec is not None:
         scene = str(sequence.info.get("scene_id", sequence.name))
-        fixer = build(spec, scene_id=scene, seed=work.seed, device=work.device, threads=work.threads)
+        fixer = build(
+            spec, scene_id=scene, seed=work.seed, device=work.device, threads=work.threads
+        )
     if work.variant.map_shift is not None:
         clip = replace(clip, sdmap=_shifted(sequence, clip, work))
     result = run_variant(clip, work.variant, fixer)
     for i in at:
         _write_png(work.picture_file(i), result.video[i])
     distances = {name: _network(name, work.weights) for name, _ in work.networks if name != JOD}
-    row = measure(clip, work.variant, result, work.seed, distances, colour_video_vdp() if len(distances) < len(work.networks) else None)
+    row = measure(
+        clip,
+        work.variant,
+        result,
+        work.seed,
+        distances,
+        colour_video_vdp() if len(distances) < len(work.networks) else None,
+    )
     if work.judging is not None:
         truth = None if work.variant.label == TRUTH else np.array(clip.truth)
         camera = camera_of(sequence, work.judging.scenes)
-        values, features = judge_clip(sequence.name, work.variant.label, result.video, truth, camera, work.judging)
+        values, features = judge_clip(
+            sequence.name, work.variant.label, result.video, truth, camera, work.judging
+        )
         row["values"] |= values
         work.features_file.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(work.features_file) as partial, partial.open("wb") as file:
             np.savez(file, **cast("dict[str, Any]", features))
     if work.filmed:
-        frames = {f"{i:04d}": encoded(".jpg", frame, (cv2.IMWRITE_JPEG_QUALITY, FILM_QUALITY)) for i, frame in enumerate(result.video)}
+        frames = {
+            f"{i:04d}": encoded(".jpg", frame, (cv2.IMWRITE_JPEG_QUALITY, FILM_QUALITY))
+            for i, frame in enumerate(result.video)
+        }
         work.film_file.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(work.film_file) as partial, partial.open("wb") as file:
             np.savez(file, **cast("dict[str, Any]", frames))
@@ -289,31 +362,64 @@ def _shifted(sequence: PairSequence, clip: QualityClip, work: Work) -> U8:
     assert work.variant.map_shift is not None
     scenario = scene_of(sequence, work.scenes)
     poses = np.array(sequence.clip.T_world_camera[: len(clip.t_us)])
-    return shifted_maps(scenario, camera_of(sequence, work.scenes), poses, clip.t_us, work.variant.map_shift, work.threads)
+    return shifted_maps(
+        scenario,
+        camera_of(sequence, work.scenes),
+        poses,
+        clip.t_us,
+        work.variant.map_shift,
+        work.threads,
+    )
 
 
 def quality_clip(sequence: PairSequence, given: Given = "render") -> QualityClip:
     """Return a sequence of pairs as a clip to measure on, its render replaced as ``--input`` says.
 
-    Whatever the picture is, recorded frames are carried into it by the depth of the degraded render, since pairs hold no other.
+    Whatever the picture is, recorded frames are carried into it by the depth of the degraded
+    render, since pairs hold no other.
     """
     clip = sequence.clip
-    facts = {**sequence.info, CONTENT: sequence.content}  # a sequence written again has another digest
+    facts = {
+        **sequence.info,
+        CONTENT: sequence.content,
+    }  # a sequence written again has another digest
     recorded = open_references(sequence)
     if given == "render":
-        return QualityClip(sequence.name, facts, clip.rgb_input, clip.rgb_gt, clip.opacity, clip.sdmap, clip.t_us, recorded)
+        return QualityClip(
+            sequence.name,
+            facts,
+            clip.rgb_input,
+            clip.rgb_gt,
+            clip.opacity,
+            clip.sdmap,
+            clip.t_us,
+            recorded,
+        )
     render, opacity = clip.rgb_gt, np.full_like(clip.opacity, 255)
     if given == "lost-resolution":
         render, opacity = lose_resolution(clip.rgb_gt, sequence.name)
-    return QualityClip(sequence.name, {**facts, "input": given}, render, clip.rgb_gt, opacity, clip.sdmap, clip.t_us, recorded)
+    return QualityClip(
+        sequence.name,
+        {**facts, "input": given},
+        render,
+        clip.rgb_gt,
+        opacity,
+        clip.sdmap,
+        clip.t_us,
+        recorded,
+    )
 
 
 def lose_resolution(video: U8, name: str) -> tuple[U8, U8]:
-    """Return a video ``(T, H, W, 3)`` that has lost resolution, and its opacity ``(T, H, W)``; the damage is keyed by the clip's name."""
+    """Return a video ``(T, H, W, 3)`` that has lost resolution, and its opacity ``(T, H, W)``; the
+    damage is keyed by the clip's name.
+    """
     lost = draw_lost_resolution(stream(name, 0, "lost-resolution"), *video.shape[1:3])
     frames = lost.apply(np.moveaxis(video, -1, 1).astype(np.float32) / np.float32(127.5) - 1)
     damaged = np.clip(np.rint((frames + 1) * np.float32(127.5)), 0, 255).astype(np.uint8)
-    return np.moveaxis(damaged, 1, -1), np.broadcast_to(np.rint(lost.opacity * 255).astype(np.uint8), video.shape[:3])
+    return np.moveaxis(damaged, 1, -1), np.broadcast_to(
+        np.rint(lost.opacity * 255).astype(np.uint8), video.shape[:3]
+    )
 
 
 def shown_frames(frames: int) -> tuple[int, ...]:
@@ -333,8 +439,12 @@ def write_results(summary: dict[str, Any], done: Sequence[Work], out: Path) -> N
             shown.setdefault(work.folder, []).append(work)
     for folder, works in shown.items():
         at = shown_frames(int(read_json(works[0].row_file)["row"]["frames"]))
-        columns = {work.variant.label: [_picture(work.picture_file(i)) for i in at] for work in works}
-        _write_png(out / "sheets" / f"{folder.name}.png", sheet(columns, [f"frame {i}" for i in at]))
+        columns = {
+            work.variant.label: [_picture(work.picture_file(i)) for i in at] for work in works
+        }
+        _write_png(
+            out / "sheets" / f"{folder.name}.png", sheet(columns, [f"frame {i}" for i in at])
+        )
 
 
 def _write_png(path: Path, rgb: U8) -> None:
@@ -351,7 +461,12 @@ def encoded(kind: str, rgb: U8, options: Sequence[int] = ()) -> U8:
 def _picture(path: Path) -> Any:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
-        raise InputError(DOING, str(path), "no readable image", "remove the clip's row and start the command again")
+        raise InputError(
+            DOING,
+            str(path),
+            "no readable image",
+            "remove the clip's row and start the command again",
+        )
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 

@@ -1,6 +1,8 @@
-"""Networks of a fixer's sizes with random weights: as shapes alone for counting, or drawn on a device for timing.
+"""Networks of a fixer's sizes with random weights: as shapes alone for counting, or drawn on a
+device for timing.
 
-The transformer is made at its final precision from the start, so that the largest size needs no more memory than it runs in.
+The transformer is made at its final precision from the start, so that the largest size needs no
+more memory than it runs in.
 """
 
 from __future__ import annotations
@@ -19,22 +21,30 @@ from alpasim_plugin.fixers.settings import WeightsSettings
 
 
 class _RandomParts(Parts):
-    """Untrained codecs, and a transformer and a prompt on the ``meta`` device; files of weights are not read."""
+    """Untrained codecs, and a transformer and a prompt on the ``meta`` device; files of weights are
+    not read.
+    """
 
     def __init__(self, settings: OneFixerSettings, text_tokens: int) -> None:
-        super().__init__(settings.model_copy(update={"weights": WeightsSettings(), "untrained": "random"}))
+        super().__init__(
+            settings.model_copy(update={"weights": WeightsSettings(), "untrained": "random"})
+        )
         self.text_tokens = text_tokens
 
     def dit(self) -> CosmosCausalDiT:
         sizes = DiTSizes(**self.settings.dit.model_dump())
         shapes = {key: torch.empty(shape, device="meta") for key, shape in sizes.shapes().items()}
-        return CosmosCausalDiT.from_state_dict(shapes, self.settings.rope_ratios).requires_grad_(False)
+        return CosmosCausalDiT.from_state_dict(shapes, self.settings.rope_ratios).requires_grad_(
+            False
+        )
 
     def prompt(self, sizes: DiTSizes) -> Tensor:
         return torch.empty(1, self.text_tokens, sizes.text_width, device="meta")
 
 
-def random_networks(settings: OneFixerSettings, device: str, text_tokens: int, seed: int = 0) -> Networks:
+def random_networks(
+    settings: OneFixerSettings, device: str, text_tokens: int, seed: int = 0
+) -> Networks:
     """Build networks of the settings' sizes; files of weights that the settings name are not read.
 
     Args:
@@ -58,4 +68,7 @@ def random_networks(settings: OneFixerSettings, device: str, text_tokens: int, s
                 value.fill_(1.0 if name.endswith("norm.weight") else 0.0)
             else:
                 value.normal_(0.0, 1 / math.sqrt(value.shape[-1]), generator=generator)
-    return replace(networks, text=TextContext(tuple((normal(k), normal(v)) for k, v in networks.text.keys_values)))
+    return replace(
+        networks,
+        text=TextContext(tuple((normal(k), normal(v)) for k, v in networks.text.keys_values)),
+    )

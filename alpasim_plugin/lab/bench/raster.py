@@ -51,7 +51,8 @@ class BenchRow:
         cpu_ms: Processor time of a frame, all threads together: comparable on a busy machine too.
         floor_ms: Least time of one core for the work (`raster_roofline`).
         of_floor: Share of ``cpu_ms`` that the floor is.
-        first_ms: Preparing the scene and drawing the first frame, including compiling or loading kernels.
+        first_ms: Preparing the scene and drawing the first frame, including compiling or loading
+            kernels.
         max_error: Largest difference of a colour from the float64 reference, full scale 1.
         share_above_lsb: Share of the pixels that differ by more than 1/255.
         torch_ms: One frame of the torch backend; None where the scene is too large for it.
@@ -77,8 +78,11 @@ class BenchRow:
     torch_ms: float | None
 
 
-def bench_raster(sizes: Sequence[Size] = SIZES, repeats: int = 20, threads: Sequence[int] = (1, 2), seed: int = 0) -> list[BenchRow]:
-    """Time the CPU rasteriser and compare its images with the float64 reference, which takes about 75 us per visible Gaussian.
+def bench_raster(
+    sizes: Sequence[Size] = SIZES, repeats: int = 20, threads: Sequence[int] = (1, 2), seed: int = 0
+) -> list[BenchRow]:
+    """Time the CPU rasteriser and compare its images with the float64 reference, which takes about
+    75 us per visible Gaussian.
 
     Args:
         sizes: ``(Gaussians, cameras, width, height)`` of each scene.
@@ -96,7 +100,9 @@ def bench_raster(sizes: Sequence[Size] = SIZES, repeats: int = 20, threads: Sequ
         cameras = [driving_camera(width, height, 2.0 * np.pi * k / count) for k in range(count)]
         references = [rasterize_reference(scene, camera, SKY) for camera in cameras]
         blends = sum(one.stats["blends"] for one in references)
-        torch_ms = _torch_ms(scene, cameras[0]) if count * n * width * height <= _TORCH_LIMIT else None
+        torch_ms = (
+            _torch_ms(scene, cameras[0]) if count * n * width * height <= _TORCH_LIMIT else None
+        )
         for used in threads:
             begin = time.perf_counter()
             nodes = [(prepare(scene), None)]
@@ -106,19 +112,43 @@ def bench_raster(sizes: Sequence[Size] = SIZES, repeats: int = 20, threads: Sequ
             times = _times_ms(partial(_frame, nodes, cameras, used), repeats)
             cpu_ms = (time.process_time() - began) / repeats * 1e3
             visible = sum(one.stats["visible"] for one in out)
-            floor_ms = RasterWork(visible, blends, count * width * height, scene.sh.shape[1]).floor_ms(core)
-            error = np.array([np.abs(mine.rgb - theirs.rgb).max(axis=2) for mine, theirs in zip(out, references, strict=True)])
+            floor_ms = RasterWork(
+                visible, blends, count * width * height, scene.sh.shape[1]
+            ).floor_ms(core)
+            error = np.array(
+                [
+                    np.abs(mine.rgb - theirs.rgb).max(axis=2)
+                    for mine, theirs in zip(out, references, strict=True)
+                ]
+            )
             rows.append(
                 BenchRow(
-                    n, count, width, height, used, visible, sum(one.stats["pairs"] for one in out), blends,
-                    min(times), float(np.median(times)), float(np.percentile(times, 95)), cpu_ms, floor_ms, floor_ms / cpu_ms, first_ms,
-                    float(error.max()), float(np.mean(error > _LSB)), torch_ms,
+                    n,
+                    count,
+                    width,
+                    height,
+                    used,
+                    visible,
+                    sum(one.stats["pairs"] for one in out),
+                    blends,
+                    min(times),
+                    float(np.median(times)),
+                    float(np.percentile(times, 95)),
+                    cpu_ms,
+                    floor_ms,
+                    floor_ms / cpu_ms,
+                    first_ms,
+                    float(error.max()),
+                    float(np.mean(error > _LSB)),
+                    torch_ms,
                 )
-            )  # fmt: skip
+            )
     return rows
 
 
-def _frame(nodes: Sequence[Node], cameras: Sequence[PinholeCamera], threads: int) -> list[RasterOutput]:
+def _frame(
+    nodes: Sequence[Node], cameras: Sequence[PinholeCamera], threads: int
+) -> list[RasterOutput]:
     return [rasterize_prepared(nodes, camera, SKY, threads=threads) for camera in cameras]
 
 

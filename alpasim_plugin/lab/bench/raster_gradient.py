@@ -1,4 +1,6 @@
-"""Measure the rasteriser's forward and backward pass: time beside the error of the gradient, on the random street of `raster`."""
+"""Measure the rasteriser's forward and backward pass: time beside the error of the gradient, on the
+random street of `raster`.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ from alpasim_plugin.lab.bench.raster import SKY
 Size = tuple[int, int, int]  # Gaussians, width, height
 SIZES: tuple[Size, ...] = ((10_000, 256, 144), (30_000, 256, 144), (100_000, 480, 272))
 FIELDS = ("means", "log_scales", "quaternions", "logit_opacities", "sh")
-_REFERENCE_LIMIT = 10_000 * 256 * 144  # Gaussians x pixels up to which the float64 reference fits into memory
+_REFERENCE_LIMIT = (
+    10_000 * 256 * 144
+)  # Gaussians x pixels up to which the float64 reference fits into memory
 
 
 @dataclass(frozen=True)
@@ -39,9 +43,11 @@ class GradientBenchRow:
         backward_ms: Median of the backward pass.
         ms_best: Fastest forward and backward pass together.
         ms_p50: Median of both together.
-        cpu_ms: Processor time of both, all threads together, median: comparable on a busy machine too.
-        error: Largest over the fields of ``|g - g64| / |g64|`` (Euclidean norms over a field) with ``g64`` from autograd of the torch
-            rasteriser in float64; None where that does not fit into memory.
+        cpu_ms: Processor time of both, all threads together, median: comparable on a busy machine
+            too.
+        error: Largest over the fields of ``|g - g64| / |g64|`` (Euclidean norms over a field) with
+            ``g64`` from autograd of the torch rasteriser in float64; None where that does not fit
+            into memory.
         reference_ms: One forward and backward pass of that reference; None likewise.
     """
 
@@ -83,29 +89,53 @@ def bench_gradients(
             times = np.array([_pass(splats, leaves, camera, count) for _ in range(repeats + 1)])[1:]
             forward, backward, cpu = np.median(times, axis=0)
             both = times[:, 0] + times[:, 1]
-            visible = int((rasterize_gradient(splats, camera, threads=count).screen.radii > 0).sum())
-            error = None if reference is None else max(_relative(a.grad, b) for a, b in zip(leaves, reference[0], strict=True))
+            visible = int(
+                (rasterize_gradient(splats, camera, threads=count).screen.radii > 0).sum()
+            )
+            error = (
+                None
+                if reference is None
+                else max(_relative(a.grad, b) for a, b in zip(leaves, reference[0], strict=True))
+            )
             rows.append(
                 GradientBenchRow(
-                    n, width, height, count, visible, forward, backward, float(both.min()), float(np.median(both)), cpu, error,
+                    n,
+                    width,
+                    height,
+                    count,
+                    visible,
+                    forward,
+                    backward,
+                    float(both.min()),
+                    float(np.median(both)),
+                    cpu,
+                    error,
                     None if reference is None else reference[1],
                 )
-            )  # fmt: skip
+            )
     return rows
 
 
 def _loss(rgb: Tensor) -> Tensor:
-    """Return the squared difference to a fixed image of stripes: residuals differ from pixel to pixel and none is zero."""
+    """Return the squared difference to a fixed image of stripes: residuals differ from pixel to
+    pixel and none is zero.
+    """
     target = torch.linspace(0, 40, rgb.numel(), dtype=rgb.dtype).sin().abs().reshape(rgb.shape)
     return (rgb - target).square().sum()
 
 
-def _pass(splats: Splats, leaves: list[Tensor], camera: PinholeCamera, threads: int) -> tuple[float, float, float]:
-    """Return the times of one forward pass, its backward pass, and the processor time of both, milliseconds."""
+def _pass(
+    splats: Splats, leaves: list[Tensor], camera: PinholeCamera, threads: int
+) -> tuple[float, float, float]:
+    """Return the times of one forward pass, its backward pass, and the processor time of both,
+    milliseconds.
+    """
     for leaf in leaves:
         leaf.grad = None
     used, begin = time.process_time(), time.perf_counter()
-    loss = _loss(rasterize_gradient(splats, camera, background=torch.tensor(SKY), threads=threads).rgb)
+    loss = _loss(
+        rasterize_gradient(splats, camera, background=torch.tensor(SKY), threads=threads).rgb
+    )
     middle = time.perf_counter()
     loss.backward()  # type: ignore[no-untyped-call]
     end = time.perf_counter()
@@ -113,7 +143,9 @@ def _pass(splats: Splats, leaves: list[Tensor], camera: PinholeCamera, threads: 
 
 
 def _reference(scene: GaussianCloud, camera: PinholeCamera) -> tuple[list[Tensor], float]:
-    """Return the gradients of the torch rasteriser in float64, in the order of FIELDS, and the time for them, milliseconds."""
+    """Return the gradients of the torch rasteriser in float64, in the order of FIELDS, and the time
+    for them, milliseconds.
+    """
     s = Splats.from_cloud(scene)
     leaves = [getattr(s, name).double().requires_grad_(True) for name in FIELDS]
     means, log_scales, quaternions, logits, sh = leaves

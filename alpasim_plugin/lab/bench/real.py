@@ -1,7 +1,9 @@
-"""Renderers against the photographs of an imported drive: those held out along its path, and those of a camera that no fit ever saw.
+"""Renderers against the photographs of an imported drive: those held out along its path, and those
+of a camera that no fit ever saw.
 
-Every photograph of such a camera is rendered in order of time, as the loop would ask for frames, so that a fixer has its history; only
-photographs that the fit did not see are measured. Pictures are compared at the size at which the scenario renders the camera.
+Every photograph of such a camera is rendered in order of time, as the loop would ask for frames, so
+that a fixer has its history; only photographs that the fit did not see are measured. Pictures are
+compared at the size at which the scenario renders the camera.
 """
 
 from __future__ import annotations
@@ -29,7 +31,15 @@ from alpasim_plugin.renderers.recorded import posed_photograph
 DOING = "measuring renderers against photographs"
 SETS = ("held-out", "never-fitted")
 BIN_M = (0.25, 0.75, 1.5, 3.0)  # rows end at these distances from the recorded path
-METRICS = ("psnr_db", "ssim", "perceptual_syn", "cvvdp_jod", "warp_l1", "paint_precision", "paint_recall")
+METRICS = (
+    "psnr_db",
+    "ssim",
+    "perceptual_syn",
+    "cvvdp_jod",
+    "warp_l1",
+    "paint_precision",
+    "paint_recall",
+)
 Row = dict[str, str | int | float | None]
 Report = Callable[[str, int, int], None]
 
@@ -79,16 +89,25 @@ def unseen_cameras(scenario: Scenario) -> list[str]:
 
 def shots_of(scenario: Scenario) -> dict[str, list[Shot]]:
     """Return all photographs of every camera of `unseen_cameras`, in order of time."""
-    path = np.array([one.T_world_camera[:3, 3] for one in scenario.recording if one.use == "fitted"])
+    path = np.array(
+        [one.T_world_camera[:3, 3] for one in scenario.recording if one.use == "fitted"]
+    )
     taken = {
-        name: sorted((one for one in scenario.recording if one.camera == name), key=lambda one: one.t_us)
+        name: sorted(
+            (one for one in scenario.recording if one.camera == name), key=lambda one: one.t_us
+        )
         for name in unseen_cameras(scenario)
-    }  # fmt: skip
-    return {name: [_shot(scenario, one, path) for one in photographs] for name, photographs in taken.items()}
+    }
+    return {
+        name: [_shot(scenario, one, path) for one in photographs]
+        for name, photographs in taken.items()
+    }
 
 
 def _shot(scenario: Scenario, one: Photograph, path: F64) -> Shot:
-    spec = next((camera for camera in scenario.cameras if camera.name == one.camera), scenario.cameras[0])
+    spec = next(
+        (camera for camera in scenario.cameras if camera.name == one.camera), scenario.cameras[0]
+    )
     camera, rgb = posed_photograph(one, spec.width, spec.height)
     road = road_of(camera, scenario.ground, scenario.ego_log.xyz)
     return Shot(one, camera, rgb, _distance(path, one.T_world_camera[:3, 3]), road)
@@ -106,7 +125,11 @@ def _to_segment(a: F64, b: F64, place: F64) -> float:
 
 
 def measure_drive(
-    name: str, scenario: Scenario, renderers: Mapping[str, Callable[[], Renderer]], judges: Judges, report: Report | None = None
+    name: str,
+    scenario: Scenario,
+    renderers: Mapping[str, Callable[[], Renderer]],
+    judges: Judges,
+    report: Report | None = None,
 ) -> list[Row]:
     """Return a row for each renderer, camera, set of photographs and distance.
 
@@ -127,7 +150,12 @@ def measure_drive(
     rows = []
     for renderer, make in renderers.items():
         for camera, taken in shots.items():
-            made = _rendered(scenario, make(), taken, lambda done, r=renderer, c=camera, n=len(taken): tell(f"{r}, {c}", done, n))  # type: ignore[misc]
+            made = _rendered(
+                scenario,
+                make(),
+                taken,
+                lambda done, r=renderer, c=camera, n=len(taken): tell(f"{r}, {c}", done, n),
+            )  # type: ignore[misc]
             for use in SETS:
                 rows += _rows(name, renderer, camera, use, taken, made, judges)
     return rows
@@ -140,10 +168,17 @@ def _refuse_blocks(renderer: Renderer) -> None:
         InputError: It is one.
     """
     if renderer.block is not None or renderer.lookahead:
-        raise InputError(DOING, type(renderer).__name__, "a renderer of blocks of frames", "name renderers that make one frame at a time")
+        raise InputError(
+            DOING,
+            type(renderer).__name__,
+            "a renderer of blocks of frames",
+            "name renderers that make one frame at a time",
+        )
 
 
-def _rendered(scenario: Scenario, renderer: Renderer, taken: Sequence[Shot], tell: Callable[[int], None]) -> list[U8]:
+def _rendered(
+    scenario: Scenario, renderer: Renderer, taken: Sequence[Shot], tell: Callable[[int], None]
+) -> list[U8]:
     """Return a picture for each photograph."""
     frames = []
     for i, shot in enumerate(taken):
@@ -156,18 +191,39 @@ def request_of(scenario: Scenario, shot: Shot) -> RenderRequest:
     """Return the request of a frame at a photograph's pose and size."""
     one = shot.photograph
     T_rig_camera = inverse(interpolate(scenario.ego_log, one.t_us)) @ one.T_world_camera
-    spec = CameraSpec(one.camera, shot.camera.width, shot.camera.height, shot.camera.K, T_rig_camera)
-    return RenderRequest(one.t_us, spec, np.stack([one.T_world_camera, one.T_world_camera]), log_actors(scenario, one.t_us))
+    spec = CameraSpec(
+        one.camera, shot.camera.width, shot.camera.height, shot.camera.K, T_rig_camera
+    )
+    return RenderRequest(
+        one.t_us,
+        spec,
+        np.stack([one.T_world_camera, one.T_world_camera]),
+        log_actors(scenario, one.t_us),
+    )
 
 
-def _rows(drive: str, renderer: str, camera: str, use: str, taken: Sequence[Shot], made: Sequence[U8], judges: Judges) -> list[Row]:
+def _rows(
+    drive: str,
+    renderer: str,
+    camera: str,
+    use: str,
+    taken: Sequence[Shot],
+    made: Sequence[U8],
+    judges: Judges,
+) -> list[Row]:
     chosen = [i for i, shot in enumerate(taken) if shot.photograph.use == use]
     bins = np.searchsorted(BIN_M, [taken[i].distance_m for i in chosen])
     rows: list[Row] = []
     for number in np.unique(bins):
         part = [i for i, b in zip(chosen, bins, strict=True) if b == number]
         distance = float(np.mean([taken[i].distance_m for i in part]))
-        head: Row = {"drive": drive, "renderer": renderer, "camera": camera, "set": use, "distance_m": round(distance, 3)}
+        head: Row = {
+            "drive": drive,
+            "renderer": renderer,
+            "camera": camera,
+            "set": use,
+            "distance_m": round(distance, 3),
+        }
         rows.append({**head, "n_frames": len(part), **_values(taken, made, part, judges)})
     return rows
 
@@ -194,7 +250,8 @@ def _mean(values: Sequence[float] | F64) -> float | None:
 
 
 def intervals(rows: Sequence[Row]) -> list[dict[str, object]]:
-    """Return mean and 95 % interval (Student) over drives of every metric, by renderer and set; none of what one drive alone measured.
+    """Return mean and 95 % interval (Student) over drives of every metric, by renderer and set;
+    none of what one drive alone measured.
 
     The drives are the sample: frames of one drive are not independent.
     """
@@ -204,12 +261,19 @@ def intervals(rows: Sequence[Row]) -> list[dict[str, object]]:
         for metric in METRICS:
             values = [
                 value
-                for value in (_of_drive(mine, drive, metric) for drive in dict.fromkeys(row["drive"] for row in mine))
+                for value in (
+                    _of_drive(mine, drive, metric)
+                    for drive in dict.fromkeys(row["drive"] for row in mine)
+                )
                 if value is not None
             ]
             if len(values) < 2:
                 continue
-            half = float(scipy.stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)))
+            half = float(
+                scipy.stats.t.ppf(0.975, len(values) - 1)
+                * np.std(values, ddof=1)
+                / np.sqrt(len(values))
+            )
             middle = float(np.mean(values))
             out.append(
                 {
@@ -225,6 +289,14 @@ def intervals(rows: Sequence[Row]) -> list[dict[str, object]]:
 
 
 def _of_drive(rows: Sequence[Row], drive: object, metric: str) -> float | None:
-    """Return a drive's mean of a metric over its rows, by their frames; None where no row has it."""
-    found = [(float(row[metric]), float(row["n_frames"])) for row in rows if row["drive"] == drive and row[metric] is not None]  # type: ignore[arg-type]
-    return float(np.average([v for v, _ in found], weights=[n for _, n in found])) if found else None
+    """Return a drive's mean of a metric over its rows, by their frames; None where no row has
+    it.
+    """
+    found = [
+        (float(row[metric]), float(row["n_frames"]))
+        for row in rows
+        if row["drive"] == drive and row[metric] is not None
+    ]  # type: ignore[arg-type]
+    return (
+        float(np.average([v for v, _ in found], weights=[n for _, n in found])) if found else None
+    )

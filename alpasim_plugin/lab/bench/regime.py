@@ -1,7 +1,9 @@
-"""Roll per-frame generators out on histories of three kinds, and say of every frame how much there was to repair and for how long it ran.
+"""Roll per-frame generators out on histories of three kinds, and say of every frame how much there
+was to repair and for how long it ran.
 
-A history is the generator's ``own`` outputs, the truth in their place (``oracle``: the most that a better history can give), or nothing
-(``empty``: every frame begins anew). References are not read, as in the paper.
+A history is the generator's ``own`` outputs, the truth in their place (``oracle``: the most that a
+better history can give), or nothing (``empty``: every frame begins anew). References are not read,
+as in the paper.
 """
 
 from __future__ import annotations
@@ -26,7 +28,11 @@ from alpasim_plugin.lab.video_metrics.frames import psnr_db
 DOING = "measuring what a history is worth"
 
 
-def measure_regime(sequences: Sequence[PairSequence], arms: Sequence[Variant], told: Callable[[int, int, str], None]) -> list[RegimeClip]:
+def measure_regime(
+    sequences: Sequence[PairSequence],
+    arms: Sequence[Variant],
+    told: Callable[[int, int, str], None],
+) -> list[RegimeClip]:
     """Measure every arm on every clip.
 
     Args:
@@ -41,10 +47,15 @@ def measure_regime(sequences: Sequence[PairSequence], arms: Sequence[Variant], t
     out = []
     for i, sequence in enumerate(sequences, start=1):
         clip = sequence.clip
-        render, sdmap, truth = (torch.from_numpy(np.array(x)).float().div(127.5).sub(1) for x in (clip.rgb_input, clip.sdmap, clip.rgb_gt))
+        render, sdmap, truth = (
+            torch.from_numpy(np.array(x)).float().div(127.5).sub(1)
+            for x in (clip.rgb_input, clip.sdmap, clip.rgb_gt)
+        )
         opacity = torch.from_numpy(np.array(clip.opacity)).float().div(255)[..., None]
         psnr = {
-            under(name, history): psnr_db(_rollout(net, render, sdmap, truth, opacity, history), np.array(clip.rgb_gt))
+            under(name, history): psnr_db(
+                _rollout(net, render, sdmap, truth, opacity, history), np.array(clip.rgb_gt)
+            )
             for name, net in nets.items()
             for history in HISTORIES
         }
@@ -63,8 +74,16 @@ def lateral_shift_m(sequence: PairSequence) -> F64:
     """
     recorded = open_references(sequence)
     if recorded is None or len(recorded.rgb_T_world_camera) < 2:
-        raise InputError(DOING, str(sequence.folder), "fewer than two recorded poses", "make the pairs with 'simrun train pairs'")
-    path, here = recorded.rgb_T_world_camera[:, :2, 3], np.asarray(sequence.clip.T_world_camera)[:, None, :2, 3]
+        raise InputError(
+            DOING,
+            str(sequence.folder),
+            "fewer than two recorded poses",
+            "make the pairs with 'simrun train pairs'",
+        )
+    path, here = (
+        recorded.rgb_T_world_camera[:, :2, 3],
+        np.asarray(sequence.clip.T_world_camera)[:, None, :2, 3],
+    )
     along = np.diff(path, axis=0)
     length = np.maximum((along**2).sum(-1), 1e-12)
     share = np.clip(((here - path[:-1]) * along).sum(-1) / length, 0.0, 1.0)
@@ -80,12 +99,18 @@ def _generator(arm: Variant) -> PixelGenerator:
     return load_generator(settings).net
 
 
-def _rollout(net: PixelGenerator, render: Tensor, sdmap: Tensor, truth: Tensor, opacity: Tensor, history: str) -> U8:
-    """Return the frames ``(T, H, W, 3)`` that a generator makes on a history of a kind; images are ``(T, H, W, C)`` in [-1, 1]."""
+def _rollout(
+    net: PixelGenerator, render: Tensor, sdmap: Tensor, truth: Tensor, opacity: Tensor, history: str
+) -> U8:
+    """Return the frames ``(T, H, W, 3)`` that a generator makes on a history of a kind; images are
+    ``(T, H, W, C)`` in [-1, 1].
+    """
     made, state = [], net.start(render[:1])
     with torch.inference_mode():
         for i in range(len(render)):
-            r, m, o = render[i : i + 1], sdmap[i : i + 1], opacity[i : i + 1]
+            r = render[i : i + 1]
+            m = sdmap[i : i + 1]
+            o = opacity[i : i + 1]
             out, after = net(r, o, m, state if history != "empty" else net.start(r))
             state = after if history == OWN else after._replace(output=truth[i : i + 1])
             made.append(out[0].clamp(-1, 1).add(1).mul(127.5).round().to(torch.uint8))

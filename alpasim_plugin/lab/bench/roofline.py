@@ -1,8 +1,10 @@
-"""Roofline of one steady block of a fixer: its work, counted on the real code without numbers, over the peak rates of a device.
+"""Roofline of one steady block of a fixer: its work, counted on the real code without numbers, over
+the peak rates of a device.
 
-Two lower bounds of the time are given for the same code. The *compute floor* is all products and convolutions at the device's peak, with
-everything else free. The *eager floor* lets every operation wait for its own arithmetic or its own memory traffic, whichever is longer:
-unfused kernels cannot be faster. The difference is what kernel fusion can gain.
+Two lower bounds of the time are given for the same code. The *compute floor* is all products and
+convolutions at the device's peak, with everything else free. The *eager floor* lets every operation
+wait for its own arithmetic or its own memory traffic, whichever is longer: unfused kernels cannot
+be faster. The difference is what kernel fusion can gain.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ class Device:
 
     Attributes:
         name: For tables.
-        half, float32: Operations per second of dense products in bfloat16 or float16, and in float32.
+        half, float32: Operations per second of dense products in bfloat16 or float16, and in
+            float32.
         bandwidth: Bytes per second of its memory.
         memory: Bytes of it.
         source: Where the numbers come from.
@@ -49,7 +52,9 @@ class Device:
         return sum(op.flops / self._peak(op.dtype) for op in ops)
 
     def eager_floor_s(self, ops: Iterable[Op]) -> float:
-        """Return the seconds that operations take one after the other, each at peak arithmetic or peak bandwidth."""
+        """Return the seconds that operations take one after the other, each at peak arithmetic or
+        peak bandwidth.
+        """
         return sum(max(op.flops / self._peak(op.dtype), op.bytes / self.bandwidth) for op in ops)
 
     def _peak(self, dtype: torch.dtype) -> float:
@@ -58,10 +63,18 @@ class Device:
 
 # Dense peaks without sparsity, without tf32 (the networks do not switch it on).
 DEVICES = {
-    "h200": Device("NVIDIA H200 SXM", 989e12, 67e12, 4.8e12, 141e9, "NVIDIA H200 data sheet, dense"),
-    "h100": Device("NVIDIA H100 SXM", 989e12, 67e12, 3.35e12, 80e9, "NVIDIA H100 data sheet, dense"),
-    "a100": Device("NVIDIA A100 SXM 80 GB", 312e12, 19.5e12, 2.039e12, 80e9, "NVIDIA A100 data sheet, dense"),
-    "rtx4090": Device("NVIDIA GeForce RTX 4090", 165e12, 82.6e12, 1.008e12, 24e9, "NVIDIA Ada whitepaper, dense"),
+    "h200": Device(
+        "NVIDIA H200 SXM", 989e12, 67e12, 4.8e12, 141e9, "NVIDIA H200 data sheet, dense"
+    ),
+    "h100": Device(
+        "NVIDIA H100 SXM", 989e12, 67e12, 3.35e12, 80e9, "NVIDIA H100 data sheet, dense"
+    ),
+    "a100": Device(
+        "NVIDIA A100 SXM 80 GB", 312e12, 19.5e12, 2.039e12, 80e9, "NVIDIA A100 data sheet, dense"
+    ),
+    "rtx4090": Device(
+        "NVIDIA GeForce RTX 4090", 165e12, 82.6e12, 1.008e12, 24e9, "NVIDIA Ada whitepaper, dense"
+    ),
 }
 
 
@@ -69,7 +82,8 @@ def device_of(name: str) -> Device:
     """Return a known device, or one given as numbers.
 
     Args:
-        name: A key of `DEVICES`, or ``half:float32:bandwidth:memory`` in TFLOP/s, TFLOP/s, GB/s and GB.
+        name: A key of `DEVICES`, or ``half:float32:bandwidth:memory`` in TFLOP/s, TFLOP/s, GB/s and
+            GB.
 
     Raises:
         InputError: Anything else.
@@ -87,7 +101,9 @@ def device_of(name: str) -> Device:
         raise InputError(DOING, name, f"known are {', '.join(DEVICES)}", do) from None
     if min(half, single, bandwidth, memory) <= 0:
         raise InputError(DOING, name, "a number that is not positive", "give positive numbers")
-    return Device(name, half * 1e12, single * 1e12, bandwidth * 1e9, memory * 1e9, "given by the user")
+    return Device(
+        name, half * 1e12, single * 1e12, bandwidth * 1e9, memory * 1e9, "given by the user"
+    )
 
 
 @dataclass(frozen=True)
@@ -113,7 +129,14 @@ class WorkRow:
     def of(cls, stage: str, ops: Sequence[Op], device: Device) -> WorkRow:
         """Sum up operations."""
         flops, moved = sum(op.flops for op in ops), sum(op.bytes for op in ops)
-        return cls(stage, flops / 1e12, moved / 1e9, len(ops), 1e3 * device.compute_floor_s(ops), 1e3 * device.eager_floor_s(ops))
+        return cls(
+            stage,
+            flops / 1e12,
+            moved / 1e9,
+            len(ops),
+            1e3 * device.compute_floor_s(ops),
+            1e3 * device.eager_floor_s(ops),
+        )
 
 
 @dataclass(frozen=True)
@@ -138,17 +161,30 @@ class BlockWork:
 
     @property
     def memory_bytes(self) -> float:
-        """What a run needs at least: everything kept and the largest stage's own tensors, with headroom."""
+        """What a run needs at least: everything kept and the largest stage's own tensors, with
+        headroom.
+        """
         peak = max(counter.peak_bytes for counter in self.stages.values())
         return HEADROOM * (self.weight_bytes + self.cache_bytes + self.state_bytes + peak)
 
     def rows(self, device: Device) -> list[WorkRow]:
         """Return one row per stage and their sum."""
         rows = [WorkRow.of(name, counter.ops, device) for name, counter in self.stages.items()]
-        return [*rows, WorkRow.of("all", [op for counter in self.stages.values() for op in counter.ops], device)]
+        return [
+            *rows,
+            WorkRow.of(
+                "all", [op for counter in self.stages.values() for op in counter.ops], device
+            ),
+        ]
 
 
-def block_work(settings: OneFixerSettings, height: int, width: int, views: int = 1, text_tokens: int = TEXT_TOKENS) -> BlockWork:
+def block_work(
+    settings: OneFixerSettings,
+    height: int,
+    width: int,
+    views: int = 1,
+    text_tokens: int = TEXT_TOKENS,
+) -> BlockWork:
     """Count one block once the window is full, on the ``meta`` device.
 
     Args:
@@ -165,10 +201,19 @@ def block_work(settings: OneFixerSettings, height: int, width: int, views: int =
     counters = {name: OpCounter() for name in STAGES}
     pipeline.stage = counters.__getitem__
     run_block(pipeline, state, 1, views, height, width)
-    state_bytes = sum(part.nbytes for codec in (state.encoder, state.decoder) for part in codec or ())
+    state_bytes = sum(
+        part.nbytes for codec in (state.encoder, state.decoder) for part in codec or ()
+    )
     counted = {name: counter for name, counter in counters.items() if counter.ops}
     cache_bytes = state.history.cache.nbytes
-    return BlockWork(4 * settings.block_latents, views, counted, networks_bytes(networks), cache_bytes, 2 * state_bytes)
+    return BlockWork(
+        4 * settings.block_latents,
+        views,
+        counted,
+        networks_bytes(networks),
+        cache_bytes,
+        2 * state_bytes,
+    )
 
 
 def steady_after(settings: OneFixerSettings) -> int:
@@ -179,13 +224,17 @@ def steady_after(settings: OneFixerSettings) -> int:
 def run_block(
     pipeline: BlockPipeline, state: PipelineState, block: int, views: int, height: int, width: int
 ) -> tuple[torch.Tensor, PipelineState]:
-    """Run one block of random images, opacity and maps; return its video and the state with the block in the history."""
+    """Run one block of random images, opacity and maps; return its video and the state with the
+    block in the history.
+    """
     settings, device = pipeline.settings, pipeline.networks.device
     frames = 4 * settings.block_latents - (0 if block else 3)
     generator = None if device.type == "meta" else torch.Generator(device).manual_seed(block)
 
     def draw(channels: int) -> torch.Tensor:
-        return torch.rand(views, channels, frames, height, width, device=device, generator=generator)
+        return torch.rand(
+            views, channels, frames, height, width, device=device, generator=generator
+        )
 
     rgb = 2 * draw(3) - 1
     sdmap = 2 * draw(3) - 1 if settings.uses_map else None
@@ -198,5 +247,10 @@ def run_block(
 
 def networks_bytes(networks: Networks) -> int:
     """Return the bytes of every network, each counted once, and of the prompt."""
-    nets = {id(net): net for net in (networks.dit, networks.finalise_dit, networks.vae, networks.decoder)}
-    return sum(weight_bytes(net) for net in nets.values()) + sum(k.nbytes + v.nbytes for k, v in networks.text.keys_values)
+    nets = {
+        id(net): net
+        for net in (networks.dit, networks.finalise_dit, networks.vae, networks.decoder)
+    }
+    return sum(weight_bytes(net) for net in nets.values()) + sum(
+        k.nbytes + v.nbytes for k, v in networks.text.keys_values
+    )

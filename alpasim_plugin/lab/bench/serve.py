@@ -1,7 +1,9 @@
-"""Load on ``simrun serve``: how many requests a second, and what the fixer adds to a request's time over handing it on.
+"""Load on ``simrun serve``: how many requests a second, and what the fixer adds to a request's time
+over handing it on.
 
-Everything runs over loopback sockets in this process: a renderer that paints stripes, the service in front of
-it, and one thread a rollout that asks for frame after frame, as AlpaSim's runtime does. Rollouts swerve apart after a few frames.
+Everything runs over loopback sockets in this process: a renderer that paints stripes, the service
+in front of it, and one thread a rollout that asks for frame after frame, as AlpaSim's runtime does.
+Rollouts swerve apart after a few frames.
 """
 
 from __future__ import annotations
@@ -60,7 +62,8 @@ class SoakRow:
     Attributes:
         frames: Answered.
         seconds: How long it took.
-        resident_first_mb, resident_last_mb: Memory of the process after a tenth of the frames, and at the end.
+        resident_first_mb, resident_last_mb: Memory of the process after a tenth of the frames, and
+            at the end.
         history_max_mb: Most memory that the histories held.
         files_grown, threads_grown: Open files and threads, end less start.
         failed: Requests without an answer.
@@ -76,17 +79,26 @@ class SoakRow:
     failed: int
 
 
-def drives(rollouts: int, frames: int, size: tuple[int, int], scene_id: str = "scene") -> list[list[Request]]:
-    """Return the requests of rollouts that share their first frames and then swerve apart, 0.2 m/s each."""
+def drives(
+    rollouts: int, frames: int, size: tuple[int, int], scene_id: str = "scene"
+) -> list[list[Request]]:
+    """Return the requests of rollouts that share their first frames and then swerve apart, 0.2 m/s
+    each.
+    """
     jpeg = sensorsim_pb2.JPEG
-    return [drive(frames, PARTS_AT, 0.2 * i, size=size, scene_id=scene_id, image_format=jpeg) for i in range(rollouts)]
+    return [
+        drive(frames, PARTS_AT, 0.2 * i, size=size, scene_id=scene_id, image_format=jpeg)
+        for i in range(rollouts)
+    ]
 
 
 @contextmanager
 def in_front(upstream: Host, settings: Settings) -> Iterator[tuple[Host, Assembled]]:
     """Run the service in front of a renderer."""
     made = assemble(settings)
-    host = Host({"SensorsimService": made.service}, "127.0.0.1:0", workers=32, every=made.tree.expire).start()
+    host = Host(
+        {"SensorsimService": made.service}, "127.0.0.1:0", workers=32, every=made.tree.expire
+    ).start()
     try:
         yield host, made
     finally:
@@ -94,11 +106,14 @@ def in_front(upstream: Host, settings: Settings) -> Iterator[tuple[Host, Assembl
         made.close()
 
 
-def ask_all(address: str, wanted: Sequence[Sequence[Request]]) -> tuple[list[list[bytes]], list[float], float]:
+def ask_all(
+    address: str, wanted: Sequence[Sequence[Request]]
+) -> tuple[list[list[bytes]], list[float], float]:
     """Drive all rollouts at the same time, each over its own thread, all over one channel.
 
     Returns:
-        The answers by rollout, the times of all requests in milliseconds, and the seconds that all took.
+        The answers by rollout, the times of all requests in milliseconds, and the seconds that all
+        took.
     """
     answers: list[list[bytes]] = [[] for _ in wanted]
     times: list[list[float]] = [[] for _ in wanted]
@@ -127,14 +142,24 @@ def ask_all(address: str, wanted: Sequence[Sequence[Request]]) -> tuple[list[lis
     return answers, [t for one in times for t in one], seconds
 
 
-def bench_serve(settings: Settings, rollouts: Sequence[int], frames: int, size: tuple[int, int]) -> list[LoadRow]:
-    """Measure the fixer of ``settings`` under load; its upstream and renderer's base are replaced by the painted one."""
+def bench_serve(
+    settings: Settings, rollouts: Sequence[int], frames: int, size: tuple[int, int]
+) -> list[LoadRow]:
+    """Measure the fixer of ``settings`` under load; its upstream and renderer's base are replaced
+    by the painted one.
+    """
     rows = []
     with ExitStack() as stack:
-        upstream = stack.enter_context(Host({"SensorsimService": PaintedRenderer()}, "127.0.0.1:0", workers=32))
+        upstream = stack.enter_context(
+            Host({"SensorsimService": PaintedRenderer()}, "127.0.0.1:0", workers=32)
+        )
         at = Upstream(upstream.address)
-        identity = stack.enter_context(in_front(upstream, Settings(renderer="identity", upstream=at)))[0]
-        fixing = Settings(settings.renderer, settings.overrides, (), at, settings.device, settings.threads)
+        identity = stack.enter_context(
+            in_front(upstream, Settings(renderer="identity", upstream=at))
+        )[0]
+        fixing = Settings(
+            settings.renderer, settings.overrides, (), at, settings.device, settings.threads
+        )
         warm = drives(1, 12, size, "warm-up")
         with in_front(upstream, fixing) as (host, _):
             ask_all(host.address, warm)  # the network is loaded and recorded
@@ -145,29 +170,58 @@ def bench_serve(settings: Settings, rollouts: Sequence[int], frames: int, size: 
                 got, fixed_ms, seconds = ask_all(host.address, wanted)
             with in_front(upstream, fixing) as (host, _):
                 alone = [ask_all(host.address, [one])[0][0] for one in wanted]
-            unequal = sum(a != b for x, y in zip(got, alone, strict=True) for a, b in zip(x, y, strict=True))
+            unequal = sum(
+                a != b for x, y in zip(got, alone, strict=True) for a, b in zip(x, y, strict=True)
+            )
             through, base = (np.percentile(ms, [50, 95, 99]) for ms in (fixed_ms, handed_ms))
-            p50, p95, p99, more50, more95, more99 = (float(ms) for ms in (*through, *(through - base)))
-            rows.append(LoadRow(count, count * frames / seconds, p50, p95, p99, more50, more95, more99, unequal))
+            p50, p95, p99, more50, more95, more99 = (
+                float(ms) for ms in (*through, *(through - base))
+            )
+            rows.append(
+                LoadRow(
+                    count, count * frames / seconds, p50, p95, p99, more50, more95, more99, unequal
+                )
+            )
     return rows
 
 
 def soak(settings: Settings, frames: int, size: tuple[int, int], rollouts: int = 4) -> SoakRow:
-    """Answer many frames and watch memory, files and threads. Rollouts of `EPISODE` frames follow one another, each on its own way."""
+    """Answer many frames and watch memory, files and threads. Rollouts of `EPISODE` frames follow
+    one another, each on its own way.
+    """
     with ExitStack() as stack:
-        upstream = stack.enter_context(Host({"SensorsimService": PaintedRenderer()}, "127.0.0.1:0", workers=32))
+        upstream = stack.enter_context(
+            Host({"SensorsimService": PaintedRenderer()}, "127.0.0.1:0", workers=32)
+        )
         served = Settings(
-            settings.renderer, settings.overrides, (), Upstream(upstream.address), settings.device, settings.threads,
+            settings.renderer,
+            settings.overrides,
+            (),
+            Upstream(upstream.address),
+            settings.device,
+            settings.threads,
             history_bytes=settings.history_bytes,
-        )  # fmt: skip
+        )
         host, made = stack.enter_context(in_front(upstream, served))
         ask_all(host.address, drives(rollouts, 12, size, "warm-up"))
-        files, threads, done, failed, most, first = open_files(), threading.active_count(), 0, 0, 0, 0.0
+        files = open_files()
+        threads = threading.active_count()
+        done = 0
+        failed = 0
+        most = 0
+        first = 0.0
         began = time.perf_counter()
         length = max(1, min(EPISODE, frames // (10 * rollouts)))
         while done < frames:
             wanted = [
-                drive(length, PARTS_AT, 0.2 * i + 1e-3 * done / length, size=size, image_format=sensorsim_pb2.JPEG) for i in range(rollouts)
+                drive(
+                    length,
+                    PARTS_AT,
+                    0.2 * i + 1e-3 * done / length,
+                    size=size,
+                    image_format=sensorsim_pb2.JPEG,
+                )
+                for i in range(rollouts)
             ]
             got, _, _ = ask_all(host.address, wanted)
             failed += sum(not data for one in got for data in one)
@@ -176,9 +230,15 @@ def soak(settings: Settings, frames: int, size: tuple[int, int], rollouts: int =
             if first == 0.0 and done >= frames // 10:
                 first = resident_mb()
         return SoakRow(
-            done, time.perf_counter() - began, first, resident_mb(), most / 2**20, open_files() - files,
-            threading.active_count() - threads, failed,
-        )  # fmt: skip
+            done,
+            time.perf_counter() - began,
+            first,
+            resident_mb(),
+            most / 2**20,
+            open_files() - files,
+            threading.active_count() - threads,
+            failed,
+        )
 
 
 def resident_mb() -> float:

@@ -1,4 +1,6 @@
-"""Read from a folder of `simrun train arms` how its arms were trained, and which of them another budget would train the same."""
+"""Read from a folder of `simrun train arms` how its arms were trained, and which of them another
+budget would train the same.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +17,23 @@ from alpasim_plugin.lab.video_metrics.perceptual_net import NAME as PERCEPTUAL
 DOING = "reading how an arm was trained"
 DO = "train the arms again with 'simrun train arms'"
 # Arms of which the paper reports some numbers of steps: each is a row of its own, ARM@N.
-STEPS: Mapping[str, tuple[int | None, ...]] = {"omnidreams": (1, 4), "artifixer-pre": (1, 4), "gsfix3d": (8,), "3dgs-enhancer": (8,)}
-TRANSFER_STEPS: Mapping[str, tuple[int | None, ...]] = {"artifixer": (None, 4)}  # the paper's DL3DV table has it after DMD at 1 and 4
+STEPS: Mapping[str, tuple[int | None, ...]] = {
+    "omnidreams": (1, 4),
+    "artifixer-pre": (1, 4),
+    "gsfix3d": (8,),
+    "3dgs-enhancer": (8,),
+}
+TRANSFER_STEPS: Mapping[str, tuple[int | None, ...]] = {
+    "artifixer": (None, 4)
+}  # the paper's DL3DV table has it after DMD at 1 and 4
 
 
 def trained_arms(folder: Path, names: Collection[str] | None = None) -> tuple[TrainedArm, ...]:
     """Return how each arm was trained, in the order in which they were planned.
 
     Args:
-        folder: Of `simrun train arms`; of another one, such as one with arms that were trained one by one, nothing is known.
+        folder: Of `simrun train arms`; of another one, such as one with arms that were trained one
+            by one, nothing is known.
         names: Only these arms; None: those that are finished.
 
     Raises:
@@ -32,16 +42,22 @@ def trained_arms(folder: Path, names: Collection[str] | None = None) -> tuple[Tr
     if not (folder / PLAN_FILE).is_file():
         return ()
     found = arms_of(folder)
-    finished = [arm for arm in found if (folder / arm / BUNDLE_FILE).is_file()] if names is None else [arm for arm in found if arm in names]
+    finished = (
+        [arm for arm in found if (folder / arm / BUNDLE_FILE).is_file()]
+        if names is None
+        else [arm for arm in found if arm in names]
+    )
     return tuple(_trained(folder, arm, found[arm]) for arm in finished)
 
 
 def within_budget(trained: Sequence[TrainedArm], folder: Path) -> tuple[TrainedArm, ...]:
-    """Return the arms that need no second training for equal core-minutes: theirs took as long already, within `WITHIN`.
+    """Return the arms that need no second training for equal core-minutes: theirs took as long
+    already, within `WITHIN`.
 
     Args:
         trained: With the paper's updates.
-        folder: Of `simrun train arms --budget minutes`; an arm that was trained there is left out. Of another folder nothing is known.
+        folder: Of `simrun train arms --budget minutes`; an arm that was trained there is left out.
+            Of another folder nothing is known.
 
     Raises:
         InputError: A plan that is not whole.
@@ -50,9 +66,11 @@ def within_budget(trained: Sequence[TrainedArm], folder: Path) -> tuple[TrainedA
     if minutes is None:
         return ()
     return tuple(
-        one for one in trained
-        if abs(one.core_minutes / minutes - 1.0) <= WITHIN and not (folder / one.arm / BUNDLE_FILE).is_file()
-    )  # fmt: skip
+        one
+        for one in trained
+        if abs(one.core_minutes / minutes - 1.0) <= WITHIN
+        and not (folder / one.arm / BUNDLE_FILE).is_file()
+    )
 
 
 def _trained(folder: Path, arm: str, trainings: list[str]) -> TrainedArm:

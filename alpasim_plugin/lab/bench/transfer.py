@@ -1,4 +1,6 @@
-"""The transfer beyond driving: arms as they are and fine-tuned, on held-out scenes that nobody drives through and on photographs."""
+"""The transfer beyond driving: arms as they are and fine-tuned, on held-out scenes that nobody
+drives through and on photographs.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,13 @@ from alpasim_plugin.lab.bench.judged import Judging, set_metrics, vectors
 from alpasim_plugin.lab.bench.quality import RAW, Variant
 from alpasim_plugin.lab.bench.quality_run import QualityRun, Work, evenly, features_of, row_of
 from alpasim_plugin.lab.paper.measured import Measured, from_rows
-from alpasim_plugin.lab.paper.transfer import COMPARED, PHOTOGRAPHS, TRANSFER, ZERO_SHOT, clip_values
+from alpasim_plugin.lab.paper.transfer import (
+    COMPARED,
+    PHOTOGRAPHS,
+    TRANSFER,
+    ZERO_SHOT,
+    clip_values,
+)
 from alpasim_plugin.lab.training.pair_store import PairDataset
 from alpasim_plugin.lab.video_metrics.summary import TRUTH
 
@@ -29,8 +37,10 @@ class TransferData:
 
     Args:
         pairs: Folder that `simrun train transfer` wrote; its split ``test`` is measured.
-        arms: Folder with ``NAME/fixer.safetensors`` of the arms that were fine-tuned on its split ``train``; None: none was.
-        photographs: Folder that `simrun train photographs` wrote; None: no photographs are measured.
+        arms: Folder with ``NAME/fixer.safetensors`` of the arms that were fine-tuned on its split
+            ``train``; None: none was.
+        photographs: Folder that `simrun train photographs` wrote; None: no photographs are
+            measured.
         clips: At most so many clips of each, evenly chosen.
         frames: First frames of a clip; None: all.
     """
@@ -43,13 +53,20 @@ class TransferData:
 
 
 def measure_transfer(
-    data: TransferData, untuned: Sequence[Variant], tuned: Sequence[Variant], out: Path, seed: int, jobs: int, told: Told
+    data: TransferData,
+    untuned: Sequence[Variant],
+    tuned: Sequence[Variant],
+    out: Path,
+    seed: int,
+    jobs: int,
+    told: Told,
 ) -> dict[str, Measured]:
     """Measure the arms of the paper's table and ours, each as it is and fine-tuned.
 
     Args:
         data: Clips.
-        untuned: Render, shipped fixers and arms trained on driving; those that the table lacks are left out.
+        untuned: Render, shipped fixers and arms trained on driving; those that the table lacks are
+            left out.
         tuned: The same arms after fine-tuning; they keep their plain names, as in the paper.
         out: Folder of the results, as of every protocol.
         seed: Of noise and swaps.
@@ -67,12 +84,23 @@ def measure_transfer(
         *(replace(arm, label=arm.label + ZERO_SHOT) for arm in untuned if arm.label in COMPARED),
         *(arm for arm in tuned if arm.label in COMPARED),
     ]
-    # Judges without seeds: nobody is asked for lanes or vehicles, features of motion alone are kept.
-    sources = {TRANSFER: data.pairs} | ({} if data.photographs is None else {PHOTOGRAPHS: data.photographs})
+    # Judges without seeds: nobody is asked for lanes or vehicles, features of motion alone are
+    # kept.
+    sources = {TRANSFER: data.pairs} | (
+        {} if data.photographs is None else {PHOTOGRAPHS: data.photographs}
+    )
     found = {}
     for name, folder in sources.items():
         sequences = evenly(PairDataset(folder, SPLIT).sequences, data.clips)
-        run = QualityRun(sequences, tuple(arms), out / name, frames=data.frames or MOST_FRAMES, seed=seed, jobs=jobs, judging=Judging(()))
+        run = QualityRun(
+            sequences,
+            tuple(arms),
+            out / name,
+            frames=data.frames or MOST_FRAMES,
+            seed=seed,
+            jobs=jobs,
+            judging=Judging(()),
+        )
         found[name] = _measured(name, run, told)
     return found
 
@@ -85,7 +113,9 @@ def _measured(name: str, run: QualityRun, told: Told) -> Measured:
     values = from_rows([row_of(work) for work in works])
     features: dict[str, dict[str, dict[str, Any]]] = {}
     for work in works:
-        row, arm, clip = row_of(work), work.variant.label, work.folder.name
+        row = row_of(work)
+        arm = work.variant.label
+        clip = work.folder.name
         series = {metric: np.asarray(found) for metric, found in row["series"].items()}
         values[arm][clip] |= clip_values(series, int(row["frames"]), counted[clip])
         kinds = features_of(work)

@@ -1,6 +1,8 @@
-"""Reference implementations of the image and window sessions: a whole clip at once in float32, as the equations are written.
+"""Reference implementations of the image and window sessions: a whole clip at once in float32, as
+the equations are written.
 
-Nothing is streamed, folded, batched by camera, cropped early or left undecoded. Images are padded to multiples of 16 like the sessions'.
+Nothing is streamed, folded, batched by camera, cropped early or left undecoded. Images are padded
+to multiples of 16 like the sessions'.
 """
 
 from __future__ import annotations
@@ -17,12 +19,21 @@ from alpasim_plugin.block_fixers.networks import LATENT, Networks, decode, load_
 from alpasim_plugin.block_fixers.onefixer import latent_noise
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers.views import HALF, ClipSize, group_views
-from alpasim_plugin.lab.image_fixers.settings import MaplessSettings, NoiseWindowSettings, RenderStepSettings
+from alpasim_plugin.lab.image_fixers.settings import (
+    MaplessSettings,
+    NoiseWindowSettings,
+    RenderStepSettings,
+)
 from alpasim_plugin.lab.image_fixers.window_fixer import fade_weights, windows
 
 
 @torch.inference_mode()
-def whole_clip_images(settings: RenderStepSettings | NoiseWindowSettings, frames: Sequence[Frame], scene_id: str, seed: int) -> U8:
+def whole_clip_images(
+    settings: RenderStepSettings | NoiseWindowSettings,
+    frames: Sequence[Frame],
+    scene_id: str,
+    seed: int,
+) -> U8:
     """Fix a clip of one camera as the session of these settings would in exact arithmetic.
 
     Args:
@@ -33,10 +44,15 @@ def whole_clip_images(settings: RenderStepSettings | NoiseWindowSettings, frames
     Returns:
         ``(T, H, W, 3)`` uint8.
     """
-    exact = settings.model_copy(update={"precision": "fp32", "codec_precision": "fp32", "fold": False})
+    exact = settings.model_copy(
+        update={"precision": "fp32", "codec_precision": "fp32", "fold": False}
+    )
     networks = load_networks(exact)
     (views,) = group_views(frames, (), len(frames))
-    clip = to_clip(views, max(len(frames), exact.window_frames if isinstance(exact, NoiseWindowSettings) else 1))
+    clip = to_clip(
+        views,
+        max(len(frames), exact.window_frames if isinstance(exact, NoiseWindowSettings) else 1),
+    )
     if isinstance(exact, NoiseWindowSettings):
         noise = _window_noise(exact, views.cameras, clip, scene_id, seed)
         video = _in_windows(networks, exact, clip, noise)
@@ -46,25 +62,43 @@ def whole_clip_images(settings: RenderStepSettings | NoiseWindowSettings, frames
     return images
 
 
-def _one_by_one(networks: Networks, settings: RenderStepSettings, clip: Clip, size: ClipSize) -> Tensor:
-    """x = z_r / (alpha + sigma), z_0 = x - t v(x, t), over the clip [render, last outputs] where there are enough outputs."""
+def _one_by_one(
+    networks: Networks, settings: RenderStepSettings, clip: Clip, size: ClipSize
+) -> Tensor:
+    """x = z_r / (alpha + sigma), z_0 = x - t v(x, t), over the clip [render, last outputs] where
+    there are enough outputs.
+    """
     alpha, sigma = settings.render_level.alpha, settings.render_level.sigma
     t = sigma / (alpha + sigma)
     shown: list[Tensor] = []
     made: list[Tensor] = []
     for i in range(clip.rgb.shape[2]):
         rgb = clip.rgb[:, :, i : i + 1]
-        video = torch.cat([rgb, *shown[-1 : -settings.references - 1 : -1]], dim=2) if len(shown) >= settings.references else rgb
+        video = (
+            torch.cat([rgb, *shown[-1 : -settings.references - 1 : -1]], dim=2)
+            if len(shown) >= settings.references
+            else rgb
+        )
         x = networks.vae.encode(video) / (alpha + sigma)
-        z_0 = x - t * networks.dit(x, float(round(1000 * t)), networks.text, torch.zeros_like(x), block_latents=None)
-        repeated = torch.cat([rgb] * video.shape[2], dim=2)  # a decoder that sees the render is only asked for the first frame
-        made.append(decode(networks, settings, z_0, repeated, _opacity(settings, clip, [i] * video.shape[2]))[0][:, :, :1])
+        z_0 = x - t * networks.dit(
+            x, float(round(1000 * t)), networks.text, torch.zeros_like(x), block_latents=None
+        )
+        repeated = torch.cat(
+            [rgb] * video.shape[2], dim=2
+        )  # a decoder that sees the render is only asked for the first frame
+        made.append(
+            decode(
+                networks, settings, z_0, repeated, _opacity(settings, clip, [i] * video.shape[2])
+            )[0][:, :, :1]
+        )
         eight_bits = (crop_clip(made[-1], size).clamp(-1, 1) + 1).mul(HALF).round() / HALF - 1
         shown.append(pad_clip(eight_bits, group=1, side=TOKEN)[0])
     return torch.cat(made, dim=2)
 
 
-def _in_windows(networks: Networks, settings: NoiseWindowSettings, clip: Clip, noise: Sequence[Tensor]) -> Tensor:
+def _in_windows(
+    networks: Networks, settings: NoiseWindowSettings, clip: Clip, noise: Sequence[Tensor]
+) -> Tensor:
     """Sum over windows of weight times the window's frames; z <- z - v / n, n times, in each."""
     frames = clip.rgb.shape[2]
     parts = windows(frames, settings.window_frames, settings.stride_frames)
@@ -75,17 +109,28 @@ def _in_windows(networks: Networks, settings: NoiseWindowSettings, clip: Clip, n
         z, z_r = eps, networks.vae.encode(clip.rgb[:, :, here])
         for t, after in zip(settings.steps, (*settings.steps[1:], 0.0), strict=True):
             z = z - (t - after) / 1000 * networks.dit(z, t, networks.text, z_r, block_latents=None)
-        made = decode(networks, settings, z, clip.rgb[:, :, here], _opacity(settings, clip, window))[0]
+        made = decode(
+            networks, settings, z, clip.rgb[:, :, here], _opacity(settings, clip, window)
+        )[0]
         out[:, :, here] += weight[here, None, None] * made
     return out
 
 
-def _window_noise(settings: NoiseWindowSettings, cameras: Sequence[str], clip: Clip, scene_id: str, seed: int) -> list[Tensor]:
+def _window_noise(
+    settings: NoiseWindowSettings, cameras: Sequence[str], clip: Clip, scene_id: str, seed: int
+) -> list[Tensor]:
     shape, n = (LATENT, clip.rgb.shape[3] // SIDE, clip.rgb.shape[4] // SIDE), settings.latents
     count = len(windows(clip.rgb.shape[2], settings.window_frames, settings.stride_frames))
     starts = np.zeros(count, int) if settings.noise == "fixed" else np.arange(count) * n
-    return [latent_noise(scene_id, seed, cameras, 1, range(int(i), int(i) + n), shape)[0] for i in starts]
+    return [
+        latent_noise(scene_id, seed, cameras, 1, range(int(i), int(i) + n), shape)[0]
+        for i in starts
+    ]
 
 
 def _opacity(settings: MaplessSettings, clip: Clip, frames: Sequence[int]) -> Tensor | None:
-    return clip.alpha[:, :, list(frames)] if settings.opacity_to_decoder and clip.alpha is not None else None
+    return (
+        clip.alpha[:, :, list(frames)]
+        if settings.opacity_to_decoder and clip.alpha is not None
+        else None
+    )

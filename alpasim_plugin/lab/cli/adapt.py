@@ -28,16 +28,27 @@ Examples:
 
 
 def adapt(
-    drive: Annotated[Path, typer.Argument(help="Folder of an imported drive, or its scenario file.")],
-    out: Annotated[Path, typer.Option("--out", help="File for the new weights; written only where they are better.")],
-    weights: Annotated[Path | None, typer.Option("--weights", help="Bundle to begin with; what ships by default.")] = None,
-    updates: Annotated[int, typer.Option("--updates", min=1, help="Updates of the training, about a second each.")] = 60,
+    drive: Annotated[
+        Path, typer.Argument(help="Folder of an imported drive, or its scenario file.")
+    ],
+    out: Annotated[
+        Path,
+        typer.Option("--out", help="File for the new weights; written only where they are better."),
+    ],
+    weights: Annotated[
+        Path | None, typer.Option("--weights", help="Bundle to begin with; what ships by default.")
+    ] = None,
+    updates: Annotated[
+        int, typer.Option("--updates", min=1, help="Updates of the training, about a second each.")
+    ] = 60,
     seed: options.Seed = 0,
     metric_weights: options.MetricWeights = None,
     as_json: options.AsJson = False,
     debug: options.Debug = False,
 ) -> None:
-    """Train the fixer a little further on a recorded street, and keep the weights only where held-out photographs gain."""
+    """Train the fixer a little further on a recorded street, and keep the weights only where
+    held-out photographs gain.
+    """
     del debug
     if out.exists():
         raise InputError(DOING, f"--out {out}", "it exists", "name another file, or remove it")
@@ -45,11 +56,21 @@ def adapt(
     scenario = load_scenario(str(drive / "scenario.yaml" if drive.is_dir() else drive))
     begin = weights or _shipped()
     done = adapt_to(
-        scenario, begin, out, updates=updates, distance=progress.perceptual_term(metric_weights), seed=seed, report=progress.update
+        scenario,
+        begin,
+        out,
+        updates=updates,
+        distance=progress.perceptual_term(metric_weights),
+        seed=seed,
+        report=progress.update,
     )
     low, high = done.ci95_db
     said = f"{done.gain_db:+.2f} dB ({low:+.2f} to {high:+.2f}) over {len(done.after)} held-out photographs"
-    verdict = f"accepted: {said}; wrote {out}" if done.accepted else f"not accepted: {said}; nothing is written, what you had is kept"
+    verdict = (
+        f"accepted: {said}; wrote {out}"
+        if done.accepted
+        else f"not accepted: {said}; nothing is written, what you had is kept"
+    )
     if as_json:
         print(json.dumps({**asdict(done), "weights": str(out) if done.accepted else None}))
     else:

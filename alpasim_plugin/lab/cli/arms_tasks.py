@@ -1,4 +1,6 @@
-"""The work behind ``simrun train arms`` as tasks: stages to train, and choices between learning rates, each after what it needs."""
+"""The work behind ``simrun train arms`` as tasks: stages to train, and choices between learning
+rates, each after what it needs.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,13 @@ from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import parsing, read_json_object
 from alpasim_plugin.lab.bench.arm_choice import Choice, Score, choose, take, write_card
-from alpasim_plugin.lab.training.arms.plan import INITIAL, Plan, Training, comparison, training_names
+from alpasim_plugin.lab.training.arms.plan import (
+    INITIAL,
+    Plan,
+    Training,
+    comparison,
+    training_names,
+)
 from alpasim_plugin.lab.training.arms.run import ArmsRun, train
 from alpasim_plugin.runs.executors.local import Send
 
@@ -74,7 +82,13 @@ class StageTask:
     def updates(self) -> int:
         """How many it has in all."""
         initial = self.training.recipe.name in INITIAL.values()
-        unit = self.run.initial.steps if initial else self.run.schedule.steps if self.steps is None else self.steps
+        unit = (
+            self.run.initial.steps
+            if initial
+            else self.run.schedule.steps
+            if self.steps is None
+            else self.steps
+        )
         return self.training.stage.updates(unit)
 
 
@@ -97,17 +111,20 @@ class ChoiceTask:
     sweep: Sweep
 
 
-def tasks_of(run: ArmsRun, plan: Plan, sweep: Sweep | None, rates: Mapping[str, float] | None = None) -> Iterator[StageTask | ChoiceTask]:
+def tasks_of(
+    run: ArmsRun, plan: Plan, sweep: Sweep | None, rates: Mapping[str, float] | None = None
+) -> Iterator[StageTask | ChoiceTask]:
     """Yield the tasks of a plan, every one behind those it depends on.
 
-    With a sweep, an arm's last stage has a candidate for each rate, from the same stages before it. What starts from an arm starts from the
-    best of them.
+    With a sweep, an arm's last stage has a candidate for each rate, from the same stages before it.
+    What starts from an arm starts from the best of them.
 
     Args:
         run: Shared options.
         plan: What is trained.
         sweep: Rates to choose from; None: no choice.
-        rates: Instead of a sweep, peak rates by training, as the whole comparison names them; others have the run's.
+        rates: Instead of a sweep, peak rates by training, as the whole comparison names them;
+            others have the run's.
     """
     names = training_names(comparison())
     for training in plan.trainings:
@@ -144,7 +161,9 @@ def work(task: StageTask | ChoiceTask, send: Send) -> None:
     if isinstance(task, ChoiceTask):
         send(_choose(task))
         return
-    folder, rate, choice = task.run.out / task.name, task.peak_lr, None
+    folder = task.run.out / task.name
+    rate = task.peak_lr
+    choice = None
     record = _record(task.run, task.training.name)
     if task.chosen:
         choice = read_choice(record)
@@ -163,8 +182,17 @@ def work(task: StageTask | ChoiceTask, send: Send) -> None:
 
 
 def _choose(task: ChoiceTask) -> Choice:
-    run, folders = task.run, {rate: task.run.out / candidate_name(task.arm, rate) for rate in task.sweep.rates}
-    choice = choose(folders, run.data, run.out / SWEEP / "quality" / task.arm, task.sweep.clips, run.batches.seed)
+    run, folders = (
+        task.run,
+        {rate: task.run.out / candidate_name(task.arm, rate) for rate in task.sweep.rates},
+    )
+    choice = choose(
+        folders,
+        run.data,
+        run.out / SWEEP / "quality" / task.arm,
+        task.sweep.clips,
+        run.batches.seed,
+    )
     if task.name == task.arm:
         take(folders[choice.rate], run.out / task.arm, choice)
     write_json(_record(run, task.arm), choice.facts())
@@ -183,7 +211,10 @@ def read_choice(path: Path) -> Choice:
     """
     found = read_json_object(path, DOING)
     with parsing(DOING, path, "remove it and start the command again", "not a choice of a rate"):
-        scores = {float(rate): Score(*(float(value) for value in values.values())) for rate, values in found["scores"].items()}
+        scores = {
+            float(rate): Score(*(float(value) for value in values.values()))
+            for rate, values in found["scores"].items()
+        }
         return Choice(float(found["rate"]), scores, tuple(found["clips"]))
 
 
@@ -195,5 +226,10 @@ def chosen_rates(folder: Path) -> dict[str, float]:
     """
     records = sorted((folder / SWEEP).glob("*.json"))
     if not records:
-        raise InputError(DOING, f"--rates {folder}", "no rates that a sweep chose", "name a folder of 'simrun train arms --sweep RATES'")
+        raise InputError(
+            DOING,
+            f"--rates {folder}",
+            "no rates that a sweep chose",
+            "name a folder of 'simrun train arms --sweep RATES'",
+        )
     return {path.stem: read_choice(path).rate for path in records}

@@ -46,14 +46,26 @@ app.command("quality", epilog=QUALITY_EXAMPLES)(quality)
 app.command("paper", epilog=PAPER_EXAMPLES)(paper)
 
 
-@app.command("raster", epilog="Examples: `simrun bench raster --repeats 20`, `simrun bench raster --gradients`")
+@app.command(
+    "raster",
+    epilog="Examples: `simrun bench raster --repeats 20`, `simrun bench raster --gradients`",
+)
 def raster(
-    gradients: Annotated[bool, typer.Option("--gradients", help="Time the forward and backward pass of training instead.")] = False,
-    repeats: Annotated[int, typer.Option("--repeats", min=3, help="Frames per row; medians are printed.")] = 15,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    gradients: Annotated[
+        bool,
+        typer.Option("--gradients", help="Time the forward and backward pass of training instead."),
+    ] = False,
+    repeats: Annotated[
+        int, typer.Option("--repeats", min=3, help="Frames per row; medians are printed.")
+    ] = 15,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document on stdout.")
+    ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
-    """Time the CPU rasteriser on a random street and compare its image, or its gradients, with float64."""
+    """Time the CPU rasteriser on a random street and compare its image, or its gradients, with
+    float64.
+    """
     del debug
     if gradients:
         # Imported on use: it loads torch.

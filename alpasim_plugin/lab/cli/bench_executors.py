@@ -10,7 +10,12 @@ from typing import Annotated
 import typer
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.lab.bench.executors import RESULT_BYTES, ExecutorRow, bench_executor, local_nodes
+from alpasim_plugin.lab.bench.executors import (
+    RESULT_BYTES,
+    ExecutorRow,
+    bench_executor,
+    local_nodes,
+)
 from alpasim_plugin.lab.cli.bench_rows import print_rows
 from alpasim_plugin.runs.executors.choice import parse_executor
 
@@ -29,21 +34,38 @@ Examples:
 
 def executors(
     executor: Annotated[
-        str | None, typer.Option("--executor", help="A running Ray cluster, `ray:HOST:PORT`; by default one made here.")
+        str | None,
+        typer.Option(
+            "--executor", help="A running Ray cluster, `ray:HOST:PORT`; by default one made here."
+        ),
     ] = None,
-    nodes: Annotated[int, typer.Option("--nodes", min=1, help="Nodes of the cluster that is made here.")] = 4,
-    cores: Annotated[int, typer.Option("--cores", min=1, help="Cores that each of them says it has.")] = 4,
+    nodes: Annotated[
+        int, typer.Option("--nodes", min=1, help="Nodes of the cluster that is made here.")
+    ] = 4,
+    cores: Annotated[
+        int, typer.Option("--cores", min=1, help="Cores that each of them says it has.")
+    ] = 4,
     workers: Annotated[str, typer.Option("--workers", help="Numbers of workers.")] = "1,2,4,8,16",
-    rollouts: Annotated[int, typer.Option("--rollouts", min=1, help="Rollouts for each worker.")] = 10,
-    seconds: Annotated[float, typer.Option("--seconds", min=0.001, help="That a rollout takes.")] = 4.0,
-    result_kb: Annotated[float, typer.Option("--result-kb", min=0.0, help="Size of a rollout's result.")] = RESULT_BYTES / 1e3,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    rollouts: Annotated[
+        int, typer.Option("--rollouts", min=1, help="Rollouts for each worker.")
+    ] = 10,
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=0.001, help="That a rollout takes.")
+    ] = 4.0,
+    result_kb: Annotated[
+        float, typer.Option("--result-kb", min=0.0, help="Size of a rollout's result.")
+    ] = RESULT_BYTES / 1e3,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document on stdout.")
+    ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
-    """Drive rollouts that only sleep with 1 to 16 workers of a Ray cluster: efficiency, and the driver's time for each.
+    """Drive rollouts that only sleep with 1 to 16 workers of a Ray cluster: efficiency, and the
+    driver's time for each.
 
-    Results travel, are checked and written as a run's are. Sleeping needs no core, so this measures the engine and not the processor;
-    on a busy machine it measures how long driver and workers wait for one, too.
+    Results travel, are checked and written as a run's are. Sleeping needs no core, so this measures
+    the engine and not the processor; on a busy machine it measures how long driver and workers wait
+    for one, too.
     """
     del debug
     counts = parse_workers(workers)
@@ -54,7 +76,11 @@ def executors(
         with local_nodes(nodes, cores) as made:
             rows = _heard(bench_executor(made, counts, rollouts, seconds, int(1e3 * result_kb)))
     else:
-        rows = _heard(bench_executor(parse_executor(executor), counts, rollouts, seconds, int(1e3 * result_kb)))
+        rows = _heard(
+            bench_executor(
+                parse_executor(executor), counts, rollouts, seconds, int(1e3 * result_kb)
+            )
+        )
     print_rows([asdict(row) for row in rows], as_json)
 
 
@@ -62,7 +88,9 @@ def _heard(rows: Iterable[ExecutorRow]) -> Sequence[ExecutorRow]:
     """Say each row on standard error when it is there; together they take minutes."""
     found = []
     for row in rows:
-        print(f"{row.workers} workers: efficiency {row.efficiency:.3f}", file=sys.stderr, flush=True)
+        print(
+            f"{row.workers} workers: efficiency {row.efficiency:.3f}", file=sys.stderr, flush=True
+        )
         found.append(row)
     return found
 
@@ -79,5 +107,7 @@ def parse_workers(text: str) -> list[int]:
     """
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() and int(part) > 0 for part in parts):
-        raise InputError(DOING, f"--workers {text}", "no numbers from 1 up", "write for example 1,4,16")
+        raise InputError(
+            DOING, f"--workers {text}", "no numbers from 1 up", "write for example 1,4,16"
+        )
     return [int(part) for part in parts]

@@ -16,7 +16,14 @@ from alpasim_plugin.cli.options import fixer_overrides
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.bench.fixer import bench_fixer
 from alpasim_plugin.lab.bench.fixer_rows import Bench, BenchOptions, Row
-from alpasim_plugin.lab.bench.fixer_table import HEAD, MARKERS, cells, markdown, plot, put_between_marks
+from alpasim_plugin.lab.bench.fixer_table import (
+    HEAD,
+    MARKERS,
+    cells,
+    markdown,
+    plot,
+    put_between_marks,
+)
 from alpasim_plugin.lab.cli.image_sizes import parse_size
 
 PAGE, PICTURE = Path("docs/experiments/speed-and-error.md"), Path("docs/img/speed-and-error.png")
@@ -30,38 +37,85 @@ Examples:
 
 
 def fixer(
-    name: Annotated[str, typer.Option("--fixer", help="A fixer of the onefixer family, or NAME@STEPS.")] = "onefixer",
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="A setting in force for every row: fixer.key=value.")] = None,
-    sizes: Annotated[str, typer.Option("--sizes", help="Image sizes, comma-separated.")] = "256x144",
-    frames: Annotated[int, typer.Option("--frames", min=13, help="Least length of the drive; blocks are completed.")] = 69,
-    passes: Annotated[int, typer.Option("--passes", min=1, help="Runs over the drive per row.")] = 3,
-    quick: Annotated[bool, typer.Option("--quick", help="21 frames, one pass, without the slow networks.")] = False,
-    only: Annotated[str, typer.Option("--only", help=f"Groups of settings, comma-separated: {', '.join(MARKERS)}.")] = "",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the drive, the noise and stand-in weights.")] = 0,
-    device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where the fixer computes.")] = "cpu",
-    threads: Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads; by default one per core.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for table.md, rows.json and plot.png.")] = None,
-    docs: Annotated[bool, typer.Option("--docs", help=f"Also write the table into {PAGE} and the plot into {PICTURE}.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    name: Annotated[
+        str, typer.Option("--fixer", help="A fixer of the onefixer family, or NAME@STEPS.")
+    ] = "onefixer",
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="A setting in force for every row: fixer.key=value."),
+    ] = None,
+    sizes: Annotated[
+        str, typer.Option("--sizes", help="Image sizes, comma-separated.")
+    ] = "256x144",
+    frames: Annotated[
+        int,
+        typer.Option("--frames", min=13, help="Least length of the drive; blocks are completed."),
+    ] = 69,
+    passes: Annotated[
+        int, typer.Option("--passes", min=1, help="Runs over the drive per row.")
+    ] = 3,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="21 frames, one pass, without the slow networks.")
+    ] = False,
+    only: Annotated[
+        str,
+        typer.Option("--only", help=f"Groups of settings, comma-separated: {', '.join(MARKERS)}."),
+    ] = "",
+    seed: Annotated[
+        int,
+        typer.Option("--seed", min=0, help="Seed of the drive, the noise and stand-in weights."),
+    ] = 0,
+    device: Annotated[
+        Literal["cpu", "cuda"], typer.Option("--device", help="Where the fixer computes.")
+    ] = "cpu",
+    threads: Annotated[
+        int | None, typer.Option("--threads", min=1, help="Torch threads; by default one per core.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for table.md, rows.json and plot.png.")
+    ] = None,
+    docs: Annotated[
+        bool,
+        typer.Option(
+            "--docs", help=f"Also write the table into {PAGE} and the plot into {PICTURE}."
+        ),
+    ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document on stdout.")
+    ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
     """Time a fixer's stages setting by setting, with the error of the same images beside it.
 
-    Rounding is the error against the same setting in float32 over the whole clip at once; model is the error against the base setting
-    with a window over the whole clip.
+    Rounding is the error against the same setting in float32 over the whole clip at once; model is
+    the error against the base setting with a window over the whole clip.
     """
     del debug
     if docs and not PAGE.is_file():
-        raise InputError("writing the fixer's bench into the docs", str(PAGE), "no such file", "run it at the root of the repository")
+        raise InputError(
+            "writing the fixer's bench into the docs",
+            str(PAGE),
+            "no such file",
+            "run it at the root of the repository",
+        )
     own = tuple(fixer_overrides(overrides or []))
-    options = BenchOptions(name, own, device, threads, 1 if quick else passes, quick, parse_groups(only), seed)
+    options = BenchOptions(
+        name, own, device, threads, 1 if quick else passes, quick, parse_groups(only), seed
+    )
     measured_sizes = [parse_size(size, "--sizes") for size in sizes.split(",")]
-    bench = bench_fixer(options, measured_sizes, 21 if quick else frames, (lambda row: None) if as_json else _print_row)
+    bench = bench_fixer(
+        options,
+        measured_sizes,
+        21 if quick else frames,
+        (lambda row: None) if as_json else _print_row,
+    )
     document = as_document(bench)
     if out is not None:
         write_results(bench, out)
     if docs:
-        page = put_between_marks(PAGE.read_text(), "table", f"{markdown(bench.rows)}\n{machine_line(bench.facts)}")
+        page = put_between_marks(
+            PAGE.read_text(), "table", f"{markdown(bench.rows)}\n{machine_line(bench.facts)}"
+        )
         PAGE.write_text(page)
         plot(bench.rows, PICTURE)
     if as_json:
@@ -73,7 +127,8 @@ def fixer(
     for row in bench.rows:
         table.add_row(*cells(row))
     console = Console()
-    # Cells that are cut off cannot be read; a line that is too long for a terminal can be scrolled to, or read in --out.
+    # Cells that are cut off cannot be read; a line that is too long for a terminal can be scrolled
+    # to, or read in --out.
     console.width = max(console.width, Console(width=1000).measure(table).maximum)
     console.print(table)
     print(machine_line(bench.facts))
@@ -88,7 +143,12 @@ def parse_groups(text: str) -> tuple[str, ...]:
     groups = tuple(part.strip() for part in text.split(",") if part.strip())
     unknown = [group for group in groups if group not in MARKERS]
     if unknown:
-        raise InputError("reading --only", f"--only {text}", f"no group {unknown[0]!r}", f"known: {', '.join(MARKERS)}")
+        raise InputError(
+            "reading --only",
+            f"--only {text}",
+            f"no group {unknown[0]!r}",
+            f"known: {', '.join(MARKERS)}",
+        )
     return groups
 
 
@@ -107,7 +167,10 @@ def write_results(bench: Bench, folder: Path) -> None:
 
 def machine_line(facts: dict[str, Any]) -> str:
     """Return one line on the fixer, the machine and its load."""
-    where = facts.get("accelerator") or f"{facts['hardware']['cpu']}, {facts['threads']} thread(s) on {facts['hardware']['cores']} cores"
+    where = (
+        facts.get("accelerator")
+        or f"{facts['hardware']['cpu']}, {facts['threads']} thread(s) on {facts['hardware']['cores']} cores"
+    )
     before, after = facts["load_before_after"]
     chosen = f" with {', '.join(facts['overrides'])}" if facts["overrides"] else ""
     return (

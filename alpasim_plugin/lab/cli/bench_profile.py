@@ -15,14 +15,23 @@ EPILOG = "Examples: `simrun bench profile`, `simrun bench profile raster --passe
 
 def profiles(
     part: Annotated[
-        Literal["all", "raster", "loop", "evaluators", "aggregation"], typer.Argument(help="Which hot part; all four by default.")
+        Literal["all", "raster", "loop", "evaluators", "aggregation"],
+        typer.Argument(help="Which hot part; all four by default."),
     ] = "all",
-    passes: Annotated[int, typer.Option("--passes", min=1, help="Frames, rollouts, scorings, tables; their mean is printed.")] = 3,
+    passes: Annotated[
+        int,
+        typer.Option(
+            "--passes", min=1, help="Frames, rollouts, scorings, tables; their mean is printed."
+        ),
+    ] = 3,
     top: Annotated[int, typer.Option("--top", min=1, help="Functions per part.")] = 10,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document on stdout.")
+    ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
-    """Print the functions that take most processor time in the rasteriser, the loop, the evaluators and the aggregation.
+    """Print the functions that take most processor time in the rasteriser, the loop, the evaluators
+    and the aggregation.
 
     Time in libraries counts for the function of ours that called them.
     """

@@ -16,7 +16,14 @@ from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.parts import RendererSpec, resolve_renderer, split_names
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.lab.bench.colour_video_vdp import load_metric
-from alpasim_plugin.lab.bench.real import DOING, Judges, Row, intervals, measure_drive, unseen_cameras
+from alpasim_plugin.lab.bench.real import (
+    DOING,
+    Judges,
+    Row,
+    intervals,
+    measure_drive,
+    unseen_cameras,
+)
 from alpasim_plugin.lab.cli.bench_rows import print_rows
 from alpasim_plugin.lab.video_metrics.image_distance import load_distance
 from alpasim_plugin.lab.video_metrics.perceptual_net import NAME
@@ -34,17 +41,30 @@ EVERY = 10  # frames between lines of progress
 
 
 def real(
-    drives: Annotated[list[Path], typer.Argument(help="Folders of imported drives, or their scenario files.")],
-    renderers: Annotated[str, typer.Option("--renderer", help="Comma-separated renderers and fixers.")] = "3dgs,onefixer",
+    drives: Annotated[
+        list[Path], typer.Argument(help="Folders of imported drives, or their scenario files.")
+    ],
+    renderers: Annotated[
+        str, typer.Option("--renderer", help="Comma-separated renderers and fixers.")
+    ] = "3dgs,onefixer",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fixers' noise.")] = 0,
-    device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where to render and to fix.")] = "cpu",
-    threads: Annotated[int | None, typer.Option("--threads", min=1, help="Threads of the rasteriser; by default all cores.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    device: Annotated[
+        Literal["cpu", "cuda"], typer.Option("--device", help="Where to render and to fix.")
+    ] = "cpu",
+    threads: Annotated[
+        int | None,
+        typer.Option("--threads", min=1, help="Threads of the rasteriser; by default all cores."),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document on stdout.")
+    ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
-    """Compare renderers with photographs that no fit saw: on the recorded path, and beside it with a second camera.
+    """Compare renderers with photographs that no fit saw: on the recorded path, and beside it with
+    a second camera.
 
-    PSNR, SSIM, perceptual-syn, ColorVideoVDP (where cvvdp is installed), Warp L1, and precision and recall of lane paint.
+    PSNR, SSIM, perceptual-syn, ColorVideoVDP (where cvvdp is installed), Warp L1, and precision and
+    recall of lane paint.
     """
     del debug
     specs = {name: resolve_renderer(name) for name in _names(renderers)}
@@ -57,17 +77,24 @@ def real(
         console.print(why_not, highlight=False)
     rows: list[Row] = []
     for name, scenario in scenarios.items():
-        makers = {part: _maker(spec, scenario, seed, device, threads) for part, spec in specs.items()}
+        makers = {
+            part: _maker(spec, scenario, seed, device, threads) for part, spec in specs.items()
+        }
         rows += measure_drive(name, scenario, makers, judges, partial(_tell, console, name))
     over = intervals(rows)
     if len(scenarios) == 1:
-        console.print("one drive: no interval; how these numbers vary from drive to drive is not known", highlight=False)
+        console.print(
+            "one drive: no interval; how these numbers vary from drive to drive is not known",
+            highlight=False,
+        )
     if as_json:
         print(json.dumps({"rows": rows, **({"intervals": over} if over else {})}))
         return
     print_rows(rows, False)
     if over:
-        print_rows([{**row, "ci95": "{:.3g} to {:.3g}".format(*row["ci95"])} for row in over], False)  # type: ignore[misc]
+        print_rows(
+            [{**row, "ci95": "{:.3g} to {:.3g}".format(*row["ci95"])} for row in over], False
+        )  # type: ignore[misc]
 
 
 def _loaded(drives: Sequence[Path]) -> dict[str, Scenario]:
@@ -76,7 +103,12 @@ def _loaded(drives: Sequence[Path]) -> dict[str, Scenario]:
         file = drive / "scenario.yaml" if drive.is_dir() else drive
         name = file.parent.name
         if name in out:
-            raise InputError(DOING, str(drive), f"two drives called {name!r}", "name each folder once, and give folders different names")
+            raise InputError(
+                DOING,
+                str(drive),
+                f"two drives called {name!r}",
+                "name each folder once, and give folders different names",
+            )
         out[name] = load_scenario(str(file))
     return out
 
@@ -84,11 +116,18 @@ def _loaded(drives: Sequence[Path]) -> dict[str, Scenario]:
 def _names(text: str) -> list[str]:
     names = split_names(text)
     if not names or len(set(names)) < len(names):
-        raise InputError(DOING, f"--renderer {text}", "no renderer, or one twice", "write for example 3dgs,onefixer")
+        raise InputError(
+            DOING,
+            f"--renderer {text}",
+            "no renderer, or one twice",
+            "write for example 3dgs,onefixer",
+        )
     return names
 
 
-def _maker(spec: RendererSpec, scenario: Scenario, seed: int, device: str, threads: int | None) -> Callable[[], Renderer]:
+def _maker(
+    spec: RendererSpec, scenario: Scenario, seed: int, device: str, threads: int | None
+) -> Callable[[], Renderer]:
     return lambda: make_renderer(spec, scenario, seed, device, threads)
 
 

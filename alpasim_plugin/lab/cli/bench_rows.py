@@ -19,5 +19,10 @@ def print_rows(rows: Sequence[Mapping[str, Any]], as_json: bool) -> None:
     for name in rows[0]:
         table.add_column(name.replace("_", " "), justify="right")
     for row in rows:
-        table.add_row(*("-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value) for value in row.values()))
+        table.add_row(
+            *(
+                "-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+                for value in row.values()
+            )
+        )
     Console().print(table)

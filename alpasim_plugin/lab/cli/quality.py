@@ -16,7 +16,14 @@ from alpasim_plugin.core.parts import resolve, split_names, split_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.lab.bench.judged import Judging
 from alpasim_plugin.lab.bench.quality import RAW, Variant
-from alpasim_plugin.lab.bench.quality_run import DOING, Given, QualityRun, Work, evenly, write_results
+from alpasim_plugin.lab.bench.quality_run import (
+    DOING,
+    Given,
+    QualityRun,
+    Work,
+    evenly,
+    write_results,
+)
 from alpasim_plugin.lab.cli.training_options import whole_numbers
 from alpasim_plugin.lab.learned_metrics.table import judged_markdown
 from alpasim_plugin.lab.training.pair_store import PairDataset
@@ -37,8 +44,15 @@ Examples:
 
 def quality(
     data: Annotated[Path, typer.Argument(help="Folder of pairs (docs/lab/pairs.md).")],
-    out: Annotated[Path, typer.Option("--out", help="Folder for results; the same command continues there.")],
-    fixers: Annotated[str, typer.Option("--fixer", help="Comma-separated: 3dgs, NAME[@STEPS], LABEL=NAME, LABEL=FILE.")] = "3dgs",
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for results; the same command continues there.")
+    ],
+    fixers: Annotated[
+        str,
+        typer.Option(
+            "--fixer", help="Comma-separated: 3dgs, NAME[@STEPS], LABEL=NAME, LABEL=FILE."
+        ),
+    ] = "3dgs",
     split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "test-known",
     given: Annotated[
         Given,
@@ -48,61 +62,147 @@ def quality(
             "that has lost resolution (blur, cells of 2 to 4 pixels, up to 3 holes that stay in place).",
         ),
     ] = "render",
-    baseline: Annotated[str, typer.Option("--baseline", help="Variant that the others are compared with.")] = RAW,
-    frames: Annotated[int, typer.Option("--frames", min=2, help="First frames of every clip; shorter clips are taken whole.")] = 198,
-    clips: Annotated[int | None, typer.Option("--clips", min=1, help="At most so many clips, evenly chosen.")] = None,
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="[LABEL:]fixer.key=value, of one variant or of all fixers.")] = None,
-    weights: Annotated[Path | None, typer.Option("--metric-weights", help=f"Folder of LPIPS weights; also {FOLDER_VARIABLE}.")] = None,
+    baseline: Annotated[
+        str, typer.Option("--baseline", help="Variant that the others are compared with.")
+    ] = RAW,
+    frames: Annotated[
+        int,
+        typer.Option(
+            "--frames", min=2, help="First frames of every clip; shorter clips are taken whole."
+        ),
+    ] = 198,
+    clips: Annotated[
+        int | None, typer.Option("--clips", min=1, help="At most so many clips, evenly chosen.")
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="[LABEL:]fixer.key=value, of one variant or of all fixers."),
+    ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option("--metric-weights", help=f"Folder of LPIPS weights; also {FOLDER_VARIABLE}."),
+    ] = None,
     judges: Annotated[
-        str | None, typer.Option("--judges", help="Also ask the judges of these training seeds, as 0,1 (docs/lab/judges.md).")
+        str | None,
+        typer.Option(
+            "--judges",
+            help="Also ask the judges of these training seeds, as 0,1 (docs/lab/judges.md).",
+        ),
     ] = None,
     scenes: Annotated[
-        Path | None, typer.Option("--scenes", help="Folder of the pairs' scenes: judges of lanes need the camera's mounting.")
+        Path | None,
+        typer.Option(
+            "--scenes",
+            help="Folder of the pairs' scenes: judges of lanes need the camera's mounting.",
+        ),
     ] = None,
-    judge_folder: Annotated[Path | None, typer.Option("--judge-folder", help="Folder of judges that you froze.")] = None,
-    detections: Annotated[Path | None, typer.Option("--detections", help="Folder of a detector's results, VARIANT/CLIP.json.")] = None,
-    pictures: Annotated[int, typer.Option("--pictures", min=0, help="Clips that are shown side by side.")] = 4,
+    judge_folder: Annotated[
+        Path | None, typer.Option("--judge-folder", help="Folder of judges that you froze.")
+    ] = None,
+    detections: Annotated[
+        Path | None,
+        typer.Option("--detections", help="Folder of a detector's results, VARIANT/CLIP.json."),
+    ] = None,
+    pictures: Annotated[
+        int, typer.Option("--pictures", min=0, help="Clips that are shown side by side.")
+    ] = 4,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fixers' noise.")] = 0,
-    device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where fixers compute.")] = "cpu",
-    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Clips at a time, one thread each; times are then of a busy machine.")] = 1,
-    threads: Annotated[int, typer.Option("--threads", min=1, help="Torch threads with one job.")] = 1,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as one JSON document on stdout.")] = False,
+    device: Annotated[
+        Literal["cpu", "cuda"], typer.Option("--device", help="Where fixers compute.")
+    ] = "cpu",
+    jobs: Annotated[
+        int,
+        typer.Option(
+            "--jobs",
+            min=1,
+            help="Clips at a time, one thread each; times are then of a busy machine.",
+        ),
+    ] = 1,
+    threads: Annotated[
+        int, typer.Option("--threads", min=1, help="Torch threads with one job.")
+    ] = 1,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the summary as one JSON document on stdout.")
+    ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
-    """Measure fixers on recorded clips: PSNR, SSIM, perceptual distances, Warp L1, drift and time, with 95 % intervals over clips.
+    """Measure fixers on recorded clips: PSNR, SSIM, perceptual distances, Warp L1, drift and time,
+    with 95 % intervals over clips.
 
-    Writes quality.json, quality.md, by-frame.png, speed.png and pictures side by side; rows of finished clips are kept.
+    Writes quality.json, quality.md, by-frame.png, speed.png and pictures side by side; rows of
+    finished clips are kept.
     """
     del debug
     variants = parse_variants(fixers, overrides or [])
     if baseline not in {variant.label for variant in variants}:
-        raise InputError(DOING, f"--baseline {baseline}", f"variants {', '.join(a.label for a in variants)}", "name one of the variants")
-    judging = None if judges is None else _judging(judges, scenes, detections, weights, judge_folder)
+        raise InputError(
+            DOING,
+            f"--baseline {baseline}",
+            f"variants {', '.join(a.label for a in variants)}",
+            "name one of the variants",
+        )
+    judging = (
+        None if judges is None else _judging(judges, scenes, detections, weights, judge_folder)
+    )
     sequences = evenly(PairDataset(data, split).sequences, clips)
     shown = frozenset(s.name for s in evenly(sequences, pictures)) if pictures else frozenset()
-    run = QualityRun(sequences, variants, out, given, frames, seed, device, jobs, threads, weights, shown, judging=judging, scenes=scenes)
+    run = QualityRun(
+        sequences,
+        variants,
+        out,
+        given,
+        frames,
+        seed,
+        device,
+        jobs,
+        threads,
+        weights,
+        shown,
+        judging=judging,
+        scenes=scenes,
+    )
     console = Console(stderr=True)
 
     def told(i: int, n: int, work: Work, row: Mapping[str, Any]) -> None:
         psnr = row["values"].get("psnr_db")
         if not as_json:
-            console.print(f"{i}/{n} {work.variant.label} {work.folder.name}" + ("" if psnr is None else f" {psnr:.2f} dB"))
+            console.print(
+                f"{i}/{n} {work.variant.label} {work.folder.name}"
+                + ("" if psnr is None else f" {psnr:.2f} dB")
+            )
 
     summary, works = run.measure(baseline, told)
     summary["run"] = {"data": str(data), "split": split, **run.facts()}
     write_results(summary, works, out)
-    print(json.dumps(summary) if as_json else markdown(summary) + judged_markdown(summary) + f"\nwrote {out / 'quality.json'}")
+    print(
+        json.dumps(summary)
+        if as_json
+        else markdown(summary) + judged_markdown(summary) + f"\nwrote {out / 'quality.json'}"
+    )
 
 
-def _judging(seeds: str, scenes: Path | None, detections: Path | None, weights: Path | None, folder: Path | None) -> Judging:
-    return Judging(tuple(whole_numbers("--judges", seeds, 0)), scenes, detections, weights_folder(weights), folder)
+def _judging(
+    seeds: str,
+    scenes: Path | None,
+    detections: Path | None,
+    weights: Path | None,
+    folder: Path | None,
+) -> Judging:
+    return Judging(
+        tuple(whole_numbers("--judges", seeds, 0)),
+        scenes,
+        detections,
+        weights_folder(weights),
+        folder,
+    )
 
 
 def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:
     """Return the variants that ``--fixer`` and ``--set`` name.
 
     Raises:
-        InputError: A label twice, a fixer or key that is not known, or a setting for a variant that is not there.
+        InputError: A label twice, a fixer or key that is not known, or a setting for a variant that
+            is not there.
     """
     common: list[str] = []
     own: dict[str, list[str]] = {}
@@ -120,16 +220,24 @@ def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:
         fixer = named if equals else label
         if label in variants or label == TRUTH or "/" in label:
             found = f"label {label!r} is taken, or no name of a folder"
-            raise InputError(DOING, f"--fixer {text}", found, "write LABEL=NAME with labels of your own")
+            raise InputError(
+                DOING, f"--fixer {text}", found, "write LABEL=NAME with labels of your own"
+            )
         if fixer == RAW:
             variants[label] = Variant(label)
             continue
         fixer, in_brackets = split_settings(fixer)
         name, settings = bundle_fixer(fixer) if fixer.endswith(".safetensors") else (fixer, ())
         settings = (*settings, *in_brackets)
-        variants[label] = Variant(label, resolve("fixer", name, (*settings, *fixer_overrides([*common, *own.pop(label, [])]))))
+        variants[label] = Variant(
+            label,
+            resolve("fixer", name, (*settings, *fixer_overrides([*common, *own.pop(label, [])]))),
+        )
     if own or not variants:
         raise InputError(
-            DOING, f"--set {next(iter(own), '')}", "no fixer of this label", f"the variants are {', '.join(variants) or 'none'}"
+            DOING,
+            f"--set {next(iter(own), '')}",
+            "no fixer of this label",
+            f"the variants are {', '.join(variants) or 'none'}",
         )
     return tuple(variants.values())

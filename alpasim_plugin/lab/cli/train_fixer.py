@@ -1,4 +1,6 @@
-"""``simrun train fixer``: train a recipe from pairs; ``simrun train memory``: its memory and time."""
+"""``simrun train fixer``: train a recipe from pairs; ``simrun train memory``: its memory and
+time.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,10 @@ def onefixer_settings(name: str) -> OneFixerSettings:
     settings = fixer_settings(name)
     if not isinstance(settings, OneFixerSettings):
         raise InputError(
-            "choosing a fixer to train", f"--fixer {name}", "it has no networks", "choose a block generator, such as onefixer-dit-tiny"
+            "choosing a fixer to train",
+            f"--fixer {name}",
+            "it has no networks",
+            "choose a block generator, such as onefixer-dit-tiny",
         )
     return settings
 
@@ -57,22 +62,43 @@ def trainable_settings(name: str) -> TrainableSettings:
     settings = fixer_settings(name)
     if not isinstance(settings, TrainableSettings):
         do = "leave it out, or choose a block generator, such as onefixer-dit-tiny"
-        raise InputError("choosing a fixer to train", f"--fixer {name}", "it has no networks on latents", do)
+        raise InputError(
+            "choosing a fixer to train", f"--fixer {name}", "it has no networks on latents", do
+        )
     return settings
 
 
 def train_fixer_command(
     data: options.Pairs,
-    vae: Annotated[Path, typer.Option("--vae", help="Trained autoencoder ('simrun train vae'), or a fixer's bundle.")],
+    vae: Annotated[
+        Path,
+        typer.Option(
+            "--vae", help="Trained autoencoder ('simrun train vae'), or a fixer's bundle."
+        ),
+    ],
     out: options.RunFolder,
-    recipe: Annotated[str, typer.Option("--recipe", "--variant", help=f"One of {', '.join(RECIPES)}.")] = "V9",
-    init: Annotated[Path | None, typer.Option("--init", help="Initial weights: a run's fixer.safetensors, or a transformer.")] = None,
+    recipe: Annotated[
+        str, typer.Option("--recipe", "--variant", help=f"One of {', '.join(RECIPES)}.")
+    ] = "V9",
+    init: Annotated[
+        Path | None,
+        typer.Option(
+            "--init", help="Initial weights: a run's fixer.safetensors, or a transformer."
+        ),
+    ] = None,
     weights: Annotated[
         list[str] | None,
-        typer.Option("--weights", help="NAME=FILE, repeatable: init-bi, of bidirectional networks; or a stage, which is then not trained."),
+        typer.Option(
+            "--weights",
+            help="NAME=FILE, repeatable: init-bi, of bidirectional networks; or a stage, which is then not trained.",
+        ),
     ] = None,
     scenes: Annotated[
-        Path | None, typer.Option("--scenes", help="Folder of the pairs' scenes; recipe appearance renders their depth for its targets.")
+        Path | None,
+        typer.Option(
+            "--scenes",
+            help="Folder of the pairs' scenes; recipe appearance renders their depth for its targets.",
+        ),
     ] = None,
     size: options.Size = None,
     steps: options.Unit = 400,
@@ -84,15 +110,35 @@ def train_fixer_command(
     lr: options.PeakLr = 2e-4,
     ema: options.Ema = 0.99,
     source_share: Annotated[
-        float, typer.Option("--source-share", min=0.0, max=0.8, help="Recipe base: share of positions at t = 1, the start of sampling.")
+        float,
+        typer.Option(
+            "--source-share",
+            min=0.0,
+            max=0.8,
+            help="Recipe base: share of positions at t = 1, the start of sampling.",
+        ),
     ] = 0.35,
     objective: Annotated[
         list[str] | None,
-        typer.Option("--objective", help="KEY=VALUE or STAGE.KEY=VALUE of the recipe's objectives, repeatable, such as dmd.steps=4."),
+        typer.Option(
+            "--objective",
+            help="KEY=VALUE or STAGE.KEY=VALUE of the recipe's objectives, repeatable, such as dmd.steps=4.",
+        ),
     ] = None,
-    block: Annotated[int | None, typer.Option("--block", min=1, help="Latents of a block, instead of the recipe's.")] = None,
-    window: Annotated[int | None, typer.Option("--window", min=1, help="Attention window in latents, instead of the recipe's.")] = None,
-    sink: Annotated[int | None, typer.Option("--sink", min=0, help="Attention sink in latents, instead of the recipe's.")] = None,
+    block: Annotated[
+        int | None,
+        typer.Option("--block", min=1, help="Latents of a block, instead of the recipe's."),
+    ] = None,
+    window: Annotated[
+        int | None,
+        typer.Option(
+            "--window", min=1, help="Attention window in latents, instead of the recipe's."
+        ),
+    ] = None,
+    sink: Annotated[
+        int | None,
+        typer.Option("--sink", min=0, help="Attention sink in latents, instead of the recipe's."),
+    ] = None,
     perceptual: options.Perceptual = 10.0,
     channels: options.Channels = "amplitude",
     class_colour_augmentation: Annotated[
@@ -102,17 +148,25 @@ def train_fixer_command(
             help="Show the map's cars in the colours of another class in mirrored clips.",
         ),
     ] = True,
-    stop_at: Annotated[int | None, typer.Option("--stop-at", min=1, help="Stop after this update and write the weights.")] = None,
+    stop_at: Annotated[
+        int | None,
+        typer.Option("--stop-at", min=1, help="Stop after this update and write the weights."),
+    ] = None,
     precision: options.Precision = "fp32",
     snapshots: options.Snapshots = 0,
     threads: options.Threads = None,
     seed: options.Seed = 0,
-    fixer: Annotated[str | None, typer.Option("--fixer", help="Fixer that gives the sizes; by default the recipe's.")] = None,
+    fixer: Annotated[
+        str | None,
+        typer.Option("--fixer", help="Fixer that gives the sizes; by default the recipe's."),
+    ] = None,
     metric_weights: options.MetricWeights = None,
     as_json: options.AsJson = False,
     debug: options.Debug = False,
 ) -> None:
-    """Train a recipe: one system of the paper's tables; writes OUT/fixer.safetensors (averaged weights, float16) and its card."""
+    """Train a recipe: one system of the paper's tables; writes OUT/fixer.safetensors (averaged
+    weights, float16) and its card.
+    """
     del debug
     options.use_threads(threads)
     chosen = with_perceptual_weight(with_source_share(recipe_of(recipe), source_share), perceptual)
@@ -120,13 +174,29 @@ def train_fixer_command(
     settings = trainable_settings(fixer or chosen.fixer)
     if not isinstance(settings, OneFixerSettings) and (block, window, sink) != (None, None, None):
         do = "leave out --block, --window and --sink"
-        raise InputError("choosing what to train", f"recipe {recipe}", "it has no blocks and no history", do)
+        raise InputError(
+            "choosing what to train", f"recipe {recipe}", "it has no blocks and no history", do
+        )
     schedule = Schedule(steps, peak_lr=lr, accumulate=accumulate, ema=ema).of_length(steps)
     form = ClipForm(latents, stride, class_colour_augmentation)
     batches = BatchForm(clips, None, columns, seed)
     own_size = None if size is None else parse_size(size)
     files, equal = named_weights(init, weights or []), channels == "equal"
-    run = FixerRun(settings, chosen, data, vae, files, form, batches, schedule, equal, PRECISIONS[precision], snapshots, scenes, own_size)
+    run = FixerRun(
+        settings,
+        chosen,
+        data,
+        vae,
+        files,
+        form,
+        batches,
+        schedule,
+        equal,
+        PRECISIONS[precision],
+        snapshots,
+        scenes,
+        own_size,
+    )
     progress = options.Progress(run.updates)
     progress.float32(run.precision, run.stages())
     distance = progress.perceptual_term(metric_weights) if run.perceptual else None
@@ -146,24 +216,38 @@ def named_weights(init: Path | None, pairs: Sequence[str]) -> dict[str, Path]:
         if not equals or not path or name in found:
             wrong = "a name that has a file already" if equals and path else "not NAME=FILE"
             raise InputError(
-                "reading --weights", f"--weights {text}", wrong, "write for example --weights teacher=runs/t/fixer.safetensors"
+                "reading --weights",
+                f"--weights {text}",
+                wrong,
+                "write for example --weights teacher=runs/t/fixer.safetensors",
             )
         found[name] = Path(path)
     return found
 
 
 def memory_command(
-    latents: Annotated[str, typer.Option("--latents", help="Latents of a clip, comma-separated.")] = "6,12,24",
+    latents: Annotated[
+        str, typer.Option("--latents", help="Latents of a clip, comma-separated.")
+    ] = "6,12,24",
     horizon: Annotated[str, typer.Option("--horizon", help="k, comma-separated.")] = "0,1,2,4,8",
     clips: Annotated[int, typer.Option("--clips", min=1, help="Clips per batch.")] = 1,
     columns: Annotated[int, typer.Option("--columns", min=2, help="Width in latents.")] = 32,
     rows: Annotated[int, typer.Option("--rows", min=2, help="Height in latents.")] = 18,
-    fixer: Annotated[str, typer.Option("--fixer", help="Fixer that gives the sizes.")] = "onefixer-dit-tiny",
+    fixer: Annotated[
+        str, typer.Option("--fixer", help="Fixer that gives the sizes.")
+    ] = "onefixer-dit-tiny",
     as_json: options.AsJson = False,
     debug: options.Debug = False,
 ) -> None:
-    """Measure peak memory and time of one training sample by clip length and horizon, each in its own process."""
+    """Measure peak memory and time of one training sample by clip length and horizon, each in its
+    own process.
+    """
     del debug
-    counts, horizons = options.whole_numbers("--latents", latents, 2), options.whole_numbers("--horizon", horizon, 0)
+    counts, horizons = (
+        options.whole_numbers("--latents", latents, 2),
+        options.whole_numbers("--horizon", horizon, 0),
+    )
     cells = measure_memory(onefixer_settings(fixer), counts, horizons, clips, rows, columns)
-    print(json.dumps([cell._asdict() for cell in cells], indent=1) if as_json else memory_table(cells))
+    print(
+        json.dumps([cell._asdict() for cell in cells], indent=1) if as_json else memory_table(cells)
+    )

@@ -54,48 +54,97 @@ class Made:
 
 def judge(
     name: Annotated[str, typer.Argument(help=f"{', '.join(NAMES)}.")],
-    data: Annotated[Path, typer.Argument(help="Folder of pairs; clean frames of the split train are used.")],
-    scenes: Annotated[Path, typer.Option("--scenes", help="Folder of the scenes that the pairs were rendered from: the truth.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder of the run; the same command resumes it.")],
-    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Total updates; by default as the shipped judge.")] = None,
+    data: Annotated[
+        Path, typer.Argument(help="Folder of pairs; clean frames of the split train are used.")
+    ],
+    scenes: Annotated[
+        Path,
+        typer.Option(
+            "--scenes", help="Folder of the scenes that the pairs were rendered from: the truth."
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder of the run; the same command resumes it.")
+    ],
+    steps: Annotated[
+        int | None,
+        typer.Option("--steps", min=1, help="Total updates; by default as the shipped judge."),
+    ] = None,
     until: Annotated[
-        int | None, typer.Option("--until", min=1, help="Stop at this update of the schedule; the same command without it goes on.")
+        int | None,
+        typer.Option(
+            "--until",
+            min=1,
+            help="Stop at this update of the schedule; the same command without it goes on.",
+        ),
     ] = None,
     sequences: Annotated[
-        int, typer.Option("--sequences", min=1, help="At most so many sequences (style: a quarter as many scenes).")
+        int,
+        typer.Option(
+            "--sequences",
+            min=1,
+            help="At most so many sequences (style: a quarter as many scenes).",
+        ),
     ] = 160,
-    kept: Annotated[Path | None, typer.Option("--labels", help="Folder that keeps the truth; OUT/../labels by default.")] = None,
+    kept: Annotated[
+        Path | None,
+        typer.Option("--labels", help="Folder that keeps the truth; OUT/../labels by default."),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights and draws.")] = 0,
     threads: Annotated[int, typer.Option("--threads", min=1, help="Torch threads.")] = 1,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Train a judge on clean frames of the simulator with its truth; writes OUT/judge-NAME-SEED.safetensors, averaged weights in float16.
+    """Train a judge on clean frames of the simulator with its truth; writes
+    OUT/judge-NAME-SEED.safetensors, averaged weights in float16.
 
-    A judge measures and is used in no loss. Freeze it before it measures anything: `simrun judge freeze`.
+    A judge measures and is used in no loss. Freeze it before it measures anything: `simrun judge
+    freeze`.
     """
     del debug
     if name not in NAMES:
-        raise InputError("training a judge", f"name {name!r}", "no such judge", f"choose one of {', '.join(NAMES)}")
+        raise InputError(
+            "training a judge",
+            f"name {name!r}",
+            "no such judge",
+            f"choose one of {', '.join(NAMES)}",
+        )
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
     total = steps or STEPS[name]
     progress = Progress(total, every=25)
     made = _BUILD[name](data, scenes, kept or out.parent / "labels", sequences, seed, progress)
     schedule = Schedule(total, peak_lr=2e-3, warmup=min(50, total // 5), ema=0.99, save_every=50)
-    trainer = Trainer(made.task.module, out, schedule, made.task.batch, made.task.loss, made.task.facts)
+    trainer = Trainer(
+        made.task.module, out, schedule, made.task.batch, made.task.loss, made.task.facts
+    )
     trainer.run(progress.update, until)
     made.task.module.load_state_dict(trainer.averaged())
     path = out / file_name(name, seed)
-    save_judge(path, name, made.net, {"made_by": "simrun train judge", "steps": str(trainer.step), "seed": str(seed)})
+    save_judge(
+        path,
+        name,
+        made.net,
+        {"made_by": "simrun train judge", "steps": str(trainer.step), "seed": str(seed)},
+    )
     rows, hours = curves(out / LOG_FILE)
-    ModelCard(WHAT[name], made.task.facts, {"schedule": asdict(schedule), "updates": trainer.step}, rows, hours).write(path)
+    ModelCard(
+        WHAT[name],
+        made.task.facts,
+        {"schedule": asdict(schedule), "updates": trainer.step},
+        rows,
+        hours,
+    ).write(path)
     progress.wrote(path, as_json)
 
 
-def _labelled(data: Path, scenes: Path, kept: Path, count: int, progress: Progress) -> LabelledFrames:
+def _labelled(
+    data: Path, scenes: Path, kept: Path, count: int, progress: Progress
+) -> LabelledFrames:
     sequences = chosen(PairDataset(data, "train").sequences, count)
-    labels = all_labels(sequences, scenes, kept, EVERY, report=lambda done, n: progress.prepared("truth", done, n))
+    labels = all_labels(
+        sequences, scenes, kept, EVERY, report=lambda done, n: progress.prepared("truth", done, n)
+    )
     return LabelledFrames(sequences, tuple(labels))
 
 
@@ -104,7 +153,9 @@ def _lane(data: Path, scenes: Path, kept: Path, count: int, seed: int, progress:
     return Made(task, task.module)
 
 
-def _cuboid(data: Path, scenes: Path, kept: Path, count: int, seed: int, progress: Progress) -> Made:
+def _cuboid(
+    data: Path, scenes: Path, kept: Path, count: int, seed: int, progress: Progress
+) -> Made:
     task = CuboidTask(_labelled(data, scenes, kept, count, progress), CuboidRecipe(seed=seed))
     return Made(task, task.module)
 
@@ -125,5 +176,8 @@ def _style(data: Path, scenes: Path, kept: Path, count: int, seed: int, progress
 
 
 _BUILD: dict[str, Callable[[Path, Path, Path, int, int, Progress], Made]] = {
-    "lane": _lane, "cuboid": _cuboid, "video": _video, "style": _style,
-}  # fmt: skip
+    "lane": _lane,
+    "cuboid": _cuboid,
+    "video": _video,
+    "style": _style,
+}

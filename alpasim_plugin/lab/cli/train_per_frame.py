@@ -37,45 +37,114 @@ Examples:
 def per_frame(
     data: options.Pairs,
     out: options.RunFolder,
-    video: Annotated[Path | None, typer.Option("--video", help="Folder of driving video (docs/lab/pairs.md).")] = None,
-    sequences: Annotated[int | None, typer.Option("--sequences", min=1, help="Only the first N sequences, in order of generation.")] = None,
+    video: Annotated[
+        Path | None, typer.Option("--video", help="Folder of driving video (docs/lab/pairs.md).")
+    ] = None,
+    sequences: Annotated[
+        int | None,
+        typer.Option(
+            "--sequences", min=1, help="Only the first N sequences, in order of generation."
+        ),
+    ] = None,
     steps: options.Steps = 20_000,
     decay_from: Annotated[
-        int | None, typer.Option("--decay-from", min=1, help="Update at which the learning rate begins to fall; by default at 4/5.")
+        int | None,
+        typer.Option(
+            "--decay-from",
+            min=1,
+            help="Update at which the learning rate begins to fall; by default at 4/5.",
+        ),
     ] = None,
-    stop_at: Annotated[int | None, typer.Option("--stop-at", min=1, help="Stop after this update and write the weights.")] = None,
+    stop_at: Annotated[
+        int | None,
+        typer.Option("--stop-at", min=1, help="Stop after this update and write the weights."),
+    ] = None,
     lr: options.PeakLr = 1e-3,
-    warmup: Annotated[int, typer.Option("--warmup", min=0, help="Updates of rising learning rate; 0 where a run goes on.")] = 100,
-    ema: Annotated[float, typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged (EMA) weights.")] = 0.998,
-    streams: Annotated[int, typer.Option("--streams", min=1, help="Streams of frames in a batch.")] = 6,
-    frames: Annotated[int, typer.Option("--frames", min=2, help="Frames of an update: k, that gradients pass through.")] = 4,
-    episode: Annotated[int, typer.Option("--episode", min=1, help="Updates that a stream stays with a sequence.")] = 12,
-    crop: Annotated[str, typer.Option("--crop", help="WIDTHxHEIGHT of a crop, multiples of 16.")] = "128x96",
-    perceptual: Annotated[float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual term.")] = 0.1,
-    temporal: Annotated[float, typer.Option("--temporal", min=0.0, help="Weight of the frames' differences.")] = 0.25,
-    flow: Annotated[float, typer.Option("--flow", min=0.0, help="Weight of flow matching below t = 1.")] = 0.25,
-    grid: Annotated[float, typer.Option("--grid", min=0.0, help="Weight of the term against patterns of the network's grid.")] = 0.01,
-    variant: Annotated[str, typer.Option("--variant", help=f"Row of the paper's ablation: {', '.join(PIXEL_VARIANTS)}.")] = DEPLOYED,
-    init: Annotated[Path | None, typer.Option("--init", help="Another run's state.safetensors, or a bundle.")] = None,
+    warmup: Annotated[
+        int,
+        typer.Option(
+            "--warmup", min=0, help="Updates of rising learning rate; 0 where a run goes on."
+        ),
+    ] = 100,
+    ema: Annotated[
+        float,
+        typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged (EMA) weights."),
+    ] = 0.998,
+    streams: Annotated[
+        int, typer.Option("--streams", min=1, help="Streams of frames in a batch.")
+    ] = 6,
+    frames: Annotated[
+        int,
+        typer.Option(
+            "--frames", min=2, help="Frames of an update: k, that gradients pass through."
+        ),
+    ] = 4,
+    episode: Annotated[
+        int, typer.Option("--episode", min=1, help="Updates that a stream stays with a sequence.")
+    ] = 12,
+    crop: Annotated[
+        str, typer.Option("--crop", help="WIDTHxHEIGHT of a crop, multiples of 16.")
+    ] = "128x96",
+    perceptual: Annotated[
+        float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual term.")
+    ] = 0.1,
+    temporal: Annotated[
+        float, typer.Option("--temporal", min=0.0, help="Weight of the frames' differences.")
+    ] = 0.25,
+    flow: Annotated[
+        float, typer.Option("--flow", min=0.0, help="Weight of flow matching below t = 1.")
+    ] = 0.25,
+    grid: Annotated[
+        float,
+        typer.Option(
+            "--grid", min=0.0, help="Weight of the term against patterns of the network's grid."
+        ),
+    ] = 0.01,
+    variant: Annotated[
+        str,
+        typer.Option(
+            "--variant", help=f"Row of the paper's ablation: {', '.join(PIXEL_VARIANTS)}."
+        ),
+    ] = DEPLOYED,
+    init: Annotated[
+        Path | None, typer.Option("--init", help="Another run's state.safetensors, or a bundle.")
+    ] = None,
     fixer: Annotated[str, typer.Option("--fixer", help="Fixer that gives the sizes.")] = "onefixer",
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="A setting of that fixer: fixer.key=value.")] = None,
-    save_every: Annotated[int, typer.Option("--save-every", min=1, help="Updates between checkpoints.")] = 200,
-    keep_every: Annotated[int, typer.Option("--keep-every", min=0, help="Updates between bundles that are kept; 0: the last.")] = 1000,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", help="A setting of that fixer: fixer.key=value.")
+    ] = None,
+    save_every: Annotated[
+        int, typer.Option("--save-every", min=1, help="Updates between checkpoints.")
+    ] = 200,
+    keep_every: Annotated[
+        int,
+        typer.Option(
+            "--keep-every", min=0, help="Updates between bundles that are kept; 0: the last."
+        ),
+    ] = 1000,
     precision: Annotated[
-        Literal["auto", "fp32", "bf16"], typer.Option("--precision", help="Of the forward passes; auto: what pays on this machine.")
+        Literal["auto", "fp32", "bf16"],
+        typer.Option("--precision", help="Of the forward passes; auto: what pays on this machine."),
     ] = "auto",
     threads: options.Threads = None,
     processes: Annotated[
-        int, typer.Option("--processes", min=1, help="Processes that share the streams of a batch; a divisor of --streams.")
+        int,
+        typer.Option(
+            "--processes",
+            min=1,
+            help="Processes that share the streams of a batch; a divisor of --streams.",
+        ),
     ] = 1,
     seed: options.Seed = 0,
     metric_weights: options.MetricWeights = None,
     as_json: options.AsJson = False,
     debug: options.Debug = False,
 ) -> None:
-    """Train the per-frame generator; writes OUT/fixer.safetensors (averaged weights, float16) and its card.
+    """Train the per-frame generator; writes OUT/fixer.safetensors (averaged weights, float16) and
+    its card.
 
-    The learning rate is constant until --decay-from; until then --steps and --decay-from may be changed, so that a run can be prolonged.
+    The learning rate is constant until --decay-from; until then --steps and --decay-from may be
+    changed, so that a run can be prolonged.
     """
     del debug
     options.use_threads(threads)
@@ -83,18 +152,36 @@ def per_frame(
     settings = fixer_settings(fixer, ["weights.bundle=null", *fixer_overrides(overrides or [])])
     if not isinstance(settings, PixelFixerSettings):
         do = "choose onefixer; 'simrun train fixer' trains the block generators"
-        raise InputError("choosing a fixer to train", f"--fixer {fixer}", "it is no generator in pixels", do)
+        raise InputError(
+            "choosing a fixer to train", f"--fixer {fixer}", "it is no generator in pixels", do
+        )
     chosen = choose_precision(precision)
     progress.console.print(f"precision: {chosen.name} ({chosen.why})", highlight=False)
     width, height = parse_size(crop, "--crop", 16)
     shares = StreamShares() if video is not None else WITHOUT_VIDEO
     source = TrainingStreams(
-        data, video, seed=seed, batch=streams, frames=frames, crop=(height, width), episode=episode, shares=shares, count=sequences
+        data,
+        video,
+        seed=seed,
+        batch=streams,
+        frames=frames,
+        crop=(height, width),
+        episode=episode,
+        shares=shares,
+        count=sequences,
     )
     schedule = Schedule(
-        steps, peak_lr=lr, warmup=warmup, clip=0.5, ema=ema, save_every=save_every, decay_from=decay_from or max(4 * steps // 5, 1)
+        steps,
+        peak_lr=lr,
+        warmup=warmup,
+        clip=0.5,
+        ema=ema,
+        save_every=save_every,
+        decay_from=decay_from or max(4 * steps // 5, 1),
     )
-    chosen_variant = pixel_variant(variant).weighted(perceptual, temporal, flow, grid, horizon=frames)
+    chosen_variant = pixel_variant(variant).weighted(
+        perceptual, temporal, flow, grid, horizon=frames
+    )
     needs_distance = any(stage.perceptual for stage in chosen_variant.stages)
     distance = progress.perceptual_term(metric_weights) if needs_distance else None
     dtype = torch.bfloat16 if chosen.name == "bf16" else None

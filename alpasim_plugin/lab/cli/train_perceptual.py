@@ -22,15 +22,22 @@ EPILOG = "Example: `simrun train perceptual data/pairs --out runs/perceptual --s
 
 
 def perceptual(
-    data: Annotated[Path, typer.Argument(help="Folder of pairs; clean frames and maps of the split train are used.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder of the run; the same command resumes it.")],
+    data: Annotated[
+        Path,
+        typer.Argument(help="Folder of pairs; clean frames and maps of the split train are used."),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder of the run; the same command resumes it.")
+    ],
     steps: Steps = 1500,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights and sampling.")] = 0,
     threads: Annotated[int, typer.Option("--threads", min=1, help="Torch threads.")] = 1,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Train the feature network of the perceptual distance; writes OUT/perceptual-syn.safetensors with averaged weights, float16."""
+    """Train the feature network of the perceptual distance; writes OUT/perceptual-syn.safetensors
+    with averaged weights, float16.
+    """
     del debug
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
@@ -41,9 +48,14 @@ def perceptual(
     trainer.run(progress.update)
     task.module.load_state_dict(trainer.averaged())
     path = out / f"{NAME}.safetensors"
-    task.module.net.save(path, {"made_by": "simrun train perceptual", "steps": str(steps), "seed": str(seed)})
+    task.module.net.save(
+        path, {"made_by": "simrun train perceptual", "steps": str(steps), "seed": str(seed)}
+    )
     rows, hours = curves(out / LOG_FILE)
-    data_card = {"pairs": "clean frames, renders and maps of the split train", "sequences": len(task.sequences)}
+    data_card = {
+        "pairs": "clean frames, renders and maps of the split train",
+        "sequences": len(task.sequences),
+    }
     training = {"schedule": asdict(schedule), "recipe": asdict(task.recipe)}
     ModelCard(WHAT, data_card, training, rows, hours).write(path)
     progress.wrote(path, as_json)

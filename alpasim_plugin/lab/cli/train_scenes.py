@@ -20,16 +20,28 @@ CHECK_EPILOG = "Example: `simrun train check-scenes data/scenes`"
 def scenes(
     out: RunFolder,
     split: Annotated[Split, typer.Option("--split", help="Split to write.")] = "train",
-    count: Annotated[int | None, typer.Option("--count", min=1, help="Number of scenes; by default 408, 24, 30 and 30.")] = None,
+    count: Annotated[
+        int | None,
+        typer.Option("--count", min=1, help="Number of scenes; by default 408, 24, 30 and 30."),
+    ] = None,
     duration_s: Annotated[
-        float | None, typer.Option("--duration-s", min=1.0, help="Length of every drive, seconds; by default 6, for tests 19.8.")
+        float | None,
+        typer.Option(
+            "--duration-s",
+            min=1.0,
+            help="Length of every drive, seconds; by default 6, for tests 19.8.",
+        ),
     ] = None,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Sample scenarios; test-unseen has families of roads and traffic, looks and damage that no other split has."""
+    """Sample scenarios; test-unseen has families of roads and traffic, looks and damage that no
+    other split has.
+    """
     del debug
-    console, paths, recipe = Console(stderr=True), [], SPLITS[split]
+    console = Console(stderr=True)
+    paths = []
+    recipe = SPLITS[split]
     for path in write_scenes(out, split, count or recipe.count, duration_s or recipe.duration_s):
         paths.append(str(path))
         console.print(str(path), highlight=False, markup=False, soft_wrap=True)
@@ -38,10 +50,21 @@ def scenes(
 
 
 def check_frozen(
-    scenes: Annotated[Path, typer.Argument(help="Folder that 'simrun train scenes' wrote, with both test splits.")],
-    record: Annotated[Path, typer.Option("--record", help="File with the hashes; by default the shipped one.")] = RECORD,
-    splits: Annotated[str, typer.Option("--split", help="Splits to freeze, comma-separated.")] = ",".join(TEST_SPLITS),
-    freeze: Annotated[bool, typer.Option("--freeze", help="Write the record, which must not exist yet, instead of checking.")] = False,
+    scenes: Annotated[
+        Path, typer.Argument(help="Folder that 'simrun train scenes' wrote, with both test splits.")
+    ],
+    record: Annotated[
+        Path, typer.Option("--record", help="File with the hashes; by default the shipped one.")
+    ] = RECORD,
+    splits: Annotated[
+        str, typer.Option("--split", help="Splits to freeze, comma-separated.")
+    ] = ",".join(TEST_SPLITS),
+    freeze: Annotated[
+        bool,
+        typer.Option(
+            "--freeze", help="Write the record, which must not exist yet, instead of checking."
+        ),
+    ] = False,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:

@@ -17,16 +17,38 @@ VIDEO_EPILOG = "Example: `simrun train video drive1.mp4 drive2.mp4 --out data/vi
 
 
 def video(
-    videos: Annotated[list[Path], typer.Argument(help="Driving videos whose licence lets you train on them.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder to write to: train/ and held-out/; the same command resumes.")],
-    size: Annotated[list[str] | None, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Repeatable; by default 256x144.")] = None,
-    variants: Annotated[int, typer.Option("--variants", min=1, help="Differently damaged sequences of each part and size.")] = 2,
-    train_share: Annotated[float, typer.Option("--train-share", min=0.05, max=0.95, help="First share of every video, to train on.")] = 0.7,
+    videos: Annotated[
+        list[Path], typer.Argument(help="Driving videos whose licence lets you train on them.")
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", help="Folder to write to: train/ and held-out/; the same command resumes."
+        ),
+    ],
+    size: Annotated[
+        list[str] | None,
+        typer.Option("--size", metavar="WIDTHxHEIGHT", help="Repeatable; by default 256x144."),
+    ] = None,
+    variants: Annotated[
+        int,
+        typer.Option(
+            "--variants", min=1, help="Differently damaged sequences of each part and size."
+        ),
+    ] = 2,
+    train_share: Annotated[
+        float,
+        typer.Option(
+            "--train-share", min=0.05, max=0.95, help="First share of every video, to train on."
+        ),
+    ] = 0.7,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the damage.")] = 0,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Cut videos into a part to train on and a held-out one, and damage both as an under-trained reconstruction would."""
+    """Cut videos into a part to train on and a held-out one, and damage both as an under-trained
+    reconstruction would.
+    """
     del debug
     console, rows = Console(stderr=True), []
     for path in videos:
@@ -34,6 +56,19 @@ def video(
             recipe = VideoRecipe(parse_size(text), variants, train_share, seed=seed)
             for folder, made in make_video_pairs(path, out, recipe):
                 rows.append({"folder": str(folder), "made": made})
-                console.print(f"{folder}{'' if made else ' (exists)'}", highlight=False, markup=False, soft_wrap=True)
+                console.print(
+                    f"{folder}{'' if made else ' (exists)'}",
+                    highlight=False,
+                    markup=False,
+                    soft_wrap=True,
+                )
     if as_json:
-        print(json.dumps({"sequences": len(rows), "made": sum(bool(row["made"]) for row in rows), "rows": rows}))
+        print(
+            json.dumps(
+                {
+                    "sequences": len(rows),
+                    "made": sum(bool(row["made"]) for row in rows),
+                    "rows": rows,
+                }
+            )
+        )

@@ -21,27 +21,61 @@ from alpasim_plugin.lab.training.trainer import LOG_FILE
 from alpasim_plugin.lab.video_metrics.image_distance import distance_for_training
 
 Pairs = Annotated[Path, typer.Argument(help="Folder of pairs; the split 'train' is used.")]
-Size = Annotated[str | None, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Train on sequences of this image size alone.")]
-RunFolder = Annotated[Path, typer.Option("--out", help="Folder of the run; the same command resumes it.")]
+Size = Annotated[
+    str | None,
+    typer.Option(
+        "--size", metavar="WIDTHxHEIGHT", help="Train on sequences of this image size alone."
+    ),
+]
+RunFolder = Annotated[
+    Path, typer.Option("--out", help="Folder of the run; the same command resumes it.")
+]
 Steps = Annotated[int, typer.Option("--steps", min=1, help="Total updates.")]
 Clips = Annotated[int, typer.Option("--clips", min=1, help="Clips per batch.")]
-Latents = Annotated[int, typer.Option("--latents", min=2, help="Latents of a clip: 12 are 45 frames, 24 are 93.")]
-Stride = Annotated[int, typer.Option("--stride", min=1, help="Frames between the starts of a sequence's clips.")]
+Latents = Annotated[
+    int, typer.Option("--latents", min=2, help="Latents of a clip: 12 are 45 frames, 24 are 93.")
+]
+Stride = Annotated[
+    int, typer.Option("--stride", min=1, help="Frames between the starts of a sequence's clips.")
+]
 PeakLr = Annotated[float, typer.Option("--lr", min=1e-7, help="Peak learning rate.")]
 Threads = Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads.")]
-Snapshots = Annotated[int, typer.Option("--snapshots", min=0, help="Bundles of every stage to keep, at equal intervals of its updates.")]
+Snapshots = Annotated[
+    int,
+    typer.Option(
+        "--snapshots",
+        min=0,
+        help="Bundles of every stage to keep, at equal intervals of its updates.",
+    ),
+]
 Unit = Annotated[int, typer.Option("--steps", min=1, help="U: updates of a stage of share 1.")]
 Accumulate = Annotated[int, typer.Option("--accumulate", min=1, help="Batches per update.")]
-Columns = Annotated[int | None, typer.Option("--columns", min=2, help="Crop to this width, in latents of 8 pixels.")]
-Ema = Annotated[float, typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged (EMA) weights.")]
-Perceptual = Annotated[float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual loss; 10 in the paper.")]
-Channels = Annotated[
-    Literal["amplitude", "equal"], typer.Option("--channels", help="Weights of latent channels: by amplitude in pixels, or equal.")
+Columns = Annotated[
+    int | None, typer.Option("--columns", min=2, help="Crop to this width, in latents of 8 pixels.")
 ]
-Precision = Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Precision of the forward passes.")]
+Ema = Annotated[
+    float, typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged (EMA) weights.")
+]
+Perceptual = Annotated[
+    float,
+    typer.Option("--perceptual", min=0.0, help="Weight of the perceptual loss; 10 in the paper."),
+]
+Channels = Annotated[
+    Literal["amplitude", "equal"],
+    typer.Option(
+        "--channels", help="Weights of latent channels: by amplitude in pixels, or equal."
+    ),
+]
+Precision = Annotated[
+    Literal["fp32", "bf16"], typer.Option("--precision", help="Precision of the forward passes.")
+]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, sampling and noise.")]
 MetricWeights = Annotated[
-    Path | None, typer.Option("--metric-weights", help="Folder with LPIPS weights for the perceptual term; otherwise perceptual-syn.")
+    Path | None,
+    typer.Option(
+        "--metric-weights",
+        help="Folder with LPIPS weights for the perceptual term; otherwise perceptual-syn.",
+    ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.")]
@@ -54,8 +88,12 @@ def use_threads(threads: int | None) -> None:
 
 
 def scene_files(scenes: Path, split: str) -> list[Path]:
-    """Return the scenarios of a split in order of number, so that the first few cover all families."""
-    return sorted((scenes / split).glob("*.yaml"), key=lambda path: (path.stem.rsplit("_", 1)[-1], path.stem))
+    """Return the scenarios of a split in order of number, so that the first few cover all
+    families.
+    """
+    return sorted(
+        (scenes / split).glob("*.yaml"), key=lambda path: (path.stem.rsplit("_", 1)[-1], path.stem)
+    )
 
 
 def whole_numbers(option: str, text: str, least: int) -> list[int]:
@@ -67,7 +105,12 @@ def whole_numbers(option: str, text: str, least: int) -> list[int]:
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() and int(part) >= least for part in parts):
         found = f"not a list of integers of at least {least}"
-        raise InputError(f"reading {option}", f"{option} {text}", found, f"write for example {option} {least + 1},{least + 3}")
+        raise InputError(
+            f"reading {option}",
+            f"{option} {text}",
+            found,
+            f"write for example {option} {least + 1},{least + 3}",
+        )
     return [int(part) for part in parts]
 
 
@@ -97,7 +140,10 @@ class Progress:
         """Say which stages are trained in float32 though the run's precision is another."""
         for stage in stages if precision is not None else ():
             if stage.always_float32:
-                self.console.print(f"stage {stage.name} is trained in float32, whatever --precision says", highlight=False)
+                self.console.print(
+                    f"stage {stage.name} is trained in float32, whatever --precision says",
+                    highlight=False,
+                )
 
     def prepared(self, what: str, done: int, count: int, every: int = 10) -> None:
         """Report preparation before the first update."""
@@ -109,14 +155,18 @@ class Progress:
         if step % self.every == 0 or step == self.steps:
             values = ", ".join(f"{key} {value:.4g}" for key, value in numbers.items())
             left = (self.steps - step) * numbers["s"]
-            self.console.print(f"{step}/{self.steps} {values}; about {left / 60:.0f} min left", highlight=False)
+            self.console.print(
+                f"{step}/{self.steps} {values}; about {left / 60:.0f} min left", highlight=False
+            )
 
     def wrote(self, path: Path, as_json: bool, card: Path | None = None) -> None:
-        """Print the path of the weights; with ``as_json`` also one JSON document on standard output.
+        """Print the path of the weights; with ``as_json`` also one JSON document on standard
+        output.
 
         Args:
             path: The file of weights, in the folder of its run.
-            as_json: Print ``weights``, ``sha256``, ``bytes``, ``card``, ``steps``, ``hours`` and ``last``, the log's last means.
+            as_json: Print ``weights``, ``sha256``, ``bytes``, ``card``, ``steps``, ``hours`` and
+                ``last``, the log's last means.
             card: Path of the model card; by default the one that `ModelCard` writes, if it exists.
         """
         self.console.print(f"wrote {path}", highlight=False, markup=False, soft_wrap=True)
@@ -125,7 +175,12 @@ class Progress:
         rows, hours = curves(path.parent / LOG_FILE)
         card = card or path.with_suffix(".card.json")
         facts = {
-            "weights": str(path), "sha256": file_sha256(path), "bytes": path.stat().st_size, "card": str(card) if card.exists() else None,
-            "steps": rows[-1]["step"], "hours": hours, "last": rows[-1],
-        }  # fmt: skip
+            "weights": str(path),
+            "sha256": file_sha256(path),
+            "bytes": path.stat().st_size,
+            "card": str(card) if card.exists() else None,
+            "steps": rows[-1]["step"],
+            "hours": hours,
+            "last": rows[-1],
+        }
         print(json.dumps(facts))

@@ -1,4 +1,6 @@
-"""The factories of the image fixers: what is known of one without loading its networks, and how a session is made."""
+"""The factories of the image fixers: what is known of one without loading its networks, and how a
+session is made.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +14,24 @@ if TYPE_CHECKING:
     from alpasim_plugin.lab.image_fixers.window_fixer import WindowFixer
 
 
-def _image_session(settings: RenderStepSettings, scene_id: str, seed: int, device: str, threads: int | None) -> ImageFixer:
+def _image_session(
+    settings: RenderStepSettings, scene_id: str, seed: int, device: str, threads: int | None
+) -> ImageFixer:
     from alpasim_plugin.lab.image_fixers.image_fixer import ImageFixer  # loads torch
 
     return ImageFixer(settings, scene_id, seed, device, threads)
 
 
-def _window_session(settings: NoiseWindowSettings, scene_id: str, seed: int, device: str, threads: int | None) -> ImageFixer | WindowFixer:
+def _window_session(
+    settings: NoiseWindowSettings, scene_id: str, seed: int, device: str, threads: int | None
+) -> ImageFixer | WindowFixer:
     """Make a session of single frames, or, where a window has more, of a whole clip."""
     from alpasim_plugin.lab.image_fixers.image_fixer import ImageFixer  # loads torch
     from alpasim_plugin.lab.image_fixers.window_fixer import WindowFixer
 
-    return (WindowFixer if settings.is_offline else ImageFixer)(settings, scene_id, seed, device, threads)
+    return (WindowFixer if settings.is_offline else ImageFixer)(
+        settings, scene_id, seed, device, threads
+    )
 
 
 image = FixerFactory(

@@ -1,7 +1,8 @@
 """Image models as a streaming session: one frame in, one frame out, every frame guarded.
 
-DiFix3D+, DiffusionHarmonizer and GSFix3D repair a frame by itself; the temporal DiffusionHarmonizer also looks at its last four outputs, as
-they were shown. Cameras of one size in a step are one batch.
+DiFix3D+, DiffusionHarmonizer and GSFix3D repair a frame by itself; the temporal DiffusionHarmonizer
+also looks at its last four outputs, as they were shown. Cameras of one size in a step are one
+batch.
 """
 
 from __future__ import annotations
@@ -25,7 +26,11 @@ from alpasim_plugin.fixers.network.machine_probe import take_threads
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import Views, check_continues, group_views
 from alpasim_plugin.lab.image_fixers.pipeline import fix_images, sample_window
-from alpasim_plugin.lab.image_fixers.settings import MaplessSettings, NoiseWindowSettings, RenderStepSettings
+from alpasim_plugin.lab.image_fixers.settings import (
+    MaplessSettings,
+    NoiseWindowSettings,
+    RenderStepSettings,
+)
 
 
 @dataclass(frozen=True)
@@ -36,23 +41,29 @@ class ImageHistory:
     t_us: int  # of the last
     raw: U8  # (H, W, 3) the last render
     fixed: U8  # (H, W, 3) the last output as generated, also if the guard returned the raw frame
-    references: tuple[U8, ...]  # (H, W, 3) last outputs as returned, newest first; as many as the network looks at
+    references: tuple[
+        U8, ...
+    ]  # (H, W, 3) last outputs as returned, newest first; as many as the network looks at
 
 
 class MaplessFixer(Fixer):
-    """What the sessions without a map have in common: networks, label, times and the key of the noise.
+    """What the sessions without a map have in common: networks, label, times and the key of the
+    noise.
 
     Args:
         settings: Of the session's kind.
         scene_id, seed: Key of the noise.
         device: ``cpu`` or ``cuda``.
-        threads: Torch threads that this process may use; as many are used as pay. None leaves their number.
+        threads: Torch threads that this process may use; as many are used as pay. None leaves their
+            number.
 
     Raises:
         InputError: Weights that are missing or do not fit.
     """
 
-    def __init__(self, settings: MaplessSettings, scene_id: str, seed: int, device: str, threads: int | None) -> None:
+    def __init__(
+        self, settings: MaplessSettings, scene_id: str, seed: int, device: str, threads: int | None
+    ) -> None:
         self.chosen = take_threads(threads)
         self.scene_id = scene_id
         self.networks = load_networks(settings, device)
@@ -69,7 +80,8 @@ class MaplessFixer(Fixer):
 
 
 class ImageFixer(MaplessFixer):
-    """Repair the frames of one rollout one by one. A step may hold other cameras than the step before.
+    """Repair the frames of one rollout one by one. A step may hold other cameras than the step
+    before.
 
     Args:
         settings: Of `RenderStepSettings`, or of `NoiseWindowSettings` with windows of one frame.
@@ -82,10 +94,27 @@ class ImageFixer(MaplessFixer):
 
     blocks = BlockRule(1, 1)
 
-    def __init__(self, settings: FixerSettings, scene_id: str, seed: int = 0, device: str = "cpu", threads: int | None = None) -> None:
-        if not isinstance(settings, RenderStepSettings | NoiseWindowSettings) or settings.is_offline:
-            found = f"settings of type {type(settings).__name__}" + (" for whole clips" if settings.is_offline else "")
-            raise InputError("making a fixer of single frames", settings.name, found, "take them from fixer_settings(name)")
+    def __init__(
+        self,
+        settings: FixerSettings,
+        scene_id: str,
+        seed: int = 0,
+        device: str = "cpu",
+        threads: int | None = None,
+    ) -> None:
+        if (
+            not isinstance(settings, RenderStepSettings | NoiseWindowSettings)
+            or settings.is_offline
+        ):
+            found = f"settings of type {type(settings).__name__}" + (
+                " for whole clips" if settings.is_offline else ""
+            )
+            raise InputError(
+                "making a fixer of single frames",
+                settings.name,
+                found,
+                "take them from fixer_settings(name)",
+            )
         self.settings = settings
         super().__init__(settings, scene_id, seed, device, threads)
 
@@ -105,7 +134,8 @@ class ImageFixer(MaplessFixer):
             As many frames, same order, times and cameras. Opacity and depth remain the render's.
 
         Raises:
-            InputError: Frames that do not continue the rollout, or are none (see `views.group_views`).
+            InputError: Frames that do not continue the rollout, or are none (see
+                `views.group_views`).
             RendererError: An opacity that is not a number or outside [0, 1].
         """
         views = group_views(block, (), 1)
@@ -120,8 +150,14 @@ class ImageFixer(MaplessFixer):
                 (i,), raw = view.index[b], view.rgb[b, 0]
                 before = None if past is None else (past.fixed, past.raw)
                 event = guard.check_frames(video[b], images[b : b + 1], raw[None], before)[0]
-                out[i] = replace(block[i], events=(*block[i].events, event)) if event else replace(block[i], rgb=images[b])
-                after[view.cameras[b]] = self._continued(past, view.t_us[b][0], raw, images[b], out[i].rgb)
+                out[i] = (
+                    replace(block[i], events=(*block[i].events, event))
+                    if event
+                    else replace(block[i], rgb=images[b])
+                )
+                after[view.cameras[b]] = self._continued(
+                    past, view.t_us[b][0], raw, images[b], out[i].rgb
+                )
         self._history = after
         return tuple(out)
 
@@ -129,21 +165,39 @@ class ImageFixer(MaplessFixer):
         """Return the fixed frames ``(B, 3, 1, H, W)``, padded and not clipped."""
         clip = to_clip(view, 1, self.networks.device)
         if isinstance(self.settings, NoiseWindowSettings):
-            return sample_window(self.networks, self.settings, clip.rgb, clip.alpha, self._noise(view, clip, pasts), self.clock)
+            return sample_window(
+                self.networks,
+                self.settings,
+                clip.rgb,
+                clip.alpha,
+                self._noise(view, clip, pasts),
+                self.clock,
+            )
         out = torch.empty_like(clip.rgb)
         wanted = self.settings.references
-        # A camera's first frames have too few outputs before them: they are fixed by themselves, in a batch of their own.
-        joined = [b for b, past in enumerate(pasts) if past is not None and len(past.references) == wanted > 0]
+        # A camera's first frames have too few outputs before them: they are fixed by themselves, in
+        # a batch of their own.
+        joined = [
+            b
+            for b, past in enumerate(pasts)
+            if past is not None and len(past.references) == wanted > 0
+        ]
         for rows in (joined, [b for b in range(len(pasts)) if b not in joined]):
             if rows:
-                references = self._references(view, [pasts[b] for b in rows]) if rows is joined else None
+                references = (
+                    self._references(view, [pasts[b] for b in rows]) if rows is joined else None
+                )
                 alpha = None if clip.alpha is None else clip.alpha[rows]
-                out[rows] = fix_images(self.networks, self.settings, clip.rgb[rows], alpha, references, self.clock)
+                out[rows] = fix_images(
+                    self.networks, self.settings, clip.rgb[rows], alpha, references, self.clock
+                )
         return out
 
     def _references(self, view: Views, pasts: Sequence[ImageHistory | None]) -> Tensor:
         rgb = np.stack([np.stack(past.references) for past in pasts if past is not None])
-        return to_clip(replace(view, rgb=rgb, alpha=None, maps=None), rgb.shape[1], self.networks.device).rgb
+        return to_clip(
+            replace(view, rgb=rgb, alpha=None, maps=None), rgb.shape[1], self.networks.device
+        ).rgb
 
     def _noise(self, view: Views, clip: Clip, pasts: Sequence[ImageHistory | None]) -> Tensor:
         assert isinstance(self.settings, NoiseWindowSettings)
@@ -151,10 +205,14 @@ class ImageFixer(MaplessFixer):
         drawn = []
         for camera, past in zip(view.cameras, pasts, strict=True):
             index = 0 if past is None or self.settings.noise == "fixed" else past.frames
-            drawn += latent_noise(self.scene_id, self.seed, [camera], 1, range(index, index + 1), shape)
+            drawn += latent_noise(
+                self.scene_id, self.seed, [camera], 1, range(index, index + 1), shape
+            )
         return torch.cat(drawn).to(self.networks.device)
 
-    def _continued(self, past: ImageHistory | None, t_us: int, raw: U8, fixed: U8, shown: U8) -> ImageHistory:
+    def _continued(
+        self, past: ImageHistory | None, t_us: int, raw: U8, fixed: U8, shown: U8
+    ) -> ImageHistory:
         count = self.settings.references if isinstance(self.settings, RenderStepSettings) else 0
         frames, references = (0, ()) if past is None else (past.frames, past.references)
         return ImageHistory(frames + 1, t_us, raw, fixed, (shown, *references)[:count])

@@ -1,19 +1,25 @@
-"""Euler's method from noise, with the render as a condition: the sampler of GSFix3D and 3DGS-Enhancer at our scale.
+"""Euler's method from noise, with the render as a condition: the sampler of GSFix3D and
+3DGS-Enhancer at our scale.
 
-Attention goes over all latents of the clip; the render's latents take the map's place at the input. The path is the straight one of flow
-matching, so the velocity is ``v = eps - z_0`` and a step from t to s is ``z_s = z_t - (t - s) v(z_t, t)``.
+Attention goes over all latents of the clip; the render's latents take the map's place at the input.
+The path is the straight one of flow matching, so the velocity is ``v = eps - z_0`` and a step from
+t to s is ``z_s = z_t - (t - s) v(z_t, t)``.
 
-One deterministic step from a render at a fixed time: the samplers of DiFix3D+ and DiffusionHarmonizer.
+One deterministic step from a render at a fixed time: the samplers of DiFix3D+ and
+DiffusionHarmonizer.
 
-Both take the render for a clean image with noise of a fixed level, ``z_r = alpha z_0 + sigma eps``, though none is added, and denoise it
-once. Divided by ``alpha + sigma`` that is a point of the straight path of flow matching, ``x = (1 - t) z_0 + t eps``, with
+Both take the render for a clean image with noise of a fixed level, ``z_r = alpha z_0 + sigma eps``,
+though none is added, and denoise it once. Divided by ``alpha + sigma`` that is a point of the
+straight path of flow matching, ``x = (1 - t) z_0 + t eps``, with
 
     t = sigma / (alpha + sigma),   x = z_r / (alpha + sigma),   z_0 = x - t v(x, t).
 
-DiFix3D+: step 199 of Stable Diffusion's 1000 (scaled linear betas), ``z_0 = (z_r - sigma eps_hat) / alpha``. DiffusionHarmonizer:
-``alpha = 1``, ``sigma = 0.25``, so that ``z_0 = 0.8 z_r - 0.2 v(0.8 z_r, 0.2)``.
+DiFix3D+: step 199 of Stable Diffusion's 1000 (scaled linear betas), ``z_0 = (z_r - sigma eps_hat) /
+alpha``. DiffusionHarmonizer: ``alpha = 1``, ``sigma = 0.25``, so that ``z_0 = 0.8 z_r - 0.2 v(0.8
+z_r, 0.2)``.
 
-Images and windows through the networks of a fixer without map and cache: encode, denoise, decode. Tensors in, tensors out.
+Images and windows through the networks of a fixer without map and cache: encode, denoise, decode.
+Tensors in, tensors out.
 
 Nothing is remembered between calls.
 """
@@ -32,20 +38,31 @@ from alpasim_plugin.block_fixers.networks import Networks, decode
 from alpasim_plugin.block_fixers.pipeline import Stage, no_clock
 from alpasim_plugin.block_fixers.sampling import flow_step
 from alpasim_plugin.fixers.network.schedule import TABLE
-from alpasim_plugin.lab.image_fixers.settings import NoiseWindowSettings, RenderLevel, RenderStepSettings
+from alpasim_plugin.lab.image_fixers.settings import (
+    NoiseWindowSettings,
+    RenderLevel,
+    RenderStepSettings,
+)
 
 LATENT_KEY, CONDITION_KEY = "x_embedder.proj.1.weight", "additional_patch_embedding.proj.1.weight"
 AREA = PATCH * PATCH
 
 
-def euler(net: CosmosCausalDiT, eps: Tensor, z_r: Tensor, times: Sequence[float], text: Tensor | TextContext) -> Tensor:
+def euler(
+    net: CosmosCausalDiT,
+    eps: Tensor,
+    z_r: Tensor,
+    times: Sequence[float],
+    text: Tensor | TextContext,
+) -> Tensor:
     """Sample clean latents from noise.
 
     Args:
         net: The network.
         eps: ``(B, C, T, H, W)`` standard normal, the start at t = 1.
         z_r: Like ``eps``, latents of the render.
-        times: Where the network is asked, falling from 1000 (`schedule.names`, without a shift); the last step ends at 0.
+        times: Where the network is asked, falling from 1000 (`schedule.names`, without a shift);
+            the last step ends at 0.
         text: Prompt.
 
     Returns:
@@ -60,19 +77,26 @@ def euler(net: CosmosCausalDiT, eps: Tensor, z_r: Tensor, times: Sequence[float]
 def share_embedding(weights: Mapping[str, Tensor], channels: int = 16) -> dict[str, Tensor]:
     """Return weights whose condition input starts as half of the latent input, which is halved.
 
-    As Marigold and GSFix3D copy the first convolution for the second image: with both inputs equal the tokens are those of before.
+    As Marigold and GSFix3D copy the first convolution for the second image: with both inputs equal
+    the tokens are those of before.
 
     Args:
         weights: State dict of `CosmosCausalDiT`; its condition input is replaced.
         channels: Of a latent.
     """
-    latent, columns = weights[LATENT_KEY].clone(), channels * AREA  # the masks' columns, behind the latents', stay as they are
+    latent, columns = (
+        weights[LATENT_KEY].clone(),
+        channels * AREA,
+    )  # the masks' columns, behind the latents', stay as they are
     latent[:, :columns] /= 2
     return {**weights, LATENT_KEY: latent, CONDITION_KEY: latent[:, :columns].clone()}
 
 
-def fixed_step(net: CosmosCausalDiT, z_r: Tensor, level: RenderLevel, text: Tensor | TextContext) -> Tensor:
-    """Predict clean latents from those of a render; attention goes over all latents, and there is no map.
+def fixed_step(
+    net: CosmosCausalDiT, z_r: Tensor, level: RenderLevel, text: Tensor | TextContext
+) -> Tensor:
+    """Predict clean latents from those of a render; attention goes over all latents, and there is
+    no map.
 
     Args:
         net: The network, or a copy folded at ``level.network_t``.
@@ -99,8 +123,9 @@ def fix_images(
 ) -> Tensor:
     """Fix one frame of B cameras in one step from the render.
 
-    With references the frames form a clip whose time runs backwards: the present render, then the last outputs, newest first. Its first
-    latent holds the render alone, for the encoder is causal; the transformer's attention joins the two. Only the first latent is decoded.
+    With references the frames form a clip whose time runs backwards: the present render, then the
+    last outputs, newest first. Its first latent holds the render alone, for the encoder is causal;
+    the transformer's attention joins the two. Only the first latent is decoded.
 
     Args:
         networks: Theirs.
@@ -114,18 +139,28 @@ def fix_images(
         Like ``rgb``, not clipped to [-1, 1].
     """
     with stage("encode"):
-        z_r = networks.vae.encode(rgb if references is None else torch.cat([rgb, references], dim=2)).float()
+        z_r = networks.vae.encode(
+            rgb if references is None else torch.cat([rgb, references], dim=2)
+        ).float()
     with stage("dit"):
         z_0 = fixed_step(networks.dit, z_r, settings.level, networks.text)
     with stage("decode"):
-        return decode(networks, settings, z_0[:, :, :1], rgb, alpha if settings.opacity_to_decoder else None)[0]
+        return decode(
+            networks, settings, z_0[:, :, :1], rgb, alpha if settings.opacity_to_decoder else None
+        )[0]
 
 
 @torch.inference_mode()
 def sample_window(
-    networks: Networks, settings: NoiseWindowSettings, rgb: Tensor, alpha: Tensor | None, eps: Tensor, stage: Stage = no_clock
+    networks: Networks,
+    settings: NoiseWindowSettings,
+    rgb: Tensor,
+    alpha: Tensor | None,
+    eps: Tensor,
+    stage: Stage = no_clock,
 ) -> Tensor:
-    """Sample the frames of a window from noise, with the render as a condition; the window is encoded from its own first frame.
+    """Sample the frames of a window from noise, with the render as a condition; the window is
+    encoded from its own first frame.
 
     Args:
         networks: Theirs.
@@ -143,4 +178,6 @@ def sample_window(
     with stage("dit"):
         z_0 = euler(networks.dit, eps, z_r, settings.steps, networks.text)
     with stage("decode"):
-        return decode(networks, settings, z_0, rgb, alpha if settings.opacity_to_decoder else None)[0]
+        return decode(networks, settings, z_0, rgb, alpha if settings.opacity_to_decoder else None)[
+            0
+        ]

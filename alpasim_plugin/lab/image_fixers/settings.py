@@ -1,4 +1,6 @@
-"""The image systems before they are loaded: settings, kinds of bundle, factories. They have no map and no history in the transformer."""
+"""The image systems before they are loaded: settings, kinds of bundle, factories. They have no map
+and no history in the transformer.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,15 @@ from pydantic import Field, field_validator, model_validator
 from alpasim_plugin.block_fixers.settings import LatentFixerSettings, latent_kind
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.schedule import TABLE
-from alpasim_plugin.fixers.settings import BundleKind, Part, Positive, Unit, check_no_blocks, check_steps, counted_steps
+from alpasim_plugin.fixers.settings import (
+    BundleKind,
+    Part,
+    Positive,
+    Unit,
+    check_no_blocks,
+    check_steps,
+    counted_steps,
+)
 
 if TYPE_CHECKING:
     pass
@@ -37,7 +47,12 @@ class RenderLevel:
     def __post_init__(self) -> None:
         if not (self.alpha > 0 and self.sigma > 0):
             found = f"alpha {self.alpha:g}, sigma {self.sigma:g}"
-            raise InputError("choosing the noise level of a render", "alpha and sigma", found, "give values above 0")
+            raise InputError(
+                "choosing the noise level of a render",
+                "alpha and sigma",
+                found,
+                "give values above 0",
+            )
 
     @property
     def t(self) -> float:
@@ -66,7 +81,8 @@ class MaplessSettings(LatentFixerSettings):
     """Attention over all latents of one call, no map, no cache."""
 
     opacity_to_decoder: bool = Field(
-        default=False, description="Whether a decoder conditioned on the render is also conditioned on its opacity; else opacity 1."
+        default=False,
+        description="Whether a decoder conditioned on the render is also conditioned on its opacity; else opacity 1.",
     )
 
     @property
@@ -86,11 +102,16 @@ class RenderStepSettings(MaplessSettings):
     """One deterministic step from the render, at a fixed time: DiFix3D+, DiffusionHarmonizer."""
 
     bundle_kind: ClassVar[BundleKind] = latent_kind(
-        "render-step", must_match=("opacity_to_decoder", "render_level.alpha", "render_level.sigma"), may_differ=("references",)
+        "render-step",
+        must_match=("opacity_to_decoder", "render_level.alpha", "render_level.sigma"),
+        may_differ=("references",),
     )
-    render_level: RenderLevelSettings = Field(description="The noise level that the render is taken to have.")
+    render_level: RenderLevelSettings = Field(
+        description="The noise level that the render is taken to have."
+    )
     references: Literal[0, 4] = Field(
-        default=0, description="Last outputs that the network looks at; a camera's first frames, which have fewer, are fixed without."
+        default=0,
+        description="Last outputs that the network looks at; a camera's first frames, which have fewer, are fixed without.",
     )
     steps: Literal[1] = Field(default=1, description="The method takes one step.")
 
@@ -111,20 +132,35 @@ class RenderStepSettings(MaplessSettings):
 
 
 class NoiseWindowSettings(MaplessSettings):
-    """Windows of frames sampled from noise by Euler steps, with the render as a condition: GSFix3D, 3DGS-Enhancer."""
+    """Windows of frames sampled from noise by Euler steps, with the render as a condition: GSFix3D,
+    3DGS-Enhancer.
+    """
 
     bundle_kind: ClassVar[BundleKind] = latent_kind(
-        "noise-window", must_match=("opacity_to_decoder", "window_frames"), may_differ=("steps", "stride_frames", "stitch", "noise")
+        "noise-window",
+        must_match=("opacity_to_decoder", "window_frames"),
+        may_differ=("steps", "stride_frames", "stitch", "noise"),
     )
-    opacity_to_decoder: bool = Field(default=True, description=MaplessSettings.model_fields["opacity_to_decoder"].description)
-    steps: tuple[float, ...] = Field(min_length=1, description="Times of the network's calls, falling from 1000, without a shift.")
-    window_frames: Positive = Field(default=1, description="Frames of a window, 1 + 4 n. More than one: whole clips only.")
-    stride_frames: Positive = Field(default=1, description="Frames from the start of a window to that of the next.")
+    opacity_to_decoder: bool = Field(
+        default=True, description=MaplessSettings.model_fields["opacity_to_decoder"].description
+    )
+    steps: tuple[float, ...] = Field(
+        min_length=1,
+        description="Times of the network's calls, falling from 1000, without a shift.",
+    )
+    window_frames: Positive = Field(
+        default=1, description="Frames of a window, 1 + 4 n. More than one: whole clips only."
+    )
+    stride_frames: Positive = Field(
+        default=1, description="Frames from the start of a window to that of the next."
+    )
     stitch: Literal["fade", "cut"] = Field(
-        default="fade", description="Where windows overlap: the later one fades in linearly, or takes over at once."
+        default="fade",
+        description="Where windows overlap: the later one fades in linearly, or takes over at once.",
     )
     noise: Literal["fresh", "fixed"] = Field(
-        default="fresh", description="Noise of a window: its own, or the first window's in all of them, which flickers less."
+        default="fresh",
+        description="Noise of a window: its own, or the first window's in all of them, which flickers less.",
     )
 
     @property
@@ -168,5 +204,7 @@ class NoiseWindowSettings(MaplessSettings):
         if (self.window_frames - 1) % LATENT_FRAMES:
             raise ValueError(f"window_frames {self.window_frames} | give 1 + 4 n, whole latents")
         if self.stride_frames > self.window_frames:
-            raise ValueError(f"stride_frames {self.stride_frames} with windows of {self.window_frames} | frames between would be missing")
+            raise ValueError(
+                f"stride_frames {self.stride_frames} with windows of {self.window_frames} | frames between would be missing"
+            )
         return self

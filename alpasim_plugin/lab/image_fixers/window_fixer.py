@@ -2,9 +2,9 @@
 
 Windows over a whole clip: the session of a fixer that needs later frames (3DGS-Enhancer).
 
-A clip is one block. Every window is fixed by itself, from noise of its own; where windows overlap, the later one fades in over the one
-before, linearly and in pixels. A frame needs those after it in its window, which a closed loop has not driven yet: such a fixer is refused
-there.
+A clip is one block. Every window is fixed by itself, from noise of its own; where windows overlap,
+the later one fades in over the one before, linearly and in pixels. A frame needs those after it in
+its window, which a closed loop has not driven yet: such a fixer is refused there.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ WHOLE_CLIP = sys.maxsize  # frames of a block: as many as there are
 
 
 def windows(frames: int, length: int, stride: int) -> list[range]:
-    """Return windows of ``length`` frames that begin ``stride`` apart; the last one ends where the clip ends.
+    """Return windows of ``length`` frames that begin ``stride`` apart; the last one ends where the
+    clip ends.
 
     A clip that is shorter than a window has one, of the clip's length.
 
@@ -50,9 +51,11 @@ def windows(frames: int, length: int, stride: int) -> list[range]:
 
 
 def fade_in(window: range, previous: range | None, overlap: int) -> F32:
-    """Return the weight of a window's frames over what the windows before it made, ``(len(window),)``.
+    """Return the weight of a window's frames over what the windows before it made,
+    ``(len(window),)``.
 
-    It rises linearly over the first ``overlap`` frames and is 1 from there on, and everywhere in a clip's first window.
+    It rises linearly over the first ``overlap`` frames and is 1 from there on, and everywhere in a
+    clip's first window.
 
     Example:
         >>> fade_in(range(17, 42), range(25), 8)[:9].round(3).tolist()
@@ -66,7 +69,8 @@ def fade_in(window: range, previous: range | None, overlap: int) -> F32:
 
 
 def fade_weights(parts: Sequence[range], overlap: int) -> F32:
-    """Return the weight of every window at every frame of the clip, ``(windows, frames)``; the columns sum to 1.
+    """Return the weight of every window at every frame of the clip, ``(windows, frames)``; the
+    columns sum to 1.
 
     The same as fading in one window after another (`fade_in`), written as a matrix.
     """
@@ -83,7 +87,8 @@ class WindowFixer(MaplessFixer):
 
     Args:
         settings: Of `NoiseWindowSettings`.
-        scene_id, seed: Key of the noise, with the camera and the latent's index, counted through the windows.
+        scene_id, seed: Key of the noise, with the camera and the latent's index, counted through
+            the windows.
         device, threads: See `MaplessFixer`.
 
     Raises:
@@ -92,10 +97,22 @@ class WindowFixer(MaplessFixer):
 
     blocks = BlockRule(WHOLE_CLIP, WHOLE_CLIP)
 
-    def __init__(self, settings: FixerSettings, scene_id: str, seed: int = 0, device: str = "cpu", threads: int | None = None) -> None:
+    def __init__(
+        self,
+        settings: FixerSettings,
+        scene_id: str,
+        seed: int = 0,
+        device: str = "cpu",
+        threads: int | None = None,
+    ) -> None:
         if not isinstance(settings, NoiseWindowSettings):
             found = f"settings of type {type(settings).__name__}"
-            raise InputError("making a fixer of whole clips", settings.name, found, "take them from fixer_settings(name)")
+            raise InputError(
+                "making a fixer of whole clips",
+                settings.name,
+                found,
+                "take them from fixer_settings(name)",
+            )
         self.settings = settings
         super().__init__(settings, scene_id, seed, device, threads)
 
@@ -121,16 +138,25 @@ class WindowFixer(MaplessFixer):
         if self._is_done:
             found = "a second block: windows reach over a whole clip"
             raise InputError(
-                "fixing a whole clip", self.settings.name, found, "give all frames of a clip in one block, or reset for another"
+                "fixing a whole clip",
+                self.settings.name,
+                found,
+                "give all frames of a clip in one block, or reset for another",
             )
         out = list(block)
         for view in group_views(block, (), WHOLE_CLIP):
             video = self._run(view)
             images = to_images(video, view.size)
             for b, mine in enumerate(view.index):
-                for t, event in enumerate(guard.check_frames(video[b], images[b], view.rgb[b], None)):
+                for t, event in enumerate(
+                    guard.check_frames(video[b], images[b], view.rgb[b], None)
+                ):
                     i = mine[t]
-                    out[i] = replace(block[i], events=(*block[i].events, event)) if event else replace(block[i], rgb=images[b, t])
+                    out[i] = (
+                        replace(block[i], events=(*block[i].events, event))
+                        if event
+                        else replace(block[i], rgb=images[b, t])
+                    )
         self._is_done = True
         return tuple(out)
 
@@ -141,21 +167,31 @@ class WindowFixer(MaplessFixer):
         out = torch.empty(len(view.cameras), 3, view.size.frames, *view.shape)
         for index, window in enumerate(parts):
             made = self._sample(view, window, index)
-            begun = parts[index - 1].stop - window.start if index else 0  # frames that the windows before reach into this one
-            share = torch.from_numpy(fade_in(window, parts[index - 1] if index else None, settings.fade_frames))[:begun, None, None]
+            begun = (
+                parts[index - 1].stop - window.start if index else 0
+            )  # frames that the windows before reach into this one
+            share = torch.from_numpy(
+                fade_in(window, parts[index - 1] if index else None, settings.fade_frames)
+            )[:begun, None, None]
             here = out[:, :, window.start : window.stop]
             here[:, :, :begun].lerp_(made[:, :, :begun], share)
             here[:, :, begun:] = made[:, :, begun:]
         return out
 
     def _sample(self, view: Views, window: range, index: int) -> Tensor:
-        """Return window ``index`` of the clip ``(B, 3, len(window), H, W)``; a short clip's last frame is repeated up to a window."""
+        """Return window ``index`` of the clip ``(B, 3, len(window), H, W)``; a short clip's last
+        frame is repeated up to a window.
+        """
         frames, settings = slice(window.start, window.stop), self.settings
         alpha = None if view.alpha is None else view.alpha[:, frames]
         cut = replace(view, rgb=view.rgb[:, frames], alpha=alpha, maps=None)
         clip = to_clip(cut, settings.window_frames, self.networks.device)
         first = 0 if settings.noise == "fixed" else index * settings.latents
         shape = (LATENT, clip.rgb.shape[3] // SIDE, clip.rgb.shape[4] // SIDE)
-        (eps,) = latent_noise(self.scene_id, self.seed, view.cameras, 1, range(first, first + settings.latents), shape)
-        made = sample_window(self.networks, settings, clip.rgb, clip.alpha, eps.to(self.networks.device), self.clock)
+        (eps,) = latent_noise(
+            self.scene_id, self.seed, view.cameras, 1, range(first, first + settings.latents), shape
+        )
+        made = sample_window(
+            self.networks, settings, clip.rgb, clip.alpha, eps.to(self.networks.device), self.clock
+        )
         return crop_clip(made, cut.size).cpu()

@@ -1,4 +1,6 @@
-"""Light on surfels: ambient light, lamps or a sun with shadows of blocks, and the darkness of corners."""
+"""Light on surfels: ambient light, lamps or a sun with shadows of blocks, and the darkness of
+corners.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ CORNER_M, CORNER = 0.30, 0.30  # the same in the corners of a room
 
 @dataclass(frozen=True)
 class Lamp:
-    """A light that shines on things: the points ``(K, 3)`` of its area, its colour ``(3,)``, and the distance at which it gives half.
+    """A light that shines on things: the points ``(K, 3)`` of its area, its colour ``(3,)``, and
+    the distance at which it gives half.
 
     A sun is a lamp far away, ``reach_m`` infinite.
     """
@@ -45,10 +48,14 @@ class Light:
     walls: tuple[F64, F64] | None = None
 
     def colours(self, surfels: Surfels, blocks: Sequence[Block]) -> F64:
-        """Return the lit colours ``(N, 3)`` of surfels among blocks that throw shadows, those of their own thing left out."""
+        """Return the lit colours ``(N, 3)`` of surfels among blocks that throw shadows, those of
+        their own thing left out.
+        """
         p, n = surfels.means + LIFT_M * surfels.normals, surfels.normals
         stacked = _stacked(blocks)
-        total = np.asarray(self.ambient) * self._open(p, stacked)[:, None] * (0.85 + 0.15 * n[:, 2:])
+        total = (
+            np.asarray(self.ambient) * self._open(p, stacked)[:, None] * (0.85 + 0.15 * n[:, 2:])
+        )
         for lamp in self.lamps:
             for point in lamp.points:
                 to = point - p
@@ -64,7 +71,9 @@ class Light:
         """Return how much ambient light reaches points ``(N,)``."""
         out = 1 - CONTACT * np.exp(-nearest(p, *stacked, 10 * CONTACT_M) / CONTACT_M)
         if self.walls is not None:
-            gap = np.sort(np.maximum(np.minimum(p - self.walls[0], self.walls[1] - p), 0.0), axis=1)[:, 1]  # the second nearest wall
+            gap = np.sort(
+                np.maximum(np.minimum(p - self.walls[0], self.walls[1] - p), 0.0), axis=1
+            )[:, 1]  # the second nearest wall
             out = out * (1 - CORNER * np.exp(-gap / CORNER_M))
         return np.asarray(out)
 
@@ -72,4 +81,8 @@ class Light:
 def _stacked(blocks: Sequence[Block]) -> tuple[F64, F64, F64]:
     """Return rotations ``(B, 3, 3)``, middles ``(B, 3)`` and half sizes ``(B, 3)``."""
     rotations = np.array([b.T[:3, :3] for b in blocks]).reshape(-1, 3, 3)
-    return rotations, np.array([b.T[:3, 3] for b in blocks]).reshape(-1, 3), np.array([b.half for b in blocks]).reshape(-1, 3)
+    return (
+        rotations,
+        np.array([b.T[:3, 3] for b in blocks]).reshape(-1, 3),
+        np.array([b.half for b in blocks]).reshape(-1, 3),
+    )

@@ -12,8 +12,11 @@ from alpasim_plugin.core.types import F64, Bool
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def reached(points: F64, light: F64, wanted: Bool, rotations: F64, middles: F64, halves: F64) -> Bool:
-    """Return whether nothing stands between points ``(N, 3)`` and a light ``(3,)``; False where it is not ``wanted (N,)``.
+def reached(
+    points: F64, light: F64, wanted: Bool, rotations: F64, middles: F64, halves: F64
+) -> Bool:
+    """Return whether nothing stands between points ``(N, 3)`` and a light ``(3,)``; False where it
+    is not ``wanted (N,)``.
 
     Args:
         points, light: World, metres.
@@ -49,7 +52,9 @@ def reached(points: F64, light: F64, wanted: Bool, rotations: F64, middles: F64,
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def nearest(points: F64, rotations: F64, middles: F64, halves: F64, most_m: float) -> F64:
-    """Return the distance ``(N,)`` from points ``(N, 3)`` to the nearest block, 0 inside, at most ``most_m``."""
+    """Return the distance ``(N,)`` from points ``(N, 3)`` to the nearest block, 0 inside, at most
+    ``most_m``.
+    """
     out = np.full(len(points), most_m)
     for i in range(len(points)):
         for b in range(len(middles)):

@@ -19,7 +19,8 @@ THICKNESS_M = 0.0015  # standard deviation across a surface
 
 
 class Surfels(NamedTuple):
-    """Flat pieces of surface: centres, unit normals and tangents ``(N, 3)``, sizes ``(N, 2)`` metres, colours ``(N, 3)``, glow ``(N,)``.
+    """Flat pieces of surface: centres, unit normals and tangents ``(N, 3)``, sizes ``(N, 2)``
+    metres, colours ``(N, 3)``, glow ``(N,)``.
 
     ``glow`` is the share of the colour that no light changes: 1 for a window.
     """
@@ -34,11 +35,15 @@ class Surfels(NamedTuple):
     def moved(self, T: F64) -> Surfels:
         """Return them in another frame; ``T`` is rigid."""
         R = T[:3, :3].T
-        return self._replace(means=self.means @ R + T[:3, 3], normals=self.normals @ R, tangents=self.tangents @ R)
+        return self._replace(
+            means=self.means @ R + T[:3, 3], normals=self.normals @ R, tangents=self.tangents @ R
+        )
 
     def cloud(self, rgb: F64) -> GaussianCloud:
         """Return Gaussians with these colours ``(N, 3)``."""
-        frames = np.stack([self.tangents, np.cross(self.normals, self.tangents), self.normals], axis=-1)
+        frames = np.stack(
+            [self.tangents, np.cross(self.normals, self.tangents), self.normals], axis=-1
+        )
         scales = np.column_stack([SPREAD * self.sizes, np.full(len(self.means), THICKNESS_M)])
         return cloud_of(self.means, quat_from_matrix(frames), scales, rgb)
 
@@ -75,7 +80,9 @@ class Panel:
 
     def surfels(self, cell_m: float) -> Surfels:
         """Cover it with a grid."""
-        corner, u, v = (np.asarray(a, dtype=np.float64) for a in (self.corner, self.edge_u, self.edge_v))
+        corner, u, v = (
+            np.asarray(a, dtype=np.float64) for a in (self.corner, self.edge_u, self.edge_v)
+        )
         length_u, length_v = float(np.linalg.norm(u)), float(np.linalg.norm(v))
         n_u, n_v = max(round(length_u / cell_m), 1), max(round(length_v / cell_m), 1)
         _, a, b = grid_cells(np.array([n_u]), np.array([n_v]))
@@ -127,12 +134,21 @@ class Turned:
         means = np.asarray(self.foot) + np.column_stack([out * radius[ring, None], height[ring]])
         sizes = np.column_stack([(2 * np.pi * radius / around)[ring], np.full(len(ring), step)])
         rgb = self.paint(turn * 2 * np.pi * float(p[:, 0].max()), at[ring])
-        return Surfels(means, normals, tangents, np.maximum(sizes, 0.2 * step), rgb, np.full(len(ring), self.glow))
+        return Surfels(
+            means,
+            normals,
+            tangents,
+            np.maximum(sizes, 0.2 * step),
+            rgb,
+            np.full(len(ring), self.glow),
+        )
 
 
 @dataclass(frozen=True)
 class Leaves:
-    """Leaves that hang in the air: centres and normals ``(N, 3)``, colours ``(N, 3)``, one size in metres."""
+    """Leaves that hang in the air: centres and normals ``(N, 3)``, colours ``(N, 3)``, one size in
+    metres.
+    """
 
     means: F64
     normals: F64
@@ -142,17 +158,28 @@ class Leaves:
     def surfels(self, cell_m: float) -> Surfels:
         """Return one surfel a leaf; where cells are larger than leaves fewer and larger ones."""
         every = max(1, round((cell_m / self.size_m) ** 2))
-        means, normals, rgb = self.means[::every], self.normals[::every], self.rgb[::every]
+        means = self.means[::every]
+        normals = self.normals[::every]
+        rgb = self.rgb[::every]
         steep = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
         tangents = np.cross(steep, normals)
         tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
         size = self.size_m * float(np.sqrt(every))
-        return Surfels(means, normals, tangents, np.tile([size, 0.7 * size], (len(means), 1)), rgb, np.zeros(len(means)))
+        return Surfels(
+            means,
+            normals,
+            tangents,
+            np.tile([size, 0.7 * size], (len(means), 1)),
+            rgb,
+            np.zeros(len(means)),
+        )
 
 
 @dataclass(frozen=True)
 class Block:
-    """A box that throws shadows: its rigid frame ``T_world_block (4, 4)`` at the middle, and half sizes ``(3,)``, metres."""
+    """A box that throws shadows: its rigid frame ``T_world_block (4, 4)`` at the middle, and half
+    sizes ``(3,)``, metres.
+    """
 
     T: F64
     half: F64
@@ -160,7 +187,9 @@ class Block:
 
 @dataclass(frozen=True)
 class Thing:
-    """Something that stands somewhere: parts and the blocks that throw its shadow, both in its own frame, feet at the origin."""
+    """Something that stands somewhere: parts and the blocks that throw its shadow, both in its own
+    frame, feet at the origin.
+    """
 
     parts: tuple[Part, ...]
     blocks: tuple[Block, ...] = ()
@@ -184,10 +213,23 @@ def block(low: npt.ArrayLike, high: npt.ArrayLike) -> Block:
     return Block(upright(*((a + b) / 2)), (b - a) / 2)
 
 
-def box(low: npt.ArrayLike, high: npt.ArrayLike, paint: Paint, top: Paint | None = None, front: Paint | None = None) -> list[Panel]:
-    """Return the six sides of a box between two corners; ``top`` and ``front`` (towards -y) may have their own paint."""
-    (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
-    x, y, z = np.array([x1 - x0, 0, 0]), np.array([0, y1 - y0, 0]), np.array([0, 0, z1 - z0])
+def box(
+    low: npt.ArrayLike,
+    high: npt.ArrayLike,
+    paint: Paint,
+    top: Paint | None = None,
+    front: Paint | None = None,
+) -> list[Panel]:
+    """Return the six sides of a box between two corners; ``top`` and ``front`` (towards -y) may
+    have their own paint.
+    """
+    (x0, y0, z0), (x1, y1, z1) = (
+        np.asarray(low, dtype=np.float64),
+        np.asarray(high, dtype=np.float64),
+    )
+    x = np.array([x1 - x0, 0, 0])
+    y = np.array([0, y1 - y0, 0])
+    z = np.array([0, 0, z1 - z0])
     return [
         Panel((x0, y0, z0), x, z, front or paint),
         Panel((x1, y1, z0), -x, z, paint),
@@ -200,4 +242,7 @@ def box(low: npt.ArrayLike, high: npt.ArrayLike, paint: Paint, top: Paint | None
 
 def solid(*boxes: tuple[npt.ArrayLike, npt.ArrayLike, Paint]) -> Thing:
     """Return a thing of boxes, each of which throws a shadow."""
-    return Thing(tuple(p for low, high, paint in boxes for p in box(low, high, paint)), tuple(block(low, high) for low, high, _ in boxes))
+    return Thing(
+        tuple(p for low, high, paint in boxes for p in box(low, high, paint)),
+        tuple(block(low, high) for low, high, _ in boxes),
+    )

@@ -1,1 +1,3 @@
-"""What learned networks and classical trackers measure: lanes, cuboids, Frechet distances, motion (docs/lab/judges.md). No torch here."""
+"""What learned networks and classical trackers measure: lanes, cuboids, Frechet distances, motion
+(docs/lab/judges.md). No torch here.
+"""

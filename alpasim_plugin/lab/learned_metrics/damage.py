@@ -14,11 +14,15 @@ from alpasim_plugin.core.types import U8
 
 Kind = Literal["blur", "noise", "repeat", "drop"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-# Blur: sigma, pixels. Noise: deviation, levels of 255, new in every frame. Repeat: share of frames that show the one before.
-# Drop: frames left out after each that stays; the clip is filled up with its end played backwards, so that it keeps its length.
+# Blur: sigma, pixels. Noise: deviation, levels of 255, new in every frame. Repeat: share of frames
+# that show the one before. Drop: frames left out after each that stays; the clip is filled up with
+# its end played backwards, so that it keeps its length.
 STRENGTHS: Mapping[Kind, tuple[float, ...]] = {
-    "blur": (0.7, 1.5, 3.0), "noise": (6.0, 15.0, 35.0), "repeat": (0.15, 0.4, 0.75), "drop": (1.0, 2.0, 4.0),
-}  # fmt: skip
+    "blur": (0.7, 1.5, 3.0),
+    "noise": (6.0, 15.0, 35.0),
+    "repeat": (0.15, 0.4, 0.75),
+    "drop": (1.0, 2.0, 4.0),
+}
 
 
 def damaged(frames: U8, kind: Kind, strength: float, seed: int = 0) -> U8:
@@ -31,10 +35,15 @@ def damaged(frames: U8, kind: Kind, strength: float, seed: int = 0) -> U8:
         return np.stack([cv2.GaussianBlur(np.asarray(frame), (0, 0), strength) for frame in frames])
     if kind == "noise":
         rng = stream("judges", seed, "damage.noise")
-        noisy = [frame.astype(np.float32) + strength * rng.standard_normal(frame.shape, dtype=np.float32) for frame in frames]
+        noisy = [
+            frame.astype(np.float32) + strength * rng.standard_normal(frame.shape, dtype=np.float32)
+            for frame in frames
+        ]
         return np.stack([np.clip(np.rint(frame), 0, 255).astype(np.uint8) for frame in noisy])
     if kind == "repeat":
-        held = stream("judges", seed, "damage.repeat").random(len(frames)) < strength  # a stronger one repeats these and more
+        held = (
+            stream("judges", seed, "damage.repeat").random(len(frames)) < strength
+        )  # a stronger one repeats these and more
         held[0] = False
         shown = np.maximum.accumulate(np.where(held, 0, np.arange(len(frames))))
         return np.asarray(frames[shown])
@@ -42,7 +51,9 @@ def damaged(frames: U8, kind: Kind, strength: float, seed: int = 0) -> U8:
         kept = np.arange(0, len(frames), 1 + round(strength))
         there_and_back = np.concatenate([kept, kept[-2:0:-1]]) if len(kept) > 1 else kept
         return np.asarray(frames[np.resize(there_and_back, len(frames))])
-    raise EvaluatorError("damaging a clip", f"kind {kind!r}", "no such kind", f"choose one of {', '.join(KINDS)}")
+    raise EvaluatorError(
+        "damaging a clip", f"kind {kind!r}", "no such kind", f"choose one of {', '.join(KINDS)}"
+    )
 
 
 def in_order(values: list[float], lower_is_better: bool, slack: float = 0.0) -> bool:

@@ -1,11 +1,14 @@
-"""Detections that a user's own detectors wrote as JSON: then, and only then, lanes and cuboids have the paper's names.
+"""Detections that a user's own detectors wrote as JSON: then, and only then, lanes and cuboids have
+the paper's names.
 
-    {"detector": "PGD R101 nuScenes 2x", "weights_sha256": "...", "size": [960, 544], "K": [[...]], "frames": [
-        {"frame": 0, "cuboids": [{"label": "car", "score": 0.7, "box": [x, y, z, length, height, width, yaw]}]},
-        {"frame": 1, "lanes": [{"score": 0.8, "points": [[forward, left], ...]}]}]}
+    {"detector": "PGD R101 nuScenes 2x", "weights_sha256": "...", "size": [960, 544], "K": [[...]],
+    "frames": [
+        {"frame": 0, "cuboids": [{"label": "car", "score": 0.7, "box": [x, y, z, length, height,
+        width, yaw]}]}, {"frame": 1, "lanes": [{"score": 0.8, "points": [[forward, left], ...]}]}]}
 
-Boxes are in the camera's axes with the origin in their middle; with ``"origin": "bottom"`` in the middle of their underside, as in
-mmdetection3d. Lane points are metres in the rig frame; only visible ones are listed.
+Boxes are in the camera's axes with the origin in their middle; with ``"origin": "bottom"`` in the
+middle of their underside, as in mmdetection3d. Lane points are metres in the rig frame; only
+visible ones are listed.
 """
 
 from __future__ import annotations
@@ -63,8 +66,14 @@ def read_detections(path: Path, frames: int) -> Detections:
         numbers = [int(row["frame"]) for row in rows]
         bottom = document.get("origin", "middle") == "bottom"
         by_frame = dict(zip(numbers, rows, strict=True))
-        cuboids = tuple(tuple(_cuboid(c, bottom) for c in by_frame.get(i, {}).get("cuboids", ())) for i in range(frames))
-        lanes = tuple(tuple(_lane(lane) for lane in by_frame.get(i, {}).get("lanes", ())) for i in range(frames))
+        cuboids = tuple(
+            tuple(_cuboid(c, bottom) for c in by_frame.get(i, {}).get("cuboids", ()))
+            for i in range(frames)
+        )
+        lanes = tuple(
+            tuple(_lane(lane) for lane in by_frame.get(i, {}).get("lanes", ()))
+            for i in range(frames)
+        )
         K = np.array(document["K"], dtype=np.float64).reshape(3, 3) if "K" in document else None
         size = (int(document["size"][1]), int(document["size"][0])) if "size" in document else None
         detector, weights = str(document["detector"]), str(document["weights_sha256"])
@@ -75,7 +84,8 @@ def read_detections(path: Path, frames: int) -> Detections:
 
 
 def read_tracks(path: Path, frames: int) -> F64:
-    """Read a clip's tracks of points: an ``.npz`` with ``tracks (W, 16, 400, 2)``, a window of 16 frames every 25.
+    """Read a clip's tracks of points: an ``.npz`` with ``tracks (W, 16, 400, 2)``, a window of 16
+    frames every 25.
 
     The first index of the last axis is x; both are pixels of the 256x256 image.
 
@@ -84,9 +94,13 @@ def read_tracks(path: Path, frames: int) -> F64:
         frames: Frames of the clip.
 
     Raises:
-        InputError: Not of this form, other windows than the clip has, or a value that is not finite.
+        InputError: Not of this form, other windows than the clip has, or a value that is not
+            finite.
     """
-    doing, do = "reading tracks", "write one window of 16 frames for every 25, 400 points each, as docs/lab/judges.md describes"
+    doing, do = (
+        "reading tracks",
+        "write one window of 16 frames for every 25, 400 points each, as docs/lab/judges.md describes",
+    )
     with parsing(doing, path, do, "not an archive with tracks"), np.load(path) as stored:
         tracks = np.asarray(stored["tracks"], dtype=np.float64)
     wanted = (len(range(0, frames - FRAMES + 1, EVERY)), FRAMES, GRID * GRID, 2)
@@ -100,7 +114,17 @@ def _cuboid(row: Mapping[str, Any], bottom: bool) -> Cuboid:
     x, y, z, length, height, width, yaw = (float(v) for v in row["box"])
     if not np.isfinite([x, y, z, yaw]).all() or not min(length, height, width) > 0:
         raise ValueError(f"box {row['box']}")
-    return Cuboid(str(row["label"]), float(row["score"]), x, y - height / 2 if bottom else y, z, length, height, width, yaw)
+    return Cuboid(
+        str(row["label"]),
+        float(row["score"]),
+        x,
+        y - height / 2 if bottom else y,
+        z,
+        length,
+        height,
+        width,
+        yaw,
+    )
 
 
 def _lane(row: Mapping[str, Any]) -> Lane3D:

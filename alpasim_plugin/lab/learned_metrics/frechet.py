@@ -1,10 +1,13 @@
-"""Frechet distance of two sets of feature vectors, for any number of vectors, and what may be concluded from it.
+"""Frechet distance of two sets of feature vectors, for any number of vectors, and what may be
+concluded from it.
 
-``|m1 - m2|^2 + tr(S1 + S2 - 2 (S1 S2)^(1/2))`` with covariances over n - 1. The last trace is the nuclear norm of ``A B^T`` for the
-centred and scaled matrices ``S1 = A^T A``, ``S2 = B^T B``: exact where covariances are singular, where a matrix square root is not.
+``|m1 - m2|^2 + tr(S1 + S2 - 2 (S1 S2)^(1/2))`` with covariances over n - 1. The last trace is the
+nuclear norm of ``A B^T`` for the centred and scaled matrices ``S1 = A^T A``, ``S2 = B^T B``: exact
+where covariances are singular, where a matrix square root is not.
 
-With fewer vectors than dimensions the value is mostly bias. A bootstrap of it is wrong (repeated items raise it); differences of two
-variants are tested by swapping their clips (`alpasim_plugin.lab.learned_metrics.swapping`).
+With fewer vectors than dimensions the value is mostly bias. A bootstrap of it is wrong (repeated
+items raise it); differences of two variants are tested by swapping their clips
+(`alpasim_plugin.lab.learned_metrics.swapping`).
 """
 
 from __future__ import annotations
@@ -44,7 +47,9 @@ def frechet_distance(a: F64, b: F64, ridge: float = 0.0) -> float:
 
 
 def moments(x: F64) -> tuple[F64, F64]:
-    """Return the mean ``(d,)`` of vectors ``(n, d)`` and a factor ``(min(n, d), d)`` whose ``A^T A`` is their covariance over n - 1."""
+    """Return the mean ``(d,)`` of vectors ``(n, d)`` and a factor ``(min(n, d), d)`` whose ``A^T
+    A`` is their covariance over n - 1.
+    """
     x = np.asarray(x, dtype=np.float64)
     mean = x.mean(axis=0)
     A = (x - mean) / np.sqrt(len(x) - 1)
@@ -58,7 +63,10 @@ def check_features(a: F64, b: F64) -> None:
     Raises:
         EvaluatorError: With what was found.
     """
-    doing, do = "computing a Frechet distance", "give at least two finite vectors (n, d) on each side"
+    doing, do = (
+        "computing a Frechet distance",
+        "give at least two finite vectors (n, d) on each side",
+    )
     if a.ndim != 2 or b.ndim != 2 or a.shape[1:] != b.shape[1:] or min(len(a), len(b)) < 2:
         raise EvaluatorError(doing, "two sets of features", f"shapes {a.shape} and {b.shape}", do)
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
@@ -66,7 +74,9 @@ def check_features(a: F64, b: F64) -> None:
 
 
 def halves(clips: Sequence[F64]) -> float | None:
-    """Return the distance of every second clip from the others: what two samples of the same videos give. None below four clips."""
+    """Return the distance of every second clip from the others: what two samples of the same videos
+    give. None below four clips.
+    """
     if len(clips) < 4:
         return None
     return frechet_distance(np.concatenate(list(clips[::2])), np.concatenate(list(clips[1::2])))

@@ -1,4 +1,6 @@
-"""Jitter of detected lanes: how far a line at one distance is from the mean of its places in the frames before and after."""
+"""Jitter of detected lanes: how far a line at one distance is from the mean of its places in the
+frames before and after.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ LEAST_FRAMES = 5
 
 
 def tracks(frames: Sequence[Sequence[Lane3D]]) -> list[list[tuple[int, Lane3D]]]:
-    """Return lanes followed from frame to frame: the same line is at most 1.5 m to the side on three quarters of the common samples.
+    """Return lanes followed from frame to frame: the same line is at most 1.5 m to the side on
+    three quarters of the common samples.
 
     Returns:
         Tracks of ``(frame, lane)``, in consecutive frames, of at least five.
@@ -33,7 +36,8 @@ def tracks(frames: Sequence[Sequence[Lane3D]]) -> list[list[tuple[int, Lane3D]]]
 
 
 def lane_jitter_m(frames: Sequence[Sequence[Lane3D]], at_m: float = AT_M[0]) -> float | None:
-    """Return the root mean square of ``v_t - (v_{t-1} + v_{t+1}) / 2`` over all tracks of a clip, metres.
+    """Return the root mean square of ``v_t - (v_{t-1} + v_{t+1}) / 2`` over all tracks of a clip,
+    metres.
 
     Args:
         frames: Lanes of every frame.
@@ -42,7 +46,10 @@ def lane_jitter_m(frames: Sequence[Sequence[Lane3D]], at_m: float = AT_M[0]) -> 
     Returns:
         None where no track has three consecutive frames that reach so far.
     """
-    squares = [_second_differences(np.array([_at(lane, at_m) for _, lane in track])) ** 2 for track in tracks(frames)]
+    squares = [
+        _second_differences(np.array([_at(lane, at_m) for _, lane in track])) ** 2
+        for track in tracks(frames)
+    ]
     values = np.concatenate([*squares, np.zeros(0)])
     return float(np.sqrt(values.mean())) if len(values) else None
 
@@ -51,7 +58,9 @@ def _at(lane: Lane3D, at_m: float) -> float:
     """Return a lane's lateral position at a distance; NaN where a sample beside it is missing."""
     k = int(np.searchsorted(FORWARD_M, at_m, side="right")) - 1
     share = (at_m - FORWARD_M[k]) / (FORWARD_M[k + 1] - FORWARD_M[k])
-    return float((1 - share) * lane.lateral_m[k] + (share * lane.lateral_m[k + 1] if share else 0.0))
+    return float(
+        (1 - share) * lane.lateral_m[k] + (share * lane.lateral_m[k + 1] if share else 0.0)
+    )
 
 
 def _second_differences(v: F64) -> F64:

@@ -1,8 +1,10 @@
-"""Lanes of a video against lanes of its reference, by the paper's protocol (App. on metrics, after OpenLane).
+"""Lanes of a video against lanes of its reference, by the paper's protocol (App. on metrics, after
+OpenLane).
 
-A lane counts with a score of at least 0.5, three visible points and 20 m of support, unless it lies more than 10 m to the side on average.
-Two lanes may be paired with 10 m of common support and at most 1.5 m apart on three quarters of their common samples; of those the
-assignment with the least mean distance is taken. Instances are pooled over a clip: ``F1 = 2 TP / (2 TP + FP + FN)``.
+A lane counts with a score of at least 0.5, three visible points and 20 m of support, unless it lies
+more than 10 m to the side on average. Two lanes may be paired with 10 m of common support and at
+most 1.5 m apart on three quarters of their common samples; of those the assignment with the least
+mean distance is taken. Instances are pooled over a clip: ``F1 = 2 TP / (2 TP + FP + FN)``.
 """
 
 from __future__ import annotations
@@ -16,8 +18,13 @@ from scipy.optimize import linear_sum_assignment
 from alpasim_plugin.core.types import F64, Bool
 from alpasim_plugin.lab.learned_metrics.types import FORWARD_M, Lane3D
 
-LEAST_SCORE, LEAST_POINTS, LEAST_SUPPORT_M, MOST_ASIDE_M = 0.5, 3, 20.0, 10.0
-COMMON_M, NEAR_ENOUGH_M, NEAR_SHARE = 10.0, 1.5, 0.75
+LEAST_SCORE = 0.5
+LEAST_POINTS = 3
+LEAST_SUPPORT_M = 20.0
+MOST_ASIDE_M = 10.0
+COMMON_M = 10.0
+NEAR_ENOUGH_M = 1.5
+NEAR_SHARE = 0.75
 NEAR_M = 30.0  # the x-error's near range ends before this
 NEVER = 1e6  # cost of a forbidden pair; infinite ones make the solver fail
 STEP_M = float(FORWARD_M[1] - FORWARD_M[0])
@@ -77,19 +84,27 @@ class LaneScore:
 
 
 def resampled(forward_m: F64, lateral_m: F64, score: float) -> Lane3D:
-    """Return a lane of any detector at the protocol's distances: linear between its points, nothing beyond them.
+    """Return a lane of any detector at the protocol's distances: linear between its points, nothing
+    beyond them.
 
     Example:
         >>> resampled(np.array([4.0, 10.0]), np.array([1.0, 2.5]), 0.9).lateral_m[:5]
         array([ nan, 1.25, 1.75, 2.25,  nan])
     """
     order = np.argsort(forward_m, kind="stable")
-    return Lane3D(np.interp(FORWARD_M, forward_m[order], lateral_m[order], left=np.nan, right=np.nan), score)
+    return Lane3D(
+        np.interp(FORWARD_M, forward_m[order], lateral_m[order], left=np.nan, right=np.nan), score
+    )
 
 
 def up_to(lanes: Sequence[Lane3D], forward_m: float) -> list[Lane3D]:
-    """Return the lanes cut at a distance: the ``_30`` values, since lines are about a pixel wide farther away."""
-    return [replace(lane, lateral_m=np.where(forward_m >= FORWARD_M, lane.lateral_m, np.nan)) for lane in lanes]
+    """Return the lanes cut at a distance: the ``_30`` values, since lines are about a pixel wide
+    farther away.
+    """
+    return [
+        replace(lane, lateral_m=np.where(forward_m >= FORWARD_M, lane.lateral_m, np.nan))
+        for lane in lanes
+    ]
 
 
 def counted(lanes: Sequence[Lane3D]) -> list[Lane3D]:
@@ -101,15 +116,22 @@ def _counts(lane: Lane3D) -> bool:
     visible = np.isfinite(lane.lateral_m)
     if lane.score < LEAST_SCORE or visible.sum() < LEAST_POINTS:
         return False
-    return _support_m(visible) >= LEAST_SUPPORT_M and abs(float(np.mean(lane.lateral_m[visible]))) <= MOST_ASIDE_M
+    return (
+        _support_m(visible) >= LEAST_SUPPORT_M
+        and abs(float(np.mean(lane.lateral_m[visible]))) <= MOST_ASIDE_M
+    )
 
 
 def _support_m(visible: Bool) -> float:
     return STEP_M * (int(visible.sum()) - 1)
 
 
-def pairs(made: Sequence[Lane3D], reference: Sequence[Lane3D], near_share: float = NEAR_SHARE) -> list[tuple[int, int]]:
-    """Return which lanes belong together: the assignment of least mean distance among allowed pairs."""
+def pairs(
+    made: Sequence[Lane3D], reference: Sequence[Lane3D], near_share: float = NEAR_SHARE
+) -> list[tuple[int, int]]:
+    """Return which lanes belong together: the assignment of least mean distance among allowed
+    pairs.
+    """
     if not made or not reference:
         return []
     cost = np.full((len(made), len(reference)), NEVER)
@@ -130,12 +152,21 @@ def score_frame(made: Sequence[Lane3D], reference: Sequence[Lane3D]) -> LaneScor
     made, reference = counted(made), counted(reference)
     found = pairs(made, reference)
     near = FORWARD_M < NEAR_M
-    apart = np.array([np.abs(made[i].lateral_m - reference[j].lateral_m) for i, j in found]).reshape(len(found), len(FORWARD_M))
-    sums = [(float(np.nansum(apart[:, which])), int(np.isfinite(apart[:, which]).sum())) for which in (near, ~near)]
-    return LaneScore(len(found), len(made), len(reference), sums[0][0], sums[1][0], sums[0][1], sums[1][1])
+    apart = np.array(
+        [np.abs(made[i].lateral_m - reference[j].lateral_m) for i, j in found]
+    ).reshape(len(found), len(FORWARD_M))
+    sums = [
+        (float(np.nansum(apart[:, which])), int(np.isfinite(apart[:, which]).sum()))
+        for which in (near, ~near)
+    ]
+    return LaneScore(
+        len(found), len(made), len(reference), sums[0][0], sums[1][0], sums[0][1], sums[1][1]
+    )
 
 
-def score_clip(made: Sequence[Sequence[Lane3D]], reference: Sequence[Sequence[Lane3D]]) -> LaneScore:
+def score_clip(
+    made: Sequence[Sequence[Lane3D]], reference: Sequence[Sequence[Lane3D]]
+) -> LaneScore:
     """Return a clip's sums over its frames."""
     total = LaneScore()
     for a, b in zip(made, reference, strict=True):

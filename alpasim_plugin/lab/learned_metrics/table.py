@@ -1,4 +1,6 @@
-"""The judges' part of the quality table as markdown: metrics of whole sets, the paper's own names, and which judges were asked."""
+"""The judges' part of the quality table as markdown: metrics of whole sets, the paper's own names,
+and which judges were asked.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,9 @@ from typing import Any
 
 
 def judged_markdown(summary: Mapping[str, Any]) -> str:
-    """Return the tables of ``sets`` and ``paper`` of a summary, or nothing where no judge was asked."""
+    """Return the tables of ``sets`` and ``paper`` of a summary, or nothing where no judge was
+    asked.
+    """
     if "sets" not in summary:
         return ""
     sets, paper = summary["sets"], summary["paper"]
@@ -24,7 +28,10 @@ def judged_markdown(summary: Mapping[str, Any]) -> str:
         + ", by swapping clips. Fewer vectors than dimensions: mostly bias.\n"
     )
     names = list(next(iter(paper.values()), {}))
-    out += "\n" + _table(["the paper's metric", *paper], [[name, *(_paper_cell(paper[v][name]) for v in paper)] for name in names])
+    out += "\n" + _table(
+        ["the paper's metric", *paper],
+        [[name, *(_paper_cell(paper[v][name]) for v in paper)] for name in names],
+    )
     judges = ", ".join(f"{file} {digest[:12]}" for file, digest in summary["judges"].items())
     return out + f"\nJudges, as frozen: {judges}.\n"
 
@@ -37,7 +44,11 @@ def _set_cell(entry: Mapping[str, Any]) -> str:
 
 
 def _paper_cell(cell: Mapping[str, Any]) -> str:
-    return f"{cell['value']:.4g}" if cell["value"] is not None else "null (" + str(cell["reason"]).partition(":")[0] + ")"
+    return (
+        f"{cell['value']:.4g}"
+        if cell["value"] is not None
+        else "null (" + str(cell["reason"]).partition(":")[0] + ")"
+    )
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:

@@ -1,8 +1,10 @@
-"""What the detectors among the judges find in one frame: lane lines on the ground, and cuboids; with the projection of a cuboid.
+"""What the detectors among the judges find in one frame: lane lines on the ground, and cuboids;
+with the projection of a cuboid.
 
-Lanes live in the rig frame (x forward, y left): the paper's ground frame with y forward and x right is the same plane, its lateral axis
-turned. Cuboids live in the camera's axes (x right, y down, z forward), as in the monocular detectors of mmdetection3d, but with the
-origin in the middle of the box.
+Lanes live in the rig frame (x forward, y left): the paper's ground frame with y forward and x right
+is the same plane, its lateral axis turned. Cuboids live in the camera's axes (x right, y down, z
+forward), as in the monocular detectors of mmdetection3d, but with the origin in the middle of the
+box.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ import numpy as np
 
 from alpasim_plugin.core.map_types import F64
 
-# Distances ahead at which lanes are compared: 3, 5 ... 59 m. The paper's 3, 5 ... 60 cannot end at 60 with a step of 2.
+# Distances ahead at which lanes are compared: 3, 5 ... 59 m. The paper's 3, 5 ... 60 cannot end at
+# 60 with a step of 2.
 FORWARD_M: F64 = np.arange(3.0, 60.0, 2.0)
 NEAREST_CORNER_M = 0.5  # a box with a corner nearer than this is dropped (paper)
 
@@ -24,7 +27,8 @@ class Lane3D:
     """A lane line on the ground.
 
     Args:
-        lateral_m: ``(29,)`` position to the left of the rig at `FORWARD_M`; NaN where the line is not visible.
+        lateral_m: ``(29,)`` position to the left of the rig at `FORWARD_M`; NaN where the line is
+            not visible.
         score: 0 to 1.
     """
 
@@ -41,7 +45,8 @@ class Cuboid:
         score: 0 to 1.
         x_m, y_m, z_m: Middle of the box.
         length_m, height_m, width_m: Full sizes.
-        yaw_rad: About the camera's y axis; 0: the length lies along x, a quarter turn to the right looks at the camera.
+        yaw_rad: About the camera's y axis; 0: the length lies along x, a quarter turn to the right
+            looks at the camera.
     """
 
     label: str
@@ -65,7 +70,9 @@ def cuboid_corners(cuboid: Cuboid) -> F64:
 
 
 def hull_pixels(cuboid: Cuboid, K: F64) -> F64 | None:
-    """Return the convex outline ``(N, 2)`` of a cuboid in the image, pixels; None where a corner is nearer than 0.5 m."""
+    """Return the convex outline ``(N, 2)`` of a cuboid in the image, pixels; None where a corner is
+    nearer than 0.5 m.
+    """
     corners = cuboid_corners(cuboid)
     if corners[:, 2].min() < NEAREST_CORNER_M:
         return None

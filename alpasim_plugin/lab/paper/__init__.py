@@ -1,1 +1,3 @@
-"""The paper's tables beside ours, its claims with a verdict each, and all systems side by side on one page."""
+"""The paper's tables beside ours, its claims with a verdict each, and all systems side by side on
+one page.
+"""

@@ -1,4 +1,6 @@
-"""The paper's appearance experiment as a section of the document: its table, ours by style, and the differences from the controls."""
+"""The paper's appearance experiment as a section of the document: its table, ours by style, and the
+differences from the controls.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +9,26 @@ from collections.abc import Mapping
 from alpasim_plugin.lab.learned_metrics.facts import LANE_F1, LANE_XERR, STYLE_ACC, of_seed
 from alpasim_plugin.lab.paper.measured import Measured
 from alpasim_plugin.lab.paper.published import Published
-from alpasim_plugin.lab.paper.tables import differences, interval_text, markdown_table, paper_against_ours
+from alpasim_plugin.lab.paper.tables import (
+    differences,
+    interval_text,
+    markdown_table,
+    paper_against_ours,
+)
 
 PROTOCOL = "appearance"
 OURS = "appearance"  # the arm, as its recipe
 TARGET = "target"  # clean frames by the formula
-METRICS = (STYLE_ACC, of_seed(STYLE_ACC, 1), LANE_F1, of_seed(LANE_F1, 1), LANE_XERR, of_seed(LANE_XERR, 1), "psnr_db", "perceptual-syn")
+METRICS = (
+    STYLE_ACC,
+    of_seed(STYLE_ACC, 1),
+    LANE_F1,
+    of_seed(LANE_F1, 1),
+    LANE_XERR,
+    of_seed(LANE_XERR, 1),
+    "psnr_db",
+    "perceptual-syn",
+)
 ABOUT = """One fixer renders the clear render in the style that its prompt asks for. The controls `V9 + formula` and `3dgs + formula` are
 another system's output restyled by the formula that makes the targets, with the simulator's depth and lamps, which no fixer sees. `target`
 is the clean frame by the same formula: what the judges say of a perfect output. Lanes are compared with those found on the clear clean
@@ -47,7 +63,10 @@ def appearance_section(published: Published, measured: Mapping[str, Measured]) -
     parts = [ABOUT, paper_against_ours(published, PROTOCOL, measured[PROTOCOL])]
     styles = [name for name in measured if name.startswith(f"{PROTOCOL}-")]
     rows = [
-        [f"**{name.removeprefix(f'{PROTOCOL}-')}**, {arm}", *(interval_text(measured[name], arm, metric) for metric in METRICS)]
+        [
+            f"**{name.removeprefix(f'{PROTOCOL}-')}**, {arm}",
+            *(interval_text(measured[name], arm, metric) for metric in METRICS),
+        ]
         for name in styles
         for arm in (*measured[name].arms, TARGET)
     ]

@@ -1,4 +1,6 @@
-"""Table 2b: one policy behind several renderers, with the paper's interval and one over scenes, paired differences, and flips."""
+"""Table 2b: one policy behind several renderers, with the paper's interval and one over scenes,
+paired differences, and flips.
+"""
 
 from __future__ import annotations
 
@@ -37,21 +39,33 @@ PAIRS = """Paired differences on the same scenes and seeds: 95 % interval and p-
 FLIPS = f"""Flips: scenes and seeds with the event behind one of the two renderers alone. The test on scenes compares how many have more
 events than behind `{BASELINE}` with how many have fewer; the test on rollouts (McNemar) takes them as independent.
 """
-PANELS = {"offroad_or_collision_at_fault": 100.0, "route_distance_m": 1.0, "progress": 100.0}  # of the figure, and their scales
+PANELS = {
+    "offroad_or_collision_at_fault": 100.0,
+    "route_distance_m": 1.0,
+    "progress": 100.0,
+}  # of the figure, and their scales
 FLIP_HEAD = (
-    "renderer", "event", "only behind it", f"only behind {BASELINE}", "p, rollouts", "scenes with more", "scenes with fewer", "p, scenes",
-)  # fmt: skip
+    "renderer",
+    "event",
+    "only behind it",
+    f"only behind {BASELINE}",
+    "p, rollouts",
+    "scenes with more",
+    "scenes with fewer",
+    "p, scenes",
+)
 
 
 class Driven(Measured):
     """Rollouts of one policy behind several renderers, as arms and scenes.
 
-    Means and differences are those of every run: a rare event gets bounds that are never without width, where a t interval over scenes
-    has none.
+    Means and differences are those of every run: a rare event gets bounds that are never without
+    width, where a t interval over scenes has none.
 
     Args:
         policy: Who drove.
-        rows: A rollout each, as `evaluators.statistics.summary.aggregate` takes them; ``renderer`` is the arm's name.
+        rows: A rollout each, as `evaluators.statistics.summary.aggregate` takes them; ``renderer``
+            is the arm's name.
     """
 
     def __init__(self, policy: str, rows: Sequence[Row]) -> None:
@@ -71,20 +85,28 @@ class Driven(Measured):
 
     def only(self, arms: Sequence[str]) -> Driven:
         """Return the rollouts behind some of the renderers, in this order."""
-        return Driven(self.policy, [row for arm in arms for row in self.rows if row["renderer"] == arm])
+        return Driven(
+            self.policy, [row for arm in arms for row in self.rows if row["renderer"] == arm]
+        )
 
     def mean(self, arm: str, metric: str) -> Interval:
         """Return the mean over rollouts with the paper's interval."""
         entry = aggregate_sides({arm: self.sides[arm]}, [metric])[arm][metric]
         if entry["ci95"] is None:
             return Interval(entry["mean"], reason=entry.get("ci95_reason", ""))
-        return Interval(entry["mean"], entry["mean"] - entry["ci95"], entry["mean"] + entry["ci95"], method="1.96 sigma / sqrt(N)")
+        return Interval(
+            entry["mean"],
+            entry["mean"] - entry["ci95"],
+            entry["mean"] + entry["ci95"],
+            method="1.96 sigma / sqrt(N)",
+        )
 
     def difference(self, metric: str, first: str, second: str, share: float = 0.0) -> Difference:
-        """Return the paired difference of two renderers with scenes as the unit; see `evaluators.statistics.paired.compare`.
+        """Return the paired difference of two renderers with scenes as the unit; see
+        `evaluators.statistics.paired.compare`.
 
-        Of what is left of the second's rate without a share of it the bounds are those of `evaluators.statistics.bounded`, which hold for
-        scenes that were not drawn as well.
+        Of what is left of the second's rate without a share of it the bounds are those of
+        `evaluators.statistics.bounded`, which hold for scenes that were not drawn as well.
 
         Raises:
             EvaluatorError: They share fewer than two rollouts.
@@ -94,11 +116,30 @@ class Driven(Measured):
             pairs = Pairs(self.sides[first], self.sides[second], metric)
             means, _ = cluster_means(pairs.mine - (1 - share) * pairs.base, pairs.scenes)
             bounds = mean_bounds(means, share - 1.0, 1.0)
-            return Difference(metric, first, f"{1 - share:.3g} of {second}", float(means.mean()), *bounds, None, len(means), 0)
+            return Difference(
+                metric,
+                first,
+                f"{1 - share:.3g} of {second}",
+                float(means.mean()),
+                *bounds,
+                None,
+                len(means),
+                0,
+            )
         found = compare(self.sides[first], self.sides[second], KNOWN.info(metric), second)
         low, high = found["ci95"] or (None, None)
         favours = {"better": 1, "worse": -1}.get(found["difference"], 0)
-        return Difference(metric, first, second, found["diff"], low, high, found["p_value"], found["n_scenes"], favours)
+        return Difference(
+            metric,
+            first,
+            second,
+            found["diff"],
+            low,
+            high,
+            found["p_value"],
+            found["n_scenes"],
+            favours,
+        )
 
 
 def closed_loop_section(published: Published, drives: Sequence[Driven], figure: str) -> str:
@@ -111,14 +152,20 @@ def closed_loop_section(published: Published, drives: Sequence[Driven], figure: 
     """
     if not drives:
         return ""
-    return "\n".join([f"![{CAPTION}]({figure})\n", *(_of_policy(published, driven) for driven in drives)])
+    return "\n".join(
+        [f"![{CAPTION}]({figure})\n", *(_of_policy(published, driven) for driven in drives)]
+    )
 
 
 def plot_closed_loop(drives: Sequence[Driven], path: Path) -> None:
-    """Draw event rate, route distance and progress by renderer, a row of panels for each policy, and write a PNG."""
+    """Draw event rate, route distance and progress by renderer, a row of panels for each policy,
+    and write a PNG.
+    """
     most = max(len(driven.arms) for driven in drives)
     figure = Figure(figsize=(10.4, (0.28 * most + 0.9) * len(drives) + 0.3), layout="constrained")
-    for driven, row in zip(drives, figure.subplots(len(drives), len(PANELS), squeeze=False), strict=True):
+    for driven, row in zip(
+        drives, figure.subplots(len(drives), len(PANELS), squeeze=False), strict=True
+    ):
         for ax, (metric, scale) in zip(row, PANELS.items(), strict=True):
             _panel(ax, driven, metric, scale)
         row[0].set_yticks(range(len(driven.arms)), driven.arms)
@@ -134,7 +181,12 @@ def _panel(ax: Axes, driven: Driven, metric: str, scale: float) -> None:
             continue
         centre = scale * entry["mean"]
         if entry["ci95_clustered"] is not None:
-            ax.plot([scale * bound for bound in entry["ci95_clustered"]], [i, i], color=colour, linewidth=1.2)
+            ax.plot(
+                [scale * bound for bound in entry["ci95_clustered"]],
+                [i, i],
+                color=colour,
+                linewidth=1.2,
+            )
         if entry["ci95"] is not None:
             half = scale * entry["ci95"]
             ax.plot([centre - half, centre + half], [i, i], color=colour, linewidth=4.5, alpha=0.35)
@@ -157,7 +209,9 @@ def _of_policy(published: Published, driven: Driven) -> str:
     pairs = {(row.variant, row.metric): row for row in pair_rows(summary)}
     others = [arm for arm in driven.arms if arm != BASELINE]
     differences = [[arm, *(_pair(pairs[arm, row.name]) for row in rows)] for arm in others]
-    flips = [_flips(arm, metric, summary["paired"][arm][metric]) for arm in others for metric in EVENTS]
+    flips = [
+        _flips(arm, metric, summary["paired"][arm][metric]) for arm in others for metric in EVENTS
+    ]
     return "\n".join(
         (
             f"### Behind `{driven.policy}`\n\n{plural(len(scenes), 'scene')} x {plural(len(seeds), 'seed')}.\n",
@@ -181,4 +235,11 @@ def _flips(arm: str, event: str, found: Mapping[str, Any]) -> list[str]:
         return [arm, f"`{event}`", *["-"] * 6]
     cells, scenes = found["cells"], found["scenes"]
     counts = [str(cells["only_here"]), str(cells["only_baseline"]), p_text(cells["p_value"])]
-    return [arm, f"`{event}`", *counts, str(scenes["up"]), str(scenes["down"]), p_text(scenes["p_value"])]
+    return [
+        arm,
+        f"`{event}`",
+        *counts,
+        str(scenes["up"]),
+        str(scenes["down"]),
+        p_text(scenes["p_value"]),
+    ]

@@ -1,4 +1,6 @@
-"""Quality against training time (the paper's figure of GPU-hours): the curve of each arm, as a table and as a figure."""
+"""Quality against training time (the paper's figure of GPU-hours): the curve of each arm, as a
+table and as a figure.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +67,9 @@ class Curve:
 
     def at(self, core_minutes: float) -> Point | None:
         """Return the last snapshot within a time; None where the first one takes longer."""
-        return next((point for point in reversed(self.points) if point.core_minutes <= core_minutes), None)
+        return next(
+            (point for point in reversed(self.points) if point.core_minutes <= core_minutes), None
+        )
 
 
 @dataclass(frozen=True)
@@ -95,11 +99,16 @@ class Cost:
     def metrics(self) -> list[str]:
         """Metrics that any point has."""
         labels = [point.label for curve in self.curves for point in curve.points]
-        return [metric for metric in METRICS if any(self.measured.has(label, metric) for label in labels)]
+        return [
+            metric
+            for metric in METRICS
+            if any(self.measured.has(label, metric) for label in labels)
+        ]
 
 
 def contested(cost: Cost, seed: int | None = None) -> Measured:
-    """Return the measurements by names that claims use: every arm at its end, and ours in half of each other arm's time.
+    """Return the measurements by names that claims use: every arm at its end, and ours in half of
+    each other arm's time.
 
     Args:
         cost: What was measured.
@@ -110,30 +119,58 @@ def contested(cost: Cost, seed: int | None = None) -> Measured:
     labels = {curve.arm: curve.points[-1].label for curve in curves}
     ours = next((curve for curve in curves if curve.arm == OURS), None)
     for curve in curves:
-        if ours is not None and curve is not ours and (point := ours.at(curve.core_minutes / 2)) is not None:
+        if (
+            ours is not None
+            and curve is not ours
+            and (point := ours.at(curve.core_minutes / 2)) is not None
+        ):
             labels[within(curve.arm)] = point.label
     values = {arm: measured.values[label] for arm, label in labels.items()}
-    features = {arm: measured.features[label] for arm, label in labels.items() if label in measured.features}
-    reference = {name: kinds for name, kinds in measured.features.items() if name == measured.reference}
+    features = {
+        arm: measured.features[label] for arm, label in labels.items() if label in measured.features
+    }
+    reference = {
+        name: kinds for name, kinds in measured.features.items() if name == measured.reference
+    }
     return Measured(values, {**features, **reference}, measured.reference, measured.seed)
 
 
 def cost_section(cost: Cost, figure: str) -> str:
-    """Return the section: how, the figure, a row for every snapshot, and what half of the others' time gives.
+    """Return the section: how, the figure, a row for every snapshot, and what half of the others'
+    time gives.
 
     Args:
         cost: What was measured.
         figure: Path of the figure, from the document's folder.
     """
-    curves, measured, shown = cost.curves, cost.measured, cost.metrics
+    curves = cost.curves
+    measured = cost.measured
+    shown = cost.metrics
     rows = []
     for curve in curves:
         for point in curve.points:
             values = [_value(measured, point.label, metric) for metric in shown]
-            rows.append([curve.arm, str(curve.seed), point.stage, str(point.updates), _minutes(point.core_minutes), *values])
-    head = ["arm", "seed", "stage", "updates", "core-minutes", *(f"{m} {ARROWS[KNOWN.info(m).direction]}" for m in shown)]
+            rows.append(
+                [
+                    curve.arm,
+                    str(curve.seed),
+                    point.stage,
+                    str(point.updates),
+                    _minutes(point.core_minutes),
+                    *values,
+                ]
+            )
+    head = [
+        "arm",
+        "seed",
+        "stage",
+        "updates",
+        "core-minutes",
+        *(f"{m} {ARROWS[KNOWN.info(m).direction]}" for m in shown),
+    ]
     ends = "".join(
-        f"- {cost.name(curve)}: {', '.join(f'{name} to {_minutes(end)}' for name, end in curve.ends.items())}\n" for curve in curves
+        f"- {cost.name(curve)}: {', '.join(f'{name} to {_minutes(end)}' for name, end in curve.ends.items())}\n"
+        for curve in curves
     )
     return (
         f"{HOW}\n\n{cost.about}\n\n![Quality against core-minutes, borders of stages dashed]({figure})\n\n"
@@ -144,27 +181,49 @@ def cost_section(cost: Cost, figure: str) -> str:
 def _halves(cost: Cost) -> str:
     lines = []
     for curve in cost.curves:
-        ours = next((other for other in cost.curves if (other.arm, other.seed) == (OURS, curve.seed)), None)
+        ours = next(
+            (other for other in cost.curves if (other.arm, other.seed) == (OURS, curve.seed)), None
+        )
         if ours is None or curve is ours:
             continue
         point, half = ours.at(curve.core_minutes / 2), curve.core_minutes / 2
-        found = "no snapshot" if point is None else f"the snapshot of {point.updates} updates, {_minutes(point.core_minutes)}"
-        lines.append(f"- Within half of the core-minutes of {cost.name(curve)} ({_minutes(half)}), {OURS} has {found}.\n")
+        found = (
+            "no snapshot"
+            if point is None
+            else f"the snapshot of {point.updates} updates, {_minutes(point.core_minutes)}"
+        )
+        lines.append(
+            f"- Within half of the core-minutes of {cost.name(curve)} ({_minutes(half)}), {OURS} has {found}.\n"
+        )
     return "".join(lines)
 
 
 def _by_seed(cost: Cost) -> str:
-    """Return the claims' comparisons of training time in every seed; empty where there is one seed."""
+    """Return the claims' comparisons of training time in every seed; empty where there is one
+    seed.
+    """
     if len(cost.seeds) == 1:
         return ""
-    comparisons = [comparison for claim in CLAIMS for comparison in claim.comparisons if comparison.protocol == "cost"]
+    comparisons = [
+        comparison
+        for claim in CLAIMS
+        for comparison in claim.comparisons
+        if comparison.protocol == "cost"
+    ]
     found = [contest_results(comparisons, {"cost": contested(cost, seed)}) for seed in cost.seeds]
     rows = []
     for i, comparison in enumerate(comparisons):
         results = [each[i] for each in found]
-        cells = [r.missing if r.difference is None else f"{difference_text(r.difference)}: {r.outcome}" for r in results]
-        rows.append([f"`{comparison.metric}`: {comparison.first} minus {comparison.second}", *cells])
-    return f"\n{BY_SEED}\n\n" + markdown_table(["comparison", *(f"seed {seed}" for seed in cost.seeds)], rows)
+        cells = [
+            r.missing if r.difference is None else f"{difference_text(r.difference)}: {r.outcome}"
+            for r in results
+        ]
+        rows.append(
+            [f"`{comparison.metric}`: {comparison.first} minus {comparison.second}", *cells]
+        )
+    return f"\n{BY_SEED}\n\n" + markdown_table(
+        ["comparison", *(f"seed {seed}" for seed in cost.seeds)], rows
+    )
 
 
 def _minutes(value: float) -> str:
@@ -178,16 +237,28 @@ def _value(measured: Measured, label: str, metric: str) -> str:
 
 
 def plot_cost(cost: Cost, path: Path) -> None:
-    """Draw every metric against core-minutes and write a PNG; dashed lines are the ends of stages before the last."""
-    curves, measured, shown = cost.curves, cost.measured, cost.metrics
+    """Draw every metric against core-minutes and write a PNG; dashed lines are the ends of stages
+    before the last.
+    """
+    curves = cost.curves
+    measured = cost.measured
+    shown = cost.metrics
     figure, panels = panels_of(len(shown))
     for ax, metric in zip(panels, shown, strict=False):
         for i, curve in enumerate(curves):
             colour = COLOURS.get(curve.arm, f"C{i + 4}")
             x = [point.core_minutes for point in curve.points if measured.has(point.label, metric)]
-            y = [measured.mean(point.label, metric).centre for point in curve.points if measured.has(point.label, metric)]
+            y = [
+                measured.mean(point.label, metric).centre
+                for point in curve.points
+                if measured.has(point.label, metric)
+            ]
             first = curve.seed == cost.seeds[0]
-            how: Any = {"marker": "o", "linewidth": 1.6} if first else {"marker": "s", "linewidth": 1.0, "alpha": 0.55}
+            how: Any = (
+                {"marker": "o", "linewidth": 1.6}
+                if first
+                else {"marker": "s", "linewidth": 1.0, "alpha": 0.55}
+            )
             ax.plot(x, y, markersize=3.5, color=colour, label=cost.name(curve), **how)
             for end in list(curve.ends.values())[:-1] if first else ():
                 ax.axvline(end, color=colour, linestyle="--", linewidth=0.9, alpha=0.5)

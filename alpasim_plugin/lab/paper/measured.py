@@ -32,7 +32,8 @@ class Difference:
         first, second: Arms.
         difference: First minus second.
         low, high: 95 % t interval over clips; None for a metric of whole sets.
-        p_value: Two-sided: of the t test over clips, or by swapping whole clips for a metric of whole sets; None with one clip.
+        p_value: Two-sided: of the t test over clips, or by swapping whole clips for a metric of
+            whole sets; None with one clip.
         n: Clips.
         favours: Whether the first is shown to be better (1) or worse (-1), or neither (0).
     """
@@ -49,12 +50,16 @@ class Difference:
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """95 % bounds; of whole sets those of the normal distribution that has the p-value of the swaps; None where nothing says so."""
+        """95 % bounds; of whole sets those of the normal distribution that has the p-value of the
+        swaps; None where nothing says so.
+        """
         if self.low is not None and self.high is not None:
             return self.low, self.high
         if self.p_value is None or not 0.0 < self.p_value < 1.0 or self.difference == 0.0:
             return None
-        half = abs(self.difference) * float(scipy.special.ndtri(1 - ALPHA / 2) / scipy.special.ndtri(1 - self.p_value / 2))
+        half = abs(self.difference) * float(
+            scipy.special.ndtri(1 - ALPHA / 2) / scipy.special.ndtri(1 - self.p_value / 2)
+        )
         return self.difference - half, self.difference + half
 
 
@@ -63,19 +68,39 @@ class Measured:
 
     Args:
         values: Of clips; a value that is undefined on a clip is not there.
-        features: For metrics of whole sets (Frechet distances): METRIC -> vectors; the arm ``reference`` holds the clean frames.
+        features: For metrics of whole sets (Frechet distances): METRIC -> vectors; the arm
+            ``reference`` holds the clean frames.
         reference: Name of the clean frames.
         seed: Of the swaps.
     """
 
-    def __init__(self, values: Values, features: Features | None = None, reference: str = "truth", seed: int = 0) -> None:
-        self.values, self.features, self.reference, self.seed = values, features or {}, reference, seed
+    def __init__(
+        self,
+        values: Values,
+        features: Features | None = None,
+        reference: str = "truth",
+        seed: int = 0,
+    ) -> None:
+        self.values, self.features, self.reference, self.seed = (
+            values,
+            features or {},
+            reference,
+            seed,
+        )
         self._tests: dict[tuple[str, str, str], SwapTest] = {}
 
     def only(self, arms: Sequence[str]) -> Measured:
-        """Return the measurements of some of the arms, in this order, beside the clean frames; tests that were made are not made again."""
-        features = {arm: self.features[arm] for arm in dict.fromkeys((*arms, self.reference)) if arm in self.features}
-        chosen = Measured({arm: self.values[arm] for arm in arms}, features, self.reference, self.seed)
+        """Return the measurements of some of the arms, in this order, beside the clean frames;
+        tests that were made are not made again.
+        """
+        features = {
+            arm: self.features[arm]
+            for arm in dict.fromkeys((*arms, self.reference))
+            if arm in self.features
+        }
+        chosen = Measured(
+            {arm: self.values[arm] for arm in arms}, features, self.reference, self.seed
+        )
         chosen._tests = self._tests
         return chosen
 
@@ -87,13 +112,17 @@ class Measured:
     @cached_property
     def set_metrics(self) -> frozenset[str]:
         """Metrics of whole sets."""
-        return frozenset(metric for clips in self.features.get(self.reference, {}).values() for metric in clips)
+        return frozenset(
+            metric for clips in self.features.get(self.reference, {}).values() for metric in clips
+        )
 
     def clips(self, arm: str, metric: str) -> list[str]:
         """Return the clips on which an arm has a metric."""
         if metric in self.set_metrics:
             mine, truth = self.features.get(arm, {}), self.features[self.reference]
-            return [clip for clip in truth if metric in truth[clip] and metric in mine.get(clip, {})]
+            return [
+                clip for clip in truth if metric in truth[clip] and metric in mine.get(clip, {})
+            ]
         return [clip for clip, found in self.values.get(arm, {}).items() if metric in found]
 
     def has(self, arm: str, metric: str) -> bool:
@@ -101,7 +130,8 @@ class Measured:
         return len(self.clips(arm, metric)) >= 2
 
     def mean(self, arm: str, metric: str) -> Interval:
-        """Return the mean over clips with its 95 % t interval, or the distance of a whole set, which has none.
+        """Return the mean over clips with its 95 % t interval, or the distance of a whole set,
+        which has none.
 
         Raises:
             EvaluatorError: Fewer than two clips.
@@ -133,17 +163,29 @@ class Measured:
             test = self._swap_test(metric, clips, *sorted((first, second)))
             difference = test.difference if first <= second else -test.difference
             favours = better * int(np.sign(difference)) if test.p_value < ALPHA else 0
-            return Difference(metric, first, second, difference, None, None, test.p_value, len(clips), favours)
+            return Difference(
+                metric, first, second, difference, None, None, test.p_value, len(clips), favours
+            )
         left = 1.0 - share
-        found = t_interval([self.values[first][clip][metric] - left * self.values[second][clip][metric] for clip in clips], "clips")
+        found = t_interval(
+            [
+                self.values[first][clip][metric] - left * self.values[second][clip][metric]
+                for clip in clips
+            ],
+            "clips",
+        )
         favours = 0
         if found.low is not None and found.high is not None and not found.low <= 0.0 <= found.high:
             favours = better * int(np.sign(found.centre))
         p_value = beyond(found, 0.0, len(clips))
-        return Difference(metric, first, second, found.centre, found.low, found.high, p_value, len(clips), favours)
+        return Difference(
+            metric, first, second, found.centre, found.low, found.high, p_value, len(clips), favours
+        )
 
     def _swap_test(self, metric: str, clips: Sequence[str], first: str, second: str) -> SwapTest:
-        """Return the test of two arms, made once: tables and verdicts ask for the same ones, in either order."""
+        """Return the test of two arms, made once: tables and verdicts ask for the same ones, in
+        either order.
+        """
         if (metric, first, second) not in self._tests:
             a, true = self._sides(metric, clips, first)
             b, _ = self._sides(metric, clips, second)
@@ -159,10 +201,20 @@ class Measured:
         clips = self._shared(metric, arm)
         found = t_interval([self.values[arm][clip][metric] - bound for clip in clips], "clips")
         better = {"higher": 1, "lower": -1}.get(KNOWN.info(metric).direction, 0)
-        decided = found.low is not None and found.high is not None and not found.low < 0.0 < found.high
+        decided = (
+            found.low is not None and found.high is not None and not found.low < 0.0 < found.high
+        )
         favours = better * (1 if found.centre >= 0 else -1) if decided else 0
         return Difference(
-            metric, arm, f"{bound:g}", found.centre, found.low, found.high, beyond(found, 0.0, len(clips)), len(clips), favours
+            metric,
+            arm,
+            f"{bound:g}",
+            found.centre,
+            found.low,
+            found.high,
+            beyond(found, 0.0, len(clips)),
+            len(clips),
+            favours,
         )
 
     def _shared(self, metric: str, *arms: str) -> list[str]:
@@ -170,15 +222,24 @@ class Measured:
         shared = [clip for clip in sides[0] if all(clip in side for side in sides[1:])]
         if len(shared) < 2:
             found = f"{len(shared)} clips in common"
-            raise EvaluatorError("comparing arms", f"{metric} of {', '.join(arms)}", found, "measure at least two clips of each")
+            raise EvaluatorError(
+                "comparing arms",
+                f"{metric} of {', '.join(arms)}",
+                found,
+                "measure at least two clips of each",
+            )
         return shared
 
     def _sides(self, metric: str, clips: Sequence[str], arm: str) -> tuple[list[F64], list[F64]]:
-        return [self.features[arm][c][metric] for c in clips], [self.features[self.reference][c][metric] for c in clips]
+        return [self.features[arm][c][metric] for c in clips], [
+            self.features[self.reference][c][metric] for c in clips
+        ]
 
 
 def beyond(found: Interval, width: float, n: int) -> float | None:
-    """Return the two-sided p-value of the t test that a mean of ``n`` values is beyond ``width`` from zero; None without an interval."""
+    """Return the two-sided p-value of the t test that a mean of ``n`` values is beyond ``width``
+    from zero; None without an interval.
+    """
     if found.low is None or found.high is None:
         return None
     excess, half = abs(found.centre) - width, (found.high - found.low) / 2
@@ -189,7 +250,9 @@ def beyond(found: Interval, width: float, n: int) -> float | None:
 
 
 def from_rows(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
-    """Return values of clips from rows as `alpasim_plugin.lab.video_metrics.summary` takes them; the time is the median over blocks."""
+    """Return values of clips from rows as `alpasim_plugin.lab.video_metrics.summary` takes them;
+    the time is the median over blocks.
+    """
     out: dict[str, dict[str, dict[str, float]]] = {}
     for row in rows:
         values = {name: float(value) for name, value in row["values"].items() if value is not None}

@@ -27,7 +27,9 @@ class PaperMetric(_Part):
     heading: str
     better: Literal["higher", "lower"]
     ours: str | None = Field(description="Our metric; null where nothing stands in its place.")
-    scale: float = Field(default=1.0, description="By what ours is multiplied to be printed like the paper's.")
+    scale: float = Field(
+        default=1.0, description="By what ours is multiplied to be printed like the paper's."
+    )
 
 
 class PaperTable(_Part):
@@ -36,8 +38,12 @@ class PaperTable(_Part):
     title: str
     protocol: str
     metrics: tuple[str, ...] = Field(description="Names of its columns.")
-    rows: dict[str, str] = Field(description="Arm to its printed numbers, one a metric: VALUE, VALUE±HALF-WIDTH, or - where none is.")
-    no_counterpart: tuple[str, ...] = Field(default=(), description="Rows of systems that cannot be run here.")
+    rows: dict[str, str] = Field(
+        description="Arm to its printed numbers, one a metric: VALUE, VALUE±HALF-WIDTH, or - where none is."
+    )
+    no_counterpart: tuple[str, ...] = Field(
+        default=(), description="Rows of systems that cannot be run here."
+    )
 
     def cells(self, arm: str) -> list[str]:
         """Return a row's printed numbers, in the order of the metrics."""
@@ -58,19 +64,33 @@ def published(path: Path | None = None) -> Published:
     """Read the numbers; without a path those that come with the package.
 
     Raises:
-        InputError: A row with more or fewer cells than its table has metrics, a cell that is no number, or an unknown metric.
+        InputError: A row with more or fewer cells than its table has metrics, a cell that is no
+            number, or an unknown metric.
     """
     path = path or Path(str(resources.files("configs.paper"))) / "published.yaml"
     file = validate(Published, load_yaml(path, DOING), DOING)
     for name, table in file.tables.items():
         if unknown := [metric for metric in table.metrics if metric not in file.metrics]:
-            raise InputError(DOING, f"{path}, table {name}", f"metrics {', '.join(unknown)}", "describe them under 'metrics'")
+            raise InputError(
+                DOING,
+                f"{path}, table {name}",
+                f"metrics {', '.join(unknown)}",
+                "describe them under 'metrics'",
+            )
         for arm in table.rows:
             cells, where = table.cells(arm), f"{path}, table {name}, row {arm}"
             if len(cells) != len(table.metrics):
-                found, do = f"{len(cells)} cells for {len(table.metrics)} metrics", "give one cell for each metric, '-' for none"
+                found, do = (
+                    f"{len(cells)} cells for {len(table.metrics)} metrics",
+                    "give one cell for each metric, '-' for none",
+                )
                 raise InputError(DOING, where, found, do)
             for metric, cell in zip(table.metrics, cells, strict=True):
                 if cell != "-" and not CELL.fullmatch(cell):
-                    raise InputError(DOING, f"{where}, {metric}", f"cell {cell!r}", "write VALUE, VALUE±HALF-WIDTH or '-'")
+                    raise InputError(
+                        DOING,
+                        f"{where}, {metric}",
+                        f"cell {cell!r}",
+                        "write VALUE, VALUE±HALF-WIDTH or '-'",
+                    )
     return file

@@ -1,4 +1,6 @@
-"""The regime map: where a history matters and where training on the own one pays, by holes, lateral shift and length of the rollout."""
+"""The regime map: where a history matters and where training on the own one pays, by holes, lateral
+shift and length of the rollout.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +80,12 @@ def under(arm: str, history: str) -> str:
 def as_measured(clips: Sequence[RegimeClip]) -> Measured:
     """Return the mean PSNR of every clip by arm and history."""
     names = clips[0].psnr_db if clips else {}
-    return Measured({name: {clip.name: {PSNR: float(clip.psnr_db[name].mean())} for clip in clips} for name in names})
+    return Measured(
+        {
+            name: {clip.name: {PSNR: float(clip.psnr_db[name].mean())} for clip in clips}
+            for name in names
+        }
+    )
 
 
 def room(clip: RegimeClip) -> F64:
@@ -87,14 +94,28 @@ def room(clip: RegimeClip) -> F64:
 
 
 def paid(clip: RegimeClip) -> F64:
-    """Return by frame what training on the own history gained over clean frames, mean over the seeds; empty without such arms."""
-    seeds = [name.removeprefix(TRAINED_ON_OWN) for name in clip.psnr_db if name.startswith(TRAINED_ON_OWN) and "history" not in name]
-    pairs = [(clip.psnr_db[TRAINED_ON_OWN + seed], clip.psnr_db[TRAINED_ON_CLEAN + seed]) for seed in seeds]
-    return np.asarray(np.mean([own - clean for own, clean in pairs], axis=0)) if pairs else np.zeros(0)
+    """Return by frame what training on the own history gained over clean frames, mean over the
+    seeds; empty without such arms.
+    """
+    seeds = [
+        name.removeprefix(TRAINED_ON_OWN)
+        for name in clip.psnr_db
+        if name.startswith(TRAINED_ON_OWN) and "history" not in name
+    ]
+    pairs = [
+        (clip.psnr_db[TRAINED_ON_OWN + seed], clip.psnr_db[TRAINED_ON_CLEAN + seed])
+        for seed in seeds
+    ]
+    return (
+        np.asarray(np.mean([own - clean for own, clean in pairs], axis=0)) if pairs else np.zeros(0)
+    )
 
 
-def bins(clips: Sequence[RegimeClip], gain: Callable[[RegimeClip], F64], crossed: bool) -> dict[At, Bin]:
-    """Return the bins of each axis alone, or those of all three crossed; what too few clips have is left out.
+def bins(
+    clips: Sequence[RegimeClip], gain: Callable[[RegimeClip], F64], crossed: bool
+) -> dict[At, Bin]:
+    """Return the bins of each axis alone, or those of all three crossed; what too few clips have is
+    left out.
 
     Args:
         clips: All.
@@ -102,19 +123,32 @@ def bins(clips: Sequence[RegimeClip], gain: Callable[[RegimeClip], F64], crossed
         crossed: Whether the axes are crossed.
     """
     counts = [len(borders) - 1 for borders in AXES.values()]
-    alone = [tuple(i if j == axis else None for j in range(len(counts))) for axis in range(len(counts)) for i in range(counts[axis])]
+    alone = [
+        tuple(i if j == axis else None for j in range(len(counts)))
+        for axis in range(len(counts))
+        for i in range(counts[axis])
+    ]
     found = {}
     for at in product(*map(range, counts)) if crossed else alone:
-        gains = [float(values[inside].mean()) for clip in clips if len(values := gain(clip)) and (inside := _inside(clip, at)).any()]
+        gains = [
+            float(values[inside].mean())
+            for clip in clips
+            if len(values := gain(clip)) and (inside := _inside(clip, at)).any()
+        ]
         if len(gains) >= LEAST_CLIPS:
             found[at] = t_interval(gains, "clips"), len(gains)
     p_values = holm([beyond(interval, 0.0, n) for interval, n in found.values()])
-    return {at: Bin(interval, n, p) for (at, (interval, n)), p in zip(found.items(), p_values, strict=True)}
+    return {
+        at: Bin(interval, n, p)
+        for (at, (interval, n)), p in zip(found.items(), p_values, strict=True)
+    }
 
 
 def _inside(clip: RegimeClip, at: Sequence[int | None]) -> Bool:
     inside = np.ones(len(clip.holes), dtype=bool)
-    for values, borders, i in zip((clip.holes, clip.shift_m, np.arange(len(clip.holes))), AXES.values(), at, strict=True):
+    for values, borders, i in zip(
+        (clip.holes, clip.shift_m, np.arange(len(clip.holes))), AXES.values(), at, strict=True
+    ):
         if i is not None:
             inside &= (values >= borders[i]) & (values < borders[i + 1])
     return inside
@@ -123,7 +157,11 @@ def _inside(clip: RegimeClip, at: Sequence[int | None]) -> Bool:
 def _label(axis: int, i: int) -> str:
     low, high = list(pairwise(list(AXES.values())[axis]))[i]
     scale, unit = ((100, " %"), (1, " m"), (1, ""))[axis]
-    return f"from {scale * low:g}{unit}" if high in (1.0, np.inf) else f"{scale * low:g} to {scale * high:g}{unit}"
+    return (
+        f"from {scale * low:g}{unit}"
+        if high in (1.0, np.inf)
+        else f"{scale * low:g} to {scale * high:g}{unit}"
+    )
 
 
 def regime_section(clips: Sequence[RegimeClip], figure: str) -> str:
@@ -137,13 +175,27 @@ def regime_section(clips: Sequence[RegimeClip], figure: str) -> str:
         rows = []
         for at, one in rooms.items():
             place = [_label(axis, i) if i is not None else "" for axis, i in enumerate(at)]
-            rows.append([*place, str(one.clips), _text(one), _text(gains[at]) if at in gains else "-"])
+            rows.append(
+                [*place, str(one.clips), _text(one), _text(gains[at]) if at in gains else "-"]
+            )
         tables.append(markdown_table([*names, "clips", "room", "paid"], rows))
     arms = [name for name in measured.arms if under(name, ORACLE) in measured.arms]
     worth = []
     for arm in arms:
-        own, others = measured.mean(arm, PSNR), [measured.difference(PSNR, under(arm, h), arm) for h in (ORACLE, EMPTY)]
-        worth.append([arm, f"{own.centre:.2f}", *(f"{d.difference:+.3f} ± {((d.high or 0) - (d.low or 0)) / 2:.3f}" for d in others)])
+        own, others = (
+            measured.mean(arm, PSNR),
+            [measured.difference(PSNR, under(arm, h), arm) for h in (ORACLE, EMPTY)],
+        )
+        worth.append(
+            [
+                arm,
+                f"{own.centre:.2f}",
+                *(
+                    f"{d.difference:+.3f} ± {((d.high or 0) - (d.low or 0)) / 2:.3f}"
+                    for d in others
+                ),
+            ]
+        )
     return "\n".join(
         (
             HOW,
@@ -162,7 +214,9 @@ def _text(one: Bin) -> str:
 
 
 def plot_regime(clips: Sequence[RegimeClip], path: Path) -> None:
-    """Draw the room in the crossed bins, a panel for each length of the rollout, and write a PNG; bold is shown."""
+    """Draw the room in the crossed bins, a panel for each length of the rollout, and write a PNG;
+    bold is shown.
+    """
     found = bins(clips, room, crossed=True)
     rows, columns, panels = (len(borders) - 1 for borders in AXES.values())
     most = max((abs(one.gain_db.centre) for one in found.values()), default=0.0) or 1.0
@@ -176,12 +230,25 @@ def plot_regime(clips: Sequence[RegimeClip], path: Path) -> None:
             half = ((one.gain_db.high or 0) - (one.gain_db.low or 0)) / 2
             text = f"{one.gain_db.centre:+.2f}\n±{half:.2f}, {one.clips}"
             colour = "white" if abs(one.gain_db.centre) > DARK * most else "black"
-            ax.text(j, i, text, ha="center", va="center", fontsize=8, weight="bold" if one.shown else "normal", color=colour)
+            ax.text(
+                j,
+                i,
+                text,
+                ha="center",
+                va="center",
+                fontsize=8,
+                weight="bold" if one.shown else "normal",
+                color=colour,
+            )
         image = ax.imshow(grid, cmap="RdBu", vmin=-most, vmax=most, aspect="auto", origin="lower")
         ax.set_xticks(range(columns), [_label(1, j) for j in range(columns)], fontsize=8)
-        ax.set_yticks(range(rows), [_label(0, i) for i in range(rows)] if k == 0 else [""] * rows, fontsize=8)
+        ax.set_yticks(
+            range(rows), [_label(0, i) for i in range(rows)] if k == 0 else [""] * rows, fontsize=8
+        )
         ax.set_title(f"{_label(2, k)} frames before it", fontsize=9)
     figure.supxlabel("camera beside the recorded path", fontsize=9)
     figure.supylabel("holes, share of the picture", fontsize=9)
-    figure.colorbar(image, ax=figure.axes, label="truth as history minus own, dB; ± 95 %, clips", shrink=0.9)
+    figure.colorbar(
+        image, ax=figure.axes, label="truth as history minus own, dB; ± 95 %, clips", shrink=0.9
+    )
     figure.savefig(path, dpi=DPI)

@@ -1,4 +1,6 @@
-"""What every arm of a comparison was given: updates, processor time, and the learning rate that a sweep chose."""
+"""What every arm of a comparison was given: updates, processor time, and the learning rate that a
+sweep chose.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,8 @@ class TrainedArm:
 
 
 def edge_of(rate: float, swept: Collection[float]) -> str | None:
-    """Return which end of the swept learning rates the chosen one is; None: it has others on both sides, or there was no choice.
+    """Return which end of the swept learning rates the chosen one is; None: it has others on both
+    sides, or there was no choice.
 
     Example:
         >>> edge_of(1e-3, [1e-4, 3e-4, 1e-3])
@@ -49,7 +52,9 @@ def training_table(arms: Sequence[TrainedArm]) -> str:
     lines = []
     for one in arms:
         stages = " + ".join(f"{name} {updates}" for name, updates in one.stages.items())
-        lines.append([one.arm, stages, f"{one.core_minutes:.2f}", f"{one.rate:g}{_candidates(one)}"])
+        lines.append(
+            [one.arm, stages, f"{one.core_minutes:.2f}", f"{one.rate:g}{_candidates(one)}"]
+        )
     return markdown_table(["arm", "stages and updates", "core-minutes", "learning rate"], lines)
 
 
@@ -62,7 +67,11 @@ def training_section(arms: Sequence[TrainedArm]) -> str:
 
 def _at_an_edge(arms: Sequence[TrainedArm], edge: str) -> str:
     names = ", ".join(f"`{one.arm}`" for one in arms if edge_of(one.rate, one.swept) == edge)
-    return f"\nThe {edge} rate of its sweep was the best of {names}: a better one may lie beyond it.\n" if names else ""
+    return (
+        f"\nThe {edge} rate of its sweep was the best of {names}: a better one may lie beyond it.\n"
+        if names
+        else ""
+    )
 
 
 def _candidates(one: TrainedArm) -> str:

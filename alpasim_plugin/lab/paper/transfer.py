@@ -14,8 +14,15 @@ from alpasim_plugin.lab.paper.published import Published
 from alpasim_plugin.lab.paper.tables import differences, means_table, paper_against_ours
 
 TRANSFER, PHOTOGRAPHS = "transfer", "transfer-photographs"
-COMPARED = (OURS, "difix", "artifixer", "artifixer@4")  # the arms of the paper's table that are trained here
-ZERO_SHOT = " zero shot"  # ends the name of an arm that was trained on driving alone; a plain name is fine-tuned, as in the paper
+COMPARED = (
+    OURS,
+    "difix",
+    "artifixer",
+    "artifixer@4",
+)  # the arms of the paper's table that are trained here
+# ends the name of an arm that was trained on driving alone; a plain name is fine-tuned, as in the
+# paper
+ZERO_SHOT = " zero shot"
 METRICS = (PSNR, PERCEPTUAL, MID, LAST, WARP, FVMD_LK)
 HOW = f"""Arms with a plain name were fine-tuned on the 32 training scenes; `{ZERO_SHOT.strip()}` means trained on driving alone;
 `onefixer` and `onefixer-dit-tiny` are as shipped. The map is black for all. The paper fine-tunes OneFixer and takes the others' published
@@ -40,7 +47,9 @@ def tenth(frames: int, last: bool) -> range:
     return range(start, start + count)
 
 
-def clip_values(series: Mapping[str, F64], frames: int, counted: Sequence[int] | None) -> dict[str, float]:
+def clip_values(
+    series: Mapping[str, F64], frames: int, counted: Sequence[int] | None
+) -> dict[str, float]:
     """Return a clip's values that this protocol adds or counts differently.
 
     Args:
@@ -49,12 +58,15 @@ def clip_values(series: Mapping[str, F64], frames: int, counted: Sequence[int] |
         counted: Indices of the frames that count for metrics of frames; None: all do.
 
     Returns:
-        PSNR and perceptual distance over the counted frames, and the latter over those in the middle and in the last tenth; a value
-        without a frame is not there.
+        PSNR and perceptual distance over the counted frames, and the latter over those in the
+        middle and in the last tenth; a value without a frame is not there.
     """
     may = range(frames) if counted is None else counted
     wanted = {PSNR: (PSNR, range(frames)), PERCEPTUAL: (PERCEPTUAL, range(frames))}
-    wanted |= {MID: (PERCEPTUAL, tenth(frames, last=False)), LAST: (PERCEPTUAL, tenth(frames, last=True))}
+    wanted |= {
+        MID: (PERCEPTUAL, tenth(frames, last=False)),
+        LAST: (PERCEPTUAL, tenth(frames, last=True)),
+    }
     out = {}
     for name, (metric, window) in wanted.items():
         at = [i for i in may if i in window]
@@ -64,11 +76,18 @@ def clip_values(series: Mapping[str, F64], frames: int, counted: Sequence[int] |
 
 
 def transfer_section(published: Published, measured: Mapping[str, Measured]) -> str:
-    """Return the section: the paper's table above ours, then photographs, paired differences below each; empty where it was not run."""
+    """Return the section: the paper's table above ours, then photographs, paired differences below
+    each; empty where it was not run.
+    """
     if TRANSFER not in measured:
         return ""
     mine = measured[TRANSFER]
-    parts = [HOW, paper_against_ours(published, "transfer", mine), _differences(mine), f"\n{_clips(mine)} held-out scenes.\n"]
+    parts = [
+        HOW,
+        paper_against_ours(published, "transfer", mine),
+        _differences(mine),
+        f"\n{_clips(mine)} held-out scenes.\n",
+    ]
     if PHOTOGRAPHS in measured:
         parts += [
             "### Photographs\n",
@@ -84,7 +103,9 @@ def _differences(measured: Measured) -> str:
     if lead is None:
         return ""
     metrics = [metric for metric in METRICS if measured.has(lead, metric)]
-    return "\n" + differences(measured, lead, [arm for arm in measured.arms if arm != lead], metrics)
+    return "\n" + differences(
+        measured, lead, [arm for arm in measured.arms if arm != lead], metrics
+    )
 
 
 def _clips(measured: Measured) -> int:

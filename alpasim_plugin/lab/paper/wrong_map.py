@@ -1,4 +1,6 @@
-"""The paper's robustness figure: what a wrong semantic map does, by how far its lanes or boxes are off."""
+"""The paper's robustness figure: what a wrong semantic map does, by how far its lanes or boxes are
+off.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,20 @@ from alpasim_plugin.lab.paper.measured import Measured
 from alpasim_plugin.lab.paper.tables import markdown_table, means_table
 from alpasim_plugin.lab.video_metrics.charts import DPI, finish, legend, panels_of
 
-METRICS = ("lane_f1_syn", "lane_xerr_syn_m", "cuboid_f1_syn", "fd_syn_16", "psnr_db", "perceptual-syn")
-PANELS = (("lane_f1_syn", "lanes"), ("lane_xerr_syn_m", "lanes"), ("cuboid_f1_syn", "boxes"), ("fd_syn_16", "lanes"))
+METRICS = (
+    "lane_f1_syn",
+    "lane_xerr_syn_m",
+    "cuboid_f1_syn",
+    "fd_syn_16",
+    "psnr_db",
+    "perceptual-syn",
+)
+PANELS = (
+    ("lane_f1_syn", "lanes"),
+    ("lane_xerr_syn_m", "lanes"),
+    ("cuboid_f1_syn", "boxes"),
+    ("fd_syn_16", "lanes"),
+)
 HOW = """Lanes and boxes of the semantic map moved by a constant, 45 configurations: lanes by -0.5 to 0.5 m to the left, boxes by
 {-0.25, 0, 0.25}² m ahead and to the left. Render, opacity and truth stay as they are. Below a black map is shown to the same weights, to V5
 that was trained with one, and `artifixer` takes none.
@@ -44,7 +58,8 @@ def means(measured: Measured) -> str:
 
 
 def ranges(measured: Measured, shifts: Mapping[str, Shift]) -> str:
-    """Return, for every distance of lanes and of boxes, the median over configurations with the smallest and the largest.
+    """Return, for every distance of lanes and of boxes, the median over configurations with the
+    smallest and the largest.
 
     Args:
         measured: An arm for each configuration.
@@ -57,8 +72,18 @@ def ranges(measured: Measured, shifts: Mapping[str, Shift]) -> str:
             cells = []
             for metric in metrics:
                 found = _values(measured, shifts, metric, what, distance)
-                cells.append(f"{np.median(found):.3f} ({min(found):.3f} to {max(found):.3f})" if found else "null")
-            rows.append([f"{what} {distance:.2f} m", str(sum(shift.by(what) == distance for shift in shifts.values())), *cells])
+                cells.append(
+                    f"{np.median(found):.3f} ({min(found):.3f} to {max(found):.3f})"
+                    if found
+                    else "null"
+                )
+            rows.append(
+                [
+                    f"{what} {distance:.2f} m",
+                    str(sum(shift.by(what) == distance for shift in shifts.values())),
+                    *cells,
+                ]
+            )
     return RANGES + "\n" + markdown_table(["off by", "maps", *metrics], rows)
 
 
@@ -68,22 +93,37 @@ def distances(shifts: Mapping[str, Shift], what: str) -> list[float]:
 
 
 def plot(measured: Measured, shifts: Mapping[str, Shift], path: Path) -> None:
-    """Draw the paper's four panels: a box over configurations for every distance, a dot for the true map, and the unconditioned arms.
+    """Draw the paper's four panels: a box over configurations for every distance, a dot for the
+    true map, and the unconditioned arms.
 
     Args:
         measured: An arm for each configuration, and arms beside them, which become lines.
         shifts: ARM -> how far it is off.
         path: Of the PNG.
     """
-    shown = [(metric, what) for metric, what in PANELS if any(measured.has(arm, metric) for arm in shifts)]
+    shown = [
+        (metric, what)
+        for metric, what in PANELS
+        if any(measured.has(arm, metric) for arm in shifts)
+    ]
     figure, panels = panels_of(max(len(shown), 1))
     beside = [arm for arm in measured.arms if arm not in shifts]
     true = [arm for arm, shift in shifts.items() if shift == Shift(0.0, 0.0)]
     for ax, (metric, what) in zip(panels, shown, strict=False):
         groups = distances(shifts, what)
-        ax.boxplot([_values(measured, shifts, metric, what, distance) for distance in groups], positions=range(len(groups)), widths=0.5)
+        ax.boxplot(
+            [_values(measured, shifts, metric, what, distance) for distance in groups],
+            positions=range(len(groups)),
+            widths=0.5,
+        )
         for i, arm in enumerate(arm for arm in beside if measured.has(arm, metric)):
-            ax.axhline(measured.mean(arm, metric).centre, color=f"C{i}", linestyle="--", label=arm, linewidth=1.4)
+            ax.axhline(
+                measured.mean(arm, metric).centre,
+                color=f"C{i}",
+                linestyle="--",
+                label=arm,
+                linewidth=1.4,
+            )
         for arm in true:
             ax.plot([0], [measured.mean(arm, metric).centre], "ko", markersize=4, label="true map")
         ax.set_xticks(range(len(groups)), [f"{distance:.2f}" for distance in groups])
@@ -93,6 +133,12 @@ def plot(measured: Measured, shifts: Mapping[str, Shift], path: Path) -> None:
     figure.savefig(path, dpi=DPI)
 
 
-def _values(measured: Measured, shifts: Mapping[str, Shift], metric: str, what: str, distance: float) -> Sequence[float]:
-    mine = [arm for arm, shift in shifts.items() if shift.by(what) == distance and measured.has(arm, metric)]
+def _values(
+    measured: Measured, shifts: Mapping[str, Shift], metric: str, what: str, distance: float
+) -> Sequence[float]:
+    mine = [
+        arm
+        for arm, shift in shifts.items()
+        if shift.by(what) == distance and measured.has(arm, metric)
+    ]
     return [measured.mean(arm, metric).centre for arm in mine]

@@ -1,8 +1,10 @@
-"""Adapt a fixer to one recorded street: some updates on its own photographs, kept only where photographs that nobody trained on gain.
+"""Adapt a fixer to one recorded street: some updates on its own photographs, kept only where
+photographs that nobody trained on gain.
 
-Training shows the model where photographs were taken that it was fitted to, with the other photographs as references; the judge is the
-photographs that were held out of the fit. New weights are accepted where the mean gain in PSNR over them is above 0 with 95 % confidence
-(Student's t over photographs), for the alternative is to keep what ships.
+Training shows the model where photographs were taken that it was fitted to, with the other
+photographs as references; the judge is the photographs that were held out of the fit. New weights
+are accepted where the mean gain in PSNR over them is above 0 with 95 % confidence (Student's t over
+photographs), for the alternative is to keep what ships.
 """
 
 from __future__ import annotations
@@ -37,7 +39,9 @@ from alpasim_plugin.lab.training.trainer import Schedule
 DOING = "adapting a fixer"
 FEWEST, ENOUGH = 12, 4  # fitted photographs to train on; held-out ones to judge by
 WIDTH_PX = 512  # of the photographs, at most
-LR, WARMUP, CROP = 2e-4, 5, (96, 128)
+LR = 2e-4
+WARMUP = 5
+CROP = (96, 128)
 VARIANT = "V9-still"
 Report = Callable[[int, Mapping[str, float]], None]
 
@@ -100,13 +104,21 @@ def compared(before: F64, after: F64) -> Adapted:
     gain = after - before
     half = float(stats.t.ppf(0.975, len(gain) - 1) * gain.std(ddof=1) / np.sqrt(len(gain)))
     mean = float(gain.mean())
-    return Adapted(tuple(before.tolist()), tuple(after.tolist()), mean, (mean - half, mean + half), mean - half > 0)
+    return Adapted(
+        tuple(before.tolist()),
+        tuple(after.tolist()),
+        mean,
+        (mean - half, mean + half),
+        mean - half > 0,
+    )
 
 
 def _pairs(scenario: Scenario, root: Path, seed: int) -> PairSequence:
     """Write the split ``train`` and return the sequence that judges."""
     camera = next((one.name for one in scenario.cameras), "")
-    taken = sorted((one for one in scenario.recording if one.camera == camera), key=lambda one: one.t_us)
+    taken = sorted(
+        (one for one in scenario.recording if one.camera == camera), key=lambda one: one.t_us
+    )
     count = {use: sum(one.use == use for one in taken) for use in ("fitted", "held-out")}
     if scenario.model is None or count["fitted"] < FEWEST or count["held-out"] < ENOUGH:
         found = f"{count['fitted']} fitted and {count['held-out']} held-out photographs of camera {camera!r}"
@@ -116,21 +128,41 @@ def _pairs(scenario: Scenario, root: Path, seed: int) -> PairSequence:
     fitted = [shot for shot in shots if shot.photograph.use == "fitted"]
     held = [shot for shot in shots if shot.photograph.use == "held-out"]
     for split, shown in (("train", fitted), ("judge", held)):
-        info: dict[str, Any] = {"scene_id": scenario.scene_id, "seed": seed, "split": split, "family": DRIVE}
-        write_drive_sequence(scenario, shown, fitted, root / "pairs" / split / "drive_0", info, threads=1)
+        info: dict[str, Any] = {
+            "scene_id": scenario.scene_id,
+            "seed": seed,
+            "split": split,
+            "family": DRIVE,
+        }
+        write_drive_sequence(
+            scenario, shown, fitted, root / "pairs" / split / "drive_0", info, threads=1
+        )
     return PairSequence(root / "pairs" / "judge" / "drive_0")
 
 
 def _psnr(judge: PairSequence, weights: Path, seed: int) -> F64:
-    """Return the PSNR of each held-out photograph behind the fixer, in order of time, so that it has its history."""
+    """Return the PSNR of each held-out photograph behind the fixer, in order of time, so that it
+    has its history.
+    """
     name, overrides = bundle_fixer(weights)
     spec = resolve("fixer", name, overrides)
     clip = quality_clip(judge)
-    made = run_variant(clip, Variant("adapted", spec), build(spec, scene_id=clip.name, seed=seed, device="cpu", threads=1))
+    made = run_variant(
+        clip,
+        Variant("adapted", spec),
+        build(spec, scene_id=clip.name, seed=seed, device="cpu", threads=1),
+    )
     return np.array([psnr_db(a, b) for a, b in zip(made.video, clip.truth, strict=True)])
 
 
-def _trained(root: Path, weights: Path, updates: int, distance: tuple[str, Distance] | None, seed: int, report: Report | None) -> Path:
+def _trained(
+    root: Path,
+    weights: Path,
+    updates: int,
+    distance: tuple[str, Distance] | None,
+    seed: int,
+    report: Report | None,
+) -> Path:
     name, overrides = bundle_fixer(weights)
     settings = resolve("fixer", name, overrides).settings
     if not isinstance(settings, PixelFixerSettings):
@@ -138,8 +170,13 @@ def _trained(root: Path, weights: Path, updates: int, distance: tuple[str, Dista
     width, height = PairSequence(root / "pairs" / "train" / "drive_0").size
     crop = min(CROP[0], height), min(CROP[1], width)
     shares = StreamShares(pairs=0.93, identity=0.07, video=0.0, damaged_video=0.0)
-    streams = TrainingStreams(root / "pairs", seed=seed, batch=4, frames=4, crop=crop, episode=6, shares=shares)
+    streams = TrainingStreams(
+        root / "pairs", seed=seed, batch=4, frames=4, crop=crop, episode=6, shares=shares
+    )
     schedule = Schedule(updates, peak_lr=LR, warmup=min(WARMUP, updates), clip=0.5, ema=0.9)
     return train_per_frame(
-        PixelRun(settings, streams, pixel_variant(VARIANT), schedule, weights, seed), root / "run", distance, report=report
+        PixelRun(settings, streams, pixel_variant(VARIANT), schedule, weights, seed),
+        root / "run",
+        distance,
+        report=report,
     )

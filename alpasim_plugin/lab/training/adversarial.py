@@ -1,7 +1,8 @@
 """One-Forcing's adversarial head on the fake score's trunk: does a noised clip look real?
 
-One learned token a tapped block attends to that block's output, and their concatenation gives one logit a clip. The head sees clips at the
-noise levels of the critic. Losses are the chunk-wise ones, with both regularisers:
+One learned token a tapped block attends to that block's output, and their concatenation gives one
+logit a clip. The head sees clips at the noise levels of the critic. Losses are the chunk-wise ones,
+with both regularisers:
 
     generator   w softplus(-D(x_fake))
     critic      w [softplus(-D(x_real)) + softplus(D(x_fake))]
@@ -54,7 +55,9 @@ class AdversarialTerm:
         """Return the generator's loss for the logits ``(B,)`` of its clips."""
         return self.weight * F.softplus(-fake).mean()
 
-    def critic(self, logits: Logits, x_real: Tensor, x_fake: Tensor, fake: Tensor, xi: Tensor) -> tuple[Tensor, Tensor]:
+    def critic(
+        self, logits: Logits, x_real: Tensor, x_fake: Tensor, fake: Tensor, xi: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return the critic's loss and the logits of the real clips.
 
         Args:
@@ -66,7 +69,9 @@ class AdversarialTerm:
         real = logits(x_real)
         loss = self.weight * (F.softplus(-real).mean() + F.softplus(fake).mean())
         loss = loss + self.r1 * (logits(x_real + self.r1_step * xi) - real).square().mean()
-        return loss + self.r2 * ((logits(x_fake + self.r2_step * xi) - fake) / self.r2_step).square().mean(), real
+        return loss + self.r2 * (
+            (logits(x_fake + self.r2_step * xi) - fake) / self.r2_step
+        ).square().mean(), real
 
 
 class AdversarialHead(nn.Module):
@@ -85,10 +90,20 @@ class AdversarialHead(nn.Module):
     def __init__(self, width: int, taps: int, heads: int, inner: int, seed: int) -> None:
         super().__init__()
         if width % heads:
-            raise InputError("building an adversarial head", f"{heads} heads", f"width {width}", "choose heads that divide it")
+            raise InputError(
+                "building an adversarial head",
+                f"{heads} heads",
+                f"width {width}",
+                "choose heads that divide it",
+            )
         with torch.device("meta"):  # layers would draw initial values from the global generator
             self.readers = nn.ModuleList(_Reader(width, heads, inner) for _ in range(taps))
-            self.verdict = nn.Sequential(nn.LayerNorm(taps * width), nn.Linear(taps * width, inner), nn.SiLU(), nn.Linear(inner, 1))
+            self.verdict = nn.Sequential(
+                nn.LayerNorm(taps * width),
+                nn.Linear(taps * width, inner),
+                nn.SiLU(),
+                nn.Linear(inner, 1),
+            )
         self.to_empty(device="cpu")
         generator = torch.Generator().manual_seed(seed % 2**63)
         with torch.no_grad():
@@ -114,7 +129,11 @@ class _Reader(nn.Module):
         super().__init__()
         self.heads = heads
         self.token = nn.Parameter(torch.zeros(width))
-        self.token_norm, self.features_norm, self.inner_norm = RMSNorm(width), nn.LayerNorm(width), nn.LayerNorm(width)
+        self.token_norm, self.features_norm, self.inner_norm = (
+            RMSNorm(width),
+            nn.LayerNorm(width),
+            nn.LayerNorm(width),
+        )
         self.q, self.k, self.v, self.out = (nn.Linear(width, width, bias=False) for _ in range(4))
         self.q_norm, self.k_norm = RMSNorm(width // heads), RMSNorm(width // heads)
         self.ffn = nn.Sequential(nn.Linear(width, inner), nn.GELU("tanh"), nn.Linear(inner, width))
@@ -123,7 +142,10 @@ class _Reader(nn.Module):
         """Map features ``(B, L, width)`` to the token's ``(B, width)``."""
         token = self.token_norm(self.token).expand(len(x), 1, -1)
         seen = self.features_norm(x)
-        q, k, v = (layer(y).unflatten(-1, (self.heads, -1)) for layer, y in ((self.q, token), (self.k, seen), (self.v, seen)))
+        q, k, v = (
+            layer(y).unflatten(-1, (self.heads, -1))
+            for layer, y in ((self.q, token), (self.k, seen), (self.v, seen))
+        )
         token = token + self.out(attend(self.q_norm(q), self.k_norm(k), v))
         out: Tensor = token + self.ffn(self.inner_norm(token))
         return out[:, 0]

@@ -1,7 +1,9 @@
-"""Night, fog and snow by fixed formulas on a clean frame and its depth: targets that cannot drift, unlike edited videos.
+"""Night, fog and snow by fixed formulas on a clean frame and its depth: targets that cannot drift,
+unlike edited videos.
 
-Fog is Koschmieder's law, ``I exp(-b d) + A (1 - exp(-b d))``. Night darkens, shifts to blue and adds lamps, also the ego's own.
-Snow whitens surfaces that face up and adds flakes that fall with time. The same seed gives the same weather for every frame of a scene.
+Fog is Koschmieder's law, ``I exp(-b d) + A (1 - exp(-b d))``. Night darkens, shifts to blue and
+adds lamps, also the ego's own. Snow whitens surfaces that face up and adds flakes that fall with
+time. The same seed gives the same weather for every frame of a scene.
 """
 
 from __future__ import annotations
@@ -57,7 +59,12 @@ def restyle(frame: SeenFrame, style: str, scene_id: str, seed: int) -> U8:
     if style == CLEAR:
         return np.array(frame.rgb)
     if style not in _FORMULAS:
-        raise InputError("restyling a frame", f"style {style!r}", "no such style", f"choose one of {', '.join(STYLES)}")
+        raise InputError(
+            "restyling a frame",
+            f"style {style!r}",
+            "no such style",
+            f"choose one of {', '.join(STYLES)}",
+        )
     image = frame.rgb.astype(np.float32) / np.float32(255)
     made = _FORMULAS[style](frame, image, stream(scene_id, seed, f"appearance.{style}"))
     return np.asarray(np.clip(np.rint(made * 255), 0, 255), dtype=np.uint8)
@@ -103,16 +110,28 @@ def snow(frame: SeenFrame, image: F32, rng: np.random.Generator) -> F32:
     up = np.clip((_up_share(frame) - 0.6) / 0.3, 0, 1)[..., None]
     grey = image.mean(axis=2, keepdims=True)
     out = image + up * cover * (white * (0.75 + 0.25 * grey) - image)
-    start, speed = rng.uniform(0, 1, (FLAKES, 3)) * BOX_M, rng.uniform([-0.5, 1.0, -0.5], [0.5, 2.0, 0.5], (FLAKES, 3))
+    start, speed = (
+        rng.uniform(0, 1, (FLAKES, 3)) * BOX_M,
+        rng.uniform([-0.5, 1.0, -0.5], [0.5, 2.0, 0.5], (FLAKES, 3)),
+    )
     return _with_flakes(frame, np.asarray(out, dtype=np.float32), start + speed * frame.t_us * 1e-6)
 
 
 def _up_share(frame: SeenFrame) -> F32:
-    """Return the upward part ``(H, W)`` of the surface's unit normal, from differences of depth; 0 where there is no surface."""
+    """Return the upward part ``(H, W)`` of the surface's unit normal, from differences of depth; 0
+    where there is no surface.
+    """
     h, w = frame.depth_m.shape
     v, u = np.mgrid[:h, :w].astype(np.float64)
     z = frame.depth_m.astype(np.float64)
-    rays = np.stack([(u + 0.5 - frame.K[0, 2]) / frame.K[0, 0], (v + 0.5 - frame.K[1, 2]) / frame.K[1, 1], np.ones_like(u)], axis=-1)
+    rays = np.stack(
+        [
+            (u + 0.5 - frame.K[0, 2]) / frame.K[0, 0],
+            (v + 0.5 - frame.K[1, 2]) / frame.K[1, 1],
+            np.ones_like(u),
+        ],
+        axis=-1,
+    )
     at = rays * z[..., None]
     normal = np.cross(np.gradient(at, axis=1), np.gradient(at, axis=0))
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
@@ -121,17 +140,27 @@ def _up_share(frame: SeenFrame) -> F32:
 
 
 def _with_flakes(frame: SeenFrame, image: F32, world: F64) -> F32:
-    """Draw flakes that fill space periodically and stand in the world, nearer ones larger; those behind a surface are hidden."""
+    """Draw flakes that fill space periodically and stand in the world, nearer ones larger; those
+    behind a surface are hidden.
+    """
     falling = world * np.array([1.0, -1.0, 1.0])  # y is the world's height here
     position = frame.T_world_camera[[0, 2, 1], 3]
-    relative = np.mod(falling - position, BOX_M) - BOX_M / 2  # x, height, y in the world, around the camera
-    at = np.stack([relative[:, 0], relative[:, 2], relative[:, 1]], axis=1) @ frame.T_world_camera[:3, :3]
+    relative = (
+        np.mod(falling - position, BOX_M) - BOX_M / 2
+    )  # x, height, y in the world, around the camera
+    at = (
+        np.stack([relative[:, 0], relative[:, 2], relative[:, 1]], axis=1)
+        @ frame.T_world_camera[:3, :3]
+    )
     h, w = image.shape[:2]
     for x, y, z in at[at[:, 2] > 0.6]:
         u, v = frame.K[0, 0] * x / z + frame.K[0, 2], frame.K[1, 1] * y / z + frame.K[1, 2]
         if 1 <= u < w - 1 and 1 <= v < h - 1 and _depth(frame)[int(v), int(u)] > z:
             radius = int(np.clip(0.012 * frame.K[0, 0] / z, 0, 3))
-            rows, columns = slice(max(int(v) - radius, 0), int(v) + radius + 1), slice(max(int(u) - radius, 0), int(u) + radius + 1)
+            rows, columns = (
+                slice(max(int(v) - radius, 0), int(v) + radius + 1),
+                slice(max(int(u) - radius, 0), int(u) + radius + 1),
+            )
             image[rows, columns] += 0.75 * (0.97 - image[rows, columns])
     return image
 
@@ -140,14 +169,18 @@ _FORMULAS = {"night": night, "fog": fog, "snow": snow}
 
 
 def lights_of_posts(world: F64, T_world_camera: F64) -> F64:
-    """Return the street lights within 80 m ahead as lamps ``(N, 6)`` of the camera, from their places ``(N, 3)`` in the world."""
+    """Return the street lights within 80 m ahead as lamps ``(N, 6)`` of the camera, from their
+    places ``(N, 3)`` in the world.
+    """
     at = (world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     seen = at[(at[:, 2] > 0) & (at[:, 2] < STREET_LIGHTS_M)]
     return np.concatenate([seen, np.tile(STREET_LIGHT_RGB, (len(seen), 1))], axis=1)
 
 
 def vehicle_lamps(corners: Sequence[F64]) -> F64:
-    """Return the lamps ``(N, 6)`` of vehicles from their boxes' corners ``(8, 3)``: white ahead, red behind."""
+    """Return the lamps ``(N, 6)`` of vehicles from their boxes' corners ``(8, 3)``: white ahead,
+    red behind.
+    """
     rows = []
     for box in corners:
         for end, rgb in ((slice(4, 8), (1.0, 0.95, 0.8)), (slice(0, 4), (0.9, 0.08, 0.05))):
@@ -156,7 +189,9 @@ def vehicle_lamps(corners: Sequence[F64]) -> F64:
             nearer = np.linalg.norm(face.mean(axis=0)) < np.linalg.norm(box.mean(axis=0))
             if not nearer:
                 continue
-            for a, b in zip(top[np.argsort(top[:, 0])], bottom[np.argsort(bottom[:, 0])], strict=True):
+            for a, b in zip(
+                top[np.argsort(top[:, 0])], bottom[np.argsort(bottom[:, 0])], strict=True
+            ):
                 side = 0.45 * a + 0.55 * b
                 middle = face.mean(axis=0)
                 rows.append([*(side + 0.15 * (middle - side)), *rgb])

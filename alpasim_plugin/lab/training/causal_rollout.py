@@ -1,10 +1,12 @@
-"""A few-step rollout of the causal generator that carries gradients: the student's own clips, as its deployment makes them.
+"""A few-step rollout of the causal generator that carries gradients: the student's own clips, as
+its deployment makes them.
 
     z^i = G(z^i_1 | history^<i)        block by block, one to n flow steps; a gradient through the last step of every block alone
 
-What the history holds decides where gradients go. With ``finalise`` the finished latents are written by a forward without gradient, so none
-crosses from one block to another (Self-Forcing). With ``last-forward`` the keys and values of the last step stay, graph and all, so a
-block's loss reaches every block before it (ArtiFixer).
+What the history holds decides where gradients go. With ``finalise`` the finished latents are
+written by a forward without gradient, so none crosses from one block to another (Self-Forcing).
+With ``last-forward`` the keys and values of the last step stay, graph and all, so a block's loss
+reaches every block before it (ArtiFixer).
 """
 
 from __future__ import annotations
@@ -35,8 +37,10 @@ def causal_rollout(
 
     Args:
         net: The generator.
-        sources: ``z_1`` of every step, each ``(B, C, N, H, W)`` and mixed with noise of its own (Eq. 1).
-        schedule: Noise levels of the steps, as many as sources: the last is the exit step, whose prediction is kept.
+        sources: ``z_1`` of every step, each ``(B, C, N, H, W)`` and mixed with noise of its own
+            (Eq. 1).
+        schedule: Noise levels of the steps, as many as sources: the last is the exit step, whose
+            prediction is kept.
         eps_context: Noise of the cache write ``(B, C, N, H, W)``; used with ``finalise``.
         text, condition: As the network takes them.
         attention: Blocks, window, sink and history, as at deployment.
@@ -52,7 +56,16 @@ def causal_rollout(
     for start in range(0, n, attention.block_latents):
         own = slice(start, min(start + attention.block_latents, n))
         with torch.set_grad_enabled(torch.is_grad_enabled() and own.start >= first):
-            made.append(_block(net, [z_1[:, :, own] for z_1 in sources], schedule, text, condition[:, :, own], cache))
+            made.append(
+                _block(
+                    net,
+                    [z_1[:, :, own] for z_1 in sources],
+                    schedule,
+                    text,
+                    condition[:, :, own],
+                    cache,
+                )
+            )
         if attention.history == "finalise":
             with torch.no_grad():
                 finalise(net, made[-1], eps_context[:, :, own], text, condition[:, :, own], cache)
@@ -69,10 +82,16 @@ def _block(
     condition: Tensor,
     cache: BlockCache,
 ) -> Tensor:
-    """Denoise a block and leave it open: steps before the last without gradient, each from the last prediction and a fresh source."""
+    """Denoise a block and leave it open: steps before the last without gradient, each from the last
+    prediction and a fresh source.
+    """
     z = sources[0]
     with torch.no_grad():
         for level, z_1, following in zip(schedule, sources[1:], schedule[1:], strict=False):
-            z_0 = flow_step(z, net.step(z, level.t, text, condition, cache, write=False), level.sigma)
+            z_0 = flow_step(
+                z, net.step(z, level.t, text, condition, cache, write=False), level.sigma
+            )
             z = interpolant(z_0, z_1, following.sigma)
-    return flow_step(z, net.step(z, schedule[-1].t, text, condition, cache, write=False), schedule[-1].sigma)
+    return flow_step(
+        z, net.step(z, schedule[-1].t, text, condition, cache, write=False), schedule[-1].sigma
+    )

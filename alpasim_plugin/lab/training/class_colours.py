@@ -1,11 +1,14 @@
-"""Class-colour augmentation: replace the colours of cars on a drawn semantic map by those of another class.
+"""Class-colour augmentation: replace the colours of cars on a drawn semantic map by those of
+another class.
 
-Training scenes contain mostly cars; a deployed fixer meets buses, cyclists and pedestrians. A network that has never seen the colour of a
-class copies it into the image. The augmentation trains on clips whose cars have the colours of another class.
+Training scenes contain mostly cars; a deployed fixer meets buses, cyclists and pedestrians. A
+network that has never seen the colour of a class copies it into the image. The augmentation trains
+on clips whose cars have the colours of another class.
 
-The colour of a box pixel is a non-negative combination of its class's front and back colour, ``a * front + b * back``, darker with
-distance. ``a`` and ``b`` are solved for and applied to the other class's colours. Most lane markings and the grey box edges are not such
-combinations; untyped lane lines are close to one, so pixels nearer to a marking's colour, at any brightness, are not changed.
+The colour of a box pixel is a non-negative combination of its class's front and back colour, ``a *
+front + b * back``, darker with distance. ``a`` and ``b`` are solved for and applied to the other
+class's colours. Most lane markings and the grey box edges are not such combinations; untyped lane
+lines are close to one, so pixels nearer to a marking's colour, at any brightness, are not changed.
 """
 
 from __future__ import annotations
@@ -18,7 +21,9 @@ from alpasim_plugin.fixers.semantic_map.style import BOX_COLOURS, COLOURS
 
 FROM = "car"
 OTHERS = ("truck", "cyclist", "pedestrian", "other")
-PAINT_OFF = 1.0  # levels; distance that rounding causes between a marking's pixel and its colour's line through black
+# levels; distance that rounding causes between a marking's pixel and its colour's line through
+# black
+PAINT_OFF = 1.0
 OFF, OFF_SHARE = 4.0, 0.06  # tolerance of the fit: levels, and share of the pixel's length
 
 
@@ -36,8 +41,15 @@ def swap_class_colours(sdmap: U8, kind: str) -> U8:
         InputError: A class without colours.
     """
     if kind not in BOX_COLOURS:
-        raise InputError("augmenting class colours", f"class {kind!r}", "it has no colours", f"choose one of {', '.join(BOX_COLOURS)}")
-    old, new = (np.array(BOX_COLOURS[name], np.float32) for name in (FROM, kind))  # (2, 3): front, back
+        raise InputError(
+            "augmenting class colours",
+            f"class {kind!r}",
+            "it has no colours",
+            f"choose one of {', '.join(BOX_COLOURS)}",
+        )
+    old, new = (
+        np.array(BOX_COLOURS[name], np.float32) for name in (FROM, kind)
+    )  # (2, 3): front, back
     out = sdmap.copy()
     inked = sdmap.any(axis=-1)
     pixels = sdmap[inked].astype(np.float32)
@@ -53,10 +65,16 @@ def swap_class_colours(sdmap: U8, kind: str) -> U8:
 
 
 def _paint_distance(pixels: F32) -> F32:
-    """Return the distance of pixels ``(N, 3)`` to the nearest marking colour at any brightness, in levels ``(N,)``."""
+    """Return the distance of pixels ``(N, 3)`` to the nearest marking colour at any brightness, in
+    levels ``(N,)``.
+    """
     colours = np.array(list(COLOURS.values()), np.float32)
     directions = colours / np.linalg.norm(colours, axis=1, keepdims=True)
     nearest = np.full(len(pixels), np.inf, np.float32)
-    for direction in directions:  # one at a time: vectorised, it takes 18 times the memory of the map
-        nearest = np.minimum(nearest, np.linalg.norm(pixels - np.outer(pixels @ direction, direction), axis=1))
+    for (
+        direction
+    ) in directions:  # one at a time: vectorised, it takes 18 times the memory of the map
+        nearest = np.minimum(
+            nearest, np.linalg.norm(pixels - np.outer(pixels @ direction, direction), axis=1)
+        )
     return nearest

@@ -1,4 +1,6 @@
-"""Batches of the block generators: clips, crops and noise, drawn by the batch's number; and what the network sees besides its source."""
+"""Batches of the block generators: clips, crops and noise, drawn by the batch's number; and what
+the network sees besides its source.
+"""
 
 from __future__ import annotations
 
@@ -26,9 +28,12 @@ class Seen:
     """What a network sees: its source and its condition, in training and at deployment.
 
     Args:
-        map: The semantic map as ``drawn``; the latents of a ``black`` one, which says that there is no road; or ``nothing``, zeros.
-        source: Eq. 1 (``mixed``); or ``noise`` alone, with the render's latents as condition after the map's.
-        opacity: Whether the opacity enters every transformer block (ArtiFixer); it follows the map in the condition.
+        map: The semantic map as ``drawn``; the latents of a ``black`` one, which says that there is
+            no road; or ``nothing``, zeros.
+        source: Eq. 1 (``mixed``); or ``noise`` alone, with the render's latents as condition after
+            the map's.
+        opacity: Whether the opacity enters every transformer block (ArtiFixer); it follows the map
+            in the condition.
     """
 
     map: Literal["drawn", "black", "nothing"] = "drawn"
@@ -64,7 +69,12 @@ class BatchForm:
 
     def __post_init__(self) -> None:
         if self.columns is not None and self.columns % PATCH:
-            raise InputError("setting up training batches", f"columns {self.columns}", "half a token", "give an even number of latents")
+            raise InputError(
+                "setting up training batches",
+                f"columns {self.columns}",
+                "half a token",
+                "give an even number of latents",
+            )
 
 
 class Drawn(NamedTuple):
@@ -75,12 +85,18 @@ class Drawn(NamedTuple):
     columns: slice
 
     def frames(self, end: int, begin: int = 0) -> tuple[Tensor, Tensor]:
-        """Return the render ``(B, 3, T, H, W)`` in [-1, 1] and its opacity ``(B, 1, T, H, W)``: the clips' frames ``begin`` to ``end``."""
+        """Return the render ``(B, 3, T, H, W)`` in [-1, 1] and its opacity ``(B, 1, T, H, W)``: the
+        clips' frames ``begin`` to ``end``.
+        """
         both = [clip.frames(end, begin) for clip in self.clips]
-        return torch.stack([self._cut(render) for render, _ in both]), torch.stack([self._cut(opacity) for _, opacity in both])
+        return torch.stack([self._cut(render) for render, _ in both]), torch.stack(
+            [self._cut(opacity) for _, opacity in both]
+        )
 
     def clean(self, end: int, begin: int = 0) -> Tensor:
-        """Return the clean frames ``(B, 3, T, H, W)`` in [-1, 1] of the clips' frames ``begin`` to ``end``."""
+        """Return the clean frames ``(B, 3, T, H, W)`` in [-1, 1] of the clips' frames ``begin`` to
+        ``end``.
+        """
         return torch.stack([self._cut(clip.clean(end, begin)) for clip in self.clips])
 
     def _cut(self, frames: Tensor) -> Tensor:
@@ -104,12 +120,15 @@ class ClipBatches:
     def __getitem__(self, index: int) -> Drawn:
         """Draw batch ``index``: a function of the index and the seed only.
 
-        Equal clips, crops and noise for every recipe of the same form, so that recipes are compared on the same draws.
+        Equal clips, crops and noise for every recipe of the same form, so that recipes are compared
+        on the same draws.
         """
         form = self.form
         rng = stream("training", form.seed, "generator.clips", index)
         clips = [self.clips[int(i)] for i in rng.integers(len(self.clips), size=form.clips)]
-        z_r, z_0, z_map, m = (torch.stack(z) for z in zip(*(clip.latents for clip in clips), strict=True))
+        z_r, z_0, z_map, m = (
+            torch.stack(z) for z in zip(*(clip.latents for clip in clips), strict=True)
+        )
         columns = self._columns(rng, z_0.shape[-1])
         latents = slice(0, form.latents)
         w = int(rng.integers(len(range(z_0.shape[2])[latents])))
@@ -117,13 +136,17 @@ class ClipBatches:
         b, n = z_0.shape[0], z_0.shape[2]
 
         def normal(what: str) -> Tensor:
-            noise = stream("training", form.seed, f"generator.{what}", index).standard_normal(z_0.shape, dtype=np.float32)
+            noise = stream("training", form.seed, f"generator.{what}", index).standard_normal(
+                z_0.shape, dtype=np.float32
+            )
             return torch.from_numpy(noise)
 
         def uniform() -> Tensor:
             return torch.from_numpy(rng.random((b, n), dtype=np.float32))
 
-        sample = Sample(z_r, z_0, z_map, m, normal("eps"), normal("context"), uniform(), uniform(), w)
+        sample = Sample(
+            z_r, z_0, z_map, m, normal("eps"), normal("context"), uniform(), uniform(), w
+        )
         drawn = Drawn(sample, clips, columns)
         return drawn._replace(sample=self._as_seen(drawn))
 
@@ -149,12 +172,18 @@ class ClipBatches:
 
 
 @torch.no_grad()
-def shown_map(map: Literal["drawn", "black", "nothing"], clips: LatentClips, vae: TinyVAE) -> Tensor | None:
-    """Return the latents ``(16, N, H/8, W/8)`` that all clips have in their maps' place; None where their own are shown."""
+def shown_map(
+    map: Literal["drawn", "black", "nothing"], clips: LatentClips, vae: TinyVAE
+) -> Tensor | None:
+    """Return the latents ``(16, N, H/8, W/8)`` that all clips have in their maps' place; None where
+    their own are shown.
+    """
     if map == "drawn":
         return None
     like = clips[0].z_map
     if map == "nothing":
         return torch.zeros_like(like)
     _, latents, rows, columns = like.shape
-    return vae.encode(torch.full((1, 3, 1 + GROUP * (latents - 1), rows * SIDE, columns * SIDE), -1.0))[0]
+    return vae.encode(
+        torch.full((1, 3, 1 + GROUP * (latents - 1), rows * SIDE, columns * SIDE), -1.0)
+    )[0]

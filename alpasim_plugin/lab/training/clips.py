@@ -1,4 +1,6 @@
-"""Sample training clips from pairs and from driving videos. Clip i depends on i and the seed only."""
+"""Sample training clips from pairs and from driving videos. Clip i depends on i and the seed
+only.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ class CropSize:
 
 @dataclass(frozen=True)
 class Clip:
-    """A clip as tensors ``(C, T, H, W)``: images in [-1, 1], opacity 0 to 1 with one channel. None: the source has no such channel."""
+    """A clip as tensors ``(C, T, H, W)``: images in [-1, 1], opacity 0 to 1 with one channel. None:
+    the source has no such channel.
+    """
 
     target: Tensor
     render: Tensor | None = None
@@ -39,7 +43,9 @@ class Clip:
     sdmap: Tensor | None = None
 
 
-def draw_pair_clip(sequences: Sequence[PairSequence], size: CropSize, seed: int, index: int) -> Clip:
+def draw_pair_clip(
+    sequences: Sequence[PairSequence], size: CropSize, seed: int, index: int
+) -> Clip:
     """Sample a clip from pairs: random sequence, start, crop and horizontal flip."""
     rng = stream("training", seed, "clips.pairs", index)
     clip = sequences[int(rng.integers(len(sequences)))].clip
@@ -50,11 +56,18 @@ def draw_pair_clip(sequences: Sequence[PairSequence], size: CropSize, seed: int,
     def tensor(x: U8) -> Tensor:
         return to_tensor(x[:, rows, columns], flip)
 
-    return Clip(tensor(cut.rgb_gt), tensor(cut.rgb_input), (tensor(cut.opacity[..., None]) + 1) / 2, tensor(cut.sdmap))
+    return Clip(
+        tensor(cut.rgb_gt),
+        tensor(cut.rgb_input),
+        (tensor(cut.opacity[..., None]) + 1) / 2,
+        tensor(cut.sdmap),
+    )
 
 
 def draw_video_clip(videos: Sequence[U8], size: CropSize, seed: int, index: int) -> Clip:
-    """Sample a clip from videos ``(T, H, W, 3)``: random start, crop, time reversal and horizontal flip."""
+    """Sample a clip from videos ``(T, H, W, 3)``: random start, crop, time reversal and horizontal
+    flip.
+    """
     rng = stream("training", seed, "clips.videos", index)
     lengths = np.array([len(v) for v in videos], dtype=np.float64)
     video = videos[int(rng.choice(len(videos), p=lengths / lengths.sum()))]
@@ -64,7 +77,8 @@ def draw_video_clip(videos: Sequence[U8], size: CropSize, seed: int, index: int)
 
 
 def read_video(path: Path, width: int, height: int, first: float = 0.0, last: float = 1.0) -> U8:
-    """Read a video's frames from share ``first`` to share ``last`` of its length, scaled to cover ``width x height`` and centre-cropped.
+    """Read a video's frames from share ``first`` to share ``last`` of its length, scaled to cover
+    ``width x height`` and centre-cropped.
 
     Raises:
         InputError: Not a readable video, or no frame in that share.
@@ -72,7 +86,9 @@ def read_video(path: Path, width: int, height: int, first: float = 0.0, last: fl
     frames = read_mp4(path).frames
     frames = frames[round(first * len(frames)) : round(last * len(frames))]
     if not len(frames):
-        raise InputError(DOING, str(path), f"no frame between shares {first} and {last}", "widen the share")
+        raise InputError(
+            DOING, str(path), f"no frame between shares {first} and {last}", "widen the share"
+        )
     return fitted(frames, width, height)
 
 
@@ -82,19 +98,35 @@ def fitted(frames: U8, width: int, height: int) -> U8:
     scale = max(width / w, height / h)
     wide, high = round(w * scale), round(h * scale)
     left, top = (wide - width) // 2, (high - height) // 2
-    small = [cv2.resize(f, (wide, high), interpolation=cv2.INTER_AREA)[top : top + height, left : left + width] for f in frames]
+    small = [
+        cv2.resize(f, (wide, high), interpolation=cv2.INTER_AREA)[
+            top : top + height, left : left + width
+        ]
+        for f in frames
+    ]
     return np.stack(small)
 
 
 def to_tensor(frames: U8, flip: bool = False) -> Tensor:
-    """Map ``(T, H, W, C)`` uint8 to ``(C, T, H, W)`` float32 in [-1, 1], flipped horizontally if asked."""
-    array = np.array(frames[:, :, ::-1] if flip else frames)  # a copy, since memory maps are read-only
+    """Map ``(T, H, W, C)`` uint8 to ``(C, T, H, W)`` float32 in [-1, 1], flipped horizontally if
+    asked.
+    """
+    array = np.array(
+        frames[:, :, ::-1] if flip else frames
+    )  # a copy, since memory maps are read-only
     return torch.from_numpy(array).permute(3, 0, 1, 2).float() / 127.5 - 1
 
 
-def _window(rng: np.random.Generator, shape: tuple[int, ...], size: CropSize) -> tuple[int, slice, slice]:
+def _window(
+    rng: np.random.Generator, shape: tuple[int, ...], size: CropSize
+) -> tuple[int, slice, slice]:
     free = [shape[0] - size.frames, shape[1] - size.height, shape[2] - size.width]
     if min(free) < 0:
-        raise InputError(DOING, f"frames {list(shape[:3])}", f"no room for {size}", "make larger sequences, or draw smaller clips")
+        raise InputError(
+            DOING,
+            f"frames {list(shape[:3])}",
+            f"no room for {size}",
+            "make larger sequences, or draw smaller clips",
+        )
     start, top, left = (int(rng.integers(f + 1)) for f in free)
     return start, slice(top, top + size.height), slice(left, left + size.width)

@@ -1,4 +1,6 @@
-"""Soft cut-outs: GSFix3D's augmentation, which hides parts of the render that the network then has to find."""
+"""Soft cut-outs: GSFix3D's augmentation, which hides parts of the render that the network then has
+to find.
+"""
 
 from __future__ import annotations
 
@@ -35,11 +37,18 @@ def cut_out(rng: np.random.Generator, render: Tensor, tries: int = 2) -> Tensor:
 
 
 def soft_mask(rng: np.random.Generator, height: int, width: int) -> F32:
-    """Draw an ellipse of at most a tenth of the image ``(H, W)``, 1 inside, with an edge blurred by 10 pixels."""
+    """Draw an ellipse of at most a tenth of the image ``(H, W)``, 1 inside, with an edge blurred by
+    10 pixels.
+    """
     area = float(rng.uniform(0, LARGEST)) * height * width
     aspect = float(np.exp(rng.uniform(-1, 1)))
     axes = np.sqrt(area * aspect / np.pi), np.sqrt(area / aspect / np.pi)
     centre = float(rng.uniform(0, width)), float(rng.uniform(0, height))
     mask = np.zeros((height, width), np.float32)
-    cv2.ellipse(mask, (centre, (2 * float(axes[0]), 2 * float(axes[1])), float(rng.uniform(0, 180))), 1.0, -1)
+    cv2.ellipse(
+        mask,
+        (centre, (2 * float(axes[0]), 2 * float(axes[1])), float(rng.uniform(0, 180))),
+        1.0,
+        -1,
+    )
     return np.asarray(cv2.GaussianBlur(mask, (0, 0), SIGMA_PX), np.float32)

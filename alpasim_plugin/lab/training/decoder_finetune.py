@@ -1,8 +1,9 @@
 """Fine-tune the decoder on the latents of its generator.
 
-The autoencoder was trained on latents of clean frames. A generator's latents have their own errors: a small transformer's differ from token
-to token, which is visible as a grid. The decoder is conditioned on the render, so it can learn which input to trust. It is trained on the
-generator's own rollouts, with encoder and generator frozen, with a pixel loss and a perceptual distance.
+The autoencoder was trained on latents of clean frames. A generator's latents have their own errors:
+a small transformer's differ from token to token, which is visible as a grid. The decoder is
+conditioned on the render, so it can learn which input to trust. It is trained on the generator's
+own rollouts, with encoder and generator frozen, with a pixel loss and a perceptual distance.
 """
 
 from __future__ import annotations
@@ -53,7 +54,8 @@ class DecoderRecipe:
 
 
 class Rollouts:
-    """A generator's rollouts over training clips, computed once and cached as float16: FOLDER/DIGEST/INDEX.npy.
+    """A generator's rollouts over training clips, computed once and cached as float16:
+    FOLDER/DIGEST/INDEX.npy.
 
     Args:
         clips: Training clips.
@@ -88,12 +90,26 @@ class Rollouts:
                 clip = clips[index]
                 name = f"{clip.sequence.name}.{clip.start}.{clip.mirrored}"
                 eps, context = (
-                    torch.from_numpy(stream(name, 0, f"training.rollout.{what}").standard_normal((1, *clip.z_0.shape), dtype=np.float32))
+                    torch.from_numpy(
+                        stream(name, 0, f"training.rollout.{what}").standard_normal(
+                            (1, *clip.z_0.shape), dtype=np.float32
+                        )
+                    )
                     for what in ("eps", "context")
                 )
                 z_map = clip.z_map if shown is None else shown
                 z_r, m, condition = (z[None] for z in (clip.z_r, clip.m, z_map))
-                z = roll_out(net, z_r, condition, m, eps, context, text, block_latents=block_latents, window=window)
+                z = roll_out(
+                    net,
+                    z_r,
+                    condition,
+                    m,
+                    eps,
+                    context,
+                    text,
+                    block_latents=block_latents,
+                    window=window,
+                )
                 write_array(path, z[0].half().numpy(), "writing training data")
             if report is not None:
                 report(index + 1, len(clips))
@@ -111,7 +127,9 @@ class Rollouts:
 
 @dataclass(frozen=True)
 class DecoderBatch:
-    """Latents ``(B, C, N, h, w)``, the render, its opacity and the clean frames ``(B, c, 1 + 4 (N - 1), 8h, 8w)``, and a position."""
+    """Latents ``(B, C, N, h, w)``, the render, its opacity and the clean frames ``(B, c, 1 + 4 (N -
+    1), 8h, 8w)``, and a position.
+    """
 
     z: Tensor
     render: Tensor
@@ -133,11 +151,19 @@ class DecoderTask:
         InputError: A crop larger than the clips.
     """
 
-    def __init__(self, vae: TinyVAE, rollouts: Rollouts, recipe: DecoderRecipe, distance: tuple[str, Distance] | None = None) -> None:
+    def __init__(
+        self,
+        vae: TinyVAE,
+        rollouts: Rollouts,
+        recipe: DecoderRecipe,
+        distance: tuple[str, Distance] | None = None,
+    ) -> None:
         size = tuple(rollouts[0][1].shape[2:])
         if recipe.rows > size[0] or recipe.columns > size[1]:
             found = f"a crop of {recipe.rows} x {recipe.columns} latents from {size[0]} x {size[1]}"
-            raise InputError("setting up the decoder's training", "its crop", found, "choose a smaller crop")
+            raise InputError(
+                "setting up the decoder's training", "its crop", found, "choose a smaller crop"
+            )
         self.vae, self.rollouts, self.recipe, self.distance = vae, rollouts, recipe, distance
         vae.requires_grad_(False)
         vae.decoder.requires_grad_(True)
@@ -147,14 +173,18 @@ class DecoderTask:
     def facts(self) -> dict[str, Any]:
         """Identify data and recipe."""
         return {
-            "clips": len(self.rollouts), "rollouts": self.rollouts.digest, "recipe": asdict(self.recipe),
+            "clips": len(self.rollouts),
+            "rollouts": self.rollouts.digest,
+            "recipe": asdict(self.recipe),
             "distance": self.distance[0] if self.distance else "none",
-        }  # fmt: skip
+        }
 
     def batch(self, index: int) -> DecoderBatch:
         """Make batch ``index``: a function of the index and the recipe's seed only."""
         r = self.recipe
-        rng = stream("training", r.seed, "painter.clips", index)  # a fixed stream name: it determines the draws
+        rng = stream(
+            "training", r.seed, "painter.clips", index
+        )  # a fixed stream name: it determines the draws
         drawn = [self._crop(rng) for _ in range(r.clips)]
         z, render, opacity, clean = (torch.stack(parts) for parts in zip(*drawn, strict=True))
         return DecoderBatch(z, render, opacity, clean, int(rng.integers(z.shape[2])))
@@ -165,17 +195,25 @@ class DecoderTask:
         parts = {"image": reconstruction_loss(made, batch.clean, self.recipe.edge_weight)}
         if self.distance is not None and self.recipe.perceptual_weight:
             frames = slice(max(1 + GROUP * (batch.w - 1), 0), 1 + GROUP * batch.w)
-            distance = self.distance[1](flatten_frames(made[:, :, frames]), flatten_frames(batch.clean[:, :, frames])).mean()
+            distance = self.distance[1](
+                flatten_frames(made[:, :, frames]), flatten_frames(batch.clean[:, :, frames])
+            ).mean()
             parts["perceptual"] = self.recipe.perceptual_weight * distance
         numbers = {name: float(value.detach()) for name, value in parts.items()}
-        decoded, render, clean = (x.detach().clamp(-1, 1).cpu().numpy() for x in (made, batch.render, batch.clean))
-        numbers["psnr_db"], numbers["render_psnr_db"] = psnr_db(decoded, clean, peak=2.0), psnr_db(render, clean, peak=2.0)
+        decoded, render, clean = (
+            x.detach().clamp(-1, 1).cpu().numpy() for x in (made, batch.render, batch.clean)
+        )
+        numbers["psnr_db"], numbers["render_psnr_db"] = (
+            psnr_db(decoded, clean, peak=2.0),
+            psnr_db(render, clean, peak=2.0),
+        )
         return torch.stack(list(parts.values())).sum(), numbers
 
     def _crop(self, rng: np.random.Generator) -> tuple[Tensor, ...]:
         clip, z = self.rollouts[int(rng.integers(len(self.rollouts)))]
         top, left = (
-            int(rng.integers(have - want + 1)) for have, want in zip(z.shape[2:], (self.recipe.rows, self.recipe.columns), strict=True)
+            int(rng.integers(have - want + 1))
+            for have, want in zip(z.shape[2:], (self.recipe.rows, self.recipe.columns), strict=True)
         )
         rows, columns = slice(top, top + self.recipe.rows), slice(left, left + self.recipe.columns)
         pixels = [slice(s.start * SIDE, s.stop * SIDE) for s in (rows, columns)]

@@ -1,4 +1,6 @@
-"""Fine-tune the decoder of a trained bundle on its generator, in one run folder: bundle in, bundle out."""
+"""Fine-tune the decoder of a trained bundle on its generator, in one run folder: bundle in, bundle
+out.
+"""
 
 from __future__ import annotations
 
@@ -40,10 +42,12 @@ def finetune_decoder(
     report: Callable[[int, Mapping[str, float]], None] | None = None,
     size: tuple[int, int] | None = None,
 ) -> Path:
-    """Train the decoder of a bundle on its generator's rollouts, and write OUT/fixer.safetensors and its card.
+    """Train the decoder of a bundle on its generator's rollouts, and write OUT/fixer.safetensors
+    and its card.
 
     Args:
-        bundle: A trained fixer whose decoder belongs to its autoencoder and is conditioned on the render.
+        bundle: A trained fixer whose decoder belongs to its autoencoder and is conditioned on the
+            render.
         data: Folder of pairs; its ``train`` split is used.
         out: Folder of the run; latents and rollouts of the clips are cached in its parent folder.
         form, recipe, schedule: Clips, batches, optimisation.
@@ -65,9 +69,24 @@ def finetune_decoder(
     def tell(what: str) -> Callable[[int, int], None] | None:
         return None if prepared is None else lambda done, count: prepared(what, done, count)
 
-    clips = LatentClips(PairDataset(data, "train", size).sequences, vae, form, out.parent / "latents", tell("latents"))
+    clips = LatentClips(
+        PairDataset(data, "train", size).sequences,
+        vae,
+        form,
+        out.parent / "latents",
+        tell("latents"),
+    )
     shown = "drawn" if settings.uses_map else settings.no_map
-    rollouts = Rollouts(clips, vae, net, settings.block_latents, settings.window, shown, out.parent / "rollouts", tell("rollouts"))
+    rollouts = Rollouts(
+        clips,
+        vae,
+        net,
+        settings.block_latents,
+        settings.window,
+        shown,
+        out.parent / "rollouts",
+        tell("rollouts"),
+    )
     task = DecoderTask(vae, rollouts, recipe, distance)
     facts = {**task.facts, "init": file_sha256(bundle)}
     trainer = Trainer(vae, out, schedule, task.batch, task.loss, facts)
@@ -81,7 +100,11 @@ def finetune_decoder(
     save_bundle(path, made, settings, trained=True, note=note)
     rows, hours = curves(out / LOG_FILE)
     about = {"pairs": "rendered scenes, split train", "clips": len(clips), "form": asdict(form)}
-    training = {"what": "decoder only, on the generator's rollouts", "schedule": asdict(schedule), **facts}
+    training = {
+        "what": "decoder only, on the generator's rollouts",
+        "schedule": asdict(schedule),
+        **facts,
+    }
     ModelCard(f"OneFixer weights: {note}", about, training, rows, hours).write(path)
     return path
 
@@ -90,12 +113,18 @@ def bundle_settings(bundle: Path) -> OneFixerSettings:
     """Return the settings that a bundle was trained for.
 
     Raises:
-        InputError: A bundle without a generator with history, or without a decoder that is conditioned on the render.
+        InputError: A bundle without a generator with history, or without a decoder that is
+            conditioned on the render.
     """
     name, overrides = bundle_fixer(bundle)
     settings = fixer_settings(name, overrides)
     if not isinstance(settings, OneFixerSettings):
-        raise InputError(DOING, str(bundle), f"it is for {name}, which has no networks", "give a bundle of 'simrun train fixer'")
+        raise InputError(
+            DOING,
+            str(bundle),
+            f"it is for {name}, which has no networks",
+            "give a bundle of 'simrun train fixer'",
+        )
     found = [
         text
         for text, wrong in (
@@ -112,5 +141,10 @@ def bundle_settings(bundle: Path) -> OneFixerSettings:
         if wrong
     ]
     if found:
-        raise InputError(DOING, str(bundle), "; ".join(found), "give a bundle that 'simrun train fixer' made with a history")
+        raise InputError(
+            DOING,
+            str(bundle),
+            "; ".join(found),
+            "give a bundle that 'simrun train fixer' made with a history",
+        )
     return settings

@@ -1,7 +1,10 @@
-"""The last stage of the distilled arms as a task: the student's rollouts, the scores' alternation, and the adversarial head.
+"""The last stage of the distilled arms as a task: the student's rollouts, the scores' alternation,
+and the adversarial head.
 
-Parts: ``dit`` (the student), ``fake`` (the fake score), ``head`` (One-Forcing). The real score is frozen. An update trains the fake score;
-every fifth one, from the first, also trains the student. Both losses of such an update are at the weights before it.
+Parts: ``dit`` (the student), ``fake`` (the fake score), ``head`` (One-Forcing). The real score is
+    frozen. An update trains the fake score;
+every fifth one, from the first, also trains the student. Both losses of such an update are at the
+weights before it.
 """
 
 from __future__ import annotations
@@ -23,7 +26,14 @@ from alpasim_plugin.fixers.network.schedule import steps
 from alpasim_plugin.lab.training.adversarial import AdversarialHead, AdversarialTerm
 from alpasim_plugin.lab.training.causal_rollout import causal_rollout
 from alpasim_plugin.lab.training.clip_batches import ClipBatches
-from alpasim_plugin.lab.training.dmd import Score, critic_loss, direction, generator_loss, noised, score_levels
+from alpasim_plugin.lab.training.dmd import (
+    Score,
+    critic_loss,
+    direction,
+    generator_loss,
+    noised,
+    score_levels,
+)
 from alpasim_plugin.lab.training.recipes.recipe import StageInputs
 from alpasim_plugin.lab.training.recipes.start import channel_weights_of, transformer_of
 from alpasim_plugin.lab.training.shared_rollout import T_SOURCE, Sample
@@ -36,9 +46,11 @@ class Distillation:
     """DMD on the student's own rollouts.
 
     Args:
-        steps: Flow steps of the schedule that the student is trained for; a rollout leaves it at a random one of them.
+        steps: Flow steps of the schedule that the student is trained for; a rollout leaves it at a
+            random one of them.
         every: Updates of the fake score to one of the student.
-        same_rollout: Whether the fake score is trained on the student's rollout in an update of both (ArtiFixer), or on one of its own.
+        same_rollout: Whether the fake score is trained on the student's rollout in an update of
+            both (ArtiFixer), or on one of its own.
         gradient_latents: Latents at the clip's end whose blocks carry gradients; None for all.
         adversarial: One-Forcing's term; None without it.
         tail_drop: Hides renders from a random frame on; None shows them all.
@@ -82,7 +94,9 @@ class RolloutNoise:
 
 @dataclass(frozen=True)
 class DistillationBatch:
-    """Clips, and the noise of the student's update (None: it has none now) and of the fake score's."""
+    """Clips, and the noise of the student's update (None: it has none now) and of the fake
+    score's.
+    """
 
     sample: Sample
     student: RolloutNoise | None
@@ -95,14 +109,25 @@ class DistillationTask:
     def __init__(self, config: Distillation, inputs: StageInputs) -> None:
         self.config, self.inputs, self.attention = config, inputs, inputs.attention
         self.batches = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.seen)
-        self.student, fake, real = (transformer_of(inputs, part) for part in ("dit", "fake", "real"))
+        self.student, fake, real = (
+            transformer_of(inputs, part) for part in ("dit", "fake", "real")
+        )
         text = torch.zeros(1, 1, self.student.sizes.text_width)
         taps = config.adversarial.taps if config.adversarial else ()
-        self.text, self.real, self.fake = text, ScoreNet(real.requires_grad_(False), text), ScoreNet(fake, text, taps)
+        self.text, self.real, self.fake = (
+            text,
+            ScoreNet(real.requires_grad_(False), text),
+            ScoreNet(fake, text, taps),
+        )
         parts: dict[str, nn.Module] = {"dit": self.student, "vae": inputs.vae, "fake": fake}
         if config.adversarial is not None:
-            a, seed = config.adversarial, derive_seed("training", inputs.form.seed, "adversarial head")
-            parts["head"] = AdversarialHead(self.student.sizes.width, len(a.taps), a.heads, a.inner, seed)
+            a, seed = (
+                config.adversarial,
+                derive_seed("training", inputs.form.seed, "adversarial head"),
+            )
+            parts["head"] = AdversarialHead(
+                self.student.sizes.width, len(a.taps), a.heads, a.inner, seed
+            )
         self.parts = nn.ModuleDict(parts)
         self.schedule = steps(config.steps)
         self.channel_weights = channel_weights_of(inputs)
@@ -126,13 +151,19 @@ class DistillationTask:
                 return torch.from_numpy(rng.standard_normal(sample.z_0.shape, dtype=np.float32))
 
             sigma = score_levels(torch.from_numpy(rng.random(len(sample.z_0), dtype=np.float32)))
-            return RolloutNoise(tuple(normal() for _ in range(exit_step + 1)), normal(), normal(), normal(), sigma)
+            return RolloutNoise(
+                tuple(normal() for _ in range(exit_step + 1)), normal(), normal(), normal(), sigma
+            )
 
         trains_student = index // self.inputs.accumulate % self.config.every == 0
-        return DistillationBatch(sample, noise("student") if trains_student else None, noise("critic"))
+        return DistillationBatch(
+            sample, noise("student") if trains_student else None, noise("critic")
+        )
 
     def loss(self, batch: DistillationBatch, index: int) -> Loss:
-        """Return the fake score's loss, with the student's where it is trained; neither reaches the other's weights."""
+        """Return the fake score's loss, with the student's where it is trained; neither reaches the
+        other's weights.
+        """
         s, z = batch.sample, None
         numbers: dict[str, float] = {}
         losses: list[Tensor] = []
@@ -152,49 +183,85 @@ class DistillationTask:
         """Return the student's clips, with gradients as `causal_rollout` says."""
         sources = [mixed_source(s.z_r, s.m, eps) for eps in noise.eps]
         return causal_rollout(
-            self.student, sources, self.schedule[: len(sources)], noise.context, self.text, s.condition, self.attention,
+            self.student,
+            sources,
+            self.schedule[: len(sources)],
+            noise.context,
+            self.text,
+            s.condition,
+            self.attention,
             self.config.gradient_latents,
-        )  # fmt: skip
+        )
 
-    def _student_loss(self, z: Tensor, s: Sample, noise: RolloutNoise) -> tuple[Tensor, dict[str, float]]:
+    def _student_loss(
+        self, z: Tensor, s: Sample, noise: RolloutNoise
+    ) -> tuple[Tensor, dict[str, float]]:
         n, sigma = mixed_source(s.z_r, s.m, noise.score), noise.sigma
-        g, normaliser = direction(self.real.given(s.condition), self.fake.given(s.condition), z.detach(), n, sigma)
+        g, normaliser = direction(
+            self.real.given(s.condition), self.fake.given(s.condition), z.detach(), n, sigma
+        )
         loss = generator_loss(z, g)
         numbers = {
-            "dmd": float(loss.detach()), "direction": float(g.abs().mean()), "normaliser_min": float(normaliser.min()),
-            "rollout": float((z.detach() - s.z_0).square().mean()), "render": float((s.z_r - s.z_0).square().mean()),
-        }  # fmt: skip
+            "dmd": float(loss.detach()),
+            "direction": float(g.abs().mean()),
+            "normaliser_min": float(normaliser.min()),
+            "rollout": float((z.detach() - s.z_0).square().mean()),
+            "render": float((s.z_r - s.z_0).square().mean()),
+        }
         if self.config.adversarial is not None:
             logits = self._logits(noised(z, n, sigma), sigma, s.condition, frozen=True)
             loss = loss + self.config.adversarial.generator(logits)
             numbers["logit_student"] = float(logits.detach().mean())
         return loss, numbers
 
-    def _critic_loss(self, z: Tensor, s: Sample, noise: RolloutNoise) -> tuple[Tensor, dict[str, float]]:
-        n, sigma, term = mixed_source(s.z_r, s.m, noise.score), noise.sigma, self.config.adversarial
+    def _critic_loss(
+        self, z: Tensor, s: Sample, noise: RolloutNoise
+    ) -> tuple[Tensor, dict[str, float]]:
+        n = mixed_source(s.z_r, s.m, noise.score)
+        sigma = noise.sigma
+        term = self.config.adversarial
         loss = critic_loss(self.fake.given(s.condition), z, n, sigma, self.channel_weights)
         numbers = {"critic": float(loss.detach())}
         if term is None:
             return loss, numbers
-        fake = self.parts["head"](self.fake.features)  # of the forward just made, on the noised rollout
+        fake = self.parts["head"](
+            self.fake.features
+        )  # of the forward just made, on the noised rollout
         x_real, x_fake = noised(s.z_0, n, sigma), noised(z, n, sigma)
-        adversarial, real = term.critic(lambda x: self._logits(x, sigma, s.condition), x_real, x_fake, fake, noise.xi)
-        numbers |= {"logit_real": float(real.detach().mean()), "logit_fake": float(fake.detach().mean())}
+        adversarial, real = term.critic(
+            lambda x: self._logits(x, sigma, s.condition), x_real, x_fake, fake, noise.xi
+        )
+        numbers |= {
+            "logit_real": float(real.detach().mean()),
+            "logit_fake": float(fake.detach().mean()),
+        }
         if abs(numbers["logit_real"]) > term.most:
             found = f"real clips have the mean logit {numbers['logit_real']:.3g}, beyond {term.most:g}: the head no longer teaches"
-            raise InfrastructureError("training", "the adversarial head", found, "lower the learning rate, and begin in another folder")
+            raise InfrastructureError(
+                "training",
+                "the adversarial head",
+                found,
+                "lower the learning rate, and begin in another folder",
+            )
         return loss + adversarial, numbers
 
     def _logits(self, x: Tensor, sigma: Tensor, condition: Tensor, frozen: bool = False) -> Tensor:
-        """Return the head's logits of noised latents; ``frozen`` sends gradients to the latents alone."""
+        """Return the head's logits of noised latents; ``frozen`` sends gradients to the latents
+        alone.
+        """
         self.fake(x, sigma, condition, frozen)
         head = self.parts["head"]
-        logits: Tensor = functional_call(head, _detached(head), (self.fake.features,)) if frozen else head(self.fake.features)
+        logits: Tensor = (
+            functional_call(head, _detached(head), (self.fake.features,))
+            if frozen
+            else head(self.fake.features)
+        )
         return logits
 
 
 class ScoreNet:
-    """A transformer as a score: the whole clip at once, without window or cache, one noise level a clip.
+    """A transformer as a score: the whole clip at once, without window or cache, one noise level a
+    clip.
 
     Args:
         net: The transformer.
@@ -210,7 +277,9 @@ class ScoreNet:
         self._kept: dict[int, Tensor] = {}
         self._taps = taps
         for tap in taps:
-            net.blocks[tap].register_forward_hook(lambda _, __, out, tap=tap: self._kept.__setitem__(tap, out))
+            net.blocks[tap].register_forward_hook(
+                lambda _, __, out, tap=tap: self._kept.__setitem__(tap, out)
+            )
 
     @property
     def features(self) -> list[Tensor]:
@@ -218,9 +287,18 @@ class ScoreNet:
         return [self._kept[tap] for tap in self._taps]
 
     def __call__(self, x: Tensor, sigma: Tensor, condition: Tensor, frozen: bool = False) -> Tensor:
-        """Return the velocity of noised clips ``(B, C, N, H, W)`` at levels ``(B,)``; ``frozen`` sends no gradient to the weights."""
-        args, attention = (x, T_SOURCE * sigma[:, None], self.text, condition), {"block_latents": None}
-        v: Tensor = functional_call(self.net, _detached(self.net), args, attention) if frozen else self.net(*args, **attention)
+        """Return the velocity of noised clips ``(B, C, N, H, W)`` at levels ``(B,)``; ``frozen``
+        sends no gradient to the weights.
+        """
+        args, attention = (
+            (x, T_SOURCE * sigma[:, None], self.text, condition),
+            {"block_latents": None},
+        )
+        v: Tensor = (
+            functional_call(self.net, _detached(self.net), args, attention)
+            if frozen
+            else self.net(*args, **attention)
+        )
         return v
 
     def given(self, condition: Tensor) -> Score:

@@ -1,7 +1,8 @@
-"""Synthetic image distortions, by kind and strength; all random numbers are drawn before the strength is chosen.
+"""Synthetic image distortions, by kind and strength; all random numbers are drawn before the
+strength is chosen.
 
-A `Distortion` at two strengths is the same distortion at two severities, in which a perceptual distance must be monotone. Strength 0 is the
-identity; 1 is the strongest.
+A `Distortion` at two strengths is the same distortion at two severities, in which a perceptual
+distance must be monotone. Strength 0 is the identity; 1 is the strongest.
 """
 
 from __future__ import annotations
@@ -45,7 +46,9 @@ def draw_distortion(rng: Draw, shape: tuple[int, ...], kind: str | None = None) 
 
 def _blur(image: F32, s: float, drawn: Mapping[str, Any]) -> F32:
     sigma_x, sigma_y = (0.25 + 3.5 * s * drawn[axis] for axis in ("x", "y"))
-    return _f32(cv2.GaussianBlur(image, (0, 0), sigma_x, sigmaY=sigma_y, borderType=cv2.BORDER_REFLECT_101))
+    return _f32(
+        cv2.GaussianBlur(image, (0, 0), sigma_x, sigmaY=sigma_y, borderType=cv2.BORDER_REFLECT_101)
+    )
 
 
 def _draw_blur(rng: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
@@ -56,7 +59,9 @@ def _draw_blur(rng: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
 def _coarse(image: F32, s: float, drawn: Mapping[str, Any]) -> F32:
     h, w = image.shape[:2]
     factor = 1 + 5 * s
-    small = cv2.resize(image, (max(2, round(w / factor)), max(2, round(h / factor))), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(
+        image, (max(2, round(w / factor)), max(2, round(h / factor))), interpolation=cv2.INTER_AREA
+    )
     return _f32(cv2.resize(small, (w, h), interpolation=drawn["up"]))
 
 
@@ -71,7 +76,9 @@ def _add(image: F32, s: float, drawn: Mapping[str, Any]) -> F32:
 def _draw_noise(rng: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
     noise = rng.standard_normal(shape if rng.random() < 0.6 else (*shape[:2], 1), dtype=np.float32)
     if rng.random() < 0.4:  # grain
-        noise = cv2.GaussianBlur(noise, (0, 0), float(rng.uniform(0.5, 1.5))).reshape(*shape[:2], -1)
+        noise = cv2.GaussianBlur(noise, (0, 0), float(rng.uniform(0.5, 1.5))).reshape(
+            *shape[:2], -1
+        )
         noise /= noise.std() + 1e-6
     return {"field": np.float32(0.12) * noise}
 
@@ -83,7 +90,15 @@ def _draw_stain(rng: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
 def _move(image: F32, s: float, drawn: Mapping[str, Any]) -> F32:
     rows, columns = np.indices(image.shape[:2], dtype=np.float32)
     flow = drawn["flow"] * np.float32(s)  # (H, W, 2) px
-    return _f32(cv2.remap(image, columns + flow[..., 0], rows + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101))
+    return _f32(
+        cv2.remap(
+            image,
+            columns + flow[..., 0],
+            rows + flow[..., 1],
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REFLECT_101,
+        )
+    )
 
 
 def _draw_shift(rng: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
@@ -106,7 +121,13 @@ def _draw_ghost(rng: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
     matrix = np.array([[1, 0, far * np.cos(angle)], [0, 1, far * np.sin(angle)]])
 
     def make(image: F32) -> Any:
-        return cv2.warpAffine(image, matrix, image.shape[1::-1], flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+        return cv2.warpAffine(
+            image,
+            matrix,
+            image.shape[1::-1],
+            flags=cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REFLECT_101,
+        )
 
     return {"mask": np.float32(0.6) * _patches(rng, shape, 0.6), "make": make}
 
@@ -154,17 +175,25 @@ def _colour(image: F32, s: float, drawn: Mapping[str, Any]) -> F32:
 
 def _draw_colour(rng: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
     return {
-        "saturation": float(rng.uniform(-1, 1)), "gamma": float(rng.uniform(-0.5, 1)), "gain": rng.uniform(-0.3, 0.3, 3),
+        "saturation": float(rng.uniform(-1, 1)),
+        "gamma": float(rng.uniform(-0.5, 1)),
+        "gain": rng.uniform(-0.3, 0.3, 3),
         "offset": rng.uniform(-0.15, 0.15, 3),
-    }  # fmt: skip
+    }
 
 
 def _jpeg(image: F32, s: float, drawn: Mapping[str, Any]) -> F32:
     quality = round(70 * (1 - s) ** 1.5) + 2
-    done, data = cv2.imencode(".jpg", np.rint(image * 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    done, data = cv2.imencode(
+        ".jpg", np.rint(image * 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality]
+    )
     assert done
-    share = np.float32(min(1.0, 8 * s))  # blended at low strengths, so that strength 0 is the identity
-    return image * (1 - share) + share * (_f32(cv2.imdecode(data, cv2.IMREAD_COLOR)) / np.float32(255))
+    share = np.float32(
+        min(1.0, 8 * s)
+    )  # blended at low strengths, so that strength 0 is the identity
+    return image * (1 - share) + share * (
+        _f32(cv2.imdecode(data, cv2.IMREAD_COLOR)) / np.float32(255)
+    )
 
 
 def _sharpen(image: F32, s: float, drawn: Mapping[str, Any]) -> F32:
@@ -188,9 +217,14 @@ KINDS: Mapping[str, tuple[Callable[[Draw, tuple[int, ...]], Mapping[str, Any]], 
 
 
 def smooth_field(rng: Draw, shape: tuple[int, ...], channels: int, scale_px: float) -> F32:
-    """Draw a smooth random field ``(H, W, channels)`` with a scale of ``scale_px`` pixels and unit root mean square."""
+    """Draw a smooth random field ``(H, W, channels)`` with a scale of ``scale_px`` pixels and unit
+    root mean square.
+    """
     h, w = shape[:2]
-    knots = rng.standard_normal((max(2, round(h / scale_px) + 1), max(2, round(w / scale_px) + 1), channels), dtype=np.float32)
+    knots = rng.standard_normal(
+        (max(2, round(h / scale_px) + 1), max(2, round(w / scale_px) + 1), channels),
+        dtype=np.float32,
+    )
     field = cv2.resize(knots, (w, h), interpolation=cv2.INTER_CUBIC).reshape(h, w, channels)
     return _f32(field / (np.sqrt((field**2).mean()) + 1e-6))
 

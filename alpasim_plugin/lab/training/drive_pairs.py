@@ -1,8 +1,10 @@
-"""Pairs of a recorded street: what a reconstruction of some photographs shows where the others were taken, and those photographs.
+"""Pairs of a recorded street: what a reconstruction of some photographs shows where the others were
+taken, and those photographs.
 
-Every ``every``-th photograph is held out, in each of the ``every`` ways. A sequence is what was held out of one camera, in order of time;
-the photographs that were fitted are its recording. Render, map and recording are made as behind an imported drive in a closed loop, so the
-damage is that of a real fit: of its poses, its depth, its exposure and its sky.
+Every ``every``-th photograph is held out, in each of the ``every`` ways. A sequence is what was
+held out of one camera, in order of time; the photographs that were fitted are its recording.
+Render, map and recording are made as behind an imported drive in a closed loop, so the damage is
+that of a real fit: of its poses, its depth, its exposure and its sky.
 """
 
 from __future__ import annotations
@@ -20,7 +22,15 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse
 from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.types import F32, U8, CameraSpec, Photograph, RecordedFrame, RenderRequest, Scenario
+from alpasim_plugin.core.types import (
+    F32,
+    U8,
+    CameraSpec,
+    Photograph,
+    RecordedFrame,
+    RenderRequest,
+    Scenario,
+)
 from alpasim_plugin.drives.build import POINTS_FILE
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
 from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes, prepare_map
@@ -55,8 +65,17 @@ class Shot:
 
     def spec(self, scenario: Scenario) -> CameraSpec:
         """Return its camera on the rig."""
-        T_rig_camera = inverse(interpolate(scenario.ego_log, self.photograph.t_us)) @ self.photograph.T_world_camera
-        return CameraSpec(self.photograph.camera, self.camera.width, self.camera.height, self.camera.K, T_rig_camera)
+        T_rig_camera = (
+            inverse(interpolate(scenario.ego_log, self.photograph.t_us))
+            @ self.photograph.T_world_camera
+        )
+        return CameraSpec(
+            self.photograph.camera,
+            self.camera.width,
+            self.camera.height,
+            self.camera.K,
+            T_rig_camera,
+        )
 
     def view(self, scenario: Scenario, i: int) -> PosedView:
         """Return it as the ``i``-th view to fit to."""
@@ -64,7 +83,9 @@ class Shot:
         return PosedView(self.camera, self.rgb, f"{self.photograph.camera}-{i:06d}", actors=actors)
 
 
-def make_drive_pairs(scenario: Scenario, name: str, out: Path, recipe: PhotographRecipe, threads: int = 1) -> Iterator[PhotographPairs]:
+def make_drive_pairs(
+    scenario: Scenario, name: str, out: Path, recipe: PhotographRecipe, threads: int = 1
+) -> Iterator[PhotographPairs]:
     """Write the sequences ``out/SPLIT/NAME_CAMERA_PHASE``; equal ones are kept.
 
     Args:
@@ -79,10 +100,17 @@ def make_drive_pairs(scenario: Scenario, name: str, out: Path, recipe: Photograp
     """
     points = read_points(Path(str(scenario.model)).parent / POINTS_FILE)
     for camera in sorted({one.camera for one in scenario.recording if one.use != "never-fitted"}):
-        taken = sorted((one for one in scenario.recording if one.camera == camera), key=lambda one: one.t_us)
+        taken = sorted(
+            (one for one in scenario.recording if one.camera == camera), key=lambda one: one.t_us
+        )
         if len(taken) < 2 * recipe.every:
             few = f"{len(taken)} photographs for every {recipe.every}th to be held out"
-            raise InputError(DOING, f"{name}, camera {camera}", few, "give more photographs, or hold out more of them")
+            raise InputError(
+                DOING,
+                f"{name}, camera {camera}",
+                few,
+                "give more photographs, or hold out more of them",
+            )
         for phase in range(recipe.every):
             folder = out / recipe.split / f"{name}_{camera}_{phase}"
             info = _info(scenario, camera, recipe, phase)
@@ -95,10 +123,18 @@ def make_drive_pairs(scenario: Scenario, name: str, out: Path, recipe: Photograp
 
 def _info(scenario: Scenario, camera: str, recipe: PhotographRecipe, phase: int) -> dict[str, Any]:
     return {
-        "scene_id": scenario.scene_id, "scene_hash": scenario.content_hash, "seed": recipe.seed, "split": recipe.split, "family": DRIVE,
-        "actors": len(scenario.actors), "moving_actors": 0, "degradation": {"kind": DRIVE}, "recipe": asdict(recipe),
-        "name_of_camera": camera, "phase": phase,
-    }  # fmt: skip
+        "scene_id": scenario.scene_id,
+        "scene_hash": scenario.content_hash,
+        "seed": recipe.seed,
+        "split": recipe.split,
+        "family": DRIVE,
+        "actors": len(scenario.actors),
+        "moving_actors": 0,
+        "degradation": {"kind": DRIVE},
+        "recipe": asdict(recipe),
+        "name_of_camera": camera,
+        "phase": phase,
+    }
 
 
 def _write(
@@ -119,14 +155,21 @@ def _write(
 
 
 def write_drive_sequence(
-    scenario: Scenario, shown: Sequence[Shot], recorded: Sequence[Shot], folder: Path, info: dict[str, Any], threads: int
+    scenario: Scenario,
+    shown: Sequence[Shot],
+    recorded: Sequence[Shot],
+    folder: Path,
+    info: dict[str, Any],
+    threads: int,
 ) -> None:
-    """Write what a drive's model shows where photographs were taken, those photographs, and its recording.
+    """Write what a drive's model shows where photographs were taken, those photographs, and its
+    recording.
 
     Args:
         scenario: With the model.
         shown: The frames of the sequence, in order of time.
-        recorded: Its recording. A photograph that is in both is never its own reference in training.
+        recorded: Its recording. A photograph that is in both is never its own reference in
+            training.
         folder: ROOT/SPLIT/SEQUENCE.
         info: Of sequence.json.
         threads: Of the rasteriser.
@@ -136,16 +179,34 @@ def write_drive_sequence(
     pairs = list(_frames(scenario, shown, renderer, geometry))
     frames = [_recorded(scenario, shot, renderer) for shot in recorded]
     lens = shown[0].spec(scenario)
-    facts = {"width": lens.width, "height": lens.height, "K": lens.K.tolist(), "T_rig_camera": lens.T_rig_camera.tolist()}
-    psnr = {"held_out": round(float(np.mean([psnr_db(pair.rgb_input, pair.rgb_gt) for pair in pairs])), 3)}
+    facts = {
+        "width": lens.width,
+        "height": lens.height,
+        "K": lens.K.tolist(),
+        "T_rig_camera": lens.T_rig_camera.tolist(),
+    }
+    psnr = {
+        "held_out": round(
+            float(np.mean([psnr_db(pair.rgb_input, pair.rgb_gt) for pair in pairs])), 3
+        )
+    }
     write_sequence(
-        folder, pairs, len(pairs), {**info, "camera": facts, "psnr_db": psnr},
+        folder,
+        pairs,
+        len(pairs),
+        {**info, "camera": facts, "psnr_db": psnr},
         lambda partial: write_references(partial, geometry, frames, scenario.actors),
-    )  # fmt: skip
+    )
 
 
 def _fitted(
-    scenario: Scenario, shots: Sequence[Shot], points: GaussianCloud, scratch: Path, recipe: PhotographRecipe, phase: int, threads: int
+    scenario: Scenario,
+    shots: Sequence[Shot],
+    points: GaussianCloud,
+    scratch: Path,
+    recipe: PhotographRecipe,
+    phase: int,
+    threads: int,
 ) -> Scenario:
     """Return the scenario with a model that was fitted to these photographs alone."""
     views = [shot.view(scenario, i) for i, shot in enumerate(shots)]
@@ -154,23 +215,33 @@ def _fitted(
     torch.set_num_threads(1)
     try:
         done = fit_drive(
-            views, points, boxes={actor.actor_id: actor.box for actor in scenario.actors}, scene_id=f"{scenario.scene_id}-{phase}",
-            seed=recipe.seed, threads=threads, recipe=splat,
-        )  # fmt: skip
+            views,
+            points,
+            boxes={actor.actor_id: actor.box for actor in scenario.actors},
+            scene_id=f"{scenario.scene_id}-{phase}",
+            seed=recipe.seed,
+            threads=threads,
+            recipe=splat,
+        )
     finally:
         torch.set_num_threads(before)
     done.model.save(scratch, {"scene_id": scenario.scene_id, "views": len(views)})
     recording = [
-        replace(shot.photograph, use="fitted", exposure=done.exposures[view.name]) for shot, view in zip(shots, views, strict=True)
+        replace(shot.photograph, use="fitted", exposure=done.exposures[view.name])
+        for shot, view in zip(shots, views, strict=True)
     ]
     return replace(scenario, model=str(scratch), recording=tuple(recording))
 
 
-def _frames(scenario: Scenario, shots: Sequence[Shot], renderer: Renderer, geometry: list[FrameGeometry]) -> Iterator[Pair]:
+def _frames(
+    scenario: Scenario, shots: Sequence[Shot], renderer: Renderer, geometry: list[FrameGeometry]
+) -> Iterator[Pair]:
     """Yield the pairs, and append depth and actors of each to ``geometry``."""
     layers = prepare_map(scenario.lane_map)
     for shot in shots:
-        spec, T, t_us = shot.spec(scenario), shot.photograph.T_world_camera, shot.photograph.t_us
+        spec = shot.spec(scenario)
+        T = shot.photograph.T_world_camera
+        t_us = shot.photograph.t_us
         actors = log_actors(scenario, t_us)
         frame = renderer.render(RenderRequest(t_us, spec, np.stack([T, T]), actors))
         assert frame.alpha is not None
@@ -187,7 +258,9 @@ def _recorded(scenario: Scenario, shot: Shot, renderer: Renderer) -> RecordedFra
 
     def read() -> tuple[U8, F32]:
         T = one.T_world_camera
-        depth = renderer.render(RenderRequest(one.t_us, shot.spec(scenario), np.stack([T, T]), actors)).depth
+        depth = renderer.render(
+            RenderRequest(one.t_us, shot.spec(scenario), np.stack([T, T]), actors)
+        ).depth
         assert depth is not None
         return shot.rgb, depth
 

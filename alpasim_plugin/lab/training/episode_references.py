@@ -1,7 +1,9 @@
-"""References of training episodes: recorded frames warped as in deployment, with the errors that real recordings have.
+"""References of training episodes: recorded frames warped as in deployment, with the errors that
+real recordings have.
 
-A sequence of pairs has its recorded frames (`training.reference_store`). A recorded video has no depth: its own neighbouring frames stand
-for the recording, carried along by optical flow, which is then bent by a smooth error.
+A sequence of pairs has its recorded frames (`training.reference_store`). A recorded video has no
+depth: its own neighbouring frames stand for the recording, carried along by optical flow, which is
+then bent by a smooth error.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ P_EXPOSURE, EXPOSURE = 0.4, 0.08  # spread of the logarithm of a channel's gain
 P_WRONG = 0.04  # one of them is of another place
 FLOW_FRAMES = (2, 10)  # of a video: how far away the frames are that stand for the recording
 P_BENT, BENT_PX, BENT_CELL_PX = 0.7, 2.0, 24  # error of the flow, smooth over so many pixels
-CONSISTENT_PX = 1.0  # forward and backward flow agree within this: the neighbouring frame shows the same surface
+# forward and backward flow agree within this: the neighbouring frame shows the same surface
+CONSISTENT_PX = 1.0
 OPEN_SEQUENCES, PICTURES = 100, 64  # kept in memory
 
 
@@ -66,9 +69,15 @@ def draw_references(rng: np.random.Generator) -> ReferenceDraw:
     return ReferenceDraw(count, skipped, errors, gains, wrong, int(rng.integers(2**31)))
 
 
-def pair_references(sequence: PairSequence, draw: ReferenceDraw, index: I64, rows: slice, columns: slice) -> U8:
-    """Return the references of some frames of a sequence of pairs, cut to a crop: ``(T, SLOTS, h, w, 4)``; zero where there is none."""
-    out = np.zeros((len(index), SLOTS, rows.stop - rows.start, columns.stop - columns.start, 4), np.uint8)
+def pair_references(
+    sequence: PairSequence, draw: ReferenceDraw, index: I64, rows: slice, columns: slice
+) -> U8:
+    """Return the references of some frames of a sequence of pairs, cut to a crop: ``(T, SLOTS, h,
+    w, 4)``; zero where there is none.
+    """
+    out = np.zeros(
+        (len(index), SLOTS, rows.stop - rows.start, columns.stop - columns.start, 4), np.uint8
+    )
     found = _opened(sequence)
     if found is None or not draw.count:
         return out
@@ -78,25 +87,37 @@ def pair_references(sequence: PairSequence, draw: ReferenceDraw, index: I64, row
     for t, i in enumerate(index):
         wanted, t_us = draw.skipped + draw.count, int(references.t_us[i])
         last = recorded.choose(references.T_world_camera[i], t_us, wanted + 1, last)
-        chosen = [j for j in last if references.rgb_t_us[j] != t_us][:wanted]  # a photograph is not its own reference
+        chosen = [j for j in last if references.rgb_t_us[j] != t_us][
+            :wanted
+        ]  # a photograph is not its own reference
         target = references.target(int(i), K, rows, columns)
         used = chosen[draw.skipped :]
-        places = [(j + len(recorded.recorded) // 2) % len(recorded.recorded) if slot == draw.wrong else j for slot, j in enumerate(used)]
-        pictures = [_misplaced(_picture(sequence, at), error) for at, error in zip(places, draw.errors, strict=False)]
+        places = [
+            (j + len(recorded.recorded) // 2) % len(recorded.recorded) if slot == draw.wrong else j
+            for slot, j in enumerate(used)
+        ]
+        pictures = [
+            _misplaced(_picture(sequence, at), error)
+            for at, error in zip(places, draw.errors, strict=False)
+        ]
         for slot, carried in enumerate(carry(pictures, target, references.T_world_rig(int(i)))):
             out[t, slot] = carried
     return out
 
 
 def road_users(sequence: PairSequence, index: I64, rows: slice, columns: slice) -> Bool:
-    """Return which pixels of some frames of a sequence of pairs show road users, hidden ones among them: ``(T, h, w)``."""
+    """Return which pixels of some frames of a sequence of pairs show road users, hidden ones among
+    them: ``(T, h, w)``.
+    """
     shape = rows.stop - rows.start, columns.stop - columns.start
     found = _opened(sequence)
     if found is None:
         return np.zeros((len(index), *shape), dtype=bool)
     references, _ = found
     K = _cropped(references.K, rows, columns)
-    return np.stack([on_boxes(shape, references.target(int(i), K, rows, columns).placed.seen) for i in index])
+    return np.stack(
+        [on_boxes(shape, references.target(int(i), K, rows, columns).placed.seen) for i in index]
+    )
 
 
 def _cropped(K: F64, rows: slice, columns: slice) -> F64:
@@ -105,13 +126,22 @@ def _cropped(K: F64, rows: slice, columns: slice) -> F64:
     return out
 
 
-def video_references(clip: PairClip, draw: ReferenceDraw, index: I64, rows: slice, columns: slice) -> U8:
+def video_references(
+    clip: PairClip, draw: ReferenceDraw, index: I64, rows: slice, columns: slice
+) -> U8:
     """Return the same for a recorded video, whose neighbouring frames stand for the recording."""
-    out = np.zeros((len(index), SLOTS, rows.stop - rows.start, columns.stop - columns.start, 4), np.uint8)
+    out = np.zeros(
+        (len(index), SLOTS, rows.stop - rows.start, columns.stop - columns.start, 4), np.uint8
+    )
     rng = stream("training", draw.seed, "references.video")
     away = rng.integers(*FLOW_FRAMES, SLOTS) * rng.choice([-1, 1], SLOTS)
     size = clip.rgb_gt.shape[1:3]
-    bent = [smooth_field(rng, size, BENT_PX * rng.random(dtype=np.float32)) if rng.random() < P_BENT else None for _ in range(SLOTS)]
+    bent = [
+        smooth_field(rng, size, BENT_PX * rng.random(dtype=np.float32))
+        if rng.random() < P_BENT
+        else None
+        for _ in range(SLOTS)
+    ]
     for t, i in enumerate(index):
         for slot in range(draw.count):
             j = int(i) + int(away[slot])
@@ -123,17 +153,27 @@ def video_references(clip: PairClip, draw: ReferenceDraw, index: I64, rows: slic
 def _carried(here: U8, there: U8, bent: F32 | None) -> U8:
     """Carry frame ``there`` to ``here`` by optical flow (Kroeger et al., 2016, DIS)."""
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # type: ignore[attr-defined]
-    grey = [cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY) for image in (here, there)]
+    grey = [
+        cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY) for image in (here, there)
+    ]
     forward, backward = flow.calc(*grey, None), flow.calc(*grey[::-1], None)
     height, width = grey[0].shape
     place = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
     at = place + forward
-    back = cv2.remap(backward, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    back = cv2.remap(
+        backward, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     agrees = np.linalg.norm(forward + back, axis=-1) < CONSISTENT_PX
     seen = (at >= 0).all(-1) & (at[..., 0] <= width - 1) & (at[..., 1] <= height - 1)
     at = at if bent is None else at + bent
     out = np.empty((height, width, 4), np.uint8)
-    out[..., :3] = cv2.remap(np.ascontiguousarray(there), at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    out[..., :3] = cv2.remap(
+        np.ascontiguousarray(there),
+        at[..., 0],
+        at[..., 1],
+        cv2.INTER_CUBIC,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
     out[..., 3] = np.where(seen, np.where(agrees, VALID, INCONSISTENT), 0)
     return out
 
@@ -141,8 +181,12 @@ def _carried(here: U8, there: U8, bent: F32 | None) -> U8:
 def smooth_field(rng: np.random.Generator, size: tuple[int, ...], spread_px: float) -> F32:
     """Draw a smooth field of shifts ``(H, W, 2)``, pixels."""
     height, width = size
-    coarse = rng.standard_normal((height // BENT_CELL_PX + 2, width // BENT_CELL_PX + 2, 2)).astype(np.float32)
-    smooth: F32 = np.float32(spread_px) * cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    coarse = rng.standard_normal((height // BENT_CELL_PX + 2, width // BENT_CELL_PX + 2, 2)).astype(
+        np.float32
+    )
+    smooth: F32 = np.float32(spread_px) * cv2.resize(
+        coarse, (width, height), interpolation=cv2.INTER_CUBIC
+    )
     return smooth
 
 

@@ -1,9 +1,11 @@
-"""Train a recipe in one run folder: pairs and a trained autoencoder in, a bundle and a model card for every stage out.
+"""Train a recipe in one run folder: pairs and a trained autoencoder in, a bundle and a model card
+for every stage out.
 
     OUT/STAGE/   a stage before the last: state.safetensors, log.jsonl, fixer.safetensors and its card
     OUT/         the last stage, whose fixer.safetensors is the result
 
-Every stage resumes from its own checkpoint; a finished one makes no update. A later stage starts from the float16 bundles of earlier ones.
+Every stage resumes from its own checkpoint; a finished one makes no update. A later stage starts
+from the float16 bundles of earlier ones.
 """
 
 from __future__ import annotations
@@ -30,7 +32,14 @@ from alpasim_plugin.lab.training.latent_clips import ClipForm, LatentClips
 from alpasim_plugin.lab.training.model_card import ModelCard, curves
 from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence
 from alpasim_plugin.lab.training.perceptual_term import Distance
-from alpasim_plugin.lab.training.recipes.recipe import GIVEN, Recipe, Stage, StageInputs, Task, Weights
+from alpasim_plugin.lab.training.recipes.recipe import (
+    GIVEN,
+    Recipe,
+    Stage,
+    StageInputs,
+    Task,
+    Weights,
+)
 from alpasim_plugin.lab.training.snapshots import snapshot_file, snapshot_steps
 from alpasim_plugin.lab.training.trainer import LOG_FILE, Schedule, Trainer
 
@@ -49,14 +58,17 @@ class FixerRun:
         recipe: Stages.
         data: Folder of pairs; its ``train`` split is used.
         vae: Trained autoencoder's weights, or a bundle that holds them.
-        weights: Files by name: ``init`` and ``init-bi``, the initial weights (without a file, a network that returns its source
-            unchanged); or a stage's name, whose weights these are, so that it is not trained.
+        weights: Files by name: ``init`` and ``init-bi``, the initial weights (without a file, a
+            network that returns its source unchanged); or a stage's name, whose weights these are,
+            so that it is not trained.
         form: Clips.
         batches: Clips of a batch.
         schedule: Optimisation of a stage of share 1; its updates are the unit U.
         equal_channels: Whether flow matching weights all latent channels alike.
-        precision: Of the forward passes: None is float32. A stage that is always trained in float32 ignores it.
-        snapshots: Weights that are kept of every stage at equal intervals (`snapshots`); equal weights come out with any number.
+        precision: Of the forward passes: None is float32. A stage that is always trained in float32
+            ignores it.
+        snapshots: Weights that are kept of every stage at equal intervals (`snapshots`); equal
+            weights come out with any number.
         scenes: Folder of the scenes behind the pairs; recipes whose targets need depth ask for it.
         size: Width and height of the sequences to train on, pixels; None: all are of one size.
     """
@@ -79,7 +91,12 @@ class FixerRun:
         names = {*GIVEN, *(stage.name for stage in self.recipe.stages[:-1])}
         if unknown := sorted(set(self.weights) - names):
             found = f"no weights of that name in recipe {self.recipe.name}"
-            raise InputError("training a fixer", f"--weights {', '.join(unknown)}", found, f"name one of {', '.join(sorted(names))}")
+            raise InputError(
+                "training a fixer",
+                f"--weights {', '.join(unknown)}",
+                found,
+                f"name one of {', '.join(sorted(names))}",
+            )
 
     def stages(self) -> list[Stage]:
         """Return the stages to train: those that the last needs and whose weights are not given."""
@@ -117,7 +134,13 @@ class FixerRun:
         """Return a stage's schedule."""
         steps = stage.updates(self.schedule.steps)
         warmup = min(self.schedule.warmup, steps)
-        return replace(self.schedule, steps=steps, warmup=warmup, decay=stage.decay, last_share=stage.last_share)
+        return replace(
+            self.schedule,
+            steps=steps,
+            warmup=warmup,
+            decay=stage.decay,
+            last_share=stage.last_share,
+        )
 
 
 def train_fixer(
@@ -128,15 +151,19 @@ def train_fixer(
     report: Report | None = None,
     stop_at: int | None = None,
 ) -> Path:
-    """Train to the end of the last stage or to ``stop_at``, from the last checkpoints if any; write OUT/fixer.safetensors and its card.
+    """Train to the end of the last stage or to ``stop_at``, from the last checkpoints if any; write
+    OUT/fixer.safetensors and its card.
 
     Args:
         run: Definition of the run.
-        out: Folder of the run; the latents of the clips are cached in its parent folder, in ``latents``.
+        out: Folder of the run; the latents of the clips are cached in its parent folder, in
+            ``latents``.
         distance: Name and function of the perceptual term.
         encoded: Called with the number of encoded sequences and the total.
-        report: Called after every update with its number, counted over all stages, and the logged values.
-        stop_at: Update, counted over all stages, after which to stop and write the weights; a later call continues.
+        report: Called after every update with its number, counted over all stages, and the logged
+            values.
+        stop_at: Update, counted over all stages, after which to stop and write the weights; a later
+            call continues.
 
     Returns:
         The bundle of the stage that was trained last.
@@ -147,13 +174,24 @@ def train_fixer(
     """
     vae = load_tiny_vae(run.vae)
     clips = LatentClips(run.sequences, vae, run.form, out.parent / "latents", encoded)
-    files, before, path = dict(run.weights), 0, out / BUNDLE_FILE
+    files = dict(run.weights)
+    before = 0
+    path = out / BUNDLE_FILE
     for stage in run.stages():
         if stop_at is not None and stop_at <= before:
             break
         last = stage is run.recipe.stages[-1]
         until = None if stop_at is None else stop_at - before
-        path = train_stage(run, stage, out if last else out / stage.name, clips, files, distance, _from(report, before), until)
+        path = train_stage(
+            run,
+            stage,
+            out if last else out / stage.name,
+            clips,
+            files,
+            distance,
+            _from(report, before),
+            until,
+        )
         files[stage.name] = path
         before += stage.updates(run.schedule.steps)
     return path
@@ -169,7 +207,8 @@ def train_stage(
     report: Report | None = None,
     until: int | None = None,
 ) -> Path:
-    """Train one stage from its last checkpoint, if any, and write its bundle; a finished one is checked and left as it is.
+    """Train one stage from its last checkpoint, if any, and write its bundle; a finished one is
+    checked and left as it is.
 
     Args:
         run: The run that the stage belongs to.
@@ -191,13 +230,30 @@ def train_stage(
         parameter.requires_grad_(any(f"{name}.".startswith(f"{part}.") for part in stage.trained))
     schedule = run.schedule_of(stage)
     facts = {
-        **task.facts, "recipe": run.recipe.name, "stage": stage.name, "clips": len(clips), "latents": clips.digest,
-        "batches": asdict(inputs.form), "equal_channels": run.equal_channels, "seen": asdict(stage.seen),
-        "attention": asdict(inputs.attention), "distance": distance[0] if distance else "none",
+        **task.facts,
+        "recipe": run.recipe.name,
+        "stage": stage.name,
+        "clips": len(clips),
+        "latents": clips.digest,
+        "batches": asdict(inputs.form),
+        "equal_channels": run.equal_channels,
+        "seen": asdict(stage.seen),
+        "attention": asdict(inputs.attention),
+        "distance": distance[0] if distance else "none",
         "start": {part: _digest(inputs.weights.get(part)) for part in stage.start},
-        "vae": file_sha256(run.vae), "precision": str(run.precision_of(stage)),
-    }  # fmt: skip
-    trainer = Trainer(task.parts, folder, schedule, task.batch, task.loss, facts, run.precision_of(stage), parts=stage.trained)
+        "vae": file_sha256(run.vae),
+        "precision": str(run.precision_of(stage)),
+    }
+    trainer = Trainer(
+        task.parts,
+        folder,
+        schedule,
+        task.batch,
+        task.loss,
+        facts,
+        run.precision_of(stage),
+        parts=stage.trained,
+    )
     if trainer.step == schedule.steps and is_written(run, stage, folder, schedule):
         return folder / BUNDLE_FILE
     kept = snapshot_steps(schedule.steps, run.snapshots)
@@ -216,25 +272,56 @@ def train_stage(
 
 def clip_latents(run: FixerRun, stage: Stage) -> int:
     """Return the latents of a stage's clips."""
-    return min(run.form.latents, run.batches.latents or run.form.latents, stage.latents or run.form.latents)
+    return min(
+        run.form.latents, run.batches.latents or run.form.latents, stage.latents or run.form.latents
+    )
 
 
 def stage_inputs(
-    run: FixerRun, stage: Stage, clips: LatentClips, files: Mapping[str, Path], distance: tuple[str, Distance] | None
+    run: FixerRun,
+    stage: Stage,
+    clips: LatentClips,
+    files: Mapping[str, Path],
+    distance: tuple[str, Distance] | None,
 ) -> StageInputs:
     """Return what a stage's objective makes its task of."""
-    weights = {part: tensors for part, source in stage.start.items() if (tensors := _weights(files, source)) is not None}
-    vae = load_tiny_vae(run.vae) if "vae" not in weights else TinyVAE.from_state_dict(weights["vae"], source=stage.start["vae"])
+    weights = {
+        part: tensors
+        for part, source in stage.start.items()
+        if (tensors := _weights(files, source)) is not None
+    }
+    vae = (
+        load_tiny_vae(run.vae)
+        if "vae" not in weights
+        else TinyVAE.from_state_dict(weights["vae"], source=stage.start["vae"])
+    )
     latents = clip_latents(run, stage)
     return StageInputs(
-        run.settings.dit, run.settings.rope_ratios, stage.attention(latents), stage.seen, weights, vae, clips,
-        replace(run.batches, latents=latents), stage.updates(run.schedule.steps), run.schedule.accumulate, run.equal_channels, distance,
-        run.settings, run.scenes,
-    )  # fmt: skip
+        run.settings.dit,
+        run.settings.rope_ratios,
+        stage.attention(latents),
+        stage.seen,
+        weights,
+        vae,
+        clips,
+        replace(run.batches, latents=latents),
+        stage.updates(run.schedule.steps),
+        run.schedule.accumulate,
+        run.equal_channels,
+        distance,
+        run.settings,
+        run.scenes,
+    )
 
 
 def write_bundle(
-    run: FixerRun, stage: Stage, folder: Path, averaged: Weights, facts: Mapping[str, Any], updates: int, schedule: Schedule
+    run: FixerRun,
+    stage: Stage,
+    folder: Path,
+    averaged: Weights,
+    facts: Mapping[str, Any],
+    updates: int,
+    schedule: Schedule,
 ) -> Path:
     """Write a stage's weights after ``updates`` updates as one float16 bundle, with its card."""
     recipe, path = run.recipe, folder / BUNDLE_FILE
@@ -242,23 +329,49 @@ def write_bundle(
     rows, hours = curves(folder / LOG_FILE)
     trained = {part: asdict(own) for part, own in stage.trained.items()}
     training = {
-        "about": recipe.about, "schedule": asdict(schedule), "trained": trained, "always_float32": stage.always_float32, **facts,
-    }  # fmt: skip
-    data = {"pairs": "rendered scenes, split train", "sequences": len(run.sequences), "form": asdict(run.form)}
-    ModelCard(f"OneFixer weights, recipe {name_of(run, stage)}: {recipe.about}", data, training, rows, hours).write(path)
+        "about": recipe.about,
+        "schedule": asdict(schedule),
+        "trained": trained,
+        "always_float32": stage.always_float32,
+        **facts,
+    }
+    data = {
+        "pairs": "rendered scenes, split train",
+        "sequences": len(run.sequences),
+        "form": asdict(run.form),
+    }
+    ModelCard(
+        f"OneFixer weights, recipe {name_of(run, stage)}: {recipe.about}",
+        data,
+        training,
+        rows,
+        hours,
+    ).write(path)
     return path
 
 
 def is_written(run: FixerRun, stage: Stage, folder: Path, schedule: Schedule) -> bool:
-    """Whether a stage's bundle of all updates and its card are there; an earlier stop may have left those of fewer."""
+    """Whether a stage's bundle of all updates and its card are there; an earlier stop may have left
+    those of fewer.
+    """
     path = folder / BUNDLE_FILE
     card = path.with_suffix(".card.json")
-    return path.exists() and card.exists() and read_metadata(path).get("note") == _note(run, stage, schedule.steps, schedule)
+    return (
+        path.exists()
+        and card.exists()
+        and read_metadata(path).get("note") == _note(run, stage, schedule.steps, schedule)
+    )
 
 
 def name_of(run: FixerRun, stage: Stage) -> str:
-    """Return what a stage's weights are called: the recipe, and the stage where it is not the last."""
-    return run.recipe.name if stage is run.recipe.stages[-1] else f"{run.recipe.name}, stage {stage.name}"
+    """Return what a stage's weights are called: the recipe, and the stage where it is not the
+    last.
+    """
+    return (
+        run.recipe.name
+        if stage is run.recipe.stages[-1]
+        else f"{run.recipe.name}, stage {stage.name}"
+    )
 
 
 def _note(run: FixerRun, stage: Stage, updates: int, schedule: Schedule) -> str:
@@ -266,9 +379,21 @@ def _note(run: FixerRun, stage: Stage, updates: int, schedule: Schedule) -> str:
     return f"{name_of(run, stage)}, {updates}{planned} updates"
 
 
-def _write_weights(run: FixerRun, stage: Stage, path: Path, averaged: Weights, updates: int, schedule: Schedule) -> None:
-    parts = {name: {k: half(v) for k, v in part.items()} for name, part in parts_of(averaged).items() if name in BUNDLED}
-    save_bundle(path, parts, deployed_settings(run, stage), trained=True, note=_note(run, stage, updates, schedule))
+def _write_weights(
+    run: FixerRun, stage: Stage, path: Path, averaged: Weights, updates: int, schedule: Schedule
+) -> None:
+    parts = {
+        name: {k: half(v) for k, v in part.items()}
+        for name, part in parts_of(averaged).items()
+        if name in BUNDLED
+    }
+    save_bundle(
+        path,
+        parts,
+        deployed_settings(run, stage),
+        trained=True,
+        note=_note(run, stage, updates, schedule),
+    )
 
 
 def deployed_settings(run: FixerRun, stage: Stage) -> TrainableSettings:
@@ -284,7 +409,12 @@ def deployed_settings(run: FixerRun, stage: Stage) -> TrainableSettings:
     try:
         return type(run.settings).model_validate({**run.settings.model_dump(), **said})
     except ValueError as error:
-        raise InputError("deploying a recipe", f"{run.recipe.name}, stage {stage.name}", str(error), "correct the recipe") from error
+        raise InputError(
+            "deploying a recipe",
+            f"{run.recipe.name}, stage {stage.name}",
+            str(error),
+            "correct the recipe",
+        ) from error
 
 
 def half(tensor: Tensor) -> Tensor:
@@ -298,7 +428,12 @@ def half(tensor: Tensor) -> Tensor:
     rounded = tensor.detach().half()
     if not torch.isfinite(rounded).all():
         found = f"values up to {float(tensor.abs().max()):.3g}"
-        raise InputError("rounding weights to float16", f"shape {list(tensor.shape)}", found, "train with a smaller learning rate")
+        raise InputError(
+            "rounding weights to float16",
+            f"shape {list(tensor.shape)}",
+            found,
+            "train with a smaller learning rate",
+        )
     return rounded
 
 
@@ -322,7 +457,9 @@ def _weights(files: Mapping[str, Path], source: str) -> Weights | None:
 
 
 def _digest(weights: Weights | None) -> str | None:
-    """Return a digest of tensors. A file's would not do: the order of its header is not fixed, and a stage's bundle is written again."""
+    """Return a digest of tensors. A file's would not do: the order of its header is not fixed, and
+    a stage's bundle is written again.
+    """
     if weights is None:
         return None
     out = hashlib.blake2b(digest_size=16)
@@ -335,4 +472,14 @@ def _from(report: Report | None, before: int) -> Report | None:
     return None if report is None else lambda step, numbers: report(before + step, numbers)
 
 
-__all__ = ["BUNDLE_FILE", "FixerRun", "Task", "deployed_settings", "half", "stage_inputs", "train_fixer", "train_stage", "write_bundle"]
+__all__ = [
+    "BUNDLE_FILE",
+    "FixerRun",
+    "Task",
+    "deployed_settings",
+    "half",
+    "stage_inputs",
+    "train_fixer",
+    "train_stage",
+    "write_bundle",
+]

@@ -1,9 +1,11 @@
-"""Flow matching on a noisy history: every clip, block or latent at its own noise level (diffusion forcing), or the whole clip at one.
+"""Flow matching on a noisy history: every clip, block or latent at its own noise level (diffusion
+forcing), or the whole clip at one.
 
     z_t = (1 - t) z_0 + t z_1          | v(z_t, t | z_t of earlier blocks, c) - (z_1 - z_0) |^2
 
-Names as in `shared_rollout`. The history of a block is noised as the block's own training is, not the clean or predicted one of the shared
-rollout; the attention alone says which latents are history: with one block a clip the network is bidirectional.
+Names as in `shared_rollout`. The history of a block is noised as the block's own training is, not
+the clean or predicted one of the shared rollout; the attention alone says which latents are
+history: with one block a clip the network is bidirectional.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ class FlowMatching:
 
     Args:
         times: What has one time t ~ U(0, 1) of its own: every latent, block or clip.
-        window: Whether history ends at the attention's window; otherwise a block sees the whole past, as the paper's backbone is trained.
+        window: Whether history ends at the attention's window; otherwise a block sees the whole
+            past, as the paper's backbone is trained.
         source_share: Share of latents at t = 1, where the deployed generator starts.
         context_share: Share of latents at the level of the cache write.
         noise_share: Share of clips whose source is noise alone.
@@ -80,17 +83,32 @@ class FlowMatchingTask:
     def batch(self, index: int) -> Sample:
         """Make batch ``index``."""
         drawn: Drawn = self.batches[index]
-        return drawn.sample if self.config.tail_drop is None else self.config.tail_drop(drawn.sample, self.batches.form.seed, index)
+        return (
+            drawn.sample
+            if self.config.tail_drop is None
+            else self.config.tail_drop(drawn.sample, self.batches.form.seed, index)
+        )
 
     def loss(self, batch: Sample, index: int) -> Loss:
         """Return the loss of a batch."""
-        s, (t, from_noise) = batch, noise_levels(self.config, batch, self.attention, self.batches.form.seed, index)
+        s, (t, from_noise) = (
+            batch,
+            noise_levels(self.config, batch, self.attention, self.batches.form.seed, index),
+        )
         z_1 = torch.where(from_noise, s.eps, mixed_source(s.z_r, s.m, s.eps))
         weights = bell_weight(t) if self.config.bell else None
         loss = flow_matching(
-            self.net, s.z_0, z_1, t, self.text, s.condition, self.attention,
-            window=self.config.window, channel_weights=self.channel_weights, weights=weights,
-        )  # fmt: skip
+            self.net,
+            s.z_0,
+            z_1,
+            t,
+            self.text,
+            s.condition,
+            self.attention,
+            window=self.config.window,
+            channel_weights=self.channel_weights,
+            weights=weights,
+        )
         return loss, {"flow": float(loss.detach())}
 
 
@@ -125,8 +143,12 @@ def flow_matching(
     return errors.mean() if weights is None else (errors.mean(dim=(1, 3, 4)) * weights).mean()
 
 
-def noise_levels(config: FlowMatching, s: Sample, attention: Attention, seed: int, index: int) -> tuple[Tensor, Tensor]:
-    """Return the noise level of every latent ``(B, N)``, and which clips start from noise ``(B, 1, 1, 1, 1)``."""
+def noise_levels(
+    config: FlowMatching, s: Sample, attention: Attention, seed: int, index: int
+) -> tuple[Tensor, Tensor]:
+    """Return the noise level of every latent ``(B, N)``, and which clips start from noise ``(B, 1,
+    1, 1, 1)``.
+    """
     n = s.t.shape[1]
     size = {"latent": 1, "block": attention.block_latents, "clip": n}[config.times]
     first = torch.arange(n) // size * size  # latents of a block or clip share the draw of its first
@@ -136,12 +158,16 @@ def noise_levels(config: FlowMatching, s: Sample, attention: Attention, seed: in
     kind = torch.from_numpy(rng.random(tuple(s.t.shape)))[:, first]
     t = torch.where(kind < config.source_share, torch.ones_like(t), t)
     t = torch.where(kind > 1 - config.context_share, torch.full_like(t, context_level().sigma), t)
-    from_noise = torch.from_numpy(rng.random(len(s.t)) < config.noise_share)[:, None, None, None, None]
+    from_noise = torch.from_numpy(rng.random(len(s.t)) < config.noise_share)[
+        :, None, None, None, None
+    ]
     return t, from_noise
 
 
 def bell_weight(sigma: Tensor) -> Tensor:
-    """Return ArtiFixer's weight of noise levels: ``exp(-2 (sigma - 1/2)^2)`` above its least value, with mean 1 over the shifted table."""
+    """Return ArtiFixer's weight of noise levels: ``exp(-2 (sigma - 1/2)^2)`` above its least value,
+    with mean 1 over the shifted table.
+    """
     table = [math.exp(-2 * (shifted(1 - i / TABLE) - 0.5) ** 2) for i in range(TABLE)]
     least = min(table)
     return (torch.exp(-2 * (sigma - 0.5).square()) - least) / (sum(table) / TABLE - least)

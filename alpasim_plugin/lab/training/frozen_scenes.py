@@ -1,7 +1,8 @@
-"""The test scenes as they were frozen before training began: hashes of their files, and the check that they are still those.
+"""The test scenes as they were frozen before training began: hashes of their files, and the check
+that they are still those.
 
-``configs/fixers/test-scenes.json`` holds, by split, the SHA-256 of every scenario file by its name, and one of all of them. Numbers on
-other scenes are not comparable with published ones.
+``configs/fixers/test-scenes.json`` holds, by split, the SHA-256 of every scenario file by its name,
+and one of all of them. Numbers on other scenes are not comparable with published ones.
 """
 
 from __future__ import annotations
@@ -48,21 +49,36 @@ def hash_scenes(folder: Path) -> FrozenSplit:
     Raises:
         InputError: There are none.
     """
-    scenes = {path.stem: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.glob("*.yaml"))}
+    scenes = {
+        path.stem: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.glob("*.yaml"))
+    }
     if not scenes:
-        raise InputError(DOING, str(folder), "no scenario", f"write them with 'simrun train scenes --split {folder.name}'")
+        raise InputError(
+            DOING,
+            str(folder),
+            "no scenario",
+            f"write them with 'simrun train scenes --split {folder.name}'",
+        )
     lines = "".join(f"{name} {digest}\n" for name, digest in scenes.items())
     return FrozenSplit(hashlib.sha256(lines.encode()).hexdigest(), scenes)
 
 
-def freeze_scenes(folder: Path, record: Path, splits: Iterable[str] = TEST_SPLITS) -> dict[str, FrozenSplit]:
+def freeze_scenes(
+    folder: Path, record: Path, splits: Iterable[str] = TEST_SPLITS
+) -> dict[str, FrozenSplit]:
     """Write the hashes of the splits below a folder of scenes.
 
     Raises:
         InputError: A split without scenes, or a record that exists already: what is frozen stays.
     """
     if record.exists():
-        raise InputError("freezing test scenes", str(record), "it exists", "remove it if the scenes are really to change")
+        raise InputError(
+            "freezing test scenes",
+            str(record),
+            "it exists",
+            "remove it if the scenes are really to change",
+        )
     found = {split: hash_scenes(folder / split) for split in splits}
     write_json(record, {split: asdict(frozen) for split, frozen in found.items()})
     return found
@@ -86,7 +102,9 @@ def check_scenes(folder: Path, record: Path = RECORD) -> dict[str, FrozenSplit]:
         if differ or found.sha256 != frozen.sha256:
             shown = ", ".join(differ[:5]) or "the hash of all scenes"
             raise InputError(
-                DOING, f"{folder / split} against {record}", f"{max(len(differ), 1)} differ: {shown}",
+                DOING,
+                f"{folder / split} against {record}",
+                f"{max(len(differ), 1)} differ: {shown}",
                 f"write the scenes again with 'simrun train scenes --split {split}', into an empty folder",
-            )  # fmt: skip
+            )
     return known

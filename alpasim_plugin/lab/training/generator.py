@@ -1,4 +1,6 @@
-"""The objectives on the shared rollout as a stage's task: the paper's ablation, one or several objectives in turn."""
+"""The objectives on the shared rollout as a stage's task: the paper's ablation, one or several
+objectives in turn.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +17,20 @@ from alpasim_plugin.lab.training.clip_batches import ClipBatches
 from alpasim_plugin.lab.training.perceptual_term import DecodedDistance
 from alpasim_plugin.lab.training.recipes.recipe import StageInputs
 from alpasim_plugin.lab.training.recipes.start import channel_weights_of, transformer_of
-from alpasim_plugin.lab.training.shared_rollout import Losses, Objectives, Perceptual, Sample, losses
+from alpasim_plugin.lab.training.shared_rollout import (
+    Losses,
+    Objectives,
+    Perceptual,
+    Sample,
+    losses,
+)
 from alpasim_plugin.lab.training.trainer import Loss
 
 
 @dataclass(frozen=True)
 class SharedRollout:
-    """Objectives on the shared rollout, in sequence; the optimiser's state is kept across their borders.
+    """Objectives on the shared rollout, in sequence; the optimiser's state is kept across their
+    borders.
 
     Args:
         objectives: In sequence.
@@ -34,7 +43,12 @@ class SharedRollout:
     def __post_init__(self) -> None:
         if len(self.shares) != len(self.objectives) or abs(sum(self.shares) - 1) > 1e-9:
             found = f"shares {self.shares} of {len(self.objectives)} objectives"
-            raise InputError("choosing objectives in sequence", "their shares", found, "give one a stage, with sum 1")
+            raise InputError(
+                "choosing objectives in sequence",
+                "their shares",
+                found,
+                "give one a stage, with sum 1",
+            )
 
     @property
     def perceptual(self) -> bool:
@@ -44,7 +58,10 @@ class SharedRollout:
     def at(self, update: int, updates: int) -> Objectives:
         """Return the objectives of an update, counted from 0."""
         ends = accumulate(self.shares)
-        return next((o for o, end in zip(self.objectives, ends, strict=True) if update < end * updates), self.objectives[-1])
+        return next(
+            (o for o, end in zip(self.objectives, ends, strict=True) if update < end * updates),
+            self.objectives[-1],
+        )
 
     def weighted(self, perceptual: float) -> SharedRollout:
         """Return the same with another weight lambda of the perceptual term.
@@ -52,7 +69,9 @@ class SharedRollout:
         Raises:
             InputError: A negative weight.
         """
-        return replace(self, objectives=tuple(replace(o, weight=perceptual) for o in self.objectives))
+        return replace(
+            self, objectives=tuple(replace(o, weight=perceptual) for o in self.objectives)
+        )
 
     def task(self, inputs: StageInputs) -> SharedRolloutTask:
         """Make the stage's batches and loss."""
@@ -61,7 +80,9 @@ class SharedRollout:
 
 @dataclass(frozen=True)
 class RolloutBatch:
-    """Latents and noise of a batch, and the render for the perceptual term's decoder (None: not needed)."""
+    """Latents and noise of a batch, and the render for the perceptual term's decoder (None: not
+    needed).
+    """
 
     sample: Sample
     render: Tensor | None
@@ -77,7 +98,12 @@ class SharedRolloutTask:
 
     def __init__(self, config: SharedRollout, inputs: StageInputs) -> None:
         if inputs.distance is None and config.perceptual:
-            raise InputError("setting up the generator's training", str(config), "a perceptual term without a distance", "give one")
+            raise InputError(
+                "setting up the generator's training",
+                str(config),
+                "a perceptual term without a distance",
+                "give one",
+            )
         self.config, self.inputs, self.vae = config, inputs, inputs.vae
         self.batches = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.seen)
         self.net = transformer_of(inputs, "dit")
@@ -87,7 +113,9 @@ class SharedRolloutTask:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Identify the configuration; the updates matter only where they move a border between objectives."""
+        """Identify the configuration; the updates matter only where they move a border between
+        objectives.
+        """
         updates = {"updates": self.inputs.updates} if len(self.config.objectives) > 1 else {}
         return {"objective": "shared rollout", **asdict(self.config), **updates}
 
@@ -105,19 +133,31 @@ class SharedRolloutTask:
 
     def loss(self, batch: RolloutBatch, index: int) -> Loss:
         """Return the loss of a batch and its parts."""
-        s, perceptual, attention = batch.sample, None, self.inputs.attention
+        s = batch.sample
+        perceptual = None
+        attention = self.inputs.attention
         if self.inputs.distance is not None and batch.render is not None:
-            distance: Perceptual = DecodedDistance(self.vae, self.inputs.distance[1], s.z_0, batch.render, batch.opacity)
+            distance: Perceptual = DecodedDistance(
+                self.vae, self.inputs.distance[1], s.z_0, batch.render, batch.opacity
+            )
             perceptual = distance
         made = losses(
-            self.net, s, self.text, self.objectives(index), perceptual,
-            block_latents=attention.block_latents, window=attention.window, channel_weights=self.channel_weights,
-        )  # fmt: skip
+            self.net,
+            s,
+            self.text,
+            self.objectives(index),
+            perceptual,
+            block_latents=attention.block_latents,
+            window=attention.window,
+            channel_weights=self.channel_weights,
+        )
         return made.total, logged(made, s)
 
 
 def logged(made: Losses, s: Sample) -> dict[str, float]:
-    """Return what the log holds of a batch: its terms, and the mean squared errors of rollout and render."""
+    """Return what the log holds of a batch: its terms, and the mean squared errors of rollout and
+    render.
+    """
     parts = {"flow": made.flow, "perceptual": made.perceptual}
     numbers = {name: float(value.detach()) for name, value in parts.items() if value is not None}
     if made.rollout is not None:

@@ -1,7 +1,9 @@
-"""A term against patterns of the network's own grid (checkerboard artefacts; Odena et al., Deconvolution and Checkerboard Artifacts, 2016).
+"""A term against patterns of the network's own grid (checkerboard artefacts; Odena et al.,
+Deconvolution and Checkerboard Artifacts, 2016).
 
-A generator that works on cells of 4 and 16 pixels may draw their borders: the steps from a pixel to its neighbour are then larger in some
-columns of a cell than in others. In the truth they are not, apart from chance, and chance is the same in both pictures.
+A generator that works on cells of 4 and 16 pixels may draw their borders: the steps from a pixel to
+its neighbour are then larger in some columns of a cell than in others. In the truth they are not,
+apart from chance, and chance is the same in both pictures.
 """
 
 from __future__ import annotations
@@ -10,19 +12,24 @@ import torch
 from torch import Tensor
 
 PERIODS = (4, 16)  # cells of the generator at 1/4 and at 1/16
-LARGEST = 0.03  # steps above count as this one: a grid shows on flat surfaces, and edges and texture say nothing about it
+# steps above count as this one: a grid shows on flat surfaces, and edges and texture say nothing
+# about it
+LARGEST = 0.03
 LEAST = 1e-3  # added to a mean step, so that a flat picture has a ratio
 
 
 def grid_term(made: Tensor, truth: Tensor) -> Tensor:
-    """Return how unevenly the steps between neighbouring pixels are spread over a cell's columns and rows, against the truth.
+    """Return how unevenly the steps between neighbouring pixels are spread over a cell's columns
+    and rows, against the truth.
 
     Args:
-        made, truth: ``(B, T, H, W, 3)`` in [-1, 1]; the grid begins in the corner, and sides are multiples of 16.
+        made, truth: ``(B, T, H, W, 3)`` in [-1, 1]; the grid begins in the corner, and sides are
+            multiples of 16.
 
     Returns:
-        Mean over streams, axes and periods of ``|r_p - mean_p r_p|``, where ``r_p`` is the logarithm of the mean step at place p of a cell
-        over that of the truth. Zero for the truth itself; 0.02 is a pattern of about 2 % of the steps.
+        Mean over streams, axes and periods of ``|r_p - mean_p r_p|``, where ``r_p`` is the
+        logarithm of the mean step at place p of a cell over that of the truth. Zero for the truth
+        itself; 0.02 is a pattern of about 2 % of the steps.
     """
     terms = []
     for axis in (2, 3):
@@ -40,6 +47,10 @@ def _steps(images: Tensor, axis: int) -> Tensor:
 
 
 def _by_place(steps: Tensor, period: int) -> Tensor:
-    """Return the mean over cells ``(B, places)``; a picture of one cell has no step across the cell's end."""
+    """Return the mean over cells ``(B, places)``; a picture of one cell has no step across the
+    cell's end.
+    """
     places = min(period, steps.shape[1])
-    return torch.stack([steps[:, place::period].mean(dim=1) for place in range(places)], dim=1) + LEAST
+    return (
+        torch.stack([steps[:, place::period].mean(dim=1) for place in range(places)], dim=1) + LEAST
+    )

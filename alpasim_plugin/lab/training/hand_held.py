@@ -1,4 +1,6 @@
-"""The motion of a camera in a hand: a smooth way, the steps of whoever walks, and the unrest of the hand, in six degrees of freedom."""
+"""The motion of a camera in a hand: a smooth way, the steps of whoever walks, and the unrest of the
+hand, in six degrees of freedom.
+"""
 
 from __future__ import annotations
 
@@ -36,11 +38,14 @@ class Hand:
     steps_hz: float = 1.8
 
 
-def hand_held(eye: F64, target: F64, t_s: F64, hand: Hand, scene_id: str, seed: int, take: str) -> F64:
+def hand_held(
+    eye: F64, target: F64, t_s: F64, hand: Hand, scene_id: str, seed: int, take: str
+) -> F64:
     """Return camera poses ``T_world_camera (T, 4, 4)``, OpenCV axes, z up in the world.
 
     Args:
-        eye, target: ``(K, 3)`` where the camera is and what it looks at, evenly spaced over ``t_s``; splines join them.
+        eye, target: ``(K, 3)`` where the camera is and what it looks at, evenly spaced over
+            ``t_s``; splines join them.
         t_s: ``(T,)`` seconds, from the first to the last of the points.
         hand: Amounts.
         scene_id, seed: Key of the random streams.
@@ -52,7 +57,10 @@ def hand_held(eye: F64, target: F64, t_s: F64, hand: Hand, scene_id: str, seed: 
     phase = rng.uniform(0, 2 * np.pi)
     drift = np.stack([_unrest(rng, t_s, SLOW_HZ) for _ in range(3)], axis=1)
     turns = np.stack(
-        [a * _unrest(rng, t_s, SLOW_HZ) + b * _unrest(rng, t_s, TREMOR_HZ) for a, b in zip(hand.turn_deg, hand.tremor_deg, strict=True)],
+        [
+            a * _unrest(rng, t_s, SLOW_HZ) + b * _unrest(rng, t_s, TREMOR_HZ)
+            for a, b in zip(hand.turn_deg, hand.tremor_deg, strict=True)
+        ],
         axis=1,
     )
     forward = (to - at) / np.linalg.norm(to - at, axis=1, keepdims=True)
@@ -64,7 +72,9 @@ def hand_held(eye: F64, target: F64, t_s: F64, hand: Hand, scene_id: str, seed: 
     out = np.tile(np.eye(4), (len(t_s), 1, 1))
     for i, (x, z) in enumerate(zip(right, forward, strict=True)):
         yaw, pitch, roll = np.radians(turns[i])
-        shaken = cv2.Rodrigues(np.array([pitch, yaw, roll]))[0]  # about the camera's x (right), y (down) and z (forward)
+        shaken = cv2.Rodrigues(np.array([pitch, yaw, roll]))[
+            0
+        ]  # about the camera's x (right), y (down) and z (forward)
         out[i, :3, :3] = np.stack([x, np.cross(z, x), z], axis=1) @ shaken
         out[i, :3, 3] = at[i]
     return out
@@ -73,4 +83,6 @@ def hand_held(eye: F64, target: F64, t_s: F64, hand: Hand, scene_id: str, seed: 
 def _unrest(rng: np.random.Generator, t_s: F64, band_hz: tuple[float, float]) -> F64:
     """Return ``(T,)`` numbers of unit spread: sines of random frequency and phase within a band."""
     frequency, phase = rng.uniform(*band_hz, WAVES), rng.uniform(0, 2 * np.pi, WAVES)
-    return np.asarray(np.sqrt(2.0 / WAVES) * np.sin(2 * np.pi * frequency * t_s[:, None] + phase).sum(axis=1))
+    return np.asarray(
+        np.sqrt(2.0 / WAVES) * np.sin(2 * np.pi * frequency * t_s[:, None] + phase).sum(axis=1)
+    )

@@ -2,9 +2,10 @@
 
     FOLDER/DIGEST/SEQUENCE-CONTENT.npy   (clips, 49, N, H/8, W/8) float16: 16 channels each of render, clean frames and map, 1 of the mask
 
-Clips of a sequence start ``stride`` frames apart. Each is used as it is and mirrored; mirrored clips have class-colour augmentation (see
-`class_colours`). Each clip is encoded as a stream that starts at its first frame. DIGEST covers the encoder's weights and the form of the
-clips, CONTENT the sequence's arrays.
+Clips of a sequence start ``stride`` frames apart. Each is used as it is and mirrored; mirrored
+clips have class-colour augmentation (see `class_colours`). Each clip is encoded as a stream that
+starts at its first frame. DIGEST covers the encoder's weights and the form of the clips, CONTENT
+the sequence's arrays.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ class ClipForm:
     Args:
         latents: N, latents of a clip: ``1 + 4 (N - 1)`` frames.
         stride: Frames between starts.
-        class_colour_augmentation: Whether mirrored clips show the map's cars in the colours of another class.
+        class_colour_augmentation: Whether mirrored clips show the map's cars in the colours of
+            another class.
     """
 
     latents: int = 12
@@ -74,13 +76,21 @@ class LatentClip(NamedTuple):
         return self.z_r, self.z_0, self.z_map, self.m
 
     def frames(self, end: int, begin: int = 0) -> tuple[Tensor, Tensor]:
-        """Return the render ``(3, T, H, W)`` in [-1, 1] and its opacity ``(1, T, H, W)`` of the clip's frames ``begin`` to ``end``."""
+        """Return the render ``(3, T, H, W)`` in [-1, 1] and its opacity ``(1, T, H, W)`` of the
+        clip's frames ``begin`` to ``end``.
+        """
         cut = self.sequence.clip.cut(self.start + begin, end - begin)
-        return to_tensor(cut.rgb_input, self.mirrored), (to_tensor(cut.opacity[..., None], self.mirrored) + 1) / 2
+        return to_tensor(cut.rgb_input, self.mirrored), (
+            to_tensor(cut.opacity[..., None], self.mirrored) + 1
+        ) / 2
 
     def clean(self, end: int, begin: int = 0) -> Tensor:
-        """Return the clean frames ``(3, T, H, W)`` in [-1, 1] of the clip's frames ``begin`` to ``end``."""
-        return to_tensor(self.sequence.clip.cut(self.start + begin, end - begin).rgb_gt, self.mirrored)
+        """Return the clean frames ``(3, T, H, W)`` in [-1, 1] of the clip's frames ``begin`` to
+        ``end``.
+        """
+        return to_tensor(
+            self.sequence.clip.cut(self.start + begin, end - begin).rgb_gt, self.mirrored
+        )
 
 
 class LatentClips:
@@ -94,11 +104,13 @@ class LatentClips:
         report: Called with the number of sequences done and the total.
 
     Attributes:
-        digest: Of everything the latents depend on: autoencoder, form, and the sequences in their order.
+        digest: Of everything the latents depend on: autoencoder, form, and the sequences in their
+            order.
         folder: Of the latents of this autoencoder and form.
 
     Raises:
-        InputError: No sequence, one that is too short for a clip, or sequences of several image sizes.
+        InputError: No sequence, one that is too short for a clip, or sequences of several image
+            sizes.
     """
 
     def __init__(
@@ -110,7 +122,9 @@ class LatentClips:
         report: Callable[[int, int], None] | None = None,
     ) -> None:
         if not sequences:
-            raise InputError(DOING, "the pairs", "no finished sequence", "run 'simrun train pairs' first")
+            raise InputError(
+                DOING, "the pairs", "no finished sequence", "run 'simrun train pairs' first"
+            )
         if len({sequence.size for sequence in sequences}) > 1:
             found = f"images of several sizes, which make no batch: {listed_sizes(sequences)}"
             raise InputError(DOING, "the pairs", found, "choose one with --size WIDTHxHEIGHT")
@@ -132,7 +146,9 @@ class LatentClips:
         sequence, array, i = self._where[index]
         z = torch.from_numpy(np.asarray(array[i], dtype=np.float32))
         z_r, z_0, z_map = z[: 3 * CHANNELS].view(3, CHANNELS, *z.shape[1:])
-        return LatentClip(z_r, z_0, z_map, z[3 * CHANNELS :], sequence, i // 2 * self.form.stride, bool(i % 2))
+        return LatentClip(
+            z_r, z_0, z_map, z[3 * CHANNELS :], sequence, i // 2 * self.form.stride, bool(i % 2)
+        )
 
     def _latents(self, sequence: PairSequence, vae: TinyVAE) -> F16:
         path = self.folder / f"{sequence.name}-{sequence.content[:12]}.npy"
@@ -142,16 +158,28 @@ class LatentClips:
 
 
 def encode_sequence(sequence: PairSequence, vae: TinyVAE, form: ClipForm) -> F16:
-    """Encode all clips of a sequence ``(clips, 49, N, H/8, W/8)``: every start, unmirrored, then mirrored."""
+    """Encode all clips of a sequence ``(clips, 49, N, H/8, W/8)``: every start, unmirrored, then
+    mirrored.
+    """
     starts = range(0, len(sequence.clip) - form.frames + 1, form.stride)
     if not starts:
         found = f"{len(sequence.clip)} frames, a clip has {form.frames}"
-        raise InputError(DOING, str(sequence.folder), found, "make longer sequences, or train on fewer latents")
-    return np.stack([_encode(sequence, vae, start, form, mirrored) for start in starts for mirrored in (False, True)])
+        raise InputError(
+            DOING, str(sequence.folder), found, "make longer sequences, or train on fewer latents"
+        )
+    return np.stack(
+        [
+            _encode(sequence, vae, start, form, mirrored)
+            for start in starts
+            for mirrored in (False, True)
+        ]
+    )
 
 
 @torch.inference_mode()
-def _encode(sequence: PairSequence, vae: TinyVAE, start: int, form: ClipForm, mirrored: bool) -> F16:
+def _encode(
+    sequence: PairSequence, vae: TinyVAE, start: int, form: ClipForm, mirrored: bool
+) -> F16:
     cut = sequence.clip.cut(start, form.frames)
     sdmap = cut.sdmap
     if mirrored and form.class_colour_augmentation:
@@ -164,7 +192,9 @@ def _encode(sequence: PairSequence, vae: TinyVAE, start: int, form: ClipForm, mi
 
 
 def digest(vae: TinyVAE, form: ClipForm) -> str:
-    """Return a digest of what latents depend on: the encoder with its statistics, and the form of the clips; not the decoder."""
+    """Return a digest of what latents depend on: the encoder with its statistics, and the form of
+    the clips; not the decoder.
+    """
     out = hashlib.blake2b(json.dumps(asdict(form)).encode(), digest_size=8)
     for key, value in sorted(vae.state_dict().items()):
         if key.startswith(DECODER):

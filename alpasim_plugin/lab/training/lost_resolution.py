@@ -1,7 +1,9 @@
-"""Damage of a recorded video by lost resolution: blur, cells of few pixels, and holes. Milder than splats, so more of it can be repaired.
+"""Damage of a recorded video by lost resolution: blur, cells of few pixels, and holes. Milder than
+splats, so more of it can be repaired.
 
-A reconstruction far from its training views is out of focus in one place and made of large splats in another; what never was seen is
-transparent. All of it stays in place during an episode, as a fault of the reconstruction would for a camera that stands still.
+A reconstruction far from its training views is out of focus in one place and made of large splats
+in another; what never was seen is transparent. All of it stays in place during an episode, as a
+fault of the reconstruction would for a camera that stands still.
 """
 
 from __future__ import annotations
@@ -13,7 +15,11 @@ import numpy as np
 
 from alpasim_plugin.core.types import F32
 
-BLUR_PX, CELLS_PX, HOLES, RADIUS_PX, STRETCH = (0.6, 3.0), (2, 4), (0, 3), (4.0, 18.0), (0.6, 2.0)
+BLUR_PX = (0.6, 3.0)
+CELLS_PX = (2, 4)
+HOLES = (0, 3)
+RADIUS_PX = (4.0, 18.0)
+STRETCH = (0.6, 2.0)
 PATCH_PX = 12  # size of the patches that are blurred or made of cells
 DEPTH = 0.9  # transparency in the middle of a hole
 
@@ -38,10 +44,16 @@ class LostResolution:
         """Return frames ``(T, 3, h, w)`` in [-1, 1], damaged; black shows through the holes."""
         height, width = self.opacity.shape
         coarse = (max(width // self.cell_px, 1), max(height // self.cell_px, 1))
-        out = np.empty(frames.shape, frames.dtype)  # in C order, whatever the frames' own is: the loop writes into a view of it
-        for image, made in zip(frames.reshape(-1, height, width), out.reshape(-1, height, width), strict=True):
+        out = np.empty(
+            frames.shape, frames.dtype
+        )  # in C order, whatever the frames' own is: the loop writes into a view of it
+        for image, made in zip(
+            frames.reshape(-1, height, width), out.reshape(-1, height, width), strict=True
+        ):
             soft = cv2.GaussianBlur(image, (0, 0), self.blur_px)
-            cells = cv2.resize(cv2.resize(image, coarse, interpolation=cv2.INTER_AREA), (width, height))
+            cells = cv2.resize(
+                cv2.resize(image, coarse, interpolation=cv2.INTER_AREA), (width, height)
+            )
             made[:] = (soft * self.blurred + cells * (1 - self.blurred) + 1) * self.opacity - 1
         return out
 
@@ -54,7 +66,11 @@ def draw_lost_resolution(rng: np.random.Generator, height: int, width: int) -> L
     y, x = np.mgrid[:height, :width].astype(np.float32)
     for _ in range(int(rng.integers(HOLES[0], HOLES[1] + 1))):
         radius, stretch = rng.uniform(*RADIUS_PX), rng.uniform(*STRETCH)
-        distance = ((y - rng.uniform(0, height)) / radius) ** 2 + ((x - rng.uniform(0, width)) / (radius * stretch)) ** 2
+        distance = ((y - rng.uniform(0, height)) / radius) ** 2 + (
+            (x - rng.uniform(0, width)) / (radius * stretch)
+        ) ** 2
         opacity *= 1 - np.float32(DEPTH) * np.exp(-distance)
     cell_px = int(rng.integers(CELLS_PX[0], CELLS_PX[1] + 1))
-    return LostResolution(float(rng.uniform(*BLUR_PX)), cell_px, blurred, opacity.astype(np.float32))
+    return LostResolution(
+        float(rng.uniform(*BLUR_PX)), cell_px, blurred, opacity.astype(np.float32)
+    )

@@ -1,7 +1,7 @@
 """Errors of the semantic map in training: pixels are the evidence, the map is a hint.
 
-A map may be missing, lack the paint of its lanes, lie beside the road, or be that of another street. A fixer that has seen all of these
-believes a map only where the picture agrees with it.
+A map may be missing, lack the paint of its lanes, lie beside the road, or be that of another
+street. A fixer that has seen all of these believes a map only where the picture agrees with it.
 """
 
 from __future__ import annotations
@@ -16,8 +16,18 @@ from alpasim_plugin.core.types import U8, Bool
 from alpasim_plugin.fixers.semantic_map.style import COLOURS
 
 Kind = Literal["true", "missing", "unpainted", "shifted", "other"]
-CHANCES: dict[Kind, float] = {"true": 0.58, "missing": 0.12, "unpainted": 0.12, "shifted": 0.12, "other": 0.06}
-SHIFT_PX, TURN_DEG, ZOOM = (8.0, 3.0), 1.5, 0.03  # spread along x and y, at 256 pixels across; of the turn; of the scale's logarithm
+CHANCES: dict[Kind, float] = {
+    "true": 0.58,
+    "missing": 0.12,
+    "unpainted": 0.12,
+    "shifted": 0.12,
+    "other": 0.06,
+}
+SHIFT_PX, TURN_DEG, ZOOM = (
+    (8.0, 3.0),
+    1.5,
+    0.03,
+)  # spread along x and y, at 256 pixels across; of the turn; of the scale's logarithm
 PAINT = ("line_untyped", "line_white", "line_yellow", "line_other")
 ALIKE = 0.985  # cosine between a pixel's colour and that of paint, at any brightness
 
@@ -42,11 +52,15 @@ def draw_map_error(rng: np.random.Generator) -> MapError:
     """Draw the error of an episode's map."""
     kind = list(CHANCES)[int(rng.choice(len(CHANCES), p=list(CHANCES.values())))]
     dx, dy, turn, zoom = rng.standard_normal(4)
-    return MapError(kind, (SHIFT_PX[0] * dx, SHIFT_PX[1] * dy), TURN_DEG * turn, float(np.exp(ZOOM * zoom)))
+    return MapError(
+        kind, (SHIFT_PX[0] * dx, SHIFT_PX[1] * dy), TURN_DEG * turn, float(np.exp(ZOOM * zoom))
+    )
 
 
 def with_error(sdmap: U8, error: MapError) -> U8:
-    """Return maps ``(T, H, W, 3)`` as the error shows them; that of another sequence is chosen by the caller."""
+    """Return maps ``(T, H, W, 3)`` as the error shows them; that of another sequence is chosen by
+    the caller.
+    """
     if error.kind == "missing":
         return np.zeros_like(sdmap)
     if error.kind == "unpainted":
@@ -56,7 +70,14 @@ def with_error(sdmap: U8, error: MapError) -> U8:
     height, width = sdmap.shape[1:3]
     turned = cv2.getRotationMatrix2D((width / 2, height / 2), error.turn_deg, error.zoom)
     turned[:, 2] += np.array(error.shift_px) * width / 256
-    return np.stack([cv2.warpAffine(np.ascontiguousarray(image), turned, (width, height), flags=cv2.INTER_LINEAR) for image in sdmap])
+    return np.stack(
+        [
+            cv2.warpAffine(
+                np.ascontiguousarray(image), turned, (width, height), flags=cv2.INTER_LINEAR
+            )
+            for image in sdmap
+        ]
+    )
 
 
 def is_paint(sdmap: U8) -> Bool:

@@ -2,7 +2,8 @@
 
     n = w_0 + sum_i s^i up(w_i),   w_i white of size / r^i,   s = strength t,   divided by its standard deviation
 
-At t = 0 it is white; towards t = 1 large scales are added, so that a network has to find a latent's mean, which white noise leaves visible.
+At t = 0 it is white; towards t = 1 large scales are added, so that a network has to find a latent's
+mean, which white noise leaves visible.
 """
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ RATIOS = (2.0, 4.0)  # r is uniform between
 
 
 def multi_resolution_noise(
-    rng: np.random.Generator, shape: tuple[int, int, int, int, int], t: Tensor, strength: float = STRENGTH
+    rng: np.random.Generator,
+    shape: tuple[int, int, int, int, int],
+    t: Tensor,
+    strength: float = STRENGTH,
 ) -> Tensor:
     """Draw noise of unit variance for every sample.
 
@@ -40,7 +44,9 @@ def _one(rng: np.random.Generator, shape: tuple[int, int, int, int], share: floa
     for i in range(int(np.log(max(height, width)) / np.log(RATIOS[0])) + 1):
         size = max(int(height / ratio**i), 1), max(int(width / ratio**i), 1)
         white = torch.from_numpy(rng.standard_normal((c, frames, *size), dtype=np.float32))
-        noise += share**i * F.interpolate(white, size=(height, width), mode="bilinear", align_corners=False)
+        noise += share**i * F.interpolate(
+            white, size=(height, width), mode="bilinear", align_corners=False
+        )
         if 1 in size:
             break
     return noise / noise.std()

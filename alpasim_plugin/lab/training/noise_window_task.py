@@ -1,4 +1,6 @@
-"""A stage of GSFix3D or 3DGS-Enhancer: configuration, batches and loss (`training.noise_window` has the equations)."""
+"""A stage of GSFix3D or 3DGS-Enhancer: configuration, batches and loss (`training.noise_window` has
+the equations).
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,8 @@ class NoiseWindowLoss:
         error: Power and weight of the velocity's error.
         multi_resolution: Whether the noise has structure at several scales; otherwise it is white.
         cut_outs: Whether soft parts of the render are hidden.
-        dropout: Share of a window's latents without their condition, the first and the last excepted.
+        dropout: Share of a window's latents without their condition, the first and the last
+            excepted.
     """
 
     times: Literal["uniform", "log-normal"]
@@ -57,7 +60,9 @@ class NoiseWindowLoss:
 
 
 class NoiseWindowBatch(NamedTuple):
-    """Frames of windows with their noise ``(B, 16, latents, H / 8, W / 8)``, times ``(B,)`` and seen conditions ``(B, latents)``."""
+    """Frames of windows with their noise ``(B, 16, latents, H / 8, W / 8)``, times ``(B,)`` and
+    seen conditions ``(B, latents)``.
+    """
 
     pictures: Pictures
     eps: Tensor
@@ -69,14 +74,20 @@ class NoiseWindowTask:
     """Batches and loss of `NoiseWindowLoss`; every window is encoded from its own first frame.
 
     Raises:
-        InputError: A fixer that does not start from noise, or clips that are shorter than its windows.
+        InputError: A fixer that does not start from noise, or clips that are shorter than its
+            windows.
     """
 
     def __init__(self, config: NoiseWindowLoss, inputs: StageInputs) -> None:
         settings = inputs.settings
         if not isinstance(settings, NoiseWindowSettings):
             found = f"{'a fixer' if settings is None else settings.name} that does not sample windows from noise"
-            raise InputError("setting up training from noise", "--fixer", found, "leave it out, or name gsfix3d or 3dgs-enhancer")
+            raise InputError(
+                "setting up training from noise",
+                "--fixer",
+                found,
+                "leave it out, or name gsfix3d or 3dgs-enhancer",
+            )
         self.config, self.vae, self.latents = config, inputs.vae, settings.latents
         self.batches = PictureBatches(inputs, settings.window_frames)
         self.net = transformer_with_render(inputs, "dit")
@@ -87,26 +98,49 @@ class NoiseWindowTask:
     @property
     def facts(self) -> dict[str, Any]:
         """Identify the configuration."""
-        return {"objective": "windows from noise", **asdict(self.config), "window_frames": self.batches.frames}
+        return {
+            "objective": "windows from noise",
+            **asdict(self.config),
+            "window_frames": self.batches.frames,
+        }
 
     def batch(self, index: int) -> NoiseWindowBatch:
         """Make batch ``index``."""
         (render, clean), seed = self.batches[index], self.batches.seed
-        t = TIMES[self.config.times](stream("training", seed, "noise_window.times", index), len(render))
-        shape = (len(render), self.vae.stats.mean.numel(), self.latents, render.shape[3] // 8, render.shape[4] // 8)
+        t = TIMES[self.config.times](
+            stream("training", seed, "noise_window.times", index), len(render)
+        )
+        shape = (
+            len(render),
+            self.vae.stats.mean.numel(),
+            self.latents,
+            render.shape[3] // 8,
+            render.shape[4] // 8,
+        )
         rng = stream("training", seed, "noise_window.eps", index)
         white = not self.config.multi_resolution
-        eps = torch.from_numpy(rng.standard_normal(shape, dtype=np.float32)) if white else multi_resolution_noise(rng, shape, t)
+        eps = (
+            torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
+            if white
+            else multi_resolution_noise(rng, shape, t)
+        )
         if self.config.cut_outs:
             render = cut_out(stream("training", seed, "noise_window.cut_outs", index), render)
         rng = stream("training", seed, "noise_window.dropout", index)
-        return NoiseWindowBatch(Pictures(render, clean), eps, t, seen_latents(rng, (len(render), self.latents), self.config.dropout))
+        return NoiseWindowBatch(
+            Pictures(render, clean),
+            eps,
+            t,
+            seen_latents(rng, (len(render), self.latents), self.config.dropout),
+        )
 
     def loss(self, batch: NoiseWindowBatch, index: int) -> Loss:
         """Return the loss of a batch."""
         with torch.no_grad():
             z_r, z_0 = self.vae.encode(torch.cat(batch.pictures)).chunk(2)
             z_r = z_r * batch.seen[:, None, :, None, None]
-        errors = noise_window_errors(self.net, z_0, z_r, batch.eps, batch.t, self.text, ERRORS[self.config.error])
+        errors = noise_window_errors(
+            self.net, z_0, z_r, batch.eps, batch.t, self.text, ERRORS[self.config.error]
+        )
         loss = channel_weighted(errors, self.channel_weights).mean()
         return loss, {"flow": float(loss.detach())}

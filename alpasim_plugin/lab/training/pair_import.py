@@ -30,12 +30,14 @@ class PairSources:
     """Paths of the channels of one sequence.
 
     Args:
-        rgb_input: Degraded renders: an mp4 file, a folder of .png or .jpg (in order of name), or a .npy array.
+        rgb_input: Degraded renders: an mp4 file, a folder of .png or .jpg (in order of name), or a
+            .npy array.
         rgb_gt: Clean frames, likewise.
-        opacity: Accumulated opacity with the sky filled (OneFixer, App. A), white is opaque, likewise.
+        opacity: Accumulated opacity with the sky filled (OneFixer, App. A), white is opaque,
+            likewise.
         sdmap: Semantic map, likewise.
-        poses: Camera poses in the world, OpenCV axes: a .npy array ``(T, 4, 4)``, or JSON: a list of 4 x 4 matrices, or of
-            ``{"T_world_camera": [[...]], "t_us": 0}``.
+        poses: Camera poses in the world, OpenCV axes: a .npy array ``(T, 4, 4)``, or JSON: a list
+            of 4 x 4 matrices, or of ``{"T_world_camera": [[...]], "t_us": 0}``.
     """
 
     rgb_input: Path
@@ -46,7 +48,12 @@ class PairSources:
 
 
 def import_sequence(
-    sources: PairSources, folder: Path, *, fps: float, size: tuple[int, int] | None = None, facts: Mapping[str, Any] | None = None
+    sources: PairSources,
+    folder: Path,
+    *,
+    fps: float,
+    size: tuple[int, int] | None = None,
+    facts: Mapping[str, Any] | None = None,
 ) -> int:
     """Write one sequence of pairs; it is as long as its shortest channel.
 
@@ -61,21 +68,38 @@ def import_sequence(
         Frames written.
 
     Raises:
-        InputError: An unreadable file, invalid poses, a channel without frames, or channels of different size without ``size``.
+        InputError: An unreadable file, invalid poses, a channel without frames, or channels of
+            different size without ``size``.
     """
     T, t_us = read_poses(sources.poses, fps)
     named = {name: getattr(sources, name) for name in CHANNELS}
-    found = {name: (first, length) for name, path in named.items() for first, length in [_first_and_count(path)]}
+    found = {
+        name: (first, length)
+        for name, path in named.items()
+        for first, length in [_first_and_count(path)]
+    }
     if size is None:
         shapes = {name: first.shape[1::-1] for name, (first, _) in found.items()}
         if len(set(shapes.values())) > 1:
             listed = ", ".join(f"{name} {w} x {h}" for name, (w, h) in shapes.items())
-            raise InputError(DOING, folder.name, f"channels of different size: {listed}", "give --size WIDTHxHEIGHT to scale them to one")
+            raise InputError(
+                DOING,
+                folder.name,
+                f"channels of different size: {listed}",
+                "give --size WIDTHxHEIGHT to scale them to one",
+            )
     length = min(len(T), *(count for _, count in found.values()))
     if length == 0:
-        raise InputError(DOING, folder.name, "no frame that every channel has", "give channels of the same drive")
+        raise InputError(
+            DOING, folder.name, "no frame that every channel has", "give channels of the same drive"
+        )
     counts = {**{name: count for name, (_, count) in found.items()}, "poses": len(T)}
-    info = {"family": "imported", **(facts or {}), "sources": {n: str(p) for n, p in named.items()}, "source_frames": counts}
+    info = {
+        "family": "imported",
+        **(facts or {}),
+        "sources": {n: str(p) for n, p in named.items()},
+        "source_frames": counts,
+    }
     write_sequence(folder, _pairs(named, T, t_us, length, size), length, info)
     return length
 
@@ -88,7 +112,9 @@ def read_poses(path: Path, fps: float) -> tuple[F64, list[int]]:
     """
     if fps <= 0:
         raise InputError(DOING, "--fps", f"{fps}", "give a positive rate")
-    with parsing(DOING, path, "give .npy (T, 4, 4), or JSON with a 4 x 4 matrix a frame", "no poses"):
+    with parsing(
+        DOING, path, "give .npy (T, 4, 4), or JSON with a 4 x 4 matrix a frame", "no poses"
+    ):
         if path.suffix == ".npy":
             T, times = np.asarray(open_npy(path, DOING), dtype=np.float64), None
         else:
@@ -97,18 +123,36 @@ def read_poses(path: Path, fps: float) -> tuple[F64, list[int]]:
             T = np.array([r["T_world_camera"] if with_times else r for r in rows], dtype=np.float64)
             times = [int(r["t_us"]) for r in rows] if with_times and "t_us" in rows[0] else None
     if T.ndim != 3 or T.shape[1:] != (4, 4) or not len(T):
-        raise InputError(DOING, str(path), f"an array of shape {T.shape}", "give one 4 x 4 matrix a frame")
+        raise InputError(
+            DOING, str(path), f"an array of shape {T.shape}", "give one 4 x 4 matrix a frame"
+        )
     off = np.abs(T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    bad = ~np.isfinite(T).all(axis=(1, 2)) | ~(off < ORTHONORMAL) | (np.linalg.det(np.nan_to_num(T[:, :3, :3])) < 0)
+    bad = (
+        ~np.isfinite(T).all(axis=(1, 2))
+        | ~(off < ORTHONORMAL)
+        | (np.linalg.det(np.nan_to_num(T[:, :3, :3])) < 0)
+    )
     with np.errstate(invalid="ignore"):
-        bad |= ~(np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) < ORTHONORMAL)  # a transposed pose has its translation in this row
+        bad |= ~(
+            np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) < ORTHONORMAL
+        )  # a transposed pose has its translation in this row
     if bad.any():
         found = f"pose {int(np.argmax(bad))} is not a rigid transform"
-        raise InputError(DOING, str(path), found, "give T_world_camera (columns: axes, then position), metres, OpenCV axes")
+        raise InputError(
+            DOING,
+            str(path),
+            found,
+            "give T_world_camera (columns: axes, then position), metres, OpenCV axes",
+        )
     if times is None:
         times = [round(i / fps * 1e6) for i in range(len(T))]
     if any(b <= a for a, b in pairwise(times)):
-        raise InputError(DOING, str(path), "times that do not increase", "sort the poses by time, or remove the times")
+        raise InputError(
+            DOING,
+            str(path),
+            "times that do not increase",
+            "sort the poses by time, or remove the times",
+        )
     return T, times
 
 
@@ -121,7 +165,12 @@ def read_frames(path: Path) -> Iterator[U8]:
     if path.is_dir():
         files = sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
         if not files:
-            raise InputError(DOING, str(path), "a folder without images", f"put {', '.join(IMAGE_SUFFIXES)} there, named in order")
+            raise InputError(
+                DOING,
+                str(path),
+                "a folder without images",
+                f"put {', '.join(IMAGE_SUFFIXES)} there, named in order",
+            )
         for file in files:
             image = read_image(file, DOING, "write it again as PNG or JPEG")
             yield np.ascontiguousarray(image[..., ::-1]).astype(np.uint8)
@@ -132,20 +181,33 @@ def read_frames(path: Path) -> Iterator[U8]:
             for frame in video:
                 yield frame.image
     else:
-        raise InputError(DOING, str(path), "no such file or folder", "give a video, a folder of images or a .npy array")
+        raise InputError(
+            DOING,
+            str(path),
+            "no such file or folder",
+            "give a video, a folder of images or a .npy array",
+        )
 
 
 def _array_frames(path: Path) -> Iterator[U8]:
     array = open_npy(path, DOING, "give a complete .npy array")
-    if array.dtype != np.uint8 or array.ndim not in (3, 4) or (array.ndim == 4 and array.shape[3] not in (1, 3)):
-        raise InputError(DOING, str(path), f"{array.dtype} {array.shape}", "give uint8 (T, H, W) or (T, H, W, 3)")
+    if (
+        array.dtype != np.uint8
+        or array.ndim not in (3, 4)
+        or (array.ndim == 4 and array.shape[3] not in (1, 3))
+    ):
+        raise InputError(
+            DOING, str(path), f"{array.dtype} {array.shape}", "give uint8 (T, H, W) or (T, H, W, 3)"
+        )
     for image in array:
         colour = image if image.ndim == 3 else image[..., None]
         yield np.ascontiguousarray(np.broadcast_to(colour, (*colour.shape[:2], 3)))
 
 
 def _first_and_count(path: Path) -> tuple[U8, int]:
-    """Return the first image and the number of images; videos are decoded to the end to count frames."""
+    """Return the first image and the number of images; videos are decoded to the end to count
+    frames.
+    """
     frames = read_frames(path)
     first = next(frames, None)
     if first is None:
@@ -153,16 +215,28 @@ def _first_and_count(path: Path) -> tuple[U8, int]:
     return first, 1 + sum(1 for _ in frames)
 
 
-def _pairs(named: Mapping[str, Path], T: F64, t_us: list[int], length: int, size: tuple[int, int] | None) -> Iterator[Pair]:
+def _pairs(
+    named: Mapping[str, Path], T: F64, t_us: list[int], length: int, size: tuple[int, int] | None
+) -> Iterator[Pair]:
     streams = {name: read_frames(path) for name, path in named.items()}
     for i in range(length):
         images = {name: _scaled(next(stream), size) for name, stream in streams.items()}
         opacity = cv2.cvtColor(images["opacity"], cv2.COLOR_RGB2GRAY)
-        yield Pair(images["rgb_input"], images["rgb_gt"], np.asarray(opacity, dtype=np.uint8), images["sdmap"], T[i], t_us[i])
+        yield Pair(
+            images["rgb_input"],
+            images["rgb_gt"],
+            np.asarray(opacity, dtype=np.uint8),
+            images["sdmap"],
+            T[i],
+            t_us[i],
+        )
 
 
 def _scaled(image: U8, size: tuple[int, int] | None) -> U8:
     if size is None or image.shape[1::-1] == size:
         return image
     smaller = size[0] * size[1] < image.shape[0] * image.shape[1]
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR), dtype=np.uint8)
+    return np.asarray(
+        cv2.resize(image, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR),
+        dtype=np.uint8,
+    )

@@ -28,7 +28,8 @@ class SequenceFacts:
     """Statistics of one sequence; means over the measured frames.
 
     Attributes:
-        split, name, family, degradation: From its folder and sequence.json; ``imported`` without an entry.
+        split, name, family, degradation: From its folder and sequence.json; ``imported`` without an
+            entry.
         frames: Frames that every channel has.
         moving_actors: Number of moving actors; None if unknown.
         psnr_db: Of rgb_input against rgb_gt, every measured frame.
@@ -76,7 +77,11 @@ def measure_sequence(sequence: PairSequence, split: str) -> SequenceFacts:
 
 def _travel_m(clip: PairClip) -> float | None:
     places = np.asarray(clip.T_world_camera[:, :3, 3])
-    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()) if np.isfinite(places).all() else None
+    return (
+        float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+        if np.isfinite(places).all()
+        else None
+    )
 
 
 def sheet(facts: Sequence[SequenceFacts]) -> dict[str, Any]:
@@ -100,7 +105,12 @@ def _group(facts: Sequence[SequenceFacts]) -> dict[str, Any]:
         "not_known_whether_actors_move": sum(f.moving_actors is None for f in facts),
         "families": dict(sorted(Counter(f.family for f in facts).items())),
         "degradations": dict(sorted(Counter(f.degradation for f in facts).items())),
-        "psnr_db": {"mean": _mean(values), "p05": _at(values, 5), "p50": _at(values, 50), "p95": _at(values, 95)},
+        "psnr_db": {
+            "mean": _mean(values),
+            "p05": _at(values, 5),
+            "p50": _at(values, 50),
+            "p95": _at(values, 95),
+        },
         "psnr_histogram": {"edges_db": list(PSNR_EDGES_DB), "frames": counts.tolist()},
         "psnr_db_by_degradation": {
             kind: _mean(np.concatenate([f.psnr_db for f in facts if f.degradation == kind]))
@@ -115,43 +125,73 @@ def _group(facts: Sequence[SequenceFacts]) -> dict[str, Any]:
 
 
 def markdown(document: Mapping[str, Any]) -> str:
-    """Return the statistics as two Markdown tables: by split, and a histogram of the input's PSNR."""
+    """Return the statistics as two Markdown tables: by split, and a histogram of the input's
+    PSNR.
+    """
     columns = {**document["splits"], "all": document["all"]}
     counted = ("sequences", "frames", "with_moving_actors", "not_known_whether_actors_move")
-    rows = [[name.replace("_", " "), *(f"{c[name]:,}" for c in columns.values())] for name in counted]
+    rows = [
+        [name.replace("_", " "), *(f"{c[name]:,}" for c in columns.values())] for name in counted
+    ]
     for name in ("families", "degradations"):
-        rows += [[name, *(", ".join(f"{k} {v}" for k, v in c[name].items()) for c in columns.values())]]
+        rows += [
+            [name, *(", ".join(f"{k} {v}" for k, v in c[name].items()) for c in columns.values())]
+        ]
     spreads = ["{p05:.1f}, {mean:.1f}, {p95:.1f}".format(**c["psnr_db"]) for c in columns.values()]
     rows.append(["PSNR of input, dB (5 %, mean, 95 %)", *spreads])
-    by_kind = [", ".join(f"{k} {v:.1f}" for k, v in c["psnr_db_by_degradation"].items()) for c in columns.values()]
+    by_kind = [
+        ", ".join(f"{k} {v:.1f}" for k, v in c["psnr_db_by_degradation"].items())
+        for c in columns.values()
+    ]
     rows.append(["PSNR by degradation, dB", *by_kind])
     for name, title, form in (
-        ("ssim", "SSIM of input", "{:.3f}"), ("hole_share", "pixels missing", "{:.2%}"), ("luminance", "mean luminance", "{:.2f}"),
-        ("map_share", "pixels with map", "{:.1%}"), ("travel_m", "metres driven, mean", "{:.0f}"),
-    ):  # fmt: skip
-        rows.append([title, *("-" if c[name] is None else form.format(c[name]) for c in columns.values())])
+        ("ssim", "SSIM of input", "{:.3f}"),
+        ("hole_share", "pixels missing", "{:.2%}"),
+        ("luminance", "mean luminance", "{:.2f}"),
+        ("map_share", "pixels with map", "{:.1%}"),
+        ("travel_m", "metres driven, mean", "{:.0f}"),
+    ):
+        rows.append(
+            [title, *("-" if c[name] is None else form.format(c[name]) for c in columns.values())]
+        )
     head = ["", *columns]
     table = [head, ["---"] * len(head), *rows]
     edges = document["all"]["psnr_histogram"]["edges_db"]
     bins = [f"{a} to {b}" for a, b in pairwise(edges)]
     spread = [["PSNR, dB", *columns], ["---"] * len(head)]
-    spread += [[b, *(str(c["psnr_histogram"]["frames"][i]) for c in columns.values())] for i, b in enumerate(bins)]
+    spread += [
+        [b, *(str(c["psnr_histogram"]["frames"][i]) for c in columns.values())]
+        for i, b in enumerate(bins)
+    ]
     text = ["\n".join("| " + " | ".join(row) + " |" for row in t) for t in (table, spread)]
     return f"{text[0]}\n\nMeasured frames (every {document['measured_every']}th) by the PSNR of the input:\n\n{text[1]}\n"
 
 
 def contact_sheet(sequences: Sequence[PairSequence], rows: int = ROWS) -> U8:
-    """Return an image ``(H, W, 3)``: one row per sequence, evenly chosen; input and clean frame at three times, opacity and map."""
-    chosen = [sequences[i] for i in np.unique(np.linspace(0, len(sequences) - 1, min(rows, len(sequences))).round().astype(int))]
+    """Return an image ``(H, W, 3)``: one row per sequence, evenly chosen; input and clean frame at
+    three times, opacity and map.
+    """
+    chosen = [
+        sequences[i]
+        for i in np.unique(
+            np.linspace(0, len(sequences) - 1, min(rows, len(sequences))).round().astype(int)
+        )
+    ]
     lines = []
     for sequence in chosen:
         clip = sequence.clip
-        tiles = [tile for i in (len(clip) // 10, len(clip) // 2, 9 * len(clip) // 10) for tile in (clip.rgb_input[i], clip.rgb_gt[i])]
+        tiles = [
+            tile
+            for i in (len(clip) // 10, len(clip) // 2, 9 * len(clip) // 10)
+            for tile in (clip.rgb_input[i], clip.rgb_gt[i])
+        ]
         middle = len(clip) // 2
         tiles += [np.repeat(clip.opacity[middle][..., None], 3, axis=2), clip.sdmap[middle]]
         lines.append(np.concatenate([_thumb(t) for t in tiles], axis=1))
     width = max(line.shape[1] for line in lines)
-    return np.concatenate([np.pad(line, ((0, 2), (0, width - line.shape[1]), (0, 0))) for line in lines])
+    return np.concatenate(
+        [np.pad(line, ((0, 2), (0, width - line.shape[1]), (0, 0))) for line in lines]
+    )
 
 
 def write_sheet(out: Path, document: Mapping[str, Any], image: U8) -> None:
@@ -163,7 +203,12 @@ def write_sheet(out: Path, document: Mapping[str, Any], image: U8) -> None:
 
 def _thumb(image: U8) -> U8:
     height = round(image.shape[0] * THUMB_WIDTH / image.shape[1])
-    return np.asarray(cv2.resize(np.ascontiguousarray(image), (THUMB_WIDTH, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return np.asarray(
+        cv2.resize(
+            np.ascontiguousarray(image), (THUMB_WIDTH, height), interpolation=cv2.INTER_AREA
+        ),
+        dtype=np.uint8,
+    )
 
 
 def _mean(values: Any) -> float:

@@ -1,4 +1,5 @@
-"""Training pairs on disk: one folder per sequence, one array file per channel, memory-mapped, readable while more are written.
+"""Training pairs on disk: one folder per sequence, one array file per channel, memory-mapped,
+readable while more are written.
 
     ROOT/SPLIT/SEQUENCE/rgb_input.npy        (T, H, W, 3) uint8   degraded render
                         rgb_gt.npy           (T, H, W, 3) uint8   clean frame
@@ -33,11 +34,15 @@ from alpasim_plugin.core.types import F64, I64, U8
 SEQUENCE_FILE = "sequence.json"
 CONTENT = "content"
 READING = "reading training pairs"
-OPEN_CLIPS = 100  # at a time; each holds a file for every channel, and a process may often open 1024
+OPEN_CLIPS = (
+    100  # at a time; each holds a file for every channel, and a process may often open 1024
+)
 
 
 class Pair(NamedTuple):
-    """One frame of a sequence: images ``(H, W, 3)``, opacity ``(H, W)`` uint8, pose ``(4, 4)``, microseconds."""
+    """One frame of a sequence: images ``(H, W, 3)``, opacity ``(H, W)`` uint8, pose ``(4, 4)``,
+    microseconds.
+    """
 
     rgb_input: U8
     rgb_gt: U8
@@ -68,15 +73,26 @@ class PairClip:
             InputError: The clip is shorter.
         """
         if not 0 <= start <= len(self) - frames:
-            raise InputError(READING, f"frames {start} to {start + frames}", f"the sequence has {len(self)}", "ask for fewer frames")
-        return type(self)(**{f.name: getattr(self, f.name)[start : start + frames] for f in fields(self)})
+            raise InputError(
+                READING,
+                f"frames {start} to {start + frames}",
+                f"the sequence has {len(self)}",
+                "ask for fewer frames",
+            )
+        return type(self)(
+            **{f.name: getattr(self, f.name)[start : start + frames] for f in fields(self)}
+        )
 
 
 CHANNELS = tuple(f.name for f in fields(PairClip))
 _FORMS: dict[str, tuple[int, str]] = {
-    "rgb_input": (4, "uint8"), "rgb_gt": (4, "uint8"), "opacity": (3, "uint8"), "sdmap": (4, "uint8"), "T_world_camera": (3, "float64"),
+    "rgb_input": (4, "uint8"),
+    "rgb_gt": (4, "uint8"),
+    "opacity": (3, "uint8"),
+    "sdmap": (4, "uint8"),
+    "T_world_camera": (3, "float64"),
     "t_us": (1, "int64"),
-}  # fmt: skip
+}
 
 
 class PairSequence:
@@ -89,7 +105,9 @@ class PairSequence:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         path = folder / SEQUENCE_FILE
-        self.info: dict[str, Any] = read_json_object(path, READING, do_this="give a folder that 'simrun train pairs' finished")
+        self.info: dict[str, Any] = read_json_object(
+            path, READING, do_this="give a folder that 'simrun train pairs' finished"
+        )
 
     @property
     def name(self) -> str:
@@ -109,7 +127,9 @@ class PairSequence:
 
     @property
     def clip(self) -> PairClip:
-        """The frames that every channel has, as memory maps; they are closed when many other sequences have been used since."""
+        """The frames that every channel has, as memory maps; they are closed when many other
+        sequences have been used since.
+        """
         return _opened(self)
 
     def _open(self, name: str) -> Any:
@@ -118,7 +138,9 @@ class PairSequence:
         array = open_npy(path, READING, "give a complete .npy file of this channel")
         if array.ndim != axes or array.dtype != np.dtype(dtype):
             found = f"{array.dtype} with {array.ndim} axes"
-            raise InputError(READING, str(path), found, f"give {dtype} with {axes} axes (docs/lab/pairs.md)")
+            raise InputError(
+                READING, str(path), found, f"give {dtype} with {axes} axes (docs/lab/pairs.md)"
+            )
         return array
 
 
@@ -133,13 +155,18 @@ def _opened(sequence: PairSequence) -> PairClip:
     length = min(len(a) for a in arrays.values())
     if length == 0:
         raise InputError(
-            READING, str(sequence.folder), "no frame that every channel has", "remove the folder and run 'simrun train pairs' again"
+            READING,
+            str(sequence.folder),
+            "no frame that every channel has",
+            "remove the folder and run 'simrun train pairs' again",
         )
     return PairClip(**{name: a[:length] for name, a in arrays.items()})
 
 
 def is_made(folder: Path, info: Mapping[str, Any]) -> bool:
-    """Return whether a folder holds a complete sequence that was made in the same way: its sequence.json agrees with ``info``."""
+    """Return whether a folder holds a complete sequence that was made in the same way: its
+    sequence.json agrees with ``info``.
+    """
     path = folder / SEQUENCE_FILE
     if not path.exists():
         return False
@@ -167,13 +194,24 @@ class PairDataset:
     def refresh(self) -> None:
         """Find new sequences."""
         known = {s.name: s for s in self.sequences}
-        finished = sorted(p.parent for p in self.folder.glob(f"*/{SEQUENCE_FILE}") if not p.parent.name.startswith("."))
+        finished = sorted(
+            p.parent
+            for p in self.folder.glob(f"*/{SEQUENCE_FILE}")
+            if not p.parent.name.startswith(".")
+        )
         if not finished:
-            raise InputError(READING, str(self.folder), "no finished sequence", "make some with 'simrun train pairs'")
+            raise InputError(
+                READING,
+                str(self.folder),
+                "no finished sequence",
+                "make some with 'simrun train pairs'",
+            )
         complete = tuple(known.get(f.name) or PairSequence(f) for f in finished)
         self.sequences = tuple(s for s in complete if self.size in (None, s.size))
         if self.size is not None and not self.sequences:
-            found = f"no sequence of {self.size[0]}x{self.size[1]}; there are {listed_sizes(complete)}"
+            found = (
+                f"no sequence of {self.size[0]}x{self.size[1]}; there are {listed_sizes(complete)}"
+            )
             raise InputError(READING, str(self.folder), found, "choose one of these sizes")
 
     def __len__(self) -> int:
@@ -181,18 +219,26 @@ class PairDataset:
 
 
 def listed_sizes(sequences: Iterable[PairSequence]) -> str:
-    """Return the image sizes of sequences with the number of each, the most frequent first, for errors."""
+    """Return the image sizes of sequences with the number of each, the most frequent first, for
+    errors.
+    """
     counts = Counter(sequence.size for sequence in sequences)
     return ", ".join(f"{width}x{height} ({n})" for (width, height), n in counts.most_common())
 
 
 def pairs_digest(sequences: Sequence[PairSequence]) -> str:
     """Return a digest of the names and arrays of sequences, in order."""
-    return hashlib.blake2b("\n".join(f"{s.name} {s.content}" for s in sequences).encode(), digest_size=8).hexdigest()
+    return hashlib.blake2b(
+        "\n".join(f"{s.name} {s.content}" for s in sequences).encode(), digest_size=8
+    ).hexdigest()
 
 
 def write_sequence(
-    folder: Path, frames: Iterable[Pair], length: int, info: Mapping[str, Any], beside: Callable[[Path], None] | None = None
+    folder: Path,
+    frames: Iterable[Pair],
+    length: int,
+    info: Mapping[str, Any],
+    beside: Callable[[Path], None] | None = None,
 ) -> None:
     """Write a sequence atomically.
 
@@ -212,7 +258,9 @@ def write_sequence(
         if beside is not None:
             beside(partial)
         document = {**info, "frames": count, CONTENT: _content(partial)}
-        (partial / SEQUENCE_FILE).write_text(json.dumps(document, indent=1, default=str) + "\n", encoding="utf-8")
+        (partial / SEQUENCE_FILE).write_text(
+            json.dumps(document, indent=1, default=str) + "\n", encoding="utf-8"
+        )
 
 
 def _content(folder: Path) -> str:
@@ -222,7 +270,12 @@ def _content(folder: Path) -> str:
             with (folder / f"{name}.npy").open("rb") as file:
                 out.update(hashlib.file_digest(file, "sha256").digest())
         except OSError as error:
-            raise InputError(READING, str(folder / f"{name}.npy"), str(error), "give a complete .npy file of this channel") from error
+            raise InputError(
+                READING,
+                str(folder / f"{name}.npy"),
+                str(error),
+                "give a complete .npy file of this channel",
+            ) from error
     return out.hexdigest()
 
 
@@ -234,10 +287,17 @@ def _write_arrays(folder: Path, frames: Iterable[Pair], length: int) -> int:
             item = np.asarray(value)
             if name not in arrays:
                 shape = (length, *item.shape)
-                arrays[name] = np.lib.format.open_memmap(folder / f"{name}.npy", mode="w+", dtype=_FORMS[name][1], shape=shape)
+                arrays[name] = np.lib.format.open_memmap(
+                    folder / f"{name}.npy", mode="w+", dtype=_FORMS[name][1], shape=shape
+                )
             if arrays[name].shape[1:] != item.shape or count > length:
                 found = f"frame {count} of {length}: {name} {item.shape}, the first is {arrays[name].shape[1:]}"
-                raise InputError("writing training pairs", str(folder), found, "give frames of one size, no more than announced")
+                raise InputError(
+                    "writing training pairs",
+                    str(folder),
+                    found,
+                    "give frames of one size, no more than announced",
+                )
             arrays[name][count - 1] = item
     if not count:
         raise InputError("writing training pairs", str(folder), "no frames", "give at least one")

@@ -1,4 +1,6 @@
-"""Render training pairs from scenarios: frames degraded as the scenario says, clean frames and the map, along paths offset from the log."""
+"""Render training pairs from scenarios: frames degraded as the scenario says, clean frames and the
+map, along paths offset from the log.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,8 @@ class PairRecipe:
     Args:
         source: Renderer of the degraded frames.
         target: Renderer of the clean frames.
-        max_offset_m: Largest lateral offset from the logged path; the offset varies smoothly, and is zero in cycle renders.
+        max_offset_m: Largest lateral offset from the logged path; the offset varies smoothly, and
+            is zero in cycle renders.
         offset_m: One lateral offset for all frames, left positive; None lets it vary.
         interval_us: Time between frames.
         camera: Name of the scenario's camera; None for the first.
@@ -46,11 +49,21 @@ class PairRecipe:
     camera: str | None = None
 
 
-def make_sequence(scenario: Scenario, folder: Path, recipe: PairRecipe, seed: int, *, split: str, family: str, threads: int = 1) -> bool:
+def make_sequence(
+    scenario: Scenario,
+    folder: Path,
+    recipe: PairRecipe,
+    seed: int,
+    *,
+    split: str,
+    family: str,
+    threads: int = 1,
+) -> bool:
     """Render one sequence of a scenario unless an equal one exists.
 
     Args:
-        scenario: Rendered over its whole duration; its section ``degradation`` says how the source differs from the target.
+        scenario: Rendered over its whole duration; its section ``degradation`` says how the source
+            differs from the target.
         folder: ROOT/SPLIT/SEQUENCE.
         recipe: Definition of the sequence.
         seed: Of the lateral offset and the source renderer.
@@ -64,15 +77,25 @@ def make_sequence(scenario: Scenario, folder: Path, recipe: PairRecipe, seed: in
         InputError: The scenario has no such camera.
     """
     info = {
-        "scene_id": scenario.scene_id, "scene_hash": scenario.content_hash, "seed": seed, "split": split, "family": family,
-        "recipe": asdict(recipe), "degradation": asdict(scenario.degradation),
-    }  # fmt: skip
+        "scene_id": scenario.scene_id,
+        "scene_hash": scenario.content_hash,
+        "seed": seed,
+        "split": split,
+        "family": family,
+        "recipe": asdict(recipe),
+        "degradation": asdict(scenario.degradation),
+    }
     if is_made(folder, info):
         return False
     camera = _camera(scenario, recipe.camera)
     times = range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)
     moving = [a.actor_id for a in scenario.actors if np.ptp(a.track.xyz, axis=0).max() > MOVING_M]
-    lens = {"width": camera.width, "height": camera.height, "K": camera.K.tolist(), "T_rig_camera": camera.T_rig_camera.tolist()}
+    lens = {
+        "width": camera.width,
+        "height": camera.height,
+        "K": camera.K.tolist(),
+        "T_rig_camera": camera.T_rig_camera.tolist(),
+    }
     facts = {**info, "camera": lens, "actors": len(scenario.actors), "moving_actors": len(moving)}
     source = make_renderer(recipe.source, scenario, seed=seed, threads=threads)
     geometry: list[FrameGeometry] = []
@@ -82,14 +105,28 @@ def make_sequence(scenario: Scenario, folder: Path, recipe: PairRecipe, seed: in
         if recorded:
             write_references(partial, geometry, recorded, scenario.actors)
 
-    write_sequence(folder, pair_frames(scenario, camera, recipe, seed, threads, source, geometry), len(times), facts, beside)
+    write_sequence(
+        folder,
+        pair_frames(scenario, camera, recipe, seed, threads, source, geometry),
+        len(times),
+        facts,
+        beside,
+    )
     return True
 
 
 def pair_frames(
-    scenario: Scenario, camera: CameraSpec, recipe: PairRecipe, seed: int, threads: int, source: Renderer, geometry: list[FrameGeometry]
+    scenario: Scenario,
+    camera: CameraSpec,
+    recipe: PairRecipe,
+    seed: int,
+    threads: int,
+    source: Renderer,
+    geometry: list[FrameGeometry],
 ) -> Iterator[Pair]:
-    """Yield the frames of one sequence in order of time, and append depth and actors of each to ``geometry``."""
+    """Yield the frames of one sequence in order of time, and append depth and actors of each to
+    ``geometry``.
+    """
     target = make_renderer(recipe.target, scenario, seed=seed, threads=threads)
     layers = prepare_map(scenario.lane_map)
     offset_m = lateral_offsets(scenario, recipe, seed)
@@ -99,20 +136,31 @@ def pair_frames(
         request = RenderRequest(t_us, camera, np.stack([T_world_camera, T_world_camera]), actors)
         damaged = source.render(request)
         if damaged.alpha is None or damaged.depth is None:
-            raise InputError(DOING, f"renderer {recipe.source!r}", "frames without opacity or depth", "choose a renderer that gives both")
+            raise InputError(
+                DOING,
+                f"renderer {recipe.source!r}",
+                "frames without opacity or depth",
+                "choose a renderer that gives both",
+            )
         geometry.append(FrameGeometry(damaged.depth.astype(np.float16), actors))
         opacity = np.rint(damaged.alpha * 255).clip(0, 255).astype(np.uint8)
-        sdmap = draw_map(layers, camera, T_world_camera, actor_boxes(actors, scenario.actors), threads=threads)
+        sdmap = draw_map(
+            layers, camera, T_world_camera, actor_boxes(actors, scenario.actors), threads=threads
+        )
         yield Pair(damaged.rgb, target.render(request).rgb, opacity, sdmap, T_world_camera, t_us)
 
 
 def lateral_offsets(scenario: Scenario, recipe: PairRecipe, seed: int) -> F64:
-    """Return the lateral offset of every frame ``(T,)``, metres, left positive: two slow sines, at most ``max_offset_m``.
+    """Return the lateral offset of every frame ``(T,)``, metres, left positive: two slow sines, at
+    most ``max_offset_m``.
 
-    A fifth of the sequences stays on the logged path, where a reconstruction is best; so do all cycle renders, which are degraded there.
+    A fifth of the sequences stays on the logged path, where a reconstruction is best; so do all
+    cycle renders, which are degraded there.
     """
     if recipe.offset_m is not None:
-        return np.full(len(range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)), recipe.offset_m)
+        return np.full(
+            len(range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)), recipe.offset_m
+        )
     rng = stream(scenario.scene_id, seed, "training.wander")
     t_s = np.arange(scenario.start_us, scenario.end_us + 1, recipe.interval_us) * 1e-6
     on_path = rng.random() < 0.2 or scenario.degradation.kind == "cycle"
@@ -123,7 +171,9 @@ def lateral_offsets(scenario: Scenario, recipe: PairRecipe, seed: int) -> F64:
 
 
 def offset_from_log(scenario: Scenario, t_us: int, offset_m: float) -> F64:
-    """Return the rig's pose ``(4, 4)`` at a lateral offset from the logged one, on the ground, with the logged heading."""
+    """Return the rig's pose ``(4, 4)`` at a lateral offset from the logged one, on the ground, with
+    the logged heading.
+    """
     T = interpolate(scenario.ego_log, t_us)
     x, y = T[:2, 3] + offset_m * T[:2, 1]
     return ground_pose(scenario.ground, float(x), float(y), yaw_of(T))
@@ -134,4 +184,6 @@ def _camera(scenario: Scenario, name: str | None) -> CameraSpec:
         if name is None or camera.name == name:
             return camera
     known = sorted(c.name for c in scenario.cameras)
-    raise InputError(DOING, f"camera {name!r}", f"scene {scenario.scene_id!r} has {known}", "name one of them")
+    raise InputError(
+        DOING, f"camera {name!r}", f"scene {scenario.scene_id!r} has {known}", "name one of them"
+    )

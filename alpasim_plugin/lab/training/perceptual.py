@@ -1,8 +1,10 @@
 """Train the feature network of `perceptual-syn` with three losses on one backbone.
 
-Semantics: predict the classes of the map in each cell from the clean frame. Reconstruction: pixels are a linear function of the features of
-the first two stages, so that features keep all pixel changes. Distance: the distance to a distorted image matches the target
-(training/perceptual_targets.py) and increases with the strength of the distortion.
+Semantics: predict the classes of the map in each cell from the clean frame. Reconstruction: pixels
+    are a linear function of the features of
+the first two stages, so that features keep all pixel changes. Distance: the distance to a distorted
+image matches the target (training/perceptual_targets.py) and increases with the strength of the
+distortion.
 """
 
 from __future__ import annotations
@@ -82,18 +84,25 @@ class PerceptualTraining(nn.Module):
         super().__init__()
         self.net = net
         one, two, three, four = net.trunk.widths
-        self.semantic_heads = nn.ModuleList([nn.Conv2d(c, len(CLASSES), 1) for c in (two, three, four)])
+        self.semantic_heads = nn.ModuleList(
+            [nn.Conv2d(c, len(CLASSES), 1) for c in (two, three, four)]
+        )
         self.reconstruct_half = nn.Conv2d(one, 3 * 2 * 2, 1)
         self.reconstruct_quarter = nn.Conv2d(two, 3 * CELL * CELL, 1)
 
     def semantics(self, features: list[Tensor]) -> Tensor:
         """Return logits ``(N, classes, H / 4, W / 4)``."""
         size = features[1].shape[2:]
-        parts = [F.interpolate(head(x), size=size, mode="bilinear") for head, x in zip(self.semantic_heads, features[1:], strict=True)]
+        parts = [
+            F.interpolate(head(x), size=size, mode="bilinear")
+            for head, x in zip(self.semantic_heads, features[1:], strict=True)
+        ]
         return torch.stack(parts).sum(0)
 
     def readout_error(self, features: list[Tensor], image: Tensor) -> Tensor:
-        """Return the mean absolute error of the linear reconstruction of ``image`` from the first two stages."""
+        """Return the mean absolute error of the linear reconstruction of ``image`` from the first
+        two stages.
+        """
         half = F.pixel_shuffle(self.reconstruct_half(features[0]), 2)
         quarter = F.pixel_shuffle(self.reconstruct_quarter(features[1]), CELL)
         return (half - image).abs().mean() + (quarter - image).abs().mean()
@@ -111,17 +120,25 @@ class PerceptualTask:
     @property
     def facts(self) -> dict[str, Any]:
         """Identify the training data and recipe."""
-        return {"sequences": [s.name for s in self.sequences], "pairs": pairs_digest(self.sequences), "recipe": asdict(self.recipe)}
+        return {
+            "sequences": [s.name for s in self.sequences],
+            "pairs": pairs_digest(self.sequences),
+            "recipe": asdict(self.recipe),
+        }
 
     def batch(self, index: int) -> PerceptualBatch:
         """Make batch ``index``."""
         r = self.recipe
         rows = [make_example(self.sequences, r, index * r.images + i) for i in range(r.images)]
         clean = torch.stack([to_image_tensor(row.clean) for row in rows])
-        damaged = torch.stack([torch.stack([to_image_tensor(row.damaged[k]) for row in rows]) for k in range(3)])
+        damaged = torch.stack(
+            [torch.stack([to_image_tensor(row.damaged[k]) for row in rows]) for k in range(3)]
+        )
         targets = torch.tensor([[row.targets[k] for row in rows] for k in range(3)])
         classes = torch.stack([torch.from_numpy(row.classes) for row in rows])
-        return PerceptualBatch(clean, damaged, targets, classes, torch.tensor([float(row.labelled) for row in rows]))
+        return PerceptualBatch(
+            clean, damaged, targets, classes, torch.tensor([float(row.labelled) for row in rows])
+        )
 
     def loss(self, batch: PerceptualBatch, index: int) -> Loss:
         """Return the loss of a batch and its parts."""
@@ -131,7 +148,12 @@ class PerceptualTask:
         everything = torch.cat([batch.clean, batch.damaged.flatten(0, 1)])
         features = module.net.trunk(everything)
         clean = [x[:n] for x in features]
-        made = torch.stack([module.net.feature_distance([x[n * k : n * (k + 1)] for x in features], clean) for k in (1, 2, 3)])  # (3, N)
+        made = torch.stack(
+            [
+                module.net.feature_distance([x[n * k : n * (k + 1)] for x in features], clean)
+                for k in (1, 2, 3)
+            ]
+        )  # (3, N)
         target = (batch.targets + LOG_FLOOR).log()
         log_distance = (made + LOG_FLOOR).log()
         step = (target[1] - target[0]).clamp(min=0)  # target difference between the two strengths
@@ -142,13 +164,18 @@ class PerceptualTask:
             "readout": r.readout * module.readout_error(features, everything),
         }
         numbers = {name: float(value.detach()) for name, value in parts.items()}
-        numbers["wrong_order"] = float(((made[1] <= made[0]) & (step > 0.1)).float().sum() / (step > 0.1).float().sum().clamp(min=1))
+        numbers["wrong_order"] = float(
+            ((made[1] <= made[0]) & (step > 0.1)).float().sum()
+            / (step > 0.1).float().sum().clamp(min=1)
+        )
         return torch.stack(list(parts.values())).sum(), numbers
 
     def _semantics(self, features: list[Tensor], batch: PerceptualBatch) -> Tensor:
         logits = self.module.semantics(features)
         rare = torch.full((len(CLASSES), 1, 1), 4.0)
-        error = F.binary_cross_entropy_with_logits(logits, batch.classes, pos_weight=rare, reduction="none")
+        error = F.binary_cross_entropy_with_logits(
+            logits, batch.classes, pos_weight=rare, reduction="none"
+        )
         return (error.mean((1, 2, 3)) * batch.labelled).sum() / batch.labelled.sum().clamp(min=1)
 
 
@@ -163,12 +190,17 @@ class Example:
     labelled: bool
 
 
-def make_example(sequences: Sequence[PairSequence], recipe: PerceptualRecipe, index: int) -> Example:
+def make_example(
+    sequences: Sequence[PairSequence], recipe: PerceptualRecipe, index: int
+) -> Example:
     """Make example ``index``: a function of the data, the recipe and the index only."""
     rng = stream("training", recipe.seed, "perceptual.example", index)
     render: F32 | None = None
     if rng.random() < recipe.shapes_share:
-        clean, classes = draw_shapes(rng, recipe.side), np.zeros((len(CLASSES), recipe.side // CELL, recipe.side // CELL), dtype=np.float32)
+        clean, classes = (
+            draw_shapes(rng, recipe.side),
+            np.zeros((len(CLASSES), recipe.side // CELL, recipe.side // CELL), dtype=np.float32),
+        )
         labelled = False
     else:
         clean, render, classes = _cut(rng, sequences[int(rng.integers(len(sequences)))], recipe)
@@ -176,7 +208,9 @@ def make_example(sequences: Sequence[PairSequence], recipe: PerceptualRecipe, in
     first, second = (_Degradation.draw(rng, clean, render, recipe) for _ in range(2))
     weak, strong = np.sort(rng.uniform(0.02, 1.0, 2) ** 1.5)
     damaged = first(clean, weak), first(clean, strong), second(clean, float(rng.uniform(0.02, 1.0)))
-    return Example(clean, tuple(d[0] for d in damaged), tuple(d[1] for d in damaged), classes, labelled)  # type: ignore[arg-type]
+    return Example(
+        clean, tuple(d[0] for d in damaged), tuple(d[1] for d in damaged), classes, labelled
+    )  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -187,7 +221,9 @@ class _Degradation:
     render: F32 | None
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, clean: F32, render: F32 | None, recipe: PerceptualRecipe) -> _Degradation:
+    def draw(
+        cls, rng: np.random.Generator, clean: F32, render: F32 | None, recipe: PerceptualRecipe
+    ) -> _Degradation:
         if render is not None and rng.random() < recipe.render_share:
             return cls(None, render)
         return cls(draw_distortion(rng, clean.shape), None)
@@ -202,26 +238,45 @@ class _Degradation:
         return out, target_distance(clean, out, self.made.kind, self.made.displacement_px(strength))
 
 
-def _cut(rng: np.random.Generator, sequence: PairSequence, recipe: PerceptualRecipe) -> tuple[F32, F32, F32]:
-    """Return a random crop of a random frame, its degraded render and its classes, with random flip, gain and gamma."""
+def _cut(
+    rng: np.random.Generator, sequence: PairSequence, recipe: PerceptualRecipe
+) -> tuple[F32, F32, F32]:
+    """Return a random crop of a random frame, its degraded render and its classes, with random
+    flip, gain and gamma.
+    """
     clip = sequence.clip
     h, w = clip.rgb_gt.shape[1:3]
     t = int(rng.integers(len(clip)))
     side = min(round(recipe.side * float(rng.uniform(*recipe.zoom))), h, w)
     top, left = int(rng.integers(h - side + 1)), int(rng.integers(w - side + 1))
-    flip, gain, gamma = bool(rng.random() < 0.5), float(rng.uniform(0.6, 1.4)), float(rng.uniform(0.6, 1.5))
+    flip = bool(rng.random() < 0.5)
+    gain = float(rng.uniform(0.6, 1.4))
+    gamma = float(rng.uniform(0.6, 1.5))
 
     def cut(frames: U8, how: int) -> U8:
         piece = np.array(frames[t, top : top + side, left : left + side])
-        return np.asarray(cv2.resize(piece[:, ::-1] if flip else piece, (recipe.side, recipe.side), interpolation=how))
+        return np.asarray(
+            cv2.resize(
+                piece[:, ::-1] if flip else piece, (recipe.side, recipe.side), interpolation=how
+            )
+        )
 
     how = cv2.INTER_AREA if side >= recipe.side else cv2.INTER_LINEAR
-    clean, render = (np.clip((cut(x, how).astype(np.float32) / 255) ** gamma * gain, 0, 1) for x in (clip.rgb_gt, clip.rgb_input))
-    return clean.astype(np.float32), render.astype(np.float32), class_masks(cut(clip.sdmap, cv2.INTER_NEAREST), CELL)
+    clean, render = (
+        np.clip((cut(x, how).astype(np.float32) / 255) ** gamma * gain, 0, 1)
+        for x in (clip.rgb_gt, clip.rgb_input)
+    )
+    return (
+        clean.astype(np.float32),
+        render.astype(np.float32),
+        class_masks(cut(clip.sdmap, cv2.INTER_NEAREST), CELL),
+    )
 
 
 def draw_shapes(rng: np.random.Generator, side: int) -> F32:
-    """Draw an image ``(side, side, 3)`` of overlapping textured ellipses and boxes: edges of all contrasts and sizes."""
+    """Draw an image ``(side, side, 3)`` of overlapping textured ellipses and boxes: edges of all
+    contrasts and sizes.
+    """
     image = np.full((side, side, 3), rng.random(3), dtype=np.float32)
     for _ in range(int(rng.integers(5, 80))):
         size = side * 0.5 * float(rng.random()) ** 3 + 1
@@ -232,9 +287,13 @@ def draw_shapes(rng: np.random.Generator, side: int) -> F32:
         if rng.random() < 0.5:
             cv2.ellipse(image, centre, axes, angle, 0, 360, colour, -1, cv2.LINE_8)
         else:
-            corners = cv2.boxPoints((centre, (2.0 * axes[0], 2.0 * axes[1]), angle)).astype(np.int32)
+            corners = cv2.boxPoints((centre, (2.0 * axes[0], 2.0 * axes[1]), angle)).astype(
+                np.int32
+            )
             cv2.fillPoly(image, [corners], colour)
-    texture = cv2.GaussianBlur(rng.standard_normal((side, side, 1), dtype=np.float32), (0, 0), float(rng.uniform(0.4, 2)))[..., None]
+    texture = cv2.GaussianBlur(
+        rng.standard_normal((side, side, 1), dtype=np.float32), (0, 0), float(rng.uniform(0.4, 2))
+    )[..., None]
     image = image + np.float32(rng.uniform(0, 0.15)) * texture / (texture.std() + 1e-6)
     return np.asarray(np.clip(cv2.GaussianBlur(image, (0, 0), 0.5), 0, 1), dtype=np.float32)
 

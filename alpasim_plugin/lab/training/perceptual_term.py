@@ -1,4 +1,6 @@
-"""The perceptual term of the shared rollout: decode one position causally and compare its frames with decoded clean latents."""
+"""The perceptual term of the shared rollout: decode one position causally and compare its frames
+with decoded clean latents.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ Distance = Callable[[Tensor, Tensor], Tensor]  # frames (F, 3, H, W) in [-1, 1],
 
 @dataclass(frozen=True)
 class DecodedDistance:
-    """Decode position w of the predictions and of the clean latents, and average a distance over its frames.
+    """Decode position w of the predictions and of the clean latents, and average a distance over
+    its frames.
 
     The decoder state before w has no gradients: truncation distance 1 (paper, App. A.3).
 
@@ -36,7 +39,9 @@ class DecodedDistance:
     opacity: Tensor | None = None
 
     def __call__(self, predicted: Tensor, w: int) -> Tensor:
-        """Return the mean distance of position ``w``'s frames; ``predicted`` includes position w."""
+        """Return the mean distance of position ``w``'s frames; ``predicted`` includes position
+        w.
+        """
         with torch.no_grad():
             wanted = self._decode(self.z_0, w)
         made = self._decode(predicted, w)
@@ -51,7 +56,9 @@ class DecodedDistance:
         return self._part(z[:, :, w : w + 1], state, slice(end, 1 + GROUP * w))[0]
 
     def _part(self, z: Tensor, state: State | None, frames: slice) -> tuple[Tensor, State]:
-        render, opacity = (None if x is None else x[:, :, frames] for x in (self.render, self.opacity))
+        render, opacity = (
+            None if x is None else x[:, :, frames] for x in (self.render, self.opacity)
+        )
         return self.decoder.decode_next(z, state, render=render, opacity=opacity, clamp=False)
 
 

@@ -1,6 +1,8 @@
-"""Perturbed rollouts for the learned policy: drives that leave the logged path and its timing, with other traffic.
+"""Perturbed rollouts for the learned policy: drives that leave the logged path and its timing, with
+other traffic.
 
-Every rollout has its own random stream (scene, seed, "training.policy.drive", number), so rollouts are independent of each other.
+Every rollout has its own random stream (scene, seed, "training.policy.drive", number), so rollouts
+are independent of each other.
 """
 
 from __future__ import annotations
@@ -14,14 +16,24 @@ from alpasim_plugin.core.geometry import ego_state_from_log, se3, yaw_of
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Actor, Scenario
 from alpasim_plugin.gaussians.scene.degrade import log_actors
-from alpasim_plugin.lab.training.policy_expert import STEP_S, DrivingStyle, ReferenceLine, acceleration, advance, leader_on
+from alpasim_plugin.lab.training.policy_expert import (
+    STEP_S,
+    DrivingStyle,
+    ReferenceLine,
+    acceleration,
+    advance,
+    leader_on,
+)
 from alpasim_plugin.world.ground import ground_pose
 from alpasim_plugin.world.idm import Bodies, bodies_from
 from alpasim_plugin.world.path import Path, smooth_path
 from alpasim_plugin.world.route import LaneIndex
 
 FRAME_INTERVAL_S = 0.5  # between two frames; the earlier one shows the motion of other road users
-MAX_OFFSET_M, MAX_OFFSET_NEIGHBOUR_M = 1.8, 1.3  # with a neighbouring lane the nearest lane must not change
+MAX_OFFSET_M, MAX_OFFSET_NEIGHBOUR_M = (
+    1.8,
+    1.3,
+)  # with a neighbouring lane the nearest lane must not change
 LEADER_SHARE = 0.55  # share of rollouts with a synthetic leader
 
 
@@ -40,22 +52,39 @@ class RolloutState:
 
 @dataclass(frozen=True)
 class PerturbedRollout:
-    """A rollout: its reference line, the expert's driving style, and its states in order, `FRAME_INTERVAL_S` apart."""
+    """A rollout: its reference line, the expert's driving style, and its states in order,
+    `FRAME_INTERVAL_S` apart.
+    """
 
     line: ReferenceLine
     style: DrivingStyle
     states: tuple[RolloutState, ...]
 
 
-def perturbed_rollouts(scenario: Scenario, count: int, drive_s: float, seed: int) -> Iterator[PerturbedRollout]:
-    """Yield rollouts of a scenario along its route, its neighbouring lanes and the other turns of its junctions."""
+def perturbed_rollouts(
+    scenario: Scenario, count: int, drive_s: float, seed: int
+) -> Iterator[PerturbedRollout]:
+    """Yield rollouts of a scenario along its route, its neighbouring lanes and the other turns of
+    its junctions.
+    """
     first = ego_state_from_log(scenario.ego_log, scenario.start_us, scenario.vehicle)
     cruise = max(first.speed_mps, 6.0)
     others = [*turning_lines(scenario), *((path, None) for path in neighbour_lines(scenario))]
     for k in range(count):
         # Every third rollout follows the route; the others alternate among the other lines.
-        path, turn_s_m = others[(k - 1 - k // 3) % len(others)] if others and k % 3 else (smooth_path(scenario.route.xyz), None)
-        yield _drive(scenario, path, turn_s_m, cruise, drive_s, stream(scenario.scene_id, seed, "training.policy.drive", k))
+        path, turn_s_m = (
+            others[(k - 1 - k // 3) % len(others)]
+            if others and k % 3
+            else (smooth_path(scenario.route.xyz), None)
+        )
+        yield _drive(
+            scenario,
+            path,
+            turn_s_m,
+            cruise,
+            drive_s,
+            stream(scenario.scene_id, seed, "training.policy.drive", k),
+        )
 
 
 def neighbour_lines(scenario: Scenario) -> list[Path]:
@@ -70,7 +99,9 @@ def neighbour_lines(scenario: Scenario) -> list[Path]:
 
 
 def turning_lines(scenario: Scenario) -> list[tuple[Path, float]]:
-    """Return the turns at the route's junctions that the route does not take: the line, and the arc length where the turn begins."""
+    """Return the turns at the route's junctions that the route does not take: the line, and the arc
+    length where the turn begins.
+    """
     index, lanes = LaneIndex(scenario.lane_map), scenario.lane_map.lanes
     out = []
     for i, lane_id in enumerate(scenario.route.lane_ids[:-1]):
@@ -78,7 +109,9 @@ def turning_lines(scenario: Scenario) -> list[tuple[Path, float]]:
             if other == scenario.route.lane_ids[i + 1] or not lanes[other].is_intersection:
                 continue
             after = index.path_ahead(other, 60.0).xyz
-            path = _joined(*(lanes[name].centre for name in scenario.route.lane_ids[: i + 1]), after)
+            path = _joined(
+                *(lanes[name].centre for name in scenario.route.lane_ids[: i + 1]), after
+            )
             out.append((path, float(path.project(after[:1])[0][0])))
     return out
 
@@ -91,23 +124,36 @@ def _joined(*lines: F64) -> Path:
 
 
 def _drive(
-    scenario: Scenario, path: Path, turn_s_m: float | None, cruise_mps: float, drive_s: float, random: np.random.Generator
+    scenario: Scenario,
+    path: Path,
+    turn_s_m: float | None,
+    cruise_mps: float,
+    drive_s: float,
+    random: np.random.Generator,
 ) -> PerturbedRollout:
     style = DrivingStyle(cruise_mps * random.uniform(0.85, 1.15))
     # The rollout's driving style differs from the expert's, so that there are errors to correct.
     driven_style = DrivingStyle(
-        style.desired_mps * random.uniform(0.8, 1.2), random.uniform(0.7, 2.0), random.uniform(2.0, 4.5), random.uniform(2.0, 4.0)
+        style.desired_mps * random.uniform(0.8, 1.2),
+        random.uniform(0.7, 2.0),
+        random.uniform(2.0, 4.5),
+        random.uniform(2.0, 4.0),
     )
     line = ReferenceLine.along(path, 1.3 * cruise_mps)
     log_s = path.project(scenario.ego_log.xyz[:, :2])[0] if turn_s_m is None else None
     t_us, s = _start(scenario, path, log_s, turn_s_m, random)
-    v = min(driven_style.desired_mps, float(np.interp(s, path.s, line.limit_mps))) * random.uniform(0.8, 1.1)
+    v = min(driven_style.desired_mps, float(np.interp(s, path.s, line.limit_mps))) * random.uniform(
+        0.8, 1.1
+    )
     if random.random() < 0.12:
         v = random.uniform(0.0, 3.0)
     front = scenario.vehicle.rear_axle_to_centre_m + scenario.vehicle.box.length_m / 2
     half = scenario.vehicle.box.width_m / 2
     leader = _SyntheticLeader.draw(scenario, path, s + front, style.desired_mps, random)
-    offset = _lateral_offset(random, MAX_OFFSET_NEIGHBOUR_M if turn_s_m is None and neighbour_lines(scenario) else MAX_OFFSET_M)
+    offset = _lateral_offset(
+        random,
+        MAX_OFFSET_NEIGHBOUR_M if turn_s_m is None and neighbour_lines(scenario) else MAX_OFFSET_M,
+    )
     states = []
     lag = random.uniform(0.0, 1.0)  # a delayed driver gets closer to the leader than the expert
     accel = 0.0
@@ -129,42 +175,71 @@ def _drive(
     return PerturbedRollout(line, style, tuple(states))
 
 
-def _start(scenario: Scenario, path: Path, log_s: F64 | None, turn_s_m: float | None, random: np.random.Generator) -> tuple[int, float]:
+def _start(
+    scenario: Scenario,
+    path: Path,
+    log_s: F64 | None,
+    turn_s_m: float | None,
+    random: np.random.Generator,
+) -> tuple[int, float]:
     if log_s is None or turn_s_m is not None:
         s = max(float(turn_s_m or 0.0) - random.uniform(6.0, 38.0), 1.0)
         return scenario.start_us + round(random.uniform(0, 2) * 1e6), s
-    t_us = scenario.start_us + round(random.uniform(0.0, 0.35) * (scenario.end_us - scenario.start_us))
+    t_us = scenario.start_us + round(
+        random.uniform(0.0, 0.35) * (scenario.end_us - scenario.start_us)
+    )
     s = float(np.interp(t_us, scenario.ego_log.t_us, log_s)) + random.normal(0.0, 2.0)
     return t_us, max(s, 1.0)
 
 
 def _lateral_offset(random: np.random.Generator, largest_m: float) -> tuple[F64, F64, F64]:
-    """Return amplitudes, angular frequencies and phases of the lateral offset: a slow and a fast sine."""
+    """Return amplitudes, angular frequencies and phases of the lateral offset: a slow and a fast
+    sine.
+    """
     size = largest_m * np.sqrt(random.uniform(0.0, 1.0)) * np.array([0.65, 0.35])
-    return size, 2 * np.pi / random.uniform([8.0, 4.0], [20.0, 8.0]), random.uniform(0, 2 * np.pi, 2)
+    return (
+        size,
+        2 * np.pi / random.uniform([8.0, 4.0], [20.0, 8.0]),
+        random.uniform(0, 2 * np.pi, 2),
+    )
 
 
 def _state_at(
-    scenario: Scenario, path: Path, t_us: int, s: float, v: float, offset_waves: tuple[F64, F64, F64], at_s: float,
-    actors: dict[str, F64], bodies: Bodies,
-) -> RolloutState:  # fmt: skip
+    scenario: Scenario,
+    path: Path,
+    t_us: int,
+    s: float,
+    v: float,
+    offset_waves: tuple[F64, F64, F64],
+    at_s: float,
+    actors: dict[str, F64],
+    bodies: Bodies,
+) -> RolloutState:
     size, frequency, phase = offset_waves
     offset = float(size @ np.sin(frequency * at_s + phase))
     drift = float((size * frequency) @ np.cos(frequency * at_s + phase))
     xyz, yaw = path.at(s, offset)
-    heading = float(yaw) + float(np.arctan2(np.clip(drift, -0.17 * max(v, 1.0), 0.17 * max(v, 1.0)), max(v, 1.0)))
+    heading = float(yaw) + float(
+        np.arctan2(np.clip(drift, -0.17 * max(v, 1.0), 0.17 * max(v, 1.0)), max(v, 1.0))
+    )
     pose = ground_pose(scenario.ground, float(xyz[0]), float(xyz[1]), heading)
     return RolloutState(t_us, pose, v, s, actors, bodies, not _collides(scenario, pose, bodies))
 
 
 def _collides(scenario: Scenario, T_world_rig: F64, bodies: Bodies, margin_m: float = 0.1) -> bool:
-    """Return whether the car's footprint overlaps an actor's (tested on a grid of points of each)."""
+    """Return whether the car's footprint overlaps an actor's (tested on a grid of points of
+    each).
+    """
     if len(bodies.xy) == 0:
         return False
     centre = T_world_rig[:2, 3] + scenario.vehicle.rear_axle_to_centre_m * T_world_rig[:2, 0]
     half = np.array([scenario.vehicle.box.length_m, scenario.vehicle.box.width_m]) / 2 + margin_m
-    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 7), [-1.0, -0.5, 0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
-    for xy, yaw, length, width in zip(bodies.xy, bodies.yaw, bodies.half_length_m, bodies.half_width_m, strict=True):
+    grid = np.stack(
+        np.meshgrid(np.linspace(-1, 1, 7), [-1.0, -0.5, 0.0, 0.5, 1.0]), axis=-1
+    ).reshape(-1, 2)
+    for xy, yaw, length, width in zip(
+        bodies.xy, bodies.yaw, bodies.half_length_m, bodies.half_width_m, strict=True
+    ):
         if np.hypot(*(xy - centre)) > length + half[0] + 3.0:
             continue
         for at, angle, extent, other, other_angle, other_extent in (
@@ -182,7 +257,9 @@ def _rotation(angle: float) -> F64:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def traffic_at(scenario: Scenario, t_us: int, leader: _SyntheticLeader | None) -> tuple[dict[str, F64], Bodies]:
+def traffic_at(
+    scenario: Scenario, t_us: int, leader: _SyntheticLeader | None
+) -> tuple[dict[str, F64], Bodies]:
     """Return the poses of all actors at a recorded time, and the same as bodies with velocities."""
     actors = log_actors(scenario, t_us)
     before, after = (log_actors(scenario, t_us + dt_us) for dt_us in (-100_000, 100_000))
@@ -216,7 +293,13 @@ class _SyntheticLeader:
     rate_mps2: float
 
     @staticmethod
-    def draw(scenario: Scenario, path: Path, bumper_s_m: float, desired_mps: float, random: np.random.Generator) -> _SyntheticLeader | None:
+    def draw(
+        scenario: Scenario,
+        path: Path,
+        bumper_s_m: float,
+        desired_mps: float,
+        random: np.random.Generator,
+    ) -> _SyntheticLeader | None:
         vehicles = [a for a in scenario.actors if a.label in ("car", "truck", "bus", "motorcycle")]
         if not vehicles or random.random() > LEADER_SHARE:
             return None
@@ -224,10 +307,20 @@ class _SyntheticLeader:
         actor = named[0] if named else vehicles[int(random.integers(len(vehicles)))]
         stands = random.random() < 0.35
         speed = 0.0 if stands else desired_mps * random.uniform(0.3, 1.0)
-        target = desired_mps if stands and random.random() < 0.3 else speed * random.choice([0.0, 0.0, 0.5, 1.0])
+        target = (
+            desired_mps
+            if stands and random.random() < 0.3
+            else speed * random.choice([0.0, 0.0, 0.5, 1.0])
+        )
         gap = random.uniform(20.0, 55.0) if stands else random.uniform(6.0, 35.0)
         return _SyntheticLeader(
-            actor, path, bumper_s_m + gap + actor.box.length_m / 2, speed, target, random.uniform(1.0, 6.0), random.uniform(1.0, 4.0)
+            actor,
+            path,
+            bumper_s_m + gap + actor.box.length_m / 2,
+            speed,
+            target,
+            random.uniform(1.0, 6.0),
+            random.uniform(1.0, 4.0),
         )
 
     def advance(self, dt_s: float) -> None:

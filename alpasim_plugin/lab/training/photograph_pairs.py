@@ -1,8 +1,9 @@
-"""Pairs of photographs: an under-trained reconstruction of most of them, seen from the places of all.
+"""Pairs of photographs: an under-trained reconstruction of most of them, seen from the places of
+all.
 
-Every ``every``-th photograph is held out; each of the ``every`` ways of doing so gives a sequence of all photographs in order along the
-way, so that each photograph is held out once. The photograph is the clean frame. There is no map (black), and between two photographs the
-camera moves far.
+Every ``every``-th photograph is held out; each of the ``every`` ways of doing so gives a sequence
+of all photographs in order along the way, so that each photograph is held out once. The photograph
+is the clean frame. There is no map (black), and between two photographs the camera moves far.
 """
 
 from __future__ import annotations
@@ -56,13 +57,24 @@ class PhotographRecipe:
 
     def __post_init__(self) -> None:
         if self.every < 2:
-            raise InputError(DOING, f"every {self.every}", "no photograph would be left to fit", "hold out every second at most")
+            raise InputError(
+                DOING,
+                f"every {self.every}",
+                "no photograph would be left to fit",
+                "hold out every second at most",
+            )
 
     def splat(self) -> SplatRecipe:
         """Return the recipe of the fit."""
         return SplatRecipe(
-            steps=self.steps, cap=self.cap, hold_out_every=0, sh_degree=1, densify_until=0.8, densify_every=30, seed=self.seed,
-        )  # fmt: skip
+            steps=self.steps,
+            cap=self.cap,
+            hold_out_every=0,
+            sh_degree=1,
+            densify_until=0.8,
+            densify_every=30,
+            seed=self.seed,
+        )
 
 
 @dataclass(frozen=True)
@@ -72,7 +84,8 @@ class PhotographPairs:
     Attributes:
         folder: Where it is.
         made: Whether it was made now.
-        psnr_db: Mean PSNR of the render on ``held_out`` photographs and on those that were fitted (``fitted``).
+        psnr_db: Mean PSNR of the render on ``held_out`` photographs and on those that were fitted
+            (``fitted``).
     """
 
     folder: Path
@@ -107,24 +120,51 @@ def make_photograph_pairs(
             matched = matches(photographs.views) if matched is None else matched
             graph = _fitted(photographs, matched, recipe, phase, name, threads)
             shown = [graph.render(view.camera, {}, threads) for view in photographs.views]
-            images = [(one.to_uint8(), np.rint(one.alpha * 255).clip(0, 255).astype(np.uint8)) for one in shown]
+            images = [
+                (one.to_uint8(), np.rint(one.alpha * 255).clip(0, 255).astype(np.uint8))
+                for one in shown
+            ]
             psnr = _psnr(photographs, [image for image, _ in images], set(info["held_out"]))
-            write_sequence(folder, _frames(photographs, images), len(images), {**info, "psnr_db": psnr})
+            write_sequence(
+                folder, _frames(photographs, images), len(images), {**info, "psnr_db": psnr}
+            )
         yield PhotographPairs(folder, made, PairSequence(folder).info["psnr_db"])
 
 
-def _info(photographs: Photographs, name: str, recipe: PhotographRecipe, phase: int) -> dict[str, Any]:
+def _info(
+    photographs: Photographs, name: str, recipe: PhotographRecipe, phase: int
+) -> dict[str, Any]:
     camera = photographs.views[0].camera
-    lens = {"width": camera.width, "height": camera.height, "K": camera.K.tolist(), "T_rig_camera": np.eye(4).tolist()}
+    lens = {
+        "width": camera.width,
+        "height": camera.height,
+        "K": camera.K.tolist(),
+        "T_rig_camera": np.eye(4).tolist(),
+    }
     return {
-        "scene_id": f"photographs-{name}", "seed": recipe.seed, "split": recipe.split, "family": "photographs", "actors": 0,
-        "moving_actors": 0, "degradation": {"kind": "photographs"}, "recipe": asdict(recipe), "camera": lens,
+        "scene_id": f"photographs-{name}",
+        "seed": recipe.seed,
+        "split": recipe.split,
+        "family": "photographs",
+        "actors": 0,
+        "moving_actors": 0,
+        "degradation": {"kind": "photographs"},
+        "recipe": asdict(recipe),
+        "camera": lens,
         "held_out": [i for i in range(len(photographs.views)) if i % recipe.every == phase],
-        "photographs": [view.name for view in photographs.views], "missing": list(photographs.missing),
-    }  # fmt: skip
+        "photographs": [view.name for view in photographs.views],
+        "missing": list(photographs.missing),
+    }
 
 
-def _fitted(photographs: Photographs, found: list[Match], recipe: PhotographRecipe, phase: int, name: str, threads: int) -> SceneGraph:
+def _fitted(
+    photographs: Photographs,
+    found: list[Match],
+    recipe: PhotographRecipe,
+    phase: int,
+    name: str,
+    threads: int,
+) -> SceneGraph:
     used = [i for i in range(len(photographs.views)) if i % recipe.every != phase]
     rng = stream(f"photographs-{name}", recipe.seed, "photographs.start", phase)
     start = triangulated(photographs.views, found, used, recipe.points, rng)
@@ -132,13 +172,17 @@ def _fitted(photographs: Photographs, found: list[Match], recipe: PhotographReci
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return fit(views, start, recipe.splat(), scene_id=f"photographs-{name}", threads=threads).graph()
+        return fit(
+            views, start, recipe.splat(), scene_id=f"photographs-{name}", threads=threads
+        ).graph()
     finally:
         torch.set_num_threads(before)
 
 
 def _psnr(photographs: Photographs, images: list[U8], held_out: set[int]) -> dict[str, float]:
-    values = [psnr_db(image, view.rgb) for image, view in zip(images, photographs.views, strict=True)]
+    values = [
+        psnr_db(image, view.rgb) for image, view in zip(images, photographs.views, strict=True)
+    ]
     groups = {
         "held_out": [v for i, v in enumerate(values) if i in held_out],
         "fitted": [v for i, v in enumerate(values) if i not in held_out],

@@ -1,4 +1,6 @@
-"""Batches in pixels: consecutive frames of the clips that the latents' batches draw, for objectives that encode them anew."""
+"""Batches in pixels: consecutive frames of the clips that the latents' batches draw, for objectives
+that encode them anew.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ class Pictures(NamedTuple):
 
 
 class PictureBatches:
-    """Draws of consecutive frames: clips and crops as `ClipBatches` draws them, from a random frame of the clips on.
+    """Draws of consecutive frames: clips and crops as `ClipBatches` draws them, from a random frame
+    of the clips on.
 
     Args:
         inputs: Clips and form of the batches.
@@ -34,13 +37,20 @@ class PictureBatches:
         have = inputs.clips.form.frames
         if have < frames:
             do = f"train on clips of at least {1 + -(-(frames - 1) // 4)} latents (--latents)"
-            raise InputError("setting up training batches", f"{frames} frames of a clip", f"clips of {have} frames", do)
+            raise InputError(
+                "setting up training batches",
+                f"{frames} frames of a clip",
+                f"clips of {have} frames",
+                do,
+            )
         self.frames, self._latest = frames, have - frames
         self._clips = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.seen)
         self.seed = inputs.form.seed
 
     def __getitem__(self, index: int) -> Pictures:
         """Draw batch ``index``: a function of the index and the seed only."""
-        begin = int(stream("training", self.seed, "pictures.begin", index).integers(self._latest + 1))
+        begin = int(
+            stream("training", self.seed, "pictures.begin", index).integers(self._latest + 1)
+        )
         drawn, end = self._clips[index], begin + self.frames
         return Pictures(drawn.frames(end, begin)[0], drawn.clean(end, begin))

@@ -1,4 +1,5 @@
-"""The objectives of a generator in pixels on one shared rollout (OneFixer, Sec. 3.2 and 3.3), frame by frame.
+"""The objectives of a generator in pixels on one shared rollout (OneFixer, Sec. 3.2 and 3.3), frame
+by frame.
 
     rollout      x^i = G(z^i_1 | state^<i)                        the deployed step, with gradients through the last k frames
     picture      | x^i - x^i_0 |                                  at every frame; pixels of road users count more
@@ -8,13 +9,13 @@
     choice       - sum_k q_k log p_k                              the blend p of render and references, q: which of them is near the truth
     flow         | v(z^i_t, t | sg(state^<i)) - (z^i_1 - x^i_0) | at sampled frames and times, on the history of the rollout
 
-The choice term is there because a weight near 0 has no gradient through the picture: a blend that never takes a reference would never
-learn when it should. Its aim is q_k = softmax(log v_k - e_k / s), without gradients; e_k is the error of source k around a pixel, and v_k
-says where it holds.
+The choice term is there because a weight near 0 has no gradient through the picture: a blend that
+never takes a reference would never learn when it should. Its aim is q_k = softmax(log v_k - e_k /
+s), without gradients; e_k is the error of source k around a pixel, and v_k says where it holds.
 
-With x_0-prediction, v = (z_t - x_0) / t, so the flow term is the error of x_0 over t. Names as in the paper: ``z_1`` source, ``m`` mask,
-``eps`` noise, ``sg`` stop-gradient. All random numbers are arguments. The state enters from the batch before and leaves to the next one,
-without gradients.
+With x_0-prediction, v = (z_t - x_0) / t, so the flow term is the error of x_0 over t. Names as in
+the paper: ``z_1`` source, ``m`` mask, ``eps`` noise, ``sg`` stop-gradient. All random numbers are
+arguments. The state enters from the batch before and leaves to the next one, without gradients.
 """
 
 from __future__ import annotations
@@ -34,7 +35,10 @@ from alpasim_plugin.lab.training.grid_term import grid_term
 
 History = Literal["own", "clean", "redenoised"]
 Distance = Callable[[Tensor, Tensor], Tensor]  # images (F, 3, H, W) in [-1, 1], twice -> (F,)
-NEAR, AROUND = 0.02, 5  # s of the choice term, of a range of 2; pixels of the side over which errors are averaged
+NEAR, AROUND = (
+    0.02,
+    5,
+)  # s of the choice term, of a range of 2; pixels of the side over which errors are averaged
 ROAD_USER = 4  # a policy looks at road users, who are few pixels
 EARLIEST = 0.3  # times below it count as this one in the weight 1 / t of the flow term
 
@@ -44,12 +48,15 @@ class PixelObjectives:
     """Weights of the terms, and the axes of the ablation.
 
     Args:
-        perceptual, temporal, flow, picture, grid, choice: Weights of the terms; 0 switches a term off.
+        perceptual, temporal, flow, picture, grid, choice: Weights of the terms; 0 switches a term
+            off.
         horizon: k, frames that gradients pass through; 1 cuts the history at every frame.
-        history: What the state holds of the past: the generator's ``own`` outputs, the truth in their place (``clean``), or the truth that
-            the generator noised and denoised again (``redenoised``; no gradient passes through it).
+        history: What the state holds of the past: the generator's ``own`` outputs, the truth in
+            their place (``clean``), or the truth that the generator noised and denoised again
+            (``redenoised``; no gradient passes through it).
         use_map: Whether the map is given; otherwise it is black.
-        source: Eq. 1 (``mixed``), noise everywhere with the render as a condition (``noise``), or the render alone (``render``).
+        source: Eq. 1 (``mixed``), noise everywhere with the render as a condition (``noise``), or
+            the render alone (``render``).
     """
 
     perceptual: float = 0.1
@@ -65,13 +72,16 @@ class PixelObjectives:
 
     @property
     def in_pixels(self) -> bool:
-        """Whether a term is computed on the deployed step, so that gradients pass through the rollout."""
+        """Whether a term is computed on the deployed step, so that gradients pass through the
+        rollout.
+        """
         return bool(self.picture or self.perceptual or self.temporal or self.grid)
 
 
 @dataclass(frozen=True)
 class PixelSample:
-    """Consecutive frames of B clips with the noise of a training step; images are ``(B, T, H, W, C)``.
+    """Consecutive frames of B clips with the noise of a training step; images are ``(B, T, H, W,
+    C)``.
 
     Args:
         render, truth, sdmap: In [-1, 1].
@@ -81,12 +91,14 @@ class PixelSample:
         t: ``(B,)`` uniform in 0..1, times of the flow term.
         flow_frame: Frame of the flow term.
         perceptual_frames: Frames of the perceptual term.
-        corner: Row and column from which the perceptual term sees the frames. Its network halves the resolution four times; from a fixed
-            corner its grid would lie on the generator's, which then learns a pattern of period 4 that only this network prefers.
+        corner: Row and column from which the perceptual term sees the frames. Its network halves
+            the resolution four times; from a fixed corner its grid would lie on the generator's,
+            which then learns a pattern of period 4 that only this network prefers.
         t_history: ``(B, T)`` uniform in 0..1, noise levels of a re-denoised history.
-        references: ``(B, T, K, H, W, 4)`` recorded frames in the view: colour in [-1, 1], and where it holds, 0 to 1.
-            None: there is none.
-        road_users: ``(B, T, H, W, 1)`` bool; pixels whose errors count `ROAD_USER` times. None: all count alike.
+        references: ``(B, T, K, H, W, 4)`` recorded frames in the view: colour in [-1, 1], and where
+            it holds, 0 to 1. None: there is none.
+        road_users: ``(B, T, H, W, 1)`` bool; pixels whose errors count `ROAD_USER` times. None: all
+            count alike.
     """
 
     render: Tensor
@@ -120,7 +132,11 @@ class PixelLosses:
 
 
 def pixel_losses(
-    net: PixelGenerator, sample: PixelSample, state: PixelState, objectives: PixelObjectives, distance: Distance | None
+    net: PixelGenerator,
+    sample: PixelSample,
+    state: PixelState,
+    objectives: PixelObjectives,
+    distance: Distance | None,
 ) -> PixelLosses:
     """Roll the generator out over the sample's frames and return the objectives.
 
@@ -133,21 +149,35 @@ def pixel_losses(
     """
     frames = sample.render.shape[1]
     zero = sample.render.new_zeros(())
-    outputs, flow, choice = [], zero, zero
+    outputs = []
+    flow = zero
+    choice = zero
     for i in range(frames):
-        render, opacity, truth = sample.render[:, i], sample.opacity[:, i], sample.truth[:, i]
+        render = sample.render[:, i]
+        opacity = sample.opacity[:, i]
+        truth = sample.truth[:, i]
         references = None if sample.references is None else sample.references[:, i]
         sdmap = sample.sdmap[:, i] if objectives.use_map else torch.full_like(render, -1.0)
         if objectives.flow and i == sample.flow_frame:
             source = _source(render, opacity, sample.eps_flow, objectives)
             t = sample.t[:, None, None, None]
-            guess, _ = net(render, opacity, sdmap, state.detached(), interpolant(truth, source, t), sample.t, references)
+            guess, _ = net(
+                render,
+                opacity,
+                sdmap,
+                state.detached(),
+                interpolant(truth, source, t),
+                sample.t,
+                references,
+            )
             flow = ((guess - truth).abs() / t.clamp(min=EARLIEST)).mean()
         if i and i % objectives.horizon == 0:
             state = state.detached()
         before, source = state, _source(render, opacity, sample.eps[:, i], objectives)
         with torch.set_grad_enabled(objectives.in_pixels):
-            out, state, sources = net.with_sources(render, opacity, sdmap, before, source, None, references)
+            out, state, sources = net.with_sources(
+                render, opacity, sdmap, before, source, None, references
+            )
         outputs.append(out)
         if objectives.choice and sources is not None:
             choice = choice + choice_term(sources, truth) / frames
@@ -156,32 +186,55 @@ def pixel_losses(
         elif objectives.history == "redenoised":
             t = sample.t_history[:, i]
             with torch.no_grad():
-                _, state = net(render, opacity, sdmap, before, interpolant(truth, source, t[:, None, None, None]), t, references)
+                _, state = net(
+                    render,
+                    opacity,
+                    sdmap,
+                    before,
+                    interpolant(truth, source, t[:, None, None, None]),
+                    t,
+                    references,
+                )
     made = torch.stack(outputs, dim=1)
     weight = torch.ones_like(sample.opacity)
     if sample.road_users is not None:
         weight = weight + (ROAD_USER - 1) * sample.road_users
-    weight = weight / weight.mean(dim=tuple(range(1, weight.ndim)), keepdim=True)  # row by row: the loss of rows is the mean of theirs
+    weight = weight / weight.mean(
+        dim=tuple(range(1, weight.ndim)), keepdim=True
+    )  # row by row: the loss of rows is the mean of theirs
     picture = (weight * (made - sample.truth).abs()).mean()
     moved = (made[:, 1:] - made[:, :-1]) - (sample.truth[:, 1:] - sample.truth[:, :-1])
     temporal = (weight[:, 1:] * moved.abs()).mean() if objectives.temporal and frames > 1 else zero
     perceptual = zero
     if objectives.perceptual and distance is not None:
         (top, left), chosen = sample.corner, list(sample.perceptual_frames)
-        images = [x[:, chosen, top:, left:].flatten(0, 1).permute(0, 3, 1, 2) for x in (made, sample.truth)]
+        images = [
+            x[:, chosen, top:, left:].flatten(0, 1).permute(0, 3, 1, 2)
+            for x in (made, sample.truth)
+        ]
         perceptual = distance(images[0], images[1]).mean()
     grid = grid_term(made, sample.truth) if objectives.grid else zero
-    total = objectives.picture * picture + objectives.perceptual * perceptual + objectives.temporal * temporal
+    total = (
+        objectives.picture * picture
+        + objectives.perceptual * perceptual
+        + objectives.temporal * temporal
+    )
     total = total + objectives.grid * grid + objectives.flow * flow + objectives.choice * choice
-    return PixelLosses(total, picture, perceptual, temporal, flow, grid, choice, made, state.detached())
+    return PixelLosses(
+        total, picture, perceptual, temporal, flow, grid, choice, made, state.detached()
+    )
 
 
 def choice_term(sources: Sources, truth: Tensor) -> Tensor:
-    """Return how far the blend is from the sources that are near the truth ``(B, H, W, 3)``: cross-entropy, nats."""
+    """Return how far the blend is from the sources that are near the truth ``(B, H, W, 3)``:
+    cross-entropy, nats.
+    """
     b, k, h, w, _ = sources.colour.shape
     with torch.no_grad():
         error = (sources.colour - truth[:, None]).abs().mean(dim=-1).flatten(0, 1)[:, None]
-        around = F.avg_pool2d(error, AROUND, 1, AROUND // 2, count_include_pad=False).view(b, k, h, w)
+        around = F.avg_pool2d(error, AROUND, 1, AROUND // 2, count_include_pad=False).view(
+            b, k, h, w
+        )
         aim = (sources.holds[..., 0].log() - around / NEAR).softmax(dim=1)
     return -(aim * sources.logit[..., 0].log_softmax(dim=1)).sum(dim=1).mean()
 

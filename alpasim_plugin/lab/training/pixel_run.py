@@ -1,4 +1,6 @@
-"""Train the per-frame generator in one run folder: streams of frames in, bundles of averaged weights and a model card out."""
+"""Train the per-frame generator in one run folder: streams of frames in, bundles of averaged
+weights and a model card out.
+"""
 
 from __future__ import annotations
 
@@ -40,10 +42,12 @@ class PixelRun:
         streams: Data.
         variant: Objectives.
         schedule: Optimisation.
-        init: A checkpoint of another run (weights, averages and moments go on) or a bundle (weights); None begins anew.
+        init: A checkpoint of another run (weights, averages and moments go on) or a bundle
+            (weights); None begins anew.
         seed: Of the initial weights and the noise.
         precision: Of the forward passes: None is float32.
-        keep_every: Updates between bundles that are kept for a learning curve; 0 keeps the last alone.
+        keep_every: Updates between bundles that are kept for a learning curve; 0 keeps the last
+            alone.
     """
 
     settings: PixelFixerSettings
@@ -64,7 +68,8 @@ def train_per_frame(
     ranks: Ranks = ALONE,
     report: Report | None = None,
 ) -> Path:
-    """Train to the schedule's end or to ``stop_at``, from the last checkpoint if any; write OUT/fixer.safetensors and its card.
+    """Train to the schedule's end or to ``stop_at``, from the last checkpoint if any; write
+    OUT/fixer.safetensors and its card.
 
     Args:
         run: Definition of the run.
@@ -80,8 +85,14 @@ def train_per_frame(
     """
     net = initial_generator(run)
     task = PixelTask(net, run.streams, run.variant, run.schedule.steps, distance, run.seed, ranks)
-    facts = {**task.facts, "init": file_sha256(run.init) if run.init else None, "precision": str(run.precision)}
-    trainer = Trainer(net, out, run.schedule, task.batch, task.loss, facts, run.precision, task, ranks)
+    facts = {
+        **task.facts,
+        "init": file_sha256(run.init) if run.init else None,
+        "precision": str(run.precision),
+    }
+    trainer = Trainer(
+        net, out, run.schedule, task.batch, task.loss, facts, run.precision, task, ranks
+    )
     if run.init is not None and _is_checkpoint(run.init):
         trainer.begin_from(run.init)
 
@@ -103,22 +114,36 @@ def train_per_frame(
 
 
 def initial_generator(run: PixelRun) -> PixelGenerator:
-    """Return the network that a run begins with: a bundle may lack the blending head or have fewer residual blocks than the settings.
+    """Return the network that a run begins with: a bundle may lack the blending head or have fewer
+    residual blocks than the settings.
 
     What it lacks is untrained; a block that it lacks leaves its input as it is.
 
     Raises:
         InputError: A bundle of another kind, or of other widths than the settings.
     """
-    net = PixelGenerator.random(sizes_of(run.settings), derive_seed("training", run.seed, "pixel.weights"))
+    net = PixelGenerator.random(
+        sizes_of(run.settings), derive_seed("training", run.seed, "pixel.weights")
+    )
     if run.init is None or _is_checkpoint(run.init):
         return net
     tensors = parts_of(load_weights(run.init, dtype=torch.float32)).get("generator")
     if tensors is None:
-        raise InputError(DOING, str(run.init), "no part generator.*", "give a checkpoint or a bundle of 'simrun train per-frame'")
+        raise InputError(
+            DOING,
+            str(run.init),
+            "no part generator.*",
+            "give a checkpoint or a bundle of 'simrun train per-frame'",
+        )
     own = net.state_dict()
-    lacking = {key for key in own.keys() - tensors.keys() if key.startswith("blend.") or BLOCK.match(key)}
-    wrong = sorted(key for key in (tensors.keys() | own.keys()) - lacking if not _fits(tensors.get(key), own.get(key)))
+    lacking = {
+        key for key in own.keys() - tensors.keys() if key.startswith("blend.") or BLOCK.match(key)
+    }
+    wrong = sorted(
+        key
+        for key in (tensors.keys() | own.keys()) - lacking
+        if not _fits(tensors.get(key), own.get(key))
+    )
     if wrong:
         found = f"{len(wrong)} tensors of other sizes than {net.facts}, such as {wrong[0]}"
         raise InputError(DOING, str(run.init), found, "choose the fixer of the same widths")
@@ -144,7 +169,9 @@ def write_bundle(run: PixelRun, path: Path, weights: Mapping[str, Tensor], updat
     settings = run.settings.model_copy(update=trained_at)
     tensors: dict[str, Any] = {key: half(value) for key, value in weights.items()}
     named = "" if run.variant.name == DEPLOYED else f"{run.variant.name}, "
-    save_bundle(path, {"generator": tensors}, settings, trained=True, note=f"{named}{updates} updates")
+    save_bundle(
+        path, {"generator": tensors}, settings, trained=True, note=f"{named}{updates} updates"
+    )
     return path
 
 

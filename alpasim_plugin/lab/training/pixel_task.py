@@ -1,4 +1,6 @@
-"""What a `Trainer` needs of the generator in pixels: batches with their noise, the loss, and the state that goes on between updates."""
+"""What a `Trainer` needs of the generator in pixels: batches with their noise, the loss, and the
+state that goes on between updates.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ SEEN = 2  # frames of the perceptual term in an update
 
 
 class FrameBatch(Protocol):
-    """Consecutive frames of B streams; images ``(B, T, C, H, W)``, as `alpasim_plugin.lab.training.streams.StreamBatch` holds them."""
+    """Consecutive frames of B streams; images ``(B, T, C, H, W)``, as
+    `alpasim_plugin.lab.training.streams.StreamBatch` holds them.
+    """
 
     @property
     def render(self) -> Tensor:
@@ -105,7 +109,14 @@ class PixelTask:
         seed: int = 0,
         ranks: Ranks = ALONE,
     ) -> None:
-        self.net, self.streams, self.variant, self.steps, self.distance, self.seed = net, streams, variant, steps, distance, seed
+        self.net, self.streams, self.variant, self.steps, self.distance, self.seed = (
+            net,
+            streams,
+            variant,
+            steps,
+            distance,
+            seed,
+        )
         self.slots = ranks.rows(streams.batch)
         self._state: PixelState | None = None
 
@@ -114,27 +125,52 @@ class PixelTask:
         """What identifies the task."""
         named = self.distance and self.distance[0]
         return {
-            "streams": dict(self.streams.facts()), "variant": self.variant.facts(self.steps), "sizes": self.net.facts, "distance": named,
+            "streams": dict(self.streams.facts()),
+            "variant": self.variant.facts(self.steps),
+            "sizes": self.net.facts,
+            "distance": named,
             "seed": self.seed,
-        }  # fmt: skip
+        }
 
     def batch(self, index: int) -> NoisyBatch:
         """Return the frames and noise of update ``index``."""
         got, slots = self.streams.update(index, self.slots), self.slots
-        render, truth, sdmap, opacity = (x.permute(0, 1, 3, 4, 2).contiguous() for x in (got.render, got.target, got.map, got.opacity))
-        source = torch.Generator().manual_seed(derive_seed("training", self.seed, "pixel.noise", index) % 2**63)
+        render, truth, sdmap, opacity = (
+            x.permute(0, 1, 3, 4, 2).contiguous()
+            for x in (got.render, got.target, got.map, got.opacity)
+        )
+        source = torch.Generator().manual_seed(
+            derive_seed("training", self.seed, "pixel.noise", index) % 2**63
+        )
         # Drawn for all streams, so that a stream's noise does not depend on which process has it.
         whole = (self.streams.batch, *render.shape[1:])
-        eps, eps_flow = (torch.randn(shape, generator=source)[slots] for shape in (whole, (whole[0], *whole[2:])))
+        eps, eps_flow = (
+            torch.randn(shape, generator=source)[slots] for shape in (whole, (whole[0], *whole[2:]))
+        )
         t = torch.rand(whole[0], generator=source)[slots]
         rng = stream("training", self.seed, "pixel.frames", index)
         frames = render.shape[1]
         seen = tuple(int(i) for i in rng.permutation(frames)[:SEEN])
         t_history = torch.rand(whole[0], frames, generator=source)[slots]
-        flow_frame, top, left = int(rng.integers(frames)), *(int(rng.integers(_corners(side))) for side in render.shape[2:4])
+        flow_frame, top, left = (
+            int(rng.integers(frames)),
+            *(int(rng.integers(_corners(side))) for side in render.shape[2:4]),
+        )
         users = got.road_users.permute(0, 1, 3, 4, 2).contiguous()
         sample = PixelSample(
-            render, truth, sdmap, opacity, eps, eps_flow, t, flow_frame, seen, (top, left), t_history, got.references, users
+            render,
+            truth,
+            sdmap,
+            opacity,
+            eps,
+            eps_flow,
+            t,
+            flow_frame,
+            seen,
+            (top, left),
+            t_history,
+            got.references,
+            users,
         )
         return NoisyBatch(sample, got.fresh)
 
@@ -144,17 +180,25 @@ class PixelTask:
         start = self.net.start(sample.render[:, 0])
         state = start if self._state is None else self._state.restarted(batch.fresh, start)
         distance = None if self.distance is None else self.distance[1]
-        found = pixel_losses(self.net, sample, state, self.variant.objectives(index, self.steps), distance)
+        found = pixel_losses(
+            self.net, sample, state, self.variant.objectives(index, self.steps), distance
+        )
         self._state = found.state
-        made, given = (_psnr_db(x, sample.truth) for x in (found.predictions.detach(), sample.render))
+        made, given = (
+            _psnr_db(x, sample.truth) for x in (found.predictions.detach(), sample.render)
+        )
         degraded = given < 40  # renders that are the truth, or nearly, say nothing about repair
         gain = float((made - given)[degraded].mean()) if bool(degraded.any()) else 0.0
         return found.total, {
-            "picture": float(found.picture.detach()), "perceptual": float(found.perceptual.detach()),
-            "temporal": float(found.temporal.detach()), "flow": float(found.flow.detach()),
-            "grid": float(found.grid.detach()), "choice": float(found.choice.detach()),
-            "psnr_db": float(made.mean()), "gain_db": gain,
-        }  # fmt: skip
+            "picture": float(found.picture.detach()),
+            "perceptual": float(found.perceptual.detach()),
+            "temporal": float(found.temporal.detach()),
+            "flow": float(found.flow.detach()),
+            "grid": float(found.grid.detach()),
+            "choice": float(found.choice.detach()),
+            "psnr_db": float(made.mean()),
+            "gain_db": gain,
+        }
 
     def carried(self) -> Mapping[str, Tensor]:
         """Return the state after the last update."""
@@ -166,7 +210,9 @@ class PixelTask:
 
 
 def _corners(side: int) -> int:
-    """Return from how many places along a side the perceptual term may begin, so that at least a cell of its coarsest grid is left."""
+    """Return from how many places along a side the perceptual term may begin, so that at least a
+    cell of its coarsest grid is left.
+    """
     return max(min(GRID_PX, side - GRID_PX + 1), 1)
 
 

@@ -1,6 +1,8 @@
-"""The paper's ablation (OneFixer, Tab. 2a) for the per-frame generator: which terms, on which history, from which source.
+"""The paper's ablation (OneFixer, Tab. 2a) for the per-frame generator: which terms, on which
+history, from which source.
 
-The terms in pixels (picture, perceptual, temporal, grid) take the place of the paper's perceptual term.
+The terms in pixels (picture, perceptual, temporal, grid) take the place of the paper's perceptual
+term.
 """
 
 from __future__ import annotations
@@ -15,7 +17,9 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.training.pixel_rollout import PixelObjectives
 
 FULL = PixelObjectives()
-FLOW_ALONE = PixelObjectives(picture=0.0, perceptual=0.0, temporal=0.0, flow=1.0, grid=0.0, choice=0.0)
+FLOW_ALONE = PixelObjectives(
+    picture=0.0, perceptual=0.0, temporal=0.0, flow=1.0, grid=0.0, choice=0.0
+)
 PIXELS_ALONE = replace(FULL, flow=0.0)
 DEPLOYED = "V9"
 
@@ -39,15 +43,26 @@ class PixelVariant:
     def objectives(self, step: int, steps: int) -> PixelObjectives:
         """Return the objectives of update ``step`` of ``steps``."""
         ends = accumulate(self.shares)
-        return next((stage for stage, end in zip(self.stages, ends, strict=True) if step < end * steps), self.stages[-1])
+        return next(
+            (stage for stage, end in zip(self.stages, ends, strict=True) if step < end * steps),
+            self.stages[-1],
+        )
 
     def facts(self, steps: int) -> dict[str, Any]:
-        """Return what identifies it in a run of ``steps`` updates; the length matters only where it moves a border between stages."""
+        """Return what identifies it in a run of ``steps`` updates; the length matters only where it
+        moves a border between stages.
+        """
         stages = [asdict(stage) for stage in self.stages]
-        return {"name": self.name, "stages": stages} | ({"shares": self.shares, "steps": steps} if len(stages) > 1 else {})
+        return {"name": self.name, "stages": stages} | (
+            {"shares": self.shares, "steps": steps} if len(stages) > 1 else {}
+        )
 
-    def weighted(self, perceptual: float, temporal: float, flow: float, grid: float, horizon: int) -> PixelVariant:
-        """Return the variant with other weights of the terms that it has, and another k unless it is about k."""
+    def weighted(
+        self, perceptual: float, temporal: float, flow: float, grid: float, horizon: int
+    ) -> PixelVariant:
+        """Return the variant with other weights of the terms that it has, and another k unless it
+        is about k.
+        """
 
         def stage_of(stage: PixelObjectives) -> PixelObjectives:
             return replace(
@@ -78,14 +93,22 @@ _ALL = (
     PixelVariant("V3", (PIXELS_ALONE,), "terms in pixels alone"),
     PixelVariant("V4", (replace(FULL, horizon=1),), "k = 1"),
     PixelVariant("V5", (replace(FULL, use_map=False),), "black map"),
-    PixelVariant("V6", (replace(FULL, source="noise"),), "from noise everywhere, render as a condition"),
-    PixelVariant("V7", (FLOW_ALONE, PIXELS_ALONE), "flow matching, then terms in pixels", (0.625, 0.375)),
+    PixelVariant(
+        "V6", (replace(FULL, source="noise"),), "from noise everywhere, render as a condition"
+    ),
+    PixelVariant(
+        "V7", (FLOW_ALONE, PIXELS_ALONE), "flow matching, then terms in pixels", (0.625, 0.375)
+    ),
     PixelVariant("V8", (replace(FULL, history="redenoised"),), "history noised and denoised again"),
     PixelVariant(DEPLOYED, (FULL,), "OneFixer"),
     PixelVariant("V9-still", (replace(FULL, source="render"),), "OneFixer, without noise in holes"),
-    PixelVariant("V3b-still", (replace(FULL, source="render", history="clean"),), "the same on clean history"),
+    PixelVariant(
+        "V3b-still", (replace(FULL, source="render", history="clean"),), "the same on clean history"
+    ),
 )
-PIXEL_VARIANTS: Mapping[str, PixelVariant] = MappingProxyType({variant.name: variant for variant in _ALL})
+PIXEL_VARIANTS: Mapping[str, PixelVariant] = MappingProxyType(
+    {variant.name: variant for variant in _ALL}
+)
 
 
 def pixel_variant(name: str) -> PixelVariant:

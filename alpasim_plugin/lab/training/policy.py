@@ -18,7 +18,14 @@ from alpasim_plugin.lab.training.demonstrations import Demonstrations, demonstra
 from alpasim_plugin.lab.training.policy_expert import SIGHT_M
 from alpasim_plugin.lab.training.trainer import Loss
 from policies.learned_input import level_view, network_input
-from policies.learned_net import KNOTS_M, PROXIMITY_M, SPEED_UNIT_MPS, LearnedNet, integrate_path, knot_weights
+from policies.learned_net import (
+    KNOTS_M,
+    PROXIMITY_M,
+    SPEED_UNIT_MPS,
+    LearnedNet,
+    integrate_path,
+    knot_weights,
+)
 
 SIGMA_KNOT = KNOTS_M.index(16.0)
 
@@ -31,7 +38,8 @@ class PolicyRecipe:
         batch: Samples in a batch.
         brightness_jitter: Largest relative change of contrast and brightness.
         speed_noise: Standard deviation of the relative noise on both speeds.
-        lateral_scale_m, lateral_scale_per_m: Lateral errors are divided by ``lateral_scale_m + lateral_scale_per_m * distance``.
+        lateral_scale_m, lateral_scale_per_m: Lateral errors are divided by ``lateral_scale_m +
+            lateral_scale_per_m * distance``.
         seed: Of sampling and noise.
     """
 
@@ -60,7 +68,9 @@ class PolicyBatch:
 class PolicyTask:
     """Batches and loss of the learned policy, for `Trainer`."""
 
-    def __init__(self, net: LearnedNet, demonstrations: Sequence[Demonstrations], recipe: PolicyRecipe) -> None:
+    def __init__(
+        self, net: LearnedNet, demonstrations: Sequence[Demonstrations], recipe: PolicyRecipe
+    ) -> None:
         self.net, self.demonstrations, self.recipe = net, demonstrations, recipe
         self.ends = np.cumsum([len(one) for one in demonstrations])
         self.weights = torch.from_numpy(knot_weights()).float()
@@ -82,39 +92,65 @@ class PolicyTask:
         random = stream("training", self.recipe.seed, "policy.batch", index)
         return self.collect(random.integers(0, self.ends[-1], self.recipe.batch), random)
 
-    def collect(self, which: Sequence[int] | Any, random: np.random.Generator | None = None) -> PolicyBatch:
+    def collect(
+        self, which: Sequence[int] | Any, random: np.random.Generator | None = None
+    ) -> PolicyBatch:
         """Return a batch of samples by number; without ``random``, no augmentation."""
         rows = [self._sample(int(number), random) for number in which]
-        return PolicyBatch(*(torch.from_numpy(np.stack([row[i] for row in rows])) for i in range(8)))
+        return PolicyBatch(
+            *(torch.from_numpy(np.stack([row[i] for row in rows])) for i in range(8))
+        )
 
     def loss(self, batch: PolicyBatch, index: int) -> Loss:
         """Return the loss of a batch and its parts."""
-        images = batch.image.contiguous(memory_format=torch.channels_last)  # as the network: a third faster
+        images = batch.image.contiguous(
+            memory_format=torch.channels_last
+        )  # as the network: a third faster
         prediction = self.net(images, batch.state, batch.command)
-        lateral, heading_error, speed_error = self.errors(prediction.heading, prediction.speed, batch)
+        lateral, heading_error, speed_error = self.errors(
+            prediction.heading, prediction.speed, batch
+        )
         path = F.smooth_l1_loss(lateral / self.unit_m, torch.zeros_like(lateral), beta=1.0)
         heading = F.smooth_l1_loss(heading_error / 0.03, torch.zeros_like(heading_error), beta=1.0)
         speed = F.smooth_l1_loss(speed_error, torch.zeros_like(speed_error), beta=0.5)
         # Gaussian negative log-likelihood for sigma alone: the errors are detached.
         mean_speed = batch.speed + batch.speeds.mean(1)
-        off = torch.stack([lateral[:, SIGMA_KNOT], speed_error.mean(1) / mean_speed.clamp_min(3.0)], dim=1).detach()
-        sigma = (torch.log(prediction.sigma) + 0.5 * (off / prediction.sigma).clamp(-6.0, 6.0) ** 2).mean()
+        off = torch.stack(
+            [lateral[:, SIGMA_KNOT], speed_error.mean(1) / mean_speed.clamp_min(3.0)], dim=1
+        ).detach()
+        sigma = (
+            torch.log(prediction.sigma) + 0.5 * (off / prediction.sigma).clamp(-6.0, 6.0) ** 2
+        ).mean()
         proximity, leader_speed = prediction.leader.T
         wanted_proximity, wanted_leader_speed = batch.leader.T
         # Auxiliary task: the plan does not depend on the predicted leader.
         leader = F.smooth_l1_loss(proximity, wanted_proximity, beta=0.05)
-        leader = leader + 0.02 * (wanted_proximity * (leader_speed - wanted_leader_speed).abs()).mean()
-        parts = {"leader": leader, "path": path, "heading": 0.3 * heading, "speed": speed, "sigma": 0.05 * sigma}
+        leader = (
+            leader + 0.02 * (wanted_proximity * (leader_speed - wanted_leader_speed).abs()).mean()
+        )
+        parts = {
+            "leader": leader,
+            "path": path,
+            "heading": 0.3 * heading,
+            "speed": speed,
+            "sigma": 0.05 * sigma,
+        }
         numbers = {name: float(value.detach()) for name, value in parts.items()}
         numbers["lateral_m"] = float(lateral[:, SIGMA_KNOT].detach().abs().mean())
         numbers["speed_mps"] = float(speed_error.detach().abs().mean())
         return torch.stack(list(parts.values())).sum(), numbers
 
-    def errors(self, heading: Tensor, speed: Tensor, batch: PolicyBatch) -> tuple[Tensor, Tensor, Tensor]:
-        """Return lateral errors ``(B, 9)`` (m), heading errors ``(B, 9)`` (rad) and speed errors ``(B, 8)`` (m/s)."""
+    def errors(
+        self, heading: Tensor, speed: Tensor, batch: PolicyBatch
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return lateral errors ``(B, 9)`` (m), heading errors ``(B, 9)`` (rad) and speed errors
+        ``(B, 8)`` (m/s).
+        """
         points, yaw = integrate_path(heading, self.weights)
         offset = points[:, self.rows] - batch.points
-        lateral = torch.cos(batch.headings) * offset[..., 1] - torch.sin(batch.headings) * offset[..., 0]
+        lateral = (
+            torch.cos(batch.headings) * offset[..., 1] - torch.sin(batch.headings) * offset[..., 0]
+        )
         return lateral, yaw[:, self.rows] - batch.headings, speed - batch.speeds
 
     def _sample(self, number: int, random: np.random.Generator | None) -> tuple[Any, ...]:
@@ -123,34 +159,66 @@ class PolicyTask:
         a, row = demonstrations.arrays, number - int(self.ends[scene] - len(demonstrations))
         frames = a["frames"]
         now = level_view(frames[a["frame"][row]], demonstrations.camera, float(a["yaw"][row]))
-        before = level_view(frames[a["before"][row]], demonstrations.camera, float(a["yaw_before"][row]))
+        before = level_view(
+            frames[a["before"][row]], demonstrations.camera, float(a["yaw_before"][row])
+        )
         speed, desired = float(a["speed"][row]), float(a["desired_speed"][row])
         real = float(a["frame"][row] != a["before"][row])
         state = np.array([speed, desired], dtype=np.float32)
         if random is not None:
-            contrast, brightness = 1.0 + random.uniform(-self.recipe.brightness_jitter, self.recipe.brightness_jitter, 2)
+            contrast, brightness = 1.0 + random.uniform(
+                -self.recipe.brightness_jitter, self.recipe.brightness_jitter, 2
+            )
             now, before = (_jitter_brightness(view, contrast, brightness) for view in (now, before))
-            state = state * (1.0 + self.recipe.speed_noise * random.standard_normal(2)).astype(np.float32)
+            state = state * (1.0 + self.recipe.speed_noise * random.standard_normal(2)).astype(
+                np.float32
+            )
         image = network_input(now, before)
         inputs = np.array([*(state / SPEED_UNIT_MPS), real], dtype=np.float32)
         gap = float(a["gap"][row])
-        leader = np.array([0.0 if gap >= SIGHT_M else np.exp(-max(gap, 0.0) / PROXIMITY_M), a["leader"][row]], dtype=np.float32)
-        return image, inputs, a["command"][row], a["points"][row], a["headings"][row], a["speed"][row], a["speeds"][row], leader
+        leader = np.array(
+            [0.0 if gap >= SIGHT_M else np.exp(-max(gap, 0.0) / PROXIMITY_M), a["leader"][row]],
+            dtype=np.float32,
+        )
+        return (
+            image,
+            inputs,
+            a["command"][row],
+            a["points"][row],
+            a["headings"][row],
+            a["speed"][row],
+            a["speeds"][row],
+            leader,
+        )
 
 
 def _jitter_brightness(view: U8, contrast: float, brightness: float) -> U8:
-    return np.asarray(cv2.convertScaleAbs(view, alpha=contrast * brightness, beta=128.0 * brightness * (1.0 - contrast)), dtype=np.uint8)
+    return np.asarray(
+        cv2.convertScaleAbs(
+            view, alpha=contrast * brightness, beta=128.0 * brightness * (1.0 - contrast)
+        ),
+        dtype=np.uint8,
+    )
 
 
 def measure(task: PolicyTask, every: int = 1, batch: int = 64) -> dict[str, float]:
-    """Return mean absolute errors over the samples of a task (or every n-th): lateral and heading at 16 m, and speed."""
+    """Return mean absolute errors over the samples of a task (or every n-th): lateral and heading
+    at 16 m, and speed.
+    """
     sums = np.zeros(4)
     chosen = np.arange(0, int(task.ends[-1]), every)
     with torch.inference_mode():
         for begin in range(0, len(chosen), batch):
             samples = task.collect(chosen[begin : begin + batch])
             prediction = task.net(samples.image, samples.state, samples.command)
-            lateral, heading_error, speed_error = task.errors(prediction.heading, prediction.speed, samples)
+            lateral, heading_error, speed_error = task.errors(
+                prediction.heading, prediction.speed, samples
+            )
             off = (lateral[:, SIGMA_KNOT], heading_error[:, SIGMA_KNOT], speed_error.abs().mean(1))
             sums += [*(float(x.abs().sum()) for x in off), len(lateral)]
-    return {"lateral_16m_m": sums[0] / sums[3], "heading_16m_rad": sums[1] / sums[3], "speed_mps": sums[2] / sums[3], "samples": sums[3]}
+    return {
+        "lateral_16m_m": sums[0] / sums[3],
+        "heading_16m_rad": sums[1] / sums[3],
+        "speed_mps": sums[2] / sums[3],
+        "samples": sums[3],
+    }

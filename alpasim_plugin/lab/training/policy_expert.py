@@ -1,4 +1,5 @@
-"""The privileged expert that the learned policy imitates: a recovery path to the lane centre, and a speed profile.
+"""The privileged expert that the learned policy imitates: a recovery path to the lane centre, and a
+speed profile.
 
 The expert knows the exact reference line, its curvature and all actors.
 """
@@ -19,7 +20,9 @@ from scenarios.expert import ExpertStyle, speed_limits
 
 STEP_S = 0.1
 LATERAL_MPS2 = 2.0
-ACCEL_MPS2, BRAKE_MPS2, HARD_BRAKE_MPS2 = 1.5, 2.0, 7.0
+ACCEL_MPS2 = 1.5
+BRAKE_MPS2 = 2.0
+HARD_BRAKE_MPS2 = 7.0
 LINE_BEFORE_M, LINE_AHEAD_M = 4.0, 80.0
 MIN_PURSUIT_MPS = 4.0  # so that a stationary car has a path too
 SIGHT_M = 60.0  # objects beyond cover only a few pixels of the image
@@ -37,7 +40,14 @@ class DrivingStyle:
     @property
     def idm(self) -> IdmParams:
         """Parameters of the intelligent driver model (IDM)."""
-        return IdmParams(max(self.desired_mps, 1.0), self.headway_s, self.min_gap_m, ACCEL_MPS2, self.brake_mps2, HARD_BRAKE_MPS2)
+        return IdmParams(
+            max(self.desired_mps, 1.0),
+            self.headway_s,
+            self.min_gap_m,
+            ACCEL_MPS2,
+            self.brake_mps2,
+            HARD_BRAKE_MPS2,
+        )
 
 
 @dataclass(frozen=True)
@@ -50,43 +60,70 @@ class ReferenceLine:
     @staticmethod
     def along(path: Path, fastest_mps: float) -> ReferenceLine:
         """Return the line with its speed limits, at most ``fastest_mps``."""
-        return ReferenceLine(path, speed_limits(path, ExpertStyle(fastest_mps, fastest_mps, LATERAL_MPS2, 1.5)))
+        return ReferenceLine(
+            path, speed_limits(path, ExpertStyle(fastest_mps, fastest_mps, LATERAL_MPS2, 1.5))
+        )
 
 
-def acceleration(line: ReferenceLine, s_m: float, speed_mps: float, leader: Leader, style: DrivingStyle) -> float:
+def acceleration(
+    line: ReferenceLine, s_m: float, speed_mps: float, leader: Leader, style: DrivingStyle
+) -> float:
     """Return the acceleration, m/s^2, of a driver at arc length ``s_m`` of the line."""
-    limit = min(float(np.interp(s_m + 0.5 * speed_mps, line.path.s, line.limit_mps)), style.desired_mps)
+    limit = min(
+        float(np.interp(s_m + 0.5 * speed_mps, line.path.s, line.limit_mps)), style.desired_mps
+    )
     wanted = min(1.5 * (limit - speed_mps), ACCEL_MPS2)
     if leader.index >= 0:
-        wanted = min(wanted, idm_acceleration(speed_mps, leader.gap_m, speed_mps - leader.speed_mps, style.idm))
+        wanted = min(
+            wanted,
+            idm_acceleration(speed_mps, leader.gap_m, speed_mps - leader.speed_mps, style.idm),
+        )
     return max(wanted, -HARD_BRAKE_MPS2)
 
 
 def advance(s_m: float, speed_mps: float, accel_mps2: float, dt_s: float) -> tuple[float, float]:
-    """Return arc length and speed after a step of constant acceleration; speeds are not negative."""
+    """Return arc length and speed after a step of constant acceleration; speeds are not
+    negative.
+    """
     after = max(speed_mps + accel_mps2 * dt_s, 0.0)
     return s_m + 0.5 * (speed_mps + after) * dt_s, after
 
 
-def leader_on(line: ReferenceLine, s_m: float, front_m: float, half_width_m: float, bodies: Bodies) -> Leader:
-    """Return the leader of a car with the rear axle at ``s_m`` and the front bumper ``front_m`` ahead of it."""
+def leader_on(
+    line: ReferenceLine, s_m: float, front_m: float, half_width_m: float, bodies: Bodies
+) -> Leader:
+    """Return the leader of a car with the rear axle at ``s_m`` and the front bumper ``front_m``
+    ahead of it.
+    """
     return find_leader(line.path, s_m + front_m, half_width_m, bodies, horizon_m=SIGHT_M)
 
 
-def expert_speeds(line: ReferenceLine, s_m: float, speed_mps: float, leader: Leader, style: DrivingStyle) -> F64:
-    """Return the changes of speed ``(8,)`` until `TIMES_S`, metres per second; the leader's speed is constant."""
-    s, v, gap = s_m, speed_mps, leader.gap_m
+def expert_speeds(
+    line: ReferenceLine, s_m: float, speed_mps: float, leader: Leader, style: DrivingStyle
+) -> F64:
+    """Return the changes of speed ``(8,)`` until `TIMES_S`, metres per second; the leader's speed
+    is constant.
+    """
+    s = s_m
+    v = speed_mps
+    gap = leader.gap_m
     speeds = [v]
     for _ in range(round(TIMES_S[-1] / STEP_S)):
         before = s
-        s, v = advance(s, v, acceleration(line, s, v, Leader(gap, leader.speed_mps, leader.index), style), STEP_S)
+        s, v = advance(
+            s,
+            v,
+            acceleration(line, s, v, Leader(gap, leader.speed_mps, leader.index), style),
+            STEP_S,
+        )
         gap += leader.speed_mps * STEP_S - (s - before)
         speeds.append(v)
     return np.array([speeds[round(t / STEP_S)] for t in TIMES_S]) - speed_mps
 
 
 def expert_path(line: Path, s_m: float, T_world_rig: F64, speed_mps: float) -> tuple[F64, F64]:
-    """Return points ``(9, 2)`` and headings ``(9,)`` at `KNOTS_M` of the recovery path to a line, in the rig frame, metres and radians.
+    """Return points ``(9, 2)`` and headings ``(9,)`` at `KNOTS_M` of the recovery path to a line,
+    in the rig frame, metres and radians.
 
     Args:
         line: The line.

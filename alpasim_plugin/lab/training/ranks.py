@@ -1,7 +1,9 @@
-"""Data-parallel training: processes that compute the gradients of their own rows of a batch and average them.
+"""Data-parallel training: processes that compute the gradients of their own rows of a batch and
+average them.
 
-Every rank has the same weights and optimiser, sees the same updates and, with averaged gradients, stays equal to the others. Only the
-first writes files. The number of ranks is no part of a run: a checkpoint continues with any other.
+Every rank has the same weights and optimiser, sees the same updates and, with averaged gradients,
+stays equal to the others. Only the first writes files. The number of ranks is no part of a run: a
+checkpoint continues with any other.
 """
 
 from __future__ import annotations
@@ -76,7 +78,12 @@ class Ranks:
             InputError: The batch cannot be divided.
         """
         if batch % self.count:
-            raise InputError(DOING, f"{batch} rows in {self.count} processes", "they cannot be divided equally", "choose a divisor")
+            raise InputError(
+                DOING,
+                f"{batch} rows in {self.count} processes",
+                "they cannot be divided equally",
+                "choose a divisor",
+            )
         size = batch // self.count
         return slice(self.rank * size, (self.rank + 1) * size)
 
@@ -87,7 +94,9 @@ class Ranks:
         flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
         self.exchange.sum(flat)
         flat /= self.count
-        for tensor, mean in zip(tensors, torch.split(flat, [tensor.numel() for tensor in tensors]), strict=True):
+        for tensor, mean in zip(
+            tensors, torch.split(flat, [tensor.numel() for tensor in tensors]), strict=True
+        ):
             tensor.copy_(mean.view_as(tensor))
 
     def joined(self, rows: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -100,7 +109,9 @@ class Ranks:
 ALONE = Ranks()
 
 
-def in_ranks(work: Callable[[Ranks, Report | None], T], count: int, report: Report | None = None) -> T:
+def in_ranks(
+    work: Callable[[Ranks, Report | None], T], count: int, report: Report | None = None
+) -> T:
     """Run ``work`` in ``count`` processes, of which this is the first, and return its result here.
 
     The others end with this process, however it ends.
@@ -120,8 +131,14 @@ def in_ranks(work: Callable[[Ranks, Report | None], T], count: int, report: Repo
     with tempfile.TemporaryDirectory(prefix="simrun-ranks-") as folder:
         meeting = Path(folder) / "meeting"
         failures = context.SimpleQueue()
-        others = [context.Process(target=_other, args=(work, rank, count, meeting, torch.get_num_threads(), failures), daemon=True)
-                  for rank in range(1, count)]  # fmt: skip
+        others = [
+            context.Process(
+                target=_other,
+                args=(work, rank, count, meeting, torch.get_num_threads(), failures),
+                daemon=True,
+            )
+            for rank in range(1, count)
+        ]
         for process in others:
             process.start()
         try:
@@ -132,26 +149,45 @@ def in_ranks(work: Callable[[Ranks, Report | None], T], count: int, report: Repo
             if failures.empty():
                 raise
             rank, found = failures.get()
-            raise InfrastructureError(DOING, f"process {rank + 1} of {count}", found, "run again: training resumes") from error
+            raise InfrastructureError(
+                DOING, f"process {rank + 1} of {count}", found, "run again: training resumes"
+            ) from error
         finally:
             for process in others:
                 process.join(GRACE_S)
                 process.kill()
 
 
-def _other(work: Callable[[Ranks, Report | None], Any], rank: int, count: int, meeting: Path, threads: int, failures: Any) -> None:
+def _other(
+    work: Callable[[Ranks, Report | None], Any],
+    rank: int,
+    count: int,
+    meeting: Path,
+    threads: int,
+    failures: Any,
+) -> None:
     end_with_parent()
     torch.set_num_threads(threads)
     try:
         _ranked(work, rank, count, meeting, None)
-    except SimrunError as error:  # the first rank raises the same, unless it concerns this one alone
+    except (
+        SimrunError
+    ) as error:  # the first rank raises the same, unless it concerns this one alone
         failures.put((rank, str(error)))
     except Exception as error:
         failures.put((rank, f"{type(error).__name__}: {error}"))
 
 
-def _ranked(work: Callable[[Ranks, Report | None], T], rank: int, count: int, meeting: Path, report: Report | None) -> T:
-    torch.distributed.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=count)
+def _ranked(
+    work: Callable[[Ranks, Report | None], T],
+    rank: int,
+    count: int,
+    meeting: Path,
+    report: Report | None,
+) -> T:
+    torch.distributed.init_process_group(
+        "gloo", init_method=f"file://{meeting}", rank=rank, world_size=count
+    )
     try:
         return work(Ranks(rank, count, TorchExchange()), report)
     finally:

@@ -1,4 +1,5 @@
-"""The recorded frames of a sequence of training pairs, beside its channels, and what carries them into a frame's view.
+"""The recorded frames of a sequence of training pairs, beside its channels, and what carries them
+into a frame's view.
 
 ROOT/SPLIT/SEQUENCE/depth.npy                (T, H, W)    float16  metres as the render sees it; 0 where no surface is
                     actors.npy               (T, A, 4, 4) float64  T_world_box of every frame; NaN where an actor is absent
@@ -62,10 +63,14 @@ class SequenceReferences:
         return ReferenceIndex([RecordedFrame(int(t), "", self.K, T, {}, _unread) for t, T in poses])
 
     def warped(self, frames: int, count: int, past: bool = False) -> Iterator[tuple[U8, ...]]:
-        """Yield the references of the first frames, at most ``count`` each, as the closed loop gives them."""
+        """Yield the references of the first frames, at most ``count`` each, as the closed loop
+        gives them.
+        """
         index, whole = self.index(), slice(None)
         last: Sequence[int] = ()
-        picture = lru_cache(count + 1)(self.picture)  # most are those of the frame before, as in a drive
+        picture = lru_cache(count + 1)(
+            self.picture
+        )  # most are those of the frame before, as in a drive
         for i in range(frames):
             last = index.choose(self.T_world_camera[i], int(self.t_us[i]), count, last, past)
             target = self.target(i, self.K, whole, whole)
@@ -84,7 +89,13 @@ class SequenceReferences:
     def picture(self, i: int) -> Picture:
         """Return recorded frame ``i``."""
         depth = self.rgb_depth[i].astype(np.float32)
-        picture = Picture(self.K, self.rgb_T_world_camera[i], np.ascontiguousarray(self.rgb[i]), depth, _named(self.rgb_actors[i]))
+        picture = Picture(
+            self.K,
+            self.rgb_T_world_camera[i],
+            np.ascontiguousarray(self.rgb[i]),
+            depth,
+            _named(self.rgb_actors[i]),
+        )
         return with_users(picture, self.sizes)
 
     @cached_property
@@ -93,7 +104,12 @@ class SequenceReferences:
         return {str(a): Box(*map(float, size)) for a, size in enumerate(self.boxes)}
 
 
-def write_references(folder: Path, frames: Sequence[FrameGeometry], recorded: Sequence[RecordedFrame], actors: Sequence[Actor]) -> None:
+def write_references(
+    folder: Path,
+    frames: Sequence[FrameGeometry],
+    recorded: Sequence[RecordedFrame],
+    actors: Sequence[Actor],
+) -> None:
     """Write the recorded frames of a sequence into its folder.
 
     Args:
@@ -129,19 +145,36 @@ def open_references(sequence: PairSequence) -> SequenceReferences | None:
     folder = sequence.folder
     if not (folder / FOLDER).is_dir():
         return None
-    names = ("depth", "actors", "boxes", *(f"{FOLDER}/{name}" for name in ("rgb", "depth", "T_world_camera", "t_us", "actors")))
-    opened = [np.asarray(open_npy(folder / f"{name}.npy", READING, "run 'simrun train pairs' again")) for name in names]  # plain: faster
+    names = (
+        "depth",
+        "actors",
+        "boxes",
+        *(f"{FOLDER}/{name}" for name in ("rgb", "depth", "T_world_camera", "t_us", "actors")),
+    )
+    opened = [
+        np.asarray(open_npy(folder / f"{name}.npy", READING, "run 'simrun train pairs' again"))
+        for name in names
+    ]  # plain: faster
     clip = sequence.clip
     if len(opened[0]) < len(clip) or len({len(array) for array in opened[3:]}) != 1:
         found = f"{len(opened[0])} depths of {len(clip)} frames, recorded frames {[len(array) for array in opened[3:]]}"
-        raise InputError(READING, str(folder / FOLDER), found, "remove the folder and run 'simrun train pairs' again")
-    K, T_rig_camera = (np.array(sequence.info["camera"][name], dtype=np.float64) for name in ("K", "T_rig_camera"))
+        raise InputError(
+            READING,
+            str(folder / FOLDER),
+            found,
+            "remove the folder and run 'simrun train pairs' again",
+        )
+    K, T_rig_camera = (
+        np.array(sequence.info["camera"][name], dtype=np.float64) for name in ("K", "T_rig_camera")
+    )
     return SequenceReferences(K, T_rig_camera, np.asarray(clip.T_world_camera), clip.t_us, *opened)
 
 
 def _poses(frames: Sequence[Mapping[str, F64]], names: Sequence[str]) -> F64:
     absent = np.full((4, 4), np.nan)
-    return np.array([[frame.get(name, absent) for name in names] for frame in frames], dtype=np.float64).reshape(-1, len(names), 4, 4)
+    return np.array(
+        [[frame.get(name, absent) for name in names] for frame in frames], dtype=np.float64
+    ).reshape(-1, len(names), 4, 4)
 
 
 def _named(poses: F64) -> dict[str, F64]:

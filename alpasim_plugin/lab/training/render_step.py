@@ -3,9 +3,10 @@
     z_r = E(r),  x = z_r / (alpha + sigma),  z_0 = x - t v(x, t),  y' = D(z_0)          `lab.image_fixers.pipeline`
     L   = | y' - y |^2  +  lambda min(d(y', y), c)  +  w L_warp(y')                      on values in [-1, 1]
 
-``r`` render, ``y`` clean frame, ``d`` perceptual distance of a picture, ``c`` the largest value that counts (DiffusionHarmonizer: beyond it
-there is no gradient), ``L_warp`` of `warping` (its temporal form). The temporal form encodes the clip ``[r_t, y'_t-1 ... y'_t-4]``, newest
-first: the last four outputs are the model's own, rounded to eight bits as they are shown, without gradients.
+``r`` render, ``y`` clean frame, ``d`` perceptual distance of a picture, ``c`` the largest value
+that counts (DiffusionHarmonizer: beyond it there is no gradient), ``L_warp`` of `warping` (its
+temporal form). The temporal form encodes the clip ``[r_t, y'_t-1 ... y'_t-4]``, newest first: the
+last four outputs are the model's own, rounded to eight bits as they are shown, without gradients.
 """
 
 from __future__ import annotations
@@ -53,13 +54,19 @@ class RenderStep:
             Like ``render``, not clipped.
         """
         text = torch.zeros(1, 1, self.net.sizes.text_width)
-        z_r = self.vae.encode(render if references is None else torch.cat([render, references], dim=2))
+        z_r = self.vae.encode(
+            render if references is None else torch.cat([render, references], dim=2)
+        )
         z_0 = fixed_step(self.net, z_r, self.level, text)
-        return self.vae.decode(z_0[:, :, :1], render=render if self.sees_render else None, clamp=False)
+        return self.vae.decode(
+            z_0[:, :, :1], render=render if self.sees_render else None, clamp=False
+        )
 
     @torch.no_grad()
     def outputs(self, render: Tensor) -> Tensor:
-        """Return what the deployed model shows of a clip from its start ``(B, 3, T, H, W)``; the first four frames have no references."""
+        """Return what the deployed model shows of a clip from its start ``(B, 3, T, H, W)``; the
+        first four frames have no references.
+        """
         shown: list[Tensor] = []
         for t in range(render.shape[2]):
             references = None if t < REFERENCES else torch.cat(shown[: -REFERENCES - 1 : -1], dim=2)
@@ -77,7 +84,9 @@ def newest_first(frames: Tensor) -> Tensor:
     return frames[:, :, -REFERENCES:].flip(2)
 
 
-def picture_losses(made: Tensor, clean: Tensor, distance: Distance, perceptual: float, clamp: float | None) -> dict[str, Tensor]:
+def picture_losses(
+    made: Tensor, clean: Tensor, distance: Distance, perceptual: float, clamp: float | None
+) -> dict[str, Tensor]:
     """Return the weighted losses of pictures ``(B, 3, 1, H, W)`` in [-1, 1].
 
     Args:
@@ -93,6 +102,10 @@ def picture_losses(made: Tensor, clean: Tensor, distance: Distance, perceptual: 
 
 
 def warp_term(made: Tensor, clean: Tensor, weight: float) -> Mapping[str, Tensor]:
-    """Return the weighted warping loss of a prediction ``(B, 3, 1, H, W)`` of the last of the clean frames ``(B, 3, T, H, W)``, T >= 5."""
+    """Return the weighted warping loss of a prediction ``(B, 3, 1, H, W)`` of the last of the clean
+    frames ``(B, 3, T, H, W)``, T >= 5.
+    """
     earlier, now = newest_first(clean[:, :, :-1]), clean[:, :, -1]
-    return {"warp-farneback": weight * warping_loss(made[:, :, 0], earlier, flow_between(earlier, now))}
+    return {
+        "warp-farneback": weight * warping_loss(made[:, :, 0], earlier, flow_between(earlier, now))
+    }

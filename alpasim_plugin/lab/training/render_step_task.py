@@ -1,4 +1,6 @@
-"""A stage of DiFix3D+ or DiffusionHarmonizer: configuration, batches and loss (`training.render_step` has the equations)."""
+"""A stage of DiFix3D+ or DiffusionHarmonizer: configuration, batches and loss
+(`training.render_step` has the equations).
+"""
 
 from __future__ import annotations
 
@@ -16,11 +18,19 @@ from alpasim_plugin.lab.training.perceptual_term import Distance
 from alpasim_plugin.lab.training.picture_batches import PictureBatches, Pictures
 from alpasim_plugin.lab.training.recipes.recipe import StageInputs
 from alpasim_plugin.lab.training.recipes.start import transformer_of
-from alpasim_plugin.lab.training.render_step import REFERENCES, RenderStep, newest_first, picture_losses, warp_term
+from alpasim_plugin.lab.training.render_step import (
+    REFERENCES,
+    RenderStep,
+    newest_first,
+    picture_losses,
+    warp_term,
+)
 from alpasim_plugin.lab.training.trainer import Loss
 
 DOING = "setting up the training of an image model"
-ROLLOUT = 8  # frames of a temporal clip; the loss is on one of those that have four outputs before them
+ROLLOUT = (
+    8  # frames of a temporal clip; the loss is on one of those that have four outputs before them
+)
 MEASURED = 64  # pictures that the clamp is measured on
 
 
@@ -30,13 +40,15 @@ class RenderStepLoss:
 
     Args:
         weight: lambda, of the perceptual distance.
-        clamp: Share of the training pictures' distances, render against clean frame, that the largest distance that counts is above; None:
-            all distances count whole. The published .3 is a value of LPIPS, and other distances have other values.
-        references: The last four outputs that the network looks at: its ``own``, the ``clean`` frames in their place (teacher forcing), or
-            none.
-        single: Share of batches without references, where there are any: a rollout begins with four frames without.
-        warp: Weight of `warp-farneback`. The published one is not known; this one makes its gradient about half as long as the picture
-            term's (docs/lab/arms.md).
+        clamp: Share of the training pictures' distances, render against clean frame, that the
+            largest distance that counts is above; None: all distances count whole. The published .3
+            is a value of LPIPS, and other distances have other values.
+        references: The last four outputs that the network looks at: its ``own``, the ``clean``
+            frames in their place (teacher forcing), or none.
+        single: Share of batches without references, where there are any: a rollout begins with four
+            frames without.
+        warp: Weight of `warp-farneback`. The published one is not known; this one makes its
+            gradient about half as long as the picture term's (docs/lab/arms.md).
     """
 
     weight: float = 1.0
@@ -69,35 +81,59 @@ class RenderStepTask:
     def __init__(self, config: RenderStepLoss, inputs: StageInputs) -> None:
         if not isinstance(inputs.settings, RenderStepSettings):
             found = f"{'a fixer' if inputs.settings is None else inputs.settings.name} that takes no step from the render"
-            raise InputError(DOING, "--fixer", found, "leave it out, or name difix, harmonizer or harmonizer-temporal")
+            raise InputError(
+                DOING,
+                "--fixer",
+                found,
+                "leave it out, or name difix, harmonizer or harmonizer-temporal",
+            )
         if inputs.distance is None:
             raise InputError(DOING, str(config), "a perceptual term without a distance", "give one")
         self.config, self.distance = config, inputs.distance[1]
         self.batches = PictureBatches(inputs, 1 if config.references is None else ROLLOUT)
         net = transformer_of(inputs, "dit")
-        self.step = RenderStep(net, inputs.vae, inputs.settings.level, inputs.settings.decoder.kind == "render")
+        self.step = RenderStep(
+            net, inputs.vae, inputs.settings.level, inputs.settings.decoder.kind == "render"
+        )
         self.parts = nn.ModuleDict({"dit": net, "vae": inputs.vae})
-        self.largest = None if config.clamp is None else largest_distance(self.batches, self.distance, config.clamp)
+        self.largest = (
+            None
+            if config.clamp is None
+            else largest_distance(self.batches, self.distance, config.clamp)
+        )
 
     @property
     def facts(self) -> dict[str, Any]:
         """Identify the configuration, with the largest distance that counts."""
         level = asdict(self.step.level)
-        return {"objective": "a step from the render", **asdict(self.config), "largest_distance": self.largest, "render_level": level}
+        return {
+            "objective": "a step from the render",
+            **asdict(self.config),
+            "largest_distance": self.largest,
+            "render_level": level,
+        }
 
     def batch(self, index: int) -> RenderStepBatch:
         """Make batch ``index``."""
         if self.config.references is None:
             return RenderStepBatch(self.batches[index], 0, False)
         rng = stream("training", self.batches.seed, "render_step.frame", index)
-        return RenderStepBatch(self.batches[index], int(rng.integers(REFERENCES, ROLLOUT)), bool(rng.random() >= self.config.single))
+        return RenderStepBatch(
+            self.batches[index],
+            int(rng.integers(REFERENCES, ROLLOUT)),
+            bool(rng.random() >= self.config.single),
+        )
 
     def loss(self, batch: RenderStepBatch, index: int) -> Loss:
         """Return the loss of a batch and its parts."""
         (render, clean), w = batch.pictures, batch.frame
         references: Tensor | None = None
         if batch.joined:
-            shown = clean[:, :, :w] if self.config.references == "clean" else self.step.outputs(render[:, :, :w])
+            shown = (
+                clean[:, :, :w]
+                if self.config.references == "clean"
+                else self.step.outputs(render[:, :, :w])
+            )
             references = newest_first(shown)
         made, wanted = self.step(render[:, :, w : w + 1], references), clean[:, :, w : w + 1]
         parts = picture_losses(made, wanted, self.distance, self.config.weight, self.largest)
@@ -112,9 +148,13 @@ class RenderStepTask:
 
 @torch.no_grad()
 def largest_distance(batches: PictureBatches, distance: Distance, share: float) -> float:
-    """Return the quantile ``share`` of the distances between renders and clean frames in the first training batches, to three digits."""
+    """Return the quantile ``share`` of the distances between renders and clean frames in the first
+    training batches, to three digits.
+    """
     found: list[float] = []
     while len(found) < MEASURED:
-        render, clean = batches[len(found)]  # any batches will do, as long as they are always the same
+        render, clean = batches[
+            len(found)
+        ]  # any batches will do, as long as they are always the same
         found += distance(render[:, :, -1], clean[:, :, -1]).tolist()
     return float(f"{np.quantile(found, share):.3g}")

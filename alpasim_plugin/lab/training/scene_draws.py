@@ -11,9 +11,22 @@ Spec = dict[str, Any]
 Rng = np.random.Generator
 
 MARGIN_M = 60.0  # road beyond the ego's path
-VEHICLES: Mapping[str, float] = {"car": 0.55, "truck": 0.16, "bus": 0.12, "motorcycle": 0.08, "cyclist": 0.09}
+VEHICLES: Mapping[str, float] = {
+    "car": 0.55,
+    "truck": 0.16,
+    "bus": 0.12,
+    "motorcycle": 0.08,
+    "cyclist": 0.09,
+}
 PARKED: Mapping[str, float] = {"car": 0.75, "truck": 0.15, "bus": 0.04, "motorcycle": 0.06}
-SPACING_M: Mapping[str, float] = {"car": 7.0, "truck": 10.5, "bus": 15.0, "motorcycle": 5.0, "cyclist": 4.0, "pedestrian": 3.0}  # in a row
+SPACING_M: Mapping[str, float] = {
+    "car": 7.0,
+    "truck": 10.5,
+    "bus": 15.0,
+    "motorcycle": 5.0,
+    "cyclist": 4.0,
+    "pedestrian": 3.0,
+}  # in a row
 
 
 def number(rng: Rng, low: float, high: float, digits: int = 2) -> float:
@@ -49,7 +62,11 @@ def straight(length_m: float) -> Spec:
 
 def arc(length_m: float, curvature_per_m: float) -> Spec:
     """Return a circular bend."""
-    return {"kind": "arc", "length_m": round(length_m, 1), "curvature_per_m": round(curvature_per_m, 5)}
+    return {
+        "kind": "arc",
+        "length_m": round(length_m, 1),
+        "curvature_per_m": round(curvature_per_m, 5),
+    }
 
 
 def bend(curvature_per_m: float, arc_m: float, ease_m: float) -> list[Spec]:
@@ -74,31 +91,59 @@ def path_m(speed_mps: float, time_s: float, margin_m: float = MARGIN_M) -> float
 
 def ego(rng: Rng, speed_mps: float, lane: int = 0) -> Spec:
     """Return the expert's section."""
-    return {"lane": lane, "speed_mps": round(speed_mps, 2), "cruise_mps": round(speed_mps * number(rng, 1.0, 1.1), 2)}
+    return {
+        "lane": lane,
+        "speed_mps": round(speed_mps, 2),
+        "cruise_mps": round(speed_mps * number(rng, 1.0, 1.1), 2),
+    }
 
 
 def leader(rng: Rng, speed_mps: float, lane: int, kind: str | None = None) -> Spec:
     """Return a reactive vehicle ahead of the ego; cyclists are slower."""
     chosen = kind or label(rng, VEHICLES)
     speed = min(speed_mps, number(rng, 4.5, 6.5)) if chosen == "cyclist" else speed_mps
-    return {"kind": "idm", "id": "ahead", "label": chosen, "lane": lane, "s_m": number(rng, 20, 45), "speed_mps": round(speed, 2)}
+    return {
+        "kind": "idm",
+        "id": "ahead",
+        "label": chosen,
+        "lane": lane,
+        "s_m": number(rng, 20, 45),
+        "speed_mps": round(speed, 2),
+    }
 
 
 def beside(rng: Rng, speed_mps: float, lane: int) -> Spec:
     """Return a reactive vehicle in a neighbouring lane."""
     kind = label(rng, {name: VEHICLES[name] for name in ("car", "truck", "bus", "motorcycle")})
     s_m = number(rng, 4, 30) if sign(rng) > 0 else number(rng, -22, -12)
-    return {"kind": "idm", "id": f"beside-{lane}", "label": kind, "lane": lane, "s_m": s_m, "speed_mps": round(speed_mps, 2)}
+    return {
+        "kind": "idm",
+        "id": f"beside-{lane}",
+        "label": kind,
+        "lane": lane,
+        "s_m": s_m,
+        "speed_mps": round(speed_mps, 2),
+    }
 
 
 def oncoming(rng: Rng, count: int, first_m: float, speed_mps: float, road_m: float) -> list[Spec]:
-    """Return at most ``count`` vehicles that come the other way, far enough apart for every class and not beyond the road."""
+    """Return at most ``count`` vehicles that come the other way, far enough apart for every class
+    and not beyond the road.
+    """
     out, s_m = [], first_m
     for i in range(count):
         if s_m > road_m - 15.0:
             break
         kind = label(rng, VEHICLES)
-        out.append({"kind": "oncoming", "id": f"oncoming-{i}", "label": kind, "s_m": round(s_m, 1), "speed_mps": round(speed_mps, 2)})
+        out.append(
+            {
+                "kind": "oncoming",
+                "id": f"oncoming-{i}",
+                "label": kind,
+                "s_m": round(s_m, 1),
+                "speed_mps": round(speed_mps, 2),
+            }
+        )
         s_m += number(rng, 25, 70)
     return out
 
@@ -107,32 +152,54 @@ def parked(rng: Rng, side: str, name: str = "parked", kinds: Mapping[str, float]
     """Return a row of standing vehicles of one class."""
     kind = label(rng, kinds)
     return {
-        "kind": "parked", "id": f"{name}-{side}", "label": kind, "s_m": number(rng, 10, 45), "side": side, "count": int(rng.integers(1, 7)),
-        "spacing_m": round(SPACING_M[kind] + number(rng, 0, 8), 2), "clearance_m": number(rng, 0.25, 0.6),
-    }  # fmt: skip
+        "kind": "parked",
+        "id": f"{name}-{side}",
+        "label": kind,
+        "s_m": number(rng, 10, 45),
+        "side": side,
+        "count": int(rng.integers(1, 7)),
+        "spacing_m": round(SPACING_M[kind] + number(rng, 0, 8), 2),
+        "clearance_m": number(rng, 0.25, 0.6),
+    }
 
 
 def bystanders(rng: Rng, side: str) -> Spec:
     """Return people who stand on the pavement."""
     return {
-        "kind": "parked", "id": f"people-{side}", "label": "pedestrian", "s_m": number(rng, 8, 60), "side": side,
-        "count": int(rng.integers(1, 6)), "spacing_m": number(rng, 1.0, 9.0), "clearance_m": number(rng, 0.9, 2.6),
+        "kind": "parked",
+        "id": f"people-{side}",
+        "label": "pedestrian",
+        "s_m": number(rng, 8, 60),
+        "side": side,
+        "count": int(rng.integers(1, 6)),
+        "spacing_m": number(rng, 1.0, 9.0),
+        "clearance_m": number(rng, 0.9, 2.6),
         "yaw_deg": number(rng, -180, 180, 0),
-    }  # fmt: skip
+    }
 
 
 def walker_along(rng: Rng, lane_width_m: float, beside_m: float, name: str = "along") -> Spec:
     """Return a person who walks along the right pavement, ``beside_m`` from the lane's edge."""
     return {
-        "kind": "drive", "id": name, "label": "pedestrian", "lane": 0, "s_m": number(rng, 12, 40),
-        "offset_m": -round(lane_width_m / 2 + beside_m, 2), "speeds": [[0, number(rng, 0.8, 1.8)]],
-    }  # fmt: skip
+        "kind": "drive",
+        "id": name,
+        "label": "pedestrian",
+        "lane": 0,
+        "s_m": number(rng, 12, 40),
+        "offset_m": -round(lane_width_m / 2 + beside_m, 2),
+        "speeds": [[0, number(rng, 0.8, 1.8)]],
+    }
 
 
 def crossing(rng: Rng, kind: str = "pedestrian") -> Spec:
     """Return a road user who crosses well before the ego."""
     speed = number(rng, 1.0, 1.8) if kind == "pedestrian" else number(rng, 3, 5)
     return {
-        "kind": "crossing_pedestrian", "id": "crosses", "label": kind, "s_m": number(rng, 40, 75), "side": pick(rng, "left", "right"),
-        "before_ego_s": number(rng, 3, 5.5), "speed_mps": speed,
-    }  # fmt: skip
+        "kind": "crossing_pedestrian",
+        "id": "crosses",
+        "label": kind,
+        "s_m": number(rng, 40, 75),
+        "side": pick(rng, "left", "right"),
+        "before_ego_s": number(rng, 3, 5.5),
+        "speed_mps": speed,
+    }

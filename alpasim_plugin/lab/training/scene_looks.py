@@ -1,4 +1,5 @@
-"""What surrounds a training scene, what its camera is, and how its reconstruction is damaged; the test of unseen looks has its own ranges.
+"""What surrounds a training scene, what its camera is, and how its reconstruction is damaged; the
+test of unseen looks has its own ranges.
 
 | | training, validation, known test | unseen test |
 |---|---|---|
@@ -30,7 +31,8 @@ class DamageRanges:
         share: Of the fit's schedule; its logarithm is uniform.
         views_per_s: Views per second of log; its logarithm is uniform.
         depth_error: Spread of the depth of the first points.
-        pose_error_m: Spread of the views' poses; half of the scenes have none where the range begins at 0.
+        pose_error_m: Spread of the views' poses; half of the scenes have none where the range
+            begins at 0.
         shift_m: Cycle: how far aside the fitted views lie, to either side.
     """
 
@@ -51,10 +53,15 @@ UNSEEN_DAMAGE = (
 
 
 def draw_damage(rng: Rng, ranges: DamageRanges, kind: str | None = None) -> Spec:
-    """Return the section ``degradation`` of a scene, of a kind that is drawn where none is given."""
+    """Return the section ``degradation`` of a scene, of a kind that is drawn where none is
+    given.
+    """
     drawn = "cycle" if rng.random() < CYCLE_SHARE else "reconstruction"
     out: Spec = {"kind": kind or drawn, "share": log_number(rng, *ranges.share)}
-    out |= {"views_per_s": log_number(rng, *ranges.views_per_s, digits=2), "depth_error": number(rng, *ranges.depth_error, digits=3)}
+    out |= {
+        "views_per_s": log_number(rng, *ranges.views_per_s, digits=2),
+        "depth_error": number(rng, *ranges.depth_error, digits=3),
+    }
     posed, pose_error_m = rng.random() < 0.5, number(rng, *ranges.pose_error_m, digits=3)
     out["pose_error_m"] = pose_error_m if posed or ranges.pose_error_m[0] > 0 else 0.0
     shift_m = sign(rng) * number(rng, *ranges.shift_m)
@@ -66,7 +73,10 @@ def draw_camera(rng: Rng) -> Spec:
     sizes: Mapping[tuple[int, int], float] = SIZES
     width, height = list(sizes)[int(rng.choice(len(sizes), p=list(sizes.values())))]
     own = rng.random() < OWN_CAMERA_SHARE
-    fov, z_m, pitch, x_m = number(rng, 55, 100, 1), number(rng, 1.2, 2.2), number(rng, 0, 8, 1), number(rng, 0.8, 2.0)
+    fov = number(rng, 55, 100, 1)
+    z_m = number(rng, 1.2, 2.2)
+    pitch = number(rng, 0, 8, 1)
+    x_m = number(rng, 0.8, 2.0)
     mount = {"hfov_deg": fov, "z_m": z_m, "pitch_down_deg": pitch, "x_m": x_m} if own else {}
     return {"width": width, "height": height} | mount
 
@@ -75,24 +85,36 @@ def known_surroundings(rng: Rng) -> Spec:
     """Return surroundings of training."""
     low = number(rng, 4, 10, 1)
     return {
-        "buildings": number(rng, 0, 1), "building_height_m": [low, min(26.0, low + number(rng, 2, 18, 1))],
-        "trees_per_100m": number(rng, 0, 9, 1), "poles_spacing_m": pick(rng, 0, 20, 25, 30, 40), "sky": pick(rng, "clear", "overcast"),
+        "buildings": number(rng, 0, 1),
+        "building_height_m": [low, min(26.0, low + number(rng, 2, 18, 1))],
+        "trees_per_100m": number(rng, 0, 9, 1),
+        "poles_spacing_m": pick(rng, 0, 20, 25, 30, 40),
+        "sky": pick(rng, "clear", "overcast"),
         "texture": number(rng, 0.35, 1.0),
-    }  # fmt: skip
+    }
 
 
 def unseen_surroundings(rng: Rng) -> Spec:
     """Return surroundings that training never sees, by one key or more."""
     out = known_surroundings(rng)
-    dusk, bare, style, woods = rng.random() < 0.5, rng.random() < 0.5, int(rng.integers(3)), rng.random() < 1 / 3
+    dusk = rng.random() < 0.5
+    bare = rng.random() < 0.5
+    style = int(rng.integers(3))
+    woods = rng.random() < 1 / 3
     if dusk:
         out["sky"] = "dusk"
     if bare:
         out["texture"] = number(rng, 0.0, 0.15)
     if style == 1:
-        out |= {"buildings": number(rng, 0.7, 1.0), "building_height_m": [number(rng, 2.4, 2.8, 1), number(rng, 2.9, 3.6, 1)]}
+        out |= {
+            "buildings": number(rng, 0.7, 1.0),
+            "building_height_m": [number(rng, 2.4, 2.8, 1), number(rng, 2.9, 3.6, 1)],
+        }
     if style == 2:
-        out |= {"buildings": number(rng, 0.8, 1.0), "building_height_m": [number(rng, 32, 38, 1), number(rng, 45, 60, 1)]}
+        out |= {
+            "buildings": number(rng, 0.8, 1.0),
+            "building_height_m": [number(rng, 32, 38, 1), number(rng, 45, 60, 1)],
+        }
     if woods or not (dusk or bare or style):
         out["trees_per_100m"] = number(rng, 13, 18, 1)
     return out

@@ -1,4 +1,6 @@
-"""Write the scenarios of the splits: disjoint by seed; the test of unseen families also by family, look and damage."""
+"""Write the scenarios of the splits: disjoint by seed; the test of unseen families also by family,
+look and damage.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.training.scene_draws import Spec
 from alpasim_plugin.lab.training.scene_families import KNOWN_FAMILIES, Family
 from alpasim_plugin.lab.training.scene_families_unseen import UNSEEN_FAMILIES
-from alpasim_plugin.lab.training.scene_looks import (  # fmt: skip
+from alpasim_plugin.lab.training.scene_looks import (
     KNOWN_DAMAGE,
     UNSEEN_DAMAGE,
     draw_camera,
@@ -28,7 +30,10 @@ from scenarios.load import load_scenario
 
 Split = Literal["train", "val", "test-known", "test-unseen", "beside-known", "beside-unseen"]
 TEST_SPLITS: tuple[Split, ...] = ("test-known", "test-unseen")
-BESIDE_SPLITS: tuple[Split, ...] = ("beside-known", "beside-unseen")  # tests of fixed distances from the recorded path
+BESIDE_SPLITS: tuple[Split, ...] = (
+    "beside-known",
+    "beside-unseen",
+)  # tests of fixed distances from the recorded path
 DRAWS = 8  # samples per scene: one that the expert cannot drive is rejected
 
 
@@ -79,22 +84,33 @@ def draw_spec(split: Split, family: str, scene_id: str, seed: int, duration_s: f
         KeyError: The split has no such family.
     """
     recipe = SPLITS[split]
-    rng, looks, damage = (stream(scene_id, seed, f"training.{part}") for part in (f"scene.{family}", "looks", "damage"))
+    rng, looks, damage = (
+        stream(scene_id, seed, f"training.{part}")
+        for part in (f"scene.{family}", "looks", "damage")
+    )
     spec = recipe.families[family](rng, duration_s + 2.0)
     spec["road"] |= {"heading_deg": round(float(rng.uniform(-180, 180)), 1)}
     spec["environment"] = unseen_surroundings(looks) if recipe.unseen else known_surroundings(looks)
     if recipe.own_cameras:
         spec["cameras"] = [draw_camera(looks)]
     kind = None if recipe.cycles else "reconstruction"
-    ranges = UNSEEN_DAMAGE[int(damage.integers(len(UNSEEN_DAMAGE)))] if recipe.unseen else KNOWN_DAMAGE
+    ranges = (
+        UNSEEN_DAMAGE[int(damage.integers(len(UNSEEN_DAMAGE)))] if recipe.unseen else KNOWN_DAMAGE
+    )
     return {
-        "version": 1, "scene_id": scene_id, "seed": seed, "tags": ["training", split, family],
-        "timing": {"duration_us": round(duration_s * 1e6)}, **spec, "degradation": draw_damage(damage, ranges, kind),
-    }  # fmt: skip
+        "version": 1,
+        "scene_id": scene_id,
+        "seed": seed,
+        "tags": ["training", split, family],
+        "timing": {"duration_us": round(duration_s * 1e6)},
+        **spec,
+        "degradation": draw_damage(damage, ranges, kind),
+    }
 
 
 def write_scenes(folder: Path, split: Split, count: int, duration_s: float) -> Iterator[Path]:
-    """Write ``count`` scenario files of a split, families in rotation, and yield their paths; existing files are kept.
+    """Write ``count`` scenario files of a split, families in rotation, and yield their paths;
+    existing files are kept.
 
     Rejection sampling: a scene must load, which requires a feasible expert path.
 
@@ -107,14 +123,25 @@ def write_scenes(folder: Path, split: Split, count: int, duration_s: float) -> I
         family = families[i % len(families)]
         path = folder / split / f"{family}_{i:03d}.yaml"
         if not path.exists():
-            _write_drivable(path, split, family, f"{split}-{family}-{i:03d}", SPLITS[split].first_seed + i * DRAWS, duration_s)
+            _write_drivable(
+                path,
+                split,
+                family,
+                f"{split}-{family}-{i:03d}",
+                SPLITS[split].first_seed + i * DRAWS,
+                duration_s,
+            )
         yield path
 
 
-def _write_drivable(path: Path, split: Split, family: str, scene_id: str, first_seed: int, duration_s: float) -> None:
+def _write_drivable(
+    path: Path, split: Split, family: str, scene_id: str, first_seed: int, duration_s: float
+) -> None:
     last: SimrunError | None = None
     for draw in range(DRAWS):
-        text = yaml.safe_dump(draw_spec(split, family, scene_id, first_seed + draw, duration_s), sort_keys=False)
+        text = yaml.safe_dump(
+            draw_spec(split, family, scene_id, first_seed + draw, duration_s), sort_keys=False
+        )
         with tempfile.TemporaryDirectory() as scratch:
             candidate = Path(scratch) / path.name
             candidate.write_text(text, encoding="utf-8")
@@ -126,7 +153,8 @@ def _write_drivable(path: Path, split: Split, family: str, scene_id: str, first_
         write_text(path, text)
         return
     raise InputError(
-        "sampling a training scene", f"{scene_id}, seeds {first_seed} to {first_seed + DRAWS - 1}",
+        "sampling a training scene",
+        f"{scene_id}, seeds {first_seed} to {first_seed + DRAWS - 1}",
         f"no sample can be driven; the last: {last}",
         f"change the family {family!r} in training/scene_families.py",
-    )  # fmt: skip
+    )

@@ -9,12 +9,29 @@ import numpy as np
 from alpasim_plugin.core.types import F32, U8
 from alpasim_plugin.fixers.semantic_map.style import BOX_COLOURS, COLOURS
 
-CLASSES = ("boundary", "white line", "yellow line", "crosswalk", "stop line", "vehicle", "other road user")
+CLASSES = (
+    "boundary",
+    "white line",
+    "yellow line",
+    "crosswalk",
+    "stop line",
+    "vehicle",
+    "other road user",
+)
 _LINES = {
-    "road_boundary": "boundary", "line_white": "white line", "line_untyped": "white line", "line_yellow": "yellow line",
-    "crosswalk": "crosswalk", "stop_line": "stop line",
-}  # fmt: skip
-_BOXES = {"car": "vehicle", "truck": "vehicle", "pedestrian": "other road user", "cyclist": "other road user"}
+    "road_boundary": "boundary",
+    "line_white": "white line",
+    "line_untyped": "white line",
+    "line_yellow": "yellow line",
+    "crosswalk": "crosswalk",
+    "stop_line": "stop line",
+}
+_BOXES = {
+    "car": "vehicle",
+    "truck": "vehicle",
+    "pedestrian": "other road user",
+    "cyclist": "other road user",
+}
 DARKEST = 24  # colours fade to black with distance; the hue of darker ones is unreliable
 
 

@@ -1,4 +1,5 @@
-"""Snapshots of a training: its averaged weights at equal intervals, and the processor time that each took.
+"""Snapshots of a training: its averaged weights at equal intervals, and the processor time that
+each took.
 
     FOLDER/snapshots/UPDATE.safetensors   a bundle each
     FOLDER/log.jsonl                      ``core_s``, the processor time of every update
@@ -29,7 +30,8 @@ class Snapshot(NamedTuple):
 
 
 def snapshot_steps(updates: int, count: int) -> frozenset[int]:
-    """Return the updates after which snapshots are kept: ``count`` of them at equal intervals, the last one included.
+    """Return the updates after which snapshots are kept: ``count`` of them at equal intervals, the
+    last one included.
 
     Example:
         >>> sorted(snapshot_steps(20, 4)), sorted(snapshot_steps(3, 8)), sorted(snapshot_steps(20, 0))
@@ -44,7 +46,8 @@ def snapshot_file(folder: Path, step: int) -> Path:
 
 
 def core_seconds(folder: Path) -> list[float]:
-    """Return the processor time that a training had taken after each of its updates; evaluation and set-up are not part of it.
+    """Return the processor time that a training had taken after each of its updates; evaluation and
+    set-up are not part of it.
 
     Raises:
         InputError: No log, or one without times of the processor.
@@ -52,10 +55,18 @@ def core_seconds(folder: Path) -> list[float]:
     path = folder / LOG_FILE
     rows = read_json_lines(path, DOING)
     if [row.get("step") for row in rows] != list(range(1, len(rows) + 1)):
-        raise InputError(DOING, str(path), "rows that are not one for each update in order", "train in another folder")
+        raise InputError(
+            DOING,
+            str(path),
+            "rows that are not one for each update in order",
+            "train in another folder",
+        )
     if not rows or any(CORE_S not in row for row in rows):
         raise InputError(
-            DOING, str(path), f"updates without {CORE_S!r}", "train again: the log of an earlier version has no processor time"
+            DOING,
+            str(path),
+            f"updates without {CORE_S!r}",
+            "train again: the log of an earlier version has no processor time",
         )
     return list(accumulate(float(row[CORE_S]) for row in rows))
 
@@ -69,6 +80,10 @@ def snapshots_of(folder: Path) -> list[Snapshot]:
     paths = sorted((folder / SNAPSHOTS).glob("*.safetensors"))
     times = core_seconds(folder)
     if not paths or int(paths[-1].stem) > len(times):
-        found = "no snapshots" if not paths else f"a snapshot of update {int(paths[-1].stem)} and a log of {len(times)}"
+        found = (
+            "no snapshots"
+            if not paths
+            else f"a snapshot of update {int(paths[-1].stem)} and a log of {len(times)}"
+        )
         raise InputError(DOING, str(folder / SNAPSHOTS), found, "train with --snapshots 8")
     return [Snapshot(int(path.stem), times[int(path.stem) - 1], path) for path in paths]

@@ -1,8 +1,11 @@
-"""Streams of consecutive training frames for a recurrent fixer, as a pure function of the update's number.
+"""Streams of consecutive training frames for a recurrent fixer, as a pure function of the update's
+number.
 
-A batch has slots. A slot's timeline is cut into episodes of equal length, staggered over the slots; everything of an episode is drawn from
-the stream keyed by (seed, slot, episode). So any update can be made alone, in any order, and a run that resumes needs nothing but its
-number. Within an episode frames follow one another, also from one update to the next; a sequence that ends is played back from there.
+A batch has slots. A slot's timeline is cut into episodes of equal length, staggered over the slots;
+everything of an episode is drawn from the stream keyed by (seed, slot, episode). So any update can
+be made alone, in any order, and a run that resumes needs nothing but its number. Within an episode
+frames follow one another, also from one update to the next; a sequence that ends is played back
+from there.
 """
 
 from __future__ import annotations
@@ -37,18 +40,37 @@ from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence, pa
 DOING = "making training streams"
 KINDS = ("pairs", "identity", "video", "damaged_video")
 SIDE = 16  # crops are multiples of it
-# Probability of each augmentation of an episode: played backward, every second frame, mirrored, photometric, class colours of the map.
-P_REVERSE, P_STRIDE_2, P_FLIP, P_PHOTOMETRIC, P_CLASS_COLOURS = 0.25, 0.2, 0.5, 0.7, 0.25
+# Probability of each augmentation of an episode: played backward, every second frame, mirrored,
+# photometric, class colours of the map.
+P_REVERSE = 0.25
+P_STRIDE_2 = 0.2
+P_FLIP = 0.5
+P_PHOTOMETRIC = 0.7
+P_CLASS_COLOURS = 0.25
 GAIN, CHANNEL_GAIN, GAMMA = (0.6, 1.15), (0.9, 1.1), (0.85, 1.2)  # of a photometric augmentation
-P_BETTER, BETTER = 0.15, (0.2, 0.95)  # a render is moved this far to the truth: the better a fit, the more every change harms
-P_DRIVE = 0.3  # an episode of pairs shows a recorded street, where there are any: few drives say more of real fits than their number
+P_BETTER, BETTER = (
+    0.15,
+    (0.2, 0.95),
+)  # a render is moved this far to the truth: the better a fit, the more every change harms
+# an episode of pairs shows a recorded street, where there are any: few drives say more of real fits
+# than their number
+P_DRIVE = 0.3
 P_GREY = 0.06  # recordings without colour
-# A long fit of photographs is sharp, and wrong by place: surfaces lie beside where they are, and edges double where views disagree. Such a
-# render is the truth, moved by a smooth field; where it doubles, the mean of two.
-P_MOVED, MOVED_PX, P_DOUBLED = 0.2, (0.3, 2.5), 0.5
-P_LOST_RESOLUTION = 0.5  # of an episode of damaged video: `training.lost_resolution` in the place of `training.video_damage`
-# Undamaged frames get detail that the corpus has little of, in both places: a camera's sharpening and its noise. Both are to be kept.
-P_DETAIL, SHARPNESS, GRAIN = 0.5, (0.0, 1.5), (0.0, 0.05)  # of the difference from a blur of 1 pixel; standard deviation, levels of [-1, 1]
+# A long fit of photographs is sharp, and wrong by place: surfaces lie beside where they are, and
+# edges double where views disagree. Such a render is the truth, moved by a smooth field; where it
+# doubles, the mean of two.
+P_MOVED = 0.2
+MOVED_PX = (0.3, 2.5)
+P_DOUBLED = 0.5
+# of an episode of damaged video: `training.lost_resolution` in the place of `training.video_damage`
+P_LOST_RESOLUTION = 0.5
+# Undamaged frames get detail that the corpus has little of, in both places: a camera's sharpening
+# and its noise. Both are to be kept.
+P_DETAIL, SHARPNESS, GRAIN = (
+    0.5,
+    (0.0, 1.5),
+    (0.0, 0.05),
+)  # of the difference from a blur of 1 pixel; standard deviation, levels of [-1, 1]
 
 
 @dataclass(frozen=True)
@@ -59,7 +81,8 @@ class StreamShares:
         pairs: Degraded and clean renders.
         identity: The clean render in both places, opaque: a perfect render stays as it is.
         video: Recorded video in both places, opaque, without a map.
-        damaged_video: Recorded video with synthetic damage (`training.video_damage`, `training.lost_resolution`), without a map.
+        damaged_video: Recorded video with synthetic damage (`training.video_damage`,
+            `training.lost_resolution`), without a map.
 
     Raises:
         InputError: A negative share, or shares that do not add up to one.
@@ -73,22 +96,29 @@ class StreamShares:
     def __post_init__(self) -> None:
         values = [getattr(self, f.name) for f in fields(self)]
         if min(values) < 0 or abs(sum(values) - 1) > 1e-9:
-            raise InputError(DOING, f"shares {values}", f"they add up to {sum(values):g}", "give shares of at least 0 that add up to 1")
+            raise InputError(
+                DOING,
+                f"shares {values}",
+                f"they add up to {sum(values):g}",
+                "give shares of at least 0 that add up to 1",
+            )
 
 
 @dataclass(frozen=True)
 class StreamBatch:
-    """The frames of one update: B slots, T frames in order of time, crops of ``h x w`` pixels; float32.
+    """The frames of one update: B slots, T frames in order of time, crops of ``h x w`` pixels;
+    float32.
 
     Attributes:
         render: ``(B, T, 3, h, w)`` in [-1, 1], degraded.
         opacity: ``(B, T, 1, h, w)`` in [0, 1], of the render; 1 where there is none to know.
-        map: ``(B, T, 3, h, w)`` in [-1, 1], semantic map; -1 where it is black, or where there is none.
+        map: ``(B, T, 3, h, w)`` in [-1, 1], semantic map; -1 where it is black, or where there is
+            none.
         target: ``(B, T, 3, h, w)`` in [-1, 1], clean.
         fresh: ``(B,)`` bool; false where the first frame follows the last one of the update before.
         kind: ``(B,)`` int64, index into `KINDS`.
-        references: ``(B, T, K, h, w, 4)`` recorded frames in the view, colour in [-1, 1] and where they hold, 0 to 1; all 0 where there is
-            none.
+        references: ``(B, T, K, h, w, 4)`` recorded frames in the view, colour in [-1, 1] and where
+            they hold, 0 to 1; all 0 where there is none.
         road_users: ``(B, T, 1, h, w)`` bool; what shows a road user's box.
     """
 
@@ -162,28 +192,59 @@ class TrainingStreams:
         episode: Updates of an episode.
         shares: Chance of each kind.
         split: Of the pairs and the videos.
-        count: Only the first sequences of pairs, in order of their numbers; None for all that are finished now.
+        count: Only the first sequences of pairs, in order of their numbers; None for all that are
+            finished now.
 
     Raises:
-        InputError: No finished sequence, a frame smaller than the crop, or a number that makes no batch.
+        InputError: No finished sequence, a frame smaller than the crop, or a number that makes no
+            batch.
     """
 
     def __init__(
-        self, pairs: Path | str, video: Path | str | None = None, *, seed: int = 0, batch: int = 6, frames: int = 4,
-        crop: tuple[int, int] = (96, 128), episode: int = 12, shares: StreamShares | None = None, split: str = "train",
+        self,
+        pairs: Path | str,
+        video: Path | str | None = None,
+        *,
+        seed: int = 0,
+        batch: int = 6,
+        frames: int = 4,
+        crop: tuple[int, int] = (96, 128),
+        episode: int = 12,
+        shares: StreamShares | None = None,
+        split: str = "train",
         count: int | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.shares = shares or StreamShares()
-        self.seed, self.batch, self.frames, self.crop, self.episode = seed, batch, frames, crop, episode
+        self.seed, self.batch, self.frames, self.crop, self.episode = (
+            seed,
+            batch,
+            frames,
+            crop,
+            episode,
+        )
         if min(batch, frames, episode, *crop) < 1 or crop[0] % SIDE or crop[1] % SIDE:
             asked = f"batch {batch}, frames {frames}, episode {episode}, crop {crop}"
-            raise InputError(DOING, asked, "no batch", f"give at least one of each, and a crop in multiples of {SIDE}")
+            raise InputError(
+                DOING,
+                asked,
+                "no batch",
+                f"give at least one of each, and a crop in multiples of {SIDE}",
+            )
         self.pairs = _in_order(PairDataset(pairs, split).sequences)[:count]
-        self.drives = tuple(sequence for sequence in self.pairs if sequence.info.get("family") == DRIVE)
+        self.drives = tuple(
+            sequence for sequence in self.pairs if sequence.info.get("family") == DRIVE
+        )
         needs_video = self.shares.video + self.shares.damaged_video > 0
         if needs_video and video is None:
-            raise InputError(DOING, f"{self.shares}", "no folder of videos", "make one with 'simrun train video', or give them no share")
-        self.videos = PairDataset(video, split).sequences if needs_video and video is not None else ()
+            raise InputError(
+                DOING,
+                f"{self.shares}",
+                "no folder of videos",
+                "make one with 'simrun train video', or give them no share",
+            )
+        self.videos = (
+            PairDataset(video, split).sequences if needs_video and video is not None else ()
+        )
         for sequence in (*self.pairs, *self.videos):
             size = sequence.clip.rgb_gt.shape[1:3]
             if size[0] < crop[0] or size[1] < crop[1]:
@@ -194,22 +255,42 @@ class TrainingStreams:
         """Return the batch of update ``i``, counted from 0, or ``some`` of its slots."""
         slots = [self.episode_of(slot, i) for slot in range(self.batch)[some]]
         shown = [self._show(episode, at) for episode, at in slots]
-        render, opacity, sdmap, target, references, users = (torch.from_numpy(np.stack(arrays)) for arrays in zip(*shown, strict=True))
+        render, opacity, sdmap, target, references, users = (
+            torch.from_numpy(np.stack(arrays)) for arrays in zip(*shown, strict=True)
+        )
         fresh = torch.tensor([at == 0 or i == 0 for _, at in slots])
-        return StreamBatch(render, opacity, sdmap, target, fresh, torch.tensor([episode.kind for episode, _ in slots]), references, users)
+        return StreamBatch(
+            render,
+            opacity,
+            sdmap,
+            target,
+            fresh,
+            torch.tensor([episode.kind for episode, _ in slots]),
+            references,
+            users,
+        )
 
     def episode_of(self, slot: int, i: int) -> tuple[Episode, int]:
-        """Return what a slot shows at update ``i``, and how many updates of the episode came before."""
+        """Return what a slot shows at update ``i``, and how many updates of the episode came
+        before.
+        """
         number, at = divmod(i + slot * self.episode // self.batch, self.episode)
         return self._draw(slot, number), at
 
     def facts(self) -> dict[str, Any]:
         """Return what the batches depend on, for a run's card and the refusal of other data."""
         return {
-            "pairs": len(self.pairs), "pairs_digest": pairs_digest(self.pairs), "videos": len(self.videos),
-            "videos_digest": pairs_digest(self.videos), "shares": asdict(self.shares), "seed": self.seed, "batch": self.batch,
-            "frames": self.frames, "crop": list(self.crop), "episode": self.episode,
-        }  # fmt: skip
+            "pairs": len(self.pairs),
+            "pairs_digest": pairs_digest(self.pairs),
+            "videos": len(self.videos),
+            "videos_digest": pairs_digest(self.videos),
+            "shares": asdict(self.shares),
+            "seed": self.seed,
+            "batch": self.batch,
+            "frames": self.frames,
+            "crop": list(self.crop),
+            "episode": self.episode,
+        }
 
     def _draw(self, slot: int, number: int) -> Episode:
         rng = stream("training", self.seed, f"streams.{slot}", number)
@@ -219,34 +300,73 @@ class TrainingStreams:
             sequences = self.drives
         sequence = sequences[int(rng.integers(len(sequences)))]
         length, height, width = sequence.clip.rgb_gt.shape[:3]
-        start, top, left = (int(rng.integers(n)) for n in (length, height - self.crop[0] + 1, width - self.crop[1] + 1))
+        start, top, left = (
+            int(rng.integers(n))
+            for n in (length, height - self.crop[0] + 1, width - self.crop[1] + 1)
+        )
         chances = (P_REVERSE, P_STRIDE_2, P_FLIP, P_PHOTOMETRIC, P_CLASS_COLOURS)
         reverse, stride_2, flip, photometric, class_colours = (rng.random(5) < chances).tolist()
-        gain, channels, gamma = rng.uniform(*GAIN), rng.uniform(*CHANNEL_GAIN, 3), rng.uniform(*GAMMA)
+        gain = rng.uniform(*GAIN)
+        channels = rng.uniform(*CHANNEL_GAIN, 3)
+        gamma = rng.uniform(*GAMMA)
         other = OTHERS[int(rng.integers(len(OTHERS)))]
         grey = np.arange(256)[:, None] / 255
-        shown = np.clip(gain * channels * grey**gamma, 0, 1) if photometric else np.repeat(grey, 3, axis=1)
+        shown = (
+            np.clip(gain * channels * grey**gamma, 0, 1)
+            if photometric
+            else np.repeat(grey, 3, axis=1)
+        )
         levels: F32 = (shown * 2 - 1).astype(np.float32)
         step = (-1 if reverse else 1) * (2 if stride_2 else 1)
         detailed = rng.random() < P_DETAIL
-        sharpness, grain = (float(rng.uniform(*span)) if detailed else 0.0 for span in (SHARPNESS, GRAIN))
+        sharpness, grain = (
+            float(rng.uniform(*span)) if detailed else 0.0 for span in (SHARPNESS, GRAIN)
+        )
         key = f"streams.{slot}.{number}"
         loses = KINDS[kind] == "damaged_video" and rng.random() < P_LOST_RESOLUTION
         lost = draw_lost_resolution(rng, *self.crop) if loses else None
-        references, better = draw_references(rng), float(rng.uniform(*BETTER)) * (rng.random() < P_BETTER)
-        moved_px, doubled = float(rng.uniform(*MOVED_PX)) * (rng.random() < P_MOVED), bool(rng.random() < P_DOUBLED)
+        references, better = (
+            draw_references(rng),
+            float(rng.uniform(*BETTER)) * (rng.random() < P_BETTER),
+        )
+        moved_px, doubled = (
+            float(rng.uniform(*MOVED_PX)) * (rng.random() < P_MOVED),
+            bool(rng.random() < P_DOUBLED),
+        )
         without_colour = rng.random() < P_GREY
         car_class = other if class_colours else None
         map_error, elsewhere = draw_map_error(rng), self.pairs[int(rng.integers(len(self.pairs)))]
         return Episode(
-            kind, sequence, start, step, top, left, flip, levels, car_class, sharpness, grain, key, lost, references, better,
-            moved_px, doubled, without_colour, map_error, elsewhere,
-        )  # fmt: skip
+            kind,
+            sequence,
+            start,
+            step,
+            top,
+            left,
+            flip,
+            levels,
+            car_class,
+            sharpness,
+            grain,
+            key,
+            lost,
+            references,
+            better,
+            moved_px,
+            doubled,
+            without_colour,
+            map_error,
+            elsewhere,
+        )
 
     def _show(self, episode: Episode, at: int) -> tuple[F32, F32, F32, F32, F32, Bool]:
-        """Return render ``(T, 3, h, w)``, opacity ``(T, 1, h, w)``, map, target, references and road users of an episode's update."""
+        """Return render ``(T, 3, h, w)``, opacity ``(T, 1, h, w)``, map, target, references and
+        road users of an episode's update.
+        """
         clip, kind = episode.sequence.clip, KINDS[episode.kind]
-        index = there_and_back(episode.start + episode.step * (at * self.frames + np.arange(self.frames)), len(clip))
+        index = there_and_back(
+            episode.start + episode.step * (at * self.frames + np.arange(self.frames)), len(clip)
+        )
         columns = slice(episode.left, episode.left + self.crop[1])
         rows = slice(episode.top, episode.top + self.crop[0])
 
@@ -257,32 +377,59 @@ class TrainingStreams:
         target = _lit(cut(clip.rgb_gt), episode.levels)
         damaged = kind in ("pairs", "damaged_video")
         if not damaged:
-            target = _detailed(target, episode.sharpness, episode.grain, stream("training", self.seed, f"{episode.key}.grain", at))
-        render = _lit(cut(clip.rgb_input), episode.levels) if damaged and not episode.lost else target
+            target = _detailed(
+                target,
+                episode.sharpness,
+                episode.grain,
+                stream("training", self.seed, f"{episode.key}.grain", at),
+            )
+        render = (
+            _lit(cut(clip.rgb_input), episode.levels) if damaged and not episode.lost else target
+        )
         opacity: F32 = np.ones((len(index), 1, *self.crop), np.float32)
         if episode.lost:
             render, opacity = episode.lost.apply(target), opacity * episode.lost.opacity
         elif damaged:
             opacity = cut(clip.opacity)[:, None].astype(np.float32) / np.float32(255)
         if episode.moved_px and kind == "pairs":
-            render, opacity = _moved(target, episode, stream("training", self.seed, f"{episode.key}.moved")), np.ones_like(opacity)
+            render, opacity = (
+                _moved(target, episode, stream("training", self.seed, f"{episode.key}.moved")),
+                np.ones_like(opacity),
+            )
         elif episode.sequence not in self.drives:  # a real fit is never exact where it looks so
             render = render + np.float32(episode.better) * (target - render)
         drawn = episode.references, index, rows, columns
-        recorded = pair_references(episode.sequence, *drawn) if kind in ("pairs", "identity") else video_references(clip, *drawn)
+        recorded = (
+            pair_references(episode.sequence, *drawn)
+            if kind in ("pairs", "identity")
+            else video_references(clip, *drawn)
+        )
         references = _lit_references(recorded, episode)
         if episode.grey:
-            render, target, references[..., :3] = _grey(render, 1), _grey(target, 1), _grey(references[..., :3], -1)
+            render, target, references[..., :3] = (
+                _grey(render, 1),
+                _grey(target, 1),
+                _grey(references[..., :3], -1),
+            )
         other = episode.other.clip.sdmap if episode.map_error.kind == "other" else clip.sdmap
         sdmap = other if other.shape == clip.sdmap.shape else clip.sdmap
         users = road_users(episode.sequence, index, rows, columns)[:, None]
         if episode.flip:
             users = users[..., ::-1].copy()
-        return render, opacity, self._map(with_error(cut(sdmap), episode.map_error), episode), target, references, users
+        return (
+            render,
+            opacity,
+            self._map(with_error(cut(sdmap), episode.map_error), episode),
+            target,
+            references,
+            users,
+        )
 
     def _map(self, sdmap: U8, episode: Episode) -> F32:
         shown = swap_class_colours(sdmap, episode.car_class) if episode.car_class else sdmap
-        return np.ascontiguousarray(shown.transpose(0, 3, 1, 2).astype(np.float32) / np.float32(127.5) - 1)
+        return np.ascontiguousarray(
+            shown.transpose(0, 3, 1, 2).astype(np.float32) / np.float32(127.5) - 1
+        )
 
 
 def there_and_back(index: I64, length: int) -> I64:
@@ -303,7 +450,9 @@ def _lit(frames: U8, levels: F32) -> F32:
 
 
 def _lit_references(references: U8, episode: Episode) -> F32:
-    """Map references ``(T, K, h, w, 4)`` to [-1, 1], with the episode's levels and each one's own gain; the last channel to 0..1."""
+    """Map references ``(T, K, h, w, 4)`` to [-1, 1], with the episode's levels and each one's own
+    gain; the last channel to 0..1.
+    """
     flipped = references[:, :, :, ::-1] if episode.flip else references
     out = np.empty(flipped.shape, np.float32)
     for c in range(3):
@@ -318,9 +467,21 @@ def _moved(frames: F32, episode: Episode, rng: np.random.Generator) -> F32:
     """Move what frames ``(T, 3, h, w)`` show by smooth fields, one or the mean of two."""
     height, width = frames.shape[2:]
     place = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
-    fields = [place + smooth_field(rng, (height, width), episode.moved_px) for _ in range(1 + episode.doubled)]
+    fields = [
+        place + smooth_field(rng, (height, width), episode.moved_px)
+        for _ in range(1 + episode.doubled)
+    ]
     moved = [
-        [cv2.remap(frame.transpose(1, 2, 0), at, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101) for frame in frames]
+        [
+            cv2.remap(
+                frame.transpose(1, 2, 0),
+                at,
+                None,
+                cv2.INTER_CUBIC,
+                borderMode=cv2.BORDER_REFLECT_101,
+            )
+            for frame in frames
+        ]
         for at in fields
     ]
     return np.clip(np.mean(moved, axis=0, dtype=np.float32), -1, 1).transpose(0, 3, 1, 2)
@@ -335,12 +496,16 @@ def _detailed(frames: F32, sharpness: float, grain: float, rng: np.random.Genera
     """Sharpen frames ``(T, 3, h, w)`` in [-1, 1] and add independent noise to every value."""
     if not sharpness and not grain:
         return frames
-    blurred = np.stack([[cv2.GaussianBlur(channel, (0, 0), 1.0) for channel in frame] for frame in frames])
+    blurred = np.stack(
+        [[cv2.GaussianBlur(channel, (0, 0), 1.0) for channel in frame] for frame in frames]
+    )
     noise = np.float32(grain) * rng.standard_normal(frames.shape, np.float32)
     detailed: F32 = np.clip(frames + np.float32(sharpness) * (frames - blurred) + noise, -1, 1)
     return detailed
 
 
 def _in_order(sequences: Sequence[PairSequence]) -> tuple[PairSequence, ...]:
-    """Return sequences by their number, the order in which they are made: the first few have every family."""
+    """Return sequences by their number, the order in which they are made: the first few have every
+    family.
+    """
     return tuple(sorted(sequences, key=lambda s: (s.name.rsplit("_", 1)[-1], s.name)))

@@ -1,4 +1,5 @@
-"""Latents of styled targets: clean frames in another appearance by the formulas, encoded when they are first drawn.
+"""Latents of styled targets: clean frames in another appearance by the formulas, encoded when they
+are first drawn.
 
     FOLDER/appearance-VERSION/SEQUENCE-CONTENT-START-SCENE.npy   (styles, 2, 16, N, H/8, W/8) float16: as it is and mirrored
 
@@ -42,7 +43,10 @@ class StyledLatents:
         if scenes is None or not scenes.is_dir():
             found = "no folder of scenes" if scenes is None else f"{scenes} is no folder"
             raise InputError(
-                "setting up styled targets", "--scenes", found, "name the scenes of the pairs: fog, lamps and snow need their depth"
+                "setting up styled targets",
+                "--scenes",
+                found,
+                "name the scenes of the pairs: fog, lamps and snow need their depth",
             )
         self.form, self.vae, self.scenes = clips.form, vae, scenes
         self._folder = clips.folder / f"appearance-{VERSION}"
@@ -57,7 +61,12 @@ class StyledLatents:
         if style == STYLES[0]:
             return clip.z_0
         if style not in FORMULAS:
-            raise InputError("encoding a styled target", f"style {style!r}", "no such style", f"choose one of {', '.join(STYLES)}")
+            raise InputError(
+                "encoding a styled target",
+                f"style {style!r}",
+                "no such style",
+                f"choose one of {', '.join(STYLES)}",
+            )
         stored = self._of(clip)[FORMULAS.index(style), int(clip.mirrored)]
         return torch.from_numpy(np.asarray(stored, dtype=np.float32))
 
@@ -74,7 +83,12 @@ class StyledLatents:
         sequence, frames = clip.sequence, self.form.frames
         seen = seen_frames(sequence, scene_of(sequence, self.scenes), clip.start, frames)
         video: U8 = sequence.clip.cut(clip.start, frames).rgb_gt
-        made = [restyle_video(video, seen, style, str(sequence.info.get("scene_id", sequence.name))) for style in FORMULAS]
-        both = torch.stack([torch.stack([to_tensor(v, mirrored) for mirrored in (False, True)]) for v in made])
+        made = [
+            restyle_video(video, seen, style, str(sequence.info.get("scene_id", sequence.name)))
+            for style in FORMULAS
+        ]
+        both = torch.stack(
+            [torch.stack([to_tensor(v, mirrored) for mirrored in (False, True)]) for v in made]
+        )
         z = self.vae.encode(both.flatten(0, 1))
         return np.asarray(z.view(*both.shape[:2], *z.shape[1:]).half().numpy())

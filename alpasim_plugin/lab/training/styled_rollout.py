@@ -1,8 +1,10 @@
-"""The paper's appearance experiment: one generator that renders a clear input in the style that its prompt asks for.
+"""The paper's appearance experiment: one generator that renders a clear input in the style that its
+prompt asks for.
 
-Input as for every other recipe: the clear render, its opacity, the map. The target of a clip is its clean latents in a style drawn for it
-(`styled_latents`), and the prompt is the style's learned embedding: one token in the text slot. The clear style's starts at zero,
-which is the prompt of all other recipes, so that the clear style starts as they do; the others start apart, at unit variance.
+Input as for every other recipe: the clear render, its opacity, the map. The target of a clip is its
+clean latents in a style drawn for it (`styled_latents`), and the prompt is the style's learned
+embedding: one token in the text slot. The clear style's starts at zero, which is the prompt of all
+other recipes, so that the clear style starts as they do; the others start apart, at unit variance.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ from alpasim_plugin.lab.training.trainer import Loss
 
 @dataclass(frozen=True)
 class StyledRollout:
-    """Objectives on the shared rollout towards targets in several styles, drawn with equal probability.
+    """Objectives on the shared rollout towards targets in several styles, drawn with equal
+    probability.
 
     Args:
         objectives: OneFixer's by default.
@@ -62,7 +65,8 @@ class StyledRollout:
 
 
 class StylePrompts(nn.Module):
-    """A learned embedding for every style: parameters by its name, each ``(tokens, text_width)``, as a bundle holds them.
+    """A learned embedding for every style: parameters by its name, each ``(tokens, text_width)``,
+    as a bundle holds them.
 
     Args:
         text_width: Of the transformer.
@@ -73,8 +77,15 @@ class StylePrompts(nn.Module):
     def __init__(self, text_width: int, seed: int, tokens: int = 1) -> None:
         super().__init__()
         for style in STYLES:
-            drawn = stream("training", seed, f"prompt.{style}").standard_normal((tokens, text_width), dtype=np.float32)
-            self.register_parameter(style, nn.Parameter(torch.zeros(tokens, text_width) if style == CLEAR else torch.from_numpy(drawn)))
+            drawn = stream("training", seed, f"prompt.{style}").standard_normal(
+                (tokens, text_width), dtype=np.float32
+            )
+            self.register_parameter(
+                style,
+                nn.Parameter(
+                    torch.zeros(tokens, text_width) if style == CLEAR else torch.from_numpy(drawn)
+                ),
+            )
 
     def forward(self, styles: tuple[str, ...]) -> Tensor:
         """Return the prompts ``(B, tokens, text_width)`` of B clips."""
@@ -82,7 +93,9 @@ class StylePrompts(nn.Module):
 
 
 class StyledBatch(NamedTuple):
-    """A batch whose ``z_0`` are styled targets, their styles, and the clear clips' render for the perceptual term's decoder."""
+    """A batch whose ``z_0`` are styled targets, their styles, and the clear clips' render for the
+    perceptual term's decoder.
+    """
 
     sample: Sample
     styles: tuple[str, ...]
@@ -94,8 +107,8 @@ class StyledBatch(NamedTuple):
 class StyledDistance:
     """The perceptual term of a batch in several styles: the mean over clips.
 
-    Clear clips are decoded with the render, as at deployment. In another style the render's detail is of other weather, so the decoder does
-    not see it (`OneFixerSettings.shows_render`).
+    Clear clips are decoded with the render, as at deployment. In another style the render's detail
+    is of other weather, so the decoder does not see it (`OneFixerSettings.shows_render`).
     """
 
     decoder: TinyVAE
@@ -103,7 +116,9 @@ class StyledDistance:
     batch: StyledBatch
 
     def __call__(self, predicted: Tensor, w: int) -> Tensor:
-        """Return the mean distance of position ``w``'s frames; ``predicted`` includes position w."""
+        """Return the mean distance of position ``w``'s frames; ``predicted`` includes position
+        w.
+        """
         b, parts = self.batch, []
         for shows_render in (True, False):
             rows = [i for i, style in enumerate(b.styles) if (style == CLEAR) == shows_render]
@@ -133,15 +148,25 @@ class StyledRolloutTask:
     @property
     def facts(self) -> dict[str, Any]:
         """Identify the configuration."""
-        return {"objective": "styled rollout", **asdict(self.config), "styles": STYLES, "formulas": VERSION}
+        return {
+            "objective": "styled rollout",
+            **asdict(self.config),
+            "styles": STYLES,
+            "formulas": VERSION,
+        }
 
     def batch(self, index: int) -> StyledBatch:
-        """Make batch ``index``: the clips, crops and noise of every other recipe, and a style for each clip."""
+        """Make batch ``index``: the clips, crops and noise of every other recipe, and a style for
+        each clip.
+        """
         drawn = self.batches[index]
         rng = stream("training", self.inputs.form.seed, "generator.styles", index)
         styles = tuple(STYLES[int(i)] for i in rng.integers(len(STYLES), size=len(drawn.clips)))
         latents = slice(0, drawn.sample.z_0.shape[2])
-        z_0 = [self.targets.target(clip, style)[:, latents, :, drawn.columns] for clip, style in zip(drawn.clips, styles, strict=True)]
+        z_0 = [
+            self.targets.target(clip, style)[:, latents, :, drawn.columns]
+            for clip, style in zip(drawn.clips, styles, strict=True)
+        ]
         render, opacity = drawn.frames(1 + GROUP * drawn.sample.w)
         return StyledBatch(replace(drawn.sample, z_0=torch.stack(z_0)), styles, render, opacity)
 
@@ -153,7 +178,13 @@ class StyledRolloutTask:
             perceptual = StyledDistance(self.vae, self.inputs.distance[1], batch)
         attention = self.inputs.attention
         made = losses(
-            self.net, batch.sample, self.prompts(batch.styles), self.config.objectives, perceptual,
-            block_latents=attention.block_latents, window=attention.window, channel_weights=self.channel_weights,
-        )  # fmt: skip
+            self.net,
+            batch.sample,
+            self.prompts(batch.styles),
+            self.config.objectives,
+            perceptual,
+            block_latents=attention.block_latents,
+            window=attention.window,
+            channel_weights=self.channel_weights,
+        )
         return made.total, logged(made, batch.sample)

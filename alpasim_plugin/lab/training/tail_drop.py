@@ -1,7 +1,10 @@
-"""ArtiFixer's augmentation: the render is hidden from a random frame on, so that the network learns to go on without it.
+"""ArtiFixer's augmentation: the render is hidden from a random frame on, so that the network learns
+to go on without it.
 
-Source: ArtiFixer's trainer. A hidden frame is black with opacity 0. Latents are hidden as a whole, as the max-pooled mask of Eq. 1 hides
-them: the latent that covers the last shown frame is shown, and holds the render of all its frames (the original blackens the rest of them
+Source: ArtiFixer's trainer. A hidden frame is black with opacity 0. Latents are hidden as a whole,
+    as the max-pooled mask of Eq. 1 hides
+them: the latent that covers the last shown frame is shown, and holds the render of all its frames
+    (the original blackens the rest of them
 before the encoder).
 """
 
@@ -20,7 +23,9 @@ from alpasim_plugin.lab.training.shared_rollout import Sample
 
 @dataclass(frozen=True)
 class TailDrop:
-    """Hide the whole render with probability ``whole``, otherwise its last U{0 .. T - 1} of T frames: about 45 % stay in sight."""
+    """Hide the whole render with probability ``whole``, otherwise its last U{0 .. T - 1} of T
+    frames: about 45 % stay in sight.
+    """
 
     whole: float = 0.1
 
@@ -30,7 +35,9 @@ class TailDrop:
         return frames - hidden
 
     def __call__(self, s: Sample, seed: int, index: int) -> Sample:
-        """Return the batch with its clips' tails hidden: mask 0, and opacity 0 in the condition's last channels."""
+        """Return the batch with its clips' tails hidden: mask 0, and opacity 0 in the condition's
+        last channels.
+        """
         rng = stream("training", seed, "artifixer.tail", index)
         n = s.z_0.shape[2]
         m, condition = s.m.clone(), s.condition.clone()
@@ -45,4 +52,11 @@ class TailDrop:
 def visible_share(drop: TailDrop, frames: int, draws: int, seed: int = 0) -> float:
     """Return the mean share of frames that stay in sight."""
     rng = stream("training", seed, "artifixer.tail", 0)
-    return float(torch.tensor([drop.shown_frames(frames, rng) for _ in range(draws)], dtype=torch.float64).mean()) / frames
+    return (
+        float(
+            torch.tensor(
+                [drop.shown_frames(frames, rng) for _ in range(draws)], dtype=torch.float64
+            ).mean()
+        )
+        / frames
+    )

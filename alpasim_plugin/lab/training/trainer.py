@@ -1,7 +1,8 @@
-"""The training loop: gradient accumulation, clipping, EMA of the weights, log, checkpoints, resume, stop at a non-finite loss.
+"""The training loop: gradient accumulation, clipping, EMA of the weights, log, checkpoints, resume,
+stop at a non-finite loss.
 
-The batch of step i is a function of i only, and what a task carries from one step to the next is part of the checkpoint. So a resumed run
-ends with the weights of an uninterrupted one.
+The batch of step i is a function of i only, and what a task carries from one step to the next is
+part of the checkpoint. So a resumed run ends with the weights of an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -28,8 +29,12 @@ from alpasim_plugin.lab.training.ranks import ALONE, Ranks
 Batch = TypeVar("Batch")
 Loss = tuple[Tensor, Mapping[str, float]]  # loss, and values for the log
 
-STATE_FILE, LOG_FILE, BAD_FILE = "state.safetensors", "log.jsonl", "bad_batch.pt"
-CORE_S = "core_s"  # processor time of an update, all threads together: unlike the wall clock's "s" alike on an idle and on a busy machine
+STATE_FILE = "state.safetensors"
+LOG_FILE = "log.jsonl"
+BAD_FILE = "bad_batch.pt"
+# processor time of an update, all threads together: unlike the wall clock's "s" alike on an idle
+# and on a busy machine
+CORE_S = "core_s"
 CARRIED = "carried."
 
 
@@ -37,9 +42,9 @@ CARRIED = "carried."
 class Schedule:
     """Optimisation schedule.
 
-    The learning rate rises linearly, then falls to a share of its peak, along a cosine unless said otherwise. With ``decay_from`` it stays
-    at its peak until that update, so that a run whose end is not known yet can go on: ``steps`` and ``decay_from`` may be changed until
-    the decay begins.
+    The learning rate rises linearly, then falls to a share of its peak, along a cosine unless said
+    otherwise. With ``decay_from`` it stays at its peak until that update, so that a run whose end
+    is not known yet can go on: ``steps`` and ``decay_from`` may be changed until the decay begins.
 
     Args:
         steps: Total updates.
@@ -77,11 +82,17 @@ class Schedule:
             return self.peak_lr
         if self.decay == "exponential":
             return self.peak_lr * math.pow(self.last_share, t)
-        return self.peak_lr * (self.last_share + (1 - self.last_share) * 0.5 * (1 + math.cos(math.pi * t)))
+        return self.peak_lr * (
+            self.last_share + (1 - self.last_share) * 0.5 * (1 + math.cos(math.pi * t))
+        )
 
     def of_length(self, steps: int) -> Schedule:
-        """Return the same for another number of updates: a twentieth of them is warm-up, and a checkpoint follows every fortieth."""
-        return replace(self, steps=steps, warmup=max(steps // 20, 1), save_every=max(steps // 40, 5))
+        """Return the same for another number of updates: a twentieth of them is warm-up, and a
+        checkpoint follows every fortieth.
+        """
+        return replace(
+            self, steps=steps, warmup=max(steps // 20, 1), save_every=max(steps // 40, 5)
+        )
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -135,11 +146,13 @@ class Trainer(Generic[Batch]):
         autocast: Precision of the forward pass, or None.
         carried: What the task carries from batch to batch, or None.
         ranks: The processes that share the batches; ``batch`` and ``carried`` are this one's rows.
-        parts: Schedules of the module's parts, by the first names of their parameters (``dit``, ``vae.decoder``; the empty name is the
-            whole). A part without a gradient in an update keeps its weights, moments and average.
+        parts: Schedules of the module's parts, by the first names of their parameters (``dit``,
+            ``vae.decoder``; the empty name is the whole). A part without a gradient in an update
+            keeps its weights, moments and average.
 
     Raises:
-        InputError: The folder holds another run, or one whose decay has begun under another schedule; or a parameter of no part.
+        InputError: The folder holds another run, or one whose decay has begun under another
+            schedule; or a parameter of no part.
     """
 
     def __init__(
@@ -159,28 +172,45 @@ class Trainer(Generic[Batch]):
         self.module, self.folder, self.schedule = module, folder, schedule
         self._batch, self._loss, self._autocast, self._carried = batch, loss, autocast, carried
         self.parameters = {name: p for name, p in module.named_parameters() if p.requires_grad}
-        self._parts = [(name, part, _parameters_of(name, self.parameters)) for name, part in parts.items()]
-        if nobodys := sorted(set(self.parameters) - {key for _, _, own in self._parts for key in own}):
+        self._parts = [
+            (name, part, _parameters_of(name, self.parameters)) for name, part in parts.items()
+        ]
+        if nobodys := sorted(
+            set(self.parameters) - {key for _, _, own in self._parts for key in own}
+        ):
             found = listed("trained without a schedule", nobodys)
-            raise InputError("setting up a training run", str(folder), found, "freeze them, or name their part")
+            raise InputError(
+                "setting up a training run", str(folder), found, "freeze them, or name their part"
+            )
         groups = [group for _, part, own in self._parts for group in _groups(part, own, schedule)]
         self.optimiser = torch.optim.AdamW([g for g in groups if g["params"]], lr=schedule.peak_lr)
         self.average = {name: p.detach().clone() for name, p in self.parameters.items()}
         self.step = 0
         self._kept: dict[str, Tensor] = {}
-        several = {} if parts == WHOLE else {"parts": {name: asdict(part) for name, part in parts.items()}}
-        self._facts = json.dumps({**facts, **several, "schedule": schedule.identity}, sort_keys=True, default=str)
+        several = (
+            {}
+            if parts == WHOLE
+            else {"parts": {name: asdict(part) for name, part in parts.items()}}
+        )
+        self._facts = json.dumps(
+            {**facts, **several, "schedule": schedule.identity}, sort_keys=True, default=str
+        )
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).exists():
             self._resume()
         if self.ranks.is_first:
             self._cut_log()
 
-    def run(self, report: Callable[[int, Mapping[str, float]], None] | None = None, until: int | None = None) -> None:
+    def run(
+        self,
+        report: Callable[[int, Mapping[str, float]], None] | None = None,
+        until: int | None = None,
+    ) -> None:
         """Train to the schedule's end, or to update ``until``.
 
         Raises:
-            InfrastructureError: A loss or gradient is not finite; the weights are those of the last good update, and the batch is saved.
+            InfrastructureError: A loss or gradient is not finite; the weights are those of the last
+                good update, and the batch is saved.
         """
         last = min(until or self.schedule.steps, self.schedule.steps)
         while self.step < last:
@@ -193,7 +223,8 @@ class Trainer(Generic[Batch]):
                 self.save()
 
     def begin_from(self, checkpoint: Path) -> None:
-        """Start a run at the weights, averages and moments of another run's checkpoint; does nothing once this run has updates.
+        """Start a run at the weights, averages and moments of another run's checkpoint; does
+        nothing once this run has updates.
 
         Raises:
             InputError: A checkpoint of other parameters.
@@ -201,11 +232,26 @@ class Trainer(Generic[Batch]):
         if self.step:
             return
         tensors = load_weights(checkpoint)
-        missing = sorted(name for name in self.parameters if f"average.{name}" not in tensors or f"weight.{name}" not in tensors)
-        wrong = sorted(name for name, p in self.parameters.items() if name not in missing and tensors[f"weight.{name}"].shape != p.shape)
+        missing = sorted(
+            name
+            for name in self.parameters
+            if f"average.{name}" not in tensors or f"weight.{name}" not in tensors
+        )
+        wrong = sorted(
+            name
+            for name, p in self.parameters.items()
+            if name not in missing and tensors[f"weight.{name}"].shape != p.shape
+        )
         if missing or wrong:
-            found = "; ".join(filter(None, (listed("no weights of", missing), listed("another shape of", wrong))))
-            raise InputError("beginning a training run", str(checkpoint), found, f"give the {STATE_FILE} of a run with the same network")
+            found = "; ".join(
+                filter(None, (listed("no weights of", missing), listed("another shape of", wrong)))
+            )
+            raise InputError(
+                "beginning a training run",
+                str(checkpoint),
+                found,
+                f"give the {STATE_FILE} of a run with the same network",
+            )
         self._take(tensors)
 
     def averaged(self) -> dict[str, Tensor]:
@@ -216,12 +262,25 @@ class Trainer(Generic[Batch]):
         """Write the checkpoint."""
         tensors: dict[str, Tensor] = {f"average.{n}": t for n, t in self.average.items()}
         tensors |= {f"weight.{n}": p.detach() for n, p in self.parameters.items()}
-        for name, p in self.parameters.items():  # a part that has had no gradient yet has no moments
-            tensors |= {f"moment.{key}.{name}": value for key, value in self.optimiser.state.get(p, {}).items()}
-        tensors |= {f"{CARRIED}{name}": value.contiguous() for name, value in self.ranks.joined(self._kept).items()}
+        for (
+            name,
+            p,
+        ) in self.parameters.items():  # a part that has had no gradient yet has no moments
+            tensors |= {
+                f"moment.{key}.{name}": value
+                for key, value in self.optimiser.state.get(p, {}).items()
+            }
+        tensors |= {
+            f"{CARRIED}{name}": value.contiguous()
+            for name, value in self.ranks.joined(self._kept).items()
+        }
         if not self.ranks.is_first:
             return
-        meta = {"step": str(self.step), "facts": self._facts, "end": json.dumps([self.schedule.steps, self.schedule.decay_from])}
+        meta = {
+            "step": str(self.step),
+            "facts": self._facts,
+            "end": json.dumps([self.schedule.steps, self.schedule.decay_from]),
+        }
         write_safetensors(self.folder / STATE_FILE, tensors, meta)
 
     def _update(self) -> dict[str, float]:
@@ -233,9 +292,13 @@ class Trainer(Generic[Batch]):
             index = self.step * n + part
             batch = self._batch(index)
             device = next(iter(self.parameters.values())).device.type
-            with torch.autocast(device, self._autocast or torch.bfloat16, enabled=self._autocast is not None):
+            with torch.autocast(
+                device, self._autocast or torch.bfloat16, enabled=self._autocast is not None
+            ):
                 loss, numbers = self._loss(batch, index)
-            if not torch.isfinite(loss) and self.ranks.count == 1:  # several notice together, by the norm of their mean gradient
+            if (
+                not torch.isfinite(loss) and self.ranks.count == 1
+            ):  # several notice together, by the norm of their mean gradient
                 self._stop(batch, f"loss {loss.item()} in batch {index}")
             (loss / n).backward()  # type: ignore[no-untyped-call]
             for name, value in {"loss": float(loss.detach()), **numbers}.items():
@@ -249,9 +312,17 @@ class Trainer(Generic[Batch]):
             group["lr"] = lr * group["rate"]
         self.optimiser.step()
         self.step += 1
-        self._kept = {} if self._carried is None else dict(self._carried.carried())  # only now: a failed update leaves the last one's
+        self._kept = (
+            {} if self._carried is None else dict(self._carried.carried())
+        )  # only now: a failed update leaves the last one's
         self._update_average()
-        return {**sums, **norms, "lr": lr, "s": time.perf_counter() - began, CORE_S: time.process_time() - core_began}
+        return {
+            **sums,
+            **norms,
+            "lr": lr,
+            "s": time.perf_counter() - began,
+            CORE_S: time.process_time() - core_began,
+        }
 
     def _clip(self) -> dict[str, float]:
         """Clip the gradients of every part that has any, and return their norms."""
@@ -267,11 +338,15 @@ class Trainer(Generic[Batch]):
         """Replace gradients and logged values by their means over the ranks."""
         if self.ranks.count > 1:
             logged = torch.tensor([*numbers.values()], dtype=torch.float32)
-            self.ranks.average([*(p.grad for p in self.parameters.values() if p.grad is not None), logged])
+            self.ranks.average(
+                [*(p.grad for p in self.parameters.values() if p.grad is not None), logged]
+            )
             numbers.update(zip(numbers, logged.tolist(), strict=True))
 
     def _update_average(self) -> None:
-        """Update the EMA; its decay is lower in early updates, so that the initial weights have little influence."""
+        """Update the EMA; its decay is lower in early updates, so that the initial weights have
+        little influence.
+        """
         decay = min(self.schedule.ema, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
             for name, p in self.parameters.items():
@@ -301,13 +376,28 @@ class Trainer(Generic[Batch]):
         with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
             self.step = int(meta["step"])
             steps, decay_from = json.loads(meta.get("end", "[null, null]"))
-        if decay_from is not None and self.step > decay_from and [steps, decay_from] != [self.schedule.steps, self.schedule.decay_from]:
+        if (
+            decay_from is not None
+            and self.step > decay_from
+            and [steps, decay_from] != [self.schedule.steps, self.schedule.decay_from]
+        ):
             found = f"its decay from {decay_from} to {steps} has begun: it is at {self.step}"
-            raise InputError(doing, str(path), found, "give the same steps and decay, or begin a run from its weights")
+            raise InputError(
+                doing,
+                str(path),
+                found,
+                "give the same steps and decay, or begin a run from its weights",
+            )
         with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
-            self._kept = {key.removeprefix(CARRIED): value for key, value in tensors.items() if key.startswith(CARRIED)}
+            self._kept = {
+                key.removeprefix(CARRIED): value
+                for key, value in tensors.items()
+                if key.startswith(CARRIED)
+            }
             if self._carried is not None:
-                self._kept = {name: value[self.ranks.rows(len(value))] for name, value in self._kept.items()}
+                self._kept = {
+                    name: value[self.ranks.rows(len(value))] for name, value in self._kept.items()
+                }
                 self._carried.carry(self._kept)
             self._take(tensors)
 
@@ -317,32 +407,58 @@ class Trainer(Generic[Batch]):
             for name, p in self.parameters.items():
                 p.copy_(tensors[f"weight.{name}"])
                 self.average[name].copy_(tensors[f"average.{name}"])
-                moments = {k.split(".")[1]: t for k, t in tensors.items() if k.startswith("moment.") and k.split(".", 2)[2] == name}
-                if wrong := [key for key, t in moments.items() if t.shape not in (p.shape, torch.Size([]))]:
+                moments = {
+                    k.split(".")[1]: t
+                    for k, t in tensors.items()
+                    if k.startswith("moment.") and k.split(".", 2)[2] == name
+                }
+                if wrong := [
+                    key for key, t in moments.items() if t.shape not in (p.shape, torch.Size([]))
+                ]:
                     raise ValueError(f"the moments {wrong} of {name} have another shape")
-                if not all(bool(t.isfinite().all()) for t in (p, self.average[name], *moments.values())):
+                if not all(
+                    bool(t.isfinite().all()) for t in (p, self.average[name], *moments.values())
+                ):
                     raise ValueError(f"{name} or its moments are not finite")
-                self.optimiser.state[p] = {k: t if k == "step" else t.to(p.device) for k, t in moments.items()}
+                self.optimiser.state[p] = {
+                    k: t if k == "step" else t.to(p.device) for k, t in moments.items()
+                }
 
     def _cut_log(self) -> None:
-        """Drop log rows of updates after the checkpoint (without one, all), which are repeated, and a last row that a kill cut short."""
+        """Drop log rows of updates after the checkpoint (without one, all), which are repeated, and
+        a last row that a kill cut short.
+        """
         path, doing = self.folder / LOG_FILE, "continuing a training log"
         if path.is_file():
             lines = read_text(path, doing).split("\n")[:-1]
-            with parsing(doing, path, f"remove {path}; only the curves are lost", "not a training log"):
-                kept = [line for line in lines if parse_json(line, path, doing)["step"] <= self.step]
+            with parsing(
+                doing, path, f"remove {path}; only the curves are lost", "not a training log"
+            ):
+                kept = [
+                    line for line in lines if parse_json(line, path, doing)["step"] <= self.step
+                ]
             write_text(path, "".join(line + "\n" for line in kept))
 
 
 def _parameters_of(part: str, parameters: Mapping[str, nn.Parameter]) -> dict[str, nn.Parameter]:
     """Return a part's parameters; the empty name is the whole."""
-    return {name: p for name, p in parameters.items() if not part or f"{name}.".startswith(f"{part}.")}
+    return {
+        name: p for name, p in parameters.items() if not part or f"{name}.".startswith(f"{part}.")
+    }
 
 
-def _groups(part: PartSchedule, own: Mapping[str, nn.Parameter], schedule: Schedule) -> list[dict[str, Any]]:
-    """Return the optimiser's groups of a part: matrices and kernels decay, gains and biases do not."""
+def _groups(
+    part: PartSchedule, own: Mapping[str, nn.Parameter], schedule: Schedule
+) -> list[dict[str, Any]]:
+    """Return the optimiser's groups of a part: matrices and kernels decay, gains and biases do
+    not.
+    """
     shared = {"rate": part.rate, "betas": part.betas}
     return [
-        {"params": [p for p in own.values() if p.ndim > 1], "weight_decay": schedule.weight_decay, **shared},
+        {
+            "params": [p for p in own.values() if p.ndim > 1],
+            "weight_decay": schedule.weight_decay,
+            **shared,
+        },
         {"params": [p for p in own.values() if p.ndim <= 1], "weight_decay": 0.0, **shared},
     ]

@@ -1,4 +1,6 @@
-"""Pairs of scenes that nobody drives through: a hand-held walk, seen clean and in an under-trained reconstruction of another take of it."""
+"""Pairs of scenes that nobody drives through: a hand-held walk, seen clean and in an under-trained
+reconstruction of another take of it.
+"""
 
 from __future__ import annotations
 
@@ -21,15 +23,19 @@ from alpasim_plugin.renderers.reconstruction_build import reconstruct
 from alpasim_plugin.renderers.reconstruction_key import recipe_for
 
 PERIOD_S = 0.1
-RECORDED, SHOWN = "recording", "replay"  # takes of the same way: the reconstruction's, and the pairs'
+RECORDED, SHOWN = (
+    "recording",
+    "replay",
+)  # takes of the same way: the reconstruction's, and the pairs'
 HAND, AT_A_TABLE = Hand(), Hand(sway_m=0.012, bob_m=0.008, drift_m=0.03)
 
 
 def make_transfer_sequence(scene: TransferScene, folder: Path, threads: int = 1) -> bool:
     """Render the sequence of a scene unless an equal one exists.
 
-    The degraded frames are made like those of driving scenes: `reconstruct` with the scene's degradation. What it is fitted to is another
-    take of the walk, so the pairs are seen from some centimetres and degrees beside its views.
+    The degraded frames are made like those of driving scenes: `reconstruct` with the scene's
+    degradation. What it is fitted to is another take of the walk, so the pairs are seen from some
+    centimetres and degrees beside its views.
 
     Args:
         scene: Its definition.
@@ -41,17 +47,32 @@ def make_transfer_sequence(scene: TransferScene, folder: Path, threads: int = 1)
     """
     camera = PinholeCamera.from_hfov(WIDTH, HEIGHT, np.radians(scene.hfov_deg))
     info = {
-        "scene_id": scene.scene_id, "scene_hash": scene.digest, "seed": scene.seed, "split": scene.split, "family": scene.family,
-        "degradation": asdict(scene.degradation), "actors": 0, "moving_actors": 0,
-        "camera": {"width": WIDTH, "height": HEIGHT, "K": camera.K.tolist(), "T_rig_camera": np.eye(4).tolist()},
-    }  # fmt: skip
+        "scene_id": scene.scene_id,
+        "scene_hash": scene.digest,
+        "seed": scene.seed,
+        "split": scene.split,
+        "family": scene.family,
+        "degradation": asdict(scene.degradation),
+        "actors": 0,
+        "moving_actors": 0,
+        "camera": {
+            "width": WIDTH,
+            "height": HEIGHT,
+            "K": camera.K.tolist(),
+            "T_rig_camera": np.eye(4).tolist(),
+        },
+    }
     if is_made(folder, info):
         return False
-    write_sequence(folder, pair_frames(scene, camera, threads, range(scene.frames)), scene.frames, info)
+    write_sequence(
+        folder, pair_frames(scene, camera, threads, range(scene.frames)), scene.frames, info
+    )
     return True
 
 
-def pair_frames(scene: TransferScene, camera: PinholeCamera, threads: int, wanted: Iterable[int]) -> Iterator[Pair]:
+def pair_frames(
+    scene: TransferScene, camera: PinholeCamera, threads: int, wanted: Iterable[int]
+) -> Iterator[Pair]:
     """Yield the ``wanted`` frames of a scene in their order; the semantic map is black."""
     place = build_place(scene.family, scene.scene_id, scene.seed)
     graph, sky = _reconstruction(scene, place, camera, threads)
@@ -60,9 +81,18 @@ def pair_frames(scene: TransferScene, camera: PinholeCamera, threads: int, wante
         T_world_camera = walk[i]
         view = PinholeCamera.from_pose(camera.width, camera.height, camera.K, T_world_camera)
         damaged = graph.render(view, {}, threads)
-        opacity = np.rint(np.maximum(damaged.alpha, sky.share(view)) * 255).clip(0, 255).astype(np.uint8)
+        opacity = (
+            np.rint(np.maximum(damaged.alpha, sky.share(view)) * 255).clip(0, 255).astype(np.uint8)
+        )
         clean: U8 = place.graph.render(view, {}, threads, sky_in_alpha=True).to_uint8()
-        yield Pair(damaged.to_uint8(), clean, opacity, np.zeros_like(clean), T_world_camera, round(i * PERIOD_S * 1e6))
+        yield Pair(
+            damaged.to_uint8(),
+            clean,
+            opacity,
+            np.zeros_like(clean),
+            T_world_camera,
+            round(i * PERIOD_S * 1e6),
+        )
 
 
 def poses(scene: TransferScene, place: Place, count: int, take: str) -> F64:
@@ -72,7 +102,9 @@ def poses(scene: TransferScene, place: Place, count: int, take: str) -> F64:
     return hand_held(place.walk.eye, place.walk.target, t_s, hand, scene.scene_id, scene.seed, take)
 
 
-def _reconstruction(scene: TransferScene, place: Place, camera: PinholeCamera, threads: int) -> tuple[SceneGraph, SkyMask]:
+def _reconstruction(
+    scene: TransferScene, place: Place, camera: PinholeCamera, threads: int
+) -> tuple[SceneGraph, SkyMask]:
     recipe = recipe_for(scene.degradation, (scene.frames - 1) * PERIOD_S)
     width = recipe.splat.width
     scale = width / camera.width

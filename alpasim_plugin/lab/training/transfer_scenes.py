@@ -1,7 +1,8 @@
-"""Which scenes the transfer beyond driving is trained and tested on: names, seeds, cameras and damage; frozen before the first training.
+"""Which scenes the transfer beyond driving is trained and tested on: names, seeds, cameras and
+damage; frozen before the first training.
 
-``configs/fixers/transfer-scenes.json`` holds a digest of every scene's definition. As with driving scenes, a definition is what is drawn;
-how it is built is the code's.
+``configs/fixers/transfer-scenes.json`` holds a digest of every scene's definition. As with driving
+scenes, a definition is what is drawn; how it is built is the code's.
 """
 
 from __future__ import annotations
@@ -46,7 +47,10 @@ class SplitFacts:
     frames: int
 
 
-SPLITS: Mapping[Split, SplitFacts] = {"train": SplitFacts(21_000_000, 32, 61), "test": SplitFacts(22_000_000, 8, 100)}
+SPLITS: Mapping[Split, SplitFacts] = {
+    "train": SplitFacts(21_000_000, 32, 61),
+    "test": SplitFacts(22_000_000, 8, 100),
+}
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,8 @@ class TransferScene:
     """The definition of a scene.
 
     Attributes:
-        split, family, scene_id, seed: What it is; ``scene_id`` and ``seed`` are the key of its random streams.
+        split, family, scene_id, seed: What it is; ``scene_id`` and ``seed`` are the key of its
+            random streams.
         frames: Of its sequence, 0.1 s apart.
         hfov_deg: Of its camera, 256x144.
         degradation: How its reconstruction is damaged.
@@ -82,17 +87,33 @@ class TransferScene:
 def transfer_scene(split: Split, number_in_split: int) -> TransferScene:
     """Return scene ``number_in_split`` of a split; families come in rotation."""
     facts, family = SPLITS[split], FAMILIES[number_in_split % len(FAMILIES)]
-    scene_id, seed = f"transfer-{split}-{family}_{number_in_split:03d}", facts.first_seed + number_in_split
+    scene_id, seed = (
+        f"transfer-{split}-{family}_{number_in_split:03d}",
+        facts.first_seed + number_in_split,
+    )
     rng = stream(scene_id, seed, "transfer.scene")
     hfov_deg = number(rng, 58, 76, 1)
     drawn: dict[str, Any] = draw_damage(rng, DAMAGE)
-    drawn.pop("shift_m", None)  # a walk has no side to be shifted to: all are reconstructions of the walk itself
-    return TransferScene(split, family, scene_id, seed, facts.frames, hfov_deg, Degradation(**{**drawn, "kind": "reconstruction"}))
+    drawn.pop(
+        "shift_m", None
+    )  # a walk has no side to be shifted to: all are reconstructions of the walk itself
+    return TransferScene(
+        split,
+        family,
+        scene_id,
+        seed,
+        facts.frames,
+        hfov_deg,
+        Degradation(**{**drawn, "kind": "reconstruction"}),
+    )
 
 
 def frozen_split(split: Split) -> FrozenSplit:
     """Return the digests of a split's scenes."""
-    scenes = {scene.name: scene.digest for scene in (transfer_scene(split, i) for i in range(SPLITS[split].count))}
+    scenes = {
+        scene.name: scene.digest
+        for scene in (transfer_scene(split, i) for i in range(SPLITS[split].count))
+    }
     lines = "".join(f"{name} {digest}\n" for name, digest in scenes.items())
     return FrozenSplit(hashlib.sha256(lines.encode()).hexdigest(), scenes)
 
@@ -104,7 +125,9 @@ def freeze(record: Path = RECORD) -> None:
         InputError: The record exists: what is frozen stays.
     """
     if record.exists():
-        raise InputError(DOING, str(record), "it exists", "remove it if the scenes are really to change")
+        raise InputError(
+            DOING, str(record), "it exists", "remove it if the scenes are really to change"
+        )
     write_json(record, {split: asdict(frozen_split(split)) for split in SPLITS})
 
 
@@ -114,9 +137,18 @@ def check_frozen(record: Path = RECORD) -> None:
     Raises:
         InputError: A scene is defined otherwise now, or no readable record.
     """
-    entries = read_json_as(dict[str, FrozenEntry], record, DOING, do_this="take the record of the package")
+    entries = read_json_as(
+        dict[str, FrozenEntry], record, DOING, do_this="take the record of the package"
+    )
     for split in SPLITS:
         known, now = entries[split]["scenes"], frozen_split(split)
         if differ := sorted({name for name, _ in known.items() ^ now.scenes.items()}):
-            found = f"{len(differ)} of split {split} are defined otherwise now: {', '.join(differ[:5])}"
-            raise InputError(DOING, str(record), found, "undo the change of what is drawn, or freeze anew and measure everything again")
+            found = (
+                f"{len(differ)} of split {split} are defined otherwise now: {', '.join(differ[:5])}"
+            )
+            raise InputError(
+                DOING,
+                str(record),
+                found,
+                "undo the change of what is drawn, or freeze anew and measure everything again",
+            )

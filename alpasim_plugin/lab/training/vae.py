@@ -1,7 +1,8 @@
 """Train the tiny autoencoder on pairs and on driving video.
 
-Three kinds of images are trained: clean frames, decoded with and without the degraded render as a condition; and degraded renders and
-semantic maps, which are inputs of the generator. Noise is added to the latents, since those of a generator have errors.
+Three kinds of images are trained: clean frames, decoded with and without the degraded render as a
+condition; and degraded renders and semantic maps, which are inputs of the generator. Noise is added
+to the latents, since those of a generator have errors.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ class VaeRecipe:
         video_clips: Clips from driving videos in a batch.
         size: Frames (1 + 4k) and crop.
         latent_noise: Standard deviation of the noise on latents, which have unit variance.
-        edge_weight: Weight of the difference of neighbouring pixels and frames: sharpness and flicker.
+        edge_weight: Weight of the difference of neighbouring pixels and frames: sharpness and
+            flicker.
         auxiliary_weight: Weight of degraded renders and semantic maps.
         seed: Of sampling and noise.
     """
@@ -59,15 +61,28 @@ class VaeBatch:
 class VaeTask:
     """Batches and loss of the autoencoder, for `Trainer`."""
 
-    def __init__(self, vae: TinyVAE, sequences: Sequence[PairSequence], videos: Sequence[U8], recipe: VaeRecipe) -> None:
+    def __init__(
+        self,
+        vae: TinyVAE,
+        sequences: Sequence[PairSequence],
+        videos: Sequence[U8],
+        recipe: VaeRecipe,
+    ) -> None:
         self.vae, self.sequences, self.videos, self.recipe = vae, sequences, videos, recipe
         vae.latents_per_pass = None  # one pass a clip is faster; results differ by rounding only
 
     @property
     def facts(self) -> dict[str, Any]:
         """Identify the training data and recipe."""
-        videos = [hashlib.blake2b(video.tobytes(), digest_size=8).hexdigest() for video in self.videos]
-        return {"sequences": len(self.sequences), "pairs": pairs_digest(self.sequences), "videos": videos, "recipe": asdict(self.recipe)}
+        videos = [
+            hashlib.blake2b(video.tobytes(), digest_size=8).hexdigest() for video in self.videos
+        ]
+        return {
+            "sequences": len(self.sequences),
+            "pairs": pairs_digest(self.sequences),
+            "videos": videos,
+            "recipe": asdict(self.recipe),
+        }
 
     def batch(self, index: int) -> VaeBatch:
         """Make batch ``index``."""
@@ -75,12 +90,23 @@ class VaeTask:
         pairs = None
         auxiliary = None
         if r.pair_clips:
-            clips = [draw_pair_clip(self.sequences, r.size, r.seed, index * r.pair_clips + i) for i in range(r.pair_clips)]
-            pairs = Clip(*(torch.stack([getattr(c, name) for c in clips]) for name in ("target", "render", "opacity", "sdmap")))
+            clips = [
+                draw_pair_clip(self.sequences, r.size, r.seed, index * r.pair_clips + i)
+                for i in range(r.pair_clips)
+            ]
+            pairs = Clip(
+                *(
+                    torch.stack([getattr(c, name) for c in clips])
+                    for name in ("target", "render", "opacity", "sdmap")
+                )
+            )
             auxiliary = (pairs.render if index % 2 else pairs.sdmap)[:1]  # type: ignore[index]
         video = None
         if r.video_clips and self.videos:
-            clips = [draw_video_clip(self.videos, r.size, r.seed, index * r.video_clips + i) for i in range(r.video_clips)]
+            clips = [
+                draw_video_clip(self.videos, r.size, r.seed, index * r.video_clips + i)
+                for i in range(r.video_clips)
+            ]
             video = torch.stack([c.target for c in clips])
         return VaeBatch(pairs, video, auxiliary)
 
@@ -90,36 +116,53 @@ class VaeTask:
         parts: dict[str, Tensor] = {}
         if batch.pairs is not None:
             z, noisy = self._latents(batch.pairs.target, index, 0)
-            parts["latent"] = reconstruction_loss(self.vae.decode(noisy, clamp=False), batch.pairs.target, r.edge_weight)
-            conditioned = self.vae.decode(noisy, render=batch.pairs.render, opacity=batch.pairs.opacity, clamp=False)
+            parts["latent"] = reconstruction_loss(
+                self.vae.decode(noisy, clamp=False), batch.pairs.target, r.edge_weight
+            )
+            conditioned = self.vae.decode(
+                noisy, render=batch.pairs.render, opacity=batch.pairs.opacity, clamp=False
+            )
             parts["render"] = reconstruction_loss(conditioned, batch.pairs.target, r.edge_weight)
             parts["spread"] = 1e-3 * (z.var(dim=(0, 2, 3, 4)).clamp_min(1e-6).log() ** 2).mean()
         if batch.video is not None:
             _, noisy = self._latents(batch.video, index, 1)
-            parts["video"] = reconstruction_loss(self.vae.decode(noisy, clamp=False), batch.video, r.edge_weight)
+            parts["video"] = reconstruction_loss(
+                self.vae.decode(noisy, clamp=False), batch.video, r.edge_weight
+            )
         if batch.auxiliary is not None:
             _, noisy = self._latents(batch.auxiliary, index, 2)
-            error = reconstruction_loss(self.vae.decode(noisy, clamp=False), batch.auxiliary, r.edge_weight)
+            error = reconstruction_loss(
+                self.vae.decode(noisy, clamp=False), batch.auxiliary, r.edge_weight
+            )
             parts["auxiliary"] = r.auxiliary_weight * error
         total = torch.stack(list(parts.values())).sum()
         return total, {name: float(value.detach()) for name, value in parts.items()}
 
     def _latents(self, video: Tensor, index: int, which: int) -> tuple[Tensor, Tensor]:
         z = self.vae.encode(video)
-        noise = stream("training", self.recipe.seed, f"vae.noise.{which}", index).standard_normal(z.shape, dtype="float32")
+        noise = stream("training", self.recipe.seed, f"vae.noise.{which}", index).standard_normal(
+            z.shape, dtype="float32"
+        )
         return z, z + self.recipe.latent_noise * torch.from_numpy(noise).to(z)
 
 
 def reconstruction_loss(made: Tensor, wanted: Tensor, edge_weight: float) -> Tensor:
-    """Return a Charbonnier loss of values plus a weighted smooth L1 loss of differences along rows, columns and frames."""
+    """Return a Charbonnier loss of values plus a weighted smooth L1 loss of differences along rows,
+    columns and frames.
+    """
     d = made - wanted
     value = torch.sqrt(d * d + 1e-4).mean()
-    edges = [F.smooth_l1_loss(x, torch.zeros_like(x), beta=0.02) for x in (d.diff(dim=-1), d.diff(dim=-2), d.diff(dim=-3))]
+    edges = [
+        F.smooth_l1_loss(x, torch.zeros_like(x), beta=0.02)
+        for x in (d.diff(dim=-1), d.diff(dim=-2), d.diff(dim=-3))
+    ]
     return value + edge_weight * torch.stack(edges).sum()
 
 
 def measure_stats(vae: TinyVAE, clips: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation ``(16,)`` of the latent channels over clips ``(1, 3, T, H, W)``."""
+    """Return mean and standard deviation ``(16,)`` of the latent channels over clips ``(1, 3, T, H,
+    W)``.
+    """
     with torch.inference_mode():
         z = torch.cat([vae.encode(c).flatten(2)[0] for c in clips], dim=1).double()
     return z.mean(1).float(), z.std(1).float()
@@ -127,12 +170,18 @@ def measure_stats(vae: TinyVAE, clips: Sequence[Tensor]) -> tuple[Tensor, Tensor
 
 @torch.no_grad()
 def channel_amplitudes(vae: TinyVAE, sigma: float = 0.3) -> Tensor:
-    """Return the root-mean-square pixel error that an error of each latent channel causes, scaled to mean 1, ``(16,)``.
+    """Return the root-mean-square pixel error that an error of each latent channel causes, scaled
+    to mean 1, ``(16,)``.
 
-    Channels have unit variance, but a unit of the brightness channel changes pixels 4 to 39 times as much as a unit of the others
-    (shipped weights). Equal channel weights spend capacity on invisible errors.
+    Channels have unit variance, but a unit of the brightness channel changes pixels 4 to 39 times
+    as much as a unit of the others (shipped weights). Equal channel weights spend capacity on
+    invisible errors.
     """
-    noise = torch.from_numpy(stream("training", 0, "vae.channel_amplitudes").standard_normal((1, LATENT, 3, 8, 8), dtype="float32"))
+    noise = torch.from_numpy(
+        stream("training", 0, "vae.channel_amplitudes").standard_normal(
+            (1, LATENT, 3, 8, 8), dtype="float32"
+        )
+    )
     z = torch.zeros_like(noise)
     still = vae.decode(z, clamp=False)
     rms = []

@@ -1,4 +1,6 @@
-"""Reconstruction quality of an autoencoder: PSNR, and temporal flicker relative to the motion of the original."""
+"""Reconstruction quality of an autoencoder: PSNR, and temporal flicker relative to the motion of
+the original.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,10 @@ class VaeQuality:
 
     Args:
         psnr_db: Peak signal-to-noise ratio of 8-bit images, per frame, dB.
-        flicker: Root mean square of the temporal difference of the error, grey levels of 255; zero for a static error.
-        copy_flicker: Root mean square of the temporal difference of the original: the effect of motion alone.
+        flicker: Root mean square of the temporal difference of the error, grey levels of 255; zero
+            for a static error.
+        copy_flicker: Root mean square of the temporal difference of the original: the effect of
+            motion alone.
     """
 
     psnr_db: float
@@ -28,19 +32,29 @@ class VaeQuality:
     copy_flicker: float
 
 
-def round_trip(vae: TinyVAE, video: Tensor, render: Tensor | None = None, opacity: Tensor | None = None) -> Tensor:
+def round_trip(
+    vae: TinyVAE, video: Tensor, render: Tensor | None = None, opacity: Tensor | None = None
+) -> Tensor:
     """Encode and decode a clip ``(1, 3, T, H, W)`` of any size; a render conditions the decoder."""
     with torch.inference_mode():
         padded, size = pad_clip(video)
         condition = [None if x is None else pad_clip(x)[0] for x in (render, opacity)]
-        return crop_clip(vae.decode(vae.encode(padded), render=condition[0], opacity=condition[1]), size)
+        return crop_clip(
+            vae.decode(vae.encode(padded), render=condition[0], opacity=condition[1]), size
+        )
 
 
 def quality(made: Tensor, wanted: Tensor) -> VaeQuality:
     """Compare clips ``(1, 3, T, H, W)`` in [-1, 1]."""
-    a, b = (np.rint((x.numpy().astype(np.float64) + 1) * 127.5).clip(0, 255) for x in (made, wanted))
+    a, b = (
+        np.rint((x.numpy().astype(np.float64) + 1) * 127.5).clip(0, 255) for x in (made, wanted)
+    )
     error = a - b
     mse = (error**2).mean(axis=(0, 1, 3, 4))
     psnr = np.array([min(CAP_DB, decibels(max(float(m), 1e-10))) for m in mse])
     change = np.diff(error, axis=2)
-    return VaeQuality(float(psnr.mean()), float(np.sqrt((change**2).mean())), float(np.sqrt((np.diff(b, axis=2) ** 2).mean())))
+    return VaeQuality(
+        float(psnr.mean()),
+        float(np.sqrt((change**2).mean())),
+        float(np.sqrt((np.diff(b, axis=2) ** 2).mean())),
+    )

@@ -1,9 +1,12 @@
-"""Damage a recorded video as an under-trained reconstruction damages a scene: the frames are drawn again with splats that move along.
+"""Damage a recorded video as an under-trained reconstruction damages a scene: the frames are drawn
+again with splats that move along.
 
-There is no pose and no geometry, so the splats live in the image: each has a place, an ellipse, a colour from the frame it appears in, and
-an opacity. From frame to frame they follow the optical flow, imperfectly, as Gaussians at a wrong depth do; where a motion opens a gap the
-ground shows through until new ones appear. Patches have few and faint splats (holes), colours err by blotches, floaters move faster than
-what is behind them. The project's own rasteriser draws them, so that edges and opacity look as in its renders.
+There is no pose and no geometry, so the splats live in the image: each has a place, an ellipse, a
+colour from the frame it appears in, and an opacity. From frame to frame they follow the optical
+flow, imperfectly, as Gaussians at a wrong depth do; where a motion opens a gap the ground shows
+through until new ones appear. Patches have few and faint splats (holes), colours err by blotches,
+floaters move faster than what is behind them. The project's own rasteriser draws them, so that
+edges and opacity look as in its renders.
 """
 
 from __future__ import annotations
@@ -25,7 +28,9 @@ from alpasim_plugin.lab.training.distortions import smooth_field
 Rng = np.random.Generator
 MARGIN_PX = 12.0  # splats live this far outside the image
 NEAR_M, FAR_M = 5.0, 20.0  # invented depths: lower rows are nearer and drawn over higher ones
-REFIT = 0.08  # share by which a colour approaches the frame's, each frame: views taken later are part of the fit as well
+# share by which a colour approaches the frame's, each frame: views taken later are part of the fit
+# as well
+REFIT = 0.08
 GROWTH = (0.92, 1.12)  # bounds of a splat's growth from frame to frame
 LARGEST_CELLS = 3.0  # a splat that grows beyond this many cells ends
 
@@ -58,7 +63,9 @@ class SplatDamage:
 
 
 def draw_damage(rng: Rng, width: int) -> SplatDamage:
-    """Draw a damage for frames ``width`` pixels wide; sizes are those of 256-pixel frames, scaled half as much as the frames."""
+    """Draw a damage for frames ``width`` pixels wide; sizes are those of 256-pixel frames, scaled
+    half as much as the frames.
+    """
     scale = (width / 256) ** 0.5
     return SplatDamage(
         cell_px=scale * float(np.exp(rng.uniform(np.log(1.7), np.log(3.8)))),
@@ -91,29 +98,50 @@ class _Splats:
         return type(self)(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
     def join(self, other: _Splats) -> Self:
-        return type(self)(**{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)})
+        return type(self)(
+            **{
+                f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)])
+                for f in fields(self)
+            }
+        )
 
 
-def damage_video(frames: Sequence[U8] | U8, damage: SplatDamage, rng: Rng) -> Iterator[tuple[U8, U8]]:
-    """Yield the damaged image ``(H, W, 3)`` and its opacity ``(H, W)``, both uint8, of every frame ``(H, W, 3)`` in order of time."""
+def damage_video(
+    frames: Sequence[U8] | U8, damage: SplatDamage, rng: Rng
+) -> Iterator[tuple[U8, U8]]:
+    """Yield the damaged image ``(H, W, 3)`` and its opacity ``(H, W)``, both uint8, of every frame
+    ``(H, W, 3)`` in order of time.
+    """
     h, w = frames[0].shape[:2]
-    camera = PinholeCamera(w, h, np.array([[w, 0.0, w / 2], [0.0, w, h / 2], [0.0, 0.0, 1.0]]), np.eye(4))
+    camera = PinholeCamera(
+        w, h, np.array([[w, 0.0, w / 2], [0.0, w, h / 2], [0.0, 0.0, 1.0]]), np.eye(4)
+    )
     flow_between = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     thin = _thin_ground(rng, (h, w), damage)
     patches = smooth_field(rng, (h, w), 4, 30 * w / 256).astype(np.float64)
-    blotches = damage.colour_error * (0.8 * patches[..., :1] + 0.35 * patches[..., 1:])  # more of brightness than of hue
-    behind = np.asarray(frames[0][: max(1, h // 4)].reshape(-1, 3).mean(axis=0) / 255 if rng.random() < 0.7 else np.zeros(3))
+    blotches = damage.colour_error * (
+        0.8 * patches[..., :1] + 0.35 * patches[..., 1:]
+    )  # more of brightness than of hue
+    behind = np.asarray(
+        frames[0][: max(1, h // 4)].reshape(-1, 3).mean(axis=0) / 255
+        if rng.random() < 0.7
+        else np.zeros(3)
+    )
     exposure, before = 1.0, np.asarray(frames[0])
     splats = _born(rng, before, damage, thin, blotches, np.zeros((0, 2)))
     floaters = _floaters(rng, before, damage, damage.floaters)
     for frame in frames:
         now = np.asarray(frame)
         empty: Any = None  # the stubs do not know that OpenCV makes the array
-        flow = flow_between.calc(cv2.cvtColor(before, cv2.COLOR_RGB2GRAY), cv2.cvtColor(now, cv2.COLOR_RGB2GRAY), empty)
+        flow = flow_between.calc(
+            cv2.cvtColor(before, cv2.COLOR_RGB2GRAY), cv2.cvtColor(now, cv2.COLOR_RGB2GRAY), empty
+        )
         splats, floaters = _moved(splats, flow, now, damage), _moved(floaters, flow, None, damage)
         splats = splats.join(_born(rng, now, damage, thin, blotches, splats.xy))
         floaters = floaters.join(_floaters(rng, now, damage, damage.floaters - len(floaters.xy)))
-        exposure = float(np.clip(exposure + damage.drift * rng.normal() - 0.1 * (exposure - 1), 0.85, 1.15))
+        exposure = float(
+            np.clip(exposure + damage.drift * rng.normal() - 0.1 * (exposure - 1), 0.85, 1.15)
+        )
         out = rasterize(_cloud(splats.join(floaters), w, h), camera, tuple(behind))
         image = np.rint(np.clip(out.rgb * exposure, 0, 1) * 255).astype(np.uint8)
         yield image, np.rint(np.clip(out.alpha, 0, 1) * 255).astype(np.uint8)
@@ -127,8 +155,12 @@ def _thin_ground(rng: Rng, shape: tuple[int, int], damage: SplatDamage) -> F32:
     return np.asarray(np.clip((field - edge) / 0.3, 0, 1), dtype=np.float32)
 
 
-def _born(rng: Rng, frame: U8, damage: SplatDamage, thin: F32, blotches: F64, taken: F64) -> _Splats:
-    """Return new splats on a jittered grid, where no other is near; fewer and fainter on thin ground."""
+def _born(
+    rng: Rng, frame: U8, damage: SplatDamage, thin: F32, blotches: F64, taken: F64
+) -> _Splats:
+    """Return new splats on a jittered grid, where no other is near; fewer and fainter on thin
+    ground.
+    """
     h, w = frame.shape[:2]
     cell = damage.cell_px
     rows, columns = int(np.ceil(h / cell)) + 2, int(np.ceil(w / cell)) + 2
@@ -142,15 +174,25 @@ def _born(rng: Rng, frame: U8, damage: SplatDamage, thin: F32, blotches: F64, ta
     x, y = (np.clip(xy[:, axis].astype(int), 0, size - 1) for axis, size in ((0, w), (1, h)))
     thinness = thin[y, x]
     stays = rng.random(len(xy)) > 0.75 * thinness
-    xy, x, y, thinness = xy[stays], x[stays], y[stays], thinness[stays]
+    xy = xy[stays]
+    x = x[stays]
+    y = y[stays]
+    thinness = thinness[stays]
     n = len(xy)
     soft = cv2.GaussianBlur(frame, (0, 0), 0.35 * cell)
     axes = cell * damage.spread * np.exp(damage.stretch * rng.standard_normal((n, 2)))
     depth_m = FAR_M - (FAR_M - NEAR_M) * np.clip(xy[:, 1] / h, 0, 1) + rng.uniform(0, 0.5, n)
     return _Splats(
-        xy, axes, rng.uniform(0, np.pi, n), soft[y, x] / 255.0, blotches[y, x], rng.uniform(0.5, 0.98, n) * (1 - 0.93 * thinness), depth_m,
-        1 + damage.wrong_motion * rng.standard_normal(n), rng.exponential(damage.life_frames, n) + 3,
-    )  # fmt: skip
+        xy,
+        axes,
+        rng.uniform(0, np.pi, n),
+        soft[y, x] / 255.0,
+        blotches[y, x],
+        rng.uniform(0.5, 0.98, n) * (1 - 0.93 * thinness),
+        depth_m,
+        1 + damage.wrong_motion * rng.standard_normal(n),
+        rng.exponential(damage.life_frames, n) + 3,
+    )
 
 
 def _floaters(rng: Rng, frame: U8, damage: SplatDamage, count: int) -> _Splats:
@@ -162,20 +204,30 @@ def _floaters(rng: Rng, frame: U8, damage: SplatDamage, count: int) -> _Splats:
     long_px = damage.cell_px * rng.uniform(1.0, 4.0, (n, 1))
     axes = long_px * np.column_stack([np.ones(n), rng.uniform(0.15, 1.0, n)])
     return _Splats(
-        xy, axes, rng.uniform(0, np.pi, n), frame[source[:, 0], source[:, 1]] / 255.0, np.zeros((n, 3)), rng.uniform(0.2, 0.8, n),
-        rng.uniform(2.0, 4.0, n), rng.uniform(1.2, 1.8, n), rng.exponential(20, n) + 5,
-    )  # fmt: skip
+        xy,
+        axes,
+        rng.uniform(0, np.pi, n),
+        frame[source[:, 0], source[:, 1]] / 255.0,
+        np.zeros((n, 3)),
+        rng.uniform(0.2, 0.8, n),
+        rng.uniform(2.0, 4.0, n),
+        rng.uniform(1.2, 1.8, n),
+        rng.exponential(20, n) + 5,
+    )
 
 
 def _moved(splats: _Splats, flow: F32, frame: U8 | None, damage: SplatDamage) -> _Splats:
-    """Move splats by the flow ``(H, W, 2)`` at their places, let them grow with it, and end those that leave, age or grow too large.
+    """Move splats by the flow ``(H, W, 2)`` at their places, let them grow with it, and end those
+    that leave, age or grow too large.
 
     With a frame their colours approach its own.
     """
     h, w = flow.shape[:2]
     x, y = (np.clip(splats.xy[:, axis].astype(int), 0, size - 1) for axis, size in ((0, w), (1, h)))
     smooth = cv2.GaussianBlur(flow, (0, 0), 3.0)
-    growth = 1 + 0.5 * (np.gradient(smooth[..., 0], axis=1) + np.gradient(smooth[..., 1], axis=0))[y, x]
+    growth = (
+        1 + 0.5 * (np.gradient(smooth[..., 0], axis=1) + np.gradient(smooth[..., 1], axis=0))[y, x]
+    )
     splats.xy = splats.xy + splats.pace[:, None] * flow[y, x]
     splats.scale_px = splats.scale_px * np.clip(growth, *GROWTH)[:, None]
     splats.life = splats.life - 1
@@ -183,7 +235,9 @@ def _moved(splats: _Splats, flow: F32, frame: U8 | None, damage: SplatDamage) ->
     largest = LARGEST_CELLS * damage.cell_px * (1 if frame is not None else 3)
     splats = splats.keep(near & (splats.life > 0) & (splats.scale_px.max(axis=1) < largest))
     if frame is not None:
-        x, y = (np.clip(splats.xy[:, axis].astype(int), 0, size - 1) for axis, size in ((0, w), (1, h)))
+        x, y = (
+            np.clip(splats.xy[:, axis].astype(int), 0, size - 1) for axis, size in ((0, w), (1, h))
+        )
         soft = cv2.GaussianBlur(frame, (0, 0), 0.35 * damage.cell_px)
         splats.rgb = splats.rgb + REFIT * (soft[y, x] / 255.0 - splats.rgb)
     return splats
@@ -199,4 +253,6 @@ def _cloud(splats: _Splats, width: int, height: int) -> GaussianCloud:
     quats = np.column_stack([np.cos(half), zero, zero, np.sin(half)])
     colour = dc_from_rgb(np.clip(splats.rgb + splats.tint, 0, 1))
     flat = np.column_stack([size, 1e-3 * size.min(axis=1)])
-    return GaussianCloud(np.column_stack([offset, z]), quats, flat, splats.opacity, np.reshape(colour, (-1, 1, 3)))
+    return GaussianCloud(
+        np.column_stack([offset, z]), quats, flat, splats.opacity, np.reshape(colour, (-1, 1, 3))
+    )

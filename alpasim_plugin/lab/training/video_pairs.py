@@ -1,7 +1,8 @@
-"""Recorded driving videos as sequences of pairs: the video is the clean channel, its damaged version the degraded one.
+"""Recorded driving videos as sequences of pairs: the video is the clean channel, its damaged
+version the degraded one.
 
-The first part of every video belongs to the split ``train``, the last to ``held-out``, with a gap between them. There is no map (black)
-and no pose (not a number).
+The first part of every video belongs to the split ``train``, the last to ``held-out``, with a gap
+between them. There is no map (black) and no pose (not a number).
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ class VideoRecipe:
         size: Width and height, pixels; frames are scaled to cover it and cut at the centre.
         variants: Sequences of each part, every one damaged in its own way.
         train_share: First share of the video, which is trained on.
-        gap_share: Share after it that nobody uses, so that held-out frames are not next to trained ones.
+        gap_share: Share after it that nobody uses, so that held-out frames are not next to trained
+            ones.
         seed: Of the damage.
     """
 
@@ -50,10 +52,18 @@ def split_frames(count: int, recipe: VideoRecipe) -> dict[str, range]:
     Raises:
         InputError: Shares without room for both parts, or a part without a frame.
     """
-    first, last = round(recipe.train_share * count), round((recipe.train_share + recipe.gap_share) * count)
+    first, last = (
+        round(recipe.train_share * count),
+        round((recipe.train_share + recipe.gap_share) * count),
+    )
     if not 0 < first <= last < count:
         shares = f"shares {recipe.train_share} and {recipe.gap_share}"
-        raise InputError(DOING, f"{count} frames, {shares}", "a part without frames", "give a longer video or other shares")
+        raise InputError(
+            DOING,
+            f"{count} frames, {shares}",
+            "a part without frames",
+            "give a longer video or other shares",
+        )
     return {TRAIN: range(first), HELD_OUT: range(last, count)}
 
 
@@ -76,13 +86,27 @@ def make_video_pairs(path: Path, folder: Path, recipe: VideoRecipe) -> Iterator[
             name = f"{path.stem}-{source[:6]}-{width}x{height}-v{variant}"
             rng = stream(source, recipe.seed, f"training.video.{width}x{height}.{split}", variant)
             damage = draw_damage(rng, width)
-            info = {"split": split, "family": "video", "source": path.name, "source_sha256": source, "first_frame": part.start}
-            info |= {"degradation": {"kind": "splats", **asdict(damage)}, "recipe": {**asdict(recipe), "size": list(recipe.size)}}
+            info = {
+                "split": split,
+                "family": "video",
+                "source": path.name,
+                "source_sha256": source,
+                "first_frame": part.start,
+            }
+            info |= {
+                "degradation": {"kind": "splats", **asdict(damage)},
+                "recipe": {**asdict(recipe), "size": list(recipe.size)},
+            }
             target = folder / split / name
             made = not is_made(target, info)
             if made:
                 shown = damage_video(frames, damage, rng)
-                write_sequence(target, _pairs(shown, frames, video.t_us[part.start : part.stop]), len(frames), info)
+                write_sequence(
+                    target,
+                    _pairs(shown, frames, video.t_us[part.start : part.stop]),
+                    len(frames),
+                    info,
+                )
             yield target, made
 
 

@@ -9,7 +9,15 @@ import numpy as np
 
 from alpasim_plugin.core.image_metrics import grid_ratio
 from alpasim_plugin.core.types import F64, U8
-from alpasim_plugin.lab.video_metrics.facts import DRIFT, GRID, PSNR, SSIM, WARP, WARP_LATE, WARP_ROAD
+from alpasim_plugin.lab.video_metrics.facts import (
+    DRIFT,
+    GRID,
+    PSNR,
+    SSIM,
+    WARP,
+    WARP_LATE,
+    WARP_ROAD,
+)
 from alpasim_plugin.lab.video_metrics.frames import identical_frames, psnr_db, ssim
 from alpasim_plugin.lab.video_metrics.perceptual import ImageDistance, picture_distances
 from alpasim_plugin.lab.video_metrics.warp import late_window, road_mask, warp_l1
@@ -21,7 +29,9 @@ GRID_EVERY = 4  # frames: a grid stands still
 
 @dataclass(frozen=True)
 class ClipQuality:
-    """One clip's values: ``(T,)`` by metric and frame, Warp L1 ``(T - 1,)`` from the second frame on."""
+    """One clip's values: ``(T,)`` by metric and frame, Warp L1 ``(T - 1,)`` from the second frame
+    on.
+    """
 
     series: Mapping[str, F64]
     identical: int  # frames that equal the truth
@@ -29,8 +39,12 @@ class ClipQuality:
 
     @property
     def means(self) -> dict[str, float]:
-        """One value a metric: the mean over the clip; the late window of Warp L1; the drift of clips that are long enough for it."""
-        out = {name: float(values.mean()) for name, values in self.series.items()} | dict(self.whole)
+        """One value a metric: the mean over the clip; the late window of Warp L1; the drift of
+        clips that are long enough for it.
+        """
+        out = {name: float(values.mean()) for name, values in self.series.items()} | dict(
+            self.whole
+        )
         if WARP in self.series:
             pairs = self.series[WARP]
             out[WARP_LATE] = float(pairs[late_window(len(pairs))].mean())
@@ -38,14 +52,17 @@ class ClipQuality:
         return out if drift is None else {**out, DRIFT: drift}
 
 
-def clip_quality(made: U8, truth: U8 | None, networks: Mapping[str, ImageDistance], sdmap: U8 | None = None) -> ClipQuality:
+def clip_quality(
+    made: U8, truth: U8 | None, networks: Mapping[str, ImageDistance], sdmap: U8 | None = None
+) -> ClipQuality:
     """Measure one clip.
 
     Args:
         made: ``(T, H, W, 3)``, at least two frames.
         truth: The ground-truth frames; None computes only the metrics without a reference.
         networks: Perceptual distances by name.
-        sdmap: Semantic maps like the frames, which say where the road is; None leaves the metric of the road out.
+        sdmap: Semantic maps like the frames, which say where the road is; None leaves the metric of
+            the road out.
 
     Raises:
         EvaluatorError: Videos that do not belong together.
@@ -55,17 +72,23 @@ def clip_quality(made: U8, truth: U8 | None, networks: Mapping[str, ImageDistanc
     if truth is not None:
         series = {PSNR: psnr_db(made, truth), SSIM: ssim(made, truth)}
         series |= {name: picture_distances(net, made, truth) for name, net in networks.items()}
-        ratios = {name: grid_ratio(made[::GRID_EVERY], truth[::GRID_EVERY], side) for side, name in GRID.items()}
+        ratios = {
+            name: grid_ratio(made[::GRID_EVERY], truth[::GRID_EVERY], side)
+            for side, name in GRID.items()
+        }
         whole = {name: ratio for name, ratio in ratios.items() if ratio is not None}
     series[WARP] = warp_l1(made)
     if sdmap is not None:
         late = slice(late_window(len(made) - 1).start, None)  # a pair begins with the frame before
-        whole[WARP_ROAD] = float(warp_l1(made[late], np.array([road_mask(drawn) for drawn in sdmap[late]])).mean())
+        whole[WARP_ROAD] = float(
+            warp_l1(made[late], np.array([road_mask(drawn) for drawn in sdmap[late]])).mean()
+        )
     return ClipQuality(series, 0 if truth is None else identical_frames(made, truth), whole)
 
 
 def drift_of(psnr: F64 | None) -> float | None:
-    """Return the mean of the last 50 frames minus that of frames 50 to 100; None where the two would overlap.
+    """Return the mean of the last 50 frames minus that of frames 50 to 100; None where the two
+    would overlap.
 
     Example:
         >>> import numpy as np

@@ -1,8 +1,10 @@
 """DISTS with VGG-16, from the user's weights; nothing is bundled or downloaded.
 
-Ding et al., "Image Quality Assessment: Unifying Structure and Texture Similarity", 2020. Six stages (the image itself, then relu1_2 to
-relu5_3), poolings by the length of a 3x3 Hann window, and per channel a similarity of means and one of covariances, weighted by alpha and
-beta. No resizing, as in pyiqa; the authors' demonstration scales the short side to 256 first, which gives other values (``dists_256``).
+Ding et al., "Image Quality Assessment: Unifying Structure and Texture Similarity", 2020. Six stages
+(the image itself, then relu1_2 to relu5_3), poolings by the length of a 3x3 Hann window, and per
+channel a similarity of means and one of covariances, weighted by alpha and beta. No resizing, as in
+pyiqa; the authors' demonstration scales the short side to 256 first, which gives other values
+(``dists_256``).
 """
 
 from __future__ import annotations
@@ -42,7 +44,10 @@ class DISTS(nn.Module):
         super().__init__()
         self.plan = plan
         self.channels = [3, *(c.outputs for c in plan.convolutions if c.tapped)]
-        layers = {str(c.index): nn.Conv2d(c.inputs, c.outputs, c.kernel, c.stride, c.padding) for c in self.plan.convolutions}
+        layers = {
+            str(c.index): nn.Conv2d(c.inputs, c.outputs, c.kernel, c.stride, c.padding)
+            for c in self.plan.convolutions
+        }
         self.features = nn.ModuleDict(layers)
         self.alpha = nn.Parameter(torch.rand(sum(self.channels)))
         self.beta = nn.Parameter(torch.rand(sum(self.channels)))
@@ -59,11 +64,18 @@ class DISTS(nn.Module):
         """
         check_images(a, b, SMALLEST_PX)
         total = self.alpha.sum() + self.beta.sum()
-        alpha, beta = (torch.split(w, self.channels) for w in (self.alpha / total, self.beta / total))
+        alpha, beta = (
+            torch.split(w, self.channels) for w in (self.alpha / total, self.beta / total)
+        )
         score = a.new_zeros(len(a))
-        for x, y, wa, wb in zip(self.stages((a + 1) / 2), self.stages((b + 1) / 2), alpha, beta, strict=True):
+        for x, y, wa, wb in zip(
+            self.stages((a + 1) / 2), self.stages((b + 1) / 2), alpha, beta, strict=True
+        ):
             mx, my = x.mean((2, 3)), y.mean((2, 3))
-            vx, vy = (x - mx[..., None, None]).square().mean((2, 3)), (y - my[..., None, None]).square().mean((2, 3))
+            vx, vy = (
+                (x - mx[..., None, None]).square().mean((2, 3)),
+                (y - my[..., None, None]).square().mean((2, 3)),
+            )
             covariance = (x * y).mean((2, 3)) - mx * my
             means = (2 * mx * my + SMALL) / (mx**2 + my**2 + SMALL)
             structure = (2 * covariance + SMALL) / (vx + vy + SMALL)
@@ -90,8 +102,11 @@ def missing_files(folder: str | Path, plan: Trunk = TRUNKS["vgg"]) -> list[str]:
     return [name for name in (plan.file, HEADS) if not (Path(folder) / name).is_file()]
 
 
-def load_dists(folder: str | Path, heads_sha256: str = HEADS_SHA256, plan: Trunk = TRUNKS["vgg"]) -> DISTS:
-    """Load DISTS from a folder of weights, frozen: PyTorch's VGG-16 and the 2 x 1475 weights as torchmetrics ships them.
+def load_dists(
+    folder: str | Path, heads_sha256: str = HEADS_SHA256, plan: Trunk = TRUNKS["vgg"]
+) -> DISTS:
+    """Load DISTS from a folder of weights, frozen: PyTorch's VGG-16 and the 2 x 1475 weights as
+    torchmetrics ships them.
 
     Args:
         folder: Of the files.
@@ -103,14 +118,26 @@ def load_dists(folder: str | Path, heads_sha256: str = HEADS_SHA256, plan: Trunk
     """
     folder, net = Path(folder), DISTS(plan)
     if missing := missing_files(folder, plan):
-        raise InputError(LOADING, str(folder), f"not there: {', '.join(missing)}", "put the files there (docs/lab/judges.md)")
+        raise InputError(
+            LOADING,
+            str(folder),
+            f"not there: {', '.join(missing)}",
+            "put the files there (docs/lab/judges.md)",
+        )
     digest = file_sha256(folder / plan.file)
     if not digest.startswith(plan.digest_start):
         found = f"sha256 {digest}, which does not begin with {plan.digest_start}"
         raise InputError(LOADING, str(folder / plan.file), found, "copy the file again")
-    trunk, heads = load_weights(folder / plan.file), load_weights(folder / HEADS, sha256=heads_sha256)
+    trunk, heads = (
+        load_weights(folder / plan.file),
+        load_weights(folder / HEADS, sha256=heads_sha256),
+    )
     state: dict[str, Tensor] = {}
-    wanted = {f"features.{c.index}.{part}": trunk for c in plan.convolutions for part in ("weight", "bias")} | {
+    wanted = {
+        f"features.{c.index}.{part}": trunk
+        for c in plan.convolutions
+        for part in ("weight", "bias")
+    } | {
         "alpha": heads,
         "beta": heads,
     }
@@ -119,7 +146,12 @@ def load_dists(folder: str | Path, heads_sha256: str = HEADS_SHA256, plan: Trunk
         value = source.get(key)
         if value is None or value.numel() != own[key].numel():
             found = "it is missing" if value is None else f"its shape is {tuple(value.shape)}"
-            raise InputError(LOADING, f"{key} in {folder}", found, f"give the published weights, where it has {own[key].numel()} numbers")
+            raise InputError(
+                LOADING,
+                f"{key} in {folder}",
+                found,
+                f"give the published weights, where it has {own[key].numel()} numbers",
+            )
         state[key] = weight(key, value.reshape(own[key].shape), torch.float32, str(folder))
     net.load_state_dict(state, strict=False)
     return net.requires_grad_(False).eval()

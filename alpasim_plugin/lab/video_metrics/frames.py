@@ -20,7 +20,8 @@ def psnr_db(made: U8, truth: U8) -> F64:
 
 
 def ssim(made: U8, truth: U8) -> F64:
-    """Return the mean structural similarity of every frame ``(T,)``, 1 for equal ones; stacks ``(T, H, W, 3)``.
+    """Return the mean structural similarity of every frame ``(T,)``, 1 for equal ones; stacks ``(T,
+    H, W, 3)``.
 
     Raises:
         EvaluatorError: Stacks that do not belong together.
@@ -30,7 +31,9 @@ def ssim(made: U8, truth: U8) -> F64:
 
 
 def identical_frames(made: U8, truth: U8) -> int:
-    """Return how many frames are equal in every value; their PSNR is the cap, which a mean should not hide."""
+    """Return how many frames are equal in every value; their PSNR is the cap, which a mean should
+    not hide.
+    """
     check_stacks("counting identical frames", made, truth)
     return int(np.sum(np.all(made == truth, axis=(1, 2, 3))))
 
@@ -44,7 +47,12 @@ def check_stacks(doing: str, made: U8, truth: U8) -> None:
     for name, frames in (("made", made), ("truth", truth)):
         check_stack(doing, name, frames)
     if made.shape != truth.shape:
-        raise EvaluatorError(doing, "two videos", f"shapes {made.shape} and {truth.shape}", "give videos of the same frames at one size")
+        raise EvaluatorError(
+            doing,
+            "two videos",
+            f"shapes {made.shape} and {truth.shape}",
+            "give videos of the same frames at one size",
+        )
 
 
 def check_stack(doing: str, name: str, frames: U8) -> None:
@@ -54,4 +62,9 @@ def check_stack(doing: str, name: str, frames: U8) -> None:
         EvaluatorError: With what was found.
     """
     if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or not len(frames):
-        raise EvaluatorError(doing, f"the video {name!r}", f"{frames.dtype} {frames.shape}", "give (T, H, W, 3) uint8, at least one frame")
+        raise EvaluatorError(
+            doing,
+            f"the video {name!r}",
+            f"{frames.dtype} {frames.shape}",
+            "give (T, H, W, 3) uint8, at least one frame",
+        )

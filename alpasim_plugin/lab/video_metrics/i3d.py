@@ -1,7 +1,9 @@
-"""FVD's network: the TorchScript I3D of the StyleGAN-V protocol, from the user's weights; nothing is bundled or downloaded.
+"""FVD's network: the TorchScript I3D of the StyleGAN-V protocol, from the user's weights; nothing
+is bundled or downloaded.
 
-The file is ``i3d_torchscript.pt``, called as ``net(video, rescale=True, resize=True, return_features=True)``: uint8 values as floats in
-0 to 255, scaled inside to [-1, 1] and to 224x224; the 400 logits are averaged over time. Distances on anything else are not called FVD.
+The file is ``i3d_torchscript.pt``, called as ``net(video, rescale=True, resize=True,
+return_features=True)``: uint8 values as floats in 0 to 255, scaled inside to [-1, 1] and to
+224x224; the 400 logits are averaged over time. Distances on anything else are not called FVD.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ def load_i3d(folder: str | Path) -> tuple[VideoFeatures, str]:
     """Load the network from a folder of metric weights.
 
     Returns:
-        The network and the SHA-256 of its file, which every table prints: no digest of the original is published.
+        The network and the SHA-256 of its file, which every table prints: no digest of the original
+        is published.
 
     Raises:
         InputError: No such file, or a file of another form.
@@ -50,9 +53,18 @@ def load_i3d(folder: str | Path) -> tuple[VideoFeatures, str]:
         with torch.inference_mode():
             made = net(torch.zeros(PROBE), rescale=True, resize=True, return_features=True)
     except (RuntimeError, ValueError, TypeError) as error:
-        raise InputError(DOING, str(path), f"not a network of this form: {str(error).splitlines()[-1].strip()[:120]}", do) from error
+        raise InputError(
+            DOING,
+            str(path),
+            f"not a network of this form: {str(error).splitlines()[-1].strip()[:120]}",
+            do,
+        ) from error
     if not isinstance(made, Tensor) or tuple(made.shape) != (1, LOGITS):
-        found = f"features of shape {tuple(made.shape)}" if isinstance(made, Tensor) else f"a {type(made).__name__}"
+        found = (
+            f"features of shape {tuple(made.shape)}"
+            if isinstance(made, Tensor)
+            else f"a {type(made).__name__}"
+        )
         raise InputError(DOING, str(path), f"{found}, not (1, {LOGITS})", do)
     return net, file_sha256(path)
 
@@ -63,8 +75,8 @@ def i3d_features(net: VideoFeatures, video: U8, frames: int | None = None) -> F6
     Args:
         net: As `load_i3d` gives it.
         video: ``(T, H, W, 3)``, at least 10 frames.
-        frames: None: one vector of the whole clip ``(1, 400)`` (the paper's ``fvd_clip``); a number: one for each whole window of
-            so many frames (``fvd_16``).
+        frames: None: one vector of the whole clip ``(1, 400)`` (the paper's ``fvd_clip``); a
+            number: one for each whole window of so many frames (``fvd_16``).
 
     Raises:
         InputError: Fewer than 10 frames in a window.
@@ -72,10 +84,21 @@ def i3d_features(net: VideoFeatures, video: U8, frames: int | None = None) -> F6
     length = len(video) if frames is None else frames
     if length < LEAST_FRAMES or len(video) < length:
         found = f"{len(video)} frames, windows of {length}"
-        raise InputError("computing FVD's features", "a clip", found, f"give at least {LEAST_FRAMES} frames a window")
+        raise InputError(
+            "computing FVD's features",
+            "a clip",
+            found,
+            f"give at least {LEAST_FRAMES} frames a window",
+        )
     rows = []
     with torch.inference_mode():
         for start in range(0, len(video) - length + 1, length):
-            window = torch.from_numpy(np.array(video[start : start + length])).permute(3, 0, 1, 2)[None].float()
-            rows.append(net(window, rescale=True, resize=True, return_features=True)[0].double().numpy())
+            window = (
+                torch.from_numpy(np.array(video[start : start + length]))
+                .permute(3, 0, 1, 2)[None]
+                .float()
+            )
+            rows.append(
+                net(window, rescale=True, resize=True, return_features=True)[0].double().numpy()
+            )
     return np.stack(rows)

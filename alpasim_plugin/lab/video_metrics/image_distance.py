@@ -1,4 +1,6 @@
-"""Perceptual image distances by name: `perceptual-syn`, shipped with the package; LPIPS and DISTS, with weights from the user."""
+"""Perceptual image distances by name: `perceptual-syn`, shipped with the package; LPIPS and DISTS,
+with weights from the user.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ class ImageDistance(Protocol):
 
 
 def weights_folder(folder: str | Path | None = None) -> Path | None:
-    """Return the folder of metric weights: the given one, else ``SIMRUN_METRIC_WEIGHTS``, else None."""
+    """Return the folder of metric weights: the given one, else ``SIMRUN_METRIC_WEIGHTS``, else
+    None.
+    """
     named = folder or os.environ.get(FOLDER_VARIABLE)
     return Path(named) if named else None
 
@@ -37,7 +41,9 @@ def available(folder: str | Path | None = None) -> tuple[DistanceName, ...]:
     """Return the names of the distances whose weights are on disk."""
     found = weights_folder(folder)
     names: tuple[DistanceName, ...] = get_args(DistanceName)
-    return tuple(name for name in names if name == NAME or (found is not None and not _missing(name, found)))
+    return tuple(
+        name for name in names if name == NAME or (found is not None and not _missing(name, found))
+    )
 
 
 def _missing(name: str, folder: Path) -> list[str]:
@@ -53,7 +59,12 @@ def load_distance(name: str, folder: str | Path | None = None) -> ImageDistance:
     if name == NAME:
         return load_perceptual()
     if name not in (*_KINDS, DISTS):
-        raise InputError("choosing a perceptual distance", f"name {name!r}", "no such distance", f"choose one of {get_args(DistanceName)}")
+        raise InputError(
+            "choosing a perceptual distance",
+            f"name {name!r}",
+            "no such distance",
+            f"choose one of {get_args(DistanceName)}",
+        )
     found = weights_folder(folder)
     if found is None:
         do = f"set {FOLDER_VARIABLE} to the folder that holds the files named in docs/lab/video-metrics.md, or use {NAME}"
@@ -62,6 +73,8 @@ def load_distance(name: str, folder: str | Path | None = None) -> ImageDistance:
 
 
 def distance_for_training(folder: str | Path | None = None) -> tuple[DistanceName, ImageDistance]:
-    """Return LPIPS with VGG where its weights are on disk, else `perceptual-syn`, with its name, which every result must state."""
+    """Return LPIPS with VGG where its weights are on disk, else `perceptual-syn`, with its name,
+    which every result must state.
+    """
     name: DistanceName = "lpips_vgg" if "lpips_vgg" in available(folder) else "perceptual-syn"
     return name, load_distance(name, folder)

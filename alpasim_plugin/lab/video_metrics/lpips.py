@@ -1,8 +1,10 @@
-"""LPIPS v0.1 with an AlexNet or VGG-16 backbone; the user provides the weights, which are not bundled or downloaded.
+"""LPIPS v0.1 with an AlexNet or VGG-16 backbone; the user provides the weights, which are not
+bundled or downloaded.
 
-Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018, Eq. 1. Images in [-1, 1] are shifted
-and scaled per channel; activations after five rectifiers are scaled to unit length over the channels; their squared differences are
-weighted by calibrated non-negative heads, averaged over the image and summed. No resizing.
+Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018,
+Eq. 1. Images in [-1, 1] are shifted and scaled per channel; activations after five rectifiers are
+scaled to unit length over the channels; their squared differences are weighted by calibrated
+non-negative heads, averaged over the image and summed. No resizing.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ LOADING = "loading LPIPS"
 
 @dataclass(frozen=True)
 class Convolution:
-    """A convolution of a trunk, before its rectifier: index among the layers of the published network, and its shape."""
+    """A convolution of a trunk, before its rectifier: index among the layers of the published
+    network, and its shape.
+    """
 
     index: int
     inputs: int
@@ -65,10 +69,16 @@ class Trunk:
 
 
 def _vgg() -> tuple[Convolution, ...]:
-    rows, index, inputs = [], 0, 3
+    rows = []
+    index = 0
+    inputs = 3
     for stage, (outputs, count) in enumerate(((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))):
         for i in range(count):
-            rows.append(Convolution(index, inputs, outputs, pooled_first=stage > 0 and i == 0, tapped=i == count - 1))
+            rows.append(
+                Convolution(
+                    index, inputs, outputs, pooled_first=stage > 0 and i == 0, tapped=i == count - 1
+                )
+            )
             index, inputs = index + 2, outputs
         index += 1
     return tuple(rows)
@@ -83,10 +93,19 @@ TRUNKS: dict[Kind, Trunk] = {
             Convolution(8, 384, 256, tapped=True),
             Convolution(10, 256, 256, tapped=True),
         ),
-        3, "alexnet-owt-7be5be79.pth", "lpips-v0.1-alex.pth", "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
+        3,
+        "alexnet-owt-7be5be79.pth",
+        "lpips-v0.1-alex.pth",
+        "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
     ),
-    "vgg": Trunk(_vgg(), 2, "vgg16-397923af.pth", "lpips-v0.1-vgg.pth", "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
-}  # fmt: skip
+    "vgg": Trunk(
+        _vgg(),
+        2,
+        "vgg16-397923af.pth",
+        "lpips-v0.1-vgg.pth",
+        "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868",
+    ),
+}
 
 
 class LPIPS(nn.Module):
@@ -102,9 +121,14 @@ class LPIPS(nn.Module):
     def __init__(self, kind: Kind) -> None:
         super().__init__()
         self.kind, self.plan = kind, TRUNKS[kind]
-        layers = {str(c.index): nn.Conv2d(c.inputs, c.outputs, c.kernel, c.stride, c.padding) for c in self.plan.convolutions}
+        layers = {
+            str(c.index): nn.Conv2d(c.inputs, c.outputs, c.kernel, c.stride, c.padding)
+            for c in self.plan.convolutions
+        }
         self.features = nn.ModuleDict(layers)
-        self.heads = nn.ParameterList([nn.Parameter(torch.rand(c.outputs)) for c in self.plan.convolutions if c.tapped])
+        self.heads = nn.ParameterList(
+            [nn.Parameter(torch.rand(c.outputs)) for c in self.plan.convolutions if c.tapped]
+        )
         self.register_buffer("shift", torch.tensor(SHIFT).view(1, 3, 1, 1))
         self.register_buffer("scale", torch.tensor(SCALE).view(1, 3, 1, 1))
 
@@ -139,20 +163,24 @@ class LPIPS(nn.Module):
 def load_lpips(kind: Kind, folder: str | Path) -> LPIPS:
     """Load LPIPS v0.1 from a folder of weights, frozen.
 
-    The folder holds the backbone of PyTorch's model zoo and the heads of the ``lpips`` package, under the file names in `TRUNKS`.
-    Digests are checked before anything is read.
+    The folder holds the backbone of PyTorch's model zoo and the heads of the ``lpips`` package,
+    under the file names in `TRUNKS`. Digests are checked before anything is read.
 
     Raises:
         InputError: A missing or modified file, or one without the expected tensors.
     """
     if kind not in get_args(Kind):
-        raise InputError(LOADING, f"kind {kind!r}", "no such trunk", f"choose one of {', '.join(get_args(Kind))}")
+        raise InputError(
+            LOADING, f"kind {kind!r}", "no such trunk", f"choose one of {', '.join(get_args(Kind))}"
+        )
     net = LPIPS(kind)
     plan, folder = net.plan, Path(folder)
     missing = missing_files(kind, folder)
     if missing:
         do = "put the files there (docs/lab/video-metrics.md says where they come from), or use perceptual-syn"
-        raise InputError(LOADING, f"lpips_{kind} from {folder}", f"not there: {', '.join(missing)}", do)
+        raise InputError(
+            LOADING, f"lpips_{kind} from {folder}", f"not there: {', '.join(missing)}", do
+        )
     digest = file_sha256(folder / plan.file)
     if not digest.startswith(plan.digest_start):
         found = f"sha256 {digest}, which does not begin with {plan.digest_start}"
@@ -165,7 +193,11 @@ def load_lpips(kind: Kind, folder: str | Path) -> LPIPS:
 
 def missing_files(kind: Kind, folder: str | Path) -> list[str]:
     """Return which of the two files of a kind are not in a folder."""
-    return [name for name in (TRUNKS[kind].file, TRUNKS[kind].heads_file) if not (Path(folder) / name).is_file()]
+    return [
+        name
+        for name in (TRUNKS[kind].file, TRUNKS[kind].heads_file)
+        if not (Path(folder) / name).is_file()
+    ]
 
 
 def _state(plan: Trunk, trunk: StateDict, heads: StateDict, source: str) -> StateDict:
@@ -178,9 +210,13 @@ def _state(plan: Trunk, trunk: StateDict, heads: StateDict, source: str) -> Stat
     for c in plan.convolutions:
         shapes = {"weight": (c.outputs, c.inputs, c.kernel, c.kernel), "bias": (c.outputs,)}
         for part, shape in shapes.items():
-            out[f"features.{c.index}.{part}"] = _tensor(trunk, f"features.{c.index}.{part}", shape, source)
+            out[f"features.{c.index}.{part}"] = _tensor(
+                trunk, f"features.{c.index}.{part}", shape, source
+            )
     for i, c in enumerate(c for c in plan.convolutions if c.tapped):
-        out[f"heads.{i}"] = _tensor(heads, f"lin{i}.model.1.weight", (1, c.outputs, 1, 1), source).flatten()
+        out[f"heads.{i}"] = _tensor(
+            heads, f"lin{i}.model.1.weight", (1, c.outputs, 1, 1), source
+        ).flatten()
     return out
 
 
@@ -188,7 +224,9 @@ def _tensor(tensors: StateDict, key: str, shape: tuple[int, ...], source: str) -
     value = tensors.get(key)
     if value is None or tuple(value.shape) != shape:
         found = "it is missing" if value is None else f"its shape is {tuple(value.shape)}"
-        raise InputError(LOADING, f"{key} in {source}", found, f"give the published weights, where it is {shape}")
+        raise InputError(
+            LOADING, f"{key} in {source}", found, f"give the published weights, where it is {shape}"
+        )
     return weight(key, value, torch.float32, source)
 
 

@@ -1,6 +1,8 @@
-"""Perceptual distance of frames by a network that is handed in: `perceptual-syn`, or LPIPS where its weights are on disk.
+"""Perceptual distance of frames by a network that is handed in: `perceptual-syn`, or LPIPS where
+its weights are on disk.
 
-Networks come from `alpasim_plugin.lab.video_metrics.image_distance.load_distance`; torch is loaded only when one is used.
+Networks come from `alpasim_plugin.lab.video_metrics.image_distance.load_distance`; torch is loaded
+only when one is used.
 """
 
 from __future__ import annotations
@@ -47,5 +49,8 @@ def picture_distances(net: ImageDistance, made: U8, truth: U8) -> F64:
         return torch.from_numpy(np.array(frames)).permute(0, 3, 1, 2).float() / 127.5 - 1
 
     with torch.inference_mode():
-        parts = [net.distance(pictures(made[i : i + BATCH]), pictures(truth[i : i + BATCH])) for i in range(0, len(made), BATCH)]
+        parts = [
+            net.distance(pictures(made[i : i + BATCH]), pictures(truth[i : i + BATCH]))
+            for i in range(0, len(made), BATCH)
+        ]
     return np.asarray(torch.cat(parts).double().numpy())

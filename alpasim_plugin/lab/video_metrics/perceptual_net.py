@@ -1,8 +1,10 @@
-"""`perceptual-syn`: a perceptual distance over a small frozen feature network. It is not LPIPS: it is trained on synthetic scenes.
+"""`perceptual-syn`: a perceptual distance over a small frozen feature network. It is not LPIPS: it
+    is trained on synthetic scenes.
 
-The definition is that of LPIPS (Zhang et al., CVPR 2018, Eq. 1): features of every stage, scaled to unit length over the channels, squared
-difference, a non-negative weight per channel, mean over the image, sum over the stages. Values cannot be compared with published LPIPS
-numbers. docs/lab/perceptual-syn.md describes training and validation.
+The definition is that of LPIPS (Zhang et al., CVPR 2018, Eq. 1): features of every stage, scaled to
+unit length over the channels, squared difference, a non-negative weight per channel, mean over the
+image, sum over the stages. Values cannot be compared with published LPIPS numbers.
+docs/lab/perceptual-syn.md describes training and validation.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ FORMAT = "simrun-perceptual-1"
 WIDTHS = (16, 32, 64, 96)  # channels of the stages, at 1/2, 1/4, 1/8 and 1/16 of the resolution
 SMALLEST_PX = 16
 HEAD_INIT = -3.0  # before softplus
-LENGTH_EPS = 1e-4  # added to the squared length of a feature, against division by nearly zero in flat dark cells
+# added to the squared length of a feature, against division by nearly zero in flat dark cells
+LENGTH_EPS = 1e-4
 DOING = "measuring a perceptual distance"
 
 
@@ -44,12 +47,19 @@ class FeatureNet(nn.Module):
                 nn.Sequential(nn.Conv2d(3, one, 4, 2, 1), _activation()),
                 nn.Sequential(nn.Conv2d(one, two, 3, 2, 1), _activation()),
                 nn.Sequential(nn.Conv2d(two, three, 3, 2, 1), _activation()),
-                nn.Sequential(nn.Conv2d(three, four, 3, 2, 1), _activation(), nn.Conv2d(four, four, 3, 1, 1), _activation()),
+                nn.Sequential(
+                    nn.Conv2d(three, four, 3, 2, 1),
+                    _activation(),
+                    nn.Conv2d(four, four, 3, 1, 1),
+                    _activation(),
+                ),
             ]
         )
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """Map ``(B, 3, H, W)`` in [-1, 1] to features ``(B, C, H / 2^k, W / 2^k)`` of stages k = 1 to 4."""
+        """Map ``(B, 3, H, W)`` in [-1, 1] to features ``(B, C, H / 2^k, W / 2^k)`` of stages k = 1
+        to 4.
+        """
         out = []
         for stage in self.stages:
             image = stage(image)
@@ -77,7 +87,8 @@ class PerceptualDistance(nn.Module):
         self.heads = nn.ParameterList([nn.Parameter(torch.full((c,), HEAD_INIT)) for c in widths])
 
     def distance(self, a: Tensor, b: Tensor) -> Tensor:
-        """Return the distances ``(B,)`` of images ``(B, 3, H, W)`` in [-1, 1]; differentiable in both, zero for equal ones.
+        """Return the distances ``(B,)`` of images ``(B, 3, H, W)`` in [-1, 1]; differentiable in
+        both, zero for equal ones.
 
         Raises:
             InputError: Shapes differ, are not ``(B, 3, H, W)``, or a side is below 16 pixels.
@@ -89,10 +100,18 @@ class PerceptualDistance(nn.Module):
 
     def feature_distance(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
         """Return the distances ``(B,)`` of features as `FeatureNet` gives them."""
-        parts = [_stage_distance(x, y, F.softplus(head)) for x, y, head in zip(a, b, self.heads, strict=True)]
+        parts = [
+            _stage_distance(x, y, F.softplus(head))
+            for x, y, head in zip(a, b, self.heads, strict=True)
+        ]
         return torch.stack(parts).sum(0)
 
-    def save(self, path: str | Path, metadata: dict[str, str] | None = None, dtype: torch.dtype = torch.float16) -> None:
+    def save(
+        self,
+        path: str | Path,
+        metadata: dict[str, str] | None = None,
+        dtype: torch.dtype = torch.float16,
+    ) -> None:
         """Write the weights as safetensors."""
         tensors = {key: value.to(dtype) for key, value in self.state_dict().items()}
         write_safetensors(path, tensors, {**(metadata or {}), "format": FORMAT, "name": NAME})
@@ -112,11 +131,24 @@ def load_perceptual(path: str | Path | None = None) -> PerceptualDistance:
     if not source.is_file():
         raise InputError(doing, str(source), "no such file", do)
     if read_metadata(source).get("format") != FORMAT:
-        raise InputError(doing, str(source), f"format {read_metadata(source).get('format')!r}, not {FORMAT!r}", do)
-    tensors = {key: weight(key, value, torch.float32, str(source)) for key, value in load_weights(source).items()}
+        raise InputError(
+            doing,
+            str(source),
+            f"format {read_metadata(source).get('format')!r}, not {FORMAT!r}",
+            do,
+        )
+    tensors = {
+        key: weight(key, value, torch.float32, str(source))
+        for key, value in load_weights(source).items()
+    }
     heads = [tensors.get(f"heads.{i}") for i in range(len(WIDTHS))]
     if any(head is None for head in heads):
-        raise InputError(doing, str(source), f"{len(tensors)} tensors without the heads of {len(WIDTHS)} stages", do)
+        raise InputError(
+            doing,
+            str(source),
+            f"{len(tensors)} tensors without the heads of {len(WIDTHS)} stages",
+            do,
+        )
     one, two, three, four = (head.numel() for head in heads if head is not None)
     net = PerceptualDistance((one, two, three, four))
     try:
@@ -128,7 +160,11 @@ def load_perceptual(path: str | Path | None = None) -> PerceptualDistance:
 
 def shipped_weights() -> Path:
     """Return the path of the shipped weights."""
-    return Path(str(resources.files("alpasim_plugin.lab.video_metrics"))) / "weights" / f"{NAME}.safetensors"
+    return (
+        Path(str(resources.files("alpasim_plugin.lab.video_metrics")))
+        / "weights"
+        / f"{NAME}.safetensors"
+    )
 
 
 def check_images(a: Tensor, b: Tensor, smallest_px: int) -> None:
@@ -139,7 +175,9 @@ def check_images(a: Tensor, b: Tensor, smallest_px: int) -> None:
     """
     if a.shape != b.shape or a.ndim != 4 or a.shape[1] != 3 or min(a.shape[2:]) < smallest_px:
         do = f"give two tensors (B, 3, H, W) of one shape, sides of at least {smallest_px}"
-        raise InputError(DOING, "two batches of images", f"shapes {tuple(a.shape)} and {tuple(b.shape)}", do)
+        raise InputError(
+            DOING, "two batches of images", f"shapes {tuple(a.shape)} and {tuple(b.shape)}", do
+        )
 
 
 def _stage_distance(a: Tensor, b: Tensor, head: Tensor) -> Tensor:

@@ -1,7 +1,8 @@
 """Warp L1: how much a video changes beyond its own motion.
 
-The flow from every frame to the one before is estimated on the video itself, so a blurred video scores better: read it beside a distance
-to the truth. The paper takes the late frames of a clip, and the road alone where it knows where that is.
+The flow from every frame to the one before is estimated on the video itself, so a blurred video
+scores better: read it beside a distance to the truth. The paper takes the late frames of a clip,
+and the road alone where it knows where that is.
 """
 
 from __future__ import annotations
@@ -20,13 +21,15 @@ LATE_SHARE, LATE_LEAST = 3, 30  # the late window is the last third of the pairs
 def warp_l1(video: U8, road: Bool | None = None) -> F64:
     """Return the warp error of every pair of neighbouring frames.
 
-    Farneback flow on grey frames (pyramid 0.5, 3 levels, window 21, 3 iterations, poly_n 5, poly_sigma 1.2); the previous frame is sampled
-    where the flow points, bilinear, in float32; mean over the pixels that come from inside the picture of the absolute difference summed
-    over RGB, divided by 765.
+    Farneback flow on grey frames (pyramid 0.5, 3 levels, window 21, 3 iterations, poly_n 5,
+    poly_sigma 1.2); the previous frame is sampled where the flow points, bilinear, in float32; mean
+    over the pixels that come from inside the picture of the absolute difference summed over RGB,
+    divided by 765.
 
     Args:
         video: ``(T, H, W, 3)``, at least two frames.
-        road: ``(T, H, W)`` pixels that count; frames of which none does count whole, as all do without it.
+        road: ``(T, H, W)`` pixels that count; frames of which none does count whole, as all do
+            without it.
 
     Returns:
         ``(T - 1,)``, 0 to 1.
@@ -41,19 +44,24 @@ def warp_l1(video: U8, road: Bool | None = None) -> F64:
     grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in video]
     counts = np.ones(video.shape[:3], dtype=bool) if road is None else road
     flows = (backward_flow(grey[i], grey[i - 1]) for i in range(1, len(video)))
-    return np.array([_pair(video[i - 1], video[i], flow, counts[i]) for i, flow in enumerate(flows, start=1)])
+    return np.array(
+        [_pair(video[i - 1], video[i], flow, counts[i]) for i, flow in enumerate(flows, start=1)]
+    )
 
 
 def road_mask(sdmap: U8) -> Bool:
-    """Return the road ahead in a semantic map ``(H, W, 3)``: in every row what lies between its borders, from the bottom of the picture
-    up to a thirtieth of its height below the farthest border, where rows show none of the near ones.
+    """Return the road ahead in a semantic map ``(H, W, 3)``: in every row what lies between its
+    borders, from the bottom of the picture up to a thirtieth of its height below the farthest
+    border, where rows show none of the near ones.
 
     Returns:
         ``(H, W)``; nothing where the map shows no border.
     """
     border = class_masks(sdmap, 1)[CLASSES.index("boundary")] > 0
     out, middle = np.zeros(border.shape, dtype=bool), border.shape[1] // 2
-    farthest = int(np.argmax(border.any(axis=1))) + len(border) // 30 if border.any() else len(border)
+    farthest = (
+        int(np.argmax(border.any(axis=1))) + len(border) // 30 if border.any() else len(border)
+    )
     for row in range(len(border) - 1, farthest, -1):
         columns = np.flatnonzero(border[row])
         left = max(columns[columns < middle], default=-1)
@@ -64,7 +72,9 @@ def road_mask(sdmap: U8) -> Bool:
 
 
 def backward_flow(grey: U8, previous: U8) -> F32:
-    """Return where each pixel of a grey frame ``(H, W)`` was in the previous one, as a displacement ``(H, W, 2)`` (x, y), pixels."""
+    """Return where each pixel of a grey frame ``(H, W)`` was in the previous one, as a displacement
+    ``(H, W, 2)`` (x, y), pixels.
+    """
     flow = cv2.calcOpticalFlowFarneback(grey, previous, None, 0.5, 3, 21, 3, 5, 1.2, 0)
     return np.asarray(flow, dtype=np.float32)
 
@@ -85,8 +95,15 @@ def _pair(previous: U8, frame: U8, flow: F32, counts: Bool) -> float:
     x, y = columns + flow[..., 0], rows + flow[..., 1]
     valid = (x >= 0) & (x <= w - 1) & (y >= 0) & (y <= h - 1)
     if not valid.any():
-        raise EvaluatorError("computing Warp L1", "two neighbouring frames", "flow that leaves the picture everywhere", "look at the video")
+        raise EvaluatorError(
+            "computing Warp L1",
+            "two neighbouring frames",
+            "flow that leaves the picture everywhere",
+            "look at the video",
+        )
     valid = valid & counts if (valid & counts).any() else valid
-    warped = cv2.remap(previous.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    warped = cv2.remap(
+        previous.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     difference = np.abs(frame.astype(np.float32) - warped).sum(axis=2)
     return float(difference[valid].mean(dtype=np.float64)) / 765.0

@@ -1,4 +1,6 @@
-"""Compare a run folder with what it says of itself, and make its tables again where only they are damaged; nothing is driven here."""
+"""Compare a run folder with what it says of itself, and make its tables again where only they are
+damaged; nothing is driven here.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,15 @@ from alpasim_plugin.log.run_folder.manifests import (
     read_run_json,
     write_run_json,
 )
-from alpasim_plugin.log.run_folder.schema import CONTENTS, DOING, MANIFEST, ROLLOUTS_FOLDER, RUN_INFO, TABLES, rollout_folder
+from alpasim_plugin.log.run_folder.schema import (
+    CONTENTS,
+    DOING,
+    MANIFEST,
+    ROLLOUTS_FOLDER,
+    RUN_INFO,
+    TABLES,
+    rollout_folder,
+)
 from alpasim_plugin.log.run_folder.writer import writing
 
 NOT_FINISHED = "missing: the run is not finished, or an older version wrote it"
@@ -70,12 +80,20 @@ class Inspection:
 
     @property
     def is_remakable(self) -> bool:
-        """Tell whether everything that is damaged can be made again from the rollouts' manifests."""
+        """Tell whether everything that is damaged can be made again from the rollouts'
+        manifests.
+        """
         of_rollouts = self.of_rollouts or self.unfinished or self.tables_only
-        return bool(self.cells) and not of_rollouts and all(one.file in REMADE or one.cell for one in self.of_run)
+        return (
+            bool(self.cells)
+            and not of_rollouts
+            and all(one.file in REMADE or one.cell for one in self.of_run)
+        )
 
 
-def inspect_run(root: Path, full: bool = False, on_cell: Callable[[int, int], None] | None = None) -> Inspection:
+def inspect_run(
+    root: Path, full: bool = False, on_cell: Callable[[int, int], None] | None = None
+) -> Inspection:
     """Compare a run folder with its manifests and its contents.
 
     Args:
@@ -87,7 +105,12 @@ def inspect_run(root: Path, full: bool = False, on_cell: Callable[[int, int], No
         InputError: The folder holds no run, or nothing is left that says what it should hold.
     """
     if not (root / RUN_INFO).exists() and not (root / CONTENTS).exists():
-        raise InputError(DOING, str(root / RUN_INFO), "no such file", "give a folder written by simrun run or simrun score")
+        raise InputError(
+            DOING,
+            str(root / RUN_INFO),
+            "no such file",
+            "give a folder written by simrun run or simrun score",
+        )
     info, contents, damage = _descriptions(root)
     if contents is not None:
         damage += damaged_files(root, contents, full)
@@ -100,7 +123,11 @@ def inspect_run(root: Path, full: bool = False, on_cell: Callable[[int, int], No
         damage += state.damage
         if state.manifest is None and not state.damage:
             unfinished.append(cell)
-        elif contents is not None and state.manifest is not None and state.checksum != contents.rollouts[cell]:
+        elif (
+            contents is not None
+            and state.manifest is not None
+            and state.checksum != contents.rollouts[cell]
+        ):
             damage.append(Damage(cell, MANIFEST, NEWER))
         if on_cell is not None:
             on_cell(done, len(cells))
@@ -121,28 +148,53 @@ def _descriptions(root: Path) -> tuple[Mapping[str, Any], Contents | None, list[
         contents = read_contents(root)
     except InputError as error:
         errors.append(error)
-        damage.append(Damage("", CONTENTS, error.found if (root / CONTENTS).exists() else NOT_FINISHED))
+        damage.append(
+            Damage("", CONTENTS, error.found if (root / CONTENTS).exists() else NOT_FINISHED)
+        )
     if info is None and contents is None:
-        raise InputError(DOING, str(root), f"{RUN_INFO}: {errors[0].found}; {CONTENTS}: {errors[1].found}", f"{AGAIN} (with --out {root})")
+        raise InputError(
+            DOING,
+            str(root),
+            f"{RUN_INFO}: {errors[0].found}; {CONTENTS}: {errors[1].found}",
+            f"{AGAIN} (with --out {root})",
+        )
     return info or (contents.run if contents else {}), contents, damage
 
 
 def planned_cells(info: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the folders of the rollouts that ``run.json`` plans, in the order of the tables; of scored logs it names none."""
+    """Return the folders of the rollouts that ``run.json`` plans, in the order of the tables; of
+    scored logs it names none.
+    """
     if info.get("kind") == "score":
         return ()
-    axes: Sequence[Sequence[Any]] = (list(info["scenes"]), info["renderers"], info["policies"], info["seeds"])
-    return tuple(rollout_folder(renderer, policy, scene, seed).as_posix() for scene, renderer, policy, seed in product(*axes))
+    axes: Sequence[Sequence[Any]] = (
+        list(info["scenes"]),
+        info["renderers"],
+        info["policies"],
+        info["seeds"],
+    )
+    return tuple(
+        rollout_folder(renderer, policy, scene, seed).as_posix()
+        for scene, renderer, policy, seed in product(*axes)
+    )
 
 
-KEPT = ("pool", "determinism", "exit_code", "alpasim")  # members of run.json that the rollouts do not tell
+KEPT = (
+    "pool",
+    "determinism",
+    "exit_code",
+    "alpasim",
+)  # members of run.json that the rollouts do not tell
 SHOWN = 5
 
 
-def prepare_reading(root: Path, say: Callable[[str], None], remake: Callable[[Inspection], None]) -> None:
+def prepare_reading(
+    root: Path, say: Callable[[str], None], remake: Callable[[Inspection], None]
+) -> None:
     """Check a run folder before its tables are read.
 
-    Tables that are missing or damaged are made again if every rollout is whole. Damaged rollouts are named; nothing is driven.
+    Tables that are missing or damaged are made again if every rollout is whole. Damaged rollouts
+    are named; nothing is driven.
 
     Args:
         root: The run folder.
@@ -158,13 +210,19 @@ def prepare_reading(root: Path, say: Callable[[str], None], remake: Callable[[In
         say(f"note: {root} has no rollouts, only tables")
     if not found.of_run:
         for one in found.of_rollouts[:SHOWN]:
-            say(f"warning: damaged: {root}/{one}; the tables are whole; simrun check {shlex.quote(str(root))} --repair")
+            say(
+                f"warning: damaged: {root}/{one}; the tables are whole; simrun check {shlex.quote(str(root))} --repair"
+            )
         if len(found.of_rollouts) > SHOWN:
-            say(f"warning: {len(found.of_rollouts) - SHOWN} more damaged files: simrun check {shlex.quote(str(root))}")
+            say(
+                f"warning: {len(found.of_rollouts) - SHOWN} more damaged files: simrun check {shlex.quote(str(root))}"
+            )
         return
     if not os.access(root, os.W_OK):
         do_this = "copy the folder to where it can be written, and repair the copy: simrun check COPY --repair"
-        raise InputError(DOING, str(root), f"{found.of_run[0]}, and the folder is read-only", do_this)
+        raise InputError(
+            DOING, str(root), f"{found.of_run[0]}, and the folder is read-only", do_this
+        )
     with writing(root):  # whoever writes it now is named here
         found = inspect_run(root)
         if found.of_run:
@@ -177,14 +235,29 @@ def prepare_reading(root: Path, say: Callable[[str], None], remake: Callable[[In
 def _check_remakable(found: Inspection) -> None:
     if found.unfinished:
         there = f"{len(found.cells) - len(found.unfinished)} of {len(found.cells)} rollouts are finished"
-        raise InputError(DOING, str(found.root), f"the run is not finished: {there}", f"give its command again: {command_of(found)}")
+        raise InputError(
+            DOING,
+            str(found.root),
+            f"the run is not finished: {there}",
+            f"give its command again: {command_of(found)}",
+        )
     if not found.is_remakable:
-        problem = [*found.of_rollouts, *(one for one in found.of_run if one.file not in REMADE), *found.of_run][0]
-        raise InputError(DOING, str(found.root), str(problem), f"simrun check {shlex.quote(str(found.root))} --repair")
+        problem = [
+            *found.of_rollouts,
+            *(one for one in found.of_run if one.file not in REMADE),
+            *found.of_run,
+        ][0]
+        raise InputError(
+            DOING,
+            str(found.root),
+            str(problem),
+            f"simrun check {shlex.quote(str(found.root))} --repair",
+        )
 
 
 def restore_run(found: Inspection) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Write ``run.json`` again if it is damaged; return the manifests, and what they do not tell of the run.
+    """Write ``run.json`` again if it is damaged; return the manifests, and what they do not tell of
+    the run.
 
     Raises:
         InputError: A manifest is damaged.
@@ -192,7 +265,13 @@ def restore_run(found: Inspection) -> tuple[list[dict[str, Any]], dict[str, Any]
     if any(one.file == RUN_INFO for one in found.damage):
         write_run_json(found.root, found.info)
     manifests = [read_manifest(found.root / cell)[0] for cell in found.cells]
-    config = as_shape(dict[str, Any], found.info["config"], f"{found.root / RUN_INFO}, config", DOING, "make the run again")
+    config = as_shape(
+        dict[str, Any],
+        found.info["config"],
+        f"{found.root / RUN_INFO}, config",
+        DOING,
+        "make the run again",
+    )
     lost = {
         "pool": {
             "workers": config.get("workers"),
@@ -201,7 +280,10 @@ def restore_run(found: Inspection) -> tuple[list[dict[str, Any]], dict[str, Any]
             "frames": sum(int(m.get("frames") or 0) for m in manifests),
             "frames_per_s_total": None,
         },
-        "determinism": {"status": "skipped", "reason": "the run was stopped before it repeated a rollout"},
+        "determinism": {
+            "status": "skipped",
+            "reason": "the run was stopped before it repeated a rollout",
+        },
     }
     return manifests, lost | {key: found.info[key] for key in KEPT if key in found.info}
 

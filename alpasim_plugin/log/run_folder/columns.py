@@ -1,8 +1,10 @@
-"""Rollouts as columns: a table of any length, read one column at a time, gives the same sides as rows in memory.
+"""Rollouts as columns: a table of any length, read one column at a time, gives the same sides as
+rows in memory.
 
-The key columns are read once and kept as codes (25 bytes a rollout). A metric is streamed in batches when a statistic asks for it; as
-many metrics are kept as `KEPT_BYTES` hold. So a million rollouts with fifty metrics fit in a few hundred megabytes, and more are only
-slower. `alpasim_plugin.log.run_folder.sides.RendererRows` is the readable reference.
+The key columns are read once and kept as codes (25 bytes a rollout). A metric is streamed in
+batches when a statistic asks for it; as many metrics are kept as `KEPT_BYTES` hold. So a million
+rollouts with fifty metrics fit in a few hundred megabytes, and more are only slower.
+`alpasim_plugin.log.run_folder.sides.RendererRows` is the readable reference.
 """
 
 from __future__ import annotations
@@ -53,45 +55,72 @@ class RolloutTable:
         n_rollouts: Rows.
     """
 
-    def __init__(self, data: pa.Table | pads.Dataset, where: str, reasons: Reasons = _unknown) -> None:
+    def __init__(
+        self, data: pa.Table | pads.Dataset, where: str, reasons: Reasons = _unknown
+    ) -> None:
         self._data, self._where, self.reasons = data, where, reasons
         self.metrics = list(metrics_in(data.schema.names))
         self._kept: dict[str, F64] = {}
         codes: dict[str, list[I64]] = {name: [] for name in ("renderer", "policy", "scene")}
         self._names: dict[str, dict[str, int]] = {name: {} for name in TEXTS}
-        seeds, ok, failures = [], [], []
+        seeds = []
+        ok = []
+        failures = []
         has_class = "failure_class" in data.schema.names
-        for batch in self._batches([*ROLLOUTS_TABLE.required, *(["failure_class"] if has_class else [])]):
+        for batch in self._batches(
+            [*ROLLOUTS_TABLE.required, *(["failure_class"] if has_class else [])]
+        ):
             for name, parts in codes.items():
                 parts.append(_codes(batch.column(name), self._names[name]))
-            seeds.append(batch.column("seed").to_numpy(zero_copy_only=False).astype(np.int64, copy=False))
-            ran = _codes(batch.column("status"), self._names["status"]) == self._names["status"].get("ok", -1)
+            seeds.append(
+                batch.column("seed").to_numpy(zero_copy_only=False).astype(np.int64, copy=False)
+            )
+            ran = _codes(batch.column("status"), self._names["status"]) == self._names[
+                "status"
+            ].get("ok", -1)
             ok.append(ran)
             if has_class:
-                failures.append(_codes(batch.column("failure_class"), self._names["failure_class"])[~ran])
-        self._renderer, self._policy, self._scene = (_joined(codes[name]) for name in ("renderer", "policy", "scene"))
+                failures.append(
+                    _codes(batch.column("failure_class"), self._names["failure_class"])[~ran]
+                )
+        self._renderer, self._policy, self._scene = (
+            _joined(codes[name]) for name in ("renderer", "policy", "scene")
+        )
         self._seed, self._ok = _joined(seeds), np.concatenate(ok) if ok else np.zeros(0, dtype=bool)
         self._failed, self._failure = np.flatnonzero(~self._ok), _joined(failures)
         self.n_rollouts = len(self._ok)
         self.renderers, self.policies = (
-            _in_order(codes, self._names[name]) for name, codes in (("renderer", self._renderer), ("policy", self._policy))
+            _in_order(codes, self._names[name])
+            for name, codes in (("renderer", self._renderer), ("policy", self._policy))
         )
 
     @classmethod
     def of_files(cls, paths: Sequence[Path], reasons: Reasons = _unknown) -> RolloutTable:
-        """Open ``rollouts.parquet`` of one or several runs; a metric that a run lacks is missing in all its rollouts.
+        """Open ``rollouts.parquet`` of one or several runs; a metric that a run lacks is missing in
+        all its rollouts.
 
         Raises:
             InputError: A file is no such table.
         """
         for path in paths:
             ROLLOUTS_TABLE.check(path, DOING, AGAIN)
-        where = ", ".join(map(str, paths[:3])) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")
+        where = ", ".join(map(str, paths[:3])) + (
+            f" and {len(paths) - 3} more" if len(paths) > 3 else ""
+        )
         with parsing(DOING, where, AGAIN, "no tables that fit together"):
-            schema = pa.unify_schemas([pq.read_schema(path) for path in paths], promote_options="permissive")
-            coded = [pa.field(f.name, pa.dictionary(pa.int32(), pa.string())) if f.name in TEXTS else f for f in schema]
+            schema = pa.unify_schemas(
+                [pq.read_schema(path) for path in paths], promote_options="permissive"
+            )
+            coded = [
+                pa.field(f.name, pa.dictionary(pa.int32(), pa.string())) if f.name in TEXTS else f
+                for f in schema
+            ]
             reader = pads.ParquetFileFormat(dictionary_columns=set(TEXTS) & set(schema.names))
-            return cls(pads.dataset([str(path) for path in paths], schema=pa.schema(coded), format=reader), where, reasons)
+            return cls(
+                pads.dataset([str(path) for path in paths], schema=pa.schema(coded), format=reader),
+                where,
+                reasons,
+            )
 
     @classmethod
     def of_table(cls, table: pa.Table) -> RolloutTable:
@@ -108,7 +137,12 @@ class RolloutTable:
         mine = self._policy == self._names["policy"][policy]
         names = _in_order(self._renderer[mine], self._names["renderer"])
         codes = self._names["renderer"]
-        return {name: self._side(name, named or policy, np.flatnonzero(mine & (self._renderer == codes[name]))) for name in names}
+        return {
+            name: self._side(
+                name, named or policy, np.flatnonzero(mine & (self._renderer == codes[name]))
+            )
+            for name in names
+        }
 
     def failures(self) -> dict[str, int]:
         """Return how many rollouts did not run to their end, by failure class."""
@@ -118,16 +152,26 @@ class RolloutTable:
         """Return the failure class of a rollout."""
         at = int(np.searchsorted(self._failed, row))
         code = int(self._failure[at]) if len(self._failure) else -1
-        return next((name for name, own in self._names["failure_class"].items() if own == code), "") or "unknown"
+        return (
+            next((name for name, own in self._names["failure_class"].items() if own == code), "")
+            or "unknown"
+        )
 
     def column(self, metric: str) -> F64:
-        """Return a metric of every rollout ``(N,)``, NaN where the rollout failed or the value is not valid or not finite."""
+        """Return a metric of every rollout ``(N,)``, NaN where the rollout failed or the value is
+        not valid or not finite.
+        """
         if metric not in self._kept:
             values = np.full(self.n_rollouts, np.nan)
             at = 0
             for batch in self._batches([metric, metric + VALID] if metric in self.metrics else []):
                 value = batch.column(metric).cast(pa.float64()).to_numpy(zero_copy_only=False)
-                valid = batch.column(metric + VALID).cast(pa.bool_()).fill_null(False).to_numpy(zero_copy_only=False)
+                valid = (
+                    batch.column(metric + VALID)
+                    .cast(pa.bool_())
+                    .fill_null(False)
+                    .to_numpy(zero_copy_only=False)
+                )
                 values[at : at + len(batch)] = np.where(valid & np.isfinite(value), value, np.nan)
                 at += len(batch)
             values[~self._ok] = np.nan
@@ -141,7 +185,9 @@ class RolloutTable:
             yield from self._data.select(columns).to_batches(BATCH_ROWS)
         elif columns:
             with parsing(DOING, self._where, AGAIN, "no readable parquet"):
-                yield from self._data.scanner(columns=list(columns), batch_size=BATCH_ROWS).to_batches()
+                yield from self._data.scanner(
+                    columns=list(columns), batch_size=BATCH_ROWS
+                ).to_batches()
 
     def _side(self, renderer: str, policy: str, rows: I64) -> RendererColumns:
         scene_names = np.array(list(self._names["scene"]), dtype=object)
@@ -150,9 +196,13 @@ class RolloutTable:
         rank = np.empty(len(present), dtype=np.int64)
         rank[order] = np.arange(len(present))
         seeds, seed = np.unique(self._seed[rows], return_inverse=True)
-        keys, cell = np.unique(rank[number.reshape(-1)] * len(seeds) + seed.reshape(-1), return_inverse=True)
+        keys, cell = np.unique(
+            rank[number.reshape(-1)] * len(seeds) + seed.reshape(-1), return_inverse=True
+        )
         cells = Cells(policy, tuple(scene_names[present][order].tolist()), seeds, keys)
-        return RendererColumns(self, renderer, rows, self._ok[rows], cells, cell.reshape(-1), cells.scene)
+        return RendererColumns(
+            self, renderer, rows, self._ok[rows], cells, cell.reshape(-1), cells.scene
+        )
 
 
 @dataclass(frozen=True)
@@ -178,7 +228,12 @@ class Cells(Sequence[Cell]):
         names, own = tuple(sorted(set(scenes))), np.unique(np.array(seeds, dtype=np.int64))
         place = {name: i for i, name in enumerate(names)}
         keys = np.array([place[name] for name in scenes], dtype=np.int64) * max(len(own), 1)
-        return cls(policies[0] if policies else "", names, own, keys + np.searchsorted(own, np.array(seeds, dtype=np.int64)))
+        return cls(
+            policies[0] if policies else "",
+            names,
+            own,
+            keys + np.searchsorted(own, np.array(seeds, dtype=np.int64)),
+        )
 
     @property
     def scene(self) -> I64:
@@ -242,7 +297,9 @@ class RendererColumns(Side):
         return self.table.column(metric)[self.rows]
 
     def _placed(self, other: Side) -> I64:
-        return self.cells.place_in(other.cells if isinstance(other.cells, Cells) else Cells.of(other.cells))
+        return self.cells.place_in(
+            other.cells if isinstance(other.cells, Cells) else Cells.of(other.cells)
+        )
 
     def first_row(self, cell: Cell) -> int | None:
         """Return the first rollout of a cell."""
@@ -267,8 +324,13 @@ def _codes(column: Any, names: dict[str, int]) -> I64:
     """Return the code ``(n,)`` of each text, -1 for null; new texts are added to ``names``."""
     if not pa.types.is_dictionary(column.type):
         column = column.dictionary_encode()
-    code_of = np.array([names.setdefault(name, len(names)) for name in column.dictionary.to_pylist()] + [-1], dtype=np.int64)
-    return np.asarray(code_of[column.indices.fill_null(len(code_of) - 1).to_numpy(zero_copy_only=False)])
+    code_of = np.array(
+        [names.setdefault(name, len(names)) for name in column.dictionary.to_pylist()] + [-1],
+        dtype=np.int64,
+    )
+    return np.asarray(
+        code_of[column.indices.fill_null(len(code_of) - 1).to_numpy(zero_copy_only=False)]
+    )
 
 
 def _in_order(codes: I64, names: Mapping[str, int]) -> list[str]:

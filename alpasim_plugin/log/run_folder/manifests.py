@@ -1,8 +1,10 @@
-"""The files that state what a run folder holds, so that nothing damaged is trusted: each ends with the checksum of its own content.
+"""The files that state what a run folder holds, so that nothing damaged is trusted: each ends with
+the checksum of its own content.
 
-``manifest.json`` of a rollout says what it is, how it went, and states the digests of its files; it is written last. ``run.json`` describes
-the run. ``contents.json`` states the tables, the scene files, AlpaSim's aggregation and the checksum of every manifest, and holds a copy of
-``run.json``. It is removed when a run begins and written last: a folder without it is unfinished.
+``manifest.json`` of a rollout says what it is, how it went, and states the digests of its files; it
+is written last. ``run.json`` describes the run. ``contents.json`` states the tables, the scene
+files, AlpaSim's aggregation and the checksum of every manifest, and holds a copy of ``run.json``.
+It is removed when a run begins and written last: a folder without it is unfinished.
 """
 
 from __future__ import annotations
@@ -12,7 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from alpasim_plugin.core.checksums import FileFacts, checksums_of, problem_of, read_sealed, write_sealed
+from alpasim_plugin.core.checksums import (
+    FileFacts,
+    checksums_of,
+    problem_of,
+    read_sealed,
+    write_sealed,
+)
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading.files import as_shape
 from alpasim_plugin.log.run_folder.schema import (
@@ -27,7 +35,12 @@ from alpasim_plugin.log.run_folder.schema import (
     STEPS_NAME,
     TABLES,
 )
-from alpasim_plugin.log.run_folder.shapes import REQUIRED_OF_RUN, ContentsFile, ManifestFile, RunInfo
+from alpasim_plugin.log.run_folder.shapes import (
+    REQUIRED_OF_RUN,
+    ContentsFile,
+    ManifestFile,
+    RunInfo,
+)
 
 AGAIN = "give the command of the run again: finished rollouts are kept"
 DOING_ROLLOUT, DRIVE_AGAIN = "reading a rollout", "simrun check RUN --repair runs the rollout again"
@@ -60,7 +73,8 @@ class RolloutState:
     Attributes:
         manifest: None where it is missing or damaged.
         checksum: Of the manifest; empty without one.
-        damage: Damaged files; a rollout without a manifest that was never finished is unfinished, not damaged.
+        damage: Damaged files; a rollout without a manifest that was never finished is unfinished,
+            not damaged.
     """
 
     manifest: dict[str, Any] | None
@@ -81,7 +95,8 @@ class Contents:
 
     Attributes:
         files: Path below the run folder -> size, time and digest.
-        rollouts: Folder of a rollout below the run folder -> checksum of its manifest, in the order of the tables.
+        rollouts: Folder of a rollout below the run folder -> checksum of its manifest, in the order
+            of the tables.
         run: A copy of ``run.json``.
     """
 
@@ -91,7 +106,8 @@ class Contents:
 
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Write the manifest of a rollout with the digests of the files that are there; those of a failed rollout are not stated.
+    """Write the manifest of a rollout with the digests of the files that are there; those of a
+    failed rollout are not stated.
 
     Raises:
         InfrastructureError: The disk refuses.
@@ -111,7 +127,9 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
     as_shape(ManifestFile, manifest, path, DOING_ROLLOUT, DRIVE_AGAIN)
     others = sorted(set(manifest["files"]) - {*DRIVEN, *DERIVED})
     if others:
-        raise InputError(DOING_ROLLOUT, str(path), f"it states {others[0]!r}, which no rollout has", DRIVE_AGAIN)
+        raise InputError(
+            DOING_ROLLOUT, str(path), f"it states {others[0]!r}, which no rollout has", DRIVE_AGAIN
+        )
     if manifest["status"] == "ok" and STEPS_NAME not in manifest["files"]:
         raise InputError(DOING_ROLLOUT, str(path), f"it does not state {STEPS_NAME}", DRIVE_AGAIN)
     return manifest, checksum
@@ -167,7 +185,11 @@ def write_contents(root: Path, rollouts: Mapping[str, str]) -> None:
         InfrastructureError: The disk refuses.
         InputError: ``run.json`` is not as it was written.
     """
-    more = sorted(path.relative_to(root).as_posix() for name in (SCENES, AGGREGATE) for path in (root / name).glob("*.*"))
+    more = sorted(
+        path.relative_to(root).as_posix()
+        for name in (SCENES, AGGREGATE)
+        for path in (root / name).glob("*.*")
+    )
     run, _ = read_sealed(root / RUN_INFO, DOING, AGAIN)
     stated = {"files": checksums_of(root, [*TABLES, *more]), "rollouts": dict(rollouts), "run": run}
     write_sealed(root / CONTENTS, stated, "writing the contents of a run")
@@ -197,7 +219,9 @@ def find_contents(root: Path) -> Contents | None:
 
 
 def damaged_files(root: Path, contents: Contents, full: bool = False) -> list[Damage]:
-    """Return the damaged tables and scene files of a run folder; ``full`` as for `inspect_rollout`."""
+    """Return the damaged tables and scene files of a run folder; ``full`` as for
+    `inspect_rollout`.
+    """
     return _damage(root, "", contents.files, full)
 
 

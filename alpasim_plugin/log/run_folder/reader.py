@@ -81,18 +81,26 @@ class Run:
 
     @property
     def scenes_asked(self) -> list[str]:
-        """List what the command named as scenarios, or, where no command did, paths that one may name."""
+        """List what the command named as scenarios, or, where no command did, paths that one may
+        name.
+        """
         refs = [scene.get("ref") or {} for scene in (self.info.get("scenes") or {}).values()]
-        return self.info.get("asked") or list(dict.fromkeys(str(ref["path"]) for ref in refs if ref.get("path")))
+        return self.info.get("asked") or list(
+            dict.fromkeys(str(ref["path"]) for ref in refs if ref.get("path"))
+        )
 
     @property
     def variants(self) -> list[str]:
-        """List the columns of the result tables: the keys under which ``summary.json`` holds metrics."""
+        """List the columns of the result tables: the keys under which ``summary.json`` holds
+        metrics.
+        """
         return list(self.summary.get("metrics") or {}) or self.renderers
 
     def rollouts_of(self, variant: str) -> list[Rollout]:
         """List the rollouts of a summary key: a renderer's name, or `Rollout.variant`."""
-        return [r for r in self.rollouts if r.variant == variant] or [r for r in self.rollouts if r.renderer == variant]
+        return [r for r in self.rollouts if r.variant == variant] or [
+            r for r in self.rollouts if r.renderer == variant
+        ]
 
     @cached_property
     def by_scene(self) -> Mapping[str, Sequence[Rollout]]:
@@ -112,7 +120,9 @@ class Run:
         return found
 
     def scene_path(self, scene: str) -> Path | None:
-        """Find the file of a scene's map, independent of how slashes in its name were encoded; None where there is none."""
+        """Find the file of a scene's map, independent of how slashes in its name were encoded; None
+        where there is none.
+        """
         return self._scene_files.get(scene)
 
     def scene_data(self, scene: str) -> Mapping[str, Any] | None:
@@ -126,24 +136,39 @@ class Run:
         return {} if path is None else read_json(path)
 
     def file_of(self, rollout: Rollout, name: str) -> Path | None:
-        """Find a file in a rollout's folder; None where absent or where the path leaves the run folder."""
+        """Find a file in a rollout's folder; None where absent or where the path leaves the run
+        folder.
+        """
         path = self._inside(rollout, name)
         return path if path is not None and path.is_file() else None
 
     def href(self, rollout: Rollout, name: str = "") -> str | None:
-        """Give a relative link to a rollout's folder or to a file in it; None where it does not exist."""
+        """Give a relative link to a rollout's folder or to a file in it; None where it does not
+        exist.
+        """
         path = self._inside(rollout, name)
-        return None if path is None else quote(path.relative_to(self.folder).as_posix()) + ("" if name else "/")
+        return (
+            None
+            if path is None
+            else quote(path.relative_to(self.folder).as_posix()) + ("" if name else "/")
+        )
 
     def _inside(self, rollout: Rollout, name: str) -> Path | None:
         path = self.folder / rollout.path / name
-        return path if rollout.path and path.exists() and path.resolve().is_relative_to(self.folder.resolve()) else None
+        return (
+            path
+            if rollout.path
+            and path.exists()
+            and path.resolve().is_relative_to(self.folder.resolve())
+            else None
+        )
 
     def steps(self, metrics: Sequence[str], scenes: Sequence[str] | None = None) -> pa.Table:
         """Read the named series from ``steps.parquet``.
 
         Returns:
-            A table with renderer, policy, scene, seed, t_us, metric, value and valid; empty without the file.
+            A table with renderer, policy, scene, seed, t_us, metric, value and valid; empty without
+            the file.
         """
         keep = pc.field("metric").isin(list(metrics))
         if scenes is not None:
@@ -154,7 +179,8 @@ class Run:
         """Read all series of one rollout, from the table in its own folder or else from the run's.
 
         Returns:
-            A table with renderer, policy, scene, seed, t_us, metric, value, valid and reason; empty where neither exists.
+            A table with renderer, policy, scene, seed, t_us, metric, value, valid and reason; empty
+            where neither exists.
         """
         own = self.file_of(rollout, STEPS_NAME)
         keep = None
@@ -162,14 +188,18 @@ class Run:
             keep = pc.field(name) == value if keep is None else keep & (pc.field(name) == value)
         return self._read_steps(own or self.folder / STEPS, (*STEP_COLUMNS, "reason"), keep)
 
-    def _read_steps(self, path: Path, columns: Sequence[str], keep: pc.Expression | None, coded: bool = True) -> pa.Table:
+    def _read_steps(
+        self, path: Path, columns: Sequence[str], keep: pc.Expression | None, coded: bool = True
+    ) -> pa.Table:
         if not path.is_file():
             return STEPS_TABLE.arrow().empty_table().select(list(columns))
         if path not in self._steps_checked:
             STEPS_TABLE.check(path)
             self._steps_checked.add(path)
         with parsing(DOING, path, AGAIN, "no readable parquet"):
-            return pads.dataset(path, format=TEXT_AS_CODES if coded else "parquet").to_table(columns=list(columns), filter=keep)
+            return pads.dataset(path, format=TEXT_AS_CODES if coded else "parquet").to_table(
+                columns=list(columns), filter=keep
+            )
 
     @cached_property
     def _steps_checked(self) -> set[Path]:
@@ -177,7 +207,9 @@ class Run:
 
     @cached_property
     def invalid_reasons(self) -> dict[tuple[str, str], str]:
-        """Give per (renderer, metric) why rollouts have no valid value: the most frequent reason, from the ledger or else the steps."""
+        """Give per (renderer, metric) why rollouts have no valid value: the most frequent reason,
+        from the ledger or else the steps.
+        """
         columns = ["renderer", "metric", "reason"]
         table = self._read_steps(self.folder / STEPS, columns, ~pc.field("valid"), coded=False)
         counts = table.group_by(columns).aggregate([([], "count_all")]).sort_by("count_all")
@@ -221,7 +253,9 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def reporting(run: Run) -> AbstractContextManager[None]:
-    """Give what makes a report of a run that says something impossible an error of that run, and not a traceback."""
+    """Give what makes a report of a run that says something impossible an error of that run, and
+    not a traceback.
+    """
     return parsing("writing a report", run.folder, AGAIN, "a run from which no report can be made")
 
 
@@ -229,10 +263,12 @@ def read_run(run_dir: Path | str) -> Run:
     """Read a run folder.
 
     Args:
-        run_dir: Folder with ``run.json``, ``rollouts.parquet`` and ``summary.json`` (docs/architecture.md).
+        run_dir: Folder with ``run.json``, ``rollouts.parquet`` and ``summary.json``
+            (docs/architecture.md).
 
     Raises:
-        InputError: A file is absent or unreadable, or ``rollouts.parquet`` is not as `ROLLOUTS_TABLE` says.
+        InputError: A file is absent or unreadable, or ``rollouts.parquet`` is not as
+            `ROLLOUTS_TABLE` says.
     """
     folder = Path(run_dir)
     info: Mapping[str, Any] = read_json_as(RunInfo, folder / RUN_INFO, DOING, do_this=AGAIN)
@@ -242,7 +278,8 @@ def read_run(run_dir: Path | str) -> Run:
 
 
 def read_so_far(root: Path) -> RunSoFar[Run]:
-    """Read a run folder that may still be written: a manifest is written last, so a rollout that has one is whole.
+    """Read a run folder that may still be written: a manifest is written last, so a rollout that
+    has one is whole.
 
     Raises:
         InputError: It holds no run, or its description or its tables are damaged.
@@ -254,6 +291,13 @@ def read_so_far(root: Path) -> RunSoFar[Run]:
     cells = planned_cells(info)
     states = [inspect_rollout(root, cell) for cell in cells]
     with parsing(DOING, root, AGAIN, "manifests from which no table can be made"):
-        table = rollout_table([state.manifest for state in states if state.manifest is not None and not state.damage])
+        table = rollout_table(
+            [state.manifest for state in states if state.manifest is not None and not state.damage]
+        )
     damage = tuple(str(one) for state in states for one in state.damage)
-    return RunSoFar(Run(root, info, {}, rollouts_of_table(table), metrics_in(table.column_names)), len(cells), damage, False)
+    return RunSoFar(
+        Run(root, info, {}, rollouts_of_table(table), metrics_in(table.column_names)),
+        len(cells),
+        damage,
+        False,
+    )

@@ -54,12 +54,15 @@ class Rollout:
 
     @property
     def variant(self) -> str:
-        """Give ``RENDERER/POLICY``, its key in ``summary.json`` of a run of several policies; of one policy that is the renderer alone."""
+        """Give ``RENDERER/POLICY``, its key in ``summary.json`` of a run of several policies; of
+        one policy that is the renderer alone.
+        """
         return cell_name(self.renderer, self.policy)
 
 
 class StoredRollouts(Sequence[Rollout]):
-    """The rows of ``rollouts.parquet``, read when the first one is asked for: what only needs columns never makes them.
+    """The rows of ``rollouts.parquet``, read when the first one is asked for: what only needs
+    columns never makes them.
 
     Args:
         path: The file.
@@ -116,7 +119,11 @@ def series_by_cell(table: pa.Table) -> Series:
     Returns:
         cell -> metric -> (``t_us (T,)``, ``value (T,)``).
     """
-    table = table.filter(pc.and_(table["valid"], pc.is_finite(table["value"]))) if table.num_rows else table
+    table = (
+        table.filter(pc.and_(table["valid"], pc.is_finite(table["value"])))
+        if table.num_rows
+        else table
+    )
     if not table.num_rows:
         return {}
     codes, names = zip(*(_coded(table[name]) for name in (*KEYS, "metric")), strict=True)
@@ -126,14 +133,21 @@ def series_by_cell(table: pa.Table) -> Series:
     for code, values in zip(codes, names, strict=True):
         group = group * len(values) + code
     order = np.lexsort((t_us, group))
-    group, t_us, value = group[order], t_us[order], value[order]
+    group = group[order]
+    t_us = t_us[order]
+    value = value[order]
     starts = np.flatnonzero(np.diff(group, prepend=-1))
     stops = np.append(starts[1:], len(group))
     found: Series = {}
     for start, stop in zip(starts, stops, strict=True):
         row = order[start]
-        renderer, policy, scene, seed, metric = (values[code[row]] for code, values in zip(codes, names, strict=True))
-        found.setdefault((renderer, policy, scene, int(seed)), {})[metric] = (t_us[start:stop], value[start:stop])
+        renderer, policy, scene, seed, metric = (
+            values[code[row]] for code, values in zip(codes, names, strict=True)
+        )
+        found.setdefault((renderer, policy, scene, int(seed)), {})[metric] = (
+            t_us[start:stop],
+            value[start:stop],
+        )
     return found
 
 
@@ -144,4 +158,6 @@ def _coded(column: pa.ChunkedArray) -> tuple[I64, list[Any]]:
         coded = pa.concat_arrays(coded.chunks)
     if not pa.types.is_dictionary(coded.type):
         coded = coded.dictionary_encode()
-    return coded.indices.to_numpy(zero_copy_only=False).astype(np.int64, copy=False), coded.dictionary.to_pylist()
+    return coded.indices.to_numpy(zero_copy_only=False).astype(
+        np.int64, copy=False
+    ), coded.dictionary.to_pylist()

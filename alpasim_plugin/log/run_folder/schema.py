@@ -1,4 +1,6 @@
-"""What a run folder holds: its files in the order in which they are written, its tables column by column, and the names of its cells."""
+"""What a run folder holds: its files in the order in which they are written, its tables column by
+column, and the names of its cells.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ if TYPE_CHECKING:
 
 DOING = "reading a run folder"
 AGAIN = "give a folder written by simrun run or simrun score, or write it again with the same command and --resume"
-LARGEST = 1e15  # of a metric's value: a double holds no thousandths of larger ones, and no picture a thousand times as much
+# of a metric's value: a double holds no thousandths of larger ones, and no picture a thousand times
+# as much
+LARGEST = 1e15
 LATEST_US = 2.0**62  # of a time: the difference of two is one of 64 bits
 VALID = "_valid"  # ends the name of the column that tells where a metric is valid
 
@@ -31,8 +35,8 @@ class File:
     Attributes:
         name: Below the folder; a folder ends with ``/``.
         holds: What is in it, for docs/architecture.md.
-        made_by: What writes it: the beginning of a run, the drive, the scoring of its log, the tables, the reports, a command of its own,
-            or the end of the run.
+        made_by: What writes it: the beginning of a run, the drive, the scoring of its log, the
+            tables, the reports, a command of its own, or the end of the run.
         is_required: Finished runs, and finished rollouts, have it.
     """
 
@@ -42,15 +46,29 @@ class File:
     is_required: bool = True
 
 
-LOG_NAME, FRAMES_NAME, OUTPUT_NAME, STEPS_NAME = "rollout.asl", "frames.jsonl", "output.log", "steps.parquet"
-STRIP_NAME, VIDEO_NAME, MANIFEST, WHY_NAME = "strip.jpg", "front.mp4", "manifest.json", "why.html"
-LOCK, RUN_INFO, CONTENTS, SUMMARY, ROLLOUTS, STEPS = (
-    ".simrun.lock", "run.json", "contents.json", "summary.json", "rollouts.parquet", "steps.parquet"
-)  # fmt: skip
-SCENES, ROLLOUTS_FOLDER, AGGREGATE, PROBES = "scenes", "rollouts", "aggregate", "probes"
+LOG_NAME = "rollout.asl"
+FRAMES_NAME = "frames.jsonl"
+OUTPUT_NAME = "output.log"
+STEPS_NAME = "steps.parquet"
+STRIP_NAME = "strip.jpg"
+VIDEO_NAME = "front.mp4"
+MANIFEST = "manifest.json"
+WHY_NAME = "why.html"
+LOCK = ".simrun.lock"
+RUN_INFO = "run.json"
+CONTENTS = "contents.json"
+SUMMARY = "summary.json"
+ROLLOUTS = "rollouts.parquet"
+STEPS = "steps.parquet"
+SCENES = "scenes"
+ROLLOUTS_FOLDER = "rollouts"
+AGGREGATE = "aggregate"
+PROBES = "probes"
 PAGES = ("report.html", "flips.html")
 REPORTS = (*PAGES, "summary.md", "junit.xml")  # made from the tables; nothing reads them
-PROBE_JSON, PROBE_TABLE, PROBE_PLOT = "probe.json", "probe.parquet", "probe.png"
+PROBE_JSON = "probe.json"
+PROBE_TABLE = "probe.parquet"
+PROBE_PLOT = "probe.png"
 
 ROLLOUT_FILES = (
     File(LOG_NAME, "the log", "drive"),
@@ -64,26 +82,51 @@ ROLLOUT_FILES = (
 )
 RUN_FILES = (
     File(LOCK, "who writes the folder, while somebody does", "start", is_required=False),
-    File(f"{SCENES}/", "lanes, edges and the logged path, so that a report needs no source files", "start"),
+    File(
+        f"{SCENES}/",
+        "lanes, edges and the logged path, so that a report needs no source files",
+        "start",
+    ),
     File(RUN_INFO, "the command, and everything that decides the results", "start"),
     File(f"{ROLLOUTS_FOLDER}/", "a folder for each rollout", "drive"),
     File(f"{AGGREGATE}/", "AlpaSim's aggregation of scored logs", "score", is_required=False),
-    File("decision.json", "question, order of scenes, looks and verdict of a run driven until decided", "drive", is_required=False),
+    File(
+        "decision.json",
+        "question, order of scenes, looks and verdict of a run driven until decided",
+        "drive",
+        is_required=False,
+    ),
     File(ROLLOUTS, "a row for each rollout", "tables"),
     File(STEPS, "a row for each metric at each instant of a rollout", "tables"),
-    File(SUMMARY, "metrics with intervals, paired differences, censoring, failures, speed", "tables"),
-    File("flips.json", "of every pair that ends differently: when the plans diverge", "report", is_required=False),
+    File(
+        SUMMARY, "metrics with intervals, paired differences, censoring, failures, speed", "tables"
+    ),
+    File(
+        "flips.json",
+        "of every pair that ends differently: when the plans diverge",
+        "report",
+        is_required=False,
+    ),
     File("flips/", "both frames at that time", "report", is_required=False),
-    *(File(name, "reports for people and for CI", "report", is_required=False) for name in reversed(REPORTS)),
+    *(
+        File(name, "reports for people and for CI", "report", is_required=False)
+        for name in reversed(REPORTS)
+    ),
     File(CONTENTS, "digests of the tables and of all manifests, a copy of run.json", "end"),
     File("view.html", "drives side by side", "command", is_required=False),
     File("gate.json", "what the last gate found, for the report", "command", is_required=False),
     File(f"{PROBES}/", "probes of logged rollouts", "command", is_required=False),
     File("forks/", "forks of logged rollouts", "command", is_required=False),
 )
-TABLES = tuple(file.name for file in RUN_FILES if file.made_by == "tables")  # made from the manifests
-DRIVEN = tuple(file.name for file in ROLLOUT_FILES if file.made_by == "drive")  # only driving makes them
-DERIVED = tuple(file.name for file in ROLLOUT_FILES if file.made_by == "score")  # scoring makes them from the log
+TABLES = tuple(
+    file.name for file in RUN_FILES if file.made_by == "tables"
+)  # made from the manifests
+DRIVEN = tuple(
+    file.name for file in ROLLOUT_FILES if file.made_by == "drive"
+)  # only driving makes them
+DERIVED = tuple(
+    file.name for file in ROLLOUT_FILES if file.made_by == "score"
+)  # scoring makes them from the log
 
 
 @dataclass(frozen=True)
@@ -135,23 +178,37 @@ class TableSchema:
         """
         import pyarrow as pa
 
-        types = {"text": pa.string(), "integer": pa.int64(), "number": pa.float64(), "flag": pa.bool_()}
+        types = {
+            "text": pa.string(),
+            "integer": pa.int64(),
+            "number": pa.float64(),
+            "flag": pa.bool_(),
+        }
         own = [column for column in self.columns if of_logs or not column.of_logs]
-        return pa.schema([(column.name, types[column.kind]) for column in (*own, *columns_of(metrics))])
+        return pa.schema(
+            [(column.name, types[column.kind]) for column in (*own, *columns_of(metrics))]
+        )
 
-    def check(self, path: Path, doing: str = DOING, do_this: str = AGAIN, rates: Container[str] = ()) -> list[str]:
-        """Compare a file with the schema before any of it is used, and return the names of its columns.
+    def check(
+        self, path: Path, doing: str = DOING, do_this: str = AGAIN, rates: Container[str] = ()
+    ) -> list[str]:
+        """Compare a file with the schema before any of it is used, and return the names of its
+        columns.
 
-        Types are read from the header; so are missing values and values out of range, where the header has statistics. Metrics that are
-        ``rates`` lie in [0, 1].
+        Types are read from the header; so are missing values and values out of range, where the
+        header has statistics. Metrics that are ``rates`` lie in [0, 1].
 
         Raises:
-            InputError: It is no such table: the error names the file, the column, and the first row that is wrong.
+            InputError: It is no such table: the error names the file, the column, and the first row
+                that is wrong.
         """
         import pyarrow.parquet as pq
 
         names = check_parquet(path, doing, self.required, do_this)
-        stated = [*(c for c in self.columns if c.name in names), *columns_of(metrics_in(names), rates)]
+        stated = [
+            *(c for c in self.columns if c.name in names),
+            *columns_of(metrics_in(names), rates),
+        ]
         with parsing(doing, path, do_this, "no readable parquet"):
             facts = pq.read_metadata(path)
             empty = pq.read_schema(path).empty_table()
@@ -161,19 +218,37 @@ class TableSchema:
                 _check_values(path, column, doing, do_this)
         if identity := [name for name in self.identity if name in names]:
             kinds = {column.name: column.kind for column in self.columns if column.name in identity}
-            _check_identity(read_parquet(path, doing, kinds, do_this, only=True), path, doing, do_this)
+            _check_identity(
+                read_parquet(path, doing, kinds, do_this, only=True), path, doing, do_this
+            )
         return names
 
-    def read(self, path: Path, doing: str = DOING, do_this: str = AGAIN, only: Sequence[str] | None = None) -> pa.Table:
+    def read(
+        self,
+        path: Path,
+        doing: str = DOING,
+        do_this: str = AGAIN,
+        only: Sequence[str] | None = None,
+    ) -> pa.Table:
         """Return a file, or ``only`` the named columns of it, after `check`."""
         names = self.check(path, doing, do_this)
         wanted = names if only is None else only
-        kinds = {column.name: column.kind for column in (*self.columns, *columns_of(metrics_in([*names, *wanted])))}
-        return read_parquet(path, doing, {name: kinds[name] for name in wanted if name in kinds}, do_this, only=only is not None)
+        kinds = {
+            column.name: column.kind
+            for column in (*self.columns, *columns_of(metrics_in([*names, *wanted])))
+        }
+        return read_parquet(
+            path,
+            doing,
+            {name: kinds[name] for name in wanted if name in kinds},
+            do_this,
+            only=only is not None,
+        )
 
 
 def columns_of(metrics: Iterable[str], rates: Container[str] = ()) -> list[Column]:
-    """Return the columns of metrics: a number, and a flag that tells whether it is valid; null where a rollout failed.
+    """Return the columns of metrics: a number, and a flag that tells whether it is valid; null
+    where a rollout failed.
 
     A number is one that reports can draw (`LARGEST`); one of the ``rates`` is in [0, 1].
     """
@@ -185,7 +260,9 @@ def columns_of(metrics: Iterable[str], rates: Container[str] = ()) -> list[Colum
 
 
 def metrics_in(columns: Iterable[str]) -> tuple[str, ...]:
-    """Return the metrics among the columns of ``rollouts.parquet``: those with a column of validity."""
+    """Return the metrics among the columns of ``rollouts.parquet``: those with a column of
+    validity.
+    """
     return tuple(name.removesuffix(VALID) for name in columns if name.endswith(VALID))
 
 
@@ -228,7 +305,9 @@ STEPS_TABLE = TableSchema(
 
 
 def _is_suspicious(facts: Any, column: Column) -> bool:
-    """Tell whether the statistics in a file's header do not show that all values of a column are there and in range."""
+    """Tell whether the statistics in a file's header do not show that all values of a column are
+    there and in range.
+    """
     if not column.is_required and column.least is None:
         return False
     (at,) = [i for i in range(facts.num_columns) if facts.schema.column(i).path == column.name]
@@ -236,7 +315,9 @@ def _is_suspicious(facts: Any, column: Column) -> bool:
         stats = facts.row_group(group).column(at).statistics
         if stats is None or not stats.has_null_count or (column.is_required and stats.null_count):
             return True
-        if column.least is None or stats.num_values == 0:  # of a chunk of nothing but nulls no least value is stated
+        if (
+            column.least is None or stats.num_values == 0
+        ):  # of a chunk of nothing but nulls no least value is stated
             continue
         if not stats.has_min_max or not column.least <= stats.min <= stats.max <= column.most:
             return True
@@ -244,22 +325,37 @@ def _is_suspicious(facts: Any, column: Column) -> bool:
 
 
 def _check_values(path: Path, column: Column, doing: str, do_this: str) -> None:
-    """Refuse a column with a value that is missing or out of range; the first row with one is named, counted from 0."""
+    """Refuse a column with a value that is missing or out of range; the first row with one is
+    named, counted from 0.
+    """
     import pyarrow.compute as pc
 
     values = read_parquet(path, doing, {column.name: column.kind}, do_this, only=True)[column.name]
     checks = [(pc.is_null(values), f"nothing, wanted {column.kind}")] if column.is_required else []
     if column.least is not None:
-        # Arrow compares an integer with a float as floats, and refuses integers that a float does not hold.
+        # Arrow compares an integer with a float as floats, and refuses integers that a float does
+        # not hold.
         bound = int if column.kind == "integer" else float
         known = pc.is_finite(values)  # what is not finite counts as missing
-        checks.append((pc.and_(known, pc.less(values, bound(column.least))), f"a value below {column.least:g}"))
+        checks.append(
+            (
+                pc.and_(known, pc.less(values, bound(column.least))),
+                f"a value below {column.least:g}",
+            )
+        )
         if math.isfinite(column.most):
-            checks.append((pc.and_(known, pc.greater(values, bound(column.most))), f"a value above {column.most:g}"))
+            checks.append(
+                (
+                    pc.and_(known, pc.greater(values, bound(column.most))),
+                    f"a value above {column.most:g}",
+                )
+            )
     for wrong, found in checks:
         row = pc.index(wrong, True).as_py()
         if row >= 0:
-            raise InputError(doing, f"{path}, row {row}", f"column {column.name!r}: {found}", do_this)
+            raise InputError(
+                doing, f"{path}, row {row}", f"column {column.name!r}: {found}", do_this
+            )
 
 
 def _check_identity(keys: pa.Table, path: Path, doing: str, do_this: str) -> None:
@@ -270,7 +366,10 @@ def _check_identity(keys: pa.Table, path: Path, doing: str, do_this: str) -> Non
     often = counted.sort_by([("count_all", "descending")]).slice(0, 1).to_pylist()[0]
     times = often.pop("count_all")
     raise InputError(
-        doing, str(path), f"{times} rows of {', '.join(f'{key} {value!r}' for key, value in often.items())}, wanted one", do_this
+        doing,
+        str(path),
+        f"{times} rows of {', '.join(f'{key} {value!r}' for key, value in often.items())}, wanted one",
+        do_this,
     )
 
 
@@ -290,7 +389,8 @@ def slug(name: str) -> str:
 
 
 def cell_name(*names: str | int) -> str:
-    """Return the key of a cell, or of a part of one, such as ``RENDERER/POLICY`` or ``RENDERER/POLICY/SCENE/SEED``.
+    """Return the key of a cell, or of a part of one, such as ``RENDERER/POLICY`` or
+    ``RENDERER/POLICY/SCENE/SEED``.
 
     It is compared, never taken apart: names may hold the separator themselves.
     """
@@ -298,11 +398,23 @@ def cell_name(*names: str | int) -> str:
 
 
 def rollout_folder(renderer: str, policy: str, scene: str, seed: int | str) -> Path:
-    """Return a rollout's folder below the run folder; of a scored log the last part is its own name instead of a seed."""
-    return Path(ROLLOUTS_FOLDER, slug(renderer), slug(policy), slug(scene), slug(seed) if isinstance(seed, str) else str(seed))
+    """Return a rollout's folder below the run folder; of a scored log the last part is its own name
+    instead of a seed.
+    """
+    return Path(
+        ROLLOUTS_FOLDER,
+        slug(renderer),
+        slug(policy),
+        slug(scene),
+        slug(seed) if isinstance(seed, str) else str(seed),
+    )
 
 
-def probe_folder(renderer: str, policy: str, scene: str, seed: int, renderers: Sequence[str] = ()) -> Path:
-    """Return the folder of a probe of ``renderers`` along a rollout, or of all its probes, below the run folder."""
+def probe_folder(
+    renderer: str, policy: str, scene: str, seed: int, renderers: Sequence[str] = ()
+) -> Path:
+    """Return the folder of a probe of ``renderers`` along a rollout, or of all its probes, below
+    the run folder.
+    """
     folder = Path(PROBES, *rollout_folder(renderer, policy, scene, seed).parts[1:])
     return folder / slug("--".join(renderers)) if renderers else folder

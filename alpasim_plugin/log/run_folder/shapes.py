@@ -1,6 +1,8 @@
-"""Shapes of the JSON files of a run folder, as far as readers rely on them; members that are not named may be anything.
+"""Shapes of the JSON files of a run folder, as far as readers rely on them; members that are not
+named may be anything.
 
-`alpasim_plugin.core.reading.read_json_as` compares a file with one of these before any of it is used.
+`alpasim_plugin.core.reading.read_json_as` compares a file with one of these before any of it is
+used.
 """
 
 from __future__ import annotations
@@ -44,7 +46,9 @@ class OutcomeFacts(TypedDict):
 
 
 class MetricFacts(TypedDict):
-    """What a metric of the run is, in ``run.json``; `alpasim_plugin.core.types.MetricInfo` has the members that may follow."""
+    """What a metric of the run is, in ``run.json``; `alpasim_plugin.core.types.MetricInfo` has the
+    members that may follow.
+    """
 
     unit: str
     direction: Direction
@@ -81,7 +85,16 @@ class RunInfo(TypedDict, total=False):
     bases: dict[str, str]
 
 
-REQUIRED_OF_RUN = ("key", "command", "config", "preset", "renderers", "policies", "seeds", "scenes")  # every run.json has them
+REQUIRED_OF_RUN = (
+    "key",
+    "command",
+    "config",
+    "preset",
+    "renderers",
+    "policies",
+    "seeds",
+    "scenes",
+)  # every run.json has them
 
 
 class ManifestFile(TypedDict):
@@ -290,6 +303,13 @@ class SceneFile(TypedDict, total=False):
 
 
 def pair_tables(summary: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
-    """List the tables of paired differences with the variant of each: renderers, fixers against their base, then policies."""
+    """List the tables of paired differences with the variant of each: renderers, fixers against
+    their base, then policies.
+    """
     keys = ("paired", "paired_with_base", "paired_arms")
-    return [(variant, pairs) for key in keys for variant, pairs in (summary.get(key) or {}).items() if pairs]
+    return [
+        (variant, pairs)
+        for key in keys
+        for variant, pairs in (summary.get(key) or {}).items()
+        if pairs
+    ]

@@ -1,4 +1,6 @@
-"""Rollouts laid out by cell, for statistics; here from rows in memory, flat (rollouts.parquet) or nested (manifests)."""
+"""Rollouts laid out by cell, for statistics; here from rows in memory, flat (rollouts.parquet) or
+nested (manifests).
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ def reason_of(row: Row, metric: str) -> str:
 
 
 def _entry_of(metrics: Mapping[str, Any], metric: str) -> tuple[Any, Any, Any]:
-    """Return value, valid and reason of a metric of a manifest, or of a reduction that was not written yet."""
+    """Return value, valid and reason of a metric of a manifest, or of a reduction that was not
+    written yet.
+    """
     entry = metrics.get(metric)
     if entry is None:
         return None, False, ""
@@ -85,10 +89,14 @@ class Side(ABC):
 
     @abstractmethod
     def raw(self, metric: str) -> F64:
-        """Return the metric of every rollout ``(R,)``, NaN where it failed or the value is not valid or not finite."""
+        """Return the metric of every rollout ``(R,)``, NaN where it failed or the value is not
+        valid or not finite.
+        """
 
     def place_in(self, other: Side) -> I64:
-        """Return the index ``(C,)`` of each cell among another side's cells, -1 where it has no such cell."""
+        """Return the index ``(C,)`` of each cell among another side's cells, -1 where it has no
+        such cell.
+        """
         if id(other) not in self._places:
             self._places[id(other)] = self._placed(other)
         return self._places[id(other)]
@@ -113,7 +121,9 @@ class Side(ABC):
         """Return the failure class of a rollout that did not run to its end."""
 
     def values(self, metric: str) -> F64:
-        """Return the metric of every cell ``(C,)``, NaN where missing; repeats of a cell are averaged first, as the paper does."""
+        """Return the metric of every cell ``(C,)``, NaN where missing; repeats of a cell are
+        averaged first, as the paper does.
+        """
         found = self.raw(metric)
         known = np.isfinite(found)
         count = np.bincount(self.cell[known], minlength=len(self.cells))
@@ -121,18 +131,26 @@ class Side(ABC):
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
     def why_missing(self, cell: Cell, metric: str, values: F64) -> str:
-        """Return why there is no value for a cell, or "" where there is one; ``values`` as `Side.values` gives them."""
+        """Return why there is no value for a cell, or "" where there is one; ``values`` as
+        `Side.values` gives them.
+        """
         row = self.first_row(cell)
         if row is None:
             return "not planned"
         if np.isfinite(values[self.cell[row]]):
             return ""
-        return f"not valid ({self.reason(row, metric)})" if self.ok[row] else f"failed ({self.failure(row)})"
+        return (
+            f"not valid ({self.reason(row, metric)})"
+            if self.ok[row]
+            else f"failed ({self.failure(row)})"
+        )
 
 
 @dataclass(frozen=True)
 class RendererRows(Side):
-    """A side made of rows in memory: for small tables, and the reference of `alpasim_plugin.log.run_folder.columns`."""
+    """A side made of rows in memory: for small tables, and the reference of
+    `alpasim_plugin.log.run_folder.columns`.
+    """
 
     rows: tuple[Row, ...]
     ok: Bool

@@ -1,4 +1,6 @@
-"""Write a run folder: be its only writer, remove what killed writers left, write scenes, and tables from the rollouts' manifests."""
+"""Write a run folder: be its only writer, remove what killed writers left, write scenes, and tables
+from the rollouts' manifests.
+"""
 
 from __future__ import annotations
 
@@ -20,17 +22,33 @@ from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.lock import one_writer
 from alpasim_plugin.core.processes import is_running
 from alpasim_plugin.core.types import F64, Actor, Scenario, Scene
-from alpasim_plugin.log.run_folder.schema import KEYS, LOCK, ROLLOUTS, ROLLOUTS_TABLE, SCENES, STEPS, STEPS_NAME, STEPS_TABLE, VALID, slug
+from alpasim_plugin.log.run_folder.schema import (
+    KEYS,
+    LOCK,
+    ROLLOUTS,
+    ROLLOUTS_TABLE,
+    SCENES,
+    STEPS,
+    STEPS_NAME,
+    STEPS_TABLE,
+    VALID,
+    slug,
+)
 
 ACTOR_STEP_US = 250_000
 GROUP_ROWS = 1 << 20  # rows of a row group: what is held in memory
 CHUNK_ROWS = 4096  # rows that are held as dictionaries, which take ten times the memory
-_TEMPORARY = re.compile(r"\..+\.(\d+)\.[0-9a-f]{8}\.tmp")  # as `alpasim_plugin.core.atomic.temporary_path` makes them
+_TEMPORARY = re.compile(
+    r"\..+\.(\d+)\.[0-9a-f]{8}\.tmp"
+)  # as `alpasim_plugin.core.atomic.temporary_path` makes them
 
 
 @contextmanager
-def writing(root: Path, wait: bool = False, waiting: Callable[[str], None] = print) -> Iterator[None]:
-    """Be the only writer of a run folder during the block; left-overs of killed writers are removed first.
+def writing(
+    root: Path, wait: bool = False, waiting: Callable[[str], None] = print
+) -> Iterator[None]:
+    """Be the only writer of a run folder during the block; left-overs of killed writers are removed
+    first.
 
     Args:
         root: The run folder; made if it does not exist.
@@ -48,8 +66,9 @@ def writing(root: Path, wait: bool = False, waiting: Callable[[str], None] = pri
 def remove_left_overs(root: Path, before_ns: int | None = None) -> list[Path]:
     """Remove temporary files and folders of processes that are gone; return them.
 
-    Only names that simrun gives are touched, only those older than the lock, and only if no process of this machine has the number in the
-    name. Run folders inside this one (forks) have writers of their own and are left alone.
+    Only names that simrun gives are touched, only those older than the lock, and only if no process
+    of this machine has the number in the name. Run folders inside this one (forks) have writers of
+    their own and are left alone.
 
     Args:
         root: A run folder whose lock is held, or a folder that only this machine's processes write.
@@ -80,7 +99,8 @@ def remove_left_overs(root: Path, before_ns: int | None = None) -> list[Path]:
 def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return one flat row per rollout: its key, its status, and every metric with its validity.
 
-    An infinite value, for which JSON has no number, is the text "inf" or "-inf" in a manifest, and a number here.
+    An infinite value, for which JSON has no number, is the text "inf" or "-inf" in a manifest, and
+    a number here.
     """
     rows = []
     for manifest in manifests:
@@ -103,7 +123,10 @@ def rollout_table(manifests: Sequence[dict[str, Any]]) -> pa.Table:
     metrics = dict.fromkeys(name for manifest in manifests for name in manifest.get("metrics", {}))
     schema = ROLLOUTS_TABLE.arrow(metrics, any("rollout" in manifest for manifest in manifests))
     starts = range(0, len(manifests), CHUNK_ROWS)
-    batches = [pa.RecordBatch.from_pylist(rollout_rows(manifests[start : start + CHUNK_ROWS]), schema) for start in starts]
+    batches = [
+        pa.RecordBatch.from_pylist(rollout_rows(manifests[start : start + CHUNK_ROWS]), schema)
+        for start in starts
+    ]
     return pa.Table.from_batches(batches, schema)
 
 
@@ -120,7 +143,9 @@ def write_tables(root: Path, manifests: Sequence[dict[str, Any]]) -> pa.Table:
     rollouts = rollout_table(manifests)
     write_parquet(root / ROLLOUTS, rollouts)
     parts = (root / m["path"] / STEPS_NAME for m in manifests if m["status"] == "ok")
-    _join_parquet(root / STEPS, STEPS_TABLE.arrow(of_logs="rollout" in rollouts.column_names), parts)
+    _join_parquet(
+        root / STEPS, STEPS_TABLE.arrow(of_logs="rollout" in rollouts.column_names), parts
+    )
     return rollouts
 
 
@@ -131,7 +156,10 @@ def write_steps(folder: Path, rows: Sequence[Mapping[str, Any]], of_logs: bool =
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> None:
     """Write rows as parquet atomically, in the order given."""
-    columns = {field.name: pa.array([row.get(field.name) for row in rows], type=field.type) for field in schema}
+    columns = {
+        field.name: pa.array([row.get(field.name) for row in rows], type=field.type)
+        for field in schema
+    }
     write_parquet(path, pa.table(columns, schema=schema))
 
 
@@ -143,9 +171,14 @@ def write_parquet(path: Path, table: pa.Table) -> None:
 
 
 def _join_parquet(path: Path, schema: pa.Schema, parts: Iterable[Path]) -> None:
-    """Write the rows of many parquet files into one, atomically and in order, in the memory of one row group."""
+    """Write the rows of many parquet files into one, atomically and in order, in the memory of one
+    row group.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_file(path) as partial, pq.ParquetWriter(partial, schema, compression="zstd") as writer:
+    with (
+        atomic_file(path) as partial,
+        pq.ParquetWriter(partial, schema, compression="zstd") as writer,
+    ):
         held: list[pa.Table] = []
         rows = 0
         for part in parts:
@@ -179,7 +212,9 @@ def write_scene(root: Path, scenario: Scenario | LoggedScene) -> None:
 
 
 def scene_as_json(scenario: Scenario | LoggedScene) -> dict[str, Any]:
-    """Return lanes, edges, crosswalks and the logged path in world metres, rounded to a centimetre."""
+    """Return lanes, edges, crosswalks and the logged path in world metres, rounded to a
+    centimetre.
+    """
     scene, log = scenario.scene, scenario.scene.ego_log
     lanes = [
         {
@@ -205,7 +240,8 @@ def scene_as_json(scenario: Scenario | LoggedScene) -> dict[str, Any]:
         "lanes": lanes,
         "road_edges": [_xy(edge) for edge in scene.lane_map.road_edges],
         "crosswalks": [_xy(ring) for ring in scene.lane_map.crosswalks],
-        "ego_log": {"t_us": log.t_us[keep].tolist()} | {f"{axis}_m": np.round(log.xyz[keep, i], 3).tolist() for i, axis in enumerate("xy")},
+        "ego_log": {"t_us": log.t_us[keep].tolist()}
+        | {f"{axis}_m": np.round(log.xyz[keep, i], 3).tolist() for i, axis in enumerate("xy")},
         "vehicle": {
             "length_m": scene.vehicle.box.length_m,
             "width_m": scene.vehicle.box.width_m,
@@ -216,13 +252,25 @@ def scene_as_json(scenario: Scenario | LoggedScene) -> dict[str, Any]:
 
 
 def _actor(scenario: Scenario | LoggedScene, actor: Actor) -> dict[str, Any]:
-    """Return what a drawing needs of a road user: its size, and its track every `ACTOR_STEP_US` while the scene runs."""
+    """Return what a drawing needs of a road user: its size, and its track every `ACTOR_STEP_US`
+    while the scene runs.
+    """
     track = actor.track
-    is_timed = scenario.end_us > scenario.start_us  # a scene that logs are scored against need not say when it runs
-    inside = np.flatnonzero((track.t_us >= scenario.start_us) & (track.t_us <= scenario.end_us)) if is_timed else np.arange(len(track))
+    is_timed = (
+        scenario.end_us > scenario.start_us
+    )  # a scene that logs are scored against need not say when it runs
+    inside = (
+        np.flatnonzero((track.t_us >= scenario.start_us) & (track.t_us <= scenario.end_us))
+        if is_timed
+        else np.arange(len(track))
+    )
     if actor.is_static:
         inside = inside[:1] if len(inside) else np.array([0])
-    step = max(1, round(ACTOR_STEP_US / max(1.0, float(np.median(np.diff(track.t_us)))))) if len(track) > 1 else 1
+    step = (
+        max(1, round(ACTOR_STEP_US / max(1.0, float(np.median(np.diff(track.t_us))))))
+        if len(track) > 1
+        else 1
+    )
     keep = np.unique(np.concatenate([inside[::step], inside[-1:]]))
     yaw = yaw_from_quat(track.quat[keep])
     return {

@@ -1,8 +1,10 @@
 """The wire messages, and the paths under which AlpaSim knows the services.
 
-The messages live in private proto packages (``simrun.wire.*``): two files that both define ``common.Vec3`` cannot share a process, and a
-user may well have AlpaSim's own package installed. Nothing on the wire depends on the package of a message; only the service path does,
-and `SERVICE_PATHS` gives it. This package stands alone: it imports protobuf and grpc, and nothing of the project.
+The messages live in private proto packages (``simrun.wire.*``): two files that both define
+``common.Vec3`` cannot share a process, and a user may well have AlpaSim's own package installed.
+Nothing on the wire depends on the package of a message; only the service path does, and
+`SERVICE_PATHS` gives it. This package stands alone: it imports protobuf and grpc, and nothing of
+the project.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ MODULES = (
     video_model_pb2,
 )
 
-#: Full gRPC path prefix of each service as its clients dial it, by the name of our compiled service.
+#: Full gRPC path prefix of each service as its clients dial it, by the name of our compiled
+#: service.
 SERVICE_PATHS = {
     "SensorsimService": "/nre.grpc.protos.sensorsim.SensorsimService/",
     "EgodriverService": "/egodriver.EgodriverService/",

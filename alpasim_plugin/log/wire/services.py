@@ -1,11 +1,12 @@
 """Call and serve the services generically, and let them be asked what they are.
 
-The methods are read off the compiled descriptors, the path from `SERVICE_PATHS`. No generated ``_pb2_grpc`` modules are needed: a path, a
-serialiser and a parser are all that gRPC wants.
+The methods are read off the compiled descriptors, the path from `SERVICE_PATHS`. No generated
+``_pb2_grpc`` modules are needed: a path, a serialiser and a parser are all that gRPC wants.
 
-``grpcurl`` and the like ask a server for its services and messages (reflection). They must see the names that are dialled
-(``nre.grpc.protos.sensorsim.SensorsimService``), not our private packages. So every file is copied with its package renamed into a
-separate pool; protobuf's default pool never holds AlpaSim's names, and AlpaSim's own package can be imported into the same process.
+``grpcurl`` and the like ask a server for its services and messages (reflection). They must see the
+names that are dialled (``nre.grpc.protos.sensorsim.SensorsimService``), not our private packages.
+So every file is copied with its package renamed into a separate pool; protobuf's default pool never
+holds AlpaSim's names, and AlpaSim's own package can be imported into the same process.
 """
 
 from __future__ import annotations
@@ -17,7 +18,11 @@ from typing import Any
 
 import grpc
 from google.protobuf.descriptor import FileDescriptor
-from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorProto, ServiceDescriptorProto
+from google.protobuf.descriptor_pb2 import (
+    DescriptorProto,
+    FileDescriptorProto,
+    ServiceDescriptorProto,
+)
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
@@ -54,9 +59,13 @@ UNIMPLEMENTED = grpc.StatusCode.UNIMPLEMENTED.value[0]
 
 
 def is_lost_connection(error: Any) -> bool:
-    """Tell whether a call failed because its peer is away, or went away, and not by the peer's own answer."""
+    """Tell whether a call failed because its peer is away, or went away, and not by the peer's own
+    answer.
+    """
     code, text = error.code(), error.details() or ""
-    broken = code in (grpc.StatusCode.UNKNOWN, grpc.StatusCode.INTERNAL) and any(sign in text for sign in BROKEN_TRANSPORT)
+    broken = code in (grpc.StatusCode.UNKNOWN, grpc.StatusCode.INTERNAL) and any(
+        sign in text for sign in BROKEN_TRANSPORT
+    )
     return broken or code in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED)
 
 
@@ -73,8 +82,13 @@ class Method:
 
     @property
     def arity(self) -> str:
-        """How gRPC names the call: ``unary_unary``, ``unary_stream``, ``stream_stream``, ``stream_unary``."""
-        return "_".join("stream" if streams else "unary" for streams in (self.client_streams, self.server_streams))
+        """How gRPC names the call: ``unary_unary``, ``unary_stream``, ``stream_stream``,
+        ``stream_unary``.
+        """
+        return "_".join(
+            "stream" if streams else "unary"
+            for streams in (self.client_streams, self.server_streams)
+        )
 
 
 @lru_cache
@@ -89,12 +103,21 @@ def methods(service: str) -> Mapping[str, Method]:
         '/egodriver.EgodriverService/drive'
     """
     prefix = SERVICE_PATHS[service]
-    descriptor = next(d for module in MODULES if (d := module.DESCRIPTOR.services_by_name.get(service)) is not None)
+    descriptor = next(
+        d
+        for module in MODULES
+        if (d := module.DESCRIPTOR.services_by_name.get(service)) is not None
+    )
     written = ServiceDescriptorProto()
     descriptor.CopyToProto(written)
     return {
         m.name: Method(
-            m.name, prefix + m.name, GetMessageClass(m.input_type), GetMessageClass(m.output_type), p.client_streaming, p.server_streaming
+            m.name,
+            prefix + m.name,
+            GetMessageClass(m.input_type),
+            GetMessageClass(m.output_type),
+            p.client_streaming,
+            p.server_streaming,
         )
         for m, p in zip(descriptor.methods, written.method, strict=True)
     }
@@ -117,18 +140,29 @@ class Stub:
         for method in methods(service).values():
             call = getattr(channel, method.arity)
             serialise = method.request.SerializeToString
-            setattr(self, method.name, call(method.path, request_serializer=serialise, response_deserializer=method.response.FromString))
+            setattr(
+                self,
+                method.name,
+                call(
+                    method.path,
+                    request_serializer=serialise,
+                    response_deserializer=method.response.FromString,
+                ),
+            )
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         raise AttributeError(f"the service has no call {name!r}")
 
 
-def handlers(service: str, implementation: object, prefix: str | None = None) -> grpc.GenericRpcHandler:
+def handlers(
+    service: str, implementation: object, prefix: str | None = None
+) -> grpc.GenericRpcHandler:
     """Return the handler of a service for `grpc.Server.add_generic_rpc_handlers`.
 
     Args:
         service: Name of the service, as in `SERVICE_PATHS`.
-        implementation: Has a method ``name(request, context)`` for each call that it serves; the others answer UNIMPLEMENTED.
+        implementation: Has a method ``name(request, context)`` for each call that it serves; the
+            others answer UNIMPLEMENTED.
         prefix: Path to serve under instead of the service's own.
     """
     made = {}
@@ -137,7 +171,9 @@ def handlers(service: str, implementation: object, prefix: str | None = None) ->
         if serve is not None:
             handler = getattr(grpc, f"{method.arity}_rpc_method_handler")
             made[method.name] = handler(
-                serve, request_deserializer=method.request.FromString, response_serializer=method.response.SerializeToString
+                serve,
+                request_deserializer=method.request.FromString,
+                response_serializer=method.response.SerializeToString,
             )
     return grpc.method_handlers_generic_handler((prefix or SERVICE_PATHS[service]).strip("/"), made)
 
@@ -163,7 +199,9 @@ def public_pool() -> DescriptorPool:
 
 
 def renamed(file: FileDescriptor) -> FileDescriptorProto:
-    """Return a file with AlpaSim's package in place of ours, in its own name and in every reference."""
+    """Return a file with AlpaSim's package in place of ours, in its own name and in every
+    reference.
+    """
     proto = FileDescriptorProto()
     file.CopyToProto(proto)
     proto.package = PACKAGES[proto.package.rsplit(".", 1)[1]]
@@ -171,7 +209,10 @@ def renamed(file: FileDescriptor) -> FileDescriptorProto:
         _rename_fields(message)
     for service in proto.service:
         for method in service.method:
-            method.input_type, method.output_type = public_name(method.input_type), public_name(method.output_type)
+            method.input_type, method.output_type = (
+                public_name(method.input_type),
+                public_name(method.output_type),
+            )
     return proto
 
 
@@ -203,7 +244,9 @@ class Reflection:
     """
 
     def __init__(self, services: Iterable[str]) -> None:
-        self.names = sorted(SERVICE_PATHS[name].strip("/") for name in {*services, "ServerReflection"})
+        self.names = sorted(
+            SERVICE_PATHS[name].strip("/") for name in {*services, "ServerReflection"}
+        )
 
     def handlers(self) -> tuple[grpc.GenericRpcHandler, ...]:
         """Return the handlers of both versions of the protocol, which are equal on the wire."""
@@ -216,12 +259,18 @@ class Reflection:
         for request in requests:
             yield self.answer(request)
 
-    def answer(self, request: reflection_pb2.ServerReflectionRequest) -> reflection_pb2.ServerReflectionResponse:
+    def answer(
+        self, request: reflection_pb2.ServerReflectionRequest
+    ) -> reflection_pb2.ServerReflectionResponse:
         """Answer one question."""
-        response = reflection_pb2.ServerReflectionResponse(valid_host=request.host, original_request=request)
+        response = reflection_pb2.ServerReflectionResponse(
+            valid_host=request.host, original_request=request
+        )
         kind, pool = request.WhichOneof("message_request"), public_pool()
         if kind == "list_services":
-            response.list_services_response.service.extend(reflection_pb2.ServiceResponse(name=name) for name in self.names)
+            response.list_services_response.service.extend(
+                reflection_pb2.ServiceResponse(name=name) for name in self.names
+            )
             return response
         if kind not in ("file_by_filename", "file_containing_symbol"):
             response.error_response.error_code = UNIMPLEMENTED
@@ -232,14 +281,18 @@ class Reflection:
             file = find(getattr(request, kind))
         except KeyError:
             response.error_response.error_code = NOT_FOUND
-            response.error_response.error_message = f"{kind}: {getattr(request, kind)!r} is not served here"
+            response.error_response.error_message = (
+                f"{kind}: {getattr(request, kind)!r} is not served here"
+            )
             return response
         response.file_descriptor_response.file_descriptor_proto.extend(_with_needed(file))
         return response
 
 
 def _with_needed(file: FileDescriptor) -> list[bytes]:
-    """Return a file and all that it imports, serialised; what is imported comes later, as clients expect."""
+    """Return a file and all that it imports, serialised; what is imported comes later, as clients
+    expect.
+    """
     found: dict[str, bytes] = {}
     todo = [file]
     while todo:

@@ -1,1 +1,3 @@
-"""Where work runs: processes of this machine, the nodes of a Ray cluster, jobs of Slurm. Results do not depend on it."""
+"""Where work runs: processes of this machine, the nodes of a Ray cluster, jobs of Slurm. Results do
+not depend on it.
+"""

@@ -1,6 +1,8 @@
-"""Load what most rollouts need, kernels too where they are compiled: imported by the process that workers are copies of.
+"""Load what most rollouts need, kernels too where they are compiled: imported by the process that
+workers are copies of.
 
-None of it starts a thread but that of an allocator, which forks well. What is missing here is loaded by each worker.
+None of it starts a thread but that of an allocator, which forks well. What is missing here is
+loaded by each worker.
 """
 
 from __future__ import annotations
@@ -14,14 +16,23 @@ import numpy as np
 from alpasim_plugin.core.lazy import arrow_without_pandas
 
 NEEDED = (
-    "alpasim_plugin.control.tracker", "alpasim_plugin.renderers.gaussian", "alpasim_plugin.runs.execute",
-    "evaluators.metrics.image_health", "evaluators.metrics.motion", "evaluators.metrics.offroad", "evaluators.metrics.outcomes",
-    "evaluators.metrics.plan", "policies.lane_camera", "pyarrow.dataset",
-)  # fmt: skip
+    "alpasim_plugin.control.tracker",
+    "alpasim_plugin.renderers.gaussian",
+    "alpasim_plugin.runs.execute",
+    "evaluators.metrics.image_health",
+    "evaluators.metrics.motion",
+    "evaluators.metrics.offroad",
+    "evaluators.metrics.outcomes",
+    "evaluators.metrics.plan",
+    "policies.lane_camera",
+    "pyarrow.dataset",
+)
 
 
 def load() -> None:
-    """Load it, and keep the collector from looking through what stays: no copy then writes to the memory that they share."""
+    """Load it, and keep the collector from looking through what stays: no copy then writes to the
+    memory that they share.
+    """
     gc.disable()
     with arrow_without_pandas():
         for name in NEEDED:
@@ -32,7 +43,9 @@ def load() -> None:
     if not is_cold("rasteriser"):
         kernels.call("rasteriser")
     cv2.setNumThreads(1)  # no threads of its own, which a copy would not have
-    cv2.cvtColor(np.zeros((1, 1, 3), np.uint8), cv2.COLOR_RGB2Lab)  # the first conversion computes tables for 0.07 s
+    cv2.cvtColor(
+        np.zeros((1, 1, 3), np.uint8), cv2.COLOR_RGB2Lab
+    )  # the first conversion computes tables for 0.07 s
     gc.freeze()
     gc.enable()
 

@@ -1,4 +1,5 @@
-"""What workers on other nodes are given, and what must be the same there: Python, libraries, simrun's code, code and files of parts.
+"""What workers on other nodes are given, and what must be the same there: Python, libraries,
+simrun's code, code and files of parts.
 
 A node that differs would give other results, so it is refused before it gets work.
 """
@@ -63,7 +64,9 @@ def differences(expected: Mapping[str, str], found: Mapping[str, str]) -> list[s
     """
     names = list(dict.fromkeys([*expected, *found]))
     pairs = [(name, expected.get(name, MISSING), found.get(name, MISSING)) for name in names]
-    return [f"{name} is {there}, the driver has {here}" for name, here, there in pairs if here != there]
+    return [
+        f"{name} is {there}, the driver has {here}" for name, here, there in pairs if here != there
+    ]
 
 
 @lru_cache(maxsize=1)
@@ -72,12 +75,18 @@ def _own_code() -> str:
     hashed = hashlib.sha256()
     for package in sorted(OWN_PACKAGES):
         for path in sorted(Path(OWN_ROOT, package).rglob("*.py")):
-            hashed.update(path.relative_to(OWN_ROOT).as_posix().encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+            hashed.update(
+                path.relative_to(OWN_ROOT).as_posix().encode()
+                + b"\0"
+                + hashlib.sha256(path.read_bytes()).digest()
+            )
     return hashed.hexdigest()[:12]
 
 
 def _digest_of(target: str) -> str:
-    """Return the digest of a module, by dotted name or file, and of what it imports; `MISSING` where it is not installed."""
+    """Return the digest of a module, by dotted name or file, and of what it imports; `MISSING`
+    where it is not installed.
+    """
     if target.endswith(".py"):
         return code_digest(target)[:12] if Path(target).is_file() else MISSING
     try:
@@ -86,7 +95,9 @@ def _digest_of(target: str) -> str:
         return MISSING
     if spec is None:
         return MISSING
-    return code_digest(spec.origin)[:12] if spec.origin and spec.origin.endswith(".py") else "compiled"
+    return (
+        code_digest(spec.origin)[:12] if spec.origin and spec.origin.endswith(".py") else "compiled"
+    )
 
 
 @dataclass(frozen=True)
@@ -113,10 +124,19 @@ class Assignment(Generic[J]):
 
 
 def assignment_as_here(
-    work: Work[J, Any], contents: Contents, targets: Sequence[str], resources: Resources, workers: int, notify: Callable[[str], None]
+    work: Work[J, Any],
+    contents: Contents,
+    targets: Sequence[str],
+    resources: Resources,
+    workers: int,
+    notify: Callable[[str], None],
 ) -> Assignment[J]:
-    """Return an assignment for nodes that are as this machine is. Arguments are those of `Assignment`."""
-    return Assignment(work, contents, tuple(targets), identity_of(targets), resources, workers, notify)
+    """Return an assignment for nodes that are as this machine is. Arguments are those of
+    `Assignment`.
+    """
+    return Assignment(
+        work, contents, tuple(targets), identity_of(targets), resources, workers, notify
+    )
 
 
 GONE_S = 5.0  # within which a killed process must be gone
@@ -166,31 +186,51 @@ def place(sha256: str, name: str, node: Node) -> Path:
         data = node.fetch(sha256)
         found = hashlib.sha256(data).hexdigest()
         if found != sha256:
-            raise InfrastructureError("placing a file on a node", f"{name} on {node.name}", f"SHA-256 {found}, not {sha256}", "try again")
+            raise InfrastructureError(
+                "placing a file on a node",
+                f"{name} on {node.name}",
+                f"SHA-256 {found}, not {sha256}",
+                "try again",
+            )
         write_bytes(folder / name, data)
 
     def read(folder: Path) -> Path:
         if sha_of_unchanged(folder / name) != sha256:
-            raise InputError("reading a placed file", str(folder / name), "not the content of its name", "it is fetched again")
+            raise InputError(
+                "reading a placed file",
+                str(folder / name),
+                "not the content of its name",
+                "it is fetched again",
+            )
         return folder / name
 
     return cached(KIND, sha256, make, read, f"{name} for {node.name}")
 
 
 def placed_path(path: str, sha256: str, node: Node) -> str:
-    """Return where this node has a file of the driver's: at the same path, in its own installation of simrun, or placed by content."""
+    """Return where this node has a file of the driver's: at the same path, in its own installation
+    of simrun, or placed by content.
+    """
     here = is_here(path, sha256)
     return here or str(place(sha256, Path(path).name, node))
 
 
 def is_here(path: str, sha256: str) -> str:
-    """Return where this machine has a file of the driver's, at the same path or in its own installation of simrun; empty if nowhere."""
-    found = (there for there in (Path(path), in_own_installation(path)) if sha_of_unchanged(there) == sha256)
+    """Return where this machine has a file of the driver's, at the same path or in its own
+    installation of simrun; empty if nowhere.
+    """
+    found = (
+        there
+        for there in (Path(path), in_own_installation(path))
+        if sha_of_unchanged(there) == sha256
+    )
     return str(next(found, ""))
 
 
 def in_own_installation(path: str) -> Path:
-    """Return the place of a driver's file in this machine's installation of simrun; the path itself where it is none of simrun's."""
+    """Return the place of a driver's file in this machine's installation of simrun; the path itself
+    where it is none of simrun's.
+    """
     for mark in ("/configs/", "/policies/", "/alpasim_plugin/"):
         _, found, rest = path.rpartition(mark)
         if found:
@@ -199,7 +239,9 @@ def in_own_installation(path: str) -> Path:
 
 
 def sha_of_unchanged(path: Path) -> str:
-    """Return a file's SHA-256, read again only if its size or time has changed; empty where it cannot be read."""
+    """Return a file's SHA-256, read again only if its size or time has changed; empty where it
+    cannot be read.
+    """
     try:
         state = path.stat()
         return _sha(str(path), state.st_size, state.st_mtime_ns)
@@ -217,7 +259,13 @@ def paths_in(settings: BaseModel | None) -> set[str]:
     found: set[str] = set()
     for name in type(settings).model_fields if settings is not None else ():
         value = getattr(settings, name)
-        found |= paths_in(value) if isinstance(value, BaseModel) else {str(value)} if isinstance(value, str | Path) else set()
+        found |= (
+            paths_in(value)
+            if isinstance(value, BaseModel)
+            else {str(value)}
+            if isinstance(value, str | Path)
+            else set()
+        )
     return found
 
 
@@ -244,15 +292,23 @@ def scratch_root() -> Path:
     """
     found = places.scratch()
     if found.path is None or not places.is_private(found.path):
-        reason = "no folder can be written" if found.path is None else "it cannot be made, or another user could write it"
-        raise InfrastructureError("choosing a scratch folder", str(found), reason, f"name a folder in {places.SCRATCH}")
+        reason = (
+            "no folder can be written"
+            if found.path is None
+            else "it cannot be made, or another user could write it"
+        )
+        raise InfrastructureError(
+            "choosing a scratch folder", str(found), reason, f"name a folder in {places.SCRATCH}"
+        )
     return found.path
 
 
 def measured_folder(run: str) -> Path | None:
-    """Return where the processes of a run on this node share what they measure (`alpasim_plugin.core.cache`).
+    """Return where the processes of a run on this node share what they measure
+    (`alpasim_plugin.core.cache`).
 
-    None: nowhere, since the cache cannot be written, or another user could write there and decide what this run takes for its machine's
+    None: nowhere, since the cache cannot be written, or another user could write there and decide
+        what this run takes for its machine's
     speed.
     """
     kept = places.cache().path
@@ -276,7 +332,8 @@ def sweep(pids: Sequence[int] = ()) -> None:
 
 
 def private_folder(path: Path, doing: str) -> Path:
-    """Make a folder that only this user can read and write, and return it: what is unpickled may lie in such a folder alone.
+    """Make a folder that only this user can read and write, and return it: what is unpickled may
+    lie in such a folder alone.
 
     Raises:
         InfrastructureError: It cannot be made, is a link, or another user could write it.
@@ -288,6 +345,15 @@ def private_folder(path: Path, doing: str) -> Path:
         raise disk_error(path, error, doing) from error
     owned = stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid()
     if not owned or state.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-        found = f"mode {stat.S_IMODE(state.st_mode):o} of user {state.st_uid}" if owned else f"a link, or of user {state.st_uid}"
-        raise InfrastructureError(doing, str(path), f"not private to this user ({found})", "remove it, or name another folder")
+        found = (
+            f"mode {stat.S_IMODE(state.st_mode):o} of user {state.st_uid}"
+            if owned
+            else f"a link, or of user {state.st_uid}"
+        )
+        raise InfrastructureError(
+            doing,
+            str(path),
+            f"not private to this user ({found})",
+            "remove it, or name another folder",
+        )
     return path

@@ -1,4 +1,5 @@
-"""What the pool and its backends share: jobs, what became of them, and what a backend of workers does.
+"""What the pool and its backends share: jobs, what became of them, and what a backend of workers
+does.
 
 No numerical library is imported here: a worker sets the number of their threads first.
 """
@@ -13,7 +14,12 @@ R = TypeVar("R")
 J_contra = TypeVar("J_contra", contravariant=True)
 R_co = TypeVar("R_co", covariant=True)
 
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+)
 
 
 @dataclass(frozen=True)
@@ -22,7 +28,8 @@ class Node:
 
     Attributes:
         name: Name of its machine, for messages.
-        fetch: Gives the bytes of a content by its SHA-256 (`alpasim_plugin.runs.executors.assignment`).
+        fetch: Gives the bytes of a content by its SHA-256
+            (`alpasim_plugin.runs.executors.assignment`).
     """
 
     name: str
@@ -47,7 +54,8 @@ class Work(Protocol[J_contra, R_co]):
 
 @dataclass(frozen=True)
 class Faulty(Generic[R]):
-    """A result that tells of its node rather than of its job: a full disk, a missing library. Another node may do better.
+    """A result that tells of its node rather than of its job: a full disk, a missing library.
+    Another node may do better.
 
     Attributes:
         value: What stands if none does.
@@ -93,7 +101,8 @@ class Rules:
     """How the pool treats the jobs of a backend.
 
     Attributes:
-        chunk_s: Seconds that the jobs handed over together should take: long against the time to hand them over. 0: each goes alone.
+        chunk_s: Seconds that the jobs handed over together should take: long against the time to
+            hand them over. 0: each goes alone.
         most_losses: A job that so many workers died of is given up.
         copies: Whether a late job is given to a second worker.
         after_hanging: What helps a job that exceeded its time limit.
@@ -104,12 +113,16 @@ class Rules:
     most_losses: int = 3
     copies: bool = True
     after_hanging: str = "look at what hangs, or raise --time-limit"
-    after_dying: str = "run it alone with --executor local --workers 1, and look at the memory it takes"
+    after_dying: str = (
+        "run it alone with --executor local --workers 1, and look at the memory it takes"
+    )
 
 
 @dataclass(frozen=True)
 class Place:
-    """A free worker, and the node that it is on (empty where nobody knows before the work is done)."""
+    """A free worker, and the node that it is on (empty where nobody knows before the work is
+    done).
+    """
 
     worker: int
     node: str
@@ -126,7 +139,9 @@ class Done:
 
 @dataclass(frozen=True)
 class Died:
-    """A worker is gone. ``of_node``: its jobs are not to blame, it went with its node or before it began them."""
+    """A worker is gone. ``of_node``: its jobs are not to blame, it went with its node or before it
+    began them.
+    """
 
     worker: int
     node: str
@@ -138,19 +153,24 @@ Event = Done | Died
 
 
 class Backend(Protocol[J_contra]):
-    """Workers somewhere: it starts them, hands them jobs and says what became of them. The pool decides everything else."""
+    """Workers somewhere: it starts them, hands them jobs and says what became of them. The pool
+    decides everything else.
+    """
 
     rules: Rules
 
     def inherited(self, jobs: Sequence[J_contra]) -> Iterable[tuple[int, Any]]:
-        """Yield index and result of jobs that the workers of an earlier driver have done; none where workers end with their driver."""
+        """Yield index and result of jobs that the workers of an earlier driver have done; none
+        where workers end with their driver.
+        """
         return ()
 
     def free(self, wanted: int) -> Sequence[Place]:
         """Start workers where there is room and return those without work.
 
         Args:
-            wanted: Workers that there are jobs for; starting more is of use only for copies of late jobs.
+            wanted: Workers that there are jobs for; starting more is of use only for copies of late
+                jobs.
 
         Raises:
             InfrastructureError: Every node was refused.

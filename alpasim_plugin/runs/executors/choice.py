@@ -15,7 +15,11 @@ from alpasim_plugin.runs.executors.assignment import Assignment
 from alpasim_plugin.runs.executors.base import Backend, Resources
 
 DOING = "choosing an executor"
-NEEDS: dict[str, Callable[[str], float]] = {"cores": int, "gpus": float, "memory": float}  # memory in GiB
+NEEDS: dict[str, Callable[[str], float]] = {
+    "cores": int,
+    "gpus": float,
+    "memory": float,
+}  # memory in GiB
 
 
 @dataclass(frozen=True)
@@ -23,8 +27,10 @@ class Executor:
     """Where rollouts run.
 
     Attributes:
-        kind: ``local``: processes of this machine. ``ray``: a Ray cluster. ``slurm``: jobs of Slurm.
-        where: Address of the cluster's head, or Slurm's partition; empty: the one at hand. ``@local`` for Slurm: processes of this machine.
+        kind: ``local``: processes of this machine. ``ray``: a Ray cluster. ``slurm``: jobs of
+            Slurm.
+        where: Address of the cluster's head, or Slurm's partition; empty: the one at hand.
+            ``@local`` for Slurm: processes of this machine.
         resources: Of each worker; not for ``local``.
     """
 
@@ -34,7 +40,9 @@ class Executor:
 
     @property
     def is_local(self) -> bool:
-        """Tell whether workers are processes of this machine that write the run folder themselves."""
+        """Tell whether workers are processes of this machine that write the run folder
+        themselves.
+        """
         return self.kind == "local"
 
     def __str__(self) -> str:
@@ -45,42 +53,64 @@ LOCAL = Executor()
 
 
 def parse_executor(text: str) -> Executor:
-    """Parse ``--executor``: a place, and behind a question mark what each worker of a cluster needs.
+    """Parse ``--executor``: a place, and behind a question mark what each worker of a cluster
+    needs.
 
     Example:
         >>> parse_executor("ray:10.0.0.1:6379").where, parse_executor("slurm?cores=4&gpus=0.5").resources
         ('10.0.0.1:6379', Resources(cores=4, gpus=0.5, memory_gib=None))
 
     Raises:
-        InputError: There is no such executor, ``local`` is given needs, or a need is unknown or no number of its kind.
+        InputError: There is no such executor, ``local`` is given needs, or a need is unknown or no
+            number of its kind.
     """
     named, _, query = text.partition("?")
     kind, _, where = named.partition(":")
     if kind == "local" and not where:
         if query:
             do_this = "use --workers, or another executor"
-            raise InputError(DOING, f"--executor {text}", "local divides this machine's cores among --workers", do_this)
+            raise InputError(
+                DOING,
+                f"--executor {text}",
+                "local divides this machine's cores among --workers",
+                do_this,
+            )
         return LOCAL
     if kind == "ray":
         return Executor("ray", where, _resources(text, query))
     if kind == "slurm":
         return Executor("slurm", where, _resources(text, query))
-    raise InputError(DOING, f"--executor {text}", "no such executor", "write local, ray, ray:HOST:PORT, slurm, or slurm:PARTITION")
+    raise InputError(
+        DOING,
+        f"--executor {text}",
+        "no such executor",
+        "write local, ray, ray:HOST:PORT, slurm, or slurm:PARTITION",
+    )
 
 
 def _resources(text: str, query: str) -> Resources:
     with suppress(KeyError, ValueError):
-        needs = {name: NEEDS[name](value) for name, value in parse_qsl(query, keep_blank_values=True)}
-        cores, gpus, memory = int(needs.get("cores", 1)), needs.get("gpus", 0.0), needs.get("memory")
+        needs = {
+            name: NEEDS[name](value) for name, value in parse_qsl(query, keep_blank_values=True)
+        }
+        cores = int(needs.get("cores", 1))
+        gpus = needs.get("gpus", 0.0)
+        memory = needs.get("memory")
         if cores >= 1 and 0 <= gpus < math.inf and (memory is None or 0 < memory < math.inf):
             return Resources(cores, gpus, memory)
-    do_this = "write for example ray?cores=2&gpus=0.5&memory=7.5: whole cores, a share of a GPU, GiB"
-    raise InputError(DOING, f"--executor {text}", f"{query!r} is not what a worker can need", do_this)
+    do_this = (
+        "write for example ray?cores=2&gpus=0.5&memory=7.5: whole cores, a share of a GPU, GiB"
+    )
+    raise InputError(
+        DOING, f"--executor {text}", f"{query!r} is not what a worker can need", do_this
+    )
 
 
 @contextmanager
 def kept_open(executor: Executor) -> Iterator[None]:
-    """Stay connected to the executor's cluster during the block, in which pools are opened several times."""
+    """Stay connected to the executor's cluster during the block, in which pools are opened several
+    times.
+    """
     if executor.kind != "ray":
         yield
         return
@@ -91,8 +121,11 @@ def kept_open(executor: Executor) -> Iterator[None]:
 
 
 @contextmanager
-def opened_backend(executor: Executor, assignment: Assignment[Any], folder: Path) -> Iterator[Backend[Any]]:
-    """Open the workers of an executor that is not ``local`` for the block; at its end, however it ends, no worker is left.
+def opened_backend(
+    executor: Executor, assignment: Assignment[Any], folder: Path
+) -> Iterator[Backend[Any]]:
+    """Open the workers of an executor that is not ``local`` for the block; at its end, however it
+    ends, no worker is left.
 
     Args:
         executor: Which.

@@ -45,7 +45,8 @@ class RolloutWork:
         threads: Of each rollout.
         scenes: Scene -> SHA-256 of the pickled scenario.
         backgrounds: Scene -> its background file (path on the driver -> SHA-256).
-        models: Scene -> files of its reconstruction (name -> SHA-256), where the driver has it; otherwise each node fits its own.
+        models: Scene -> files of its reconstruction (name -> SHA-256), where the driver has it;
+            otherwise each node fits its own.
         store: URL of a store in which rollouts are looked up and committed.
         fresh: As for `alpasim_plugin.runs.commits.commit_key`.
     """
@@ -72,7 +73,10 @@ class RolloutWork:
             return self._faulty(cell, node, error)
         except OSError as error:
             return self._faulty(cell, node, disk_error(scratch_root(), error))
-        if result.manifest["status"] != "ok" and result.manifest["error"]["failure_class"] == InfrastructureError.failure_class:
+        if (
+            result.manifest["status"] != "ok"
+            and result.manifest["error"]["failure_class"] == InfrastructureError.failure_class
+        ):
             return Faulty(result, result.manifest["error"]["found"])
         return result
 
@@ -90,10 +94,17 @@ class RolloutWork:
         return commit_key(cell, self.options, self.fresh)
 
     def needs(self, cell: Cell) -> list[str]:
-        """Return the SHA-256 of the scene, of its background and reconstruction, and of the files of the cell's parts."""
+        """Return the SHA-256 of the scene, of its background and reconstruction, and of the files
+        of the cell's parts.
+        """
         parts = (cell.renderer.base, cell.renderer.fixer, cell.policy, cell.controller)
         files = [sha256 for part in parts if part is not None for sha256 in part.files.values()]
-        return [self.scenes[cell.scene], *self.models.get(cell.scene, {}).values(), *self.backgrounds.get(cell.scene, {}).values(), *files]
+        return [
+            self.scenes[cell.scene],
+            *self.models.get(cell.scene, {}).values(),
+            *self.backgrounds.get(cell.scene, {}).values(),
+            *files,
+        ]
 
     def _faulty(self, cell: Cell, node: Node, error: SimrunError) -> Faulty[RolloutResult]:
         manifest = failed_manifest(cell, error) | {"node": node.name, "files": {}}
@@ -104,16 +115,28 @@ class RolloutWork:
         scenario = _loaded(self.scenes[scene], node)
         if scenario.background is None:
             return scenario
-        path = placed_path(scenario.background.path, self.backgrounds[scene][scenario.background.path], node)
+        path = placed_path(
+            scenario.background.path, self.backgrounds[scene][scenario.background.path], node
+        )
         return replace(scenario, background=replace(scenario.background, path=path))
 
     def _placed(self, cell: Cell, node: Node) -> Cell:
-        """Return a cell whose parts name files of this node, with the scene's reconstruction in this node's cache."""
+        """Return a cell whose parts name files of this node, with the scene's reconstruction in
+        this node's cache.
+        """
         if self.models.get(cell.scene):
             place_model(self._scenario(cell.scene, node), self.models[cell.scene], node)
-        base, fixer = _part(cell.renderer.base, node), cell.renderer.fixer and _part(cell.renderer.fixer, node)
+        base, fixer = (
+            _part(cell.renderer.base, node),
+            cell.renderer.fixer and _part(cell.renderer.fixer, node),
+        )
         renderer = replace(cell.renderer, base=base, fixer=fixer)
-        return replace(cell, renderer=renderer, policy=_part(cell.policy, node), controller=_part(cell.controller, node))
+        return replace(
+            cell,
+            renderer=renderer,
+            policy=_part(cell.policy, node),
+            controller=_part(cell.controller, node),
+        )
 
 
 _scenes: OrderedDict[str, Scenario] = OrderedDict()  # by SHA-256, as read last by this process
@@ -131,7 +154,8 @@ def _part(spec: PartSpec, node: Node) -> PartSpec:
     """Return a part whose settings name files of this node.
 
     Raises:
-        InfrastructureError: A file that no setting names is not on this node, or has another content here.
+        InfrastructureError: A file that no setting names is not on this node, or has another
+            content here.
     """
     if not spec.files:
         return spec
@@ -139,15 +163,26 @@ def _part(spec: PartSpec, node: Node) -> PartSpec:
     for path, sha256 in spec.files.items():
         if path not in named and not is_here(path, sha256):
             what = f"{path} of {spec.kind} {spec.name} on {node.name}"
-            raise InfrastructureError("driving on a node", what, "not there, or another content", "install the part's files on the nodes")
+            raise InfrastructureError(
+                "driving on a node",
+                what,
+                "not there, or another content",
+                "install the part's files on the nodes",
+            )
     if spec.settings is None:
         return spec
-    moved = {path: placed_path(path, sha256, node) for path, sha256 in spec.files.items() if path in named}
+    moved = {
+        path: placed_path(path, sha256, node)
+        for path, sha256 in spec.files.items()
+        if path in named
+    }
     return replace(spec, settings=with_paths(spec.settings, moved))
 
 
 def place_model(scenario: Scenario, files: Mapping[str, str], node: Node) -> None:
-    """Put a reconstruction into this node's cache, unless it is there; the renderer checks its content."""
+    """Put a reconstruction into this node's cache, unless it is there; the renderer checks its
+    content.
+    """
     key = model_key(scenario)
     assert key is not None
 
@@ -156,11 +191,22 @@ def place_model(scenario: Scenario, files: Mapping[str, str], node: Node) -> Non
             data = node.fetch(sha256)
             if hashlib.sha256(data).hexdigest() != sha256:
                 what = f"reconstruction of {scenario.scene_id}"
-                raise InfrastructureError("placing a reconstruction on a node", what, f"{name} is not what was sent", "try again")
+                raise InfrastructureError(
+                    "placing a reconstruction on a node",
+                    what,
+                    f"{name} is not what was sent",
+                    "try again",
+                )
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(data)
 
-    cached(MODELS, key, make, lambda folder: folder, f"reconstruction of {scenario.scene_id} for {node.name}")
+    cached(
+        MODELS,
+        key,
+        make,
+        lambda folder: folder,
+        f"reconstruction of {scenario.scene_id} for {node.name}",
+    )
 
 
 def rollout_work(
@@ -173,7 +219,9 @@ def rollout_work(
     """
     contents = Contents()
     used = dict.fromkeys(cell.scene for cell in cells)
-    scenes, backgrounds, models = {}, {}, {}
+    scenes = {}
+    backgrounds = {}
+    models = {}
     for name in used:
         scenario = plan.scenarios[name]
         scenes[name] = contents.add_bytes(pickle.dumps(scenario))
@@ -184,8 +232,12 @@ def rollout_work(
         folder = cache_root() / MODELS / key if key else None
         if folder is not None and folder.is_dir():
             found = sorted(one for one in folder.rglob("*") if one.is_file())
-            models[name] = {one.relative_to(folder).as_posix(): contents.add_file(one) for one in found}
+            models[name] = {
+                one.relative_to(folder).as_posix(): contents.add_file(one) for one in found
+            }
     for part in plan.parts:
         for file in part.files:
             contents.add_file(Path(file))
-    return RolloutWork(run, plan.options, threads, scenes, backgrounds, models, store, fresh), contents
+    return RolloutWork(
+        run, plan.options, threads, scenes, backgrounds, models, store, fresh
+    ), contents

@@ -1,6 +1,7 @@
 """Workers that are processes of this machine: the pool's backend, and what runs jobs in them.
 
-Parent and worker talk over one pipe each. There is nothing else to share, so nothing is left behind when both are killed at once.
+Parent and worker talk over one pipe each. There is nothing else to share, so nothing is left behind
+when both are killed at once.
 """
 
 from __future__ import annotations
@@ -18,8 +19,22 @@ from multiprocessing.process import BaseProcess
 from typing import Any, Protocol, TypeVar
 
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.core.subprocesses import copy_context, end_with_parent, load_for_copies, spawn_context
-from alpasim_plugin.runs.executors.base import THREAD_VARIABLES, Backend, Died, Done, Event, Lost, Place, Rules
+from alpasim_plugin.core.subprocesses import (
+    copy_context,
+    end_with_parent,
+    load_for_copies,
+    spawn_context,
+)
+from alpasim_plugin.runs.executors.base import (
+    THREAD_VARIABLES,
+    Backend,
+    Died,
+    Done,
+    Event,
+    Lost,
+    Place,
+    Rules,
+)
 from alpasim_plugin.runs.executors.pool import run_jobs
 
 J = TypeVar("J")
@@ -33,12 +48,17 @@ RULES = Rules(chunk_s=0.0, most_losses=1, copies=False, after_hanging="", after_
 
 
 def run_in_processes(
-    work: Callable[[J], R], jobs: Sequence[J], workers: int, threads: int = 1, limit_s: float | None = None
+    work: Callable[[J], R],
+    jobs: Sequence[J],
+    workers: int,
+    threads: int = 1,
+    limit_s: float | None = None,
 ) -> Iterator[tuple[J, R | Lost]]:
-    """Yield every job with its result, as they finish; a worker that dies or hangs costs only its own job.
+    """Yield every job with its result, as they finish; a worker that dies or hangs costs only its
+    own job.
 
-    Workers end with this process, however it ends. Call it from the main thread: Linux takes the end of the thread that started a worker
-    for the end of its parent.
+    Workers end with this process, however it ends. Call it from the main thread: Linux takes the
+    end of the thread that started a worker for the end of its parent.
 
     Args:
         work: A module-level function.
@@ -56,11 +76,18 @@ def run_in_processes(
 
 
 def run_or_retry(
-    work: Callable[[J], R], jobs: Sequence[J], workers: int, threads: int, limit_s: float | None, known: Callable[[J], R | None]
+    work: Callable[[J], R],
+    jobs: Sequence[J],
+    workers: int,
+    threads: int,
+    limit_s: float | None,
+    known: Callable[[J], R | None],
 ) -> Iterator[tuple[J, R | Lost]]:
-    """Yield every job with its result, as they finish: in this process for one worker without a time limit.
+    """Yield every job with its result, as they finish: in this process for one worker without a
+    time limit.
 
-    A job whose worker died runs again at the end, alone: it may have been the victim of another's memory.
+    A job whose worker died runs again at the end, alone: it may have been the victim of another's
+    memory.
 
     Args:
         work, jobs, workers, threads, limit_s: As for `run_in_processes`.
@@ -97,13 +124,16 @@ def _advised(got: R | Lost) -> R | Lost:
 
 
 def load_early() -> None:
-    """Load what rollouts need, while this process finds out what to do: workers of one thread are then copies that have it."""
+    """Load what rollouts need, while this process finds out what to do: workers of one thread are
+    then copies that have it.
+    """
     with _thread_environment(1):
         load_for_copies([AHEAD])
 
 
 def map_jobs(work: Callable[[J], R], jobs: Sequence[J], workers: int) -> Iterator[tuple[J, R]]:
-    """Yield every job with its result, as they finish; in order for one worker. Results do not depend on the number of workers.
+    """Yield every job with its result, as they finish; in order for one worker. Results do not
+    depend on the number of workers.
 
     Args:
         work: A module-level function. One worker is this process.
@@ -139,13 +169,19 @@ class Task(Protocol):
 T = TypeVar("T", bound=Task)
 
 
-def run_dependent(work: Callable[[T, Send], None], tasks: Sequence[T], workers: int, on_message: Callable[[str, Any], None]) -> None:
+def run_dependent(
+    work: Callable[[T, Send], None],
+    tasks: Sequence[T],
+    workers: int,
+    on_message: Callable[[str, Any], None],
+) -> None:
     """Do all tasks, each after those it depends on; results do not depend on the number of workers.
 
     Args:
         work: A module-level function of a task and of what sends a message here.
         tasks: Every one behind those it depends on.
-        workers: Processes, one thread each. One is this process, which does the tasks in their order.
+        workers: Processes, one thread each. One is this process, which does the tasks in their
+            order.
         on_message: Called with the name of a task and what its work sent.
 
     Raises:
@@ -158,7 +194,9 @@ def run_dependent(work: Callable[[T, Send], None], tasks: Sequence[T], workers: 
         for task in tasks:
             work(task, partial(on_message, task.name))
         return
-    backend: LocalBackend[T] = LocalBackend(work, workers, 1, lambda task, message: on_message(task.name, message))
+    backend: LocalBackend[T] = LocalBackend(
+        work, workers, 1, lambda task, message: on_message(task.name, message)
+    )
     with closing(backend):
         for task, got in run_jobs(backend, tasks, _ignore, after=after):
             _kept(got, task.name)
@@ -170,14 +208,18 @@ def _indices_before(tasks: Sequence[Task]) -> dict[int, list[int]]:
     for index, task in enumerate(tasks):
         before = [names[name] for name in task.after if name in names]
         if early := sorted(tasks[i].name for i in before if i >= index):
-            raise ValueError(f"task {task.name} comes before {', '.join(early)}, which it depends on")
+            raise ValueError(
+                f"task {task.name} comes before {', '.join(early)}, which it depends on"
+            )
         after[index] = before
     return after
 
 
 def _kept(got: R | Lost, name: str) -> R:
     if isinstance(got, Lost):
-        raise InfrastructureError("working in several processes", name, got.found, f"{DYING} --jobs 1")
+        raise InfrastructureError(
+            "working in several processes", name, got.found, f"{DYING} --jobs 1"
+        )
     return got
 
 
@@ -207,17 +249,27 @@ class LocalBackend(Backend[J]):
 
     rules = RULES
 
-    def __init__(self, work: Callable[..., Any], workers: int, threads: int, on_message: Callable[[J, Any], None] | None = None) -> None:
+    def __init__(
+        self,
+        work: Callable[..., Any],
+        workers: int,
+        threads: int,
+        on_message: Callable[[J, Any], None] | None = None,
+    ) -> None:
         self._work, self._most, self._threads, self._on_message = work, workers, threads, on_message
         self._workers: dict[int, _Worker] = {}
         self._next = 0
 
     def free(self, wanted: int) -> list[Place]:
-        """Start as many workers as are wanted and allowed, and return those that are ready and idle."""
+        """Start as many workers as are wanted and allowed, and return those that are ready and
+        idle.
+        """
         idle = sum(not one.busy for one in self._workers.values())
         for _ in range(min(self._most - len(self._workers), wanted - idle)):
             self._open()
-        return [Place(number, "") for number, one in self._workers.items() if one.ready and not one.busy]
+        return [
+            Place(number, "") for number, one in self._workers.items() if one.ready and not one.busy
+        ]
 
     def start(self, worker: int, jobs: Sequence[J]) -> None:
         """Hand one job to a free worker."""
@@ -259,7 +311,9 @@ class LocalBackend(Backend[J]):
     def _open(self) -> None:
         context = (copy_context() if self._threads == 1 else None) or spawn_context()
         ours, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(theirs, self._work, self._on_message is not None), daemon=False)
+        process = context.Process(
+            target=_serve, args=(theirs, self._work, self._on_message is not None), daemon=False
+        )
         with _thread_environment(self._threads):
             process.start()
         theirs.close()  # so that the pipe ends when the worker does
@@ -273,7 +327,12 @@ class LocalBackend(Backend[J]):
         except (EOFError, OSError):
             del self._workers[number]
             one.process.join(GRACE_S)
-            return Died(number, "", f"its worker process ended ({_exit_reason(one.process.exitcode)})", of_node=not one.reached)
+            return Died(
+                number,
+                "",
+                f"its worker process ended ({_exit_reason(one.process.exitcode)})",
+                of_node=not one.reached,
+            )
         if kind == "ready":
             one.ready = True
         elif kind == "message" and self._on_message is not None:
@@ -286,7 +345,11 @@ class LocalBackend(Backend[J]):
 
 def _exit_reason(code: int | None) -> str:
     if code is not None and code < 0:
-        name = signal.Signals(-code).name if -code in [int(one) for one in signal.Signals] else f"signal {-code}"
+        name = (
+            signal.Signals(-code).name
+            if -code in [int(one) for one in signal.Signals]
+            else f"signal {-code}"
+        )
         return f"killed by {name}"
     return "its pipe broke" if code is None else f"exit code {code}"
 
@@ -294,7 +357,9 @@ def _exit_reason(code: int | None) -> str:
 def _serve(pipe: Connection, work: Callable[..., Any], sends: bool) -> None:
     """Answer jobs until the pipe ends; the main function of a worker."""
     end_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group, and the parent handles it
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C reaches the whole process group, and the parent handles it
     more = [lambda message: pipe.send(("message", message))] if sends else []
     pipe.send(("ready", None))
     while True:
@@ -313,7 +378,17 @@ def _serve(pipe: Connection, work: Callable[..., Any], sends: bool) -> None:
             return
         except Exception as error:  # what cannot be pickled
             found = f"{type(answer).__name__} cannot be sent to the parent: {error}"
-            pipe.send(("answer", InfrastructureError("working in a process", getattr(work, "__name__", "a function"), found, "report it")))
+            pipe.send(
+                (
+                    "answer",
+                    InfrastructureError(
+                        "working in a process",
+                        getattr(work, "__name__", "a function"),
+                        found,
+                        "report it",
+                    ),
+                )
+            )
 
 
 @contextmanager

@@ -1,6 +1,8 @@
-"""The far side of a pool: a process on a node that says whether it may work, and then answers with results.
+"""The far side of a pool: a process on a node that says whether it may work, and then answers with
+results.
 
-Numerical libraries read the number of their threads when they are imported, so this module imports none.
+Numerical libraries read the number of their threads when they are imported, so this module imports
+none.
 """
 
 from __future__ import annotations
@@ -29,7 +31,9 @@ class Serving:
         targets: Modules of parts that are not simrun's.
     """
 
-    def __init__(self, node: str, threads: int, expected: Mapping[str, str], targets: Sequence[str]) -> None:
+    def __init__(
+        self, node: str, threads: int, expected: Mapping[str, str], targets: Sequence[str]
+    ) -> None:
         own_path_only()  # Ray adds the driver's working directory
         os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
         self._node, self._expected, self._targets = node, expected, targets
@@ -39,7 +43,9 @@ class Serving:
         """Answer, so that the driver knows that this process runs."""
 
     def accept(self, work: bytes) -> tuple[int, list[str]]:
-        """Compare this node with the driver; take the work if nothing differs. Return the process number and what differs."""
+        """Compare this node with the driver; take the work if nothing differs. Return the process
+        number and what differs.
+        """
         from alpasim_plugin.runs.executors.assignment import differences, identity_of, sweep
 
         sweep()
@@ -52,7 +58,11 @@ class Serving:
         """Do jobs; ``refs`` are Ray's references to the contents that they need, by SHA-256."""
         import ray
 
-        return serve(self._work, pickle.loads(jobs), Node(self._node, lambda sha256: bytes(ray.get(refs[sha256]))))
+        return serve(
+            self._work,
+            pickle.loads(jobs),
+            Node(self._node, lambda sha256: bytes(ray.get(refs[sha256]))),
+        )
 
 
 @dataclass(frozen=True)
@@ -73,7 +83,13 @@ class JobAnswer:
 
 
 def serve_job(
-    folder: str, work: str, jobs: bytes, keys: Sequence[str], expected: Mapping[str, str], targets: Sequence[str], threads: int
+    folder: str,
+    work: str,
+    jobs: bytes,
+    keys: Sequence[str],
+    expected: Mapping[str, str],
+    targets: Sequence[str],
+    threads: int,
 ) -> JobAnswer:
     """Do the pool's jobs in a job of Slurm; contents are files of a folder that all nodes see.
 
@@ -89,11 +105,16 @@ def serve_job(
     from alpasim_plugin.runs.executors.assignment import differences, identity_of, sweep
 
     sweep()
-    node = Node(os.environ.get("SLURMD_NODENAME") or socket.gethostname(), lambda sha256: Path(folder, "placed", sha256).read_bytes())
+    node = Node(
+        os.environ.get("SLURMD_NODENAME") or socket.gethostname(),
+        lambda sha256: Path(folder, "placed", sha256).read_bytes(),
+    )
     reasons = differences(expected, identity_of(targets))
     if reasons:
         return JobAnswer(node.name, reasons, keys, b"")
-    return JobAnswer(node.name, (), keys, serve(pickle.loads(node.fetch(work)), pickle.loads(jobs), node))
+    return JobAnswer(
+        node.name, (), keys, serve(pickle.loads(node.fetch(work)), pickle.loads(jobs), node)
+    )
 
 
 def serve(work: Callable[[Any, Node], Any], jobs: Sequence[Any], node: Node) -> bytes:
@@ -114,5 +135,10 @@ def _sendable(error: Exception) -> Exception:
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:  # whatever an exception's own pickling raises
-        return InfrastructureError("working on a node", type(error).__name__, str(error), "read the traceback with --executor local")
+        return InfrastructureError(
+            "working on a node",
+            type(error).__name__,
+            str(error),
+            "read the traceback with --executor local",
+        )
     return error

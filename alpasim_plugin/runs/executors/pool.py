@@ -1,7 +1,9 @@
-"""The pool: give jobs to the workers of a backend, wherever they are: lost ones again elsewhere, short ones in chunks, late ones twice.
+"""The pool: give jobs to the workers of a backend, wherever they are: lost ones again elsewhere,
+short ones in chunks, late ones twice.
 
-This is all of the policy; a backend (`Backend`) only starts workers, hands them jobs and says what became of them. Jobs without a result
-stay with the driver, and a worker gets the next ones only when the results of its last ones were taken, so nothing piles up.
+This is all of the policy; a backend (`Backend`) only starts workers, hands them jobs and says what
+became of them. Jobs without a result stay with the driver, and a worker gets the next ones only
+when the results of its last ones were taken, so nothing piles up.
 """
 
 from __future__ import annotations
@@ -42,7 +44,8 @@ def run_jobs(
         notify: Called with a line for whatever a person should know.
         limit_s: Seconds that one job may take before its worker is ended; None: no limit.
         clock: Seconds of this process; no clock of any other machine is asked.
-        after: Index of a job -> indices of the earlier jobs that must be done before it; jobs that are not named wait for none.
+        after: Index of a job -> indices of the earlier jobs that must be done before it; jobs that
+            are not named wait for none.
 
     Raises:
         The first exception of the work.
@@ -113,7 +116,9 @@ class _Pool(Generic[J, R]):
                 self._backend.start(place.worker, [self._jobs[index] for index in chosen])
 
     def _choose(self, place: Place) -> tuple[int, ...]:
-        """Return what a free worker is to do: a lost job that failed elsewhere, new jobs, or the copy of a late one."""
+        """Return what a free worker is to do: a lost job that failed elsewhere, new jobs, or the
+        copy of a late one.
+        """
         for index in list(self._again):
             if index in self._done:
                 self._again.remove(index)
@@ -121,7 +126,9 @@ class _Pool(Generic[J, R]):
                 self._again.remove(index)
                 return (index,)
         if self._after:
-            ready = (index for index in self._todo if self._done.issuperset(self._after.get(index, ())))
+            ready = (
+                index for index in self._todo if self._done.issuperset(self._after.get(index, ()))
+            )
             first = next(ready, None)
             if first is None:
                 return ()
@@ -132,12 +139,20 @@ class _Pool(Generic[J, R]):
         return self._late(place) if self._rules.copies else ()
 
     def _suits(self, index: int, node: str) -> bool:
-        """Tell whether a lost job may go to a node: not to one that failed it, unless there is no other or none has come for a while."""
+        """Tell whether a lost job may go to a node: not to one that failed it, unless there is no
+        other or none has come for a while.
+        """
         tried, now_s = self._tried.get(index, set()), self._clock()
-        return node not in tried or self._backend.nodes() <= tried or now_s - self._lost_s.get(index, now_s) > ELSEWHERE_S
+        return (
+            node not in tried
+            or self._backend.nodes() <= tried
+            or now_s - self._lost_s.get(index, now_s) > ELSEWHERE_S
+        )
 
     def _chunk(self) -> int:
-        """Return how many jobs make one unit: short ones go together, the last ones singly so that all workers end together."""
+        """Return how many jobs make one unit: short ones go together, the last ones singly so that
+        all workers end together.
+        """
         if not self._took_s:
             return 1
         wanted = self._rules.chunk_s / max(median(self._took_s), 1e-6)
@@ -148,13 +163,19 @@ class _Pool(Generic[J, R]):
         """Return a copy of the unit that is most overdue; on another node where there is one."""
         if not self._took_s:
             return ()
-        usual_s, now_s, several = median(self._took_s), self._clock(), len(self._backend.nodes()) > 1
+        usual_s = median(self._took_s)
+        now_s = self._clock()
+        several = len(self._backend.nodes()) > 1
         overdue = []
         for unit in self._running.values():
             if place.node and several and unit.node == place.node:
                 continue
-            left = tuple(index for index in unit.jobs if index not in self._done and self._copies(index) < 2)
-            late_s = now_s - unit.since_s - max(LATE_FACTOR * usual_s, usual_s + LATE_S) * len(unit.jobs)
+            left = tuple(
+                index for index in unit.jobs if index not in self._done and self._copies(index) < 2
+            )
+            late_s = (
+                now_s - unit.since_s - max(LATE_FACTOR * usual_s, usual_s + LATE_S) * len(unit.jobs)
+            )
             if left and late_s > 0:
                 overdue.append((late_s, left))
         self._copied |= bool(overdue)
@@ -164,10 +185,14 @@ class _Pool(Generic[J, R]):
         return sum(index in unit.jobs for unit in self._running.values())
 
     def _patience_s(self) -> float:
-        """Return how long to wait for news: not beyond the next time limit, and never so long that new nodes go unseen."""
+        """Return how long to wait for news: not beyond the next time limit, and never so long that
+        new nodes go unseen.
+        """
         if self._limit_s is None or not self._running:
             return LOOK_S
-        due_s = min(unit.since_s + self._limit_s * len(unit.jobs) for unit in self._running.values())
+        due_s = min(
+            unit.since_s + self._limit_s * len(unit.jobs) for unit in self._running.values()
+        )
         return min(LOOK_S, max(0.0, due_s - self._clock()) + 0.01)
 
     def _take(self, event: Event) -> list[tuple[int, R | Lost]]:
@@ -179,7 +204,9 @@ class _Pool(Generic[J, R]):
             return self._lost(unit, event)
         self._strike(event.node, event.found)  # it could not even start
         if self._rules.most_losses == 1 and self._todo:
-            return [(self._todo.popleft(), Lost(event.found))]  # costs a job, so that it is not started for ever
+            return [
+                (self._todo.popleft(), Lost(event.found))
+            ]  # costs a job, so that it is not started for ever
         return []
 
     def _answered(self, unit: _Unit, event: Done) -> list[tuple[int, R | Lost]]:
@@ -211,14 +238,26 @@ class _Pool(Generic[J, R]):
             self._strike(node, event.found)
         left = [index for index in unit.jobs if index not in self._done and not self._copies(index)]
         for index in left:
-            if len(unit.jobs) == 1 and not event.of_node:  # of a chunk nobody knows which job it was
+            if (
+                len(unit.jobs) == 1 and not event.of_node
+            ):  # of a chunk nobody knows which job it was
                 self._losses[index] += 1
             if self._losses[index] >= self._rules.most_losses:
-                finished.append((index, Lost(self._why_given_up(index, node, event.found), do_this=self._rules.after_dying)))
+                finished.append(
+                    (
+                        index,
+                        Lost(
+                            self._why_given_up(index, node, event.found),
+                            do_this=self._rules.after_dying,
+                        ),
+                    )
+                )
             else:
                 self._try_again(index, node)
         if len(left) > len(finished):
-            self._notify(f"a worker on {node or 'a node'} was lost ({event.found}); its work is done again")
+            self._notify(
+                f"a worker on {node or 'a node'} was lost ({event.found}); its work is done again"
+            )
         return finished
 
     def _why_given_up(self, index: int, node: str, found: str) -> str:
@@ -235,7 +274,11 @@ class _Pool(Generic[J, R]):
     def _strike(self, node: str, found: str) -> None:
         """Count a failure of a node; several in a row set it aside where another gives results."""
         self._strikes[node] += 1
-        if node and self._strikes[node] >= STRIKES and (self._backend.nodes() & self._good) - {node}:
+        if (
+            node
+            and self._strikes[node] >= STRIKES
+            and (self._backend.nodes() & self._good) - {node}
+        ):
             self._backend.set_aside(node, f"{STRIKES} failures in a row, the last: {found}")
 
     def _call_off(self) -> None:
@@ -249,7 +292,9 @@ class _Pool(Generic[J, R]):
         """End workers that exceeded the time limit; of a chunk each job is then tried alone."""
         finished: list[tuple[int, R | Lost]] = []
         for worker, unit in list(self._running.items()):
-            if self._limit_s is None or self._clock() - unit.since_s <= self._limit_s * len(unit.jobs):
+            if self._limit_s is None or self._clock() - unit.since_s <= self._limit_s * len(
+                unit.jobs
+            ):
                 continue
             self._backend.end(worker)
             del self._running[worker]
@@ -257,6 +302,8 @@ class _Pool(Generic[J, R]):
             if len(unit.jobs) > 1:
                 self._again.extend(left)
                 continue
-            lost = Lost(f"it did not finish within {self._limit_s:g} s", True, self._rules.after_hanging)
+            lost = Lost(
+                f"it did not finish within {self._limit_s:g} s", True, self._rules.after_hanging
+            )
             finished += [(index, lost) for index in left]
         return finished

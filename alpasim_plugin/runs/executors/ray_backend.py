@@ -1,4 +1,6 @@
-"""Workers on the nodes of a Ray cluster: one actor each, placed by us, so that a node that was refused or set aside stays unused."""
+"""Workers on the nodes of a Ray cluster: one actor each, placed by us, so that a node that was
+refused or set aside stays unused.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +29,15 @@ BARREN_S = 60.0  # without any node before giving up
 FAILED_STARTS = 3  # of workers on a node that never had one
 START_S = 300.0  # for a worker to start, and again for it to compare versions and take the work
 AGAIN_S = 2.0  # after a failed start
-HELD_CONTENTS = 256  # references that the driver keeps, so that a scene is sent once for all its rollouts
+HELD_CONTENTS = (
+    256  # references that the driver keeps, so that a scene is sent once for all its rollouts
+)
 SWEEP_S = 20.0  # that nodes may take to remove what killed workers left
 GIB = 2**30
 SAME_VERSIONS = "install the same versions on the nodes"
-LOOK_THERE = "look at Ray's logs and the file systems of these nodes, then give the same command again"
+LOOK_THERE = (
+    "look at Ray's logs and the file systems of these nodes, then give the same command again"
+)
 
 
 @dataclass
@@ -51,17 +57,25 @@ def connected(address: str | None) -> Iterator[None]:
     """Be connected to a Ray cluster during the block; one inside another stays with the outer's.
 
     Args:
-        address: HOST:PORT of its head. None: the one that ``RAY_ADDRESS`` names or that runs on this machine; where there is none, one of
-            this machine's cores is started for the block.
+        address: HOST:PORT of its head. None: the one that ``RAY_ADDRESS`` names or that runs on
+            this machine; where there is none, one of this machine's cores is started for the block.
 
     Raises:
         InputError: Ray is not installed, or the address is that of a Ray client server.
-        InfrastructureError: There is no cluster at the address, or it has another version of Ray or Python.
+        InfrastructureError: There is no cluster at the address, or it has another version of Ray or
+            Python.
     """
-    ray = require_library("ray", "choosing an executor", "--executor ray", "pip install 'alpasim-onefixer[ray]'")
+    ray = require_library(
+        "ray", "choosing an executor", "--executor ray", "pip install 'alpasim-onefixer[ray]'"
+    )
     if address is not None and address.startswith("ray://"):
         do_this = "start simrun on a node of the cluster, with --executor ray"
-        raise InputError("choosing an executor", f"--executor ray:{address}", "a Ray client cannot place workers on nodes", do_this)
+        raise InputError(
+            "choosing an executor",
+            f"--executor ray:{address}",
+            "a Ray client cannot place workers on nodes",
+            do_this,
+        )
     if ray.is_initialized():
         with _signals_as_raised():
             yield
@@ -76,12 +90,22 @@ def connected(address: str | None) -> Iterator[None]:
         except ConnectionError:
             if address is not None:
                 raise
-            ray.init(address="local", num_cpus=len(os.sched_getaffinity(0)), include_dashboard=False, **quiet)
+            ray.init(
+                address="local",
+                num_cpus=len(os.sched_getaffinity(0)),
+                include_dashboard=False,
+                **quiet,
+            )
     except (ConnectionError, RuntimeError, ValueError) as error:
         do_this = "start the cluster (ray start --head), or correct the address"
-        raise InfrastructureError("connecting to a Ray cluster", address or "this machine", str(error), do_this) from error
+        raise InfrastructureError(
+            "connecting to a Ray cluster", address or "this machine", str(error), do_this
+        ) from error
     finally:
-        for number, handler in held.items():  # Ray puts its own in place, which would end the run without a word
+        for (
+            number,
+            handler,
+        ) in held.items():  # Ray puts its own in place, which would end the run without a word
             signal.signal(number, handler)
     try:
         with _signals_as_raised():
@@ -92,7 +116,9 @@ def connected(address: str | None) -> Iterator[None]:
 
 @contextmanager
 def _signals_as_raised() -> Iterator[None]:
-    """Raise what a signal's handler has raised: out of Ray's compiled code it comes as the cause of a `SystemError`."""
+    """Raise what a signal's handler has raised: out of Ray's compiled code it comes as the cause of
+    a `SystemError`.
+    """
     try:
         yield
     except SystemError as error:
@@ -106,7 +132,8 @@ class RayBackend(Backend[J]):
 
     Args:
         assignment: What the workers do.
-        start_s: Seconds for a worker to start, and again for it to be ready. A node that fails this without another worker is set aside.
+        start_s: Seconds for a worker to start, and again for it to be ready. A node that fails this
+            without another worker is set aside.
     """
 
     rules = Rules(chunk_s=1.0)
@@ -122,7 +149,9 @@ class RayBackend(Backend[J]):
         self._events: list[Event] = []
         self._refused: dict[str, str] = {}  # node -> why
         self._do_this = SAME_VERSIONS  # against the last refusal
-        self._pings: dict[str, tuple[Any, float]] = {}  # node -> a process there that needs no core, when it was asked for
+        self._pings: dict[
+            str, tuple[Any, float]
+        ] = {}  # node -> a process there that needs no core, when it was asked for
         self._accepted: set[str] = set()
         self._failed: dict[str, tuple[int, float]] = {}  # node -> failed starts, time of the last
         self._ended: dict[str, list[int]] = {}  # node -> processes that were killed
@@ -135,11 +164,16 @@ class RayBackend(Backend[J]):
         """Start workers where there is room and return those without work.
 
         Raises:
-            InfrastructureError: Every node was refused, none has the resources, or none has been there for a minute.
+            InfrastructureError: Every node was refused, none has the resources, or none has been
+                there for a minute.
         """
         if time.monotonic() - self._looked_s >= LOOK_S:
             self._look()
-        return [Place(number, one.node) for number, one in self._workers.items() if one.ready and one.ref is None]
+        return [
+            Place(number, one.node)
+            for number, one in self._workers.items()
+            if one.ready and one.ref is None
+        ]
 
     def start(self, worker: int, jobs: Sequence[J]) -> None:
         """Hand jobs to a free worker."""
@@ -191,12 +225,18 @@ class RayBackend(Backend[J]):
         """End all workers, and remove what those that were at work have left on their nodes."""
         for number in list(self._workers):
             self.end(number)
-        sweeps = [self._sweep(node, pids) for node, pids in self._ended.items() if node in self._ids]
+        sweeps = [
+            self._sweep(node, pids) for node, pids in self._ended.items() if node in self._ids
+        ]
         if sweeps:
             self._ray.wait(sweeps, num_returns=len(sweeps), timeout=SWEEP_S)
 
     def _sweep(self, node: str, pids: list[int]) -> Any:
-        return self._ray.remote(sweep).options(num_cpus=0, max_retries=0, scheduling_strategy=self._on(node)).remote(pids)
+        return (
+            self._ray.remote(sweep)
+            .options(num_cpus=0, max_retries=0, scheduling_strategy=self._on(node))
+            .remote(pids)
+        )
 
     def _on(self, node: str) -> Any:
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
@@ -204,7 +244,9 @@ class RayBackend(Backend[J]):
         return NodeAffinitySchedulingStrategy(self._ids[node], soft=False)
 
     def _reference(self, sha256: str) -> Any:
-        """Return Ray's reference to a content; Ray copies it to a node once, for all workers there."""
+        """Return Ray's reference to a content; Ray copies it to a node once, for all workers
+        there.
+        """
         if sha256 not in self._refs:
             self._refs[sha256] = self._ray.put(self._given.contents.read(sha256))
             while len(self._refs) > HELD_CONTENTS:
@@ -215,19 +257,34 @@ class RayBackend(Backend[J]):
     def _look(self) -> None:
         """Look at the nodes and start workers where there is room, evenly."""
         self._looked_s = now = time.monotonic()
-        alive = {f"{node['NodeManagerHostname']}/{node['NodeID'][:8]}": node for node in self._ray.nodes() if node["Alive"]}
+        alive = {
+            f"{node['NodeManagerHostname']}/{node['NodeID'][:8]}": node
+            for node in self._ray.nodes()
+            if node["Alive"]
+        }
         self._ids = {name: node["NodeID"] for name, node in alive.items()}
         self._end_overdue(now)
-        room = {name: self._room(node["Resources"]) for name, node in alive.items() if name not in self._refused}
+        room = {
+            name: self._room(node["Resources"])
+            for name, node in alive.items()
+            if name not in self._refused
+        }
         self._usable = frozenset(name for name, workers in room.items() if workers)
         if alive:
             self._alive_s = now
         if alive and not room:
             found = "; ".join(f"{name}: {why}" for name, why in self._refused.items())
-            raise InfrastructureError(DOING, "all of its nodes", f"no node takes the work: {found}", self._do_this)
+            raise InfrastructureError(
+                DOING, "all of its nodes", f"no node takes the work: {found}", self._do_this
+            )
         if (room and not any(room.values())) or now - self._alive_s > BARREN_S:
             found = "no node has that much" if room else f"no node for {BARREN_S:g} s"
-            raise InfrastructureError(DOING, str(self._given.resources), found, "ask for less behind --executor, or add nodes")
+            raise InfrastructureError(
+                DOING,
+                str(self._given.resources),
+                found,
+                "ask for less behind --executor, or add nodes",
+            )
         on = {name: sum(one.node == name for one in self._workers.values()) for name in room}
         while len(self._workers) < self._given.workers:
             open_ = [name for name in room if on[name] < room[name] and not self._rests(name, now)]
@@ -238,7 +295,9 @@ class RayBackend(Backend[J]):
             self._open(chosen)
 
     def _end_overdue(self, now_s: float) -> None:
-        """End workers that do not become ready, unless they wait for cores that another driver's workers hold."""
+        """End workers that do not become ready, unless they wait for cores that another driver's
+        workers hold.
+        """
         starting = {number: one for number, one in self._workers.items() if not one.ready}
         new = {one.begun: one for one in starting.values() if not one.has_begun}
         if new:
@@ -254,15 +313,23 @@ class RayBackend(Backend[J]):
             if any(other.node == one.node and other.ready for other in self._workers.values()):
                 self._failed[one.node] = self._failed.get(one.node, (0, 0.0))[0] + 1, now_s
             else:
-                what = "its worker has started, but was not ready" if one.has_begun else "no process has started there"
+                what = (
+                    "its worker has started, but was not ready"
+                    if one.has_begun
+                    else "no process has started there"
+                )
                 self._refuse(one.node, f"{what} within {self._start_s:g} s", LOOK_THERE)
 
     def _may_wait_for_cores(self, node: str, now_s: float) -> bool:
-        """Tell whether a process that needs no core starts on a node where a worker does not; true until there was time to see."""
+        """Tell whether a process that needs no core starts on a node where a worker does not; true
+        until there was time to see.
+        """
         if node not in self._pings:
             options = {"num_cpus": 0, "max_retries": 0, "scheduling_strategy": self._on(node)}
             self._pings[node] = self._ray.remote(_ping).options(**options).remote(), now_s
-            self._given.notify(f"node {node} has started no worker for {self._start_s:g} s; others may hold its cores")
+            self._given.notify(
+                f"node {node} has started no worker for {self._start_s:g} s; others may hold its cores"
+            )
             return True
         ping, asked_s = self._pings[node]
         if not self._ray.wait([ping], timeout=0)[0]:
@@ -284,7 +351,11 @@ class RayBackend(Backend[J]):
         return times > 0 and now_s - last_s < AGAIN_S
 
     def _open(self, node: str) -> None:
-        memory = {"memory": int(self._given.resources.memory_gib * GIB)} if self._given.resources.memory_gib else {}
+        memory = (
+            {"memory": int(self._given.resources.memory_gib * GIB)}
+            if self._given.resources.memory_gib
+            else {}
+        )
         made = self._ray.remote(Serving).options(
             num_cpus=self._given.resources.cores,
             num_gpus=self._given.resources.gpus,
@@ -293,8 +364,12 @@ class RayBackend(Backend[J]):
             scheduling_strategy=self._on(node),
             **memory,
         )
-        actor = made.remote(node, self._given.resources.cores, dict(self._given.expected), self._given.targets)
-        self._workers[self._next] = _Worker(actor, node, actor.begun.remote(), actor.accept.remote(self._blob), time.monotonic())
+        actor = made.remote(
+            node, self._given.resources.cores, dict(self._given.expected), self._given.targets
+        )
+        self._workers[self._next] = _Worker(
+            actor, node, actor.begun.remote(), actor.accept.remote(self._blob), time.monotonic()
+        )
         self._next += 1
 
     def _receive(self, number: int) -> None:
@@ -304,7 +379,9 @@ class RayBackend(Backend[J]):
         try:
             answer = self._ray.get(one.ref)
         except errors.RayTaskError as error:
-            self._gone(number, one, f"{type(error.cause or error).__name__}: {error.cause or error}", error)
+            self._gone(
+                number, one, f"{type(error.cause or error).__name__}: {error.cause or error}", error
+            )
         except errors.RayError as error:
             self._gone(number, one, reason_of(error), error)
         else:
@@ -325,7 +402,9 @@ class RayBackend(Backend[J]):
         self.end(number)
         self._looked_s = -LOOK_S
         alive = {node["NodeID"] for node in self._ray.nodes() if node["Alive"]}
-        of_node = self._ids.get(one.node) not in alive or isinstance(error, self._ray.exceptions.NodeDiedError)
+        of_node = self._ids.get(one.node) not in alive or isinstance(
+            error, self._ray.exceptions.NodeDiedError
+        )
         if was_ready:
             self._events.append(Died(number, one.node, found, of_node))
             return

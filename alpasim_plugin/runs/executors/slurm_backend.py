@@ -1,11 +1,13 @@
-"""Jobs of Slurm through submitit: each is one chunk of the pool's jobs, and answers through a folder that all nodes see.
+"""Jobs of Slurm through submitit: each is one chunk of the pool's jobs, and answers through a
+folder that all nodes see.
 
 $SIMRUN_SLURM/RUN/SESSION/jobs          one line per job: its number, and for a local one when its process started
                          /placed/SHA    contents, by their SHA-256
                          /N_*.pkl, .out what submitit writes; gone as soon as a result was taken
-RUN is a digest of the run folder's path. Work and results are pickles, which run code when they are read, so they lie outside of the run
-folder, which may come from anybody, in a folder that only this user can read and write.
-A driver that was killed leaves its session. The next one takes over the results that lie there and cancels what still runs.
+RUN is a digest of the run folder's path. Work and results are pickles, which run code when they are
+read, so they lie outside of the run folder, which may come from anybody, in a folder that only this
+user can read and write. A driver that was killed leaves its session. The next one takes over the
+results that lie there and cancels what still runs.
 """
 
 from __future__ import annotations
@@ -34,16 +36,21 @@ from alpasim_plugin.runs.executors.node import JobAnswer, serve_job
 J = TypeVar("J")
 
 DOING = "working in jobs of Slurm"
-LOCAL = "@local"  # instead of a partition: submitit's local executor, to try everything but Slurm itself
+# instead of a partition: submitit's local executor, to try everything but Slurm itself
+LOCAL = "@local"
 JOB_MIN = 240  # time limit of a job, minutes
-POLL_S, GRACE_S = 0.2, 3.0  # between looks; between the end of a job and its result on a slow file system
+POLL_S, GRACE_S = (
+    0.2,
+    3.0,
+)  # between looks; between the end of a job and its result on a slow file system
 UNSEEN = "another"  # stands for the nodes that no job has run on yet
 MOST_REFUSALS = 3  # of nodes, while none was accepted
 MOST_JOBS = 256  # at a time
 
 
 class SlurmBackend(Backend[J]):
-    """Jobs as workers; see `alpasim_plugin.runs.executors.base.Backend`. A worker is a slot for a job.
+    """Jobs as workers; see `alpasim_plugin.runs.executors.base.Backend`. A worker is a slot for a
+    job.
 
     Args:
         assignment: What the jobs do.
@@ -58,7 +65,12 @@ class SlurmBackend(Backend[J]):
     rules = Rules(chunk_s=600.0)
 
     def __init__(self, assignment: Assignment[J], partition: str, folder: Path) -> None:
-        submitit = require_library("submitit", "choosing an executor", "--executor slurm", "pip install 'alpasim-onefixer[slurm]'")
+        submitit = require_library(
+            "submitit",
+            "choosing an executor",
+            "--executor slurm",
+            "pip install 'alpasim-onefixer[slurm]'",
+        )
         self._given = assignment
         self._is_local = partition == LOCAL
         sessions = sessions_folder(folder)
@@ -66,13 +78,17 @@ class SlurmBackend(Backend[J]):
         self._session = private_folder(sessions / f"{os.getpid()}.{os.urandom(4).hex()}", DOING)
         self._blob = self._placed(assignment.contents.add_bytes(pickle.dumps(assignment.work)))
         try:
-            self._executor = submitit.AutoExecutor(folder=str(self._session), cluster="local" if self._is_local else "slurm")
+            self._executor = submitit.AutoExecutor(
+                folder=str(self._session), cluster="local" if self._is_local else "slurm"
+            )
         except RuntimeError as error:
             do_this = f"start simrun where sbatch is, or try --executor slurm:{LOCAL}"
             raise InfrastructureError(DOING, "submitit", str(error), do_this) from error
         self._executor.update_parameters(**self._parameters("" if self._is_local else partition))
         self._jobs: dict[int, Any] = {}  # slot -> job
-        self._ended_s: dict[int, float] = {}  # slot -> when its job was first seen to have ended without a result
+        self._ended_s: dict[
+            int, float
+        ] = {}  # slot -> when its job was first seen to have ended without a result
         self._slots = range(min(assignment.workers, MOST_JOBS))
         self._accepted: set[str] = set()
         self._refused: dict[str, str] = {}
@@ -106,7 +122,9 @@ class SlurmBackend(Backend[J]):
             )
         self._jobs[worker] = submitted
         with (self._session / "jobs").open("a") as file:
-            file.write(f"{submitted.job_id} {started_of(int(submitted.job_id)) if self._is_local else ''}\n")
+            file.write(
+                f"{submitted.job_id} {started_of(int(submitted.job_id)) if self._is_local else ''}\n"
+            )
 
     def wait(self, timeout_s: float) -> list[Event]:
         """Wait until jobs answer or end."""
@@ -125,7 +143,10 @@ class SlurmBackend(Backend[J]):
 
     def nodes(self) -> frozenset[str]:
         """Return the nodes that are in use; on a cluster there may be another."""
-        return frozenset(self._accepted | (set() if self._is_local else {UNSEEN})) - self._refused.keys()
+        return (
+            frozenset(self._accepted | (set() if self._is_local else {UNSEEN}))
+            - self._refused.keys()
+        )
 
     def set_aside(self, node: str, why: str) -> None:
         """Keep later jobs off a node; what runs there may end."""
@@ -135,9 +156,16 @@ class SlurmBackend(Backend[J]):
         self._given.notify(f"node {node} is set aside: {why}")
         if not self._is_local:
             self._executor.update_parameters(slurm_exclude=",".join(sorted(self._refused)))
-        if not self._accepted - self._refused.keys() and (self._is_local or len(self._refused) >= MOST_REFUSALS):
+        if not self._accepted - self._refused.keys() and (
+            self._is_local or len(self._refused) >= MOST_REFUSALS
+        ):
             found = "; ".join(f"{name}: {reason}" for name, reason in self._refused.items())
-            raise InfrastructureError(DOING, "its nodes", f"no node takes the work: {found}", "install the same versions on the nodes")
+            raise InfrastructureError(
+                DOING,
+                "its nodes",
+                f"no node takes the work: {found}",
+                "install the same versions on the nodes",
+            )
 
     def close(self) -> None:
         """Cancel all jobs and remove their files."""
@@ -151,9 +179,15 @@ class SlurmBackend(Backend[J]):
             self._session.parent.rmdir()
 
     def _parameters(self, partition: str) -> dict[str, Any]:
-        wanted: dict[str, Any] = {"timeout_min": JOB_MIN, "cpus_per_task": self._given.resources.cores, "name": "simrun"}
+        wanted: dict[str, Any] = {
+            "timeout_min": JOB_MIN,
+            "cpus_per_task": self._given.resources.cores,
+            "name": "simrun",
+        }
         if self._given.resources.gpus:
-            wanted["gpus_per_node"] = max(1, round(self._given.resources.gpus))  # Slurm gives whole GPUs
+            wanted["gpus_per_node"] = max(
+                1, round(self._given.resources.gpus)
+            )  # Slurm gives whole GPUs
         if self._given.resources.memory_gib:
             wanted["mem_gb"] = self._given.resources.memory_gib
         if partition:
@@ -181,7 +215,12 @@ class SlurmBackend(Backend[J]):
         if time.monotonic() - self._ended_s.setdefault(slot, time.monotonic()) < GRACE_S:
             return None
         del self._jobs[slot], self._ended_s[slot]
-        return Died(slot, "", f"job {job.job_id} ended without a result ({job.state})", of_node=job.state == "NODE_FAIL")
+        return Died(
+            slot,
+            "",
+            f"job {job.job_id} ended without a result ({job.state})",
+            of_node=job.state == "NODE_FAIL",
+        )
 
     def _answered(self, slot: int, answer: JobAnswer) -> Event:
         if answer.reasons:
@@ -192,7 +231,8 @@ class SlurmBackend(Backend[J]):
 
 
 def sessions_folder(run: Path) -> Path:
-    """Return the folder of a run's sessions: outside of it, private to this user, and on a file system that all nodes see.
+    """Return the folder of a run's sessions: outside of it, private to this user, and on a file
+    system that all nodes see.
 
     It is below `alpasim_plugin.core.places.state`.
 
@@ -210,7 +250,9 @@ def _forget(folder: Path, job_id: str) -> None:
 
 
 def _take_over(folder: Path, notify: Callable[[str], None]) -> dict[str, Any]:
-    """Return the results that killed drivers' jobs have left, cancel what runs, and remove the sessions. The run folder's lock is held."""
+    """Return the results that killed drivers' jobs have left, cancel what runs, and remove the
+    sessions. The run folder's lock is held.
+    """
     results: dict[str, Any] = {}
     for session in sorted(folder.iterdir()) if folder.is_dir() else []:
         jobs = session / "jobs"
@@ -221,8 +263,12 @@ def _take_over(folder: Path, notify: Callable[[str], None]) -> dict[str, Any]:
             outcome, answer = pickle.loads(path.read_bytes())
             if outcome == "success" and not answer.reasons:
                 done = zip(answer.keys, pickle.loads(answer.answers), strict=True)
-                results |= {key: got for key, got in done if not isinstance(got, Exception | Faulty)}
-        notify(f"an earlier run was cut off: {len(results)} of its results are taken over, {len(running)} of its jobs are cancelled")
+                results |= {
+                    key: got for key, got in done if not isinstance(got, Exception | Faulty)
+                }
+        notify(
+            f"an earlier run was cut off: {len(results)} of its results are taken over, {len(running)} of its jobs are cancelled"
+        )
         shutil.rmtree(session)
     return results
 
@@ -233,7 +279,9 @@ def _cancel(words: Sequence[str]) -> bool:
     if len(words) == 1:
         return subprocess.run(["scancel", number], check=False, capture_output=True).returncode == 0
     pid = int(number)
-    if not is_running(pid) or started_of(pid) != words[1]:  # the number may be another process's by now
+    if (
+        not is_running(pid) or started_of(pid) != words[1]
+    ):  # the number may be another process's by now
         return False
     os.kill(pid, signal.SIGINT)
     return True

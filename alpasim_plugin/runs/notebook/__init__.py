@@ -1,4 +1,6 @@
-"""`open_run`: a run folder as data frames, for notebooks and scripts; runs and rollouts show themselves in a notebook."""
+"""`open_run`: a run folder as data frames, for notebooks and scripts; runs and rollouts show
+themselves in a notebook.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,14 @@ from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.rows import Rollout
-from alpasim_plugin.log.run_folder.schema import KEYS, LOG_NAME, ROLLOUTS, ROLLOUTS_TABLE, STEPS, STEPS_TABLE
+from alpasim_plugin.log.run_folder.schema import (
+    KEYS,
+    LOG_NAME,
+    ROLLOUTS,
+    ROLLOUTS_TABLE,
+    STEPS,
+    STEPS_TABLE,
+)
 from evaluators.opening import Run, read_run
 from evaluators.report.flips import inline_jpeg
 from evaluators.report.headline import find
@@ -29,7 +38,8 @@ def open_run(folder: str | Path, frames: Library = "pandas") -> OpenRun:
 
     Args:
         folder: What ``simrun run``, ``score`` or ``fork`` wrote.
-        frames: Which library's data frames its tables are: ``pandas`` or ``polars``; each is imported here, and needs to be installed.
+        frames: Which library's data frames its tables are: ``pandas`` or ``polars``; each is
+            imported here, and needs to be installed.
 
     Raises:
         InputError: No run folder, a damaged one, or a library that is not installed.
@@ -42,9 +52,11 @@ def open_run(folder: str | Path, frames: Library = "pandas") -> OpenRun:
 
 
 class OpenRun:
-    """A run. In a notebook it shows its verdict, its headline metrics and frames; iterating gives its rollouts.
+    """A run. In a notebook it shows its verdict, its headline metrics and frames; iterating gives
+    its rollouts.
 
-    Every table is read when it is first asked for. A metric that is not valid has no value in any of them (NaN, or null).
+    Every table is read when it is first asked for. A metric that is not valid has no value in any
+    of them (NaN, or null).
     """
 
     def __init__(self, run: Run, frames: Library) -> None:
@@ -62,40 +74,67 @@ class OpenRun:
 
     @cached_property
     def rollouts(self) -> Any:
-        """Give a frame with a row a rollout: renderer, policy, scene, seed, status, every metric and ``METRIC_valid``."""
+        """Give a frame with a row a rollout: renderer, policy, scene, seed, status, every metric
+        and ``METRIC_valid``.
+        """
         return frame_of(valid_only(ROLLOUTS_TABLE.read(self.folder / ROLLOUTS)), self._library)
 
     @cached_property
     def steps(self) -> Any:
-        """Give a frame with a row a rollout, metric and instant: ``t_us`` (microseconds), ``value``, ``valid``, ``reason``."""
+        """Give a frame with a row a rollout, metric and instant: ``t_us`` (microseconds),
+        ``value``, ``valid``, ``reason``.
+        """
         return frame_of(self._steps, self._library)
 
     @cached_property
     def summary(self) -> Any:
-        """Give a frame with a row a renderer and metric: ``mean``, ``ci95``, ``ci95_low``, ``ci95_high``, and more.
+        """Give a frame with a row a renderer and metric: ``mean``, ``ci95``, ``ci95_low``,
+        ``ci95_high``, and more.
 
-        ``ci95`` is a half-width over rollouts; the two ends take scenes as clusters. Rates are fractions.
+        ``ci95`` is a half-width over rollouts; the two ends take scenes as clusters. Rates are
+        fractions.
         """
         return frame_of(summary_table(self._run.summary), self._library)
 
     @cached_property
     def paired(self) -> Any:
-        """Give a frame with a row a paired difference: ``renderer`` minus ``baseline``, its 95 % interval, p-value and verdict."""
+        """Give a frame with a row a paired difference: ``renderer`` minus ``baseline``, its 95 %
+        interval, p-value and verdict.
+        """
         return frame_of(paired_table(self._run.summary), self._library)
 
-    def rollout(self, renderer: str, policy: str | None = None, scene: str | None = None, seed: int | None = None) -> OpenRollout:
+    def rollout(
+        self,
+        renderer: str,
+        policy: str | None = None,
+        scene: str | None = None,
+        seed: int | None = None,
+    ) -> OpenRollout:
         """Return the one rollout that fits.
 
         Raises:
             InputError: None fits, or several.
         """
         wanted = dict(zip(KEYS, (renderer, policy, scene, seed), strict=True))
-        found = [r for r in self._run.rollouts if all(value in (None, getattr(r, key)) for key, value in wanted.items())]
+        found = [
+            r
+            for r in self._run.rollouts
+            if all(value in (None, getattr(r, key)) for key, value in wanted.items())
+        ]
         if len(found) != 1:
-            asked = ", ".join(f"{key} {value!r}" for key, value in wanted.items() if value is not None)
+            asked = ", ".join(
+                f"{key} {value!r}" for key, value in wanted.items() if value is not None
+            )
             shown = "; ".join(title(one) for one in (found or self._run.rollouts)[:3])
-            do_this = f"name policy, scene and seed too: {shown}" if found else f"there are: {shown}"
-            raise InputError("choosing a rollout", f"{self.folder}: {asked}", f"{len(found)} rollouts fit", do_this)
+            do_this = (
+                f"name policy, scene and seed too: {shown}" if found else f"there are: {shown}"
+            )
+            raise InputError(
+                "choosing a rollout",
+                f"{self.folder}: {asked}",
+                f"{len(found)} rollouts fit",
+                do_this,
+            )
         return OpenRollout(self, found[0])
 
     def __iter__(self) -> Iterator[OpenRollout]:
@@ -116,7 +155,8 @@ class OpenRun:
 
 
 class OpenRollout:
-    """A rollout of an open run. In a notebook it shows how it ended, its headline metrics and its frames.
+    """A rollout of an open run. In a notebook it shows how it ended, its headline metrics and its
+    frames.
 
     Attributes:
         renderer, policy, scene, seed: Which one it is.
@@ -140,12 +180,16 @@ class OpenRollout:
 
     @cached_property
     def steps(self) -> Any:
-        """Give a frame with a column for each metric and a row for each instant ``t_us``; a metric that is not valid there has no value.
+        """Give a frame with a column for each metric and a row for each instant ``t_us``; a metric
+        that is not valid there has no value.
 
         The index is ``t_us`` in pandas; in polars it is a column.
         """
         table = self._open._steps
-        mine = [pc.equal(table[key], pa.scalar(value, table[key].type)) for key, value in zip(KEYS, self._rollout.cell, strict=True)]
+        mine = [
+            pc.equal(table[key], pa.scalar(value, table[key].type))
+            for key, value in zip(KEYS, self._rollout.cell, strict=True)
+        ]
         keep = pc.and_(pc.and_(mine[0], mine[1]), pc.and_(mine[2], mine[3]))
         own = table.filter(pc.and_(keep, table["valid"])).select(["t_us", "metric", "value"])
         frame = frame_of(own, self._open._library)
@@ -180,7 +224,12 @@ def require(library: str) -> Any:
         InputError: It is none of the known ones, or not installed.
     """
     if library not in LIBRARIES:
-        raise InputError(DOING, f"frames={library!r}", "no such library", f"the libraries are {' and '.join(LIBRARIES)}")
+        raise InputError(
+            DOING,
+            f"frames={library!r}",
+            "no such library",
+            f"the libraries are {' and '.join(LIBRARIES)}",
+        )
     other = next(name for name in LIBRARIES if name != library)
     do_this = f"install the extra [notebook], or pip install {library}; frames={other!r} gives frames of {other}"
     return require_library(library, DOING, f"frames={library!r}", do_this)
@@ -201,7 +250,9 @@ def valid_only(table: pa.Table) -> pa.Table:
 
     The column ``NAME_valid`` of each metric ``NAME`` stays.
     """
-    for name in [column.removesuffix("_valid") for column in table.column_names if column.endswith("_valid")]:
+    for name in [
+        column.removesuffix("_valid") for column in table.column_names if column.endswith("_valid")
+    ]:
         empty = pa.scalar(None, table[name].type)
         kept = pc.if_else(pc.fill_null(table[f"{name}_valid"], False), table[name], empty)
         table = table.set_column(table.column_names.index(name), name, kept)
@@ -214,20 +265,41 @@ def summary_table(summary: Mapping[str, Any]) -> pa.Table:
     for renderer, metrics in (summary.get("metrics") or {}).items():
         for metric, entry in metrics.items():
             low, high = _ends(entry.get("ci95_clustered"))
-            facts = {key: entry.get(key) for key in ("mean", "ci95", "n_rollouts", "n_scenes", "unit", "direction")}
-            rows.append({"renderer": renderer, "metric": metric, **facts, "ci95_low": low, "ci95_high": high})
+            facts = {
+                key: entry.get(key)
+                for key in ("mean", "ci95", "n_rollouts", "n_scenes", "unit", "direction")
+            }
+            rows.append(
+                {
+                    "renderer": renderer,
+                    "metric": metric,
+                    **facts,
+                    "ci95_low": low,
+                    "ci95_high": high,
+                }
+            )
     return pa.Table.from_pylist(rows, SUMMARY)
 
 
 def paired_table(summary: Mapping[str, Any]) -> pa.Table:
-    """Return the paired differences of a summary, against the baseline and against a fixer's base, one row each."""
+    """Return the paired differences of a summary, against the baseline and against a fixer's base,
+    one row each.
+    """
     rows = []
     for kind in ("paired", "paired_with_base"):
         for renderer, metrics in (summary.get(kind) or {}).items():
             for metric, entry in metrics.items():
                 low, high = _ends(entry.get("ci95"))
                 facts = {key: entry.get(key) for key in ("baseline", "diff", "p_value", "verdict")}
-                rows.append({"renderer": renderer, "metric": metric, **facts, "ci95_low": low, "ci95_high": high})
+                rows.append(
+                    {
+                        "renderer": renderer,
+                        "metric": metric,
+                        **facts,
+                        "ci95_low": low,
+                        "ci95_high": high,
+                    }
+                )
     return pa.Table.from_pylist(rows, PAIRED)
 
 
@@ -268,16 +340,22 @@ LEFT = 'style="text-align:left"'
 
 
 def run_html(run: Run) -> str:
-    """Return a run: its verdict, its headline metrics by renderer, and a strip of frames of its first rollout."""
+    """Return a run: its verdict, its headline metrics by renderer, and a strip of frames of its
+    first rollout.
+    """
     rows = metric_rows(run.summary, known=run.table)
     rows = [row for row in rows if row.is_headline] or rows
     names = list(run.summary.get("metrics") or {})[:MOST_RENDERERS]
     lines = []
     for row in rows:
         label = " ".join(part for part in (row.name, row.unit, row.arrow) if part)
-        cells = [f"{cell.text} <small>{escape(cell.detail)}</small>" for cell in row.cells[: len(names)]]
+        cells = [
+            f"{cell.text} <small>{escape(cell.detail)}</small>" for cell in row.cells[: len(names)]
+        ]
         lines.append([escape(label), *cells])
-    first = next((rollout for rollout in run.rollouts if run.file_of(rollout, "strip.jpg") is not None), None)
+    first = next(
+        (rollout for rollout in run.rollouts if run.file_of(rollout, "strip.jpg") is not None), None
+    )
     preset = escape(str(run.summary.get("preset")))
     return _block(
         f"<b>{escape(find(run).title)}</b>",
@@ -294,7 +372,13 @@ def rollout_html(run: Run, rollout: Rollout) -> str:
     lines = []
     for metric in metrics:
         value = rollout.metrics.get(metric.name)
-        shown = DASH if value is None else f"{100 * value:.1f} %" if metric.in_percent else escape(short(value, metric.unit))
+        shown = (
+            DASH
+            if value is None
+            else f"{100 * value:.1f} %"
+            if metric.in_percent
+            else escape(short(value, metric.unit))
+        )
         lines.append([escape(metric.name), shown])
     return _block(
         f"<b>{escape(outcome(rollout))}</b>",
@@ -313,7 +397,11 @@ def outcome(rollout: Rollout) -> str:
     """Say in a few words how a rollout ended."""
     if not rollout.ok:
         return f"failed ({rollout.failure_class}): {rollout.failure}"
-    events = [word for word, metric in (("collision", "collision_any"), ("off-road", "offroad")) if rollout.flag(metric)]
+    events = [
+        word
+        for word, metric in (("collision", "collision_any"), ("off-road", "offroad"))
+        if rollout.flag(metric)
+    ]
     return " and ".join(events) or "no event"
 
 
@@ -329,7 +417,12 @@ def _picture(run: Run, rollout: Rollout) -> str:
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     heads = "".join(f'<th scope="col" {LEFT}>{cell}</th>' for cell in head)
-    lines = [f'<tr><th scope="row" {LEFT}>{row[0]}</th>' + "".join(f"<td>{cell}</td>" for cell in row[1:]) + "</tr>" for row in rows]
+    lines = [
+        f'<tr><th scope="row" {LEFT}>{row[0]}</th>'
+        + "".join(f"<td>{cell}</td>" for cell in row[1:])
+        + "</tr>"
+        for row in rows
+    ]
     return f"<table><thead><tr>{heads}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
 
 

@@ -1,4 +1,6 @@
-"""What a recording holds: one scene, policy and seed behind each renderer, on one time line, in world metres and microseconds."""
+"""What a recording holds: one scene, policy and seed behind each renderer, on one time line, in
+world metres and microseconds.
+"""
 
 from __future__ import annotations
 
@@ -56,13 +58,18 @@ class Camera:
     source: Source
 
     def pictures(self) -> Iterator[Picture]:
-        """Yield its frames in order of time: those of a log byte for byte, those of a video as JPEG.
+        """Yield its frames in order of time: those of a log byte for byte, those of a video as
+        JPEG.
 
         Raises:
             InputError: A frame is neither PNG nor JPEG, or the video is damaged.
         """
         for image in self.source.images:
-            yield Picture(image.end_us, media_type_of(image.data, f"camera {self.name!r} at {image.end_us} us"), image.data)
+            yield Picture(
+                image.end_us,
+                media_type_of(image.data, f"camera {self.name!r} at {image.end_us} us"),
+                image.data,
+            )
         for t_us, rgb in self.source.filmed():
             yield Picture(t_us, "image/jpeg", encode_image(rgb, "jpeg"))
 
@@ -73,12 +80,15 @@ class Drive:
 
     Attributes:
         renderer: Its name.
-        label: The same for topics and frames: letters, digits and ``@+._-``, distinct from those of the other drives.
+        label: The same for topics and frames: letters, digits and ``@+._-``, distinct from those of
+            the other drives.
         log: Its log.
         rig: Poses of the rear axle on the ground, world.
         cameras: Those with frames.
-        metrics: Metric -> times ``(T,)`` and values ``(T,)``; instants without a valid value are left out, never zero.
-        events: Time and words of what its metrics count: the first contact, the first departure from the road.
+        metrics: Metric -> times ``(T,)`` and values ``(T,)``; instants without a valid value are
+            left out, never zero.
+        events: Time and words of what its metrics count: the first contact, the first departure
+            from the road.
     """
 
     renderer: str
@@ -123,7 +133,12 @@ def media_type_of(data: bytes, what: str) -> str:
     for head, media_type in MEDIA.items():
         if data.startswith(head):
             return media_type
-    raise InputError(DOING, what, f"an image that begins with {data[:4].hex()}", "store PNG or JPEG images in the log")
+    raise InputError(
+        DOING,
+        what,
+        f"an image that begins with {data[:4].hex()}",
+        "store PNG or JPEG images in the log",
+    )
 
 
 def collect(run: Run, cell: WatchedCell, logs: Logs) -> Recording:
@@ -135,9 +150,14 @@ def collect(run: Run, cell: WatchedCell, logs: Logs) -> Recording:
         logs: Its logs (`evaluators.viewer.cells.read_logs`).
 
     Raises:
-        InputError: A log is damaged, there is none, or one has an instant before zero, which MCAP cannot write.
+        InputError: A log is damaged, there is none, or one has an instant before zero, which MCAP
+            cannot write.
     """
-    notes = [f"{r.renderer}: failed ({r.failure_class or 'unknown'}), so there is no rollout" for r in cell.rollouts if not r.ok]
+    notes = [
+        f"{r.renderer}: failed ({r.failure_class or 'unknown'}), so there is no rollout"
+        for r in cell.rollouts
+        if not r.ok
+    ]
     found: list[tuple[Rollout, RolloutLog]] = []
     for rollout in cell.rollouts:
         log = logs.get(rollout.path)
@@ -148,13 +168,30 @@ def collect(run: Run, cell: WatchedCell, logs: Logs) -> Recording:
         elif rollout.ok:
             notes.append(f"{rollout.renderer}: its log is not there, so it is left out")
     if not found:
-        raise InputError(DOING, cell.name, "; ".join(notes) or "no rollout", "export a run whose rollouts have finished, with their logs")
+        raise InputError(
+            DOING,
+            cell.name,
+            "; ".join(notes) or "no rollout",
+            "export a run whose rollouts have finished, with their logs",
+        )
     early = [rollout.renderer for rollout, log in found if int(log.ego.t_us[0]) < 0]
     if early:
-        raise InputError(DOING, f"{cell.name}, {early[0]}", "times before zero", "give a log whose clock begins at zero or later")
+        raise InputError(
+            DOING,
+            f"{cell.name}, {early[0]}",
+            "times before zero",
+            "give a log whose clock begins at zero or later",
+        )
     labels = distinct_labels([rollout.renderer for rollout, _ in found])
-    drives = tuple(_drive(run, rollout, log, label) for (rollout, log), label in zip(found, labels, strict=True))
-    notes += [f"{d.renderer}: {no_frames(run.manifest(r), True, None)}" for d, (r, _) in zip(drives, found, strict=True) if not d.cameras]
+    drives = tuple(
+        _drive(run, rollout, log, label)
+        for (rollout, log), label in zip(found, labels, strict=True)
+    )
+    notes += [
+        f"{d.renderer}: {no_frames(run.manifest(r), True, None)}"
+        for d, (r, _) in zip(drives, found, strict=True)
+        if not d.cameras
+    ]
     content = run.scene_data(cell.scene)
     lines = () if content is None else map_lines(content, found[0][1].ego_log)
     if content is None:
@@ -164,25 +201,38 @@ def collect(run: Run, cell: WatchedCell, logs: Logs) -> Recording:
 
 def _drive(run: Run, rollout: Rollout, log: RolloutLog, label: str) -> Drive:
     specs = {spec.name: spec for spec in log.info["cameras"]}
-    cameras = tuple(Camera(one.camera, specs.get(one.camera), one) for one in sources(run, rollout, log))
+    cameras = tuple(
+        Camera(one.camera, specs.get(one.camera), one) for one in sources(run, rollout, log)
+    )
     series = series_by_cell(run.steps_of(rollout))
-    events = tuple((event.t_us, event.what) for event in events_of(rollout, series) if event.t_us is not None)
+    events = tuple(
+        (event.t_us, event.what) for event in events_of(rollout, series) if event.t_us is not None
+    )
     rig = offset_trajectory(log.ego, inverse(log.T_rig_box))
-    return Drive(rollout.renderer, label, log, rig, cameras, next(iter(series.values()), {}), events)
+    return Drive(
+        rollout.renderer, label, log, rig, cameras, next(iter(series.values()), {}), events
+    )
 
 
 def _facts(run: Run, cell: WatchedCell) -> dict[str, str]:
     info = run.info
     facts = {
-        "run": run.folder.resolve().name, "key": info.get("key"), "scene": cell.scene, "policy": cell.policy, "seed": cell.seed,
-        "preset": info.get("preset"), "simrun": info.get("version"), "commit": (info.get("project") or {}).get("commit"),
+        "run": run.folder.resolve().name,
+        "key": info.get("key"),
+        "scene": cell.scene,
+        "policy": cell.policy,
+        "seed": cell.seed,
+        "preset": info.get("preset"),
+        "simrun": info.get("version"),
+        "commit": (info.get("project") or {}).get("commit"),
         "content_hash": ((info.get("scenes") or {}).get(cell.scene) or {}).get("content_hash"),
-    }  # fmt: skip
+    }
     return {key: str(value) for key, value in facts.items() if value not in (None, "")}
 
 
 def map_lines(content: Mapping[str, Any], recorded: Trajectory) -> tuple[Line, ...]:
-    """Return the map that a run keeps, which is flat, laid at the height of the nearest point of the recorded drive.
+    """Return the map that a run keeps, which is flat, laid at the height of the nearest point of
+    the recorded drive.
 
     Args:
         content: ``scenes/SCENE.json``.
@@ -193,7 +243,9 @@ def map_lines(content: Mapping[str, Any], recorded: Trajectory) -> tuple[Line, .
     def add(kind: Kind, line: Sequence[Sequence[float]] | None) -> None:
         if line is not None and len(line) >= 2:
             xy = np.asarray(line, dtype=np.float64)[:, :2]
-            found.setdefault(xy.tobytes(), Line(kind, np.column_stack([xy, heights(xy, recorded.xyz)])))  # lanes share borders
+            found.setdefault(
+                xy.tobytes(), Line(kind, np.column_stack([xy, heights(xy, recorded.xyz)]))
+            )  # lanes share borders
 
     for lane in content.get("lanes") or []:
         add("lane border", lane.get("left"))
@@ -233,7 +285,9 @@ def distinct_labels(names: Sequence[str]) -> list[str]:
 
 
 def present(track: Trajectory, t_us: I64) -> I64:
-    """Return the index ``(T,)`` of each instant among a track's own, -1 where the body is not there."""
+    """Return the index ``(T,)`` of each instant among a track's own, -1 where the body is not
+    there.
+    """
     at = np.searchsorted(track.t_us, t_us)
     inside = at < len(track)
     same = np.zeros(len(t_us), dtype=bool)
@@ -244,8 +298,12 @@ def present(track: Trajectory, t_us: I64) -> I64:
 Rgba = tuple[float, float, float, float]
 
 RENDERERS: tuple[Rgba, ...] = (
-    (0.04, 0.42, 0.70, 1.0), (0.85, 0.40, 0.08, 1.0), (0.0, 0.60, 0.45, 1.0), (0.65, 0.33, 0.60, 1.0), (0.65, 0.52, 0.0, 1.0),
-)  # fmt: skip
+    (0.04, 0.42, 0.70, 1.0),
+    (0.85, 0.40, 0.08, 1.0),
+    (0.0, 0.60, 0.45, 1.0),
+    (0.65, 0.33, 0.60, 1.0),
+    (0.65, 0.52, 0.0, 1.0),
+)
 MAP: dict[Kind, Rgba] = {
     "lane border": (0.75, 0.75, 0.78, 1.0),
     "road edge": (0.45, 0.48, 0.52, 1.0),

@@ -1,4 +1,6 @@
-"""Write a recording as .rrd for Rerun, with a layout: a scene a renderer, its cameras, and metrics below."""
+"""Write a recording as .rrd for Rerun, with a layout: a scene a renderer, its cameras, and metrics
+below.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,9 @@ def write_rrd(recording: Recording, path: Path) -> dict[str, int]:
     rr = require_rerun()
     with atomic_file(path, "writing a Rerun file") as partial:
         facts = json.dumps([recording.name, *recording.facts.items()])
-        stream = rr.RecordingStream("simrun", recording_id=hashlib.sha256(facts.encode()).hexdigest()[:32])
+        stream = rr.RecordingStream(
+            "simrun", recording_id=hashlib.sha256(facts.encode()).hexdigest()[:32]
+        )
         rr.set_log_time_enabled(False, recording=stream)  # one time line: that of the drive
         rr.set_log_tick_enabled(False, recording=stream)
         writer = _Writer(rr, stream)
@@ -66,7 +70,12 @@ def write_rrd(recording: Recording, path: Path) -> dict[str, int]:
 
 def require_rerun() -> Any:
     """Import the library; see `require_library`."""
-    return require_library("rerun", DOING, "--rrd", "install the extra [rerun], or pip install rerun-sdk (half a gigabyte)")
+    return require_library(
+        "rerun",
+        DOING,
+        "--rrd",
+        "install the extra [rerun], or pip install rerun-sdk (half a gigabyte)",
+    )
 
 
 class _Writer:
@@ -86,39 +95,66 @@ class _Writer:
         for kind, rgba in MAP.items():
             lines = [line.points for line in recording.lines if line.kind == kind]
             if lines:
-                self._static(["world", "map", kind], rr.LineStrips3D(lines, colors=as_bytes(rgba), radii=THIN_M))
+                self._static(
+                    ["world", "map", kind],
+                    rr.LineStrips3D(lines, colors=as_bytes(rgba), radii=THIN_M),
+                )
         for number, drive in enumerate(recording.drives):
             self._drive(drive, of_renderer(number))
 
     def _drive(self, drive: Drive, rgba: Rgba) -> None:
-        rr, base, log = self._rr, ["world", drive.renderer], drive.log
+        rr = self._rr
+        base = ["world", drive.renderer]
+        log = drive.log
         self._box([*base, "ego"], log.ego_box, log.ego, log.ego.t_us, drive.renderer, rgba)
         for name, actor in log.actors.items():
-            self._box([*base, "road users", name], actor.box, actor.track, log.ego.t_us, f"{actor.label} {name}", ROAD_USER)
-        self._static([*base, "path"], rr.LineStrips3D([drive.rig.xyz], colors=as_bytes(fainter(rgba, 0.6)), radii=THIN_M))
+            self._box(
+                [*base, "road users", name],
+                actor.box,
+                actor.track,
+                log.ego.t_us,
+                f"{actor.label} {name}",
+                ROAD_USER,
+            )
+        self._static(
+            [*base, "path"],
+            rr.LineStrips3D([drive.rig.xyz], colors=as_bytes(fainter(rgba, 0.6)), radii=THIN_M),
+        )
         self._poses([*base, "rig"], drive.rig)
         for plan in log.plans:
             lines = [plan.trajectory.xyz, *(one.xyz for one in plan.samples)]
             colors = [as_bytes(rgba), *([as_bytes(fainter(rgba, 0.35))] * len(plan.samples))]
             radii = [THICK_M, *([THIN_M] * len(plan.samples))]
-            self._at(plan.now_us, [*base, "plan"], rr.LineStrips3D(lines, colors=colors, radii=radii))
+            self._at(
+                plan.now_us, [*base, "plan"], rr.LineStrips3D(lines, colors=colors, radii=radii)
+            )
         for camera in drive.cameras:
             self._camera([*base, "rig", camera.name], camera)
         for name, (t_us, value) in drive.metrics.items():
             finite, parts = np.isfinite(value), ["metrics", name, drive.renderer]
             if finite.any():
                 self._columns(parts, t_us[finite], rr.Scalars.columns(scalars=value[finite]))
-                self._stream.log(self._path(parts), rr.SeriesLines(colors=as_bytes(rgba), names=parts[-1]), static=True)
+                self._stream.log(
+                    self._path(parts),
+                    rr.SeriesLines(colors=as_bytes(rgba), names=parts[-1]),
+                    static=True,
+                )
         for at_us, text in drive.events:
             self._at(at_us, ["events", drive.renderer], rr.TextLog(text, level="WARN"))
 
-    def _box(self, parts: list[str], box: Box, track: Trajectory, steps: I64, label: str, rgba: Rgba) -> None:
-        """Log a box that moves; it appears and goes as the log's steps ``(T,)`` have a pose of it."""
+    def _box(
+        self, parts: list[str], box: Box, track: Trajectory, steps: I64, label: str, rgba: Rgba
+    ) -> None:
+        """Log a box that moves; it appears and goes as the log's steps ``(T,)`` have a pose of
+        it.
+        """
         half = [[box.length_m / 2, box.width_m / 2, box.height_m / 2]]
         there = present(track, steps) >= 0
         changed = np.flatnonzero(there != np.concatenate([[False], there[:-1]]))
         for k in changed.tolist():
-            shown = self._rr.Boxes3D(half_sizes=half, colors=as_bytes(rgba), labels=[label], show_labels=False)
+            shown = self._rr.Boxes3D(
+                half_sizes=half, colors=as_bytes(rgba), labels=[label], show_labels=False
+            )
             self._at(int(steps[k]), parts, shown if there[k] else self._rr.Clear(recursive=False))
         self._poses(parts, track)
 
@@ -131,11 +167,26 @@ class _Writer:
         rr, spec = self._rr, camera.spec
         if spec is not None:
             place = spec.T_rig_camera
-            self._static(parts, rr.Transform3D(translation=place[:3, 3], quaternion=quat_from_matrix(place[:3, :3])[[1, 2, 3, 0]]))
-            pinhole = rr.Pinhole(image_from_camera=spec.K, width=spec.width, height=spec.height, camera_xyz=rr.ViewCoordinates.RDF)
+            self._static(
+                parts,
+                rr.Transform3D(
+                    translation=place[:3, 3],
+                    quaternion=quat_from_matrix(place[:3, :3])[[1, 2, 3, 0]],
+                ),
+            )
+            pinhole = rr.Pinhole(
+                image_from_camera=spec.K,
+                width=spec.width,
+                height=spec.height,
+                camera_xyz=rr.ViewCoordinates.RDF,
+            )
             self._stream.log(self._path(parts), pinhole, static=True)
         for one in camera.pictures():
-            self._at(one.t_us, [*parts, "image"], rr.EncodedImage(contents=one.data, media_type=one.media_type))
+            self._at(
+                one.t_us,
+                [*parts, "image"],
+                rr.EncodedImage(contents=one.data, media_type=one.media_type),
+            )
 
     def _path(self, parts: list[str] | str) -> str:
         return parts if isinstance(parts, str) else str(self._rr.new_entity_path(parts))
@@ -160,19 +211,40 @@ class _Writer:
 
 
 def _layout(rr: Any, recording: Recording) -> Any:
-    """Return the first view of a file: what each renderer did from above, what its cameras saw, and a few metrics."""
+    """Return the first view of a file: what each renderer did from above, what its cameras saw, and
+    a few metrics.
+    """
     bp = import_module("rerun.blueprint")
     columns = []
     for drive in recording.drives:
         own = f"/{rr.new_entity_path(['world', drive.renderer])}".replace("//", "/")
-        scene = bp.Spatial3DView(name=drive.renderer, origin="/world", contents=["/world/map/**", f"{own}/**", f"- {own}/rig/**"])
+        scene = bp.Spatial3DView(
+            name=drive.renderer,
+            origin="/world",
+            contents=["/world/map/**", f"{own}/**", f"- {own}/rig/**"],
+        )
         cameras = [
-            bp.Spatial2DView(name=f"{drive.renderer} {camera.name}", origin=f"{own}/rig/{rr.escape_entity_path_part(camera.name)}")
+            bp.Spatial2DView(
+                name=f"{drive.renderer} {camera.name}",
+                origin=f"{own}/rig/{rr.escape_entity_path_part(camera.name)}",
+            )
             for camera in drive.cameras
         ]
-        columns.append(bp.Vertical(scene, bp.Tabs(*cameras), row_shares=[3, 2]) if cameras else scene)
-    known = [name for name in METRICS.first_curves() if any(name in drive.metrics for drive in recording.drives)]
+        columns.append(
+            bp.Vertical(scene, bp.Tabs(*cameras), row_shares=[3, 2]) if cameras else scene
+        )
+    known = [
+        name
+        for name in METRICS.first_curves()
+        if any(name in drive.metrics for drive in recording.drives)
+    ]
     others = sorted({name for drive in recording.drives for name in drive.metrics} - set(known))
-    curves = [bp.TimeSeriesView(name=name, origin=f"/metrics/{rr.escape_entity_path_part(name)}") for name in [*known, *others]]
+    curves = [
+        bp.TimeSeriesView(name=name, origin=f"/metrics/{rr.escape_entity_path_part(name)}")
+        for name in [*known, *others]
+    ]
     below = [bp.Tabs(*curves)] if curves else []
-    return bp.Blueprint(bp.Vertical(bp.Horizontal(*columns), *below, row_shares=[3, 1] if below else None), collapse_panels=True)
+    return bp.Blueprint(
+        bp.Vertical(bp.Horizontal(*columns), *below, row_shares=[3, 1] if below else None),
+        collapse_panels=True,
+    )

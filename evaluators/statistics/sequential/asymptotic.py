@@ -1,10 +1,12 @@
 """Asymptotic e-processes and confidence sequences for means of differences without bounds.
 
-Sums of many scenes behave like a Brownian motion with the variance of a scene, at all numbers of scenes at once (strong approximation).
-The chance that it reaches a line before the ceiling is a martingale (`line.py`), which gives bounds that hold at every look once the first
-look is late enough (Waudby-Smith, Arbour, Sinha, Kennedy and Ramdas, Time-uniform central limit theory and asymptotic confidence
-sequences, Annals of Statistics 52, 2024). The guarantee is approximate, as that of a t interval is. Two things keep it honest with few
-scenes: the t statistic of n scenes is mapped to the normal value of equal probability, and nothing is said before the first look.
+Sums of many scenes behave like a Brownian motion with the variance of a scene, at all numbers of
+scenes at once (strong approximation). The chance that it reaches a line before the ceiling is a
+martingale (`line.py`), which gives bounds that hold at every look once the first look is late
+enough (Waudby-Smith, Arbour, Sinha, Kennedy and Ramdas, Time-uniform central limit theory and
+asymptotic confidence sequences, Annals of Statistics 52, 2024). The guarantee is approximate, as
+that of a t interval is. Two things keep it honest with few scenes: the t statistic of n scenes is
+mapped to the normal value of equal probability, and nothing is said before the first look.
 """
 
 from __future__ import annotations
@@ -17,13 +19,16 @@ from evaluators.statistics.sequential import line
 from evaluators.statistics.sequential.draws import Draws
 from evaluators.statistics.sequential.line import Plan
 
-FIRST_LOOK = 20  # scenes before the first statement; the error by first look is in docs/experiments/sequential.md
-LEAST_SPREAD = 0.25  # of the planned distance: scenes that are all alike show no spread, which is not the absence of one
+# scenes before the first statement; the error by first look is in docs/experiments/sequential.md
+FIRST_LOOK = 20
+# of the planned distance: scenes that are all alike show no spread, which is not the absence of one
+LEAST_SPREAD = 0.25
 NO_SPREAD = 1e-150  # its square is above 0
 
 
 def log_evidence(draws: Draws, mean: F64 | float, plan: Plan, first_look: int = FIRST_LOOK) -> F64:
-    """Return the log of the e-process ``(..., n)`` against "the mean is at most ``mean``"; -inf before the first look.
+    """Return the log of the e-process ``(..., n)`` against "the mean is at most ``mean``"; -inf
+    before the first look.
 
     Args:
         draws: The scenes; their bounds are not used.
@@ -33,7 +38,10 @@ def log_evidence(draws: Draws, mean: F64 | float, plan: Plan, first_look: int = 
     """
     n = np.arange(1, draws.n + 1)
     may_say, spread, slope = _looks(draws, plan, first_look)
-    total = np.cumsum(draws.x - draws.offset, axis=-1) - np.cumsum(draws.slope, axis=-1) * np.asarray(mean, dtype=np.float64)[..., None]
+    total = (
+        np.cumsum(draws.x - draws.offset, axis=-1)
+        - np.cumsum(draws.slope, axis=-1) * np.asarray(mean, dtype=np.float64)[..., None]
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         z = _normal_of_t(total / (spread * np.sqrt(n)), draws.freedom)
     w = np.where(may_say, z * np.sqrt(n / plan.horizon), -np.inf)
@@ -41,19 +49,25 @@ def log_evidence(draws: Draws, mean: F64 | float, plan: Plan, first_look: int = 
 
 
 def lower_bound(draws: Draws, plan: Plan, first_look: int = FIRST_LOOK) -> F64:
-    """Return the greatest mean ``(...)`` that the scenes refute as too small, at any look so far; -inf before the first look."""
+    """Return the greatest mean ``(...)`` that the scenes refute as too small, at any look so far;
+    -inf before the first look.
+    """
     may_say, spread, slope = _looks(draws, plan, first_look)
     if not may_say.any():
         return np.full(draws.x.shape[:-1], -np.inf)
     n = np.arange(1, draws.n + 1)
     z = (line.height(slope, plan.alpha) + slope * n / plan.horizon) * np.sqrt(plan.horizon / n)
     t = _t_of_normal(z, draws.freedom)
-    lows = (np.cumsum(draws.x - draws.offset, axis=-1) - t * spread * np.sqrt(n)) / np.cumsum(draws.slope, axis=-1)
+    lows = (np.cumsum(draws.x - draws.offset, axis=-1) - t * spread * np.sqrt(n)) / np.cumsum(
+        draws.slope, axis=-1
+    )
     return np.asarray(np.where(may_say, lows, -np.inf).max(axis=-1))
 
 
 def _looks(draws: Draws, plan: Plan, first_look: int) -> tuple[Bool, F64, F64]:
-    """Return where something may be said ``(n,)``, the standard deviation there ``(..., n)``, and the slope of the line ``(..., 1)``."""
+    """Return where something may be said ``(n,)``, the standard deviation there ``(..., n)``, and
+    the slope of the line ``(..., 1)``.
+    """
     may_say = draws.is_end & (np.arange(1, draws.n + 1) >= first_look) & (draws.freedom >= 1.0)
     floor = LEAST_SPREAD * plan.distance if plan.distance is not None else NO_SPREAD
     spread = np.maximum(draws.spread, floor)

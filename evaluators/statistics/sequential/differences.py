@@ -1,4 +1,6 @@
-"""From rollout rows to one paired difference a scene, and from these how many seeds to drive in the next scenes."""
+"""From rollout rows to one paired difference a scene, and from these how many seeds to drive in the
+next scenes.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ class SceneDifferences:
     """Paired differences of one metric, scene by scene in the order of the drawing.
 
     Attributes:
-        diff: ``(n,)`` candidate minus baseline, mean over the scene's pairs, in the metric's own sign; NaN where a pair is missing.
+        diff: ``(n,)`` candidate minus baseline, mean over the scene's pairs, in the metric's own
+            sign; NaN where a pair is missing.
         within: ``(n,)`` variance between the pairs of the scene; NaN with fewer than two.
         pairs: ``(n,)`` pairs of the scene.
         missing: Cells without a pair.
@@ -34,14 +37,19 @@ class SceneDifferences:
         return np.isfinite(self.diff)
 
     def harm(self, direction: Direction) -> F64:
-        """Return the differences with the sign that makes positive worse; without a better side as they are."""
+        """Return the differences with the sign that makes positive worse; without a better side as
+        they are.
+        """
         return -self.diff if direction == "higher" else self.diff
 
 
-def scene_differences(candidate: Side, baseline: Side, metric: str, scenes: Sequence[str]) -> SceneDifferences:
+def scene_differences(
+    candidate: Side, baseline: Side, metric: str, scenes: Sequence[str]
+) -> SceneDifferences:
     """Return the differences of the scenes named, in their order.
 
-    A scene with a cell that lacks its pair has no difference: which pairs are lost may depend on how the drive went.
+    A scene with a cell that lacks its pair has no difference: which pairs are lost may depend on
+    how the drive went.
 
     Args:
         candidate: Rollouts of the renderer in question, of one policy.
@@ -55,7 +63,11 @@ def scene_differences(candidate: Side, baseline: Side, metric: str, scenes: Sequ
     of_scene: dict[str, list[float]] = {}
     for (_, scene, _), value in zip(candidate.cells, mine - partner, strict=True):
         of_scene.setdefault(scene, []).append(float(value))
-    alone = [cell for cell, place in zip(baseline.cells, baseline.place_in(candidate), strict=True) if place < 0]
+    alone = [
+        cell
+        for cell, place in zip(baseline.cells, baseline.place_in(candidate), strict=True)
+        if place < 0
+    ]
     for _, scene, _ in alone:
         of_scene.setdefault(scene, []).append(float("nan"))
     values = [np.array(of_scene.get(scene, [np.nan])) for scene in scenes]
@@ -71,9 +83,11 @@ PILOT_SEEDS = 2  # of the first scenes: one seed says nothing of the variance be
 
 
 def variances(found: SceneDifferences) -> tuple[float, float] | None:
-    """Return the variance between scenes and between the seeds of a scene, by the method of moments; None before both are known.
+    """Return the variance between scenes and between the seeds of a scene, by the method of
+    moments; None before both are known.
 
-    The variance of scene means is that between scenes plus the mean of within / seeds; where the first comes out negative it is 0.
+    The variance of scene means is that between scenes plus the mean of within / seeds; where the
+    first comes out negative it is 0.
     """
     several = np.isfinite(found.within)
     if several.sum() < 2 or found.known.sum() < 3:
@@ -84,14 +98,16 @@ def variances(found: SceneDifferences) -> tuple[float, float] | None:
 
 
 def best_seeds(between: float, within: float, scene_cost: float, most: int) -> int:
-    """Return the seeds a scene that give the least variance for the cost: sqrt(scene_cost * within / between), from 1 to ``most``.
+    """Return the seeds a scene that give the least variance for the cost: sqrt(scene_cost * within
+    / between), from 1 to ``most``.
 
     The classic allocation of two-stage sampling (Cochran, Sampling Techniques, 1977, section 10.6).
 
     Args:
         between: Variance between scenes.
         within: Variance between the seeds of a scene.
-        scene_cost: What a new scene costs, in pairs of rollouts: fitting its reconstruction, for example.
+        scene_cost: What a new scene costs, in pairs of rollouts: fitting its reconstruction, for
+            example.
         most: Seeds that there are.
 
     Example:
@@ -105,8 +121,11 @@ def best_seeds(between: float, within: float, scene_cost: float, most: int) -> i
     return int(min(most, max(1, round(math.sqrt(scene_cost * within / between)))))
 
 
-def scarce_seeds(between: float, within: float, distance: float, log_bar: float, scenes: int, most: int) -> int:
-    """Return the fewest seeds with which a suite of ``scenes`` is expected to suffice; ``most`` where none is.
+def scarce_seeds(
+    between: float, within: float, distance: float, log_bar: float, scenes: int, most: int
+) -> int:
+    """Return the fewest seeds with which a suite of ``scenes`` is expected to suffice; ``most``
+    where none is.
 
     A bet at the planned distance needs about 2 log(1 / alpha) variance / distance^2 scenes.
     """
@@ -116,8 +135,16 @@ def scarce_seeds(between: float, within: float, distance: float, log_bar: float,
     return most
 
 
-def next_seeds(found: SceneDifferences, distance: float | None, log_bar: float, scene_cost: float, scenes: int, most: int) -> int:
-    """Return the seeds of the next scenes; they depend on earlier scenes only, so the guarantee stays.
+def next_seeds(
+    found: SceneDifferences,
+    distance: float | None,
+    log_bar: float,
+    scene_cost: float,
+    scenes: int,
+    most: int,
+) -> int:
+    """Return the seeds of the next scenes; they depend on earlier scenes only, so the guarantee
+    stays.
 
     Args:
         found: Of the metric that is furthest from a decision.
@@ -131,4 +158,8 @@ def next_seeds(found: SceneDifferences, distance: float | None, log_bar: float, 
     if known is None:
         return min(PILOT_SEEDS, most)
     by_cost = best_seeds(*known, scene_cost, most)
-    return by_cost if distance is None else max(by_cost, scarce_seeds(*known, distance, log_bar, scenes, most))
+    return (
+        by_cost
+        if distance is None
+        else max(by_cost, scarce_seeds(*known, distance, log_bar, scenes, most))
+    )

@@ -1,12 +1,15 @@
-"""How far the truth is expected from the threshold, and the capital of a test that stops where a motion reaches a rising line.
+"""How far the truth is expected from the threshold, and the capital of a test that stops where a
+motion reaches a rising line.
 
-The plan makes a decision fast, never wrong. Time runs from 0 to 1 at the ceiling, and the motion W has variance 1 there. The test refutes
-"no drift" where W reaches ``height + slope * time``. The chance of that, given W now, is a martingale; over alpha it begins at 1 and is
-1 / alpha on the line. So it is the e-process that spends all of alpha before the ceiling: far from it a bet on the drift 2 slope (Wald's
-test), near it bolder where little is left. Wald's line with a ceiling needs about as few scenes as any group-sequential test of equal power
-(docs/experiments/sequential.md).
+The plan makes a decision fast, never wrong. Time runs from 0 to 1 at the ceiling, and the motion W
+has variance 1 there. The test refutes "no drift" where W reaches ``height + slope * time``. The
+chance of that, given W now, is a martingale; over alpha it begins at 1 and is 1 / alpha on the
+line. So it is the e-process that spends all of alpha before the ceiling: far from it a bet on the
+drift 2 slope (Wald's test), near it bolder where little is left. Wald's line with a ceiling needs
+about as few scenes as any group-sequential test of equal power (docs/experiments/sequential.md).
 
-Source: Siegmund, Sequential Analysis, 1985, equation 3.15 (first passage of Brownian motion to a line).
+Source: Siegmund, Sequential Analysis, 1985, equation 3.15 (first passage of Brownian motion to a
+    line).
 """
 
 from __future__ import annotations
@@ -20,8 +23,9 @@ import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.types import F64
 
-# Half of the distance that is bet on, in standard deviations of the sum over all scenes up to the ceiling. A test with a ceiling that is
-# just large enough for 80 % power has 1.4; smaller bets gain nothing, whatever the plan.
+# Half of the distance that is bet on, in standard deviations of the sum over all scenes up to the
+# ceiling. A test with a ceiling that is just large enough for 80 % power has 1.4; smaller bets gain
+# nothing, whatever the plan.
 USUAL_SLOPE, LEAST_SLOPE = 1.4, 1.0
 
 
@@ -30,9 +34,11 @@ class Plan:
     """How large bets are.
 
     Attributes:
-        distance: Expected distance of the true mean from the threshold, in the metric's unit; None: such that ``horizon`` just suffices.
+        distance: Expected distance of the true mean from the threshold, in the metric's unit; None:
+            such that ``horizon`` just suffices.
         horizon: Most scenes that can be driven.
-        alpha: Evidence of 1 / alpha is aimed at: the chance of a wrong decision, divided by the number of answers that share it.
+        alpha: Evidence of 1 / alpha is aimed at: the chance of a wrong decision, divided by the
+            number of answers that share it.
     """
 
     distance: float | None
@@ -45,16 +51,22 @@ class Plan:
         return -math.log(self.alpha)
 
     def slope(self, spread: F64) -> F64:
-        """Return the slope of the line that is bet on, for standard deviations of a scene of any shape."""
+        """Return the slope of the line that is bet on, for standard deviations of a scene of any
+        shape.
+        """
         if self.distance is None:
             return np.full_like(spread, USUAL_SLOPE)
-        return np.asarray(np.maximum(LEAST_SLOPE, 0.5 * self.distance * math.sqrt(self.horizon) / spread))
+        return np.asarray(
+            np.maximum(LEAST_SLOPE, 0.5 * self.distance * math.sqrt(self.horizon) / spread)
+        )
 
 
 NEWTON_STEPS = 12
 LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 # The table of `relative_slope`: roots of -log chance (chances down to exp(-42)), and slopes.
-ROOTS, SLOPES, GAPS = np.linspace(0.0, 6.5, 131), np.linspace(0.0, 10.0, 101), np.linspace(0.0, 10.0, 4001)
+ROOTS = np.linspace(0.0, 6.5, 131)
+SLOPES = np.linspace(0.0, 10.0, 101)
+GAPS = np.linspace(0.0, 10.0, 4001)
 
 
 def log_chance(gap: F64, left: F64, slope: F64) -> F64:
@@ -88,7 +100,8 @@ def log_rate(gap: F64, slope: F64) -> F64:
 def height(slope: F64, alpha: float) -> F64:
     """Return where lines of slopes ``(...)`` begin that are reached with the chance alpha.
 
-    By Newton's method: the log chance is concave in the gap, so the steps come from above and cannot overshoot.
+    By Newton's method: the log chance is concave in the gap, so the steps come from above and
+    cannot overshoot.
     """
     one = np.ones_like(slope, dtype=np.float64)
     gap = np.zeros_like(one)
@@ -99,7 +112,8 @@ def height(slope: F64, alpha: float) -> F64:
 
 
 def log_evidence(w: F64, time: F64, slope: F64, alpha: float) -> F64:
-    """Return the log of the chance over alpha, ``(..., n)``; once the line is reached, that of Wald's test, which goes on.
+    """Return the log of the chance over alpha, ``(..., n)``; once the line is reached, that of
+    Wald's test, which goes on.
 
     Args:
         w: ``(..., n)`` the motion at every look; -inf before the first.
@@ -124,9 +138,11 @@ def _table() -> F64:
 
 
 def relative_slope(log_p: F64, slope: F64) -> F64:
-    """Return how fast the chance grows with the motion, relative to itself, where the time left is 1: d log chance / d W.
+    """Return how fast the chance grows with the motion, relative to itself, where the time left is
+    1: d log chance / d W.
 
-    With another time left, give ``slope * sqrt(left)`` and divide the result by ``sqrt(left)``. Past the line it is that of Wald's test.
+    With another time left, give ``slope * sqrt(left)`` and divide the result by ``sqrt(left)``.
+    Past the line it is that of Wald's test.
 
     Args:
         log_p: ``(...)`` log of the chance now.
@@ -137,6 +153,10 @@ def relative_slope(log_p: F64, slope: F64) -> F64:
     row = np.minimum(slope / SLOPES[1], len(SLOPES) - 1.001)
     i, j = row.astype(np.int64), column.astype(np.int64)
     f, g = row - i, column - j
-    found = (1 - f) * ((1 - g) * table[i, j] + g * table[i, j + 1]) + f * ((1 - g) * table[i + 1, j] + g * table[i + 1, j + 1])
-    beyond = 2.0 * np.maximum(slope - SLOPES[-1], 0.0)  # far from the ceiling the chance is exp(-2 slope gap)
+    found = (1 - f) * ((1 - g) * table[i, j] + g * table[i, j + 1]) + f * (
+        (1 - g) * table[i + 1, j] + g * table[i + 1, j + 1]
+    )
+    beyond = 2.0 * np.maximum(
+        slope - SLOPES[-1], 0.0
+    )  # far from the ceiling the chance is exp(-2 slope gap)
     return np.asarray(np.where(log_p >= 0.0, 2.0 * slope, np.exp(found) + beyond))

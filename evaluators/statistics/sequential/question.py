@@ -1,4 +1,6 @@
-"""What is to be decided (metrics, margins, how sure), and ``decision.json``: the question, every look and the answer of such a run."""
+"""What is to be decided (metrics, margins, how sure), and ``decision.json``: the question, every
+look and the answer of such a run.
+"""
 
 from __future__ import annotations
 
@@ -39,9 +41,11 @@ class MetricQuestion:
     Attributes:
         facts: The metric.
         margin: How much worse is accepted, or how much better is wanted, in the metric's unit.
-        asked: ``non-inferior``: is the difference at most ``margin`` worse; ``better``: is it at least ``margin`` better.
+        asked: ``non-inferior``: is the difference at most ``margin`` worse; ``better``: is it at
+            least ``margin`` better.
         expected: Expected difference, positive is worse; None: see `distance`.
-        binding: The decision waits for this metric; otherwise the metric counts only if it is shown to be worse.
+        binding: The decision waits for this metric; otherwise the metric counts only if it is shown
+            to be worse.
         method: How its e-process is made.
     """
 
@@ -69,7 +73,9 @@ class MetricQuestion:
 
     @property
     def distance(self) -> float | None:
-        """Give how far from the threshold the difference is expected; without an expectation no difference (or twice the wanted one)."""
+        """Give how far from the threshold the difference is expected; without an expectation no
+        difference (or twice the wanted one).
+        """
         if self.expected is not None:
             return abs(self.expected - self.threshold) or None
         return self.margin or None
@@ -88,7 +94,8 @@ class Question:
     Attributes:
         metrics: One or several.
         alpha: Chance that the decision is wrong, over all looks.
-        population: ``scenes``: scenes are draws from a population, and its mean is asked for; ``suite``: the mean over this suite's scenes.
+        population: ``scenes``: scenes are draws from a population, and its mean is asked for;
+            ``suite``: the mean over this suite's scenes.
         first_look: Scenes before the first look of asymptotic metrics.
         min_scenes: Scenes before any decision.
     """
@@ -131,23 +138,45 @@ def metric_question(
         method: None: betting where differences are bounded, else asymptotic.
 
     Raises:
-        InputError: A negative margin, a metric without a better side for which none is possible, or betting on unbounded differences.
+        InputError: A negative margin, a metric without a better side for which none is possible, or
+            betting on unbounded differences.
     """
     facts = METRICS.info(metric)
     direction = facts.direction
     chosen = margin if margin is not None else facts.accepted if asked == "non-inferior" else 0.0
     if chosen < 0.0 or not math.isfinite(chosen):
-        raise InputError(DOING, f"margin {chosen:g} for {metric}", "not a number from 0 up", "give how much worse is accepted, as 0.05")
+        raise InputError(
+            DOING,
+            f"margin {chosen:g} for {metric}",
+            "not a number from 0 up",
+            "give how much worse is accepted, as 0.05",
+        )
     if direction == "none" and (asked == "better" or chosen == 0.0):
-        found = "it has no better side" if asked == "better" else "it has no better side and a margin of 0"
-        raise InputError(DOING, metric, found, "ask whether it is non-inferior, with a margin: the change to either side that is accepted")
+        found = (
+            "it has no better side"
+            if asked == "better"
+            else "it has no better side and a margin of 0"
+        )
+        raise InputError(
+            DOING,
+            metric,
+            found,
+            "ask whether it is non-inferior, with a margin: the change to either side that is accepted",
+        )
     low, high = facts.difference_range
     bounded = math.isfinite(low) and math.isfinite(high)
     if method == "betting" and not bounded:
-        raise InputError(DOING, f"--method betting for {metric}", "its differences have no bounds", "leave --method out")
+        raise InputError(
+            DOING,
+            f"--method betting for {metric}",
+            "its differences have no bounds",
+            "leave --method out",
+        )
     sign = -1.0 if direction == "higher" else 1.0
     harm = None if expected is None else sign * expected
-    return MetricQuestion(facts, chosen, asked, harm, binding, method or ("betting" if bounded else "asymptotic"))
+    return MetricQuestion(
+        facts, chosen, asked, harm, binding, method or ("betting" if bounded else "asymptotic")
+    )
 
 
 DECISION = "decision.json"
@@ -213,7 +242,9 @@ class Decision(TypedDict):
     ceiling: dict[str, int]  # scenes, rollouts
     seeds: dict[str, Any]  # how many a scene and why
     controls: dict[str, Any]  # what takes out variance, by metric
-    drawn: NotRequired[dict[str, Any]]  # order: random (where absent) or stratified, then the number of scenes of each family
+    drawn: NotRequired[
+        dict[str, Any]
+    ]  # order: random (where absent) or stratified, then the number of scenes of each family
     order: list[str]  # scenes driven, in their order
     looks: list[Look]
     verdict: str
@@ -255,7 +286,9 @@ def write_decision(root: Path, decision: Decision) -> None:
 
 
 def stopping_note(root: Path) -> str | None:
-    """Say that the intervals of a fixed number of scenes do not hold for a run that stopped when it was decided; None of any other run."""
+    """Say that the intervals of a fixed number of scenes do not hold for a run that stopped when it
+    was decided; None of any other run.
+    """
     if read_decision(root) is None:
         return None
     return f"note: {root} was driven until it was decided: only the intervals of {DECISION} and of the report's first section hold for it"

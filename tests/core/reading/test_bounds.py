@@ -1,4 +1,6 @@
-"""Rule 1: every quantity has one bound, and every source is checked against it before anything is built."""
+"""Rule 1: every quantity has one bound, and every source is checked against it before anything is
+built.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +23,26 @@ from scenarios.load import load_scenario
 from tests.fuzz import seen
 
 REFUSED = (
-    "road of 1e6 m", "road of 1e15 m", "road of 1e308 m", "OpenDRIVE s = 1e5", "OpenDRIVE curvature 1e9", "AV2 width 1e300",
-    "usdz size NaN", "usdz size 1e9", "size_m 1e6", "1e9 trees", "poles every 1e-9 m", "20,000 parked cars", "CommonRoad time -1e308",
-    "4 MB of '- a'", "error of 7 MB", "pipe as scenario", "pipe as CommonRoad", "pipe as AlpaSim scene", "path of 5,000 characters",
-)  # fmt: skip
+    "road of 1e6 m",
+    "road of 1e15 m",
+    "road of 1e308 m",
+    "OpenDRIVE s = 1e5",
+    "OpenDRIVE curvature 1e9",
+    "AV2 width 1e300",
+    "usdz size NaN",
+    "usdz size 1e9",
+    "size_m 1e6",
+    "1e9 trees",
+    "poles every 1e-9 m",
+    "20,000 parked cars",
+    "CommonRoad time -1e308",
+    "4 MB of '- a'",
+    "error of 7 MB",
+    "pipe as scenario",
+    "pipe as CommonRoad",
+    "pipe as AlpaSim scene",
+    "path of 5,000 characters",
+)
 
 
 def test_every_bound_has_a_range_a_reason_and_a_name_of_its_own() -> None:
@@ -58,9 +76,13 @@ def test_counts_of_seeds_are_bounded(text: str) -> None:
 
 
 def test_a_long_map_costs_what_the_drive_can_see(tmp_path: Path) -> None:
-    short, long = (load_scenario(seen.xodr(length)(folder(tmp_path, length))[-1]) for length in ("900", "9000"))
+    short, long = (
+        load_scenario(seen.xodr(length)(folder(tmp_path, length))[-1]) for length in ("900", "9000")
+    )
     assert long.ground.z.size <= 1.5 * short.ground.z.size
-    assert len(long.lane_map.road_edges[0]) > 8 * len(short.lane_map.road_edges[0])  # the map itself is whole
+    assert len(long.lane_map.road_edges[0]) > 8 * len(
+        short.lane_map.road_edges[0]
+    )  # the map itself is whole
 
 
 def folder(root: Path, name: str) -> Path:
@@ -77,10 +99,14 @@ def drive_of(length_m: float, scenario: Scenario) -> Scenario:
 def test_the_cost_of_a_recorded_drive_is_refused_before_it_is_built() -> None:
     scenario = load_scenario("smoke/straight")
     check_scenario(drive_of(3000.0, scenario), "a log")
-    with pytest.raises(InputError, match=r"Gaussians, at most 20,000,000: about \d+ GiB and \d+ s to build"):
+    with pytest.raises(
+        InputError, match=r"Gaussians, at most 20,000,000: about \d+ GiB and \d+ s to build"
+    ):
         check_scenario(drive_of(9000.0, scenario), "a log")
     with pytest.raises(InputError, match="road users"):
-        check_scenario(replace(scenario, actors=load_scenario("smoke/lead_car").actors * 1001), "a log")
+        check_scenario(
+            replace(scenario, actors=load_scenario("smoke/lead_car").actors * 1001), "a log"
+        )
 
 
 def queue(n: int, seed: int) -> tuple[Bodies, np.ndarray]:
@@ -113,7 +139,10 @@ def test_on_a_loop_the_place_of_a_body_depends_on_who_asks() -> None:
     places, yaw = path.at(np.array([5.0, 30.0, path.length_m - 4.0]))
     bodies = Bodies(places[:, :2], yaw, np.full(3, 2.3), np.full(3, 0.9), np.zeros((3, 2)))
     fronts, rows = np.array([7.3, 32.3, path.length_m - 1.7]), np.arange(3)
-    alone = [find_leader(path, front, 0.9, bodies, own_row=row) for front, row in zip(fronts, rows, strict=True)]
+    alone = [
+        find_leader(path, front, 0.9, bodies, own_row=row)
+        for front, row in zip(fronts, rows, strict=True)
+    ]
     assert find_leaders(path, fronts, np.full(3, 0.9), bodies, rows) == alone
 
 
@@ -127,7 +156,9 @@ def test_the_tree_names_the_station_that_comparing_all_names() -> None:
 
 
 def test_the_schema_and_the_readers_name_the_same_limits() -> None:
-    schema = json.loads((Path(__file__).resolve().parents[3] / "scenarios" / "schema.json").read_text())
+    schema = json.loads(
+        (Path(__file__).resolve().parents[3] / "scenarios" / "schema.json").read_text()
+    )
     arc = schema["$defs"]["ArcSegment"]["properties"]
     assert (arc["curvature_per_m"]["minimum"], arc["curvature_per_m"]["maximum"]) == (
         bounds.CURVATURE_PER_M.low,

@@ -40,7 +40,10 @@ def test_xml_holds_any_text() -> None:
 
 def test_parts_of_errors_are_short_and_cannot_act() -> None:
     error = InputError("reading", "a" * 10_000, f"found {HOSTILE}" + "b" * 7_500_000, "do")
-    assert all(len(part) <= MAX_PART and part.isprintable() for part in (error.doing, error.with_what, error.found, error.do_this))
+    assert all(
+        len(part) <= MAX_PART and part.isprintable()
+        for part in (error.doing, error.with_what, error.found, error.do_this)
+    )
     assert "10000" not in error.with_what
     assert error.with_what.startswith("aaa")
     assert "more" in error.with_what
@@ -56,8 +59,19 @@ def test_shortening_keeps_both_ends(length: int) -> None:
 
 
 def test_a_run_of_hostile_names_is_reported_in_whole_tables(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", Plan(renderers=("clean", HOSTILE), scenes=(HOSTILE, "plain"), seeds=(0, 1), steps=20, pictures=False,
-                                          clips=False, fail=[("clean", "plain", 0)], failure=HOSTILE))  # fmt: skip
+    run = make_run(
+        tmp_path / "run",
+        Plan(
+            renderers=("clean", HOSTILE),
+            scenes=(HOSTILE, "plain"),
+            seeds=(0, 1),
+            steps=20,
+            pictures=False,
+            clips=False,
+            fail=[("clean", "plain", 0)],
+            failure=HOSTILE,
+        ),
+    )
     text = write_summary_md(run).read_text()
     assert "\x1b" not in text
     assert "<img" not in text.partition("### Made with")[0]  # the command stands in a block of code

@@ -1,4 +1,6 @@
-"""Rule 2: one way to read a file. Nothing that a file holds makes a reader hang, swell or show its internals."""
+"""Rule 2: one way to read a file. Nothing that a file holds makes a reader hang, swell or show its
+internals.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,15 @@ from typing_extensions import TypedDict
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import FILE_BYTES
-from alpasim_plugin.core.reading import exists, read_bytes, read_json, read_json_as, read_json_lines, read_text, tables
+from alpasim_plugin.core.reading import (
+    exists,
+    read_bytes,
+    read_json,
+    read_json_as,
+    read_json_lines,
+    read_text,
+    tables,
+)
 from alpasim_plugin.core.reading.arrays import open_npy, parse_npy
 from alpasim_plugin.core.reading.files import check_names, gunzip, parse_xml, unzstd
 from alpasim_plugin.core.reading.images import decode_image, image_size
@@ -29,7 +39,13 @@ from tests.fuzz.targets import CORE, check, inputs, workplace
 
 DOING = "testing"
 SLICE = int(os.environ.get("SIMRUN_FUZZ", "1"))  # inputs of each reader
-QUICK = ("scenario", "CommonRoad", "PLY", "SPZ", "PNG")  # CI runs all readers for a minute: python -m tests.fuzz --seconds 60
+QUICK = (
+    "scenario",
+    "CommonRoad",
+    "PLY",
+    "SPZ",
+    "PNG",
+)  # CI runs all readers for a minute: python -m tests.fuzz --seconds 60
 
 
 def refused(call: Callable[[], object]) -> str:
@@ -51,7 +67,9 @@ def special(kind: str, path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["pipe", "socket", "folder", "device"])
-def test_only_regular_files_are_read(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_regular_files_are_read(
+    tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)  # names of sockets are short
     special(kind, Path("x"))
     found = refused(lambda: read_bytes("x", DOING))
@@ -64,7 +82,9 @@ def test_size_is_checked_before_reading(tmp_path: Path) -> None:
     assert "1099511627776 bytes" in refused(lambda: read_bytes(tmp_path / "large", DOING))
     (tmp_path / "small").write_bytes(b"12345")
     assert read_bytes(tmp_path / "small", DOING, replace(FILE_BYTES, high=5)) == b"12345"
-    assert "5 bytes, more than 4" in refused(lambda: read_bytes(tmp_path / "small", DOING, replace(FILE_BYTES, high=4)))
+    assert "5 bytes, more than 4" in refused(
+        lambda: read_bytes(tmp_path / "small", DOING, replace(FILE_BYTES, high=4))
+    )
 
 
 @pytest.mark.parametrize("name", ["a" * 5000, "a\0b", "none"])
@@ -81,12 +101,21 @@ class Shape(TypedDict, total=False):
 @pytest.mark.parametrize(
     ("text", "found"),
     [
-        ("{", "broken JSON"), ("[" * 100_000, "broken JSON"), ("[" * 100 + "]" * 100, "deeper than 64"), ("1" * 5000, "broken JSON"),
-        ('{"count": NaN}', "nan"), ('{"count": 1e999}', "inf"), ("[1]", "the document: a list of 1"), ('{"count": "1"}', "count: the text"),
-        ('{"count": 1.5}', "count: the value 1.5"), ('{"names": {"a": [1, [2]]}}', "names.a.1: a list of 1"), ("\ud800", "broken JSON"),
-        ('["\\ud800"]', "half a surrogate"), ('{"a\\udc00": 1}', "half a surrogate"),
+        ("{", "broken JSON"),
+        ("[" * 100_000, "broken JSON"),
+        ("[" * 100 + "]" * 100, "deeper than 64"),
+        ("1" * 5000, "broken JSON"),
+        ('{"count": NaN}', "nan"),
+        ('{"count": 1e999}', "inf"),
+        ("[1]", "the document: a list of 1"),
+        ('{"count": "1"}', "count: the text"),
+        ('{"count": 1.5}', "count: the value 1.5"),
+        ('{"names": {"a": [1, [2]]}}', "names.a.1: a list of 1"),
+        ("\ud800", "broken JSON"),
+        ('["\\ud800"]', "half a surrogate"),
+        ('{"a\\udc00": 1}', "half a surrogate"),
     ],
-)  # fmt: skip
+)
 def test_json_has_limits_and_a_shape(tmp_path: Path, text: str, found: str) -> None:
     (tmp_path / "a.json").write_bytes(text.encode("utf-8", "surrogatepass"))
     assert found in refused(lambda: read_json_as(Shape, tmp_path / "a.json", DOING))
@@ -94,7 +123,11 @@ def test_json_has_limits_and_a_shape(tmp_path: Path, text: str, found: str) -> N
 
 def test_json_of_the_right_shape_comes_back_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text('{"count": 2, "more": null}')
-    assert read_json_as(Shape, tmp_path / "a.json", DOING) == {"count": 2, "more": None} == read_json(tmp_path / "a.json", DOING)
+    assert (
+        read_json_as(Shape, tmp_path / "a.json", DOING)
+        == {"count": 2, "more": None}
+        == read_json(tmp_path / "a.json", DOING)
+    )
     (tmp_path / "a.jsonl").write_text('{"a": 1}\n\n{"a": 2}\n')
     assert read_json_lines(tmp_path / "a.jsonl", DOING) == [{"a": 1}, {"a": 2}]
 
@@ -105,7 +138,14 @@ def npy(shape: str, body: bytes = b"", descr: str = "'<f8'") -> bytes:
 
 
 @pytest.mark.parametrize(
-    "data", [npy("(999999999999,)"), npy("(2, 2)", b"\0" * 31), npy("(-1,)", b"\0" * 8), npy("(1,)", b"0" * 8, "'|O'"), b""]
+    "data",
+    [
+        npy("(999999999999,)"),
+        npy("(2, 2)", b"\0" * 31),
+        npy("(-1,)", b"\0" * 8),
+        npy("(1,)", b"0" * 8, "'|O'"),
+        b"",
+    ],
 )
 def test_arrays_are_as_long_as_their_header_says(tmp_path: Path, data: bytes) -> None:
     assert "NumPy" in refused(lambda: parse_npy(data, "a.npy", DOING))
@@ -115,7 +155,11 @@ def test_arrays_are_as_long_as_their_header_says(tmp_path: Path, data: bytes) ->
 
 def test_a_whole_array_is_read(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.arange(6).reshape(2, 3))
-    assert open_npy(tmp_path / "a.npy", DOING).sum() == 15 == parse_npy((tmp_path / "a.npy").read_bytes(), "a", DOING).sum()
+    assert (
+        open_npy(tmp_path / "a.npy", DOING).sum()
+        == 15
+        == parse_npy((tmp_path / "a.npy").read_bytes(), "a", DOING).sum()
+    )
 
 
 def test_pictures_are_measured_before_they_are_decoded() -> None:
@@ -139,15 +183,23 @@ def test_members_stay_in_their_archive(names: list[str]) -> None:
 
 
 def test_tables_have_their_columns_and_types(tmp_path: Path) -> None:
-    pq.write_table(pa.table({"a": [1, 2], "b": ["x", None], "c": [[1], [2]]}), tmp_path / "t.parquet")
+    pq.write_table(
+        pa.table({"a": [1, 2], "b": ["x", None], "c": [[1], [2]]}), tmp_path / "t.parquet"
+    )
     assert read_parquet(tmp_path / "t.parquet", DOING, {"a": "integer", "b": "text"}).num_rows == 2
-    assert "no column 'd'" in refused(lambda: read_parquet(tmp_path / "t.parquet", DOING, {"d": "number"}))
-    assert "wanted number" in refused(lambda: read_parquet(tmp_path / "t.parquet", DOING, {"c": "number"}))
+    assert "no column 'd'" in refused(
+        lambda: read_parquet(tmp_path / "t.parquet", DOING, {"d": "number"})
+    )
+    assert "wanted number" in refused(
+        lambda: read_parquet(tmp_path / "t.parquet", DOING, {"c": "number"})
+    )
     (tmp_path / "t.parquet").write_bytes((tmp_path / "t.parquet").read_bytes()[:-20])
     refused(lambda: read_parquet(tmp_path / "t.parquet", DOING))
 
 
-def test_runs_of_equal_values_count_as_what_they_become(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_of_equal_values_count_as_what_they_become(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pq.write_table(pa.table({"a": pa.nulls(1_000_000, pa.int64())}), tmp_path / "t.parquet")
     assert (tmp_path / "t.parquet").stat().st_size < 10_000
     monkeypatch.setattr(tables, "TABLE_BYTES", replace(tables.TABLE_BYTES, high=7_999_999))
@@ -155,14 +207,26 @@ def test_runs_of_equal_values_count_as_what_they_become(tmp_path: Path, monkeypa
 
 
 @pytest.mark.parametrize(
-    "text", ["<a>" * 100 + "</a>" * 100, "<!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>", "<a", '<?xml version="1.0" encoding="x"?><a/>']
+    "text",
+    [
+        "<a>" * 100 + "</a>" * 100,
+        "<!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>",
+        "<a",
+        '<?xml version="1.0" encoding="x"?><a/>',
+    ],
 )
 def test_xml_has_limits_and_no_entities(text: str) -> None:
     refused(lambda: parse_xml(text.encode(), "a.xml", DOING))
 
 
-@pytest.mark.parametrize("target", [pytest.param(t, id=t.name, marks=[] if t.name in QUICK else [pytest.mark.slow]) for t in CORE])
+@pytest.mark.parametrize(
+    "target",
+    [pytest.param(t, id=t.name, marks=[] if t.name in QUICK else [pytest.mark.slow]) for t in CORE],
+)
 def test_damaged_files_are_refused_or_usable(target) -> None:
     with workplace() as folder:
         for number in range(SLICE):
-            assert check(target, inputs(target, random.Random(f"suite/{number}")), folder) in ("refused", "accepted")
+            assert check(target, inputs(target, random.Random(f"suite/{number}")), folder) in (
+                "refused",
+                "accepted",
+            )

@@ -9,7 +9,18 @@ from typing import ClassVar
 
 import numpy as np
 
-from alpasim_plugin.core.types import Box, EgoState, Frame, Lane, LaneMap, MetricInfo, Plan, SensorSpec, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    Box,
+    EgoState,
+    Frame,
+    Lane,
+    LaneMap,
+    MetricInfo,
+    Plan,
+    SensorSpec,
+    Trajectory,
+    Vehicle,
+)
 from alpasim_plugin.world.ground import flat
 from evaluators import series
 from scenarios.recorded import RecordedLog
@@ -82,7 +93,9 @@ class Jump:
 class Wobble:
     """A metric of its own."""
 
-    metrics: ClassVar = {"toy_wobble_m": MetricInfo("m", "lower", "max", "largest lateral coordinate, for a test")}
+    metrics: ClassVar = {
+        "toy_wobble_m": MetricInfo("m", "lower", "max", "largest lateral coordinate, for a test")
+    }
 
     def __call__(self, rollout, scene):
         return [series("toy_wobble_m", rollout.ego.t_us, np.abs(rollout.ego.xyz[:, 1]) / DIVISOR)]
@@ -100,10 +113,20 @@ class Csv:
         data = path.read_bytes()
         rows = np.array([line.split(",") for line in data.decode().split()], dtype=np.float64)
         xyz = np.column_stack([rows[:, 1:], np.zeros(len(rows))])
-        drive = Trajectory(rows[:, 0].astype(np.int64), xyz, np.tile([1.0, 0.0, 0.0, 0.0], (len(rows), 1)))
+        drive = Trajectory(
+            rows[:, 0].astype(np.int64), xyz, np.tile([1.0, 0.0, 0.0, 0.0], (len(rows), 1))
+        )
         aside = np.array([0.0, 2.0, 0.0])
         lane = Lane("lane", xyz, xyz + aside, xyz - aside)
         return RecordedLog(
-            path.stem, "toy", LaneMap({"lane": lane}), flat(0.0), drive, Vehicle(Box(4.0, 1.8, 1.5)), (), (), (0.0, 0.0, 0.0),
+            path.stem,
+            "toy",
+            LaneMap({"lane": lane}),
+            flat(0.0),
+            drive,
+            Vehicle(Box(4.0, 1.8, 1.5)),
+            (),
+            (),
+            (0.0, 0.0, 0.0),
             hashlib.sha256(data).hexdigest(),
-        )  # fmt: skip
+        )

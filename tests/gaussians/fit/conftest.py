@@ -1,4 +1,6 @@
-"""A small posed scene: a wall of coloured Gaussians, a floor, and an actor that crosses in front of them."""
+"""A small posed scene: a wall of coloured Gaussians, a floor, and an actor that crosses in front of
+them.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,16 @@ def posed() -> Posed:
     wall = patch(at(12, 0, 2), [0.3, 6, 2.2], 250, rng, 0.5)
     floor = patch(at(8, 0, 0), [4, 5, 0.05], 200, rng, 0.4)
     actor = patch([0, 0, 0], [1.6, 0.8, 0.6], 40, rng, 0.3)
-    background = SceneNode("all", "background", (Level(0.0, GaussianCloud.concatenate([wall, floor])),))
-    scene = SceneGraph([background], [SceneNode("car", "actor", (Level(0.0, actor),))], make_sky("clear", stream("fit-tests", 0, "sky")))
-    views = [seen_from(camera_at(0.4 * i - 1.4), scene, {"car": actor_pose(i)}, f"view-{i}", 1) for i in range(8)]
+    background = SceneNode(
+        "all", "background", (Level(0.0, GaussianCloud.concatenate([wall, floor])),)
+    )
+    scene = SceneGraph(
+        [background],
+        [SceneNode("car", "actor", (Level(0.0, actor),))],
+        make_sky("clear", stream("fit-tests", 0, "sky")),
+    )
+    views = [
+        seen_from(camera_at(0.4 * i - 1.4), scene, {"car": actor_pose(i)}, f"view-{i}", 1)
+        for i in range(8)
+    ]
     return Posed(scene, views, start_from_depth(views, {"car": BOX}, 300, "fit-tests", 0, 60))

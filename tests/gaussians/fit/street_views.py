@@ -15,7 +15,9 @@ STREET = Street(bow_m=0.0)
 
 
 def street_views(count: int = 10, aside_m: float = 0.0, first: int = 0) -> list[PosedView]:
-    """Return photographs every 0.6 m along the street, the world's z up, named ``front-000000`` and on."""
+    """Return photographs every 0.6 m along the street, the world's z up, named ``front-000000`` and
+    on.
+    """
     views = []
     for i in range(first, first + count):
         T = STREET.pose(STEP_M * i, aside_m)
@@ -25,13 +27,20 @@ def street_views(count: int = 10, aside_m: float = 0.0, first: int = 0) -> list[
 
 
 def true_depth(view: PosedView) -> np.ndarray:
-    """Return ``(H, W)`` metres of the road and the walls, which hide nothing of each other; infinite for sky. The box is left out."""
+    """Return ``(H, W)`` metres of the road and the walls, which hide nothing of each other;
+    infinite for sky. The box is left out.
+    """
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
-    ray = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=2) @ view.camera.T_camera_world[:3, :3]
+    ray = (
+        np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=2)
+        @ view.camera.T_camera_world[:3, :3]
+    )
     eye = view.camera.centre_world
     with np.errstate(divide="ignore"):
         road = np.where(ray[..., 2] < 0, -CAMERA_M / ray[..., 2], np.inf)
-        wall = np.where(ray[..., 1] > 0, (WALL_M - eye[1]) / ray[..., 1], (-WALL_M - eye[1]) / ray[..., 1])
+        wall = np.where(
+            ray[..., 1] > 0, (WALL_M - eye[1]) / ray[..., 1], (-WALL_M - eye[1]) / ray[..., 1]
+        )
     wall = np.where(eye[2] + wall * ray[..., 2] < 6.0, wall, np.inf)
     return np.minimum(road, np.abs(wall))
 
@@ -40,7 +49,9 @@ def turned(view: PosedView, turn_rad: np.ndarray, shift_m: np.ndarray) -> PosedV
     """Return a view whose pose is wrong by a rotation vector and a shift, both in its own frame."""
     wrong = np.eye(4)
     wrong[:3, :3], wrong[:3, 3] = cv2.Rodrigues(turn_rad)[0], shift_m
-    return replace(view, camera=replace(view.camera, T_camera_world=wrong @ view.camera.T_camera_world))
+    return replace(
+        view, camera=replace(view.camera, T_camera_world=wrong @ view.camera.T_camera_world)
+    )
 
 
 def brightened(view: PosedView, gain: tuple[float, float, float]) -> PosedView:

@@ -1,4 +1,6 @@
-"""`fit_drive` on a drawn street: learns depth with the colours, tells about views held out, resumes, refuses what it cannot start."""
+"""`fit_drive` on a drawn street: learns depth with the colours, tells about views held out,
+resumes, refuses what it cannot start.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ from tests.gaussians.fit.street_views import brightened, street_views, true_dept
 
 pytestmark = pytest.mark.slow
 
-QUICK = replace(SplatRecipe.street(), steps=45, points=3000, cap=3500, save_every=15, densify_every=20)
+QUICK = replace(
+    SplatRecipe.street(), steps=45, points=3000, cap=3500, save_every=15, densify_every=20
+)
 GAINS = [(1 + 0.1 * np.sin(i),) * 3 for i in range(8)]
 
 
@@ -34,13 +38,20 @@ def fitted(views: list[PosedView]) -> tuple[FittedDrive, list[tuple[str, dict[st
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(drive, "LEAST_WAY_M", 2.0)  # these views cover 4 m
         done = fit_drive(
-            [*views[:4], *views[5:]], None, kept=views[4:5], scene_id="s", threads=1, recipe=QUICK,
+            [*views[:4], *views[5:]],
+            None,
+            kept=views[4:5],
+            scene_id="s",
+            threads=1,
+            recipe=QUICK,
             report=lambda stage, at, all, numbers: told.append((stage, dict(numbers))),
-        )  # fmt: skip
+        )
     return done, told
 
 
-def test_a_view_that_was_kept_is_shown_and_reported_on_the_way(fitted: tuple[FittedDrive, list[tuple[str, dict[str, float]]]]) -> None:
+def test_a_view_that_was_kept_is_shown_and_reported_on_the_way(
+    fitted: tuple[FittedDrive, list[tuple[str, dict[str, float]]]],
+) -> None:
     heard = [numbers["held_out_db"] for _, numbers in fitted[1] if "held_out_db" in numbers]
     assert len(heard) == 3
     assert heard[-1] > 18.0
@@ -57,13 +68,17 @@ def test_after_few_steps_the_depth_of_the_fit_is_already_near_the_street_s(
     assert np.median(np.abs(out.depth[near] / truth[near] - 1)) < 0.2
 
 
-def test_the_sky_stays_free_of_gaussians(fitted: tuple[FittedDrive, object], views: list[PosedView]) -> None:
+def test_the_sky_stays_free_of_gaussians(
+    fitted: tuple[FittedDrive, object], views: list[PosedView]
+) -> None:
     sky = ~np.isfinite(true_depth(views[4]))
     out = fitted[0].model.graph().render(views[4].camera, {}, 1)
     assert out.alpha[sky].mean() < 0.25
 
 
-def test_exposures_are_told_for_every_view_and_a_kept_one_has_its_neighbours(fitted: tuple[FittedDrive, object]) -> None:
+def test_exposures_are_told_for_every_view_and_a_kept_one_has_its_neighbours(
+    fitted: tuple[FittedDrive, object],
+) -> None:
     found = fitted[0].exposures
     assert len(found) == 8
     fitted_ones = [i for i in range(8) if i != 4]
@@ -73,7 +88,9 @@ def test_exposures_are_told_for_every_view_and_a_kept_one_has_its_neighbours(fit
     assert found["front-000004"][1] == pytest.approx(between, abs=0.01)
 
 
-def test_a_fit_of_a_drive_that_was_cut_off_ends_with_the_same_bits(views: list[PosedView], tmp_path) -> None:
+def test_a_fit_of_a_drive_that_was_cut_off_ends_with_the_same_bits(
+    views: list[PosedView], tmp_path
+) -> None:
     recipe = replace(QUICK, steps=8, save_every=4, points=500, cap=600)
 
     class CutOffError(Exception):
@@ -93,7 +110,10 @@ def test_a_fit_of_a_drive_that_was_cut_off_ends_with_the_same_bits(views: list[P
 
 def test_photographs_that_share_nothing_and_no_points_are_refused(views: list[PosedView]) -> None:
     rng = np.random.default_rng(0)
-    noise = [replace(view, rgb=rng.integers(0, 255, view.rgb.shape, dtype=np.uint8)) for view in views[:3]]
+    noise = [
+        replace(view, rgb=rng.integers(0, 255, view.rgb.shape, dtype=np.uint8))
+        for view in views[:3]
+    ]
     with pytest.raises(InputError, match="nothing whose distance they measure"):
         fit_drive(noise, None, recipe=QUICK)
     with pytest.raises(InputError, match="no photograph"):
@@ -102,20 +122,33 @@ def test_photographs_that_share_nothing_and_no_points_are_refused(views: list[Po
 
 def test_photographs_that_share_nothing_start_from_given_points(views: list[PosedView]) -> None:
     rng = np.random.default_rng(0)
-    noise = [replace(view, rgb=rng.integers(0, 255, view.rgb.shape, dtype=np.uint8)) for view in views[:2]]
+    noise = [
+        replace(view, rgb=rng.integers(0, 255, view.rgb.shape, dtype=np.uint8))
+        for view in views[:2]
+    ]
     points = cloud_from_points(rng.uniform([4, -3, 0], [12, 3, 2], (50, 3)), np.full((50, 3), 0.5))
-    assert len(fit_drive(noise, points, recipe=replace(QUICK, steps=2, densify_every=0)).model) == 50
+    assert (
+        len(fit_drive(noise, points, recipe=replace(QUICK, steps=2, densify_every=0)).model) == 50
+    )
 
 
 def test_a_weight_of_depth_moves_gaussians_to_the_measured_depth(views: list[PosedView]) -> None:
-    """Of a flat grey picture colours say nothing: the weight pulls the points, 12 m away, towards the depth of 8 m."""
+    """Of a flat grey picture colours say nothing: the weight pulls the points, 12 m away, towards
+    the depth of 8 m.
+    """
     rng = np.random.default_rng(0)
-    flat = replace(views[0], rgb=np.full_like(views[0].rgb, 128), depth=np.full(views[0].rgb.shape[:2], 8.0, np.float32))
+    flat = replace(
+        views[0],
+        rgb=np.full_like(views[0].rgb, 128),
+        depth=np.full(views[0].rgb.shape[:2], 8.0, np.float32),
+    )
     points = np.column_stack([np.full(400, 12.0), rng.uniform(-4, 4, 400), rng.uniform(0, 4, 400)])
     cloud = cloud_from_points(points, np.full((400, 3), 0.5))
 
     def fitted_to(weight: float) -> float:
-        recipe = SplatRecipe(steps=60, densify_every=0, depth_weight=weight, lr_means=0.05, lr_means_end=0.05)
+        recipe = SplatRecipe(
+            steps=60, densify_every=0, depth_weight=weight, lr_means=0.05, lr_means_end=0.05
+        )
         run = SplatFit([flat], Start(cloud, {}), recipe, "s", "cpu", 1, None)
         while run.step < recipe.steps:
             run.update()
@@ -125,7 +158,10 @@ def test_a_weight_of_depth_moves_gaussians_to_the_measured_depth(views: list[Pos
 
 
 def test_a_needle_costs_and_a_disc_does_not() -> None:
-    disc, needle = torch.log(torch.tensor([[1.0, 1.0, 0.01]])), torch.log(torch.tensor([[1.0, 0.05, 0.05]]))
+    disc, needle = (
+        torch.log(torch.tensor([[1.0, 1.0, 0.01]])),
+        torch.log(torch.tensor([[1.0, 0.05, 0.05]])),
+    )
     assert float(needles(disc, 6.0)) == 0
     assert float(needles(needle, 6.0)) == pytest.approx(np.log(20 / 6), rel=1e-4)
 

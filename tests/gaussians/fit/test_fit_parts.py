@@ -13,8 +13,20 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.image_metrics import C1, C2, SIGMA_PX, WINDOW_PX, psnr_db, ssim
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians import GaussianCloud
-from alpasim_plugin.gaussians.fit import SplatRecipe, Start, cloud_from_points, held_out, start_from_depth
-from alpasim_plugin.gaussians.fit.model import RowAdam, ScreenGradients, SplatModel, densify, reset_opacities
+from alpasim_plugin.gaussians.fit import (
+    SplatRecipe,
+    Start,
+    cloud_from_points,
+    held_out,
+    start_from_depth,
+)
+from alpasim_plugin.gaussians.fit.model import (
+    RowAdam,
+    ScreenGradients,
+    SplatModel,
+    densify,
+    reset_opacities,
+)
 from alpasim_plugin.gaussians.fit.quality import SsimTarget
 from alpasim_plugin.gaussians.fit.reconstruction import sky_of
 from alpasim_plugin.gaussians.fit.start import start_in_boxes
@@ -30,15 +42,19 @@ def images() -> tuple[torch.Tensor, torch.Tensor]:
     return a, (a + 0.3 * b) / 1.3
 
 
-def model_of(cloud: GaussianCloud, actors: dict[str, GaussianCloud] | None = None, degree: int = 1) -> SplatModel:
+def model_of(
+    cloud: GaussianCloud, actors: dict[str, GaussianCloud] | None = None, degree: int = 1
+) -> SplatModel:
     return SplatModel.from_start(Start(cloud, actors or {}), np.zeros(3), degree)
 
 
-# --- loss -----------------------------------------------------------------------------------------------------------
+# --- loss
 
 
 def plain_ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Return the mean structural similarity of images ``(H, W, 3)`` through convolutions that autograd can follow."""
+    """Return the mean structural similarity of images ``(H, W, 3)`` through convolutions that
+    autograd can follow.
+    """
     x = torch.arange(WINDOW_PX, dtype=torch.float64) - WINDOW_PX // 2
     weight = torch.exp(-(x**2) / (2 * SIGMA_PX**2))
     kernel = (weight / weight.sum()).to(a.dtype)[None, None, None, :]
@@ -70,7 +86,9 @@ def test_similarity_on_a_gpu_equals_that_on_the_cpu() -> None:
     for value in values:
         value.backward()
     assert float(values[0].detach()) == pytest.approx(float(values[1].detach()), abs=1e-6)
-    assert float((on_cpu.grad - on_gpu.grad.cpu()).abs().max()) < 1e-4 * float(on_cpu.grad.abs().max())
+    assert float((on_cpu.grad - on_gpu.grad.cpu()).abs().max()) < 1e-4 * float(
+        on_cpu.grad.abs().max()
+    )
 
 
 def test_similarity_of_an_image_with_itself_is_one_and_psnr_is_that_of_a_known_error() -> None:
@@ -79,13 +97,16 @@ def test_similarity_of_an_image_with_itself_is_one_and_psnr_is_that_of_a_known_e
     assert psnr_db(a, a + 0.1, peak=1.0) == pytest.approx(20.0, abs=1e-4)
 
 
-# --- optimiser ------------------------------------------------------------------------------------------------------
+# --- optimiser
 
 
 def test_updates_follow_the_published_algorithm() -> None:
     start = stream("fit-tests", 0, "adam").standard_normal((5, 3)).astype(np.float32)
     p = torch.as_tensor(start.copy()).requires_grad_()
-    adam, wanted, m, v = RowAdam({"p": p}), start.astype(np.float64), 0.0, 0.0
+    adam = RowAdam({"p": p})
+    wanted = start.astype(np.float64)
+    m = 0.0
+    v = 0.0
     for t in range(1, 11):
         p.pow(3).sum().backward()
         adam.update({"p": p}, {"p": 0.01 / t})
@@ -105,7 +126,7 @@ def test_rows_keep_their_moments_when_others_come_and_go() -> None:
     assert torch.equal(adam.first["p"], torch.stack([before[2], before[0], torch.zeros(2)]))
 
 
-# --- model ----------------------------------------------------------------------------------------------------------
+# --- model
 
 
 def test_an_actor_is_placed_as_a_moved_cloud_is() -> None:
@@ -127,7 +148,9 @@ def test_a_placed_actor_passes_gradients_to_its_own_frame() -> None:
     splats.means[3:, 0].sum().backward()
     gradient = model.params["means"].grad
     assert gradient is not None
-    assert torch.allclose(gradient[3:], torch.as_tensor(T[0, :3], dtype=torch.float32).expand(4, 3), atol=1e-6)
+    assert torch.allclose(
+        gradient[3:], torch.as_tensor(T[0, :3], dtype=torch.float32).expand(4, 3), atol=1e-6
+    )
     assert not gradient[:3].any()
 
 
@@ -142,19 +165,31 @@ def test_clouds_come_back_as_they_went_in_far_from_the_origin() -> None:
     assert np.allclose(background.opacities, far.opacities, atol=1e-6)
 
 
-# --- density --------------------------------------------------------------------------------------------------------
+# --- density
 
 
 def density_case(cap: int = 100) -> tuple[SplatModel, RowAdam, ScreenGradients, SplatRecipe]:
-    """Three background Gaussians (small and pulled, large and pulled, calm), one of a car (pulled)."""
+    """Three background Gaussians (small and pulled, large and pulled, calm), one of a car
+    (pulled).
+    """
     cloud = GaussianCloud(
-        np.array([[0, 0, 0], [1.0, 0, 0], [2, 0, 0]]), np.tile([1.0, 0, 0, 0], (3, 1)), np.array([[0.1] * 3, [2.0] * 3, [0.2] * 3]),
-        np.full(3, 0.5), np.zeros((3, 1, 3)),
-    )  # fmt: skip
+        np.array([[0, 0, 0], [1.0, 0, 0], [2, 0, 0]]),
+        np.tile([1.0, 0, 0, 0], (3, 1)),
+        np.array([[0.1] * 3, [2.0] * 3, [0.2] * 3]),
+        np.full(3, 0.5),
+        np.zeros((3, 1, 3)),
+    )
     model = model_of(cloud, {"car": cloud.take([0])})
     gradients = ScreenGradients(4)
-    gradients.add(torch.arange(4), torch.tensor([1e-3, 2e-3, 0.0, 5e-3]) / 50, torch.tensor([3, 3, 3, 3]), 100)
-    return model, RowAdam(model.params), gradients, SplatRecipe(cap=cap, densify_gradient=2e-4, dense_share=0.01, prune_share=1.0)
+    gradients.add(
+        torch.arange(4), torch.tensor([1e-3, 2e-3, 0.0, 5e-3]) / 50, torch.tensor([3, 3, 3, 3]), 100
+    )
+    return (
+        model,
+        RowAdam(model.params),
+        gradients,
+        SplatRecipe(cap=cap, densify_gradient=2e-4, dense_share=0.01, prune_share=1.0),
+    )
 
 
 def test_small_ones_are_cloned_large_ones_split_calm_ones_kept() -> None:
@@ -166,7 +201,9 @@ def test_small_ones_are_cloned_large_ones_split_calm_ones_kept() -> None:
     at = sorted(round(float(x), 3) for x in model.params["means"].detach()[:5, 0])
     assert at.count(0.0) == 2, "a clone starts where its original is"
     assert at.count(1.0) == 0, "two drawn from the split one"
-    assert all(len(t) == 7 for t in (*adam.first.values(), *adam.second.values(), *model.params.values()))
+    assert all(
+        len(t) == 7 for t in (*adam.first.values(), *adam.second.values(), *model.params.values())
+    )
 
 
 def test_where_the_cap_leaves_room_for_one_the_strongest_pull_wins() -> None:
@@ -179,7 +216,14 @@ def test_faint_and_oversized_ones_are_removed() -> None:
     model, adam, gradients, recipe = density_case()
     with torch.no_grad():
         model.params["logit_opacities"][2] = -6.0
-    densify(model, adam, gradients, replace(recipe, densify_gradient=1.0, prune_share=0.03), 50.0, stream("t", 0, "split"))
+    densify(
+        model,
+        adam,
+        gradients,
+        replace(recipe, densify_gradient=1.0, prune_share=0.03),
+        50.0,
+        stream("t", 0, "split"),
+    )
     assert [round(float(x), 3) for x in model.params["means"].detach()[:, 0]] == [0.0, 0.0]
 
 
@@ -198,14 +242,15 @@ def test_a_gaussian_that_no_view_showed_has_no_pull() -> None:
     assert gradients.mean().tolist() == pytest.approx([0.6, 0.0])
 
 
-# --- start and sky --------------------------------------------------------------------------------------------------
+# --- start and sky
 
 
 def test_start_points_lie_on_the_surfaces_and_actors_own_theirs(posed: Posed) -> None:
     start = start_from_depth(posed.views, {"car": BOX}, 400, "s", 0, 50)
     assert len(start.actors["car"]) == 50
     assert np.abs(start.actors["car"].means).max() < 2.2
-    # What is left is the wall and the floor, up to the range error and the sizes of their Gaussians.
+    # What is left is the wall and the floor, up to the range error and the sizes of their
+    # Gaussians.
     local = start.background.means - FAR
     assert np.quantile(np.minimum(np.abs(local[:, 0] - 12), np.abs(local[:, 2])), 0.9) < 1.0
     again = start_from_depth(posed.views, {"car": BOX}, 400, "s", 0, 50)
@@ -214,7 +259,13 @@ def test_start_points_lie_on_the_surfaces_and_actors_own_theirs(posed: Posed) ->
 
 def test_an_actor_that_is_not_in_view_gets_no_model(posed: Posed) -> None:
     views = [
-        replace(v, actors={"car": actor_pose(0) @ np.diag([1.0, 1, 1, 1]) + np.array([[0, 0, 0, 500.0]] * 3 + [[0] * 4])})
+        replace(
+            v,
+            actors={
+                "car": actor_pose(0) @ np.diag([1.0, 1, 1, 1])
+                + np.array([[0, 0, 0, 500.0]] * 3 + [[0] * 4])
+            },
+        )
         for v in posed.views
     ]
     assert not start_from_depth(views, {"car": BOX}, 100, "s", 0).actors
@@ -263,19 +314,28 @@ def test_a_view_whose_image_has_another_size_is_refused(posed: Posed) -> None:
         replace(posed.views[0], rgb=np.zeros((HEIGHT + 1, WIDTH, 3), np.uint8))
 
 
-# --- recipe ---------------------------------------------------------------------------------------------------------
+# --- recipe
 
 
 def test_the_schedule_stretches_with_the_steps() -> None:
-    short, long = SplatRecipe(steps=100, reset_every=0.3, densify_every=10), SplatRecipe(steps=1000, reset_every=0.3, densify_every=100)
+    short, long = (
+        SplatRecipe(steps=100, reset_every=0.3, densify_every=10),
+        SplatRecipe(steps=1000, reset_every=0.3, densify_every=100),
+    )
     assert [i for i in range(101) if short.densifies_after(i)] == [20, 30, 40, 50, 60]
-    assert [10 * i for i in range(101) if short.resets_after(i)] == [i for i in range(1001) if long.resets_after(i)] == [300, 600]
+    assert (
+        [10 * i for i in range(101) if short.resets_after(i)]
+        == [i for i in range(1001) if long.resets_after(i)]
+        == [300, 600]
+    )
     assert short.lr_means_at(0) == pytest.approx(short.lr_means)
     assert short.lr_means_at(100) == pytest.approx(short.lr_means_end)
     assert [short.sh_size_at(i) for i in (0, 24, 25, 50, 99)] == [1, 1, 4, 9, 9]
 
 
-@pytest.mark.parametrize("change", [{"steps": 0}, {"sh_degree": 4}, {"hold_out_every": 1}, {"ssim_weight": 1.5}])
+@pytest.mark.parametrize(
+    "change", [{"steps": 0}, {"sh_degree": 4}, {"hold_out_every": 1}, {"ssim_weight": 1.5}]
+)
 def test_a_recipe_outside_its_range_is_refused(change: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(change))):
         replace(SplatRecipe(), **change)

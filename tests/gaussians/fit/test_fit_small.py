@@ -1,4 +1,6 @@
-"""The training loop on a scene of 500 Gaussians: does it learn, continue, follow the actor, and stop on a bad number."""
+"""The training loop on a scene of 500 Gaussians: does it learn, continue, follow the actor, and
+stop on a bad number.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +12,21 @@ import torch
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.gaussians import GaussianCloud
-from alpasim_plugin.gaussians.fit import PosedView, Reconstruction, SplatRecipe, Start, held_out, loop
+from alpasim_plugin.gaussians.fit import (
+    PosedView,
+    Reconstruction,
+    SplatRecipe,
+    Start,
+    held_out,
+    loop,
+)
 from alpasim_plugin.gaussians.fit.loop import STATE_FILE, fit
 from alpasim_plugin.gaussians.fit.quality import compare, summary
 from tests.gaussians.fit.conftest import BOX, Posed, actor_pose, at, camera_at
 
-QUICK = SplatRecipe(steps=40, points=300, cap=420, densify_every=10, reset_every=0.25, save_every=15, sh_degree=1)
+QUICK = SplatRecipe(
+    steps=40, points=300, cap=420, densify_every=10, reset_every=0.25, save_every=15, sh_degree=1
+)
 
 
 def mean_psnr(model: Reconstruction, views: list[PosedView]) -> float:
@@ -24,7 +35,11 @@ def mean_psnr(model: Reconstruction, views: list[PosedView]) -> float:
 
 def bits(model: Reconstruction) -> list[bytes]:
     clouds = [model.background, *(model.actors[name] for name in sorted(model.actors))]
-    return [np.ascontiguousarray(getattr(c, name)).tobytes() for c in clouds for name in ("means", "quats", "scales", "opacities", "sh")]
+    return [
+        np.ascontiguousarray(getattr(c, name)).tobytes()
+        for c in clouds
+        for name in ("means", "quats", "scales", "opacities", "sh")
+    ]
 
 
 def test_views_held_out_are_shown_better_after_the_fit_than_by_the_start(posed: Posed) -> None:
@@ -32,7 +47,9 @@ def test_views_held_out_are_shown_better_after_the_fit_than_by_the_start(posed: 
     recipe = replace(QUICK, steps=80, reset_every=0.0)
     before = mean_psnr(fit(train, posed.start, replace(recipe, steps=1)), kept)
     numbers: list[dict[str, float]] = []
-    after = fit(train, posed.start, recipe, report=lambda step, row: numbers.append({"step": step, **row}))
+    after = fit(
+        train, posed.start, recipe, report=lambda step, row: numbers.append({"step": step, **row})
+    )
     assert mean_psnr(after, kept) > before + 4.0
     assert [row["step"] for row in numbers] == list(range(1, 81))
     assert numbers[-1]["loss"] < 0.5 * numbers[0]["loss"]
@@ -52,19 +69,30 @@ def test_a_fit_cut_off_and_continued_ends_with_the_same_bits(posed: Posed, tmp_p
     with pytest.raises(CutOffError):
         fit(posed.views, posed.start, QUICK, scene_id="s", folder=tmp_path / "cut", report=cut)
     steps: list[int] = []
-    again = fit(posed.views, posed.start, QUICK, scene_id="s", folder=tmp_path / "cut", report=lambda step, _: steps.append(step))
+    again = fit(
+        posed.views,
+        posed.start,
+        QUICK,
+        scene_id="s",
+        folder=tmp_path / "cut",
+        report=lambda step, _: steps.append(step),
+    )
     assert steps[0] == 16, "continues after the checkpoint"
     assert bits(again) == bits(whole)
 
 
 def test_threads_do_not_change_the_result(posed: Posed) -> None:
     recipe = replace(QUICK, steps=12)
-    assert bits(fit(posed.views, posed.start, recipe, threads=1)) == bits(fit(posed.views, posed.start, recipe, threads=2))
+    assert bits(fit(posed.views, posed.start, recipe, threads=1)) == bits(
+        fit(posed.views, posed.start, recipe, threads=2)
+    )
 
 
 def test_another_seed_gives_another_model(posed: Posed) -> None:
     recipe = replace(QUICK, steps=3)
-    assert bits(fit(posed.views, posed.start, recipe)) != bits(fit(posed.views, posed.start, replace(recipe, seed=1)))
+    assert bits(fit(posed.views, posed.start, recipe)) != bits(
+        fit(posed.views, posed.start, replace(recipe, seed=1))
+    )
 
 
 def test_a_folder_begun_with_another_recipe_is_refused(posed: Posed, tmp_path) -> None:
@@ -81,13 +109,18 @@ def test_the_actor_is_learned_in_its_own_frame(posed: Posed) -> None:
     car = model.actors["car"]
     solid = car.opacities > 0.3
     assert solid.sum() > 10
-    inside = np.all(np.abs(car.means[solid]) < np.array([BOX.length_m, BOX.width_m, BOX.height_m]) / 2 + 0.5, axis=1)
+    inside = np.all(
+        np.abs(car.means[solid]) < np.array([BOX.length_m, BOX.width_m, BOX.height_m]) / 2 + 0.5,
+        axis=1,
+    )
     assert inside.mean() > 0.9, "in the frame of its box, not in the world"
     # Put where no view saw it, it is drawn there and nowhere else.
     camera, graph = camera_at(0.0), model.graph()
     T = actor_pose(0)
     T[:3, 3] = at(8.0, 2.0, 0.8)
-    moved = np.abs(graph.render(camera, {"car": T}, 1).rgb - graph.render(camera, {}, 1).rgb).max(axis=2)
+    moved = np.abs(graph.render(camera, {"car": T}, 1).rgb - graph.render(camera, {}, 1).rgb).max(
+        axis=2
+    )
     rows, columns = np.nonzero(moved > 0.1)
     assert len(rows) > 20
     assert columns.max() < 0.6 * camera.width, "to the left, as it was put"
@@ -105,7 +138,9 @@ def test_a_mask_keeps_what_it_hides_out_of_the_model(posed: Posed) -> None:
     assert magenta.mean() < 0.05
 
 
-def test_a_loss_that_is_not_finite_stops_the_fit_with_the_state_before_it(posed: Posed, tmp_path, monkeypatch) -> None:
+def test_a_loss_that_is_not_finite_stops_the_fit_with_the_state_before_it(
+    posed: Posed, tmp_path, monkeypatch
+) -> None:
     real, calls = loop.rasterize_gradient, []
 
     def breaks(*args, **kwargs):
@@ -137,4 +172,6 @@ def test_a_gradient_that_is_not_finite_stops_it_too(posed: Posed) -> None:
 @pytest.mark.parametrize("missing", ["views", "start"])
 def test_nothing_to_learn_from_is_one_clear_error(posed: Posed, missing: str) -> None:
     with pytest.raises(InputError):
-        fit([], posed.start, QUICK) if missing == "views" else fit(posed.views, Start(GaussianCloud.empty(), {}), QUICK)
+        fit([], posed.start, QUICK) if missing == "views" else fit(
+            posed.views, Start(GaussianCloud.empty(), {}), QUICK
+        )

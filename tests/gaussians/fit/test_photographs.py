@@ -1,4 +1,6 @@
-"""Photographs with poses: what is missing is said, lenses are straightened, points are placed; and the facts of a real set."""
+"""Photographs with poses: what is missing is said, lenses are straightened, points are placed; and
+the facts of a real set.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,18 @@ from alpasim_plugin.gaussians.fit.photographs import read_photographs, read_view
 from alpasim_plugin.gaussians.fit.start import Match, triangulated
 from alpasim_plugin.gaussians.fit.views import PosedView
 
-LENS = {"fl_x": 300.0, "fl_y": 302.0, "cx": 158.0, "cy": 121.0, "w": 320, "h": 240, "k1": -0.12, "k2": 0.03, "p1": 0.002, "p2": -0.001}
+LENS = {
+    "fl_x": 300.0,
+    "fl_y": 302.0,
+    "cx": 158.0,
+    "cy": 121.0,
+    "w": 320,
+    "h": 240,
+    "k1": -0.12,
+    "k2": 0.03,
+    "p1": 0.002,
+    "p2": -0.001,
+}
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -26,16 +39,29 @@ def pose(x: float) -> np.ndarray:
     return T @ OPENGL  # the file's axes are OpenGL's: this camera looks along the world's z, y down
 
 
-def write(folder: Path, dots: np.ndarray, places: tuple[float, ...] = (-0.5, 0.5), lens: dict[str, float] = LENS) -> Path:
-    """Photograph white dots ``(N, 3)`` from places along x; one more photograph is listed and missing."""
+def write(
+    folder: Path,
+    dots: np.ndarray,
+    places: tuple[float, ...] = (-0.5, 0.5),
+    lens: dict[str, float] = LENS,
+) -> Path:
+    """Photograph white dots ``(N, 3)`` from places along x; one more photograph is listed and
+    missing.
+    """
     (folder / "images").mkdir(parents=True)
-    K = np.array([[lens["fl_x"], 0, lens["cx"] - 0.5], [0, lens["fl_y"], lens["cy"] - 0.5], [0, 0, 1]])
+    K = np.array(
+        [[lens["fl_x"], 0, lens["cx"] - 0.5], [0, lens["fl_y"], lens["cy"] - 0.5], [0, 0, 1]]
+    )
     bend = np.array([lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2")])
     frames = []
     for i, x in enumerate(places):
         image = np.zeros((int(lens["h"]), int(lens["w"]), 3), np.uint8)
-        for u, v in cv2.projectPoints(dots - [x, 0, 0], np.zeros(3), np.zeros(3), K, bend)[0].reshape(-1, 2):
-            cv2.circle(image, (round(u * 16), round(v * 16)), 3 * 16, (255, 255, 255), -1, cv2.LINE_AA, 4)
+        for u, v in cv2.projectPoints(dots - [x, 0, 0], np.zeros(3), np.zeros(3), K, bend)[
+            0
+        ].reshape(-1, 2):
+            cv2.circle(
+                image, (round(u * 16), round(v * 16)), 3 * 16, (255, 255, 255), -1, cv2.LINE_AA, 4
+            )
         cv2.imwrite(str(folder / f"images/{i}.png"), image)
         frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose(x).tolist()})
     frames.append({"file_path": "images/lost.png", "transform_matrix": pose(9.0).tolist()})
@@ -54,18 +80,31 @@ def test_a_bent_lens_is_straightened_and_a_missing_photograph_is_named(tmp_path:
         scale = local[:, 2].mean() / 4.0
         assert scale == pytest.approx(1.0)  # no place lies along z
         true = local * [1, 1, 1]
-        true[:, :2] = dots[:, :2] - [0.5 if view.name == "1" else -0.5, 0.0]  # the unit is arbitrary: cameras are moved, dots are not
+        true[:, :2] = dots[:, :2] - [
+            0.5 if view.name == "1" else -0.5,
+            0.0,
+        ]  # the unit is arbitrary: cameras are moved, dots are not
         pixel = true @ camera.K.T
         for u, v in pixel[:, :2] / pixel[:, 2:]:
             if 4 < u < 252 and 4 < v < 188:
-                patch = view.rgb[round(v) - 4 : round(v) + 4, round(u) - 4 : round(u) + 4, 0].astype(float)
+                patch = view.rgb[
+                    round(v) - 4 : round(v) + 4, round(u) - 4 : round(u) + 4, 0
+                ].astype(float)
                 y, x = np.indices(patch.shape) + 0.5
-                centre = np.array([(x * patch).sum(), (y * patch).sum()]) / patch.sum() + [round(u) - 4, round(v) - 4]
+                centre = np.array([(x * patch).sum(), (y * patch).sum()]) / patch.sum() + [
+                    round(u) - 4,
+                    round(v) - 4,
+                ]
                 assert np.abs(centre - [u, v]).max() < 0.4
 
 
-def test_views_for_a_scenario_and_photographs_of_a_place_are_straightened_alike(tmp_path: Path) -> None:
-    path = write(tmp_path, np.array([[-1.6, -1.2, 4.0], [1.5, 1.1, 4.0], [0.2, -0.9, 4.0]])) / "transforms.json"
+def test_views_for_a_scenario_and_photographs_of_a_place_are_straightened_alike(
+    tmp_path: Path,
+) -> None:
+    path = (
+        write(tmp_path, np.array([[-1.6, -1.2, 4.0], [1.5, 1.1, 4.0], [0.2, -0.9, 4.0]]))
+        / "transforms.json"
+    )
     document = json.loads(path.read_text())
     frames = [{**frame, "sky_path": frame["file_path"]} for frame in document["frames"][:2]]
     path.write_text(json.dumps({**document, "axes": "opengl", "frames": frames}))
@@ -75,17 +114,24 @@ def test_views_for_a_scenario_and_photographs_of_a_place_are_straightened_alike(
         assert np.array_equal(view.rgb, photograph.rgb)
         assert np.array_equal(view.camera.K, photograph.camera.K)
         assert view.camera.cx != LENS["cx"]
-        assert np.array_equal(view.sky, view.rgb[..., 0] > 127)  # what lies over the picture is straightened with it
+        assert np.array_equal(
+            view.sky, view.rgb[..., 0] > 127
+        )  # what lies over the picture is straightened with it
 
 
 @pytest.mark.parametrize(
     ("change", "found"),
     [
-        ({"fl_x": None}, "focal length"), ({"k4": 0.1}, "k4"), ({"camera_model": "FISHEYE"}, "FISHEYE"), ({"w": 321}, "320x240"),
+        ({"fl_x": None}, "focal length"),
+        ({"k4": 0.1}, "k4"),
+        ({"camera_model": "FISHEYE"}, "FISHEYE"),
+        ({"w": 321}, "320x240"),
         ({"frames": []}, "0 of 0"),
     ],
-)  # fmt: skip
-def test_what_cannot_be_a_set_of_photographs_is_refused(tmp_path: Path, change: dict[str, object], found: str) -> None:
+)
+def test_what_cannot_be_a_set_of_photographs_is_refused(
+    tmp_path: Path, change: dict[str, object], found: str
+) -> None:
     path = write(tmp_path, np.array([[0.0, 0.0, 4.0]])) / "transforms.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
     with pytest.raises(InputError) as caught:
@@ -96,7 +142,12 @@ def test_what_cannot_be_a_set_of_photographs_is_refused(tmp_path: Path, change: 
 def test_points_that_two_views_place_are_kept_and_wrong_matches_are_not() -> None:
     K = np.array([[200.0, 0, 64], [0, 200, 48], [0, 0, 1]])
     cameras = [
-        PinholeCamera.from_pose(128, 96, K, np.block([[np.eye(3), np.array([[x], [0], [0]])], [np.zeros((1, 3)), np.ones((1, 1))]]))
+        PinholeCamera.from_pose(
+            128,
+            96,
+            K,
+            np.block([[np.eye(3), np.array([[x], [0], [0]])], [np.zeros((1, 3)), np.ones((1, 1))]]),
+        )
         for x in (-0.3, 0.3)
     ]
     views = [PosedView(camera, np.full((96, 128, 3), 100, np.uint8)) for camera in cameras]
@@ -116,11 +167,20 @@ def test_the_facts_of_a_real_set(data_set: Callable[[str], Path]) -> None:
     folder = data_set("fox")
     found = read_photographs(folder, 64)
     assert (len(found.views), found.listed, len(found.missing)) == (50, 67, 17)
-    assert found.missing[:4] == ("images/0005.jpg", "images/0016.jpg", "images/0017.jpg", "images/0024.jpg")
+    assert found.missing[:4] == (
+        "images/0005.jpg",
+        "images/0016.jpg",
+        "images/0017.jpg",
+        "images/0024.jpg",
+    )
     assert {view.rgb.shape for view in found.views} == {(112, 64, 3)}
     frames = json.loads((folder / "transforms.json").read_text())["frames"]
     everywhere = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
-    np.testing.assert_allclose([everywhere.min(axis=0), everywhere.max(axis=0)], [(1.47, -5.55, -2.66), (5.94, 1.54, 2.85)], atol=0.006)
+    np.testing.assert_allclose(
+        [everywhere.min(axis=0), everywhere.max(axis=0)],
+        [(1.47, -5.55, -2.66), (5.94, 1.54, 2.85)],
+        atol=0.006,
+    )
     here = everywhere[[frame["file_path"] not in found.missing for frame in frames]]
     centres = np.array([view.camera.centre_world for view in found.views])
     spread = [np.linalg.norm(x - x.mean(axis=0), axis=1) for x in (here, centres)]

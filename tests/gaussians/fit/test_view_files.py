@@ -26,7 +26,10 @@ def change(folder: Path, **keys: object) -> None:
 
 def write_points(path: Path, names: str, rows: np.ndarray) -> None:
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n"
-    header += "".join(f"property {'uchar' if n in ('red', 'green', 'blue') else 'float'} {n}\n" for n in names.split())
+    header += "".join(
+        f"property {'uchar' if n in ('red', 'green', 'blue') else 'float'} {n}\n"
+        for n in names.split()
+    )
     dtype = [(n, "u1" if n in ("red", "green", "blue") else "<f4") for n in names.split()]
     data = np.array([tuple(row) for row in rows], dtype=dtype)
     path.write_bytes(header.encode() + b"end_header\n" + data.tobytes())
@@ -41,7 +44,12 @@ def test_views_come_back_as_they_were_written(posed: Posed, tmp_path: Path) -> N
         assert np.array_equal(found.rgb, wanted.rgb)
         assert np.array_equal(found.sky, wanted.sky)
         assert np.allclose(found.camera.K, wanted.camera.K)
-        assert np.abs(inverse(found.camera.T_camera_world) - inverse(wanted.camera.T_camera_world)).max() < 1e-9
+        assert (
+            np.abs(
+                inverse(found.camera.T_camera_world) - inverse(wanted.camera.T_camera_world)
+            ).max()
+            < 1e-9
+        )
     assert views[0].mask is None
     assert np.array_equal(views[1].mask, masked.mask)
 
@@ -49,7 +57,11 @@ def test_views_come_back_as_they_were_written(posed: Posed, tmp_path: Path) -> N
 def test_axes_of_opengl_are_turned_to_ours(posed: Posed, tmp_path: Path) -> None:
     write_views(tmp_path, posed.views[:1])
     pose = inverse(posed.views[0].camera.T_camera_world)
-    change(tmp_path, axes="opengl", frame={"transform_matrix": (pose @ np.diag([1.0, -1, -1, 1])).tolist()})
+    change(
+        tmp_path,
+        axes="opengl",
+        frame={"transform_matrix": (pose @ np.diag([1.0, -1, -1, 1])).tolist()},
+    )
     views, _ = read_views(tmp_path)
     assert np.abs(inverse(views[0].camera.T_camera_world) - pose).max() < 1e-9
 
@@ -74,7 +86,9 @@ def test_actors_are_placed_at_a_frames_time(posed: Posed, tmp_path: Path) -> Non
 def test_points_to_start_from_keep_place_and_colour(posed: Posed, tmp_path: Path) -> None:
     write_views(tmp_path, posed.views[:1])
     write_points(
-        tmp_path / "points.ply", "x y z red green blue", np.array([[1, 2, 3, 255, 0, 128], [2, 2, 3, 0, 0, 0], [np.nan, 0, 0, 0, 0, 0]])
+        tmp_path / "points.ply",
+        "x y z red green blue",
+        np.array([[1, 2, 3, 255, 0, 128], [2, 2, 3, 0, 0, 0], [np.nan, 0, 0, 0, 0, 0]]),
     )
     change(tmp_path, ply_file_path="points.ply")
     _, start = read_views(tmp_path)
@@ -99,7 +113,9 @@ def test_points_to_start_from_keep_place_and_colour(posed: Posed, tmp_path: Path
         ({"ply_file_path": "gone.ply"}, "gone.ply"),
     ],
 )
-def test_what_cannot_be_is_one_clear_error(posed: Posed, tmp_path: Path, keys: dict[str, object], says: str) -> None:
+def test_what_cannot_be_is_one_clear_error(
+    posed: Posed, tmp_path: Path, keys: dict[str, object], says: str
+) -> None:
     write_views(tmp_path, posed.views[:1])
     change(tmp_path, **keys)
     with pytest.raises(InputError, match=says):

@@ -1,4 +1,6 @@
-"""What photographs say before a fit, on a street whose truth is known: tracks, poses, depth, sky, exposure."""
+"""What photographs say before a fit, on a street whose truth is known: tracks, poses, depth, sky,
+exposure.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ def placed(views: list[PosedView], tracks: Tracks) -> Placed:
     return place(tracks, [view.camera for view in views])
 
 
-def test_points_followed_through_the_street_lie_on_its_surfaces(tracks: Tracks, placed: Placed) -> None:
+def test_points_followed_through_the_street_lie_on_its_surfaces(
+    tracks: Tracks, placed: Placed
+) -> None:
     good = np.ones(tracks.count, bool)
     np.logical_and.at(good, tracks.point, placed.error_px < 0.5)
     good &= placed.angle_rad > 0.05
@@ -64,17 +68,25 @@ def test_poses_that_are_off_come_back_to_the_truth(views: list[PosedView]) -> No
     assert found.after_px < 0.3
 
     def errors(cameras: list) -> np.ndarray:
-        """Return turns between neighbours against the truth, degrees: what all have in common does not count."""
+        """Return turns between neighbours against the truth, degrees: what all have in common does
+        not count.
+        """
         out = []
         for a, b, c, d in zip(cameras, cameras[1:], views, views[1:], strict=False):
             mine, true = (
                 b.T_camera_world @ np.linalg.inv(a.T_camera_world),
                 d.camera.T_camera_world @ np.linalg.inv(c.camera.T_camera_world),
             )
-            out.append(np.degrees(np.arccos(np.clip((np.trace(mine[:3, :3] @ true[:3, :3].T) - 1) / 2, -1, 1))))
+            out.append(
+                np.degrees(
+                    np.arccos(np.clip((np.trace(mine[:3, :3] @ true[:3, :3].T) - 1) / 2, -1, 1))
+                )
+            )
         return np.array(out)
 
-    assert np.median(errors(list(found.cameras))) < 0.25 * np.median(errors([view.camera for view in wrong]))
+    assert np.median(errors(list(found.cameras))) < 0.25 * np.median(
+        errors([view.camera for view in wrong])
+    )
 
 
 def test_poses_without_tracks_stay_as_they_are(views: list[PosedView]) -> None:
@@ -85,7 +97,9 @@ def test_poses_without_tracks_stay_as_they_are(views: list[PosedView]) -> None:
     assert np.isnan(found.after_px)
 
 
-def test_depth_by_flow_is_the_street_s(views: list[PosedView], tracks: Tracks, placed: Placed) -> None:
+def test_depth_by_flow_is_the_street_s(
+    views: list[PosedView], tracks: Tracks, placed: Placed
+) -> None:
     maps = depth_maps(views, tracks, placed)
     middle = 4
     depth, truth = maps[middle].depth, true_depth(views[middle])
@@ -95,7 +109,9 @@ def test_depth_by_flow_is_the_street_s(views: list[PosedView], tracks: Tracks, p
     assert np.median(error) < 0.02
     assert np.mean(error > 0.15) < 0.08  # the box hides some of the wall
     assert (maps[middle].spread[depth > 0] > 0).all()
-    assert (depth > 0)[~np.isfinite(truth)].mean() < 0.05, "the sky has no depth, but for its border"
+    assert (depth > 0)[~np.isfinite(truth)].mean() < 0.05, (
+        "the sky has no depth, but for its border"
+    )
 
 
 def test_nothing_is_measured_where_tracks_place_too_few_points(views: list[PosedView]) -> None:
@@ -113,7 +129,10 @@ def test_sky_is_found_where_the_street_has_none_of_its_own(views: list[PosedView
 
 
 def test_a_smooth_wall_with_depth_is_no_sky(views: list[PosedView]) -> None:
-    walled = [replace(view, depth=np.where(np.isfinite(true_depth(view)), 0, 8).astype(np.float32)) for view in views]
+    walled = [
+        replace(view, depth=np.where(np.isfinite(true_depth(view)), 0, 8).astype(np.float32))
+        for view in views
+    ]
     thinned = []
     for view in walled:
         depth = np.zeros_like(view.depth)
@@ -122,17 +141,24 @@ def test_a_smooth_wall_with_depth_is_no_sky(views: list[PosedView]) -> None:
     assert not any(mask.any() for mask in sky_masks(thinned))
 
 
-def test_exposure_and_white_balance_are_found_to_a_percent(views: list[PosedView], tracks: Tracks) -> None:
+def test_exposure_and_white_balance_are_found_to_a_percent(
+    views: list[PosedView], tracks: Tracks
+) -> None:
     rng = np.random.default_rng(5)
     true = rng.uniform(0.85, 1.15, (len(views), 3))
     true /= np.exp(np.log(true).mean(axis=0))
-    found = balances([brightened(view, tuple(gain)) for view, gain in zip(views, true, strict=True)], tracks)
+    found = balances(
+        [brightened(view, tuple(gain)) for view, gain in zip(views, true, strict=True)], tracks
+    )
     assert np.abs(found / true - 1).max() < 0.03
     assert np.abs(np.log(found).mean(axis=0)).max() < 1e-9
 
 
 def test_a_gain_between_photographs_is_that_of_the_nearest_two() -> None:
-    centres, gains = np.array([[0.0, 0, 0], [1, 0, 0], [9, 0, 0]]), np.array([[1.0] * 3, [1.2] * 3, [5.0] * 3])
+    centres, gains = (
+        np.array([[0.0, 0, 0], [1, 0, 0], [9, 0, 0]]),
+        np.array([[1.0] * 3, [1.2] * 3, [5.0] * 3]),
+    )
     assert np.allclose(gain_between(centres, gains, np.array([0.5, 0, 0])), 1.1, atol=1e-3)
     assert np.allclose(gain_between(centres, gains, np.zeros(3)), 1.0, atol=1e-3)
     assert np.allclose(gain_between(centres[:0], gains[:0], np.zeros(3)), 1.0)
@@ -142,7 +168,10 @@ def test_a_halved_view_sees_the_same_with_a_quarter_of_the_pixels(views: list[Po
     depth = np.arange(views[0].rgb[..., 0].size, dtype=np.float32).reshape(views[0].rgb.shape[:2])
     small = halved(replace(views[0], depth=depth, sky=depth > 100, gain=(1.1, 1.0, 0.9)))
     point = views[0].camera.centre_world + np.array([8.0, 1.0, 0.5])
-    whole, half = (c.K @ (c.T_camera_world[:3, :3] @ point + c.T_camera_world[:3, 3]) for c in (views[0].camera, small.camera))
+    whole, half = (
+        c.K @ (c.T_camera_world[:3, :3] @ point + c.T_camera_world[:3, 3])
+        for c in (views[0].camera, small.camera)
+    )
     assert np.allclose(whole[:2] / whole[2], 2 * half[:2] / half[2])
     assert small.depth is not None
     assert small.depth[1, 1] == depth[2, 2]

@@ -12,7 +12,9 @@ from alpasim_plugin.block_fixers.sizes import AREA, DiTSizes
 
 @dataclass(frozen=True)
 class ForwardWork:
-    """Floating-point operations and least memory traffic of one forward of the transformer over one block."""
+    """Floating-point operations and least memory traffic of one forward of the transformer over one
+    block.
+    """
 
     linear: float
     self_attention: float
@@ -45,24 +47,35 @@ def forward_work(
         tokens: Of one latent: ``height / 16 * width / 16`` in pixels.
         latents: Of the block.
         window: Latents in sight, own block included.
-        text_tokens: Of the prompt; its keys and values are made once and not counted. A single token needs no attention.
+        text_tokens: Of the prompt; its keys and values are made once and not counted. A single
+            token needs no attention.
         folded: Whether the modulation is folded away.
         width_bytes: Bytes of a weight, and of a cached number.
         batch: Views side by side.
-        mapped: Whether a semantic map is embedded (by its own product; a map of zeros is not skipped).
+        mapped: Whether a semantic map is embedded (by its own product; a map of zeros is not
+            skipped).
     """
-    d, f, c, n = sizes.width, sizes.mlp_width, sizes.latent_channels, sizes.blocks
+    d = sizes.width
+    f = sizes.mlp_width
+    c = sizes.latent_channels
+    n = sizes.blocks
     q = latents * tokens * batch
     seen = max(window, latents) * tokens
     alone = text_tokens == 1  # attention to a single token returns its value, projected once
     cross = 2 * batch * d * d if alone else 4 * q * d * d
-    linear = n * (8 * q * d * d + 4 * q * d * f + cross) + 2 * q * d * AREA * (2 * c + (sizes.map_channels if mapped else 0))
+    linear = n * (8 * q * d * d + 4 * q * d * f + cross) + 2 * q * d * AREA * (
+        2 * c + (sizes.map_channels if mapped else 0)
+    )
     cross_weights = d * d if alone else 2 * d * d
     per_block = 4 * d * d + 2 * d * f + cross_weights
     modulation = 0.0
     if not folded:
         steps, rank = 1, sizes.adaln_rank  # one time step for the whole block
-        modulation = steps * (n * 3 * 2 * (d * rank + 3 * d * rank) + 2 * (d * d + 3 * d * d) + 2 * (d * rank + 2 * d * rank))
+        modulation = steps * (
+            n * 3 * 2 * (d * rank + 3 * d * rank)
+            + 2 * (d * d + 3 * d * d)
+            + 2 * (d * rank + 2 * d * rank)
+        )
     return ForwardWork(
         linear=float(linear),
         self_attention=float(4 * n * q * seen * d),
@@ -73,6 +86,8 @@ def forward_work(
     )
 
 
-def cache_bytes(sizes: DiTSizes, tokens: int, window: int, batch: int = 1, width_bytes: int = 2) -> int:
+def cache_bytes(
+    sizes: DiTSizes, tokens: int, window: int, batch: int = 1, width_bytes: int = 2
+) -> int:
     """Return the bytes of a rolling cache, allocated once."""
     return 2 * sizes.blocks * batch * window * tokens * sizes.width * width_bytes

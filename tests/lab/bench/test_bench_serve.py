@@ -13,7 +13,9 @@ from alpasim_plugin.lab.cli.bench_serve import parse_counts
 def test_answers_under_load_equal_those_alone(overrides: list[str]) -> None:
     rows = bench_serve(Settings(overrides=overrides, threads=1), [1, 3], 6, (48, 32))
     assert [(row.rollouts, row.unequal) for row in rows] == [(1, 0), (3, 0)]
-    assert all(0 < row.p50_ms <= row.p95_ms <= row.p99_ms and row.requests_per_s > 0 for row in rows)
+    assert all(
+        0 < row.p50_ms <= row.p95_ms <= row.p99_ms and row.requests_per_s > 0 for row in rows
+    )
 
 
 @pytest.mark.slow

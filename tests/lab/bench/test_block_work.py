@@ -1,4 +1,6 @@
-"""Work of a block counted without numbers: it is that of the real networks; what does not fit is refused before it is allocated."""
+"""Work of a block counted without numbers: it is that of the real networks; what does not fit is
+refused before it is allocated.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,13 @@ from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.lab.bench.block_speed import measure_blocks, require_memory
 from alpasim_plugin.lab.bench.op_counter import OpCounter
 from alpasim_plugin.lab.bench.random_networks import random_networks
-from alpasim_plugin.lab.bench.roofline import DEVICES, block_work, device_of, networks_bytes, run_block
+from alpasim_plugin.lab.bench.roofline import (
+    DEVICES,
+    block_work,
+    device_of,
+    networks_bytes,
+    run_block,
+)
 from alpasim_plugin.lab.cli.bench import app
 from tests.block_fixers.fixer_cases import SMALL_DIT, small_settings
 from tests.examples import first_of
@@ -27,10 +35,15 @@ LAPTOP = "1:0.1:20:8"
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "overrides",
-    first_of([("history=finalise", "window=4", "holes=noise"), ("precision=bf16", "codec_precision=bf16", "steps=[1000,500]"),
-              ("vae.kind=wan", "vae.base=8", "decoder.kind=taehv", "uses_map=false")]),
+    first_of(
+        [
+            ("history=finalise", "window=4", "holes=noise"),
+            ("precision=bf16", "codec_precision=bf16", "steps=[1000,500]"),
+            ("vae.kind=wan", "vae.base=8", "decoder.kind=taehv", "uses_map=false"),
+        ]
+    ),
     ids=",".join,
-)  # fmt: skip
+)
 def test_work_without_numbers_is_the_work_of_the_real_networks(overrides):
     settings = small_settings(*overrides)
     work = block_work(settings, 32, 48, views=1, text_tokens=3)
@@ -43,7 +56,9 @@ def test_work_without_numbers_is_the_work_of_the_real_networks(overrides):
     assert sum(stage.flops for stage in work.stages.values()) == counter.flops
     assert work.weight_bytes == networks_bytes(networks)
     assert work.cache_bytes == state.history.cache.nbytes
-    assert work.state_bytes == 2 * sum(part.nbytes for codec in (state.encoder, state.decoder) for part in codec)
+    assert work.state_bytes == 2 * sum(
+        part.nbytes for codec in (state.encoder, state.decoder) for part in codec
+    )
     assert set(work.stages) <= set(STAGES)
     assert ("cache write" in work.stages) == (settings.history == "finalise")
 
@@ -78,7 +93,9 @@ def test_measuring_gives_every_stage():
     times = measure_blocks(settings, work, 32, 48, "cpu", blocks=2, text_tokens=1)
     assert len(times.all_in) == 2
     assert set(work.stages) <= set(times.stages)
-    assert all(len(ms) == 2 and min(ms) > 0 for name, ms in times.stages.items() if name in work.stages)
+    assert all(
+        len(ms) == 2 and min(ms) > 0 for name, ms in times.stages.items() if name in work.stages
+    )
     assert (times.calls, times.peak_mb, times.device) == ({}, None, "cpu")
 
 
@@ -86,7 +103,9 @@ def test_absent_gpu_is_an_error_before_anything_is_made(monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     settings = fixer_settings("onefixer-2b")
     work = block_work(small_settings(), 32, 48, text_tokens=1)
-    with pytest.raises(FixerError, match=r"measuring onefixer-2b[\s\S]*sees no CUDA device[\s\S]*--device cpu"):
+    with pytest.raises(
+        FixerError, match=r"measuring onefixer-2b[\s\S]*sees no CUDA device[\s\S]*--device cpu"
+    ):
         measure_blocks(settings, work, 544, 960, "cuda")
 
 
@@ -95,28 +114,49 @@ def test_gpu_that_is_too_small_is_an_error_with_both_numbers(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (500_000_000, 8_000_000_000))
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "Small GPU")
-    with pytest.raises(FixerError, match=r"Small GPU[\s\S]*0\.7 GB needed, 0\.5 GB free of 8\.0 GB[\s\S]*fixer.window"):
+    with pytest.raises(
+        FixerError,
+        match=r"Small GPU[\s\S]*0\.7 GB needed, 0\.5 GB free of 8\.0 GB[\s\S]*fixer.window",
+    ):
         require_memory(small_settings(), work, "cuda")
 
 
 @pytest.mark.slow
 def test_command_prints_the_table_and_the_measurement():
     sets = [part for text in SMALL_DIT for part in ("--set", f"fixer.{text}")]
-    args = ["roofline", "--fixer", "onefixer-dit-tiny", "--size", "48x32", "--on", LAPTOP, "--text-tokens", "1", *sets]
+    args = [
+        "roofline",
+        "--fixer",
+        "onefixer-dit-tiny",
+        "--size",
+        "48x32",
+        "--on",
+        LAPTOP,
+        "--text-tokens",
+        "1",
+        *sets,
+    ]
     plain = CliRunner().invoke(app, args, catch_exceptions=False)
     assert plain.exit_code == 0
     assert "| dit |" in plain.stdout
     assert "measured" not in plain.stdout
-    document = json.loads(CliRunner().invoke(app, [*args, "--json", "--measure", "--device", "cpu", "--blocks", "1"]).stdout)
+    document = json.loads(
+        CliRunner()
+        .invoke(app, [*args, "--json", "--measure", "--device", "cpu", "--blocks", "1"])
+        .stdout
+    )
     assert [row["stage"] for row in document["rows"]][-1] == "all"
     assert len(document["measured"]["all_in"]) == 1
 
 
 @pytest.mark.parametrize(
     ("args", "error", "message"),
-    [(["--size", "960x540"], InputError, "multiples of 16"), (["--fixer", "identity"], SimrunError, "onefixer family"),
-     (["--on", "toaster"], InputError, "known are h200")],
-)  # fmt: skip
+    [
+        (["--size", "960x540"], InputError, "multiples of 16"),
+        (["--fixer", "identity"], SimrunError, "onefixer family"),
+        (["--on", "toaster"], InputError, "known are h200"),
+    ],
+)
 def test_command_refuses(args, error, message):
     with pytest.raises(error, match=message):
         CliRunner().invoke(app, ["roofline", *args], catch_exceptions=False)
@@ -125,7 +165,11 @@ def test_command_refuses(args, error, message):
 @pytest.mark.slow
 @pytest.mark.parametrize(("window", "ms"), [(6, 25.6), (12, 37.2)])
 def test_full_size_transformer_has_the_published_floor(window, ms):
-    work = block_work(fixer_settings("onefixer-2b", [f"window={window}", "vae.base=24", "history=last-forward"]), 544, 960)
+    work = block_work(
+        fixer_settings("onefixer-2b", [f"window={window}", "vae.base=24", "history=last-forward"]),
+        544,
+        960,
+    )
     rows = {row.stage: row for row in work.rows(DEVICES["h200"])}
     assert rows["dit"].compute_ms == pytest.approx(ms, abs=0.1)
     assert rows["all"].eager_ms < 80
@@ -134,7 +178,9 @@ def test_full_size_transformer_has_the_published_floor(window, ms):
 @pytest.mark.gpu
 @pytest.mark.parametrize("window", [6, 12])
 def test_full_size_on_a_gpu_fits_the_estimate(window):
-    settings = fixer_settings("onefixer-2b", [f"window={window}", "vae.base=24", "history=last-forward"])
+    settings = fixer_settings(
+        "onefixer-2b", [f"window={window}", "vae.base=24", "history=last-forward"]
+    )
     work = block_work(settings, 544, 960)
     times = measure_blocks(settings, work, 544, 960, "cuda", blocks=10)
     assert times.peak_mb * 1e6 < work.memory_bytes

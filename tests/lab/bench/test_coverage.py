@@ -32,7 +32,9 @@ REPEATS = 4000  # standard error of a coverage of 95 %: 0.35 points
 @pytest.mark.parametrize("rate", RATES)
 @pytest.mark.parametrize("correlation", CORRELATIONS)
 def test_the_clustered_interval_covers_93_to_97_percent_and_the_papers_does_not(rate, correlation):
-    paper, wilson, t_on_scenes, ours = coverage_of(Design(rate=rate, correlation=correlation), REPEATS)
+    paper, wilson, t_on_scenes, ours = coverage_of(
+        Design(rate=rate, correlation=correlation), REPEATS
+    )
     assert 0.93 <= ours <= 0.97
     if correlation >= 0.3:
         assert paper < 0.91
@@ -46,7 +48,9 @@ def test_the_clustered_interval_covers_93_to_97_percent_and_the_papers_does_not(
 def test_fewer_and_more_scenes_than_the_papers_are_covered_too(n_scenes):
     for rate in (0.5, 0.106):
         for correlation in (0.0, 0.6):
-            assert 0.92 <= coverage_of(Design(n_scenes, 5, rate, correlation), REPEATS // 2)[3] <= 0.98
+            assert (
+                0.92 <= coverage_of(Design(n_scenes, 5, rate, correlation), REPEATS // 2)[3] <= 0.98
+            )
 
 
 @pytest.mark.parametrize("n_scenes", [5, 10])
@@ -61,8 +65,12 @@ def test_the_bootstrap_is_too_short_at_the_papers_size():
 
 def test_differences_of_rates_are_covered():
     for correlation in (0.0, 0.6):
-        assert 0.93 <= paired_coverage(Design(60, 5, RATES[0], correlation), RATES[1], REPEATS) <= 0.97
-    assert paired_coverage(Design(10, 5, RATES[0], 0.6), RATES[1], 1000) >= 0.95  # fewer than six changed scenes: wide, not short
+        assert (
+            0.93 <= paired_coverage(Design(60, 5, RATES[0], correlation), RATES[1], REPEATS) <= 0.97
+        )
+    assert (
+        paired_coverage(Design(10, 5, RATES[0], 0.6), RATES[1], 1000) >= 0.95
+    )  # fewer than six changed scenes: wide, not short
 
 
 def test_shared_random_numbers_multiply_the_power():
@@ -81,7 +89,7 @@ def test_the_model_has_the_rate_and_the_correlation_it_claims():
     assert abs(same - other).mean() < 0.2
 
 
-# --- planning -----------------------------------------------------------------------------------------------------------
+# --- planning
 
 
 def test_the_planned_number_of_scenes_decides_in_four_of_five_runs():
@@ -97,10 +105,14 @@ def test_the_planned_number_of_scenes_decides_in_four_of_five_runs():
 def test_more_scenes_counts_from_what_there_is():
     total = scenes_needed(0.3, 1.0)
     assert more_scenes(0.4, 1.0, 20, 0.1, None) == total - 20
-    assert more_scenes(-0.2, 1.0, 20, 0.1, None) == total - 20  # the same way to the margin, from the other side
+    assert (
+        more_scenes(-0.2, 1.0, 20, 0.1, None) == total - 20
+    )  # the same way to the margin, from the other side
     assert more_scenes(0.4, 1.0, total + 5, 0.1, None) == 1
     assert more_scenes(0.1, 1.0, 20, 0.1, None) is None  # on the margin
-    assert more_scenes(0.0, 0.01, 20, 0.1, 4.0) == 126, "as many as show that no scene went wrong by 4 m"
+    assert more_scenes(0.0, 0.01, 20, 0.1, 4.0) == 126, (
+        "as many as show that no scene went wrong by 4 m"
+    )
 
 
 def test_without_any_event_the_exact_bound_says_how_many_scenes_are_needed():

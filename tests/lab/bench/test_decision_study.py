@@ -1,4 +1,6 @@
-"""The study of sequential decisions on a small grid; the whole is in docs/experiments/sequential.md."""
+"""The study of sequential decisions on a small grid; the whole is in
+docs/experiments/sequential.md.
+"""
 
 from __future__ import annotations
 
@@ -35,27 +37,37 @@ def test_the_fixed_design_has_the_power_and_error_that_it_is_planned_for():
 
 def test_rates_on_the_threshold_are_rarely_judged_and_rates_as_planned_mostly():
     on_edge = ends(Case("edge", rate_pairs(*RATES, 0.3, 1), GAP, GAP), 200, 400)
-    assert max((on_edge.good < NEVER).mean(), (on_edge.bad < NEVER).mean()) <= 0.08  # three standard errors above 5 %
+    assert (
+        max((on_edge.good < NEVER).mean(), (on_edge.bad < NEVER).mean()) <= 0.08
+    )  # three standard errors above 5 %
     planned = ends(Case("planned", rate_pairs(RATES[1], RATES[1], 0.3, 1), GAP, GAP), 200, 700)
     assert planned.share(planned.good, 700) > 0.8
     assert planned.mean_scenes(700) < 450
 
 
 def test_a_suite_is_decided_sooner_than_its_population_and_a_control_helps():
-    population, suite, known = (suite_ends(40, 100, share, on_threshold=False).mean_scenes(100) for share in (None, 0.0, 0.7))
+    population, suite, known = (
+        suite_ends(40, 100, share, on_threshold=False).mean_scenes(100)
+        for share in (None, 0.0, 0.7)
+    )
     assert known < suite < population
 
 
 @pytest.mark.parametrize("sizes", [(12,) * 5, (20, 15, 12, 10, 3)])
 def test_where_families_differ_the_stratified_order_saves_more_than_the_control(sizes):
-    random, control, stratified = (family_ends(40, sizes, 0.6, way, on_threshold=False).mean_scenes(60) for way in get_args(Way))
+    random, control, stratified = (
+        family_ends(40, sizes, 0.6, way, on_threshold=False).mean_scenes(60)
+        for way in get_args(Way)
+    )
     assert stratified < 0.95 * control < 0.95 * random
 
 
 @pytest.mark.parametrize("bounded", [False, True])
 def test_the_stratified_order_rarely_errs_on_the_threshold(bounded):
     on_edge = family_ends(100, (20, 15, 12, 10, 3), 0.3, "stratified", True, bounded)
-    assert max((on_edge.good < 60).mean(), (on_edge.bad < 60).mean()) <= 0.11  # three standard errors above 5 %
+    assert (
+        max((on_edge.good < 60).mean(), (on_edge.bad < 60).mean()) <= 0.11
+    )  # three standard errors above 5 %
 
 
 @pytest.mark.slow

@@ -16,7 +16,12 @@ from evaluators.metrics.reference import busy_road
 
 def test_all_three_ways_agree_on_a_small_world_with_contacts_and_departures():
     contact, road = bench_evaluators(actors=(16,), steps=(50,), repeats=1)
-    assert (contact.part, contact.actors, contact.steps, contact.reference_steps) == ("contact", 16, 50, 50)
+    assert (contact.part, contact.actors, contact.steps, contact.reference_steps) == (
+        "contact",
+        16,
+        50,
+        50,
+    )
     assert contact.hits > 0
     assert (contact.differ_per_step, contact.differ_reference) == (0, 0)
     assert contact.gap_error_m < 1e-12

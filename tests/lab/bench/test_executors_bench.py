@@ -16,7 +16,9 @@ from alpasim_plugin.lab.bench.executors import bench_executor, local_nodes
         (["--executor", "slurm"], "cannot be started before the clock"),
     ],
 )
-def test_an_executor_that_cannot_be_measured_is_refused(more: list[str], found: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_executor_that_cannot_be_measured_is_refused(
+    more: list[str], found: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(["bench", "executors", *more]) == 2
     assert found in capsys.readouterr().err
 

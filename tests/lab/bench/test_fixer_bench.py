@@ -1,4 +1,6 @@
-"""The fixer's bench: the right reference for each row, errors that mean something, settings that cannot be run, tables and plots."""
+"""The fixer's bench: the right reference for each row, errors that mean something, settings that
+cannot be run, tables and plots.
+"""
 
 from __future__ import annotations
 
@@ -56,18 +58,28 @@ def test_streaming_in_float32_is_the_whole_clip_up_to_rounding(rows: dict[str, R
 
 @pytest.mark.slow
 def test_less_precision_is_more_error_and_still_small(rows: dict[str, Row]) -> None:
-    error = {name: mean_error(rows[f"precision: {name}"].rounding) for name in ("float32", "float16", "bfloat16")}
+    error = {
+        name: mean_error(rows[f"precision: {name}"].rounding)
+        for name in ("float32", "float16", "bfloat16")
+    }
     assert error["float32"] < error["float16"] < error["bfloat16"] < 2
 
 
 @pytest.mark.slow
 def test_an_identity_hides_what_precision_costs(rows: dict[str, Row]) -> None:
-    assert mean_error(rows["precision: bfloat16, identity"].rounding) < mean_error(rows["precision: bfloat16"].rounding)
+    assert mean_error(rows["precision: bfloat16, identity"].rounding) < mean_error(
+        rows["precision: bfloat16"].rounding
+    )
 
 
 @pytest.mark.slow
-def test_a_narrow_window_is_another_model_but_the_whole_one_is_the_base(rows: dict[str, Row]) -> None:
-    error = {name: mean_error(rows[f"window: {name}"].model) for name in ("4 latents", "6 latents", "all")}
+def test_a_narrow_window_is_another_model_but_the_whole_one_is_the_base(
+    rows: dict[str, Row],
+) -> None:
+    error = {
+        name: mean_error(rows[f"window: {name}"].model)
+        for name in ("4 latents", "6 latents", "all")
+    }
     assert error["all"] < 1e-3
     assert error["4 latents"] > 10 * error["all"]
     assert error["4 latents"] >= error["6 latents"] > error["all"]
@@ -83,9 +95,16 @@ def test_other_weights_are_not_compared_with_the_base(rows: dict[str, Row]) -> N
 def test_a_setting_that_given_weights_cannot_run_says_why(tmp_path: Path) -> None:
     save_stand_in(tmp_path / "w.safetensors", small_settings())
     options = BenchOptions(
-        overrides=(*SMALL_DIT, f"weights.bundle={tmp_path / 'w.safetensors'}"), passes=1, threads=1, only=("decoder",), quick=True
+        overrides=(*SMALL_DIT, f"weights.bundle={tmp_path / 'w.safetensors'}"),
+        passes=1,
+        threads=1,
+        only=("decoder",),
+        quick=True,
     )
-    made = {f"{row.group}: {row.name}": row for row in bench_clip(options, driving_clip(13, *SIZE), own_process=False)}
+    made = {
+        f"{row.group}: {row.name}": row
+        for row in bench_clip(options, driving_clip(13, *SIZE), own_process=False)
+    }
     assert "decoder.kind" in made["decoder: latent only"].problem
     assert made["decoder: latent and render"].weights == "given"
     assert made["decoder: latent and render"].problem == ""
@@ -97,13 +116,24 @@ def test_a_setting_that_given_weights_cannot_run_says_why(tmp_path: Path) -> Non
 def test_a_row_measured_in_its_own_process_gives_the_same_pictures() -> None:
     options = BenchOptions(overrides=SMALL_DIT, passes=1, quick=True, threads=1)
     chosen = small_settings("untrained=random")
-    here, apart = (bench.measured(options, chosen, driving_clip(13, *SIZE), own_process) for own_process in (False, True))
+    here, apart = (
+        bench.measured(options, chosen, driving_clip(13, *SIZE), own_process)
+        for own_process in (False, True)
+    )
     assert np.array_equal(here.images, apart.images)
 
 
-def test_frames_that_the_guard_replaced_are_counted_and_left_out_of_the_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_that_the_guard_replaced_are_counted_and_left_out_of_the_errors(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(guard, "LIMIT", 0.5)  # now an ordinary picture is out of range
-    options = BenchOptions(overrides=(*SMALL_DIT, "untrained=random"), passes=1, quick=True, threads=1, only=("decoder",))
+    options = BenchOptions(
+        overrides=(*SMALL_DIT, "untrained=random"),
+        passes=1,
+        quick=True,
+        threads=1,
+        only=("decoder",),
+    )
     row = bench_clip(options, driving_clip(5, *SIZE), own_process=False)[0]
     assert row.guarded == row.frames == 5
     assert row.rounding is None
@@ -124,7 +154,9 @@ def test_difference_names_the_largest_and_the_mean() -> None:
 
 
 @pytest.mark.slow
-def test_the_table_has_a_line_per_row_and_the_plot_is_a_picture(rows: dict[str, Row], tmp_path: Path) -> None:
+def test_the_table_has_a_line_per_row_and_the_plot_is_a_picture(
+    rows: dict[str, Row], tmp_path: Path
+) -> None:
     lines = [line for line in markdown(list(rows.values())).splitlines() if line.startswith("| ")]
     assert len(lines) == len(rows) + 1
     assert {line.count("|") for line in lines} == {len(HEAD) + 1}

@@ -1,4 +1,6 @@
-"""The bench's drives: what went into the fixer, what the policy saw, and what it cost, in both modes of the loop."""
+"""The bench's drives: what went into the fixer, what the policy saw, and what it cost, in both
+modes of the loop.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ def drive_small(mode: str, frames: int = 13, *overrides: str) -> DriveSample:
 
 
 def check(sample: DriveSample, frames: int) -> None:
-    assert sample.shown.shape == sample.clip.rgb.shape == (len(sample.clip.t_us), SIZE[1], SIZE[0], 3)
+    assert (
+        sample.shown.shape == sample.clip.rgb.shape == (len(sample.clip.t_us), SIZE[1], SIZE[0], 3)
+    )
     assert len(sample.clip.t_us) >= frames
     assert (np.diff(sample.clip.t_us) == 100_000).all()
     assert sample.clip.maps.any()
@@ -32,7 +36,10 @@ def check(sample: DriveSample, frames: int) -> None:
     assert {"encode", "dit", "decode", "cache write"} <= set(sample.stages)
     for series in sample.stages.values():
         assert len(series) == len(sample.ms)
-    assert all(sum(parts) < total for parts, total in zip(zip(*sample.stages.values(), strict=True), sample.ms, strict=True))
+    assert all(
+        sum(parts) < total
+        for parts, total in zip(zip(*sample.stages.values(), strict=True), sample.ms, strict=True)
+    )
 
 
 @pytest.mark.slow
@@ -54,14 +61,24 @@ def test_a_speculative_drive_without_tolerance_shows_them_too_and_hits_less() ->
 
 @pytest.mark.slow
 def test_nothing_fixed_shows_what_was_rendered() -> None:
-    sample = drive(SCENE, 5, SIZE, fixer_settings("identity", ["mode=chunk", "uses_map=true"]), "bench", renderer="clean", threads=1)
+    sample = drive(
+        SCENE,
+        5,
+        SIZE,
+        fixer_settings("identity", ["mode=chunk", "uses_map=true"]),
+        "bench",
+        renderer="clean",
+        threads=1,
+    )
     assert np.array_equal(sample.shown, sample.clip.rgb)
     assert sample.stages == {}
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_the_bench_prints_a_row_for_every_setting_and_writes_table_and_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_bench_prints_a_row_for_every_setting_and_writes_table_and_plot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     small = [text for key in SMALL_DIT for text in ("--set", f"fixer.{key}")]
     chosen = ["--quick", "--sizes", "64x48", "--threads", "1", "--only", "precision,mode", *small]
     command = ["bench", "fixer", *chosen, "--out", str(tmp_path / "out"), "--json"]
@@ -73,8 +90,16 @@ def test_the_bench_prints_a_row_for_every_setting_and_writes_table_and_plot(tmp_
     assert rows["mode: speculative"]["hit_rate"] > 0
     assert rows["mode: chunk"]["hit_rate"] is None
     assert rows["precision: float32"]["peak_mb"] > 10
-    assert rows["precision: float32"]["rounding"][0] < 1e-3 < rows["precision: bfloat16"]["rounding"][0]
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"table.md", "rows.json", "plot.png"}
+    assert (
+        rows["precision: float32"]["rounding"][0]
+        < 1e-3
+        < rows["precision: bfloat16"]["rounding"][0]
+    )
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "table.md",
+        "rows.json",
+        "plot.png",
+    }
 
 
 @pytest.mark.parametrize(
@@ -87,7 +112,9 @@ def test_the_bench_prints_a_row_for_every_setting_and_writes_table_and_plot(tmp_
         (["--fixer", "identity"], "identity"),
     ],
 )
-def test_bad_options_of_the_bench_are_four_part_errors(options: list[str], mention: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_options_of_the_bench_are_four_part_errors(
+    options: list[str], mention: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(["bench", "fixer", *options]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")

@@ -1,4 +1,6 @@
-"""Measuring a fixer: whole blocks, stages that add up, memory, and weights that make every layer count."""
+"""Measuring a fixer: whole blocks, stages that add up, memory, and weights that make every layer
+count.
+"""
 
 from __future__ import annotations
 
@@ -25,13 +27,18 @@ def stand_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("frames", "blocks"), [(4, []), (5, [5]), (12, [5]), (13, [5, 8]), (22, [5, 8, 8])])
+@pytest.mark.parametrize(
+    ("frames", "blocks"), [(4, []), (5, [5]), (12, [5]), (13, [5, 8]), (22, [5, 8, 8])]
+)
 def test_only_whole_blocks_are_given_out(frames: int, blocks: list[int]) -> None:
     clip = driving_clip(frames)
     given = list(clip.blocks(lambda index: 5 if index == 0 else 8))
     assert [len(part) for part, _ in given] == blocks
     assert [frame.t_us for part, _ in given for frame in part] == clip.t_us[: sum(blocks)].tolist()
-    assert all(np.array_equal(maps, clip.maps[i : i + 1]) for i, maps in enumerate([m[None] for _, ms in given for m in ms]))
+    assert all(
+        np.array_equal(maps, clip.maps[i : i + 1])
+        for i, maps in enumerate([m[None] for _, ms in given for m in ms])
+    )
 
 
 def test_a_stage_that_is_entered_twice_adds_up() -> None:
@@ -47,11 +54,20 @@ def test_a_stage_that_is_entered_twice_adds_up() -> None:
     assert clock.take() == {}
 
 
-def test_a_measured_run_gives_the_images_of_an_unmeasured_one_and_a_time_per_block(stand_in: Path) -> None:
-    clip, chosen = driving_clip(13, 48, 32), settings(f"weights.bundle={stand_in}", "history=finalise")
+def test_a_measured_run_gives_the_images_of_an_unmeasured_one_and_a_time_per_block(
+    stand_in: Path,
+) -> None:
+    clip, chosen = (
+        driving_clip(13, 48, 32),
+        settings(f"weights.bundle={stand_in}", "history=finalise"),
+    )
     timing = measure(chosen, clip, "scene", seed=3, passes=2)
     fixer = make_fixer(chosen.name, chosen, scene_id="scene", seed=3)
-    plain = [frame.rgb for frames, maps in clip.blocks(fixer.blocks.frames) for frame in fixer.step(frames, maps)]
+    plain = [
+        frame.rgb
+        for frames, maps in clip.blocks(fixer.blocks.frames)
+        for frame in fixer.step(frames, maps)
+    ]
     assert np.array_equal(timing.images, np.stack(plain))
     assert len(timing.all_in) == 2  # one block of steady state, two passes
     assert {name: len(ms) for name, ms in timing.stages.items()} == dict.fromkeys(TIMED, 2)
@@ -63,15 +79,21 @@ def test_a_measured_run_gives_the_images_of_an_unmeasured_one_and_a_time_per_blo
         assert timing.peak_mb > 0
 
 
-def test_stand_in_weights_follow_their_seed_and_say_that_they_are_untrained(stand_in: Path, tmp_path: Path) -> None:
+def test_stand_in_weights_follow_their_seed_and_say_that_they_are_untrained(
+    stand_in: Path, tmp_path: Path
+) -> None:
     save_stand_in(tmp_path / "same.safetensors", settings())
     save_stand_in(tmp_path / "other.safetensors", settings(), seed=1)
     same, first = load_weights(tmp_path / "same.safetensors"), load_weights(stand_in)
     assert same.keys() == first.keys()
     assert all(torch.equal(same[key], first[key]) for key in first)
     other = load_weights(tmp_path / "other.safetensors")
-    assert not torch.equal(other["dit.final_layer.linear.weight"], first["dit.final_layer.linear.weight"])
-    fixer = make_fixer("onefixer-dit-tiny", settings(f"weights.bundle={stand_in}"), scene_id="scene")
+    assert not torch.equal(
+        other["dit.final_layer.linear.weight"], first["dit.final_layer.linear.weight"]
+    )
+    fixer = make_fixer(
+        "onefixer-dit-tiny", settings(f"weights.bundle={stand_in}"), scene_id="scene"
+    )
     assert not fixer.trained
     assert "random" in fixer.label
 

@@ -20,7 +20,10 @@ def test_a_history_is_the_own_output_the_truth_or_nothing() -> None:
     rng = torch.Generator().manual_seed(0)
     render, sdmap, truth = (torch.rand(3, 16, 32, 3, generator=rng) * 2 - 1 for _ in range(3))
     opacity = torch.ones(3, 16, 32, 1)
-    made = {history: regime._rollout(net, render, sdmap, truth, opacity, history) for history in regime.HISTORIES}
+    made = {
+        history: regime._rollout(net, render, sdmap, truth, opacity, history)
+        for history in regime.HISTORIES
+    }
     assert {video.shape for video in made.values()} == {(3, 16, 32, 3)}
     first = made["own"][0]
     assert all(np.array_equal(video[0], first) for video in made.values()), "nothing came before"
@@ -35,8 +38,12 @@ def test_the_shift_is_the_distance_from_the_recorded_path(monkeypatch: pytest.Mo
     poses[:, 0, 3] = 0.0, 10.0, 20.0
     here = np.tile(np.eye(4), (2, 1, 1))
     here[:, :2, 3] = (5.0, -1.5), (12.0, 2.0)
-    sequence = SimpleNamespace(clip=SimpleNamespace(T_world_camera=here), folder=Path("pairs/val/street"))
-    monkeypatch.setattr(regime, "open_references", lambda _: SimpleNamespace(rgb_T_world_camera=poses))
+    sequence = SimpleNamespace(
+        clip=SimpleNamespace(T_world_camera=here), folder=Path("pairs/val/street")
+    )
+    monkeypatch.setattr(
+        regime, "open_references", lambda _: SimpleNamespace(rgb_T_world_camera=poses)
+    )
     assert regime.lateral_shift_m(sequence) == pytest.approx([1.5, 2.0])  # type: ignore[arg-type]
     monkeypatch.setattr(regime, "open_references", lambda _: None)
     with pytest.raises(InputError, match="recorded poses"):

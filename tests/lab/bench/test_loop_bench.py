@@ -24,7 +24,9 @@ def test_the_reference_is_the_same_work_each_time() -> None:
     assert reference_ms(times=3) > 0
 
 
-def test_a_record_has_stages_errors_commands_and_the_ratios_of_its_times(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_record_has_stages_errors_commands_and_the_ratios_of_its_times(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(module, "COMMANDS", {"start": ("--version",)})
     monkeypatch.setattr(module, "SIZES", ((128, 72), (64, 36)))
     record = bench_loop(["clean"], repeats=1, seconds=0.5)
@@ -39,7 +41,15 @@ def test_a_record_has_stages_errors_commands_and_the_ratios_of_its_times(monkeyp
     assert frame["raster_levels"] <= 1
     rows = [line.split("|") for line in markdown(record).splitlines() if line.startswith("|")]
     assert {len(row) for row in rows[:3]} == {len(rows[0])}
-    assert [row[1].strip() for row in rows] == ["frame behind", "---", "`clean`", "`clean`", "command", "---", "start"]
+    assert [row[1].strip() for row in rows] == [
+        "frame behind",
+        "---",
+        "`clean`",
+        "`clean`",
+        "command",
+        "---",
+        "start",
+    ]
 
 
 def test_the_page_holds_the_record_that_lies_beside_it() -> None:

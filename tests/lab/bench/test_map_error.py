@@ -28,7 +28,9 @@ def street() -> Scenario:
 
 def poses(street: Scenario) -> tuple[F64, np.ndarray]:
     t_us = np.array([street.start_us, street.start_us + 300_000])
-    return np.stack([interpolate(street.ego_log, int(t)) @ street.cameras[0].T_rig_camera for t in t_us]), t_us
+    return np.stack(
+        [interpolate(street.ego_log, int(t)) @ street.cameras[0].T_rig_camera for t in t_us]
+    ), t_us
 
 
 def drawn(street: Scenario, T: F64, t_us: int) -> U8:
@@ -42,20 +44,29 @@ def maps(street: Scenario, shift: MapShift) -> U8:
 
 def test_no_shift_is_the_map_itself(street: Scenario) -> None:
     T, t_us = poses(street)
-    assert np.array_equal(maps(street, MapShift()), np.stack([drawn(street, p, int(t)) for p, t in zip(T, t_us, strict=True)]))
+    assert np.array_equal(
+        maps(street, MapShift()),
+        np.stack([drawn(street, p, int(t)) for p, t in zip(T, t_us, strict=True)]),
+    )
 
 
 @pytest.mark.parametrize("left_m", [0.5, -0.25])
-def test_road_and_boxes_moved_alike_are_a_camera_moved_the_other_way(street: Scenario, left_m: float) -> None:
+def test_road_and_boxes_moved_alike_are_a_camera_moved_the_other_way(
+    street: Scenario, left_m: float
+) -> None:
     T, t_us = poses(street)
     rig = interpolate(street.ego_log, int(t_us[0]))
     moved = T[0].copy()
     moved[:3, 3] -= left_m * rig[:3, 1]
-    assert np.array_equal(maps(street, MapShift(left_m, 0.0, left_m))[0], drawn(street, moved, int(t_us[0])))
+    assert np.array_equal(
+        maps(street, MapShift(left_m, 0.0, left_m))[0], drawn(street, moved, int(t_us[0]))
+    )
 
 
 def test_lanes_and_boxes_move_alone(street: Scenario) -> None:
-    plain, lanes, boxes = maps(street, MapShift()), maps(street, MapShift(0.5)), maps(street, MapShift(0, 0, 0.25))
+    plain = maps(street, MapShift())
+    lanes = maps(street, MapShift(0.5))
+    boxes = maps(street, MapShift(0, 0, 0.25))
     changed = [(a != plain).any(axis=-1)[0] for a in (lanes, boxes)]
     assert changed[0].any()
     assert changed[1].any()
@@ -63,7 +74,10 @@ def test_lanes_and_boxes_move_alone(street: Scenario) -> None:
 
 
 def test_a_box_is_over_configurations_and_its_dot_is_the_true_map(tmp_path: Path) -> None:
-    found_at = {shift.label: {"lane_f1_syn": 0.9 - abs(shift.lanes_left_m), "psnr_db": 20.0} for shift in CONFIGURATIONS}
+    found_at = {
+        shift.label: {"lane_f1_syn": 0.9 - abs(shift.lanes_left_m), "psnr_db": 20.0}
+        for shift in CONFIGURATIONS
+    }
     values = {f"V9 {label}": {clip: found for clip in "ab"} for label, found in found_at.items()}
     raw = Measured({**values, "V5": {clip: {"lane_f1_syn": 0.3} for clip in "ab"}})
     measured, shifts = shifted(raw)
@@ -88,10 +102,18 @@ def test_a_black_map_is_the_bundles_own_fixer_with_another_input() -> None:
 
 def test_the_papers_configurations_are_grouped_by_distance() -> None:
     assert len(CONFIGURATIONS) == len({shift.label for shift in CONFIGURATIONS}) == 45
-    values = {f"V9 {shift.label}": {"a": {"psnr_db": abs(shift.lanes_left_m)}} for shift in CONFIGURATIONS}
+    values = {
+        f"V9 {shift.label}": {"a": {"psnr_db": abs(shift.lanes_left_m)}} for shift in CONFIGURATIONS
+    }
     found = grouped(Measured({**values, "V5": {"a": {"psnr_db": 7.0}}})).values
     assert found["V5"] == {"a": {"psnr_db": 7.0}}
-    assert [found[f"V9, lanes {m} m aside"]["a"]["psnr_db"] for m in ("0.00", "0.25", "0.50")] == [0.0, 0.25, 0.5]
+    assert [found[f"V9, lanes {m} m aside"]["a"]["psnr_db"] for m in ("0.00", "0.25", "0.50")] == [
+        0.0,
+        0.25,
+        0.5,
+    ]
     groups = {name for name in found if "boxes" in name}
     assert groups == {f"V9, boxes {m} m aside" for m in ("0.00", "0.25", "0.35")}
-    assert found["V9, boxes 0.35 m aside"]["a"]["psnr_db"] == pytest.approx(0.3)  # the mean over 20 of 45
+    assert found["V9, boxes 0.35 m aside"]["a"]["psnr_db"] == pytest.approx(
+        0.3
+    )  # the mean over 20 of 45

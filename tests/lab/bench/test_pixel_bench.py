@@ -1,4 +1,6 @@
-"""The bench of the per-frame generator: every setting against float32, and cameras in a batch as one alone."""
+"""The bench of the per-frame generator: every setting against float32, and cameras in a batch as
+one alone.
+"""
 
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
@@ -15,7 +17,11 @@ def test_rows_have_times_and_errors_that_mean_something() -> None:
     assert isinstance(settings, PixelFixerSettings)
     seen: list[Row] = []
     rows = bench_clip(
-        BenchOptions("onefixer", SMALL, threads=1, passes=1), settings, driving_clip(5, 64, 48), seen.append, own_process=False
+        BenchOptions("onefixer", SMALL, threads=1, passes=1),
+        settings,
+        driving_clip(5, 64, 48),
+        seen.append,
+        own_process=False,
     )
     assert rows == seen
     assert [row.name for row in rows] == [case.name for case in CASES]

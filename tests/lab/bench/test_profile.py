@@ -40,12 +40,17 @@ def test_the_profile_of_the_rasteriser_names_its_kernels(monkeypatch):
     small = module.driving_like_scene(2000)
     monkeypatch.setattr(module, "driving_like_scene", lambda n: small)
     rows = profile("raster", 2)
-    assert {"project_parts", "raster_tiles", "depth_order", "fill_tiles", "outside kernels"} <= {row.where for row in rows}
+    assert {"project_parts", "raster_tiles", "depth_order", "fill_tiles", "outside kernels"} <= {
+        row.where for row in rows
+    }
     assert sum(row.share for row in rows) == pytest.approx(1.0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("part", "where"), [("loop", "rasterize_cpu"), ("evaluators", "contact.find_contacts"), ("aggregation", "")])
+@pytest.mark.parametrize(
+    ("part", "where"),
+    [("loop", "rasterize_cpu"), ("evaluators", "contact.find_contacts"), ("aggregation", "")],
+)
 def test_the_profile_of_a_part_names_its_own_functions(part, where):
     rows = profile(part, 1)
     assert any(where in row.where for row in rows[:12])

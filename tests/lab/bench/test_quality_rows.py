@@ -25,7 +25,9 @@ def test_every_twentieth_frame_is_asked_about(label: str, wanted: float | None) 
     render = truth.copy()
     render[::JOD_EVERY] += 2
     opacity, t_us = np.full((41, 16, 16), 255, np.uint8), np.arange(41) * 100_000
-    clip, variant, vdp = QualityClip("one", {}, render, truth, opacity, np.zeros_like(truth), t_us), Variant(label), Apart()
+    clip = QualityClip("one", {}, render, truth, opacity, np.zeros_like(truth), t_us)
+    variant = Variant(label)
+    vdp = Apart()
     row = measure(clip, variant, run_variant(clip, variant, None), 0, {}, vdp)  # type: ignore[arg-type]
     assert row["values"].get(JOD) == wanted
     assert JOD not in measure(clip, variant, run_variant(clip, variant, None), 0, {})["values"]

@@ -32,16 +32,27 @@ def test_rows_pair_each_time_with_the_error_of_its_image():
 
 def test_six_cameras_see_all_around_and_their_work_is_that_of_each():
     (row,) = bench_raster(sizes=[(500, 6, 32, 18)], repeats=3, threads=(1,))
-    scene, cameras = driving_like_scene(500), [driving_camera(32, 18, k * np.pi / 3) for k in range(6)]
-    assert row.blends == sum(rasterize_reference(scene, camera).stats["blends"] for camera in cameras)
-    assert row.visible == sum(rasterize(scene, camera, backend="cpu").stats["visible"] for camera in cameras)
+    scene, cameras = (
+        driving_like_scene(500),
+        [driving_camera(32, 18, k * np.pi / 3) for k in range(6)],
+    )
+    assert row.blends == sum(
+        rasterize_reference(scene, camera).stats["blends"] for camera in cameras
+    )
+    assert row.visible == sum(
+        rasterize(scene, camera, backend="cpu").stats["visible"] for camera in cameras
+    )
     assert row.max_error <= 1 / 255
     centre = cameras[1].T_camera_world @ [np.cos(np.pi / 3), np.sin(np.pi / 3), 1.6, 1.0]
-    assert centre[:3] == pytest.approx([0, 0, 1], abs=1e-9)  # the second looks 60 degrees to the left
+    assert centre[:3] == pytest.approx(
+        [0, 0, 1], abs=1e-9
+    )  # the second looks 60 degrees to the left
 
 
 def test_scene_depends_on_its_seed_alone_and_covers_the_view():
-    a, b, c = driving_like_scene(1000, 1), driving_like_scene(1000, 1), driving_like_scene(1000, 2)
+    a = driving_like_scene(1000, 1)
+    b = driving_like_scene(1000, 1)
+    c = driving_like_scene(1000, 2)
     assert np.array_equal(a.means, b.means)
     assert not np.array_equal(a.means, c.means)
     assert rasterize(driving_like_scene(20_000), driving_camera(96, 54)).alpha.mean() > 0.9
@@ -56,7 +67,11 @@ def test_kernels_are_compiled_once_and_then_cached(tmp_path):
 
     def start_s():
         begin = time.perf_counter()
-        subprocess.run([sys.executable, "-c", code], env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}, check=True)
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+            check=True,
+        )
         return time.perf_counter() - begin
 
     compiled_s, cached_s = start_s(), start_s()

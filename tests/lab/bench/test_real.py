@@ -1,4 +1,6 @@
-"""`simrun bench real` on a drive made by hand: rows by camera, set and distance, and what is refused."""
+"""`simrun bench real` on a drive made by hand: rows by camera, set and distance, and what is
+refused.
+"""
 
 from __future__ import annotations
 
@@ -59,45 +61,83 @@ def test_photographs_that_no_fit_saw_make_rows_by_camera_and_distance(drive: Sce
     rows = measure_drive("d", drive, {"truth": lambda: truth}, Judges(Difference(), None))
     assert [list(row) for row in rows] == [KEYS] * 2
     held, beside = rows
-    assert (held["camera"], held["set"], held["n_frames"], held["distance_m"]) == ("front", "held-out", 1, 0.0)
+    assert (held["camera"], held["set"], held["n_frames"], held["distance_m"]) == (
+        "front",
+        "held-out",
+        1,
+        0.0,
+    )
     assert (beside["camera"], beside["set"], beside["n_frames"]) == ("right", "never-fitted", 9)
     assert beside["distance_m"] == pytest.approx(0.5, abs=0.02)
     assert held["psnr_db"] == 100.0
     assert held["perceptual_syn"] == 0.0
     assert held["cvvdp_jod"] is None
     assert held["paint_precision"] is None, "there is no paint"
-    assert truth.asked == sorted(truth.asked[:9]) * 2, "every photograph in order of time, so that a fixer has its history"
+    assert truth.asked == sorted(truth.asked[:9]) * 2, (
+        "every photograph in order of time, so that a fixer has its history"
+    )
 
 
-def test_the_model_is_near_its_photographs_and_a_second_drive_gives_intervals(drive: Scenario) -> None:
+def test_the_model_is_near_its_photographs_and_a_second_drive_gives_intervals(
+    drive: Scenario,
+) -> None:
     judges = Judges(Difference(), None)
-    rows = measure_drive("d", drive, {"3dgs": lambda: make_renderer("3dgs", drive, threads=1)}, judges)
+    rows = measure_drive(
+        "d", drive, {"3dgs": lambda: make_renderer("3dgs", drive, threads=1)}, judges
+    )
     assert all(float(row["psnr_db"]) > 17 for row in rows)  # type: ignore[arg-type]
     assert intervals(rows) == []
     other = [{**row, "drive": "e", "psnr_db": float(row["psnr_db"]) + 2.0} for row in rows]  # type: ignore[arg-type]
-    found = next(row for row in intervals([*rows, *other]) if row["metric"] == "psnr_db" and row["set"] == "held-out")
+    found = next(
+        row
+        for row in intervals([*rows, *other])
+        if row["metric"] == "psnr_db" and row["set"] == "held-out"
+    )
     assert found["drives"] == 2
     assert found["mean"] == pytest.approx(float(rows[0]["psnr_db"]) + 1.0)  # type: ignore[arg-type]
     low, high = found["ci95"]  # type: ignore[misc]
-    assert (high - low) / 2 == pytest.approx(12.706, rel=1e-3), "Student's t of one degree of freedom, spread of the mean 1"
+    assert (high - low) / 2 == pytest.approx(12.706, rel=1e-3), (
+        "Student's t of one degree of freedom, spread of the mean 1"
+    )
 
 
 def test_what_cannot_be_measured_is_refused(drive: Scenario) -> None:
     with pytest.raises(InputError, match="no recorded drive"):
         shots_of(straight())
     with pytest.raises(InputError, match="no photograph that the fit did not see"):
-        shots_of(replace(drive, recording=tuple(one for one in drive.recording if one.use == "fitted")))
+        shots_of(
+            replace(drive, recording=tuple(one for one in drive.recording if one.use == "fitted"))
+        )
     with pytest.raises(InputError, match="blocks of frames"):
         measure_drive("d", drive, {"blocks": Blocks}, Judges(Difference(), None))
 
 
-def test_the_command_prints_one_document(drive: Scenario, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_one_document(
+    drive: Scenario, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(bench_real, "_loaded", lambda drives: {"d": drive})
-    monkeypatch.setattr(bench_real, "load_metric", lambda: (None, "cvvdp_jod is not measured: there is no module 'pycvvdp'"))
+    monkeypatch.setattr(
+        bench_real,
+        "load_metric",
+        lambda: (None, "cvvdp_jod is not measured: there is no module 'pycvvdp'"),
+    )
     monkeypatch.setattr(bench_real, "load_distance", lambda name: Difference())
     assert (
         run_command(
-            ["bench", "real", "d", "--renderer", "3dgs,nearest[references=2]", "--json", "--threads", "1", "--seed", "1", "--device", "cpu"]
+            [
+                "bench",
+                "real",
+                "d",
+                "--renderer",
+                "3dgs,nearest[references=2]",
+                "--json",
+                "--threads",
+                "1",
+                "--seed",
+                "1",
+                "--device",
+                "cpu",
+            ]
         )
         == 0
     )
@@ -105,7 +145,12 @@ def test_the_command_prints_one_document(drive: Scenario, monkeypatch: pytest.Mo
     document = json.loads(out)
     assert list(document) == ["rows"]
     assert [list(row) for row in document["rows"]] == [KEYS] * 4
-    assert [row["renderer"] for row in document["rows"]] == ["3dgs", "3dgs", "nearest[references=2]", "nearest[references=2]"]
+    assert [row["renderer"] for row in document["rows"]] == [
+        "3dgs",
+        "3dgs",
+        "nearest[references=2]",
+        "nearest[references=2]",
+    ]
     assert document["rows"][2]["psnr_db"] > 12
     assert "one drive: no interval" in err
     assert "cvvdp_jod is not measured" in err

@@ -1,4 +1,6 @@
-"""`simrun bench quality`: the raw render, an identity and a small network over made-up pairs, whole and resumed."""
+"""`simrun bench quality`: the raw render, an identity and a small network over made-up pairs, whole
+and resumed.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,13 @@ from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer, save_bundle
-from alpasim_plugin.lab.bench.quality_run import Work, finish, identity, lose_resolution, shown_frames
+from alpasim_plugin.lab.bench.quality_run import (
+    Work,
+    finish,
+    identity,
+    lose_resolution,
+    shown_frames,
+)
 from alpasim_plugin.lab.cli.quality import parse_variants
 from alpasim_plugin.lab.video_metrics import clip_quality
 from alpasim_plugin.lab.video_metrics.sheet import sheet
@@ -32,7 +40,10 @@ FRAMES = 14
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("bundle") / "small.safetensors"
     settings: OneFixerSettings = small_settings("holes=noise", "window=3")
-    parts = {"dit": initial_weights(DiTSizes(**settings.dit.model_dump()), 3), "vae": TinyVAE.random(seed=3).state_dict()}
+    parts = {
+        "dit": initial_weights(DiTSizes(**settings.dit.model_dump()), 3),
+        "vae": TinyVAE.random(seed=3).state_dict(),
+    }
     prompt = {"text": torch.zeros(1, settings.dit.text_width)}
     save_bundle(path, {**parts, "prompt": prompt}, settings, trained=True, note="random")
     return path
@@ -46,9 +57,21 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_a_table_a_document_charts_and_pictures(data: Path, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_a_document_charts_and_pictures(
+    data: Path, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "out"
-    command = ["bench", "quality", str(data), "--fixer", f"3dgs,identity,small={bundle}", "--pictures", "1", "--out", str(out)]
+    command = [
+        "bench",
+        "quality",
+        str(data),
+        "--fixer",
+        f"3dgs,identity,small={bundle}",
+        "--pictures",
+        "1",
+        "--out",
+        str(out),
+    ]
     assert run_command([*command, "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     variants = summary["arms"]
@@ -63,7 +86,13 @@ def test_a_table_a_document_charts_and_pictures(data: Path, bundle: Path, tmp_pa
     assert "ms_per_frame" not in variants["3dgs"]
     assert summary["run"]["fixers"]["small"]["settings"]["window"] == 3
     assert summary["run"]["fixers"]["small"]["trained"] is True
-    unit = {"frames": 8, "network_calls": 1, "latents": 2, "lookahead_frames": 7, "calls_per_frame": 0.125}
+    unit = {
+        "frames": 8,
+        "network_calls": 1,
+        "latents": 2,
+        "lookahead_frames": 7,
+        "calls_per_frame": 0.125,
+    }
     assert summary["run"]["units"] == {"3dgs": None, "identity": None, "small": unit}
     for name in ("quality.json", "quality.md", "by-frame.png", "speed.png", "sheets/a.png"):
         assert (out / name).stat().st_size > 0
@@ -80,7 +109,19 @@ def test_a_table_a_document_charts_and_pictures(data: Path, bundle: Path, tmp_pa
 def test_finished_clips_are_kept_until_something_differs(data: Path, tmp_path: Path) -> None:
     networks = (("perceptual-syn", identity("perceptual-syn", None)),)
     variant = parse_variants("identity", [])[0]
-    work = Work(data / "test-known" / "b", "render", variant, FRAMES, 0, "cpu", 1, networks, None, tmp_path, True)
+    work = Work(
+        data / "test-known" / "b",
+        "render",
+        variant,
+        FRAMES,
+        0,
+        "cpu",
+        1,
+        networks,
+        None,
+        tmp_path,
+        True,
+    )
     row = finish(work)
     stamp = work.row_file.stat().st_mtime_ns
     assert finish(work) == row
@@ -91,16 +132,38 @@ def test_finished_clips_are_kept_until_something_differs(data: Path, tmp_path: P
     assert picture.is_file()
     key = json.loads(work.row_file.read_text())["key"]
     other = parse_variants("identity", ["fixer.block_latents=3"])[0]
-    for changed in (replace(work, seed=1), replace(work, frames=9), replace(work, variant=other), replace(work, given="truth")):
+    for changed in (
+        replace(work, seed=1),
+        replace(work, frames=9),
+        replace(work, variant=other),
+        replace(work, given="truth"),
+    ):
         assert finish(changed)["frames"] == changed.frames
         assert json.loads(work.row_file.read_text())["key"] != key
 
 
 @pytest.mark.slow
-def test_the_truth_as_input_is_what_the_fixer_should_leave_alone(data: Path, bundle: Path, tmp_path: Path) -> None:
-    command = ["bench", "quality", str(data), "--input", "truth", "--baseline", "small", "--pictures", "0", "--out", str(tmp_path)]
+def test_the_truth_as_input_is_what_the_fixer_should_leave_alone(
+    data: Path, bundle: Path, tmp_path: Path
+) -> None:
+    command = [
+        "bench",
+        "quality",
+        str(data),
+        "--input",
+        "truth",
+        "--baseline",
+        "small",
+        "--pictures",
+        "0",
+        "--out",
+        str(tmp_path),
+    ]
     assert run_command([*command, "--fixer", f"identity,small={bundle}"]) == 0
-    rows = {label: json.loads((tmp_path / "clips" / label / "a.json").read_text())["row"] for label in ("identity", "small")}
+    rows = {
+        label: json.loads((tmp_path / "clips" / label / "a.json").read_text())["row"]
+        for label in ("identity", "small")
+    }
     assert rows["identity"]["identical"] == FRAMES
     assert rows["small"]["values"]["psnr_db"] < rows["identity"]["values"]["psnr_db"]
     assert json.loads((tmp_path / "quality.json").read_text())["run"]["input"] == "truth"
@@ -119,7 +182,9 @@ def test_lost_resolution_is_the_same_damage_at_every_frame_and_of_the_clip_alone
 
 
 def test_labels_overrides_and_bundles_are_told_apart(bundle: Path) -> None:
-    variants = parse_variants(f"3dgs,two=onefixer-dit-tiny@2,small={bundle}", ["fixer.mode=chunk", "small:fixer.window=5"])
+    variants = parse_variants(
+        f"3dgs,two=onefixer-dit-tiny@2,small={bundle}", ["fixer.mode=chunk", "small:fixer.window=5"]
+    )
     assert [variant.label for variant in variants] == ["3dgs", "two", "small"]
     assert variants[0].spec is None
     two, small = (variant.spec.settings for variant in variants[1:] if variant.spec)
@@ -135,23 +200,41 @@ def test_labels_overrides_and_bundles_are_told_apart(bundle: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "overrides", "words"),
     [
-        ("3dgs,3dgs", [], "taken"), ("truth=identity", [], "taken"), ("a/b=identity", [], "taken"), ("nothing", [], "nothing"),
-        ("identity", ["other:fixer.mode=chunk"], "no fixer of this label"), ("identity", ["window=3"], "not a key of the fixer"),
+        ("3dgs,3dgs", [], "taken"),
+        ("truth=identity", [], "taken"),
+        ("a/b=identity", [], "taken"),
+        ("nothing", [], "nothing"),
+        ("identity", ["other:fixer.mode=chunk"], "no fixer of this label"),
+        ("identity", ["window=3"], "not a key of the fixer"),
     ],
-)  # fmt: skip
+)
 def test_variants_that_cannot_be_are_refused(text: str, overrides: list[str], words: str) -> None:
     with pytest.raises(InputError, match=words):
         parse_variants(text, overrides)
 
 
-def test_unknown_baseline_is_refused(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["bench", "quality", str(data), "--fixer", "identity", "--out", str(tmp_path)]) == 2
+def test_unknown_baseline_is_refused(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        run_command(["bench", "quality", str(data), "--fixer", "identity", "--out", str(tmp_path)])
+        == 2
+    )
     assert "--baseline 3dgs" in capsys.readouterr().err
 
 
 def row(variant: str, clip: str, psnr: float, frames: int = 200) -> dict[str, object]:
     values, series = {"psnr_db": psnr}, {"psnr_db": [psnr] * frames}
-    return {"arm": variant, "clip": clip, "seed": 0, "frames": frames, "values": values, "series": series, "identical": 0, "events": {}}
+    return {
+        "arm": variant,
+        "clip": clip,
+        "seed": 0,
+        "frames": frames,
+        "values": values,
+        "series": series,
+        "identical": 0,
+        "events": {},
+    }
 
 
 def test_intervals_are_over_clips_and_pairs_are_sharper() -> None:

@@ -1,4 +1,6 @@
-"""The commands of ``simrun train`` as a user meets them: one document with ``--json``, progress beside it, errors in four parts."""
+"""The commands of ``simrun train`` as a user meets them: one document with ``--json``, progress
+beside it, errors in four parts.
+"""
 
 from __future__ import annotations
 
@@ -44,12 +46,17 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("bundle") / "small.safetensors"
     settings = small_settings()
-    parts = {"dit": initial_weights(DiTSizes(**settings.dit.model_dump()), 3), "vae": TinyVAE.random(seed=3).state_dict()}
+    parts = {
+        "dit": initial_weights(DiTSizes(**settings.dit.model_dump()), 3),
+        "vae": TinyVAE.random(seed=3).state_dict(),
+    }
     save_bundle(path, parts, settings, trained=True)
     return path
 
 
-def run_train(capsys: pytest.CaptureFixture[str], *command: str | Path) -> tuple[dict[str, Any], str]:
+def run_train(
+    capsys: pytest.CaptureFixture[str], *command: str | Path
+) -> tuple[dict[str, Any], str]:
     """Run ``simrun train`` and return its document and what it said beside it."""
     assert run_command(["train", *map(str, command), "--json"]) == 0
     out, err = capsys.readouterr()
@@ -57,15 +64,32 @@ def run_train(capsys: pytest.CaptureFixture[str], *command: str | Path) -> tuple
 
 
 def test_scenes_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    document, err = run_train(capsys, "scenes", "--out", tmp_path, "--split", "val", "--count", 1, "--duration-s", 2)
-    assert document == {"split": "val", "scenes": 1, "paths": [str(path) for path in (tmp_path / "val").glob("*.yaml")]}
+    document, err = run_train(
+        capsys, "scenes", "--out", tmp_path, "--split", "val", "--count", 1, "--duration-s", 2
+    )
+    assert document == {
+        "split": "val",
+        "scenes": 1,
+        "paths": [str(path) for path in (tmp_path / "val").glob("*.yaml")],
+    }
     assert document["paths"][0] in err
 
 
-def test_pairs_made_and_kept_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pairs_made_and_kept_are_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "scenes" / "val").mkdir(parents=True)
     (tmp_path / "scenes" / "val" / "mine.yaml").write_text(BARE)
-    command = ("pairs", tmp_path / "scenes", "--out", tmp_path / "pairs", "--split", "val", "--source", "clean")
+    command = (
+        "pairs",
+        tmp_path / "scenes",
+        "--out",
+        tmp_path / "pairs",
+        "--split",
+        "val",
+        "--source",
+        "clean",
+    )
     first, again = (run_train(capsys, *command)[0] for _ in range(2))
     assert (first["sequences"], first["made"], again["made"]) == (1, 1, 0)
     assert Path(first["rows"][0]["folder"], "sequence.json").is_file()
@@ -73,21 +97,37 @@ def test_pairs_made_and_kept_are_counted(tmp_path: Path, capsys: pytest.CaptureF
 
 def test_imported_pairs_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rgb, grey = np.zeros((4, 32, 48, 3), dtype=np.uint8), np.zeros((4, 32, 48), dtype=np.uint8)
-    channels = {"rgb-input": rgb, "rgb-gt": rgb, "opacity": grey, "sdmap": rgb, "poses": np.tile(np.eye(4), (4, 1, 1))}
+    channels = {
+        "rgb-input": rgb,
+        "rgb-gt": rgb,
+        "opacity": grey,
+        "sdmap": rgb,
+        "poses": np.tile(np.eye(4), (4, 1, 1)),
+    }
     options: list[str | Path] = []
     for name, array in channels.items():
         np.save(tmp_path / f"{name}.npy", array)
         options += [f"--{name}", tmp_path / f"{name}.npy"]
     document, _ = run_train(capsys, "import-pairs", tmp_path / "pairs", "--name", "drive", *options)
-    assert document == {"folder": str(tmp_path / "pairs" / "train" / "drive"), "split": "train", "frames": 4}
+    assert document == {
+        "folder": str(tmp_path / "pairs" / "train" / "drive"),
+        "split": "train",
+        "frames": 4,
+    }
 
 
-def test_weights_come_with_digest_updates_and_time(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_weights_come_with_digest_updates_and_time(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     document, err = run_train(capsys, "vae", data, "--out", tmp_path, "--steps", 1)
     weights = tmp_path / "vae.safetensors"
     assert document["weights"] == str(weights)
     assert document["sha256"] == hashlib.sha256(weights.read_bytes()).hexdigest()
-    assert (document["bytes"], document["steps"], document["card"]) == (weights.stat().st_size, 1, None)
+    assert (document["bytes"], document["steps"], document["card"]) == (
+        weights.stat().st_size,
+        1,
+        None,
+    )
     assert document["hours"] > 0
     assert document["last"]["loss"] > 0
     assert "1/1" in err
@@ -99,38 +139,63 @@ def demonstrations(folder: Path) -> None:
     folder.mkdir(parents=True)
     numbers = ("yaw", "yaw_before", "speed", "desired_speed", "gap", "leader")
     arrays = {
-        "frames": np.full((2, 114, 352, 3), 128, dtype=np.uint8), "points": np.ones((2, 9, 2), dtype=np.float32),
-        "headings": np.zeros((2, 9), dtype=np.float32), "speeds": np.zeros((2, 8), dtype=np.float32),
-        "frame": np.array([0, 1], dtype=np.int32), "before": np.array([0, 0], dtype=np.int32), "command": np.zeros(2, dtype=np.int64),
+        "frames": np.full((2, 114, 352, 3), 128, dtype=np.uint8),
+        "points": np.ones((2, 9, 2), dtype=np.float32),
+        "headings": np.zeros((2, 9), dtype=np.float32),
+        "speeds": np.zeros((2, 8), dtype=np.float32),
+        "frame": np.array([0, 1], dtype=np.int32),
+        "before": np.array([0, 0], dtype=np.int32),
+        "command": np.zeros(2, dtype=np.int64),
         **{name: np.full(2, 0.1, dtype=np.float32) for name in numbers},
-    }  # fmt: skip
+    }
     for name, array in arrays.items():
         np.save(folder / f"{name}.npy", array)
     lens = {"K": [[176.0, 0, 176], [0, 176.0, 57], [0, 0, 1]], "T_rig_camera": np.eye(4).tolist()}
-    (folder / "demonstrations.json").write_text(json.dumps({**lens, "samples": 2, "recipe": {"renderer": "clean"}}))
+    (folder / "demonstrations.json").write_text(
+        json.dumps({**lens, "samples": 2, "recipe": {"renderer": "clean"}})
+    )
 
 
 def test_a_policys_card_says_what_made_it_and_how_well_it_does(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for split, name in (("train", "street_000"), ("train", "street_003"), ("train", "bend_001"), ("val", "street_000")):
+    for split, name in (
+        ("train", "street_000"),
+        ("train", "street_003"),
+        ("train", "bend_001"),
+        ("val", "street_000"),
+    ):
         demonstrations(tmp_path / "demonstrations" / split / name)
-    monkeypatch.setattr(sys, "argv", ["simrun", "train", "policy", "demonstrations", "--threads", "1"])
-    document, _ = run_train(capsys, "policy", tmp_path / "demonstrations", "--out", tmp_path / "run", "--steps", 1)
+    monkeypatch.setattr(
+        sys, "argv", ["simrun", "train", "policy", "demonstrations", "--threads", "1"]
+    )
+    document, _ = run_train(
+        capsys, "policy", tmp_path / "demonstrations", "--out", tmp_path / "run", "--steps", 1
+    )
     card = json.loads(Path(document["card"]).read_text())
     load_net(Path(document["weights"]))
     assert Path(document["card"]).name == "learned.json"
     assert card["command"] == "simrun train policy demonstrations --threads 1"
     assert card["machine"]["cores"] == os.cpu_count()
     assert card["sha256"] == document["sha256"]
-    assert card["data"] == {"frames": 6, "samples": 6, "scenes": {"bend": 1, "street": 2}, "renderer": "clean"}
+    assert card["data"] == {
+        "frames": 6,
+        "samples": 6,
+        "scenes": {"bend": 1, "street": 2},
+        "renderer": "clean",
+    }
     assert card["held_out"]["samples"] == 2
     assert card["curves"][-1]["step"] == card["steps"] == 1
 
 
-def test_a_bundle_is_measured_as_its_autoencoder_is(data: Path, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bundle_is_measured_as_its_autoencoder_is(
+    data: Path, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     TinyVAE.random(seed=3).save(tmp_path / "vae.safetensors")
-    (whole, err), (alone, _) = (run_train(capsys, "vae-quality", path, data) for path in (bundle, tmp_path / "vae.safetensors"))
+    (whole, err), (alone, _) = (
+        run_train(capsys, "vae-quality", path, data)
+        for path in (bundle, tmp_path / "vae.safetensors")
+    )
     assert whole["rows"] == alone["rows"]
     assert [row["from"] for row in whole["rows"]] == ["latent", "latent and render", "render alone"]
     assert "[1/1] a: " in err
@@ -140,13 +205,22 @@ def test_a_file_without_an_autoencoder_is_refused(bundle: Path, tmp_path: Path) 
     assert load_tiny_vae(bundle).sizes == TinyVAE.random().sizes
     path = tmp_path / "other.safetensors"
     settings = small_settings()
-    save_bundle(path, {"dit": initial_weights(DiTSizes(**settings.dit.model_dump()), 3), "vae": {}}, settings, trained=True)
+    save_bundle(
+        path,
+        {"dit": initial_weights(DiTSizes(**settings.dit.model_dump()), 3), "vae": {}},
+        settings,
+        trained=True,
+    )
     with pytest.raises(InputError, match=r"other\.safetensors"):
         load_tiny_vae(path)
 
 
-def test_errors_are_documents_and_tracebacks_are_shown_on_request(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["train", "vae-quality", "untrained", str(tmp_path), "--json", "--debug"]) == 2
+def test_errors_are_documents_and_tracebacks_are_shown_on_request(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        run_command(["train", "vae-quality", "untrained", str(tmp_path), "--json", "--debug"]) == 2
+    )
     out, err = capsys.readouterr()
     assert "no finished sequence" in json.loads(out)["error"]["found"]
     assert "Traceback" in err
@@ -154,11 +228,18 @@ def test_errors_are_documents_and_tracebacks_are_shown_on_request(tmp_path: Path
     assert "--latents 6,x" in capsys.readouterr().err
 
 
-def test_scenes_of_any_name_are_in_order_of_their_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scenes_of_any_name_are_in_order_of_their_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "train").mkdir()
     for name in ("street_001", "bend_000", "foo", "bend_001"):
         (tmp_path / "train" / f"{name}.yaml").write_text("version: 1\nroda: {}\n")
-    assert [path.stem for path in scene_files(tmp_path, "train")] == ["bend_000", "bend_001", "street_001", "foo"]
+    assert [path.stem for path in scene_files(tmp_path, "train")] == [
+        "bend_000",
+        "bend_001",
+        "street_001",
+        "foo",
+    ]
     assert run_command(["train", "policy-data", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert "roda" in capsys.readouterr().err
 

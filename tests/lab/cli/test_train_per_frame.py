@@ -1,4 +1,6 @@
-"""``simrun train per-frame`` as a user meets it: from pairs to a bundle that a renderer's name takes."""
+"""``simrun train per-frame`` as a user meets it: from pairs to a bundle that a renderer's name
+takes.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +15,26 @@ from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from tests.lab.training.pair_files import make
 
-SIZES = ["--set", "fixer.generator.widths=[8,8,8]", "--set", "fixer.generator.detail=8", "--set", "fixer.generator.hidden=4"]
-FEW = ["--streams", "2", "--frames", "2", "--crop", "48x32", "--precision", "fp32", "--threads", "1"]
+SIZES = [
+    "--set",
+    "fixer.generator.widths=[8,8,8]",
+    "--set",
+    "fixer.generator.detail=8",
+    "--set",
+    "fixer.generator.hidden=4",
+]
+FEW = [
+    "--streams",
+    "2",
+    "--frames",
+    "2",
+    "--crop",
+    "48x32",
+    "--precision",
+    "fp32",
+    "--threads",
+    "1",
+]
 
 
 @pytest.fixture
@@ -23,11 +43,26 @@ def pairs(tmp_path: Path) -> Path:
     return tmp_path / "pairs"
 
 
-def test_pairs_become_a_bundle_with_its_card(pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pairs_become_a_bundle_with_its_card(
+    pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "run"
-    command = ["train", "per-frame", str(pairs), "--out", str(out), *SIZES, *FEW, "--keep-every", "1", "--json"]
+    command = [
+        "train",
+        "per-frame",
+        str(pairs),
+        "--out",
+        str(out),
+        *SIZES,
+        *FEW,
+        "--keep-every",
+        "1",
+        "--json",
+    ]
     assert run_command([*command, "--steps", "5", "--stop-at", "1"]) == 0
-    assert run_command([*command, "--steps", "2", "--decay-from", "2"]) == 0  # prolonged otherwise than planned
+    assert (
+        run_command([*command, "--steps", "2", "--decay-from", "2"]) == 0
+    )  # prolonged otherwise than planned
     captured = capsys.readouterr()
     document = json.loads(captured.out.splitlines()[-1])
     assert document["steps"] == 2
@@ -40,7 +75,11 @@ def test_pairs_become_a_bundle_with_its_card(pairs: Path, tmp_path: Path, capsys
     fixer = make_fixer("onefixer", settings, scene_id="scene")
     assert fixer.trained
     assert fixer.label.startswith("onefixer, 2 updates, ")
-    assert fixer.step([Frame(0, "front", np.zeros((20, 30, 3), np.uint8))], ())[0].rgb.shape == (20, 30, 3)
+    assert fixer.step([Frame(0, "front", np.zeros((20, 30, 3), np.uint8))], ())[0].rgb.shape == (
+        20,
+        30,
+        3,
+    )
 
 
 @pytest.mark.parametrize(
@@ -52,8 +91,26 @@ def test_pairs_become_a_bundle_with_its_card(pairs: Path, tmp_path: Path, capsys
     ],
 )
 def test_what_cannot_be_trained_is_refused(
-    pairs: Path, tmp_path: Path, options: list[str], mention: str, capsys: pytest.CaptureFixture[str]
+    pairs: Path,
+    tmp_path: Path,
+    options: list[str],
+    mention: str,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     sizes = [] if "--fixer" in options else SIZES
-    assert run_command(["train", "per-frame", str(pairs), "--out", str(tmp_path / "run"), *sizes, *FEW, *options]) == 2
+    assert (
+        run_command(
+            [
+                "train",
+                "per-frame",
+                str(pairs),
+                "--out",
+                str(tmp_path / "run"),
+                *sizes,
+                *FEW,
+                *options,
+            ]
+        )
+        == 2
+    )
     assert mention in capsys.readouterr().err

@@ -21,7 +21,9 @@ SMALL = ["--steps", "3", "--views", "6", "--width", "32", "--gaussians", "240", 
 
 
 @pytest.mark.slow
-def test_files_metrics_and_pictures_and_the_same_command_continues(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_metrics_and_pictures_and_the_same_command_continues(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     command = ["train", "splat", SCENE, "--out", str(tmp_path), *SMALL, "--json"]
     assert run_command(command) == 0
     first = capsys.readouterr()
@@ -43,11 +45,22 @@ def test_files_metrics_and_pictures_and_the_same_command_continues(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_given_images_with_times_and_points_make_a_scene_with_its_actors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_given_images_with_times_and_points_make_a_scene_with_its_actors(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     scenario, images = load_scenario("smoke/lead_car"), tmp_path / "images"
     views = logged_views(scenario, scene_of(scenario), 6, 32, threads=1)
     write_views(images, views)
-    command = ["train", "splat", "smoke/lead_car", "--out", str(tmp_path / "out"), "--images", str(images), *SMALL]
+    command = [
+        "train",
+        "splat",
+        "smoke/lead_car",
+        "--out",
+        str(tmp_path / "out"),
+        "--images",
+        str(images),
+        *SMALL,
+    ]
     assert run_command(command) == 2, "no points to start from"
     assert "ply_file_path" in capsys.readouterr().err
     write_ply(images / "points.ply", start_from_depth(views, {}, 100, "s", 0).background)
@@ -58,7 +71,9 @@ def test_given_images_with_times_and_points_make_a_scene_with_its_actors(tmp_pat
     assert run_command(command) == 0
     model = Reconstruction.load(tmp_path / "out")
     assert set(model.actors) == {actor.actor_id for actor in scenario.actors}
-    assert "aside_2m" not in json.loads((tmp_path / "out" / "metrics.json").read_text()), "there is no truth beside given images"
+    assert "aside_2m" not in json.loads((tmp_path / "out" / "metrics.json").read_text()), (
+        "there is no truth beside given images"
+    )
 
 
 def test_a_folder_without_a_model_is_refused(tmp_path: Path) -> None:

@@ -1,4 +1,6 @@
-"""The error budget: what samples add is a decomposition of the variance, what steps add is a paired change."""
+"""The error budget: what samples add is a decomposition of the variance, what steps add is a paired
+change.
+"""
 
 from __future__ import annotations
 
@@ -26,33 +28,64 @@ def test_variance_of_seeds_and_of_scenes_add_up(budget: ModuleType) -> None:
     rng = np.random.default_rng(0)
     scene, families = np.repeat(np.arange(400), 5), np.arange(400)
     found = budget.sources(rng.normal(0, 1, 400)[scene] + rng.normal(0, 2, 2000), scene, families)
-    assert found["scenes"] ** 2 + found["seeds"] ** 2 == pytest.approx(found["scenes and seeds"] ** 2)
+    assert found["scenes"] ** 2 + found["seeds"] ** 2 == pytest.approx(
+        found["scenes and seeds"] ** 2
+    )
     assert found["seeds"] == pytest.approx(1.966 * np.sqrt(4 / 5 / 400), rel=0.05)
     assert found["scenes"] == pytest.approx(1.966 * np.sqrt(1 / 400), rel=0.2)
-    assert found["families"] == pytest.approx(found["scenes and seeds"]), "each scene is a family of its own"
+    assert found["families"] == pytest.approx(found["scenes and seeds"]), (
+        "each scene is a family of its own"
+    )
 
 
-def drives(budget: ModuleType, what: str, harm: float, event: float = 0.0) -> dict[str, dict[str, float]]:
+def drives(
+    budget: ModuleType, what: str, harm: float, event: float = 0.0
+) -> dict[str, dict[str, float]]:
     out = {}
     for k in range(6):
-        for renderer, far in ((budget.BASELINE, 1.0), (budget.FIXED, 0.5 + 0.1 * k + harm * (1 + 0.1 * (k % 2)))):
+        for renderer, far in (
+            (budget.BASELINE, 1.0),
+            (budget.FIXED, 0.5 + 0.1 * k + harm * (1 + 0.1 * (k % 2))),
+        ):
             ms = 10.0 * (2.0 if what == "resolution" else 1.0)
-            out[f"s/{k}|{what}|{renderer}"] = {budget.EVENT: event, budget.DISTANCE: far, "ms": ms, "frames": 40}
+            out[f"s/{k}|{what}|{renderer}"] = {
+                budget.EVENT: event,
+                budget.DISTANCE: far,
+                "ms": ms,
+                "frames": 40,
+            }
     return out
 
 
-def test_a_step_is_judged_by_its_paired_change_against_a_tenth_of_the_interval(budget: ModuleType, tmp_path: Path) -> None:
+def test_a_step_is_judged_by_its_paired_change_against_a_tenth_of_the_interval(
+    budget: ModuleType, tmp_path: Path
+) -> None:
     far = {budget.BASELINE: [1.0] * 6, budget.FIXED: [0.5 + 0.1 * k for k in range(6)]}
     rows = [
-        {"renderer": name, "scene": f"test-{'ab'[k % 2]}-{k}", "seed": seed, budget.DISTANCE: m[k],
-         budget.EVENT: float(k == seed and name == budget.BASELINE)}
-        for name, m in far.items() for k in range(6) for seed in range(2)
-    ]  # fmt: skip
+        {
+            "renderer": name,
+            "scene": f"test-{'ab'[k % 2]}-{k}",
+            "seed": seed,
+            budget.DISTANCE: m[k],
+            budget.EVENT: float(k == seed and name == budget.BASELINE),
+        }
+        for name, m in far.items()
+        for k in range(6)
+        for seed in range(2)
+    ]
     pq.write_table(pa.Table.from_pylist(rows), tmp_path / "rollouts.parquet")
     known = {"raster": {"s/0": [1e-4, 1]}, "drives": {}}
-    for what, harm, event in (("", 0.0, 0.0), ("vehicle step", 1e-6, 0.0), ("resolution", 0.5, 1.0)):
+    for what, harm, event in (
+        ("", 0.0, 0.0),
+        ("vehicle step", 1e-6, 0.0),
+        ("resolution", 0.5, 1.0),
+    ):
         known["drives"] |= drives(budget, what, harm, event)
-    known["drives"] |= {key: row for key, row in drives(budget, "fixer precision", 0.0).items() if budget.FIXED in key}
+    known["drives"] |= {
+        key: row
+        for key, row in drives(budget, "fixer precision", 0.0).items()
+        if budget.FIXED in key
+    }
     rescored = {key.replace("||", "|"): [row, row] for key, row in drives(budget, "", 0.0).items()}
     lines = budget.table(tmp_path, json.loads(json.dumps(known)), rescored).splitlines()
     of = {line.split(" | ")[0].removeprefix("| "): line for line in lines if line.startswith("| ")}
@@ -83,7 +116,10 @@ def test_draws_of_a_scene_count_as_one_scene(budget: ModuleType) -> None:
         for name in ("s/0", "s/0#1", "s/1")
         for arm in (budget.FIXED, budget.BASELINE)
     }
-    other = {key: {**row, budget.DISTANCE: 1.0 + 0.4 * key.startswith("s/0#1|" + budget.FIXED)} for key, row in usual.items()}
+    other = {
+        key: {**row, budget.DISTANCE: 1.0 + 0.4 * key.startswith("s/0#1|" + budget.FIXED)}
+        for key, row in usual.items()
+    }
     found = budget.changed(usual, other)
     assert found["scenes"] == 2
     assert found["moved"][budget.DISTANCE] == pytest.approx([0.2, 0.0])

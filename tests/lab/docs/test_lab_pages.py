@@ -1,4 +1,6 @@
-"""The laboratory's pages, what leads to them from the other pages, and the commands of its verbs on all of them."""
+"""The laboratory's pages, what leads to them from the other pages, and the commands of its verbs on
+all of them.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +27,29 @@ def test_links_to_and_from_the_pages_resolve(repo: Path, everywhere: list[Path])
 
 def test_pages_that_code_and_pages_name_exist(repo: Path, everywhere: list[Path]) -> None:
     folders = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs", "tests", "docs")
-    code = [path for folder in folders for suffix in ("py", "yaml") for path in (repo / folder).rglob(f"*.{suffix}")]
-    named = [(file, page) for file in (*code, *everywhere) for page in core.MENTION.findall(file.read_text(encoding="utf-8"))]
-    assert [f"{file.relative_to(repo)}: {page}" for file, page in named if page.startswith(LAB) and not (repo / page).is_file()] == []
+    code = [
+        path
+        for folder in folders
+        for suffix in ("py", "yaml")
+        for path in (repo / folder).rglob(f"*.{suffix}")
+    ]
+    named = [
+        (file, page)
+        for file in (*code, *everywhere)
+        for page in core.MENTION.findall(file.read_text(encoding="utf-8"))
+    ]
+    assert [
+        f"{file.relative_to(repo)}: {page}"
+        for file, page in named
+        if page.startswith(LAB) and not (repo / page).is_file()
+    ] == []
 
 
 def test_pages_are_short_and_reachable_and_their_pictures_shown(repo: Path) -> None:
     assert core.too_long(repo, lab_pages(repo)) == {}
-    assert [page.name for page in lab_pages(repo) if page not in core.reachable(repo / "docs")] == []
+    assert [
+        page.name for page in lab_pages(repo) if page not in core.reachable(repo / "docs")
+    ] == []
     assert core.unshown(repo / LAB, lab_pages(repo)) == []
 
 

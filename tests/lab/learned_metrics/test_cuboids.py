@@ -12,7 +12,8 @@ from alpasim_plugin.lab.learned_metrics.types import Cuboid, cuboid_corners, hul
 
 K = np.array([[100.0, 0.0, 128.0], [0.0, 100.0, 72.0], [0.0, 0.0, 1.0]])
 SIZE = (144, 256)
-# Seen from behind at yaw -90 degrees: the length lies along z. Its nearest face is 4 m wide and 2 m high, 10 m away.
+# Seen from behind at yaw -90 degrees: the length lies along z. Its nearest face is 4 m wide and 2 m
+# high, 10 m away.
 FRONTAL = Cuboid("car", 0.8, 0.0, 0.0, 12.0, 4.0, 2.0, 4.0, -np.pi / 2)
 
 
@@ -25,7 +26,9 @@ def test_the_outline_of_a_box_seen_head_on_is_its_nearest_face() -> None:
     assert hull is not None
     assert hull.min(axis=0) == pytest.approx([108.0, 62.0], abs=1e-4)
     assert hull.max(axis=0) == pytest.approx([148.0, 82.0], abs=1e-4)
-    assert abs(int(union_mask([FRONTAL], K, SIZE).sum()) - 40 * 20) <= 61  # a pixel of border on each side
+    assert (
+        abs(int(union_mask([FRONTAL], K, SIZE).sum()) - 40 * 20) <= 61
+    )  # a pixel of border on each side
 
 
 def test_yaw_turns_about_the_cameras_y_axis() -> None:
@@ -49,8 +52,12 @@ def test_half_a_width_aside_scores_a_half() -> None:
 
 def test_areas_are_pooled_over_the_clip() -> None:
     other = shifted(FRONTAL, 8.0)
-    both, made, reference = cuboid_areas([[FRONTAL], [], [FRONTAL]], [[FRONTAL], [FRONTAL], [other]], K, SIZE)
-    assert cuboid_f1([[FRONTAL], [], [FRONTAL]], [[FRONTAL], [FRONTAL], [other]], K, SIZE) == pytest.approx(2 * both / (made + reference))
+    both, made, reference = cuboid_areas(
+        [[FRONTAL], [], [FRONTAL]], [[FRONTAL], [FRONTAL], [other]], K, SIZE
+    )
+    assert cuboid_f1(
+        [[FRONTAL], [], [FRONTAL]], [[FRONTAL], [FRONTAL], [other]], K, SIZE
+    ) == pytest.approx(2 * both / (made + reference))
     assert both < made < reference
 
 
@@ -59,7 +66,12 @@ def test_boxes_that_overlap_count_once() -> None:
 
 
 def test_unsure_near_and_other_boxes_do_not_count() -> None:
-    for box in (replace(FRONTAL, score=0.09), replace(FRONTAL, z_m=2.4), replace(FRONTAL, label="pedestrian"), replace(FRONTAL, z_m=-20.0)):
+    for box in (
+        replace(FRONTAL, score=0.09),
+        replace(FRONTAL, z_m=2.4),
+        replace(FRONTAL, label="pedestrian"),
+        replace(FRONTAL, z_m=-20.0),
+    ):
         assert not union_mask([box], K, SIZE).any()
     assert union_mask([replace(FRONTAL, score=0.10)], K, SIZE).any()
 

@@ -1,4 +1,6 @@
-"""The paper's names: null with a reason without the user's detections or weights, and detections read from JSON."""
+"""The paper's names: null with a reason without the user's detections or weights, and detections
+read from JSON.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +23,12 @@ LANE = {"score": 0.8, "points": [[3.0, 1.7], [30.0, 1.9]]}
 
 def write(path: Path, **changes: Any) -> Path:
     document = {
-        "detector": "D", "weights_sha256": "ab", "size": [256, 144], "K": [[100, 0, 128], [0, 100, 72], [0, 0, 1]],
+        "detector": "D",
+        "weights_sha256": "ab",
+        "size": [256, 144],
+        "K": [[100, 0, 128], [0, 100, 72], [0, 0, 1]],
         "frames": [{"frame": 1, "cuboids": [BOX], "lanes": [LANE]}],
-    }  # fmt: skip
+    }
     path.write_text(json.dumps({**document, **changes}))
     return path
 
@@ -67,7 +72,10 @@ def test_boxes_that_stand_on_their_origin_are_lifted(tmp_path: Path) -> None:
     [
         ({"frames": [{"frame": 0}, {"frame": 0}]}, "list every frame once"),
         ({"frames": [{"frame": 9}]}, "of a clip of 3"),
-        ({"frames": [{"frame": 0, "cuboids": [{**BOX, "box": [0, 0, 1]}]}]}, "not a detector's results"),
+        (
+            {"frames": [{"frame": 0, "cuboids": [{**BOX, "box": [0, 0, 1]}]}]},
+            "not a detector's results",
+        ),
         ({"frames": [{"frame": 0, "lanes": [{"score": 1.0, "points": []}]}]}, "without points"),
         ({"detector": None, "frames": 3}, "not a detector's results"),
     ],
@@ -81,7 +89,9 @@ def test_damage_keeps_the_length_and_grows() -> None:
     rng = np.random.default_rng(0)
     clip = rng.integers(0, 255, (20, 16, 24, 3)).astype(np.uint8)
     for kind in KINDS:
-        changed = [float(np.abs(damaged(clip, kind, s).astype(int) - clip).mean()) for s in STRENGTHS[kind]]
+        changed = [
+            float(np.abs(damaged(clip, kind, s).astype(int) - clip).mean()) for s in STRENGTHS[kind]
+        ]
         assert damaged(clip, kind, STRENGTHS[kind][0]).shape == clip.shape
         assert changed[0] > 0
         if kind != "drop":  # of a random clip, any dropping changes all later frames

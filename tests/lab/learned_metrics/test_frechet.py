@@ -1,4 +1,6 @@
-"""The Frechet distance against closed forms and against scipy's matrix square root, singular covariances included."""
+"""The Frechet distance against closed forms and against scipy's matrix square root, singular
+covariances included.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,16 @@ def by_square_root(a: np.ndarray, b: np.ndarray, ridge: float = 0.0) -> float:
 
 
 def by_symmetric_roots(a: np.ndarray, b: np.ndarray) -> float:
-    """The same through eigenvalues of ``S1^(1/2) S2 S1^(1/2)``, which also holds where covariances are singular."""
+    """The same through eigenvalues of ``S1^(1/2) S2 S1^(1/2)``, which also holds where covariances
+    are singular.
+    """
     s1, s2 = np.cov(a, rowvar=False), np.cov(b, rowvar=False)
     values, vectors = np.linalg.eigh(s1)
     root = (vectors * np.sqrt(values.clip(min=0))) @ vectors.T
     inner = np.linalg.eigvalsh(root @ s2 @ root).clip(min=0)
-    return float(((a.mean(0) - b.mean(0)) ** 2).sum() + np.trace(s1 + s2) - 2 * np.sqrt(inner).sum())
+    return float(
+        ((a.mean(0) - b.mean(0)) ** 2).sum() + np.trace(s1 + s2) - 2 * np.sqrt(inner).sum()
+    )
 
 
 def draw(seed: int, n: int, d: int, scale: float = 1.0, shift: float = 0.0) -> np.ndarray:
@@ -81,4 +87,6 @@ def test_what_cannot_be_compared_is_refused() -> None:
 def test_halves_need_four_clips() -> None:
     clips = [draw(i, 5, 3) for i in range(4)]
     assert halves(clips[:3]) is None
-    assert halves(clips) == pytest.approx(frechet_distance(np.concatenate(clips[::2]), np.concatenate(clips[1::2])))
+    assert halves(clips) == pytest.approx(
+        frechet_distance(np.concatenate(clips[::2]), np.concatenate(clips[1::2]))
+    )

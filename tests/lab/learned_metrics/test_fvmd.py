@@ -6,7 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from alpasim_plugin.lab.learned_metrics.fvmd import ANGLES, fvmd_lk, histograms, lk_tracks, motion_features
+from alpasim_plugin.lab.learned_metrics.fvmd import (
+    ANGLES,
+    fvmd_lk,
+    histograms,
+    lk_tracks,
+    motion_features,
+)
 
 CUBES = (4, 4, 4, ANGLES)  # time, rows, columns, angle
 
@@ -74,6 +80,7 @@ def test_windows_and_distance_of_a_set() -> None:
     features = motion_features(clip)
     assert features.shape == (2, 1024)  # starts at 0 and 25
     assert motion_features(clip[:15]).shape == (0, 1024)
-    # With its ridge inside the root only, FVMD's code gives -2 r d instead of 0 for one set twice; the distance stops at 0.
+    # With its ridge inside the root only, FVMD's code gives -2 r d instead of 0 for one set twice;
+    # the distance stops at 0.
     few = features[:, :40]
     assert fvmd_lk([few], [few]) == pytest.approx(0.0, abs=1e-6)

@@ -1,4 +1,6 @@
-"""The judges' networks: what they decode, that files are those that were frozen, and the loaders of the paper's own networks."""
+"""The judges' networks: what they decode, that files are those that were frozen, and the loaders of
+the paper's own networks.
+"""
 
 from __future__ import annotations
 
@@ -33,11 +35,15 @@ TYPES = "alpasim_plugin.lab.learned_metrics.types"  # what is measured, without 
 LAB = REPO / "alpasim_plugin" / "lab"
 K = np.array([[167.0, 0.0, 128.0], [0.0, 167.0, 72.0], [0.0, 0.0, 1.0]])
 # 1.5 m above the ground, looking along the rig's x axis.
-MOUNT = np.array([[0.0, 0.0, 1.0, 1.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]])
+MOUNT = np.array(
+    [[0.0, 0.0, 1.0, 1.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]]
+)
 CAMERA = CameraSpec("camera", 256, 144, K, MOUNT)
 
 
-def cells_with(lines: dict[float, float], logit: float = 4.0, rows: range = range(29)) -> np.ndarray:
+def cells_with(
+    lines: dict[float, float], logit: float = 4.0, rows: range = range(29)
+) -> np.ndarray:
     """Network output for straight lines: lateral position at 3 m -> slope, metres per row."""
     out = np.zeros((3, 29, CELLS), dtype=np.float32)
     out[0] = -6.0
@@ -51,7 +57,11 @@ def cells_with(lines: dict[float, float], logit: float = 4.0, rows: range = rang
 def test_points_are_joined_to_lines_where_they_are() -> None:
     found = join_lines(cells_with({-1.73: 0.0, 1.81: 0.05, 5.0: 0.06}))
     assert sorted(round(float(lane.lateral_m[0]), 2) for lane in found) == [-1.73, 1.81, 5.0]
-    assert {round(float(lane.lateral_m[28] - lane.lateral_m[0]), 2) for lane in found} == {0.0, 1.4, 1.68}
+    assert {round(float(lane.lateral_m[28] - lane.lateral_m[0]), 2) for lane in found} == {
+        0.0,
+        1.4,
+        1.68,
+    }
     assert found[0].score == pytest.approx(1 / (1 + np.exp(-4.0)), rel=1e-6)
 
 
@@ -65,7 +75,9 @@ def test_a_line_bridges_a_gap_between_dashes_and_no_longer_one() -> None:
 def test_lines_that_cross_keep_their_direction() -> None:
     found = join_lines(cells_with({-2.0: 0.2, 3.6: -0.2}))
     ends = sorted(
-        (round(float(lane.lateral_m[0]), 1), round(float(lane.lateral_m[28]), 1)) for lane in found if np.isfinite(lane.lateral_m).all()
+        (round(float(lane.lateral_m[0]), 1), round(float(lane.lateral_m[28]), 1))
+        for lane in found
+        if np.isfinite(lane.lateral_m).all()
     )
     assert (-2.0, 3.6) in ends
 
@@ -107,12 +119,17 @@ def test_a_vehicle_that_is_encoded_is_decoded(yaw: float) -> None:
     (found,) = decode(cells, K, 256, 0.1)
     assert found.label == "truck"
     assert (found.x_m, found.y_m, found.z_m) == pytest.approx((-4.0, 0.6, 27.0), rel=1e-5)
-    assert (found.length_m, found.height_m, found.width_m) == pytest.approx((8.2, 3.1, 2.5), rel=1e-5)
+    assert (found.length_m, found.height_m, found.width_m) == pytest.approx(
+        (8.2, 3.1, 2.5), rel=1e-5
+    )
     assert np.exp(1j * found.yaw_rad) == pytest.approx(np.exp(1j * yaw), rel=1e-5)
 
 
 def test_the_focal_length_sets_the_depth() -> None:
-    near, far = Cuboid("car", 1.0, 0.0, 0.5, 10.0, 4.0, 1.5, 1.8, 0.0), Cuboid("car", 1.0, 0.0, 0.5, 20.0, 4.0, 1.5, 1.8, 0.0)
+    near, far = (
+        Cuboid("car", 1.0, 0.0, 0.5, 10.0, 4.0, 1.5, 1.8, 0.0),
+        Cuboid("car", 1.0, 0.0, 0.5, 20.0, 4.0, 1.5, 1.8, 0.0),
+    )
     twice = np.array([[334.0, 0, 128], [0, 334.0, 72], [0, 0, 1]])
     one, other = encode(near, K, 256), encode(far, twice, 256)
     assert one is not None
@@ -146,7 +163,11 @@ def test_a_judge_whose_file_has_changed_is_not_loaded(tmp_path: Path) -> None:
     assert not any(p.requires_grad for p in load_judge("style", 0, tmp_path).parameters())
     save_judge(path, "style", untrained("style"), {"seed": "1"})
     load_judge.cache_clear()
-    for call in (lambda: load_judge("style", 0, tmp_path), lambda: check_digests(tmp_path), lambda: freeze(tmp_path)):
+    for call in (
+        lambda: load_judge("style", 0, tmp_path),
+        lambda: check_digests(tmp_path),
+        lambda: freeze(tmp_path),
+    ):
         with pytest.raises(InputError, match="frozen was"):
             call()
 
@@ -171,21 +192,35 @@ IMPORT = re.compile(r"^\s*(?:from ([\w.]+) import (\([^)]*\)|[^\n]*)|import ([\w
 
 
 def imported(path: Path) -> set[str]:
-    """Return the modules and names that a file imports, by its text: parsing every file takes seconds."""
+    """Return the modules and names that a file imports, by its text: parsing every file takes
+    seconds.
+    """
     found: set[str] = set()
     for module, names, plain in IMPORT.findall(path.read_text()):
-        found |= {f"{module}.{name}" for name in re.findall(r"\w+", names)} | {module} if module else set(re.findall(r"[\w.]+", plain))
+        found |= (
+            {f"{module}.{name}" for name in re.findall(r"\w+", names)} | {module}
+            if module
+            else set(re.findall(r"[\w.]+", plain))
+        )
     return found
 
 
 def test_imports_are_read_from_text() -> None:
     seen = imported(Path(__file__))
-    assert {"alpasim_plugin.lab.learned_metrics.nets.files.load_judge", "numpy", "alpasim_plugin.core.types"} <= seen
+    assert {
+        "alpasim_plugin.lab.learned_metrics.nets.files.load_judge",
+        "numpy",
+        "alpasim_plugin.core.types",
+    } <= seen
 
 
 def test_nothing_that_is_trained_or_driven_may_load_a_judge() -> None:
     trained = [*(LAB / "training").rglob("*.py"), *(LAB / "cli").glob("train*.py")]
-    driven = [p for part in ("fixers", "renderers", "runtime", "nets") for p in (REPO / "alpasim_plugin" / part).rglob("*.py")]
+    driven = [
+        p
+        for part in ("fixers", "renderers", "runtime", "nets")
+        for p in (REPO / "alpasim_plugin" / part).rglob("*.py")
+    ]
     driven += (REPO / "policies").rglob("*.py")
     loaders = {
         "alpasim_plugin.lab.learned_metrics.nets.files.load_judge",
@@ -195,7 +230,11 @@ def test_nothing_that_is_trained_or_driven_may_load_a_judge() -> None:
     wrong = []
     for path in (*trained, *driven):
         inside = "learned_metrics" in path.parts or path.name == "train_judge.py"
-        names = {name for name in imported(path) if name.startswith("alpasim_plugin.lab.learned_metrics") and not name.startswith(TYPES)}
+        names = {
+            name
+            for name in imported(path)
+            if name.startswith("alpasim_plugin.lab.learned_metrics") and not name.startswith(TYPES)
+        }
         if names & loaders or (names and not inside):
             wrong.append((path.name, sorted(names)))
     assert len(trained) > 40

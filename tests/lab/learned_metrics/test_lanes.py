@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.lab.learned_metrics.lane_jitter import lane_jitter_m, tracks
-from alpasim_plugin.lab.learned_metrics.lanes import NEVER, LaneScore, counted, pairs, resampled, score_clip, score_frame, up_to
+from alpasim_plugin.lab.learned_metrics.lanes import (
+    NEVER,
+    LaneScore,
+    counted,
+    pairs,
+    resampled,
+    score_clip,
+    score_frame,
+    up_to,
+)
 from alpasim_plugin.lab.learned_metrics.types import FORWARD_M, Lane3D
 
 ROWS = len(FORWARD_M)
@@ -85,11 +94,15 @@ def test_the_assignment_is_the_best_of_all() -> None:
         made = [straight(float(x)) for x in rng.uniform(-6, 6, 4)]
         cost = np.array([[abs(a.lateral_m[0] - b.lateral_m[0]) for b in truth] for a in made])
         cost[cost > 1.5] = NEVER
-        best = min(permutations(range(4)), key=lambda order: sum(cost[i, j] for i, j in enumerate(order)))
+        best = min(
+            permutations(range(4)), key=lambda order: sum(cost[i, j] for i, j in enumerate(order))
+        )
         wanted = [(i, j) for i, j in enumerate(best) if cost[i, j] < NEVER]
         found = pairs(made, truth)
         assert len(found) == len(wanted)
-        assert sum(cost[i, j] for i, j in found) == pytest.approx(sum(cost[i, j] for i, j in wanted))
+        assert sum(cost[i, j] for i, j in found) == pytest.approx(
+            sum(cost[i, j] for i, j in wanted)
+        )
 
 
 def test_instances_are_pooled_over_a_clip() -> None:

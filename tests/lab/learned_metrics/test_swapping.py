@@ -1,4 +1,6 @@
-"""The permutation test by swapping clips: its fast distances against the plain ones, its p-values against the plain test."""
+"""The permutation test by swapping clips: its fast distances against the plain ones, its p-values
+against the plain test.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +19,26 @@ def draw(seed: int, n: int, d: int, scale: float = 1.0) -> np.ndarray:
     return scale * np.random.default_rng(seed).normal(size=(n, d))
 
 
-def plain_test(first: list[np.ndarray], second: list[np.ndarray], truth: list[np.ndarray], swaps: int, seed: int) -> float:
-    """The share of all the same draws, with the distance of the joined vectors each time and no early end."""
+def plain_test(
+    first: list[np.ndarray],
+    second: list[np.ndarray],
+    truth: list[np.ndarray],
+    swaps: int,
+    seed: int,
+) -> float:
+    """The share of all the same draws, with the distance of the joined vectors each time and no
+    early end.
+    """
     reference = np.concatenate(truth)
 
     def difference(a: list[np.ndarray], b: list[np.ndarray]) -> float:
-        return frechet_distance(np.concatenate(a), reference) - frechet_distance(np.concatenate(b), reference)
+        return frechet_distance(np.concatenate(a), reference) - frechet_distance(
+            np.concatenate(b), reference
+        )
 
-    measured, rng, extreme = abs(difference(first, second)), stream("judges", seed, "frechet.swap"), 0
+    measured = abs(difference(first, second))
+    rng = stream("judges", seed, "frechet.swap")
+    extreme = 0
     for _ in range(swaps):
         swapped = rng.random(len(first)) < 0.5
         a = [y if s else x for x, y, s in zip(first, second, swapped, strict=True)]
@@ -51,7 +65,9 @@ def hard_clips(kind: str) -> tuple[list[np.ndarray], np.ndarray]:
     if kind == "one vector a clip":
         return [draw(i, 1, 4) for i in range(8)], draw(9, 4, 4)
     assert kind == "scales apart by a thousand million"
-    return [draw(i, 6, 5) * 10.0 ** -np.arange(0, 10, 2) for i in range(8)], draw(9, 24, 5) * 10.0 ** -np.arange(0, 10, 2)
+    return [draw(i, 6, 5) * 10.0 ** -np.arange(0, 10, 2) for i in range(8)], draw(
+        9, 24, 5
+    ) * 10.0 ** -np.arange(0, 10, 2)
 
 
 KINDS = (
@@ -105,9 +121,18 @@ def test_few_clips_are_swapped_in_every_way(d: int, shift: float) -> None:
     second = [x + 0.1 * draw(200 + i, 3, d) + shift for i, x in enumerate(truth)]
     reference, differences = np.concatenate(truth), []
     for swapped in product((False, True), repeat=5):
-        sides = [[pair[side ^ s] for pair, s in zip(zip(first, second, strict=True), swapped, strict=True)] for side in (0, 1)]
+        sides = [
+            [
+                pair[side ^ s]
+                for pair, s in zip(zip(first, second, strict=True), swapped, strict=True)
+            ]
+            for side in (0, 1)
+        ]
         differences.append(
-            abs(frechet_distance(np.concatenate(sides[0]), reference) - frechet_distance(np.concatenate(sides[1]), reference))
+            abs(
+                frechet_distance(np.concatenate(sides[0]), reference)
+                - frechet_distance(np.concatenate(sides[1]), reference)
+            )
         )
     found = swap_test(first, second, truth, swaps=16)
     assert found.swaps == 16
@@ -138,7 +163,10 @@ def test_the_share_of_false_alarms_is_the_level() -> None:
     alarms = 0
     for trial in range(200):
         truth = [draw(1000 * trial + i, 2, 2) for i in range(7)]
-        sides = [[x + 0.5 * draw(1000 * trial + 100 * side + i, 2, 2) for i, x in enumerate(truth)] for side in (1, 2)]
+        sides = [
+            [x + 0.5 * draw(1000 * trial + 100 * side + i, 2, 2) for i, x in enumerate(truth)]
+            for side in (1, 2)
+        ]
         alarms += swap_test(sides[0], sides[1], truth, swaps=99, seed=trial).p_value <= 0.05
     assert alarms <= 19  # binomial(200, .05): 20 or more in 0.3 % of repetitions
 

@@ -13,4 +13,9 @@ def arms(**shift: float) -> Measured:
     """Return arms whose PSNR is a clip's own level plus the arm's shift and a little noise."""
     rng = np.random.default_rng(0)
     level = {clip: 24 + 3 * rng.normal() for clip in CLIPS}
-    return Measured({arm: {c: {"psnr_db": level[c] + by + 0.1 * rng.normal()} for c in CLIPS} for arm, by in shift.items()})
+    return Measured(
+        {
+            arm: {c: {"psnr_db": level[c] + by + 0.1 * rng.normal()} for c in CLIPS}
+            for arm, by in shift.items()
+        }
+    )

@@ -17,7 +17,9 @@ from alpasim_plugin.lab.paper.training import TrainedArm, edge_of, training_sect
         (1e-3, (), None),
     ],
 )
-def test_the_ends_of_a_sweep_are_known(rate: float, swept: tuple[float, ...], edge: str | None) -> None:
+def test_the_ends_of_a_sweep_are_known(
+    rate: float, swept: tuple[float, ...], edge: str | None
+) -> None:
     assert edge_of(rate, swept) == edge
 
 
@@ -28,7 +30,10 @@ def test_the_section_has_every_arm_and_names_those_at_the_end_of_their_sweep() -
         TrainedArm("gsfix3d", {"teacher": 10, "gsfix3d": 20}, 8.0, 1e-3, {3e-4: 0.5, 1e-3: 0.4}),
     ]
     section = training_section(arms)
-    assert "| gsfix3d | teacher 10 + gsfix3d 20 | 8.00 | 0.001 (0.0003: 0.500, 0.001: 0.400) |" in section
+    assert (
+        "| gsfix3d | teacher 10 + gsfix3d 20 | 8.00 | 0.001 (0.0003: 0.500, 0.001: 0.400) |"
+        in section
+    )
     assert "The highest rate of its sweep was the best of `difix`, `gsfix3d`:" in section
     assert "lowest rate of its" not in section
     assert training_section([]) == ""

@@ -7,9 +7,20 @@ import pytest
 
 from alpasim_plugin.lab.paper.measured import Measured
 from alpasim_plugin.lab.paper.published import published
-from alpasim_plugin.lab.paper.transfer import COMPARED, PHOTOGRAPHS, TRANSFER, clip_values, tenth, transfer_section
+from alpasim_plugin.lab.paper.transfer import (
+    COMPARED,
+    PHOTOGRAPHS,
+    TRANSFER,
+    clip_values,
+    tenth,
+    transfer_section,
+)
 
-SERIES = {"psnr_db": np.arange(50.0), "perceptual-syn": np.linspace(0, 0.49, 50), "warp_l1": np.zeros(49)}
+SERIES = {
+    "psnr_db": np.arange(50.0),
+    "perceptual-syn": np.linspace(0, 0.49, 50),
+    "warp_l1": np.zeros(49),
+}
 
 
 def test_a_clip_has_its_middle_and_last_tenth() -> None:
@@ -36,7 +47,10 @@ def test_tenths_lie_within_the_clip(frames: int) -> None:
 
 
 def test_the_section_has_photographs_where_they_were_measured() -> None:
-    clips = {f"c{i}": {"psnr_db": 20.0 + i, "perceptual-syn": 0.2, "perceptual-syn-mid": 0.2} for i in range(3)}
+    clips = {
+        f"c{i}": {"psnr_db": 20.0 + i, "perceptual-syn": 0.2, "perceptual-syn-mid": 0.2}
+        for i in range(3)
+    }
     mine = Measured({"3dgs": clips, "V9": clips, "V9 zero shot": clips})
     text = transfer_section(published(), {TRANSFER: mine})
     assert "Photographs" not in text

@@ -20,10 +20,19 @@ timing: {{duration_us: {duration_us}, warmup_us: 100_000}}
 
 
 def make_corner(scenes: Path, pairs: Path, split: str, duration_us: int) -> Path:
-    """Write the scene and its pairs, whose input is the clean render, below their folders; return the folder of the pairs."""
+    """Write the scene and its pairs, whose input is the clean render, below their folders; return
+    the folder of the pairs.
+    """
     path, folder = scenes / split / "corner.yaml", pairs / split / "corner"
     path.parent.mkdir(parents=True)
     path.write_text(SCENE.format(duration_us=duration_us))
-    assert make_sequence(load_scenario(path), folder, PairRecipe(source="clean", max_offset_m=0.0), 0, split=split, family="street")
+    assert make_sequence(
+        load_scenario(path),
+        folder,
+        PairRecipe(source="clean", max_offset_m=0.0),
+        0,
+        split=split,
+        family="street",
+    )
     clear_cache()
     return folder

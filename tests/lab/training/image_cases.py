@@ -15,9 +15,15 @@ from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.lab.image_fixers.settings import NoiseWindowSettings, RenderStepSettings
 
 SMALL = (
-    "vae.widths=[16,16,16,16,16]", "dit.width=24", "dit.blocks=2", "dit.head_width=12", "dit.mlp_width=40", "dit.adaln_rank=5",
-    "dit.text_width=7", "dit.context_width=9",
-)  # fmt: skip
+    "vae.widths=[16,16,16,16,16]",
+    "dit.width=24",
+    "dit.blocks=2",
+    "dit.head_width=12",
+    "dit.mlp_width=40",
+    "dit.adaln_rank=5",
+    "dit.text_width=7",
+    "dit.context_width=9",
+)
 DAMPED = 0.3  # of the velocity and of the autoencoder's corrections: the guard finds nothing
 
 
@@ -28,7 +34,9 @@ def image_settings(name: str, *overrides: str) -> RenderStepSettings | NoiseWind
     return settings
 
 
-def busy_settings(folder: Path, name: str, *overrides: str) -> RenderStepSettings | NoiseWindowSettings:
+def busy_settings(
+    folder: Path, name: str, *overrides: str
+) -> RenderStepSettings | NoiseWindowSettings:
     """Return settings whose weights make every layer count."""
     kind = image_settings(name, *overrides).decoder.kind
     path = folder / f"{name}_{kind}.safetensors"
@@ -49,6 +57,10 @@ def damp(*weights: Tensor) -> None:
             weight.mul_(DAMPED)
 
 
-def save(path: Path, parts: Mapping[str, Mapping[str, Tensor]], settings: RenderStepSettings | NoiseWindowSettings) -> None:
+def save(
+    path: Path,
+    parts: Mapping[str, Mapping[str, Tensor]],
+    settings: RenderStepSettings | NoiseWindowSettings,
+) -> None:
     """Write a bundle."""
     save_bundle(path, parts, settings, trained=True, note="3 updates")

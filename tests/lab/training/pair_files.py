@@ -16,13 +16,26 @@ def pair(i: int, height: int = 32, width: int = 48) -> Pair:
     opacity = np.where(y < 4, 0, 255).astype(np.uint8)
     T = np.eye(4)
     T[0, 3] = i
-    return Pair((rgb // 2).astype(np.uint8), rgb, opacity, (255 - rgb).astype(np.uint8), T, 100_000 * i)
+    return Pair(
+        (rgb // 2).astype(np.uint8), rgb, opacity, (255 - rgb).astype(np.uint8), T, 100_000 * i
+    )
 
 
 def make(
-    root: Path, split: str = "train", name: str = "a", frames: int = 12, height: int = 32, width: int = 48, **more: str
+    root: Path,
+    split: str = "train",
+    name: str = "a",
+    frames: int = 12,
+    height: int = 32,
+    width: int = 48,
+    **more: str,
 ) -> PairSequence:
     """Write one sequence, with ``more`` of sequence.json, and open it."""
     folder = root / split / name
-    write_sequence(folder, (pair(i, height, width) for i in range(frames)), frames, {"scene_id": name, "split": split, **more})
+    write_sequence(
+        folder,
+        (pair(i, height, width) for i in range(frames)),
+        frames,
+        {"scene_id": name, "split": split, **more},
+    )
     return PairSequence(folder)

@@ -1,4 +1,6 @@
-"""`simrun adapt`: weights are kept only where held-out photographs gain, and nothing is written otherwise."""
+"""`simrun adapt`: weights are kept only where held-out photographs gain, and nothing is written
+otherwise.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,12 @@ from tests.renderers.recorded_drive import recorded_drive
 def drive(folder: Path, count: int) -> Scenario:
     made = recorded_drive(folder, count)
     front = [one for one in made.recording if one.camera == "front"]
-    return replace(made, recording=tuple(replace(one, use="held-out" if i % 4 == 2 else "fitted") for i, one in enumerate(front)))
+    return replace(
+        made,
+        recording=tuple(
+            replace(one, use="held-out" if i % 4 == 2 else "fitted") for i, one in enumerate(front)
+        ),
+    )
 
 
 def shipped() -> Path:
@@ -36,7 +43,9 @@ def test_a_gain_is_accepted_where_chance_does_not_explain_it() -> None:
     assert not compared(before, before).accepted
 
 
-def test_a_drive_without_enough_photographs_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
+def test_a_drive_without_enough_photographs_is_refused_and_nothing_is_written(
+    tmp_path: Path,
+) -> None:
     with pytest.raises(InputError, match="5 fitted and 2 held-out photographs of camera"):
         adapt(drive(tmp_path, 7), shipped(), tmp_path / "new.safetensors", updates=1, distance=None)
     assert not (tmp_path / "new.safetensors").exists()

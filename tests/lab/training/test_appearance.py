@@ -1,4 +1,6 @@
-"""The recipe ``appearance``: targets with the depth of their scene, a start that is OneFixer's, and prompts that alone decide the style."""
+"""The recipe ``appearance``: targets with the depth of their scene, a start that is OneFixer's, and
+prompts that alone decide the style.
+"""
 
 from __future__ import annotations
 
@@ -53,28 +55,51 @@ def run_of(data: Path, scenes: Path | None, recipe: str = "appearance") -> Fixer
     schedule = Schedule(1, peak_lr=1e-2, warmup=1, accumulate=1, save_every=1, ema=0.5)
     chosen = with_attention(recipe_of(recipe), window=4)
     form = ClipForm(latents=2, stride=1)
-    return FixerRun(settings, chosen, data, data / "vae.safetensors", {}, form, BatchForm(clips=3), schedule, scenes=scenes)
+    return FixerRun(
+        settings,
+        chosen,
+        data,
+        data / "vae.safetensors",
+        {},
+        form,
+        BatchForm(clips=3),
+        schedule,
+        scenes=scenes,
+    )
 
 
 def task_of(run: FixerRun, folder: Path) -> Any:
     def brightness(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         return (a.mean(dim=(1, 2, 3)) - b.mean(dim=(1, 2, 3))).abs()
 
-    clips = LatentClips(PairDataset(run.data, "train").sequences, TinyVAE.load(run.vae), run.form, folder)
+    clips = LatentClips(
+        PairDataset(run.data, "train").sequences, TinyVAE.load(run.vae), run.form, folder
+    )
     stage = run.recipe.stages[0]
     return stage.objective.task(stage_inputs(run, stage, clips, {}, ("brightness", brightness)))
 
 
 def test_fog_hides_by_the_depth_of_the_scene(data: Path) -> None:
-    """Of two rows of level ground the share of fog follows from their distances, 1.5 m below the camera's height over the sine."""
+    """Of two rows of level ground the share of fog follows from their distances, 1.5 m below the
+    camera's height over the sine.
+    """
     sequence = PairSequence(data / "train" / "corner")
     seen = seen_frames(sequence, scene_of(sequence, data / "scenes"), 0, 1)
     clean = np.array(sequence.clip.rgb_gt[:1])
     foggy = restyle_video(clean, seen, "fog", "corner")[0].astype(float)
-    light = restyle_video(np.zeros_like(clean), [replace(seen[0], depth_m=np.zeros_like(seen[0].depth_m))], "fog", "corner")[0, 0, 0]
-    through = [np.median((light - foggy[v]) / (light - clean[0, v].astype(float))) for v in (20, 30)]
+    light = restyle_video(
+        np.zeros_like(clean),
+        [replace(seen[0], depth_m=np.zeros_like(seen[0].depth_m))],
+        "fog",
+        "corner",
+    )[0, 0, 0]
+    through = [
+        np.median((light - foggy[v]) / (light - clean[0, v].astype(float))) for v in (20, 30)
+    ]
     T = seen[0].T_world_camera
-    rays = [(v + 0.5 - seen[0].K[1, 2]) / seen[0].K[1, 1] for v in (20, 30)]  # straight ahead, depth 1
+    rays = [
+        (v + 0.5 - seen[0].K[1, 2]) / seen[0].K[1, 1] for v in (20, 30)
+    ]  # straight ahead, depth 1
     depth = [-T[2, 3] / (T[2, 1] * ray + T[2, 2]) for ray in rays]
     assert depth[0] > 1.8 * depth[1]
     density = [-np.log(t) / d for t, d in zip(through, depth, strict=True)]
@@ -115,7 +140,10 @@ def test_targets_are_encoded_once_and_repeat(data: Path, tmp_path: Path) -> None
     assert 2 <= len(files) <= 3, "starts 0, 1 and 2 of seven frames"
     again = [task_of(run_of(data, data / "scenes"), tmp_path).batch(i) for i in range(4)]
     assert {path: path.stat().st_mtime_ns for path in files} == files
-    assert all(torch.equal(a.sample.z_0, b.sample.z_0) and a.styles == b.styles for a, b in zip(first, again, strict=True))
+    assert all(
+        torch.equal(a.sample.z_0, b.sample.z_0) and a.styles == b.styles
+        for a, b in zip(first, again, strict=True)
+    )
     assert {style for batch in first for style in batch.styles} == set(STYLES)
     clip = task.batches.clips[1]
     assert clip.mirrored
@@ -126,8 +154,13 @@ def test_targets_are_encoded_once_and_repeat(data: Path, tmp_path: Path) -> None
     assert frames[0].mean() < frames[1].mean() - 0.3
 
 
-def test_the_clear_prompt_starts_as_onefixer_and_every_style_learns_its_own(data: Path, tmp_path: Path) -> None:
-    task, plain = task_of(run_of(data, data / "scenes"), tmp_path), task_of(run_of(data, None, "V9"), tmp_path)
+def test_the_clear_prompt_starts_as_onefixer_and_every_style_learns_its_own(
+    data: Path, tmp_path: Path
+) -> None:
+    task, plain = (
+        task_of(run_of(data, data / "scenes"), tmp_path),
+        task_of(run_of(data, None, "V9"), tmp_path),
+    )
     for key, value in plain.net.state_dict().items():
         assert torch.equal(task.net.state_dict()[key], value), key
     assert torch.equal(task.prompts((CLEAR,)), plain.text)
@@ -135,10 +168,14 @@ def test_the_clear_prompt_starts_as_onefixer_and_every_style_learns_its_own(data
     assert torch.equal(batch.sample.z_r, wanted.sample.z_r)
     clear = batch._replace(sample=wanted.sample, styles=(CLEAR,) * 3)
     assert task.loss(clear, 0)[0].item() == plain.loss(wanted, 0)[0].item()
-    torch.nn.init.normal_(task.net.final_layer.linear.weight, generator=torch.Generator().manual_seed(0))
+    torch.nn.init.normal_(
+        task.net.final_layer.linear.weight, generator=torch.Generator().manual_seed(0)
+    )
     task.loss(batch._replace(styles=("night", "fog", "fog")), 0)[0].backward()
     gradients = {style: task.prompts.get_parameter(style).grad for style in STYLES}
-    assert {style for style, grad in gradients.items() if grad is not None and bool((grad != 0).any())} == {"night", "fog"}
+    assert {
+        style for style, grad in gradients.items() if grad is not None and bool((grad != 0).any())
+    } == {"night", "fog"}
 
 
 def test_no_scenes_no_targets(data: Path, tmp_path: Path) -> None:
@@ -151,8 +188,14 @@ def bundle(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     def distance(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         return (a - b).square().mean(dim=(1, 2, 3))
 
-    path = train_fixer(run_of(data, data / "scenes"), tmp_path_factory.mktemp("run") / "appearance", ("squared", distance))
-    assert len((path.parent / "log.jsonl").read_text().splitlines()) == 4, "four times the updates of V9"
+    path = train_fixer(
+        run_of(data, data / "scenes"),
+        tmp_path_factory.mktemp("run") / "appearance",
+        ("squared", distance),
+    )
+    assert len((path.parent / "log.jsonl").read_text().splitlines()) == 4, (
+        "four times the updates of V9"
+    )
     return path
 
 
@@ -165,7 +208,9 @@ def fixed(bundle: Path, *overrides: str) -> Any:
 
 def test_the_bundle_renders_what_the_prompt_asks_for_and_is_clear_by_itself(bundle: Path) -> None:
     tensors = load_weights(bundle)
-    assert {key for key in tensors if key.startswith("prompt.")} == {f"prompt.{style}" for style in STYLES}
+    assert {key for key in tensors if key.startswith("prompt.")} == {
+        f"prompt.{style}" for style in STYLES
+    }
     session, plain = fixed(bundle)
     assert isinstance(session.settings, OneFixerSettings)
     assert (session.settings.prompt, session.settings.shows_render) == (CLEAR, True)
@@ -175,13 +220,18 @@ def test_the_bundle_renders_what_the_prompt_asks_for_and_is_clear_by_itself(bund
     assert not night.settings.keeps_appearance, "refine does not take it for damage"
     assert (out != plain).any()
     weights = [net.networks.dit.state_dict() for net in (session, night)]
-    assert all(torch.equal(value, weights[1][key]) for key, value in weights[0].items()), "the embeddings alone differ"
+    assert all(torch.equal(value, weights[1][key]) for key, value in weights[0].items()), (
+        "the embeddings alone differ"
+    )
     assert (fixed(bundle, "prompt=fog")[1] != out).any()
 
 
 @pytest.mark.parametrize(
     ("prompt", "found"),
-    [("rain", "its weights learned the prompts clear, fog, night, snow"), ("null", "choose one: --set fixer.prompt=")],
+    [
+        ("rain", "its weights learned the prompts clear, fog, night, snow"),
+        ("null", "choose one: --set fixer.prompt="),
+    ],
 )
 def test_a_prompt_that_was_not_learned_is_refused(bundle: Path, prompt: str, found: str) -> None:
     with pytest.raises(InputError) as caught:

@@ -1,4 +1,6 @@
-"""What the comparison's arms have in common, in what order it is made, and how equal time divides it; nothing is trained."""
+"""What the comparison's arms have in common, in what order it is made, and how equal time divides
+it; nothing is trained.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,12 @@ def names(found: Plan) -> list[str]:
 
 
 def minutes_of(recipe: Recipe) -> float:
-    return sum(stage.updates(UNIT) * SECONDS[NAMES[recipe.name, stage.name]] for stage in recipe.stages) / 60
+    return (
+        sum(
+            stage.updates(UNIT) * SECONDS[NAMES[recipe.name, stage.name]] for stage in recipe.stages
+        )
+        / 60
+    )
 
 
 def test_every_training_comes_behind_what_it_starts_from_and_once() -> None:
@@ -37,7 +44,9 @@ def test_every_training_comes_behind_what_it_starts_from_and_once() -> None:
         made.add(training.name)
     assert names(found)[:3] == ["initial/base", "initial/base-bi", "V9"]
     assert set(found.arms) <= made
-    assert sum(len(recipe.stages) for recipe in ALL) + 2 - len(made) == 7, "stages that some arms have in common"
+    assert sum(len(recipe.stages) for recipe in ALL) + 2 - len(made) == 7, (
+        "stages that some arms have in common"
+    )
 
 
 @pytest.mark.parametrize(
@@ -50,14 +59,21 @@ def test_every_training_comes_behind_what_it_starts_from_and_once() -> None:
         ("harmonizer-temporal-teacher", ("harmonizer", "harmonizer-temporal-teacher")),
     ],
 )
-def test_equal_stages_are_one_training_with_the_folder_that_it_has_in_the_whole_comparison(arm: str, trainings: tuple[str, ...]) -> None:
+def test_equal_stages_are_one_training_with_the_folder_that_it_has_in_the_whole_comparison(
+    arm: str, trainings: tuple[str, ...]
+) -> None:
     alone = plan(ALL, [arm])
     assert alone.arms == {arm: trainings}
     assert set(names(alone)) - {"initial/base", "initial/base-bi"} == set(trainings)
 
 
 def test_given_initial_networks_are_not_trained() -> None:
-    assert names(plan(ALL, ["V9", "self-forcing"], ["base", "base-bi"])) == ["V9", "self-forcing/teacher", "omnidreams", "self-forcing"]
+    assert names(plan(ALL, ["V9", "self-forcing"], ["base", "base-bi"])) == [
+        "V9",
+        "self-forcing/teacher",
+        "omnidreams",
+        "self-forcing",
+    ]
     with pytest.raises(InputError, match="no such arm"):
         plan(ALL, ["V10"])
     with pytest.raises(InputError, match="no initial network"):
@@ -67,12 +83,15 @@ def test_given_initial_networks_are_not_trained() -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"share": 2.0}, {"latents": 3}, {"decay": "constant"}, {"always_float32": True},
+        {"share": 2.0},
+        {"latents": 3},
+        {"decay": "constant"},
+        {"always_float32": True},
         {"objective": replace(recipe_of("self-forcing").stages[1].objective, shift=2.0)},  # type: ignore[type-var]
         {"start": {"dit": "init-bi.dit"}},
     ],
     ids=lambda change: next(iter(change)),
-)  # fmt: skip
+)
 def test_a_stage_that_differs_is_a_training_of_its_own(change: dict[str, object]) -> None:
     recipe = recipe_of("self-forcing")
     teacher, student, dmd = recipe.stages
@@ -87,15 +106,23 @@ def test_every_arm_has_equal_core_minutes_and_related_ones_still_share() -> None
     for recipe in given:
         assert minutes_of(recipe) == pytest.approx(30, abs=SECONDS[recipe.name] / 60), recipe.name
     found = plan(given, [recipe.name for recipe in given]).arms
-    assert found["self-forcing"][:2] == found["one-forcing"][:2] == ("self-forcing/teacher", "self-forcing/student")
+    assert (
+        found["self-forcing"][:2]
+        == found["one-forcing"][:2]
+        == ("self-forcing/teacher", "self-forcing/student")
+    )
     assert found["artifixer"][0] == found["artifixer-pre"][0] == "artifixer-pre/bidirectional"
 
 
-@pytest.mark.parametrize("chosen", [["self-forcing"], ["artifixer-pre"], ["V9", "harmonizer-temporal"]])
+@pytest.mark.parametrize(
+    "chosen", [["self-forcing"], ["artifixer-pre"], ["V9", "harmonizer-temporal"]]
+)
 def test_a_part_of_the_comparison_gets_the_updates_of_the_whole(chosen: list[str]) -> None:
     whole = {recipe.name: recipe for recipe in in_equal_time(ALL, NAMES, SECONDS, 30, UNIT)}
     for recipe in in_equal_time(related(ALL, chosen), NAMES, SECONDS, 30, UNIT):
-        assert [stage.updates(UNIT) for stage in recipe.stages] == [stage.updates(UNIT) for stage in whole[recipe.name].stages]
+        assert [stage.updates(UNIT) for stage in recipe.stages] == [
+            stage.updates(UNIT) for stage in whole[recipe.name].stages
+        ]
 
 
 def test_a_time_without_an_update_for_the_last_stage_is_refused() -> None:
@@ -109,7 +136,12 @@ def test_trainings_can_be_sent_to_another_process() -> None:
 
 
 def test_one_forcing_alone_is_always_in_float32() -> None:
-    assert [(recipe.name, stage.name) for recipe in ALL for stage in recipe.stages if stage.always_float32] == [("one-forcing", "dmd")]
+    assert [
+        (recipe.name, stage.name)
+        for recipe in ALL
+        for stage in recipe.stages
+        if stage.always_float32
+    ] == [("one-forcing", "dmd")]
 
 
 def test_snapshots_are_at_equal_intervals() -> None:

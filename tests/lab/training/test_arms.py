@@ -1,4 +1,6 @@
-"""Every causal arm, end to end: its stages train, resume bit for bit, and give a bundle that steps as a renderer."""
+"""Every causal arm, end to end: its stages train, resume bit for bit, and give a bundle that steps
+as a renderer.
+"""
 
 from __future__ import annotations
 
@@ -42,10 +44,19 @@ def arm_settings(name: str, *overrides: str) -> OneFixerSettings:
     return settings
 
 
-def run_of(data: Path, recipe: Recipe, **weights: Path) -> FixerRun:  # noqa: F811
+def run_of(data: Path, recipe: Recipe, **weights: Path) -> FixerRun:
     schedule = Schedule(STEPS, peak_lr=1e-2, warmup=1, accumulate=1, save_every=1, ema=0.5)
     batches = BatchForm(clips=2, columns=4)
-    return FixerRun(arm_settings(recipe.fixer), recipe, data, data / "vae.safetensors", weights, FORM, batches, schedule)
+    return FixerRun(
+        arm_settings(recipe.fixer),
+        recipe,
+        data,
+        data / "vae.safetensors",
+        weights,
+        FORM,
+        batches,
+        schedule,
+    )
 
 
 def deployed(path: Path, steps: int = 1) -> OneFixer:
@@ -56,26 +67,40 @@ def deployed(path: Path, steps: int = 1) -> OneFixer:
 
 
 @pytest.fixture(scope="module")
-def student(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
-    return train_fixer(run_of(data, recipe_of("omnidreams")), tmp_path_factory.mktemp("arms") / "student")
+def student(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train_fixer(
+        run_of(data, recipe_of("omnidreams")), tmp_path_factory.mktemp("arms") / "student"
+    )
 
 
-QUICK = ("self-forcing",)  # it has the stages of the others; the adversarial head is tried by itself
+QUICK = (
+    "self-forcing",
+)  # it has the stages of the others; the adversarial head is tried by itself
 
 
-@pytest.mark.parametrize("recipe", [pytest.param(r, id=r.name, marks=() if r.name in QUICK else pytest.mark.slow) for r in CAUSAL_ARMS])
-def test_an_arm_trains_resumes_and_drives(data: Path, tmp_path: Path, recipe: Recipe) -> None:  # noqa: F811
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        pytest.param(r, id=r.name, marks=() if r.name in QUICK else pytest.mark.slow)
+        for r in CAUSAL_ARMS
+    ],
+)
+def test_an_arm_trains_resumes_and_drives(data: Path, tmp_path: Path, recipe: Recipe) -> None:
     run = run_of(data, recipe)
     whole = train_fixer(run, tmp_path / "whole")
     last = recipe.stages[-1].updates(STEPS)
-    stopped = train_fixer(run, tmp_path / "cut", stop_at=run.updates - last + 1)  # within the last stage
+    stopped = train_fixer(
+        run, tmp_path / "cut", stop_at=run.updates - last + 1
+    )  # within the last stage
     assert json.loads(stopped.with_suffix(".card.json").read_text())["curves"][-1]["step"] == 1
     again = train_fixer(run, tmp_path / "cut")
     assert stopped == again
     one, other = (load_weights(path.with_name(STATE_FILE)) for path in (whole, again))
     assert all(torch.equal(value, other[key]) for key, value in one.items())
     for stage in recipe.stages[:-1]:
-        one, other = (load_weights(tmp_path / folder / stage.name / STATE_FILE) for folder in ("whole", "cut"))
+        one, other = (
+            load_weights(tmp_path / folder / stage.name / STATE_FILE) for folder in ("whole", "cut")
+        )
         assert all(torch.equal(value, other[key]) for key, value in one.items())
     session = deployed(whole)
     assert session.label.startswith(f"{recipe.fixer}, {recipe.name}, {last} updates")
@@ -85,8 +110,11 @@ def test_an_arm_trains_resumes_and_drives(data: Path, tmp_path: Path, recipe: Re
     assert deployed(whole, steps=4).label.startswith(f"{recipe.fixer}@4")
 
 
-def test_the_bundle_carries_what_the_network_sees(data: Path, tmp_path: Path) -> None:  # noqa: F811
-    recipe = replace(recipe_of("artifixer-pre"), stages=(replace(recipe_of("artifixer-pre").stages[0], name="only"),))
+def test_the_bundle_carries_what_the_network_sees(data: Path, tmp_path: Path) -> None:
+    recipe = replace(
+        recipe_of("artifixer-pre"),
+        stages=(replace(recipe_of("artifixer-pre").stages[0], name="only"),),
+    )
     session = deployed(train_fixer(run_of(data, recipe), tmp_path / "run"))
     settings = session.settings
     assert (settings.uses_map, settings.no_map, settings.opacity_input) == (False, "nothing", True)
@@ -99,7 +127,9 @@ def test_the_bundle_carries_what_the_network_sees(data: Path, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_given_weights_take_a_stages_place_and_the_student_moves_in_its_updates_alone(data: Path, student: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_given_weights_take_a_stages_place_and_the_student_moves_in_its_updates_alone(
+    data: Path, student: Path, tmp_path: Path
+) -> None:
     recipe = recipe_of("self-forcing")
     run = run_of(data, recipe, student=student, teacher=student)
     assert [stage.name for stage in run.stages()] == ["dmd"]
@@ -107,9 +137,15 @@ def test_given_weights_take_a_stages_place_and_the_student_moves_in_its_updates_
     path = train_fixer(run, tmp_path / "run")
     assert not (tmp_path / "run" / "student").exists()
     second = load_weights(path.with_name(STATE_FILE))
-    moved = {key.split(".")[1] for key in first if key.startswith("weight.") and not torch.equal(first[key], second[key])}
+    moved = {
+        key.split(".")[1]
+        for key in first
+        if key.startswith("weight.") and not torch.equal(first[key], second[key])
+    }
     assert moved == {"fake"}, "the second update trains the critic alone"
-    assert all(torch.equal(first[key], second[key]) for key in first if key.startswith("average.dit"))
+    assert all(
+        torch.equal(first[key], second[key]) for key in first if key.startswith("average.dit")
+    )
     facts = json.loads(path.with_suffix(".card.json").read_text())["training"]
     assert facts["start"]["dit"] == facts["start"]["real"]
     assert len(facts["start"]["dit"]) == 32
@@ -126,7 +162,7 @@ def test_given_weights_take_a_stages_place_and_the_student_moves_in_its_updates_
 
 @pytest.mark.parametrize(("same", "rollouts"), [(True, 1), (False, 2)])
 def test_the_critic_judges_the_students_rollout_or_one_of_its_own(
-    data: Path,  # noqa: F811
+    data: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     same: bool,
@@ -151,10 +187,19 @@ def test_the_critic_judges_the_students_rollout_or_one_of_its_own(
     assert task.batch(1).student is None
 
 
-def test_a_head_that_no_longer_teaches_stops_its_run(data: Path, student: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_a_head_that_no_longer_teaches_stops_its_run(
+    data: Path, student: Path, tmp_path: Path
+) -> None:
     recipe = recipe_of("one-forcing")
-    strict = replace(recipe.stages[-1], objective=Distillation(adversarial=AdversarialTerm(most=0.0)))
-    run = run_of(data, replace(recipe, stages=(*recipe.stages[:-1], strict)), student=student, teacher=student)
+    strict = replace(
+        recipe.stages[-1], objective=Distillation(adversarial=AdversarialTerm(most=0.0))
+    )
+    run = run_of(
+        data,
+        replace(recipe, stages=(*recipe.stages[:-1], strict)),
+        student=student,
+        teacher=student,
+    )
     with pytest.raises(InfrastructureError, match="no longer teaches"):
         train_fixer(run, tmp_path / "run")
 
@@ -166,11 +211,15 @@ def test_without_weights_an_arm_says_what_trains_it(name: str) -> None:
 
 
 def test_objectives_can_be_changed_by_field() -> None:
-    four = with_objective(recipe_of("one-forcing"), ["steps=4", "dmd.gradient_latents=null", "teacher.shift=5"])
+    four = with_objective(
+        recipe_of("one-forcing"), ["steps=4", "dmd.gradient_latents=null", "teacher.shift=5"]
+    )
     teacher, student, dmd = (stage.objective for stage in four.stages)
     assert (dmd.steps, dmd.gradient_latents, dmd.adversarial) == (4, None, AdversarialTerm())
     assert (teacher.shift, student.shift) == (5.0, 1.0)
-    shown = with_objective(recipe_of("artifixer"), ["tail_drop=null", "causal.tail_drop={whole: 0.2}"])
+    shown = with_objective(
+        recipe_of("artifixer"), ["tail_drop=null", "causal.tail_drop={whole: 0.2}"]
+    )
     assert [stage.objective.tail_drop for stage in shown.stages] == [None, TailDrop(0.2), None]
     for text in ("steps", "step=4", "student.steps=4"):
         with pytest.raises(InputError, match=r"no such field[\s\S]*dmd\.steps"):

@@ -1,4 +1,6 @@
-"""Class-colour augmentation of a drawn map equals drawing it with the other class, and changes nothing else."""
+"""Class-colour augmentation of a drawn map equals drawing it with the other class, and changes
+nothing else.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +18,14 @@ LABELS = {"truck": "truck", "cyclist": "rider", "pedestrian": "person", "other":
 
 def drawn(label: str) -> np.ndarray:
     edges = replace(
-        EMPTY, road_edges=(line((2, 3, 0), (60, 3, 0)),), crosswalks=(np.array([[14, -4, 0], [17, -4, 0], [17, 4, 0], [14, 4, 0.0]]),)
+        EMPTY,
+        road_edges=(line((2, 3, 0), (60, 3, 0)),),
+        crosswalks=(np.array([[14, -4, 0], [17, -4, 0], [17, 4, 0], [14, 4, 0.0]]),),
     )
-    boxes = (ActorBox(se2(10, 0.5, 0.4, 0.8), CAR, label), ActorBox(se2(30, -3, 2.0, 0.8), CAR, label))
+    boxes = (
+        ActorBox(se2(10, 0.5, 0.4, 0.8), CAR, label),
+        ActorBox(se2(30, -3, 2.0, 0.8), CAR, label),
+    )
     return draw_map(prepare_map(edges), PIN, at(), boxes)
 
 
@@ -29,7 +36,9 @@ def test_augmented_cars_have_the_colours_of_the_other_class(kind: str) -> None:
     differs = (car != wanted).any(axis=-1)
     off = np.abs(made.astype(int) - wanted).max(axis=-1)
     assert differs.sum() > 100
-    assert (off[differs] <= 6).mean() > 0.85, "but for pixels that a box shares with its grey edges or with paint"
+    assert (off[differs] <= 6).mean() > 0.85, (
+        "but for pixels that a box shares with its grey edges or with paint"
+    )
     np.testing.assert_array_equal(made[~differs], car[~differs])
 
 

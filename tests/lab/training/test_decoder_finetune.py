@@ -1,4 +1,6 @@
-"""Adapting the decoder: the rollouts are the deployed generator's, only the decoder learns, and pictures get nearer to the truth."""
+"""Adapting the decoder: the rollouts are the deployed generator's, only the decoder learns, and
+pictures get nearer to the truth.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,10 @@ RECIPE = DecoderRecipe(clips=2, rows=4, columns=4, perceptual_weight=0.1)
 
 
 @pytest.fixture(scope="module")
-def bundle(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
-    return train_fixer(run_of(data, "V9"), tmp_path_factory.mktemp("run") / "v9", ("brightness", brightness))
+def bundle(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train_fixer(
+        run_of(data, "V9"), tmp_path_factory.mktemp("run") / "v9", ("brightness", brightness)
+    )
 
 
 def vae_of(bundle: Path) -> TinyVAE:
@@ -38,10 +42,14 @@ def vae_of(bundle: Path) -> TinyVAE:
 
 def net_of(bundle: Path) -> CosmosCausalDiT:
     tensors = load_weights(bundle, dtype=torch.float32)
-    return CosmosCausalDiT.from_state_dict({key[4:]: value for key, value in tensors.items() if key.startswith("dit.")})
+    return CosmosCausalDiT.from_state_dict(
+        {key[4:]: value for key, value in tensors.items() if key.startswith("dit.")}
+    )
 
 
-def test_rollouts_are_those_of_the_shared_rollout_and_are_made_once(data: Path, bundle: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_rollouts_are_those_of_the_shared_rollout_and_are_made_once(
+    data: Path, bundle: Path, tmp_path: Path
+) -> None:
     clips, net = clips_of(data, tmp_path / "z"), net_of(bundle)
     rollouts = Rollouts(clips, vae_of(bundle), net, 2, 4, "drawn", tmp_path / "r")
     assert len(rollouts) == len(clips)
@@ -54,32 +62,49 @@ def test_rollouts_are_those_of_the_shared_rollout_and_are_made_once(data: Path, 
     other = net_of(bundle)
     with torch.no_grad():
         other.final_layer.linear.weight.add_(0.1)
-    assert Rollouts(clips, vae_of(bundle), other, 2, 4, "drawn", tmp_path / "r").digest != rollouts.digest
+    assert (
+        Rollouts(clips, vae_of(bundle), other, 2, 4, "drawn", tmp_path / "r").digest
+        != rollouts.digest
+    )
 
 
 @pytest.mark.slow
-def test_a_generator_without_a_map_is_rolled_out_without_one(data: Path, bundle: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_a_generator_without_a_map_is_rolled_out_without_one(
+    data: Path, bundle: Path, tmp_path: Path
+) -> None:
     clips, net = clips_of(data, tmp_path / "z"), net_of(bundle)
-    with_map, without = (Rollouts(clips, vae_of(bundle), net, 2, 4, shown, tmp_path / "r") for shown in ("drawn", "nothing"))
+    with_map, without = (
+        Rollouts(clips, vae_of(bundle), net, 2, 4, shown, tmp_path / "r")
+        for shown in ("drawn", "nothing")
+    )
     assert not torch.equal(with_map[0][1], without[0][1])
     blind = Path(copytree(data, tmp_path / "blind")) / "train"
     for name in ("a", "b"):  # the same pairs, but for their maps
         np.save(blind / name / "sdmap.npy", np.zeros_like(np.load(blind / name / "sdmap.npy")))
         info = blind / name / "sequence.json"
-        info.write_text(json.dumps({k: v for k, v in json.loads(info.read_text()).items() if k != "content"}))
+        info.write_text(
+            json.dumps({k: v for k, v in json.loads(info.read_text()).items() if k != "content"})
+        )
     unmapped = clips_of(blind.parent, tmp_path / "z")
-    assert torch.equal(Rollouts(unmapped, vae_of(bundle), net, 2, 4, "nothing", tmp_path / "r")[0][1], without[0][1])
-    assert not torch.equal(Rollouts(unmapped, vae_of(bundle), net, 2, 4, "drawn", tmp_path / "r")[0][1], with_map[0][1]), (
-        "other pairs, other rollouts"
+    assert torch.equal(
+        Rollouts(unmapped, vae_of(bundle), net, 2, 4, "nothing", tmp_path / "r")[0][1],
+        without[0][1],
     )
+    assert not torch.equal(
+        Rollouts(unmapped, vae_of(bundle), net, 2, 4, "drawn", tmp_path / "r")[0][1], with_map[0][1]
+    ), "other pairs, other rollouts"
 
 
 def test_roll_out_equals_the_rollout_of_the_losses(bundle: Path) -> None:
     from alpasim_plugin.lab.training.shared_rollout import roll_out
 
     generator = torch.Generator().manual_seed(0)
-    z_r, z_0, z_map, eps, context = (torch.randn(1, 16, 5, 4, 4, generator=generator) for _ in range(5))
-    m, t, text = torch.rand(1, 1, 5, 4, 4, generator=generator).round(), torch.rand(1, 5, generator=generator), torch.zeros(1, 1, 7)
+    z_r, z_0, z_map, eps, context = (
+        torch.randn(1, 16, 5, 4, 4, generator=generator) for _ in range(5)
+    )
+    m = torch.rand(1, 1, 5, 4, 4, generator=generator).round()
+    t = torch.rand(1, 5, generator=generator)
+    text = torch.zeros(1, 1, 7)
     net = net_of(bundle)
     text = torch.zeros(1, 1, net.sizes.text_width)
     made = roll_out(net, z_r, z_map, m, eps, context, text, block_latents=2, window=4)
@@ -90,28 +115,48 @@ def test_roll_out_equals_the_rollout_of_the_losses(bundle: Path) -> None:
     assert torch.equal(made, wanted)
 
 
-def test_only_the_decoder_learns_and_pictures_get_nearer(data: Path, bundle: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_only_the_decoder_learns_and_pictures_get_nearer(
+    data: Path, bundle: Path, tmp_path: Path
+) -> None:
     schedule = Schedule(30, peak_lr=5e-3, warmup=3, ema=0.5, save_every=10)
-    path = finetune_decoder(bundle, data, tmp_path / "decoder", FORM, RECIPE, schedule, ("brightness", brightness))
+    path = finetune_decoder(
+        bundle, data, tmp_path / "decoder", FORM, RECIPE, schedule, ("brightness", brightness)
+    )
     before, after = load_weights(bundle), load_weights(path)
     assert before.keys() == after.keys()
     changed = {key for key in before if not torch.equal(before[key], after[key])}
     assert changed
     assert all(key.startswith("vae.decoder.") for key in changed)
-    rows = [json.loads(line) for line in (tmp_path / "decoder" / "log.jsonl").read_text().splitlines()]
+    rows = [
+        json.loads(line) for line in (tmp_path / "decoder" / "log.jsonl").read_text().splitlines()
+    ]
     gains = [row["psnr_db"] - row["render_psnr_db"] for row in rows]
     assert np.mean(gains[-8:]) > np.mean(gains[:8]) + 0.5, "decibels over the render"
     card = json.loads(path.with_suffix(".card.json").read_text())
     assert card["training"]["recipe"]["rows"] == 4
     frames = moving_picture(13)
-    session = fixer(small_settings("window=4", "holes=noise", "history=finalise", f"weights.bundle={path}"))
+    session = fixer(
+        small_settings("window=4", "holes=noise", "history=finalise", f"weights.bundle={path}")
+    )
     assert "decoder 30 updates" in session.label
     assert pixels(run_blocks(session, frames, maps_of(frames))).shape[0] == 13
 
 
-def test_batches_are_functions_of_their_number_and_crops_fit(data: Path, bundle: Path, tmp_path: Path) -> None:  # noqa: F811
-    rollouts = Rollouts(clips_of(data, tmp_path / "z"), vae_of(bundle), net_of(bundle), 2, 4, "drawn", tmp_path / "r")
-    one, two = (DecoderTask(TinyVAE.load(data / "vae.safetensors"), rollouts, RECIPE) for _ in range(2))
+def test_batches_are_functions_of_their_number_and_crops_fit(
+    data: Path, bundle: Path, tmp_path: Path
+) -> None:
+    rollouts = Rollouts(
+        clips_of(data, tmp_path / "z"),
+        vae_of(bundle),
+        net_of(bundle),
+        2,
+        4,
+        "drawn",
+        tmp_path / "r",
+    )
+    one, two = (
+        DecoderTask(TinyVAE.load(data / "vae.safetensors"), rollouts, RECIPE) for _ in range(2)
+    )
     two.batch(0)
     a, b = one.batch(3), two.batch(3)
     assert torch.equal(a.z, b.z)
@@ -121,10 +166,12 @@ def test_batches_are_functions_of_their_number_and_crops_fit(data: Path, bundle:
     wanted = clip.sequence.clip.rgb_gt[0, :, ::-1].astype(np.float32) / 127.5 - 1
     np.testing.assert_allclose(clip.clean(1)[:, 0].permute(1, 2, 0), wanted, atol=1e-6)
     with pytest.raises(InputError, match="a crop of 9 x 4"):
-        DecoderTask(TinyVAE.load(data / "vae.safetensors"), rollouts, DecoderRecipe(rows=9, columns=4))
+        DecoderTask(
+            TinyVAE.load(data / "vae.safetensors"), rollouts, DecoderRecipe(rows=9, columns=4)
+        )
 
 
-def test_a_fixer_without_history_is_refused(data: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_a_fixer_without_history_is_refused(data: Path, tmp_path: Path) -> None:
     image = train_fixer(run_of(data, "image"), tmp_path / "image", ("brightness", brightness))
     with pytest.raises(InputError, match="no history"):
         finetune_decoder(image, data, tmp_path / "out", FORM, RECIPE, Schedule(1))

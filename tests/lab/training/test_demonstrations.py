@@ -1,4 +1,6 @@
-"""Demonstrations of the learned policy: drawn the same every time, kept once made, and enough to learn from."""
+"""Demonstrations of the learned policy: drawn the same every time, kept once made, and enough to
+learn from.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,11 @@ from alpasim_plugin.lab.training.demonstrations import (
     wide_camera,
     write_demonstrations,
 )
-from alpasim_plugin.lab.training.perturbed_rollouts import perturbed_rollouts, traffic_at, turning_lines
+from alpasim_plugin.lab.training.perturbed_rollouts import (
+    perturbed_rollouts,
+    traffic_at,
+    turning_lines,
+)
 from alpasim_plugin.lab.training.policy import PolicyRecipe, PolicyTask, measure
 from alpasim_plugin.lab.training.trainer import Schedule, Trainer
 from policies.learned_input import COMMANDS
@@ -70,7 +76,10 @@ def test_sample_has_a_frame_a_state_and_a_target(root: Path) -> None:
     assert (a["before"] <= a["frame"]).all()
     assert set(a["command"].tolist()) == {COMMANDS.index("keep")}
     # A car rotated_about_camera to the left of its road is led to the right.
-    turn, heading = (x.reshape(-1, 3) - x.reshape(-1, 3).mean(axis=1, keepdims=True) for x in (a["yaw"], a["headings"][:, -1]))
+    turn, heading = (
+        x.reshape(-1, 3) - x.reshape(-1, 3).mean(axis=1, keepdims=True)
+        for x in (a["yaw"], a["headings"][:, -1])
+    )
     assert np.corrcoef(turn.ravel(), heading.ravel())[0, 1] < -0.7
 
 
@@ -79,7 +88,9 @@ def test_missing_and_damaged_demonstrations_are_named(root: Path, tmp_path: Path
         read_demonstrations(root, "val")
     broken = tmp_path / "train" / "a"
     broken.mkdir(parents=True)
-    (broken / DEMONSTRATIONS_FILE).write_text((root / "train" / "lead_000" / DEMONSTRATIONS_FILE).read_text())
+    (broken / DEMONSTRATIONS_FILE).write_text(
+        (root / "train" / "lead_000" / DEMONSTRATIONS_FILE).read_text()
+    )
     np.save(broken / "frames.npy", np.zeros((2, 3)))
     with pytest.raises(InputError, match=r"float64 with 2 axes"):
         _ = read_demonstrations(tmp_path, "train")[0].arrays
@@ -89,7 +100,9 @@ def test_turning_leaves_the_camera_where_it_is(scenario) -> None:
     camera = wide_camera(scenario.cameras[0])
     T = np.array([[0.6, -0.8, 0, 5], [0.8, 0.6, 0, 7], [0, 0, 1, 0], [0, 0, 0, 1.0]])
     after = rotated_about_camera(T, camera, 0.1)
-    np.testing.assert_allclose((after @ camera.T_rig_camera)[:3, 3], (T @ camera.T_rig_camera)[:3, 3], atol=1e-12)
+    np.testing.assert_allclose(
+        (after @ camera.T_rig_camera)[:3, 3], (T @ camera.T_rig_camera)[:3, 3], atol=1e-12
+    )
     assert yaw_of(after) - yaw_of(T) == pytest.approx(0.1)
 
 
@@ -107,8 +120,12 @@ def test_every_turn_of_a_junction_has_a_rollout() -> None:
 
 
 def test_who_appears_at_this_instant_moves_as_the_log_shows_it_next(scenario) -> None:
-    actor = next(a for a in scenario.actors if np.linalg.norm(np.ptp(a.track.xyz[:, :2], axis=0)) > 5.0)
-    late = replace(actor, track=Trajectory(actor.track.t_us[10:], actor.track.xyz[10:], actor.track.quat[10:]))
+    actor = next(
+        a for a in scenario.actors if np.linalg.norm(np.ptp(a.track.xyz[:, :2], axis=0)) > 5.0
+    )
+    late = replace(
+        actor, track=Trajectory(actor.track.t_us[10:], actor.track.xyz[10:], actor.track.quat[10:])
+    )
     t_us = int(late.track.t_us[0])
     _, seen = traffic_at(replace(scenario, actors=(late,)), t_us, None)
     _, before = traffic_at(replace(scenario, actors=(actor,)), t_us, None)
@@ -118,7 +135,9 @@ def test_who_appears_at_this_instant_moves_as_the_log_shows_it_next(scenario) ->
 
 def test_drives_leave_the_path_and_meet_others(scenario) -> None:
     drives = list(perturbed_rollouts(scenario, 12, 3.0, 0))
-    lateral = np.array([d.line.path.project(m.T_world_rig[None, :2, 3])[1][0] for d in drives for m in d.states])
+    lateral = np.array(
+        [d.line.path.project(m.T_world_rig[None, :2, 3])[1][0] for d in drives for m in d.states]
+    )
     assert 0.3 < np.abs(lateral).mean() < 1.0
     assert np.abs(lateral).max() < 1.85
     slow = [m.speed_mps < 0.7 * d.style.desired_mps for d in drives for m in d.states]
@@ -127,14 +146,24 @@ def test_drives_leave_the_path_and_meet_others(scenario) -> None:
 
 
 @pytest.mark.slow
-def test_batches_depend_on_their_number_alone_and_can_be_learned(root: Path, tmp_path: Path) -> None:
+def test_batches_depend_on_their_number_alone_and_can_be_learned(
+    root: Path, tmp_path: Path
+) -> None:
     torch.set_num_threads(1)
-    task = PolicyTask(LearnedNet(0), read_demonstrations(root, "train"), PolicyRecipe(batch=6, brightness_jitter=0.0))
-    first, again, other = task.batch(3), task.batch(3), task.batch(4)
+    task = PolicyTask(
+        LearnedNet(0),
+        read_demonstrations(root, "train"),
+        PolicyRecipe(batch=6, brightness_jitter=0.0),
+    )
+    first = task.batch(3)
+    again = task.batch(3)
+    other = task.batch(4)
     assert torch.equal(first.image, again.image)
     assert not torch.equal(first.image, other.image)
     before = measure(task)
-    Trainer(task.net, tmp_path, Schedule(60, peak_lr=2e-3, warmup=5), task.batch, task.loss, task.facts).run()
+    Trainer(
+        task.net, tmp_path, Schedule(60, peak_lr=2e-3, warmup=5), task.batch, task.loss, task.facts
+    ).run()
     after = measure(task)
     assert after["lateral_16m_m"] < 0.6 * before["lateral_16m_m"]
     assert after["speed_mps"] < 0.8 * before["speed_mps"]
@@ -158,12 +187,16 @@ def test_sigma_sends_no_gradient_into_the_plan(root: Path) -> None:
 
 
 def test_commands_train_a_policy_that_can_be_loaded(root: Path, tmp_path: Path) -> None:
-    run = CliRunner().invoke(app, ["policy", str(root), "--out", str(tmp_path / "run"), "--steps", "2"])
+    run = CliRunner().invoke(
+        app, ["policy", str(root), "--out", str(tmp_path / "run"), "--steps", "2"]
+    )
     assert run.exit_code == 0, run.output
     load_net(tmp_path / "run" / "learned.safetensors")
     card = json.loads((tmp_path / "run" / "learned.json").read_text())
     assert card["data"]["scenes"] == {"lead": 1}
     assert card["steps"] == 2
     assert card["parameters"] < 600_000
-    refused = CliRunner().invoke(app, ["policy-data", str(root), "--out", str(tmp_path), "--split", "test-known"])
+    refused = CliRunner().invoke(
+        app, ["policy-data", str(root), "--out", str(tmp_path), "--split", "test-known"]
+    )
     assert isinstance(refused.exception, InputError)

@@ -1,4 +1,6 @@
-"""DMD: the direction is a divergence's gradient, scales do not matter, and gradients go where each paper sends them and nowhere else."""
+"""DMD: the direction is a divergence's gradient, scales do not matter, and gradients go where each
+paper sends them and nowhere else.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,13 @@ from alpasim_plugin.fixers.network.schedule import steps
 from alpasim_plugin.lab.training.adversarial import AdversarialHead, AdversarialTerm
 from alpasim_plugin.lab.training.causal_rollout import causal_rollout
 from alpasim_plugin.lab.training.distillation import ScoreNet
-from alpasim_plugin.lab.training.dmd import critic_loss, direction, generator_loss, noised, score_levels
+from alpasim_plugin.lab.training.dmd import (
+    critic_loss,
+    direction,
+    generator_loss,
+    noised,
+    score_levels,
+)
 from alpasim_plugin.lab.training.flow_matching import FlowMatching, bell_weight, noise_levels
 from alpasim_plugin.lab.training.recipes.causal_arms import long_blocks
 from alpasim_plugin.lab.training.recipes.recipe import Attention
@@ -33,7 +41,9 @@ def noise(name: str, *shape: int) -> Tensor:
 
 @pytest.fixture(scope="module")
 def net() -> CosmosCausalDiT:
-    sizes = DiTSizes(width=24, blocks=2, head_width=12, mlp_width=32, adaln_rank=4, text_width=8, context_width=8)
+    sizes = DiTSizes(
+        width=24, blocks=2, head_width=12, mlp_width=32, adaln_rank=4, text_width=8, context_width=8
+    )
     weights = initial_weights(sizes, 0)
     key = "final_layer.adaln_modulation.2.weight"
     return CosmosCausalDiT.from_state_dict({**weights, key: 0.05 * noise(key, *weights[key].shape)})
@@ -63,11 +73,20 @@ def divergence(a: Gaussian, b: Gaussian, sigma: float) -> float:
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.5, 0.9])
-def test_the_direction_is_the_gradient_of_the_divergence_from_the_student_to_the_teacher(sigma: float) -> None:
-    """With z = mean + std a, the gradient of KL to the mean is E[(score_F - score_R)(1 - sigma)], score = ((1-sigma) x0 - x) / sigma^2."""
-    fake, real, h = Gaussian(0.7, 0.5), Gaussian(-0.4, 1.2), 1e-5
+def test_the_direction_is_the_gradient_of_the_divergence_from_the_student_to_the_teacher(
+    sigma: float,
+) -> None:
+    """With z = mean + std a, the gradient of KL to the mean is E[(score_F - score_R)(1 - sigma)],
+    score = ((1-sigma) x0 - x) / sigma^2.
+    """
+    fake = Gaussian(0.7, 0.5)
+    real = Gaussian(-0.4, 1.2)
+    h = 1e-5
     a, n = noise("a", 64, 1, 1, 1, 1).double(), noise("n", 64, 1, 1, 1, 1).double()
-    a, n = torch.cat([a, -a, a, -a]), torch.cat([n, n, -n, -n])  # means of linear functions are then exact
+    a, n = (
+        torch.cat([a, -a, a, -a]),
+        torch.cat([n, n, -n, -n]),
+    )  # means of linear functions are then exact
     levels = torch.full((len(a),), sigma, dtype=torch.float64)
     z = fake.mean + fake.std * a
     g, normaliser = direction(real, fake, z, n, levels)
@@ -81,11 +100,9 @@ def test_the_direction_is_the_gradient_of_the_divergence_from_the_student_to_the
 
 
 def test_scaling_latents_and_predictions_leaves_the_direction() -> None:
-    z, n, sigma = (
-        noise("z", 3, 2, 4, 2, 2).double(),
-        noise("n", 3, 2, 4, 2, 2).double(),
-        score_levels(torch.tensor([0.1, 0.5, 0.9])).double(),
-    )
+    z = noise("z", 3, 2, 4, 2, 2).double()
+    n = noise("n", 3, 2, 4, 2, 2).double()
+    sigma = score_levels(torch.tensor([0.1, 0.5, 0.9])).double()
     real, fake = noise("real", *z.shape).double(), noise("fake", *z.shape).double()
 
     def seeing(z_0: Tensor, scale: float) -> Tensor:
@@ -98,17 +115,23 @@ def test_scaling_latents_and_predictions_leaves_the_direction() -> None:
     s = sigma[:, None, None, None, None]
     still = direction(lambda x, _: (x - z) / s, lambda x, _: (x - fake) / s, z, n, sigma)
     assert float(still.normaliser.max()) < 1e-9
-    assert torch.isfinite(still.g).all(), "the floor holds where the teacher sees the student's own latents"
+    assert torch.isfinite(still.g).all(), (
+        "the floor holds where the teacher sees the student's own latents"
+    )
 
 
-def test_both_scores_see_the_same_noised_latents_and_the_critic_sends_no_gradient_to_the_student() -> None:
+def test_both_scores_see_the_same_noised_latents_and_the_critic_sends_no_gradient_to_the_student() -> (
+    None
+):
     seen: list[Tensor] = []
 
     def score(x: Tensor, sigma: Tensor) -> Tensor:
         seen.append(x)
         return torch.zeros_like(x)
 
-    z, n, sigma = noise("z", 2, 2, 4, 2, 2).requires_grad_(True), noise("n", 2, 2, 4, 2, 2), torch.tensor([0.3, 0.6])
+    z = noise("z", 2, 2, 4, 2, 2).requires_grad_(True)
+    n = noise("n", 2, 2, 4, 2, 2)
+    sigma = torch.tensor([0.3, 0.6])
     direction(score, score, z, n, sigma)
     assert torch.equal(seen[0], seen[1])
     torch.testing.assert_close(seen[0], noised(z, n, sigma))
@@ -122,26 +145,49 @@ def test_both_scores_see_the_same_noised_latents_and_the_critic_sends_no_gradien
 
 def test_levels_of_the_scores_are_the_tables_and_bounded() -> None:
     levels = score_levels(torch.tensor([0.0, 0.0015, 0.5004, 0.9999]))
-    torch.testing.assert_close(levels, torch.tensor([0.02, 0.02, 5 * 0.5 / 3, 0.98]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        levels, torch.tensor([0.02, 0.02, 5 * 0.5 / 3, 0.98]), atol=1e-6, rtol=0
+    )
 
 
 @pytest.mark.parametrize(("history", "crosses"), [("finalise", False), ("last-forward", True)])
-def test_gradients_cross_blocks_where_the_history_is_the_last_forward(net: CosmosCausalDiT, history: str, crosses: bool) -> None:
+def test_gradients_cross_blocks_where_the_history_is_the_last_forward(
+    net: CosmosCausalDiT, history: str, crosses: bool
+) -> None:
     z_1 = noise("z_1", 1, 16, N, 4, 4).requires_grad_(True)
     second = noise("second", 1, 16, N, 4, 4)
     made = causal_rollout(
-        net, [second, z_1], steps(2), noise("context", *z_1.shape), TEXT, torch.zeros_like(second), Attention(2, 4, 0, history)
+        net,
+        [second, z_1],
+        steps(2),
+        noise("context", *z_1.shape),
+        TEXT,
+        torch.zeros_like(second),
+        Attention(2, 4, 0, history),
     )  # the exit step's source enters without the first step's prediction
     reached = torch.autograd.grad(made[:, :, 2:].square().sum(), z_1, allow_unused=True)[0]
     assert reached is None, "steps before the exit, and their renoising, carry no gradient"
-    one = causal_rollout(net, [z_1], steps(1), noise("context", *z_1.shape), TEXT, torch.zeros_like(second), Attention(2, 4, 0, history))
+    one = causal_rollout(
+        net,
+        [z_1],
+        steps(1),
+        noise("context", *z_1.shape),
+        TEXT,
+        torch.zeros_like(second),
+        Attention(2, 4, 0, history),
+    )
     (reached,) = torch.autograd.grad(one[:, :, 2:].square().sum(), z_1)
     assert float(reached[:, :, 2:].abs().max()) > 0
     assert (float(reached[:, :, :2].abs().max()) > 0) == crosses
 
 
-def test_gradients_are_those_of_the_last_latents_alone_and_values_are_the_deployed_ones(net: CosmosCausalDiT) -> None:
-    z_1, context = noise("z_1", 1, 16, N, 4, 4).requires_grad_(True), noise("context", 1, 16, N, 4, 4)
+def test_gradients_are_those_of_the_last_latents_alone_and_values_are_the_deployed_ones(
+    net: CosmosCausalDiT,
+) -> None:
+    z_1, context = (
+        noise("z_1", 1, 16, N, 4, 4).requires_grad_(True),
+        noise("context", 1, 16, N, 4, 4),
+    )
     args = steps(1), context, TEXT, torch.zeros_like(context), Attention(2, 4, 0, "finalise")
     made = causal_rollout(net, [z_1], *args, gradient_latents=2)
     (reached,) = torch.autograd.grad(made.square().sum(), z_1)
@@ -150,12 +196,18 @@ def test_gradients_are_those_of_the_last_latents_alone_and_values_are_the_deploy
         torch.testing.assert_close(made, causal_rollout(net, [z_1], *args), rtol=0, atol=0)
 
 
-def test_the_head_judges_frozen_trunks_for_the_student_and_trains_them_for_the_critic(net: CosmosCausalDiT) -> None:
+def test_the_head_judges_frozen_trunks_for_the_student_and_trains_them_for_the_critic(
+    net: CosmosCausalDiT,
+) -> None:
     term = AdversarialTerm(heads=2, inner=8)
     head, score = AdversarialHead(24, 1, 2, 8, seed=0), ScoreNet(net, TEXT, term.taps)
-    x, sigma, condition = noise("x", 2, 16, N, 4, 4).requires_grad_(True), torch.tensor([0.2, 0.7]), torch.zeros(2, 16, N, 4, 4)
+    x = noise("x", 2, 16, N, 4, 4).requires_grad_(True)
+    sigma = torch.tensor([0.2, 0.7])
+    condition = torch.zeros(2, 16, N, 4, 4)
     v = score(x, sigma, condition, frozen=True)
-    torch.testing.assert_close(v, net(x, 1000 * sigma[:, None], TEXT, condition, block_latents=None))
+    torch.testing.assert_close(
+        v, net(x, 1000 * sigma[:, None], TEXT, condition, block_latents=None)
+    )
     score(x, sigma, condition, frozen=True)
     term.generator(head(score.features)).backward()
     assert float(x.grad.abs().max()) > 0
@@ -182,7 +234,17 @@ def test_the_head_judges_frozen_trunks_for_the_student_and_trains_them_for_the_c
 def test_the_tail_drop_shows_forty_five_percent_on_average() -> None:
     assert visible_share(TailDrop(), 93, 20_000) == pytest.approx(0.45, abs=0.01)
     ones = torch.ones(64, 16, 6, 2, 2)
-    sample = Sample(ones, ones, torch.cat([ones, ones], dim=1), ones[:, :1], ones, ones, ones[:, 0, :, 0, 0], ones[:, 0, :, 0, 0], 0)
+    sample = Sample(
+        ones,
+        ones,
+        torch.cat([ones, ones], dim=1),
+        ones[:, :1],
+        ones,
+        ones,
+        ones[:, 0, :, 0, 0],
+        ones[:, 0, :, 0, 0],
+        0,
+    )
     hidden = TailDrop()(sample, 0, 0)
     shown = hidden.m[:, 0, :, 0, 0]
     assert (shown[:, 1:] <= shown[:, :-1]).all(), "hidden from some latent on"
@@ -195,7 +257,10 @@ def test_times_are_one_a_latent_a_block_or_a_clip_and_the_bell_has_mean_one() ->
     t = torch.from_numpy(stream("dmd", 0, "t").random((3, 8))).float()
     z = torch.zeros(3, 16, 8, 2, 2)
     sample = Sample(z, z, z, z[:, :1], z, z, t, t, 0)
-    drawn = {times: noise_levels(FlowMatching(times), sample, Attention(2), 0, 0)[0] for times in ("latent", "block", "clip")}
+    drawn = {
+        times: noise_levels(FlowMatching(times), sample, Attention(2), 0, 0)[0]
+        for times in ("latent", "block", "clip")
+    }
     assert torch.equal(drawn["latent"], t)
     assert torch.equal(drawn["block"], t[:, [0, 0, 2, 2, 4, 4, 6, 6]])
     assert torch.equal(drawn["clip"], t[:, :1].expand(3, 8))
@@ -209,4 +274,7 @@ def test_times_are_one_a_latent_a_block_or_a_clip_and_the_bell_has_mean_one() ->
 
 
 def test_blocks_of_the_long_block_arm() -> None:
-    assert [long_blocks(n) for n in (24, 12)] == [Attention(6, 18, 6, "last-forward"), Attention(4, 12, 4, "last-forward")]
+    assert [long_blocks(n) for n in (24, 12)] == [
+        Attention(6, 18, 6, "last-forward"),
+        Attention(4, 12, 4, "last-forward"),
+    ]

@@ -1,4 +1,6 @@
-"""Pairs of a recorded street: what was held out is never in the recording, and a folder that exists is kept."""
+"""Pairs of a recorded street: what was held out is never in the recording, and a folder that exists
+is kept.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,11 @@ def test_each_photograph_is_held_out_once_and_the_others_are_its_recording(tmp_p
     write_points(tmp_path / "points.ply", xyz, np.full((400, 3), 100, np.uint8))
     recipe = PhotographRecipe(width=64, every=3, steps=2, split="train")
     made = list(make_drive_pairs(drive, "street", tmp_path / "pairs", recipe))
-    assert [one.folder.name for one in made] == ["street_front_0", "street_front_1", "street_front_2"]
+    assert [one.folder.name for one in made] == [
+        "street_front_0",
+        "street_front_1",
+        "street_front_2",
+    ]
     taken = {one.t_us for one in drive.recording if one.camera == "front"}
     shown: list[int] = []
     for one in made:
@@ -39,17 +45,28 @@ def test_each_photograph_is_held_out_once_and_the_others_are_its_recording(tmp_p
         assert (references.depth[0, 40:] > 0).any()
         shown += sorted(held)
     assert sorted(shown) == sorted(taken)
-    assert not any(one.made for one in make_drive_pairs(drive, "street", tmp_path / "pairs", recipe))
+    assert not any(
+        one.made for one in make_drive_pairs(drive, "street", tmp_path / "pairs", recipe)
+    )
 
 
 def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
     write_points(tmp_path / "points.ply", np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
     with pytest.raises(InputError, match="9 photographs for every 5th"):
-        list(make_drive_pairs(recorded_drive(tmp_path), "street", tmp_path / "pairs", PhotographRecipe(width=64, every=5)))
+        list(
+            make_drive_pairs(
+                recorded_drive(tmp_path),
+                "street",
+                tmp_path / "pairs",
+                PhotographRecipe(width=64, every=5),
+            )
+        )
 
 
 @pytest.mark.slow
-def test_real_photographs_become_pairs_once(data_set: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_real_photographs_become_pairs_once(
+    data_set: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ["--width", "64", "--every", "2", "--steps", "60", "--json"]
     command = ["train", "photographs", str(data_set("fox")), "--out", str(tmp_path), *words]
     assert run_command(command) == 0

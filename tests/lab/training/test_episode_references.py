@@ -1,4 +1,6 @@
-"""References of training episodes: cut as the frames are, absent where they are missing, wrong where they are drawn so."""
+"""References of training episodes: cut as the frames are, absent where they are missing, wrong
+where they are drawn so.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +20,20 @@ from alpasim_plugin.lab.training.episode_references import (
     road_users,
     video_references,
 )
-from alpasim_plugin.lab.training.map_errors import CHANCES, MapError, draw_map_error, is_paint, with_error
+from alpasim_plugin.lab.training.map_errors import (
+    CHANCES,
+    MapError,
+    draw_map_error,
+    is_paint,
+    with_error,
+)
 from alpasim_plugin.lab.training.pair_store import PairSequence, write_sequence
 from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_references
 from tests.lab.training.pair_files import make, pair
 
-FRAMES, HEIGHT, WIDTH = 6, 32, 48
+FRAMES = 6
+HEIGHT = 32
+WIDTH = 48
 EXACT = ReferenceDraw(2, 0, np.zeros((SLOTS, 6)), np.ones((SLOTS, 3)), -1, 0)
 INDEX = np.arange(3)
 K = [[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]
@@ -34,21 +44,46 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> PairSequence:
     """Give a sequence with three recorded frames; a wall stands 10 m ahead."""
     folder = tmp_path_factory.mktemp("references") / "train" / "a"
     wall = np.full((HEIGHT, WIDTH), 10, np.float16)
-    car = Actor("car", "car", Box(4, 2, 1.5), Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])))
+    car = Actor(
+        "car",
+        "car",
+        Box(4, 2, 1.5),
+        Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])),
+    )
 
     def recorded(i: int) -> RecordedFrame:
         T = np.eye(4)
         T[0, 3] = 2.0 * i
-        return RecordedFrame(200_000 * i, "front", np.array(K), T, {}, lambda: (pair(10 * i).rgb_gt, wall.astype(np.float32)))
+        return RecordedFrame(
+            200_000 * i,
+            "front",
+            np.array(K),
+            T,
+            {},
+            lambda: (pair(10 * i).rgb_gt, wall.astype(np.float32)),
+        )
 
     def beside(partial: Path) -> None:
-        write_references(partial, [FrameGeometry(wall, {})] * FRAMES, [recorded(i) for i in range(3)], [car])
+        write_references(
+            partial, [FrameGeometry(wall, {})] * FRAMES, [recorded(i) for i in range(3)], [car]
+        )
 
-    write_sequence(folder, (pair(i) for i in range(FRAMES)), FRAMES, {"camera": {"K": K, "T_rig_camera": np.eye(4).tolist()}}, beside)
+    write_sequence(
+        folder,
+        (pair(i) for i in range(FRAMES)),
+        FRAMES,
+        {"camera": {"K": K, "T_rig_camera": np.eye(4).tolist()}},
+        beside,
+    )
     return PairSequence(folder)
 
 
-def shown(sequence: PairSequence, draw: ReferenceDraw, rows: slice = slice(0, HEIGHT), columns: slice = slice(0, WIDTH)) -> U8:
+def shown(
+    sequence: PairSequence,
+    draw: ReferenceDraw,
+    rows: slice = slice(0, HEIGHT),
+    columns: slice = slice(0, WIDTH),
+) -> U8:
     return pair_references(sequence, draw, INDEX, rows, columns)
 
 
@@ -64,11 +99,33 @@ def test_road_users_are_where_their_boxes_are(tmp_path: Path) -> None:
     wall, T_world_box = np.full((HEIGHT, WIDTH), 10, np.float16), np.eye(4)
     T_world_box[2, 3] = 10.0
     frames = [FrameGeometry(wall, {"car": T_world_box} if i == 0 else {}) for i in range(FRAMES)]
-    car = Actor("car", "car", Box(4, 2, 1.5), Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])))
-    recorded = [RecordedFrame(0, "front", np.array(K), np.eye(4), {}, lambda: (pair(0).rgb_gt, wall.astype(np.float32)))]
+    car = Actor(
+        "car",
+        "car",
+        Box(4, 2, 1.5),
+        Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])),
+    )
+    recorded = [
+        RecordedFrame(
+            0,
+            "front",
+            np.array(K),
+            np.eye(4),
+            {},
+            lambda: (pair(0).rgb_gt, wall.astype(np.float32)),
+        )
+    ]
     info = {"camera": {"K": K, "T_rig_camera": np.eye(4).tolist()}}
-    write_sequence(tmp_path / "a", (pair(i) for i in range(FRAMES)), FRAMES, info, lambda to: write_references(to, frames, recorded, [car]))
-    whole = road_users(PairSequence(tmp_path / "a"), np.array([0, 1]), slice(0, HEIGHT), slice(0, WIDTH))
+    write_sequence(
+        tmp_path / "a",
+        (pair(i) for i in range(FRAMES)),
+        FRAMES,
+        info,
+        lambda to: write_references(to, frames, recorded, [car]),
+    )
+    whole = road_users(
+        PairSequence(tmp_path / "a"), np.array([0, 1]), slice(0, HEIGHT), slice(0, WIDTH)
+    )
     part = road_users(PairSequence(tmp_path / "a"), np.array([0]), slice(8, 24), slice(16, 48))
     assert whole[0].any()
     assert not whole[0].all()
@@ -79,18 +136,26 @@ def test_road_users_are_where_their_boxes_are(tmp_path: Path) -> None:
     assert not without.any()
 
 
-def test_as_many_references_as_drawn_and_none_without_a_recording(sequence: PairSequence, tmp_path: Path) -> None:
+def test_as_many_references_as_drawn_and_none_without_a_recording(
+    sequence: PairSequence, tmp_path: Path
+) -> None:
     for count in range(SLOTS + 1):
         there = shown(sequence, replace(EXACT, count=count)).any(axis=(0, 2, 3, 4))
         assert there.tolist() == [True] * count + [False] * (SLOTS - count)
     assert not shown(make(tmp_path), EXACT).any()
 
 
-def test_missing_nearest_frames_misplaced_poses_and_wrong_places_show_something_else(sequence: PairSequence) -> None:
+def test_missing_nearest_frames_misplaced_poses_and_wrong_places_show_something_else(
+    sequence: PairSequence,
+) -> None:
     exact = shown(sequence, EXACT)[:, 0]
     errors = np.zeros((SLOTS, 6))
     errors[0, 0] = 0.5
-    for other in (replace(EXACT, skipped=1), replace(EXACT, errors=errors), replace(EXACT, wrong=0)):
+    for other in (
+        replace(EXACT, skipped=1),
+        replace(EXACT, errors=errors),
+        replace(EXACT, wrong=0),
+    ):
         assert not np.array_equal(shown(sequence, other)[:, 0], exact)
 
 
@@ -103,7 +168,10 @@ def test_the_neighbours_of_a_standing_video_are_the_video_itself(tmp_path: Path)
     index = np.arange(10, 13)
     draws = [replace(EXACT, seed=seed, count=1) for seed in range(24)]
     found = [video_references(clip, draw, index, slice(0, 64), slice(0, 96)) for draw in draws]
-    same = [np.abs(images[:, 0, 8:-8, 8:-8, :3].astype(int) - still.rgb_gt[8:-8, 8:-8]).mean() < 2 for images in found]
+    same = [
+        np.abs(images[:, 0, 8:-8, 8:-8, :3].astype(int) - still.rgb_gt[8:-8, 8:-8]).mean() < 2
+        for images in found
+    ]
     assert any(same)
     assert not all(same)  # most flows are bent
 

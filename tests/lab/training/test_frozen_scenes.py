@@ -7,7 +7,12 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.lab.training.frozen_scenes import RECORD, check_scenes, freeze_scenes, hash_scenes
+from alpasim_plugin.lab.training.frozen_scenes import (
+    RECORD,
+    check_scenes,
+    freeze_scenes,
+    hash_scenes,
+)
 from alpasim_plugin.lab.training.scenes import SPLITS, TEST_SPLITS, write_scenes
 
 
@@ -27,7 +32,9 @@ def test_frozen_scenes_pass_their_check(scenes: Path, tmp_path: Path) -> None:
     assert len({split.sha256 for split in frozen.values()}) == len(TEST_SPLITS)
 
 
-def test_a_changed_a_missing_and_a_further_scene_are_each_noticed(scenes: Path, tmp_path: Path) -> None:
+def test_a_changed_a_missing_and_a_further_scene_are_each_noticed(
+    scenes: Path, tmp_path: Path
+) -> None:
     record, one = tmp_path / "record.json", scenes / TEST_SPLITS[1] / "b.yaml"
     freeze_scenes(scenes, record)
     before = one.read_text()
@@ -57,12 +64,19 @@ def test_a_record_that_cannot_be_read_is_said(scenes: Path, tmp_path: Path) -> N
             check_scenes(scenes, tmp_path / "record.json")
 
 
-def test_command_freezes_and_checks(scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_freezes_and_checks(
+    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     record = ["--record", str(tmp_path / "record.json")]
     assert run_command(["train", "check-scenes", str(scenes), *record, "--freeze"]) == 0
     assert run_command(["train", "check-scenes", str(scenes), *record, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["test-known"] == hash_scenes(scenes / "test-known").sha256
-    assert run_command(["train", "check-scenes", str(scenes)]) != 0  # these are not the shipped ones
+    assert (
+        json.loads(capsys.readouterr().out)["test-known"]
+        == hash_scenes(scenes / "test-known").sha256
+    )
+    assert (
+        run_command(["train", "check-scenes", str(scenes)]) != 0
+    )  # these are not the shipped ones
 
 
 def test_first_scene_of_each_split_is_drawn_as_it_was_frozen(tmp_path: Path) -> None:

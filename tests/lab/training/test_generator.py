@@ -1,4 +1,6 @@
-"""Training a row of the ablation: latents on disk, equal draws, budgets, and a bundle that drives."""
+"""Training a row of the ablation: latents on disk, equal draws, budgets, and a bundle that
+drives.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,12 @@ from alpasim_plugin.core.reading.arrays import read_metadata
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.fixers.network.checkpoints import load_weights
-from alpasim_plugin.lab.bench.training_memory import MemoryCell, measure_memory, memory_table, monotone
+from alpasim_plugin.lab.bench.training_memory import (
+    MemoryCell,
+    measure_memory,
+    memory_table,
+    monotone,
+)
 from alpasim_plugin.lab.training.clip_batches import BatchForm, ClipBatches, Seen
 from alpasim_plugin.lab.training.fixer_run import FixerRun, stage_inputs, train_fixer
 from alpasim_plugin.lab.training.generator import SharedRollout
@@ -31,7 +38,12 @@ from alpasim_plugin.lab.training.latent_clips import ClipForm, LatentClips, dige
 from alpasim_plugin.lab.training.pair_store import PairDataset, write_sequence
 from alpasim_plugin.lab.training.recipes.ablation import ABLATION
 from alpasim_plugin.lab.training.recipes.recipe import Recipe
-from alpasim_plugin.lab.training.recipes.registry import recipe_of, with_attention, with_perceptual_weight, with_source_share
+from alpasim_plugin.lab.training.recipes.registry import (
+    recipe_of,
+    with_attention,
+    with_perceptual_weight,
+    with_source_share,
+)
 from alpasim_plugin.lab.training.recipes.start import widen_map
 from alpasim_plugin.lab.training.shared_rollout import Objectives
 from alpasim_plugin.lab.training.trainer import Schedule
@@ -61,7 +73,16 @@ def run_of(data: Path, recipe: str, *, steps: int = 2, init: Path | None = None)
     settings = small_settings("window=4", "history=finalise", "holes=noise")
     weights = {} if init is None else {"init": init}
     chosen = with_attention(recipe_of(recipe), window=4)
-    return FixerRun(settings, chosen, data, data / "vae.safetensors", weights, FORM, BatchForm(clips=2, columns=4), schedule)
+    return FixerRun(
+        settings,
+        chosen,
+        data,
+        data / "vae.safetensors",
+        weights,
+        FORM,
+        BatchForm(clips=2, columns=4),
+        schedule,
+    )
 
 
 def task_of(run: FixerRun, clips: LatentClips, distance: object = ("b", brightness)) -> Any:
@@ -76,10 +97,14 @@ def objectives_of(recipe: Recipe) -> tuple[Objectives, ...]:
 
 
 def clips_of(data: Path, folder: Path) -> LatentClips:
-    return LatentClips(PairDataset(data, "train").sequences, TinyVAE.load(data / "vae.safetensors"), FORM, folder)
+    return LatentClips(
+        PairDataset(data, "train").sequences, TinyVAE.load(data / "vae.safetensors"), FORM, folder
+    )
 
 
-def test_latents_are_those_of_a_rollout_that_starts_there_and_are_encoded_once(data: Path, tmp_path: Path) -> None:
+def test_latents_are_those_of_a_rollout_that_starts_there_and_are_encoded_once(
+    data: Path, tmp_path: Path
+) -> None:
     clips = clips_of(data, tmp_path)
     assert len(clips) == 2 * (2 + 1)  # starts 0 and 7 of 21 frames, 0 of 14; each mirrored as well
     clip = clips[3]
@@ -91,7 +116,11 @@ def test_latents_are_those_of_a_rollout_that_starts_there_and_are_encoded_once(d
     torch.testing.assert_close(clip.z_0, wanted, atol=4e-3, rtol=2e-3)  # float16 on disk
     assert clip.m.shape == (1, 4, 4, 6)
     render, opacity = clip.frames(5)
-    np.testing.assert_allclose((render.permute(1, 2, 3, 0) + 1) * 127.5, clip.sequence.clip.rgb_input[7:12, :, ::-1], atol=1e-3)
+    np.testing.assert_allclose(
+        (render.permute(1, 2, 3, 0) + 1) * 127.5,
+        clip.sequence.clip.rgb_input[7:12, :, ::-1],
+        atol=1e-3,
+    )
     assert set(opacity.unique().tolist()) == {0.0, 1.0}
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npy")}
     clips_of(data, tmp_path)
@@ -110,26 +139,45 @@ def test_other_pairs_under_the_same_name_are_encoded_anew(data: Path, tmp_path: 
     assert not torch.equal(after[0].z_r, before[0].z_r)
 
 
-@pytest.mark.parametrize(("part", "same"), [("decoder.", True), ("encoder.", False), ("stats.", False)])
-def test_latents_belong_to_the_encoder_and_its_statistics_whatever_the_decoder(data: Path, part: str, same: bool) -> None:
+@pytest.mark.parametrize(
+    ("part", "same"), [("decoder.", True), ("encoder.", False), ("stats.", False)]
+)
+def test_latents_belong_to_the_encoder_and_its_statistics_whatever_the_decoder(
+    data: Path, part: str, same: bool
+) -> None:
     vae = TinyVAE.load(data / "vae.safetensors")
-    weights = {key: value + 0.01 if key.startswith(part) else value for key, value in vae.state_dict().items()}
+    weights = {
+        key: value + 0.01 if key.startswith(part) else value
+        for key, value in vae.state_dict().items()
+    }
     assert (digest(TinyVAE.from_state_dict(weights), FORM) == digest(vae, FORM)) == same
 
 
 def test_sequences_that_make_no_clips_or_no_batch_are_refused(data: Path, tmp_path: Path) -> None:
     make(tmp_path, name="short", frames=9)
     with pytest.raises(InputError, match="a clip has 13"):
-        LatentClips(PairDataset(tmp_path, "train").sequences, TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
+        LatentClips(
+            PairDataset(tmp_path, "train").sequences,
+            TinyVAE.load(data / "vae.safetensors"),
+            FORM,
+            tmp_path / "z",
+        )
     with pytest.raises(InputError, match="no finished sequence"):
         LatentClips([], TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
     make(tmp_path, "mixed/train", "a", frames=13)
     make(tmp_path, "mixed/train", "b", frames=13, width=64)
     with pytest.raises(InputError, match=r"make no batch: 48x32 \(1\), 64x32 \(1\)"):
-        LatentClips(PairDataset(tmp_path / "mixed", "train").sequences, TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
+        LatentClips(
+            PairDataset(tmp_path / "mixed", "train").sequences,
+            TinyVAE.load(data / "vae.safetensors"),
+            FORM,
+            tmp_path / "z",
+        )
 
 
-def test_of_several_sizes_one_is_chosen_and_gives_the_weights_of_a_folder_of_its_own(data: Path, tmp_path: Path) -> None:
+def test_of_several_sizes_one_is_chosen_and_gives_the_weights_of_a_folder_of_its_own(
+    data: Path, tmp_path: Path
+) -> None:
     run = run_of(data, "base")
     alone = train_fixer(run, tmp_path / "alone", ("brightness", brightness))
     make(tmp_path / "mixed", name="a", frames=21)
@@ -138,17 +186,28 @@ def test_of_several_sizes_one_is_chosen_and_gives_the_weights_of_a_folder_of_its
     mixed = replace(run, data=tmp_path / "mixed")
     with pytest.raises(InputError, match=r"make no batch: 48x32 \(2\), 64x32 \(1\)"):
         train_fixer(mixed, tmp_path / "of-mixed", ("brightness", brightness))
-    with pytest.raises(InputError, match=r"no sequence of 32x48; there are 48x32 \(2\), 64x32 \(1\)"):
-        train_fixer(replace(mixed, size=(32, 48)), tmp_path / "of-mixed", ("brightness", brightness))
-    chosen = train_fixer(replace(mixed, size=(48, 32)), tmp_path / "of-mixed", ("brightness", brightness))
-    assert all(torch.equal(value, load_weights(alone)[key]) for key, value in load_weights(chosen).items())
+    with pytest.raises(
+        InputError, match=r"no sequence of 32x48; there are 48x32 \(2\), 64x32 \(1\)"
+    ):
+        train_fixer(
+            replace(mixed, size=(32, 48)), tmp_path / "of-mixed", ("brightness", brightness)
+        )
+    chosen = train_fixer(
+        replace(mixed, size=(48, 32)), tmp_path / "of-mixed", ("brightness", brightness)
+    )
+    assert all(
+        torch.equal(value, load_weights(alone)[key]) for key, value in load_weights(chosen).items()
+    )
     assert json.loads(chosen.with_suffix(".card.json").read_text())["data"]["sequences"] == 2
 
 
 QUICK = ("base", "V5", "V8")  # the branches that V9, which is trained below, does not take
 
 
-@pytest.mark.parametrize("name", [r.name if r.name in QUICK else pytest.param(r.name, marks=pytest.mark.slow) for r in ABLATION])
+@pytest.mark.parametrize(
+    "name",
+    [r.name if r.name in QUICK else pytest.param(r.name, marks=pytest.mark.slow) for r in ABLATION],
+)
 def test_every_row_trains_by_one_function(data: Path, tmp_path: Path, name: str) -> None:
     steps = 3 if name == "V7" else 2  # the last of three is its perceptual term's
     run = run_of(data, name, steps=steps)
@@ -159,10 +218,14 @@ def test_every_row_trains_by_one_function(data: Path, tmp_path: Path, name: str)
     assert card["curves"][-1]["step"] == steps
     rows = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert len(rows) == steps
-    asked = objectives_of(run.recipe) if name not in ("base", "base-bi") else (Objectives("own", 0),)
+    asked = (
+        objectives_of(run.recipe) if name not in ("base", "base-bi") else (Objectives("own", 0),)
+    )
     assert any("flow" in row for row in rows) == any(o.flow is not None for o in asked)
     assert any("perceptual" in row for row in rows) == any(o.horizon for o in asked)
-    assert load_weights(path)["dit.additional_patch_embedding.proj.1.weight"].shape[1] == (128 if name == "V6" else 64)
+    assert load_weights(path)["dit.additional_patch_embedding.proj.1.weight"].shape[1] == (
+        128 if name == "V6" else 64
+    )
 
 
 @pytest.mark.slow
@@ -171,12 +234,17 @@ def test_a_run_can_be_stopped_for_what_there_is_and_goes_on(data: Path, tmp_path
     assert read_metadata(path)["note"] == "base, 2 of 3 updates"
     whole = train_fixer(run_of(data, "base", steps=3), tmp_path / "whole")
     again = train_fixer(run_of(data, "base", steps=3), tmp_path / "run")
-    assert all(torch.equal(value, load_weights(whole)[key]) for key, value in load_weights(again).items())
+    assert all(
+        torch.equal(value, load_weights(whole)[key]) for key, value in load_weights(again).items()
+    )
 
 
 def test_terms_can_be_weighted_and_shared_from_outside() -> None:
     assert [o.weight for o in objectives_of(recipe_of("V7"))] == [10.0, 10.0]
-    assert [o.weight for o in objectives_of(with_perceptual_weight(recipe_of("V7"), 2.5))] == [2.5, 2.5]
+    assert [o.weight for o in objectives_of(with_perceptual_weight(recipe_of("V7"), 2.5))] == [
+        2.5,
+        2.5,
+    ]
     with pytest.raises(InputError, match="weight -1"):
         with_perceptual_weight(recipe_of("V9"), -1.0)
     assert with_source_share(recipe_of("base"), 0.0).stages[0].objective.source_share == 0
@@ -202,15 +270,22 @@ def test_an_interrupted_run_ends_with_the_same_weights(data: Path, tmp_path: Pat
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_fixer(run_of(data, "V9", steps=3), tmp_path / "cut", ("brightness", brightness), report=stop)
+        train_fixer(
+            run_of(data, "V9", steps=3), tmp_path / "cut", ("brightness", brightness), report=stop
+        )
     cut = train_fixer(run_of(data, "V9", steps=3), tmp_path / "cut", ("brightness", brightness))
     one, other = load_weights(cut), load_weights(whole)
     assert one.keys() == other.keys()
     assert all(torch.equal(value, other[key]) for key, value in one.items())
 
 
-@pytest.mark.parametrize(("variant", "extra"), [("V9", "history=finalise"), pytest.param("image", "history=none", marks=pytest.mark.slow)])
-def test_trained_weights_serve_the_streaming_fixer(data: Path, tmp_path: Path, variant: str, extra: str) -> None:
+@pytest.mark.parametrize(
+    ("variant", "extra"),
+    [("V9", "history=finalise"), pytest.param("image", "history=none", marks=pytest.mark.slow)],
+)
+def test_trained_weights_serve_the_streaming_fixer(
+    data: Path, tmp_path: Path, variant: str, extra: str
+) -> None:
     path = train_fixer(run_of(data, variant), tmp_path / "run", ("brightness", brightness))
     blocks = "block_latents=1" if variant == "image" else "block_latents=2"
     settings = small_settings("window=4", "holes=noise", extra, blocks, f"weights.bundle={path}")
@@ -222,17 +297,23 @@ def test_trained_weights_serve_the_streaming_fixer(data: Path, tmp_path: Path, v
     assert np.abs(fixed.astype(int) - pixels(frames)).max() > 0
 
 
-def test_a_generator_from_noise_drives_with_the_render_as_its_condition(data: Path, tmp_path: Path) -> None:
+def test_a_generator_from_noise_drives_with_the_render_as_its_condition(
+    data: Path, tmp_path: Path
+) -> None:
     path = train_fixer(run_of(data, "V6"), tmp_path / "run", ("brightness", brightness))
     with pytest.raises(InputError, match="render_input is False for True"):
-        load_networks(small_settings("window=4", "holes=noise", "history=finalise", f"weights.bundle={path}"))
+        load_networks(
+            small_settings("window=4", "holes=noise", "history=finalise", f"weights.bundle={path}")
+        )
     name, overrides = bundle_fixer(path)
     settings = fixer_settings(name, overrides)
     assert isinstance(settings, OneFixerSettings)
     assert (settings.holes, settings.render_input) == ("everywhere", True)
     frames = moving_picture(5)
     dark = [replace(frame, rgb=frame.rgb // 2) for frame in frames]
-    one, other = (pixels(run_blocks(fixer(settings), clip, maps_of(frames))) for clip in (frames, dark))
+    one, other = (
+        pixels(run_blocks(fixer(settings), clip, maps_of(frames))) for clip in (frames, dark)
+    )
     assert (one != other).any()
 
 
@@ -243,27 +324,40 @@ def test_a_black_map_is_encoded_in_training_and_on_the_road(data: Path, tmp_path
     assert (settings.uses_map, settings.no_map) == (False, "black")
     clips = clips_of(data, tmp_path)
     vae = TinyVAE.load(data / "vae.safetensors")
-    shown = ClipBatches(clips, vae, BatchForm(clips=2, columns=4), Seen(map="black"))[0].sample.condition
+    shown = ClipBatches(clips, vae, BatchForm(clips=2, columns=4), Seen(map="black"))[
+        0
+    ].sample.condition
     with torch.inference_mode():
         black = vae.encode(torch.full((1, 3, 13, 32, 48), -1.0))
     assert float(black.abs().mean()) > 0.1
-    torch.testing.assert_close(shown[:, :, :, :, 2:], black[..., 2:4].expand_as(shown[:, :, :, :, 2:]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        shown[:, :, :, :, 2:], black[..., 2:4].expand_as(shown[:, :, :, :, 2:]), atol=1e-5, rtol=0
+    )
     frames = moving_picture(5)
     fixed, nothing = (
-        pixels(run_blocks(fixer(s), frames, maps_of(frames))) for s in (settings, settings.model_copy(update={"no_map": "nothing"}))
+        pixels(run_blocks(fixer(s), frames, maps_of(frames)))
+        for s in (settings, settings.model_copy(update={"no_map": "nothing"}))
     )
     given = settings.model_copy(update={"uses_map": True})
-    blacked = pixels(run_blocks(fixer(given), frames, [np.zeros_like(frame.rgb) for frame in frames]))
+    blacked = pixels(
+        run_blocks(fixer(given), frames, [np.zeros_like(frame.rgb) for frame in frames])
+    )
     np.testing.assert_array_equal(fixed, blacked)
     assert (fixed != nothing).any()
 
 
-def test_without_history_a_frame_does_not_depend_on_those_before(data: Path, tmp_path: Path) -> None:
+def test_without_history_a_frame_does_not_depend_on_those_before(
+    data: Path, tmp_path: Path
+) -> None:
     path = train_fixer(run_of(data, "image"), tmp_path / "run", ("brightness", brightness))
-    settings = small_settings("window=4", "holes=noise", "history=none", "block_latents=1", f"weights.bundle={path}")
+    settings = small_settings(
+        "window=4", "holes=noise", "history=none", "block_latents=1", f"weights.bundle={path}"
+    )
     frames = moving_picture(6)
     changed = [replace(frames[0], rgb=255 - frames[0].rgb), *frames[1:]]
-    one, other = (pixels(run_blocks(fixer(settings), clip, maps_of(clip))) for clip in (frames, changed))
+    one, other = (
+        pixels(run_blocks(fixer(settings), clip, maps_of(clip))) for clip in (frames, changed)
+    )
     np.testing.assert_array_equal(one[1:], other[1:])
     assert (one[0] != other[0]).any()
     with pytest.raises(InputError, match="block_latents"):
@@ -275,7 +369,10 @@ def test_draws_are_functions_of_their_number(data: Path, tmp_path: Path) -> None
     one, two = task_of(run, clips), task_of(run, clips)
     two.batch(0)
     a, b = one.batch(5), two.batch(5)
-    assert all(torch.equal(getattr(a.sample, key), getattr(b.sample, key)) for key in ("z_0", "z_r", "m", "eps", "t"))
+    assert all(
+        torch.equal(getattr(a.sample, key), getattr(b.sample, key))
+        for key in ("z_0", "z_r", "m", "eps", "t")
+    )
     assert a.sample.w == b.sample.w
     assert a.sample.z_0.shape == (2, 16, 4, 4, 4)  # cropped to 4 of 6 columns
     assert not torch.equal(a.sample.eps, one.batch(6).sample.eps)
@@ -293,9 +390,13 @@ def test_a_widened_map_input_changes_nothing_at_first() -> None:
     x, z_map, z_r = (torch.randn(1, 16, 2, 4, 4, generator=generator) for _ in range(3))
     text = torch.zeros(1, 1, 7)
     for net in (narrow_net, wide_net):
-        torch.nn.init.normal_(net.final_layer.linear.weight, generator=torch.Generator().manual_seed(1))
+        torch.nn.init.normal_(
+            net.final_layer.linear.weight, generator=torch.Generator().manual_seed(1)
+        )
     with torch.no_grad():
-        torch.testing.assert_close(wide_net(x, 500.0, text, torch.cat([z_map, z_r], 1)), narrow_net(x, 500.0, text, z_map))
+        torch.testing.assert_close(
+            wide_net(x, 500.0, text, torch.cat([z_map, z_r], 1)), narrow_net(x, 500.0, text, z_map)
+        )
     with pytest.raises(InputError, match="they take 32"):
         widen_map(wide, 16)
 
@@ -310,6 +411,10 @@ def test_memory_grows_with_the_clip_and_the_horizon() -> None:
 
 
 def test_memory_that_falls_with_the_horizon_is_not_monotone() -> None:
-    cells = [MemoryCell(8, 1, 100.0, 1.0), MemoryCell(8, 4, 95.0, 1.0), MemoryCell(16, 4, 300.0, 1.0)]
+    cells = [
+        MemoryCell(8, 1, 100.0, 1.0),
+        MemoryCell(8, 4, 95.0, 1.0),
+        MemoryCell(16, 4, 300.0, 1.0),
+    ]
     assert monotone(cells)
     assert not monotone([*cells, MemoryCell(16, 8, 200.0, 1.0)])

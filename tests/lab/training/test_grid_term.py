@@ -1,4 +1,6 @@
-"""The term sees patterns of the cells and nothing else: noise, blur and edges do not count, and it falls by its own gradient."""
+"""The term sees patterns of the cells and nothing else: noise, blur and edges do not count, and it
+falls by its own gradient.
+"""
 
 import numpy as np
 import pytest
@@ -34,7 +36,9 @@ def test_the_truth_has_none() -> None:
 @pytest.mark.parametrize("period", [4, 16])
 def test_it_grows_with_a_pattern_of_a_cell(period: int) -> None:
     truth = picture()
-    found = [float(grid_term(truth + pattern(period, size), truth)) for size in (0.0, 0.005, 0.01, 0.02)]
+    found = [
+        float(grid_term(truth + pattern(period, size), truth)) for size in (0.0, 0.005, 0.01, 0.02)
+    ]
     assert found == sorted(found)
     assert found[-1] > 0.02
 
@@ -43,7 +47,11 @@ def test_blur_noise_and_contrast_count_little() -> None:
     truth = picture()
     marked = float(grid_term(truth + pattern(4, 0.02), truth))
     flat = truth.flatten(0, 1).permute(0, 3, 1, 2)
-    blurred = functional.avg_pool2d(functional.pad(flat, (1, 1, 1, 1), mode="replicate"), 3, 1).permute(0, 2, 3, 1).unflatten(0, (2, 2))
+    blurred = (
+        functional.avg_pool2d(functional.pad(flat, (1, 1, 1, 1), mode="replicate"), 3, 1)
+        .permute(0, 2, 3, 1)
+        .unflatten(0, (2, 2))
+    )
     noisy = truth + 0.003 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(0))
     for other in (blurred, noisy, 0.8 * truth):
         assert float(grid_term(other, truth)) < 0.35 * marked

@@ -1,4 +1,6 @@
-"""Every image arm by the command: what it trains, that it resumes bit for bit, and that its bundle drives as a fixer."""
+"""Every image arm by the command: what it trains, that it resumes bit for bit, and that its bundle
+drives as a fixer.
+"""
 
 from __future__ import annotations
 
@@ -31,9 +33,13 @@ from tests.fixers.clip_cases import moving_picture, pixels
 from tests.lab.training.pair_files import make
 
 TRAINED = {
-    "difix": {"dit", "vae.decoder"}, "harmonizer": {"dit", "vae.encoder", "vae.decoder"}, "gsfix3d": {"dit"}, "3dgs-enhancer": {"dit"},
-    "harmonizer-temporal": {"dit", "vae.encoder", "vae.decoder"}, "harmonizer-temporal-teacher": {"dit", "vae.encoder", "vae.decoder"},
-}  # fmt: skip
+    "difix": {"dit", "vae.decoder"},
+    "harmonizer": {"dit", "vae.encoder", "vae.decoder"},
+    "gsfix3d": {"dit"},
+    "3dgs-enhancer": {"dit"},
+    "harmonizer-temporal": {"dit", "vae.encoder", "vae.decoder"},
+    "harmonizer-temporal-teacher": {"dit", "vae.encoder", "vae.decoder"},
+}
 Train = Callable[..., Path]
 
 
@@ -43,7 +49,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make(root, name="a", frames=31)
     make(root, name="b", frames=26)
     TinyVAE.random(TinySizes(16, 16, 16, 16, 16)).save(root / "vae.safetensors")
-    write_safetensors(root / "dit.safetensors", initial_weights(DiTSizes(24, 2, 12, 40, 5, 7, 9), 0))
+    write_safetensors(
+        root / "dit.safetensors", initial_weights(DiTSizes(24, 2, 12, 40, 5, 7, 9), 0)
+    )
     return root
 
 
@@ -54,17 +62,29 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def train(data: Path, runs: Path) -> Train:
-    """Return a function that trains a recipe for some updates by the command and returns its folder."""
+    """Return a function that trains a recipe for some updates by the command and returns its
+    folder.
+    """
 
     def run(recipe: str, updates: int, folder: str, *more: str) -> Path:
         torch.set_num_threads(1)
         start = "init-bi" if recipe == "3dgs-enhancer" else "init"
         options = {
-            "--vae": data / "vae.safetensors", "--weights": f"{start}={data / 'dit.safetensors'}", "--out": runs / folder,
+            "--vae": data / "vae.safetensors",
+            "--weights": f"{start}={data / 'dit.safetensors'}",
+            "--out": runs / folder,
             "--recipe": recipe,
-            "--steps": 3, "--stop-at": updates, "--clips": 2, "--accumulate": 1, "--columns": 4, "--latents": 7, "--lr": 0.01,
-        }  # fmt: skip
-        done = CliRunner().invoke(app, ["fixer", str(data), *(str(x) for pair in options.items() for x in pair), *more])
+            "--steps": 3,
+            "--stop-at": updates,
+            "--clips": 2,
+            "--accumulate": 1,
+            "--columns": 4,
+            "--latents": 7,
+            "--lr": 0.01,
+        }
+        done = CliRunner().invoke(
+            app, ["fixer", str(data), *(str(x) for pair in options.items() for x in pair), *more]
+        )
         if done.exception is not None:
             raise done.exception
         return runs / folder
@@ -87,16 +107,33 @@ def trained(train: Train, runs: Path) -> Callable[[str], Path]:
 
 
 NAMES = [arm.name for arm in IMAGE_ARMS]
-QUICK = ("difix", "harmonizer-temporal", "gsfix3d", "3dgs-enhancer")  # the temporal one trains harmonizer first
+QUICK = (
+    "difix",
+    "harmonizer-temporal",
+    "gsfix3d",
+    "3dgs-enhancer",
+)  # the temporal one trains harmonizer first
 
 
-@pytest.mark.parametrize("recipe", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in NAMES])
-def test_an_arm_trains_its_parts_and_its_bundle_is_a_fixer(data: Path, trained: Callable[[str], Path], recipe: str) -> None:
+@pytest.mark.parametrize(
+    "recipe",
+    [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in NAMES],
+)
+def test_an_arm_trains_its_parts_and_its_bundle_is_a_fixer(
+    data: Path, trained: Callable[[str], Path], recipe: str
+) -> None:
     path = trained(recipe)
     card = json.loads(path.with_suffix(".card.json").read_text())
-    assert (card["training"]["recipe"], set(card["training"]["trained"])) in [(recipe, TRAINED[recipe]), (recipe, {"dit", "vae"})]
+    assert (card["training"]["recipe"], set(card["training"]["trained"])) in [
+        (recipe, TRAINED[recipe]),
+        (recipe, {"dit", "vae"}),
+    ]
     after, vae = load_weights(path), load_weights(data / "vae.safetensors")
-    learned = [key for key, value in after.items() if key.startswith("vae.") and not torch.equal(value, vae[key[4:]].half())]
+    learned = [
+        key
+        for key, value in after.items()
+        if key.startswith("vae.") and not torch.equal(value, vae[key[4:]].half())
+    ]
     assert {".".join(key.split(".")[:2]) for key in learned} == TRAINED[recipe] - {"dit"}
     name, overrides = bundle_fixer(path)
     fixer = make_fixer(name, fixer_settings(name, overrides), scene_id="scene")
@@ -104,7 +141,11 @@ def test_an_arm_trains_its_parts_and_its_bundle_is_a_fixer(data: Path, trained: 
     assert fixer.trained
     assert f"{recipe}, 2 of " in fixer.label
     frames = moving_picture(6)
-    fixed = [frame for block in refine_frames([(frame, None) for frame in frames], fixer) for frame in block.fixed]
+    fixed = [
+        frame
+        for block in refine_frames([(frame, None) for frame in frames], fixer)
+        for frame in block.fixed
+    ]
     assert np.abs(pixels(fixed).astype(int) - pixels(frames)).max() > 0
     assert [frame.t_us for frame in fixed] == [frame.t_us for frame in frames]
 
@@ -115,8 +156,12 @@ def test_the_published_decay_of_gsfix3d_in_the_papers_updates() -> None:
     assert schedule.lr(10_000) == pytest.approx(0.1585, abs=1e-4)  # a hundredth after 25,000
 
 
-@pytest.mark.parametrize("recipe", ["harmonizer-temporal", pytest.param("gsfix3d", marks=pytest.mark.slow)])
-def test_an_arm_resumes_bit_for_bit(train: Train, trained: Callable[[str], Path], recipe: str) -> None:
+@pytest.mark.parametrize(
+    "recipe", ["harmonizer-temporal", pytest.param("gsfix3d", marks=pytest.mark.slow)]
+)
+def test_an_arm_resumes_bit_for_bit(
+    train: Train, trained: Callable[[str], Path], recipe: str
+) -> None:
     more = ("--weights", f"harmonizer={trained('harmonizer')}") if "temporal" in recipe else ()
     train(recipe, 1, f"{recipe}-cut", *more)
     again = load_weights(train(recipe, 2, f"{recipe}-cut", *more) / "fixer.safetensors")
@@ -136,26 +181,60 @@ def test_windows_fix_recorded_clips_by_both_commands(
     for i, image in enumerate(pixels(moving_picture(frames, (32, 32)))):
         cv2.imwrite(str(given / f"{i:03d}.png"), image)
     weights = f"fixer.weights.bundle={bundle}"
-    assert run_command(["refine", str(given), "-o", str(made), "--fixer", "3dgs-enhancer", "--set", weights, "--anyway", "--quiet"]) == 0
+    assert (
+        run_command(
+            [
+                "refine",
+                str(given),
+                "-o",
+                str(made),
+                "--fixer",
+                "3dgs-enhancer",
+                "--set",
+                weights,
+                "--anyway",
+                "--quiet",
+            ]
+        )
+        == 0
+    )
     assert len(list(made.iterdir())) == frames
-    command = ["bench", "quality", str(tmp_path / "pairs"), "--split", "val", "--pictures", "0", "--out", str(tmp_path / "q"), "--json"]
+    command = [
+        "bench",
+        "quality",
+        str(tmp_path / "pairs"),
+        "--split",
+        "val",
+        "--pictures",
+        "0",
+        "--out",
+        str(tmp_path / "q"),
+        "--json",
+    ]
     capsys.readouterr()
     assert run_command([*command, "--fixer", f"3dgs,e={bundle},g={trained('gsfix3d')}"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["arms"]["e"]["psnr_db"]["mean"] != summary["arms"]["3dgs"]["psnr_db"]["mean"]
     units = summary["run"]["units"]
     assert units["3dgs"] is None
-    assert (units["e"]["lookahead_frames"], units["e"]["calls_per_frame"]) == (24, pytest.approx(8 / 17))
+    assert (units["e"]["lookahead_frames"], units["e"]["calls_per_frame"]) == (
+        24,
+        pytest.approx(8 / 17),
+    )
     assert (units["g"]["lookahead_frames"], units["g"]["calls_per_frame"]) == (0, 8)
 
 
-def test_the_clamp_is_measured_written_down_and_the_temporal_batches_are_of_both_kinds(trained: Callable[[str], Path]) -> None:
+def test_the_clamp_is_measured_written_down_and_the_temporal_batches_are_of_both_kinds(
+    trained: Callable[[str], Path],
+) -> None:
     path = trained("harmonizer")
     card = json.loads(path.with_suffix(".card.json").read_text())
     rows = [json.loads(line) for line in (path.parent / "log.jsonl").read_text().splitlines()]
     assert 0 < card["training"]["largest_distance"] == rows[-1]["largest_distance"]
     assert rows[-1]["perceptual"] <= 0.3 * rows[-1]["largest_distance"] + 1e-6
-    assert "largest_distance" not in json.loads((trained("difix").parent / "log.jsonl").read_text().splitlines()[0])
+    assert "largest_distance" not in json.loads(
+        (trained("difix").parent / "log.jsonl").read_text().splitlines()[0]
+    )
     assert RenderStepLoss(weight=0.3, clamp=0.9, references="own").single == 0.5
 
 
@@ -164,7 +243,9 @@ def test_what_an_arm_cannot_train_on_is_refused(train: Train) -> None:
         train("difix", 1, "refused", "--block", "4")
     with pytest.raises(InputError, match="gsfix3d that takes no step from the render"):
         train("difix", 1, "refused", "--fixer", "gsfix3d")
-    with pytest.raises(InputError, match="onefixer-dit-tiny that does not sample windows from noise"):
+    with pytest.raises(
+        InputError, match="onefixer-dit-tiny that does not sample windows from noise"
+    ):
         train("gsfix3d", 1, "refused", "--fixer", "onefixer-dit-tiny")
     with pytest.raises(InputError, match="at least 7 latents"):
         train("3dgs-enhancer", 1, "refused", "--latents", "6")

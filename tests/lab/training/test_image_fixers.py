@@ -1,4 +1,6 @@
-"""Image models and windows as sessions: streaming equals the whole clip, cameras are independent, windows cover a clip."""
+"""Image models and windows as sessions: streaming equals the whole clip, cameras are independent,
+windows cover a clip.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ STREAMED = ("difix", "harmonizer", "harmonizer-temporal", "gsfix3d")
 
 @pytest.fixture(autouse=True)
 def one_thread() -> None:
-    torch.set_num_threads(1)  # matrices this small are slower on several; tests/conftest.py sets the number back
+    torch.set_num_threads(
+        1
+    )  # matrices this small are slower on several; tests/conftest.py sets the number back
 
 
 @pytest.fixture
@@ -49,7 +53,11 @@ def session(settings_of: Callable[..., Settings]) -> Callable[..., Fixer]:
 
 
 def run(fixer: Fixer, frames: Sequence[Frame]) -> list[Frame]:
-    return [out for block in refine_frames([(frame, None) for frame in frames], fixer) for out in block.fixed]
+    return [
+        out
+        for block in refine_frames([(frame, None) for frame in frames], fixer)
+        for out in block.fixed
+    ]
 
 
 def levels(a: np.ndarray, b: np.ndarray) -> int:
@@ -59,15 +67,22 @@ def levels(a: np.ndarray, b: np.ndarray) -> int:
 @pytest.mark.parametrize("overrides", [(), ("decoder.kind=latent",)], ids=["render", "latent"])
 @pytest.mark.parametrize("name", STREAMED)
 def test_streaming_equals_the_whole_clip(
-    session: Callable[..., Fixer], settings_of: Callable[..., Settings], name: str, overrides: tuple[str, ...]
+    session: Callable[..., Fixer],
+    settings_of: Callable[..., Settings],
+    name: str,
+    overrides: tuple[str, ...],
 ) -> None:
     frames = moving_picture(7, (16, 40))
     streamed = pixels(run(session(name, *overrides), frames))
-    assert levels(streamed, whole_clip_images(settings_of(name, *overrides), frames, "scene", 0)) <= 1
+    assert (
+        levels(streamed, whole_clip_images(settings_of(name, *overrides), frames, "scene", 0)) <= 1
+    )
     assert np.abs(streamed.astype(int) - pixels(frames)).mean() > 2, "these weights do something"
 
 
-@pytest.mark.parametrize(("count", "stitch"), [(7, "fade"), (25, "fade"), (45, "fade"), (45, "cut")])
+@pytest.mark.parametrize(
+    ("count", "stitch"), [(7, "fade"), (25, "fade"), (45, "fade"), (45, "cut")]
+)
 def test_windows_equal_the_weighted_sum_over_the_whole_clip(
     session: Callable[..., Fixer], settings_of: Callable[..., Settings], count: int, stitch: str
 ) -> None:
@@ -75,8 +90,12 @@ def test_windows_equal_the_weighted_sum_over_the_whole_clip(
     streamed = run(session("3dgs-enhancer", "steps=2", f"stitch={stitch}"), frames)
     assert [frame.t_us for frame in streamed] == [frame.t_us for frame in frames]
     if count < 25:
-        frames = frames + [replace(frames[-1], t_us=frames[-1].t_us + 1 + i) for i in range(25 - count)]
-    wanted = whole_clip_images(settings_of("3dgs-enhancer", "steps=2", f"stitch={stitch}"), frames, "scene", 0)
+        frames = frames + [
+            replace(frames[-1], t_us=frames[-1].t_us + 1 + i) for i in range(25 - count)
+        ]
+    wanted = whole_clip_images(
+        settings_of("3dgs-enhancer", "steps=2", f"stitch={stitch}"), frames, "scene", 0
+    )
     assert levels(pixels(streamed), wanted[:count]) <= 1
 
 
@@ -102,15 +121,21 @@ def test_where_windows_overlap_the_later_one_fades_in_linearly() -> None:
 
 
 @pytest.mark.parametrize("name", ["harmonizer-temporal", "gsfix3d"])
-def test_cameras_are_alike_alone_together_and_at_different_rates(session: Callable[..., Fixer], name: str) -> None:
+def test_cameras_are_alike_alone_together_and_at_different_rates(
+    session: Callable[..., Fixer], name: str
+) -> None:
     left, right = (moving_picture(6, (16, 32), key=key, camera=key) for key in ("left", "right"))
     small = moving_picture(6, (16, 16), key="small", camera="small")
-    alone = {clip[0].camera: pixels(run(session(name), clip)) for clip in (left, small)} | {"right": pixels(run(session(name), right[::2]))}
+    alone = {clip[0].camera: pixels(run(session(name), clip)) for clip in (left, small)} | {
+        "right": pixels(run(session(name), right[::2]))
+    }
     fixer, out = session(name), {"left": [], "right": [], "small": []}
     for i in range(6):
         for frame in fixer.step([small[i], left[i], *([right[i]] if i % 2 == 0 else [])], ()):
             out[frame.camera].append(frame)
-    assert {camera: levels(pixels(frames), alone[camera]) for camera, frames in out.items()} == pytest.approx(dict.fromkeys(out, 0), abs=1)
+    assert {
+        camera: levels(pixels(frames), alone[camera]) for camera, frames in out.items()
+    } == pytest.approx(dict.fromkeys(out, 0), abs=1)
 
 
 def test_noise_follows_seed_and_frame_unless_it_is_fixed(session: Callable[..., Fixer]) -> None:
@@ -122,13 +147,21 @@ def test_noise_follows_seed_and_frame_unless_it_is_fixed(session: Callable[..., 
     fixed = run(session("gsfix3d", "noise=fixed"), still)
     assert levels(fixed[0].rgb, fixed[1].rgb) == 0
     for name in ("difix", "harmonizer"):
-        assert np.array_equal(pixels(run(session(name, seed=0), still)), pixels(run(session(name, seed=1), still))), "no noise at all"
+        assert np.array_equal(
+            pixels(run(session(name, seed=0), still)), pixels(run(session(name, seed=1), still))
+        ), "no noise at all"
 
 
-def test_the_temporal_model_looks_at_four_outputs_and_no_further(session: Callable[..., Fixer]) -> None:
+def test_the_temporal_model_looks_at_four_outputs_and_no_further(
+    session: Callable[..., Fixer],
+) -> None:
     frames = moving_picture(7, (16, 24), holes=False)
-    temporal, single = (pixels(run(session("harmonizer-temporal", f"references={n}"), frames)) for n in (4, 0))
-    assert np.array_equal(temporal[:4], single[:4]), "a camera's first four frames are fixed by themselves"
+    temporal, single = (
+        pixels(run(session("harmonizer-temporal", f"references={n}"), frames)) for n in (4, 0)
+    )
+    assert np.array_equal(temporal[:4], single[:4]), (
+        "a camera's first four frames are fixed by themselves"
+    )
     assert levels(temporal[4], single[4]) > 0
     changed = [replace(frames[0], rgb=255 - frames[0].rgb), *frames[1:]]
     after = pixels(run(session("harmonizer-temporal"), changed))
@@ -144,7 +177,9 @@ def test_the_present_latent_does_not_depend_on_the_references_in_the_encoder_nor
     generator = torch.Generator().manual_seed(0)
     now, one, other = (torch.rand(1, 3, n, 16, 24, generator=generator) * 2 - 1 for n in (1, 4, 4))
     with torch.inference_mode():
-        z_one, z_other = (networks.vae.encode(torch.cat([now, references], dim=2)) for references in (one, other))
+        z_one, z_other = (
+            networks.vae.encode(torch.cat([now, references], dim=2)) for references in (one, other)
+        )
         assert torch.equal(z_one[:, :, 0], z_other[:, :, 0])
         assert not torch.equal(z_one[:, :, 1], z_other[:, :, 1])
         torch.testing.assert_close(z_one[:, :, :1], networks.vae.encode(now), atol=1e-6, rtol=0)
@@ -160,13 +195,18 @@ class Spoilt(ImageFixer):
         return video * float("nan") if pasts[0] is not None and pasts[0].frames == 2 else video
 
 
-def test_a_broken_frame_is_replaced_and_enters_the_references_as_it_was_shown(settings_of: Callable[..., Settings]) -> None:
+def test_a_broken_frame_is_replaced_and_enters_the_references_as_it_was_shown(
+    settings_of: Callable[..., Settings],
+) -> None:
     frames = moving_picture(8, (16, 24))
     fixer = Spoilt(settings_of("harmonizer-temporal"), "scene")
     out = run(fixer, frames)
     assert [frame.events for frame in out] == [(), (), ("fixer-nan",), (), (), (), (), ()]
     assert np.array_equal(out[2].rgb, frames[2].rgb)
-    assert all(np.array_equal(a, b.rgb) for a, b in zip(fixer._history["front"].references, out[:-5:-1], strict=True))
+    assert all(
+        np.array_equal(a, b.rgb)
+        for a, b in zip(fixer._history["front"].references, out[:-5:-1], strict=True)
+    )
 
 
 def test_what_does_not_continue_a_rollout_is_refused(session: Callable[..., Fixer]) -> None:
@@ -186,7 +226,9 @@ def test_what_does_not_continue_a_rollout_is_refused(session: Callable[..., Fixe
 
 
 def test_windows_are_refused_in_a_closed_loop_before_anything_is_loaded() -> None:
-    with pytest.raises(InputError, match=r"24 frames after it[^$]*simrun refine --fixer 3dgs-enhancer"):
+    with pytest.raises(
+        InputError, match=r"24 frames after it[^$]*simrun refine --fixer 3dgs-enhancer"
+    ):
         resolve_renderer("3dgs-enhancer")
     with pytest.raises(InputError, match="which a closed loop has not driven yet"):
         resolve_renderer("3dgs-enhancer@4+clean")
@@ -195,41 +237,58 @@ def test_windows_are_refused_in_a_closed_loop_before_anything_is_loaded() -> Non
 
 @pytest.mark.parametrize("name", ["difix", "omnidreams@4", "onefixer-2b"])
 def test_a_run_with_a_fixer_without_weights_is_refused_before_it_starts(name: str) -> None:
-    with pytest.raises(InputError, match=r"closed loop[\s\S]*weights missing[\s\S]*give --set fixer\.weights\.dit=FILE"):
+    with pytest.raises(
+        InputError,
+        match=r"closed loop[\s\S]*weights missing[\s\S]*give --set fixer\.weights\.dit=FILE",
+    ):
         resolve_renderer(name)
-    with pytest.raises(InputError, match=r"weights missing: vae[\s\S]*give --set fixer\.weights\.vae=FILE"):
+    with pytest.raises(
+        InputError, match=r"weights missing: vae[\s\S]*give --set fixer\.weights\.vae=FILE"
+    ):
         resolve_renderer(name, [f"weights.dit={__file__}"])
 
 
 @pytest.mark.parametrize(
     ("name", "unit"),
     [
-        ("difix", Unit(1, 1, 1, 0)), ("harmonizer", Unit(1, 1, 1, 0)), ("harmonizer-temporal", Unit(1, 1, 2, 0)),
+        ("difix", Unit(1, 1, 1, 0)),
+        ("harmonizer", Unit(1, 1, 1, 0)),
+        ("harmonizer-temporal", Unit(1, 1, 2, 0)),
         ("gsfix3d", Unit(1, 8, 1, 0)),
-        ("gsfix3d@4", Unit(1, 4, 1, 0)), ("3dgs-enhancer", Unit(17, 8, 7, 24)), ("onefixer", Unit(1, 1, 0, 0)),
+        ("gsfix3d@4", Unit(1, 4, 1, 0)),
+        ("3dgs-enhancer", Unit(17, 8, 7, 24)),
+        ("onefixer", Unit(1, 1, 0, 0)),
         ("onefixer-dit-tiny", Unit(8, 2, 2, 7)),
     ],
-)  # fmt: skip
+)
 def test_what_an_arm_costs_is_declared(name: str, unit: Unit) -> None:
     assert fixer_settings(name).unit == unit
 
 
 def test_labels_blocks_and_refused_settings(session: Callable[..., Fixer]) -> None:
     assert session("gsfix3d").label == "gsfix3d@8, 3 updates"
-    assert (session("difix").label, session("difix").blocks) == ("difix, 3 updates", BlockRule(1, 1))
+    assert (session("difix").label, session("difix").blocks) == (
+        "difix, 3 updates",
+        BlockRule(1, 1),
+    )
     assert isinstance(session("3dgs-enhancer"), WindowFixer)
     for name, override, message in (
-        ("difix", "steps=4", "steps"), ("difix", "uses_map=true", "no input for a map"), ("difix", "mode=chunk", "no blocks"),
-        ("3dgs-enhancer", "window_frames=24", "1 \\+ 4 n"), ("3dgs-enhancer", "stride_frames=26", "frames between"),
+        ("difix", "steps=4", "steps"),
+        ("difix", "uses_map=true", "no input for a map"),
+        ("difix", "mode=chunk", "no blocks"),
+        ("3dgs-enhancer", "window_frames=24", "1 \\+ 4 n"),
+        ("3dgs-enhancer", "stride_frames=26", "frames between"),
         ("difix", "render_level.sigma=0", "greater than 0"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(InputError, match=message):
             image_settings(name, override)
     with pytest.raises(InputError, match=r"weights\.dit"):
         make_fixer("difix", scene_id="scene")
 
 
-def test_a_bundle_loads_only_at_the_level_it_was_trained_for(weights: Path, settings_of: Callable[..., Settings]) -> None:
+def test_a_bundle_loads_only_at_the_level_it_was_trained_for(
+    weights: Path, settings_of: Callable[..., Settings]
+) -> None:
     settings_of("harmonizer")
     path = weights / "harmonizer_render.safetensors"
     name, overrides = bundle_fixer(path)

@@ -1,4 +1,6 @@
-"""The image arms' equations: steps, losses, noise and augmentation against what the papers write."""
+"""The image arms' equations: steps, losses, noise and augmentation against what the papers
+write.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,13 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.network.schedule import names
-from alpasim_plugin.lab.image_fixers.pipeline import CONDITION_KEY, LATENT_KEY, euler, fixed_step, share_embedding
+from alpasim_plugin.lab.image_fixers.pipeline import (
+    CONDITION_KEY,
+    LATENT_KEY,
+    euler,
+    fixed_step,
+    share_embedding,
+)
 from alpasim_plugin.lab.image_fixers.settings import RenderLevel, RenderStepSettings
 from alpasim_plugin.lab.training.cut_outs import cut_out, soft_mask
 from alpasim_plugin.lab.training.multi_resolution_noise import multi_resolution_noise
@@ -50,7 +58,9 @@ def net() -> CosmosCausalDiT:
 
 @pytest.fixture(autouse=True)
 def one_thread() -> None:
-    torch.set_num_threads(1)  # matrices this small are slower on several; tests/conftest.py sets the number back
+    torch.set_num_threads(
+        1
+    )  # matrices this small are slower on several; tests/conftest.py sets the number back
 
 
 def normal(*shape: int, key: str = "z") -> Tensor:
@@ -58,7 +68,9 @@ def normal(*shape: int, key: str = "z") -> Tensor:
 
 
 def ddpm(steps: int = 1000) -> tuple[np.ndarray, np.ndarray]:
-    """Return alpha and sigma of Stable Diffusion's schedule, as its scheduler's configuration defines them."""
+    """Return alpha and sigma of Stable Diffusion's schedule, as its scheduler's configuration
+    defines them.
+    """
     kept = np.cumprod(1 - np.linspace(0.00085**0.5, 0.012**0.5, steps) ** 2)
     return np.sqrt(kept), np.sqrt(1 - kept)
 
@@ -73,12 +85,18 @@ def test_difixs_step_is_the_ddpm_formula_at_199(net: CosmosCausalDiT) -> None:
     assert (level.t, level.scale, level.network_t) == pytest.approx((0.3628, 0.7333, 363), abs=1e-4)
     z_r = normal(2, 16, 1, 4, 6)
     x = z_r / (alpha + sigma)
-    eps = x + (1 - sigma / (alpha + sigma)) * net(x, 363.0, TEXT, torch.zeros_like(x), block_latents=None)  # x = (1-t) z_0 + t eps
-    torch.testing.assert_close(fixed_step(net, z_r, level, TEXT), (z_r - sigma * eps) / alpha, atol=1e-5, rtol=0)
+    eps = x + (1 - sigma / (alpha + sigma)) * net(
+        x, 363.0, TEXT, torch.zeros_like(x), block_latents=None
+    )  # x = (1-t) z_0 + t eps
+    torch.testing.assert_close(
+        fixed_step(net, z_r, level, TEXT), (z_r - sigma * eps) / alpha, atol=1e-5, rtol=0
+    )
     wide = net.double()  # in float64, so that the formula is held to 1e-6
     exact = fixed_step(wide, z_r.double(), RenderLevel(alpha, sigma), TEXT.double())
     x = z_r.double() / (alpha + sigma)
-    eps = x + (1 - sigma / (alpha + sigma)) * wide(x, 363.0, TEXT.double(), torch.zeros_like(x), block_latents=None)
+    eps = x + (1 - sigma / (alpha + sigma)) * wide(
+        x, 363.0, TEXT.double(), torch.zeros_like(x), block_latents=None
+    )
     net.float()
     torch.testing.assert_close(exact, (z_r - sigma * eps) / alpha, atol=1e-6, rtol=0)
 
@@ -88,7 +106,9 @@ def test_the_harmonizers_step_at_a_fifth(net: CosmosCausalDiT) -> None:
     assert isinstance(settings, RenderStepSettings)
     z_r = normal(1, 16, 2, 4, 6)
     v = net(0.8 * z_r, 200.0, TEXT, torch.zeros_like(z_r), block_latents=None)
-    torch.testing.assert_close(fixed_step(net, z_r, settings.level, TEXT), 0.8 * z_r - 0.2 * v, atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        fixed_step(net, z_r, settings.level, TEXT), 0.8 * z_r - 0.2 * v, atol=1e-6, rtol=0
+    )
     with pytest.raises(InputError, match="above 0"):
         RenderLevel(1.0, 0.0)
 
@@ -101,7 +121,11 @@ def test_the_training_sees_the_outputs_that_the_session_shows(weights: Path, nam
     fixer = make_fixer(name, settings, scene_id="s")
     shown = pixels([fixer.step([frame], ())[0] for frame in frames])
     render = torch.from_numpy(pixels(frames)).permute(3, 0, 1, 2)[None].float() / 127.5 - 1
-    made = step_of(settings).outputs(render) if name.endswith("temporal") else step_of(settings).outputs(render[:, :, :4])
+    made = (
+        step_of(settings).outputs(render)
+        if name.endswith("temporal")
+        else step_of(settings).outputs(render[:, :, :4])
+    )
     wanted = shown[: made.shape[2]]
     assert np.abs((made[0].permute(1, 2, 3, 0).numpy() + 1) * 127.5 - wanted).max() < 1.01
 
@@ -110,34 +134,56 @@ def step_of(settings: RenderStepSettings) -> RenderStep:
     parts = Parts(settings)
     vae = parts.vae()
     assert isinstance(vae, TinyVAE)
-    return RenderStep(parts.dit().float(), vae.float(), settings.level, settings.decoder.kind == "render")
+    return RenderStep(
+        parts.dit().float(), vae.float(), settings.level, settings.decoder.kind == "render"
+    )
 
 
-def test_a_distance_beyond_the_clamp_has_no_gradient_and_gradients_reach_encoder_decoder_and_network(weights: Path) -> None:
+def test_a_distance_beyond_the_clamp_has_no_gradient_and_gradients_reach_encoder_decoder_and_network(
+    weights: Path,
+) -> None:
     settings = busy_settings(weights, "harmonizer")
     assert isinstance(settings, RenderStepSettings)
     step = step_of(settings)
     step.net.requires_grad_(True)
     step.vae.requires_grad_(True)
-    render, clean = torch.rand(2, 3, 1, 16, 16, generator=torch.Generator().manual_seed(0)) * 2 - 1, torch.zeros(2, 3, 1, 16, 16)
+    render, clean = (
+        torch.rand(2, 3, 1, 16, 16, generator=torch.Generator().manual_seed(0)) * 2 - 1,
+        torch.zeros(2, 3, 1, 16, 16),
+    )
 
     def distance(a: Tensor, b: Tensor) -> Tensor:
         return (a - b).abs().mean((1, 2, 3))
 
-    near, far = (picture_losses(step(render), clean, distance, 0.3, clamp)["perceptual"] for clamp in (10.0, 0.1))
-    assert float(near.detach()) == pytest.approx(0.3 * float(distance(step(render), clean).mean().detach()))
+    near, far = (
+        picture_losses(step(render), clean, distance, 0.3, clamp)["perceptual"]
+        for clamp in (10.0, 0.1)
+    )
+    assert float(near.detach()) == pytest.approx(
+        0.3 * float(distance(step(render), clean).mean().detach())
+    )
     assert float(far.detach()) == pytest.approx(0.03)
     (gradient,) = torch.autograd.grad(far, step.vae.decoder.head.weight)
     assert not gradient.any()
     parts = picture_losses(step(render), clean, distance, 0.3, None)
     sum(parts.values()).backward()  # type: ignore[union-attr]
-    for weight in (step.vae.encoder.stem.weight, step.vae.decoder.head.weight, step.net.blocks[0].mlp.layer1.weight):  # type: ignore[union-attr]
+    for weight in (
+        step.vae.encoder.stem.weight,
+        step.vae.decoder.head.weight,
+        step.net.blocks[0].mlp.layer1.weight,
+    ):  # type: ignore[union-attr]
         assert weight.grad is not None
         assert weight.grad.abs().sum() > 0
 
 
 def test_the_warping_loss_is_small_where_the_prediction_moves_with_the_clean_frames() -> None:
-    clip = torch.from_numpy(pixels(moving_picture(6, (48, 64), holes=False))).permute(3, 0, 1, 2)[None].float() / 127.5 - 1
+    clip = (
+        torch.from_numpy(pixels(moving_picture(6, (48, 64), holes=False)))
+        .permute(3, 0, 1, 2)[None]
+        .float()
+        / 127.5
+        - 1
+    )
     earlier, now = clip[:, :, 1:5].flip(2), clip[:, :, 5]
     flow = flow_between(earlier, now)
     assert flow.shape == (1, 4, 48, 64, 2)
@@ -145,15 +191,22 @@ def test_the_warping_loss_is_small_where_the_prediction_moves_with_the_clean_fra
     np.testing.assert_allclose(inner, [-3, -1], atol=0.3)  # the picture slides by (-3, -1) a frame
     prediction = now.clone().requires_grad_(True)
     last = earlier[:, :, :1], flow[:, :1]
-    moving, still = warping_loss(prediction, *last), warping_loss(now, last[0], torch.zeros_like(last[1]))
+    moving, still = (
+        warping_loss(prediction, *last),
+        warping_loss(now, last[0], torch.zeros_like(last[1])),
+    )
     assert float(moving.detach()) < 0.3 * float(still)
     moving.backward()  # type: ignore[no-untyped-call]
     assert prediction.grad is not None
     assert prediction.grad.abs().sum() > 0
     away = torch.full_like(flow, 1e4)
-    assert float(warping_loss(now, earlier, away)) == pytest.approx(1e-3, rel=1e-3), "outside the picture nothing counts: sqrt(1e-6)"
+    assert float(warping_loss(now, earlier, away)) == pytest.approx(1e-3, rel=1e-3), (
+        "outside the picture nothing counts: sqrt(1e-6)"
+    )
     weighted = warp_term(now[:, :, None], clip, 2.0)["warp-farneback"]
-    assert float(weighted) == pytest.approx(2 * float(warping_loss(now, earlier, flow)), rel=1e-5), "the last four, newest first"
+    assert float(weighted) == pytest.approx(
+        2 * float(warping_loss(now, earlier, flow)), rel=1e-5
+    ), "the last four, newest first"
 
 
 def test_conditions_are_dropped_between_the_ends_of_a_window() -> None:
@@ -167,16 +220,26 @@ def test_the_enhancers_loss_is_edms_on_the_clean_latents(net: CosmosCausalDiT) -
     s = torch.tensor([0.1, 2.0, 30.0])
     t = s / (1 + s)
     made = noise_window_errors(net, z_0, z_r, eps, t, TEXT, edm_error)
-    x = (z_0 + s.view(-1, 1, 1, 1, 1) * eps) / (1 + s).view(-1, 1, 1, 1, 1)  # EDM's noised latents on the straight path
+    x = (z_0 + s.view(-1, 1, 1, 1, 1) * eps) / (1 + s).view(
+        -1, 1, 1, 1, 1
+    )  # EDM's noised latents on the straight path
     x0_hat = x - t.view(-1, 1, 1, 1, 1) * net(x, 1000 * t[:, None], TEXT, z_r, block_latents=None)
     wanted = ((1 + s**2) / s**2).view(-1, 1, 1, 1, 1) * (x0_hat - z_0).abs()
     torch.testing.assert_close(made, wanted, rtol=1e-3, atol=1e-3)
     plain = noise_window_errors(net, z_0, z_r, eps, t, TEXT, squared_error)
-    torch.testing.assert_close(plain, (made / (((1 - t) ** 2 + t**2) / t).view(-1, 1, 1, 1, 1)).square(), rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(
+        plain,
+        (made / (((1 - t) ** 2 + t**2) / t).view(-1, 1, 1, 1, 1)).square(),
+        rtol=1e-3,
+        atol=1e-5,
+    )
 
 
 def test_times_are_uniform_and_log_normal() -> None:
-    uniform, log_normal = (draw(stream("tests", 0, "times"), 20000).numpy() for draw in (uniform_times, log_normal_times))
+    uniform, log_normal = (
+        draw(stream("tests", 0, "times"), 20000).numpy()
+        for draw in (uniform_times, log_normal_times)
+    )
     assert uniform.mean() == pytest.approx(0.5, abs=0.01)
     s = np.log(log_normal / (1 - log_normal))
     assert (s.mean(), s.std()) == pytest.approx((0.7, 1.6), abs=0.04)
@@ -199,10 +262,16 @@ def test_eulers_steps_end_at_the_clean_latents_of_a_straight_path() -> None:
 def test_a_shared_embedding_leaves_the_tokens_of_equal_inputs() -> None:
     weights = initial_weights(SIZES, 1)
     shared = share_embedding(weights)
-    before, after = (CosmosCausalDiT.from_state_dict(w).requires_grad_(False) for w in (weights, shared))
+    before, after = (
+        CosmosCausalDiT.from_state_dict(w).requires_grad_(False) for w in (weights, shared)
+    )
     x = normal(1, 16, 2, 4, 4)
-    torch.testing.assert_close(after(x, 500.0, TEXT, x), before(x, 500.0, TEXT, torch.zeros_like(x)), atol=1e-5, rtol=0)
-    assert torch.equal(shared[LATENT_KEY][:, 64:], weights[LATENT_KEY][:, 64:]), "the masks' columns stay"
+    torch.testing.assert_close(
+        after(x, 500.0, TEXT, x), before(x, 500.0, TEXT, torch.zeros_like(x)), atol=1e-5, rtol=0
+    )
+    assert torch.equal(shared[LATENT_KEY][:, 64:], weights[LATENT_KEY][:, 64:]), (
+        "the masks' columns stay"
+    )
     assert shared[CONDITION_KEY].shape == weights[CONDITION_KEY].shape
 
 

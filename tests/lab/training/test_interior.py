@@ -1,4 +1,6 @@
-"""Rooms, tables and garden paths: the same key gives the same place, light is stopped by blocks, and the eye never stands in furniture."""
+"""Rooms, tables and garden paths: the same key gives the same place, light is stopped by blocks,
+and the eye never stands in furniture.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,10 @@ def rng(seed: int = 0) -> np.random.Generator:
 @pytest.mark.parametrize("family", sorted(FAMILIES))
 def test_a_place_is_that_of_its_key_and_fills_the_picture(family: str) -> None:
     first, same, other = (build_place(family, "scene", seed, COARSE) for seed in (5, 5, 6))
-    a, b = (np.concatenate([node.levels[0].cloud.sh for node in place.graph.background]) for place in (first, same))
+    a, b = (
+        np.concatenate([node.levels[0].cloud.sh for node in place.graph.background])
+        for place in (first, same)
+    )
     np.testing.assert_array_equal(a, b)
     assert len(first.graph) != len(other.graph)
     eye, target = first.walk.eye[4], first.walk.target[4]
@@ -50,9 +55,15 @@ def test_nobody_carries_a_camera_through_furniture(family: str) -> None:
 
 
 @pytest.mark.parametrize("family", ["room", "table"])
-def test_furniture_along_the_walls_stands_neither_in_other_furniture_nor_in_the_middle(family: str) -> None:
+def test_furniture_along_the_walls_stands_neither_in_other_furniture_nor_in_the_middle(
+    family: str,
+) -> None:
     for seed in range(8):
-        feet = [one.footprint() for one in FAMILIES[family](rng(seed)).standing if one.name.startswith("wall")]
+        feet = [
+            one.footprint()
+            for one in FAMILIES[family](rng(seed)).standing
+            if one.name.startswith("wall")
+        ]
         assert len(feet) >= 4, seed
         for i, (low, high) in enumerate(feet):
             assert np.any(low > 0.75) or np.any(high < -0.75), seed
@@ -61,23 +72,41 @@ def test_furniture_along_the_walls_stands_neither_in_other_furniture_nor_in_the_
 
 
 def _arrays(blocks: list[Block]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return np.array([b.T[:3, :3] for b in blocks]), np.array([b.T[:3, 3] for b in blocks]), np.array([b.half for b in blocks])
+    return (
+        np.array([b.T[:3, :3] for b in blocks]),
+        np.array([b.T[:3, 3] for b in blocks]),
+        np.array([b.half for b in blocks]),
+    )
 
 
 def test_a_block_hides_what_is_behind_it_and_nothing_else() -> None:
     turned = Block(upright(0.0, 0.0, 1.0, np.pi / 4), np.array([0.5, 0.5, 0.1]))
     points = np.array([[0, 0, 0.0], [0.6, 0, 0.0], [0.9, 0, 0.0], [0, 0, 1.5]])
     arrays = _arrays([turned])
-    np.testing.assert_array_equal(reached(points, np.array([0.0, 0, 9.0]), np.ones(4, dtype=bool), *arrays), [False, False, True, True])
-    np.testing.assert_array_equal(reached(points, np.array([0.0, 0, 9.0]), np.zeros(4, dtype=bool), *arrays), [False] * 4)
-    np.testing.assert_allclose(nearest(points, *arrays, 5.0), [0.9, 0.9, np.hypot(0.9, 0.9 - np.sqrt(0.5)), 0.4], atol=1e-9)
     np.testing.assert_array_equal(
-        nearest(points, *_arrays([turned])[:0] or (np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3))), 5.0), 5.0
+        reached(points, np.array([0.0, 0, 9.0]), np.ones(4, dtype=bool), *arrays),
+        [False, False, True, True],
+    )
+    np.testing.assert_array_equal(
+        reached(points, np.array([0.0, 0, 9.0]), np.zeros(4, dtype=bool), *arrays), [False] * 4
+    )
+    np.testing.assert_allclose(
+        nearest(points, *arrays, 5.0), [0.9, 0.9, np.hypot(0.9, 0.9 - np.sqrt(0.5)), 0.4], atol=1e-9
+    )
+    np.testing.assert_array_equal(
+        nearest(
+            points,
+            *_arrays([turned])[:0] or (np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3))),
+            5.0,
+        ),
+        5.0,
     )
 
 
 def test_a_floor_is_darker_in_the_shadow() -> None:
-    floor = Panel((-1, -1, 0), (2, 0, 0), (0, 2, 0), plain(rng(), (0.5, 0.5, 0.5), 0.0)).surfels(0.1)
+    floor = Panel((-1, -1, 0), (2, 0, 0), (0, 2, 0), plain(rng(), (0.5, 0.5, 0.5), 0.0)).surfels(
+        0.1
+    )
     light = Light((0.4, 0.4, 0.4), (Lamp(np.array([[0.0, 0.0, 3.0]]), (0.5, 0.5, 0.5)),))
     lit = light.colours(floor, [block((-0.2, -0.2, 0.5), (0.2, 0.2, 0.6))])[:, 0]
     middle = np.hypot(*floor.means[:, :2].T) < 0.15
@@ -93,7 +122,9 @@ def test_levels_of_detail_show_the_same_picture() -> None:
 
 
 def test_a_turned_body_faces_outwards_and_is_closed_around() -> None:
-    body = Turned((1, 2, 3), [[0.1, 0], [0.2, 0.1], [0.1, 0.3]], plain(rng(), (1, 1, 1))).surfels(0.01)
+    body = Turned((1, 2, 3), [[0.1, 0], [0.2, 0.1], [0.1, 0.3]], plain(rng(), (1, 1, 1))).surfels(
+        0.01
+    )
     out = body.means - [1, 2, 3]
     assert (np.einsum("ij,ij->i", out[:, :2], body.normals[:, :2]) > 0).all()
     np.testing.assert_allclose(np.linalg.norm(body.normals, axis=1), 1.0)
@@ -106,5 +137,7 @@ def test_a_turned_body_faces_outwards_and_is_closed_around() -> None:
 def test_an_object_stands_on_the_table(make) -> None:  # type: ignore[no-untyped-def]
     surfels = make(rng(3)).surfels(0.01)
     assert -0.005 < surfels.means[:, 2].min() < 0.05
-    assert np.isfinite(np.concatenate([surfels.means, surfels.normals, surfels.tangents, surfels.rgb], axis=1)).all()
+    assert np.isfinite(
+        np.concatenate([surfels.means, surfels.normals, surfels.tangents, surfels.rgb], axis=1)
+    ).all()
     assert np.abs(surfels.means[:, :2]).max() < 0.4

@@ -1,4 +1,6 @@
-"""Training of the judges: the truth of a scene, labels that fit their frames, batches that repeat, styles by formula."""
+"""Training of the judges: the truth of a scene, labels that fit their frames, batches that repeat,
+styles by formula.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +16,27 @@ from alpasim_plugin.core.types import CameraSpec, Lane, LaneMap, Marking
 from alpasim_plugin.lab.learned_metrics.nets.cuboid_net import decode
 from alpasim_plugin.lab.learned_metrics.types import FORWARD_M, Cuboid, cuboid_corners
 from alpasim_plugin.lab.training.appearance import SeenFrame, restyle, vehicle_lamps
-from alpasim_plugin.lab.training.learned_metrics.cuboid import CuboidRecipe, CuboidTask, cuboid_cells
+from alpasim_plugin.lab.training.learned_metrics.cuboid import (
+    CuboidRecipe,
+    CuboidTask,
+    cuboid_cells,
+)
 from alpasim_plugin.lab.training.learned_metrics.frames import LabelledFrames, chosen
 from alpasim_plugin.lab.training.learned_metrics.labels import Labels, for_training
 from alpasim_plugin.lab.training.learned_metrics.lane import LaneRecipe, LaneTask, lane_cells
 from alpasim_plugin.lab.training.learned_metrics.style import StyleRecipe, StyleTask
-from alpasim_plugin.lab.training.learned_metrics.truth import lanes_seen, visible_cuboids, world_lines
+from alpasim_plugin.lab.training.learned_metrics.truth import (
+    lanes_seen,
+    visible_cuboids,
+    world_lines,
+)
 from alpasim_plugin.lab.training.learned_metrics.video import VideoRecipe, VideoTask
 from tests.lab.training.pair_files import make
 
 K = np.array([[167.0, 0.0, 128.0], [0.0, 167.0, 72.0], [0.0, 0.0, 1.0]])
-MOUNT = np.array([[0.0, 0.0, 1.0, 1.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]])
+MOUNT = np.array(
+    [[0.0, 0.0, 1.0, 1.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]]
+)
 CAMERA = CameraSpec("camera", 256, 144, K, MOUNT)
 CAR = Cuboid("car", 1.0, 0.0, 0.7, 20.0, 4.5, 1.5, 1.8, -np.pi / 2)
 
@@ -41,7 +53,14 @@ def test_pieces_of_one_line_are_joined_in_either_direction_and_others_are_not() 
 
 
 def test_paint_on_lane_edges_counts_beside_markings_of_their_own() -> None:
-    lane = Lane("a", line(0, 60, 0.0), line(0, 60, 1.8), line(0, 60, -1.8), left_paint="solid_white", right_paint="unknown")
+    lane = Lane(
+        "a",
+        line(0, 60, 0.0),
+        line(0, 60, 1.8),
+        line(0, 60, -1.8),
+        left_paint="solid_white",
+        right_paint="unknown",
+    )
     found = world_lines(LaneMap({"a": lane}, markings=(Marking(line(0, 60, 9.0), "dashed_white"),)))
     assert sorted(float(one[0, 1]) for one in found) == [1.8, 9.0]
 
@@ -71,7 +90,9 @@ def test_cells_of_lanes_say_where_they_pass() -> None:
     cells = lane_cells(lane[None], np.ones((58, 216), dtype=np.float32))
     rows, columns = np.nonzero(cells[0])
     assert rows.tolist() == list(range(2, 10))
-    assert 10.8 - 0.4 * (columns + 0.5 + cells[1, rows, columns]) == pytest.approx(lane[2:10], abs=1e-5)
+    assert 10.8 - 0.4 * (columns + 0.5 + cells[1, rows, columns]) == pytest.approx(
+        lane[2:10], abs=1e-5
+    )
     assert cells[2, rows, columns] == pytest.approx(0.1, abs=1e-5)
     across = np.full(29, np.nan)
     across[5:7] = -3.0, 3.0
@@ -82,15 +103,25 @@ def test_cells_of_vehicles_decode_to_them() -> None:
     heat, middle, numbers, kind = cuboid_cells([CAR, replace(CAR, x_m=60.0)], K, 256, 144)
     assert middle.sum() == 1
     assert heat.max() == 1.0
-    cells = np.concatenate([np.where(middle, 5.0, -5.0)[None], numbers, (kind[None] == np.arange(3)[:, None, None]) * 1.0])
+    cells = np.concatenate(
+        [
+            np.where(middle, 5.0, -5.0)[None],
+            numbers,
+            (kind[None] == np.arange(3)[:, None, None]) * 1.0,
+        ]
+    )
     (found,) = decode(cells.astype(np.float32), K, 256, 0.1)
-    assert (found.x_m, found.y_m, found.z_m, found.length_m) == pytest.approx((0.0, 0.7, 20.0, 4.5), rel=1e-4, abs=1e-4)
+    assert (found.x_m, found.y_m, found.z_m, found.length_m) == pytest.approx(
+        (0.0, 0.7, 20.0, 4.5), rel=1e-4, abs=1e-4
+    )
 
 
 def labelled(tmp_path: Path) -> LabelledFrames:
     sequence = make(tmp_path / "pairs", height=144, width=256, frames=3)
     lanes = np.full((2, 1, 29), 1.8)
-    vehicle = np.array([[0, CAR.x_m, CAR.y_m, CAR.z_m, CAR.length_m, CAR.height_m, CAR.width_m, CAR.yaw_rad]])
+    vehicle = np.array(
+        [[0, CAR.x_m, CAR.y_m, CAR.z_m, CAR.length_m, CAR.height_m, CAR.width_m, CAR.yaw_rad]]
+    )
     labels = Labels(np.array([0, 2]), lanes, np.stack([vehicle, np.full((1, 8), np.nan)]), CAMERA)
     return LabelledFrames((sequence,), (labels,))
 
@@ -99,11 +130,17 @@ def test_batches_depend_on_their_number_alone_and_give_finite_gradients(tmp_path
     data = labelled(tmp_path)
     for task in (LaneTask(data, LaneRecipe(batch=2)), CuboidTask(data, CuboidRecipe(batch=2))):
         one, again = task.batch(3), task.batch(3)
-        assert all(torch.equal(getattr(one, k), getattr(again, k)) for k in one.__dataclass_fields__)
-        assert not torch.equal(one.__dict__[next(iter(one.__dict__))], task.batch(4).__dict__[next(iter(one.__dict__))])
+        assert all(
+            torch.equal(getattr(one, k), getattr(again, k)) for k in one.__dataclass_fields__
+        )
+        assert not torch.equal(
+            one.__dict__[next(iter(one.__dict__))], task.batch(4).__dict__[next(iter(one.__dict__))]
+        )
         loss, _ = task.loss(one, 3)
         loss.backward()
-        assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in task.module.parameters())
+        assert all(
+            p.grad is not None and bool(p.grad.isfinite().all()) for p in task.module.parameters()
+        )
         assert task.facts["labelled_frames"] == 2
 
 
@@ -118,7 +155,9 @@ def test_augmentation_moves_the_truth_with_the_picture(tmp_path: Path) -> None:
         row, column = (int(v) for v in batch.middle[0].nonzero()[0])
         numbers = batch.numbers[0, :, row, column]
         seen += 1
-        zoom_depth = float(np.exp(float(numbers[2]) + np.log(30.0)) / 256)  # depth over focal length
+        zoom_depth = float(
+            np.exp(float(numbers[2]) + np.log(30.0)) / 256
+        )  # depth over focal length
         assert zoom_depth * 1.0001 >= 20.0 / (1.3 * 167)
         assert zoom_depth <= 20.0 / 167 * 1.0001
     assert seen > 3
@@ -152,7 +191,9 @@ def seen(depth_m: float = 20.0) -> SeenFrame:
     rgb = np.full((36, 64, 3), 128, dtype=np.uint8)
     pose = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
     lens = np.array([[40.0, 0, 32], [0, 40.0, 18], [0, 0, 1]])
-    return SeenFrame(rgb, np.full((36, 64), depth_m, dtype=np.float32), lens, pose, 0, np.zeros((0, 6)))
+    return SeenFrame(
+        rgb, np.full((36, 64), depth_m, dtype=np.float32), lens, pose, 0, np.zeros((0, 6))
+    )
 
 
 def test_fog_is_koschmieders_law() -> None:
@@ -165,11 +206,16 @@ def test_fog_is_koschmieders_law() -> None:
 
 def test_night_is_dark_and_lamps_shine_where_nothing_hides_them() -> None:
     lamp = np.array([[0.0, 0.0, 15.0, 1.0, 1.0, 1.0]])
-    dark, lit = restyle(seen(), "night", "scene", 0), restyle(replace(seen(), lamps=lamp), "night", "scene", 0)
+    dark, lit = (
+        restyle(seen(), "night", "scene", 0),
+        restyle(replace(seen(), lamps=lamp), "night", "scene", 0),
+    )
     assert dark.mean() < 50
     assert lit[18, 32].min() > 150 > dark[18, 32].max()
     hidden = replace(seen(10.0), lamps=lamp)
-    assert np.array_equal(restyle(hidden, "night", "scene", 0), restyle(seen(10.0), "night", "scene", 0))
+    assert np.array_equal(
+        restyle(hidden, "night", "scene", 0), restyle(seen(10.0), "night", "scene", 0)
+    )
 
 
 def test_snow_lies_on_ground_and_not_on_walls() -> None:

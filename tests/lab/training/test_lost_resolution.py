@@ -1,4 +1,6 @@
-"""Lost resolution: detail goes, holes are transparent and black, nothing else changes, and the same draw gives the same damage."""
+"""Lost resolution: detail goes, holes are transparent and black, nothing else changes, and the same
+draw gives the same damage.
+"""
 
 import numpy as np
 import pytest
@@ -35,5 +37,7 @@ def test_black_shows_through_holes_by_their_transparency() -> None:
 
 @pytest.mark.parametrize("size", [(16, 16), (1, 40)])
 def test_crops_smaller_than_a_patch_have_a_damage(size: tuple[int, int]) -> None:
-    made = draw_lost_resolution(np.random.default_rng(1), *size).apply(np.zeros((1, 3, *size), np.float32))
+    made = draw_lost_resolution(np.random.default_rng(1), *size).apply(
+        np.zeros((1, 3, *size), np.float32)
+    )
     assert np.isfinite(made).all()

@@ -1,4 +1,6 @@
-"""Anyone's own renders become pairs: videos, folders and arrays; what does not fit is said in four parts."""
+"""Anyone's own renders become pairs: videos, folders and arrays; what does not fit is said in four
+parts.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence
 from alpasim_plugin.log.video import write_mp4
 
 H, W = 32, 48
-MOVED = np.eye(4) + np.outer([3.0, 2.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0])  # a pose away from the origin
+MOVED = np.eye(4) + np.outer(
+    [3.0, 2.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]
+)  # a pose away from the origin
 
 
 def picture(i: int, height: int = H, width: int = W) -> np.ndarray:
@@ -27,7 +31,9 @@ def picture(i: int, height: int = H, width: int = W) -> np.ndarray:
 
 @pytest.fixture
 def sources(tmp_path: Path) -> PairSources:
-    """Give 6 frames of render (mp4), 7 of truth (folder), 9 of opacity (array), 8 of map (mp4) and 10 poses with times."""
+    """Give 6 frames of render (mp4), 7 of truth (folder), 9 of opacity (array), 8 of map (mp4) and
+    10 poses with times.
+    """
     folder = tmp_path / "own"
     (folder / "gt").mkdir(parents=True)
     write_mp4(folder / "render.mp4", (picture(i) // 2 for i in range(6)), 10, crf=4)
@@ -45,7 +51,9 @@ def sources(tmp_path: Path) -> PairSources:
     return PairSources(*(folder / name for name in names))
 
 
-def test_channels_are_cut_to_the_shortest_and_keep_their_values(sources: PairSources, tmp_path: Path) -> None:
+def test_channels_are_cut_to_the_shortest_and_keep_their_values(
+    sources: PairSources, tmp_path: Path
+) -> None:
     folder = tmp_path / "pairs" / "train" / "own"
     assert import_sequence(sources, folder, fps=10) == 6
     sequence = PairSequence(folder)
@@ -58,7 +66,13 @@ def test_channels_are_cut_to_the_shortest_and_keep_their_values(sources: PairSou
         assert np.abs(clip.sdmap[i].astype(int) - (255 - picture(i))).mean() < 3
     np.testing.assert_array_equal(clip.t_us, 40_000 * np.arange(6))
     np.testing.assert_array_equal(clip.T_world_camera[:, 0, 3], np.arange(6))
-    assert sequence.info["source_frames"] == {"rgb_input": 6, "rgb_gt": 7, "opacity": 9, "sdmap": 8, "poses": 10}
+    assert sequence.info["source_frames"] == {
+        "rgb_input": 6,
+        "rgb_gt": 7,
+        "opacity": 9,
+        "sdmap": 8,
+        "poses": 10,
+    }
     assert len(PairDataset(tmp_path / "pairs", "train")) == 1
 
 
@@ -93,26 +107,59 @@ def test_poses_without_times_follow_the_frame_rate(tmp_path: Path) -> None:
         (lambda f: {"rgb_gt": f}, "a folder without images"),
         (lambda f: {"opacity": _saved(f / "a.npy", np.zeros((4, H, W)))}, "float64"),
         (lambda f: {"poses": _saved(f / "p.npy", np.zeros((4, 3, 4)))}, r"shape \(4, 3, 4\)"),
-        (lambda f: {"poses": _saved(f / "p.npy", np.tile(2 * np.eye(4), (4, 1, 1)))}, "pose 0 is not a rigid"),
-        (lambda f: {"poses": _saved(f / "p.npy", np.tile(MOVED.T, (4, 1, 1)))}, "pose 0 is not a rigid"),
+        (
+            lambda f: {"poses": _saved(f / "p.npy", np.tile(2 * np.eye(4), (4, 1, 1)))},
+            "pose 0 is not a rigid",
+        ),
+        (
+            lambda f: {"poses": _saved(f / "p.npy", np.tile(MOVED.T, (4, 1, 1)))},
+            "pose 0 is not a rigid",
+        ),
         (lambda f: {"poses": _written(f / "p.json", '[{"t_us": 0}]')}, "KeyError"),
-        (lambda f: {"poses": _written(f / "p.json", json.dumps([{"T_world_camera": np.eye(4).tolist(), "t_us": 5}] * 2))}, "increase"),
+        (
+            lambda f: {
+                "poses": _written(
+                    f / "p.json",
+                    json.dumps([{"T_world_camera": np.eye(4).tolist(), "t_us": 5}] * 2),
+                )
+            },
+            "increase",
+        ),
         (lambda f: {"sdmap": _written(f / "v.mp4", "no video")}, r"v\.mp4"),
     ],
 )
-def test_what_cannot_be_read_is_named(sources: PairSources, tmp_path: Path, change: object, message: str) -> None:
+def test_what_cannot_be_read_is_named(
+    sources: PairSources, tmp_path: Path, change: object, message: str
+) -> None:
     broken = replace(sources, **change(tmp_path))  # type: ignore[operator]
     with pytest.raises(InputError, match=message):
         import_sequence(broken, tmp_path / "pairs" / "train" / "own", fps=10)
     assert not (tmp_path / "pairs").exists()
 
 
-def test_command_imports_and_refuses_names_that_are_paths(sources: PairSources, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = [word for name, path in vars(sources).items() for word in (f"--{name.replace('_', '-')}", str(path))]
+def test_command_imports_and_refuses_names_that_are_paths(
+    sources: PairSources, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = [
+        word
+        for name, path in vars(sources).items()
+        for word in (f"--{name.replace('_', '-')}", str(path))
+    ]
     command = ["train", "import-pairs", str(tmp_path / "pairs"), *options]
-    assert run_command([*command, "--name", "drive", "--split", "test-known", "--size", "24x16"]) == 0
-    assert PairDataset(tmp_path / "pairs", "test-known").sequences[0].clip.rgb_gt.shape == (6, 16, 24, 3)
-    for bad in (["--name", "../drive"], ["--name", "drive", "--split", "tests"], ["--name", "drive", "--size", "big"]):
+    assert (
+        run_command([*command, "--name", "drive", "--split", "test-known", "--size", "24x16"]) == 0
+    )
+    assert PairDataset(tmp_path / "pairs", "test-known").sequences[0].clip.rgb_gt.shape == (
+        6,
+        16,
+        24,
+        3,
+    )
+    for bad in (
+        ["--name", "../drive"],
+        ["--name", "drive", "--split", "tests"],
+        ["--name", "drive", "--size", "big"],
+    ):
         assert run_command([*command, *bad]) == 2
     assert "write WIDTHxHEIGHT" in capsys.readouterr().err
 

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.lab.training.pair_store import CHANNELS, OPEN_CLIPS, Pair, PairDataset, PairSequence, write_sequence
+from alpasim_plugin.lab.training.pair_store import (
+    CHANNELS,
+    OPEN_CLIPS,
+    Pair,
+    PairDataset,
+    PairSequence,
+    write_sequence,
+)
 from tests.lab.training.pair_files import make, pair
 
 
@@ -71,7 +78,10 @@ def test_dataset_sees_finished_sequences_only_and_new_ones_after_refresh(tmp_pat
         (lambda f: (f / "sdmap.npy").unlink(), "sdmap.npy"),
         (lambda f: np.save(f / "rgb_gt.npy", np.zeros((3, 8, 8, 3))), "float64 with 4 axes"),
         (lambda f: np.save(f / "rgb_input.npy", np.zeros((12, 8, 8, 3), np.uint8)), "rgb_input is"),
-        (lambda f: np.save(f / "t_us.npy", np.zeros(0, np.int64)), "no frame that every channel has"),
+        (
+            lambda f: np.save(f / "t_us.npy", np.zeros(0, np.int64)),
+            "no frame that every channel has",
+        ),
         (lambda f: (f / "opacity.npy").write_bytes(b"\x93NUMPY\x01\x00"), "opacity.npy"),
     ],
 )
@@ -90,7 +100,12 @@ def test_pickled_array_is_refused(tmp_path: Path) -> None:
 
 
 def test_frames_of_changing_size_are_refused(tmp_path: Path) -> None:
-    frames = [pair(0), Pair(*(v[:16] if i < 4 else v for i, v in enumerate(pair(1)[:4])), pair(1).T_world_camera, 5)]
+    frames = [
+        pair(0),
+        Pair(
+            *(v[:16] if i < 4 else v for i, v in enumerate(pair(1)[:4])), pair(1).T_world_camera, 5
+        ),
+    ]
     with pytest.raises(InputError, match="frame 2 of 2"):
         write_sequence(tmp_path / "train" / "x", frames, 2, {})
 
@@ -106,7 +121,9 @@ def test_facts_are_plain_json(tmp_path: Path) -> None:
     assert json.loads((make(tmp_path).folder / "sequence.json").read_text())["scene_id"] == "a"
 
 
-@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts the open files of the process")
+@pytest.mark.skipif(
+    not Path("/proc/self/fd").is_dir(), reason="counts the open files of the process"
+)
 def test_many_sequences_are_read_with_few_open_files(tmp_path: Path) -> None:
     first = make(tmp_path, name="0", frames=2, height=4, width=4)
     for i in range(1, OPEN_CLIPS + 8):

@@ -31,9 +31,13 @@ def street(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scenario:
     return replace(scenario, ego_log=log, end_us=400_000)
 
 
-def test_camera_drifts_beside_a_reconstruction_and_stays_on_the_path_of_a_cycle_render(street: Scenario) -> None:
+def test_camera_drifts_beside_a_reconstruction_and_stays_on_the_path_of_a_cycle_render(
+    street: Scenario,
+) -> None:
     def largest(scenario: Scenario) -> list[float]:
-        return [float(np.abs(lateral_offsets(scenario, PairRecipe(), seed)).max()) for seed in range(60)]
+        return [
+            float(np.abs(lateral_offsets(scenario, PairRecipe(), seed)).max()) for seed in range(60)
+        ]
 
     aside = largest(street)
     assert max(aside) > 0.4
@@ -43,7 +47,9 @@ def test_camera_drifts_beside_a_reconstruction_and_stays_on_the_path_of_a_cycle_
     assert set(largest(replace(street, degradation=Degradation("cycle")))) == {0.0}
 
 
-def test_sequence_holds_both_renders_opacity_map_and_how_it_was_made(street: Scenario, tmp_path: Path) -> None:
+def test_sequence_holds_both_renders_opacity_map_and_how_it_was_made(
+    street: Scenario, tmp_path: Path
+) -> None:
     recipe, folder = PairRecipe(), tmp_path / "pairs" / "val" / "s"
     cycle = replace(street, degradation=Degradation("cycle", share=0.1))
     assert make_sequence(cycle, folder, recipe, 0, split="val", family="street")
@@ -66,7 +72,11 @@ def test_sequence_holds_both_renders_opacity_map_and_how_it_was_made(street: Sce
 def test_actors_whose_tracks_are_long_count_as_moving(street: Scenario, tmp_path: Path) -> None:
     car = street.actors[0]
     track = replace(car.track, xyz=car.track.xyz + np.array([[0.0, 0, 0], [MOVING_M + 1, 0, 0]]))
-    moving = replace(street, actors=(car, replace(car, actor_id="moves", track=track)), degradation=Degradation("none"))
+    moving = replace(
+        street,
+        actors=(car, replace(car, actor_id="moves", track=track)),
+        degradation=Degradation("none"),
+    )
     folder = tmp_path / "pairs" / "val" / "s"
     make_sequence(moving, folder, PairRecipe(), 0, split="val", family="street")
     assert PairSequence(folder).info["moving_actors"] == 1
@@ -75,10 +85,14 @@ def test_actors_whose_tracks_are_long_count_as_moving(street: Scenario, tmp_path
 
 def test_unknown_camera_names_the_known_ones(street: Scenario, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"has \['front'\]"):
-        make_sequence(street, tmp_path / "x", PairRecipe(camera="rear"), 0, split="val", family="street")
+        make_sequence(
+            street, tmp_path / "x", PairRecipe(camera="rear"), 0, split="val", family="street"
+        )
 
 
-def test_recorded_frames_lie_beside_the_channels_and_carry_the_truth_into_the_view(street: Scenario, tmp_path: Path) -> None:
+def test_recorded_frames_lie_beside_the_channels_and_carry_the_truth_into_the_view(
+    street: Scenario, tmp_path: Path
+) -> None:
     folder = tmp_path / "pairs" / "val" / "s"
     exact = replace(street, degradation=Degradation("surrogate", severity=1e-9))
     make_sequence(exact, folder, PairRecipe(offset_m=0.4), 0, split="val", family="street")
@@ -94,12 +108,21 @@ def test_recorded_frames_lie_beside_the_channels_and_carry_the_truth_into_the_vi
         assert np.median(error[held]) < 3  # the same surfaces, seen from beside
 
 
-def test_a_sequence_without_a_recording_has_no_references_and_a_damaged_one_is_refused(street: Scenario, tmp_path: Path) -> None:
+def test_a_sequence_without_a_recording_has_no_references_and_a_damaged_one_is_refused(
+    street: Scenario, tmp_path: Path
+) -> None:
     folder = tmp_path / "pairs" / "val" / "s"
     make_sequence(street, folder, PairRecipe(source="clean"), 0, split="val", family="street")
     assert open_references(PairSequence(folder)) is None
     again = tmp_path / "pairs" / "val" / "t"
-    make_sequence(replace(street, degradation=Degradation("surrogate")), again, PairRecipe(), 0, split="val", family="street")
+    make_sequence(
+        replace(street, degradation=Degradation("surrogate")),
+        again,
+        PairRecipe(),
+        0,
+        split="val",
+        family="street",
+    )
     (again / "references" / "t_us.npy").unlink()
     with pytest.raises(InputError, match=r"t_us\.npy"):
         open_references(PairSequence(again))

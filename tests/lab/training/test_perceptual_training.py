@@ -1,4 +1,6 @@
-"""Training of the perceptual distance: damage that is monotone, targets that say so, batches that repeat, module that are learned."""
+"""Training of the perceptual distance: damage that is monotone, targets that say so, batches that
+repeat, module that are learned.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,12 @@ from alpasim_plugin.core.types import F32
 from alpasim_plugin.lab.training.distortions import KINDS, draw_distortion
 from alpasim_plugin.lab.training.perceptual import PerceptualRecipe, PerceptualTask, draw_shapes
 from alpasim_plugin.lab.training.perceptual_check import SeveritySweep, check, shift_one_px
-from alpasim_plugin.lab.training.perceptual_targets import GAINS, colour_error, structure_error, target_distance
+from alpasim_plugin.lab.training.perceptual_targets import (
+    GAINS,
+    colour_error,
+    structure_error,
+    target_distance,
+)
 from alpasim_plugin.lab.training.semantics import CLASSES, class_masks
 from alpasim_plugin.lab.training.trainer import Schedule, Trainer
 from alpasim_plugin.lab.video_metrics.perceptual_net import PerceptualDistance, load_perceptual
@@ -30,20 +37,33 @@ def test_damage_begins_at_nothing_and_its_target_grows(kind: str) -> None:
         assert damage.kind == kind
         assert np.array_equal(damage(PICTURE, 0.0), PICTURE)
         made = [damage(PICTURE, s) for s in (0.1, 0.5, 1.0)]
-        assert all(m.shape == PICTURE.shape and m.dtype == np.float32 and m.min() >= 0 and m.max() <= 1 for m in made)
-        found.append([target_distance(PICTURE, m, kind, damage.displacement_px(s)) for m, s in zip(made, (0.1, 0.5, 1.0), strict=True)])
+        assert all(
+            m.shape == PICTURE.shape and m.dtype == np.float32 and m.min() >= 0 and m.max() <= 1
+            for m in made
+        )
+        found.append(
+            [
+                target_distance(PICTURE, m, kind, damage.displacement_px(s))
+                for m, s in zip(made, (0.1, 0.5, 1.0), strict=True)
+            ]
+        )
     assert np.all(np.diff(np.mean(found, axis=0)) > 0)
 
 
 def test_the_same_draw_damages_the_same_way() -> None:
     for kind in KINDS:
-        a, b = (draw_distortion(stream("training", 1, kind), PICTURE.shape, kind)(PICTURE, 0.5) for _ in range(2))
+        a, b = (
+            draw_distortion(stream("training", 1, kind), PICTURE.shape, kind)(PICTURE, 0.5)
+            for _ in range(2)
+        )
         assert np.array_equal(a, b)
 
 
 def test_every_kind_has_a_gain_or_a_displacement() -> None:
     for kind in KINDS:
-        moved = draw_distortion(stream("training", 0, kind), PICTURE.shape, kind).displacement_px(1.0)
+        moved = draw_distortion(stream("training", 0, kind), PICTURE.shape, kind).displacement_px(
+            1.0
+        )
         assert (kind in GAINS) != (moved > 0)
 
 
@@ -57,7 +77,12 @@ def test_equal_pictures_have_no_error_and_a_colour_cast_is_no_structure() -> Non
 
 
 def test_map_colours_are_read_back_however_faded() -> None:
-    colours = {"boundary": (253, 1, 232), "white line": (255, 255, 255), "yellow line": (255, 255, 0), "crosswalk": (139, 93, 255)}
+    colours = {
+        "boundary": (253, 1, 232),
+        "white line": (255, 255, 255),
+        "yellow line": (255, 255, 0),
+        "crosswalk": (139, 93, 255),
+    }
     colours |= {"vehicle": (126, 206, 255), "other road user": (255, 124, 171)}
     for fade in (1.0, 0.5, 0.25):
         for name, colour in colours.items():
@@ -99,15 +124,23 @@ def test_every_loss_term_reaches_the_trunk(task: PerceptualTask) -> None:
 
 
 @pytest.mark.slow
-def test_training_lowers_the_loss_and_the_result_loads(task: PerceptualTask, tmp_path: Path) -> None:
+def test_training_lowers_the_loss_and_the_result_loads(
+    task: PerceptualTask, tmp_path: Path
+) -> None:
     schedule = Schedule(6, peak_lr=6e-3, warmup=1)
-    trainer = Trainer(task.module, tmp_path / "run", schedule, lambda i: task.batch(0), task.loss, task.facts)
+    trainer = Trainer(
+        task.module, tmp_path / "run", schedule, lambda i: task.batch(0), task.loss, task.facts
+    )
     seen: list[float] = []
     trainer.run(lambda step, numbers: seen.append(numbers["loss"]))
     assert seen[-1] < 0.8 * seen[0]
     task.module.load_state_dict(trainer.averaged())
     task.module.net.save(tmp_path / "net.safetensors")
-    for a, b in zip(task.module.net.parameters(), load_perceptual(tmp_path / "net.safetensors").parameters(), strict=True):
+    for a, b in zip(
+        task.module.net.parameters(),
+        load_perceptual(tmp_path / "net.safetensors").parameters(),
+        strict=True,
+    ):
         assert torch.equal(a.detach().half().float(), b)
 
 

@@ -26,14 +26,33 @@ def test_streaming_equals_the_rollout_of_the_training(tmp_path: Path, holes: str
     bundle = write_bundle(tmp_path / "small.safetensors")
     streamed = pixels(run(session(bundle, "keep_render=false", f"holes={holes}"), FRAMES, MAPS))
     render, sdmap = scaled(pixels(FRAMES))[None], scaled(np.stack(MAPS))[None]
-    opacity = torch.from_numpy(np.stack([f.alpha for f in FRAMES if f.alpha is not None]))[None, ..., None]
+    opacity = torch.from_numpy(np.stack([f.alpha for f in FRAMES if f.alpha is not None]))[
+        None, ..., None
+    ]
     everywhere = np.arange(SIZE[0] * SIZE[1])
-    eps = np.stack([pixel_noise("scene", 0, "front", 0, i, everywhere).reshape(*SIZE, 3) for i in range(len(FRAMES))])
+    eps = np.stack(
+        [
+            pixel_noise("scene", 0, "front", 0, i, everywhere).reshape(*SIZE, 3)
+            for i in range(len(FRAMES))
+        ]
+    )
     sample = PixelSample(
-        render, render, sdmap, opacity, torch.from_numpy(eps)[None], render[:, 0], torch.ones(1), 0, (), (0, 0), torch.ones(1, 1)
+        render,
+        render,
+        sdmap,
+        opacity,
+        torch.from_numpy(eps)[None],
+        render[:, 0],
+        torch.ones(1),
+        0,
+        (),
+        (0, 0),
+        torch.ones(1, 1),
     )
     net = generator().requires_grad_(False)
-    objectives = PixelObjectives(0, 0, 0, horizon=99, source="mixed" if holes == "noise" else "noise")
+    objectives = PixelObjectives(
+        0, 0, 0, horizon=99, source="mixed" if holes == "noise" else "noise"
+    )
     with torch.no_grad():
         whole = pixel_losses(net, sample, net.start(render[:, 0]), objectives, None).predictions[0]
     expected = whole.clamp(-1, 1).add(1).mul(127.5).round().to(torch.uint8).numpy()

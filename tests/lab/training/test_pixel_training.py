@@ -1,4 +1,6 @@
-"""The per-frame generator's training: objectives against their definition, gradients through k frames, resumed runs are equal."""
+"""The per-frame generator's training: objectives against their definition, gradients through k
+frames, resumed runs are equal.
+"""
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -16,12 +18,23 @@ from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelS
 from alpasim_plugin.fixers.network.reference_blend import Sources, mix
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.training.grid_term import grid_term
-from alpasim_plugin.lab.training.pixel_rollout import ROAD_USER, PixelObjectives, PixelSample, choice_term, pixel_losses
+from alpasim_plugin.lab.training.pixel_rollout import (
+    ROAD_USER,
+    PixelObjectives,
+    PixelSample,
+    choice_term,
+    pixel_losses,
+)
 from alpasim_plugin.lab.training.pixel_run import PixelRun, initial_generator, train_per_frame
 from alpasim_plugin.lab.training.pixel_variants import pixel_variant
 from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule
 
-SMALL = ("generator.widths=[8,8,8]", "generator.detail=8", "generator.hidden=4", "weights.bundle=null")
+SMALL = (
+    "generator.widths=[8,8,8]",
+    "generator.detail=8",
+    "generator.hidden=4",
+    "weights.bundle=null",
+)
 FRAMES = 3
 
 
@@ -39,7 +52,9 @@ class Batch:
 
 
 class Streams:
-    """Two streams whose renders are darker than the truth; one starts anew at every third update."""
+    """Two streams whose renders are darker than the truth; one starts anew at every third
+    update.
+    """
 
     batch = 2
 
@@ -48,8 +63,21 @@ class Streams:
         target = torch.rand(2, FRAMES, 3, 16, 32, generator=source) * 2 - 1
         opacity = torch.rand(2, FRAMES, 1, 16, 32, generator=source)
         users = torch.rand(opacity.shape, generator=source) < 0.1
-        whole = Batch(target * 0.5 - 0.4, opacity, target.roll(1, 2), target, torch.tensor([i % 3 == 0, i == 0]), users)
-        return Batch(*(getattr(whole, field.name)[slots] for field in fields(whole) if field.name != "references"))
+        whole = Batch(
+            target * 0.5 - 0.4,
+            opacity,
+            target.roll(1, 2),
+            target,
+            torch.tensor([i % 3 == 0, i == 0]),
+            users,
+        )
+        return Batch(
+            *(
+                getattr(whole, field.name)[slots]
+                for field in fields(whole)
+                if field.name != "references"
+            )
+        )
 
     def facts(self) -> dict[str, Any]:
         return {"streams": "dark"}
@@ -57,7 +85,9 @@ class Streams:
 
 def sample(seed: int = 0, t: float = 0.4) -> PixelSample:
     got = Streams().update(seed)
-    render, truth, sdmap, opacity = (x.permute(0, 1, 3, 4, 2) for x in (got.render, got.target, got.map, got.opacity))
+    render, truth, sdmap, opacity = (
+        x.permute(0, 1, 3, 4, 2) for x in (got.render, got.target, got.map, got.opacity)
+    )
     torch.manual_seed(seed)
     return PixelSample(
         render,
@@ -81,7 +111,13 @@ def generator() -> PixelGenerator:
 
 def test_terms_are_what_they_are_called() -> None:
     net, s = generator(), sample()
-    found = pixel_losses(net, s, net.start(s.render[:, 0]), PixelObjectives(), lambda a, b: (a - b).abs().amax((1, 2, 3)))
+    found = pixel_losses(
+        net,
+        s,
+        net.start(s.render[:, 0]),
+        PixelObjectives(),
+        lambda a, b: (a - b).abs().amax((1, 2, 3)),
+    )
     state, made = net.start(s.render[:, 0]), []
     for i in range(FRAMES):
         if i == 1:  # the flow term: the velocity of the interpolant, on the rollout's history
@@ -89,16 +125,32 @@ def test_terms_are_what_they_are_called() -> None:
             z_t = 0.6 * s.truth[:, 1] + 0.4 * z_1
             guess, _ = net(s.render[:, 1], s.opacity[:, 1], s.sdmap[:, 1], state, z_t, s.t)
             velocity = (z_t - guess) / 0.4
-            torch.testing.assert_close(found.flow, (velocity - (z_1 - s.truth[:, 1])).abs().mean(), atol=1e-5, rtol=0)
-        out, state = net(s.render[:, i], s.opacity[:, i], s.sdmap[:, i], state, pixel_source(s.render[:, i], s.opacity[:, i], s.eps[:, i]))
+            torch.testing.assert_close(
+                found.flow, (velocity - (z_1 - s.truth[:, 1])).abs().mean(), atol=1e-5, rtol=0
+            )
+        out, state = net(
+            s.render[:, i],
+            s.opacity[:, i],
+            s.sdmap[:, i],
+            state,
+            pixel_source(s.render[:, i], s.opacity[:, i], s.eps[:, i]),
+        )
         made.append(out)
     torch.testing.assert_close(found.predictions, torch.stack(made, 1))
     error = found.predictions - s.truth
     torch.testing.assert_close(found.picture, error.abs().mean())
     torch.testing.assert_close(found.temporal, (error[:, 1:] - error[:, :-1]).abs().mean())
-    torch.testing.assert_close(found.perceptual, error[:, [0, 2], 3:, 1:].abs().amax((2, 3, 4)).mean())
+    torch.testing.assert_close(
+        found.perceptual, error[:, [0, 2], 3:, 1:].abs().amax((2, 3, 4)).mean()
+    )
     torch.testing.assert_close(found.grid, grid_term(found.predictions, s.truth))
-    total = found.picture + 0.1 * found.perceptual + 0.25 * found.temporal + 0.25 * found.flow + 0.01 * found.grid
+    total = (
+        found.picture
+        + 0.1 * found.perceptual
+        + 0.25 * found.temporal
+        + 0.25 * found.flow
+        + 0.01 * found.grid
+    )
     torch.testing.assert_close(found.total, total)
     assert torch.equal(found.state.output, made[-1].clamp(-1, 1))
 
@@ -108,14 +160,19 @@ def test_errors_at_road_users_count_more_and_the_scale_of_the_terms_stays() -> N
     start = net.start(s.render[:, 0])
     users = torch.zeros_like(s.opacity, dtype=torch.bool)
     users[:, :, 4:8, 8:16] = True
-    plain, found = (pixel_losses(net, replace(s, road_users=which), start, PixelObjectives(0, 1, 0), None) for which in (None, users))
+    plain, found = (
+        pixel_losses(net, replace(s, road_users=which), start, PixelObjectives(0, 1, 0), None)
+        for which in (None, users)
+    )
     error = (found.predictions - s.truth).abs()
     inside, all_of_them = error[:, :, 4:8, 8:16].mean(), error.mean()
     share = users.float().mean()
     expected = (all_of_them + (ROAD_USER - 1) * share * inside) / (1 + (ROAD_USER - 1) * share)
     torch.testing.assert_close(found.picture, expected)
     assert not torch.allclose(found.temporal, plain.temporal)
-    everywhere = pixel_losses(net, replace(s, road_users=torch.ones_like(users)), start, PixelObjectives(0, 1, 0), None)
+    everywhere = pixel_losses(
+        net, replace(s, road_users=torch.ones_like(users)), start, PixelObjectives(0, 1, 0), None
+    )
     torch.testing.assert_close(everywhere.picture, plain.picture)
 
 
@@ -123,7 +180,13 @@ def test_errors_at_road_users_count_more_and_the_scale_of_the_terms_stays() -> N
 def test_gradients_pass_through_the_last_k_frames(horizon: int, reaches: int) -> None:
     net, s = generator(), sample()
     eps = s.eps.clone().requires_grad_()
-    found = pixel_losses(net, replace(s, eps=eps), net.start(s.render[:, 0]), PixelObjectives(0, 0, 0, horizon=horizon), None)
+    found = pixel_losses(
+        net,
+        replace(s, eps=eps),
+        net.start(s.render[:, 0]),
+        PixelObjectives(0, 0, 0, horizon=horizon),
+        None,
+    )
     (gradient,) = torch.autograd.grad(found.predictions[:, 2].square().mean(), eps)
     reached = [i for i in range(FRAMES) if bool(gradient[:, i].any())]
     assert len(reached) - 1 == reaches
@@ -135,7 +198,9 @@ def test_switches_of_the_ablation() -> None:
     start = net.start(s.render[:, 0])
 
     def made(**changes: Any) -> Tensor:
-        return pixel_losses(net, s, start, PixelObjectives(perceptual=0, **changes), None).predictions
+        return pixel_losses(
+            net, s, start, PixelObjectives(perceptual=0, **changes), None
+        ).predictions
 
     own = made()
     for history in ("clean", "redenoised"):
@@ -148,7 +213,9 @@ def test_switches_of_the_ablation() -> None:
 
 def test_a_redenoised_history_is_the_truth_noised_and_denoised() -> None:
     net, s = generator(), sample()
-    found = pixel_losses(net, s, net.start(s.render[:, 0]), PixelObjectives(perceptual=0, history="redenoised"), None)
+    found = pixel_losses(
+        net, s, net.start(s.render[:, 0]), PixelObjectives(perceptual=0, history="redenoised"), None
+    )
     state = net.start(s.render[:, 0])
     for i in range(FRAMES):
         z_1 = pixel_source(s.render[:, i], s.opacity[:, i], s.eps[:, i])
@@ -168,7 +235,9 @@ def test_flow_matching_alone_sends_no_gradient_through_the_rollout() -> None:
 
 
 def test_stages_take_their_shares_of_the_updates() -> None:
-    two = pixel_variant("V7").weighted(perceptual=0.2, temporal=0.25, flow=0.25, grid=0.01, horizon=4)
+    two = pixel_variant("V7").weighted(
+        perceptual=0.2, temporal=0.25, flow=0.25, grid=0.01, horizon=4
+    )
     assert [two.objectives(i, 8).in_pixels for i in range(8)] == [False] * 5 + [True] * 3
     assert two.objectives(7, 8).perceptual == 0.2
     assert two.objectives(0, 8).perceptual == 0
@@ -187,8 +256,16 @@ def test_a_variant_is_written_as_it_must_be_run(tmp_path: Path) -> None:
 def run_of(steps: int = 4, decay_from: int = 3, variant: str = "V9", **changes: Any) -> PixelRun:
     settings = fixer_settings("onefixer", SMALL)
     assert isinstance(settings, PixelFixerSettings)
-    schedule = Schedule(steps, peak_lr=3e-3, warmup=2, clip=0.5, ema=0.9, save_every=2, decay_from=decay_from)
-    return PixelRun(settings, Streams(), pixel_variant(variant).weighted(0, 0.25, 0.25, 0.01, horizon=4), schedule, **changes)
+    schedule = Schedule(
+        steps, peak_lr=3e-3, warmup=2, clip=0.5, ema=0.9, save_every=2, decay_from=decay_from
+    )
+    return PixelRun(
+        settings,
+        Streams(),
+        pixel_variant(variant).weighted(0, 0.25, 0.25, 0.01, horizon=4),
+        schedule,
+        **changes,
+    )
 
 
 def weights(path: Path) -> dict[str, Tensor]:
@@ -212,7 +289,10 @@ def test_a_run_may_be_prolonged_until_its_decay_begins(tmp_path: Path) -> None:
     train_per_frame(run_of(20, 12), tmp_path / "long", None, stop_at=3)
     train_per_frame(run_of(6, 4), tmp_path / "run", None, stop_at=2)
     train_per_frame(run_of(20, 12), tmp_path / "run", None, stop_at=3)
-    assert all(torch.equal(value, weights(tmp_path / "run")[key]) for key, value in weights(tmp_path / "long").items())
+    assert all(
+        torch.equal(value, weights(tmp_path / "run")[key])
+        for key, value in weights(tmp_path / "long").items()
+    )
     train_per_frame(run_of(5, 3), tmp_path / "run", None)
     with pytest.raises(InputError, match="its decay from 3 to 5 has begun"):
         train_per_frame(run_of(20, 12), tmp_path / "run", None)
@@ -235,7 +315,9 @@ def test_a_deeper_network_begins_as_the_one_of_its_bundle(tmp_path: Path) -> Non
     deeper = fixer_settings("onefixer", (*SMALL, "generator.blocks=[1,2,2,2,2]"))
     assert isinstance(deeper, PixelFixerSettings)
     net = initial_generator(replace(run_of(init=shallow), settings=deeper))
-    before = PixelGenerator.from_state_dict(parts_of(load_weights(shallow, dtype=torch.float32))["generator"])
+    before = PixelGenerator.from_state_dict(
+        parts_of(load_weights(shallow, dtype=torch.float32))["generator"]
+    )
     picture = torch.rand(1, 32, 48, 3, generator=torch.Generator().manual_seed(0))
     inputs = picture, picture[..., :1], picture, net.start(picture)
     assert sum(p.numel() for p in net.parameters()) > sum(p.numel() for p in before.parameters())
@@ -244,18 +326,34 @@ def test_a_deeper_network_begins_as_the_one_of_its_bundle(tmp_path: Path) -> Non
 
 def test_it_learns(tmp_path: Path) -> None:
     seen: list[float] = []
-    train_per_frame(run_of(24, 20), tmp_path, None, report=lambda step, numbers: seen.append(numbers["picture"]))
+    train_per_frame(
+        run_of(24, 20), tmp_path, None, report=lambda step, numbers: seen.append(numbers["picture"])
+    )
     assert sum(seen[-4:]) < 0.7 * sum(seen[:4])
 
 
-def test_a_blend_that_is_sure_of_the_wrong_source_learns_from_the_choice_term_where_the_picture_teaches_nothing() -> None:
+def test_a_blend_that_is_sure_of_the_wrong_source_learns_from_the_choice_term_where_the_picture_teaches_nothing() -> (
+    None
+):
     truth = torch.zeros(1, 16, 16, 3)
-    colour = torch.stack([torch.full_like(truth, 0.1), truth], dim=1)  # the render is wrong, the reference right
+    colour = torch.stack(
+        [torch.full_like(truth, 0.1), truth], dim=1
+    )  # the render is wrong, the reference right
     weight = torch.full((1, 1, 16, 16, 1), -12.0, requires_grad=True)
-    sources = Sources(colour, torch.cat([torch.zeros(1, 1, 16, 16, 1), weight], dim=1), torch.ones(1, 2, 16, 16, 1))
-    (by_picture,) = torch.autograd.grad((mix(sources)[0] - truth).abs().mean(), weight, retain_graph=True)
+    sources = Sources(
+        colour,
+        torch.cat([torch.zeros(1, 1, 16, 16, 1), weight], dim=1),
+        torch.ones(1, 2, 16, 16, 1),
+    )
+    (by_picture,) = torch.autograd.grad(
+        (mix(sources)[0] - truth).abs().mean(), weight, retain_graph=True
+    )
     (by_choice,) = torch.autograd.grad(choice_term(sources, truth), weight)
     assert float(by_choice.sum()) < -0.5
     assert abs(float(by_picture.sum())) < 1e-4
-    nowhere = sources._replace(holds=torch.cat([torch.ones(1, 1, 16, 16, 1), torch.full((1, 1, 16, 16, 1), 1e-6)], dim=1))
-    assert float(choice_term(nowhere, truth).detach()) < 0.1, "a reference that holds nowhere is not to be chosen"
+    nowhere = sources._replace(
+        holds=torch.cat([torch.ones(1, 1, 16, 16, 1), torch.full((1, 1, 16, 16, 1), 1e-6)], dim=1)
+    )
+    assert float(choice_term(nowhere, truth).detach()) < 0.1, (
+        "a reference that holds nowhere is not to be chosen"
+    )

@@ -26,8 +26,15 @@ LEFT_CIRCLE = smooth_path(40.0 * np.stack([np.sin(ANGLE), 1.0 - np.cos(ANGLE)], 
 STYLE = DrivingStyle(10.0)
 
 
-def speeds(speed_mps: float, leader: Leader = NO_LEADER, line: ReferenceLine | None = None, s_m: float = 20.0) -> np.ndarray:
-    return speed_mps + expert_speeds(line or ReferenceLine.along(STRAIGHT, 20.0), s_m, speed_mps, leader, STYLE)
+def speeds(
+    speed_mps: float,
+    leader: Leader = NO_LEADER,
+    line: ReferenceLine | None = None,
+    s_m: float = 20.0,
+) -> np.ndarray:
+    return speed_mps + expert_speeds(
+        line or ReferenceLine.along(STRAIGHT, 20.0), s_m, speed_mps, leader, STYLE
+    )
 
 
 @pytest.mark.parametrize("offset_m", [-1.5, 0.0, 0.7])
@@ -35,14 +42,18 @@ def test_car_beside_a_straight_line_is_led_back_to_it_without_a_jump(offset_m: f
     points, heading = expert_path(STRAIGHT, 50.0, se2(50.0, offset_m, 0.0), 10.0)
     assert points[-1, 1] == pytest.approx(-offset_m, abs=0.05)
     assert np.abs(heading[-1]) < 0.01
-    assert abs(points[0, 1]) < 0.2 * abs(offset_m) + 1e-6  # the first metres go where the car already points
+    assert (
+        abs(points[0, 1]) < 0.2 * abs(offset_m) + 1e-6
+    )  # the first metres go where the car already points
     assert (np.diff(np.abs(points[:, 1])) > -0.2).all()
 
 
 def test_car_on_a_bend_stays_on_it() -> None:
     s = 20.0
     xyz, yaw = LEFT_CIRCLE.at(s)
-    points, heading = expert_path(LEFT_CIRCLE, s, se2(float(xyz[0]), float(xyz[1]), float(yaw)), 8.0)
+    points, heading = expert_path(
+        LEFT_CIRCLE, s, se2(float(xyz[0]), float(xyz[1]), float(yaw)), 8.0
+    )
     k = KNOTS_M.index(22.0)
     wanted = 40.0 * np.array([np.sin(22.0 / 40.0), 1.0 - np.cos(22.0 / 40.0)])
     np.testing.assert_allclose(points[k], wanted, atol=0.35)
@@ -70,7 +81,9 @@ def test_free_car_at_the_wanted_speed_keeps_it_and_a_slower_one_gains_it() -> No
 
 def test_car_stops_before_what_stands_and_stays_there() -> None:
     for gap_m in (12.0, 20.0, 30.0):
-        s, v, line = 20.0, 8.0, ReferenceLine.along(STRAIGHT, 20.0)
+        s = 20.0
+        v = 8.0
+        line = ReferenceLine.along(STRAIGHT, 20.0)
         wall = 20.0 + gap_m
         for _ in range(150):
             s, v = advance(s, v, acceleration(line, s, v, Leader(wall - s, 0.0, 0), STYLE), 0.1)
@@ -91,7 +104,12 @@ def test_bend_is_entered_slowly() -> None:
 
 def test_only_bodies_that_reach_into_the_way_are_leaders() -> None:
     line, car = ReferenceLine.along(STRAIGHT, 20.0), Box(4.5, 1.8, 1.5)
-    there = bodies_from(np.array([[40.0, 3.4], [60.0, 0.3]]), np.zeros(2), [car, car], np.array([[0.0, 0.0], [5.0, 0.0]]))
+    there = bodies_from(
+        np.array([[40.0, 3.4], [60.0, 0.3]]),
+        np.zeros(2),
+        [car, car],
+        np.array([[0.0, 0.0], [5.0, 0.0]]),
+    )
     leader = leader_on(line, 10.0, 3.8, 0.94, there)
     assert leader.index == 1
     assert leader.gap_m == pytest.approx(60.0 - 2.25 - 13.8, abs=0.05)

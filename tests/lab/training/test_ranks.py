@@ -1,4 +1,6 @@
-"""Several ranks train to the weights of one: the same rows, the mean of their gradients, one checkpoint."""
+"""Several ranks train to the weights of one: the same rows, the mean of their gradients, one
+checkpoint.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ class Exchanging:
 
 @pytest.fixture(autouse=True)
 def one_seeding_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Threads share torch's random state, from which initial weights are drawn; processes do not."""
+    """Threads share torch's random state, from which initial weights are drawn; processes do
+    not.
+    """
     lock, draw = threading.Lock(), PixelGenerator.random
 
     def locked(sizes: PixelSizes, seed: int) -> PixelGenerator:
@@ -57,8 +61,13 @@ def one_seeding_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def in_threads(folder: Path, stop_at: int | None = None) -> None:
     shared = Threads(2)
-    trained = [threading.Thread(target=train_per_frame, args=(run_of(), folder, None, stop_at, Ranks(rank, 2, shared.of(rank))))
-               for rank in range(2)]  # fmt: skip
+    trained = [
+        threading.Thread(
+            target=train_per_frame,
+            args=(run_of(), folder, None, stop_at, Ranks(rank, 2, shared.of(rank))),
+        )
+        for rank in range(2)
+    ]
     for thread in trained:
         thread.start()
     for thread in trained:

@@ -1,4 +1,6 @@
-"""Scenes of the splits: apart by seed and, for the unseen test, by family, look and damage; all of them can be driven."""
+"""Scenes of the splits: apart by seed and, for the unseen test, by family, look and damage; all of
+them can be driven.
+"""
 
 import itertools
 from dataclasses import fields
@@ -29,9 +31,15 @@ def test_seeds_of_splits_do_not_meet() -> None:
 
 def test_unseen_test_shares_no_family_and_no_part_of_a_road_with_training() -> None:
     assert not set(KNOWN_FAMILIES) & set(UNSEEN_FAMILIES)
-    parts = {split: {s["kind"] for spec in drawn(split) for s in spec["road"]["segments"]} for split in ("train", "test-unseen")}
+    parts = {
+        split: {s["kind"] for spec in drawn(split) for s in spec["road"]["segments"]}
+        for split in ("train", "test-unseen")
+    }
     assert {"merge", "narrow_gap"} <= parts["test-unseen"] - parts["train"]
-    labels = {split: {a.get("label", "car") for spec in drawn(split) for a in spec["actors"]} for split in ("train", "test-unseen")}
+    labels = {
+        split: {a.get("label", "car") for spec in drawn(split) for a in spec["actors"]}
+        for split in ("train", "test-unseen")
+    }
     assert labels["test-unseen"] - labels["train"] == {"other"}
     assert {"car", "truck", "bus", "motorcycle", "cyclist", "pedestrian"} <= labels["train"]
 
@@ -39,7 +47,13 @@ def test_unseen_test_shares_no_family_and_no_part_of_a_road_with_training() -> N
 def test_every_unseen_scene_looks_as_no_training_scene_can() -> None:
     def strange(around: dict) -> bool:
         low, high = around["building_height_m"]
-        return around["sky"] == "dusk" or around["texture"] <= 0.15 or high < 4 or low > 26 or around["trees_per_100m"] > 9
+        return (
+            around["sky"] == "dusk"
+            or around["texture"] <= 0.15
+            or high < 4
+            or low > 26
+            or around["trees_per_100m"] > 9
+        )
 
     assert all(strange(spec["environment"]) for spec in drawn("test-unseen"))
     for split in ("train", "val", "test-known"):
@@ -49,9 +63,15 @@ def test_every_unseen_scene_looks_as_no_training_scene_can() -> None:
 def test_every_unseen_scene_is_damaged_beyond_some_range_of_training() -> None:
     def beyond(damage: dict) -> bool:
         names = [f.name for f in fields(KNOWN_DAMAGE) if f.name in damage and f.name != "shift_m"]
-        return any(not low <= damage[name] <= high for name in names for low, high in [getattr(KNOWN_DAMAGE, name)])
+        return any(
+            not low <= damage[name] <= high
+            for name in names
+            for low, high in [getattr(KNOWN_DAMAGE, name)]
+        )
 
-    unseen, train = ([spec["degradation"] for spec in drawn(split)] for split in ("test-unseen", "train"))
+    unseen, train = (
+        [spec["degradation"] for spec in drawn(split)] for split in ("test-unseen", "train")
+    )
     assert all(beyond(damage) for damage in unseen)
     assert not any(beyond(damage) for damage in train)
     cycles = [abs(d["shift_m"]) for d in unseen if d["kind"] == "cycle"]
@@ -75,7 +95,11 @@ def test_cameras_vary_in_training_only() -> None:
     sizes = [(c["width"], c["height"]) for spec in drawn("train") for c in spec["cameras"]]
     assert set(sizes) == set(SIZES)
     assert sizes.count((256, 144)) > DRAWN / 2
-    assert all("cameras" not in spec for split in ("val", "test-known", "test-unseen") for spec in drawn(split))
+    assert all(
+        "cameras" not in spec
+        for split in ("val", "test-known", "test-unseen")
+        for spec in drawn(split)
+    )
 
 
 @pytest.mark.parametrize(("split", "family"), ALL)
@@ -87,7 +111,10 @@ def test_draws_repeat_and_differ_by_seed(split: Split, family: str) -> None:
 
 
 def test_scenes_can_be_driven_and_files_are_kept(tmp_path: Path) -> None:
-    paths = [*write_scenes(tmp_path, "train", 2, 2.0), *write_scenes(tmp_path, "test-unseen", 1, 2.0)]
+    paths = [
+        *write_scenes(tmp_path, "train", 2, 2.0),
+        *write_scenes(tmp_path, "test-unseen", 1, 2.0),
+    ]
     assert [p.parent.name for p in paths] == ["train", "train", "test-unseen"]
     scenario = load_scenario(paths[0])
     assert scenario.end_us - scenario.start_us == 2_000_000
@@ -100,5 +127,7 @@ def test_scenes_can_be_driven_and_files_are_kept(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("split", list(SPLITS))
 def test_every_family_can_be_driven(split: Split, tmp_path: Path) -> None:
-    paths = list(write_scenes(tmp_path, split, len(SPLITS[split].families), SPLITS[split].duration_s))
+    paths = list(
+        write_scenes(tmp_path, split, len(SPLITS[split].families), SPLITS[split].duration_s)
+    )
     assert {p.stem.rsplit("_", 1)[0] for p in paths} == set(SPLITS[split].families)

@@ -1,4 +1,6 @@
-"""The shared rollout: what it computes, against a slow reading of the equations; and where gradients flow and where they do not."""
+"""The shared rollout: what it computes, against a slow reading of the equations; and where
+gradients flow and where they do not.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ from alpasim_plugin.lab.training.perceptual_term import DecodedDistance
 from alpasim_plugin.lab.training.shared_rollout import Objectives, Sample, losses
 from tests.examples import first_of
 
-N, H, W = 8, 4, 4
+N = 8
+H = 4
+W = 4
 
 
 def noise(name: str, *shape: int) -> Tensor:
@@ -38,8 +42,15 @@ def net() -> CosmosCausalDiT:
 
 def make_net(map_channels: int) -> CosmosCausalDiT:
     sizes = DiTSizes(
-        width=48, blocks=2, head_width=24, mlp_width=96, adaln_rank=8, text_width=8, context_width=16, map_channels=map_channels
-    )  # fmt: skip
+        width=48,
+        blocks=2,
+        head_width=24,
+        mlp_width=96,
+        adaln_rank=8,
+        text_width=8,
+        context_width=16,
+        map_channels=map_channels,
+    )
     weights = initial_weights(sizes, 0)
     key = "final_layer.adaln_modulation.2.weight"
     weights[key] = 0.05 * noise(key, *weights[key].shape)
@@ -52,9 +63,16 @@ TEXT = noise("text", 1, 1, 8)
 def sample(w: int = 5) -> Sample:
     shape = (1, 16, N, H, W)
     return Sample(
-        noise("z_r", *shape), noise("z_0", *shape), noise("z_map", *shape), (uniform("m", 1, 1, N, H, W) > 0.3).float(),
-        noise("eps", *shape), noise("context", *shape), uniform("t", 1, N), uniform("again", 1, N), w,
-    )  # fmt: skip
+        noise("z_r", *shape),
+        noise("z_0", *shape),
+        noise("z_map", *shape),
+        (uniform("m", 1, 1, N, H, W) > 0.3).float(),
+        noise("eps", *shape),
+        noise("context", *shape),
+        uniform("t", 1, N),
+        uniform("again", 1, N),
+        w,
+    )
 
 
 def at_w(predicted: Tensor, w: int) -> Tensor:
@@ -62,12 +80,18 @@ def at_w(predicted: Tensor, w: int) -> Tensor:
     return (predicted[:, :, w] * noise("probe", *predicted[:, :, w].shape)).sum()
 
 
-def velocity(net: CosmosCausalDiT, s: Sample, b: slice, history: Tensor, x: Tensor, t: Tensor) -> Tensor:
-    """Return a block's velocity by one whole-clip forward: noised history before it, block-causal mask, one time a latent."""
+def velocity(
+    net: CosmosCausalDiT, s: Sample, b: slice, history: Tensor, x: Tensor, t: Tensor
+) -> Tensor:
+    """Return a block's velocity by one whole-clip forward: noised history before it, block-causal
+    mask, one time a latent.
+    """
     level = context_level()
     past = interpolant(history[:, :, : b.start], s.eps_context[:, :, : b.start], level.sigma)
     times = torch.cat([torch.full((1, b.start), CONTEXT_STEP), t], dim=1)
-    return net(torch.cat([past, x], dim=2), times, TEXT, s.condition[:, :, : b.stop], block_latents=2)[:, :, b]
+    return net(
+        torch.cat([past, x], dim=2), times, TEXT, s.condition[:, :, : b.stop], block_latents=2
+    )[:, :, b]
 
 
 def slow_rollout(net: CosmosCausalDiT, s: Sample) -> Tensor:
@@ -100,16 +124,26 @@ def test_rollout_and_flow_matching_are_the_equations(net: CosmosCausalDiT) -> No
 
 @pytest.mark.parametrize("k", first_of([2, 8, 1, 4], 2))
 @pytest.mark.parametrize("w", first_of([5, 0, 4, 7], 2))
-def test_perceptual_gradient_reaches_the_last_k_predictions_and_no_other(net: CosmosCausalDiT, k: int, w: int) -> None:
+def test_perceptual_gradient_reaches_the_last_k_predictions_and_no_other(
+    net: CosmosCausalDiT, k: int, w: int
+) -> None:
     result = losses(net, sample(w), TEXT, Objectives(flow=None, horizon=k), at_w)
     live = [z for z in result.predictions if z.requires_grad]
     grads = torch.autograd.grad(result.total, [*live, *net.parameters()], allow_unused=True)
     by_block = {id(z): g for z, g in zip(live, grads, strict=False)}
-    reached = torch.cat([torch.zeros_like(z) if by_block.get(id(z)) is None else by_block[id(z)] for z in result.predictions], dim=2)
+    reached = torch.cat(
+        [
+            torch.zeros_like(z) if by_block.get(id(z)) is None else by_block[id(z)]
+            for z in result.predictions
+        ],
+        dim=2,
+    )
     for position in range(w + 1):
         size = reached[:, :, position].abs().max()
         assert torch.isfinite(size)
-        in_history = position < w // 2 * 2  # w's own block is made at once: its other prediction is nobody's history yet
+        in_history = (
+            position < w // 2 * 2
+        )  # w's own block is made at once: its other prediction is nobody's history yet
         assert (size > 0) == (position > w - k and (in_history or position == w))
     assert (reached[:, :, w + 1 :] == 0).all()
     assert all(g is None or torch.isfinite(g).all() for g in grads)
@@ -118,7 +152,9 @@ def test_perceptual_gradient_reaches_the_last_k_predictions_and_no_other(net: Co
 def test_predictions_with_gradient_have_the_values_of_the_rollout(net: CosmosCausalDiT) -> None:
     for k in (1, 2, 3, 8):
         result = losses(net, sample(5), TEXT, Objectives(horizon=k), at_w)
-        torch.testing.assert_close(torch.cat(result.predictions, dim=2), result.rollout[:, :, :6], atol=0, rtol=0)
+        torch.testing.assert_close(
+            torch.cat(result.predictions, dim=2), result.rollout[:, :, :6], atol=0, rtol=0
+        )
         assert not result.rollout.requires_grad
 
 
@@ -126,9 +162,17 @@ def test_sources_outside_the_horizon_have_exactly_no_gradient(net: CosmosCausalD
     for k, w in ((1, 5), (2, 5), (4, 5), (4, 6), (8, 7)):
         s = sample(w)
         leaf = s.z_r.clone().requires_grad_(True)
-        total = losses(net, replace(s, z_r=leaf, m=torch.ones_like(s.m)), TEXT, Objectives(flow=None, horizon=k), at_w).total
+        total = losses(
+            net,
+            replace(s, z_r=leaf, m=torch.ones_like(s.m)),
+            TEXT,
+            Objectives(flow=None, horizon=k),
+            at_w,
+        ).total
         reached = torch.autograd.grad(total, leaf)[0].abs().amax(dim=(0, 1, 3, 4))
-        block_of_first = (w - k + 1) // 2 * 2 if w - k + 1 > 0 else 0  # a prediction depends on its whole block's source
+        block_of_first = (
+            (w - k + 1) // 2 * 2 if w - k + 1 > 0 else 0
+        )  # a prediction depends on its whole block's source
         assert (reached[:block_of_first] == 0).all()
         assert (reached[w // 2 * 2 + 2 :] == 0).all()
         assert reached[w] > 0
@@ -139,12 +183,22 @@ def test_flow_matching_sends_no_gradient_through_its_history(net: CosmosCausalDi
     leaf = s.z_r.clone().requires_grad_(True)
     later = replace(s, z_r=leaf, m=torch.ones_like(s.m))
     result = losses(net, later, TEXT, Objectives(horizon=0))
-    # With t = 0 at a position its input and target hold the source only through the target z_1 - z_0.
+    # With t = 0 at a position its input and target hold the source only through the target z_1 -
+    # z_0.
     grad = torch.autograd.grad(result.flow, leaf, retain_graph=True)[0]
     own = torch.zeros_like(grad)
     for i in range(0, N, 2):  # each block alone, with its history fixed to the rollout's values
-        part = losses(net, replace(later, z_r=torch.cat([s.z_r[:, :, :i], leaf[:, :, i : i + 2], s.z_r[:, :, i + 2 :]], dim=2)), TEXT,
-                      Objectives(horizon=0)).flow  # fmt: skip
+        part = losses(
+            net,
+            replace(
+                later,
+                z_r=torch.cat(
+                    [s.z_r[:, :, :i], leaf[:, :, i : i + 2], s.z_r[:, :, i + 2 :]], dim=2
+                ),
+            ),
+            TEXT,
+            Objectives(horizon=0),
+        ).flow
         own += torch.autograd.grad(part, leaf)[0]
     torch.testing.assert_close(grad, own, atol=1e-7, rtol=1e-4)
 
@@ -152,9 +206,17 @@ def test_flow_matching_sends_no_gradient_through_its_history(net: CosmosCausalDi
 def test_history_of_every_kind_is_what_its_name_says(net: CosmosCausalDiT) -> None:
     s = sample()
     with torch.no_grad():
-        own, clean, again = (losses(net, s, TEXT, Objectives(flow=kind, horizon=0)).flow for kind in ("own", "clean", "redenoised"))
+        own, clean, again = (
+            losses(net, s, TEXT, Objectives(flow=kind, horizon=0)).flow
+            for kind in ("own", "clean", "redenoised")
+        )
         # a model at almost no noise gives the clean latents back: history as if it were clean
-        near = losses(net, replace(s, t_redenoise=torch.zeros_like(s.t_redenoise)), TEXT, Objectives(flow="redenoised", horizon=0)).flow
+        near = losses(
+            net,
+            replace(s, t_redenoise=torch.zeros_like(s.t_redenoise)),
+            TEXT,
+            Objectives(flow="redenoised", horizon=0),
+        ).flow
     assert len({float(x) for x in (own, clean, again)}) == 3
     torch.testing.assert_close(near, clean, atol=0, rtol=0)
 
@@ -163,7 +225,12 @@ def test_channel_weights_weigh_the_error_of_channels_and_nothing_else(net: Cosmo
     s, ones = sample(), torch.ones(16)
     with torch.no_grad():
         plain = losses(net, s, TEXT, Objectives(horizon=0)).flow
-        parts = [losses(net, s, TEXT, Objectives(horizon=0), channel_weights=16.0 * torch.eye(16)[c]).flow for c in range(16)]
+        parts = [
+            losses(
+                net, s, TEXT, Objectives(horizon=0), channel_weights=16.0 * torch.eye(16)[c]
+            ).flow
+            for c in range(16)
+        ]
         alike = losses(net, s, TEXT, Objectives(horizon=0), channel_weights=ones).flow
     assert plain is not None
     assert alike is not None
@@ -192,13 +259,20 @@ def test_decoded_frames_are_those_of_the_whole_clip() -> None:
     with torch.no_grad():
         vae.decoder.head.weight.copy_(0.02 * noise("head", *vae.decoder.head.weight.shape))
     z, frames = noise("z", 1, 16, 4, H, W), 1 + 4 * 3
-    render, opacity = noise("render", 1, 3, frames, 8 * H, 8 * W).clamp(-1, 1), uniform("opacity", 1, 1, frames, 8 * H, 8 * W)
+    render, opacity = (
+        noise("render", 1, 3, frames, 8 * H, 8 * W).clamp(-1, 1),
+        uniform("opacity", 1, 1, frames, 8 * H, 8 * W),
+    )
     whole = vae.decode(z, render=render, opacity=opacity, clamp=False)
     predictions = []
-    term = DecodedDistance(vae, lambda a, b: predictions.append(a) or a.mean(dim=(1, 2, 3)), z, render, opacity)  # type: ignore[func-returns-value]
+    term = DecodedDistance(
+        vae, lambda a, b: predictions.append(a) or a.mean(dim=(1, 2, 3)), z, render, opacity
+    )  # type: ignore[func-returns-value]
     for w, frames_of_w in ((0, slice(0, 1)), (1, slice(1, 5)), (3, slice(9, 13))):
         term(z, w)
-        torch.testing.assert_close(predictions[-1], whole[0, :, frames_of_w].transpose(0, 1), atol=1e-5, rtol=0)
+        torch.testing.assert_close(
+            predictions[-1], whole[0, :, frames_of_w].transpose(0, 1), atol=1e-5, rtol=0
+        )
 
 
 def test_impossible_objectives_are_refused(net: CosmosCausalDiT) -> None:

@@ -1,4 +1,6 @@
-"""Training streams: a pure function of the update's number, frames in a row within an episode, identity where it is promised."""
+"""Training streams: a pure function of the update's number, frames in a row within an episode,
+identity where it is promised.
+"""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -34,7 +36,13 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def streams(root: Path, **settings: object) -> TrainingStreams:
-    chosen = {"batch": 3, "frames": 2, "crop": (32, 48), "episode": 4, "shares": ALL_KINDS} | settings
+    chosen = {
+        "batch": 3,
+        "frames": 2,
+        "crop": (32, 48),
+        "episode": 4,
+        "shares": ALL_KINDS,
+    } | settings
     return TrainingStreams(root / "pairs", root / "video", **chosen)  # type: ignore[arg-type]
 
 
@@ -52,7 +60,12 @@ def test_update_is_a_pure_function_of_its_number_and_the_seed(root: Path) -> Non
 
 def test_shapes_types_and_ranges_are_those_promised(root: Path) -> None:
     batch = streams(root).update(5)
-    for name, channels, low in (("render", 3, -1), ("opacity", 1, 0), ("map", 3, -1), ("target", 3, -1)):
+    for name, channels, low in (
+        ("render", 3, -1),
+        ("opacity", 1, 0),
+        ("map", 3, -1),
+        ("target", 3, -1),
+    ):
         value = getattr(batch, name)
         assert value.shape == (3, 2, channels, 32, 48)
         assert value.dtype == torch.float32
@@ -107,8 +120,12 @@ def test_undamaged_frames_get_detail_and_damaged_ones_none(root: Path) -> None:
             if episode.grey:
                 assert np.ptp(batch.target[slot].numpy(), axis=1).max() < 0.5  # the grain alone
                 continue
-            index = there_and_back(episode.start + episode.step * (at * 2 + np.arange(2)), len(episode.sequence.clip))
-            raw = episode.sequence.clip.rgb_gt[index, episode.top : episode.top + 32, episode.left : episode.left + 48]
+            index = there_and_back(
+                episode.start + episode.step * (at * 2 + np.arange(2)), len(episode.sequence.clip)
+            )
+            raw = episode.sequence.clip.rgb_gt[
+                index, episode.top : episode.top + 32, episode.left : episode.left + 48
+            ]
             raw = raw[:, :, ::-1] if episode.flip else raw
             plain = np.stack([episode.levels[raw[..., c], c] for c in range(3)], axis=1)
             changed = not np.array_equal(batch.target[slot].numpy(), plain)
@@ -119,8 +136,12 @@ def test_undamaged_frames_get_detail_and_damaged_ones_none(root: Path) -> None:
     grey = np.zeros((2, 3, 64, 64), np.float32)
     noisy = _detailed(grey, 1.0, 0.05, rng)
     assert noisy.std() == pytest.approx(0.05, rel=0.02)  # flat: nothing to sharpen
-    assert abs(np.corrcoef(noisy[0].ravel(), noisy[1].ravel())[0, 1]) < 0.05  # no pattern that stays
-    edge = np.where(np.arange(64) < 32, -0.5, 0.5).astype(np.float32) * np.ones((1, 3, 64, 1), np.float32)
+    assert (
+        abs(np.corrcoef(noisy[0].ravel(), noisy[1].ravel())[0, 1]) < 0.05
+    )  # no pattern that stays
+    edge = np.where(np.arange(64) < 32, -0.5, 0.5).astype(np.float32) * np.ones(
+        (1, 3, 64, 1), np.float32
+    )
     assert np.ptp(_detailed(edge, 1.0, 0.0, rng)) > 1.2 * np.ptp(edge)
 
 
@@ -132,9 +153,14 @@ def test_render_and_target_are_relit_by_the_same_levels(root: Path) -> None:
         if episode.better or episode.moved_px or episode.grey:
             continue
         compared += 1
-        index = there_and_back(episode.start + episode.step * (at * 2 + np.arange(2)), len(episode.sequence.clip))
+        index = there_and_back(
+            episode.start + episode.step * (at * 2 + np.arange(2)), len(episode.sequence.clip)
+        )
         cut = np.s_[episode.top : episode.top + 32, episode.left : episode.left + 48]
-        for channel, shown in ((episode.sequence.clip.rgb_input, batch.render), (episode.sequence.clip.rgb_gt, batch.target)):
+        for channel, shown in (
+            (episode.sequence.clip.rgb_input, batch.render),
+            (episode.sequence.clip.rgb_gt, batch.target),
+        ):
             raw = channel[index[0]][cut][:, ::-1] if episode.flip else channel[index[0]][cut]
             wanted = np.stack([episode.levels[raw[..., c], c] for c in range(3)])
             np.testing.assert_array_equal(shown[0, 0].numpy(), wanted)
@@ -148,7 +174,9 @@ def test_a_moved_render_is_the_truth_out_of_place(root: Path) -> None:
     assert 0.05 < np.mean([episode.moved_px > 0 for episode in episodes]) < 0.3
     plain = replace(episodes[0], moved_px=0.0, better=0.0, grey=False)
     for doubled in (False, True):
-        still, moved = (made._show(replace(plain, moved_px=px, doubled=doubled), 0) for px in (1e-6, 2.0))
+        still, moved = (
+            made._show(replace(plain, moved_px=px, doubled=doubled), 0) for px in (1e-6, 2.0)
+        )
         np.testing.assert_allclose(still[0], still[3], atol=1e-3)
         assert np.abs(moved[0] - moved[3]).mean() > 1e-3
         np.testing.assert_array_equal(moved[3], made._show(plain, 0)[3])
@@ -169,7 +197,10 @@ def test_a_count_keeps_the_list_while_more_are_made(root: Path, tmp_path: Path) 
     before = two.facts()
     make(tmp_path, name="b_011", height=32, width=48)
     assert TrainingStreams(tmp_path, crop=(32, 48), shares=shares, count=2).facts() == before
-    assert TrainingStreams(tmp_path, crop=(32, 48), shares=shares).facts()["pairs_digest"] != before["pairs_digest"]
+    assert (
+        TrainingStreams(tmp_path, crop=(32, 48), shares=shares).facts()["pairs_digest"]
+        != before["pairs_digest"]
+    )
 
 
 def test_reflection_keeps_neighbours_together_on_both_sides() -> None:
@@ -199,7 +230,9 @@ def test_video_needs_a_folder_and_shares_must_add_up(root: Path) -> None:
         StreamShares(0.8, 0.1, 0.1, 0.1)
 
 
-def test_references_are_lit_and_mirrored_with_the_frames_and_renders_may_be_better(root: Path) -> None:
+def test_references_are_lit_and_mirrored_with_the_frames_and_renders_may_be_better(
+    root: Path,
+) -> None:
     made = streams(root, shares=StreamShares(1, 0, 0, 0))
     batch = made.update(3)
     assert batch.references.shape == (3, 2, SLOTS, 32, 48, 4)
@@ -210,7 +243,11 @@ def test_references_are_lit_and_mirrored_with_the_frames_and_renders_may_be_bett
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (2, SLOTS, 4, 6, 4), dtype=np.uint8)
     images[..., 3] = 255
-    plain = replace(episodes[0], flip=False, levels=np.repeat(np.linspace(-1, 1, 256, dtype=np.float32)[:, None], 3, axis=1))
+    plain = replace(
+        episodes[0],
+        flip=False,
+        levels=np.repeat(np.linspace(-1, 1, 256, dtype=np.float32)[:, None], 3, axis=1),
+    )
     exact = replace(plain, references=replace(plain.references, gains=np.ones((SLOTS, 3))))
     shown = _lit_references(images, exact)
     assert np.abs(shown[..., :3] - (images[..., :3] / 127.5 - 1)).max() < 1e-5
@@ -219,7 +256,16 @@ def test_references_are_lit_and_mirrored_with_the_frames_and_renders_may_be_bett
 
 def test_recorded_streets_are_shown_more_often_than_their_number(tmp_path: Path) -> None:
     for i in range(8):
-        make(tmp_path / "pairs", name=f"street_{i:03d}", frames=6, family="drive" if i == 0 else "street")
+        make(
+            tmp_path / "pairs",
+            name=f"street_{i:03d}",
+            frames=6,
+            family="drive" if i == 0 else "street",
+        )
     made = streams(tmp_path, shares=StreamShares(1, 0, 0, 0))
-    shown = [made.episode_of(slot, i)[0].sequence.info["family"] for slot in range(3) for i in range(0, 400, 4)]
+    shown = [
+        made.episode_of(slot, i)[0].sequence.info["family"]
+        for slot in range(3)
+        for i in range(0, 400, 4)
+    ]
     assert 0.25 < np.mean([family == "drive" for family in shown]) < 0.55

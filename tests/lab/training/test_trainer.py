@@ -1,4 +1,6 @@
-"""The training loop: resuming gives equal weights, and a non-finite loss or a full disk loses nothing."""
+"""The training loop: resuming gives equal weights, and a non-finite loss or a full disk loses
+nothing.
+"""
 
 import json
 import os
@@ -28,12 +30,16 @@ def batch(index: int) -> Tensor:
 TRUTH = torch.arange(12.0).reshape(3, 4) / 12
 
 
-def trainer(folder: Path, schedule: Schedule, facts: str = "a", bad_at: int = -1) -> Trainer[Tensor]:
+def trainer(
+    folder: Path, schedule: Schedule, facts: str = "a", bad_at: int = -1
+) -> Trainer[Tensor]:
     model = Linear()
 
     def loss(x: Tensor, index: int) -> tuple[Tensor, dict[str, float]]:
         error = ((x @ model.weight.T + model.bias - x @ TRUTH.T) ** 2).mean()
-        return (error * float("nan") if index == bad_at else error), {"error": float(error.detach())}
+        return (error * float("nan") if index == bad_at else error), {
+            "error": float(error.detach())
+        }
 
     return Trainer(model, folder, schedule, batch, loss, {"data": facts})
 
@@ -56,7 +62,9 @@ def test_resumed_run_ends_with_equal_weights_and_log(tmp_path: Path) -> None:
     again.run()
     for name, p in whole.averaged().items():
         assert torch.equal(p, again.averaged()[name])
-    steps = [line.split(",")[0] for line in (tmp_path / "cut" / "log.jsonl").read_text().splitlines()]
+    steps = [
+        line.split(",")[0] for line in (tmp_path / "cut" / "log.jsonl").read_text().splitlines()
+    ]
     assert steps == [f'{{"step": {i}' for i in range(1, 21)]
 
 
@@ -113,10 +121,13 @@ def test_learning_rate_rises_then_falls_along_a_cosine() -> None:
 
 def test_learning_rate_falls_exponentially_or_stays() -> None:
     s = Schedule(steps=110, peak_lr=2.0, warmup=10, decay="exponential", last_share=0.01)
-    assert [s.lr(step) for step in (4, 10, 60, 110, 500)] == pytest.approx([1.0, 2.0, 0.2, 0.02, 0.02])
-    assert [Schedule(steps=110, peak_lr=2.0, warmup=10, decay="constant").lr(step) for step in (4, 10, 110)] == pytest.approx(
-        [1.0, 2.0, 2.0]
+    assert [s.lr(step) for step in (4, 10, 60, 110, 500)] == pytest.approx(
+        [1.0, 2.0, 0.2, 0.02, 0.02]
     )
+    assert [
+        Schedule(steps=110, peak_lr=2.0, warmup=10, decay="constant").lr(step)
+        for step in (4, 10, 110)
+    ] == pytest.approx([1.0, 2.0, 2.0])
 
 
 @pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="this system has no /dev/full")
@@ -127,7 +138,9 @@ def test_full_disk_under_the_log_has_four_parts(tmp_path: Path) -> None:
     assert caught.value.doing == "writing a training log"
 
 
-def test_full_disk_under_the_checkpoint_has_four_parts_and_keeps_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_under_the_checkpoint_has_four_parts_and_keeps_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     t = trainer(tmp_path, Schedule(steps=4, save_every=2))
     t.run(until=2)
 
@@ -154,7 +167,9 @@ def two_parts(folder: Path, schedule: Schedule, parts: dict[str, PartSchedule]) 
 
     def loss(x: Tensor, index: int) -> tuple[Tensor, dict[str, float]]:
         trained = (model.critic, model.student) if index % 3 == 0 else (model.critic,)
-        return torch.stack([((x @ part.weight.T + part.bias - x @ TRUTH.T) ** 2).mean() for part in trained]).sum(), {}
+        return torch.stack(
+            [((x @ part.weight.T + part.bias - x @ TRUTH.T) ** 2).mean() for part in trained]
+        ).sum(), {}
 
     return Trainer(model, folder, schedule, batch, loss, {}, parts=parts)
 
@@ -162,12 +177,16 @@ def two_parts(folder: Path, schedule: Schedule, parts: dict[str, PartSchedule]) 
 PARTS = {"student": PartSchedule(rate=0.5), "critic": PartSchedule(betas=(0.0, 0.9), clip=1e-3)}
 
 
-def test_parts_have_rates_and_clips_of_their_own_and_rest_without_a_gradient(tmp_path: Path) -> None:
+def test_parts_have_rates_and_clips_of_their_own_and_rest_without_a_gradient(
+    tmp_path: Path,
+) -> None:
     schedule = Schedule(steps=6, peak_lr=0.01, warmup=1, weight_decay=0.0, clip=100.0)
     t = two_parts(tmp_path, schedule, PARTS)
     t.run(until=1)
     first = {name: p.detach().clone() for name, p in t.parameters.items()}
-    assert float(first["student.weight"].abs().max()) == pytest.approx(0.005, rel=1e-3), "Adam's first step is the rate"
+    assert float(first["student.weight"].abs().max()) == pytest.approx(0.005, rel=1e-3), (
+        "Adam's first step is the rate"
+    )
     assert float(first["critic.weight"].abs().max()) == pytest.approx(0.01, rel=1e-3)
     average = t.average["student.weight"].clone()
     t.run(until=3)

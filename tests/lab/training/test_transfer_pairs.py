@@ -17,15 +17,26 @@ from alpasim_plugin.lab.training import transfer_pairs
 from alpasim_plugin.lab.training.hand_held import Hand, hand_held
 from alpasim_plugin.lab.training.pair_store import PairSequence
 from alpasim_plugin.lab.training.transfer_pairs import make_transfer_sequence
-from alpasim_plugin.lab.training.transfer_scenes import FAMILIES, SPLITS, check_frozen, freeze, transfer_scene
+from alpasim_plugin.lab.training.transfer_scenes import (
+    FAMILIES,
+    SPLITS,
+    check_frozen,
+    freeze,
+    transfer_scene,
+)
 
-EYE, TARGET = np.array([[0.0, 0, 1.5], [1.0, 0, 1.5], [2.0, 0.5, 1.5]]), np.array([[3.0, 0, 1], [4.0, 1, 1], [5.0, 1, 1]])
+EYE, TARGET = (
+    np.array([[0.0, 0, 1.5], [1.0, 0, 1.5], [2.0, 0.5, 1.5]]),
+    np.array([[3.0, 0, 1], [4.0, 1, 1], [5.0, 1, 1]]),
+)
 T_S = np.arange(40) / 10
 
 
 def test_scenes_are_those_that_were_frozen_and_splits_share_none() -> None:
     check_frozen()
-    scenes = {split: [transfer_scene(split, i) for i in range(SPLITS[split].count)] for split in SPLITS}
+    scenes = {
+        split: [transfer_scene(split, i) for i in range(SPLITS[split].count)] for split in SPLITS
+    }
     assert {split: len(many) for split, many in scenes.items()} == {"train": 32, "test": 8}
     assert {scene.family for scene in scenes["test"]} == set(FAMILIES)
     assert len({scene.seed for many in scenes.values() for scene in many}) == 40
@@ -47,14 +58,23 @@ def test_a_scene_that_is_defined_otherwise_is_named(tmp_path: Path) -> None:
 
 def test_a_hand_is_that_of_its_key_and_two_takes_stay_near_each_other() -> None:
     first, same, other, unkeyed = (
-        hand_held(EYE, TARGET, T_S, Hand(), "scene", seed, take) for seed, take in ((0, "a"), (0, "a"), (0, "b"), (1, "a"))
+        hand_held(EYE, TARGET, T_S, Hand(), "scene", seed, take)
+        for seed, take in ((0, "a"), (0, "a"), (0, "b"), (1, "a"))
     )
     np.testing.assert_array_equal(first, same)
     assert np.abs(first - unkeyed).max() > 1e-3
     apart = np.linalg.norm(first[:, :3, 3] - other[:, :3, 3], axis=1)
     assert 0.02 < apart.max() < 0.5
-    np.testing.assert_allclose(first[:, :3, :3] @ np.swapaxes(first[:, :3, :3], 1, 2), np.tile(np.eye(3), (40, 1, 1)), atol=1e-9)
-    turn = np.degrees(np.arccos(np.clip((np.einsum("tij,tij->t", first[1:, :3, :3], first[:-1, :3, :3]) - 1) / 2, -1, 1)))
+    np.testing.assert_allclose(
+        first[:, :3, :3] @ np.swapaxes(first[:, :3, :3], 1, 2),
+        np.tile(np.eye(3), (40, 1, 1)),
+        atol=1e-9,
+    )
+    turn = np.degrees(
+        np.arccos(
+            np.clip((np.einsum("tij,tij->t", first[1:, :3, :3], first[:-1, :3, :3]) - 1) / 2, -1, 1)
+        )
+    )
     assert 0.1 < turn.mean() < 4.0  # degrees between frames: all three angles move
 
 
@@ -68,7 +88,9 @@ def test_without_unrest_the_camera_looks_at_its_target_upright() -> None:
     assert (poses[:, 2, 1] < 0).all()  # y points down
 
 
-def test_a_sequence_has_the_form_of_all_pairs_a_black_map_and_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sequence_has_the_form_of_all_pairs_a_black_map_and_is_made_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(transfer_pairs, "build_place", partial(build_place, coarseness=6.0))
     scene = replace(transfer_scene("test", 1), frames=6)
     folder = tmp_path / "test" / scene.name
@@ -86,6 +108,8 @@ def test_a_sequence_has_the_form_of_all_pairs_a_black_map_and_is_made_once(tmp_p
 
 
 @pytest.mark.parametrize("split", ["val", "test,test"])
-def test_an_unknown_split_is_refused(split: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_split_is_refused(
+    split: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(["train", "transfer", "--out", str(tmp_path), "--split", split]) == 2
     assert "choose from train, test" in " ".join(capsys.readouterr().err.split())

@@ -1,4 +1,6 @@
-"""Training the tiny autoencoder: draws repeat, the loss falls, quality is what its definition says."""
+"""Training the tiny autoencoder: draws repeat, the loss falls, quality is what its definition
+says.
+"""
 
 from pathlib import Path
 
@@ -28,7 +30,10 @@ def test_a_draw_repeats_and_its_channels_belong_together(tmp_path: Path) -> None
     torch.testing.assert_close(damaged, (grey.round() / 2).floor(), atol=1e-3, rtol=0)
     np.testing.assert_allclose(one.sdmap, -one.target, atol=1e-6)
     assert set(one.opacity.unique().tolist()) <= {0.0, 1.0}
-    assert any(not torch.equal(one.target, draw_pair_clip(sequences, SIZE, 7, i).target) for i in range(4, 8))
+    assert any(
+        not torch.equal(one.target, draw_pair_clip(sequences, SIZE, 7, i).target)
+        for i in range(4, 8)
+    )
 
 
 def test_clip_larger_than_the_frames_is_refused(tmp_path: Path) -> None:
@@ -41,10 +46,22 @@ def test_clip_larger_than_the_frames_is_refused(tmp_path: Path) -> None:
 def test_a_few_updates_lower_the_loss_of_every_kind(tmp_path: Path) -> None:
     vae = TinyVAE.random()
     video = make(tmp_path, name="v").clip.rgb_gt
-    task = VaeTask(vae, [make(tmp_path)], [np.asarray(video)], VaeRecipe(pair_clips=1, size=SIZE, latent_noise=0.0))
+    task = VaeTask(
+        vae,
+        [make(tmp_path)],
+        [np.asarray(video)],
+        VaeRecipe(pair_clips=1, size=SIZE, latent_noise=0.0),
+    )
     fixed = task.batch(0)
     before = task.loss(fixed, 0)[1]
-    Trainer(vae, tmp_path / "run", Schedule(steps=12, peak_lr=2e-3, warmup=2), lambda _: fixed, task.loss, task.facts).run()
+    Trainer(
+        vae,
+        tmp_path / "run",
+        Schedule(steps=12, peak_lr=2e-3, warmup=2),
+        lambda _: fixed,
+        task.loss,
+        task.facts,
+    ).run()
     after = task.loss(fixed, 0)[1]
     for kind in ("latent", "render", "video", "auxiliary"):
         assert after[kind] < before[kind]
@@ -52,7 +69,9 @@ def test_a_few_updates_lower_the_loss_of_every_kind(tmp_path: Path) -> None:
 
 def test_quality_of_a_known_error() -> None:
     wanted = torch.full((1, 3, 4, 8, 8), 100 / 127.5 - 1)
-    made = wanted + 3 / 127.5 * torch.tensor([1.0, -1.0, 1.0, -1.0])[None, None, :, None, None]  # three grey levels up and down
+    made = (
+        wanted + 3 / 127.5 * torch.tensor([1.0, -1.0, 1.0, -1.0])[None, None, :, None, None]
+    )  # three grey levels up and down
     q = quality(made, wanted)
     assert q.psnr_db == pytest.approx(20 * np.log10(255 / 3))
     assert (q.flicker, q.copy_flicker) == (pytest.approx(6.0), 0.0)
@@ -61,7 +80,10 @@ def test_quality_of_a_known_error() -> None:
 
 def test_stats_of_random_latents_are_those_of_their_sample() -> None:
     vae = TinyVAE.random()
-    clips = [torch.from_numpy(np.random.default_rng(i).uniform(-1, 1, (1, 3, 5, 16, 24))).float() for i in range(3)]
+    clips = [
+        torch.from_numpy(np.random.default_rng(i).uniform(-1, 1, (1, 3, 5, 16, 24))).float()
+        for i in range(3)
+    ]
     mean, std = measure_stats(vae, clips)
     z = torch.cat([vae.encode(c).flatten(2)[0] for c in clips], dim=1)
     torch.testing.assert_close(mean, z.mean(1))
@@ -79,9 +101,12 @@ def test_channel_amplitudes_are_what_an_error_of_a_channel_does_to_pixels() -> N
     assert float(weights.mean()) == pytest.approx(1.0)
     assert torch.equal(weights, channel_amplitudes(vae))
     assert weights.requires_grad is False
-    # Untrained, the picture is linear in the latents: a channel whose unit is five times as large shows five times as strongly.
+    # Untrained, the picture is linear in the latents: a channel whose unit is five times as large
+    # shows five times as strongly.
     assert int(weights.argmax()) == 0, "brightness"
     vae.stats = LatentStats([0.0] * 16, [*[1.0] * 3, 5.0, *[1.0] * 12], stored=True)
     louder = channel_amplitudes(vae)
-    torch.testing.assert_close(louder[3] / louder[0], 5 * weights[3] / weights[0], atol=0.0, rtol=1e-3)
+    torch.testing.assert_close(
+        louder[3] / louder[0], 5 * weights[3] / weights[0], atol=0.0, rtol=1e-3
+    )
     torch.testing.assert_close(louder[4] / louder[0], weights[4] / weights[0], atol=0.0, rtol=1e-3)

@@ -1,4 +1,6 @@
-"""Recorded videos as sequences: two parts that do not meet, and damage that holes, blurs and moves along."""
+"""Recorded videos as sequences: two parts that do not meet, and damage that holes, blurs and moves
+along.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,13 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.lab.training.pair_store import PairDataset
 from alpasim_plugin.lab.training.video_damage import SplatDamage, damage_video, draw_damage
-from alpasim_plugin.lab.training.video_pairs import HELD_OUT, TRAIN, VideoRecipe, make_video_pairs, split_frames
+from alpasim_plugin.lab.training.video_pairs import (
+    HELD_OUT,
+    TRAIN,
+    VideoRecipe,
+    make_video_pairs,
+    split_frames,
+)
 from alpasim_plugin.log.video import read_mp4, write_mp4
 
 MILD = SplatDamage(2.5, 0.75, 0.3, 0.0, 0.0, 0.0, 0, 60.0, 0.0)
@@ -22,19 +30,27 @@ MILD = SplatDamage(2.5, 0.75, 0.3, 0.0, 0.0, 0.0, 0, 60.0, 0.0)
 def moving(frames: int, step_px: int = 2, height: int = 48, width: int = 80) -> np.ndarray:
     """Return a smooth pattern that moves to the left."""
     rng = np.random.default_rng(0)
-    wide = cv2.resize(rng.random((8, 40, 3)).astype(np.float32), (width * 4, height), interpolation=cv2.INTER_CUBIC)
+    wide = cv2.resize(
+        rng.random((8, 40, 3)).astype(np.float32),
+        (width * 4, height),
+        interpolation=cv2.INTER_CUBIC,
+    )
     wide = np.clip(wide * 255, 0, 255).astype(np.uint8)
     return np.stack([wide[:, i * step_px : i * step_px + width] for i in range(frames)])
 
 
-def damaged(frames: np.ndarray, damage: SplatDamage, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def damaged(
+    frames: np.ndarray, damage: SplatDamage, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     images, opacities = zip(*damage_video(frames, damage, np.random.default_rng(seed)), strict=True)
     return np.stack(images), np.stack(opacities)
 
 
 def test_damage_depends_on_its_generator_alone() -> None:
     frames = moving(3)
-    one, again, other = damaged(frames, MILD), damaged(frames, MILD), damaged(frames, MILD, seed=1)
+    one = damaged(frames, MILD)
+    again = damaged(frames, MILD)
+    other = damaged(frames, MILD, seed=1)
     np.testing.assert_array_equal(one[0], again[0])
     assert not np.array_equal(one[0], other[0])
 
@@ -70,16 +86,22 @@ def test_damage_moves_with_the_image() -> None:
     frames = moving(8)
     images, _ = damaged(frames, SplatDamage(3.5, 0.7, 0.4, 0.0, 0.03, 0.05, 0, 200.0, 0.0))
     error = images.astype(float) - frames
-    along = np.abs(error[6, :, :-2] - error[5, :, 2:]).mean()  # moved by the two pixels of the motion
+    along = np.abs(
+        error[6, :, :-2] - error[5, :, 2:]
+    ).mean()  # moved by the two pixels of the motion
     fixed = np.abs(error[6] - error[5]).mean()
-    afresh = np.abs(error[6] - (damaged(frames, MILD, seed=9)[0][6].astype(float) - frames[6])).mean()
+    afresh = np.abs(
+        error[6] - (damaged(frames, MILD, seed=9)[0][6].astype(float) - frames[6])
+    ).mean()
     assert along < 0.75 * min(fixed, afresh)
 
 
 def test_drawn_damages_differ_and_grow_with_the_frames() -> None:
     drawn = [draw_damage(np.random.default_rng(i), 256) for i in range(40)]
     assert min(d.hole_share for d in drawn) < 0.02 < 0.05 < max(d.hole_share for d in drawn)
-    assert draw_damage(np.random.default_rng(0), 1024).cell_px == pytest.approx(2 * drawn[0].cell_px)
+    assert draw_damage(np.random.default_rng(0), 1024).cell_px == pytest.approx(
+        2 * drawn[0].cell_px
+    )
 
 
 def test_parts_of_a_video_do_not_meet() -> None:
@@ -94,7 +116,17 @@ def test_parts_of_a_video_do_not_meet() -> None:
 def test_command_writes_both_parts_once_with_the_frames_of_the_video(tmp_path: Path) -> None:
     source, out = tmp_path / "drive.mp4", tmp_path / "video"
     write_mp4(source, moving(20), 10, crf=4)
-    command = ["train", "video", str(source), "--out", str(out), "--size", "64x32", "--variants", "2"]
+    command = [
+        "train",
+        "video",
+        str(source),
+        "--out",
+        str(out),
+        "--size",
+        "64x32",
+        "--variants",
+        "2",
+    ]
     assert run_command(command) == 0
     frames = read_mp4(source).frames
     for split, first, count in ((TRAIN, 0, 14), (HELD_OUT, 15, 5)):
@@ -114,5 +146,6 @@ def test_command_writes_both_parts_once_with_the_frames_of_the_video(tmp_path: P
     assert run_command(command) == 0
     assert (out / TRAIN / sequences[0].name / "sequence.json").stat().st_mtime_ns == made
     assert list(make_video_pairs(source, out, VideoRecipe((64, 32)))) == [
-        (folder, False) for folder in sorted([*(out / TRAIN).iterdir()]) + sorted([*(out / HELD_OUT).iterdir()])
+        (folder, False)
+        for folder in sorted([*(out / TRAIN).iterdir()]) + sorted([*(out / HELD_OUT).iterdir()])
     ]

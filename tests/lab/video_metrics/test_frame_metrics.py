@@ -15,7 +15,9 @@ from alpasim_plugin.lab.video_metrics.frames import identical_frames, psnr_db, s
 
 RNG = stream("video", 0, "frames")
 TRUTH: U8 = RNG.integers(0, 256, (3, 20, 27, 3)).astype(np.uint8)
-SMOOTH: U8 = np.stack([np.add.outer(np.arange(24) * 4, np.arange(31) * 3)] * 3, axis=-1)[None].astype(np.uint8)
+SMOOTH: U8 = np.stack([np.add.outer(np.arange(24) * 4, np.arange(31) * 3)] * 3, axis=-1)[
+    None
+].astype(np.uint8)
 
 
 def slow_ssim(a: U8, b: U8) -> float:
@@ -31,14 +33,20 @@ def slow_ssim(a: U8, b: U8) -> float:
             return convolve2d(image, window, mode="same", boundary="fill", fillvalue=0)
 
         mp, mq = mean(p), mean(q)
-        vp, vq, cov = mean(p * p) - mp**2, mean(q * q) - mq**2, mean(p * q) - mp * mq
-        values.append((2 * mp * mq + 1e-4) * (2 * cov + 9e-4) / ((mp**2 + mq**2 + 1e-4) * (vp + vq + 9e-4)))
+        vp = mean(p * p) - mp**2
+        vq = mean(q * q) - mq**2
+        cov = mean(p * q) - mp * mq
+        values.append(
+            (2 * mp * mq + 1e-4) * (2 * cov + 9e-4) / ((mp**2 + mq**2 + 1e-4) * (vp + vq + 9e-4))
+        )
     return float(np.mean(values))
 
 
 @pytest.mark.parametrize("noise", [1, 10, 60])
 def test_ssim_equals_the_slow_one(noise: int) -> None:
-    made = np.clip(SMOOTH.astype(int) + RNG.integers(-noise, noise + 1, SMOOTH.shape), 0, 255).astype(np.uint8)
+    made = np.clip(
+        SMOOTH.astype(int) + RNG.integers(-noise, noise + 1, SMOOTH.shape), 0, 255
+    ).astype(np.uint8)
     assert ssim(made, SMOOTH)[0] == pytest.approx(slow_ssim(made[0], SMOOTH[0]), abs=2e-5)
 
 
@@ -50,7 +58,9 @@ def test_ssim_of_black_against_white_and_of_flat_frames() -> None:
 
 def test_pictures_smaller_than_the_window_have_an_ssim() -> None:
     small = TRUTH[:1, :7, :6]
-    assert ssim(small[:, ::-1], small)[0] == pytest.approx(slow_ssim(small[0, ::-1], small[0]), abs=2e-5)
+    assert ssim(small[:, ::-1], small)[0] == pytest.approx(
+        slow_ssim(small[0, ::-1], small[0]), abs=2e-5
+    )
 
 
 def test_psnr_of_a_known_error_and_of_identical_frames() -> None:
@@ -73,7 +83,12 @@ def test_one_wrong_value_in_a_large_frame_stays_below_the_cap() -> None:
 @pytest.mark.parametrize("metric", [psnr_db, ssim])
 @pytest.mark.parametrize(
     ("made", "words"),
-    [(TRUTH[:2], "shapes"), (TRUTH.astype(np.float32), "float32"), (TRUTH[:0], r"\(0, 20, 27, 3\)"), (TRUTH[..., 0], "uint8")],
+    [
+        (TRUTH[:2], "shapes"),
+        (TRUTH.astype(np.float32), "float32"),
+        (TRUTH[:0], r"\(0, 20, 27, 3\)"),
+        (TRUTH[..., 0], "uint8"),
+    ],
 )
 def test_videos_that_do_not_belong_together_are_refused(metric, made, words) -> None:
     with pytest.raises(EvaluatorError, match=words):
@@ -83,16 +98,23 @@ def test_videos_that_do_not_belong_together_are_refused(metric, made, words) -> 
 def test_equal_images_have_ssim_one_and_noise_lowers_it() -> None:
     a = RNG.integers(0, 256, (40, 60, 3), dtype=np.uint8)
     assert image_metrics.ssim(a, a) == pytest.approx(1.0)
-    near, far = ((a.astype(int) + RNG.integers(-n, n + 1, a.shape)).clip(0, 255).astype(np.uint8) for n in (10, 90))
+    near, far = (
+        (a.astype(int) + RNG.integers(-n, n + 1, a.shape)).clip(0, 255).astype(np.uint8)
+        for n in (10, 90)
+    )
     assert 1 > image_metrics.ssim(a, near) > image_metrics.ssim(a, far) > 0
 
 
 @pytest.mark.parametrize(("low", "peak"), [(0, 255.0), (0, 1.0), (-1, 2.0)])
 def test_the_range_of_values_does_not_change_psnr(low: int, peak: float) -> None:
     a = np.full((2, 2, 3), low, np.float32)
-    assert image_metrics.psnr_db(a, a + np.float32(peak / 255), peak) == pytest.approx(20 * np.log10(255), abs=1e-4)
+    assert image_metrics.psnr_db(a, a + np.float32(peak / 255), peak) == pytest.approx(
+        20 * np.log10(255), abs=1e-4
+    )
 
 
 def test_ssim_of_floats_equals_that_of_their_eight_bits() -> None:
     a, b = TRUTH[0], TRUTH[1]
-    assert image_metrics.ssim(a / np.float32(255), b / np.float32(255), peak=1.0) == pytest.approx(image_metrics.ssim(a, b), abs=1e-6)
+    assert image_metrics.ssim(a / np.float32(255), b / np.float32(255), peak=1.0) == pytest.approx(
+        image_metrics.ssim(a, b), abs=1e-6
+    )

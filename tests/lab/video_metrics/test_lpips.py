@@ -1,4 +1,6 @@
-"""LPIPS: shapes and laws with random trunks; published values only where the published weights are on disk."""
+"""LPIPS: shapes and laws with random trunks; published values only where the published weights are
+on disk.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +16,21 @@ import torch
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.fixers.network.checkpoints import file_sha256
-from alpasim_plugin.lab.video_metrics.image_distance import FOLDER_VARIABLE, available, distance_for_training, load_distance
+from alpasim_plugin.lab.video_metrics.image_distance import (
+    FOLDER_VARIABLE,
+    available,
+    distance_for_training,
+    load_distance,
+)
 from alpasim_plugin.lab.video_metrics.lpips import LPIPS, TRUNKS, Kind, load_lpips
 
 KINDS: tuple[Kind, ...] = ("alex", "vgg")
 
 
 def pictures(seed: int, count: int = 2, side: int = 64) -> torch.Tensor:
-    return torch.from_numpy(stream("nets", seed, "lpips").uniform(-1, 1, (count, 3, side, side))).float()
+    return torch.from_numpy(
+        stream("nets", seed, "lpips").uniform(-1, 1, (count, 3, side, side))
+    ).float()
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -34,7 +43,9 @@ def test_activations_have_the_published_channels_and_sizes(net: LPIPS) -> None:
     channels = {"alex": [64, 192, 384, 256, 256], "vgg": [64, 128, 256, 512, 512]}[net.kind]
     sides = {"alex": [15, 7, 3, 3, 3], "vgg": [64, 32, 16, 8, 4]}[net.kind]
     found = net.activations(pictures(0, 1))
-    assert [list(x.shape) for x in found] == [[1, c, s, s] for c, s in zip(channels, sides, strict=True)]
+    assert [list(x.shape) for x in found] == [
+        [1, c, s, s] for c, s in zip(channels, sides, strict=True)
+    ]
     assert all(float(x.min()) >= 0 for x in found)
 
 
@@ -45,7 +56,21 @@ def test_trunks_have_the_published_number_of_weights() -> None:
 
 def test_convolutions_are_named_as_in_the_published_files() -> None:
     assert [c.index for c in TRUNKS["alex"].convolutions] == [0, 3, 6, 8, 10]
-    assert [c.index for c in TRUNKS["vgg"].convolutions] == [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]
+    assert [c.index for c in TRUNKS["vgg"].convolutions] == [
+        0,
+        2,
+        5,
+        7,
+        10,
+        12,
+        14,
+        17,
+        19,
+        21,
+        24,
+        26,
+        28,
+    ]
 
 
 def test_identity_symmetry_and_independence_of_the_batch(net: LPIPS) -> None:
@@ -61,23 +86,36 @@ def test_identity_symmetry_and_independence_of_the_batch(net: LPIPS) -> None:
 def test_colours_are_shifted_and_scaled_before_the_trunk(net: LPIPS) -> None:
     middle = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1).expand(1, 3, 64, 64)
     first = net.plan.convolutions[0]
-    x = net.features[str(first.index)](torch.zeros(1, 3, 64, 64))  # those colours are the zero that the trunk sees
+    x = net.features[str(first.index)](
+        torch.zeros(1, 3, 64, 64)
+    )  # those colours are the zero that the trunk sees
     if not first.tapped:
         x = net.features["2"](torch.relu(x))
     torch.testing.assert_close(net.activations(middle)[0], torch.relu(x))
 
 
 def write(folder: Path, kind: Kind) -> None:
-    """Write random weights under the published names; their digests are wrong unless a test says otherwise."""
+    """Write random weights under the published names; their digests are wrong unless a test says
+    otherwise.
+    """
     plan, net = TRUNKS[kind], LPIPS(kind)
     layers = [(f"features.{c.index}", net.features[str(c.index)]) for c in plan.convolutions]
-    trunk = {f"{name}.{part}": getattr(layer, part).detach() for name, layer in layers for part in ("weight", "bias")}
-    heads = {f"lin{i}.model.1.weight": head.detach().view(1, -1, 1, 1) for i, head in enumerate(net.heads)}
+    trunk = {
+        f"{name}.{part}": getattr(layer, part).detach()
+        for name, layer in layers
+        for part in ("weight", "bias")
+    }
+    heads = {
+        f"lin{i}.model.1.weight": head.detach().view(1, -1, 1, 1)
+        for i, head in enumerate(net.heads)
+    }
     torch.save(trunk | {"classifier.1.weight": torch.zeros(2, 2)}, folder / plan.file)
     torch.save(heads, folder / plan.heads_file)
 
 
-def test_missing_weights_are_named_and_no_number_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_weights_are_named_and_no_number_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv(FOLDER_VARIABLE, raising=False)
     with pytest.raises(InputError, match=r"alexnet-owt-7be5be79.pth, lpips-v0.1-alex.pth"):
         load_lpips("alex", tmp_path)
@@ -95,14 +133,22 @@ def test_files_with_other_content_are_refused(tmp_path: Path) -> None:
         load_lpips("alex", tmp_path)
 
 
-def test_published_layout_is_read_tensor_by_tensor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the digests of made-up files in place of the published ones; everything else is as for a user."""
+def test_published_layout_is_read_tensor_by_tensor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the digests of made-up files in place of the published ones; everything else is as for a
+    user.
+    """
     write(tmp_path, "alex")
     plan = TRUNKS["alex"]
     digest = file_sha256(tmp_path / plan.file)
     named = f"alexnet-owt-{digest[:8]}.pth"
     (tmp_path / plan.file).rename(tmp_path / named)
-    monkeypatch.setitem(TRUNKS, "alex", replace(plan, file=named, heads_sha256=file_sha256(tmp_path / plan.heads_file)))
+    monkeypatch.setitem(
+        TRUNKS,
+        "alex",
+        replace(plan, file=named, heads_sha256=file_sha256(tmp_path / plan.heads_file)),
+    )
     net = load_lpips("alex", tmp_path)
     stored = torch.load(tmp_path / named, weights_only=True)
     for c in plan.convolutions:
@@ -110,7 +156,11 @@ def test_published_layout_is_read_tensor_by_tensor(tmp_path: Path, monkeypatch: 
     assert available(tmp_path) == ("perceptual-syn", "lpips_alex")
     assert not any(p.requires_grad for p in net.parameters())
     torch.save({"features.0.weight": torch.zeros(1)}, tmp_path / plan.heads_file)
-    monkeypatch.setitem(TRUNKS, "alex", replace(TRUNKS["alex"], heads_sha256=file_sha256(tmp_path / plan.heads_file)))
+    monkeypatch.setitem(
+        TRUNKS,
+        "alex",
+        replace(TRUNKS["alex"], heads_sha256=file_sha256(tmp_path / plan.heads_file)),
+    )
     with pytest.raises(InputError, match=r"lin0.model.1.weight"):
         load_lpips("alex", tmp_path)
 
@@ -122,7 +172,12 @@ def test_published_values_where_the_weights_are_there(shared_data: Path) -> None
     net = load_lpips("alex", folder)
     white = torch.ones(1, 3, 64, 64)
     assert float(net.distance(-white, white)) == pytest.approx(0.8140091, abs=1e-5)
-    images = [cv2.imread(str(shared_data / "lpips" / f"{n}.png"))[..., ::-1] for n in ("ex_ref", "ex_p0", "ex_p1")]
-    ref, p0, p1 = (torch.from_numpy(np.ascontiguousarray(x)).permute(2, 0, 1)[None] / 127.5 - 1 for x in images)
+    images = [
+        cv2.imread(str(shared_data / "lpips" / f"{n}.png"))[..., ::-1]
+        for n in ("ex_ref", "ex_p0", "ex_p1")
+    ]
+    ref, p0, p1 = (
+        torch.from_numpy(np.ascontiguousarray(x)).permute(2, 0, 1)[None] / 127.5 - 1 for x in images
+    )
     assert float(net.distance(ref, p0)) == pytest.approx(0.722, abs=5e-4)
     assert float(net.distance(ref, p1)) == pytest.approx(0.138, abs=5e-4)

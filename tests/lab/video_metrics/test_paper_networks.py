@@ -1,4 +1,6 @@
-"""Loaders of FVD's and DISTS's networks, on random weights of the same form; published values only where the weights are on disk."""
+"""Loaders of FVD's and DISTS's networks, on random weights of the same form; published values only
+where the weights are on disk.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,10 @@ from alpasim_plugin.lab.video_metrics.lpips import TRUNKS
 # VGG-16 with a sixteenth of its channels: the published one costs seconds.
 SMALL = replace(
     TRUNKS["vgg"],
-    convolutions=tuple(replace(c, inputs=max(c.inputs // 16, 3), outputs=c.outputs // 16) for c in TRUNKS["vgg"].convolutions),
+    convolutions=tuple(
+        replace(c, inputs=max(c.inputs // 16, 3), outputs=c.outputs // 16)
+        for c in TRUNKS["vgg"].convolutions
+    ),
 )
 
 
@@ -30,11 +35,18 @@ class RandomI3D(nn.Module):
         super().__init__()
         self.layer = nn.Conv3d(3, logits, (2, 8, 8), (2, 8, 8))
 
-    def forward(self, video: Tensor, rescale: bool = True, resize: bool = True, return_features: bool = True) -> Tensor:
+    def forward(
+        self, video: Tensor, rescale: bool = True, resize: bool = True, return_features: bool = True
+    ) -> Tensor:
         x = video / 127.5 - 1 if rescale else video
         if resize:
             b, c, t, h, w = x.shape
-            x = nn.functional.interpolate(x.transpose(1, 2).reshape(b * t, c, h, w), size=[16, 16], mode="bilinear", align_corners=False)
+            x = nn.functional.interpolate(
+                x.transpose(1, 2).reshape(b * t, c, h, w),
+                size=[16, 16],
+                mode="bilinear",
+                align_corners=False,
+            )
             x = x.reshape(b, t, c, 16, 16).transpose(1, 2)
         return self.layer(x).mean([2, 3, 4])
 
@@ -56,7 +68,9 @@ def test_features_are_one_vector_a_clip_or_a_window(tmp_path: Path) -> None:
     assert windows.shape == (2, 400)
     tensor = torch.from_numpy(video[16:32]).permute(3, 0, 1, 2)[None].float()
     with torch.inference_mode():
-        assert windows[1] == pytest.approx(own(tensor)[0].numpy(), rel=1e-4, abs=1e-6)  # scaled from 0..255 inside
+        assert windows[1] == pytest.approx(
+            own(tensor)[0].numpy(), rel=1e-4, abs=1e-6
+        )  # scaled from 0..255 inside
 
 
 def test_a_missing_file_and_other_forms_are_refused(tmp_path: Path) -> None:
@@ -117,7 +131,9 @@ def test_dists_of_the_image_stage_alone_is_its_formula(net: DISTS) -> None:
     mx, my = x.mean((2, 3)), y.mean((2, 3))
     covariance = (x * y).mean((2, 3)) - mx * my
     s1 = (2 * mx * my + 1e-6) / (mx**2 + my**2 + 1e-6)
-    s2 = (2 * covariance + 1e-6) / (x.var((2, 3), correction=0) + y.var((2, 3), correction=0) + 1e-6)
+    s2 = (2 * covariance + 1e-6) / (
+        x.var((2, 3), correction=0) + y.var((2, 3), correction=0) + 1e-6
+    )
     wanted = 1 - (0.2 * s1 + 0.1 * s2).sum(1) / 0.9
     torch.testing.assert_close(only.distance(a, b).double(), wanted, atol=1e-4, rtol=1e-4)
 
@@ -129,7 +145,10 @@ def test_dists_is_loaded_from_files_of_the_published_form(tmp_path: Path, net: D
         for c in plan.convolutions
         for part in ("weight", "bias")
     }
-    heads = {"alpha": net.alpha.view(1, -1, 1, 1).clone(), "beta": net.beta.view(1, -1, 1, 1).clone()}
+    heads = {
+        "alpha": net.alpha.view(1, -1, 1, 1).clone(),
+        "beta": net.beta.view(1, -1, 1, 1).clone(),
+    }
     torch.save(heads, tmp_path / HEADS)
     with pytest.raises(InputError, match="not there: vgg16"):
         load_dists(tmp_path, plan=plan)
@@ -143,4 +162,6 @@ def test_dists_is_loaded_from_files_of_the_published_form(tmp_path: Path, net: D
     with pytest.raises(InputError, match="sha256"):
         load_dists(tmp_path, plan=own)
     loaded = load_dists(tmp_path, file_sha256(tmp_path / HEADS), own)
-    torch.testing.assert_close(loaded.distance(pictures(0), pictures(1)), net.distance(pictures(0), pictures(1)))
+    torch.testing.assert_close(
+        loaded.distance(pictures(0), pictures(1)), net.distance(pictures(0), pictures(1))
+    )

@@ -1,4 +1,6 @@
-"""`perceptual-syn`: what holds for any weights, and what the shipped ones must do on pictures made here."""
+"""`perceptual-syn`: what holds for any weights, and what the shipped ones must do on pictures made
+here.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,12 @@ from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.lab.video_metrics.perceptual_net import PerceptualDistance, load_perceptual, shipped_weights, unit
+from alpasim_plugin.lab.video_metrics.perceptual_net import (
+    PerceptualDistance,
+    load_perceptual,
+    shipped_weights,
+    unit,
+)
 
 
 def pictures(count: int = 2, height: int = 40, width: int = 56, seed: int = 0) -> Tensor:
@@ -25,7 +32,9 @@ def pictures(count: int = 2, height: int = 40, width: int = 56, seed: int = 0) -
 
 def blurred(image: Tensor, sigma: float) -> Tensor:
     arrays = image.permute(0, 2, 3, 1).numpy()
-    return torch.from_numpy(np.stack([cv2.GaussianBlur(x, (0, 0), sigma) for x in arrays])).permute(0, 3, 1, 2)
+    return torch.from_numpy(np.stack([cv2.GaussianBlur(x, (0, 0), sigma) for x in arrays])).permute(
+        0, 3, 1, 2
+    )
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +42,9 @@ def net() -> PerceptualDistance:
     return load_perceptual()
 
 
-def test_distance_is_zero_for_equal_and_symmetric_for_other_pictures(net: PerceptualDistance) -> None:
+def test_distance_is_zero_for_equal_and_symmetric_for_other_pictures(
+    net: PerceptualDistance,
+) -> None:
     a, b = pictures(), pictures(seed=1)
     assert torch.equal(net.distance(a, a), torch.zeros(2))
     torch.testing.assert_close(net.distance(a, b), net.distance(b, a))
@@ -52,7 +63,11 @@ def test_distance_is_the_sum_over_stages_written_out(net: PerceptualDistance) ->
     wanted = 0.0
     for x, y, head in zip(net.trunk(a), net.trunk(b), net.heads, strict=True):
         p, q = (f[0].double() / (f[0].double().square().sum(0) + 1e-4).sqrt() for f in (x, y))
-        wanted += float(((p - q) ** 2 * torch.nn.functional.softplus(head.double())[:, None, None]).sum(0).mean())
+        wanted += float(
+            ((p - q) ** 2 * torch.nn.functional.softplus(head.double())[:, None, None])
+            .sum(0)
+            .mean()
+        )
     assert float(net.distance(a, b)) == pytest.approx(wanted, rel=1e-5)
 
 
@@ -64,7 +79,9 @@ def test_gradient_is_that_of_finite_differences() -> None:
     for seed in range(4):
         along = torch.from_numpy(stream("nets", seed, "direction").standard_normal(a.shape))
         plus, minus = (net.distance(a.detach() + step * along, b) for step in (1e-6, -1e-6))
-        assert float((gradient * along).sum()) == pytest.approx(float((plus - minus) / 2e-6), rel=1e-5, abs=1e-9)
+        assert float((gradient * along).sum()) == pytest.approx(
+            float((plus - minus) / 2e-6), rel=1e-5, abs=1e-9
+        )
 
 
 def test_network_is_frozen_and_pictures_get_a_finite_gradient(net: PerceptualDistance) -> None:
@@ -93,19 +110,30 @@ def test_unit_features_have_unit_length_unless_they_are_nearly_nothing() -> None
 def test_shipped_distance_grows_with_blur_and_noise(net: PerceptualDistance) -> None:
     a = pictures(4, 64, 96)
     noise = torch.from_numpy(stream("nets", 0, "noise").standard_normal(a.shape)).float()
-    for damaged in ([blurred(a, s) for s in (0.5, 1.0, 2.0, 4.0)], [(a + s * noise).clamp(-1, 1) for s in (0.02, 0.05, 0.1, 0.3)]):
+    for damaged in (
+        [blurred(a, s) for s in (0.5, 1.0, 2.0, 4.0)],
+        [(a + s * noise).clamp(-1, 1) for s in (0.02, 0.05, 0.1, 0.3)],
+    ):
         rungs = torch.stack([net.distance(d, a) for d in damaged])
         assert torch.all(rungs.diff(dim=0) > 0)
 
 
-def test_shipped_distance_minds_blur_more_than_a_shift_of_one_pixel_where_ssim_does_not(shared_data: Path, net: PerceptualDistance) -> None:
-    """The example pictures of LPIPS: p0 is blurred, p1 is warped and nearer to the eye (and to LPIPS); by SSIM it is farther."""
+def test_shipped_distance_minds_blur_more_than_a_shift_of_one_pixel_where_ssim_does_not(
+    shared_data: Path, net: PerceptualDistance
+) -> None:
+    """The example pictures of LPIPS: p0 is blurred, p1 is warped and nearer to the eye (and to
+    LPIPS); by SSIM it is farther.
+    """
 
     def read(name: str) -> Tensor:
         image = cv2.imread(str(shared_data / "lpips" / f"{name}.png"))[..., ::-1]
-        return torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float() / 127.5 - 1
+        return (
+            torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float() / 127.5 - 1
+        )
 
-    ref, p0, p1 = read("ex_ref"), read("ex_p0"), read("ex_p1")
+    ref = read("ex_ref")
+    p0 = read("ex_p0")
+    p1 = read("ex_p1")
     assert float(net.distance(ref, p1)) < float(net.distance(ref, p0))
 
 
@@ -124,8 +152,13 @@ def test_saved_weights_load_as_they_were(tmp_path: Path) -> None:
         assert torch.equal(again.state_dict()[key], value.detach().half().float())
 
 
-@pytest.mark.parametrize(("a", "b"), [((1, 3, 32, 32), (2, 3, 32, 32)), ((3, 32, 32), (3, 32, 32)), ((1, 3, 8, 32), (1, 3, 8, 32))])
-def test_pictures_that_cannot_be_compared_are_refused(net: PerceptualDistance, a: tuple[int, ...], b: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [((1, 3, 32, 32), (2, 3, 32, 32)), ((3, 32, 32), (3, 32, 32)), ((1, 3, 8, 32), (1, 3, 8, 32))],
+)
+def test_pictures_that_cannot_be_compared_are_refused(
+    net: PerceptualDistance, a: tuple[int, ...], b: tuple[int, ...]
+) -> None:
     with pytest.raises(InputError, match="two tensors"):
         net.distance(torch.zeros(a), torch.zeros(b))
 

@@ -22,7 +22,9 @@ def texture(height: int, width: int) -> U8:
 
 def test_picture_that_moves_three_pixels_is_followed() -> None:
     wide = texture(120, 200)
-    video = np.stack([wide[:, 3 * i : 3 * i + 160] for i in range(3)])  # what is seen moves left: it was 3 px to the right
+    video = np.stack(
+        [wide[:, 3 * i : 3 * i + 160] for i in range(3)]
+    )  # what is seen moves left: it was 3 px to the right
     flow = backward_flow(*(cv2.cvtColor(f, cv2.COLOR_RGB2GRAY) for f in (video[1], video[0])))
     inner = flow[20:-20, 20:-20].reshape(-1, 2)
     assert np.median(inner, axis=0) == pytest.approx([3.0, 0.0], abs=0.05)
@@ -57,7 +59,9 @@ def test_flow_out_of_the_picture_is_left_out() -> None:
     assert warp_l1(video)[0] < 0.02
 
 
-@pytest.mark.parametrize(("pairs", "first"), [(197, 131), (899, 599), (90, 60), (89, 59), (30, 0), (5, 0)])
+@pytest.mark.parametrize(
+    ("pairs", "first"), [(197, 131), (899, 599), (90, 60), (89, 59), (30, 0), (5, 0)]
+)
 def test_late_window_is_the_last_third_but_at_least_thirty(pairs: int, first: int) -> None:
     assert len(range(pairs)[late_window(pairs)]) == pairs - first
 

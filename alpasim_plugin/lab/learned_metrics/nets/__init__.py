@@ -1,1 +1,3 @@
-"""Networks that judge images: lanes, cuboids, features of video, style. They measure, and are used in no loss (docs/lab/judges.md)."""
+"""Networks that judge images: lanes, cuboids, features of video, style. They measure, and are used
+in no loss (docs/lab/judges.md).
+"""

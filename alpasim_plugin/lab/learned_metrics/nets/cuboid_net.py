@@ -1,7 +1,9 @@
-"""The cuboid judge: vehicles as boxes in space from one frame, after CenterNet (Zhou et al., 2019, "Objects as Points").
+"""The cuboid judge: vehicles as boxes in space from one frame, after CenterNet (Zhou et al., 2019,
+"Objects as Points").
 
-Every cell of 4x4 pixels holds the logit of a vehicle's middle, its place in the cell, the logarithm of its depth at a focal length of
-one image width, the logarithms of its sizes relative to a car's, the angle under which it is seen, and its class.
+Every cell of 4x4 pixels holds the logit of a vehicle's middle, its place in the cell, the logarithm
+of its depth at a focal length of one image width, the logarithms of its sizes relative to a car's,
+the angle under which it is seen, and its class.
 """
 
 from __future__ import annotations
@@ -35,11 +37,18 @@ class CuboidNet(nn.Module):
         super().__init__()
         one, two, three, four = widths
         self.stem = nn.Conv2d(3, one, 4, 2, 1)
-        self.down = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in ((one, two), (two, three), (three, four))])
+        self.down = nn.ModuleList(
+            [nn.Conv2d(a, b, 3, 2, 1) for a, b in ((one, two), (two, three), (three, four))]
+        )
         self.body = nn.ModuleList([nn.Sequential(), ResidualPair(three), ResidualPair(four)])
         self.up = nn.ModuleList([nn.Conv2d(four, three, 1), nn.Conv2d(three, two, 1)])
         self.merge = ResidualPair(two)
-        self.head = nn.Sequential(nn.GroupNorm(4, two), nn.Conv2d(two, 64, 1), nn.LeakyReLU(0.1), nn.Conv2d(64, OUTPUTS, 1))
+        self.head = nn.Sequential(
+            nn.GroupNorm(4, two),
+            nn.Conv2d(two, 64, 1),
+            nn.LeakyReLU(0.1),
+            nn.Conv2d(64, OUTPUTS, 1),
+        )
 
     def rest(self) -> None:
         """Let the untrained network see no vehicle."""
@@ -57,22 +66,33 @@ class CuboidNet(nn.Module):
             x = body(F.leaky_relu(down(x), 0.1))
             levels.append(x)
         for up, level in zip(self.up, levels[-2::-1], strict=True):
-            x = level + F.interpolate(up(x), size=level.shape[2:], mode="bilinear", align_corners=False)
+            x = level + F.interpolate(
+                up(x), size=level.shape[2:], mode="bilinear", align_corners=False
+            )
         out: Tensor = self.head(self.merge(x))
         return out
 
 
 def encode(cuboid: Cuboid, K: F64, width: int) -> tuple[float, float, F64] | None:
-    """Return column and row of a vehicle's middle in cells, and the 7 regressed numbers; None behind the camera.
+    """Return column and row of a vehicle's middle in cells, and the 7 regressed numbers; None
+    behind the camera.
 
     The inverse of `decode`.
     """
     if cuboid.z_m <= 0:
         return None
-    u, v = (K[0, 0] * cuboid.x_m / cuboid.z_m + K[0, 2]) / STRIDE, (K[1, 1] * cuboid.y_m / cuboid.z_m + K[1, 2]) / STRIDE
+    u, v = (
+        (K[0, 0] * cuboid.x_m / cuboid.z_m + K[0, 2]) / STRIDE,
+        (K[1, 1] * cuboid.y_m / cuboid.z_m + K[1, 2]) / STRIDE,
+    )
     seen_rad = cuboid.yaw_rad - np.arctan2(cuboid.x_m, cuboid.z_m)
     sizes = np.log(np.array([cuboid.length_m, cuboid.height_m, cuboid.width_m]) / TYPICAL_M)
-    numbers = [np.log(cuboid.z_m * width / K[0, 0]) - LOG_DEPTH, *sizes, np.sin(seen_rad), np.cos(seen_rad)]
+    numbers = [
+        np.log(cuboid.z_m * width / K[0, 0]) - LOG_DEPTH,
+        *sizes,
+        np.sin(seen_rad),
+        np.cos(seen_rad),
+    ]
     return float(u), float(v), np.array([CLASSES.index(cuboid.label), *numbers])
 
 
@@ -92,7 +112,10 @@ def decode(cells: F32, K: F64, width: int, least_score: float) -> list[Cuboid]:
     """
     heat = 1 / (1 + np.exp(-cells[0].astype(np.float64)))
     padded = np.pad(heat, 1)
-    around = np.max([padded[i : i + heat.shape[0], j : j + heat.shape[1]] for i in range(3) for j in range(3)], axis=0)
+    around = np.max(
+        [padded[i : i + heat.shape[0], j : j + heat.shape[1]] for i in range(3) for j in range(3)],
+        axis=0,
+    )
     rows, columns = np.nonzero((heat >= around) & (heat >= least_score))
     best = np.argsort(-heat[rows, columns], kind="stable")[:MOST]
     out = []
@@ -101,8 +124,14 @@ def decode(cells: F32, K: F64, width: int, least_score: float) -> list[Cuboid]:
         u, v = (column + at[1]) * STRIDE, (row + at[2]) * STRIDE
         z = float(np.exp(np.clip(at[3], -3.0, 2.0) + LOG_DEPTH) * K[0, 0] / width)
         x, y = (u - K[0, 2]) * z / K[0, 0], (v - K[1, 2]) * z / K[1, 1]
-        length, height, wide = (float(s) for s in np.array(TYPICAL_M) * np.exp(np.clip(at[4:7], -2.0, 2.0)))
+        length, height, wide = (
+            float(s) for s in np.array(TYPICAL_M) * np.exp(np.clip(at[4:7], -2.0, 2.0))
+        )
         yaw = float(np.arctan2(at[7], at[8]) + np.arctan2(x, z))
         label = CLASSES[int(np.argmax(at[9:]))]
-        out.append(Cuboid(label, float(heat[row, column]), float(x), float(y), z, length, height, wide, yaw))
+        out.append(
+            Cuboid(
+                label, float(heat[row, column]), float(x), float(y), z, length, height, wide, yaw
+            )
+        )
     return out

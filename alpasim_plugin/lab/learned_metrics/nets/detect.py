@@ -1,4 +1,6 @@
-"""Detections of the judges on a clip: arrays in, lanes and cuboids out; no tensor leaves, so nothing is trained through a judge."""
+"""Detections of the judges on a clip: arrays in, lanes and cuboids out; no tensor leaves, so
+nothing is trained through a judge.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ LEAST_SCORE = 0.1  # of a box
 
 
 def find_lanes(net: nn.Module, frames: U8, camera: CameraSpec) -> list[list[Lane3D]]:
-    """Return the lanes of every frame ``(T, H, W, 3)`` of a camera; needs its mounting, since lanes live on the ground.
+    """Return the lanes of every frame ``(T, H, W, 3)`` of a camera; needs its mounting, since lanes
+    live on the ground.
 
     Raises:
         InputError: Frames of another size than the camera's.
@@ -34,18 +37,25 @@ def find_lanes(net: nn.Module, frames: U8, camera: CameraSpec) -> list[list[Lane
 
 
 def find_cuboids(net: nn.Module, frames: U8, K: F64) -> list[list[Cuboid]]:
-    """Return the vehicles of every frame ``(T, H, W, 3)``, at the camera's own focal length; ``K`` in pixels.
+    """Return the vehicles of every frame ``(T, H, W, 3)``, at the camera's own focal length; ``K``
+    in pixels.
 
     Raises:
         InputError: Sides that are no multiples of 16.
     """
     if frames.shape[1] % MULTIPLE or frames.shape[2] % MULTIPLE:
         found = f"frames of {frames.shape[2]}x{frames.shape[1]}"
-        raise InputError("looking for vehicles", "a clip", found, f"give sides that are multiples of {MULTIPLE}")
+        raise InputError(
+            "looking for vehicles", "a clip", found, f"give sides that are multiples of {MULTIPLE}"
+        )
     out = []
     with torch.inference_mode():
         for at in range(0, len(frames), BATCH):
-            images = torch.from_numpy(np.array(frames[at : at + BATCH])).permute(0, 3, 1, 2).float() / 127.5 - 1
+            images = (
+                torch.from_numpy(np.array(frames[at : at + BATCH])).permute(0, 3, 1, 2).float()
+                / 127.5
+                - 1
+            )
             out += [decode(cells, K, frames.shape[2], LEAST_SCORE) for cells in net(images).numpy()]
     return out
 
@@ -53,4 +63,6 @@ def find_cuboids(net: nn.Module, frames: U8, K: F64) -> list[list[Cuboid]]:
 def _require_size(frames: U8, width: int, height: int) -> None:
     if frames.shape[1:3] != (height, width):
         found = f"frames of {frames.shape[2]}x{frames.shape[1]}, a camera of {width}x{height}"
-        raise InputError("looking for lanes", "a clip", found, "give the camera that took the frames")
+        raise InputError(
+            "looking for lanes", "a clip", found, "give the camera that took the frames"
+        )

@@ -1,8 +1,10 @@
-"""The frozen judges: files of weights, the record of their digests, and the only function that loads one.
+"""The frozen judges: files of weights, the record of their digests, and the only function that
+loads one.
 
-``weights/judges.json`` holds the SHA-256 of every shipped judge as it was frozen, before any fixer was compared with it. A judge whose file
-has another digest is not loaded. Nothing that trains a fixer or a policy may import this module (a test enforces it), and a loaded
-judge gives arrays, not tensors, so that no gradient can pass.
+``weights/judges.json`` holds the SHA-256 of every shipped judge as it was frozen, before any fixer
+was compared with it. A judge whose file has another digest is not loaded. Nothing that trains a
+fixer or a policy may import this module (a test enforces it), and a loaded judge gives arrays, not
+tensors, so that no gradient can pass.
 """
 
 from __future__ import annotations
@@ -49,9 +51,19 @@ def untrained(name: str) -> nn.Module:
     Raises:
         InputError: No such judge.
     """
-    nets: Mapping[str, type[nn.Module]] = {"lane": LaneNet, "cuboid": CuboidNet, "video": VideoNet, "style": StyleNet}
+    nets: Mapping[str, type[nn.Module]] = {
+        "lane": LaneNet,
+        "cuboid": CuboidNet,
+        "video": VideoNet,
+        "style": StyleNet,
+    }
     if name not in nets:
-        raise InputError("choosing a judge", f"name {name!r}", "no such judge", f"choose one of {', '.join(nets)}")
+        raise InputError(
+            "choosing a judge",
+            f"name {name!r}",
+            "no such judge",
+            f"choose one of {', '.join(nets)}",
+        )
     return nets[name]()
 
 
@@ -72,7 +84,9 @@ def read_judge(path: Path, name: JudgeName) -> nn.Module:
         raise InputError(DOING, str(path), "no such file", do)
     facts = read_metadata(path)
     if (facts.get("format"), facts.get("judge")) != (FORMAT, name):
-        raise InputError(DOING, str(path), f"format {facts.get('format')!r} of judge {facts.get('judge')!r}", do)
+        raise InputError(
+            DOING, str(path), f"format {facts.get('format')!r} of judge {facts.get('judge')!r}", do
+        )
     net = untrained(name)
     try:
         net.load_state_dict({key: value.float() for key, value in load_weights(path).items()})
@@ -96,15 +110,27 @@ def load_judge(name: JudgeName, seed: int = 0, folder: Path | None = None) -> nn
     folder = folder or judges_folder()
     file, digest = file_name(name, seed), frozen_digests(folder).get(file_name(name, seed))
     if digest is None:
-        raise InputError(DOING, f"{file} in {folder}", f"{RECORD} does not hold it", "freeze it first: 'simrun judge freeze'")
+        raise InputError(
+            DOING,
+            f"{file} in {folder}",
+            f"{RECORD} does not hold it",
+            "freeze it first: 'simrun judge freeze'",
+        )
     found = file_sha256(folder / file)
     if found != digest:
-        raise InputError(DOING, str(folder / file), f"sha256 {found[:16]}, frozen was {digest[:16]}", "restore the frozen file")
+        raise InputError(
+            DOING,
+            str(folder / file),
+            f"sha256 {found[:16]}, frozen was {digest[:16]}",
+            "restore the frozen file",
+        )
     return read_judge(folder / file, name)
 
 
 def frozen_digests(folder: Path | None = None) -> dict[str, str]:
-    """Return the SHA-256 of every frozen judge by the name of its file; empty where nothing is frozen."""
+    """Return the SHA-256 of every frozen judge by the name of its file; empty where nothing is
+    frozen.
+    """
     path = (folder or judges_folder()) / RECORD
     if not path.is_file():
         return {}
@@ -113,7 +139,8 @@ def frozen_digests(folder: Path | None = None) -> dict[str, str]:
 
 
 def check_digests(folder: Path | None = None) -> dict[str, str]:
-    """Return `frozen_digests` after comparing every file with its own: what a table that used judges prints.
+    """Return `frozen_digests` after comparing every file with its own: what a table that used
+    judges prints.
 
     Raises:
         InputError: A file is missing or has changed.
@@ -124,18 +151,25 @@ def check_digests(folder: Path | None = None) -> dict[str, str]:
         found = file_sha256(folder / file) if (folder / file).is_file() else "missing"
         if found != digest:
             raise InputError(
-                "checking the frozen judges", str(folder / file), f"sha256 {found[:16]}, frozen was {digest[:16]}", "restore it"
+                "checking the frozen judges",
+                str(folder / file),
+                f"sha256 {found[:16]}, frozen was {digest[:16]}",
+                "restore it",
             )
     return digests
 
 
 def freeze(folder: Path) -> dict[str, str]:
-    """Write the record of all judges in a folder; judges that are in it already must not have changed.
+    """Write the record of all judges in a folder; judges that are in it already must not have
+    changed.
 
     Raises:
         InputError: A frozen judge has changed or is missing.
     """
     known = check_digests(folder)
     found = {path.name: file_sha256(path) for path in sorted(folder.glob("judge-*.safetensors"))}
-    write_json(folder / RECORD, {"what": "SHA-256 of the judges as they were frozen", "sha256": {**known, **found}})
+    write_json(
+        folder / RECORD,
+        {"what": "SHA-256 of the judges as they were frozen", "sha256": {**known, **found}},
+    )
     return found

@@ -1,4 +1,6 @@
-"""The ground ahead of the rig as seen by a camera: the plane z = 0 on a grid of 1 m by 0.1 m, the input of the lane judge."""
+"""The ground ahead of the rig as seen by a camera: the plane z = 0 on a grid of 1 m by 0.1 m, the
+input of the lane judge.
+"""
 
 from __future__ import annotations
 
@@ -29,17 +31,31 @@ class GroundView:
         x = FIRST_ROW_M + ROW_M * np.arange(ROWS)
         y = HALF_WIDTH_M - COLUMN_M * (np.arange(COLUMNS) + 0.5) + shift_m
         T = inverse(camera.T_rig_camera)
-        at = T[:3, 0] * x[:, None, None] + T[:3, 1] * y[None, :, None] + T[:3, 3]  # (R, C, 3) camera axes
+        at = (
+            T[:3, 0] * x[:, None, None] + T[:3, 1] * y[None, :, None] + T[:3, 3]
+        )  # (R, C, 3) camera axes
         ahead = at[..., 2] > 0.5
-        uv = (at @ camera.K.T)[..., :2] / np.where(ahead, at[..., 2], 1.0)[..., None] - 0.5  # pixel centres at integers
+        uv = (at @ camera.K.T)[..., :2] / np.where(ahead, at[..., 2], 1.0)[
+            ..., None
+        ] - 0.5  # pixel centres at integers
         u, v = uv[..., 0], uv[..., 1]
-        self.inside: F32 = (ahead & (u >= -0.5) & (u <= camera.width - 0.5) & (v >= -0.5) & (v <= camera.height - 0.5)).astype(np.float32)
+        self.inside: F32 = (
+            ahead
+            & (u >= -0.5)
+            & (u <= camera.width - 0.5)
+            & (v >= -0.5)
+            & (v <= camera.height - 0.5)
+        ).astype(np.float32)
         self.map_u: F32 = np.where(ahead, u, -1e4).astype(np.float32)
         self.map_v: F32 = np.where(ahead, v, -1e4).astype(np.float32)
 
     def __call__(self, image: U8) -> F32:
-        """Return ``(4, 58, 216)``: RGB in [-1, 1], 0 outside the image, and 1 where the point is inside."""
-        seen = cv2.remap(image, self.map_u, self.map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
+        """Return ``(4, 58, 216)``: RGB in [-1, 1], 0 outside the image, and 1 where the point is
+        inside.
+        """
+        seen = cv2.remap(
+            image, self.map_u, self.map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        ).astype(np.float32)
         rgb = (seen / np.float32(127.5) - 1) * self.inside[..., None]
         return np.concatenate([np.moveaxis(rgb, -1, 0), self.inside[None]])
 
@@ -48,10 +64,14 @@ class GroundView:
 def _cached(key: tuple[int, int, bytes, bytes]) -> GroundView:
     width, height, K, T = key
     lens: F64 = np.frombuffer(K, dtype=np.float64).reshape(3, 3)
-    return GroundView(CameraSpec("camera", width, height, lens, np.frombuffer(T, dtype=np.float64).reshape(4, 4)))
+    return GroundView(
+        CameraSpec("camera", width, height, lens, np.frombuffer(T, dtype=np.float64).reshape(4, 4))
+    )
 
 
 def ground_view(camera: CameraSpec) -> GroundView:
     """Return the view of a camera, made once per lens and mounting."""
-    K, T = (np.ascontiguousarray(m, dtype=np.float64).tobytes() for m in (camera.K, camera.T_rig_camera))
+    K, T = (
+        np.ascontiguousarray(m, dtype=np.float64).tobytes() for m in (camera.K, camera.T_rig_camera)
+    )
     return _cached((camera.width, camera.height, K, T))

@@ -1,8 +1,10 @@
 """The lane judge: lane lines on the ground from one frame.
 
-The image is laid on the ground plane by the known camera, so that a line has one width at all distances. The network says for each of
-29 distances (3, 5 ... 59 m) and 54 cells of 0.4 m whether a line passes, where in the cell, and in which direction. Points are joined to
-lines along these directions. Baselines with a fixed number of line slots need a set loss and far more training than this takes.
+The image is laid on the ground plane by the known camera, so that a line has one width at all
+distances. The network says for each of 29 distances (3, 5 ... 59 m) and 54 cells of 0.4 m whether a
+line passes, where in the cell, and in which direction. Points are joined to lines along these
+directions. Baselines with a fixed number of line slots need a set loss and far more training than
+this takes.
 """
 
 from __future__ import annotations
@@ -38,26 +40,34 @@ class LaneNet(nn.Module):
         super().__init__()
         self.stem = nn.Conv2d(4, channels // 2, (3, 4), stride=(1, 2), padding=(1, 1))
         self.down = nn.Conv2d(channels // 2, channels, 4, stride=2, padding=1)
-        self.body = nn.Sequential(*(ResidualPair(channels, (5, 1), (1, 5), dilation) for dilation in (1, 2, 4, 1)))
+        self.body = nn.Sequential(
+            *(ResidualPair(channels, (5, 1), (1, 5), dilation) for dilation in (1, 2, 4, 1))
+        )
         self.norm = nn.GroupNorm(4, channels)
         self.head = nn.Conv2d(channels, 3, 1)
 
     def forward(self, ground: Tensor) -> Tensor:
-        """Map ``(B, 4, 58, 216)`` of `GroundView` to ``(B, 3, 29, 54)``: logit, offset to the right in cells, slope in metres per row."""
+        """Map ``(B, 4, 58, 216)`` of `GroundView` to ``(B, 3, 29, 54)``: logit, offset to the right
+        in cells, slope in metres per row.
+        """
         x = F.leaky_relu(self.stem(ground), 0.1)
         out: Tensor = self.head(F.leaky_relu(self.norm(self.body(self.down(x))), 0.1))
         return out
 
 
 def join_lines(cells: F32) -> list[Lane3D]:
-    """Return the lines in one frame's cells ``(3, 29, 54)`` as `LaneNet` gives them, the surest first.
+    """Return the lines in one frame's cells ``(3, 29, 54)`` as `LaneNet` gives them, the surest
+    first.
 
-    From near to far, a point goes to the line whose extrapolation is nearest, at most 0.8 m away; a line may miss three rows. The
-    score of a line is the mean probability of its points. Missed rows between points are filled in linearly.
+    From near to far, a point goes to the line whose extrapolation is nearest, at most 0.8 m away; a
+    line may miss three rows. The score of a line is the mean probability of its points. Missed rows
+    between points are filled in linearly.
     """
     probability = 1 / (1 + np.exp(-cells[0].astype(np.float64)))
     lateral = HALF_WIDTH_M - CELL_M * (np.arange(CELLS) + 0.5 + np.clip(cells[1], -0.75, 0.75))
-    open_lines: list[list[tuple[int, float, float, float]]] = []  # points: row, lateral, slope, probability
+    open_lines: list[
+        list[tuple[int, float, float, float]]
+    ] = []  # points: row, lateral, slope, probability
     done: list[list[tuple[int, float, float, float]]] = []
     for row in range(len(FORWARD_M)):
         done += [line for line in open_lines if row - line[-1][0] > GAP_ROWS + 1]
@@ -67,7 +77,12 @@ def join_lines(cells: F32) -> list[Lane3D]:
             for c in _peaks(probability[row], lateral[row])
         ]
         pairs = sorted(
-            (abs(p[1] - (line[-1][1] + _slope(line) * (row - line[-1][0]))) - 0.1 * len(line[-5:]), i, j)
+            (
+                abs(p[1] - (line[-1][1] + _slope(line) * (row - line[-1][0])))
+                - 0.1 * len(line[-5:]),
+                i,
+                j,
+            )
             for i, line in enumerate(open_lines)
             for j, p in enumerate(points)
             if abs(p[1] - (line[-1][1] + _slope(line) * (row - line[-1][0]))) <= LINK_M
@@ -85,7 +100,9 @@ def join_lines(cells: F32) -> list[Lane3D]:
 
 
 def _slope(line: list[tuple[int, float, float, float]]) -> float:
-    """Return where a line points, metres per row: the mean of the network's slopes and the line's own over the last points."""
+    """Return where a line points, metres per row: the mean of the network's slopes and the line's
+    own over the last points.
+    """
     said = line[-1][2]
     if len(line) < 3:
         return said

@@ -18,7 +18,13 @@ class ResidualPair(nn.Module):
         dilation: Of the first one, along its rows.
     """
 
-    def __init__(self, channels: int, first: tuple[int, int] = (3, 3), second: tuple[int, int] = (3, 3), dilation: int = 1) -> None:
+    def __init__(
+        self,
+        channels: int,
+        first: tuple[int, int] = (3, 3),
+        second: tuple[int, int] = (3, 3),
+        dilation: int = 1,
+    ) -> None:
         super().__init__()
         pad = (first[0] // 2 * dilation, first[1] // 2)
         self.norm = nn.GroupNorm(GROUPS, channels)
@@ -32,13 +38,17 @@ class ResidualPair(nn.Module):
 
 
 def initialise(module: nn.Module, seed: int) -> None:
-    """Set convolutions and linear layers after He et al. (2015) from a seed; biases are zero, norms the identity."""
+    """Set convolutions and linear layers after He et al. (2015) from a seed; biases are zero, norms
+    the identity.
+    """
     generator = torch.Generator().manual_seed(seed)
     for layer in module.modules():
         if isinstance(layer, nn.Conv2d | nn.Conv3d | nn.Linear):
             fan_in = layer.weight[0].numel()
             with torch.no_grad():
-                layer.weight.copy_(torch.randn(layer.weight.shape, generator=generator) * (2.0 / fan_in) ** 0.5)
+                layer.weight.copy_(
+                    torch.randn(layer.weight.shape, generator=generator) * (2.0 / fan_in) ** 0.5
+                )
                 if layer.bias is not None:
                     layer.bias.zero_()
         if isinstance(layer, ResidualPair):

@@ -4,8 +4,9 @@
     ARM                             an arm's last stage
     ARM/STAGE                       a stage before the last that is no arm's last; ARM is the first of the comparison that has it
 
-Two stages are one training where everything that decides their weights is equal: objective, share of the updates, attention, what the
-network sees, trained parts and rates, sizes, and, likewise, what they start from. Names play no part, nor do settings of the deployment.
+Two stages are one training where everything that decides their weights is equal: objective, share
+of the updates, attention, what the network sees, trained parts and rates, sizes, and, likewise,
+what they start from. Names play no part, nor do settings of the deployment.
 """
 
 from __future__ import annotations
@@ -21,8 +22,18 @@ from alpasim_plugin.lab.training.recipes.recipe import INIT, INIT_BI, Recipe, St
 from alpasim_plugin.lab.training.recipes.registry import RECIPES
 
 FIRST = "V9"
-INITIAL: Mapping[str, str] = {INIT: BASE, INIT_BI: BASE_BI}  # weights that stages start from -> recipe that makes them
-BUILT_FROM = ("dit", "vae", "decoder", "rope_ratios", "render_level", "opacity_to_decoder")  # settings that decide weights
+INITIAL: Mapping[str, str] = {
+    INIT: BASE,
+    INIT_BI: BASE_BI,
+}  # weights that stages start from -> recipe that makes them
+BUILT_FROM = (
+    "dit",
+    "vae",
+    "decoder",
+    "rope_ratios",
+    "render_level",
+    "opacity_to_decoder",
+)  # settings that decide weights
 DOING = "planning the arms"
 
 
@@ -73,10 +84,12 @@ def comparison() -> tuple[Recipe, ...]:
 
 
 def plan(recipes: Sequence[Recipe], chosen: Collection[str], given: Collection[str] = ()) -> Plan:
-    """Return the trainings of the chosen arms; an arm that another one starts from is trained as well.
+    """Return the trainings of the chosen arms; an arm that another one starts from is trained as
+    well.
 
     Args:
-        recipes: All of the comparison, of which folders and sharing are a function: a part has the folders of the whole.
+        recipes: All of the comparison, of which folders and sharing are a function: a part has the
+            folders of the whole.
         chosen: Names of arms.
         given: Initial networks that need no training, by recipe (``base``).
 
@@ -85,12 +98,20 @@ def plan(recipes: Sequence[Recipe], chosen: Collection[str], given: Collection[s
     """
     known = {recipe.name: recipe for recipe in recipes}
     if unknown := sorted(set(chosen) - set(known)):
-        raise InputError(DOING, ", ".join(unknown), "no such arm", f"name some of {', '.join(known)}")
+        raise InputError(
+            DOING, ", ".join(unknown), "no such arm", f"name some of {', '.join(known)}"
+        )
     if unknown := sorted(set(given) - set(INITIAL.values())):
-        raise InputError(DOING, ", ".join(unknown), "no initial network", f"give {' or '.join(INITIAL.values())}")
+        raise InputError(
+            DOING, ", ".join(unknown), "no initial network", f"give {' or '.join(INITIAL.values())}"
+        )
     every = {training.name: training for training in _trainings(recipes)}
     names = training_names(recipes)
-    arms = {name: tuple(names[name, stage.name] for stage in recipe.stages) for name, recipe in known.items() if name in chosen}
+    arms = {
+        name: tuple(names[name, stage.name] for stage in recipe.stages)
+        for name, recipe in known.items()
+        if name in chosen
+    }
     wanted: dict[str, Training] = {}
 
     def want(name: str) -> None:
@@ -101,8 +122,14 @@ def plan(recipes: Sequence[Recipe], chosen: Collection[str], given: Collection[s
     for trainings in arms.values():
         for name in trainings:
             want(name)
-    left = [training for name, training in wanted.items() if name not in {initial_name(one) for one in given}]
-    return Plan(tuple(sorted(left, key=lambda training: training.recipe.name not in INITIAL.values())), arms)
+    left = [
+        training
+        for name, training in wanted.items()
+        if name not in {initial_name(one) for one in given}
+    ]
+    return Plan(
+        tuple(sorted(left, key=lambda training: training.recipe.name not in INITIAL.values())), arms
+    )
 
 
 def initial_name(recipe: str) -> str:
@@ -118,7 +145,11 @@ def training_names(recipes: Sequence[Recipe]) -> dict[tuple[str, str], str]:
     for recipe in recipes:
         for stage in recipe.stages[:-1]:
             owners.setdefault(identity(recipe, stage), f"{recipe.name}/{stage.name}")
-    return {(recipe.name, stage.name): owners[identity(recipe, stage)] for recipe in recipes for stage in recipe.stages}
+    return {
+        (recipe.name, stage.name): owners[identity(recipe, stage)]
+        for recipe in recipes
+        for stage in recipe.stages
+    }
 
 
 def identity(recipe: Recipe, stage: Stage) -> Hashable:
@@ -131,9 +162,18 @@ def identity(recipe: Recipe, stage: Stage) -> Hashable:
     settings = fixer_settings(recipe.fixer).model_dump()
     built = tuple((key, repr(settings.get(key))) for key in BUILT_FROM)
     return (
-        stage.objective, stage.share, stage.attention, stage.seen, tuple(starts), tuple(sorted(stage.trained.items(), key=_first)),
-        stage.decay, stage.last_share, stage.latents, stage.always_float32, built,
-    )  # fmt: skip
+        stage.objective,
+        stage.share,
+        stage.attention,
+        stage.seen,
+        tuple(starts),
+        tuple(sorted(stage.trained.items(), key=_first)),
+        stage.decay,
+        stage.last_share,
+        stage.latents,
+        stage.always_float32,
+        built,
+    )
 
 
 def _first(pair: tuple[str, Any]) -> str:
@@ -152,5 +192,8 @@ def _trainings(recipes: Sequence[Recipe]) -> Iterator[Training]:
         if name in seen:
             continue
         seen.add(name)
-        starts = {one: initial_name(INITIAL[one]) if one in INITIAL else names[recipe.name, one] for one in stage.sources}
+        starts = {
+            one: initial_name(INITIAL[one]) if one in INITIAL else names[recipe.name, one]
+            for one in stage.sources
+        }
         yield Training(name, recipe, stage, starts)

@@ -1,4 +1,5 @@
-"""Train one stage of the comparison in its folder, with the options that all arms share; time one; what became of them.
+"""Train one stage of the comparison in its folder, with the options that all arms share; time one;
+what became of them.
 
 OUT/TRAINING/       `plan` names them
 OUT/latents/        of the clips, encoded once for all
@@ -23,7 +24,13 @@ from alpasim_plugin.core.reading import read_json_object
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.lab.training.arms.plan import INITIAL, Plan, Training, initial_name
 from alpasim_plugin.lab.training.clip_batches import BatchForm
-from alpasim_plugin.lab.training.fixer_run import BUNDLE_FILE, FixerRun, Report, TrainableSettings, train_stage
+from alpasim_plugin.lab.training.fixer_run import (
+    BUNDLE_FILE,
+    FixerRun,
+    Report,
+    TrainableSettings,
+    train_stage,
+)
 from alpasim_plugin.lab.training.latent_clips import ClipForm, LatentClips
 from alpasim_plugin.lab.training.pair_store import PairDataset
 from alpasim_plugin.lab.training.recipes.recipe import Recipe
@@ -85,17 +92,32 @@ class ArmsRun:
             InputError: No pairs, none of the size, or pairs of several sizes and none chosen.
         """
         sequences = PairDataset(self.data, "train", self.size).sequences
-        return LatentClips(sequences, load_tiny_vae(self.vae), self.form, self.out / "latents", encoded)
+        return LatentClips(
+            sequences, load_tiny_vae(self.vae), self.form, self.out / "latents", encoded
+        )
 
-    def fixer_run(self, recipe: Recipe, weights: Mapping[str, Path], schedule: Schedule | None = None) -> FixerRun:
+    def fixer_run(
+        self, recipe: Recipe, weights: Mapping[str, Path], schedule: Schedule | None = None
+    ) -> FixerRun:
         """Return the run of a recipe with these options."""
         settings = fixer_settings(recipe.fixer)
         assert isinstance(settings, TrainableSettings)
         chosen = self.initial if recipe.name in INITIAL.values() else self.schedule
         return FixerRun(
-            settings, recipe, self.data, self.vae, weights, self.form, self.batches, schedule or chosen, self.equal_channels,
-            self.precision, self.snapshots, self.scenes, self.size,
-        )  # fmt: skip
+            settings,
+            recipe,
+            self.data,
+            self.vae,
+            weights,
+            self.form,
+            self.batches,
+            schedule or chosen,
+            self.equal_channels,
+            self.precision,
+            self.snapshots,
+            self.scenes,
+            self.size,
+        )
 
 
 def train(
@@ -125,42 +147,73 @@ def train(
     schedule = of.schedule if steps is None else of.schedule.of_length(steps)
     of = replace(of, schedule=schedule if peak_lr is None else replace(schedule, peak_lr=peak_lr))
     distance = _distance(run) if training.stage.objective.perceptual else None
-    return train_stage(of, training.stage, run.out / (folder or training.name), run.clips(), files, distance, report)
+    return train_stage(
+        of,
+        training.stage,
+        run.out / (folder or training.name),
+        run.clips(),
+        files,
+        distance,
+        report,
+    )
 
 
 def seconds_of_update(run: ArmsRun, training: Training, updates: int) -> float:
-    """Return the processor seconds of an update: the mean over a stage of so many, its borders between objectives included.
+    """Return the processor seconds of an update: the mean over a stage of so many, its borders
+    between objectives included.
 
-    The stage begins at initial networks, for those before it are not trained yet; the time does not depend on the weights' values.
+    The stage begins at initial networks, for those before it are not trained yet; the time does not
+    depend on the weights' values.
     """
     distance = _distance(run) if training.stage.objective.perceptual else None
-    files = {source: path for source, recipe in INITIAL.items() if (path := run.bundle_of(initial_name(recipe))).exists()}
+    files = {
+        source: path
+        for source, recipe in INITIAL.items()
+        if (path := run.bundle_of(initial_name(recipe))).exists()
+    }
     files = {source: path for source, path in files.items() if source in training.stage.sources}
     with tempfile.TemporaryDirectory(prefix="simrun-probe-") as scratch:
         for name, count in (("warm-up", WARM_UP), ("timed", updates)):
             stage = replace(training.stage, share=1.0)
-            recipe = replace(training.recipe, stages=tuple(stage if one is training.stage else one for one in training.recipe.stages))
+            recipe = replace(
+                training.recipe,
+                stages=tuple(
+                    stage if one is training.stage else one for one in training.recipe.stages
+                ),
+            )
             of = replace(run.fixer_run(recipe, files, run.schedule.of_length(count)), snapshots=0)
             train_stage(of, stage, Path(scratch) / name, run.clips(), files, distance)
         return core_seconds(Path(scratch) / "timed")[-1] / updates
 
 
-def probe(run: ArmsRun, trainings: Sequence[Training], updates: int, told: Callable[[str, float], None]) -> dict[str, float]:
-    """Return the processor seconds of an update of every training, measured once and kept in the run's folder.
+def probe(
+    run: ArmsRun, trainings: Sequence[Training], updates: int, told: Callable[[str, float], None]
+) -> dict[str, float]:
+    """Return the processor seconds of an update of every training, measured once and kept in the
+    run's folder.
 
     Raises:
         InputError: The folder has times that were measured with other options.
     """
     path = run.out / PROBE_FILE
     options = {
-        "updates": updates, "form": asdict(run.form), "batches": asdict(run.batches), "accumulate": run.schedule.accumulate,
-        "precision": str(run.precision), "threads": torch.get_num_threads(),
-    }  # fmt: skip
+        "updates": updates,
+        "form": asdict(run.form),
+        "batches": asdict(run.batches),
+        "accumulate": run.schedule.accumulate,
+        "precision": str(run.precision),
+        "threads": torch.get_num_threads(),
+    }
     known: dict[str, Any] = {"options": options, "seconds_of_update": {}}
     if path.exists():
         known = read_json_object(path, DOING)
         if (begun := known.get("options")) != options:
-            raise InputError(DOING, str(path), f"times measured with {begun}, this is {options}", "choose another folder")
+            raise InputError(
+                DOING,
+                str(path),
+                f"times measured with {begun}, this is {options}",
+                "choose another folder",
+            )
     seconds = dict(known["seconds_of_update"])
     for training in trainings:
         if training.name not in seconds:
@@ -171,9 +224,17 @@ def probe(run: ArmsRun, trainings: Sequence[Training], updates: int, told: Calla
 
 
 def write_plan(run: ArmsRun, plan: Plan, facts: Mapping[str, Any]) -> None:
-    """Record the trainings of every arm in the folder, beside arms that are recorded there already."""
+    """Record the trainings of every arm in the folder, beside arms that are recorded there
+    already.
+    """
     arms = {**arms_of(run.out)} if (run.out / PLAN_FILE).exists() else {}
-    write_json(run.out / PLAN_FILE, {**facts, "arms": {**arms, **{name: list(trainings) for name, trainings in plan.arms.items()}}})
+    write_json(
+        run.out / PLAN_FILE,
+        {
+            **facts,
+            "arms": {**arms, **{name: list(trainings) for name, trainings in plan.arms.items()}},
+        },
+    )
 
 
 def arms_of(folder: Path) -> dict[str, list[str]]:
@@ -190,7 +251,8 @@ def arms_of(folder: Path) -> dict[str, list[str]]:
 
 
 def minutes_of(folder: Path) -> float | None:
-    """Return the core-minutes that every arm in a folder of arms was given; None: it has the paper's updates.
+    """Return the core-minutes that every arm in a folder of arms was given; None: it has the
+    paper's updates.
 
     Raises:
         InputError: It was not made by `simrun train arms`.

@@ -1,1 +1,3 @@
-"""Training of the judges: networks that measure images and are used in no loss (docs/lab/judges.md)."""
+"""Training of the judges: networks that measure images and are used in no loss
+(docs/lab/judges.md).
+"""

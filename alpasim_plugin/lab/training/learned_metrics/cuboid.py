@@ -43,7 +43,9 @@ class CuboidRecipe:
 
 @dataclass(frozen=True)
 class CuboidBatch:
-    """B frames ``(B, 3, H, W)`` in [-1, 1]; heat, middles (0 or 1) and class ``(B, h, w)``, regressed numbers ``(B, 8, h, w)``."""
+    """B frames ``(B, 3, H, W)`` in [-1, 1]; heat, middles (0 or 1) and class ``(B, h, w)``,
+    regressed numbers ``(B, 8, h, w)``.
+    """
 
     image: Tensor
     heat: Tensor
@@ -70,17 +72,29 @@ class CuboidTask:
     def batch(self, index: int) -> CuboidBatch:
         """Make batch ``index``."""
         rows = [self._example(index * self.recipe.batch + i) for i in range(self.recipe.batch)]
-        return CuboidBatch(*(torch.from_numpy(np.stack([row[k] for row in rows])) for k in range(5)))
+        return CuboidBatch(
+            *(torch.from_numpy(np.stack([row[k] for row in rows])) for k in range(5))
+        )
 
     def loss(self, batch: CuboidBatch, index: int) -> Loss:
-        """Return the loss of a batch and its parts: CenterNet's focal loss for middles, absolute errors, cross entropy of classes."""
+        """Return the loss of a batch and its parts: CenterNet's focal loss for middles, absolute
+        errors, cross entropy of classes.
+        """
         del index
-        r, made = self.recipe, self.module(batch.image.contiguous(memory_format=torch.channels_last))
+        r, made = (
+            self.recipe,
+            self.module(batch.image.contiguous(memory_format=torch.channels_last)),
+        )
         count = batch.middle.sum().clamp(min=1)
         log_p, log_q = F.logsigmoid(made[:, 0]), F.logsigmoid(-made[:, 0])
         p = torch.sigmoid(made[:, 0])
-        focal = batch.middle * (1 - p) ** 2 * log_p + (1 - batch.middle) * (1 - batch.heat) ** 4 * p**2 * log_q
-        error = (F.smooth_l1_loss(made[:, 1 : 1 + NUMBERS], batch.numbers, beta=0.05, reduction="none")).sum(1)
+        focal = (
+            batch.middle * (1 - p) ** 2 * log_p
+            + (1 - batch.middle) * (1 - batch.heat) ** 4 * p**2 * log_q
+        )
+        error = (
+            F.smooth_l1_loss(made[:, 1 : 1 + NUMBERS], batch.numbers, beta=0.05, reduction="none")
+        ).sum(1)
         kind = F.cross_entropy(made[:, 1 + NUMBERS :], batch.kind, reduction="none")
         parts = {
             "heat": -r.heat * focal.sum() / count,
@@ -107,14 +121,21 @@ class CuboidTask:
         # Pixel centres lie at halves for K, at integers for cv2.
         moved = A + np.array([[0, 0, 0.5 * zoom - 0.5], [0, 0, 0.5 * zoom - 0.5], [0, 0, 0]])
         image = cv2.warpAffine(
-            jitter_colours(rng, image), moved[:2], (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            jitter_colours(rng, image),
+            moved[:2],
+            (width, height),
+            flags=cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
         )
         picture = np.moveaxis(image, -1, 0).astype(np.float32) / np.float32(127.5) - 1
         return (picture, *cuboid_cells(cuboids, A @ K, width, height))
 
 
-def cuboid_cells(cuboids: list[Cuboid], K: F64, width: int, height: int) -> tuple[F32, F32, F32, Any]:
-    """Return heat ``(h, w)``, middles ``(h, w)``, numbers ``(8, h, w)`` and classes ``(h, w)`` of a frame's vehicles.
+def cuboid_cells(
+    cuboids: list[Cuboid], K: F64, width: int, height: int
+) -> tuple[F32, F32, F32, Any]:
+    """Return heat ``(h, w)``, middles ``(h, w)``, numbers ``(8, h, w)`` and classes ``(h, w)`` of a
+    frame's vehicles.
 
     Vehicles whose middle is outside the image are left out: their cell does not exist.
     """
@@ -131,7 +152,9 @@ def cuboid_cells(cuboids: list[Cuboid], K: F64, width: int, height: int) -> tupl
         if not (0 <= u < w and 0 <= v < h):
             continue
         spread = np.maximum(np.ptp(hull, axis=0) / STRIDE / 8, 0.4)
-        bump = np.exp(-0.5 * (((columns - column) / spread[0]) ** 2 + ((rows - row) / spread[1]) ** 2))
+        bump = np.exp(
+            -0.5 * (((columns - column) / spread[0]) ** 2 + ((rows - row) / spread[1]) ** 2)
+        )
         heat = np.maximum(heat, bump).astype(np.float32)
         middle[row, column] = 1
         numbers[:, row, column] = u - column, v - row, *values[1:]

@@ -1,4 +1,5 @@
-"""Labels of a pair sequence from its scene, kept on disk: what the simulator knows about some of its frames.
+"""Labels of a pair sequence from its scene, kept on disk: what the simulator knows about some of
+its frames.
 
 FOLDER/SPLIT/SEQUENCE.npz   frames (F,), lanes (F, L, 29) metres or NaN, vehicles (F, B, 8) or NaN rows, T_rig_camera, K, size
 """
@@ -19,7 +20,12 @@ from alpasim_plugin.core.geometry import interpolate, inverse
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, I64, CameraSpec, Scenario
 from alpasim_plugin.lab.learned_metrics.types import Cuboid, Lane3D
-from alpasim_plugin.lab.training.learned_metrics.truth import VEHICLES, lanes_seen, vehicles_seen, world_lines
+from alpasim_plugin.lab.training.learned_metrics.truth import (
+    VEHICLES,
+    lanes_seen,
+    vehicles_seen,
+    world_lines,
+)
 from alpasim_plugin.lab.training.pair_store import PairSequence
 from scenarios.load import load_scenario
 
@@ -36,7 +42,8 @@ class Labels:
     Args:
         frames: ``(F,)`` numbers of the frames.
         lanes: ``(F, L, 29)`` lateral positions, metres, rig frame; NaN where not visible.
-        vehicles: ``(F, B, 8)``: class number, x, y, z, length, height, width (metres), yaw (radians); NaN rows fill up.
+        vehicles: ``(F, B, 8)``: class number, x, y, z, length, height, width (metres), yaw
+            (radians); NaN rows fill up.
         camera: Lens and mounting.
     """
 
@@ -52,14 +59,19 @@ class Labels:
     def cuboids_of(self, row: int) -> list[Cuboid]:
         """Return the vehicles of a labelled frame."""
         found = self.vehicles[row]
-        return [Cuboid(VEHICLES[int(v[0])], 1.0, *(float(x) for x in v[1:])) for v in found if np.isfinite(v[0])]
+        return [
+            Cuboid(VEHICLES[int(v[0])], 1.0, *(float(x) for x in v[1:]))
+            for v in found
+            if np.isfinite(v[0])
+        ]
 
 
 def sequence_labels(sequence: PairSequence, scenes: Path, kept: Path, every: int) -> Labels:
     """Return the truth of every n-th frame of a sequence, from disk where it is there.
 
     Args:
-        sequence: Of the split ``train`` or ``val``, or of a test split when a frozen judge is measured.
+        sequence: Of the split ``train`` or ``val``, or of a test split when a frozen judge is
+            measured.
         scenes: ROOT of the scenario files, ROOT/SPLIT/NAME.yaml.
         kept: Folder of the labels.
         every: Frames between two labelled ones.
@@ -75,17 +87,30 @@ def sequence_labels(sequence: PairSequence, scenes: Path, kept: Path, every: int
         camera = labels.camera
         with atomic_file(path) as partial_path, partial_path.open("wb") as file:
             np.savez_compressed(
-                file, frames=labels.frames, lanes=labels.lanes, vehicles=labels.vehicles, T_rig_camera=camera.T_rig_camera, K=camera.K,
+                file,
+                frames=labels.frames,
+                lanes=labels.lanes,
+                vehicles=labels.vehicles,
+                T_rig_camera=camera.T_rig_camera,
+                K=camera.K,
                 size=np.array([camera.width, camera.height]),
-            )  # fmt: skip
-    with parsing(DOING, path, f"remove {path}; it is made again", "not whole labels"), np.load(path) as stored:
+            )
+    with (
+        parsing(DOING, path, f"remove {path}; it is made again", "not whole labels"),
+        np.load(path) as stored,
+    ):
         width, height = (int(v) for v in stored["size"])
         camera = CameraSpec("camera", width, height, stored["K"], stored["T_rig_camera"])
         return Labels(stored["frames"], stored["lanes"], stored["vehicles"], camera)
 
 
 def all_labels(
-    sequences: Sequence[PairSequence], scenes: Path, kept: Path, every: int, jobs: int = 1, report: Callable[[int, int], None] | None = None
+    sequences: Sequence[PairSequence],
+    scenes: Path,
+    kept: Path,
+    every: int,
+    jobs: int = 1,
+    report: Callable[[int, int], None] | None = None,
 ) -> list[Labels]:
     """Return `sequence_labels` of many sequences, in order; ``report`` gets how many are done."""
     one = partial(sequence_labels, scenes=scenes, kept=kept, every=every)
@@ -113,16 +138,25 @@ def for_training(sequences: Sequence[PairSequence]) -> tuple[PairSequence, ...]:
     for sequence in sequences:
         if sequence.info.get("split", "train") not in TRAINING_SPLITS:
             found = f"split {sequence.info.get('split')!r}"
-            raise InputError(DOING, str(sequence.folder), found, "train judges on the splits train and val only")
+            raise InputError(
+                DOING, str(sequence.folder), found, "train judges on the splits train and val only"
+            )
     return tuple(sequences)
 
 
 def _make(sequence: PairSequence, path: Path, every: int) -> Labels:
     if not path.is_file():
-        raise InputError(DOING, str(path), "no such scene", "give the folder of scenes that the pairs were rendered from")
+        raise InputError(
+            DOING,
+            str(path),
+            "no such scene",
+            "give the folder of scenes that the pairs were rendered from",
+        )
     scenario = load_scenario(path)
     clip = sequence.clip
-    camera = next((c for c in scenario.cameras if c.width == clip.rgb_gt.shape[2]), scenario.cameras[0])
+    camera = next(
+        (c for c in scenario.cameras if c.width == clip.rgb_gt.shape[2]), scenario.cameras[0]
+    )
     _require_same_scene(scenario, camera, sequence, path)
     T_camera_rig = inverse(camera.T_rig_camera)
     lines = world_lines(scenario.lane_map)
@@ -133,13 +167,28 @@ def _make(sequence: PairSequence, path: Path, every: int) -> Labels:
         seen = lanes_seen(lines, T_world_camera @ T_camera_rig, camera)
         lanes.append(np.array([lane.lateral_m for lane in seen]).reshape(len(seen), -1))
         boxes = vehicles_seen(scenario, int(clip.t_us[i]), T_world_camera, camera)
-        rows = [[VEHICLES.index(b.label), b.x_m, b.y_m, b.z_m, b.length_m, b.height_m, b.width_m, b.yaw_rad] for b in boxes]
+        rows = [
+            [
+                VEHICLES.index(b.label),
+                b.x_m,
+                b.y_m,
+                b.z_m,
+                b.length_m,
+                b.height_m,
+                b.width_m,
+                b.yaw_rad,
+            ]
+            for b in boxes
+        ]
         vehicles.append(np.array(rows).reshape(len(rows), 8))
     return Labels(frames, _filled(lanes, 29), _filled(vehicles, 8), camera)
 
 
-def _require_same_scene(scenario: Scenario, camera: CameraSpec, sequence: PairSequence, path: Path) -> None:
-    """Refuse a scene in which the sequence's camera cannot have stood: another lens, or a rig away from the recorded drive.
+def _require_same_scene(
+    scenario: Scenario, camera: CameraSpec, sequence: PairSequence, path: Path
+) -> None:
+    """Refuse a scene in which the sequence's camera cannot have stood: another lens, or a rig away
+    from the recorded drive.
 
     The scene's hash is no test: it changes with the format of scenes, and pairs outlive it.
     """
@@ -150,7 +199,9 @@ def _require_same_scene(scenario: Scenario, camera: CameraSpec, sequence: PairSe
     away = float(np.linalg.norm(rig[:, :3, 3] - recorded[:, :3, 3], axis=1).max())
     if (lens is not None and not np.allclose(lens, camera.K)) or away > AWAY_M:
         found = f"a camera of another lens, or up to {away:.1f} m from the recorded drive"
-        raise InputError(DOING, str(path), found, "give the folder of scenes that the pairs were rendered from")
+        raise InputError(
+            DOING, str(path), found, "give the folder of scenes that the pairs were rendered from"
+        )
 
 
 def _filled(rows: Sequence[F64], width: int) -> F64:

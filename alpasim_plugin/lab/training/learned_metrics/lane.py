@@ -44,7 +44,9 @@ class LaneRecipe:
 
 @dataclass(frozen=True)
 class LaneBatch:
-    """B frames on the ground ``(B, 4, 58, 216)``, and ``(B, 4, 29, 54)``: line (0 or 1), offset, slope, counted (0: outside the image)."""
+    """B frames on the ground ``(B, 4, 58, 216)``, and ``(B, 4, 29, 54)``: line (0 or 1), offset,
+    slope, counted (0: outside the image).
+    """
 
     ground: Tensor
     cells: Tensor
@@ -73,14 +75,27 @@ class LaneTask:
     def loss(self, batch: LaneBatch, index: int) -> Loss:
         """Return the loss of a batch and its parts."""
         del index
-        r, made = self.recipe, self.module(batch.ground.contiguous(memory_format=torch.channels_last))
+        r, made = (
+            self.recipe,
+            self.module(batch.ground.contiguous(memory_format=torch.channels_last)),
+        )
         line, offset, slope, counted = batch.cells.unbind(1)
-        exists = F.binary_cross_entropy_with_logits(made[:, 0], line, pos_weight=torch.tensor(r.rare), reduction="none")
+        exists = F.binary_cross_entropy_with_logits(
+            made[:, 0], line, pos_weight=torch.tensor(r.rare), reduction="none"
+        )
         lines = (line * counted).sum().clamp(min=1)
         parts = {
             "exists": (exists * counted).sum() / counted.sum().clamp(min=1) * 10,
-            "offset": r.offset * (F.smooth_l1_loss(made[:, 1], offset, beta=0.1, reduction="none") * line * counted).sum() / lines,
-            "slope": r.slope * (F.smooth_l1_loss(made[:, 2], slope, beta=0.1, reduction="none") * line * counted).sum() / lines,
+            "offset": r.offset
+            * (
+                F.smooth_l1_loss(made[:, 1], offset, beta=0.1, reduction="none") * line * counted
+            ).sum()
+            / lines,
+            "slope": r.slope
+            * (
+                F.smooth_l1_loss(made[:, 2], slope, beta=0.1, reduction="none") * line * counted
+            ).sum()
+            / lines,
         }
         numbers = {name: float(value.detach()) for name, value in parts.items()}
         found = (made[:, 0] > 0).float() * counted
@@ -94,14 +109,18 @@ class LaneTask:
         shift_m = float(rng.uniform(-self.recipe.shift_m, self.recipe.shift_m))
         view = GroundView(labels.camera, shift_m)
         ground = view(jitter_colours(rng, image))
-        lanes = np.array([lane.lateral_m for lane in labels.lanes_of(row)]).reshape(-1, len(FORWARD_M)) - shift_m
+        lanes = (
+            np.array([lane.lateral_m for lane in labels.lanes_of(row)]).reshape(-1, len(FORWARD_M))
+            - shift_m
+        )
         if rng.random() < 0.5:
             ground, lanes = np.ascontiguousarray(ground[:, :, ::-1]), -lanes
         return ground, lane_cells(lanes, ground[3])
 
 
 def lane_cells(lanes: F64, inside: F32) -> F32:
-    """Return ``(4, 29, 54)``: where lines pass, offset to the right of the cell's middle in cells, slope in metres per row, counted.
+    """Return ``(4, 29, 54)``: where lines pass, offset to the right of the cell's middle in cells,
+    slope in metres per row, counted.
 
     Args:
         lanes: ``(L, 29)`` lateral positions, metres; NaN where not visible.
@@ -112,14 +131,20 @@ def lane_cells(lanes: F64, inside: F32) -> F32:
     for lane in lanes:
         slope = _slopes(lane)
         at = (HALF_WIDTH_M - lane) / CELL_M  # cells from the left border
-        for row in np.flatnonzero(np.isfinite(lane) & (np.abs(slope) <= STEEPEST) & (at >= 0) & (at < CELLS)):
+        for row in np.flatnonzero(
+            np.isfinite(lane) & (np.abs(slope) <= STEEPEST) & (at >= 0) & (at < CELLS)
+        ):
             cell = int(at[row])
             out[:3, row, cell] = 1, at[row] - cell - 0.5, slope[row]
     return out
 
 
 def _slopes(lane: F64) -> F64:
-    """Return the change of a lane to the next row (else from the last one), 0 for a single point."""
+    """Return the change of a lane to the next row (else from the last one), 0 for a single
+    point.
+    """
     ahead = np.append(lane[1:] - lane[:-1], np.nan)
     behind = np.insert(lane[1:] - lane[:-1], 0, np.nan)
-    return np.asarray(np.where(np.isfinite(ahead), ahead, np.where(np.isfinite(behind), behind, 0.0)))
+    return np.asarray(
+        np.where(np.isfinite(ahead), ahead, np.where(np.isfinite(behind), behind, 0.0))
+    )

@@ -1,4 +1,6 @@
-"""Train the style judge on clean frames of training scenes and their targets by formula; the frames are rendered with their depth."""
+"""Train the style judge on clean frames of training scenes and their targets by formula; the frames
+are rendered with their depth.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,10 @@ class StyleTask:
     def batch(self, index: int) -> StyleBatch:
         """Make batch ``index``."""
         rows = [self._example(index * self.recipe.batch + i) for i in range(self.recipe.batch)]
-        return StyleBatch(torch.from_numpy(np.stack([image for image, _ in rows])), torch.tensor([style for _, style in rows]))
+        return StyleBatch(
+            torch.from_numpy(np.stack([image for image, _ in rows])),
+            torch.tensor([style for _, style in rows]),
+        )
 
     def loss(self, batch: StyleBatch, index: int) -> Loss:
         """Return the cross entropy of a batch."""
@@ -87,11 +92,15 @@ class StyleTask:
         return (np.ascontiguousarray(seen[..., ::-1]) if rng.random() < 0.5 else seen), style
 
 
-def styled_frames(scenes: Sequence[Path], kept: Path, report: Callable[[int, int], None] | None = None) -> U8:
-    """Return frames of scenes in all styles ``(S, N, H, W, 3)``, six a scene, from disk where they are there.
+def styled_frames(
+    scenes: Sequence[Path], kept: Path, report: Callable[[int, int], None] | None = None
+) -> U8:
+    """Return frames of scenes in all styles ``(S, N, H, W, 3)``, six a scene, from disk where they
+    are there.
 
     Args:
-        scenes: Scenario files below a folder ``train`` or ``val``; those of another camera than the judges' are left out.
+        scenes: Scenario files below a folder ``train`` or ``val``; those of another camera than the
+            judges' are left out.
         kept: Folder of the frames.
         report: Gets how many scenes are done.
 
@@ -101,23 +110,38 @@ def styled_frames(scenes: Sequence[Path], kept: Path, report: Callable[[int, int
     parts = []
     for done, path in enumerate(scenes, start=1):
         if path.parent.name not in TRAINING_SPLITS:
-            raise InputError("rendering frames for a judge", str(path), "not a training split", "give scenes of the splits train and val")
+            raise InputError(
+                "rendering frames for a judge",
+                str(path),
+                "not a training split",
+                "give scenes of the splits train and val",
+            )
         file = kept / path.parent.name / f"{path.stem}-style-{VERSION}.npz"
         if not file.is_file():
             scenario = load_scenario(path)
-            frames = _render(scenario) if scenario.cameras[0].width == WIDTH_PX else np.zeros((len(STYLES), 0, 1, 1, 3), dtype=np.uint8)
+            frames = (
+                _render(scenario)
+                if scenario.cameras[0].width == WIDTH_PX
+                else np.zeros((len(STYLES), 0, 1, 1, 3), dtype=np.uint8)
+            )
             file.parent.mkdir(parents=True, exist_ok=True)
             with atomic_file(file) as partial, partial.open("wb") as out:
                 np.savez_compressed(out, frames=frames)
         do = f"remove {file}; it is made again"
-        with parsing("reading frames for a judge", file, do, "not whole frames"), np.load(file) as stored:
+        with (
+            parsing("reading frames for a judge", file, do, "not whole frames"),
+            np.load(file) as stored,
+        ):
             if stored["frames"].shape[1]:
                 parts.append(stored["frames"])
         if report is not None:
             report(done, len(scenes))
     if not parts:
         raise InputError(
-            "rendering frames for a judge", f"{len(scenes)} scenes", f"none with a camera {WIDTH_PX} pixels wide", "give others"
+            "rendering frames for a judge",
+            f"{len(scenes)} scenes",
+            f"none with a camera {WIDTH_PX} pixels wide",
+            "give others",
         )
     return np.concatenate(parts, axis=1)
 
@@ -127,7 +151,9 @@ def _render(scenario: Scenario) -> U8:
     scene = SeenScene(scenario, camera, with_street_lights=False)
     out: list[list[U8]] = [[] for _ in STYLES]
     for t_us in np.linspace(scenario.start_us, scenario.end_us, FRAMES_A_SCENE).astype(np.int64):
-        seen = scene.frame(int(t_us), offset_from_log(scenario, int(t_us), 0.0) @ camera.T_rig_camera)
+        seen = scene.frame(
+            int(t_us), offset_from_log(scenario, int(t_us), 0.0) @ camera.T_rig_camera
+        )
         for frames, style in zip(out, STYLES, strict=True):
             frames.append(restyle(seen, style, scenario.scene_id, 0))
     return np.stack([np.stack(frames) for frames in out])

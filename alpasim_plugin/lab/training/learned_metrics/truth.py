@@ -1,7 +1,9 @@
-"""What the simulator knows about a frame: lane lines on the ground, and the boxes of vehicles, both seen from the camera.
+"""What the simulator knows about a frame: lane lines on the ground, and the boxes of vehicles, both
+seen from the camera.
 
-Lane lines are the painted lines of the map; a double line is one line. Their ends are joined where they meet, so that a line that the map
-cuts at a junction of roads is one instance. A line that turns back is cut where it does. Occlusion of lines is ignored.
+Lane lines are the painted lines of the map; a double line is one line. Their ends are joined where
+they meet, so that a line that the map cuts at a junction of roads is one instance. A line that
+turns back is cut where it does. Occlusion of lines is ignored.
 """
 
 from __future__ import annotations
@@ -14,7 +16,13 @@ import numpy as np
 from alpasim_plugin.core.geometry import inverse, resample, transform_points
 from alpasim_plugin.core.types import F64, CameraSpec, LaneMap, Scenario
 from alpasim_plugin.gaussians.scene.degrade import log_actors
-from alpasim_plugin.lab.learned_metrics.types import FORWARD_M, NEAREST_CORNER_M, Cuboid, Lane3D, hull_pixels
+from alpasim_plugin.lab.learned_metrics.types import (
+    FORWARD_M,
+    NEAREST_CORNER_M,
+    Cuboid,
+    Lane3D,
+    hull_pixels,
+)
 from alpasim_plugin.world.paint import painted_lines
 
 VEHICLES = ("car", "truck", "bus")
@@ -26,7 +34,9 @@ STEP_M = 1.0
 
 
 def world_lines(lane_map: LaneMap) -> list[F64]:
-    """Return the painted lines of a map, each ``(N, 3)`` metres, world; ends that meet are joined."""
+    """Return the painted lines of a map, each ``(N, 3)`` metres, world; ends that meet are
+    joined.
+    """
     lines = [xyz for xyz, _ in painted_lines(lane_map)]
     out: list[F64] = []
     while lines:
@@ -42,7 +52,10 @@ def _continuation(line: F64, others: Sequence[F64]) -> tuple[int, F64] | None:
     """Return which other line goes on where this one ends or begins, and the two as one."""
     for i, other in enumerate(others):
         for a, b in ((line, other), (line, other[::-1]), (other, line), (other[::-1], line)):
-            if np.linalg.norm(a[-1] - b[0]) < JOIN_M and _direction(a[-2:]) @ _direction(b[:2]) > JOIN_COS:
+            if (
+                np.linalg.norm(a[-1] - b[0]) < JOIN_M
+                and _direction(a[-2:]) @ _direction(b[:2]) > JOIN_COS
+            ):
                 return i, np.concatenate([a, b[1:]])
     return None
 
@@ -78,11 +91,17 @@ def lanes_seen(lines: Sequence[F64], T_world_rig: F64, camera: CameraSpec) -> li
 
 
 def _monotone(at: F64) -> list[F64]:
-    """Cut a line ``(N, 3)`` in the rig frame where its forward direction turns; parts run away from the rig."""
+    """Cut a line ``(N, 3)`` in the rig frame where its forward direction turns; parts run away from
+    the rig.
+    """
     sign = np.sign(np.diff(at[:, 0]))
     cuts = np.flatnonzero(np.diff(sign) != 0) + 1
     parts = [at[a : b + 1] for a, b in zip([0, *cuts], [*cuts, len(at) - 1], strict=True)]
-    return [part if part[-1, 0] > part[0, 0] else part[::-1] for part in parts if abs(part[-1, 0] - part[0, 0]) > 1e-6]
+    return [
+        part if part[-1, 0] > part[0, 0] else part[::-1]
+        for part in parts
+        if abs(part[-1, 0] - part[0, 0]) > 1e-6
+    ]
 
 
 def in_view(points: F64, camera: CameraSpec) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -90,15 +109,25 @@ def in_view(points: F64, camera: CameraSpec) -> np.ndarray[tuple[int], np.dtype[
     at = transform_points(inverse(camera.T_rig_camera), points)
     ahead = at[:, 2] > NEAREST_CORNER_M
     uv = (at @ camera.K.T)[:, :2] / np.where(ahead, at[:, 2], 1.0)[:, None]
-    return np.asarray(ahead & (uv >= 0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height))
+    return np.asarray(
+        ahead & (uv >= 0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
+    )
 
 
-def vehicles_seen(scenario: Scenario, t_us: int, T_world_camera: F64, camera: CameraSpec) -> list[Cuboid]:
-    """Return the vehicles inside 60 m of which the camera sees at least a fifth, with score 1; nearer ones hide farther ones."""
-    return visible_cuboids(vehicle_cuboids(scenario, log_actors(scenario, t_us), T_world_camera), camera)
+def vehicles_seen(
+    scenario: Scenario, t_us: int, T_world_camera: F64, camera: CameraSpec
+) -> list[Cuboid]:
+    """Return the vehicles inside 60 m of which the camera sees at least a fifth, with score 1;
+    nearer ones hide farther ones.
+    """
+    return visible_cuboids(
+        vehicle_cuboids(scenario, log_actors(scenario, t_us), T_world_camera), camera
+    )
 
 
-def vehicle_cuboids(scenario: Scenario, poses: Mapping[str, F64], T_world_camera: F64) -> list[Cuboid]:
+def vehicle_cuboids(
+    scenario: Scenario, poses: Mapping[str, F64], T_world_camera: F64
+) -> list[Cuboid]:
     """Return the boxes of all vehicles in the camera's axes."""
     T_camera_world, out = inverse(T_world_camera), []
     for actor in scenario.actors:
@@ -113,7 +142,9 @@ def vehicle_cuboids(scenario: Scenario, poses: Mapping[str, F64], T_world_camera
 
 
 def visible_cuboids(cuboids: Sequence[Cuboid], camera: CameraSpec) -> list[Cuboid]:
-    """Return the boxes inside 60 m, in order of depth, of whose outline at least a fifth is in the image and not behind another box."""
+    """Return the boxes inside 60 m, in order of depth, of whose outline at least a fifth is in the
+    image and not behind another box.
+    """
     size = camera.height, camera.width
     taken = np.zeros(size, dtype=bool)
     out = []

@@ -1,7 +1,8 @@
-"""The causal video arms of the paper's comparison: OmniDreams, Self-Forcing, One-Forcing, ArtiFixer.
+"""The causal video arms of the paper's comparison: OmniDreams, Self-Forcing, One-Forcing,
+ArtiFixer.
 
-Shares and rates are the papers': U is OneFixer's updates, a rate is relative to OneFixer's. Where they are not published, docs/lab/arms.md
-has the choice.
+Shares and rates are the papers': U is OneFixer's updates, a rate is relative to OneFixer's. Where
+they are not published, docs/lab/arms.md has the choice.
 """
 
 from __future__ import annotations
@@ -21,10 +22,13 @@ from alpasim_plugin.lab.training.trainer import PartSchedule
 STUDENT = PartSchedule(rate=1 / 15, betas=(0.0, 0.999), clip=10.0)
 CRITIC = PartSchedule(rate=1 / 75, betas=(0.0, 0.999), clip=10.0)
 
-# OmniDreams: the causal backbone, fine-tuned to the fixer task. It is also the student of the distilled arms.
+# OmniDreams: the causal backbone, fine-tuned to the fixer task. It is also the student of the
+# distilled arms.
 CAUSAL = Stage("student", FlowMatching("block"))
 # Their teacher: the bidirectional backbone, fine-tuned alike.
-TEACHER = Stage("teacher", FlowMatching("clip"), attention=whole_clip, start={"dit": f"{INIT_BI}.dit"})
+TEACHER = Stage(
+    "teacher", FlowMatching("clip"), attention=whole_clip, start={"dit": f"{INIT_BI}.dit"}
+)
 SELF_FORCING = Stage(
     "dmd",
     Distillation(),
@@ -42,7 +46,8 @@ ONE_FORCING = replace(
 
 
 def long_blocks(latents: int) -> Attention:
-    """Return ArtiFixer's attention: blocks of a quarter of the clip, with the first block as a sink; a third of short clips.
+    """Return ArtiFixer's attention: blocks of a quarter of the clip, with the first block as a
+    sink; a third of short clips.
 
     The published block of 7 latents in a window of 21, 7 of them sink, divides no clip of 24.
     """
@@ -51,13 +56,23 @@ def long_blocks(latents: int) -> Attention:
 
 
 def artifixers(times: Literal["block", "clip"]) -> FlowMatching:
-    """Return ArtiFixer's flow matching: times warped towards the source, errors weighted by a bell, renders hidden from a frame on."""
+    """Return ArtiFixer's flow matching: times warped towards the source, errors weighted by a bell,
+    renders hidden from a frame on.
+    """
     return FlowMatching(times, shift=SHIFT, bell=True, tail_drop=TailDrop())
 
 
 OPACITY = Seen(map="nothing", opacity=True)
-BIDIRECTIONAL = Stage("bidirectional", artifixers("clip"), attention=whole_clip, seen=OPACITY, start={"dit": f"{INIT_BI}.dit"})
-FORCED = Stage("causal", artifixers("block"), 1.5, long_blocks, OPACITY, {"dit": "bidirectional.dit"})
+BIDIRECTIONAL = Stage(
+    "bidirectional",
+    artifixers("clip"),
+    attention=whole_clip,
+    seen=OPACITY,
+    start={"dit": f"{INIT_BI}.dit"},
+)
+FORCED = Stage(
+    "causal", artifixers("block"), 1.5, long_blocks, OPACITY, {"dit": "bidirectional.dit"}
+)
 DISTILLED = Stage(
     "dmd",
     Distillation(steps=4, same_rollout=True, gradient_latents=None, tail_drop=TailDrop()),
@@ -70,9 +85,26 @@ DISTILLED = Stage(
 )
 
 CAUSAL_ARMS = (
-    Recipe("omnidreams", "diffusion forcing from the mixed source", (replace(CAUSAL, name="omnidreams"),), "omnidreams"),
+    Recipe(
+        "omnidreams",
+        "diffusion forcing from the mixed source",
+        (replace(CAUSAL, name="omnidreams"),),
+        "omnidreams",
+    ),
     Recipe("self-forcing", "DMD on own rollouts", (TEACHER, CAUSAL, SELF_FORCING), "self-forcing"),
-    Recipe("one-forcing", "DMD on own rollouts with an adversarial head", (TEACHER, CAUSAL, ONE_FORCING), "one-forcing"),
-    Recipe("artifixer-pre", "opacity in every block, diffusion forcing in long blocks", (BIDIRECTIONAL, FORCED), "artifixer-pre"),
-    Recipe("artifixer", "the same, distilled by DMD", (BIDIRECTIONAL, FORCED, DISTILLED), "artifixer"),
+    Recipe(
+        "one-forcing",
+        "DMD on own rollouts with an adversarial head",
+        (TEACHER, CAUSAL, ONE_FORCING),
+        "one-forcing",
+    ),
+    Recipe(
+        "artifixer-pre",
+        "opacity in every block, diffusion forcing in long blocks",
+        (BIDIRECTIONAL, FORCED),
+        "artifixer-pre",
+    ),
+    Recipe(
+        "artifixer", "the same, distilled by DMD", (BIDIRECTIONAL, FORCED, DISTILLED), "artifixer"
+    ),
 )

@@ -1,8 +1,10 @@
-"""What a recipe is: stages of training, each with an objective, a share of the updates, initial weights and trained parts.
+"""What a recipe is: stages of training, each with an objective, a share of the updates, initial
+weights and trained parts.
 
-An objective is a frozen configuration that makes a `Task`: batches and a loss over named parts (``dit``, ``vae``, and parts that only the
-training has). The framework (`lab.training.fixer_run`) trains, resumes, and writes the bundle and the card of every stage. A new
-system needs an objective where its loss is new, and a `Recipe` in the registry.
+An objective is a frozen configuration that makes a `Task`: batches and a loss over named parts
+(``dit``, ``vae``, and parts that only the training has). The framework (`lab.training.fixer_run`)
+trains, resumes, and writes the bundle and the card of every stage. A new system needs an objective
+where its loss is new, and a `Recipe` in the registry.
 """
 
 from __future__ import annotations
@@ -32,13 +34,15 @@ Weights = Mapping[str, Tensor]
 
 @dataclass(frozen=True)
 class Attention:
-    """What a latent attends to, in latents: the rows of the paper's attention mask, in training and at deployment.
+    """What a latent attends to, in latents: the rows of the paper's attention mask, in training and
+    at deployment.
 
     Args:
         block_latents: Latents made at once.
         window: Latents in sight, the own block and the sink included.
         sink: First latents of the rollout that stay in sight.
-        history: Keys and values of a finished block: of an extra forward over its clean latents, or of its last step; or none.
+        history: Keys and values of a finished block: of an extra forward over its clean latents, or
+            of its last step; or none.
     """
 
     block_latents: int = 2
@@ -66,8 +70,9 @@ class Task(Protocol):
     """Batches and loss of one stage, for `alpasim_plugin.lab.training.trainer.Trainer`.
 
     Attributes:
-        parts: Every part by its name: ``dit`` and ``vae`` go into the bundle, others into the stage's checkpoints alone. Which are trained
-            is the stage's to say; the framework freezes the rest.
+        parts: Every part by its name: ``dit`` and ``vae`` go into the bundle, others into the
+            stage's checkpoints alone. Which are trained is the stage's to say; the framework
+            freezes the rest.
     """
 
     parts: nn.ModuleDict
@@ -96,7 +101,8 @@ class StageInputs:
         attention: Of the stage.
         seen: What the network sees.
         weights: Initial weights by part, as `Stage.start` names them.
-        vae: Autoencoder of the clips, or the one that ``vae`` starts from; each task may train it or leave it frozen.
+        vae: Autoencoder of the clips, or the one that ``vae`` starts from; each task may train it
+            or leave it frozen.
         clips: Training latents.
         form: Clips of a batch.
         updates: Of the stage.
@@ -150,9 +156,11 @@ class Stage:
         share: Updates, in units of the run's ``--steps`` (U).
         attention: From the clip's latents to what a latent attends to.
         seen: What the network sees.
-        start: Initial weights by part: ``SOURCE.PART``, where the source is ``init``, ``init-bi`` or an earlier stage. A part that is not
-            named is the objective's to initialise; ``vae`` is then the run's ``--vae``.
-        trained: Trained parts, by the first names of their parameters, with learning rates relative to the run's.
+        start: Initial weights by part: ``SOURCE.PART``, where the source is ``init``, ``init-bi``
+            or an earlier stage. A part that is not named is the objective's to initialise; ``vae``
+            is then the run's ``--vae``.
+        trained: Trained parts, by the first names of their parameters, with learning rates relative
+            to the run's.
         decay: How the learning rate falls after the warm-up.
         last_share: Share of the peak that it falls to.
         latents: Latents from a clip's start; None for the whole clip.
@@ -206,13 +214,24 @@ class Recipe:
         for stage in self.stages:
             if unknown := [source for source in stage.sources if source not in known]:
                 found = f"stage {stage.name!r} starts from {', '.join(unknown)}"
-                raise InputError("defining a recipe", self.name, found, f"name one of {', '.join(known)}")
+                raise InputError(
+                    "defining a recipe", self.name, found, f"name one of {', '.join(known)}"
+                )
             known.append(stage.name)
 
     def settings(self, stage: Stage, latents: int) -> dict[str, Any]:
-        """Return the settings to deploy a stage's weights with in a block generator, for clips of so many latents."""
-        return {"steps": (1000.0,), **asdict(stage.attention(latents)), **stage.seen.settings(), **self.own_settings(stage)}
+        """Return the settings to deploy a stage's weights with in a block generator, for clips of
+        so many latents.
+        """
+        return {
+            "steps": (1000.0,),
+            **asdict(stage.attention(latents)),
+            **stage.seen.settings(),
+            **self.own_settings(stage),
+        }
 
     def own_settings(self, stage: Stage) -> dict[str, Any]:
-        """Return the settings that recipe and stage name: all that there are for a fixer without blocks."""
+        """Return the settings that recipe and stage name: all that there are for a fixer without
+        blocks.
+        """
         return {**self.deployed, **stage.deployed}

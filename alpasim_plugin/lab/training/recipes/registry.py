@@ -31,7 +31,12 @@ def by_name(recipes: Iterable[Recipe]) -> Mapping[str, Recipe]:
     found: dict[str, Recipe] = {}
     for recipe in recipes:
         if recipe.name in found:
-            raise InputError("registering a recipe", recipe.name, "a recipe of that name already", "choose another name")
+            raise InputError(
+                "registering a recipe",
+                recipe.name,
+                "a recipe of that name already",
+                "choose another name",
+            )
         found[recipe.name] = recipe
     return MappingProxyType(found)
 
@@ -46,34 +51,51 @@ def recipe_of(name: str) -> Recipe:
         InputError: No such recipe.
     """
     if name not in RECIPES:
-        raise InputError("choosing what to train", f"recipe {name!r}", "no such recipe", f"choose one of {', '.join(RECIPES)}")
+        raise InputError(
+            "choosing what to train",
+            f"recipe {name!r}",
+            "no such recipe",
+            f"choose one of {', '.join(RECIPES)}",
+        )
     return RECIPES[name]
 
 
 def with_perceptual_weight(recipe: Recipe, weight: float) -> Recipe:
-    """Return a recipe with another weight lambda of the shared rollouts' perceptual term; others keep their papers' weights.
+    """Return a recipe with another weight lambda of the shared rollouts' perceptual term; others
+    keep their papers' weights.
 
     Raises:
         InputError: A negative weight.
     """
 
     def weighted(objective: Objective) -> Objective:
-        return objective.weighted(weight) if isinstance(objective, SharedRollout | StyledRollout) else objective
+        return (
+            objective.weighted(weight)
+            if isinstance(objective, SharedRollout | StyledRollout)
+            else objective
+        )
 
     return _with_objectives(recipe, weighted)
 
 
 def with_source_share(recipe: Recipe, share: float) -> Recipe:
-    """Return a recipe with another share of positions at the source, where its flow matching has such a share."""
+    """Return a recipe with another share of positions at the source, where its flow matching has
+    such a share.
+    """
 
     def shared(objective: Objective) -> Objective:
-        return replace(objective, source_share=share) if isinstance(objective, FlowMatching) and objective.source_share else objective
+        return (
+            replace(objective, source_share=share)
+            if isinstance(objective, FlowMatching) and objective.source_share
+            else objective
+        )
 
     return _with_objectives(recipe, shared)
 
 
 def with_objective(recipe: Recipe, texts: Sequence[str]) -> Recipe:
-    """Return a recipe with other fields of its objectives: ``KEY=VALUE`` in every stage that has it, ``STAGE.KEY=VALUE`` in one.
+    """Return a recipe with other fields of its objectives: ``KEY=VALUE`` in every stage that has
+    it, ``STAGE.KEY=VALUE`` in one.
 
     Example:
         >>> with_objective(recipe_of("self-forcing"), ["dmd.steps=4"]).stages[-1].objective.steps
@@ -91,21 +113,40 @@ def _with_field(recipe: Recipe, text: str) -> Recipe:
     path, equals, value = text.partition("=")
     stage_name, dot, key = path.rpartition(".")
     fields = {stage.name: get_type_hints(type(stage.objective)) for stage in recipe.stages}
-    chosen = [name for name, known in fields.items() if key in known and (not dot or name == stage_name)]
+    chosen = [
+        name for name, known in fields.items() if key in known and (not dot or name == stage_name)
+    ]
     doing, given = "changing an objective", f"--objective {text}"
     if not equals or not chosen:
         known = sorted({f"{name}.{field}" for name, types in fields.items() for field in types})
-        raise InputError(doing, given, f"no such field in recipe {recipe.name}", f"write KEY=VALUE with one of {', '.join(known)}")
+        raise InputError(
+            doing,
+            given,
+            f"no such field in recipe {recipe.name}",
+            f"write KEY=VALUE with one of {', '.join(known)}",
+        )
     try:
         read = TypeAdapter(fields[chosen[0]][key]).validate_python(yaml.safe_load(value))
     except (ValueError, yaml.YAMLError) as error:
-        raise InputError(doing, given, f"not a value of {key}: {str(error).splitlines()[-1].strip()}", "write it as YAML") from error
-    stages = (replace(s, objective=replace(s.objective, **{key: read})) if s.name in chosen else s for s in recipe.stages)  # type: ignore[type-var]
+        raise InputError(
+            doing,
+            given,
+            f"not a value of {key}: {str(error).splitlines()[-1].strip()}",
+            "write it as YAML",
+        ) from error
+    stages = (
+        replace(s, objective=replace(s.objective, **{key: read})) if s.name in chosen else s
+        for s in recipe.stages
+    )  # type: ignore[type-var]
     return replace(recipe, stages=tuple(stages))
 
 
-def with_attention(recipe: Recipe, block: int | None = None, window: int | None = None, sink: int | None = None) -> Recipe:
-    """Return a recipe whose causal stages have another block, window or sink in latents; None leaves the recipe's."""
+def with_attention(
+    recipe: Recipe, block: int | None = None, window: int | None = None, sink: int | None = None
+) -> Recipe:
+    """Return a recipe whose causal stages have another block, window or sink in latents; None
+    leaves the recipe's.
+    """
     if block is None and window is None and sink is None:
         return recipe
 
@@ -119,10 +160,16 @@ def with_attention(recipe: Recipe, block: int | None = None, window: int | None 
         )
 
     stages = (
-        stage if stage.attention is whole_clip else replace(stage, attention=partial(chosen, stage.attention)) for stage in recipe.stages
+        stage
+        if stage.attention is whole_clip
+        else replace(stage, attention=partial(chosen, stage.attention))
+        for stage in recipe.stages
     )
     return replace(recipe, stages=tuple(stages))
 
 
 def _with_objectives(recipe: Recipe, change: Callable[[Objective], Objective]) -> Recipe:
-    return replace(recipe, stages=tuple(replace(stage, objective=change(stage.objective)) for stage in recipe.stages))
+    return replace(
+        recipe,
+        stages=tuple(replace(stage, objective=change(stage.objective)) for stage in recipe.stages),
+    )

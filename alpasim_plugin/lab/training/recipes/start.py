@@ -1,4 +1,6 @@
-"""Networks at the start of a stage: built from its initial weights, or initialised to return their source unchanged."""
+"""Networks at the start of a stage: built from its initial weights, or initialised to return their
+source unchanged.
+"""
 
 from __future__ import annotations
 
@@ -23,37 +25,52 @@ AREA = 4  # latents of a token
 
 
 def transformer_of(inputs: StageInputs, part: str) -> CosmosCausalDiT:
-    """Build a part that is a transformer; inputs that its weights do not have yet start at zero, so that they change nothing."""
+    """Build a part that is a transformer; inputs that its weights do not have yet start at zero, so
+    that they change nothing.
+    """
     weights = start_weights(inputs, part)
     if inputs.seen.source == "noise":
         weights = widen_map(weights, 2 * LATENT)
     if inputs.seen.opacity:
         weights = with_opacity(weights)
-    return CosmosCausalDiT.from_state_dict(weights, inputs.rope_ratios, source=f"initial weights of {part}")
+    return CosmosCausalDiT.from_state_dict(
+        weights, inputs.rope_ratios, source=f"initial weights of {part}"
+    )
 
 
 def transformer_with_render(inputs: StageInputs, part: str) -> CosmosCausalDiT:
-    """Build a part that is a transformer whose map input takes the render's latents instead; see `euler.share_embedding`."""
+    """Build a part that is a transformer whose map input takes the render's latents instead; see
+    `euler.share_embedding`.
+    """
     weights = share_embedding(start_weights(inputs, part))
-    return CosmosCausalDiT.from_state_dict(weights, inputs.rope_ratios, source=f"initial weights of {part}")
+    return CosmosCausalDiT.from_state_dict(
+        weights, inputs.rope_ratios, source=f"initial weights of {part}"
+    )
 
 
 def start_weights(inputs: StageInputs, part: str) -> Mapping[str, Tensor]:
-    """Return a part's weights as given, or those of a transformer that returns its source unchanged."""
+    """Return a part's weights as given, or those of a transformer that returns its source
+    unchanged.
+    """
     weights = inputs.weights.get(part)
     if weights is not None:
         return weights
     sizes = DiTSizes(**inputs.dit.model_dump())
-    return initial_weights(sizes, derive_seed("training", inputs.form.seed, "generator"), zero_velocity=True)
+    return initial_weights(
+        sizes, derive_seed("training", inputs.form.seed, "generator"), zero_velocity=True
+    )
 
 
 def channel_weights_of(inputs: StageInputs) -> Tensor | None:
-    """Return the weights ``(C,)`` of latent channels in flow matching: by amplitude in pixels, or None where all weigh alike."""
+    """Return the weights ``(C,)`` of latent channels in flow matching: by amplitude in pixels, or
+    None where all weigh alike.
+    """
     return None if inputs.equal_channels else channel_amplitudes(inputs.vae)
 
 
 def widen_map(weights: Mapping[str, Tensor], channels: int) -> dict[str, Tensor]:
-    """Return weights whose map input has ``channels`` channels; new columns are zero, so outputs do not change.
+    """Return weights whose map input has ``channels`` channels; new columns are zero, so outputs do
+    not change.
 
     Raises:
         InputError: The weights have more channels already.
@@ -62,7 +79,12 @@ def widen_map(weights: Mapping[str, Tensor], channels: int) -> dict[str, Tensor]
     width, have = old.shape[0], old.shape[1] // AREA
     if have > channels:
         found = f"they take {have} channels"
-        raise InputError("widening a map input", f"to {channels} channels", found, "start from weights that take no more")
+        raise InputError(
+            "widening a map input",
+            f"to {channels} channels",
+            found,
+            "start from weights that take no more",
+        )
     new = torch.zeros(width, channels * AREA)
     # Inputs of a token are channel-major (`embeddings.PatchEmbed`): existing channels come first.
     new[:, : have * AREA] = old
@@ -70,7 +92,9 @@ def widen_map(weights: Mapping[str, Tensor], channels: int) -> dict[str, Tensor]
 
 
 def with_opacity(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return weights with an opacity embedding in every block, zero where there is none yet, so that outputs do not change."""
+    """Return weights with an opacity embedding in every block, zero where there is none yet, so
+    that outputs do not change.
+    """
     width = weights[MAP_KEY].shape[0]
     depth = 1 + max(int(key.split(".")[1]) for key in weights if key.startswith("blocks."))
     new = {OPACITY_KEY.format(i): torch.zeros(width, OPACITY_CHANNELS * AREA) for i in range(depth)}

@@ -1,1 +1,3 @@
-"""Wire messages in private packages (``simrun.wire.*``): the ``.proto`` files, and what tests/alpasim/compile_protos.py made of them."""
+"""Wire messages in private packages (``simrun.wire.*``): the ``.proto`` files, and what
+tests/alpasim/compile_protos.py made of them.
+"""
