@@ -64,9 +64,7 @@ def front_camera(scenario: Scenario, policy: str = "lane-camera") -> CameraSpec:
     for camera in sorted(ahead, key=lambda c: "front" not in c.name):
         return camera
     raise InputError(
-        f"making the policy {policy!r}",
-        f"scene {scenario.scene_id!r}",
-        f"no camera looks ahead among {[camera.name for camera in scenario.cameras]}",
+        f"scene {scenario.scene_id!r}: no camera looks ahead among {[camera.name for camera in scenario.cameras]}",
         "add a front camera to the scenario or choose another policy",
     )
 
@@ -91,9 +89,7 @@ def camera_frame(observation: Observation, camera: CameraSpec, policy: str) -> F
             else f"a frame of shape {frame.rgb.shape}"
         )
         raise PolicyError(
-            "planning by camera",
-            f"policy {policy!r} at {observation.t_us} us",
-            f"{found}; needed is {camera.name!r} of shape {expected}",
+            f"policy {policy!r} at {observation.t_us} us: {found}; needed is {camera.name!r} of shape {expected}",
             "render the cameras that the policy names in `sensors`, at the scenario's size",
         )
     return frame

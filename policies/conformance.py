@@ -300,9 +300,7 @@ def check_policy(
         try:
             made = make_policy(policy, scenario)
         except PolicyError as error:
-            return Report(
-                (Check("made", False, f"{error.doing} failed: {error.found}"),), (), (0.0, 0.0)
-            )
+            return Report((Check("made", False, f"{error.message}"),), (), (0.0, 0.0))
         report = _checked(made, scenario, latency_limit_ms)
         with suppress(SimrunError):  # what it did before is the finding
             made.close()
@@ -411,7 +409,7 @@ def _drive(
             if step:
                 durations.append(1e3 * (time.perf_counter() - began))
     except SimrunError as error:
-        return f"{where} failed: {error.doing}: {error.found}"
+        return f"{where} failed: {error.message}"
     except (
         Exception
     ) as error:  # whatever a foreign policy raises is a finding, not a crash of the check

@@ -57,9 +57,7 @@ class Learned(Policy):
 
         if not (np.isfinite(temperature) and temperature >= 0):
             raise InputError(
-                "making the policy 'learned'",
-                "temperature",
-                f"{temperature}",
+                f"temperature: {temperature}",
                 "give 0 or a positive number",
             )
         self.camera = front_camera(scenario, "learned")

@@ -152,20 +152,19 @@ def load_net(path: Path) -> LearnedNet:
     Raises:
         InputError: No such file, or not weights of this network.
     """
-    doing = "loading the learned policy"
-    check_regular(path, doing, do_this="give weights that 'simrun train policy' wrote")
+    check_regular(path, do_this="give weights that 'simrun train policy' wrote")
     net = LearnedNet()
     wanted = {name: tuple(value.shape) for name, value in net.state_dict().items()}
-    with parsing(doing, path, "copy or train it again", "not a complete safetensors file"):
+    with parsing(path, "copy or train it again", "not a complete safetensors file"):
         state = load_file(str(path))
     found = {name: tuple(value.shape) for name, value in state.items()}
     if found != wanted:
         odd = sorted(
             name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name)
         )
-        text = f"{len(odd)} tensors that are missing, foreign or of another shape, first {odd[0]}"
         raise InputError(
-            doing, str(path), text, "give weights that 'simrun train policy' of this version wrote"
+            f"{path}: {len(odd)} tensors that are missing, foreign or of another shape, first {odd[0]}",
+            "give weights that 'simrun train policy' of this version wrote",
         )
     net.load_state_dict({name: value.float() for name, value in state.items()})
     return net.eval().requires_grad_(False)

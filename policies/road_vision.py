@@ -91,9 +91,7 @@ def make_grid(camera: CameraSpec) -> GroundGrid:
     v = rows_v[[0, -1]]
     if height < 0.3 or not np.isfinite(v).all() or v[0] - v[1] < 8 or v[1] > camera.height - 8:
         raise PolicyError(
-            "setting up the view of the road",
-            f"camera {camera.name!r} {height:.2f} m above the ground",
-            f"the ground from {near:.1f} to {FAR_M:.0f} m ahead falls on image rows {v[0]:.1f} to {v[1]:.1f} of {camera.height}",
+            f"camera {camera.name!r} {height:.2f} m above the ground: the ground from {near:.1f} to {FAR_M:.0f} m ahead falls on image rows {v[0]:.1f} to {v[1]:.1f} of {camera.height}",
             "give the policy a front camera that sees the road",
         )
     first, last = min(v[0], camera.height - 1.0), v[1]

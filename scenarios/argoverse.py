@@ -302,7 +302,7 @@ def read_argoverse(path: str | Path) -> RecordedLog:
         InputError: A file is missing, damaged, or holds what no log may hold; the message names it.
     """
     folder = Path(path)
-    files = SourceFiles("reading an Argoverse 2 log")
+    files = SourceFiles()
     pose_path = files.only(folder, ("city_SE3_egovehicle.feather",), "the ego poses")
     box_path = files.only(
         folder, ("annotations.feather", "annotations*.feather"), "the annotated cuboids"
@@ -464,7 +464,7 @@ def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:
         InputError: The log has no ``calibration`` folder, or a file in it is damaged.
     """
     folder = Path(path) / "calibration"
-    files = SourceFiles("reading an Argoverse 2 calibration")
+    files = SourceFiles()
     inner_path = files.only(folder, ("intrinsics.feather",), "the intrinsics")
     outer_path = files.only(folder, ("egovehicle_SE3_sensor.feather",), "the sensor poses")
     lens: dict[str, Kind] = dict.fromkeys(

@@ -68,7 +68,7 @@ def check_specification(drawn: Drawn) -> None:
     assert spec.road is not None
 
     def fail(key: tuple[str, ...], found: str, do_this: str) -> InputError:
-        return drawn.document.error("reading a scenario", key, found, do_this)
+        return drawn.document.error(key, found, do_this)
 
     lengths = [
         getattr(segment, "length_m", 2 * getattr(segment, "arm_length_m", 0.0))
@@ -118,7 +118,6 @@ def check_record(record: RecordedLog, where: str) -> None:
     """
     b.COORDINATE_M.check(
         _reach(record.ego_log.xyz, *_lines(record.lane_map)),
-        DOING,
         f"{where}, map",
         "farthest point",
     )
@@ -128,12 +127,10 @@ def check_record(record: RecordedLog, where: str) -> None:
     _check_cameras(record.cameras, where)
     _check_box(record.vehicle.box, f"{where}, ego", b.VEHICLE_M)
     for name in ("rear_axle_to_centre_m", "wheelbase_m"):
-        b.AXLE_M.check(getattr(record.vehicle, name), DOING, f"{where}, ego", name)
+        b.AXLE_M.check(getattr(record.vehicle, name), f"{where}, ego", name)
     if not (np.isfinite(record.ground.z).all() and record.ground.cell_m > 0):
         raise InputError(
-            DOING,
-            f"{where}, ground",
-            "a height that is not finite",
+            f"{where}, ground: a height that is not finite",
             "repair the heights of the map",
         )
 
@@ -147,7 +144,7 @@ def check_scenario(scenario: Scenario, where: str) -> None:
     """
     _check_actors(scenario.actors, where)
     _check_cameras(scenario.cameras, where)
-    b.LOG_S.check((scenario.end_us - scenario.start_us) * 1e-6, DOING, where, "length")
+    b.LOG_S.check((scenario.end_us - scenario.start_us) * 1e-6, where, "length")
     if scenario.background is not None:
         return
     xy = scenario.ego_log.xyz[:, :2]
@@ -157,13 +154,11 @@ def check_scenario(scenario: Scenario, where: str) -> None:
     )
     if not GAUSSIANS.holds(count):
         raise InputError(
-            DOING,
-            where,
-            _cost(count),
+            f"{where}: {_cost(count)}",
             "drive a shorter part of it, or lower environment.building_height_m",
         )
     cells = wide * high / PLAN_CELL_M2
-    PLAN_CELLS.check(float(cells), DOING, f"{where}: a drive through {wide:.0f} x {high:.0f} m")
+    PLAN_CELLS.check(float(cells), f"{where}: a drive through {wide:.0f} x {high:.0f} m")
 
 
 def gaussians(
@@ -229,20 +224,20 @@ def _reach(*lines: F64) -> float:
 
 
 def _check_map(lane_map: LaneMap, where: str) -> None:
-    LANES.check(len(lane_map.lanes), DOING, f"{where}, map")
-    VERTICES.check(sum(len(line) for line in _lines(lane_map)), DOING, f"{where}, map")
+    LANES.check(len(lane_map.lanes), f"{where}, map")
+    VERTICES.check(sum(len(line) for line in _lines(lane_map)), f"{where}, map")
     for lane in lane_map.lanes.values():
         if lane.speed_limit_mps is not None:
-            b.LIMIT_MPS.check(lane.speed_limit_mps, DOING, f"{where}, lane {lane.lane_id}")
+            b.LIMIT_MPS.check(lane.speed_limit_mps, f"{where}, lane {lane.lane_id}")
     for pose, box in lane_map.signs:
-        b.COORDINATE_M.check(_reach(pose), DOING, f"{where}, signs")
+        b.COORDINATE_M.check(_reach(pose), f"{where}, signs")
         _check_box(box, f"{where}, signs", b.SIGN_M)
 
 
 def _check_actors(actors: tuple[Actor, ...], where: str) -> None:
-    ACTORS.check(len(actors), DOING, where)
-    REACTIVE.check(sum(actor.behaviour.kind == "idm" for actor in actors), DOING, where)
-    POSES.check(sum(len(actor.track) for actor in actors), DOING, where)
+    ACTORS.check(len(actors), where)
+    REACTIVE.check(sum(actor.behaviour.kind == "idm" for actor in actors), where)
+    POSES.check(sum(len(actor.track) for actor in actors), where)
     for actor in actors:
         here = f"{where}, road user {actor.actor_id}"
         _check_box(actor.box, here, b.BODY_M)
@@ -250,24 +245,22 @@ def _check_actors(actors: tuple[Actor, ...], where: str) -> None:
 
 
 def _check_track(track: Trajectory, where: str) -> None:
-    b.COORDINATE_M.check(_reach(track.xyz), DOING, where, "farthest position")
-    b.EPOCH_US.check(float(np.abs(track.t_us[[0, -1]].astype(np.float64)).max()), DOING, where)
-    b.LOG_S.check(float(track.t_us[-1] - track.t_us[0]) * 1e-6, DOING, where, "length of its track")
+    b.COORDINATE_M.check(_reach(track.xyz), where, "farthest position")
+    b.EPOCH_US.check(float(np.abs(track.t_us[[0, -1]].astype(np.float64)).max()), where)
+    b.LOG_S.check(float(track.t_us[-1] - track.t_us[0]) * 1e-6, where, "length of its track")
     if not np.isfinite(track.quat).all():
-        raise InputError(DOING, where, "a rotation that is not finite", "repair or drop its track")
+        raise InputError(f"{where}: a rotation that is not finite", "repair or drop its track")
 
 
 def _check_box(box: Box, where: str, bound: b.Bound) -> None:
     for name in ("length_m", "width_m", "height_m"):
-        bound.check(getattr(box, name), DOING, where, name)
+        bound.check(getattr(box, name), where, name)
 
 
 def _check_cameras(cameras: tuple[CameraSpec, ...], where: str) -> None:
     for camera in cameras:
         for name in ("width", "height"):
-            b.IMAGE_SIDE_PX.check(
-                getattr(camera, name), DOING, f"{where}, camera {camera.name}", name
-            )
+            b.IMAGE_SIDE_PX.check(getattr(camera, name), f"{where}, camera {camera.name}", name)
         if not (
             np.isfinite(camera.K).all()
             and np.isfinite(camera.T_rig_camera).all()
@@ -275,9 +268,7 @@ def _check_cameras(cameras: tuple[CameraSpec, ...], where: str) -> None:
             and camera.K[1, 1] > 0
         ):
             raise InputError(
-                DOING,
-                f"{where}, camera {camera.name}",
-                "a lens or mount that is not finite",
+                f"{where}, camera {camera.name}: a lens or mount that is not finite",
                 "repair the calibration",
             )
-        b.MOUNT_M.check(_reach(camera.T_rig_camera[:3, 3]), DOING, f"{where}, camera {camera.name}")
+        b.MOUNT_M.check(_reach(camera.T_rig_camera[:3, 3]), f"{where}, camera {camera.name}")

@@ -118,7 +118,7 @@ def _ego_path(spec: ScenarioSpec, written: RoadSpec, road: Road) -> EgoPath:
 def _too_short(length_m: float, s_m: float, when: str = "") -> InputError:
     found = f"the road is {length_m:.0f} m long and the ego stands at {s_m:.0f} m{when}"
     do_this = "add or lengthen a segment, shorten timing.duration_us, or lower ego.cruise_mps"
-    return InputError("driving the expert", "road", found, do_this)
+    return InputError(f"road: {found}", do_this)
 
 
 def elements(spec: RoadSpec) -> list[Element]:
@@ -168,10 +168,7 @@ def _check_drive(
     Raises:
         InputError: It does not, with the position of the road or of the actor.
     """
-    doing, last_us = (
-        "checking the expert's drive",
-        min(drawn.spec.built_until_us, int(ego_log.t_us[-1])),
-    )
+    last_us = min(drawn.spec.built_until_us, int(ego_log.t_us[-1]))
     t_us = np.arange(int(ego_log.t_us[0]), last_us + 1, STEP_US, dtype=np.int64)
     ego = _footprints(interpolate(ego_log, t_us), vehicle.box, vehicle.rear_axle_to_centre_m)
     lanes = [lane for lane in lane_map.lanes.values() if lane.kind == "vehicle"]
@@ -183,9 +180,7 @@ def _check_drive(
         found = f"at {t_us[off[0]] / 1e6:.2f} s {outside_m2:.2f} m2 of the ego leave the lanes"
         with drawn.at("road", "segments"):
             raise InputError(
-                doing,
-                "the road",
-                found,
+                f"the road: {found}",
                 "use wider lanes, gentler bends, a larger corner_radius_m, or a smaller shift_m",
             )
     gap, when, who = min(
@@ -198,9 +193,7 @@ def _check_drive(
         )
         with drawn.at(*_key_of(drawn.spec, who)):
             raise InputError(
-                doing,
-                f"actor {who}",
-                found,
+                f"actor {who}: {found}",
                 "start the actor farther away, change its timing, or slow the ego down",
             )
 

@@ -124,7 +124,7 @@ def read_obstacles(
         )
         times = [number(files, where, s.find("time/exact"), "time") for s in states]
         for time in times:
-            STEP.check(time, files.doing, where, "time step")
+            STEP.check(time, where, "time step")
         steps = np.array([round(time) for time in times], dtype=np.int64)
         speeds = [s.find("velocity/exact") for s in states]
         speed = np.array(
@@ -228,7 +228,7 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
             ego; ``ego`` names none.
     """
     file = Path(path)
-    files = SourceFiles("reading a CommonRoad scenario")
+    files = SourceFiles()
     root = files.read_xml(file)
     version = root.get("commonRoadVersion")
     if root.tag != "commonRoad" or version not in VERSIONS:
@@ -304,7 +304,7 @@ def _time_step(files: SourceFiles, path: Path, root: Element) -> float:
         raise files.fail(
             path, f"timeStepSize = {root.get('timeStepSize')!r}", "give the time step in seconds"
         ) from error
-    TIME_STEP_S.check(dt_s, files.doing, path, "timeStepSize")
+    TIME_STEP_S.check(dt_s, path, "timeStepSize")
     return dt_s
 
 

@@ -312,7 +312,7 @@ def read_cosmos(path: str | Path) -> RecordedLog:
             poses are not a drive.
     """
     folder = Path(path)
-    files = SourceFiles("reading a Cosmos-Drive-Dreams clip")
+    files = SourceFiles()
     if not folder.is_dir():
         raise files.fail(folder, "no such folder", "give the folder that holds 3d_lanes")
     ego_log, clip = read_poses(files, folder)

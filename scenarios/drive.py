@@ -228,9 +228,9 @@ def read_drive(folder: Path) -> RecordedLog:
         InputError: A file is missing or damaged, or holds what no drive may hold; the message names
             it.
     """
-    files = SourceFiles(DOING)
+    files = SourceFiles()
     path = folder / DRIVE_FILE
-    document = as_shape(DriveDocument, files.read_json(path), path, DOING, DO_THIS)
+    document = as_shape(DriveDocument, files.read_json(path), path, DO_THIS)
     ego = document["ego"]
     log = checked_trajectory(
         files,
@@ -346,7 +346,7 @@ def _map_of(document: _Map) -> LaneMap:
 def _ground_of(files: SourceFiles, folder: Path, grid: _Grid) -> HeightField:
     path = folder / GROUND_FILE
     files.note_bytes(GROUND_FILE, files.read_bytes(path))
-    z = np.asarray(open_npy(path, DOING, DO_THIS))
+    z = np.asarray(open_npy(path, DO_THIS))
     if z.ndim != 2 or min(z.shape) < 2:
         raise files.fail(path, f"heights of shape {z.shape}", DO_THIS)
     return HeightField(grid["x0_m"], grid["y0_m"], grid["cell_m"], np.array(z, dtype=np.float64))
@@ -396,7 +396,7 @@ def _obstacle_actor(one: _Obstacle, ego: Trajectory) -> Actor:
 
 def _recording(files: SourceFiles, folder: Path) -> tuple[Photograph, ...]:
     path = folder / TRANSFORMS_FILE
-    frames = as_shape(_Transforms, files.read_json(path), path, DOING, DO_THIS)["frames"]
+    frames = as_shape(_Transforms, files.read_json(path), path, DO_THIS)["frames"]
     return tuple(_photograph(folder, frame) for frame in frames)
 
 
@@ -428,7 +428,7 @@ def _note_files(files: SourceFiles, model: Path) -> None:
             "give the same import command again; it goes on where it stopped",
         )
     for path in found:
-        check_regular(path, DOING)
+        check_regular(path)
         with path.open("rb") as stream:
             files.note_bytes(
                 path.relative_to(model).as_posix(), hashlib.file_digest(stream, "sha256").digest()

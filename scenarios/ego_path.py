@@ -66,20 +66,15 @@ def make_ego_path(
     chain = road.forward_chain(lane)
     if not chain:
         raise InputError(
-            "placing the ego",
-            f"lane {lane}",
-            "the road has no such forward lane",
+            f"lane {lane}: the road has no such forward lane",
             "choose a smaller lane number",
         )
     parts = [road.lane_map.lanes[i].centre for i, _ in chain]
     for change in changes:
         parts, chain = _change(road, parts, chain, change)
     if len(chain) < len(road.stretches):
-        found = f"that lane leaves the main road after {chain[-1][0]} (element {len(chain) - 1})"
         raise InputError(
-            "placing the ego",
-            f"lane {lane}",
-            found,
+            f"lane {lane}: that lane leaves the main road after {chain[-1][0]} (element {len(chain) - 1})",
             "start in a lane that goes on, or change lanes before",
         )
     line = np.concatenate([parts[0]] + [p[1:] for p in parts[1:]])
@@ -100,15 +95,11 @@ def _change(
     first = int(np.searchsorted(begin, change.at_m, side="right")) - 1
     where = f"lane change at {change.at_m:.0f} m to lane {change.to_lane}"
     if first >= len(parts):
-        raise InputError(
-            "placing the ego", where, f"the road ends at {begin[-1]:.0f} m", "change lanes earlier"
-        )
+        raise InputError(f"{where}: the road ends at {begin[-1]:.0f} m", "change lanes earlier")
     stretch = road.stretches[first]
     if change.to_lane >= len(stretch.forward) or stretch.forward[change.to_lane] is None:
         raise InputError(
-            "placing the ego",
-            where,
-            f"element {first} has no such lane",
+            f"{where}: element {first} has no such lane",
             "choose a lane that exists there",
         )
     target = road.forward_chain(change.to_lane, first)
@@ -118,9 +109,9 @@ def _change(
         goal = road.lane_map.lanes[lane_id].centre
         if begin[min(i, len(begin) - 1)] < change.at_m + change.length_m:
             if i >= len(parts) or len(parts[i]) != len(goal):
-                do_this = "change lanes earlier or within a shorter length"
                 raise InputError(
-                    "placing the ego", where, f"the lanes part at element {i}", do_this
+                    f"{where}: the lanes part at element {i}",
+                    "change lanes earlier or within a shorter length",
                 )
             share = smoothstep((begin[i] + arc_lengths(parts[i]) - change.at_m) / change.length_m)[
                 :, None
@@ -172,8 +163,10 @@ def lane_chain(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) ->
             sum(f is not None for f in stretch.forward),
             sum(b is not None for b in stretch.backward),
         )
-        found = f"{n[0]} forward and {n[1]} oncoming lanes at {at_s_m:.0f} m"
-        raise InputError("placing an actor", f"lane {lane}", found, "choose one that exists")
+        raise InputError(
+            f"lane {lane}: {n[0]} forward and {n[1]} oncoming lanes at {at_s_m:.0f} m",
+            "choose one that exists",
+        )
     return tuple(ids)
 
 
@@ -195,9 +188,7 @@ def _follow(road: Road, lane_id: str) -> list[str]:
     lanes = road.lane_map.lanes
     if lane_id not in lanes:
         raise InputError(
-            "placing an actor",
-            f"lane {lane_id!r}",
-            f"the road's lanes are {', '.join(lanes)}",
+            f"lane {lane_id!r}: the road's lanes are {', '.join(lanes)}",
             "choose one of them",
         )
     out = [lane_id]

@@ -168,7 +168,7 @@ def _window(drawn: Drawn, drive: RecordedLog) -> tuple[int, int]:
     if end > last:
         found = f"ends at {(end - first) / 1e6:.2f} s of a log {(last - first) / 1e6:.2f} s long"
         raise drawn.document.error(
-            DOING, ("timing", "duration_us"), found, "shorten timing.duration_us or leave it out"
+            ("timing", "duration_us"), found, "shorten timing.duration_us or leave it out"
         )
     return start, end
 
@@ -200,15 +200,14 @@ def _check_timing(drawn: Drawn, scenario: Scenario) -> None:
         clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
     except InputError as e:
         key = next(
-            (k for k in ("control_us", "camera_us", "policy_us") if f"rates.{k}" in e.with_what),
+            (k for k in ("control_us", "camera_us", "policy_us") if f"rates.{k}" in e.message),
             None,
         )
         loc: tuple[str, ...] = ("rates", key) if key else ("timing", "duration_us")
-        raise document.error(DOING, loc, f"{e.with_what}: {e.found}", e.do_this) from e
+        raise document.error(loc, f"{e.message}", e.hint) from e
     if timing.timeline == "alpasim" and warmup_us % control_us:
         found = f"a control period of {control_us} us, of which {warmup_us} us is not a multiple"
         raise document.error(
-            DOING,
             ("timing", "timeline"),
             found,
             "choose a rates.control_us that divides AlpaSim's 1.7 s",
@@ -216,7 +215,6 @@ def _check_timing(drawn: Drawn, scenario: Scenario) -> None:
     if timing.start_time_offset_us and timing.timeline != "alpasim":
         found = f"an offset of {timing.start_time_offset_us} us in the scenario's own time line"
         raise document.error(
-            DOING,
             ("timing", "start_time_offset_us"),
             found,
             "set timing.start_us, or timing.timeline: alpasim",
@@ -225,7 +223,6 @@ def _check_timing(drawn: Drawn, scenario: Scenario) -> None:
     if warmup_us >= length_us:
         found = f"warmup_us = {warmup_us} of a scene of {length_us} us: nothing is left to drive"
         raise document.error(
-            DOING,
             ("timing", "warmup_us"),
             found,
             "shorten timing.warmup_us or lengthen timing.duration_us",
@@ -267,15 +264,11 @@ def _background(drawn: Drawn) -> BackgroundFile | None:
         return None
     path = document.folder_of(("background", "file")) / background.file
     if not path.is_file():
-        raise document.error(
-            DOING, ("background", "file"), f"{path} does not exist", "correct the path"
-        )
+        raise document.error(("background", "file"), f"{path} does not exist", "correct the path")
     matrix = np.eye(4) if background.transform is None else np.array(background.transform)
     if abs(np.linalg.det(matrix[:3, :3])) < 1e-12 or not np.allclose(matrix[3], [0, 0, 0, 1]):
         found = "no inverse, or a last row other than 0 0 0 1"
-        raise document.error(
-            DOING, ("background", "transform"), found, "give rotation, scale and shift"
-        )
+        raise document.error(("background", "transform"), found, "give rotation, scale and shift")
     return BackgroundFile(str(path), matrix, background.keep_road)
 
 
@@ -297,7 +290,7 @@ def _hash(drawn: Drawn, scene_id: str, source_hash: str) -> str:
     scene = hashlib.sha256(json.dumps([scene_id, source_hash, content], sort_keys=True).encode())
     if spec.background is not None:
         file = drawn.document.folder_of(("background", "file")) / spec.background.file
-        check_regular(file, DOING)
+        check_regular(file)
         with file.open("rb") as stream:
             scene.update(hashlib.file_digest(stream, "sha256").digest())
     return scene.hexdigest()

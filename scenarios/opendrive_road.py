@@ -296,7 +296,7 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
         return tuple(sorted(records, key=lambda r: r.s_m))
 
     road_m = number(element, "length")
-    MAP_ROAD_M.check(road_m, files.doing, here, "length")
+    MAP_ROAD_M.check(road_m, here, "length")
 
     def geometry(record: Element) -> Geometry:
         shape = next((child for child in record if child.tag in KINDS), None)
@@ -310,7 +310,7 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
         s, x, y, heading, length = (
             number(record, name) for name in ("s", "x", "y", "hdg", "length")
         )
-        MAP_ROAD_M.check(length, files.doing, here, "length of a <geometry>")
+        MAP_ROAD_M.check(length, here, "length of a <geometry>")
         if not -1.0 <= s <= road_m + 1.0:
             raise files.fail(
                 here,
@@ -319,7 +319,7 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
             )
         if shape.tag in ("arc", "spiral"):
             for value in numbers:
-                MAP_CURVATURE_PER_M.check(value, files.doing, here)
+                MAP_CURVATURE_PER_M.check(value, here)
         kind = next(k for k in KINDS if k == shape.tag)
         return Geometry(
             s,

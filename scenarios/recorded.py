@@ -48,11 +48,9 @@ class SourceFiles:
     """Reads the files of one recorded log and hashes what it read.
 
     Args:
-        doing: Verb phrase for error messages, such as "reading an Argoverse 2 log".
     """
 
-    def __init__(self, doing: str) -> None:
-        self.doing = doing
+    def __init__(self) -> None:
         self._hash = hashlib.sha256()
 
     @property
@@ -62,7 +60,7 @@ class SourceFiles:
 
     def fail(self, path: Path | str, found: str, do_this: str) -> InputError:
         """Make the error that names a file; the caller raises it."""
-        return InputError(self.doing, str(path), found, do_this)
+        return InputError(f"{path}: {found}", do_this)
 
     def near(self, where: Path | str, xyz: F64) -> F64:
         """Return local points ``(..., 3)`` after checking that they are finite and within
@@ -106,7 +104,7 @@ class SourceFiles:
         Raises:
             InputError: It is missing, no file, empty, too large or unreadable.
         """
-        data = reading.read_bytes(path, self.doing, SOURCE_BYTES)
+        data = reading.read_bytes(path, SOURCE_BYTES)
         if not data:
             raise self.fail(path, "an empty file", "fetch the file again")
         self.note_bytes(path.name, data)
@@ -123,9 +121,7 @@ class SourceFiles:
 
     def parse_json(self, data: bytes, where: Path | str) -> Any:
         """Parse a JSON document that came out of ``where``."""
-        return reading.parse_json(
-            data, where, self.doing, "fetch the file again; it may be truncated"
-        )
+        return reading.parse_json(data, where, "fetch the file again; it may be truncated")
 
     def read_feather(
         self, path: Path, columns: Mapping[str, Kind]
@@ -137,10 +133,10 @@ class SourceFiles:
                 or with empty values.
         """
         data, do = self.read_bytes(path), "fetch the file again; it may be truncated"
-        with reading.parsing(self.doing, path, do, "no readable Arrow IPC file"):
+        with reading.parsing(path, do, "no readable Arrow IPC file"):
             table = feather.read_table(pa.BufferReader(data))
             table.validate(full=True)
-        check_columns(table, columns, path, self.doing, "use a file of the Argoverse 2 sensor set")
+        check_columns(table, columns, path, "use a file of the Argoverse 2 sensor set")
         nulls = next((name for name in columns if table.column(name).null_count), None)
         if nulls is not None:
             raise self.fail(
@@ -150,18 +146,18 @@ class SourceFiles:
 
     def parse_npy(self, data: bytes, where: Path | str) -> np.ndarray[Any, Any]:
         """Parse a NumPy array without pickles."""
-        return parse_npy(data, where, self.doing, "fetch the file again; it may be truncated")
+        return parse_npy(data, where, "fetch the file again; it may be truncated")
 
     def read_tar(self, path: Path) -> dict[str, bytes]:
         """Read the regular files of an uncompressed tar, in memory, by member name."""
         data = self.read_bytes(path)
         damaged = reading.parsing(
-            self.doing, path, "fetch the file again; it may be truncated", "a damaged tar"
+            path, "fetch the file again; it may be truncated", "a damaged tar"
         )
         members: dict[str, bytes] = {}
         with damaged, tarfile.open(fileobj=io.BytesIO(data), mode="r:") as archive:
             for info in archive:
-                MEMBERS.check(len(members), self.doing, path)
+                MEMBERS.check(len(members), path)
                 handle = archive.extractfile(info) if info.isfile() else None
                 if handle is not None:
                     content = handle.read()
@@ -192,7 +188,7 @@ class SourceFiles:
 
     def parse_xml(self, data: bytes, path: Path | str) -> ElementTree.Element:
         """Parse an XML document that came out of ``path``; see `read_xml`."""
-        return parse_xml(data, path, self.doing)
+        return parse_xml(data, path)
 
 
 @dataclass(frozen=True)

@@ -120,10 +120,9 @@ def open_document(path: Path, source: str | None) -> Document:
         place = str(path.resolve())
         log = {kind: place} if kind in SHIPPED else {"source": kind, "path": place}
         return Document({"version": 1, "log": log}, {}, str(path))
-    document = load_yaml(path, DOING)
+    document = load_yaml(path)
     if isinstance(document.data, dict) and "scenarios" in document.data:
         raise document.error(
-            DOING,
             ("scenarios",),
             "a suite, not a scenario",
             "use load_suite, or run it with simrun",
@@ -155,8 +154,10 @@ def detect(path: Path) -> str:
         else "a file"
     )
     formats = ", ".join(_source(name)[1].help or name for name in names("source"))
-    do = f"give a scenario .yaml, or one of: {formats}; a reader of your own is named with --source (docs/extending.md)"
-    raise InputError(DOING, str(path), f"{what} that no reader recognises", do)
+    raise InputError(
+        f"{path}: {what} that no reader recognises",
+        f"give a scenario .yaml, or one of: {formats}; a reader of your own is named with --source (docs/extending.md)",
+    )
 
 
 def recorded_drive(drawn: Drawn) -> RecordedLog:
@@ -172,20 +173,16 @@ def recorded_drive(drawn: Drawn) -> RecordedLog:
     path = document.folder_of(("log", key)) / text if document.marks else Path(text)
     if not path.exists():
         raise document.error(
-            DOING,
             ("log", key),
             f"{path} does not exist",
             "correct the path; it is relative to the scenario file",
         )
     spec, source = _source(kind)
-    with parsing(DOING, path, "repair this log, or use another one"):
+    with parsing(path, "repair this log, or use another one"):
         record = source.read(path, None if log.ego is None else str(log.ego))
         if not isinstance(record, RecordedLog):
-            found = f"a {type(record).__name__}"
             raise InputError(
-                DOING,
-                f"source {spec.name!r}, {path}",
-                found,
+                f"source {spec.name!r}, {path}: a {type(record).__name__}",
                 "make the reader return a scenarios.recorded.RecordedLog",
             )
         check_record(record, str(path))

@@ -64,10 +64,10 @@ def find(path_or_name: str | Path) -> Path:
     name = str(path_or_name).removesuffix(".yaml")
     if name in shipped:
         return shipped[name]
-    raise unknown("reading a scenario", str(path_or_name), "scenario", shipped)
+    raise unknown(str(path_or_name), "scenario", shipped)
 
 
-def unknown(doing: str, text: str, kind: str, names: Mapping[str, Path]) -> InputError:
+def unknown(text: str, kind: str, names: Mapping[str, Path]) -> InputError:
     """Make the error for a text that is neither a path nor one of the shipped names, with the
     nearest of these.
     """
@@ -75,7 +75,7 @@ def unknown(doing: str, text: str, kind: str, names: Mapping[str, Path]) -> Inpu
         Path(text).stat()
     except PermissionError as error:  # it may be there
         found = f"{error.strerror}: a folder on the way to it may not be searched"
-        return InputError(doing, text, found, "let this user search and read it")
+        return InputError(f"{text}: {found}", "let this user search and read it")
     except (OSError, ValueError):
         pass
     name = text.removesuffix(".yaml")
@@ -86,7 +86,7 @@ def unknown(doing: str, text: str, kind: str, names: Mapping[str, Path]) -> Inpu
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     found = f"no such file or folder, and no shipped {kind} has that name"
     return InputError(
-        doing, text, found, f"{hint}give a path, or a name that 'simrun list scenarios' shows"
+        f"{text}: {found}", f"{hint}give a path, or a name that 'simrun list scenarios' shows"
     )
 
 
@@ -168,22 +168,22 @@ def _expand(
         ]
         if not files:
             raise InputError(
-                DOING,
-                str(path),
-                "a folder without scenario files",
+                f"{path}: a folder without scenario files",
                 "give a folder of scenario .yaml files, or a log folder",
             )
         return [ScenarioRef(str(f)) for f in files]
     if path.suffix not in (".yaml", ".yml") or "scenarios" not in _head(path):
         return [ScenarioRef(str(path))]
     if path.resolve() in chain:
-        raise InputError(DOING, str(path), "a suite that contains itself", "remove the entry")
+        raise InputError(f"{path}: a suite that contains itself", "remove the entry")
     opened.append(path)
     if len(opened) > MOST_SUITES:
-        found = f"more than {MOST_SUITES} suites to read, {len(set(opened))} different ones"
-        raise InputError(DOING, str(path), found, "name each suite once")
-    document = load_yaml(path, DOING)
-    spec = validate(SuiteSpec, document, DOING)
+        raise InputError(
+            f"{path}: more than {MOST_SUITES} suites to read, {len(set(opened))} different ones",
+            "name each suite once",
+        )
+    document = load_yaml(path)
+    spec = validate(SuiteSpec, document)
     out: list[ScenarioRef] = []
     for i, entry in enumerate(spec.scenarios):
         item = SuiteItem(path=entry) if isinstance(entry, str) else entry
@@ -211,16 +211,14 @@ def _locate(text: str, base: Path | None) -> Path:
     for key in (name, f"suites/{name}"):
         if key in names:
             return names[key]
-    raise unknown("finding a scenario", text, "scenario or suite", names)
+    raise unknown(text, "scenario or suite", names)
 
 
 def _placed(document: Document, i: int, e: InputError) -> InputError:
-    return InputError(
-        e.doing, f"{document.mark(('scenarios', i))} ({e.with_what})", e.found, e.do_this
-    )
+    return InputError(f"{document.mark(('scenarios', i))}: {e.message}", e.hint)
 
 
 def _head(path: Path) -> dict[str, Any]:
     """Return a file's plain data, or nothing where it is not a mapping."""
-    data = load_yaml(path, DOING).data
+    data = load_yaml(path).data
     return data if isinstance(data, dict) else {}

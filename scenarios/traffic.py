@@ -141,11 +141,8 @@ class _Placer:
             if not 0 <= at <= self.ego_path.path.length_m:
                 s = -1.0
         if not 0 <= s <= path.length_m:
-            room = f"its lane has room from {-self.spec.ego.start_m:.0f} to {self.ego_path.path.length_m - self.spec.ego.start_m:.0f} m"
             raise InputError(
-                "placing an actor",
-                actor_id,
-                f"s_m = {s_m:.1f} is not on the road: {room}",
+                f"{actor_id}: s_m = {s_m:.1f} is not on the road: its lane has room from {-self.spec.ego.start_m:.0f} to {self.ego_path.path.length_m - self.spec.ego.start_m:.0f} m",
                 "choose s_m inside",
             )
         return path, s
@@ -224,9 +221,7 @@ def _parked(placer: _Placer, actor: ParkedActor, box: Box) -> list[Actor]:
         at = placer.spec.ego.start_m + actor.s_m + n * actor.spacing_m
         if not 0 <= at <= placer.ego_path.path.length_m:
             raise InputError(
-                "placing an actor",
-                actor.id,
-                f"vehicle {n + 1} of {actor.count} at {at:.0f} m is beyond the road",
+                f"{actor.id}: vehicle {n + 1} of {actor.count} at {at:.0f} m is beyond the road",
                 "move it",
             )
         name = actor.id if actor.count == 1 else f"{actor.id}-{n}"
@@ -348,8 +343,10 @@ def _crossing(placer: _Placer, actor: CrossingActor, ego_log: Trajectory) -> Act
     s_log, _ = placer.ego_path.path.project(ego_log.xyz[:, :2])
     if not s_log[0] + front_m < at < s_log[-1] + front_m:
         first_m, last_m = (s + front_m - placer.spec.ego.start_m for s in (s_log[0], s_log[-1]))
-        found = f"the ego's front drives from {first_m:.0f} to {last_m:.0f} m, the crossing is at s_m = {actor.s_m:.0f}"
-        raise InputError("timing a crossing", actor.id, found, "choose s_m inside")
+        raise InputError(
+            f"{actor.id}: the ego's front drives from {first_m:.0f} to {last_m:.0f} m, the crossing is at s_m = {actor.s_m:.0f}",
+            "choose s_m inside",
+        )
     arrival_us = float(np.interp(at - front_m, s_log, ego_log.t_us.astype(np.float64)))
     right, left = (
         _road_edge(placer.road, placer.ego_path.path, at, side) for side in ("right", "left")
@@ -379,9 +376,7 @@ def _road_edge(road: Road, path: Path, at: float, side: str) -> float:
         best = min(best, float(d.min())) if len(d) else best
     if not np.isfinite(best):
         raise InputError(
-            "timing a crossing",
-            f"{at:.0f} m",
-            f"no road edge on the {side}",
+            f"{at:.0f} m: no road edge on the {side}",
             "choose a place on the road",
         )
     return best if side == "left" else -best

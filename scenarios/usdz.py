@@ -89,7 +89,7 @@ def read_usdz(path: str | Path, rails: bool = True, needs_map: bool = True) -> R
         InputError: A member is missing or damaged, or there is no map.
     """
     path = Path(path)
-    files = SourceFiles(DOING)
+    files = SourceFiles()
     with Archive(files, path) as archive:
         scene_id = _scene_id(archive)
         rig = _Rig(archive)
@@ -153,7 +153,7 @@ def usdz_scene_id(path: str | Path) -> str:
     Raises:
         InputError: No archive, or no usable metadata.yaml in it.
     """
-    with Archive(SourceFiles(DOING), Path(path)) as archive:
+    with Archive(SourceFiles(), Path(path)) as archive:
         return _scene_id(archive)
 
 

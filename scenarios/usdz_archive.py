@@ -29,13 +29,11 @@ class Archive:
     def __init__(self, files: SourceFiles, path: Path) -> None:
         self.files, self.path = files, path
         with contextlib.ExitStack() as opening:
-            stream = opening.enter_context(open_regular(path, files.doing, ARCHIVE_BYTES))
-            with parsing(
-                files.doing, path, "fetch the file again; it may be truncated", "no readable ZIP"
-            ):
+            stream = opening.enter_context(open_regular(path, ARCHIVE_BYTES))
+            with parsing(path, "fetch the file again; it may be truncated", "no readable ZIP"):
                 self._zip = zipfile.ZipFile(stream)
                 infos = self._zip.infolist()
-            check_names([info.filename for info in infos], path, files.doing)
+            check_names([info.filename for info in infos], path)
             self._open = opening.pop_all()
         self._infos = {info.filename: info for info in infos}
 
@@ -77,7 +75,7 @@ class Archive:
             )
         do = "fetch the file again; it may be damaged"
         with (
-            parsing(self.files.doing, where, do, "it cannot be read"),
+            parsing(where, do, "it cannot be read"),
             self._zip.open(info) as stream,
         ):
             data = stream.read(most + 1)
@@ -95,17 +93,15 @@ class Archive:
         file.
         """
         where, data = f"{self.path}, {member}", self.read(member)
-        YAML_BYTES.check(len(data), self.files.doing, where)
-        with parsing(self.files.doing, where, "fetch the file again", "broken YAML"):
+        YAML_BYTES.check(len(data), where)
+        with parsing(where, "fetch the file again", "broken YAML"):
             text = data.decode("utf-8")
-        return parse(text, where, self.files.doing)[0]
+        return parse(text, where)[0]
 
     def table(self, member: str) -> list[dict[str, Any]]:
         """Read a parquet member as rows."""
         where = f"{self.path}, {member}"
-        table = parse_parquet(
-            self.read(member), where, self.files.doing, do_this="fetch the file again"
-        )
-        with parsing(self.files.doing, where, "fetch the file again", "no readable parquet"):
+        table = parse_parquet(self.read(member), where, do_this="fetch the file again")
+        with parsing(where, "fetch the file again", "no readable parquet"):
             rows: list[dict[str, Any]] = table.to_pylist()
         return rows

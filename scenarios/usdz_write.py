@@ -58,9 +58,7 @@ def write_usdz(path: Path, scenario: Scenario) -> None:
     lane_map = scenario.lane_map
     if all(lane.kind == "sidewalk" for lane in lane_map.lanes.values()):
         raise InputError(
-            DOING,
-            f"scene {clip!r}",
-            "no lane",
+            f"scene {clip!r}: no lane",
             "export a scene with a map: AlpaSim routes and scores along lanes",
         )
     mesh = ground_mesh(scenario)
@@ -76,7 +74,7 @@ def write_usdz(path: Path, scenario: Scenario) -> None:
         "mesh_ground.ply": mesh,
     }
     with (
-        atomic_file(path, DOING) as partial,
+        atomic_file(path) as partial,
         zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive,
     ):
         for name, data in members.items():
@@ -163,8 +161,10 @@ def frame_times(scenario: Scenario, camera: CameraSpec) -> list[list[int]]:
     ends = range(scenario.start_us, last_us + 1, scenario.rates.camera_us)
     frames = [[end - shutter_us, end] for end in ends if end - shutter_us >= first_us]
     if not frames:
-        found = f"no frame of camera {camera.name!r} fits between {first_us} and {last_us} us"
-        raise InputError(DOING, f"scene {scenario.scene_id!r}", found, "export a longer recording")
+        raise InputError(
+            f"scene {scenario.scene_id!r}: no frame of camera {camera.name!r} fits between {first_us} and {last_us} us",
+            "export a longer recording",
+        )
     return frames
 
 

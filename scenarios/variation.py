@@ -47,9 +47,7 @@ class Drawn:
         try:
             yield
         except InputError as e:
-            raise InputError(
-                e.doing, f"{self.document.mark(loc)} ({e.with_what})", e.found, e.do_this
-            ) from e
+            raise InputError(f"{self.document.mark(loc)}: {e.message}", e.hint) from e
 
 
 def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Drawn:
@@ -64,15 +62,15 @@ def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Draw
         InputError: A key or value that the schema refuses, or a name that stands twice, with its
             position.
     """
-    document = apply_overrides(document, overrides, DOING)
+    document = apply_overrides(document, overrides)
     own_seed = document.data.get("seed", 0) if isinstance(document.data, dict) else 0
     if seed is not None:
-        document = apply_overrides(document, [f"seed={int(seed)}"], DOING)
-    written = validate(ScenarioSpec, document, DOING)
+        document = apply_overrides(document, [f"seed={int(seed)}"])
+    written = validate(ScenarioSpec, document)
     scene_id = written.scene_id or _default_id(Path(document.path))
     fixed = tuple(text.partition("=")[0].strip() for text in overrides)
     document = _varied(document, written, scene_id, fixed)
-    spec = validate(ScenarioSpec, document, DOING)
+    spec = validate(ScenarioSpec, document)
     _check_names(document, spec)
     if spec.seed != AS_WRITTEN:
         spec = _jitter(spec, scene_id, fixed)
@@ -92,7 +90,6 @@ def _check_names(document: Document, spec: ScenarioSpec) -> None:
         if actor.id in seen:
             first = document.mark(("actors", seen[actor.id], "id"))
             raise document.error(
-                DOING,
                 ("actors", i, "id"),
                 f"duplicate actor id {actor.id!r}, first at {first}",
                 "give it another id",
@@ -102,14 +99,12 @@ def _check_names(document: Document, spec: ScenarioSpec) -> None:
     for i, name in enumerate(names):
         if name in names[:i]:
             raise document.error(
-                DOING,
                 ("cameras", i, "name"),
                 f"duplicate camera name {name!r}",
                 "give it another name",
             )
     if spec.log is not None and spec.actors:
         raise document.error(
-            DOING,
             ("actors",),
             "actors beside a recorded log",
             "remove actors; log.actors chooses the recorded traffic",
@@ -132,7 +127,7 @@ def _varied(
     if spec.samples:
         chosen |= spec.samples[spec.seed % len(spec.samples)]
     kept = [f"{key}={json.dumps(value)}" for key, value in chosen.items() if key not in fixed]
-    return apply_overrides(document, kept, "drawing a variation", origin="variation")
+    return apply_overrides(document, kept, origin="variation")
 
 
 def _jitter(spec: ScenarioSpec, scene_id: str, fixed: tuple[str, ...]) -> ScenarioSpec:

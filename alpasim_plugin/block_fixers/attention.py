@@ -61,9 +61,7 @@ def axis_widths(head_width: int) -> tuple[int, int, int]:
     """
     if head_width < 2 or head_width % 2:
         raise InputError(
-            "splitting a head for rotary positions",
-            "head width",
-            str(head_width),
+            f"head width: {head_width}",
             "use an even head width",
         )
     spatial = 2 * (head_width // 6)
@@ -350,9 +348,7 @@ def attention_kernel(
     """
     if name not in get_args(Kernel):
         raise InputError(
-            "choosing an attention kernel",
-            name,
-            "no such kernel",
+            f"{name}: no such kernel",
             f"take one of {', '.join(get_args(Kernel))}",
         )
     if name == "auto":
@@ -363,8 +359,8 @@ def attention_kernel(
         try:
             F.scaled_dot_product_attention(x, x, x)
         except RuntimeError as error:
-            found = f"{str(error).splitlines()[0]} ({device}, {dtype}, head width {head_width})"
             raise InputError(
-                "choosing an attention kernel", name, found, "use auto, or another precision"
+                f"{name}: {str(error).splitlines()[0]} ({device}, {dtype}, head width {head_width})",
+                "use auto, or another precision",
             ) from error
         yield

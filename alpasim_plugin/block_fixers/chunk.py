@@ -67,9 +67,7 @@ class ChunkRenderer(Renderer):
             counts[request.camera.name] = counts.get(request.camera.name, 0) + 1
         if set(counts.values()) != {due}:
             raise RendererError(
-                "rendering a block",
-                f"block {self.blocks}",
-                f"frames by camera: {counts}; the block has {due}",
+                f"block {self.blocks}: frames by camera: {counts}; the block has {due}",
                 "request whole blocks",
             )
         self.runner.reset_times()

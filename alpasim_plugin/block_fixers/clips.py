@@ -82,13 +82,12 @@ def crop_clip(video: Tensor, size: ClipSize) -> Tensor:
 
 
 def check_frames(
-    video: Tensor, doing: str, first: bool, group: int = GROUP, side: int = SIDE, channels: int = 3
+    video: Tensor, first: bool, group: int = GROUP, side: int = SIDE, channels: int = 3
 ) -> None:
     """Refuse clips of an invalid size.
 
     Args:
         video: Meant to be ``(B, channels, T, H, W)`` floating point.
-        doing: For the message.
         first: Whether these frames start the video (1 + group * k) or continue it (group * k).
         group: Frames of a latent after the first.
         side: What height and width must be a multiple of.
@@ -99,43 +98,39 @@ def check_frames(
     """
     shape = list(video.shape)
     if video.ndim != 5 or shape[1] != channels or not video.is_floating_point():
-        do = f"give (B, {channels}, T, H, W) with values in [-1, 1]"
         raise InputError(
-            doing, f"a tensor {shape} of {video.dtype}", "not a floating-point video", do
+            f"a tensor {shape} of {video.dtype}: not a floating-point video",
+            f"give (B, {channels}, T, H, W) with values in [-1, 1]",
         )
     frames, height, width = shape[2:]
     if height < side or width < side or height % side or width % side:
         raise InputError(
-            doing,
-            f"frames of {height} x {width} pixels (height x width)",
-            f"height and width must be multiples of {side}",
+            f"frames of {height} x {width} pixels (height x width): height and width must be multiples of {side}",
             f"pad to {max(side, height + -height % side)} x {max(side, width + -width % side)} (pad_clip), crop the result (crop_clip)",
         )
     if first and (frames < 1 or (frames - 1) % group):
         raise InputError(
-            doing,
-            f"{frames} frames at the start of a video",
-            f"the first latent holds 1 frame and every later one {group}: 1 + {group}k frames are needed",
+            f"{frames} frames at the start of a video: the first latent holds 1 frame and every later one {group}: 1 + {group}k frames are needed",
             f"give {max(1, 1 + (frames - 1) // group * group)} or {on_grid(max(1, frames), group)} frames (pad_clip repeats the last one)",
         )
     if not first and (frames < 1 or frames % group):
         raise InputError(
-            doing,
-            f"{frames} frames in the middle of a stream",
-            f"every latent after the first holds {group} frames",
+            f"{frames} frames in the middle of a stream: every latent after the first holds {group} frames",
             f"push a multiple of {group} frames, or start a new stream for a new video",
         )
 
 
-def check_latents(z: Tensor, doing: str, channels: int) -> None:
+def check_latents(z: Tensor, channels: int) -> None:
     """Refuse other tensors than ``(B, channels, t, h, w)`` floating point with at least one latent.
 
     Raises:
         InputError: Another shape or dtype.
     """
     if z.ndim != 5 or z.shape[1] != channels or not z.is_floating_point() or 0 in z.shape:
-        do = f"give (B, {channels}, t, h, w) floating point, t at least 1"
-        raise InputError(doing, f"a tensor {list(z.shape)} of {z.dtype}", "not a video latent", do)
+        raise InputError(
+            f"a tensor {list(z.shape)} of {z.dtype}: not a video latent",
+            f"give (B, {channels}, t, h, w) floating point, t at least 1",
+        )
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,6 @@ def load_checked(
     net: nn.Module,
     tensors: Mapping[str, Tensor],
     dtype: torch.dtype,
-    doing: str,
     source: str,
     do: str,
 ) -> None:
@@ -102,9 +101,7 @@ def load_checked(
     }
     if found := [listed(what, keys) for what, keys in groups.items() if keys]:
         raise InputError(
-            doing,
-            f"{source} ({len(tensors)} tensors, {len(expected)} expected)",
-            "; ".join(found),
+            f"{source} ({len(tensors)} tensors, {len(expected)} expected): {'; '.join(found)}",
             do,
         )
     constants = {key for key, _ in net.named_buffers()}
@@ -175,9 +172,7 @@ class LatentStats(Float32Buffers):
         super().__init__()
         if len(mean) != len(std) or not all(s > 0 for s in std):
             raise InputError(
-                "setting latent statistics",
-                f"{len(mean)} means and {len(std)} standard deviations",
-                f"standard deviations {list(std)}",
+                f"{len(mean)} means and {len(std)} standard deviations: standard deviations {list(std)}",
                 "give one mean and one positive standard deviation for each latent channel",
             )
         self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32), persistent=stored)

@@ -250,9 +250,9 @@ class CosmosCausalDiT(nn.Module):
         if keeps_graph:
             return GraphCache(self.rope, batch, height, width, window, sink, self.device)
         if window is None:
-            do = "give the number of latents to hold, or keeps_graph=True"
             raise InputError(
-                "making a rolling cache", "window", "None: a fixed buffer needs a length", do
+                "window: None: a fixed buffer needs a length",
+                "give the number of latents to hold, or keeps_graph=True",
             )
         return RollingCache(
             self.rope,
@@ -287,9 +287,7 @@ class CosmosCausalDiT(nn.Module):
         """
         if self.folded_t is not None:
             raise InputError(
-                "folding a time step",
-                f"t={t}",
-                f"already folded for t={self.folded_t}",
+                f"t={t}: already folded for t={self.folded_t}",
                 "fold the original network",
             )
         net = copy.deepcopy(self).requires_grad_(False)
@@ -338,10 +336,9 @@ class CosmosCausalDiT(nn.Module):
                 else t.is_meta or bool((t == self.folded_t).all())
             )
             if not same:
-                found = f"t={t if not isinstance(t, Tensor) else t.flatten()[:4].tolist()}"
-                do = f"pass t={self.folded_t}, or use the network that is not folded"
                 raise InputError(
-                    "running a folded network", f"folded for t={self.folded_t}", found, do
+                    f"folded for t={self.folded_t}: t={t if not isinstance(t, Tensor) else t.flatten()[:4].tolist()}",
+                    f"pass t={self.folded_t}, or use the network that is not folded",
                 )
             return None
         steps = t if isinstance(t, Tensor) else torch.full((1, 1), float(t), device=self.device)
@@ -356,7 +353,6 @@ class CosmosCausalDiT(nn.Module):
         hdmap: Tensor,
         block_latents: int | None,
     ) -> None:
-        doing = "running a causal network"
         sizes = self.sizes
         if (
             x.ndim != 5
@@ -366,26 +362,26 @@ class CosmosCausalDiT(nn.Module):
             or x.shape[4] % 2
             or 0 in x.shape
         ):
-            do = f"give (batch, {sizes.latent_channels}, latents, height, width) with even height and width (pixels in multiples of 16)"
-            raise InputError(doing, "x", f"shape {list(x.shape)}", do)
+            raise InputError(
+                f"x: shape {list(x.shape)}",
+                f"give (batch, {sizes.latent_channels}, latents, height, width) with even height and width (pixels in multiples of 16)",
+            )
         expected = [x.shape[0], sizes.condition_channels, *x.shape[2:]]
         if list(hdmap.shape) != expected:
             raise InputError(
-                doing,
-                "hdmap",
-                f"shape {list(hdmap.shape)}",
+                f"hdmap: shape {list(hdmap.shape)}",
                 f"give {expected}, the map at the latents of x",
             )
         if isinstance(t, Tensor) and (
             t.ndim != 2 or t.shape[0] not in (1, x.shape[0]) or t.shape[1] not in (1, x.shape[2])
         ):
-            do = f"give one step per latent, [{x.shape[0]}, {x.shape[2]}], or one number"
-            raise InputError(doing, "t", f"shape {list(t.shape)}", do)
+            raise InputError(
+                f"t: shape {list(t.shape)}",
+                f"give one step per latent, [{x.shape[0]}, {x.shape[2]}], or one number",
+            )
         if block_latents is not None and block_latents < 1:
             raise InputError(
-                doing,
-                "block_latents",
-                str(block_latents),
+                f"block_latents: {block_latents}",
                 "give at least one latent a block, or None for no causality",
             )
         if isinstance(text, Tensor):
@@ -399,8 +395,10 @@ class CosmosCausalDiT(nn.Module):
             or text.shape[2] != self.sizes.text_width
             or text.shape[1] < 1
         ):
-            do = f"give (batch or 1, tokens, {self.sizes.text_width})"
-            raise InputError("projecting text features", "text", f"shape {list(text.shape)}", do)
+            raise InputError(
+                f"text: shape {list(text.shape)}",
+                f"give (batch or 1, tokens, {self.sizes.text_width})",
+            )
 
     def _check_cache(self, x: Tensor, cache: BlockCache) -> None:
         made: tuple[object, ...] = (
@@ -423,11 +421,7 @@ class CosmosCausalDiT(nn.Module):
                 (*expected, self.sizes.blocks, self.sizes.heads, self.dtype),
             )
         if made != expected:
-            do = "make the cache with this network's new_cache for this batch and latent size"
-            names = "batch, height, width, head width, rope ratios, layers, heads, dtype"
             raise InputError(
-                "running one block with a cache",
-                names,
-                f"cache {made}, block and network {expected}",
-                do,
+                f"batch, height, width, head width, rope ratios, layers, heads, dtype: cache {made}, block and network {expected}",
+                "make the cache with this network's new_cache for this batch and latent size",
             )

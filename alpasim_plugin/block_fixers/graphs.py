@@ -72,9 +72,9 @@ class CudaRecorder:
                     outputs = function()
         except RuntimeError as error:
             found = str(error).splitlines()[0]
-            do = "run without graphs (for a fixer: --set fixer.graphs=off) and report this"
             raise InfrastructureError(
-                "recording a CUDA graph", str(self._device), found, do
+                f"{self._device}: {found}",
+                "run without graphs (for a fixer: --set fixer.graphs=off) and report this",
             ) from error
         self._pool = self._pool or graph.pool()
         return Recording(outputs, graph.replay)

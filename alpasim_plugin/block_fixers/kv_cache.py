@@ -47,21 +47,14 @@ class BlockCache(ABC):
         sink: int,
         device: torch.device,
     ) -> None:
-        doing = "making a cache for a causal network"
         if batch < 1 or height < 2 or width < 2 or height % 2 or width % 2:
-            found = f"batch {batch}, latent size {height} x {width}"
             raise InputError(
-                doing,
-                "batch, height, width",
-                found,
+                f"batch, height, width: batch {batch}, latent size {height} x {width}",
                 "give a positive batch and even latent sizes (pixels / 8)",
             )
         if sink < 0 or (window is not None and (window < 1 or sink > window)):
-            found = f"window {window}, sink {sink}"
             raise InputError(
-                doing,
-                "window and sink, in latents",
-                found,
+                f"window and sink, in latents: window {window}, sink {sink}",
                 "use window >= 1 and 0 <= sink <= window",
             )
         self.rope, self.batch, self.height, self.width = rope, batch, height, width
@@ -107,9 +100,9 @@ class BlockCache(ABC):
             InputError: No forward since the last commit or reset.
         """
         if not self.open_latents:
-            do = "run the block first, with write=False if it is not final"
             raise InputError(
-                "keeping a block in a cache", f"latent {self.position}", "no forward to keep", do
+                f"latent {self.position}: no forward to keep",
+                "run the block first, with write=False if it is not final",
             )
         self.position += self.open_latents
         self.filled += self.open_latents
@@ -180,13 +173,9 @@ class RollingCache(BlockCache):
         """
         overwritten = self.filled + self.open_latents > self.size
         if 0 < latents < self.open_latents and overwritten:
-            found = f"{latents} latents after a forward with {self.open_latents} at latent {self.position}"
-            do = "repeat a block with its first length (its forwards share slots), or write it, or reset the cache"
             raise InputError(
-                "opening a block of a rolling cache",
-                f"window {self.window}, sink {self.sink}",
-                found,
-                do,
+                f"window {self.window}, sink {self.sink}: {latents} latents after a forward with {self.open_latents} at latent {self.position}",
+                "repeat a block with its first length (its forwards share slots), or write it, or reset the cache",
             )
         table = super().begin(latents)
         if self._chosen == (self.filled, latents):  # reopened: no transfer to the device
@@ -294,12 +283,9 @@ class GraphCache(BlockCache):
             InputError: A block is open.
         """
         if self.open_latents:
-            do = "commit the block first, or reset the cache"
             raise InputError(
-                "forking a cache",
-                f"latent {self.position}",
-                "an open block with forwards that were not committed",
-                do,
+                f"latent {self.position}: an open block with forwards that were not committed",
+                "commit the block first, or reset the cache",
             )
         copy = GraphCache(
             self.rope, self.batch, self.height, self.width, self.window, self.sink, self.device

@@ -124,7 +124,7 @@ def load_networks(settings: LatentFixerSettings, device: str = "cpu") -> Network
         InputError: Weights that are missing or do not fit.
         FixerError: The device does not work.
     """
-    require_device(device, DOING)
+    require_device(device)
     loop = FixerSettings(name="")  # settings of the loop do not change the networks
     return _load(
         settings.model_copy(
@@ -152,11 +152,9 @@ def streaming_dit(
     expected = condition_sizes(settings)
     found = {key: getattr(net.sizes, key) for key in expected}
     if found != expected:
-        do = (
-            "set fixer.render_input and fixer.opacity_input as in its training; its bundle has them"
-        )
         raise InputError(
-            DOING, source, f"{_listed(found)}, streaming gives {_listed(expected)}", do
+            f"{source}: {_listed(found)}, streaming gives {_listed(expected)}",
+            "set fixer.render_input and fixer.opacity_input as in its training; its bundle has them",
         )
     return net
 
@@ -298,14 +296,14 @@ class Parts:
             return torch.zeros(1, 1, sizes.text_width)
         text = given[0].get("text")
         if text is None and given[0]:
-            found = f"its weights learned several prompts: {', '.join(sorted(given[0]))}"
             raise InputError(
-                DOING, given[1], found, f"choose one: --set fixer.prompt={min(given[0])}"
+                f"{given[1]}: its weights learned several prompts: {', '.join(sorted(given[0]))}",
+                f"choose one: --set fixer.prompt={min(given[0])}",
             )
         if text is None or text.ndim != 2 or text.shape[1] != sizes.text_width:
             found = "no tensor 'text'" if text is None else f"text is {list(text.shape)}"
             raise InputError(
-                DOING, given[1], found, f"give 'text' of shape [tokens, {sizes.text_width}]"
+                f"{given[1]}: {found}", f"give 'text' of shape [tokens, {sizes.text_width}]"
             )
         return text.float()[None]
 
@@ -338,13 +336,11 @@ class Parts:
                 if known
                 else "leave fixer.prompt out, or give a bundle of 'simrun train fixer --recipe appearance'"
             )
-            raise InputError("choosing a prompt", f"{source}, fixer.prompt={name}", found, do)
+            raise InputError(f"{source}, fixer.prompt={name}: {found}", do)
         text = known[name]
         if text.ndim != 2 or text.shape[1] != sizes.text_width:
             raise InputError(
-                DOING,
-                f"prompt {name}",
-                f"shape {list(text.shape)}",
+                f"prompt {name}: shape {list(text.shape)}",
                 f"give [tokens, {sizes.text_width}]",
             )
         return text.float()[None]
@@ -377,9 +373,7 @@ class Parts:
     def refuse(self, part: str, found: str) -> None:
         """Raise the error for weights that are missing."""
         raise InputError(
-            DOING,
-            f"{self.settings.name}, weights.{part}",
-            found,
+            f"{self.settings.name}, weights.{part}: {found}",
             weights_to_give(part, self.settings.trained_by),
         )
 

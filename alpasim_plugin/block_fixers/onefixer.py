@@ -36,7 +36,7 @@ from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.network.machine_probe import take_threads
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.fixers.views import DOING, Views, group_views
+from alpasim_plugin.fixers.views import Views, group_views
 
 
 def latent_noise(
@@ -119,9 +119,9 @@ class OneFixer(Fixer):
         threads: int | None = None,
     ) -> None:
         if not isinstance(settings, OneFixerSettings):
-            found = f"settings of type {type(settings).__name__}"
             raise InputError(
-                "making a fixer", settings.name, found, "take them from fixer_settings(name)"
+                f"{settings.name}: settings of type {type(settings).__name__}",
+                "take them from fixer_settings(name)",
             )
         self.chosen: dict[str, Any] = take_threads(threads)
         self.chosen["precision"] = {
@@ -209,18 +209,15 @@ class OneFixer(Fixer):
         if given != known and not self._done:
             self._history, self._pending = tuple(self._open(view) for view in views), ()
         elif given != known:
-            do = "give the same cameras at the same sizes in every block, or reset"
             raise InputError(
-                DOING, f"block {self._done}", f"cameras and sizes {given} after {known}", do
+                f"block {self._done}: cameras and sizes {given} after {known}",
+                "give the same cameras at the same sizes in every block, or reset",
             )
         for view, history in zip(views, self._history, strict=True) if self._done else ():
             for camera, times, last in zip(view.cameras, view.t_us, history.last_t_us, strict=True):
                 if times[0] <= last:
-                    found = f"a frame at {times[0]} us after one at {last} us"
                     raise InputError(
-                        DOING,
-                        f"camera {camera!r}, block {self._done}",
-                        found,
+                        f"camera {camera!r}, block {self._done}: a frame at {times[0]} us after one at {last} us",
                         "give frames in the order of time, or reset",
                     )
         return views

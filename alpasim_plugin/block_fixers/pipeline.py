@@ -234,9 +234,7 @@ class BlockPipeline:
                 else "no map after blocks with one"
             )
             raise InputError(
-                "fixing a block",
-                f"latent {state.latent}",
-                found,
+                f"latent {state.latent}: {found}",
                 "give the map in every block of a rollout, or in none",
             )
         with self.stage("source"):
@@ -346,9 +344,10 @@ class BlockPipeline:
                 history.write()
             history.kept, history.draft, history.write = state, None, lambda: None
         elif state is not history.kept:
-            found = "an out-of-date state: another run or later blocks came since"
-            do = "continue from the newest state, or start a new rollout"
-            raise InputError("continuing a rollout", f"latent {state.latent}", found, do)
+            raise InputError(
+                f"latent {state.latent}: an out-of-date state: another run or later blocks came since",
+                "continue from the newest state, or start a new rollout",
+            )
         return state
 
     @torch.inference_mode()

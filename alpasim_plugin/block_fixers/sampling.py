@@ -110,7 +110,6 @@ def opacity_values(opacity: Tensor, first: bool = True) -> Tensor:
 
 def _checked_opacity(opacity: Tensor, first: bool, nan_as: float | None) -> Tensor:
     """Return opacity in [0, 1], four frames a latent."""
-    doing = "pooling opacity to latents"
     frames = opacity.shape[2] if opacity.ndim == 5 else 0
     if (
         opacity.ndim != 5
@@ -120,32 +119,33 @@ def _checked_opacity(opacity: Tensor, first: bool, nan_as: float | None) -> Tens
         or opacity.shape[3] % 8
         or opacity.shape[4] % 8
     ):
-        do = f"give (B, 1, {'1 + 4 n' if first else '4 n'} frames, H, W) with H and W in multiples of 8"
-        raise InputError(doing, "opacity", f"shape {list(opacity.shape)}", do)
+        raise InputError(
+            f"opacity: shape {list(opacity.shape)}",
+            f"give (B, 1, {'1 + 4 n' if first else '4 n'} frames, H, W) with H and W in multiples of 8",
+        )
     if not opacity.is_meta:
-        opacity = _without_nan(opacity, nan_as, doing)
+        opacity = _without_nan(opacity, nan_as)
     video = opacity.clamp(0, 1)
     if first:
         video = torch.cat([video[:, :, :1].expand(-1, -1, 3, -1, -1), video], dim=2)
     return video
 
 
-def _without_nan(opacity: Tensor, nan_as: float | None, doing: str) -> Tensor:
+def _without_nan(opacity: Tensor, nan_as: float | None) -> Tensor:
     """Replace NaN, if allowed, and refuse values outside [0, 1]."""
     unknown = opacity.isnan()
     count = int(unknown.sum())
     if count and nan_as is None:
-        found = f"{count} of {opacity.numel()} values are NaN"
-        do = "repair the renderer, or give a replacement with nan_as (0 treats those pixels as empty)"
-        raise InputError(doing, "opacity", found, do)
+        raise InputError(
+            f"opacity: {count} of {opacity.numel()} values are NaN",
+            "repair the renderer, or give a replacement with nan_as (0 treats those pixels as empty)",
+        )
     if count:
         opacity = opacity.masked_fill(unknown, nan_as if nan_as is not None else 0.0)
     low, high = float(opacity.min()), float(opacity.max())
     if low < -SLACK or high > 1 + SLACK:
         raise InputError(
-            doing,
-            "opacity",
-            f"values from {low:.4g} to {high:.4g}",
+            f"opacity: values from {low:.4g} to {high:.4g}",
             "give accumulated alpha between 0 and 1",
         )
     return opacity
@@ -223,11 +223,13 @@ def sample_block(
         InputError: A wrong number of sources.
     """
     if len(sources) != sources_needed(schedule, history) or not schedule:
-        found = f"{len(sources)} sources for {len(schedule)} steps with history {history!r}"
         do = f"give {sources_needed(schedule, history)}: one per step" + (
             ", one for the cache write" if history == "finalise" else ""
         )
-        raise InputError("sampling a block of latents", "sources", found, do)
+        raise InputError(
+            f"sources: {len(sources)} sources for {len(schedule)} steps with history {history!r}",
+            do,
+        )
     fixed, mask = _given(given, sources[0])
     z = sources[0]
     for i, level in enumerate(schedule):

@@ -189,7 +189,7 @@ def _is_block(key: str) -> bool:
 def _refusal(source: str, count: int, parts: list[str]) -> InputError:
     found = "; ".join(part for part in parts if part)
     do = "give the weights of a causal single-view network with a semantic-map embedding (docs/block-fixers.md lists keys and shapes)"
-    return InputError("loading CosmosCausalDiT weights", f"{source} ({count} tensors)", found, do)
+    return InputError(f"{source} ({count} tensors): {found}", do)
 
 
 def initial_weights(sizes: DiTSizes, seed: int, zero_velocity: bool = False) -> dict[str, Tensor]:

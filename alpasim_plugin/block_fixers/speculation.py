@@ -318,17 +318,13 @@ class _CameraGroup:
         )
         if names != sorted(self.cameras) or len(t_us) > 1:
             raise RendererError(
-                "rendering for a fixer",
-                f"cameras {', '.join(names)} at {sorted(t_us)} us",
-                f"the block in progress belongs to {', '.join(self.cameras)} at one instant",
+                f"cameras {', '.join(names)} at {sorted(t_us)} us: the block in progress belongs to {', '.join(self.cameras)} at one instant",
                 "request cameras with the same frame times together",
             )
         now = next(iter(t_us))
         if self.last_us is not None and now <= self.last_us:
             raise RendererError(
-                "rendering for a fixer",
-                f"{now} us",
-                f"the last frame was of {self.last_us} us",
+                f"{now} us: the last frame was of {self.last_us} us",
                 "make a new renderer for every rollout",
             )
         self.last_us = now

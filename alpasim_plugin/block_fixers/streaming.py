@@ -72,9 +72,7 @@ class StreamingState:
         past = x[:, :0] if self._old is None else self._old[len(self._new)].to(x.dtype)
         if past.shape[0] != x.shape[0] or past.shape[2:] != x.shape[2:]:
             raise InputError(
-                "continuing a video stream",
-                f"a block whose layers have shape {list(x.shape)}",
-                f"the stream so far had {list(past.shape)} (batch, frames, then sizes)",
+                f"a block whose layers have shape {list(x.shape)}: the stream so far had {list(past.shape)} (batch, frames, then sizes)",
                 "keep batch and frame size for the whole stream, or start a new stream",
             )
         joined = torch.cat([past, x], dim=1) if past.shape[1] else x

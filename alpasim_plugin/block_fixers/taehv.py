@@ -162,14 +162,12 @@ class TinyDecoder(StreamingDecoder):
         latent, widths = _read_widths(tensors, source)
         if scaled and len(mean) != latent:
             raise InputError(
-                DOING,
-                source,
-                f"{latent} latent channels, {len(mean)} latent means",
+                f"{source}: {latent} latent channels, {len(mean)} latent means",
                 "pass mean= and std=, a value a channel",
             )
         with torch.device("meta"):
             net = cls(latent, widths, scaled)
-        load_checked(net, _last_rows(tensors, widths), dtype, DOING, source, DO)
+        load_checked(net, _last_rows(tensors, widths), dtype, source, DO)
         net.stats = LatentStats(mean, std) if scaled else None
         return net
 
@@ -202,7 +200,7 @@ class TinyDecoder(StreamingDecoder):
         Raises:
             InputError: Another shape.
         """
-        check_latents(z, "decoding latents with the tiny decoder", self.latent)
+        check_latents(z, self.latent)
         video, state = in_passes(
             partial(self._pass, detach=detach),
             z.to(self.dtype),
@@ -229,9 +227,7 @@ def _read_widths(tensors: Mapping[str, Tensor], source: str) -> tuple[int, tuple
     stem, last = "decoder.1.weight", f"decoder.{FIRST + STAGE * len(GROWTH) + 1}.weight"
     missing = [key for key in (stem, *first_convs, last) if key not in tensors]
     if missing:
-        raise InputError(
-            DOING, f"{source} ({len(tensors)} tensors)", f"missing: {', '.join(missing)}", DO
-        )
+        raise InputError(f"{source} ({len(tensors)} tensors): missing: {', '.join(missing)}", DO)
     widths = [tensors[key].numel() for key in first_convs]
     latent = _other_side(tensors[stem], widths[0], stem, source)
     return latent, (*widths, _other_side(tensors[last], COLOURS, last, source))
@@ -241,9 +237,7 @@ def _other_side(kernel: Tensor, known: int, key: str, source: str) -> int:
     sides = list(kernel.shape[:2])
     if kernel.ndim != 4 or known not in sides:
         raise InputError(
-            DOING,
-            source,
-            f"wrong shape: {key} is {list(kernel.shape)}, where one side should be {known}",
+            f"{source}: wrong shape: {key} is {list(kernel.shape)}, where one side should be {known}",
             DO,
         )
     return int(sides[1] if sides[0] == known else sides[0])

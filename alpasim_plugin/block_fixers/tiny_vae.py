@@ -119,10 +119,10 @@ class TinyVAE(StreamingCodec):
             InputError: Missing, unexpected, mis-shaped or transposed keys.
         """
         tensors = unwrap(sd, source)
-        sizes = TinySizes.read(tensors, DOING, source, DO)
+        sizes = TinySizes.read(tensors, source, DO)
         with torch.device("meta"):
             vae = cls(sizes)
-        load_checked(vae, tensors, dtype, DOING, source, DO)
+        load_checked(vae, tensors, dtype, source, DO)
         vae.transform = CosineTransform()
         vae.requires_grad_(False)
         return vae
@@ -146,7 +146,7 @@ class TinyVAE(StreamingCodec):
         """Encode the next frames of a stream; a pure function, with the same rules as
         `WanVAE.encode_next`.
         """
-        check_frames(frames, "encoding video frames with the tiny VAE", first=state is None)
+        check_frames(frames, first=state is None)
         ends = group_ends(frames.shape[2], state is None, self.latents_per_pass)
         return in_passes(partial(self._encode_pass, detach=detach), frames.float(), state, ends)
 
@@ -179,7 +179,7 @@ class TinyVAE(StreamingCodec):
         Raises:
             InputError: Another shape, or an opacity without a render.
         """
-        check_latents(z, "decoding latents with the tiny VAE", LATENT)
+        check_latents(z, LATENT)
         b, _, m, h, w = z.shape
         frames = GROUP * m - (DROPPED if state is None else 0)
         _check_condition(render, opacity, (b, frames, h * SIDE, w * SIDE))
@@ -277,15 +277,11 @@ def _check_condition(
     for name, given, channels in (("render", render, COLOURS), ("opacity", opacity, 1)):
         if given is not None and tuple(given.shape) != (b, channels, *size):
             raise InputError(
-                "decoding latents with the tiny VAE",
-                f"a {name} of shape {list(given.shape)}",
-                f"these latents decode to {[b, channels, *size]}",
+                f"a {name} of shape {list(given.shape)}: these latents decode to {[b, channels, *size]}",
                 f"give the {name} of exactly the frames that come out",
             )
     if render is None and opacity is not None:
         raise InputError(
-            "decoding latents with the tiny VAE",
-            "an opacity",
-            "no render with it",
+            "an opacity: no render with it",
             "give both, or the render alone",
         )

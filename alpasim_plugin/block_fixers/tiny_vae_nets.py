@@ -183,7 +183,7 @@ class TinySizes:
     decoder_frame: int = 48
 
     @classmethod
-    def read(cls, tensors: Mapping[str, Tensor], doing: str, source: str, do: str) -> TinySizes:
+    def read(cls, tensors: Mapping[str, Tensor], source: str, do: str) -> TinySizes:
         """Read the widths off biases.
 
         Raises:
@@ -199,7 +199,7 @@ class TinySizes:
         missing = [key for key in keys.values() if key not in tensors]
         if missing:
             raise InputError(
-                doing, f"{source} ({len(tensors)} tensors)", f"missing: {', '.join(missing)}", do
+                f"{source} ({len(tensors)} tensors): missing: {', '.join(missing)}", do
             )
         return cls(**{field.name: tensors[keys[field.name]].numel() for field in fields(cls)})
 

@@ -35,7 +35,6 @@ from alpasim_plugin.block_fixers.streaming import (
 from alpasim_plugin.block_fixers.wan_vae_blocks import (
     DECODER_TIME,
     DO,
-    DOING,
     ENCODER_TIME,
     CausalConv,
     ChannelNorm,
@@ -160,11 +159,13 @@ class WanVAE(StreamingCodec):
         tensors = unwrap(sd, source)
         layout = read_layout(tensors, source)
         if len(mean) != layout.latent:
-            found = f"{layout.latent} latent channels, {len(mean)} latent means"
-            raise InputError(DOING, source, found, "pass mean= and std=, one value a channel")
+            raise InputError(
+                f"{source}: {layout.latent} latent channels, {len(mean)} latent means",
+                "pass mean= and std=, one value a channel",
+            )
         with torch.device("meta"):
             vae = cls(layout)
-        load_checked(vae, tensors, dtype, DOING, source, DO)
+        load_checked(vae, tensors, dtype, source, DO)
         vae.stats = LatentStats(mean, std)
         return vae
 
@@ -194,9 +195,7 @@ class WanVAE(StreamingCodec):
         Raises:
             InputError: An invalid number of frames or size.
         """
-        check_frames(
-            frames, "encoding video frames", first=state is None, channels=self.layout.colours
-        )
+        check_frames(frames, first=state is None, channels=self.layout.colours)
         ends = group_ends(frames.shape[2], state is None, self.latents_per_pass)
         return in_passes(
             partial(self._encode_pass, detach=detach), frames.to(self.dtype), state, ends
@@ -221,7 +220,7 @@ class WanVAE(StreamingCodec):
         Raises:
             InputError: Another shape.
         """
-        check_latents(z, "decoding video latents", self.layout.latent)
+        check_latents(z, self.layout.latent)
         ends = pass_ends(z.shape[2], self.latents_per_pass)
         video, state = in_passes(
             partial(self._decode_pass, detach=detach), z.to(self.dtype), state, ends

@@ -95,9 +95,7 @@ def read_layout(sd: Mapping[str, Tensor], source: str = "a state dict") -> WanLa
     ]
     if not halvings:
         raise InputError(
-            DOING,
-            f"{source} ({len(sd)} tensors)",
-            "missing: encoder.downsamples.2.resample.1.weight",
+            f"{source} ({len(sd)} tensors): missing: encoder.downsamples.2.resample.1.weight",
             DO,
         )
     blocks = min(halvings)
@@ -123,7 +121,7 @@ def read_layout(sd: Mapping[str, Tensor], source: str = "a state dict") -> WanLa
 
 def _length(sd: Mapping[str, Tensor], source: str, key: str) -> int:
     if key not in sd:
-        raise InputError(DOING, f"{source} ({len(sd)} tensors)", f"missing: {key}", DO)
+        raise InputError(f"{source} ({len(sd)} tensors): missing: {key}", DO)
     return sd[key].numel()
 
 

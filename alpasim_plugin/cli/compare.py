@@ -60,9 +60,7 @@ def compare(
     listed.
     """
     if len(runs) > 2:
-        raise InputError(
-            "comparing runs", f"{len(runs)} folders", "more than two", "name one run, or two"
-        )
+        raise InputError(f"{len(runs)} folders: more than two", "name one run, or two")
     for run in runs:
         use_run(run, warn)
         if note := stopping_note(run):

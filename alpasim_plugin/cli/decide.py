@@ -146,9 +146,7 @@ def decide(
     spec = None if metric else load_gate(gate)[0]
     if spec is not None and (ask != "non-inferior" or expect is not None):
         raise InputError(
-            DOING,
-            f"--ask {ask}" if ask != "non-inferior" else "--expect",
-            "no metric is named",
+            f"{f'--ask {ask}' if ask != 'non-inferior' else '--expect'}: no metric is named",
             "name it with --metric",
         )
     asked = questions_of(metric, ask, expect, method) if spec is None else questions_of_gate(spec)
@@ -159,8 +157,10 @@ def decide(
     question = Question(asked, alpha, population, first_look, least)
     is_auto = what.seeds.startswith(AUTO)
     if is_auto and population == "suite":
-        found = "the suite's mean is over the same seeds in every scene"
-        raise InputError(DOING, f"--seeds {what.seeds}", found, "give a number of seeds")
+        raise InputError(
+            f"--seeds {what.seeds}: the suite's mean is over the same seeds in every scene",
+            "give a number of seeds",
+        )
     how = where.arguments() | care.arguments()
     plan = plan_of(
         replace(what, seeds=what.seeds.removeprefix(AUTO)),
@@ -244,22 +244,14 @@ def plan_of(what: What, options: RunOptions, stored: bool = False) -> RunPlan:
     what_is_asked = f"--renderer {what.renderer} --policy {what.policy}"
     if stored:
         if len(renderers) * len(policies) != 1:
-            found = (
-                f"{len(renderers)} renderers and {len(policies)} policies beside a stored baseline"
-            )
             raise InputError(
-                DOING,
-                what_is_asked,
-                found,
+                f"{what_is_asked}: {len(renderers)} renderers and {len(policies)} policies beside a stored baseline",
                 "name the arm in question; the baseline is not driven again",
             )
         return planned(what, renderers, policies, replace(options, baseline=None))
     if sorted((len(renderers), len(policies))) not in ([1, 2], [2, 2]):
-        found = f"{len(renderers)} renderers and {len(policies)} policies"
         raise InputError(
-            DOING,
-            what_is_asked,
-            found,
+            f"{what_is_asked}: {len(renderers)} renderers and {len(policies)} policies",
             "name two renderers or two policies: the baseline and the one in question",
         )
     plan = planned(what, renderers, policies, options)
@@ -269,15 +261,12 @@ def plan_of(what: What, options: RunOptions, stored: bool = False) -> RunPlan:
     base = (
         usual_base(arms)
         if options.baseline is None
-        else base_named(options.baseline, arms, DOING, "the plan")
+        else base_named(options.baseline, arms, "the plan")
     )
     if len(arms) == 4:
         if base.renderer is None or base.policy is None:
-            found = f"baseline {base.name} leaves open which of four arms is in question"
             raise InputError(
-                DOING,
-                what_is_asked,
-                found,
+                f"{what_is_asked}: baseline {base.name} leaves open which of four arms is in question",
                 f"name one arm, as --baseline {arms[0].name}: the one in question shares nothing with it",
             )
         arms = [
@@ -319,7 +308,7 @@ def side_of_baseline(
     planned = {(cell.scene, cell.seed) for cell in plan.cells}
     there = arms_of((str(row["renderer"]), str(row["policy"])) for row in stored.rows)
     driven = Arm(plan.renderers[0].name, plan.policies[0].name)
-    arm = driven if baseline is None else base_named(baseline, there, DOING, str(path)).of(driven)
+    arm = driven if baseline is None else base_named(baseline, there, str(path)).of(driven)
     return stored_side(stored.rows, arm.renderer, arm.policy, planned, max_missing, path)
 
 
@@ -338,16 +327,14 @@ def questions_of(
             value = float(margin) if margin else None
         except ValueError:
             raise InputError(
-                DOING,
-                f"--metric {text}",
-                f"margin {margin!r} is no number",
+                f"--metric {text}: margin {margin!r} is no number",
                 "write NAME=MARGIN, as progress=0.05",
             ) from None
         found.append(metric_question(name, value, asked, expected, method=method))
     names = [one.metric for one in found]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise InputError(DOING, f"--metric {twice[0]}", "named twice", "name every metric once")
+        raise InputError(f"--metric {twice[0]}: named twice", "name every metric once")
     return tuple(found)
 
 
@@ -364,9 +351,7 @@ def questions_of_gate(spec: GateSpec) -> tuple[MetricQuestion, ...]:
     )
     if not any(one.binding for one in found):
         raise InputError(
-            DOING,
-            "the gate",
-            "no margin of it must be decided",
+            "the gate: no margin of it must be decided",
             "give it a metric with a margin, or judge a run without",
         )
     return found
@@ -395,22 +380,19 @@ def controls_of(
     if not texts:
         return {}
     if question.population != "suite":
-        found = "the mean of a control over a population of scenes is not known"
         raise InputError(
-            DOING,
-            f"--control {texts[0]}",
-            found,
+            f"--control {texts[0]}: the mean of a control over a population of scenes is not known",
             "ask about the suite itself with --population suite, or leave it out",
         )
     if "family" in texts and order == "stratified":
-        found = "with --order stratified, families are taken out by the order"
-        raise InputError(DOING, "--control family", found, "leave out one of the two")
+        raise InputError(
+            "--control family: with --order stratified, families are taken out by the order",
+            "leave out one of the two",
+        )
     base, asked = arms_asked(plan, stored is not None)
     if base.policy != asked.policy and any(text != "family" for text in texts):
         raise InputError(
-            DOING,
-            "--control RUN",
-            "two policies are compared",
+            "--control RUN: two policies are compared",
             "take --control family: an earlier run is of two renderers",
         )
     scenes = list(plan.scenarios)
@@ -458,12 +440,9 @@ def decide_into(
     """
     scenes, least = len(plan.scenarios), question.min_scenes
     if scenes < least:
-        do_this = "name more scenes, or drive these and judge all of them: simrun --renderer A,B SCENARIO..., then simrun gate RUN"
         raise InputError(
-            DOING,
-            plural(scenes, "scene"),
-            f"nothing is decided on fewer than {least} (min_scenes)",
-            do_this,
+            f"{plural(scenes, 'scene')}: nothing is decided on fewer than {least} (min_scenes)",
+            "name more scenes, or drive these and judge all of them: simrun --renderer A,B SCENARIO..., then simrun gate RUN",
         )
     plan = replace(plan, question=key_of(question, design, controls, stored))
     folder = root or Path(
@@ -499,8 +478,10 @@ def population_of(text: Population, max_missing: float, allowed_by: str) -> Popu
         InputError: Pairs may be missing.
     """
     if text == "suite" and max_missing > 0.0:
-        found = "scenes without a pair would be left out of the suite that is asked about"
-        raise InputError(DOING, allowed_by, found, "leave it out, or ask with --population scenes")
+        raise InputError(
+            f"{allowed_by}: scenes without a pair would be left out of the suite that is asked about",
+            "leave it out, or ask with --population scenes",
+        )
     return text
 
 

@@ -34,11 +34,8 @@ def docs(
     """Read a page of the documentation in the terminal, or list all."""
     folder = next((one for one in FOLDERS if (one / "index.md").is_file()), None)
     if folder is None:
-        found = "this installation has no pages"
         raise InputError(
-            "reading the documentation",
-            str(FOLDERS[1]),
-            found,
+            f"{FOLDERS[1]}: this installation has no pages",
             "install the wheel with pip, or use a checkout",
         )
     pages = {path.stem: path for path in sorted(folder.glob("*.md"))}
@@ -57,9 +54,7 @@ def docs(
     if name not in pages:
         near = difflib.get_close_matches(name, pages, 1) or ["index"]
         raise InputError(
-            "reading the documentation",
-            page,
-            f"no such page among {len(pages)}",
+            f"{page}: no such page among {len(pages)}",
             f"did you mean {near[0]!r}? simrun docs lists all",
         )
     text = pages[name].read_text(encoding="utf-8")

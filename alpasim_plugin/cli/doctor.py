@@ -48,8 +48,8 @@ def doctor(
                     "check": name,
                     "ok": False,
                     "needed": name in needed,
-                    "found": error.found,
-                    "do": error.do_this,
+                    "found": error.message,
+                    "do": error.hint,
                 }
             )
     broken = [row for row in rows if row["needed"] and not row["ok"]]
@@ -122,9 +122,7 @@ def _writable(place: places.Place) -> str:
     """
     trouble = places.trouble_of(place)
     if trouble:
-        raise InfrastructureError(
-            "choosing folders", str(place), f"{place}: {trouble}", places.DO_THIS
-        )
+        raise InfrastructureError(f"{place}: {place}: {trouble}", places.DO_THIS)
     return str(place)
 
 

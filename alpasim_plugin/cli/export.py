@@ -17,7 +17,6 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.log.run_folder.schema import CONTENTS
 from alpasim_plugin.runs.export import Export, export_run, export_scenes
-from alpasim_plugin.runs.recordings.content import DOING as RECORDING
 from alpasim_plugin.runs.recordings.content import Recording, collect
 from alpasim_plugin.runs.recordings.mcap_file import require_mcap, write_mcap
 from alpasim_plugin.runs.recordings.rerun_file import require_rerun, write_rrd
@@ -85,24 +84,20 @@ def export(
     if (alpasim is None) == (not files):
         found = "nothing to write" if alpasim is None else "--alpasim beside --mcap or --rrd"
         raise InputError(
-            DOING, " ".join(items), found, "give --alpasim DIR, or --mcap FILE and --rrd FILE"
+            f"{' '.join(items)}: {found}", "give --alpasim DIR, or --mcap FILE and --rrd FILE"
         )
     if alpasim is None:
         _print_recording(*export_recording(items, wanted, files, overwrite), as_json)
         return
     if not wanted.is_all:
         raise InputError(
-            DOING,
-            "--alpasim",
-            "--scene, --policy, --seed or --renderer beside it",
+            "--alpasim: --scene, --policy, --seed or --renderer beside it",
             "leave them out: a run is exported whole",
         )
     runs = [item for item in items if is_run(Path(item))]
     if runs and len(items) > 1:
         raise InputError(
-            "exporting to AlpaSim",
-            " ".join(items),
-            "a run folder among several items",
+            f"{' '.join(items)}: a run folder among several items",
             "export one run at a time",
         )
     if runs:
@@ -139,20 +134,18 @@ def export_recording(
     """
     if len(items) > 1:
         raise InputError(
-            RECORDING,
-            " ".join(items),
-            "several items",
+            f"{' '.join(items)}: several items",
             "give one run folder, or the folder of one rollout",
         )
     for name, path in files.items():
-        refuse_existing(path, overwrite, RECORDING, "")
+        refuse_existing(path, overwrite, "")
         FORMATS[name][0]()  # the library, before anything is read
     what = Path(items[0])
-    root, of_rollout = find_cell(what, RECORDING)
+    root, of_rollout = find_cell(what)
     if (root / CONTENTS).exists():
         use_run(root, warn)
     run = read_so_far(root).run
-    wanted = narrowed(what, of_rollout, asked, RECORDING)
+    wanted = narrowed(what, of_rollout, asked)
     check_wanted(run, wanted)
     cells = cells_of(run, wanted)
     if len(cells) != 1:
@@ -165,9 +158,7 @@ def export_recording(
             else "no finished rollout that was asked for"
         )
         raise InputError(
-            RECORDING,
-            str(root),
-            found,
+            f"{root}: {found}",
             "choose one by --scene, --policy and --seed, or name a rollout's folder",
         )
     recording = collect(run, cells[0], read_logs(run, cells[0]))

@@ -23,7 +23,7 @@ from alpasim_plugin.runs.fork import Change, fork_rollout
 from alpasim_plugin.runs.logged_rollout import find_rollout
 from alpasim_plugin.runs.probe import probe_rollout, write_probe
 from alpasim_plugin.runs.repair import use_run
-from alpasim_plugin.runs.why import DOING, explain
+from alpasim_plugin.runs.why import explain
 from evaluators.opening import read_run
 from evaluators.viewer.cause import write_cause
 
@@ -83,7 +83,7 @@ def fork(
         raise typer.Exit(result.exit_code)
     for failed in result.summary["failures"]["cells"]:
         print(
-            f"failed: {failed['path']}: {failed['error']['found']} -> {failed['error']['do']}",
+            f"failed: {failed['path']}: {failed['error']['message']} -> {failed['error']['hint']}",
             file=sys.stderr,
         )
     if fork_facts:
@@ -149,9 +149,7 @@ def _check_names(renderers: list[str] | tuple[str, ...], policy: str | None) -> 
     if policy is not None:
         resolve("policy", policy)
     if any("," in name for name in renderers):
-        raise InputError(
-            "choosing a renderer", f"--renderer {renderers[0]}", "several names", "name one"
-        )
+        raise InputError(f"--renderer {renderers[0]}: several names", "name one")
 
 
 WHY_EPILOG = """
@@ -181,9 +179,7 @@ def why(
     root = next((folder for folder in cell.parents if (folder / RUN_INFO).exists()), None)
     if root is None:
         raise InputError(
-            DOING,
-            str(cell),
-            "no run folder above it",
+            f"{cell}: no run folder above it",
             "give RUN/RENDERER/POLICY/SCENE/SEED as in the tables of the run",
         )
     use_run(root, warn)

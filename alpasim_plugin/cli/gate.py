@@ -238,27 +238,23 @@ def gate(
     if self_test:
         if run is not None or baseline_file is not None or approve is not None:
             raise InputError(
-                "testing a gate",
-                "--self-test",
-                "a run or baseline is named as well",
+                "--self-test: a run or baseline is named as well",
                 "give --gate and --out only",
             )
         raise typer.Exit(_self_test(gate_file, out, where.workers, as_json))
     if run is None:
-        raise InputError(
-            DOING, "simrun gate", "no run folder is named", "name one, or use --self-test"
-        )
+        raise InputError("simrun gate: no run folder is named", "name one, or use --self-test")
     if until.until_decided:
         if approve is not None:
             raise InputError(
-                DOING,
-                "--until-decided",
-                "a baseline is to be written as well",
+                "--until-decided: a baseline is to be written as well",
                 "write it of a run that is driven",
             )
         if not until.scenes or until.renderer is None:
-            do_this = "name them: --scenes SUITE --renderer A,B (one, with --baseline-file)"
-            raise InputError(DOING, "--until-decided", "no scenes or renderers", do_this)
+            raise InputError(
+                "--until-decided: no scenes or renderers",
+                "name them: --scenes SUITE --renderer A,B (one, with --baseline-file)",
+            )
         what = replace(what, scenarios=until.scenes, renderer=until.renderer)
         raise typer.Exit(
             _until_decided(run, gate_file, until, what, design, baseline_file, out, as_json, how)
@@ -271,9 +267,7 @@ def gate(
     }
     if named := [name for name, is_given in driving.items() if is_given]:
         raise InputError(
-            DOING,
-            ", ".join(named),
-            "nothing is driven without --until-decided",
+            f"{', '.join(named)}: nothing is driven without --until-decided",
             "add it, or leave them out",
         )
     use_run(run, warn)
@@ -287,8 +281,10 @@ def gate(
     spec, source = load_gate(gate_file, found.table)
     preset = str(found.summary.get("preset"))
     if spec.preset is not None and spec.preset != preset:
-        wanted = f"preset {preset!r}, the gate {source} is for {spec.preset!r}"
-        raise InputError(DOING, str(run), wanted, "score it with that preset")
+        raise InputError(
+            f"{run}: preset {preset!r}, the gate {source} is for {spec.preset!r}",
+            "score it with that preset",
+        )
     stored = None
     if baseline_file is not None:
         stored = read_baseline(baseline_file)

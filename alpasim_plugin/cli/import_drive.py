@@ -100,9 +100,7 @@ def import_splat(
         tell("reading the model", 0, 1)
         cloud, kept = read_gaussians(file)
         if kept.n_kept == 0:
-            raise InputError(
-                DOING, str(file), str(kept), "give a file with at least one drawable Gaussian"
-            )
+            raise InputError(f"{file}: {kept}", "give a file with at least one drawable Gaussian")
         key = key_of(drive, None, file if file.is_file() else None)
         if out.exists():
             return finished(out, key)
@@ -147,20 +145,14 @@ def _built(
     background = placed_cloud(cloud, placed.T_world_source)
     share = 0.0 if placed.strip is None else _carried(placed)
     if share < LEAST_CARRIED:
-        found = f"{100 * share:.0f} % of the way of the poses runs over Gaussians of the model"
         raise InputError(
-            DOING,
-            str(file),
-            found,
+            f"{file}: {100 * share:.0f} % of the way of the poses runs over Gaussians of the model",
             "give the poses in the model's own frame and unit: those that it was trained with",
         )
     above, below = _stands(placed)
     if below > above:
-        found = f"upside down: beside the way {below} of its surfaces lie below the road and {above} stand on it"
         raise InputError(
-            DOING,
-            str(file),
-            found,
+            f"{file}: upside down: beside the way {below} of its surfaces lie below the road and {above} stand on it",
             "turn the model over, or give the poses that it was trained with",
         )
     model = Reconstruction(background, {}, Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)))

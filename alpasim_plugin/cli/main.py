@@ -119,17 +119,19 @@ def with_verb(args: list[str]) -> list[str]:
         return args
     if args[0] in OF_EXTRA:
         extra = OF_EXTRA[args[0]]
-        do_this = f"install the extra that brings it: pip install 'alpasim-onefixer[{extra}]'"
-        raise InputError(READING, f"simrun {args[0]}", "the verb is not installed", do_this)
+        raise InputError(
+            f"simrun {args[0]}: the verb is not installed",
+            f"install the extra that brings it: pip install 'alpasim-onefixer[{extra}]'",
+        )
     near = (
         []
         if args[0].startswith("-") or Path(args[0]).exists()
         else difflib.get_close_matches(args[0], verbs(), 1, 0.7)
     )
     if near:
-        found = f"neither a verb nor a scenario; {near[0]} is one"
         raise InputError(
-            READING, args[0], found, f"type 'simrun {near[0]}', or 'simrun --help' for all verbs"
+            f"{args[0]}: neither a verb nor a scenario; {near[0]} is one",
+            f"type 'simrun {near[0]}', or 'simrun --help' for all verbs",
         )
     return ["run", *args]
 
@@ -235,9 +237,7 @@ def _run(args: list[str]) -> int:
             return InputError.exit_code
         where = error.ctx.command_path if error.ctx else "simrun"
         raise InputError(
-            READING,
-            where,
-            error.format_message().replace("Value error, ", ""),
+            f"{where}: {error.format_message().replace('Value error, ', '')}",
             f"'{where} --help' lists what it takes",
         ) from error
     return 0
@@ -286,32 +286,24 @@ def _unforeseen(error: Exception, args: list[str]) -> SimrunError:
     command = " ".join(["simrun", *args])
     if isinstance(error, MemoryError):
         return InfrastructureError(
-            "running a command",
-            command,
-            f"out of memory: {error}",
+            f"{command}: out of memory: {error}",
             "use fewer --workers, or free memory",
         )
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         where = error.filename or "where the output goes"
         return InfrastructureError(
-            "running a command",
-            command,
-            f"{error.strerror}: {where}",
+            f"{command}: {error.strerror}: {where}",
             "free space, then give the same command again",
         )
     if isinstance(error, PermissionError) and error.filename:
         return InputError(
-            "running a command",
-            str(error.filename),
-            str(error.strerror),
+            f"{error.filename}: {error.strerror}",
             "let this user read and write it, or name another",
         )
     if (
         isinstance(error, OSError) and places.nothing_is_writable()
     ):  # of a library that needs a folder for itself
-        return InfrastructureError(
-            "running a command", command, f"no folder can be written: {error}", places.DO_THIS
-        )
+        return InfrastructureError(f"{command}: no folder can be written: {error}", places.DO_THIS)
     failure = InternalError.of(error, command)
     failure.__cause__ = error
     return failure

@@ -133,13 +133,11 @@ def new(
     """Write a working policy, scenario, renderer, fixer or metric with a test, to begin from."""
     if not re.fullmatch("[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
         raise InputError(
-            DOING,
-            f"name {name!r}",
-            "not a name of a Python file",
+            f"name {name!r}: not a name of a Python file",
             "use lower case, digits and underscores: my_policy",
         )
     if not folder.is_dir():
-        raise InputError(DOING, f"--folder {folder}", "no such folder", "make it first")
+        raise InputError(f"--folder {folder}: no such folder", "make it first")
     words = {
         "name": name,
         "file": f"{name}.yaml" if kind == "scenario" else f"{name}.py",
@@ -149,15 +147,12 @@ def new(
     targets = {folder / words["file"]: f"{kind}.txt", folder / words["test"]: f"{kind}_test.txt"}
     for path in targets:
         if path.exists():
-            raise InputError(
-                DOING, str(path), "it exists already", "choose another name or --folder"
-            )
+            raise InputError(f"{path}: it exists already", "choose another name or --folder")
     templates = files("alpasim_plugin.cli") / "templates"
     for path, template in targets.items():
         write_text(
             path,
             Template((templates / template).read_text(encoding="utf-8")).substitute(words),
-            DOING,
         )
     command = TRY[kind].format(file=folder / words["file"], cls=words["Class"])
     if as_json:

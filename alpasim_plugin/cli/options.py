@@ -336,9 +336,7 @@ def fixer_overrides(texts: Sequence[str]) -> list[str]:
     for text in texts:
         if not text.startswith(FIXER_PREFIX):
             raise InputError(
-                "reading --set",
-                f"--set {text}",
-                "not a key of the fixer",
+                f"--set {text}: not a key of the fixer",
                 f"write --set {FIXER_PREFIX}key=value",
             )
     return [text.removeprefix(FIXER_PREFIX) for text in texts]
@@ -359,16 +357,13 @@ def parse_seeds(text: str) -> list[int]:
     except ValueError:
         values = []
     if "," not in text and len(values) == 1 and values[0] > 0:
-        SEEDS.check(values[0], "reading --seeds", f"--seeds {text}")
+        SEEDS.check(values[0], f"--seeds {text}")
         return list(range(values[0]))
     if "," in text and values and all(SEED.holds(value) for value in values):
-        SEEDS.check(len(values), "reading --seeds", "--seeds")
+        SEEDS.check(len(values), "--seeds")
         return values
-    found = "neither a count from 1 up nor a list of seeds from 0 to 2^63 - 1"
     raise InputError(
-        "reading --seeds",
-        f"--seeds {text}",
-        found,
+        f"--seeds {text}: neither a count from 1 up nor a list of seeds from 0 to 2^63 - 1",
         "write a count such as 3, or a list such as 4,7",
     )
 
@@ -383,14 +378,12 @@ def check_preset(preset: str) -> None:
 
     if preset not in PRESETS:
         raise InputError(
-            "choosing a preset",
-            f"--preset {preset}",
-            "no such preset",
+            f"--preset {preset}: no such preset",
             f"known: {', '.join(PRESETS)}",
         )
 
 
-def refuse_existing(path: Path | None, overwrite: bool, doing: str, option: str) -> None:
+def refuse_existing(path: Path | None, overwrite: bool, option: str) -> None:
     """Refuse to write over a file without ``--overwrite``.
 
     Raises:
@@ -398,8 +391,6 @@ def refuse_existing(path: Path | None, overwrite: bool, doing: str, option: str)
     """
     if path is not None and path.exists() and not overwrite:
         raise InputError(
-            doing,
-            f"{option} {path}".strip(),
-            "it exists already",
+            f"{f'{option} {path}'.strip()}: it exists already",
             "name another file, or pass --overwrite",
         )

@@ -77,7 +77,7 @@ def draw_preview(scenario: Scenario, path: Path, renderer: str | None = None) ->
         InfrastructureError: The file cannot be written.
     """
     if path.suffix not in (".png", ".html"):
-        raise InputError(DOING, str(path), f"suffix {path.suffix!r}", "name it .png or .html")
+        raise InputError(f"{path}: suffix {path.suffix!r}", "name it .png or .html")
     times = [int(t) for t in np.linspace(scenario.start_us, scenario.end_us, MOMENTS)]
     there = [
         actor
@@ -317,7 +317,7 @@ def preview(
     """
     loaded = load_scenario(scenario, seed, overrides)
     path = out or Path(f"{slug(loaded.scene_id)}.png")
-    refuse_existing(path, overwrite, DOING, "")
+    refuse_existing(path, overwrite, "")
     made = draw_preview(loaded, path, renderer)
     if as_json:
         print(

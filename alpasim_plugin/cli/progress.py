@@ -217,7 +217,9 @@ def describe(manifest: dict[str, Any], reused: bool) -> str:
         f"{manifest['renderer']} {manifest['policy']} {manifest['scene']} seed {manifest['seed']}"
     )
     if manifest["status"] != "ok":
-        return f"{cell}: FAILED ({manifest['error']['failure_class']}) {manifest['error']['found']}"
+        return (
+            f"{cell}: FAILED ({manifest['error']['failure_class']}) {manifest['error']['message']}"
+        )
     events = (
         ", ".join(
             dict.fromkeys(event_words(event["metric"]) for event in manifest.get("events", []))

@@ -88,7 +88,7 @@ def run(
         arms = arms_of(
             (renderer.name, policy.name) for policy in plan.policies for renderer in plan.renderers
         )
-        base_named(options.baseline, arms, "choosing a baseline", "the run")
+        base_named(options.baseline, arms, "the run")
     root = out or default_folder(plan)
     if dry_run:
         repeats = foreseen(plan, care.certify) is not None
@@ -181,7 +181,7 @@ def _print_result(result: RunResult, as_json: bool, video: str) -> None:
         print(f"warning  {line}")
     for cell in result.summary["failures"]["cells"][:5]:
         print(
-            f"failed: {cell['path']}: {cell['error']['found']} -> {cell['error']['do']}",
+            f"failed: {cell['path']}: {cell['error']['message']} -> {cell['error']['hint']}",
             file=sys.stderr,
         )
         for line in last_lines(result.root / cell["path"] / OUTPUT_NAME):
@@ -206,7 +206,7 @@ def last_lines(log: Path) -> list[str]:
     """
     if not log.is_file():
         return []
-    text = read_bytes(log, "reading the log of a rollout", SOURCE_BYTES).decode("utf-8", "replace")
+    text = read_bytes(log, SOURCE_BYTES).decode("utf-8", "replace")
     return [terminal(line.rstrip()) for line in text.rstrip().splitlines()[-TRACEBACK_LINES:]] + [
         f"log {log}"
     ]

@@ -18,7 +18,6 @@ from alpasim_plugin.core.flags import Flag, Positional
 from evaluators.metrics import METRICS
 from evaluators.report.numbers import plural
 from evaluators.report.runs import (
-    DOING,
     STATES,
     Choice,
     RunEntry,
@@ -104,7 +103,7 @@ def runs(
         as_day(since, "--since", now) if since else None,
         as_day(until, "--until", now) if until else None,
     )
-    refuse_existing(page, overwrite, DOING, "--trend")
+    refuse_existing(page, overwrite, "--trend")
     found = find_runs(places, bool(metric) or steps or page is not None)
     taken, lost = chosen(found, choice)
     taken = taken[:last]
@@ -156,14 +155,9 @@ def _trend(
             "; ".join(dict.fromkeys(reason for _, reason in found.left_out))
             or "no finished run has these metrics"
         )
-        do_this = (
-            "keep a run folder for each commit, with the same scenes, seeds, policy and preset"
-        )
         raise InputError(
-            DOING,
-            f"{plural(len(entries), 'run')} below {', '.join(map(str, places))}",
-            f"none to compare: {why}",
-            do_this,
+            f"{plural(len(entries), 'run')} below {', '.join(map(str, places))}: none to compare: {why}",
+            "keep a run folder for each commit, with the same scenes, seeds, policy and preset",
         )
     if page is not None:
         from evaluators.report.trend_page import (
@@ -189,9 +183,7 @@ def _trend(
 def _states(asked: Sequence[str]) -> tuple[State, ...]:
     strange = [one for one in asked if one not in STATES]
     if strange:
-        raise InputError(
-            DOING, f"--state {strange[0]}", "no such state", f"name one of {', '.join(STATES)}"
-        )
+        raise InputError(f"--state {strange[0]}: no such state", f"name one of {', '.join(STATES)}")
     return tuple(one for one in STATES if one in asked)
 
 
@@ -213,9 +205,7 @@ def _metrics(asked: Sequence[str], entries: list[RunEntry]) -> list[str]:
             near = difflib.get_close_matches(name, {*METRICS, *seen}, 1)
             hint = f"did you mean {near[0]}? " if near else ""
             raise InputError(
-                DOING,
-                f"--metric {name}",
-                "no such metric",
+                f"--metric {name}: no such metric",
                 f"{hint}simrun list metrics names those that ship",
             )
     return list(asked)

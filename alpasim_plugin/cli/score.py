@@ -17,7 +17,7 @@ from rich.console import Console
 from alpasim_plugin.cli.options import Evaluators, Json, Presets, Quiet, Report, Wait
 from alpasim_plugin.cli.progress import describe, report_line
 from alpasim_plugin.core.atomic import write_json
-from alpasim_plugin.core.errors import EvaluatorError, InputError, four_parts
+from alpasim_plugin.core.errors import EvaluatorError, InputError, error_text
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.parts import PartSpec, digest
 from alpasim_plugin.core.parts.source import own_code_digest
@@ -108,9 +108,7 @@ def execute_score(
         held = _held_key(root)
         if held not in (None, key):
             raise InputError(
-                "scoring logs",
-                f"folder {root}",
-                f"it holds other results (key {held})",
+                f"folder {root}: it holds other results (key {held})",
                 "choose another --out",
             )
         (root / CONTENTS).unlink(missing_ok=True)  # from here on the folder is unfinished
@@ -206,7 +204,7 @@ def _reduce(
         ]
         return reduced, {i: scene_score(one.values, settings.scene_score) for i, one in kept}, None
     except EvaluatorError as error:
-        return reduced if "scene score" in error.doing else [], {}, error
+        return reduced, {}, error
 
 
 def _write_aggregate(
@@ -230,7 +228,7 @@ def _write_aggregate(
             "run_uuid": None,
             "run_name": own[0].run_name,
         }
-        rows.append(ids | {"error": one["error"]["found"]})
+        rows.append(ids | {"error": one["error"]["message"]})
     write_json(
         folder / "results-summary.json",
         results_summary(reduced, marks, rows, sweeps, settings.scene_score),
@@ -295,9 +293,7 @@ def _hash(path: Path) -> str:
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
-        raise InputError(
-            "scoring logs", str(path), f"cannot open: {error.strerror}", "check the path"
-        ) from error
+        raise InputError(f"{path}: cannot open: {error.strerror}", "check the path") from error
 
 
 EPILOG = """
@@ -408,9 +404,7 @@ def _settings(preset: presets.Preset, path: Path | None) -> EvalSettings | None:
         return EvalSettings() if path is None else load_settings(path)
     if path is not None:
         raise InputError(
-            "reading evaluation settings",
-            f"--settings {path}",
-            f"--preset {preset.name}",
+            f"--settings {path}: --preset {preset.name}",
             "add --preset alpasim: the file is AlpaSim's",
         )
     return None
@@ -426,10 +420,10 @@ def _print(result: ScoreResult, with_table: bool) -> None:
             )
         )
     for cell in result.summary["failures"]["cells"][:5]:
-        print(four_parts(cell["error"]), file=sys.stderr)
+        print(error_text(cell["error"]), file=sys.stderr)
     aggregation = result.summary.get("alpasim") or {}
     if aggregation.get("skipped"):
         print(f"AlpaSim's aggregation was not written: {aggregation['skipped']}", file=sys.stderr)
     if aggregation.get("error"):
-        print(four_parts(aggregation["error"]), file=sys.stderr)
+        print(error_text(aggregation["error"]), file=sys.stderr)
     print(report_line(result.root))

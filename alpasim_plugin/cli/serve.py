@@ -150,9 +150,7 @@ def parted(text: str, option: str) -> tuple[str, str]:
     name, equals, value = text.partition("=")
     if not (name and equals and value):
         raise InputError(
-            DOING,
-            f"{option} {text}",
-            "no NAME=VALUE",
+            f"{option} {text}: no NAME=VALUE",
             "write for example --mask camera_front_wide_120fov=hood.png",
         )
     return name, value

@@ -66,12 +66,12 @@ def view(
     """Replay rollouts in a browser: cameras side by side, a map from above, metrics over time,
     events; offline, or of a running run.
     """
-    root, of_rollout = find_cell(what, DOING)
-    wanted = narrowed(what, of_rollout, asked, DOING)
+    root, of_rollout = find_cell(what)
+    wanted = narrowed(what, of_rollout, asked)
     options = Options(int(max_mb * MB), camera=camera)
     if serve is not None:
         if out is not None:
-            raise InputError(DOING, "--serve and --out", "both", "give one of them")
+            raise InputError("--serve and --out: both", "give one of them")
         _serve(root, serve, wanted, options, as_json)
         return
     if (root / CONTENTS).exists():
@@ -85,13 +85,11 @@ def view(
         )
     if not so_far.run.rollouts:
         raise InputError(
-            DOING,
-            str(root),
-            "no rollout has finished",
+            f"{root}: no rollout has finished",
             "wait for the first, or watch with --serve 8000",
         )
     path = out or root / PAGE
-    refuse_existing(out, overwrite, DOING, "--out")
+    refuse_existing(out, overwrite, "--out")
     made = write_page(so_far.run, path, wanted, options, cells)
     if as_json:
         shown = [
@@ -137,7 +135,7 @@ def is_run(what: Path) -> bool:
     return (what / RUN_INFO).exists() or (what / CONTENTS).exists()
 
 
-def find_cell(what: Path, doing: str) -> tuple[Path, Wanted | None]:
+def find_cell(what: Path) -> tuple[Path, Wanted | None]:
     """Return the run folder of a run or a rollout, and which rollouts to show if a rollout was
     named.
 
@@ -157,14 +155,12 @@ def find_cell(what: Path, doing: str) -> tuple[Path, Wanted | None]:
             )
     found = "no run.json and no manifest.json" if what.exists() else "no such folder"
     raise InputError(
-        doing,
-        str(what),
-        found,
+        f"{what}: {found}",
         "give a folder that simrun run wrote, or RUN/rollouts/RENDERER/POLICY/SCENE/SEED",
     )
 
 
-def narrowed(what: Path, rollout: Wanted | None, asked: Wanted, doing: str) -> Wanted:
+def narrowed(what: Path, rollout: Wanted | None, asked: Wanted) -> Wanted:
     """Return which rollouts to show: all that was asked for of a run, of a rollout's cell the
     renderers that were.
 
@@ -175,9 +171,7 @@ def narrowed(what: Path, rollout: Wanted | None, asked: Wanted, doing: str) -> W
         return asked
     if asked.scenes or asked.policies or asked.seeds:
         raise InputError(
-            doing,
-            str(what),
-            "--scene, --policy or --seed beside a rollout, which has one of each",
+            f"{what}: --scene, --policy or --seed beside a rollout, which has one of each",
             "name its run folder",
         )
     return Wanted(rollout.scenes, rollout.policies, rollout.seeds, asked.renderers)

@@ -79,11 +79,8 @@ def step(
     """
     values = (*vars(state).values(), *vars(command).values(), dt_s)
     if not all(map(math.isfinite, values)) or dt_s < 0:
-        found = f"a value that is not finite, or dt_s = {dt_s} < 0"
         raise InputError(
-            "advancing the vehicle",
-            f"{state} under {command}",
-            found,
+            f"{state} under {command}: a value that is not finite, or dt_s = {dt_s} < 0",
             "give finite values and dt_s >= 0",
         )
     target = _clip(command.steer_rad, vehicle.max_steer_rad)

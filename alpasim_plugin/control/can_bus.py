@@ -67,8 +67,10 @@ class Address:
                 if not channel
                 else f"timeout_ms = {timeout!r}"
             )
-            do_this = f"write can://[{'|'.join(INTERFACES)}:]CHANNEL[?map=NAME&dbc=FILE&timeout_ms=1..10000]"
-            raise InputError(DOING, f"can://{text}", found, do_this)
+            raise InputError(
+                f"can://{text}: {found}",
+                f"write can://[{'|'.join(INTERFACES)}:]CHANNEL[?map=NAME&dbc=FILE&timeout_ms=1..10000]",
+            )
         return cls(
             interface,
             channel,
@@ -89,9 +91,10 @@ def open_bus(address: Address) -> can.BusABC:
             interface=address.interface, channel=address.channel, receive_own_messages=False
         )
     except Exception as error:  # every interface raises errors of its own
-        found = f"{type(error).__name__}: {error}"
-        do_this = f"use one that this machine has: {', '.join(INTERFACES)}"
-        raise InputError(DOING, f"{address.interface}:{address.channel}", found, do_this) from error
+        raise InputError(
+            f"{address.interface}:{address.channel}: {type(error).__name__}: {error}",
+            f"use one that this machine has: {', '.join(INTERFACES)}",
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -136,9 +139,7 @@ class Exchange:
         parts = self.codec.map.steer, self.codec.map.accel
         if parts[0] is None or parts[1] is None:
             raise InputError(
-                DOING,
-                f"a map for {self.codec.map.dbc}",
-                "it has no steering or acceleration command",
+                f"a map for {self.codec.map.dbc}: it has no steering or acceleration command",
                 "use a map with both",
             )
         self._steer, self._accel = (_Command(part) for part in parts if part is not None)
@@ -198,9 +199,7 @@ class Exchange:
             )
         except can.CanError as error:
             raise PolicyError(
-                "sending on a CAN bus",
-                f"{self.bus.channel_info}",
-                f"{error}",
+                f"{self.bus.channel_info}: {error}",
                 "check that the bus is up",
             ) from error
         self.counts["sent"] += 1

@@ -21,7 +21,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from alpasim_plugin.core.config import load_yaml, validate
 from alpasim_plugin.core.errors import InputError
 
-MAP_DOING = "reading a CAN map"
 FOLDER = Path(__file__).resolve().parents[2] / "configs" / "can"
 
 Quantity = Literal[
@@ -122,16 +121,12 @@ def load_map(name: str, dbc: str | None = None) -> tuple[CanMap, Path]:
     path = shipped if shipped.is_file() else Path(name)
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in FOLDER.glob("*.yaml")))
-        raise InputError(
-            MAP_DOING, f"map={name}", "no such map or file", f"known: {known}; or name a YAML file"
-        )
-    found: CanMap = validate(CanMap, load_yaml(path, MAP_DOING), MAP_DOING)
+        raise InputError(f"map={name}: no such map or file", f"known: {known}; or name a YAML file")
+    found: CanMap = validate(CanMap, load_yaml(path))
     database = Path(dbc) if dbc is not None else path.parent / found.dbc
     if not database.is_file():
         raise InputError(
-            MAP_DOING,
-            f"database {database}",
-            "no such file",
+            f"database {database}: no such file",
             f"name it with dbc=FILE; the map {name!r} is for {found.dbc}",
         )
     return found, database
@@ -292,9 +287,7 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
         import cantools
     except ImportError as error:
         raise InputError(
-            DOING,
-            str(database),
-            "cantools is not installed",
+            f"{database}: cantools is not installed",
             "install the extra [can], or pip install cantools",
         ) from error
     try:
@@ -302,9 +295,9 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
         # messages are checked below.
         loaded = cantools.database.load_file(database, strict=False)
     except Exception as error:  # the parser raises errors of many kinds
-        found = f"{type(error).__name__}: {error}"
         raise InputError(
-            DOING, str(database), found, "repair the database, or remove the message that it names"
+            f"{database}: {type(error).__name__}: {error}",
+            "repair the database, or remove the message that it names",
         ) from error
     codec = Codec(can_map, loaded)
     parts: list[Sent | Received] = [
@@ -323,9 +316,9 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
             for name in signals:
                 message.get_signal_by_name(name)
         except KeyError as error:
-            do_this = "name a database of the vehicle that the map is for"
             raise InputError(
-                DOING, str(database), f"no {error} of message {part.message}", do_this
+                f"{database}: no {error} of message {part.message}",
+                "name a database of the vehicle that the map is for",
             ) from error
     return codec
 

@@ -57,11 +57,8 @@ class CanPolicy(Policy):
         self._codec = open_codec(can_map, database)
         self._step_us = min((sent.period_us for sent in can_map.send), default=PLAN_STEP_US)
         if self._period_us % self._step_us:
-            found = f"the shortest message period is {self._step_us} us, the query period {self._period_us} us"
             raise InputError(
-                "connecting a CAN bus",
-                f"can://{address}",
-                found,
+                f"can://{address}: the shortest message period is {self._step_us} us, the query period {self._period_us} us",
                 "choose a rates.policy_us that is a whole multiple",
             )
         self._bus = open_bus(self._address)

@@ -71,25 +71,23 @@ def read_recording(folder: Path, bus: int = 0) -> Recording:
     arrays = {}
     for name, kind in (("t", "f"), ("src", "iu"), ("address", "iu"), ("data", "S")):
         path = folder / "processed_log" / "CAN" / "raw_can" / f"{name}.npy"
-        check_regular(path, DOING)
-        with parsing(DOING, path, do_this="fetch the segment again", what="a numpy array"):
+        check_regular(path)
+        with parsing(path, do_this="fetch the segment again", what="a numpy array"):
             arrays[name] = np.load(path, allow_pickle=False)
         if (
             arrays[name].ndim != 1
             or arrays[name].dtype.kind not in kind
             or len(arrays[name]) != len(arrays["t"])
         ):
-            found = f"{arrays[name].dtype} {arrays[name].shape}"
             raise InputError(
-                DOING, str(path), found, "give one value a frame in each of t, src, address, data"
+                f"{path}: {arrays[name].dtype} {arrays[name].shape}",
+                "give one value a frame in each of t, src, address, data",
             )
     own = arrays["src"] == bus
     if not own.any() or bus >= ECHOES:
         buses = sorted(set(arrays["src"].tolist()))
         raise InputError(
-            DOING,
-            str(folder),
-            f"no frame of bus {bus}",
+            f"{folder}: no frame of bus {bus}",
             f"choose among {buses}; those from {ECHOES} on are echoes",
         )
     order = np.argsort(arrays["t"][own], kind="stable")

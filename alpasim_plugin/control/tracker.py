@@ -48,16 +48,18 @@ def check_plan(plan: Trajectory) -> None:
         row = int(np.argmax(bad))
         found = f"times {int(plan.t_us[row])} and then {int(plan.t_us[row + 1])} us in rows {row} and {row + 1}"
     if found:
-        do_this = "make the policy return at least one finite pose and strictly increasing times; `check_policy` finds such faults"
-        raise PolicyError("following a plan", f"a plan of {len(plan)} poses", found, do_this)
+        raise PolicyError(
+            f"a plan of {len(plan)} poses: {found}",
+            "make the policy return at least one finite pose and strictly increasing times; `check_policy` finds such faults",
+        )
 
 
 def check_interval(state: EgoState, to_us: int) -> float:
     """Return the seconds from the state to ``to_us``; raise InputError unless they are positive."""
     if to_us <= state.t_us:
-        found = f"the target time {to_us} us is not later"
         raise InputError(
-            "advancing the ego", f"a state at {state.t_us} us", found, "ask for a later time"
+            f"a state at {state.t_us} us: the target time {to_us} us is not later",
+            "ask for a later time",
         )
     return (to_us - state.t_us) * 1e-6
 

@@ -28,9 +28,7 @@ DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 DOING = "writing a result"
 
 
-def disk_error(
-    path: Path, error: OSError, doing: str = DOING, do_this: str | None = None
-) -> InfrastructureError:
+def disk_error(path: Path, error: OSError, do_this: str | None = None) -> InfrastructureError:
     """Return a failed write as an error with four parts; the advice follows from the cause unless
     ``do_this`` is given.
     """
@@ -41,7 +39,7 @@ def disk_error(
         do_this = (
             full if error.errno in DISK_FULL else missing if error.errno == errno.ENOENT else other
         )
-    return InfrastructureError(doing, str(path), error.strerror or str(error), do_this)
+    return InfrastructureError(f"{path}: {error.strerror or str(error)}", do_this)
 
 
 def temporary_path(path: Path) -> Path:
@@ -50,7 +48,7 @@ def temporary_path(path: Path) -> Path:
 
 
 @contextmanager
-def atomic_file(path: Path | str, doing: str = DOING, do_this: str | None = None) -> Iterator[Path]:
+def atomic_file(path: Path | str, do_this: str | None = None) -> Iterator[Path]:
     """Yield a temporary path to write; it is renamed to ``path`` when the block ends, and removed
     if the block raises.
 
@@ -72,7 +70,7 @@ def atomic_file(path: Path | str, doing: str = DOING, do_this: str | None = None
             os.fsync(file.fileno())
         partial.replace(path)
     except OSError as error:
-        raise disk_error(path, error, doing, do_this) from error
+        raise disk_error(path, error, do_this) from error
     finally:
         # A read-only folder refuses this as well, even for a file that is not there; the write's
         # own error says so.
@@ -81,7 +79,7 @@ def atomic_file(path: Path | str, doing: str = DOING, do_this: str | None = None
 
 
 @contextmanager
-def atomic_folder(folder: Path, doing: str = DOING, do_this: str | None = None) -> Iterator[Path]:
+def atomic_folder(folder: Path, do_this: str | None = None) -> Iterator[Path]:
     """Yield a new empty folder; it replaces ``folder`` when the block ends, and is removed if the
     block raises.
 
@@ -98,14 +96,14 @@ def atomic_folder(folder: Path, doing: str = DOING, do_this: str | None = None) 
     except OSError as error:
         if old.exists() and not folder.exists():
             old.replace(folder)
-        raise disk_error(folder, error, doing, do_this) from error
+        raise disk_error(folder, error, do_this) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)
 
 
 @contextmanager
-def scratch_folder(path: Path, doing: str = DOING) -> Iterator[Path]:
+def scratch_folder(path: Path) -> Iterator[Path]:
     """Yield a new empty folder with a temporary name beside ``path``; it is removed when the block
     ends.
 
@@ -116,14 +114,14 @@ def scratch_folder(path: Path, doing: str = DOING) -> Iterator[Path]:
     try:
         scratch.mkdir(parents=True)
     except OSError as error:
-        raise disk_error(scratch, error, doing) from error
+        raise disk_error(scratch, error) from error
     try:
         yield scratch
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def write_bytes(path: Path, data: bytes, doing: str = DOING) -> None:
+def write_bytes(path: Path, data: bytes) -> None:
     """Write a file atomically; its folder is made if it does not exist.
 
     Raises:
@@ -132,30 +130,30 @@ def write_bytes(path: Path, data: bytes, doing: str = DOING) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise disk_error(path.parent, error, doing) from error
-    with atomic_file(path, doing) as partial:
+        raise disk_error(path.parent, error) from error
+    with atomic_file(path) as partial:
         partial.write_bytes(data)
 
 
-def write_text(path: Path, text: str, doing: str = DOING) -> None:
+def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically; see `write_bytes`."""
-    write_bytes(path, text.encode(), doing)
+    write_bytes(path, text.encode())
 
 
-def write_json(path: Path, value: Any, doing: str = DOING) -> None:
+def write_json(path: Path, value: Any) -> None:
     """Write JSON atomically; see `write_bytes`.
 
     Raises:
         ValueError: NaN or infinity, which JSON does not have.
     """
-    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n", doing)
+    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
-def write_array(path: Path, array: npt.NDArray[Any], doing: str = DOING) -> None:
+def write_array(path: Path, array: npt.NDArray[Any]) -> None:
     """Write a ``.npy`` file atomically; see `atomic_file`."""
     import numpy as np
 
-    with atomic_file(path, doing) as partial, partial.open("wb") as file:
+    with atomic_file(path) as partial, partial.open("wb") as file:
         np.save(file, array)
 
 
@@ -166,7 +164,7 @@ def write_safetensors(
     from safetensors import SafetensorError
     from safetensors.torch import save_file
 
-    with atomic_file(path, "writing network weights") as partial:
+    with atomic_file(path) as partial:
         try:
             save_file(
                 {name: value.detach().cpu().contiguous() for name, value in tensors.items()},

@@ -27,7 +27,6 @@ DOING, DO_THIS = (
     "writing to the cache",
     "free disk space, or name a writable folder in SIMRUN_CACHE",
 )
-MEASURING = "measuring the machine"
 KEPT_S = 7 * 86400.0  # a folder of an earlier run, which nobody else removes
 
 _taken: dict[tuple[Path | None, str], Mapping[str, Any]] = {}
@@ -42,7 +41,7 @@ def cache_root() -> Path:
     """
     found = places.cache().path
     if found is None:
-        raise InfrastructureError(DOING, "the cache", "no folder can be written", places.DO_THIS)
+        raise InfrastructureError("the cache: no folder can be written", places.DO_THIS)
     return found
 
 
@@ -80,7 +79,6 @@ def cached(
     lock = folder.with_name(f"{key}.lock")
     with one_writer(
         lock,
-        DOING,
         what,
         wait=True,
         waiting=lambda text: print(text, file=sys.stderr, flush=True),
@@ -103,7 +101,7 @@ def _readable(folder: Path, read: Callable[[Path], T], what: str, warn: bool = T
     except InputError as error:
         if warn:
             print(
-                f"warning: {what} is damaged ({error.with_what}: {error.found}); making it again",
+                f"warning: {what} is damaged ({error.message}); making it again",
                 file=sys.stderr,
                 flush=True,
             )
@@ -113,7 +111,7 @@ def _readable(folder: Path, read: Callable[[Path], T], what: str, warn: bool = T
 def _make(folder: Path, make: Callable[[Path], None], what: str) -> None:
     print(f"{what} ...", file=sys.stderr, flush=True)
     began = time.perf_counter()
-    with atomic_folder(folder, DOING, DO_THIS) as partial:
+    with atomic_folder(folder, DO_THIS) as partial:
         make(partial)
     print(f"{what}: {time.perf_counter() - began:.1f} s", file=sys.stderr, flush=True)
 
@@ -150,15 +148,14 @@ def _once(folder: Path, name: str, measure: Callable[[], Mapping[str, Any]]) -> 
     path = folder / f"{name}.json"
     with one_writer(
         folder / f"{name}.lock",
-        MEASURING,
         f"{name} of this machine",
         wait=True,
         waiting=lambda said: None,
     ):
         if not path.exists():
             _forget(folder.parent)
-            write_json(path, measure(), MEASURING)
-        return read_json_object(path, MEASURING)
+            write_json(path, measure())
+        return read_json_object(path)
 
 
 def _forget(root: Path) -> None:

@@ -90,7 +90,7 @@ def problem_of(path: Path, facts: FileFacts, full: bool = False) -> str | None:
     return None
 
 
-def write_sealed(path: Path, value: Mapping[str, Any], doing: str) -> str:
+def write_sealed(path: Path, value: Mapping[str, Any]) -> str:
     """Write a JSON object with its seal, atomically, and return the seal.
 
     Raises:
@@ -102,28 +102,26 @@ def write_sealed(path: Path, value: Mapping[str, Any], doing: str) -> str:
         raise ValueError(f"a sealed object needs keys other than {SEAL!r}")
     body = json.dumps(value, indent=1, allow_nan=False).removesuffix("\n}").encode()
     seal = hashlib.sha256(body).hexdigest()
-    write_bytes(path, body + f',\n "{SEAL}": "{seal}"\n}}\n'.encode(), doing)
+    write_bytes(path, body + f',\n "{SEAL}": "{seal}"\n}}\n'.encode())
     return seal
 
 
-def read_sealed(path: Path, doing: str, do_this: str) -> tuple[dict[str, Any], str]:
+def read_sealed(path: Path, do_this: str) -> tuple[dict[str, Any], str]:
     """Read what `write_sealed` wrote, without the seal, and the seal.
 
     Raises:
         InputError: The file is missing, cut, changed, or was not written by `write_sealed`.
     """
-    data = read_bytes(path, doing, do_this=do_this)
+    data = read_bytes(path, do_this=do_this)
     tail = _TAIL.search(data, max(0, len(data) - TAIL_BYTES))
     if tail is None:
         raise InputError(
-            doing,
-            str(path),
-            "cut, or written by another program or version: its seal is missing",
+            f"{path}: cut, or written by another program or version: its seal is missing",
             do_this,
         )
     seal = tail[1].decode()
     if hashlib.sha256(data[: tail.start()]).hexdigest() != seal:
-        raise InputError(doing, str(path), "not the content that was written", do_this)
-    value = parse_json(data, path, doing, do_this)
+        raise InputError(f"{path}: not the content that was written", do_this)
+    value = parse_json(data, path, do_this)
     del value[SEAL]
     return value, seal

@@ -43,16 +43,12 @@ class Clock:
             period = getattr(self.rates, name)
             if period <= 0 or period % self.rates.control_us:
                 raise InputError(
-                    "setting up the clock",
-                    f"rates.{name} = {period} us",
-                    f"not a positive multiple of rates.control_us = {self.rates.control_us} us",
+                    f"rates.{name} = {period} us: not a positive multiple of rates.control_us = {self.rates.control_us} us",
                     "choose periods that are whole multiples of the control period",
                 )
         if self.n_steps < 1:
             raise InputError(
-                "setting up the clock",
-                f"{self.start_us}..{self.end_us} us at {self.rates.control_us} us a step",
-                "not a single control step fits",
+                f"{self.start_us}..{self.end_us} us at {self.rates.control_us} us a step: not a single control step fits",
                 "use a longer log or a shorter control period",
             )
 

@@ -29,7 +29,7 @@ __all__ = ["Document", "Mark", "apply_overrides", "load_yaml", "parse_scalar", "
 MOST_READ = 64  # files of one document, through extends
 
 
-def load_yaml(path: str | Path, doing: str = "reading a configuration") -> Document:
+def load_yaml(path: str | Path) -> Document:
     """Read a YAML file and everything that its ``extends:`` list names.
 
     ``extends`` (a list of paths relative to the file, or one path) is merged first to last, then
@@ -39,23 +39,22 @@ def load_yaml(path: str | Path, doing: str = "reading a configuration") -> Docum
         InputError: Missing or unreadable file, YAML syntax (with line and column), duplicate or
             non-text key, a bound exceeded, or a cycle of ``extends``.
     """
-    return _load(Path(path), doing, (), [])
+    return _load(Path(path), (), [])
 
 
-def parse_scalar(text: str, doing: str, with_what: str) -> Any:
+def parse_scalar(text: str, with_what: str) -> Any:
     """Parse one YAML value from a string, for overrides.
 
     Raises:
         InputError: Not valid YAML.
     """
-    data, _ = parse(text, with_what, doing, override=True)
+    data, _ = parse(text, with_what, override=True)
     return data
 
 
 def apply_overrides(
     document: Document,
     overrides: Sequence[str],
-    doing: str = "applying overrides",
     origin: str = "--set",
 ) -> Document:
     """Set dotted keys: ``road.lane_width_m=3.2``, ``actors.lead.speed_mps=8`` (list items by index
@@ -73,40 +72,40 @@ def apply_overrides(
         where = f"{origin} {text}"
         if not equals or not key.strip():
             raise InputError(
-                doing, where, "no KEY=VALUE", "write for example --set road.lane_width_m=3.2"
+                f"{where}: no KEY=VALUE", "write for example --set road.lane_width_m=3.2"
             )
-        value = parse_scalar(value_text, doing, where)
-        loc, before = _assign(data, key.strip(), value, where, doing)
+        value = parse_scalar(value_text, where)
+        loc, before = _assign(data, key.strip(), value, where)
         for old in _paths(before, loc):
             marks.pop(old, None)
         marks[loc] = Mark(where, 0, 0)
     return Document(data, marks, document.path, document.sources, (*document.overrides, *overrides))
 
 
-def _load(path: Path, doing: str, chain: tuple[Path, ...], read: list[Path]) -> Document:
+def _load(path: Path, chain: tuple[Path, ...], read: list[Path]) -> Document:
     """Read a file and its bases; ``read`` counts every reading: files that name each other twice
     double at each step.
     """
     resolved = path.resolve()
     if resolved in chain:
         raise InputError(
-            doing,
-            str(path),
-            f"extends itself through {' -> '.join(str(p) for p in chain)}",
+            f"{path}: extends itself through {' -> '.join(str(p) for p in chain)}",
             "break the cycle of extends",
         )
     read.append(resolved)
     if len(read) > MOST_READ:
-        found = f"more than {MOST_READ} files to read, {len(set(read))} different ones"
-        raise InputError(doing, str(path), found, "name each base once in extends")
-    raw = read_bytes(path, doing, YAML_BYTES)
+        raise InputError(
+            f"{path}: more than {MOST_READ} files to read, {len(set(read))} different ones",
+            "name each base once in extends",
+        )
+    raw = read_bytes(path, YAML_BYTES)
     try:
         text = raw.decode("utf-8")
     except UnicodeDecodeError as e:
         raise InputError(
-            doing, str(path), f"byte {e.start} is not UTF-8", "save the file as UTF-8 text"
+            f"{path}: byte {e.start} is not UTF-8", "save the file as UTF-8 text"
         ) from e
-    data, marks = parse(text, str(path), doing)
+    data, marks = parse(text, str(path))
     sources: list[tuple[str, str]] = []
     if isinstance(data, dict) and "extends" in data:
         at = marks.get(("extends",), Mark(str(path), 1, 1))
@@ -115,7 +114,7 @@ def _load(path: Path, doing: str, chain: tuple[Path, ...], read: list[Path]) -> 
         names = [names] if isinstance(names, str) else names
         if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
             raise InputError(
-                doing, str(at), f"extends: {names!r}", "give a list of paths, relative to this file"
+                f"{at}: extends: {names!r}", "give a list of paths, relative to this file"
             )
         merged: Any = {}
         merged_marks: dict[Key, Mark] = {}
@@ -123,12 +122,10 @@ def _load(path: Path, doing: str, chain: tuple[Path, ...], read: list[Path]) -> 
             base_path = resolved.parent / name
             if not base_path.is_file():
                 raise InputError(
-                    doing,
-                    str(at),
-                    f"extends {name!r}, but {base_path} does not exist",
+                    f"{at}: extends {name!r}, but {base_path} does not exist",
                     "correct the path",
                 )
-            base = _load(base_path, doing, (*chain, resolved), read)
+            base = _load(base_path, (*chain, resolved), read)
             merged, merged_marks = _merged(merged, merged_marks, base.data, base.marks)
             sources.extend(base.sources)
         data, marks = _merged(merged, merged_marks, data, marks)
@@ -167,7 +164,7 @@ def _copy(data: Any) -> Any:
     return [_copy(v) for v in data] if isinstance(data, list) else data
 
 
-def _assign(data: Any, key: str, value: Any, where: str, doing: str) -> tuple[Key, Any]:
+def _assign(data: Any, key: str, value: Any, where: str) -> tuple[Key, Any]:
     """Set a dotted key in place; return its path and what stood there, None if nothing did."""
     parts = key.split(".")
     loc: list[str | int] = []
@@ -179,12 +176,10 @@ def _assign(data: Any, key: str, value: Any, where: str, doing: str) -> tuple[Ke
             if not last:
                 node.setdefault(part, {})
         elif isinstance(node, list):
-            step = _item(node, part, where, doing)
+            step = _item(node, part, where)
         else:
             raise InputError(
-                doing,
-                where,
-                f"{'.'.join(map(str, loc)) or 'the file'} holds a value, not keys",
+                f"{where}: {'.'.join(map(str, loc)) or 'the file'} holds a value, not keys",
                 "shorten the path",
             )
         loc.append(step)
@@ -210,44 +205,44 @@ def _paths(value: Any, loc: Key) -> Iterator[Key]:
         yield from _paths(child, (*loc, key))
 
 
-def _item(items: list[Any], part: str, where: str, doing: str) -> int:
+def _item(items: list[Any], part: str, where: str) -> int:
     ids = [item.get("id") if isinstance(item, dict) else None for item in items]
     if part in ids:
         return ids.index(part)
     if part.isdecimal() and int(part) < len(items):
         return int(part)
     known = ", ".join(str(i) for i in ids if i) or f"0..{len(items) - 1}"
-    raise InputError(doing, where, f"no list item {part!r}", f"use one of: {known}")
+    raise InputError(f"{where}: no list item {part!r}", f"use one of: {known}")
 
 
 EXAMINED, EXPLAINED = 200, 4  # problems of one file: those put in order, and those put into words
 M = TypeVar("M", bound=BaseModel)
 
 
-def validate(model: type[M], document: Document, doing: str = "reading a configuration") -> M:
+def validate(model: type[M], document: Document) -> M:
     """Validate a document strictly (no text for a number, no unknown key).
 
     Raises:
         InputError: The first problem in file order, with its position and a hint; the others are
             listed after it.
     """
-    _refuse_non_finite(document, document.data, (), doing)
+    _refuse_non_finite(document, document.data, ())
     try:
         # JSON mode is strict about types and still lets a list fill a tuple.
         return model.model_validate_json(json.dumps(document.data), strict=True)
     except ValidationError as e:
-        raise _as_input_error(model, document, e, doing) from None
+        raise _as_input_error(model, document, e) from None
 
 
-def _refuse_non_finite(document: Document, data: Any, loc: Key, doing: str) -> None:
+def _refuse_non_finite(document: Document, data: Any, loc: Key) -> None:
     if isinstance(data, dict):
         for key, value in data.items():
-            _refuse_non_finite(document, value, (*loc, key), doing)
+            _refuse_non_finite(document, value, (*loc, key))
     elif isinstance(data, list):
         for i, value in enumerate(data):
-            _refuse_non_finite(document, value, (*loc, i), doing)
+            _refuse_non_finite(document, value, (*loc, i))
     elif isinstance(data, float) and not math.isfinite(data):
-        raise document.error(doing, loc, f"{dotted(loc)} = {data}", "give a finite number")
+        raise document.error(loc, f"{dotted(loc)} = {data}", "give a finite number")
 
 
 def dotted(loc: Sequence[str | int]) -> str:
@@ -259,7 +254,7 @@ def dotted(loc: Sequence[str | int]) -> str:
 
 
 def _as_input_error(
-    model: type[BaseModel], document: Document, error: ValidationError, doing: str
+    model: type[BaseModel], document: Document, error: ValidationError
 ) -> InputError:
     items = error.errors(include_url=False)[:EXAMINED]
     placed = []
@@ -278,7 +273,7 @@ def _as_input_error(
     if len(placed) > 1:
         rest = "; ".join(f"{m}: {f}" for m, f, _ in texts[1:])
         found = f"{shorten(found, 180)} (and {error.error_count() - len(items) + len(placed) - 1} more: {rest})"
-    return InputError(doing, str(mark), found, hint)
+    return InputError(f"{mark}: {found}", hint)
 
 
 def _follows_from_another(item: Any, items: Sequence[Any]) -> bool:

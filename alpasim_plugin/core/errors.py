@@ -1,4 +1,4 @@
-"""Errors with four parts: doing what, with what, found what, do this.
+"""Errors in two sentences: what is wrong with which value, and what to do.
 
 Every failure that a user can meet is a `SimrunError`. Its class sets the process exit code
 (docs/cli.md) and the failure class in ``rollouts.parquet``, so the printed text, the table and the
@@ -15,45 +15,39 @@ from alpasim_plugin.core.escape import shorten, terminal
 
 
 class SimrunError(Exception):
-    """State what was attempted, with which object, what was found, and what the user can do.
+    """State what is wrong, and what the user can do.
 
-    A part is at most `alpasim_plugin.core.escape.MAX_PART` characters long, and nothing in it can
-    act on a terminal.
+    Neither sentence is longer than `alpasim_plugin.core.escape.MAX_PART` characters, and nothing in
+    them can act on a terminal.
 
     Args:
-        doing: The attempted action, as a verb phrase ("reading a scenario").
-        with_what: The object of the action: file with line and column, option, renderer name.
-        found: What was found instead, with the offending value.
-        do_this: One action that would help.
+        message: What is wrong with which value, as one sentence without its full stop.
+        hint: What to do, as one sentence without its full stop.
     """
 
     exit_code: ClassVar[int] = 2
     failure_class: ClassVar[str] = "input"
 
-    def __init__(self, doing: str, with_what: str, found: str, do_this: str) -> None:
-        doing, with_what, found, do_this = (
-            shorten(terminal(str(part))) for part in (doing, with_what, found, do_this)
-        )
-        super().__init__(doing, with_what, found, do_this)
-        self.doing, self.with_what, self.found, self.do_this = doing, with_what, found, do_this
+    def __init__(self, message: str, hint: str) -> None:
+        self.message = shorten(terminal(message))
+        self.hint = shorten(terminal(hint))
+        super().__init__(self.message, self.hint)
 
     def __str__(self) -> str:
-        return four_parts(self.as_dict())
+        return error_text(self.as_dict())
 
     def as_dict(self) -> dict[str, str]:
-        """Return the four parts and the failure class, for ``--json`` and manifests."""
+        """Return message, hint and failure class, for ``--json`` and manifests."""
         return {
-            "doing": self.doing,
-            "with": self.with_what,
-            "found": self.found,
-            "do": self.do_this,
+            "message": self.message,
+            "hint": self.hint,
             "failure_class": self.failure_class,
         }
 
 
-def four_parts(error: Mapping[str, str]) -> str:
+def error_text(error: Mapping[str, str]) -> str:
     """Return the text of an error from what `SimrunError.as_dict` gave."""
-    return f"error: {error['doing']}\n   with: {error['with']}\n  found: {error['found']}\n     do: {error['do']}"
+    return f"error: {error['message']}\n  hint: {error['hint']}"
 
 
 class InputError(SimrunError):
@@ -120,4 +114,4 @@ class InternalError(SimrunError):
         do_this = (
             "run the command with --debug and report the traceback to whoever maintains that file"
         )
-        return cls("running a command", command, f"{type(error).__name__}: {error}{where}", do_this)
+        return cls(f"{command}: {type(error).__name__}: {error}{where}", do_this)

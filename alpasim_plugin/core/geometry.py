@@ -195,9 +195,7 @@ def interpolate(trajectory: Trajectory, t_us: npt.ArrayLike) -> F64:
     first, last = int(trajectory.t_us[0]), int(trajectory.t_us[-1])
     if t.size and (int(t.min()) < first or int(t.max()) > last):
         raise InputError(
-            "interpolating a trajectory",
-            f"times {int(t.min())}..{int(t.max())} us",
-            f"the trajectory covers {first}..{last} us",
+            f"times {int(t.min())}..{int(t.max())} us: the trajectory covers {first}..{last} us",
             "ask only for times inside it",
         )
     if len(trajectory) == 1:

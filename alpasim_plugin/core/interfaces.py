@@ -287,9 +287,7 @@ def complete(part: T, interface: Any, what: str = "") -> T:
     if missing:
         kind = interface.__name__.lower()
         raise contract_error(kind)(
-            f"making a {kind}",
-            what or type(part).__name__,
-            f"a {type(part).__name__} without {', '.join(missing)}",
+            f"{what or type(part).__name__}: a {type(part).__name__} without {', '.join(missing)}",
             f"give it {', '.join(f'`{name}`' for name in required)}; docs/extending.md shows a {kind}",
         )
     for name, default in optional.items():

@@ -37,12 +37,12 @@ def lazy_names(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
     return get
 
 
-def require_library(module: str, doing: str, with_what: str, do_this: str) -> Any:
+def require_library(module: str, with_what: str, do_this: str) -> Any:
     """Import an optional library.
 
     Args:
         module: Name of its module.
-        doing, with_what, do_this: Parts of the error.
+        with_what, do_this: Parts of the error.
 
     Raises:
         InputError: It is not installed, or cannot be imported.
@@ -51,9 +51,7 @@ def require_library(module: str, doing: str, with_what: str, do_this: str) -> An
         return import_module(module)
     except ImportError as error:
         raise InputError(
-            doing,
-            with_what,
-            f"the library {module.partition('.')[0]} cannot be imported: {error}",
+            f"{with_what}: the library {module.partition('.')[0]} cannot be imported: {error}",
             do_this,
         ) from error
 
@@ -118,9 +116,7 @@ def installed_names(group: str, taken: Mapping[str, str], what: str) -> dict[str
         other = found.get(point.name, taken.get(point.name))
         if other is not None and other != point.value:
             raise InputError(
-                f"loading {what} plugins",
-                f"entry point {point.name!r} = {point.value!r}",
-                f"the name is taken by {other}",
+                f"entry point {point.name!r} = {point.value!r}: the name is taken by {other}",
                 "uninstall one of the two packages or rename its entry point",
             )
         found[point.name] = point.value

@@ -27,12 +27,11 @@ class Bound:
         """Return whether a value is in the range; NaN never is."""
         return self.low <= value <= self.high
 
-    def check(self, value: float, doing: str, where: object, what: str = "") -> None:
+    def check(self, value: float, where: object, what: str = "") -> None:
         """Refuse a value outside the range.
 
         Args:
             value: In the bound's unit.
-            doing: What the caller is doing, for messages.
             where: File and place that the value stands in.
             what: Its name there; by default the quantity's.
 
@@ -41,8 +40,10 @@ class Bound:
         """
         if not self.holds(value):
             unit = f" {self.unit}" if self.unit else ""
-            found = f"{what or self.name} = {number(value)}{unit}, outside {self.range_text}"
-            raise InputError(doing, str(where), found, f"correct it: {self.reason}")
+            raise InputError(
+                f"{where}: {what or self.name} = {number(value)}{unit}, outside {self.range_text}",
+                f"correct it: {self.reason}",
+            )
 
     @property
     def range_text(self) -> str:

@@ -43,7 +43,6 @@ class Held:
 @contextmanager
 def one_writer(
     path: Path,
-    doing: str,
     what: str,
     wait: bool = False,
     waiting: Callable[[str], None] = print,
@@ -53,7 +52,6 @@ def one_writer(
 
     Args:
         path: The lock file; its folder is made if it does not exist.
-        doing: The attempted action, for errors.
         what: What is written under the lock, for errors.
         wait: Wait until it is free; otherwise refuse.
         waiting: Called once with a line that says who is waited for.
@@ -68,12 +66,12 @@ def one_writer(
             path.parent.mkdir(parents=True, exist_ok=True)
             taken, owner = _take(path)
         except OSError as error:
-            raise disk_error(path, error, doing, do_this) from error
+            raise disk_error(path, error, do_this) from error
         if taken is not None:
             break
         if not wait:
             named = _named(path)
-            raise _in_use(named if named.exists() else path, doing, what, owner)
+            raise _in_use(named if named.exists() else path, what, owner)
         if not announced:
             waiting(f"waiting: {owner or 'another process'} writes {what}")
             announced = True
@@ -101,19 +99,17 @@ def holder_of(path: Path) -> ProcessName | None:
     return None
 
 
-def _in_use(path: Path, doing: str, what: str, owner: ProcessName | None) -> InfrastructureError:
+def _in_use(path: Path, what: str, owner: ProcessName | None) -> InfrastructureError:
     if owner is None:
         return InfrastructureError(
-            doing,
-            what,
-            "another process is writing it",
+            f"{what}: another process is writing it",
             "wait for it (--wait), or name another folder",
         )
     if owner.life == "elsewhere":
         do_this = f"wait for it (--wait); if nothing runs there any more, remove {path}"
     else:
         do_this = f"wait for it (--wait), stop it (kill {owner.pid}), or name another folder"
-    return InfrastructureError(doing, what, f"{owner} is writing it", do_this)
+    return InfrastructureError(f"{what}: {owner} is writing it", do_this)
 
 
 Release = Callable[[], None]

@@ -38,7 +38,6 @@ SCRATCH = "SIMRUN_SCRATCH"
 STATE = "SIMRUN_SLURM"
 TEMPORARY = "simrun-cache-"  # then the process that made it
 SECRET = "scratch-name"  # file of the cache
-TEMPORARILY = "making a temporary folder"
 INTERPRETED = "NUMBA_DISABLE_JIT"
 DO_THIS = f"name a writable folder in {CACHE}, and one for temporary files in TMPDIR"
 
@@ -149,9 +148,7 @@ def require_kernels() -> None:
         InfrastructureError: `prepare` found no folder for them.
     """
     if nothing_is_writable():
-        raise InfrastructureError(
-            "compiling kernels", "the cache of kernels", "no folder can be written", DO_THIS
-        )
+        raise InfrastructureError("the cache of kernels: no folder can be written", DO_THIS)
 
 
 def temporary_folder(prefix: str) -> TemporaryDirectory[str]:
@@ -166,9 +163,7 @@ def temporary_folder(prefix: str) -> TemporaryDirectory[str]:
     try:
         return tempfile.TemporaryDirectory(prefix=prefix, dir=root)
     except OSError as error:
-        raise InfrastructureError(
-            TEMPORARILY, str(root), error.strerror or str(error), DO_THIS
-        ) from error
+        raise InfrastructureError(f"{root}: {error.strerror or str(error)}", DO_THIS) from error
 
 
 def _temporary_root() -> Path:
@@ -178,7 +173,7 @@ def _temporary_root() -> Path:
         return Path(tempfile.gettempdir())
     except FileNotFoundError as error:
         raise InfrastructureError(
-            TEMPORARILY, "TMPDIR, /tmp, /var/tmp", "none of them can be written", DO_THIS
+            "TMPDIR, /tmp, /var/tmp: none of them can be written", DO_THIS
         ) from error
 
 
@@ -296,9 +291,7 @@ def _secret(kept: Path) -> str:
             drawn.unlink()
         text = path.read_text()
     except OSError as error:
-        raise disk_error(path, error, "choosing a scratch folder", DO_THIS) from error
+        raise disk_error(path, error, DO_THIS) from error
     if not text.isalnum():
-        raise InfrastructureError(
-            "choosing a scratch folder", str(path), "not what simrun wrote", "remove the file"
-        )
+        raise InfrastructureError(f"{path}: not what simrun wrote", "remove the file")
     return text

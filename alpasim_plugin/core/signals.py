@@ -41,13 +41,10 @@ class Stopped(BaseException):
         return f"stopped by {signal.Signals(self.number).name}; {self.kept or NOTHING_KEPT}"
 
     def as_dict(self) -> dict[str, str]:
-        """Return the four parts of an error, for ``--json``."""
-        found = f"stopped by {signal.Signals(self.number).name}"
+        """Return message, hint and class of an error, for ``--json``."""
         return {
-            "doing": "running a command",
-            "with": "simrun",
-            "found": found,
-            "do": self.kept or NOTHING_KEPT,
+            "message": f"stopped by {signal.Signals(self.number).name}",
+            "hint": self.kept or NOTHING_KEPT,
             "failure_class": "stopped",
         }
 

@@ -198,9 +198,7 @@ class Child:
     ) -> None:
         if sys.platform == "win32":
             raise InputError(
-                DOING,
-                command[0],
-                "Windows has no process groups to end it with",
+                f"{command[0]}: Windows has no process groups to end it with",
                 "use Linux, macOS or WSL",
             )
         self.last: deque[str] = deque(maxlen=LAST_LINES)

@@ -61,9 +61,9 @@ class Document:
                 return found
         return Mark(self.path, 1, 1)
 
-    def error(self, doing: str, loc: Sequence[str | int], found: str, do_this: str) -> InputError:
-        """Build a four-part error at a key path."""
-        return InputError(doing, str(self.mark(loc)), found, do_this)
+    def error(self, loc: Sequence[str | int], found: str, do_this: str) -> InputError:
+        """Return an error at a key path."""
+        return InputError(f"{self.mark(loc)}: {found}", do_this)
 
     def folder_of(self, loc: Sequence[str | int]) -> Path:
         """Return the folder against which a relative path written at ``loc`` is resolved."""
@@ -93,25 +93,22 @@ for _tag, _pattern, _first in (
     )
 
 
-def parse(
-    text: str, file: str, doing: str, *, override: bool = False
-) -> tuple[Any, dict[Key, Mark]]:
+def parse(text: str, file: str, *, override: bool = False) -> tuple[Any, dict[Key, Mark]]:
     """Return plain data and the position of every key path.
 
     Args:
         text: YAML.
         file: Name for positions and messages.
-        doing: What the caller is doing, for messages.
         override: The text is a command-line value: positions inside it mean nothing.
 
     Raises:
         InputError: Not valid YAML, or outside the bounds.
     """
     try:
-        _check_events(text, file, doing)
+        _check_events(text, file)
         loader = _CoreLoader(text)
         node = loader.get_single_node()
-        builder = _Builder(file, doing)
+        builder = _Builder(file)
         data = builder.build(node, (), 0) if node is not None else None
     except yaml.MarkedYAMLError as e:
         mark = e.problem_mark or e.context_mark
@@ -119,12 +116,10 @@ def parse(
         if "nesting depth" in str(
             e.problem
         ):  # libyaml 0.2.6 looks ahead of the events counted here and has a bound of its own
-            raise InputError(doing, at, _TOO_DEEP, "flatten the file") from e
+            raise InputError(f"{at}: {_TOO_DEEP}", "flatten the file") from e
         found = " ".join(str(part) for part in (e.context, e.problem) if part)
         raise InputError(
-            doing,
-            at,
-            f"not valid YAML: {found}",
+            f"{at}: not valid YAML: {found}",
             "correct the syntax (indentation, colon, quote or bracket)",
         ) from e
     except yaml.reader.ReaderError as e:
@@ -133,15 +128,13 @@ def parse(
             file if override else f"{file}:{line}:{e.position - text.rfind(chr(10), 0, e.position)}"
         )
         raise InputError(
-            doing,
-            at,
-            f"not valid YAML: the control character {e.character!r}",
+            f"{at}: not valid YAML: the control character {e.character!r}",
             "save the file as plain UTF-8 text",
         ) from e
     return data, builder.marks
 
 
-def _check_events(text: str, file: str, doing: str) -> None:
+def _check_events(text: str, file: str) -> None:
     """Refuse too many or too deeply nested values before nodes are built, which takes stack and
     memory.
     """
@@ -157,9 +150,7 @@ def _check_events(text: str, file: str, doing: str) -> None:
             mark = event.start_mark
             at = f"{file}:{mark.line + 1}:{mark.column + 1}" if mark is not None else file
             raise InputError(
-                doing,
-                at,
-                found,
+                f"{at}: {found}",
                 "flatten the file"
                 if depth > MAX_DEPTH + 1
                 else "split the file or use a data file",
@@ -169,14 +160,14 @@ def _check_events(text: str, file: str, doing: str) -> None:
 class _Builder:
     """Turns a node tree into plain data and positions, within bounds."""
 
-    def __init__(self, file: str, doing: str) -> None:
-        self.file, self.doing = file, doing
+    def __init__(self, file: str) -> None:
+        self.file = file
         self.marks: dict[Key, Mark] = {}
         self.n_nodes = 0
         self.open: set[int] = set()
 
     def fail(self, node: yaml.Node, found: str, do_this: str) -> InputError:
-        return InputError(self.doing, str(self.position(node)), found, do_this)
+        return InputError(f"{self.position(node)}: {found}", do_this)
 
     def position(self, node: yaml.Node) -> Mark:
         return Mark(self.file, node.start_mark.line + 1, node.start_mark.column + 1)

@@ -28,7 +28,7 @@ from alpasim_plugin.drives.placing import NO_MAP, PlacedDrive, corridor, given_m
 from alpasim_plugin.drives.points import road_points, triangulated, with_corrected_poses
 from alpasim_plugin.drives.quality import measure, write_page
 from alpasim_plugin.drives.sfm import forget
-from alpasim_plugin.drives.source import DOING, Points, SourceDrive, checked
+from alpasim_plugin.drives.source import Points, SourceDrive, checked
 from alpasim_plugin.gaussians.files.ply import write_points
 from alpasim_plugin.gaussians.fit.drive import fit_drive
 from alpasim_plugin.gaussians.fit.photographs import Picture, resized
@@ -241,7 +241,7 @@ def key_of(drive: SourceDrive, camera_height_m: float | None, lane_map: Path | N
     lenses, and the options.
     """
     digest = hashlib.sha256(
-        repr((drive.kind, camera_height_m, lane_map and read_bytes(lane_map, DOING))).encode()
+        repr((drive.kind, camera_height_m, lane_map and read_bytes(lane_map))).encode()
     )
     for one in drive.pictures:
         status = one.file.stat() if one.file.is_file() else None
@@ -258,19 +258,15 @@ def finished(out: Path, key: str) -> dict[str, Any]:
     """Return the quality of a finished import, or refuse another thing in its place."""
     if not (out / SCENARIO_FILE).is_file() or not (out / KEY_FILE).is_file():
         raise InputError(
-            DOING,
-            str(out),
-            "it exists and is no imported drive",
+            f"{out}: it exists and is no imported drive",
             "name a folder that does not exist yet",
         )
-    if read_json(out / KEY_FILE, DOING).get("key") != key:
+    if read_json(out / KEY_FILE).get("key") != key:
         raise InputError(
-            DOING,
-            str(out),
-            "it holds another import",
+            f"{out}: it holds another import",
             "name another folder, or remove this one first",
         )
-    quality: dict[str, Any] = read_json(out / "quality.json", DOING)
+    quality: dict[str, Any] = read_json(out / "quality.json")
     return quality
 
 
@@ -361,9 +357,9 @@ def write_photographs(work: Path, shown: Sequence[Shown], tell: Report) -> None:
         data = (
             cv2.imencode(".png", one.picture.rgb()[..., ::-1])[1].tobytes()
             if bends
-            else read_bytes(one.picture.file, DOING)
+            else read_bytes(one.picture.file)
         )
-        write_bytes(path, data, DOING)
+        write_bytes(path, data)
 
 
 def _write_transforms(

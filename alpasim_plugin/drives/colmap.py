@@ -89,14 +89,14 @@ def read_colmap(
     """
     model = model_folder(folder)
     if model is None:
-        raise InputError(DOING, str(folder), "no cameras.bin or cameras.txt", DO_THIS)
+        raise InputError(f"{folder}: no cameras.bin or cameras.txt", DO_THIS)
     binary = (model / "cameras.bin").is_file()
     end = ".bin" if binary else ".txt"
     data = {
-        name: read_bytes(model / f"{name}{end}", DOING, SOURCE_BYTES, DO_THIS)
+        name: read_bytes(model / f"{name}{end}", SOURCE_BYTES, DO_THIS)
         for name in ("cameras", "images", "points3D")
     }
-    with parsing(DOING, model, DO_THIS, "a damaged model"):
+    with parsing(model, DO_THIS, "a damaged model"):
         cameras = dict(_cameras_bin(data["cameras"]) if binary else _cameras_txt(data["cameras"]))
         images = sorted(
             _images_bin(data["images"]) if binary else _images_txt(data["images"]),
@@ -104,7 +104,7 @@ def read_colmap(
         )
         xyz, rgb = _points_bin(data["points3D"]) if binary else _points_txt(data["points3D"])
     if not images:
-        raise InputError(DOING, str(model), "no image with a pose", DO_THIS)
+        raise InputError(f"{model}: no image with a pose", DO_THIS)
     root = pictures_at or _pictures_root(folder, model, images[0].name, photographs)
     shots = [
         Picture(
@@ -155,9 +155,7 @@ def _pictures_root(folder: Path, model: Path, name: str, needed: bool) -> Path:
     if not needed:
         return folder / PICTURES[0]
     raise InputError(
-        DOING,
-        str(folder),
-        f"no picture {name}",
+        f"{folder}: no picture {name}",
         "put the pictures into a folder 'images' beside the model",
     )
 
@@ -165,9 +163,7 @@ def _pictures_root(folder: Path, model: Path, name: str, needed: bool) -> Path:
 def _lens(number: int, width: int, height: int, p: tuple[float, ...]) -> Lens:
     if number not in MODELS:
         raise InputError(
-            DOING,
-            f"camera model {number}",
-            "a lens that OpenCV does not have",
+            f"camera model {number}: a lens that OpenCV does not have",
             "undistort the images (colmap image_undistorter)",
         )
     name, count, fisheye = MODELS[number]
@@ -180,7 +176,7 @@ def _lens(number: int, width: int, height: int, p: tuple[float, ...]) -> Lens:
     if fisheye:
         bend = np.array([*p[4:], *[0.0] * 4])[:4]
     return Lens(width, height, K, bend, "fisheye" if fisheye else "opencv").check(
-        DOING, f"a {name} camera", DO_THIS
+        f"a {name} camera", DO_THIS
     )
 
 
@@ -218,9 +214,7 @@ def _image(camera: int, name: str, pose: F64) -> _Image:
     quat = pose[:4]
     if not np.isfinite(pose).all() or abs(np.linalg.norm(quat) - 1) > 1e-2:
         raise InputError(
-            DOING,
-            f"image {name}",
-            "a pose that is not finite or no rotation",
+            f"image {name}: a pose that is not finite or no rotation",
             "give unit quaternions and finite shifts",
         )
     return _Image(name, camera, se3(pose[4:], quat / np.linalg.norm(quat)))

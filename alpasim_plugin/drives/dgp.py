@@ -59,11 +59,11 @@ def read_dgp(folder: Path) -> SourceDrive:
     if len(scenes) != 1:
         names = ", ".join(path.name for path in scenes)
         raise InputError(
-            DOING, str(folder), f"{len(scenes)} scenes ({names})", "give the folder of one scene"
+            f"{folder}: {len(scenes)} scenes ({names})", "give the folder of one scene"
         )
     path = scenes[0]
-    document = read_json_object(path, DOING)
-    with parsing(DOING, path, "give a whole scene of DGP, with its calibration"):
+    document = read_json_object(path)
+    with parsing(path, "give a whole scene of DGP, with its calibration"):
         lenses, mounts = _calibration(folder, document)
         data = list(document["data"])
         pictures = tuple(
@@ -114,7 +114,7 @@ def _calibration(
     """Return intrinsics and mounts of every camera by its name."""
     key = document["samples"][0]["calibration_key"]
     path = folder / "calibration" / f"{key}.json"
-    found = read_json_object(path, DOING)
+    found = read_json_object(path)
     lenses, mounts = {}, {}
     for name, K, T in zip(found["names"], found["intrinsics"], found["extrinsics"], strict=True):
         if K["fx"] > 0:  # the LiDAR has none
@@ -165,7 +165,7 @@ def _lidar(
         path, T = folder / datum["filename"], _pose(datum["pose"])
         local = _sweep(path)
         labels = datum["annotations"].get("1")
-        for one in read_json_object(folder / labels, DOING)["annotations"] if labels else ():
+        for one in read_json_object(folder / labels)["annotations"] if labels else ():
             size = one["box"]
             body, T_box = Box(size["length"], size["width"], size["height"]), _pose(size["pose"])
             local = local[~_inside(transform_points(inverse(T_box), local), body)]
@@ -189,16 +189,16 @@ def _lidar(
 
 def _classes(folder: Path, document: Mapping[str, Any]) -> dict[int, str]:
     key = document["ontologies"].get("1")
-    items = read_json_object(folder / "ontology" / f"{key}.json", DOING)["items"] if key else []
+    items = read_json_object(folder / "ontology" / f"{key}.json")["items"] if key else []
     return {int(item["id"]): LABELS.get(str(item["name"]), "other") for item in items}
 
 
 def _sweep(path: Path) -> F64:
     """Return the points ``(N, 3)`` of a sweep within `NEAR_M`, sensor frame."""
     if path.suffix == ".npy":
-        data = np.asarray(open_npy(path, DOING), dtype=np.float64)
+        data = np.asarray(open_npy(path), dtype=np.float64)
     else:
-        read_bytes(path, DOING)
+        read_bytes(path)
         with np.load(path, allow_pickle=False) as file:
             data = np.asarray(file["data"], dtype=np.float64)
     xyz = data[:, :3]

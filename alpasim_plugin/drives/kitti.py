@@ -59,7 +59,7 @@ def read_kitti(folder: Path) -> SourceDrive:
         K, T_left_camera = _camera(projections, name, folder / "calib.txt")
         times = _times(folder, len(poses))
         for i, path in enumerate(taken):
-            lens = Lens(*check_image(read_bytes(path, DOING), path, DOING), K)
+            lens = Lens(*check_image(read_bytes(path), path), K)
             pictures.append(
                 Picture(
                     path,
@@ -97,9 +97,9 @@ def _matched(
     if not spare:
         return files, []
     if abs(spare) > max(2, poses // 10):
-        do = "give the poses of these very photographs, one row each"
         raise InputError(
-            DOING, str(folder / name), f"{len(files)} photographs and {poses} poses", do
+            f"{folder / name}: {len(files)} photographs and {poses} poses",
+            "give the poses of these very photographs, one row each",
         )
     if spare < 0:
         return files, [
@@ -116,7 +116,7 @@ def _matched(
 def _rows(path: Path, width: int) -> list[list[float]]:
     """Return the rows of a text file of numbers, names before a colon left out."""
     rows = []
-    for i, line in enumerate(read_text(path, DOING).splitlines()):
+    for i, line in enumerate(read_text(path).splitlines()):
         words = line.rpartition(":")[2].split()
         if not words:
             continue
@@ -124,15 +124,13 @@ def _rows(path: Path, width: int) -> list[list[float]]:
             numbers = [float(word) for word in words]
         except ValueError as error:
             raise InputError(
-                DOING, f"{path}, line {i + 1}", str(error), f"give {width} numbers a line"
+                f"{path}, line {i + 1}: {error}", f"give {width} numbers a line"
             ) from error
         if len(numbers) == width:
             rows.append(numbers)
         elif len(words) not in (9, 12):  # calib.txt of raw drives also holds rotations
             raise InputError(
-                DOING,
-                f"{path}, line {i + 1}",
-                f"{len(numbers)} numbers",
+                f"{path}, line {i + 1}: {len(numbers)} numbers",
                 f"give {width} numbers a line",
             )
     return rows
@@ -143,18 +141,16 @@ def _poses(folder: Path) -> list[F64]:
     path = next((one for one in places if one.is_file()), None)
     if path is None:
         raise InputError(
-            DOING,
-            str(folder),
-            "no poses.txt",
+            f"{folder}: no poses.txt",
             "put the poses of the left camera beside the pictures, one row of 12 numbers each",
         )
     rows = _rows(path, 12)
     if len(rows) < 2:
         raise InputError(
-            DOING, str(path), f"{len(rows)} poses", "give a row of 12 numbers for each photograph"
+            f"{path}: {len(rows)} poses", "give a row of 12 numbers for each photograph"
         )
     return [
-        rigid_pose(np.reshape(row, (3, 4)).tolist(), f"{path}, line {i + 1}", DOING)
+        rigid_pose(np.reshape(row, (3, 4)).tolist(), f"{path}, line {i + 1}")
         for i, row in enumerate(rows)
     ]
 
@@ -163,9 +159,7 @@ def _projections(path: Path) -> list[F64]:
     rows = _rows(path, 12)
     if not rows:
         raise InputError(
-            DOING,
-            str(path),
-            "no row of 12 numbers",
+            f"{path}: no row of 12 numbers",
             "give the cameras' projections, left and right",
         )
     return [np.reshape(row, (3, 4)) for row in rows]
@@ -175,18 +169,14 @@ def _camera(projections: list[F64], name: str, path: Path) -> tuple[F64, F64]:
     """Return a camera's intrinsics and its pose against the left grey camera."""
     if ROWS[name] >= len(projections):
         raise InputError(
-            DOING,
-            str(path),
-            f"{len(projections)} projections, none for {name}",
+            f"{path}: {len(projections)} projections, none for {name}",
             "give a row of 12 numbers for each camera",
         )
     P = projections[ROWS[name]]
     K = P[:, :3].copy()
     if not np.isfinite(P).all() or min(K[0, 0], K[1, 1]) <= 0:
         raise InputError(
-            DOING,
-            f"{path}, row {ROWS[name] + 1}",
-            "no focal length",
+            f"{path}, row {ROWS[name] + 1}: no focal length",
             "give the projection of a rectified camera",
         )
     T = np.eye(4)
@@ -200,7 +190,7 @@ def _times(folder: Path, count: int) -> list[int]:
     path = folder / "times.txt"
     if not path.is_file():
         return [i * PERIOD_US for i in range(count)]
-    seconds = np.array([float(word) for word in read_text(path, DOING).split()])
+    seconds = np.array([float(word) for word in read_text(path).split()])
     if len(seconds) < count or not (np.diff(seconds) > 0).all() or not np.isfinite(seconds).all():
         found = (
             f"{len(seconds)} times for {count} poses"
@@ -208,6 +198,6 @@ def _times(folder: Path, count: int) -> list[int]:
             else "times that do not increase"
         )
         raise InputError(
-            DOING, str(path), found, "give the time of each photograph in seconds, in order"
+            f"{path}: {found}", "give the time of each photograph in seconds, in order"
         )
     return [round(1e6 * float(one - seconds[0])) for one in seconds]

@@ -14,7 +14,7 @@ from alpasim_plugin.drives.dgp import is_dgp, read_dgp
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
 from alpasim_plugin.drives.points import agreeing
 from alpasim_plugin.drives.sfm import Report, is_unposed, read_unposed
-from alpasim_plugin.drives.source import DOING, Points, SourceDrive, timed
+from alpasim_plugin.drives.source import Points, SourceDrive, timed
 from alpasim_plugin.gaussians.fit.photographs import (
     AXES,
     FILE,
@@ -48,7 +48,7 @@ def read_source(folder: Path, work: Path, tell: Report, photographs: bool = True
         InputError: There is nothing, no reader knows it, or it is damaged.
     """
     if not folder.exists():
-        raise InputError(DOING, str(folder), "it does not exist", f"give {FORMS}")
+        raise InputError(f"{folder}: it does not exist", f"give {FORMS}")
     if folder.is_dir() and (folder / FILE).is_file():
         return _transforms(folder, photographs)
     if folder.is_dir() and is_kitti(folder):
@@ -64,14 +64,12 @@ def read_source(folder: Path, work: Path, tell: Report, photographs: bool = True
         if folder.is_dir()
         else "a file"
     )
-    raise InputError(
-        DOING, str(folder), f"{inside or 'nothing'}: no known form of a drive", f"give {FORMS}"
-    )
+    raise InputError(f"{folder}: {inside or 'nothing'}: no known form of a drive", f"give {FORMS}")
 
 
 def _transforms(folder: Path, photographs: bool) -> SourceDrive:
     """Read a ``transforms.json`` of either convention of axes."""
-    document = read_json_object(folder / FILE, DOING)
+    document = read_json_object(folder / FILE)
     notes = []
     if "axes" in document:
         axes = str(document["axes"])
@@ -98,9 +96,7 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
         elif any(one.t_us is None for one in mine):
             bad = next(one for one in mine if one.t_us is None)
             raise InputError(
-                DOING,
-                bad.where,
-                "no t_us, which other photographs have",
+                f"{bad.where}: no t_us, which other photographs have",
                 "give every photograph its time, or none",
             )
         pictures += sorted(timed(mine, PERIOD_US), key=lambda one: int(one.t_us or 0))
@@ -147,9 +143,10 @@ def recognised_axes(folder: Path) -> tuple[str, str]:
     inliers = dict(zip(AXES, (int(count) for count in counts), strict=True))
     best, other = sorted(inliers, key=lambda axes: -inliers[axes])
     if inliers[best] < FEWEST or inliers[best] < CLEARLY * inliers[other]:
-        found = f"no 'axes', and photographs fit together alike with {best} ({inliers[best]} matches) and {other} ({inliers[other]})"
-        do = 'write "axes": "opencv" (y down, z forward) or "axes": "opengl" (y up, z back) into the file'
-        raise InputError(DOING, str(folder / FILE), found, do)
+        raise InputError(
+            f"{folder / FILE}: no 'axes', and photographs fit together alike with {best} ({inliers[best]} matches) and {other} ({inliers[other]})",
+            'write "axes": "opencv" (y down, z forward) or "axes": "opengl" (y up, z back) into the file',
+        )
     return (
         best,
         f"axes recognised as {best}: {inliers[best]} matches of neighbouring photographs fit, {inliers[other]} with {other}",

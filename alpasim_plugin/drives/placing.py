@@ -21,7 +21,7 @@ from alpasim_plugin.core.geometry import (
 )
 from alpasim_plugin.core.types import F64, Actor, HeightField, Lane, LaneMap, Trajectory
 from alpasim_plugin.drives.ground import GroundStrip, fit_ground
-from alpasim_plugin.drives.source import DOING, Points, SourceDrive
+from alpasim_plugin.drives.source import Points, SourceDrive
 from alpasim_plugin.world.ground import from_points, height_at
 from scenarios.opendrive import lane_map_of
 from scenarios.opendrive_road import parse_map
@@ -354,12 +354,10 @@ def given_map(
     """
     if drive.metric is None:
         raise InputError(
-            DOING,
-            str(path),
-            "a map in metres for poses without a unit",
+            f"{path}: a map in metres for poses without a unit",
             "give poses in metres, in the map's coordinates",
         )
-    files = SourceFiles(DOING)
+    files = SourceFiles()
     odr = parse_map(files, path, files.read_xml(path))
     lane_map, notes = lane_map_of(files, path, odr, placed.T_world_source)
     centres = np.concatenate(
@@ -370,9 +368,9 @@ def given_map(
         dx, dy = np.linalg.inv(placed.T_world_source)[:2, :2] @ np.median(
             centres[nearest, :2] - placed.ego.xyz[:, :2], axis=0
         )
-        found = f"its nearest lane lies {np.median(away):.1f} m from the drive: {dx:+.1f} m in x and {dy:+.1f} m in y"
         raise InputError(
-            DOING, str(path), found, "give the map of this street, in the coordinates of the poses"
+            f"{path}: its nearest lane lies {np.median(away):.1f} m from the drive: {dx:+.1f} m in x and {dy:+.1f} m in y",
+            "give the map of this street, in the coordinates of the poses",
         )
 
     def laid(line: F64) -> F64:

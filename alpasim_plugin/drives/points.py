@@ -19,7 +19,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, transform_points
 from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
 from alpasim_plugin.drives.ground import GroundStrip
-from alpasim_plugin.drives.source import DOING, Points, SourceDrive
+from alpasim_plugin.drives.source import Points, SourceDrive
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.photographs import Picture, resized
 from alpasim_plugin.gaussians.fit.start import matches
@@ -67,11 +67,10 @@ def triangulated(pictures: Sequence[Picture], folder: str) -> Points:
     if len(points) < 4 * FEWEST_POINTS:
         points = max(points, placed(_matched(views), views), key=len)
     if len(points) < FEWEST_POINTS:
-        found = (
-            f"{len(points)} points that {FEWEST_VIEWS} of {len(pictures)} photographs place alike"
+        raise InputError(
+            f"{folder}: {len(points)} points that {FEWEST_VIEWS} of {len(pictures)} photographs place alike",
+            "give photographs that overlap, in order along the way, with their own poses and lens",
         )
-        do = "give photographs that overlap, in order along the way, with their own poses and lens"
-        raise InputError(DOING, folder, found, do)
     return points
 
 

@@ -102,11 +102,8 @@ def write_frames(path: Path, out: Path, tell: Report) -> Frames:
     files, films = files_of(path)
     chosen, notes = _moving(files, films, tell)
     if len(chosen) < FEWEST:
-        found = f"{len(chosen)} pictures that show something and in which the world moves"
         raise InputError(
-            DOING,
-            str(path),
-            found,
+            f"{path}: {len(chosen)} pictures that show something and in which the world moves",
             f"give at least {FEWEST}, of a car that drives: depth comes from moving",
         )
     share = car_begins([one.small for one in chosen])
@@ -147,7 +144,7 @@ def _write(out: Path, number: int, file: Path | None, image: U8, scale: float, s
         else cut
     )
     name = f"{number:06d}.png" if file is None else f"{file.stem}.png"
-    write_bytes(out / name, cv2.imencode(".png", small)[1].tobytes(), DOING)
+    write_bytes(out / name, cv2.imencode(".png", small)[1].tobytes())
     return name
 
 
@@ -238,8 +235,8 @@ def _pictures(files: Sequence[Path], films: bool) -> Iterator[tuple[int, int, Pa
         return
     first: tuple[int, int] | None = None
     for number, file in enumerate(files):
-        data = read_bytes(file, DOING, SOURCE_BYTES)
-        size = check_image(data, file, DOING)
+        data = read_bytes(file, SOURCE_BYTES)
+        size = check_image(data, file)
         first = first or size
         fault = picture_fault(data) or (
             f"{size[0]}x{size[1]} pixels, others have {first[0]}x{first[1]}"
@@ -248,16 +245,14 @@ def _pictures(files: Sequence[Path], films: bool) -> Iterator[tuple[int, int, Pa
         )
         if fault:
             raise InputError(
-                DOING,
-                str(file),
-                fault,
+                f"{file}: {fault}",
                 "give whole photographs of one camera, PNG or JPEG in grey or RGB, as they were",
             )
         yield (
             number,
             number * PERIOD_US,
             file,
-            decode_image(data, file, DOING, flag=cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION),
+            decode_image(data, file, flag=cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION),
         )
 
 
@@ -267,9 +262,9 @@ def _filmed(files: Sequence[Path]) -> Iterator[tuple[int, int, Path, U8]]:
     last_us = 0
     step_us = 0
     for file in files:
-        check_regular(file, DOING)
+        check_regular(file)
         with (
-            parsing(DOING, file, "give a whole video that ffmpeg reads", "no readable video"),
+            parsing(file, "give a whole video that ffmpeg reads", "no readable video"),
             av.open(str(file)) as container,
         ):
             begins: float | None = None
@@ -334,16 +329,17 @@ def read_unposed(path: Path, work: Path, tell: Report) -> SourceDrive:
         write_json(
             work / TIMES, {"times": frames.times, "middle": frames.middle, "notes": frames.notes}
         )
-    kept: dict[str, Any] = read_json(work / TIMES, DOING)
+    kept: dict[str, Any] = read_json(work / TIMES)
     times, notes = kept["times"], list(kept["notes"])
     if model_folder(work) is None:
         _register(path, work, tuple(kept["middle"]), tell)
     drive = read_colmap(work, work / FRAMES, kind="sfm")
     known = drive.of(drive.front)
     if len(known) < max(FEWEST, LEAST_SHARE * len(times)):
-        found = f"{len(known)} of {len(times)} photographs could be registered"
-        do = "give a part in which the car moves and the world around it stands, in daylight, or photographs with poses"
-        raise InputError(DOING, str(path), found, do)
+        raise InputError(
+            f"{path}: {len(known)} of {len(times)} photographs could be registered",
+            "give a part in which the car moves and the world around it stands, in daylight, or photographs with poses",
+        )
     pictures = tuple(replace(one, t_us=times[one.file.name]) for one in drive.pictures)
     lens = known[0].lens
     half = 0.5 * lens.width / lens.K[0, 0]
@@ -363,8 +359,10 @@ def _register(path: Path, work: Path, middle: tuple[float, float], tell: Report)
     try:
         import pycolmap
     except ImportError as error:
-        do = "pip install 'alpasim-onefixer[sfm]', or give photographs with poses"
-        raise InputError(DOING, str(path), "no poses, and pycolmap is not installed", do) from error
+        raise InputError(
+            f"{path}: no poses, and pycolmap is not installed",
+            "pip install 'alpasim-onefixer[sfm]', or give photographs with poses",
+        ) from error
     pycolmap.logging.minloglevel = 3  # progress is ours
     database, threads = work / DATABASE, cv2.getNumberOfCPUs()
     database.unlink(missing_ok=True)
@@ -387,11 +385,13 @@ def _register(path: Path, work: Path, middle: tuple[float, float], tell: Report)
     do = "give a part in which the car moves and the world stands, in daylight, or poses"
     deep = _verified(work, middle, threads)
     if deep < LEAST_DEEP:
-        found = f"{100 * deep:.0f} % of the pairs of photographs show depth: the camera only turns, or stands"
-        raise InputError(DOING, str(path), found, do)
+        raise InputError(
+            f"{path}: {100 * deep:.0f} % of the pairs of photographs show depth: the camera only turns, or stands",
+            do,
+        )
     models = _mapped(work, threads)
     if not models:
-        raise InputError(DOING, str(path), "no two photographs from which a model can begin", do)
+        raise InputError(f"{path}: no two photographs from which a model can begin", do)
     target = work / "sparse" / "unfinished"
     target.mkdir(parents=True, exist_ok=True)
     best = max(models, key=lambda model: model.compute_num_observations())

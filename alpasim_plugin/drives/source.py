@@ -135,19 +135,13 @@ def checked(drive: SourceDrive, folder: Path, photographs: bool = True) -> Sourc
     """
     pictures = drive.of(drive.front)
     if len(pictures) < 2 or (drive.kind != "dgp" and len(pictures) < FEWEST):
-        found = f"{len(pictures)} photographs of the camera {drive.front!r}"
         raise InputError(
-            DOING,
-            str(folder),
-            found,
+            f"{folder}: {len(pictures)} photographs of the camera {drive.front!r}",
             f"give at least {FEWEST} photographs with poses along a drive",
         )
     if len(pictures) > MOST:
-        found = f"{len(pictures)} photographs of the camera {drive.front!r}, at most {MOST}"
         raise InputError(
-            DOING,
-            str(folder),
-            found,
+            f"{folder}: {len(pictures)} photographs of the camera {drive.front!r}, at most {MOST}",
             "give a part of the drive, or every second photograph with its pose",
         )
     for one in drive.pictures:
@@ -155,38 +149,32 @@ def checked(drive: SourceDrive, folder: Path, photographs: bool = True) -> Sourc
             whole_photograph(one.file, one.lens, one.where)
         first = drive.of(str(one.camera))[0].lens
         if (one.lens.width, one.lens.height) != (first.width, first.height):
-            found = f"{one.lens.width}x{one.lens.height} pixels, others of the camera {one.camera!r} have {first.width}x{first.height}"
             raise InputError(
-                DOING,
-                f"{one.where}, {one.file}",
-                found,
+                f"{one.where}, {one.file}: {one.lens.width}x{one.lens.height} pixels, others of the camera {one.camera!r} have {first.width}x{first.height}",
                 "give the photographs as they were, each with its camera's name",
             )
     steps = np.linalg.norm(np.diff(drive.path, axis=0), axis=1)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     length = float(steps.sum())
     if length == 0 or (drive.metric and length < LEAST_M and len(pictures) >= FEWEST):
-        found = f"the camera {drive.front!r} moves {length:.2f} m over {len(pictures)} photographs: it stands, or only turns"
         raise InputError(
-            DOING,
-            str(folder),
-            found,
+            f"{folder}: the camera {drive.front!r} moves {length:.2f} m over {len(pictures)} photographs: it stands, or only turns",
             "give a part of the drive in which the car moves: depth comes from moving",
         )
     far = int(np.argmax(steps))
     if steps[far] > JUMP * usual and steps[far] > 0.2 * length:
         one = pictures[far + 1]
-        found = (
-            f"a step of {steps[far]:.4g} to {one.file.name}, where the usual step is {usual:.4g}"
-        )
         raise InputError(
-            DOING, one.where, found, "give all poses in one unit, metres, and one drive at a time"
+            f"{one.where}: a step of {steps[far]:.4g} to {one.file.name}, where the usual step is {usual:.4g}",
+            "give all poses in one unit, metres, and one drive at a time",
         )
     ratio = _unit_change(steps)
     if ratio is not None:
         one = pictures[ratio[0]]
-        found = f"steps {ratio[1]:.0f} times as long from {one.file.name} on as before it: metres and centimetres mixed?"
-        raise InputError(DOING, one.where, found, "give all poses in one unit, metres")
+        raise InputError(
+            f"{one.where}: steps {ratio[1]:.0f} times as long from {one.file.name} on as before it: metres and centimetres mixed?",
+            "give all poses in one unit, metres",
+        )
     return drive
 
 

@@ -78,12 +78,9 @@ class FixerFactory(Generic[S]):
         }
         for key, path in files.items():
             if not path.is_file():
-                do = f"correct --set fixer.{key}, or where it is written"
                 raise InputError(
-                    "looking for a fixer's weights",
-                    f"{settings.name}: {key} = {path}",
-                    "no such file",
-                    do,
+                    f"{settings.name}: {key} = {path}: no such file",
+                    f"correct --set fixer.{key}, or where it is written",
                 )
         if "weights.bundle" in files:
             trained = read_metadata(files["weights.bundle"]).get("trained") == "true"
@@ -153,8 +150,10 @@ def save_bundle(
     kind = settings.bundle_kind
     problems = kind.problems(parts)
     if problems:
-        do = f"give {', '.join(sorted(kind.needed))}, and nothing else but {', '.join(sorted(kind.optional)) or 'these'}"
-        raise InputError("saving a fixer's weights", str(path), "; ".join(problems), do)
+        raise InputError(
+            f"{path}: {'; '.join(problems)}",
+            f"give {', '.join(sorted(kind.needed))}, and nothing else but {', '.join(sorted(kind.optional)) or 'these'}",
+        )
     tensors = {f"{part}.{key}": value for part, sd in parts.items() for key, value in sd.items()}
     plain = settings.model_dump(mode="json", exclude={"weights"})
     header = {
@@ -178,12 +177,9 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
     kind = settings.bundle_kind
     found_kind = header.get("kind", OLDEST_KIND)
     if found_kind != kind.name:
-        do = f"take a fixer of that kind: `simrun list fixers`, this bundle is for {trained_with['name']}"
         raise InputError(
-            DOING,
-            f"{path} with the settings of {settings.name}",
-            f"a bundle of the kind {found_kind!r}, not {kind.name!r}",
-            do,
+            f"{path} with the settings of {settings.name}: a bundle of the kind {found_kind!r}, not {kind.name!r}",
+            f"take a fixer of that kind: `simrun list fixers`, this bundle is for {trained_with['name']}",
         )
     # A header written before a setting existed lacks it: its weights were trained at what is now
     # the default.
@@ -199,9 +195,7 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
     ]
     if wrong:
         raise InputError(
-            DOING,
-            f"{path} with the settings of {settings.name}",
-            "; ".join(wrong),
+            f"{path} with the settings of {settings.name}: {'; '.join(wrong)}",
             "set these as the weights need them",
         )
     from alpasim_plugin.fixers.network.checkpoints import load_weights  # loads torch
@@ -209,8 +203,10 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
     parts = parts_of(load_weights(path, sha256=settings.weights.sha256.bundle))
     problems = kind.problems(parts)
     if problems:
-        do = f"write it with save_bundle (parts {', '.join(sorted(kind.needed | kind.optional))})"
-        raise InputError(DOING, str(path), "; ".join(problems), do)
+        raise InputError(
+            f"{path}: {'; '.join(problems)}",
+            f"write it with save_bundle (parts {', '.join(sorted(kind.needed | kind.optional))})",
+        )
     trained = header.get("trained") == "true"
     others = [
         f"{key} {used} instead of {due}"
@@ -234,9 +230,7 @@ def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
     name = trained_with.pop("name")
     if not isinstance(name, str):
         raise InputError(
-            DOING,
-            f"{path}, settings in its header",
-            f"name: {kind_of(name)}",
+            f"{path}, settings in its header: name: {kind_of(name)}",
             "give a file that save_bundle wrote",
         )
     return RENAMED.get(name, name), (
@@ -261,11 +255,12 @@ def _header(path: str | Path) -> tuple[Mapping[str, str], dict[str, object]]:
         InputError: Not a bundle.
     """
     header = read_metadata(path)
-    settings = parse_json(header.get("settings", "{}"), f"{path}, settings in its header", DOING)
+    settings = parse_json(header.get("settings", "{}"), f"{path}, settings in its header")
     if header.get("format") != FORMAT or not isinstance(settings, dict) or "name" not in settings:
-        found = f"format {header.get('format')!r} in its header"
-        do = f"give a file that save_bundle wrote ({FORMAT}), or the parts as weights.dit and weights.vae"
-        raise InputError(DOING, str(path), found, do)
+        raise InputError(
+            f"{path}: format {header.get('format')!r} in its header",
+            f"give a file that save_bundle wrote ({FORMAT}), or the parts as weights.dit and weights.vae",
+        )
     return header, settings
 
 

@@ -108,18 +108,14 @@ class BlockRunner:
                 raise
             except Exception as error:
                 raise FixerError(
-                    DOING,
-                    name,
-                    f"{type(error).__name__}: {error}",
+                    f"{name}: {type(error).__name__}: {error}",
                     "see the traceback in the rollout's manifest",
                 ) from error
         self._add_fixer_stages(before, fixer.stage_ms)
         problem = _problem(frames, fixed)
         if problem:
             raise FixerError(
-                DOING,
-                name,
-                problem,
+                f"{name}: {problem}",
                 "fix the fixer: as many frames out as in, with the same times, cameras and sizes",
             )
         return [replace(frame, references=()) for frame in fixed]
@@ -240,10 +236,9 @@ def fixed_renderer(
         return PerFrameRenderer(runner, first)
     modes = installed(MODES)
     if settings.mode not in modes:
-        found = f"no installed package has this mode (entry points {MODES}); known: {', '.join(modes) or 'none'}"
-        do = "install simrun with its block fixers, or take a fixer of single frames, such as onefixer"
         raise InputError(
-            "running a fixer of blocks", f"{settings.name}, fixer.mode={settings.mode}", found, do
+            f"{settings.name}, fixer.mode={settings.mode}: no installed package has this mode (entry points {MODES}); known: {', '.join(modes) or 'none'}",
+            "install simrun with its block fixers, or take a fixer of single frames, such as onefixer",
         )
     renderer: Renderer = modes[settings.mode].load()(runner, make, settings, first)
     return renderer

@@ -127,9 +127,9 @@ class PixelFixer(Fixer):
         threads: int | None = None,
     ) -> None:
         if not isinstance(settings, PixelFixerSettings):
-            found = f"settings of type {type(settings).__name__}"
             raise InputError(
-                "making a fixer", settings.name, found, "take them from fixer_settings(name)"
+                f"{settings.name}: settings of type {type(settings).__name__}",
+                "take them from fixer_settings(name)",
             )
         self.chosen: dict[str, Any] = take_threads(threads)
         self.settings, self.scene_id = settings, scene_id

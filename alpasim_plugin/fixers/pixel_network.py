@@ -86,7 +86,7 @@ def load_generator(settings: PixelFixerSettings, device: str = "cpu") -> LoadedG
         InputError: Weights that are missing or do not fit.
         FixerError: The device does not work.
     """
-    require_device(device, DOING)
+    require_device(device)
     return _load(settings.model_copy(update={"keep_render": True}), device)
 
 
@@ -113,9 +113,9 @@ def _load(settings: PixelFixerSettings, device: str) -> LoadedGenerator:
 
 def _untrained(settings: PixelFixerSettings) -> PixelGenerator:
     if settings.untrained == "refuse":
-        found = "no weights, and settings.untrained is 'refuse'"
         raise InputError(
-            DOING, f"{settings.name}, weights.bundle", found, weights_to_give("bundle")
+            f"{settings.name}, weights.bundle: no weights, and settings.untrained is 'refuse'",
+            weights_to_give("bundle"),
         )
     given = settings.generator
     sizes = PixelSizes(**given.model_dump())

@@ -254,13 +254,11 @@ def load_settings(name: str, model: type[S], overrides: Sequence[str] = ()) -> S
     """
     path = Path(str(resources.files("configs.fixers"))) / f"{name}.yaml"
     document = (
-        load_yaml(path, DOING)
+        load_yaml(path)
         if path.is_file()
         else Document({"name": name}, {}, f"the defaults of {name}")
     )
-    return validate(
-        model, _absolute(_override(_without_shipped(document, overrides), overrides)), DOING
-    )
+    return validate(model, _absolute(_override(_without_shipped(document, overrides), overrides)))
 
 
 def _without_shipped(document: Document, overrides: Sequence[str]) -> Document:
@@ -276,9 +274,10 @@ def _without_shipped(document: Document, overrides: Sequence[str]) -> Document:
         return document
     sizes = sorted(key for key in keys if key.partition(".")[0] in ("dit", "vae", "generator"))
     if sizes:
-        found = f"the weights in {weights['bundle']} have their sizes"
-        do = "add --set fixer.weights.bundle=null for an untrained network of other sizes, or give a bundle of yours"
-        raise InputError(DOING, ", ".join(f"fixer.{key}" for key in sizes), found, do)
+        raise InputError(
+            f"{', '.join(f'fixer.{key}' for key in sizes)}: the weights in {weights['bundle']} have their sizes",
+            "add --set fixer.weights.bundle=null for an untrained network of other sizes, or give a bundle of yours",
+        )
     if not any(f"weights.{part}" in keys for part in ("dit", "vae", "decoder", "prompt")):
         return document
     kept = {key: value for key, value in weights.items() if key not in ("bundle", "sha256")}
@@ -294,7 +293,7 @@ def _override(document: Document, overrides: Sequence[str]) -> Document:
         {("fixer", *loc): mark for loc, mark in document.marks.items()},
         document.path,
     )
-    done = apply_overrides(nested, [f"fixer.{text}" for text in overrides], DOING)
+    done = apply_overrides(nested, [f"fixer.{text}" for text in overrides])
     marks = {loc[1:]: mark for loc, mark in done.marks.items()}
     return Document(done.data["fixer"], marks, document.path, document.sources, tuple(overrides))
 

@@ -88,10 +88,7 @@ def trust_cells(text: str) -> U8:
         columns, rows = (int(part) for part in size.split("x"))
         return np.array([int(digit, 16) for digit in digits], np.uint8).reshape(rows, columns, 2)
     except ValueError as error:
-        found = f"{text[:40]!r}"
         raise InputError(
-            "reading where a picture comes from",
-            TRUST_CELLS,
-            found,
+            f"{TRUST_CELLS}: {text[:40]!r}",
             "run the rollout again: its frames.jsonl is damaged",
         ) from error

@@ -83,12 +83,10 @@ def group_views(block: Sequence[Frame], maps: Sequence[U8], frames_due: int) -> 
         RendererError: An opacity that is not a number or outside [0, 1].
     """
     if not block:
-        raise InputError(DOING, "the block", "no frames", "give at least one frame per camera")
+        raise InputError("the block: no frames", "give at least one frame per camera")
     if maps and len(maps) != len(block):
         raise InputError(
-            DOING,
-            "semantic maps",
-            f"{len(maps)} for {len(block)} frames",
+            f"semantic maps: {len(maps)} for {len(block)} frames",
             "give one per frame in the same order, or none",
         )
     order = sorted(
@@ -99,8 +97,10 @@ def group_views(block: Sequence[Frame], maps: Sequence[U8], frames_due: int) -> 
         index.setdefault(block[i].camera, []).append(i)
     counts = {camera: len(mine) for camera, mine in index.items()}
     if len(set(counts.values())) > 1 or max(counts.values()) > frames_due:
-        do = f"give each camera the same number of frames, at most {frames_due}"
-        raise InputError(DOING, "frames by camera", str(counts), do)
+        raise InputError(
+            f"frames by camera: {counts}",
+            f"give each camera the same number of frames, at most {frames_due}",
+        )
     for camera, mine in index.items():
         _check_view(camera, [block[i] for i in mine], [maps[i] for i in mine] if maps else [])
     sizes: dict[tuple[int, ...], list[str]] = {}
@@ -116,17 +116,14 @@ def check_continues(view: Views, pasts: Mapping[str, Past]) -> None:
         if past is None:
             continue
         if past.raw.shape[:2] != view.shape:
-            found = f"{view.shape} (height, width) after {past.raw.shape[:2]}"
             raise InputError(
-                DOING,
-                f"camera {camera!r}",
-                found,
+                f"camera {camera!r}: {view.shape} (height, width) after {past.raw.shape[:2]}",
                 "keep a camera's image size for the whole rollout, or reset",
             )
         if times[0] <= past.t_us:
-            found = f"a frame at {times[0]} us after one at {past.t_us} us"
             raise InputError(
-                DOING, f"camera {camera!r}", found, "give frames in the order of time, or reset"
+                f"camera {camera!r}: a frame at {times[0]} us after one at {past.t_us} us",
+                "give frames in the order of time, or reset",
             )
 
 
@@ -135,7 +132,7 @@ def _check_view(camera: str, frames: Sequence[Frame], maps: Sequence[U8]) -> Non
     shape = frames[0].rgb.shape
     if len(set(times)) < len(times):
         raise InputError(
-            DOING, f"camera {camera!r}", f"two frames at one time: {times}", "give every frame once"
+            f"camera {camera!r}: two frames at one time: {times}", "give every frame once"
         )
     for frame in frames:
         what = f"camera {camera!r} at {frame.t_us} us"
@@ -146,31 +143,26 @@ def _check_view(camera: str, frames: Sequence[Frame], maps: Sequence[U8]) -> Non
             or frame.rgb.dtype != np.uint8
         ):
             raise InputError(
-                DOING,
-                what,
-                f"rgb is {frame.rgb.dtype} {frame.rgb.shape}",
+                f"{what}: rgb is {frame.rgb.dtype} {frame.rgb.shape}",
                 "give (height, width, 3) uint8",
             )
         if frame.rgb.shape != shape:
-            do = "keep a camera's image size for the whole rollout"
             raise InputError(
-                DOING, what, f"rgb of {frame.rgb.shape[:2]} after {shape[:2]} (height, width)", do
+                f"{what}: rgb of {frame.rgb.shape[:2]} after {shape[:2]} (height, width)",
+                "keep a camera's image size for the whole rollout",
             )
         if frame.alpha is not None:
             _check_alpha(what, frame.alpha, shape[:2])
         for image in frame.references:
             if image.shape != (*shape[:2], 4) or image.dtype != np.uint8:
-                found = f"a reference of {image.dtype} {image.shape}"
                 raise InputError(
-                    DOING, what, found, f"give uint8 {(*shape[:2], 4)}, the size of the frame"
+                    f"{what}: a reference of {image.dtype} {image.shape}",
+                    f"give uint8 {(*shape[:2], 4)}, the size of the frame",
                 )
     for t_us, image in zip(times, maps, strict=False):
         if image.shape != shape or image.dtype != np.uint8:
-            found = f"{image.dtype} {image.shape}"
             raise InputError(
-                DOING,
-                f"map of camera {camera!r} at {t_us} us",
-                found,
+                f"map of camera {camera!r} at {t_us} us: {image.dtype} {image.shape}",
                 f"give uint8 {shape}, the size of the frame",
             )
 
@@ -178,16 +170,14 @@ def _check_view(camera: str, frames: Sequence[Frame], maps: Sequence[U8]) -> Non
 def _check_alpha(what: str, alpha: F32, shape: tuple[int, ...]) -> None:
     if alpha.shape != shape:
         raise InputError(
-            DOING,
-            what,
-            f"alpha of {alpha.shape} with rgb of {shape} (height, width)",
+            f"{what}: alpha of {alpha.shape} with rgb of {shape} (height, width)",
             "give both at one size",
         )
     low, high = float(alpha.min()), float(alpha.max())
     if not (low >= -SLACK and high <= 1 + SLACK):  # also refuses NaN, which min and max propagate
-        found = f"opacity with {int(np.isnan(alpha).sum())} NaN, values from {np.nanmin(alpha):.4g} to {np.nanmax(alpha):.4g}"
         raise RendererError(
-            DOING, what, found, "repair the renderer: its opacity is accumulated alpha, 0 to 1"
+            f"{what}: opacity with {int(np.isnan(alpha).sum())} NaN, values from {np.nanmin(alpha):.4g} to {np.nanmax(alpha):.4g}",
+            "repair the renderer: its opacity is accumulated alpha, 0 to 1",
         )
 
 

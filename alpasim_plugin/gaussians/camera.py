@@ -44,9 +44,7 @@ class PinholeCamera:
         )
         if self.width < 1 or self.height < 1:
             raise InputError(
-                "building a camera",
-                f"{self.width} x {self.height} pixels",
-                "no pixel",
+                f"{self.width} x {self.height} pixels: no pixel",
                 "give at least one",
             )
         k = self.K
@@ -59,19 +57,17 @@ class PinholeCamera:
         )
         if not upper or k[0, 0] <= 0 or k[1, 1] <= 0:
             raise InputError(
-                "building a camera",
-                "the intrinsics K",
-                np.array2string(k, separator=", ").replace("\n", ""),
+                "the intrinsics K" + ": " + np.array2string(k, separator=", ").replace("\n", ""),
                 "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels with fx, fy > 0",
             )
-        require_rigid(self.T_camera_world, "building a camera")
+        require_rigid(self.T_camera_world)
 
     @classmethod
     def from_pose(
         cls, width: int, height: int, K: npt.ArrayLike, T_world_camera: F64
     ) -> PinholeCamera:
         """Build a camera from its pose, the transform that maps camera points to the world."""
-        require_rigid(T_world_camera, "building a camera")
+        require_rigid(T_world_camera)
         return cls(
             width,
             height,

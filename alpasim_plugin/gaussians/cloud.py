@@ -96,9 +96,7 @@ class GaussianCloud:
         )
         if n < 0 or found != wanted or not sh_ok:
             raise InputError(
-                "building a Gaussian cloud",
-                f"{n} means",
-                ", ".join(f"{k} {v}" for k, v in {**found, "sh": self.sh.shape}.items()),
+                f"{n} means: {', '.join((f'{k} {v}' for k, v in {**found, 'sh': self.sh.shape}.items()))}",
                 "give means (N,3), quats (N,4), scales (N,3), opacities (N,) and sh (N,K,3) with K in 1, 4, 9, 16",
             )
 
@@ -216,7 +214,7 @@ class GaussianCloud:
             and all(np.isfinite(array).all() for array in (self.means, self.quats, self.sh))
         )
 
-    def require_drawable(self, doing: str) -> None:
+    def require_drawable(self) -> None:
         """Raise where any Gaussian could not be drawn.
 
         Raises:
@@ -237,9 +235,7 @@ class GaussianCloud:
         for cause, good in checks.items():
             if not good.all():
                 raise InputError(
-                    doing,
-                    f"a cloud of {len(self)} Gaussians",
-                    f"{int(np.count_nonzero(~good))} with {cause}, the first at index {int(np.argmin(good))}",
+                    f"a cloud of {len(self)} Gaussians: {int(np.count_nonzero(~good))} with {cause}, the first at index {int(np.argmin(good))}",
                     "build it with GaussianCloud.cleaned, which drops and counts them",
                 )
 
@@ -265,7 +261,7 @@ class GaussianCloud:
         Raises:
             InputError: ``T`` is not rigid.
         """
-        require_rigid(T, "moving a Gaussian cloud")
+        require_rigid(T)
         rotation = np.asarray(T[:3, :3], dtype=np.float64)
         means = self.means.astype(np.float64) @ rotation.T + T[:3, 3]
         quats = quat_multiply(quat_from_matrix(rotation), self.quats.astype(np.float64))
@@ -317,7 +313,7 @@ def quat_multiply(a: F64, b: F64) -> F64:
     )
 
 
-def require_rigid(T: npt.ArrayLike, doing: str) -> None:
+def require_rigid(T: npt.ArrayLike, name: str = "a transform") -> None:
     """Raise `InputError` unless ``T`` is a finite ``(4, 4)`` rigid transform (rotation to 1e-5, no
     reflection, no scale).
     """
@@ -337,9 +333,7 @@ def require_rigid(T: npt.ArrayLike, doing: str) -> None:
         fault = f"last row {m[3].tolist()}"
     if fault:
         raise InputError(
-            doing,
-            "a transform",
-            fault,
+            f"{name}: {fault}",
             "give a (4, 4) rotation and translation, metres, column vectors",
         )
 

@@ -12,9 +12,7 @@ try:
     import gymnasium
 except ImportError as error:
     raise InputError(
-        "importing alpasim_plugin.gym",
-        "library gymnasium",
-        f"it cannot be imported: {error}",
+        f"library gymnasium: it cannot be imported: {error}",
         "install the extra [gym], or gymnasium>=1.0",
     ) from error
 

@@ -198,9 +198,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         name = camera if camera is not None else known[0] if known else ""
         if name and name not in known:
             raise InputError(
-                DOING,
-                f"camera {name!r}",
-                f"the scenario has {known}",
+                f"camera {name!r}: the scenario has {known}",
                 "name one of them, or camera='' for none",
             )
         self._sensors = (SensorSpec(name),) if name else ()
@@ -208,9 +206,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
             self.metadata = self.metadata | {"render_modes": []}
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise InputError(
-                DOING,
-                f"render_mode={render_mode!r}",
-                f"it has {self.metadata['render_modes']}",
+                f"render_mode={render_mode!r}: it has {self.metadata['render_modes']}",
                 "rgb_array needs a camera",
             )
         self._camera = next((one for one in self._scenario.cameras if one.name == name), None)
@@ -238,9 +234,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
     def observation(self) -> Observation:
         """Give the observation as policies get it: with times, poses and camera models."""
         if self._observation is None:
-            raise InputError(
-                "observing", "an environment", "no episode has begun", "call reset() first"
-            )
+            raise InputError("an environment: no episode has begun", "call reset() first")
         return self._observation
 
     def reset(
@@ -300,13 +294,11 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
             or self._recorder is None
             or self._loop is None
         ):
-            raise InputError("stepping", "an environment", "no episode runs", "call reset() first")
+            raise InputError("an environment: no episode runs", "call reset() first")
         plan = self._actions.plan(np.asarray(action), self.observation)
         problem = plan_problem(plan, self.observation.t_us)
         if problem:
-            raise InputError(
-                "stepping", "an action", problem, "give finite numbers within the action space"
-            )
+            raise InputError(f"an action: {problem}", "give finite numbers within the action space")
         over = False
         try:
             self._observation = self._driving.send(plan)
@@ -436,4 +428,4 @@ def _check(
     }
     for name, found in problems.items():
         if found:
-            raise InputError(DOING, name, found, "see docs/gym.md")
+            raise InputError(f"{name}: {found}", "see docs/gym.md")

@@ -93,9 +93,9 @@ class Scorer:
 
     def _value(self, series: MetricSeries) -> F64:
         if not series.valid.all():
-            do_this = "choose a scene with a road and a recorded drive that moves"
             raise EvaluatorError(
-                DOING, f"scene {self._scenario.scene_id!r}, {series.name}", series.reason, do_this
+                f"scene {self._scenario.scene_id!r}, {series.name}: {series.reason}",
+                "choose a scene with a road and a recorded drive that moves",
             )
         return series.value
 

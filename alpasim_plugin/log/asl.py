@@ -79,15 +79,13 @@ class AslReader:
             InputError: Missing or empty file, or damage before the last entry.
         """
         self.truncated = None
-        with open_regular(self.path, "reading a rollout log", LOG_BYTES) as stream:
+        with open_regular(self.path, LOG_BYTES) as stream:
             index = 0
             while (body := self._next(stream, index)) is not None:
                 yield self._parse(body, index, stream.tell() - len(body))
                 index += 1
         if index == 0 and self.truncated is None:
-            raise InputError(
-                "reading a rollout log", str(self.path), "an empty file", "run the rollout again"
-            )
+            raise InputError(f"{self.path}: an empty file", "run the rollout again")
 
     def _next(self, stream: BinaryIO, index: int) -> bytes | None:
         """Return the bytes of the next entry, or None at the end; notes an unfinished one."""
@@ -123,9 +121,7 @@ class AslReader:
 
     def _damaged(self, index: int, offset: int, found: str) -> InputError:
         return InputError(
-            "reading a rollout log",
-            f"{self.path}, entry {index} at byte {offset}",
-            found,
+            f"{self.path}, entry {index} at byte {offset}: {found}",
             _COPY_AGAIN,
         )
 
@@ -154,9 +150,7 @@ class AslFile:
         """
         if self._stream is None:
             raise InfrastructureError(
-                "writing a rollout log",
-                str(self.path),
-                "the log is already finished",
+                f"{self.path}: the log is already finished",
                 "open a new log",
             )
         body = entry.SerializeToString()
@@ -208,7 +202,7 @@ class AslFile:
             self.abandon()
 
     def _failure(self, error: OSError) -> InfrastructureError:
-        return disk_error(self.path, error, "writing a rollout log")
+        return disk_error(self.path, error)
 
 
 def _may_begin_entry(head: bytes, announced: int) -> bool:
@@ -293,9 +287,7 @@ def copy_log(source: Path, target: Path, *stages: Stage) -> int:
             for made in entries:
                 out.write(made)
         if reader.truncated is not None:
-            raise InputError(
-                "copying a rollout log", str(source), str(reader.truncated), "run the rollout again"
-            )
+            raise InputError(f"{source}: {reader.truncated}", "run the rollout again")
     return out.entries
 
 

@@ -25,9 +25,7 @@ def encode_image(rgb: U8, encoding: ImageEncoding = "png", quality: int = 95) ->
     """
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3 or 0 in rgb.shape:
         raise InputError(
-            "encoding a camera image",
-            f"array {rgb.shape} {rgb.dtype}",
-            "not (H, W, 3) uint8",
+            f"array {rgb.shape} {rgb.dtype}: not (H, W, 3) uint8",
             "give an sRGB image as uint8",
         )
     options = {
@@ -48,9 +46,7 @@ def encode_image(rgb: U8, encoding: ImageEncoding = "png", quality: int = 95) ->
     )
     if not done:
         raise InputError(
-            "encoding a camera image",
-            f"array {rgb.shape} as {encoding}",
-            "the encoder refused",
+            f"array {rgb.shape} as {encoding}: the encoder refused",
             "use a smaller image",
         )
     return data.tobytes()
@@ -63,7 +59,5 @@ def decode_image(data: bytes, what: str = "a camera image") -> U8:
     Raises:
         InputError: Not a whole image.
     """
-    bgr = images.decode_image(
-        data, what, "decoding a camera image", "store PNG or JPEG images in the log"
-    )
+    bgr = images.decode_image(data, what, "store PNG or JPEG images in the log")
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))

@@ -98,9 +98,7 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
 
 def _metadata(got: _Collected, message: logging_pb2.RolloutMetadata, where: str) -> None:
     if got.metadata is not None:
-        raise InputError(
-            "reading a rollout log", where, "a second rollout_metadata", "give one rollout a file"
-        )
+        raise InputError(f"{where}: a second rollout_metadata", "give one rollout a file")
     got.metadata = message
 
 
@@ -117,9 +115,7 @@ def _driver_return(got: _Collected, message: egodriver_pb2.DriveResponse, where:
     """Pair first in, first out; a response without poses is a driver that is not ready yet."""
     if not got.requests:
         raise InputError(
-            "reading a rollout log",
-            where,
-            "a driver_return without a driver_request",
+            f"{where}: a driver_return without a driver_request",
             "give a whole log",
         )
     request = got.requests.pop(0)
@@ -256,9 +252,9 @@ def _box(aabb: common_pb2.AABB, path: Path, actor: str) -> Box:
         )
     )
     for side in (box.length_m, box.width_m):
-        BODY_M.check(side, "reading a rollout log", f"{path}, box of actor {actor!r}")
+        BODY_M.check(side, f"{path}, box of actor {actor!r}")
     return box
 
 
 def _bad(path: Path, found: str, do_this: str) -> InputError:
-    return InputError("reading a rollout log", str(path), found, do_this)
+    return InputError(f"{path}: {found}", do_this)

@@ -196,9 +196,7 @@ def _checked_rows(xyz: F64, quat: F64, what: str) -> F64:
     if not (near.all() and long.all()):
         i = int(np.argmin(near.all(axis=-1) & long[:, 0]))
         raise InputError(
-            "writing a rollout log",
-            what,
-            f"pose {i}: position {np.round(xyz[i], 3).tolist()}, quaternion {np.round(quat[i], 6).tolist()}",
+            f"{what}: pose {i}: position {np.round(xyz[i], 3).tolist()}, quaternion {np.round(quat[i], 6).tolist()}",
             f"give finite poses within {MAX_LOCAL_M / 1000:.0f} km of the scene's local origin: the log stores them in float32",
         )
     return np.concatenate([xyz, quat / norm], axis=1)
@@ -398,9 +396,7 @@ def read_poses(poses: Iterable[common_pb2.Pose], what: str) -> tuple[F64, F64]:
     if bad.any():
         i = int(np.argmax(bad))
         raise InputError(
-            "reading a rollout log",
-            what,
-            f"pose {i}: position {xyz[i].tolist()}, quaternion {quat[i].tolist()} with |q|^2 = {square[i]:.6g}",
+            f"{what}: pose {i}: position {xyz[i].tolist()}, quaternion {quat[i].tolist()} with |q|^2 = {square[i]:.6g}",
             "write the log again with finite positions and unit quaternions (w = 1 where there is no rotation)",
         )
     return xyz, quat / np.sqrt(square)[:, None]
@@ -428,9 +424,7 @@ def increasing_times(times: Sequence[int], what: str) -> np.ndarray[tuple[int], 
     if len(late):
         i = int(late[0])
         raise InputError(
-            "reading a rollout log",
-            what,
-            f"time {times[i]} us at index {i} after {times[i - 1]} us",
+            f"{what}: time {times[i]} us at index {i} after {times[i - 1]} us",
             "write the log again with strictly increasing times in microseconds",
         )
     return t_us.astype(np.int64)

@@ -37,15 +37,13 @@ def write_facts(path: Path | str, rows: Iterable[Mapping[str, Fact]]) -> None:
     path = Path(path)
     try:
         with (
-            atomic_file(path, "writing facts of a rollout") as partial,
+            atomic_file(path) as partial,
             partial.open("w", encoding="utf-8") as stream,
         ):
             stream.writelines(json.dumps(dict(row), allow_nan=False) + "\n" for row in rows)
     except (TypeError, ValueError) as error:
         raise InputError(
-            "writing facts of a rollout",
-            str(path),
-            str(error),
+            f"{path}: {error}",
             "give finite numbers, text or booleans",
         ) from error
 
@@ -56,9 +54,7 @@ def read_facts(path: Path | str) -> list[dict[str, Fact]]:
     Raises:
         InputError: Missing file, or a line that is no JSON object.
     """
-    rows: list[dict[str, Fact]] = read_json_lines(
-        path, "reading facts of a rollout", do_this="run the rollout again"
-    )
+    rows: list[dict[str, Fact]] = read_json_lines(path, do_this="run the rollout again")
     return rows
 
 
@@ -139,11 +135,8 @@ def trace_log(path: Path, facts: Iterable[Mapping[str, Fact]] = ()) -> dict[str,
         )
         t_us, camera = fact.get("t_us"), fact.get("camera")
         if not isinstance(t_us, int) or not isinstance(camera, str):
-            found = f"frame facts of camera {camera!r} at t_us {t_us!r}"
             raise InputError(
-                "comparing rollouts",
-                str(path),
-                found,
+                f"{path}: frame facts of camera {camera!r} at t_us {t_us!r}",
                 "run the rollout again: its facts are damaged",
             )
         parts["frames"][t_us, f"camera {camera}"] = sha256(text.encode())

@@ -31,15 +31,13 @@ WRITABLE = {
     7: 7,
     9: 9,
 }  # stated matrix -> the one to convert with
-WRITING = "writing a video"
 _MAX_DENOMINATOR = 1001  # covers whole rates and the 1001 family (29.97 = 30000/1001)
 
 
-def load_av(doing: str) -> Any:
+def load_av() -> Any:
     """Return the module ``av``.
 
     Args:
-        doing: For the message.
 
     Raises:
         InfrastructureError: It is not installed, or does not load.
@@ -49,7 +47,7 @@ def load_av(doing: str) -> Any:
         import av.video.reformatter
     except ImportError as missing:
         raise InfrastructureError(
-            doing, "PyAV", f"it does not load ({missing})", 'pip install "av>=14"'
+            f"PyAV: it does not load ({missing})", 'pip install "av>=14"'
         ) from missing
     return av
 
@@ -105,7 +103,6 @@ class VideoReader:
 
     Args:
         path: The file.
-        doing: For messages.
 
     Raises:
         InputError: Missing or unreadable file, no video in it, no frames, damage, a changing
@@ -116,10 +113,10 @@ class VideoReader:
         ...     print(video.format.rate, [frame.time for frame in video])
     """
 
-    def __init__(self, path: Path | str, doing: str = "reading a video") -> None:
-        self.path, self._doing = Path(path), doing
-        check_regular(self.path, doing, ARCHIVE_BYTES)
-        self._av = load_av(doing)
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        check_regular(self.path, ARCHIVE_BYTES)
+        self._av = load_av()
         try:
             self._container = self._av.open(str(self.path), metadata_errors="replace")
         except (OSError, self._av.FFmpegError) as error:
@@ -225,7 +222,7 @@ class VideoReader:
         return np.ascontiguousarray(np.rot90(image, turns)) if turns else image
 
     def _refusal(self, found: str, do: str = GIVE) -> InputError:
-        return InputError(self._doing, str(self.path), found, do)
+        return InputError(f"{self.path}: {found}", do)
 
 
 class VideoWriter:
@@ -267,7 +264,7 @@ class VideoWriter:
         self._matrix = WRITABLE.get(colour[0], BT709)
         self._size: tuple[int, ...] | None = None
         self._partial = temporary_path(self.path)
-        self._av = load_av(WRITING)
+        self._av = load_av()
         try:
             self._container = self._av.open(str(self._partial), mode="w", format="mp4")
         except (OSError, self._av.FFmpegError) as error:
@@ -296,7 +293,7 @@ class VideoWriter:
             if error is None or self.count:
                 self._container.close()
             if error is None and not self.count:
-                raise InputError(WRITING, str(self.path), "no frames", "give at least one frame")
+                raise InputError(f"{self.path}: no frames", "give at least one frame")
             if error is None:
                 self._partial.replace(self.path)
         except (OSError, self._av.FFmpegError) as failure:
@@ -313,9 +310,9 @@ class VideoWriter:
             or image.shape[2] != 3
             or image.shape != self._size
         ):
-            found = f"frame {self.count}: {image.shape} {image.dtype}, the first is {self._size}"
             raise InputError(
-                WRITING, str(self.path), found, "give frames (H, W, 3) uint8 of one size"
+                f"{self.path}: frame {self.count}: {image.shape} {image.dtype}, the first is {self._size}",
+                "give frames (H, W, 3) uint8 of one size",
             )
         even = np.pad(
             image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), mode="edge"
@@ -347,7 +344,7 @@ class VideoWriter:
 
     def _failure(self, error: Exception) -> InfrastructureError:
         return InfrastructureError(
-            WRITING, str(self.path), str(error), "check that the folder exists and has room"
+            f"{self.path}: {error}", "check that the folder exists and has room"
         )
 
 
@@ -383,9 +380,7 @@ def write_mp4(path: Path | str, frames: Iterable[U8], fps: float | Fraction, crf
     path = Path(path)
     rate = Fraction(fps).limit_denominator(_MAX_DENOMINATOR)
     if rate <= 0:
-        raise InputError(
-            "writing a video", str(path), f"{fps} frames per second", "give a positive rate"
-        )
+        raise InputError(f"{path}: {fps} frames per second", "give a positive rate")
     with VideoWriter(path, 1 / rate, rate, crf=crf) as video:
         for index, image in enumerate(frames):
             video.write(image, index)
@@ -403,6 +398,6 @@ def read_mp4(path: Path | str) -> Video:
         rate = video.format.rate
         base = video.format.time_base
     if rate is None:
-        raise InputError("reading a video", str(path), "no frame rate", "give a whole MP4 file")
+        raise InputError(f"{path}: no frame rate", "give a whole MP4 file")
     t_us = np.array([round(frame.time * base * 1_000_000) for frame in decoded], dtype=np.int64)
     return Video(np.stack([frame.image for frame in decoded]), t_us, rate)

@@ -71,9 +71,7 @@ class AslWriter:
         names = [actor.actor_id for actor in header.actors]
         if EGO in names or len(set(names)) < len(names):
             raise InputError(
-                "writing a rollout log",
-                f"scene {header.scene_id!r}",
-                f"actor ids {sorted({n for n in names if n == EGO or names.count(n) > 1})} are taken or repeated",
+                f"scene {header.scene_id!r}: actor ids {sorted({n for n in names if n == EGO or names.count(n) > 1})} are taken or repeated",
                 f"give every actor an id of its own; {EGO!r} is the ego's",
             )
         self.header = header
@@ -134,9 +132,7 @@ class AslWriter:
         unknown = set(actors) - self._known
         if unknown:
             raise InputError(
-                "writing a rollout log",
-                f"actor poses at {t_us} us",
-                f"actors {sorted(unknown)} are not in the header",
+                f"actor poses at {t_us} us: actors {sorted(unknown)} are not in the header",
                 "list every actor in RolloutHeader.actors; others are invisible to scorers",
             )
         ids = sorted(actors)

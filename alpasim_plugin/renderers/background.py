@@ -139,9 +139,7 @@ def read_background(background: BackgroundFile, path: F64) -> tuple[GaussianClou
     cloud, report = read_gaussians(background.path)
     if report.n_kept == 0:
         raise InputError(
-            "loading a background",
-            background.path,
-            str(report),
+            f"{background.path}: {report}",
             "give a file with at least one drawable Gaussian",
         )
     coverage = coverage_of(placed_cloud(cloud, background.T_world_file), path)
@@ -150,8 +148,10 @@ def read_background(background: BackgroundFile, path: F64) -> tuple[GaussianClou
         drive = ", ".join(
             f"{axis} {a:.1f} to {b:.1f}" for axis, a, b in zip("xyz", low, high, strict=True)
         )
-        found = f"{coverage}, which runs through {drive} m: nothing of it would be seen"
-        raise InputError("placing a background", background.path, found, _advice(cloud, path))
+        raise InputError(
+            f"{background.path}: {coverage}, which runs through {drive} m: nothing of it would be seen",
+            _advice(cloud, path),
+        )
     return cloud, coverage
 
 

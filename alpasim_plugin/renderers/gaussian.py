@@ -57,9 +57,10 @@ class CleanRenderer(Renderer):
 
     def __init__(self, scenario: Scenario, seed: int, device: str, threads: int | None) -> None:
         if scenario.model is not None:
-            found = "a recorded drive: nothing was built, so there is no built truth to show"
-            do = "use 3dgs; photographs are the truth of a recorded drive (simrun bench real)"
-            raise InputError("rendering the scene as built", scenario.scene_id, found, do)
+            raise InputError(
+                f"{scenario.scene_id}: a recorded drive: nothing was built, so there is no built truth to show",
+                "use 3dgs; photographs are the truth of a recorded drive (simrun bench real)",
+            )
         self.scenario, self.seed, self.threads = scenario, seed, threads
         self.backend = backend_of(device)
         self.scene = scene_of(scenario)
@@ -144,9 +145,7 @@ def backend_of(device: str) -> Backend:
         InputError: Neither ``cpu`` nor ``cuda``.
     """
     if device not in ("cpu", "cuda"):
-        raise InputError(
-            "choosing a rasteriser", f"device {device!r}", "no such device", "use cpu or cuda"
-        )
+        raise InputError(f"device {device!r}: no such device", "use cpu or cuda")
     return "cpu" if device == "cpu" else "gsplat"
 
 

@@ -243,9 +243,7 @@ def graph_of(scenario: Scenario) -> SceneGraph:
     """
     if scenario.model is None:
         raise InputError(
-            "showing an imported drive",
-            scenario.scene_id,
-            "no model",
+            f"{scenario.scene_id}: no model",
             "import the drive again: simrun import drive FOLDER -o OUT",
         )
     folder = Path(scenario.model)

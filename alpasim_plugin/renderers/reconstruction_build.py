@@ -46,9 +46,7 @@ def build(
     """
     if not scenario.cameras:
         raise InputError(
-            "fitting a reconstruction",
-            f"scene {scenario.scene_id!r}",
-            "no camera",
+            f"scene {scenario.scene_id!r}: no camera",
             "give the scenario a camera",
         )
     splat = recipe.splat

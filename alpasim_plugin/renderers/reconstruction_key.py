@@ -85,9 +85,7 @@ def recipe_for(amount: Degradation, watched_s: float) -> ReconstructionRecipe:
     """
     if amount.kind not in ("reconstruction", "cycle"):
         raise InputError(
-            "fitting a reconstruction",
-            f"degradation kind {amount.kind!r}",
-            "nothing to fit",
+            f"degradation kind {amount.kind!r}: nothing to fit",
             "say reconstruction or cycle",
         )
     points = min(MOST_POINTS, max(POINTS_PER_S, round(POINTS_PER_S * watched_s)))
@@ -260,7 +258,7 @@ def read_model(folder: Path) -> tuple[Reconstruction, list[SkyView]]:
         Reconstruction,
     )  # it loads the rasteriser, which a key needs not
 
-    hashes = read_json_as(dict[str, str], folder / HASHES, DOING, do_this=DO_THIS)
+    hashes = read_json_as(dict[str, str], folder / HASHES, do_this=DO_THIS)
     there = set(_files(folder)) - {HASHES}
     odd = sorted(there ^ set(hashes))
     if odd or not hashes:  # a list that names other files than are there checks nothing
@@ -309,4 +307,4 @@ def _files(folder: Path) -> list[str]:
 
 
 def _damaged(path: Path, found: str) -> InputError:
-    return InputError(DOING, str(path), found, DO_THIS)
+    return InputError(f"{path}: {found}", DO_THIS)

@@ -224,7 +224,7 @@ def photograph_picture(one: Photograph, camera: PinholeCamera) -> U8:
     Raises:
         InputError: The file is missing or damaged.
     """
-    rgb = np.asarray(read_image(Path(one.path), DOING)[..., ::-1], np.uint8)
+    rgb = np.asarray(read_image(Path(one.path))[..., ::-1], np.uint8)
     size = camera.width, camera.height
     small = (
         rgb

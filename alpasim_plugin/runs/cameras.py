@@ -22,8 +22,6 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.runs.loop_state import Forecaster, PredictedRequests, drawn, shutter_poses
 
-IN_BLOCKS = "setting up a loop in whole blocks of frames"
-
 
 @dataclass(frozen=True)
 class Cadence:
@@ -85,26 +83,20 @@ def make_cadence(
     periods = {sensor.interval_us or scenario.rates.camera_us for sensor in sensors}
     if len(periods) > 1:
         raise InputError(
-            IN_BLOCKS,
-            f"cameras {', '.join(sensor.camera for sensor in sensors)}",
-            f"periods of {' and '.join(map(str, sorted(periods)))} us",
+            f"cameras {', '.join(sensor.camera for sensor in sensors)}: periods of {' and '.join(map(str, sorted(periods)))} us",
             "give all cameras one period, or use the mode 'speculative'",
         )
     (period_us,) = periods
     warm_up_us = (first - 1) * period_us
     if warm_up_us > scenario.warmup_us:
         raise InputError(
-            IN_BLOCKS,
-            f"scene {scenario.scene_id!r}",
-            f"the first block of {first} frames ends after {warm_up_us} us, the warm-up after {scenario.warmup_us} us",
+            f"scene {scenario.scene_id!r}: the first block of {first} frames ends after {warm_up_us} us, the warm-up after {scenario.warmup_us} us",
             f"--set timing.warmup_us={warm_up_us}, or use the mode 'speculative'",
         )
     queries = np.arange(clock.start_us + warm_up_us, end_us, then * period_us, dtype=np.int64)
     if not len(queries):
         raise InputError(
-            IN_BLOCKS,
-            f"scene {scenario.scene_id!r}",
-            f"it ends after {end_us - clock.start_us} us, before the first block of {first} frames",
+            f"scene {scenario.scene_id!r}: it ends after {end_us - clock.start_us} us, before the first block of {first} frames",
             "lengthen timing.duration_us, or use the mode 'speculative'",
         )
     return Cadence(queries, whole_blocks=True)
@@ -144,17 +136,13 @@ class CameraRig:
         for sensor in sensors:
             if sensor.camera not in known:
                 raise InputError(
-                    "connecting a policy to its cameras",
-                    f"scene {scenario.scene_id!r}",
-                    f"the policy needs camera {sensor.camera!r}; the scenario has {sorted(known)}",
+                    f"scene {scenario.scene_id!r}: the policy needs camera {sensor.camera!r}; the scenario has {sorted(known)}",
                     "add that camera to the scenario or choose another policy",
                 )
             period = sensor.interval_us or scenario.rates.camera_us
             if period % clock.rates.control_us:
                 raise InputError(
-                    "connecting a policy to its cameras",
-                    f"camera {sensor.camera!r}",
-                    f"period {period} us is no multiple of the control period {clock.rates.control_us} us",
+                    f"camera {sensor.camera!r}: period {period} us is no multiple of the control period {clock.rates.control_us} us",
                     "choose a whole multiple",
                 )
             self._due.append((known[sensor.camera], period))

@@ -224,10 +224,8 @@ def _failure(error: Exception, folder: Path) -> dict[str, Any]:
     if isinstance(error, OSError):
         return {"status": "failed", "error": disk_error(folder, error).as_dict()} | trace
     found = {
-        "doing": "running a rollout",
-        "with": "a part that raised something other than a SimrunError",
-        "found": f"{type(error).__name__}: {error}",
-        "do": "read the traceback in the manifest and report it",
+        "message": f"{type(error).__name__}: {error}",
+        "hint": "read the traceback in the manifest and report it",
         "failure_class": "infrastructure",
     }
     return {"status": "failed", "error": found} | trace

@@ -46,7 +46,7 @@ class Repeat:
 def repeating(plan: RunPlan, root: Path, mode: Certify) -> Iterator[Repeat]:
     """Yield what is to be repeated of a plan; the second drive is removed when the block ends."""
     # In the run folder, under a name that the next run removes if this process is killed.
-    with scratch_folder(root / "repeat", "repeating a rollout") as scratch:
+    with scratch_folder(root / "repeat") as scratch:
         yield Repeat(foreseen(plan, mode), scratch)
 
 
@@ -211,7 +211,7 @@ def _not_repeated(error: Mapping[str, str]) -> dict[str, Any]:
         "component": "run",
         "t_us": None,
         "step": None,
-        "what": f"the repeat failed: {error['found']}",
+        "what": f"the repeat failed: {error['message']}",
     }
     return {
         "status": "different",
@@ -223,7 +223,7 @@ def _not_repeated(error: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _skipped(error: Mapping[str, str]) -> dict[str, Any]:
-    reason = f"the repeat failed: {error['doing']}, {error['with']}: {error['found']}"
+    reason = f"the repeat failed: {error['message']}"
     return {"status": "skipped", "reason": reason, "error": dict(error)}
 
 

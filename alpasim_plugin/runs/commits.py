@@ -65,16 +65,12 @@ def open_objects(url: str) -> Objects:
     """
     if "://" not in url or url.startswith("file://"):
         return FolderObjects(Path(url.removeprefix("file://")))
-    fsspec = require_library(
-        "fsspec", DOING, f"--store {url}", "pip install 'alpasim-onefixer[s3]'"
-    )
+    fsspec = require_library("fsspec", f"--store {url}", "pip install 'alpasim-onefixer[s3]'")
     try:
         system, root = fsspec.core.url_to_fs(url, use_listings_cache=False)
     except (ValueError, ImportError) as error:
         raise InputError(
-            DOING,
-            f"--store {url}",
-            str(error),
+            f"--store {url}: {error}",
             "write a path or s3://BUCKET/PREFIX; s3 needs the extra [s3]",
         ) from error
     return RemoteObjects(system, root, url)
@@ -95,23 +91,23 @@ class FolderObjects:
         except FileNotFoundError:
             return None
         except OSError as error:
-            raise disk_error(self._root / key, error, DOING) from error
+            raise disk_error(self._root / key, error) from error
 
     def write(self, key: str, data: bytes) -> None:
         """See `Objects`."""
-        write_bytes(self._root / key, data, DOING)
+        write_bytes(self._root / key, data)
 
     def create(self, key: str, data: bytes) -> bool:
         """See `Objects`."""
         path = self._root / key
         partial = temporary_path(path)
-        write_bytes(partial, data, DOING)
+        write_bytes(partial, data)
         try:
             os.link(partial, path)
         except FileExistsError:
             return False
         except OSError as error:
-            raise disk_error(path, error, DOING) from error
+            raise disk_error(path, error) from error
         finally:
             partial.unlink(missing_ok=True)
         return True
@@ -175,17 +171,16 @@ class RemoteObjects:
                 PermissionError,
                 FileNotFoundError,
             ) as error:  # no right, no bucket: asking again would not help
-                do_this = "check the address, the bucket and the credentials, on the nodes too"
                 raise InfrastructureError(
-                    DOING, f"{self._url}/{key}", f"{type(error).__name__}: {error}", do_this
+                    f"{self._url}/{key}: {type(error).__name__}: {error}",
+                    "check the address, the bucket and the credentials, on the nodes too",
                 ) from error
             # libraries of object stores have families of errors for a network that is down
             except Exception as error:
                 if time.monotonic() + wait_s > until_s:
-                    found = f"no answer for {self._patience_s:g} s: {type(error).__name__}: {error}"
-                    do_this = "give the same command again when the store is back; finished rollouts are kept"
                     raise InfrastructureError(
-                        DOING, f"{self._url}/{key}", found, do_this
+                        f"{self._url}/{key}: no answer for {self._patience_s:g} s: {type(error).__name__}: {error}",
+                        "give the same command again when the store is back; finished rollouts are kept",
                     ) from error
             time.sleep(wait_s)
             wait_s = min(2 * wait_s, LONGEST_WAIT_S)
@@ -231,11 +226,8 @@ def unpack(result: RolloutResult, root: Path) -> dict[str, Any]:
     folder = root / result.manifest["path"]
     for name, facts in result.manifest["files"].items():
         if hashlib.sha256(result.files[name]).hexdigest() != facts["sha256"]:
-            where = f"{result.manifest['path']}/{name} from {result.manifest['node']}"
             raise InfrastructureError(
-                "receiving a rollout",
-                where,
-                "not the content that the node wrote",
+                f"{result.manifest['path']}/{name} from {result.manifest['node']}: not the content that the node wrote",
                 "give the same command again",
             )
     try:
@@ -245,7 +237,7 @@ def unpack(result: RolloutResult, root: Path) -> dict[str, Any]:
         for name, data in result.files.items():
             (folder / name).write_bytes(data)
     except OSError as error:
-        raise disk_error(folder, error, "writing a rollout") from error
+        raise disk_error(folder, error) from error
     manifest = {name: value for name, value in result.manifest.items() if name != "files"}
     write_manifest(folder, manifest)
     return manifest
@@ -286,9 +278,7 @@ class Commits:
             return result
         if there is None:
             raise InfrastructureError(
-                "committing a rollout",
-                f"{self.url}/{_name(key)}",
-                "it exists, and cannot be read",
+                f"{self.url}/{_name(key)}: it exists, and cannot be read",
                 "try again",
             )
         return self._result(key, json.loads(there))
@@ -308,9 +298,10 @@ class Commits:
             data = self._objects.read(f"{stated['attempt']}/{name}")
             facts = stated["manifest"]["files"].get(name)
             if data is None or (facts and hashlib.sha256(data).hexdigest() != facts["sha256"]):
-                found = f"{name} is {'missing' if data is None else 'not what was committed'}"
-                do_this = "remove that commit; the same command then drives the rollout again"
-                raise InfrastructureError(READING, f"{self.url}/{_name(key)}", found, do_this)
+                raise InfrastructureError(
+                    f"{self.url}/{_name(key)}: {name} is {'missing' if data is None else 'not what was committed'}",
+                    "remove that commit; the same command then drives the rollout again",
+                )
             files[name] = data
         return RolloutResult(stated["manifest"], files)
 

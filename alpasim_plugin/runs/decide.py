@@ -155,11 +155,8 @@ def strata_of(plan: RunPlan, question: Question, design: Design, most: int) -> S
     if design.order == "random":
         return None
     if question.population != "suite":
-        found = "the shares of families in a population of scenes are not known"
         raise InputError(
-            DOING,
-            f"--order {design.order}",
-            found,
+            f"--order {design.order}: the shares of families in a population of scenes are not known",
             "ask about the suite itself with --population suite, or leave it out",
         )
     sizes = [min(design.look_every, most - begun) for begun in range(0, most, design.look_every)]

@@ -363,9 +363,7 @@ def _lost(cell: Cell, root: Path, lost: Lost) -> dict[str, Any]:
     """Write the manifest of a rollout whose workers died, or that was ended since it took too
     long.
     """
-    error = InfrastructureError(
-        "running a rollout in a worker process", cell.folder.as_posix(), lost.found, lost.do_this
-    )
+    error = InfrastructureError(f"{cell.folder.as_posix()}: {lost.found}", lost.do_this)
     manifest = failed_manifest(cell, error)
     write_manifest(root / cell.folder, manifest)
     return manifest

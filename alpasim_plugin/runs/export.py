@@ -61,7 +61,6 @@ RUN_METADATA = "run_metadata.yaml"
 EVAL_CONFIG = "eval-config.yaml"
 WIZARD_CONFIG = "wizard-config.yaml"
 SCENES = "scenes"
-OF_SCENES = "exporting scenes"
 DOING = "exporting to AlpaSim"
 COMPLETE, FAILED = "_complete", "failed_rollouts.json"
 # AlpaSim's longest minADE horizon; one shorter sample loses all four metrics of its rollout
@@ -137,17 +136,15 @@ def scenes_of(info: Mapping[str, Any]) -> dict[str, tuple[ScenarioRef, Scenario]
         given = stated.get("ref") or {}
         if "path" not in given:
             raise InputError(
-                OF_SCENES,
-                f"scene {scene_id!r}",
-                "run.json has no path of its scenario",
+                f"scene {scene_id!r}: run.json has no path of its scenario",
                 "export a folder that simrun run wrote",
             )
         ref = ref_of(given)
         scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
         if scenario.content_hash != stated["content_hash"]:
-            found = f"{ref.path} is not what was driven: its content has changed"
             raise InputError(
-                OF_SCENES, f"scene {scene_id!r}", found, "run again, or restore the scenario"
+                f"scene {scene_id!r}: {ref.path} is not what was driven: its content has changed",
+                "run again, or restore the scenario",
             )
         out[scene_id] = (ref, scenario)
     return out
@@ -167,14 +164,14 @@ def _archive_of(ref: ScenarioRef) -> Path:
     path = find(ref.path)
     if path.suffix not in (".yaml", ".yml"):
         return path
-    document = load_yaml(path, OF_SCENES)
+    document = load_yaml(path)
     key = next(key for key in ("usdz", "path") if key in document.data["log"])
     return Path(document.folder_of(("log", key)) / document.data["log"][key])
 
 
 def _copy(path: Path, source: Path, scenario: Scenario) -> None:
     with (
-        atomic_file(path, OF_SCENES) as partial,
+        atomic_file(path) as partial,
         zipfile.ZipFile(source) as old,
         zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as new,
     ):
@@ -249,13 +246,11 @@ def export_scenes(places: Sequence[str], out: Path) -> Export:
         scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
         if scenario.scene_id in loaded:
             raise InputError(
-                DOING,
-                ref.path,
-                f"a second scene with the id {scenario.scene_id!r}",
+                f"{ref.path}: a second scene with the id {scenario.scene_id!r}",
                 "name every scene once",
             )
         loaded[scenario.scene_id] = (ref, scenario)
-    with atomic_folder(out, DOING) as partial:
+    with atomic_folder(out) as partial:
         return Export(out, (), _write_scenes(partial, loaded))
 
 
@@ -276,15 +271,13 @@ def export_run(root: Path, out: Path, say: Callable[[str], None]) -> Export:
     info = contents.run
     if info.get("kind") == "score":
         raise InputError(
-            DOING,
-            str(root),
-            "scores of logs, without the logs",
+            f"{root}: scores of logs, without the logs",
             "export the run folder that holds them",
         )
     manifests = [read_manifest(root / cell)[0] for cell in contents.rollouts]
     loaded = scenes_of(info)
     runs: dict[tuple[str, str], ExportedRun] = {}
-    with atomic_folder(out, DOING) as partial:
+    with atomic_folder(out) as partial:
         for manifest in manifests:
             key = (str(manifest["renderer"]), str(manifest["policy"]))
             run = runs.setdefault(key, ExportedRun(*key, f"{slug(key[0])}/{slug(key[1])}"))
@@ -343,9 +336,7 @@ def _added(
     (main,) = list(alpasim_cameras(scenario.cameras).values())[:1] or (None,)
     if main is None:
         raise InputError(
-            DOING,
-            manifest["path"],
-            "no camera in the scenario, and no image in the log",
+            f"{manifest['path']}: no camera in the scenario, and no image in the log",
             "add a camera to the scenario",
         )
     threads = thread_budget(1, 1).per_worker
@@ -395,7 +386,7 @@ def _finish(
                 "run_name": name,
                 "clipgt_id": m["scene"],
                 "rollout_id": f"seed-{m['seed']}",
-                "error": m["error"]["found"],
+                "error": m["error"]["message"],
             }
             for m in failed
         ]
@@ -414,9 +405,7 @@ def _write_scenes(
 def _check_free(out: Path) -> None:
     if out.exists() and (not out.is_dir() or any(os.scandir(out))):
         raise InputError(
-            DOING,
-            f"--alpasim {out}",
-            "it is there and not empty",
+            f"--alpasim {out}: it is there and not empty",
             "name a new folder, or remove it first",
         )
 

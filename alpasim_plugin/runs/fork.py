@@ -62,9 +62,7 @@ class SwitchedRenderer(Renderer):
         self.block = first.block
         if first.block != then.block:
             raise InputError(
-                "switching to another renderer",
-                f"{first.block or 'frames one by one'} and {then.block or 'frames one by one'}",
-                "the two have different query times of the policy",
+                f"{first.block or 'frames one by one'} and {then.block or 'frames one by one'}: the two have different query times of the policy",
                 "choose the mode 'speculative' for both",
             )
         self.lookahead = max(first.lookahead, then.lookahead)
@@ -289,16 +287,13 @@ def _check(past: LoggedRollout, change: Change, root: Path) -> None:
     scenario = past.scenario
     length_us = int(past.manifest["steps"]) * scenario.rates.control_us
     if not 0 <= change.after_us < length_us:
-        found = f"the rollout lasts {length_us * 1e-6:g} s"
         raise InputError(
-            DOING,
-            f"--at {change.after_us * 1e-6:g}",
-            found,
+            f"--at {change.after_us * 1e-06:g}: the rollout lasts {length_us * 1e-06:g} s",
             "choose an instant within it, in seconds after the first frame",
         )
-    past.check_repeatable(DOING)
+    past.check_repeatable()
     if (root / RUN_INFO).exists():
-        raise InputError(DOING, f"--out {root}", "it holds a run already", "choose another --out")
+        raise InputError(f"--out {root}: it holds a run already", "choose another --out")
 
 
 def _copied(past: LoggedRollout, root: Path) -> dict[str, Any]:
@@ -363,9 +358,7 @@ def _compare_with_log(
     if difference is not None:
         (folder / MANIFEST).unlink()
         raise InfrastructureError(
-            DOING,
-            past.name,
-            f"its replay differs from the log before the change: {difference}",
+            f"{past.name}: its replay differs from the log before the change: {difference}",
             "use the machine and the versions in run.json, or run the rollout again",
         )
     if change == Change(change.after_us):

@@ -39,12 +39,10 @@ def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> lis
     except SimrunError:
         raise
     except Exception as error:
-        raise RendererError("rendering a frame", name, raised(error), TRACEBACK) from error
+        raise RendererError(f"{name}: {raised(error)}", TRACEBACK) from error
     if len(frames) != len(requests):
         raise RendererError(
-            "rendering a frame",
-            name,
-            f"{len(frames)} frames for {len(requests)} requests",
+            f"{name}: {len(frames)} frames for {len(requests)} requests",
             "return one frame for each request",
         )
     return [
@@ -64,11 +62,8 @@ def _checked(renderer: str, frame: Frame, request: RenderRequest) -> Frame:
         if plane is not None and (plane.shape != wanted[:2] or not np.isfinite(plane).all()):
             problems.append(f"{label} has shape {plane.shape} or is not finite")
     if problems:
-        name = f"{renderer}, camera {request.camera.name!r} at {request.t_us} us"
         raise RendererError(
-            "rendering a frame",
-            name,
-            "; ".join(problems),
+            f"{renderer}, camera {request.camera.name!r} at {request.t_us} us: {'; '.join(problems)}",
             "fix the renderer; its contract is types.Frame",
         )
     if "black" not in frame.events and is_black(frame.rgb):
@@ -97,7 +92,7 @@ def checked_sensors(policy: Policy) -> Sequence[SensorSpec]:
     """
     found = sensors_problem(policy.sensors)
     if found:
-        raise PolicyError("reading a policy's sensors", type(policy).__name__, found, CHECK)
+        raise PolicyError(f"{type(policy).__name__}: {found}", CHECK)
     return policy.sensors
 
 
@@ -112,9 +107,7 @@ def reset_policy(policy: Policy, seed: int, route: Route) -> None:
     except SimrunError:
         raise
     except Exception as error:  # whatever a foreign policy raises
-        raise PolicyError(
-            "resetting a policy", type(policy).__name__, raised(error), TRACEBACK
-        ) from error
+        raise PolicyError(f"{type(policy).__name__}: {raised(error)}", TRACEBACK) from error
 
 
 def checked_plan(policy: Policy, observation: Observation) -> Plan:
@@ -130,8 +123,8 @@ def checked_plan(policy: Policy, observation: Observation) -> Plan:
     except SimrunError:
         raise
     except Exception as error:
-        raise PolicyError("querying the policy", name, raised(error), TRACEBACK) from error
+        raise PolicyError(f"{name}: {raised(error)}", TRACEBACK) from error
     found = plan_problem(plan, observation.t_us)
     if found:
-        raise PolicyError("querying the policy", name, found, CHECK)
+        raise PolicyError(f"{name}: {found}", CHECK)
     return plan

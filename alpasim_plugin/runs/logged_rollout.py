@@ -46,21 +46,24 @@ class LoggedRollout:
         """Give the name by which `find_rollout` finds it."""
         return cell_name(*self.cell.names.values())
 
-    def check_repeatable(self, doing: str) -> None:
+    def check_repeatable(self) -> None:
         """Refuse a rollout that cannot be replayed.
 
         Args:
-            doing: The attempted action, for the error.
 
         Raises:
             InputError: Its latency is measured, or a service moved its road users.
         """
         if self.options.traffic is not None:
-            found = f"the traffic service {self.options.traffic} moved its road users: nothing here can move them so again"
-            raise InputError(doing, self.name, found, "run it without --traffic")
+            raise InputError(
+                f"{self.name}: the traffic service {self.options.traffic} moved its road users: nothing here can move them so again",
+                "run it without --traffic",
+            )
         if self.scenario.latency.kind == "measured":
-            found = "its latency is measured: the delay of its plans depended on the machine"
-            raise InputError(doing, self.name, found, "run it with --set latency.kind=fixed")
+            raise InputError(
+                f"{self.name}: its latency is measured: the delay of its plans depended on the machine",
+                "run it with --set latency.kind=fixed",
+            )
 
 
 def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRollout:
@@ -79,30 +82,26 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRo
     info = read_run_json(root)
     state = inspect_rollout(root, row["path"], full=True, known=True)
     if state.damage or state.manifest is None:
-        do_this = f"simrun check {shlex.quote(str(root))} --repair runs it again"
         raise InputError(
-            DOING, name, "; ".join(f"{one.file}: {one.problem}" for one in state.damage), do_this
+            f"{name}: {'; '.join(f'{one.file}: {one.problem}' for one in state.damage)}",
+            f"simrun check {shlex.quote(str(root))} --repair runs it again",
         )
     manifest = state.manifest
     if manifest.get("fork"):
         raise InputError(
-            DOING,
-            name,
-            "it is the continuation of another rollout",
+            f"{name}: it is the continuation of another rollout",
             f"name that rollout: {manifest['fork']['of']}",
         )
     stated: Mapping[str, Any] = (info["scenes"].get(row["scene"]) or {}).get("ref") or {}
     where = scenario or stated.get("path")
     if where is None:
         raise InputError(
-            DOING,
-            f"{root / RUN_INFO}",
-            "it has no path of the scenario",
+            f"{root / RUN_INFO}: it has no path of the scenario",
             "name it with --scenario PATH",
         )
     ref = ref_of({**stated, "path": where})
     options = replace(options_of(info), baseline=None, video="none")
-    refuse_commands([row["policy"]], DOING, str(root))
+    refuse_commands([row["policy"]], str(root))
     # Fixer settings may belong to another renderer of the run; a plan refuses settings without a
     # fixer.
     has_fixer = resolve_renderer(row["renderer"], options.fixer).fixer is not None
@@ -117,9 +116,7 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRo
             else "content key differs"
         )
         raise InputError(
-            DOING,
-            name,
-            f"{what}: the scenario, a part or the version has changed since the log was written",
+            f"{name}: {what}: the scenario, a part or the version has changed since the log was written",
             "run the rollout again, or name its scenario with --scenario PATH",
         )
     return LoggedRollout(root, cell, options, loaded, manifest)
@@ -128,7 +125,7 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRo
 def _row(root: Path, name: str) -> dict[str, Any]:
     path = root / ROLLOUTS
     rows = ROLLOUTS_TABLE.read(
-        path, DOING, "name a folder written by simrun run", (*KEYS, "status", "path", "failure")
+        path, "name a folder written by simrun run", (*KEYS, "status", "path", "failure")
     ).to_pylist()
     by_name = {cell_name(*(row[key] for key in KEYS)): row for row in rows}
     wanted = name.strip("/")
@@ -139,13 +136,11 @@ def _row(root: Path, name: str) -> dict[str, Any]:
         near = difflib.get_close_matches(wanted, by_name, 3, 0.0)
         do_this = f"did you mean {' or '.join(near)}?" if near else "name a run that has rollouts"
         raise InputError(
-            DOING, f"--cell {name}", f"the run has no such rollout among its {len(rows)}", do_this
+            f"--cell {name}: the run has no such rollout among its {len(rows)}", do_this
         )
     if row["status"] != "ok":
         raise InputError(
-            DOING,
-            f"--cell {name}",
-            f"it did not finish: {row['failure']}",
+            f"--cell {name}: it did not finish: {row['failure']}",
             "name a finished rollout",
         )
     return dict(row)

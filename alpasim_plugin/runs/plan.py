@@ -195,9 +195,7 @@ def make_plan(
     same = [str(spec) for spec in rendering]
     if len(set(same)) != len(same):
         raise InputError(
-            DOING,
-            f"renderers {list(renderers)}",
-            f"they resolve to {same}",
+            f"renderers {list(renderers)}: they resolve to {same}",
             "name every renderer once",
         )
     _check_fixer_settings(options.fixer, renderers, rendering)
@@ -224,9 +222,7 @@ def _check_named_once(what: str, values: Sequence[object]) -> None:
     if not values or twice:
         found = f"{', '.join(twice)} twice" if twice else "none"
         raise InputError(
-            DOING,
-            f"{what}s {', '.join(map(str, values)) or '(none)'}",
-            found,
+            f"{what}s {', '.join(map(str, values)) or '(none)'}: {found}",
             f"name every {what} once",
         )
 
@@ -238,14 +234,14 @@ def _check_fixer_settings(
     fixed = {spec.name for spec in renderers if spec.fixer is not None}
     labels = {label for text in settings if (label := text.partition("=")[0].rpartition(":")[0])}
     if unknown := sorted(labels - fixed):
-        found = f"no fixer of that name among the renderers {list(names)}"
         raise InputError(
-            DOING, f"--set {unknown[0]}:fixer...", found, "write the name as --renderer has it"
+            f"--set {unknown[0]}:fixer...: no fixer of that name among the renderers {list(names)}",
+            "write the name as --renderer has it",
         )
     if settings and not fixed:
-        found = f"no fixer among the renderers {list(names)}"
         raise InputError(
-            DOING, f"--set fixer.{settings[0]}", found, "leave it out, or name a fixer"
+            f"--set fixer.{settings[0]}: no fixer among the renderers {list(names)}",
+            "leave it out, or name a fixer",
         )
 
 
@@ -255,9 +251,10 @@ def _load(refs: Sequence[ScenarioRef]) -> list[tuple[ScenarioRef, Scenario]]:
     for ref in dict.fromkeys(refs):  # what two suites list is driven once
         scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
         if scenario.scene_id in loaded:
-            both = f"{ref.path} and {loaded[scenario.scene_id][0].path}"
-            found = f"both have the scene id {scenario.scene_id!r}"
-            raise InputError(DOING, both, found, "give one of them another id, or name it once")
+            raise InputError(
+                f"{ref.path} and {loaded[scenario.scene_id][0].path}: both have the scene id {scenario.scene_id!r}",
+                "give one of them another id, or name it once",
+            )
         note = background_note(scenario)
         loaded[scenario.scene_id] = (
             ref,
@@ -276,12 +273,11 @@ def part_of(plan: RunPlan, cells: Sequence[Cell]) -> RunPlan:
     )
 
 
-def refuse_commands(policies: Sequence[str], doing: str, where: str) -> None:
+def refuse_commands(policies: Sequence[str], where: str) -> None:
     """Refuse policies that a file names as commands: only what a user types is run.
 
     Args:
         policies: Names that were read from a run folder.
-        doing: The attempted action, for the error.
         where: The run folder, or its file.
 
     Raises:
@@ -289,12 +285,9 @@ def refuse_commands(policies: Sequence[str], doing: str, where: str) -> None:
     """
     for name in policies:
         if name.startswith(COMMAND):
-            do_this = "give simrun run the same command again: it drives what is missing or damaged"
             raise InputError(
-                doing,
-                where,
-                f"its policy is a command, {name}; no command is run because a file names it",
-                do_this,
+                f"{where}: its policy is a command, {name}; no command is run because a file names it",
+                "give simrun run the same command again: it drives what is missing or damaged",
             )
 
 

@@ -114,11 +114,8 @@ class _MultiRenderer(Renderer):
             (name for name, renderer in renderers.items() if renderer.block != self.block), None
         )
         if other is not None:
-            found = f"{other!r} renders {renderers[other].block or 'frames one by one'}, {driver!r} {self.block or 'frames one by one'}"
             raise InputError(
-                DOING,
-                f"--renderers {','.join(renderers)}",
-                found,
+                f"--renderers {','.join(renderers)}: {other!r} renders {renderers[other].block or 'frames one by one'}, {driver!r} {self.block or 'frames one by one'}",
                 "choose the mode 'speculative' for both",
             )
         self.lookahead = max(renderer.lookahead for renderer in renderers.values())
@@ -185,9 +182,7 @@ def probe_rollout(past: LoggedRollout, renderers: Sequence[str]) -> Probe:
     """
     if len(set(renderers)) < 2 or len(set(renderers)) < len(renderers):
         raise InputError(
-            DOING,
-            f"--renderers {','.join(renderers)}",
-            "fewer than two, or one of them twice",
+            f"--renderers {','.join(renderers)}: fewer than two, or one of them twice",
             "name two renderers",
         )
     queries = replay(past, renderers, must_see=True)
@@ -203,7 +198,7 @@ def replay(
     Raises:
         As `probe_rollout`.
     """
-    past.check_repeatable(DOING)
+    past.check_repeatable()
     own, threads = past.cell, thread_budget(1, 1).per_worker
     specs = {own.renderer.name: own.renderer} | {
         name: resolve_renderer(name, past.options.fixer)
@@ -218,9 +213,7 @@ def replay(
     policy = _MultiPolicy({name: p.policy for name, p in parts.items()}, renderer)
     if must_see and not policy.sensors:
         raise InputError(
-            DOING,
-            past.name,
-            f"the policy {own.policy.name!r} has no camera",
+            f"{past.name}: the policy {own.policy.name!r} has no camera",
             "probe a rollout of a policy with cameras",
         )
     with temporary_folder("simrun-probe-") as folder:
@@ -241,9 +234,7 @@ def replay(
     )
     if difference is not None:
         raise InfrastructureError(
-            DOING,
-            past.name,
-            f"its replay differs from the log: {difference}",
+            f"{past.name}: its replay differs from the log: {difference}",
             "use the machine and the versions in run.json, or run the rollout again",
         )
     return tuple(policy.queries)

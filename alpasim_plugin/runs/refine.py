@@ -32,7 +32,6 @@ DOING = "refining a video"
 CAMERA = "video"
 SAME_RATE = 5e-4  # relative; 29.97 and 30 differ by twice that
 PERIOD = Fraction(1, 10)  # seconds from picture to picture: they have no times of their own
-WRITING = "writing a folder of pictures"
 GREY_LEVELS = 40  # channels of an opacity video may differ by this much, because of compression
 
 
@@ -41,15 +40,14 @@ class PictureFolderReader:
 
     Args:
         path: The folder.
-        doing: For messages.
 
     Raises:
         InputError: No such folder, no picture in it, a picture that cannot be read or is not of 8
             bits, or a changing size.
     """
 
-    def __init__(self, path: Path | str, doing: str = "reading a folder of pictures") -> None:
-        self.path, self._doing = Path(path), doing
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
         self.names = tuple(sorted(file.name for file in self.path.glob("*.png")))
         if not self.names:
             raise self._refusal(
@@ -99,7 +97,7 @@ class PictureFolderReader:
         return np.asarray(cv2.cvtColor(image, kind), dtype=np.uint8)
 
     def _refusal(self, found: str, do: str) -> InputError:
-        return InputError(self._doing, str(self.path), found, do)
+        return InputError(f"{self.path}: {found}", do)
 
 
 class PictureFolderWriter:
@@ -117,7 +115,7 @@ class PictureFolderWriter:
 
     def __init__(self, path: Path | str, names: tuple[str, ...] | None = None) -> None:
         self.path, self.count, self._names = Path(path), 0, names
-        self._folder: AbstractContextManager[Path] = atomic_folder(self.path, WRITING)
+        self._folder: AbstractContextManager[Path] = atomic_folder(self.path)
         self._partial = self._folder.__enter__()
 
     def __enter__(self) -> Self:
@@ -130,7 +128,7 @@ class PictureFolderWriter:
         trace: TracebackType | None,
     ) -> None:
         if error is None and not self.count:
-            error = InputError(WRITING, str(self.path), "no frames", "give at least one frame")
+            error = InputError(f"{self.path}: no frames", "give at least one frame")
             self._folder.__exit__(type(error), error, None)
             raise error
         self._folder.__exit__(kind, error, trace)
@@ -142,7 +140,7 @@ class PictureFolderWriter:
         done, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
         if not done:
             raise InfrastructureError(
-                WRITING, f"{self.path}/{name}", "the encoder refused", "check the picture's size"
+                f"{self.path}/{name}: the encoder refused", "check the picture's size"
             )
         write_bytes(self._partial / name, png.tobytes())
         self.count += 1
@@ -250,9 +248,7 @@ def refine_video(
     with ExitStack() as stack:
         readers: dict[str, Reader] = {}
         for role, path in files.inputs.items():
-            readers[role] = (
-                PictureFolderReader(path, DOING) if path.is_dir() else VideoReader(path, DOING)
-            )
+            readers[role] = PictureFolderReader(path) if path.is_dir() else VideoReader(path)
             stack.enter_context(readers[role])
         check_formats(readers)
         source = readers["input"].format
@@ -310,29 +306,25 @@ def check_names(files: RefineFiles) -> None:
         taken = resolved.get(path.resolve())
         if taken is not None:
             raise InputError(
-                DOING,
-                str(path),
-                f"the {role} would be written over the {taken}",
+                f"{path}: the {role} would be written over the {taken}",
                 "give the result a name of its own",
             )
         resolved[path.resolve()] = role
         if not path.parent.is_dir():
-            raise InputError(DOING, str(path), f"no folder {path.parent}", "make it first")
+            raise InputError(f"{path}: no folder {path.parent}", "make it first")
         if path.suffix.lower() not in ("", ".mp4"):
-            do = "results are MP4 files or folders of PNG: name it .mp4, or without a suffix"
-            raise InputError(DOING, str(path), f"suffix {path.suffix!r} of the {role}", do)
+            raise InputError(
+                f"{path}: suffix {path.suffix!r} of the {role}",
+                "results are MP4 files or folders of PNG: name it .mp4, or without a suffix",
+            )
         if path.is_dir() and (path.suffix or any(file.suffix != ".png" for file in path.iterdir())):
             raise InputError(
-                DOING,
-                str(path),
-                f"the {role} is a folder with other things than pictures",
+                f"{path}: the {role} is a folder with other things than pictures",
                 "name a new folder or file",
             )
         if path.exists() and not files.overwrite:
             raise InputError(
-                DOING,
-                str(path),
-                f"the {role} exists already",
+                f"{path}: the {role} exists already",
                 "choose another name, or pass --overwrite",
             )
 
@@ -363,21 +355,25 @@ def check_formats(readers: Mapping[str, Reader]) -> None:
     for role, reader in readers.items():
         mine = reader.format
         if type(reader) is not type(readers["input"]):
-            found = f"the {role} is a {_form(reader)}, the input a {_form(readers['input'])}"
             raise InputError(
-                DOING, str(reader.path), found, "give both as videos, or both as folders of PNG"
+                f"{reader.path}: the {role} is a {_form(reader)}, the input a {_form(readers['input'])}",
+                "give both as videos, or both as folders of PNG",
             )
         if (mine.width, mine.height) != (source.width, source.height):
-            found = f"the {role} is {mine.width}x{mine.height}, the input {source.width}x{source.height}"
-            raise InputError(DOING, str(reader.path), found, "give both at one size")
+            raise InputError(
+                f"{reader.path}: the {role} is {mine.width}x{mine.height}, the input {source.width}x{source.height}",
+                "give both at one size",
+            )
         if mine.frames and source.frames and mine.frames != source.frames:
             raise _lengths_differ(
                 role, reader.path, f"{mine.frames} frames, the input {source.frames}"
             )
         several = (source.frames or 2) > 1  # a single frame has no rate
         if several and mine.rate and source.rate and abs(mine.rate / source.rate - 1) > SAME_RATE:
-            found = f"the {role} has {float(mine.rate):.3f} frames per second, the input {float(source.rate):.3f}"
-            raise InputError(DOING, str(reader.path), found, "give both at one frame rate")
+            raise InputError(
+                f"{reader.path}: the {role} has {float(mine.rate):.3f} frames per second, the input {float(source.rate):.3f}",
+                "give both at one frame rate",
+            )
 
 
 def _form(reader: Reader) -> str:
@@ -427,11 +423,8 @@ def _check_times(
     rate = readers["input"].format.rate
     for role, time_s in times_s.items():
         if rate and abs(time_s - times_s["input"]) > 1 / (2 * rate):
-            found = f"frame {index} of the {role} comes {float(time_s):.3f} s after its first, the input's {float(times_s['input']):.3f} s"
             raise InputError(
-                DOING,
-                str(readers[role].path),
-                found,
+                f"{readers[role].path}: frame {index} of the {role} comes {float(time_s):.3f} s after its first, the input's {float(times_s['input']):.3f} s",
                 "give videos of the same frames at the same times",
             )
 
@@ -439,12 +432,12 @@ def _check_times(
 def _alpha(image: U8, index: int, path: Path) -> F32:
     sample = image[::8, ::8].astype(np.int16)
     if int((sample.max(axis=2) - sample.min(axis=2)).max()) > GREY_LEVELS:
-        do = "give the accumulated opacity as a grey video, white where the input is reliable"
-        raise InputError(DOING, str(path), f"frame {index} of the opacity is coloured", do)
+        raise InputError(
+            f"{path}: frame {index} of the opacity is coloured",
+            "give the accumulated opacity as a grey video, white where the input is reliable",
+        )
     return image[..., 1].astype(np.float32) / np.float32(255)
 
 
 def _lengths_differ(role: str, path: Path, counts: str) -> InputError:
-    return InputError(
-        DOING, str(path), f"the {role} has {counts}", "give videos of the same frames"
-    )
+    return InputError(f"{path}: the {role} has {counts}", "give videos of the same frames")

@@ -18,7 +18,7 @@ from alpasim_plugin.log.run_folder.check import (
     prepare_reading,
     restore_run,
 )
-from alpasim_plugin.log.run_folder.schema import DOING, REPORTS, RUN_INFO
+from alpasim_plugin.log.run_folder.schema import REPORTS, RUN_INFO
 from alpasim_plugin.log.run_folder.writer import writing
 
 if (
@@ -43,9 +43,7 @@ def remake_tables(found: Inspection) -> None:
     manifests, more = restore_run(found)
     from alpasim_plugin.runs.run import finish_run
 
-    with parsing(
-        DOING, found.root, "make the run again", "manifests from which no table can be made"
-    ):
+    with parsing(found.root, "make the run again", "manifests from which no table can be made"):
         finish_run(found.root, manifests, more, (found.root / REPORTS[0]).exists())
 
 
@@ -79,16 +77,14 @@ def repair_run(
         }
         what = kinds[found.info["kind"]]
         raise InputError(
-            "repairing a run",
-            str(found.root),
-            f"{found.damage[0]}; {what}",
+            f"{found.root}: {found.damage[0]}; {what}",
             f"give the command again: {command_of(found)}",
         )
     plan = plan_of_run(found.info)
     if plan.content != found.info.get("content"):
-        now = "the scenario, a part or the version has changed since the run: new rollouts would not be comparable with the old ones"
         raise InputError(
-            "repairing a run", str(found.root), now, f"run everything again: {command_of(found)}"
+            f"{found.root}: the scenario, a part or the version has changed since the run: new rollouts would not be comparable with the old ones",
+            f"run everything again: {command_of(found)}",
         )
     before = found.info.get("determinism") or {}
     certificate: Certify = (
@@ -122,12 +118,10 @@ def plan_of_run(info: Mapping[str, Any]) -> RunPlan:
         ref = scene.get("ref")
         if not isinstance(ref, dict) or not isinstance(ref.get("path"), str):
             raise InputError(
-                "repairing a run",
-                RUN_INFO,
-                f"it has no path of the scenario {name}",
+                f"{RUN_INFO}: it has no path of the scenario {name}",
                 "give the command of the run again",
             )
         refs.append(ref_of(ref))
-    refuse_commands(info["policies"], "repairing a run", RUN_INFO)
+    refuse_commands(info["policies"], RUN_INFO)
     plan = make_plan(refs, info["renderers"], info["policies"], info["seeds"], options_of(info))
     return replace(plan, asked=tuple(info.get("asked") or ()))

@@ -123,7 +123,7 @@ def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
             for name, r in zip(flip.sides, (flip.base, flip.other), strict=True)
         }
     except SimrunError as error:
-        return {"t_us": None, "reason": f"a log could not be read: {error.found}"}
+        return {"t_us": None, "reason": f"a log could not be read: {error.message}"}
     one, other = logs.values()
     if not one.plans or not other.plans:
         return {"t_us": None, "reason": "a log without plans"}

@@ -262,9 +262,10 @@ def _finished_already(plan: RunPlan, root: Path) -> RunResult:
     ):
         problems.append("its tables are missing or those of another run")
     if problems:
-        found = f"it is read-only, and {' and '.join(problems)}"
-        do_this = "name another --out, or copy the folder to where it can be written"
-        raise InfrastructureError("starting a run", f"folder {root}", found, do_this)
+        raise InfrastructureError(
+            f"folder {root}: it is read-only, and {' and '.join(problems)}",
+            "name another --out, or copy the folder to where it can be written",
+        )
     summary = read_json(root / SUMMARY)
     return RunResult(root, summary, len(plan.cells), summary["failures"]["n_failed"])
 
@@ -287,9 +288,7 @@ def claim(
     held, lost = _held(root, contents, noticed)
     if held and held.get("key") != plan.command_key and not resume:
         raise InputError(
-            "starting a run",
-            f"folder {root}",
-            f"it holds another run (key {held.get('key')}; this command has {plan.command_key})",
+            f"folder {root}: it holds another run (key {held.get('key')}; this command has {plan.command_key})",
             "choose another --out, or pass --resume to reuse its matching rollouts and replace its tables",
         )
     damage = [] if contents is None else damaged_files(root, contents)
@@ -317,7 +316,7 @@ def _held(
     try:
         return read_run_json(root), False
     except InputError as error:
-        noticed(f"damaged: {RUN_INFO}: {error.found}; writing it again")
+        noticed(f"damaged: {RUN_INFO}: {error.message}; writing it again")
         return {} if contents is None else dict(contents.run), True
 
 

@@ -66,9 +66,7 @@ def find_logs(items: Sequence[str]) -> list[Path]:
                 "a folder without .asl logs" if path.is_dir() else "no such file, folder or match"
             )
             raise InputError(
-                "finding logs",
-                item,
-                what,
+                f"{item}: {what}",
                 "give rollout.asl files, folders that hold them, or a pattern in quotes",
             )
         for log in paths:
@@ -186,7 +184,7 @@ def check_vouched(log: Path) -> None:
         facts = read_manifest(log.parent)[0]["files"].get(LOG_NAME)
         problem = None if facts is None else problem_of(log, facts, full=True)
     except InputError as error:
-        problem = f"its {MANIFEST} is damaged: {error.found}"
+        problem = f"its {MANIFEST} is damaged: {error.message}"
     if problem is not None:
         run = next(
             (folder for folder in log.resolve().parents if (folder / RUN_INFO).exists()), None
@@ -194,7 +192,7 @@ def check_vouched(log: Path) -> None:
         do_this = (
             "run the rollout again" if run is None else f"simrun check {run} --repair runs it again"
         )
-        raise InputError("reading a rollout log", str(log), problem, do_this)
+        raise InputError(f"{log}: {problem}", do_this)
 
 
 def check_complete(log: Path, rollout: RolloutLog) -> None:
@@ -215,9 +213,7 @@ def check_complete(log: Path, rollout: RolloutLog) -> None:
     if done < steps and not _ends_with_the_path(rollout):
         cut = f"; {rollout.warnings[0]}" if rollout.warnings else ""
         raise InfrastructureError(
-            "scoring a log",
-            str(log),
-            f"the rollout ended after {done} of {steps} control steps{cut}",
+            f"{log}: the rollout ended after {done} of {steps} control steps{cut}",
             "run this rollout again",
         )
 
@@ -248,7 +244,7 @@ def run_names(log: Path) -> tuple[str | None, str | None]:
     for folder in list(log.resolve().parents)[:5]:
         path = folder / "run_metadata.yaml"
         if path.is_file():
-            data = load_yaml(path, "reading the names of a run").data
+            data = load_yaml(path).data
             uuid, name = (
                 data.get(key) if isinstance(data, dict) else None
                 for key in ("run_uuid", "run_name")
@@ -296,7 +292,6 @@ def exit_code(
     return 4 if classes and not failures_allowed else 0
 
 
-FINDING = "finding the scene of a log"
 _SEEDED = re.compile(
     r"(?P<own>.+)-seed(?P<seed>\d+)"
 )  # a seed other than the file's is part of the id
@@ -343,9 +338,7 @@ class KnownScenes:
         if scene_id not in self._read:
             known = sorted({*self._archives, *self._read})
             raise InputError(
-                FINDING,
-                f"scene {scene_id!r}",
-                f"not among the {len(known)} scenes of {', '.join(self.places)}: {', '.join(known[:5])}",
+                f"scene {scene_id!r}: not among the {len(known)} scenes of {', '.join(self.places)}: {', '.join(known[:5])}",
                 "name the log's scene with --scene, or a folder that holds it",
             )
         return self._read[scene_id]
@@ -373,9 +366,7 @@ class KnownScenes:
         before = self._archives.get(scene_id)
         if before is not None and before.resolve() != path.resolve():
             raise InputError(
-                FINDING,
-                f"{before} and {path}",
-                f"both have the id {scene_id!r}",
+                f"{before} and {path}: both have the id {scene_id!r}",
                 "remove one of them",
             )
         self._archives[scene_id] = path
@@ -438,9 +429,7 @@ def scenario_finder(places: Sequence[str]) -> Callable[[str], Scenario]:
         if scene_id not in found:
             shown = ", ".join(sorted(found)[:5])
             raise InputError(
-                FINDING,
-                f"scene {scene_id!r}",
-                f"not among the {len(found)} scenes given: {shown}",
+                f"scene {scene_id!r}: not among the {len(found)} scenes given: {shown}",
                 "name it with --scenes",
             )
         return found[scene_id]

@@ -14,7 +14,7 @@ import numpy as np
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.log.run_folder.columns import AGAIN, DOING, RolloutTable
+from alpasim_plugin.log.run_folder.columns import AGAIN, RolloutTable
 from alpasim_plugin.log.run_folder.manifests import damaged_files, find_contents, read_run_json
 from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS, ROLLOUTS_TABLE, SUMMARY
 from alpasim_plugin.log.run_folder.writer import write_tables
@@ -211,14 +211,14 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[st
         if run.resolve() in {other.resolve() for other in runs[:i]}
     ]
     if twice:
-        raise InputError(DOING, str(twice[0]), "named twice", "name every run once")
+        raise InputError(f"{twice[0]}: named twice", "name every run once")
     infos = {run: _info_of(run) for run in runs}
     _check_alike(infos)
     first = next(iter(infos.values()))
     table = RolloutTable.of_files([run / ROLLOUTS for run in runs])
     arms = arms_of((name, policy) for policy in table.policies for name in table.sides(policy))
     if baseline is not None:
-        base_named(baseline, arms, DOING, "the runs together")
+        base_named(baseline, arms, "the runs together")
     known = _joined(infos, table.metrics)
     bases = {
         name: base for info in infos.values() for name, base in (info.get("bases") or {}).items()
@@ -245,7 +245,7 @@ def _joined(infos: Mapping[Path, Mapping[str, Any]], metrics: Sequence[str]) -> 
     first, *others = infos.items()
     known = MetricTable.of_run(first[1])
     for run, info in others:
-        known = known.joined(MetricTable.of_run(info), metrics, DOING, f"{first[0]} and {run}")
+        known = known.joined(MetricTable.of_run(info), metrics, f"{first[0]} and {run}")
     return known
 
 
@@ -264,9 +264,9 @@ def _info_of(run: Path) -> dict[str, Any]:
     )
     if contents is None or damaged is not None:
         raise InputError(
-            DOING, str(run), "the run is not finished" if damaged is None else str(damaged), AGAIN
+            f"{run}: {'the run is not finished' if damaged is None else str(damaged)}", AGAIN
         )
-    ROLLOUTS_TABLE.check(run / ROLLOUTS, DOING, AGAIN, MetricTable.of_run(info).rates)
+    ROLLOUTS_TABLE.check(run / ROLLOUTS, AGAIN, MetricTable.of_run(info).rates)
     return info
 
 
@@ -280,11 +280,8 @@ def _check_alike(infos: Mapping[Path, Mapping[str, Any]]) -> None:
     first, kind = next((run, info["preset"]) for run, info in infos.items())
     for run, info in infos.items():
         if info["preset"] != kind:
-            found = f"presets {kind!r} and {info['preset']!r}"
             raise InputError(
-                DOING,
-                f"{first} and {run}",
-                found,
+                f"{first} and {run}: presets {kind!r} and {info['preset']!r}",
                 "give the command of one run again with --preset",
             )
         for scene, facts in info["scenes"].items():
@@ -292,8 +289,6 @@ def _check_alike(infos: Mapping[Path, Mapping[str, Any]]) -> None:
             other, where = seen.setdefault(scene, (content, run))
             if other != content:
                 raise InputError(
-                    DOING,
-                    f"{where} and {run}",
-                    f"scene {scene} with another content",
+                    f"{where} and {run}: scene {scene} with another content",
                     "aggregate runs of the same scene files",
                 )

@@ -188,13 +188,13 @@ def trials(camera_x_m: float) -> Iterator[Trial]:
     ):
         what = f"its plan has the wrong unit ({unit}): it goes {1 / factor:.2g} times as far as it should"
         yield Trial(
-            f"plan scaled by {factor:.3g}", what, answer=moved(lambda p, a, _, k=factor: (p * k, a))
-        )  # type: ignore[misc]
+            f"plan scaled by {factor:.3g}", what, answer=moved(lambda p, a, _, k=factor: (p * k, a))  # type: ignore[misc]
+        )
     for factor in (0.5, 2.0):
         what = f"the time step of its plan is wrong: poses come after {1 / factor:g} times as long as they should"
         yield Trial(
-            f"plan in {factor:g} times the time", what, answer=lambda p, _, k=factor: later(p, k)
-        )  # type: ignore[misc]
+            f"plan in {factor:g} times the time", what, answer=lambda p, _, k=factor: later(p, k)  # type: ignore[misc]
+        )
     world = moved(lambda p, a, o: _turned(p, a, -yaw_of(o.ego.T_world_rig)))
     yield Trial(
         "plan turned into the rig", "its plan has the world's axes, not the rig's", answer=world
@@ -434,8 +434,8 @@ def investigate(
     depends = tuple(
         found
         for what, see in INPUTS
-        if (found := _dependence(what, lambda see=see: with_change(see), given))
-    )  # type: ignore[misc]
+        if (found := _dependence(what, lambda see=see: with_change(see), given))  # type: ignore[misc]
+    )
     pulses = tuple(_pulses(make, given, observations, **reset)) if observations[0].frames else ()
     mount_x_m = max(
         (float(c.T_rig_camera[0, 3]) for c in observations[0].cameras.values()), default=0.0
@@ -449,7 +449,7 @@ def investigate(
         try:
             plans = plans_over(Changed(make(), trial), observations, **reset)
         except PolicyError as error:
-            tried.append(Tried(trial, None, error.found))
+            tried.append(Tried(trial, None, error.message))
             continue
         moved_m = float(apart_m(given, plans).max())
         tried.append(Tried(trial, error_m(plans, observations, recorded), moved_m=moved_m))

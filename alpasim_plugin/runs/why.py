@@ -91,7 +91,7 @@ def explain(past: LoggedRollout, run: Run, say: Say) -> Cause:
     except InputError as error:
         if not others:
             raise
-        notes.append(f"Other renderers cannot be shown at the same poses: {error.found}.")
+        notes.append(f"Other renderers cannot be shown at the same poses: {error.message}.")
         queries = replay(past)
     failed_us = failed_at(past.manifest)
     until = [one for one in queries if failed_us is None or one.t_us <= failed_us]
@@ -216,7 +216,7 @@ def _drive(past: LoggedRollout, tried: Tried, say: Say) -> Driven:
             lambda _: past.scenario,
         )
     if manifest["status"] != "ok":
-        return Driven(tried.trial, f"failed: {manifest['error']['found']}", False)
+        return Driven(tried.trial, f"failed: {manifest['error']['message']}", False)
     outcomes, aside = _outcomes(manifest), manifest["metrics"].get("lateral_distance_m") or {}
     return Driven(
         tried.trial,

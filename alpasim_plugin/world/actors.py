@@ -102,9 +102,7 @@ class Actors:
         """
         if self.t_us is not None and t_us <= self.t_us:
             raise InputError(
-                "moving the actors",
-                f"t = {t_us} us",
-                f"the last time was {self.t_us} us",
+                f"t = {t_us} us: the last time was {self.t_us} us",
                 "step forwards, or reset first",
             )
         poses = self.replay.at(t_us, self.replay.cursor)

@@ -44,11 +44,8 @@ def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> H
             if len(xyz) == 0
             else f"{int((~np.isfinite(xyz)).any(axis=1).sum())} points that are not finite"
         )
-        with_what = f"{len(xyz)} points, cell {cell_m} m"
         raise InputError(
-            "fitting a ground height field",
-            with_what,
-            bad,
+            f"{len(xyz)} points, cell {cell_m} m: {bad}",
             "give finite ground points and a cell > 0",
         )
     if drive is not None:
@@ -61,12 +58,8 @@ def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> H
     low = np.floor(xyz[:, :2].min(axis=0) / cell_m) * cell_m
     nx, ny = (int(n) + 2 for n in np.floor((xyz[:, :2].max(axis=0) - low) / cell_m))
     if nx * ny > MAX_NODES:
-        found = f"a grid of {nx} x {ny} nodes, more than {MAX_NODES}"
-        with_what = f"{len(xyz)} points, cell {cell_m} m"
         raise InputError(
-            "fitting a ground height field",
-            with_what,
-            found,
+            f"{len(xyz)} points, cell {cell_m} m: a grid of {nx} x {ny} nodes, more than {MAX_NODES}",
             "check the extent, or use a larger cell",
         )
     means = _cell_means(xyz, low, cell_m, nx)

@@ -45,9 +45,7 @@ class IdmParams:
             if key not in known or not value > 0:
                 found = f"{value} is not positive" if key in known else "no such parameter"
                 raise InputError(
-                    "reading a driver's behaviour",
-                    f"idm parameter {key!r}",
-                    found,
+                    f"idm parameter {key!r}: {found}",
                     f"use positive {', '.join(known)}",
                 )
         return IdmParams(**{k: float(v) for k, v in params.items()})

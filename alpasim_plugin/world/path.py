@@ -54,9 +54,7 @@ def sample_clothoid(
     """
     if not (length_m > 0 and step_m > 0):
         raise InputError(
-            "sampling a clothoid",
-            f"length {length_m} m, step {step_m} m",
-            "not positive",
+            f"length {length_m} m, step {step_m} m: not positive",
             "give lengths > 0",
         )
     n = max(1, int(np.ceil(length_m / step_m - 1e-9)))
@@ -255,7 +253,7 @@ def nearest(xy: F64, stations: F64) -> I64:
     return np.asarray(np.take_along_axis(around, best[:, None], axis=1)[:, 0])
 
 
-def polyline_path(xyz: F64, doing: str = "building a path") -> Path:
+def polyline_path(xyz: F64) -> Path:
     """Build a path from a polyline ``(N, 2 or 3)``; repeated points are dropped.
 
     Raises:
@@ -269,9 +267,7 @@ def polyline_path(xyz: F64, doing: str = "building a path") -> Path:
     ]
     if len(line) < 2:
         raise InputError(
-            doing,
-            f"a line of {len(xyz)} points",
-            "fewer than two distinct points",
+            f"a line of {len(xyz)} points: fewer than two distinct points",
             "give a longer line",
         )
     s = arc_lengths(line)

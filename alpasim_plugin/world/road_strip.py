@@ -301,10 +301,7 @@ def _check_width(name: str, curve: F64, profile: Profile) -> None:
     )
     if tight > 0.9:
         raise InputError(
-            "building a road",
-            name,
-            f"curvature {float(np.max(np.abs(curve[:, 3]))):.4f} per m on a road {profile.left_extent_m():.1f} m wide to the left "
-            f"and {profile.right_extent_m():.1f} m to the right: its inner edge would fold",
+            f"{name}: curvature {float(np.max(np.abs(curve[:, 3]))):.4f} per m on a road {profile.left_extent_m():.1f} m wide to the left and {profile.right_extent_m():.1f} m to the right: its inner edge would fold",
             "use a smaller curvature or fewer or narrower lanes",
         )
 

@@ -84,9 +84,7 @@ def build_intersection(
     """
     if element.turn not in element.arms:
         raise InputError(
-            "building an intersection",
-            name,
-            f"turn: {element.turn}, but the arms are {', '.join(element.arms)}",
+            f"{name}: turn: {element.turn}, but the arms are {', '.join(element.arms)}",
             "add that arm",
         )
     side = replace(
@@ -339,9 +337,7 @@ def build_road(
     """
     if not elements or not isinstance(elements[0], Curve):
         raise InputError(
-            "building a road",
-            f"{len(elements)} elements",
-            "the first is not a straight, arc or clothoid",
+            f"{len(elements)} elements: the first is not a straight, arc or clothoid",
             "start with one",
         )
     draft = MapDraft()
@@ -357,9 +353,7 @@ def build_road(
             stretches.append(_grow_intersection(draft, name, tip, element))
     if tip.junction is not None:
         raise InputError(
-            "building a road",
-            f"element {len(elements) - 1}",
-            "an intersection ends the road",
+            f"element {len(elements) - 1}: an intersection ends the road",
             "add a straight after it",
         )
     return Road(draft.finish(), tuple(stretches))
@@ -387,11 +381,7 @@ def _grow_taper(
     narrow = replace(tip.profile, forward=before - 1 if element.kind == "merge" else before)
     if narrow.forward < 1 or tip.junction is not None:
         raise InputError(
-            "building a road",
-            f"{name} ({element.kind})",
-            f"{before} forward lanes before it"
-            if narrow.forward < 1
-            else "follows an intersection",
+            f"{name} ({element.kind}): {f'{before} forward lanes before it' if narrow.forward < 1 else 'follows an intersection'}",
             "a merge needs two forward lanes and a straight, arc or clothoid before it",
         )
     curve = sample_clothoid(tip.pose, element.length_m, 0.0, 0.0, step_m)
@@ -414,9 +404,7 @@ def _grow_taper(
 def _grow_intersection(draft: MapDraft, name: str, tip: _Tip, element: Intersection) -> Stretch:
     if tip.joint is None or tip.junction is not None or tip.strip is None:
         raise InputError(
-            "building a road",
-            name,
-            "two intersections without a road between them",
+            f"{name}: two intersections without a road between them",
             "put a straight between them",
         )
     n = tip.profile.forward

@@ -95,9 +95,7 @@ class LaneIndex:
         """
         if not self._kd:
             raise InputError(
-                "finding the nearest lane",
-                "a lane map",
-                "it has no lanes",
+                "a lane map: it has no lanes",
                 "use a map with at least one lane",
             )
         distance, vertex = self._kd[len(point)].query(np.asarray(point, dtype=np.float64))
@@ -211,9 +209,7 @@ def route_from_log(
     """
     if len(ego_log) == 0 or not np.isfinite(ego_log.xyz).all():
         found = "no poses" if len(ego_log) == 0 else "positions that are not finite"
-        raise InputError(
-            "making a route", "the recorded drive", found, "use a log with at least one finite pose"
-        )
+        raise InputError(f"the recorded drive: {found}", "use a log with at least one finite pose")
     driven = _thin(ego_log.xyz)
     index = LaneIndex(lane_map)
     if len(driven) < 2:

@@ -72,9 +72,7 @@ def reduce_run(rollouts: Sequence[ScoredRollout], preset: Preset) -> list[Reduce
     names = {one.name: one.metric for rollout in rollouts for one in rollout.series}
     if rollouts and "img_is_black" not in names:
         raise EvaluatorError(
-            "aggregating as AlpaSim does",
-            f"{len(rollouts)} rollouts",
-            f"no image of camera {preset.image_camera!r} in any log",
+            f"{len(rollouts)} rollouts: no image of camera {preset.image_camera!r} in any log",
             "log that camera, or name another one in scorers.image.camera_logical_id",
         )
     return [_reduce(rollout, names, preset) for rollout in rollouts]
@@ -151,9 +149,7 @@ def _ranks(rollouts: Sequence[ReducedRollout]) -> list[int]:
         twice = next((name for name in own if own.count(name) > 1), None)
         if twice is not None:
             raise InputError(
-                "aggregating as AlpaSim does",
-                f"scene {scene!r}",
-                f"two rollouts named {twice!r}",
+                f"scene {scene!r}: two rollouts named {twice!r}",
                 "score the runs apart, or rename the folder of one log",
             )
         own.sort()
@@ -217,9 +213,7 @@ def scene_score(values: Mapping[str, float | None], settings: SceneScoreSettings
                 f"missing metric {name!r}" if name not in values else f"metric {name!r} is {value}"
             )
             raise EvaluatorError(
-                "computing the scene score",
-                f"metrics {', '.join(needed)}",
-                what,
+                f"metrics {', '.join(needed)}: {what}",
                 "give the scene a map with road edges, or set scene_score.enabled: false in --settings",
             )
         found[name] = float(value)

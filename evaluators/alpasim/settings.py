@@ -124,4 +124,4 @@ def load_settings(path: str | Path) -> EvalSettings:
         InputError: Missing or broken file, unknown key, or a value out of range, with line and
             column.
     """
-    return validate(EvalSettings, load_yaml(path, DOING), DOING)
+    return validate(EvalSettings, load_yaml(path))

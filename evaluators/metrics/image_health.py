@@ -28,7 +28,7 @@ def decode(image: LoggedImage) -> U8:
 
     where = f"camera {image.camera!r} at {image.end_us} us"
     return np.asarray(
-        decode_image(image.data, where, "decoding a logged image", "log PNG or JPEG"),
+        decode_image(image.data, where, "log PNG or JPEG"),
         dtype=np.uint8,
     )
 

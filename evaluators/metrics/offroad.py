@@ -175,9 +175,7 @@ def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[
 
 def _no_map(rollout: RolloutLog, preset: Preset, found: str) -> EvaluatorError:
     return EvaluatorError(
-        "scoring lane keeping",
-        f"scene {rollout.scene_id!r}, preset {preset.name!r}",
-        found,
+        f"scene {rollout.scene_id!r}, preset {preset.name!r}: {found}",
         "score with a scene that has a map, or with a preset that can do without (paper, alpasim)",
     )
 

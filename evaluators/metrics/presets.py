@@ -111,9 +111,7 @@ class Preset:
             self.contact == "between_steps" or self.offroad_rule == "margin"
         ):
             raise InputError(
-                "building an evaluator preset",
-                f"preset {self.name!r}",
-                f"roundness {self.roundness} together with contact {self.contact!r} and off-road rule {self.offroad_rule!r}",
+                f"preset {self.name!r}: roundness {self.roundness} together with contact {self.contact!r} and off-road rule {self.offroad_rule!r}",
                 "set roundness to 0: motion between steps and the off-road margin are worked out for sharp corners only",
             )
 
@@ -242,9 +240,7 @@ def preset(name: str | Preset) -> Preset:
         return name
     if name not in PRESETS:
         raise InputError(
-            "choosing an evaluator preset",
-            f"name {name!r}",
-            "no preset has that name",
+            f"name {name!r}: no preset has that name",
             f"known: {', '.join(PRESETS)}",
         )
     return PRESETS[name]

@@ -79,9 +79,9 @@ def score(
     for spec in specs:
         for one in run_evaluator(spec.name, build(spec, preset=chosen), rollout, scene, known):
             if one.name in out:
-                found = f"metric {one.name!r} was given twice"
                 raise EvaluatorError(
-                    "scoring a rollout", f"evaluator {spec.name!r}", found, "rename one of them"
+                    f"evaluator {spec.name!r}: metric {one.name!r} was given twice",
+                    "rename one of them",
                 )
             out[one.name] = one
     return list(out.values())
@@ -102,9 +102,7 @@ def run_evaluator(
         raise
     except Exception as exc:  # third-party code: the cause is chained, nothing is swallowed
         raise EvaluatorError(
-            "scoring a rollout",
-            f"evaluator {name!r}, scene {rollout.scene_id!r}",
-            f"{type(exc).__name__}: {exc}",
+            f"evaluator {name!r}, scene {rollout.scene_id!r}: {type(exc).__name__}: {exc}",
             "run with --debug for the traceback",
         ) from exc
     for one in answer:
@@ -112,10 +110,7 @@ def run_evaluator(
             one.reason == "" and not bool(np.all(one.valid))
         ):
             raise EvaluatorError(
-                "scoring a rollout",
-                f"evaluator {name!r}, metric {one.name!r}",
-                f"shapes {one.t_us.shape}, {one.value.shape}, {one.valid.shape}; "
-                f"{int(np.sum(~one.valid))} invalid steps, reason {one.reason!r}",
+                f"evaluator {name!r}, metric {one.name!r}: shapes {one.t_us.shape}, {one.value.shape}, {one.valid.shape}; {int(np.sum(~one.valid))} invalid steps, reason {one.reason!r}",
                 "give one time, value and validity per step, and a reason where any is invalid",
             )
     return answer
@@ -204,9 +199,7 @@ def _all_sound(tracks: Sequence[Trajectory]) -> bool:
 def _check_track(who: str, track: Trajectory, rollout: RolloutLog) -> None:
     def refuse(found: str) -> EvaluatorError:
         return EvaluatorError(
-            "checking a rollout log",
-            f"{who} in scene {rollout.scene_id!r}, session {rollout.session_uuid!r}",
-            found,
+            f"{who} in scene {rollout.scene_id!r}, session {rollout.session_uuid!r}: {found}",
             "repair or leave out this log",
         )
 
@@ -239,9 +232,7 @@ def _check_track(who: str, track: Trajectory, rollout: RolloutLog) -> None:
 def _check_size(who: str, length_m: float, width_m: float, rollout: RolloutLog) -> None:
     if not (np.isfinite([length_m, width_m]).all() and length_m > 0 and width_m > 0):
         raise EvaluatorError(
-            "checking a rollout log",
-            f"{who} in scene {rollout.scene_id!r}, session {rollout.session_uuid!r}",
-            f"a box of {length_m} x {width_m} m",
+            f"{who} in scene {rollout.scene_id!r}, session {rollout.session_uuid!r}: a box of {length_m} x {width_m} m",
             "give every box a positive length and width",
         )
 

@@ -75,13 +75,13 @@ class MetricTable(Mapping[str, MetricInfo]):
         if found.help:
             return found
         if self._is_read:
-            do = "give a folder that simrun wrote, or score its logs again"
             raise InputError(
-                "reading a run folder", f"metric {name!r}", "run.json does not say what it is", do
+                f"metric {name!r}: run.json does not say what it is",
+                "give a folder that simrun wrote, or score its logs again",
             )
-        do = "name it in the evaluator's `metrics`, or check the spelling"
         raise EvaluatorError(
-            "looking up a metric", f"name {name!r}", "no evaluator declares it", do
+            f"name {name!r}: no evaluator declares it",
+            "name it in the evaluator's `metrics`, or check the spelling",
         )
 
     def shown(self, name: str) -> MetricInfo:
@@ -139,15 +139,12 @@ class MetricTable(Mapping[str, MetricInfo]):
         """
         for name, facts in metrics.items():
             if self._metrics.get(name, replace(facts, name=name)) != replace(facts, name=name):
-                found = "it is declared already with other facts"
                 raise EvaluatorError(
-                    "declaring a metric", f"name {name!r}", found, "choose another name"
+                    f"name {name!r}: it is declared already with other facts", "choose another name"
                 )
             if facts.is_primary and name != self.primary:
                 raise EvaluatorError(
-                    "declaring a metric",
-                    f"name {name!r}",
-                    f"{self.primary!r} is primary",
+                    f"name {name!r}: {self.primary!r} is primary",
                     "leave is_primary out",
                 )
         return MetricTable({**self._metrics, **metrics})
@@ -181,7 +178,7 @@ class MetricTable(Mapping[str, MetricInfo]):
             stored[name] = MetricInfo(**known)
         return cls(METRICS._metrics | stored, is_read=True)
 
-    def joined(self, other: MetricTable, names: Iterable[str], doing: str, who: str) -> MetricTable:
+    def joined(self, other: MetricTable, names: Iterable[str], who: str) -> MetricTable:
         """Return the table of two runs that are set side by side: this one's metrics, and what only
         the other has.
 
@@ -200,11 +197,8 @@ class MetricTable(Mapping[str, MetricInfo]):
                     [getattr(table[name], key) for key in AGREE] for table in (self, other)
                 )
                 if here != there:
-                    found = f"unit, better side and reduction are {here} and {there}"
                     raise InputError(
-                        doing,
-                        f"{who}, metric {name!r}",
-                        found,
+                        f"{who}, metric {name!r}: unit, better side and reduction are {here} and {there}",
                         "choose runs of one version of the metric",
                     )
         return MetricTable({**other._metrics, **self._metrics})

@@ -54,7 +54,7 @@ def write_summary_md(run_dir: Path | str | Run) -> Path:
     path = run.folder / "summary.md"
     with reporting(run):
         text = summary_md(run)
-    write_text(path, cut(text), "writing a report")
+    write_text(path, cut(text))
     return path
 
 
@@ -196,7 +196,6 @@ def _write_xml(path: Path, root: ET.Element) -> Path:
     write_text(
         path,
         '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n",
-        "writing a report",
     )
     return path
 
@@ -354,7 +353,7 @@ def write_gate_files(
     text = gate_md(verdict, gate, str(run.folder), worst)
     folder.mkdir(parents=True, exist_ok=True)
     page = folder / "gate.md"
-    write_text(page, cut(text), "writing a report")
+    write_text(page, cut(text))
     tests = _write_xml(folder / "gate.junit.xml", gate_junit(verdict, gate, run))
     append_job_summary(text)
     if folder.resolve() != run.folder.resolve():
@@ -374,7 +373,7 @@ def append_job_summary(text: str) -> Path | None:
     before = before.rstrip("\n") + "\n\n" if before else ""
     room = MAX_BYTES - len(before.encode())
     if room > len(CUT_NOTE):
-        write_text(path, before + cut(text, room), "writing a report")
+        write_text(path, before + cut(text, room))
     return path
 
 

@@ -158,8 +158,8 @@ def inline_jpeg(path: Path) -> tuple[str, int, int] | None:
     readable picture.
     """
     try:
-        data = read_bytes(path, "reading a picture of a run", SOURCE_BYTES)
-        image = decode_image(data, path, "reading a picture of a run")
+        data = read_bytes(path, SOURCE_BYTES)
+        image = decode_image(data, path)
     except InputError:
         return None  # the report says that the picture is absent
     height, width = image.shape[:2]

@@ -28,7 +28,7 @@ from alpasim_plugin.core.reading import parsing, read_bytes
 from alpasim_plugin.core.reading.images import decode_image
 from alpasim_plugin.log.run_folder.reader import reporting
 from alpasim_plugin.log.run_folder.rows import Rollout, Series
-from alpasim_plugin.log.run_folder.schema import AGAIN, DOING, STRIP_NAME, WHY_NAME
+from alpasim_plugin.log.run_folder.schema import AGAIN, STRIP_NAME, WHY_NAME
 from evaluators.metrics.outcomes import OUTCOMES, first_failure, has_ended, in_words, outcomes_of
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
@@ -62,7 +62,6 @@ FLIP_BUDGET_BYTES = 2_000_000
 SHOTS = 3
 USUAL_FRAME = 2  # of a strip, where nothing happened
 SHOT_WIDTH_PX = 420
-DOING_SHOT = "reading a picture of a run"
 NO_REPLAYS: Mapping[FlipKey, str] = {}
 
 
@@ -83,7 +82,7 @@ def write_report(run_dir: Path | str | Run, replays: Mapping[FlipKey, str] = NO_
     path = run.folder / "report.html"
     with reporting(run):
         text = render_report(run, replays)
-    write_text(path, text, "writing a report")
+    write_text(path, text)
     return path
 
 
@@ -300,7 +299,7 @@ def scene_views(
         content = run.scene_data(scene)
         if content is None:
             continue
-        with parsing(DOING, run.scene_path(scene) or scene, AGAIN, "no scene that can be drawn"):
+        with parsing(run.scene_path(scene) or scene, AGAIN, "no scene that can be drawn"):
             view = scene_view(scene, content, rollouts, series, variant_of)
         if view is not None:
             drawn[scene] = view
@@ -404,7 +403,7 @@ def _shot(run: Run, rollout: Rollout) -> Shot | None:
     ):  # what led to it: after a contact the camera may be inside the other vehicle
         k = max((i for i, t_us in enumerate(times) if t_us <= int(first["t_us"])), default=0)
     try:
-        strip = decode_image(read_bytes(path, DOING_SHOT, SOURCE_BYTES), path, DOING_SHOT)
+        strip = decode_image(read_bytes(path, SOURCE_BYTES), path)
     except InputError:
         return None  # the report says elsewhere that the picture is absent
     width = strip.shape[1] // len(times)

@@ -213,14 +213,12 @@ def failure_rows(run: Run) -> tuple[list[FailureRow], int]:
     for rollout in failed[:MAX_FAILURE_ROWS]:
         error = errors.get(rollout.cell, {})
         parts = tuple(
-            (label, str(error[label]))
-            for label in ("doing", "with", "found", "do")
-            if error.get(label)
+            (label, str(error[label])) for label in ("message", "hint") if error.get(label)
         )
         rows.append(
             FailureRow(
                 rollout,
-                parts or (("found", rollout.failure or "no message was recorded"),),
+                parts or (("message", rollout.failure or "no message was recorded"),),
                 run.href(rollout),
             )
         )

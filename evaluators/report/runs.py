@@ -137,9 +137,7 @@ class RunEntry:
         """
         if self.state != "finished":
             return {}
-        summary: Mapping[str, Any] = read_json_as(
-            Summary, self.folder / SUMMARY, DOING, do_this=CHECK
-        )
+        summary: Mapping[str, Any] = read_json_as(Summary, self.folder / SUMMARY, do_this=CHECK)
         return summary
 
     def metric(self, metric: str, renderer: str, policy: str) -> Mapping[str, Any]:
@@ -201,7 +199,7 @@ def read_entry(folder: Path, with_summary: bool = False) -> RunEntry:
     try:
         info = _run_info(folder / RUN_INFO, is_copy=False)
     except InputError as error:
-        problem = f"{RUN_INFO}: {error.found}"
+        problem = f"{RUN_INFO}: {error.message}"
         with suppress(InputError):  # the copy may be damaged too
             info = _run_info(folder / CONTENTS, is_copy=True) if finished else info
     if problem or not finished:
@@ -216,14 +214,14 @@ def read_entry(folder: Path, with_summary: bool = False) -> RunEntry:
         if with_summary or "outcome" not in info:
             entry.summary  # noqa: B018 - read now, so that damage is a fact of the entry
     except InputError as error:
-        return RunEntry(folder, "damaged", f"{SUMMARY}: {error.found}", info)
+        return RunEntry(folder, "damaged", f"{SUMMARY}: {error.message}", info)
     return entry
 
 
 def _run_info(path: Path, is_copy: bool) -> Mapping[str, Any]:
-    content, _ = read_sealed(path, DOING, CHECK)
+    content, _ = read_sealed(path, CHECK)
     shaped: Mapping[str, Any] = as_shape(
-        RunInfo, (content.get("run") or {}) if is_copy else content, path, DOING, CHECK
+        RunInfo, (content.get("run") or {}) if is_copy else content, path, CHECK
     )
     return shaped
 
@@ -250,9 +248,7 @@ def find_runs(roots: Sequence[Path], with_summary: bool = False) -> list[RunEntr
         if not root.is_dir():
             what = "a file" if root.exists() else "no such folder"
             raise InputError(
-                DOING,
-                str(root),
-                what,
+                f"{root}: {what}",
                 "name the folder that holds the run folders; simrun run writes them below runs/",
             )
         for folder in _run_folders(root, set()):
@@ -322,9 +318,7 @@ class Choice:
         for one in (*self.commits, *self.weights):
             if len(one) < LEAST_DIGITS:
                 raise InputError(
-                    DOING,
-                    f"--commit or --weights {one!r}",
-                    "too short",
+                    f"--commit or --weights {one!r}: too short",
                     f"give at least {LEAST_DIGITS} characters",
                 )
 
@@ -394,9 +388,7 @@ def as_day(text: str, option: str, now: datetime) -> datetime:
         found = datetime.fromisoformat(text)
     except (ValueError, OverflowError):
         raise InputError(
-            DOING,
-            f"{option} {text}",
-            "neither a date nor an age",
+            f"{option} {text}: neither a date nor an age",
             "write 2026-03-01, 2026-03-01T18:00, 7d or 12h",
         ) from None
     return found if found.tzinfo is not None else found.replace(tzinfo=UTC)

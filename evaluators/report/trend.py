@@ -377,7 +377,7 @@ def _step(
     before: RunEntry, after: RunEntry, metric: str, renderer: str, policy: str, tables: _Tables
 ) -> Step:
     there, here = (tables.rows(one, renderer, policy) for one in (before, after))
-    known = after.table.joined(before.table, [metric], DOING, f"{before.folder} and {after.folder}")
+    known = after.table.joined(before.table, [metric], f"{before.folder} and {after.folder}")
     entry = compare(here, there, known.info(metric), before.folder.name, listed=0)
     return Step(before, after, entry, changes(before, after, renderer, policy))
 
@@ -412,9 +412,7 @@ class _Tables:
             metrics = [name for name in self._metrics if name in stated]
             columns = [*ROLLOUTS_TABLE.required, *(column.name for column in columns_of(metrics))]
             split: dict[tuple[str, str], list[Row]] = {}
-            for row in ROLLOUTS_TABLE.read(
-                entry.folder / ROLLOUTS, DOING, CHECK, columns
-            ).to_pylist():
+            for row in ROLLOUTS_TABLE.read(entry.folder / ROLLOUTS, CHECK, columns).to_pylist():
                 split.setdefault((row["renderer"], row["policy"]), []).append(row)
             self._read[id(entry)] = split
         return self._read[id(entry)]

@@ -75,7 +75,7 @@ def write_trend(found: Trend, roots: Sequence[Path], path: Path) -> None:
     Raises:
         InfrastructureError: The disk refuses.
     """
-    write_text(path, render_trend(found, roots, path.parent), DOING)
+    write_text(path, render_trend(found, roots, path.parent))
 
 
 def render_trend(found: Trend, roots: Sequence[Path], beside: Path) -> str:

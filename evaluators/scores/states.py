@@ -246,8 +246,8 @@ def savitzky_golay(values: F64, window: int, order: int, times: int = 0, step: f
 
 def _enough(values: F64, order: int) -> int:
     if len(values) <= order:
-        found = f"{len(values)} instants, a polynomial of order {order}"
         raise EvaluatorError(
-            "smoothing a drive", "a Savitzky-Golay filter", found, "score a log of more steps"
+            f"a Savitzky-Golay filter: {len(values)} instants, a polynomial of order {order}",
+            "score a log of more steps",
         )
     return len(values)

@@ -63,13 +63,11 @@ def compare_within(
     table = table_of_run(run)
     arms = arms_of((r, policy) for policy in table.policies for r in table.sides(policy))
     where, known = str(run.folder), table.renderers
-    base = None if baseline is None else base_named(baseline, arms, DOING, where)
+    base = None if baseline is None else base_named(baseline, arms, where)
     if len(arms) < 2:
         only = arms[0].name if arms else "none"
         raise InputError(
-            DOING,
-            where,
-            f"only one arm, {only}",
+            f"{where}: only one arm, {only}",
             "name a second run, or run two renderers or two policies",
         )
     if base is not None and base.policy is not None:
@@ -82,9 +80,7 @@ def compare_within(
     )
     if base is not None and by_renderer is None:
         raise InputError(
-            DOING,
-            where,
-            f"only one renderer, {known[0]}",
+            f"{where}: only one renderer, {known[0]}",
             f"choose one of {', '.join(choices(arms))}",
         )
     name = "" if by_renderer is None else by_renderer.renderer
@@ -126,13 +122,11 @@ def compare_runs(
     presets = [str(run.summary.get("preset")) for run in (first, second)]
     if presets[0] != presets[1]:
         raise InputError(
-            DOING,
-            both,
-            f"presets {presets[0]!r} and {presets[1]!r}",
+            f"{both}: presets {presets[0]!r} and {presets[1]!r}",
             "give the command of one run again with --preset",
         )
     check_scenes(
-        scene_hashes(first), scene_hashes(second), both, DOING, "run both on the same scene files"
+        scene_hashes(first), scene_hashes(second), both, "run both on the same scene files"
     )
     table, base = table_of_run(second), table_of_run(first)
     partner_of = {policy: policy for policy in table.policies if policy in base.policies}
@@ -140,8 +134,10 @@ def compare_runs(
     if not partner_of and not _names_policy(baseline, base):
         theirs, ours = base.policies, table.policies
         if len(theirs) != 1 or len(ours) != 1:
-            do = "compare runs of one policy each or of the same policies, or name one with --baseline RENDERER/POLICY"
-            raise InputError(DOING, f"policies {theirs} and {ours}", "none in common", do)
+            raise InputError(
+                f"policies {theirs} and {ours}: none in common",
+                "compare runs of one policy each or of the same policies, or name one with --baseline RENDERER/POLICY",
+            )
         partner_of, notes = (
             {ours[0]: theirs[0]},
             (f"policy {ours[0]} is compared with policy {theirs[0]}",),
@@ -150,20 +146,16 @@ def compare_runs(
     notes += weights_note(first, second)
     if baseline is not None:
         theirs_arms = arms_of((r, policy) for policy in base.policies for r in base.sides(policy))
-        named = base_named(baseline, theirs_arms, DOING, str(first.folder))
+        named = base_named(baseline, theirs_arms, str(first.folder))
         if named.policy is not None:
             mine = arms_of((r, policy) for policy in table.policies for r in table.sides(policy))
             chosen_arms = [(arm, named.of(arm)) for arm in mine if named.of(arm) in theirs_arms]
             if not chosen_arms:
                 raise InputError(
-                    DOING,
-                    f"baseline {baseline!r}",
-                    f"behind no renderer of {second.folder}",
+                    f"baseline {baseline!r}: behind no renderer of {second.folder}",
                     "name RENDERER/POLICY",
                 )
-            metrics = second.table.joined(
-                first.table, {*table.metrics} & {*base.metrics}, DOING, both
-            )
+            metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, both)
             pairs = paired_arms(
                 table, chosen_arms, metrics, base, margins, listed, f"{first.folder}: "
             )
@@ -173,13 +165,11 @@ def compare_runs(
     lone = [name for name, other in partner.items() if other is None]
     if lone:
         raise InputError(
-            DOING,
-            f"renderers {lone} of {second.folder}",
-            f"{first.folder} has {', '.join(there)}",
+            f"renderers {lone} of {second.folder}: {first.folder} has {', '.join(there)}",
             "name one by --baseline",
         )
     chosen = {name: other for name, other in partner.items() if other is not None}
-    metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, DOING, both)
+    metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, both)
     return Comparison(
         _pairs(table, base, chosen, f"{first.folder}: ", margins, metrics, listed, partner_of),
         notes,

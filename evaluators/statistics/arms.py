@@ -81,13 +81,12 @@ def arms_of(cells: Iterable[tuple[str, str]]) -> list[Arm]:
     return [Arm(*cell) for cell in dict.fromkeys(cells)]
 
 
-def base_named(text: str, arms: Sequence[Arm], doing: str, where: str) -> Base:
+def base_named(text: str, arms: Sequence[Arm], where: str) -> Base:
     """Return the base that a text names: RENDERER, POLICY or RENDERER/POLICY.
 
     Args:
         text: The name.
         arms: Those that there are.
-        doing: For the error.
         where: Who has the arms, for the error.
 
     Raises:
@@ -104,9 +103,7 @@ def base_named(text: str, arms: Sequence[Arm], doing: str, where: str) -> Base:
     found = next((arm for arm in arms if text == arm.name), None)
     if found is None:
         raise InputError(
-            doing,
-            f"baseline {text!r}",
-            f"{where} does not have it",
+            f"baseline {text!r}: {where} does not have it",
             f"choose one of {', '.join(choices(arms)) or 'none'}",
         )
     return Base(found.renderer, found.policy)
@@ -157,7 +154,7 @@ def axis_bases(arms: Sequence[Arm], baseline: str | None = None) -> tuple[Base |
     )
     named = Base()
     if baseline in {*renderers, *policies, *(arm.name for arm in arms)}:
-        named = base_named(str(baseline), arms, "", "")
+        named = base_named(str(baseline), arms, "")
     return (
         Base(renderer=named.renderer or renderers[0]) if len(renderers) > 1 else None,
         Base(policy=named.policy or policies[0]) if len(policies) > 1 else None,

@@ -143,12 +143,10 @@ def write_baseline(run: Run, path: Path) -> None:
             else "it holds no rollouts"
         )
         raise InputError(
-            "storing a baseline",
-            str(run.folder),
-            found,
+            f"{run.folder}: {found}",
             "store a run in which every rollout ran to its end",
         )
-    write_json(path, asdict(baseline_of(run)), "writing a report")
+    write_json(path, asdict(baseline_of(run)))
 
 
 def read_baseline(path: Path) -> Baseline:
@@ -159,21 +157,17 @@ def read_baseline(path: Path) -> Baseline:
     """
     if path.is_dir():
         return baseline_of(read_run(path))
-    content = read_json_object(
-        path, DOING, do_this="write one with simrun gate RUN --write-baseline FILE"
-    )
+    content = read_json_object(path, do_this="write one with simrun gate RUN --write-baseline FILE")
     names = set(Baseline.__dataclass_fields__)
     if set(content) != names or content["schema_version"] != SCHEMA_VERSION:
         raise InputError(
-            DOING,
-            str(path),
-            f"not a baseline of version {SCHEMA_VERSION}",
+            f"{path}: not a baseline of version {SCHEMA_VERSION}",
             "write it again with this version",
         )
     do = "restore the file or write it again"
-    as_shape(StoredBaseline, content, path, DOING, do)
+    as_shape(StoredBaseline, content, path, do)
     for i, row in enumerate(content["rows"]):
-        as_shape(BaselineRow, row, f"{path}, row {i}", DOING, do)
+        as_shape(BaselineRow, row, f"{path}, row {i}", do)
         odd = next(
             (
                 name
@@ -183,9 +177,7 @@ def read_baseline(path: Path) -> Baseline:
             None,
         )
         if odd is not None:
-            raise InputError(
-                DOING, f"{path}, row {i}", f"{odd}: {kind_of(row[odd])}, wanted a number", do
-            )
+            raise InputError(f"{path}, row {i}: {odd}: {kind_of(row[odd])}, wanted a number", do)
     return Baseline(**content)
 
 
@@ -224,21 +216,19 @@ def check_made_alike(
         InputError: As `check_matches`.
     """
     if baseline.preset != preset:
-        raise InputError(
-            DOING, str(path), f"preset {baseline.preset!r}, the run has {preset!r}", APPROVE
-        )
+        raise InputError(f"{path}: preset {baseline.preset!r}, the run has {preset!r}", APPROVE)
     if dict(baseline.weights) != weights:
         names = sorted(
             name
             for name in {*baseline.weights, *weights}
             if baseline.weights.get(name) != weights.get(name)
         )
-        raise InputError(DOING, str(path), f"other weights: {', '.join(names)}", APPROVE)
-    check_scenes(baseline.scenes, hashes, str(path), DOING, APPROVE)
+        raise InputError(f"{path}: other weights: {', '.join(names)}", APPROVE)
+    check_scenes(baseline.scenes, hashes, str(path), APPROVE)
 
 
 def check_scenes(
-    here: Mapping[str, str], there: Mapping[str, str], with_what: str, doing: str, do_this: str
+    here: Mapping[str, str], there: Mapping[str, str], with_what: str, do_this: str
 ) -> None:
     """Refuse two sets of scenes that share none, or share a name with another content.
 
@@ -247,11 +237,9 @@ def check_scenes(
     """
     changed = sorted(name for name in here.keys() & there.keys() if here[name] != there[name])
     if changed:
-        raise InputError(
-            doing, with_what, f"scenes with another content: {', '.join(changed)}", do_this
-        )
+        raise InputError(f"{with_what}: scenes with another content: {', '.join(changed)}", do_this)
     if not here.keys() & there.keys():
-        raise InputError(doing, with_what, "no scene in common", do_this)
+        raise InputError(f"{with_what}: no scene in common", do_this)
 
 
 def scene_hashes(run: Run) -> dict[str, str]:
@@ -266,11 +254,8 @@ def scene_hashes(run: Run) -> dict[str, str]:
         name for name in {r.scene for r in run.rollouts} | set(hashes) if not hashes.get(name)
     )
     if bare:
-        found = f"no content hash for {', '.join(bare)}"
         raise InputError(
-            "reading the scenes of a run",
-            str(run.folder / "run.json"),
-            found,
+            f"{run.folder / 'run.json'}: no content hash for {', '.join(bare)}",
             "make the run again with this version",
         )
     return hashes
@@ -333,17 +318,13 @@ def stored_side(
     mine = of_policy(rows, policy)
     if not mine:
         raise InputError(
-            DOING,
-            str(path),
-            f"no rollout of policy {policy}",
+            f"{path}: no rollout of policy {policy}",
             f"drive one of {', '.join(policies_of(rows))}",
         )
     known = sorted({str(row["renderer"]) for row in mine})
     if renderer not in known:
         raise InputError(
-            DOING,
-            str(path),
-            f"no rollout of renderer {renderer}",
+            f"{path}: no rollout of renderer {renderer}",
             f"name one of {', '.join(known)}: `baseline` of a gate, --baseline of decide",
         )
     side = StoredSide(
@@ -353,11 +334,8 @@ def stored_side(
     lacking = sorted(set(planned) - there)
     if len(lacking) > max_missing * len(planned):
         named = ", ".join(f"{scene} seed {seed}" for scene, seed in lacking[:NAMED])
-        found = f"{len(lacking)} of the {len(planned)} scenes and seeds that may be driven are not in it: {named}"
         raise InputError(
-            DOING,
-            str(path),
-            found,
+            f"{path}: {len(lacking)} of the {len(planned)} scenes and seeds that may be driven are not in it: {named}",
             "make the baseline on all scenes and seeds of the suite, or name a smaller suite",
         )
     return side

@@ -110,13 +110,11 @@ def load_gate(path_or_name: str | Path, known: MetricTable = METRICS) -> tuple[G
     path = next((one for one in (Path(path_or_name), shipped) if one.is_file()), None)
     if path is None:
         raise InputError(
-            DOING,
-            str(path_or_name),
-            "no such file",
+            f"{path_or_name}: no such file",
             f"name a YAML file, or a shipped gate: {', '.join(shipped_gates())}",
         )
-    document = load_yaml(path, DOING)
-    spec = validate(GateSpec, document, DOING)
+    document = load_yaml(path)
+    spec = validate(GateSpec, document)
     _check_names(spec, document, known)
     return spec, str(path)
 
@@ -132,7 +130,6 @@ def _check_names(spec: GateSpec, document: Document, known: MetricTable) -> None
             facts = known.info(name)
         except (EvaluatorError, InputError) as error:
             raise document.error(
-                DOING,
                 ("metrics", name),
                 f"no metric {name!r}",
                 "simrun list metrics prints the known ones",
@@ -140,12 +137,10 @@ def _check_names(spec: GateSpec, document: Document, known: MetricTable) -> None
         if rule.margin == 0.0 and facts.direction == "none":
             found = f"a margin of 0 for {name!r}, which has no better side"
             raise document.error(
-                DOING, ("metrics", name), found, "give the change to either side that is accepted"
+                ("metrics", name), found, "give the change to either side that is accepted"
             )
     if spec.preset is not None and spec.preset not in PRESETS:
-        raise document.error(
-            DOING, ("preset",), f"preset {spec.preset!r}", f"known: {', '.join(PRESETS)}"
-        )
+        raise document.error(("preset",), f"preset {spec.preset!r}", f"known: {', '.join(PRESETS)}")
 
 
 Kind = Literal["margin", "limit"]
@@ -257,9 +252,7 @@ def judge_sides(
         stored: The same of a stored baseline.
     """
     if not any(sides.values()):
-        raise InputError(
-            "judging a run", "its rollouts", "there are none", "give a run with rollouts"
-        )
+        raise InputError("its rollouts: there are none", "give a run with rollouts")
     checks: list[Check] = []
     arms = [Arm(renderer, policy) for policy, here in sides.items() for renderer in here]
     has_margin = any(rule.margin is not None for rule in spec.metrics.values())
@@ -331,9 +324,7 @@ def _base(
         if stored is None
         else [Arm(renderer, policy) for policy, here in stored.items() for renderer in here]
     )
-    return base_named(
-        spec.baseline, there, DOING_JUDGE, "the run" if stored is None else "the stored baseline"
-    )
+    return base_named(spec.baseline, there, "the run" if stored is None else "the stored baseline")
 
 
 def _judged(arms: Sequence[Arm], spec: GateSpec, base: Base | None, has_margin: bool) -> list[Arm]:
@@ -341,21 +332,16 @@ def _judged(arms: Sequence[Arm], spec: GateSpec, base: Base | None, has_margin: 
     absent = [name for name in spec.renderers if name not in known]
     if absent:
         raise InputError(
-            DOING_JUDGE,
-            f"renderers {absent}",
-            "the run has none of these",
+            f"renderers {absent}: the run has none of these",
             f"it has {', '.join(sorted(known))}",
         )
     if spec.renderers:
         return [arm for arm in arms if arm.renderer in spec.renderers]
     judged = [arm for arm in arms if base is None or base.of(arm) != arm]
     if not judged and has_margin and base is not None:
-        do = "run two renderers or two policies, or give --baseline-file"
         raise InputError(
-            DOING_JUDGE,
-            f"baseline {base.name!r}",
-            "the run has nothing else to compare with it",
-            do,
+            f"baseline {base.name!r}: the run has nothing else to compare with it",
+            "run two renderers or two policies, or give --baseline-file",
         )
     return judged or list(arms)  # a gate of limits alone needs no second arm
 
@@ -376,9 +362,7 @@ def _partner(arm: Arm, base: Base | None, there: Mapping[str, Sides], is_stored:
     where = "the stored baseline" if is_stored else "the run"
     names = ", ".join(one.name for one in known)
     raise InputError(
-        DOING_JUDGE,
-        f"baseline {wanted.name!r}",
-        f"{where} does not have it",
+        f"baseline {wanted.name!r}: {where} does not have it",
         f"`baseline` of the gate may be one of: {names}",
     )
 

@@ -212,11 +212,8 @@ def rate_interval(means: F64) -> Interval:
     """
     n, centre = len(means), float(np.mean(means))
     if means.min() < 0.0 or means.max() > 1.0:
-        found = f"values from {means.min():g} to {means.max():g}"
         raise EvaluatorError(
-            "computing the interval of a rate",
-            f"{n} scene means",
-            found,
+            f"{n} scene means: values from {means.min():g} to {means.max():g}",
             "give rates as fractions in [0, 1]",
         )
     if n < 2:

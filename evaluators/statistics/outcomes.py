@@ -44,7 +44,7 @@ def rollouts_of(manifests: Iterable[Mapping[str, Any]]) -> tuple[list[Rollout], 
             int(one["seed"]),
             one["status"],
             str(error.get("failure_class") or ""),
-            str(error.get("found") or ""),
+            str(error.get("message") or ""),
             metrics=numbers,
         )
         rows.append(row)

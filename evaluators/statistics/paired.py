@@ -105,9 +105,7 @@ def paired_sides(
     """
     if baseline not in sides:
         raise InputError(
-            "pairing renderers",
-            f"baseline {baseline!r}",
-            "no rollout has it",
+            f"baseline {baseline!r}: no rollout has it",
             f"choose one of {', '.join(sides)}",
         )
     return {

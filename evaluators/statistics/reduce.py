@@ -120,9 +120,7 @@ def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = DEFAUL
     table = {one.name: one for one in series}
     if "eval_relevant" not in table:
         raise EvaluatorError(
-            "reducing a rollout",
-            f"series {sorted(table)}",
-            "no eval_relevant",
+            f"series {sorted(table)}: no eval_relevant",
             "pass everything that score() returned",
         )
     for name, parts in _DERIVED_FLAGS.items():

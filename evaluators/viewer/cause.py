@@ -158,7 +158,7 @@ def write_cause(run: Run, cause: Cause) -> Path:
         report=report,
         failed_s=None if cause.failed_us is None else (cause.failed_us - cause.start_us) * 1e-6,
     )
-    write_text(path, html, DOING)
+    write_text(path, html)
     return path
 
 
@@ -265,9 +265,7 @@ def heat_png(values: npt.NDArray[Any]) -> str:
     )
     done, png = cv2.imencode(".png", bgra.astype(np.uint8))
     if not done:
-        raise InputError(
-            DOING, f"heat map {values.shape}", "the encoder refused", "give a smaller one"
-        )
+        raise InputError(f"heat map {values.shape}: the encoder refused", "give a smaller one")
     return base64.b64encode(png.tobytes()).decode()
 
 

@@ -159,8 +159,10 @@ def check_wanted(run: Run, wanted: Wanted) -> None:
     ):
         strange = [one for one in asked if not _spellings(one) & {*known}]
         if strange:
-            found = f"the run has none; it has {', '.join(map(str, known[:8]))}"
-            raise InputError(DOING, f"{flag} {strange[0]}", found, "name one of these")
+            raise InputError(
+                f"{flag} {strange[0]}: the run has none; it has {', '.join(map(str, known[:8]))}",
+                "name one of these",
+            )
 
 
 def has_policies_alone(run: Run) -> bool:
@@ -323,9 +325,9 @@ def cell_data(
     """
     content = run.scene_data(cell.scene)
     if content is None:
-        found = f"no file of scene {cell.scene} in {run.folder / 'scenes'}"
         raise InputError(
-            READING, cell.name, found, "make the run again; runs of earlier versions kept no maps"
+            f"{cell.name}: no file of scene {cell.scene} in {run.folder / 'scenes'}",
+            "make the run again; runs of earlier versions kept no maps",
         )
     recorded = recorded_drive(content, cell.scene)
     place = Place(recorded[0], clock_zero_us(content, _first_us(run, cell, logs)))
@@ -343,7 +345,7 @@ def cell_data(
         log = logs[rollout.path]
         if isinstance(log, SimrunError):
             drives.append(
-                {"renderer": cell.side(rollout), "failed": f"its log cannot be read: {log.found}"}
+                {"renderer": cell.side(rollout), "failed": f"its log cannot be read: {log.message}"}
             )
             continue
         facts = frame_rows(run, rollout)

@@ -97,9 +97,7 @@ def recorded_drive(content: Mapping[str, Any], scene: str) -> F64:
     """
     log = np.column_stack([content["ego_log"]["x_m"], content["ego_log"]["y_m"]]).astype(np.float64)
     if len(log) < 2:
-        raise InputError(
-            "drawing a scene", scene, f"a recorded drive of {len(log)} points", "make the run again"
-        )
+        raise InputError(f"{scene}: a recorded drive of {len(log)} points", "make the run again")
     return log
 
 
@@ -240,9 +238,7 @@ def _ego(
     )
     if any(name not in own for name in POSE_SERIES) or "length_m" not in vehicle:
         raise InputError(
-            "reading a rollout to watch",
-            "the table of steps",
-            "neither a log nor the ego's poses",
+            "the table of steps: neither a log nor the ego's poses",
             "run it again",
         )
     (t_us, x), (_, y), (_, yaw) = (own[name] for name in POSE_SERIES)

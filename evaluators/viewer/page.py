@@ -322,9 +322,7 @@ def write_page(
     cells = cells_of(run, wanted, arms=True)
     if not any(cell.watchable for cell in cells):
         raise InputError(
-            DOING,
-            str(run.folder),
-            "no finished rollout that was asked for",
+            f"{run.folder}: no finished rollout that was asked for",
             "ask for others; simrun report lists failures",
         )
     with reporting(run):
@@ -332,7 +330,7 @@ def write_page(
         page = make_page(
             run, cells, shown_by_default(cells, wanted, at_most), options, REPORT if beside else ""
         )
-    write_text(path, page.html, DOING)
+    write_text(path, page.html)
     return Written(path, path.stat().st_size, page.cells, tuple(cells), page.notes)
 
 
@@ -353,7 +351,7 @@ def write_flips_page(run_dir: Path | Run) -> Mapping[FlipKey, str]:
         return {}
     with reporting(run):
         page = make_page(run, flipped, flipped[:MAX_FLIP_CELLS], FLIPS_OPTIONS, REPORT)
-    write_text(run.folder / FLIPS_PAGE, page.html, DOING)
+    write_text(run.folder / FLIPS_PAGE, page.html)
     return {
         flip.key: f"{FLIPS_PAGE}#{address(cell, cell.side(flip.other))}"
         for cell in page.cells

@@ -142,9 +142,7 @@ def jpeg(rgb: U8) -> str:
     done, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
     if not done:
         raise InputError(
-            "encoding a camera frame",
-            f"array {rgb.shape}",
-            "the encoder refused",
+            f"array {rgb.shape}: the encoder refused",
             "use smaller images",
         )
     return base64.b64encode(data.tobytes()).decode()

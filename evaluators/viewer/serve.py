@@ -78,9 +78,7 @@ def loopback(text: str) -> tuple[str, int]:
     host = host.removeprefix("[").removesuffix("]") or "127.0.0.1"
     if not port.isdecimal() or int(port) > 65535:
         raise InputError(
-            DOING,
-            f"--serve {text}",
-            "no port",
+            f"--serve {text}: no port",
             "give HOST:PORT, such as 127.0.0.1:8000, or a port alone",
         )
     try:
@@ -88,11 +86,8 @@ def loopback(text: str) -> tuple[str, int]:
     except ValueError:
         near = False
     if not near:
-        found = "not an address of this machine alone"
         raise InputError(
-            DOING,
-            f"--serve {text}",
-            found,
+            f"--serve {text}: not an address of this machine alone",
             "give 127.0.0.1:PORT and reach it from elsewhere through ssh -L",
         )
     return host, int(port)
@@ -131,9 +126,9 @@ class RunServer(ThreadingHTTPServer):
         try:
             super().__init__(address, _Handler)
         except OSError as error:
-            what = f"{address[0]}:{address[1]}"
             raise InfrastructureError(
-                DOING, what, error.strerror or str(error), "choose another port, or 0 for any"
+                f"{address[0]}:{address[1]}: {error.strerror or str(error)}",
+                "choose another port, or 0 for any",
             ) from error
 
     @property

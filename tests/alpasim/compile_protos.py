@@ -22,7 +22,7 @@ import tempfile
 from importlib import metadata
 from pathlib import Path
 
-PROTOS = Path(__file__).resolve().parents[2] / "alpasim_plugin" / "wire" / "protos"
+PROTOS = Path(__file__).resolve().parents[2] / "alpasim_plugin" / "log" / "wire" / "protos"
 GENERATOR = "1.62.3"
 IMPORTS = (
     "simrun/wire"  # how the files import each other; also their names in protobuf's descriptor pool

@@ -102,7 +102,7 @@ def test_overwritten_length_is_damage_not_a_cut_tail(tmp_path: Path) -> None:
     path.write_bytes(bytes(data))
     with pytest.raises(InputError, match="does not fit what follows") as caught:
         list(AslReader(path))
-    assert "entry 0 at byte 0" in caught.value.with_what
+    assert "entry 0 at byte 0" in caught.value.message
 
 
 def test_varint_lengths_are_refused(tmp_path: Path) -> None:
@@ -120,7 +120,7 @@ def test_garbage_in_the_middle_is_an_error_with_its_place(tmp_path: Path) -> Non
     path.write_bytes(bytes(data))
     with pytest.raises(InputError, match="no log entry") as caught:
         list(AslReader(path))
-    assert f"entry 1 at byte {size + 4}" in caught.value.with_what
+    assert f"entry 1 at byte {size + 4}" in caught.value.message
 
 
 @pytest.mark.parametrize("length", [0, 2**31])

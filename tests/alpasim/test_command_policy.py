@@ -184,7 +184,7 @@ def test_the_script_of_the_page_drives_as_in_the_process(
         assert run_command([*words, "--json"]) == 2
         assert (
             "no command is run because a file names it"
-            in json.loads(capfd.readouterr().out)["error"]["found"]
+            in json.loads(capfd.readouterr().out)["error"]["message"]
         )
 
 
@@ -217,9 +217,9 @@ def test_a_command_that_dies_is_told_with_its_last_words_and_starts_anew(
     (one, two) = json.loads(capfd.readouterr().out)["summary"]["failures"]["cells"]
     for cell in (one, two):
         assert cell["error"]["failure_class"] == "policy"
-        assert "exit code 3; its last lines:" in cell["error"]["found"]
-        assert cell["error"]["found"].endswith("cannot find the road")
-    assert "seed 2 | cannot find the road" in two["error"]["found"], (
+        assert "exit code 3; its last lines:" in cell["error"]["message"]
+        assert cell["error"]["message"].endswith("cannot find the road")
+    assert "seed 2 | cannot find the road" in two["error"]["message"], (
         "the second rollout had a command of its own"
     )
 

@@ -101,7 +101,7 @@ def test_a_driver_killed_in_the_middle_is_an_infrastructure_failure_and_is_drive
     (failed,) = json.loads(capsys.readouterr().out)["summary"]["failures"]["cells"]
     assert failed["error"]["failure_class"] == "infrastructure"
     assert failed["error"]["doing"] == "calling EgodriverService.drive"
-    assert "of simulated time" in failed["error"]["with"]
+    assert "of simulated time" in failed["error"]["message"]
     with driver(address):
         assert run_command([*command, "--resume"]) == 0
     assert json.loads(capsys.readouterr().out)["summary"]["failures"]["n_failed"] == 0
@@ -144,8 +144,7 @@ def test_only_what_a_driver_does_itself_is_its_own_fault(
             )
         service.close()
     assert type(caught.value) is kind
-    assert caught.value.doing == "calling EgodriverService.drive"
-    assert caught.value.with_what == f"{host.address}, at 1700000 us of simulated time"
+    assert caught.value.message == f"{host.address}, at 1700000 us of simulated time"
     assert not getattr(caught.value, "is_final", False) or kind is PolicyError
 
 

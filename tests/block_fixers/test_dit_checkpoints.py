@@ -33,9 +33,9 @@ def test_missing_tensor_is_named(key):
     del sd[key]
     with pytest.raises(InputError) as caught:
         load(sd, source="weights.safetensors")
-    assert f"missing: {key}" in caught.value.found
-    assert "weights.safetensors" in caught.value.with_what
-    assert "docs/block-fixers.md" in caught.value.do_this
+    assert f"missing: {key}" in caught.value.message
+    assert "weights.safetensors" in caught.value.message
+    assert "docs/block-fixers.md" in caught.value.hint
 
 
 @pytest.mark.parametrize("key", [key for key in KEYS if key not in SQUARE])
@@ -46,7 +46,7 @@ def test_transposed_tensor_is_named_alone(key):
     with pytest.raises(InputError) as caught:
         load(sd)
     assert (
-        caught.value.found
+        caught.value.message
         == f"wrong shape: {key} is {list(shape[::-1])} for {list(shape)}, transposed"
     )
 
@@ -57,7 +57,7 @@ def test_mis_shaped_tensor_is_named(key):
     sd[key] = torch.cat([sd[key], sd[key][:1]])
     with pytest.raises(InputError) as caught:
         load(sd)
-    assert key in caught.value.found
+    assert key in caught.value.message
 
 
 def test_whole_missing_block_and_extra_tensors_are_listed_and_counted():
@@ -67,9 +67,9 @@ def test_whole_missing_block_and_extra_tensors_are_listed_and_counted():
     sd["blocks.0.cross_view_attn.q_proj.weight"] = torch.zeros(2, 2)
     with pytest.raises(InputError) as caught:
         load(sd)
-    assert "missing: blocks.1.adaln_modulation_cross_attn.1.weight" in caught.value.found
-    assert "and 12 more" in caught.value.found
-    assert "unexpected: blocks.0.cross_view_attn.q_proj.weight" in caught.value.found
+    assert "missing: blocks.1.adaln_modulation_cross_attn.1.weight" in caught.value.message
+    assert "and 12 more" in caught.value.message
+    assert "unexpected: blocks.0.cross_view_attn.q_proj.weight" in caught.value.message
 
 
 def test_foreign_tensors_are_refused():

@@ -366,6 +366,5 @@ def test_a_spoiled_file_is_named_in_four_parts(vae: TinyVAE, name: str) -> None:
     spoil(sd)
     with pytest.raises(InputError, match=text) as error:
         TinyVAE.from_state_dict(sd, source="tiny.safetensors")
-    assert error.value.doing == "loading tiny VAE weights"
-    assert "tiny.safetensors" in error.value.with_what
-    assert "TinyVAE.save" in error.value.do_this
+    assert "tiny.safetensors" in error.value.message
+    assert "TinyVAE.save" in error.value.hint

@@ -163,10 +163,9 @@ def test_one_and_five_frames_give_one_and_two_latents(vae: WanVAE) -> None:
 def test_six_frames_are_refused_with_both_ways_out(vae: WanVAE) -> None:
     with pytest.raises(InputError) as error:
         vae.encode(clip(6, 16, 16))
-    assert error.value.doing == "encoding video frames"
-    assert error.value.with_what == "6 frames at the start of a video"
-    assert "1 + 4k" in error.value.found
-    assert "give 5 or 9 frames (pad_clip" in error.value.do_this
+    assert error.value.message == "6 frames at the start of a video"
+    assert "1 + 4k" in error.value.message
+    assert "give 5 or 9 frames (pad_clip" in error.value.hint
 
 
 def test_six_frames_padded_encode_as_nine_and_crop_back(vae: WanVAE) -> None:
@@ -418,9 +417,8 @@ def test_a_spoiled_checkpoint_is_named_in_four_parts(vae: WanVAE, name: str) -> 
     spoil(sd)
     with pytest.raises(InputError, match=text) as error:
         WanVAE.from_state_dict(sd, source="weights.safetensors")
-    assert error.value.doing == "loading Wan VAE weights"
-    assert "weights.safetensors" in error.value.with_what
-    assert "LightVAE" in error.value.do_this
+    assert "weights.safetensors" in error.value.message
+    assert "LightVAE" in error.value.hint
 
 
 def test_many_faults_are_listed_in_one_error(vae: WanVAE) -> None:

@@ -67,9 +67,7 @@ def test_known_scenes_are_shipped_ones() -> None:
 def test_a_scene_in_which_the_driver_is_lost_is_driven_once_more(
     times_lost: int, outcomes: tuple[str, ...] | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    losses = iter(
-        [InfrastructureError("calling", "a driver", "UNAVAILABLE", "start it")] * times_lost
-    )
+    losses = iter([InfrastructureError("a driver: UNAVAILABLE", "start it")] * times_lost)
     waited = []
 
     def drive(*_: object) -> SimpleNamespace:

@@ -179,7 +179,7 @@ def test_with_json_it_is_one_document(
     document = json.loads(capsys.readouterr().out)
     assert document["exit_code"] == 70
     assert document["error"]["failure_class"] == "internal"
-    assert document["error"]["found"].startswith("RecursionError: too deep")
+    assert document["error"]["message"].startswith("RecursionError: too deep")
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,7 @@ def test_json_is_one_document_with_every_number(
     assert document["events"] == {}
     assert captured.err == ""
     assert run_command(command) == 2
-    assert "exists already" in json.loads(capsys.readouterr().out)["error"]["found"]
+    assert "exists already" in json.loads(capsys.readouterr().out)["error"]["message"]
     assert run_command([*command, "--overwrite"]) == 0
 
 

@@ -192,4 +192,4 @@ def test_zero_seconds_change_nothing() -> None:
 def test_senseless_input_is_refused_with_its_value(command: Command, seconds: float) -> None:
     with pytest.raises(InputError, match="advancing the vehicle") as caught:
         step(BicycleState(0.0, 0.0, 0.0, 1.0, 0.0), command, seconds, VEHICLE)
-    assert "not finite" in caught.value.found
+    assert "not finite" in caught.value.message

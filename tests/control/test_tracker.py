@@ -255,7 +255,7 @@ def test_broken_plan_is_a_policy_error_that_says_what_was_found(
 ) -> None:
     with pytest.raises(PolicyError, match="following a plan") as caught:
         make_controller(name, VEHICLE).advance(at(speed=1.0), plan, 100_000)
-    assert found in caught.value.found
+    assert found in caught.value.message
 
 
 @pytest.mark.parametrize("name", ["bicycle", "perfect"])

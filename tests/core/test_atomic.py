@@ -53,8 +53,8 @@ def test_a_full_disk_leaves_the_old_file_and_no_litter(
     monkeypatch.setattr(atomic.os, "fsync", full)
     with pytest.raises(InfrastructureError, match="No space left on device") as caught:
         write(path, 2)
-    assert (caught.value.with_what, caught.value.exit_code) == (str(path), 4)
-    assert "free disk space" in caught.value.do_this
+    assert (caught.value.message, caught.value.exit_code) == (str(path), 4)
+    assert "free disk space" in caught.value.hint
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
     monkeypatch.undo()
@@ -158,7 +158,7 @@ def test_two_writers_in_one_process_do_not_meet(tmp_path: Path) -> None:
 def test_a_missing_folder_is_named_with_advice(name: str, tmp_path: Path) -> None:
     with pytest.raises(InfrastructureError, match="No such file or directory") as caught:
         WRITERS[name](tmp_path / "absent" / "a", 1)
-    assert "exists" in caught.value.do_this
+    assert "exists" in caught.value.hint
 
 
 def test_the_folder_of_bytes_is_made_and_a_file_in_its_place_is_refused(tmp_path: Path) -> None:
@@ -178,7 +178,7 @@ def test_a_read_only_folder_is_an_error_with_four_parts(
     monkeypatch.setattr(Path, "unlink", refuse)  # refused even where there is no file
     with pytest.raises(InfrastructureError, match="Read-only file system") as caught:
         write(tmp_path / "out", 1)
-    assert "make the folder writable" in caught.value.do_this
+    assert "make the folder writable" in caught.value.hint
 
 
 def test_nan_is_refused_in_json(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def read(folder: Path) -> str:
     text = (folder / "text").read_text() if (folder / "text").exists() else ""
     if not text.startswith("good"):
-        raise InputError("reading a text", str(folder / "text"), f"{text!r}", "make it again")
+        raise InputError(f"{folder / 'text'}: {text!r}", "make it again")
     return text
 
 

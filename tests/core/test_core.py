@@ -73,7 +73,7 @@ def test_fields_of_a_key_cannot_run_into_each_other(a: str, b: str) -> None:
 
 
 def test_an_error_shows_its_four_parts_one_a_line() -> None:
-    text = str(InputError("reading a scene", "a.yaml:3:5", "no key 'roda'", "did you mean 'road'?"))
+    text = str(InputError("a.yaml:3:5: no key 'roda'", "did you mean 'road'?"))
     assert [line.split(":")[0].strip() for line in text.splitlines()] == [
         "error",
         "with",

@@ -66,8 +66,8 @@ def test_a_second_process_is_refused_by_name_and_a_killed_one_holds_nothing(
         one_writer(path, "writing", "it"),
     ):
         pass
-    assert "--wait" in caught.value.do_this
-    assert f"kill {process.pid}" in caught.value.do_this
+    assert "--wait" in caught.value.hint
+    assert f"kill {process.pid}" in caught.value.hint
     process.send_signal(signal.SIGKILL)
     process.wait()
     for _ in range(2):
@@ -120,7 +120,7 @@ def test_what_a_holder_left_is_judged_by_machine_number_and_start(
         one_writer(path, "writing", "it"),
     ):
         pass
-    assert f"remove {named if how == 'text' else path}" in caught.value.do_this
+    assert f"remove {named if how == 'text' else path}" in caught.value.hint
 
 
 def test_the_time_of_the_lock_is_after_what_was_there_before(tmp_path: Path) -> None:

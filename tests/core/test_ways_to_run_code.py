@@ -359,7 +359,7 @@ def test_text_of_a_stranger_stays_text(text: str) -> None:
     from alpasim_plugin.core.errors import InputError
     from alpasim_plugin.core.escape import markdown, terminal
 
-    said = str(InputError("reading", text, text, text))
+    said = str(InputError(f"{text}: {text}", text))
     assert all(part.isprintable() for part in said.splitlines())
     assert terminal(text).isprintable()
     assert "<script" not in markdown(text)

@@ -54,7 +54,7 @@ def test_a_run_with_a_refused_write_says_so_and_the_same_command_finishes_it(
         try:
             announced = run(tmp_path / "full", plan)
         except InfrastructureError as error:  # a write of the run itself
-            advice = error.do_this
+            advice = error.hint
         else:  # a write of a rollout, which is a failed one then
             assert [status for status, _ in announced.results].count("failed") == 1
             advice = "free disk space"

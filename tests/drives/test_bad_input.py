@@ -154,8 +154,8 @@ def test_a_recording_that_cannot_be_is_refused_and_leaves_nothing(
     before = sorted(path.name for path in tmp_path.iterdir())
     with pytest.raises(InputError) as caught:
         import_drive(folder, tmp_path / "out")
-    assert found in caught.value.found
-    assert do in caught.value.do_this
+    assert found in caught.value.message
+    assert do in caught.value.hint
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
@@ -166,7 +166,7 @@ def test_axes_that_both_fit_are_asked_for(tmp_path: Path, quick_fit: None) -> No
         cv2.imwrite(str(path), blank)
     with pytest.raises(InputError, match="'axes'") as caught:
         import_drive(folder, tmp_path / "out")
-    assert '"axes": "opengl"' in caught.value.do_this
+    assert '"axes": "opengl"' in caught.value.hint
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
@@ -203,7 +203,7 @@ def test_photographs_without_poses_name_the_extra_where_it_is_missing(
         cv2.imwrite(str(tmp_path / f"photos/{i}.png"), np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
     with pytest.raises(InputError, match="pycolmap is not installed") as caught:
         import_drive(tmp_path / "photos", tmp_path / "out")
-    assert "[sfm]" in caught.value.do_this
+    assert "[sfm]" in caught.value.hint
     assert not (tmp_path / ".out.poses").exists()
 
 

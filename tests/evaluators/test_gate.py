@@ -233,8 +233,8 @@ def test_a_bad_gate_file_is_refused_with_its_line_and_a_hint(tmp_path: Path, tex
     path.write_text(text)
     with pytest.raises(InputError) as caught:
         load_gate(path)
-    assert f"gate.yaml{place}" in caught.value.with_what or "not valid YAML" in caught.value.found
-    assert mention in f"{caught.value.found} {caught.value.do_this}"
+    assert f"gate.yaml{place}" in caught.value.message or "not valid YAML" in caught.value.message
+    assert mention in f"{caught.value.message} {caught.value.hint}"
 
 
 def test_an_unknown_gate_lists_the_shipped_ones():

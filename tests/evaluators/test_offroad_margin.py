@@ -222,7 +222,7 @@ def test_no_map_is_an_error_that_says_what_to_do():
     log = rollout(track([0.0, 1.0], 0.0))
     with pytest.raises(EvaluatorError, match="no lanes") as caught:
         scored(log, LaneMap({}))
-    assert "preset" in caught.value.do_this
+    assert "preset" in caught.value.hint
     assert caught.value.exit_code == 5
 
 

@@ -53,8 +53,8 @@ def test_a_log_with_a_broken_track_is_refused(who, poses, text):
     assert text in str(caught.value)
     assert {"ego": "the ego ", "ego_log": "the recorded drive", "actor": "actor 'a'"}[
         who
-    ] in caught.value.with_what
-    assert "session 'uuid'" in caught.value.with_what
+    ] in caught.value.message
+    assert "session 'uuid'" in caught.value.message
 
 
 def test_a_broken_plan_is_refused_and_named():
@@ -68,8 +68,8 @@ def test_a_broken_plan_is_refused_and_named():
     )
     with pytest.raises(EvaluatorError) as caught:
         score(*bad(plans=plans))
-    assert caught.value.with_what.startswith("the plan at 300000 us")
-    assert "time 300100 us is repeated" in caught.value.found
+    assert caught.value.message.startswith("the plan at 300000 us")
+    assert "time 300100 us is repeated" in caught.value.message
 
 
 @pytest.mark.parametrize("box", [Box(0.0, 1.0, 1.0), Box(4.0, -1.0, 1.0), Box(np.nan, 1.0, 1.0)])
@@ -121,7 +121,7 @@ def test_an_evaluator_that_raises_is_named_and_its_cause_kept():
 
     with pytest.raises(EvaluatorError, match="evaluator 'mine', scene 'scene'") as caught:
         run_evaluator("mine", broken, log, where)
-    assert "ZeroDivisionError: by zero" in caught.value.found
+    assert "ZeroDivisionError: by zero" in caught.value.message
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
 
 
@@ -201,16 +201,13 @@ def test_a_table_comes_back_from_a_run_folder_as_it_was():
 def test_two_runs_agree_on_unit_side_and_reduction_and_may_differ_in_words():
     other = METRICS.adding({"jerk": replace(JERK, help="the greatest jerk", label="", margin=1.0)})
     table = METRICS.adding({"jerk": JERK})
-    assert table.joined(other, ["jerk"], "comparing runs", "a and b")["jerk"].help == "largest jerk"
-    assert (
-        METRICS.joined(other, ["jerk"], "comparing runs", "a and b")["jerk"].help
-        == "the greatest jerk"
-    )
+    assert table.joined(other, ["jerk"], "a and b")["jerk"].help == "largest jerk"
+    assert METRICS.joined(other, ["jerk"], "a and b")["jerk"].help == "the greatest jerk"
     for change in ({"unit": "g"}, {"direction": "higher"}, {"aggregation": "mean"}):
         other = METRICS.adding({"jerk": replace(JERK, **change)})
-        assert table.joined(other, ["offroad"], "comparing runs", "a and b")
+        assert table.joined(other, ["offroad"], "a and b")
         with pytest.raises(InputError, match="a and b, metric 'jerk'"):
-            table.joined(other, ["jerk"], "comparing runs", "a and b")
+            table.joined(other, ["jerk"], "a and b")
 
 
 @pytest.mark.parametrize(

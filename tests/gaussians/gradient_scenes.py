@@ -41,7 +41,7 @@ def cloud_of(splats: Splats) -> GaussianCloud:
         unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
         arrays = (unit, np.exp(log_scales), sigmoid(logits), sh)
     cloud = GaussianCloud(means, *(a.astype(np.float32) for a in arrays))
-    cloud.require_drawable("turning trained splats into a cloud")
+    cloud.require_drawable()
     return cloud
 
 

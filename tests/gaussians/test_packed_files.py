@@ -97,7 +97,7 @@ def test_biker_cut_short_is_refused_in_four_parts(
 def test_plain_reader_points_to_the_right_one_for_a_compressed_ply(biker: Path) -> None:
     with pytest.raises(InputError, match="it is a compressed PLY") as caught:
         read_ply(biker / "biker.compressed.ply")
-    assert "read_gaussians" in caught.value.do_this
+    assert "read_gaussians" in caught.value.hint
 
 
 # --- compressed PLY, worked by hand

@@ -240,7 +240,7 @@ def test_street_model_asks_which_part(street: Path) -> None:
         InputError, match=r"2 models in one file: \['vertex_background', 'vertex_obj_000'\]"
     ) as caught:
         read_ply(street)
-    assert "element='vertex_background'" in caught.value.do_this
+    assert "element='vertex_background'" in caught.value.hint
 
 
 def test_street_model_gives_the_named_part(street: Path) -> None:
@@ -283,7 +283,7 @@ def test_ascii_body_is_refused(tmp_path: Path) -> None:
     path.write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
     with pytest.raises(InputError, match="format 'ascii'") as caught:
         read_ply(path)
-    assert "binary" in caught.value.do_this
+    assert "binary" in caught.value.hint
 
 
 def test_wrong_magic_is_refused(tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ def test_damage_in_the_middle_is_an_error_with_its_place(path: Path) -> None:
     path.write_bytes(bytes(data))
     with pytest.raises(InputError) as caught:
         read_asl(path)
-    assert "entry 1 at byte" in caught.value.with_what
+    assert "entry 1 at byte" in caught.value.message
 
 
 def edited(path: Path, change: object) -> Path:

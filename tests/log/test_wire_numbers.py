@@ -80,7 +80,7 @@ def test_coordinates_too_large_for_float32_are_refused_at_writing(tmp_path: Path
         pytest.raises(InputError, match=r"position .*500001\.4") as caught,
     ):
         log.actor_poses(T0_US, se2(500_000, 0, 0), {})
-    assert "local origin" in caught.value.do_this
+    assert "local origin" in caught.value.hint
 
 
 def test_nan_pose_is_refused_at_writing(tmp_path: Path) -> None:

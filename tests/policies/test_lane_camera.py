@@ -203,7 +203,7 @@ def test_missing_or_misshapen_frame_is_a_policy_error() -> None:
     one = policy()
     with pytest.raises(PolicyError, match="planning by camera") as caught:
         one.act(observe(np.zeros((10, 10, 3), np.uint8), EgoState(0, np.eye(4), 5.0)))
-    assert "(10, 10, 3)" in caught.value.found
+    assert "(10, 10, 3)" in caught.value.message
     without = replace(
         observe(np.zeros((144, 256, 3), np.uint8), EgoState(0, np.eye(4), 5.0)), frames={}
     )

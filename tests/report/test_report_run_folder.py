@@ -89,10 +89,9 @@ def test_broken_folder_is_a_four_part_error(
     break_it(tmp_path / "run")
     with pytest.raises(InputError) as caught:
         read_run(tmp_path / "run")
-    assert caught.value.doing == "reading a run folder"
-    assert found in caught.value.found
-    assert str(tmp_path) in caught.value.with_what
-    assert caught.value.do_this
+    assert found in caught.value.message
+    assert str(tmp_path) in caught.value.message
+    assert caught.value.hint
 
 
 def test_run_without_steps_has_no_series(tmp_path: Path, usual_run: Path) -> None:

@@ -58,7 +58,7 @@ def test_a_name_that_stands_for_nothing_is_refused_with_the_nearest(
 ) -> None:
     with pytest.raises(InputError, match=found) as caught:
         resolve_renderer(name)
-    assert re.search(do, caught.value.do_this)
+    assert re.search(do, caught.value.hint)
 
 
 def test_the_mode_decides_the_kind_of_session(straight_road: Scenario) -> None:
@@ -168,8 +168,8 @@ def test_a_bad_setting_is_named_with_the_nearest(override: str, found: str, do: 
     with pytest.raises(InputError) as caught:
         plan(("onefixer-dit-tiny",), (override,))
     assert found in str(caught.value)
-    assert do in caught.value.do_this
-    assert "--set fixer." in caught.value.with_what
+    assert do in caught.value.hint
+    assert "--set fixer." in caught.value.message
 
 
 def test_weights_that_are_not_there_are_refused_before_anything_runs() -> None:

@@ -387,7 +387,7 @@ def test_a_warm_up_shorter_than_the_first_block_is_refused(straight_road: Scenar
         InputError, match="ends after 400000 us, the warm-up after 300000 us"
     ) as caught:
         drive(replace(straight_road, warmup_us=300_000), mode="chunk")
-    assert "--set timing.warmup_us=400000" in caught.value.do_this
+    assert "--set timing.warmup_us=400000" in caught.value.hint
 
 
 def test_cameras_of_different_periods_make_no_common_block(straight_road: Scenario) -> None:
@@ -437,7 +437,7 @@ def test_a_fixer_that_breaks_its_contract_is_named(
     with pytest.raises(FixerError, match=found) as caught:
         drive(straight_road, fixer=fixer, mode=mode)
     assert caught.value.failure_class == "fixer"
-    assert fixer.__name__ in caught.value.with_what
+    assert fixer.__name__ in caught.value.message
 
 
 @pytest.mark.parametrize(("mode", "refused"), [("speculative", 12), ("chunk", 11)])

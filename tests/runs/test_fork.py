@@ -184,7 +184,7 @@ def test_rollouts_are_found_by_name_or_folder_and_near_names_are_offered(
     assert find_rollout(root, str(past.manifest["path"])).cell == past.cell
     with pytest.raises(InputError, match="no such rollout among its 2") as caught:
         find_rollout(root, "claen/lane-camera/smoke-lead_car/0")
-    assert CELL in caught.value.do_this
+    assert CELL in caught.value.hint
 
 
 def test_a_scenario_that_has_changed_is_refused(

@@ -211,8 +211,8 @@ def test_more_than_any_node_has_is_an_error_that_says_so(tmp_path: Path, three: 
         pytest.raises(InfrastructureError) as caught,
     ):
         dict(run_jobs(pool, ["a"], print))
-    assert "cores=64" in caught.value.with_what
-    assert "no node has that much" in caught.value.found
+    assert "cores=64" in caught.value.message
+    assert "no node has that much" in caught.value.message
 
 
 HANGING = """
@@ -269,12 +269,11 @@ def test_an_only_node_whose_worker_is_never_ready_is_an_error_that_names_it(tmp_
             dict(run_jobs(pool, ["a"], print))
     finally:
         one.close()
-    assert caught.value.doing == "working on a Ray cluster"
     assert (
         f"/{head[:8]}: its worker has started, but was not ready within {PATIENCE_S:g} s"
-        in caught.value.found
+        in caught.value.message
     )
-    assert "file systems of these nodes" in caught.value.do_this
+    assert "file systems of these nodes" in caught.value.hint
 
 
 def test_a_node_whose_core_another_driver_holds_is_waited_for(
@@ -368,7 +367,7 @@ def test_a_rollout_that_kills_its_workers_fails_alone(tmp_path: Path, three: Nod
     assert result.exit_code == 4
     for cell in result.summary["failures"]["cells"]:
         assert cell["policy"] == KILLER
-        assert "3 workers died of it" in cell["error"]["found"]
+        assert "3 workers died of it" in cell["error"]["message"]
 
 
 @pytest.fixture

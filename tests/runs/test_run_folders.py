@@ -188,10 +188,10 @@ def test_a_fork_and_a_scoring_need_the_log_itself(root: Path) -> None:
     flip(root / CELL / "rollout.asl")
     with pytest.raises(InputError, match="not the content that was written") as caught:
         find_rollout(root, CELL)
-    assert f"simrun check {root} --repair" in caught.value.do_this
+    assert f"simrun check {root} --repair" in caught.value.hint
     with pytest.raises(InputError, match="not the content that was written") as caught:
         check_vouched(root / CELL / "rollout.asl")
-    assert f"simrun check {root} --repair" in caught.value.do_this
+    assert f"simrun check {root} --repair" in caught.value.hint
 
 
 def test_a_run_that_was_stopped_is_not_read_until_it_is_finished(

@@ -129,7 +129,7 @@ def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path: Path) -> 
     run(cheap_plan(), tmp_path)
     with pytest.raises(InputError, match="it holds another run") as caught:
         run(cheap_plan((0, 1)), tmp_path)
-    assert "--resume" in caught.value.do_this
+    assert "--resume" in caught.value.hint
     result, announced = run(cheap_plan((0, 1)), tmp_path, resume=True)
     assert announced.results.count(("ok", True)) == 4
     assert result.n_rollouts == 8

@@ -160,9 +160,9 @@ def test_wrong_content_is_placed_and_explained(
     tmp_path: Path, text: str, at: str, found: str, do: str
 ) -> None:
     e = fails(tmp_path, text)
-    assert f"scene.yaml{at}" in e.with_what
-    assert found in e.found
-    assert do in e.do_this
+    assert f"scene.yaml{at}" in e.message
+    assert found in e.message
+    assert do in e.hint
 
 
 @pytest.mark.parametrize(
@@ -208,13 +208,13 @@ def test_scenes_that_cannot_be_built_are_placed_and_explained(
         tmp_path,
         text + "jitter: {length: 0, position_m: 0, speed: 0, lane_width: 0, curvature: 0}\n",
     )
-    assert f"scene.yaml{at}" in e.with_what
-    assert found in e.found
+    assert f"scene.yaml{at}" in e.message
+    assert found in e.message
 
 
 def test_ego_that_would_leave_its_lane_is_refused(tmp_path: Path) -> None:
     e = fails(tmp_path, swap(STRAIGHT, SWERVE))
-    assert "leave the lanes" in e.found
+    assert "leave the lanes" in e.message
 
 
 def test_several_problems_are_all_listed(tmp_path: Path) -> None:
@@ -222,9 +222,9 @@ def test_several_problems_are_all_listed(tmp_path: Path) -> None:
         tmp_path,
         swap("length_m: 200", "length_m: -5").replace("id: lead", "id: 'a b'") + "sed: 1\n",
     )
-    assert ":4:24" in e.with_what
-    assert "and 2 more" in e.found
-    assert "unknown key 'sed'" in e.found
+    assert ":4:24" in e.message
+    assert "and 2 more" in e.message
+    assert "unknown key 'sed'" in e.message
 
 
 def test_no_actors_is_a_fine_scene(tmp_path: Path) -> None:
@@ -241,8 +241,8 @@ def test_actors_beside_a_recording_are_refused(tmp_path: Path, repo: Path) -> No
         tmp_path,
         f"version: 1\nlog: {{commonroad: {xml}}}\nactors:\n  - {{kind: parked, id: a, s_m: 3}}\n",
     )
-    assert ":3:1" in e.with_what
-    assert "recorded log" in e.found
+    assert ":3:1" in e.message
+    assert "recorded log" in e.message
 
 
 @pytest.mark.parametrize(
@@ -256,8 +256,8 @@ def test_actors_beside_a_recording_are_refused(tmp_path: Path, repo: Path) -> No
 )
 def test_bad_log_sections(tmp_path: Path, log: str, at: str, found: str) -> None:
     e = fails(tmp_path, f"version: 1\nlog: {log}\n")
-    assert f"scene.yaml{at}" in e.with_what
-    assert found in e.found
+    assert f"scene.yaml{at}" in e.message
+    assert found in e.message
 
 
 def test_a_duration_beyond_the_recording_is_refused(repo: Path) -> None:

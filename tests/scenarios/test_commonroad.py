@@ -45,8 +45,7 @@ def refused(tmp_path, ego=None, text=None, **parts):
         read_commonroad(path, ego)
     error = caught.value
     assert error.exit_code == 2
-    assert error.doing == "reading a CommonRoad scenario"
-    assert error.with_what.startswith(str(path))
+    assert error.message.startswith(str(path))
     return error
 
 
@@ -272,8 +271,8 @@ def test_folder_instead_of_a_file(tmp_path):
 def test_truncated_file(tmp_path, keep):
     text = document().encode()
     error = refused(tmp_path, text=text[: int(len(text) * keep)])
-    assert "malformed XML" in error.found
-    assert "line" in error.found
+    assert "malformed XML" in error.message
+    assert "line" in error.message
 
 
 def test_empty_file(tmp_path):
@@ -289,8 +288,8 @@ def test_doctype_is_refused_before_any_entity_counts(tmp_path, encoding):
     text = BOMB + rest.replace(b"ZAM_Test", b"&b;")
     text = head + text if encoding == "utf-8" else text.decode().encode("utf-16")
     error = refused(tmp_path, text=text)
-    assert error.found == "a DOCTYPE declaration"
-    assert "entities are not accepted" in error.do_this
+    assert error.message == "a DOCTYPE declaration"
+    assert "entities are not accepted" in error.hint
 
 
 def test_unknown_encoding(tmp_path):
@@ -335,19 +334,19 @@ def test_times_that_do_not_increase(tmp_path):
     error = refused(
         tmp_path, ego="11", traffic=obstacle(11, [state(k, 20 + k, 0) for k in (0, 1, 1, 2)])
     )
-    assert "time 100000 us after 100000 us in row 2" in error.found
-    assert "obstacle 11" in error.with_what
+    assert "time 100000 us after 100000 us in row 2" in error.message
+    assert "obstacle 11" in error.message
 
 
 def test_ego_of_one_state(tmp_path):
     error = refused(tmp_path, ego="11", traffic=obstacle(11, drive(20, 0, steps=[0])))
-    assert error.found == "1 state"
+    assert error.message == "1 state"
 
 
 def test_unknown_ego(tmp_path):
     error = refused(tmp_path, ego="99")
-    assert error.found == "no moving obstacle '99'"
-    assert error.do_this == "choose the ego among 11, 12, 13"
+    assert error.message == "no moving obstacle '99'"
+    assert error.hint == "choose the ego among 11, 12, 13"
 
 
 # --- the facts of two recorded files

@@ -233,7 +233,7 @@ def test_what_is_no_usable_map_is_refused(root, content, found):
             parse_map(FILES, "map.xodr", ElementTree.fromstring(f"<{root}>{content}</{root}>")),
             np.eye(4),
         )
-    assert found in error.value.found
+    assert found in error.value.message
 
 
 # --- AlpaSim's rule

@@ -203,8 +203,8 @@ def test_damaged_content_is_refused_with_its_place(
 ) -> None:
     with pytest.raises(InputError) as error:
         read_usdz(write(tmp_path / "a.usdz", content))
-    assert found in error.value.found
-    assert "a.usdz" in error.value.with_what
+    assert found in error.value.message
+    assert "a.usdz" in error.value.message
 
 
 @pytest.mark.parametrize("name", ["../evil", "/etc/x", "a/../../b", "C:\\x"])

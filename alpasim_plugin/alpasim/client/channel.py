@@ -49,9 +49,7 @@ class Address:
             found = f"no option {unknown[0]!r}" if unknown else "no HOST:PORT"
             shown = f"[?{'&'.join(f'{name}=...' for name in known)}]" if known else ""
             raise InputError(
-                "reading a service's address",
-                f"{scheme}://{text}",
-                found,
+                f"{scheme}://{text}: {found}",
                 f"write {scheme}://HOST:PORT{shown}",
             )
         return cls(target, options)
@@ -67,9 +65,7 @@ def encoding_of(address: str, given: str) -> ImageEncoding:
     if given in known:
         return known[given]
     raise InputError(
-        "reading a service's address",
-        address,
-        f"encoding {given!r}",
+        f"{address}: encoding {given!r}",
         "write encoding=jpeg or encoding=png",
     )
 
@@ -100,11 +96,8 @@ class Service:
         try:
             grpc.channel_ready_future(self._channel).result(timeout=timeout_s)
         except grpc.FutureTimeoutError as error:
-            found = f"nothing answers at {self.target} within {timeout_s:g} s"
             raise InfrastructureError(
-                f"calling {self.name}",
-                self.target,
-                found,
+                f"{self.target}: nothing answers at {self.target} within {timeout_s:g} s",
                 "start the service, or correct the address",
             ) from error
 
@@ -141,16 +134,11 @@ class Service:
 
     def _failure(self, error: Any, method: str, at_us: int | None) -> SimrunError:
         where = self.target if at_us is None else f"{self.target}, at {at_us} us of simulated time"
-        doing, found = (
-            f"calling {self.name}.{method}",
-            f"{error.code().name}: {error.details() or ''}",
-        )
+        found = f"{self.name}.{method} failed: {error.code().name}: {error.details() or ''}"
         if not is_lost_connection(error) or issubclass(self._error, InfrastructureError):
-            return self._error(doing, where, found, "see the service's own log")
+            return self._error(f"{where}: {found}", "see the service's own log")
         return InfrastructureError(
-            doing,
-            where,
-            found,
+            f"{where}: {found}",
             "see the service's own log, and drive the rollout again with --resume",
         )
 

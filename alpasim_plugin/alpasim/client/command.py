@@ -30,7 +30,6 @@ from alpasim_plugin.core.types import Scenario
 MAX_PATH = 100  # of a socket file; the system's own limit is 104 (macOS) or 108 (Linux)
 LOOPBACK = "127.0.0.1"
 DOING = "starting a policy's command"
-DRIVING = "driving by a policy's command"
 VARIABLE = "SIMRUN_POLICY_ADDRESS"
 READY_S = 120.0  # a container starts, a network is loaded
 POLL_S = 0.02
@@ -67,11 +66,8 @@ class SocketFile:
         self._folder, path = folder, folder / "policy.sock"
         if len(str(path)) > MAX_PATH:
             shutil.rmtree(folder)
-            found = f"{path} is longer than {MAX_PATH} characters"
             raise InputError(
-                "choosing a socket",
-                "the folder for temporary files",
-                found,
+                f"the folder for temporary files: {path} is longer than {MAX_PATH} characters",
                 "set TMPDIR=/tmp, or name {port} in the command",
             )
         self._path, self.address = path, f"unix:{path}"
@@ -157,7 +153,7 @@ class Command:
         Raises:
             InputError: No program, one that is not found, an open quote, or an unknown option.
         """
-        doing, whole = "reading a policy's command", f"exec:{text}"
+        whole = f"exec:{text}"
         head, _, rest = text.partition(" ") if text.startswith("?") else ("", "", text)
         options = {
             key: values[-1] for key, values in parse_qs(head[1:], keep_blank_values=True).items()
@@ -166,29 +162,23 @@ class Command:
         unknown = sorted(set(options) - set(known))
         if unknown:
             raise InputError(
-                doing, whole, f"no option {unknown[0]!r}", f"the options are {', '.join(known)}"
+                f"{whole}: no option {unknown[0]!r}", f"the options are {', '.join(known)}"
             )
         for key in ("ready_s", "timeout_s"):
             if not re.fullmatch(r"\d+(\.\d+)?", options.get(key, "1")):
-                raise InputError(
-                    doing, whole, f"{key}={options[key]!r}", "write seconds as a number"
-                )
+                raise InputError(f"{whole}: {key}={options[key]!r}", "write seconds as a number")
         try:
             words = tuple(shlex.split(rest))
         except ValueError as error:
-            raise InputError(doing, whole, str(error), "close the quotes") from error
+            raise InputError(f"{whole}: {error}", "close the quotes") from error
         if not words:
             raise InputError(
-                doing,
-                whole,
-                "no program",
+                f"{whole}: no program",
                 "write exec:PROGRAM ARGUMENT..., such as 'exec:python my_policy.py'",
             )
         if shutil.which(words[0]) is None:
             raise InputError(
-                doing,
-                whole,
-                f"no program {words[0]!r}",
+                f"{whole}: no program {words[0]!r}",
                 "install it, or write its path; a shell is not asked",
             )
         return cls(text, words, options)
@@ -218,11 +208,8 @@ class Served:
             self.require_running()
             if time.monotonic() > end_s:
                 self.stop()
-                found = f"nothing listens at {self.address} after {limit_s:g} s{self._said()}"
                 raise PolicyError(
-                    DOING,
-                    self._name,
-                    found,
+                    f"{self._name}: nothing listens at {self.address} after {limit_s:g} s{self._said()}",
                     f"let it serve at the address in {VARIABLE}, or give it longer: ?ready_s=N",
                 )
             time.sleep(POLL_S)
@@ -238,9 +225,7 @@ class Served:
         if code is not None:
             self.stop()
             raise PolicyError(
-                DRIVING,
-                self._name,
-                f"it ended with {exit_reason(code)}{self._said()}",
+                f"{self._name}: it ended with {exit_reason(code)}{self._said()}",
                 "see output.log of the rollout",
             )
 
@@ -318,6 +303,6 @@ class CommandPolicy(DriverPolicy):
             SimrunError
         ) as error:  # a connection is lost, too, where the command has ended: that is its own fault
             self._served.require_running(0.0 if isinstance(error, PolicyError) else REAP_S)
-            if "DEADLINE_EXCEEDED" in error.found:  # it hangs: the next rollout gets a new one
+            if "DEADLINE_EXCEEDED" in error.message:  # it hangs: the next rollout gets a new one
                 self._served.stop()
             raise

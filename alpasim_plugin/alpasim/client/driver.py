@@ -187,18 +187,17 @@ class DriverPolicy(Policy):
     def _plan(self, answer: egodriver_pb2.DriveResponse, observation: Observation) -> Plan:
         if answer.terminate_session:
             raise PolicyError(
-                "asking an AlpaSim driver",
-                self.service.target,
-                "it ends the session",
+                f"{self.service.target}: it ends the session",
                 "see the driver's own log",
             )
         now = observation.t_us
         if not answer.trajectory.poses:
             self._facts["empty_plans"] += 1
             if now > self._scenario.start_us + self._scenario.warmup_us:
-                found = "an empty plan after the warm-up"
-                do_this = "lengthen timing.warmup_us until the driver has the frames that it needs"
-                raise PolicyError("asking an AlpaSim driver", self.service.target, found, do_this)
+                raise PolicyError(
+                    f"{self.service.target}: an empty plan after the warm-up",
+                    "lengthen timing.warmup_us until the driver has the frames that it needs",
+                )
             return straight_on(now, observation.ego.speed_mps)
         times, rows = in_rig(self._read(answer.trajectory, "the driver's plan"), observation)
         reach = (int(times[-1]) - now) * 1e-6
@@ -220,10 +219,9 @@ class DriverPolicy(Policy):
         try:
             return read_trajectory(message, what)
         except InputError as error:
-            found = f"{error.with_what}: {error.found}"
-            do_this = "send strictly increasing times, finite positions and unit quaternions"
             raise PolicyError(
-                "asking an AlpaSim driver", self.service.target, found, do_this
+                f"{self.service.target}: {error.message}",
+                "send strictly increasing times, finite positions and unit quaternions",
             ) from error
 
     def _call(self, method: str, request: Any) -> Any:
@@ -272,9 +270,7 @@ def cameras_of(
     if missing or not pairs:
         found = f"no camera {missing[0]!r} among {sorted(own)}" if missing else "no camera"
         raise InputError(
-            "connecting a driver to its cameras",
-            f"scene {scenario.scene_id!r}",
-            found,
+            f"scene {scenario.scene_id!r}: {found}",
             "write ?cameras=THEIRS:OURS,...",
         )
     return {a: own[b] for a, b in pairs}

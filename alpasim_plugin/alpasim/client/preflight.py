@@ -117,7 +117,7 @@ def findings(
         Finding(
             "a session from start to close",
             "failed" if failed else "passed",
-            str(failed.found) if failed else "answered throughout",
+            failed.message if failed else "answered throughout",
         )
     ]
     if times.seconds:
@@ -246,5 +246,5 @@ def _tried(name: str, call: Callable[[], Any]) -> Finding:
     try:
         call()
     except SimrunError as error:
-        return Finding(name, "failed", error.found)
+        return Finding(name, "failed", error.message)
     return Finding(name, "passed", "answered")

@@ -68,11 +68,8 @@ class NreRenderer(Renderer):
         got = {item.camera_name: item for item in answer.items}
         wanted = [item.camera_name for item in items]
         if sorted(got) != sorted(wanted) or len(answer.items) != len(wanted):
-            found = f"cameras {[item.camera_name for item in answer.items]} for {wanted}"
             raise RendererError(
-                DOING,
-                self._service.target,
-                found,
+                f"{self._service.target}: cameras {[item.camera_name for item in answer.items]} for {wanted}",
                 "make the service answer each camera of a batch once",
             )
         return [
@@ -89,9 +86,7 @@ class NreRenderer(Renderer):
     def _frame(self, item: sensorsim_pb2.BatchRGBRenderReturnItem, request: RenderRequest) -> Frame:
         if not item.success:
             raise RendererError(
-                DOING,
-                self._service.target,
-                f"camera {item.camera_name!r}: {item.error_message}",
+                f"{self._service.target}: camera {item.camera_name!r}: {item.error_message}",
                 "see the service's log",
             )
         try:
@@ -100,9 +95,7 @@ class NreRenderer(Renderer):
             )
         except InputError as error:
             raise RendererError(
-                DOING,
-                self._service.target,
-                f"{error.with_what}: {error.found}",
+                f"{self._service.target}: {error.message}",
                 "see the service's log",
             ) from error
         return Frame(request.t_us, request.camera.name, rgb)
@@ -110,13 +103,8 @@ class NreRenderer(Renderer):
     def _check_scene(self) -> None:
         scenes = self._service.call("get_available_scenes", common_pb2.Empty(), READY_S).scene_ids
         if "*" not in scenes and self._scene not in scenes:
-            found = (
-                f"no scene {self._scene!r} among its {len(scenes)}: {', '.join(sorted(scenes)[:5])}"
-            )
             raise InputError(
-                DOING,
-                self._service.target,
-                found,
+                f"{self._service.target}: no scene {self._scene!r} among its {len(scenes)}: {', '.join(sorted(scenes)[:5])}",
                 "give the service that scene, or name one of its own with ?scene=ID",
             )
 

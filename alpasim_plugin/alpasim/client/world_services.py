@@ -53,7 +53,6 @@ OPTIONS = ("physics", "scene", "timeout_s")
 DOING = "asking an AlpaSim controller"
 STEERED_MPS = 0.5  # below this speed a turn says nothing about the wheel
 _SESSIONS = itertools.count()
-ASKING_TRAFFIC = "asking an AlpaSim traffic service"
 
 
 class VdcController(Controller):
@@ -166,11 +165,8 @@ class VdcController(Controller):
             pose = answer.pose_local_to_rig.pose
             moving = answer.dynamic_state
         if t_us != to_us:
-            found = f"a state at {t_us} us for {to_us} us"
             raise InfrastructureError(
-                DOING,
-                self._service.target,
-                found,
+                f"{self._service.target}: a state at {t_us} us for {to_us} us",
                 "make the service answer with the state at future_time_us",
             )
         speed, turn = float(moving.linear_velocity.x), float(moving.angular_velocity.z)
@@ -206,13 +202,8 @@ class Physics:
         self._service.version()
         known = self._service.call("get_available_scenes", common_pb2.Empty()).scene_ids
         if "*" not in known and self._scene not in known:
-            found = (
-                f"no scene {self._scene!r} among its {len(known)}: {', '.join(sorted(known)[:5])}"
-            )
             raise InputError(
-                "setting the ego on the ground",
-                self._service.target,
-                found,
+                f"{self._service.target}: no scene {self._scene!r} among its {len(known)}: {', '.join(sorted(known)[:5])}",
                 "name one of its own with &scene=ID",
             )
         self._aabb = wire_box(vehicle.box)
@@ -235,11 +226,8 @@ class Physics:
         answer = self._service.call("ground_intersection", request, at_us=after.t_us)
         there = {int(one.timestamp_us): one.pose for one in answer.ego_trajectory_aabb.poses}
         if after.t_us not in there:
-            found = f"poses at {sorted(there)} us, none at {after.t_us} us"
             raise InfrastructureError(
-                "setting the ego on the ground",
-                self._service.target,
-                found,
+                f"{self._service.target}: poses at {sorted(there)} us, none at {after.t_us} us",
                 "see the service's own log",
             )
         box = _sent(there[after.t_us], "the box on the ground", self._service)
@@ -280,7 +268,7 @@ def _sent(pose: Any, what: str, service: Service) -> F64:
         return read_transform(pose, what)
     except InputError as error:
         raise InfrastructureError(
-            DOING, service.target, f"{error.with_what}: {error.found}", "see the service's own log"
+            f"{service.target}: {error.message}", "see the service's own log"
         ) from error
 
 
@@ -352,18 +340,15 @@ class RemoteActors(Actors):
         facts = self.service.call("get_metadata", common_pb2.Empty())
         past_us = scenario.start_us + scenario.warmup_us - int(scenario.ego_log.t_us[0])
         if facts.minimum_history_length_us > past_us:
-            found = f"it needs {facts.minimum_history_length_us * 1e-6:g} s of the past, the scenario has {past_us * 1e-6:g} s at the hand-over"
             raise InputError(
-                ASKING_TRAFFIC,
-                self.service.target,
-                found,
+                f"{self.service.target}: it needs {facts.minimum_history_length_us * 1e-06:g} s of the past, the scenario has {past_us * 1e-06:g} s at the hand-over",
                 "lengthen timing.warmup_us, or start later in the recording",
             )
         known = self.service.call("get_available_scenes", common_pb2.Empty()).scene_ids
         if "*" not in known and scenario.scene_id not in known:
-            found = f"no scene {scenario.scene_id!r} among its {len(known)}: {', '.join(sorted(known)[:5])}"
             raise InputError(
-                ASKING_TRAFFIC, self.service.target, found, "give the service that scene"
+                f"{self.service.target}: no scene {scenario.scene_id!r} among its {len(known)}: {', '.join(sorted(known)[:5])}",
+                "give the service that scene",
             )
 
     def _moved(self, answer: traffic_pb2.TrafficReturn, t_us: int) -> dict[str, F64]:
@@ -382,15 +367,15 @@ class RemoteActors(Actors):
                     else "is unknown"
                 )
                 raise InfrastructureError(
-                    ASKING_TRAFFIC, self.service.target, found, "see the service's own log"
+                    f"{self.service.target}: {found}", "see the service's own log"
                 )
             try:
                 out[update.object_id] = read_transform(
                     now[0], f"track {update.object_id!r} at {t_us} us"
                 )
             except InputError as error:
-                found = f"{error.with_what}: {error.found}"
                 raise InfrastructureError(
-                    ASKING_TRAFFIC, self.service.target, found, "see the service's own log"
+                    f"{self.service.target}: {error.message}",
+                    "see the service's own log",
                 ) from error
         return out

@@ -104,9 +104,9 @@ class Upstream:
             or not set(given) <= known
             or given.get("image", "png") not in ("png", "as-asked")
         ):
-            do_this = "write HOST:PORT[?ca=FILE&token_file=FILE&image=png|as-asked]"
             raise InputError(
-                DOING, f"--upstream {text}", "no address, or an option that is unknown", do_this
+                f"--upstream {text}: no address, or an option that is unknown",
+                "write HOST:PORT[?ca=FILE&token_file=FILE&image=png|as-asked]",
             )
         ca, token = (Path(given[key]) if key in given else None for key in ("ca", "token_file"))
         return cls(address, ca, read_token(token), given.get("image") != "as-asked")
@@ -117,9 +117,7 @@ class Upstream:
         if self.ca is None:
             if self.token is not None:
                 raise InputError(
-                    DOING,
-                    f"upstream {self.address}",
-                    "a token over plain text",
+                    f"upstream {self.address}: a token over plain text",
                     "give ?ca=FILE as well",
                 )
             return grpc.insecure_channel(self.address, options)
@@ -212,31 +210,22 @@ def assemble(settings: Settings) -> Assembled:
     spec = resolve_served(settings.renderer, settings.overrides)
     if settings.upstream is None and not settings.scenes:
         raise InputError(
-            DOING,
-            "the command",
-            "neither --scenes nor --upstream",
+            "the command: neither --scenes nor --upstream",
             "say what to render, or who renders",
         )
     if settings.upstream is not None and spec.fixer is None and settings.renderer != "identity":
-        found = f"{settings.renderer!r} renders itself"
         raise InputError(
-            DOING,
-            f"--upstream {settings.upstream.address}",
-            found,
+            f"--upstream {settings.upstream.address}: {settings.renderer!r} renders itself",
             "give a fixer (onefixer), identity, or no --upstream",
         )
     if settings.upstream is None and (settings.masks or settings.reliability is not None):
         raise InputError(
-            DOING,
-            "--reliability, --mask",
-            "our own renderer states its opacity",
+            "--reliability, --mask: our own renderer states its opacity",
             "use them with --upstream",
         )
     if settings.upstream is not None and settings.render_width is not None:
         raise InputError(
-            DOING,
-            "--render-width",
-            "the upstream chooses the size of its pictures",
+            "--render-width: the upstream chooses the size of its pictures",
             "use it without --upstream",
         )
     busy = threading.Lock()

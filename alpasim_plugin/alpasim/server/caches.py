@@ -28,7 +28,6 @@ from alpasim_plugin.runs.guards import checked_frames
 from scenarios.load import load_scenario
 from scenarios.usdz import usdz_scene_id
 
-CHOOSING = "choosing a renderer to serve"
 DOING = "looking for a scene"
 FILES = (".usdz", ".yaml", ".yml", ".xml")
 
@@ -65,9 +64,7 @@ def resolve_served(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
     if settings.loop_mode == "frame by frame":
         found = f"{spec.fixer.name} has one history a camera, and requests of several drives come over one connection"
     raise InputError(
-        CHOOSING,
-        f"renderer {name!r}",
-        found,
+        f"renderer {name!r}: {found}",
         "serve a fixer with an explicit past, such as onefixer",
     )
 
@@ -98,11 +95,8 @@ class FixerCache:
                 self._made.clear()
             fixer = build(self._spec, scene_id=scene_id, seed=seed, **self._session)
             if fixer.blocks != BlockRule(1, 1) or not hasattr(fixer, "advance"):
-                found = f"{type(fixer).__name__} has no advance(frame, map, past)"
                 raise InputError(
-                    CHOOSING,
-                    f"fixer {self._spec.name!r}",
-                    found,
+                    f"fixer {self._spec.name!r}: {type(fixer).__name__} has no advance(frame, map, past)",
                     "serve a fixer of single frames, such as onefixer",
                 )
             self._made[key] = fixer
@@ -220,9 +214,7 @@ class SceneCache:
         if scene_id not in self._sources:
             some = ", ".join(self.ids[:5]) + (" ..." if len(self._sources) > 5 else "")
             raise UnknownScene(
-                DOING,
-                f"scene {scene_id!r}",
-                f"it is none of the {len(self._sources)} known: {some}",
+                f"scene {scene_id!r}: it is none of the {len(self._sources)} known: {some}",
                 "add its file to --scenes",
             )
         return None
@@ -267,9 +259,7 @@ class SceneCache:
         )
         if scene_id in self._sources:
             raise InputError(
-                DOING,
-                f"scene {scene_id!r}",
-                f"both {self._sources[scene_id]} and {source} have this id",
+                f"scene {scene_id!r}: both {self._sources[scene_id]} and {source} have this id",
                 "remove one",
             )
         self._sources[scene_id] = source
@@ -292,8 +282,10 @@ def sources_in(place: str | Path) -> list[str | Path]:
         return files
     logs: list[str | Path] = [path for path in sorted(folder.iterdir()) if path.is_dir()]
     if not logs:
-        do = "name a folder with scenes, a file or a shipped scenario"
-        raise InputError(DOING, str(place), f"no {', '.join(FILES)} and no recorded log", do)
+        raise InputError(
+            f"{place}: no {', '.join(FILES)} and no recorded log",
+            "name a folder with scenes, a file or a shipped scenario",
+        )
     return logs
 
 

@@ -172,9 +172,7 @@ class DriverService:
         session = self.sessions.get(name)
         if session is None:
             raise InputError(
-                "serving a policy",
-                f"session {name!r}",
-                "it is not open, or has expired",
+                f"session {name!r}: it is not open, or has expired",
                 "call start_session first",
             )
         return session
@@ -215,11 +213,9 @@ class Driving:
                 than those before.
         """
         if image.logical_id not in self._native:
-            found = (
-                f"an image of camera {image.logical_id!r}; the session has {sorted(self._native)}"
-            )
             raise InputError(
-                DOING, "submit_image_observation", found, "send only the cameras of the session"
+                f"submit_image_observation: an image of camera {image.logical_id!r}; the session has {sorted(self._native)}",
+                "send only the cameras of the session",
             )
         check_time(image.frame_end_us, "submit_image_observation")
         rgb = decode_image(
@@ -227,11 +223,8 @@ class Driving:
         )
         height, width = rgb.shape[:2]
         if (held := self._sizes.setdefault(image.logical_id, (width, height))) != (width, height):
-            found = f"{width} x {height} pixels after {held[0]} x {held[1]}"
             raise InputError(
-                DOING,
-                f"camera {image.logical_id!r}",
-                found,
+                f"camera {image.logical_id!r}: {width} x {height} pixels after {held[0]} x {held[1]}",
                 "send all images of a camera in one size",
             )
         lens = straight_of(self._native[image.logical_id].intrinsics, width, height)
@@ -295,9 +288,7 @@ class Driving:
             problem = plan_problem(plan, now_us)
             if problem:
                 raise PolicyError(
-                    DOING,
-                    type(policy).__name__,
-                    problem,
+                    f"{type(policy).__name__}: {problem}",
                     "simrun check-policy finds all faults of a policy",
                 )
             return self._answer(plan, ego.T_world_rig)
@@ -332,9 +323,7 @@ class Driving:
                 found or f"it asks for cameras {missing}; the session has {sorted(self._native)}"
             )
             raise PolicyError(
-                DOING,
-                type(policy).__name__,
-                found,
+                f"{type(policy).__name__}: {found}",
                 "name the session's cameras as the policy does: ?cameras=NAME,...",
             )
         self._cameras = {camera.name: camera for camera in cameras if camera.name in wanted}
@@ -371,7 +360,7 @@ class Driving:
 def check_time(t_us: int, call: str) -> None:
     """Raise `InputError` for a time that no rollout has: computing with it would overflow."""
     if t_us >= MAX_TIME_US:
-        raise InputError(DOING, call, f"{t_us} us", "send a time below 2^62 microseconds")
+        raise InputError(f"{call}: {t_us} us", "send a time below 2^62 microseconds")
 
 
 def _absolute(plan: Plan, rows: F64, T_world_rig: F64) -> Any:
@@ -391,18 +380,16 @@ def _native(listed: Any) -> dict[str, sensorsim_pb2.AvailableCamerasReturn.Avail
         InputError: An invalid lens or camera pose, or too many cameras.
     """
     if len(listed) > MOST_CAMERAS:
-        raise InputError(
-            DOING, "start_session", f"{len(listed)} cameras", f"name at most {MOST_CAMERAS}"
-        )
+        raise InputError(f"start_session: {len(listed)} cameras", f"name at most {MOST_CAMERAS}")
     for camera in listed:
         try:
             straight_of(
                 camera.intrinsics, camera.intrinsics.resolution_w, camera.intrinsics.resolution_h
             )
         except InputError as error:
-            do_this = "give the driver a pinhole view of it: runtime.extra_cameras in AlpaSim, or a renderer that serves pinholes"
             raise InputError(
-                DOING, f"camera {camera.logical_id!r}", error.found, do_this
+                f"camera {camera.logical_id!r}: {error.message}",
+                "give the driver a pinhole view of it: runtime.extra_cameras in AlpaSim, or a renderer that serves pinholes",
             ) from error
         read_transform(camera.rig_to_camera, f"mounting of camera {camera.logical_id!r}")
     return {camera.logical_id: camera for camera in listed}
@@ -427,9 +414,9 @@ def serve_policy(factory: Callable[..., Any], address: str | None = None) -> Non
     """
     place = address or os.environ.get(ADDRESS, "")
     if not place:
-        do_this = f"start the script by simrun --policy 'exec:python SCRIPT.py', or set {ADDRESS}=127.0.0.1:6000"
         raise InputError(
-            "serving a policy", f"environment variable {ADDRESS}", "it is not set", do_this
+            f"environment variable {ADDRESS}: it is not set",
+            f"start the script by simrun --policy 'exec:python SCRIPT.py', or set {ADDRESS}=127.0.0.1:6000",
         )
     takes_scenario = "scenario" in inspect.signature(factory).parameters
     name = getattr(factory, "__name__", type(factory).__name__)

@@ -91,9 +91,7 @@ class FrameServer:
         views = [read_view(request) for request in requests]
         if (pixels := sum(view.width * view.height for view in views)) > MOST_PIXELS:
             raise InputError(
-                DOING,
-                f"{len(views)} frames",
-                f"{pixels} pixels",
+                f"{len(views)} frames: {pixels} pixels",
                 f"ask for at most {MOST_PIXELS} in one call",
             )
         sizes = [(view.width, view.height) for view in views]
@@ -159,11 +157,8 @@ class FrameServer:
             # and the entry.
             parent = self.tree.parent_of(view)
             if parent is not None and parent.state.image.shape != item.frame.rgb.shape:
-                found = f"a picture of {item.frame.rgb.shape[:2]} after {parent.state.image.shape[:2]} (height, width)"
                 raise UpstreamFault(
-                    DOING,
-                    f"scene {view.scene_id!r}, camera {view.camera!r}",
-                    found,
+                    f"scene {view.scene_id!r}, camera {view.camera!r}: a picture of {item.frame.rgb.shape[:2]} after {parent.state.image.shape[:2]} (height, width)",
                     "see the upstream's log",
                 )
             past = None if parent is None else parent.state.past
@@ -218,11 +213,9 @@ def image_form(request: Request) -> tuple[int, float]:
             if request.image_format < 7
             else str(request.image_format)
         )
-        raise InputError(
-            DOING, f"image_format {name}", "no format that is made here", "ask for PNG or JPEG"
-        )
+        raise InputError(f"image_format {name}: no format that is made here", "ask for PNG or JPEG")
     if not 1 <= quality <= 100:
-        raise InputError(DOING, f"image_quality {quality}", "not between 1 and 100", "ask for 95")
+        raise InputError(f"image_quality {quality}: not between 1 and 100", "ask for 95")
     return request.image_format, quality if request.image_format == sensorsim_pb2.JPEG else 0.0
 
 

@@ -225,9 +225,9 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
 
     def _exchange(self, handler: Any, messages: Iterator[bytes], context: Any) -> Iterator[Any]:
         following = iter(partial(self._light_messages.next, messages, context), None)
-        return handler.stream_stream(
+        return handler.stream_stream(  # type: ignore[no-any-return]
             (parsed(handler, data, context) for data in following), context
-        )  # type: ignore[no-any-return]
+        )
 
 
 def unauthenticated(messages: Iterator[bytes], context: Any) -> None:

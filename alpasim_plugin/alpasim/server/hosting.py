@@ -67,9 +67,7 @@ class HostPolicy:
         if self.tls_cert is None and self.tls_key is None and self.tls_client_ca is None:
             return None
         if self.tls_cert is None or self.tls_key is None:
-            raise InputError(
-                DOING, "TLS", "one of certificate and key", "give --tls-cert and --tls-key"
-            )
+            raise InputError("TLS: one of certificate and key", "give --tls-cert and --tls-key")
         ca = None if self.tls_client_ca is None else read_pem(self.tls_client_ca)
         pair = read_pem(self.tls_key), read_pem(self.tls_cert)
         return grpc.ssl_server_credentials(
@@ -90,9 +88,7 @@ def read_pem(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InputError(
-            DOING, str(path), error.strerror or str(error), "name a PEM file"
-        ) from error
+        raise InputError(f"{path}: {error.strerror or str(error)}", "name a PEM file") from error
 
 
 def read_token(path: Path | None) -> str | None:
@@ -106,11 +102,9 @@ def read_token(path: Path | None) -> str | None:
     try:
         token = path.read_text().strip()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            "reading a token", str(path), f"{error}", "name a readable text file"
-        ) from error
+        raise InputError(f"{path}: {error}", "name a readable text file") from error
     if not token:
-        raise InputError("reading a token", str(path), "an empty file", "write the token into it")
+        raise InputError(f"{path}: an empty file", "write the token into it")
     return token
 
 
@@ -164,16 +158,11 @@ class Sessions(Generic[S]):
         self.expire()
         with self._lock:
             if name in self._open:
-                raise InputError(
-                    "opening a session", f"session {name!r}", "it is open already", "close it first"
-                )
+                raise InputError(f"session {name!r}: it is open already", "close it first")
             if len(self._open) >= self._most:
-                do_this = f"close sessions that are over; abandoned ones end after {self._expiry_s:g} s (--expiry-s)"
                 raise Full(
-                    "opening a session",
-                    f"session {name!r}",
-                    f"{self._most} sessions are open",
-                    do_this,
+                    f"session {name!r}: {self._most} sessions are open",
+                    f"close sessions that are over; abandoned ones end after {self._expiry_s:g} s (--expiry-s)",
                 )
             self._open[name] = session, self._clock()
 
@@ -251,9 +240,7 @@ class Host:
         try:
             if not is_socket and (not host or not port.isdigit()):
                 raise InputError(
-                    DOING,
-                    f"--listen {listen}",
-                    "no HOST:PORT",
+                    f"--listen {listen}: no HOST:PORT",
                     "write for example 127.0.0.1:50051, or unix:PATH",
                 )
             add = (
@@ -263,7 +250,7 @@ class Host:
             )
         except RuntimeError as error:
             raise InfrastructureError(
-                DOING, listen, str(error), "choose a free port and an address of this machine"
+                f"{listen}: {error}", "choose a free port and an address of this machine"
             ) from error
         self.address = listen if is_socket else f"{host}:{add}"
         policy.warn(self.address)

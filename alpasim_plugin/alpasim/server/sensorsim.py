@@ -78,9 +78,7 @@ class Sensorsim(Failures):
         left = CallTime(context)
         names = [item.camera_name for item in request.items]
         if len(set(names)) < len(names):
-            raise InputError(
-                DOING, f"a batch of {names}", "a camera name twice", "send one item a camera"
-            )
+            raise InputError(f"a batch of {names}: a camera name twice", "send one item a camera")
         if self._verbatim:
             return self._pass(
                 "batch_render_rgb", request, context, sensorsim_pb2.BatchRGBRenderReturn

@@ -44,7 +44,6 @@ NEAR_M, FAR_M = (
     3.0,
 )  # distance from the recorded path where trust begins to fall, and where it has fallen
 FAR = 0.6  # above 0.5: a hole is never invented
-ESTIMATING = "estimating the reliability of an upstream's frame"
 DOING = "rendering a requested frame"
 MAP_OFF = "map-off"
 log = logging.getLogger("simrun.serve")
@@ -72,7 +71,7 @@ def read_masks(named: Mapping[str, Path]) -> dict[str, U8]:
         InputError: A file that is no picture.
     """
     return {
-        camera: np.asarray(read_image(path, ESTIMATING, flag=cv2.IMREAD_GRAYSCALE))
+        camera: np.asarray(read_image(path, flag=cv2.IMREAD_GRAYSCALE))
         for camera, path in named.items()
     }
 
@@ -80,7 +79,7 @@ def read_masks(named: Mapping[str, Path]) -> dict[str, U8]:
 def trusted_opacity(trust: float, mask: U8 | None, height: int, width: int) -> F32:
     """Return the opacity ``(H, W)`` that stands for a frame's trust."""
     if not 0.0 <= trust <= 1.0:
-        raise InputError(ESTIMATING, "the reliability", f"{trust}", "give a number from 0 to 1")
+        raise InputError(f"the reliability: {trust}", "give a number from 0 to 1")
     out = np.full((height, width), trust, dtype=np.float32)
     if mask is not None:
         out = np.minimum(
@@ -124,8 +123,10 @@ def boxes_at(entry: SceneEntry, view: View) -> dict[str, F64]:
         found = f"track {foreign[0]!r}" + (
             f" and {len(foreign) - 1} more" if len(foreign) > 1 else ""
         )
-        do = "render with the scene file that the runtime uses"
-        raise InputError(DOING, f"scene {view.scene_id!r}", f"{found}, not in the scene", do)
+        raise InputError(
+            f"scene {view.scene_id!r}: {found}, not in the scene",
+            "render with the scene file that the runtime uses",
+        )
     poses = {}
     for actor_id, actor in known.items():
         if (
@@ -427,12 +428,9 @@ class UpstreamSource:
                     asked, timeout=left.left_s()
                 ).available_trajectories
                 if not listed or len(listed[0].trajectory.poses) < 2:
-                    do = "give --scenes with the scene's file, or a fixed --reliability"
                     raise InputError(
-                        ESTIMATING,
-                        f"scene {view.scene_id!r}",
-                        "the upstream lists no recorded path",
-                        do,
+                        f"scene {view.scene_id!r}: the upstream lists no recorded path",
+                        "give --scenes with the scene's file, or a fixed --reliability",
                     )
                 path = read_trajectory(
                     listed[0].trajectory, f"recorded path of scene {view.scene_id!r}"
@@ -485,7 +483,7 @@ def batch_images(reply: sensorsim_pb2.BatchRGBRenderReturn, names: Sequence[str]
     ]
     if bad or len(reply.items) != len(names) or set(found) != set(names):
         what = bad[0] if bad else f"{len(reply.items)} items for {len(names)}"
-        raise UpstreamFault(DOING, "the upstream's batch", what, "see the upstream's log")
+        raise UpstreamFault(f"the upstream's batch: {what}", "see the upstream's log")
     return [found[name].result.image_bytes for name in names]
 
 
@@ -503,15 +501,13 @@ def decoded(data: bytes, what: str) -> U8:
     try:
         if not whole:
             raise InputError(
-                DOING,
-                what,
-                f"{len(data)} bytes that are no whole PNG or JPEG",
+                f"{what}: {len(data)} bytes that are no whole PNG or JPEG",
                 "see the upstream's log",
             )
         return decode_image(data, what)
     except SimrunError as error:
         raise UpstreamFault(
-            DOING, what, f"the upstream's picture: {error.found}", "see the upstream's log"
+            f"{what}: the upstream's picture: {error.message}", "see the upstream's log"
         ) from error
 
 

@@ -117,7 +117,7 @@ def status_of(error: Exception) -> tuple[Any, str]:
 
 def one_line(error: SimrunError) -> str:
     """Return an error's four parts in one line."""
-    return f"{error.doing}: {error.with_what}: {error.found}; {error.do_this}"
+    return f"{error.message}; {error.hint}"
 
 
 def answering(call: Callable[[Any, Any, Any], Any]) -> Callable[[Any, Any, Any], Any]:

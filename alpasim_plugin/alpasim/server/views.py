@@ -28,7 +28,6 @@ DOING = "reading a render request"
 QUAT_NORM_TOLERANCE = 1e-4  # of the squared norm, as AlpaSim checks it
 MAX_SIDE_PX, MAX_PIXELS = 8192, 1 << 24
 MAX_TIME_US = 2**62
-READING_LENS = "reading a camera's intrinsics"
 WIDEST_RAD = np.deg2rad(80.0)  # from the optical axis: beyond it one plane cannot carry the picture
 MAX_COVER_PX = (
     6_000_000  # pixels of the covering pinhole; its resolution falls for lenses that need more
@@ -81,19 +80,21 @@ def read_view(request: sensorsim_pb2.RGBRenderRequest) -> View:
     what = f"scene {request.scene_id!r}, camera {camera!r} at {request.frame_end_us} us"
     sides = request.resolution_w, request.resolution_h
     if not (min(sides) > 0 and max(sides) <= MAX_SIDE_PX and sides[0] * sides[1] <= MAX_PIXELS):
-        found = f"{request.resolution_w} x {request.resolution_h} pixels"
         raise InputError(
-            DOING, what, found, f"ask for 1 to {MAX_SIDE_PX} pixels a side, and {MAX_PIXELS} in all"
+            f"{what}: {request.resolution_w} x {request.resolution_h} pixels",
+            f"ask for 1 to {MAX_SIDE_PX} pixels a side, and {MAX_PIXELS} in all",
         )
     if not request.frame_start_us <= request.frame_end_us < MAX_TIME_US:
-        found = f"a shutter from {request.frame_start_us} to {request.frame_end_us} us"
-        raise InputError(DOING, what, found, "give microseconds that do not fall")
+        raise InputError(
+            f"{what}: a shutter from {request.frame_start_us} to {request.frame_end_us} us",
+            "give microseconds that do not fall",
+        )
     objects = {
         o.track_id: read_pair(o.pose_pair, f"{what}, track {o.track_id!r}")
         for o in request.dynamic_objects
     }
     if len(objects) != len(request.dynamic_objects):
-        raise InputError(DOING, what, "a track id twice", "send every dynamic object once")
+        raise InputError(f"{what}: a track id twice", "send every dynamic object once")
     content = sensorsim_pb2.RGBRenderRequest()
     content.CopyFrom(request)
     content.ClearField("image_format")
@@ -127,11 +128,8 @@ def read_pose(pose: common_pb2.Pose, what: str) -> F64:
     )
     square = float(quat @ quat)
     if not (np.isfinite(xyz).all() and abs(square - 1.0) <= QUAT_NORM_TOLERANCE):
-        found = f"position {xyz.tolist()}, quaternion {quat.tolist()} with |q|^2 = {square:.6g}"
         raise InputError(
-            DOING,
-            what,
-            found,
+            f"{what}: position {xyz.tolist()}, quaternion {quat.tolist()} with |q|^2 = {square:.6g}",
             "give finite positions and unit quaternions (w = 1 where there is no rotation)",
         )
     return se3(xyz, quat / np.sqrt(square))
@@ -299,18 +297,14 @@ def _read(data: bytes, width: int, height: int) -> Lens:
     spec = sensorsim_pb2.CameraSpec.FromString(data)
     what = f"camera {spec.logical_id!r}"
     if spec.resolution_w == 0 or spec.resolution_h == 0:
-        raise InputError(
-            READING_LENS, what, "no calibrated resolution", "fill resolution_w and resolution_h"
-        )
+        raise InputError(f"{what}: no calibrated resolution", "fill resolution_w and resolution_h")
     if width * height > MAX_PIXELS:
         raise InputError(
-            READING_LENS, what, f"{width} x {height} pixels", f"ask for at most {MAX_PIXELS} in all"
+            f"{what}: {width} x {height} pixels", f"ask for at most {MAX_PIXELS} in all"
         )
     if spec.WhichOneof("external_distortion") is not None:
         raise InputError(
-            READING_LENS,
-            what,
-            "a windshield model",
+            f"{what}: a windshield model",
             "it cannot be rendered here: put a renderer that can behind --upstream",
         )
     scale = width / spec.resolution_w, height / spec.resolution_h
@@ -322,9 +316,7 @@ def _read(data: bytes, width: int, height: int) -> Lens:
     if kind == "ftheta_param":
         return _ftheta(spec.ftheta_param, scale, width, height, what)
     raise InputError(
-        READING_LENS,
-        what,
-        "no intrinsics",
+        f"{what}: no intrinsics",
         "fill ftheta_param, opencv_pinhole_param or opencv_fisheye_param",
     )
 
@@ -484,11 +476,8 @@ def _covered(
         np.arccos(np.clip(rays[seen, 2] / np.linalg.norm(rays[seen], axis=1), -1, 1)).max()
     )
     if widest > WIDEST_RAD:
-        found = f"a view of {np.rad2deg(widest):.0f} degrees from the axis"
         raise InputError(
-            READING_LENS,
-            what,
-            found,
+            f"{what}: a view of {np.rad2deg(widest):.0f} degrees from the axis",
             f"set max_angle to at most {np.rad2deg(WIDEST_RAD):.0f} degrees, or use --upstream",
         )
     xy = np.divide(
@@ -521,4 +510,4 @@ def _centres(width: int, height: int) -> F64:
 
 def _require(fine: bool, what: str, found: str) -> None:
     if not fine:
-        raise InputError(READING_LENS, what, found, "send intrinsics that describe a lens")
+        raise InputError(f"{what}: {found}", "send intrinsics that describe a lens")

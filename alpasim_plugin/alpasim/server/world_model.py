@@ -119,18 +119,20 @@ class WorldModel(Failures):
         mounts = request.rig_to_camera
         frames = request.initial_frames
         if not specs or not len(specs) == len(mounts) == len(frames):
-            found = f"{len(specs)} camera_specs, {len(mounts)} rig_to_camera, {len(frames)} initial_frames"
-            raise InputError(DOING, "a session request", found, "send one of each for every view")
+            raise InputError(
+                f"a session request: {len(specs)} camera_specs, {len(mounts)} rig_to_camera, {len(frames)} initial_frames",
+                "send one of each for every view",
+            )
         names = [spec.logical_id for spec in specs]
         if len(set(names)) < len(names):
             raise InputError(
-                DOING, "a session request", f"cameras {names}", "give every view its own logical_id"
+                f"a session request: cameras {names}", "give every view its own logical_id"
             )
         scene_id = self._scene_of(clip_of(request.static_world_map.hdmap_parquets))
         cameras = []
         for spec, mount, frame in zip(specs, mounts, frames, strict=True):
             what = f"camera {spec.logical_id!r}"
-            check_image(frame.data, f"{what}, its initial frame", DOING)
+            check_image(frame.data, f"{what}, its initial frame")
             lens = read_lens(spec, spec.resolution_w, spec.resolution_h)
             cameras.append(
                 (
@@ -169,9 +171,9 @@ class WorldModel(Failures):
         left = CallTime(context)
         session = self.sessions.get(request.session_id.session_id)
         if session is None:
-            found = "it is unknown, closed or expired"
             raise UnknownScene(
-                DOING, f"session {request.session_id.session_id!r}", found, "start a session first"
+                f"session {request.session_id.session_id!r}: it is unknown, closed or expired",
+                "start a session first",
             )
         with left.holding(session.lock):
             data = request.SerializeToString(deterministic=True)
@@ -190,9 +192,7 @@ class WorldModel(Failures):
             b >= t for b, t in zip(before, times[-len(before) :] if before else [], strict=True)
         ):
             raise InputError(
-                DOING,
-                f"session of {session.scene_id!r}",
-                f"times {times} after {session.end_us}",
+                f"session of {session.scene_id!r}: times {times} after {session.end_us}",
                 "give times that increase",
             )
         entry = self._scenes.get(session.scene_id, left)
@@ -256,8 +256,10 @@ class WorldModel(Failures):
         for scene_id in (clip, f"clipgt-{clip}"):
             if scene_id in known:
                 return scene_id
-        found = f"none of the {len(known)} known scenes is it"
-        raise UnknownScene(DOING, f"clip {clip!r}", found, "add the scene's file to --scenes")
+        raise UnknownScene(
+            f"clip {clip!r}: none of the {len(known)} known scenes is it",
+            "add the scene's file to --scenes",
+        )
 
 
 def clip_of(archive: bytes) -> str:
@@ -268,7 +270,7 @@ def clip_of(archive: bytes) -> str:
     """
     what = f"{len(archive)} bytes that are no ZIP"
     with (
-        parsing(DOING, "the map of a session", "send zipped parquet tables", what),
+        parsing("the map of a session", "send zipped parquet tables", what),
         zipfile.ZipFile(BytesIO(archive)) as zipped,
     ):
         names = zipped.namelist()[:MAX_MEMBERS]
@@ -278,11 +280,8 @@ def clip_of(archive: bytes) -> str:
         if name.endswith(".parquet")
     }
     if len(clips) != 1 or "" in clips:
-        found = f"{len(names)} members of clips {sorted(clips)[:3]}"
         raise InputError(
-            DOING,
-            "the map of a session",
-            found,
+            f"the map of a session: {len(names)} members of clips {sorted(clips)[:3]}",
             "send members named CLIP.TABLE.parquet, all of one clip",
         )
     return clips.pop()
@@ -296,9 +295,7 @@ def check_length(frames: int, first: bool) -> None:
         rule = (
             "1 + 4 k in the first chunk (5, 9, 13)" if first else "4 k in a later chunk (8, 12, 16)"
         )
-        raise InputError(
-            DOING, "a chunk", f"{frames} poses", f"ask for {rule}, at most {MAX_FRAMES}"
-        )
+        raise InputError(f"a chunk: {frames} poses", f"ask for {rule}, at most {MAX_FRAMES}")
 
 
 def boxes_by_time(
@@ -331,11 +328,8 @@ def boxes_by_time(
             actor for actor in free.values() if np.abs(sizes(actor) - size).max() < SAME_SIZE_M
         ]
         if not alike:
-            found = f"road user {index} of {np.round(size, 3).tolist()} m"
             raise InputError(
-                DOING,
-                f"scene {entry.scenario.scene_id!r}",
-                found,
+                f"scene {entry.scenario.scene_id!r}: road user {index} of {np.round(size, 3).tolist()} m",
                 "render with the scene file that the runtime uses",
             )
         t_us, pose = next(iter(poses.items()))

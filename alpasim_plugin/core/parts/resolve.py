@@ -80,8 +80,10 @@ def find(kind: KindName, name: str) -> Entry:
         return known[name]
     near = difflib.get_close_matches(name, known, n=1)
     hint = f"did you mean {near[0]!r}? " if near else ""
-    do = f"{hint}known: {', '.join(known)}; or name one of your own as package.module:Class"
-    raise InputError(f"looking up a {kind}", f"name {name!r}", f"no {kind} has that name", do)
+    raise InputError(
+        f"name {name!r}: no {kind} has that name",
+        f"{hint}known: {', '.join(known)}; or name one of your own as package.module:Class",
+    )
 
 
 BASE = "3dgs"  # the renderer below a fixer where nothing else is said
@@ -181,12 +183,9 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
     front, plus, base = plain.partition("+")
     if not plus:
         if own and front in entries("renderer"):
-            do = "leave the brackets out, or name a fixer: onefixer[references=0]"
             raise InputError(
-                DOING,
-                f"renderer {name!r}",
-                f"{front!r} is no fixer: it has no settings for brackets",
-                do,
+                f"renderer {name!r}: {front!r} is no fixer: it has no settings for brackets",
+                "leave the brackets out, or name a fixer: onefixer[references=0]",
             )
         if (
             front in entries("renderer")
@@ -223,9 +222,7 @@ def split_settings(name: str) -> tuple[str, tuple[str, ...]]:
     settings = tuple(text.strip() for text in match[2].split(",")) if match else ()
     if match is None or not all(re.fullmatch(r"[\w.]+=.+", text) for text in settings):
         raise InputError(
-            DOING,
-            f"renderer {name!r}",
-            "no settings in its brackets",
+            f"renderer {name!r}: no settings in its brackets",
             "write FIXER[KEY=VALUE,...]: onefixer[references=0]",
         )
     return match[1] + match[3], settings
@@ -262,9 +259,9 @@ def split_steps(name: str) -> tuple[str, int | None]:
     """
     plain, at, count = name.partition("@")
     if at and not re.fullmatch("[1-9][0-9]?", count):
-        found = f"{count!r} after @ is no step count"
         raise InputError(
-            "choosing a fixer", f"name {name!r}", found, "write NAME@STEPS, such as onefixer@2"
+            f"name {name!r}: {count!r} after @ is no step count",
+            "write NAME@STEPS, such as onefixer@2",
         )
     return plain, int(count) if at else None
 
@@ -361,9 +358,8 @@ def _settings(
     if hasattr(model, "load"):
         settings: BaseModel = model.load(name, overrides)
         return settings
-    doing = f"reading the settings of a {kind}"
     validated: BaseModel = validate(
-        model, apply_overrides(Document({}, {}, f"the defaults of {name}"), overrides, doing), doing
+        model, apply_overrides(Document({}, {}, f"the defaults of {name}"), overrides)
     )
     return validated
 
@@ -378,17 +374,16 @@ def _in_the_loop(fixer: PartSpec) -> PartSpec:
     """Refuse a fixer without weights, and one that needs frames which a closed loop has not
     rendered yet.
     """
-    doing, named = "choosing a renderer for a closed loop", f"fixer {fixer.name!r}"
+    named = f"fixer {fixer.name!r}"
     settings: Any = fixer.settings
     if getattr(settings, "is_offline", False):
         ahead = settings.unit.lookahead_frames
-        found = (
-            f"its first frame needs {ahead} frames after it, which a closed loop has not driven yet"
+        raise InputError(
+            f"{named}: its first frame needs {ahead} frames after it, which a closed loop has not driven yet",
+            f"fix recorded clips with it: simrun refine --fixer {fixer.name}, simrun bench quality --fixer {fixer.name}",
         )
-        do = f"fix recorded clips with it: simrun refine --fixer {fixer.name}, simrun bench quality --fixer {fixer.name}"
-        raise InputError(doing, named, found, do)
     if fixer.missing:
-        raise InputError(doing, named, fixer.note, fixer.missing)
+        raise InputError(f"{named}: {fixer.note}", fixer.missing)
     return fixer
 
 
@@ -404,16 +399,12 @@ def _require_fixer(name: str, front: str, is_composite: bool) -> None:
         return
     if steps is not None and plain in renderers:
         raise InputError(
-            DOING,
-            f"renderer {name!r}",
-            f"{plain!r} has no step count",
+            f"renderer {name!r}: {plain!r} has no step count",
             f"write {plain}, or FIXER@STEPS",
         )
     near = difflib.get_close_matches(plain, [*renderers, *fixers], n=1)
     raise InputError(
-        DOING,
-        f"renderer {name!r}",
-        f"no {'fixer' if is_composite else 'renderer or fixer'} has the name {plain!r}",
+        f"renderer {name!r}: no {'fixer' if is_composite else 'renderer or fixer'} has the name {plain!r}",
         (f"did you mean {near[0]!r}? " if near else "")
         + "'simrun list renderers' and 'simrun list fixers' name them; together FIXER+RENDERER; your own as package.module:Class",
     )

@@ -298,9 +298,7 @@ def load(target: str, kind: str) -> Any:
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # whatever a user's module raises while it is imported
-        raise InputError(
-            f"importing a {kind}", f"{kind} {target!r}", f"{type(error).__name__}: {error}", DO_THIS
-        ) from error
+        raise InputError(f"{kind} {target!r}: {type(error).__name__}: {error}", DO_THIS) from error
 
 
 def make_importable(target: str) -> str:
@@ -358,11 +356,8 @@ def require_unedited(file: Path, digest: str) -> None:
         InputError: The digest is another than when the part was first resolved in this process.
     """
     if _imported_code.setdefault(file, digest) != digest:
-        found = "it, or a module that it imports, was edited after this process had imported it"
         raise InputError(
-            "resolving a part",
-            str(file),
-            found,
+            f"{file}: it, or a module that it imports, was edited after this process had imported it",
             "start a new process (in a notebook: restart the kernel)",
         )
 
@@ -401,8 +396,10 @@ def _serve(name: str, file: str | None) -> None:
     if file is None:
         return
     if other != file and name in sys.modules:
-        found = f"a module named {name} was imported from {other} before"
-        raise InputError("importing a part", file, found, "rename one of the two")
+        raise InputError(
+            f"{file}: a module named {name} was imported from {other} before",
+            "rename one of the two",
+        )
     _NamedFolders.files[name] = file
 
 

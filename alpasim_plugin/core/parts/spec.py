@@ -149,12 +149,9 @@ def file_digest(path: Path, what: str) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        do = "correct the path, or install the part again with its files"
         raise InputError(
-            "reading a file that a part declares",
-            f"{what}: {path}",
-            error.strerror or str(error),
-            do,
+            f"{what}: {path}: {error.strerror or str(error)}",
+            "correct the path, or install the part again with its files",
         ) from error
 
 
@@ -217,9 +214,7 @@ def build(spec: PartSpec, **known: Any) -> Any:
         raise
     except Exception as error:  # a part of any origin: the cause is chained
         raise ERRORS.get(spec.kind, InputError)(
-            f"making a {spec.kind}",
-            f"{spec.kind} {spec.name!r}",
-            f"{type(error).__name__}: {error}",
+            f"{spec.kind} {spec.name!r}: {type(error).__name__}: {error}",
             "run with --debug for the traceback",
         ) from error
     return complete(part, kind.interface, f"{spec.kind} {spec.name!r}")
@@ -253,9 +248,7 @@ def _arguments(
     ]
     if unknown:
         raise contract_error(spec.kind)(
-            f"making a {spec.kind}",
-            f"{spec.kind} {spec.name!r}",
-            f"its factory asks for {', '.join(unknown)}",
+            f"{spec.kind} {spec.name!r}: its factory asks for {', '.join(unknown)}",
             f"give the parameter a default; a {spec.kind} may ask for {', '.join(KINDS[spec.kind].arguments) or 'nothing'}",
         )
     return {p.name: known[p.name] for p in named if p.name in known}

@@ -23,40 +23,36 @@ Array = np.ndarray[Any, Any]
 LONGEST_HEADER = 1 << 16  # bytes; NumPy itself refuses headers of more than 10,000
 
 
-def parse_npy(data: bytes, where: Path | str, doing: str, do_this: str = FETCH_AGAIN) -> Array:
+def parse_npy(data: bytes, where: Path | str, do_this: str = FETCH_AGAIN) -> Array:
     """Return the array of a ``.npy`` document.
 
     Raises:
         InputError: No NumPy array, one of objects, or less data than its header announces.
     """
     stream = io.BytesIO(data)
-    with parsing(doing, where, do_this, "no readable NumPy array"):
-        _check_header(stream, len(data), where, doing, do_this)
+    with parsing(where, do_this, "no readable NumPy array"):
+        _check_header(stream, len(data), where, do_this)
         stream.seek(0)
         return np.asarray(np.load(stream, allow_pickle=False))
 
 
-def open_npy(
-    path: Path | str, doing: str, do_this: str = FETCH_AGAIN, bound: Bound = FILE_BYTES
-) -> Array:
+def open_npy(path: Path | str, do_this: str = FETCH_AGAIN, bound: Bound = FILE_BYTES) -> Array:
     """Return a ``.npy`` file as a read-only memory map; see `parse_npy` for what is refused."""
     with (
-        open_regular(path, doing, bound, do_this) as stream,
-        parsing(doing, path, do_this, "no readable NumPy array"),
+        open_regular(path, bound, do_this) as stream,
+        parsing(path, do_this, "no readable NumPy array"),
     ):
         size = stream.seek(0, io.SEEK_END)
         stream.seek(0)
         # A header may claim any length; a file gives the memory for it before it looks how much
         # there is.
-        _check_header(io.BytesIO(stream.read(LONGEST_HEADER)), size, path, doing, do_this)
-    with parsing(doing, path, do_this, "no readable NumPy array"):
+        _check_header(io.BytesIO(stream.read(LONGEST_HEADER)), size, path, do_this)
+    with parsing(path, do_this, "no readable NumPy array"):
         array: Array = np.load(path, mmap_mode="r", allow_pickle=False)
         return array
 
 
-def _check_header(
-    stream: IO[bytes], size: int, where: Path | str, doing: str, do_this: str
-) -> None:
+def _check_header(stream: IO[bytes], size: int, where: Path | str, do_this: str) -> None:
     version = npy_format.read_magic(stream)
     read = (
         npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
@@ -72,18 +68,17 @@ def _check_header(
             if dtype.hasobject
             else f"{present} bytes for {dtype} {shape} of {need}"
         )
-        raise InputError(doing, str(where), f"no readable NumPy array: {found}", do_this)
+        raise InputError(f"{where}: no readable NumPy array: {found}", do_this)
 
 
 START_ANEW = "remove the folder and start again, or put a whole copy of the file there"
 
 
-def read_checkpoint(path: Path, doing: str, facts: str) -> tuple[dict[str, str], dict[str, Tensor]]:
+def read_checkpoint(path: Path, facts: str) -> tuple[dict[str, str], dict[str, Tensor]]:
     """Return a checkpoint's header entries and its tensors.
 
     Args:
         path: The file.
-        doing: What the caller is doing, for messages.
         facts: What the run is made of; the entry ``facts`` of the header must equal it.
 
     Raises:
@@ -92,16 +87,16 @@ def read_checkpoint(path: Path, doing: str, facts: str) -> tuple[dict[str, str],
     from safetensors import safe_open
     from safetensors.torch import load_file
 
-    check_regular(path, doing, WEIGHT_BYTES)
-    with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
+    check_regular(path, WEIGHT_BYTES)
+    with parsing(path, START_ANEW, "not a whole checkpoint"):
         with safe_open(str(path), "np") as file:
             meta = dict(file.metadata() or {})
         begun = meta["facts"]
     if begun != facts:
         raise InputError(
-            doing, str(path), f"it was begun as {begun}, this is {facts}", "choose another folder"
+            f"{path}: it was begun as {begun}, this is {facts}", "choose another folder"
         )
-    with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
+    with parsing(path, START_ANEW, "not a whole checkpoint"):
         return meta, load_file(str(path))
 
 
@@ -113,7 +108,7 @@ def read_metadata(path: str | Path) -> dict[str, str]:
     """
     from safetensors import safe_open
 
-    doing, do = "reading the header of a safetensors file", "give a whole .safetensors file"
-    check_regular(path, doing, WEIGHT_BYTES)
-    with parsing(doing, path, do, "not safetensors"), safe_open(path, framework="np") as file:
+    do = "give a whole .safetensors file"
+    check_regular(path, WEIGHT_BYTES)
+    with parsing(path, do, "not safetensors"), safe_open(path, framework="np") as file:
         return dict(file.metadata() or {})

@@ -45,7 +45,7 @@ _KINDS = (
 
 @contextmanager
 def open_regular(
-    path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None
+    path: Path | str, bound: Bound = FILE_BYTES, do_this: str | None = None
 ) -> Iterator[BinaryIO]:
     """Open a regular file for reading, after checking its kind and size on the open file itself.
 
@@ -53,7 +53,6 @@ def open_regular(
 
     Args:
         path: File.
-        doing: What the caller is doing, for messages.
         bound: Greatest size.
         do_this: Last part of the errors; None: one that follows from the cause.
 
@@ -70,31 +69,29 @@ def open_regular(
             | getattr(os, "O_BINARY", 0),
         )
     except FileNotFoundError as error:
-        raise InputError(doing, str(path), "no such file", do_this or "check the path") from error
+        raise InputError(f"{path}: no such file", do_this or "check the path") from error
     except (OSError, ValueError) as error:  # ValueError: a null character in the name
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise InputError(
-            doing,
-            str(path),
-            f"it cannot be opened: {reason}",
+            f"{path}: it cannot be opened: {reason}",
             do_this or "check the path and its permissions",
         ) from error
     facts = os.fstat(handle)
     if not stat.S_ISREG(facts.st_mode):
         os.close(handle)
         kind = next((name for test, name in _KINDS if test(facts.st_mode)), "no regular file")
-        raise InputError(doing, str(path), f"{kind}, not a file", do_this or "give a regular file")
+        raise InputError(f"{path}: {kind}, not a file", do_this or "give a regular file")
     with os.fdopen(handle, "rb") as stream:
         if facts.st_size > bound.high:
-            found = f"{facts.st_size} bytes, more than {bound.high:.0f} ({bound.name})"
-            raise InputError(doing, str(path), found, "give a smaller file")
+            raise InputError(
+                f"{path}: {facts.st_size} bytes, more than {bound.high:.0f} ({bound.name})",
+                "give a smaller file",
+            )
         try:
             yield stream
         except OSError as error:
             raise InputError(
-                doing,
-                str(path),
-                f"it cannot be read: {error.strerror or error}",
+                f"{path}: it cannot be read: {error.strerror or error}",
                 do_this or FETCH_AGAIN,
             ) from error
 
@@ -110,16 +107,14 @@ def exists(path: Path | str) -> bool:
     return True
 
 
-def read_bytes(
-    path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None
-) -> bytes:
+def read_bytes(path: Path | str, bound: Bound = FILE_BYTES, do_this: str | None = None) -> bytes:
     """Return a file's bytes; see `open_regular`.
 
     Raises:
         InputError: As there, or the file grew beyond the bound while it was read.
     """
     parts: list[bytes] = []
-    with open_regular(path, doing, bound, do_this) as stream:
+    with open_regular(path, bound, do_this) as stream:
         # As much as the file holds, not as the bound allows: a read takes the memory that it is
         # asked for at once.
         size = os.fstat(stream.fileno()).st_size + 1
@@ -127,54 +122,45 @@ def read_bytes(
             parts.append(part)
             if sum(map(len, parts)) > bound.high:
                 raise InputError(
-                    doing,
-                    str(path),
-                    f"more than {bound.high:.0f} bytes ({bound.name})",
+                    f"{path}: more than {bound.high:.0f} bytes ({bound.name})",
                     "give a smaller file",
                 )
     return b"".join(parts)
 
 
-def read_text(
-    path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None
-) -> str:
+def read_text(path: Path | str, bound: Bound = FILE_BYTES, do_this: str | None = None) -> str:
     """Return a file's text, UTF-8; see `read_bytes`.
 
     Raises:
         InputError: As there, or bytes that are not UTF-8.
     """
-    data = read_bytes(path, doing, bound, do_this)
+    data = read_bytes(path, bound, do_this)
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(
-            doing,
-            str(path),
-            f"byte {error.start} is not UTF-8",
+            f"{path}: byte {error.start} is not UTF-8",
             do_this or "save the file as UTF-8 text",
         ) from error
 
 
-def check_regular(
-    path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None
-) -> int:
+def check_regular(path: Path | str, bound: Bound = FILE_BYTES, do_this: str | None = None) -> int:
     """Check a file that a library will open by its path; return its size in bytes. See
     `open_regular`.
     """
-    with open_regular(path, doing, bound, do_this) as stream:
+    with open_regular(path, bound, do_this) as stream:
         return os.fstat(stream.fileno()).st_size
 
 
 @contextmanager
 def parsing(
-    doing: str, where: Path | str, do_this: str = FETCH_AGAIN, what: str = "it cannot be used"
+    where: Path | str, do_this: str = FETCH_AGAIN, what: str = "it cannot be used"
 ) -> Iterator[None]:
     """Turn whatever a parser raises into the four-part error of the file that it parses.
 
     The original stays the cause, so ``--debug`` shows where it was raised.
 
     Args:
-        doing: First part.
         where: The file, or the member of a file.
         do_this: Last part.
         what: What is wrong if anything is, for the third part: "no readable parquet".
@@ -193,19 +179,18 @@ def parsing(
             if lines and not isinstance(error, KeyError)
             else f"{type(error).__name__} {error}"
         )
-        raise InputError(doing, str(where), f"{what}: {reason}", do_this) from error
+        raise InputError(f"{where}: {what}: {reason}", do_this) from error
 
 
 T = TypeVar("T")
 
 
-def parse_json(data: bytes | str, where: Path | str, doing: str, do_this: str | None = None) -> Any:
+def parse_json(data: bytes | str, where: Path | str, do_this: str | None = None) -> Any:
     """Return the plain data of a JSON document.
 
     Args:
         data: The document, UTF-8.
         where: Its file, for messages.
-        doing: What the caller is doing, for messages.
         do_this: Last part of the errors.
 
     Raises:
@@ -215,50 +200,45 @@ def parse_json(data: bytes | str, where: Path | str, doing: str, do_this: str | 
     do_this = do_this or FETCH_AGAIN
     # Besides the parser's own errors: bytes that are not UTF-8, nesting beyond the stack, integers
     # of more than 4300 digits.
-    with parsing(doing, where, do_this, "broken JSON"):
+    with parsing(where, do_this, "broken JSON"):
         value = json.loads(data)
-    _check(value, where, doing, do_this)
+    _check(value, where, do_this)
     return value
 
 
-def read_json(
-    path: Path | str, doing: str, bound: Bound = JSON_BYTES, do_this: str | None = None
-) -> Any:
+def read_json(path: Path | str, bound: Bound = JSON_BYTES, do_this: str | None = None) -> Any:
     """Return the plain data of a JSON file; see `parse_json` and
     `alpasim_plugin.core.reading.files.read_bytes` for what is refused.
     """
-    return parse_json(read_bytes(path, doing, bound, do_this), path, doing, do_this)
+    return parse_json(read_bytes(path, bound, do_this), path, do_this)
 
 
 def read_json_object(
-    path: Path | str, doing: str, bound: Bound = JSON_BYTES, do_this: str | None = None
+    path: Path | str, bound: Bound = JSON_BYTES, do_this: str | None = None
 ) -> dict[str, Any]:
     """Return a JSON file's object; see `read_json`.
 
     Raises:
         InputError: As there, or the document is no object.
     """
-    value = read_json(path, doing, bound, do_this)
+    value = read_json(path, bound, do_this)
     if not isinstance(value, dict):
-        raise InputError(
-            doing, str(path), f"{kind_of(value)}, not an object", do_this or FETCH_AGAIN
-        )
+        raise InputError(f"{path}: {kind_of(value)}, not an object", do_this or FETCH_AGAIN)
     return value
 
 
 def read_json_as(
     shape: type[T],
     path: Path | str,
-    doing: str,
     bound: Bound = JSON_BYTES,
     do_this: str | None = None,
 ) -> T:
     """Return a JSON file's content after checking that it has a shape; see `as_shape`."""
-    return as_shape(shape, read_json(path, doing, bound, do_this), path, doing, do_this)
+    return as_shape(shape, read_json(path, bound, do_this), path, do_this)
 
 
 def read_json_lines(
-    path: Path | str, doing: str, bound: Bound = JSON_BYTES, do_this: str | None = None
+    path: Path | str, bound: Bound = JSON_BYTES, do_this: str | None = None
 ) -> list[dict[str, Any]]:
     """Return the objects of a file with one JSON object a line; empty lines are skipped.
 
@@ -266,21 +246,17 @@ def read_json_lines(
         InputError: As `read_json`, with the number of the line.
     """
     rows = []
-    for n, line in enumerate(read_bytes(path, doing, bound, do_this).splitlines(), 1):
+    for n, line in enumerate(read_bytes(path, bound, do_this).splitlines(), 1):
         if not line.strip():
             continue
-        value = parse_json(line, f"{path}:{n}", doing, do_this)
+        value = parse_json(line, f"{path}:{n}", do_this)
         if not isinstance(value, dict):
-            raise InputError(
-                doing, f"{path}:{n}", f"{kind_of(value)}, not an object", do_this or FETCH_AGAIN
-            )
+            raise InputError(f"{path}:{n}: {kind_of(value)}, not an object", do_this or FETCH_AGAIN)
         rows.append(value)
     return rows
 
 
-def as_shape(
-    shape: type[T], value: Any, where: Path | str, doing: str, do_this: str | None = None
-) -> T:
+def as_shape(shape: type[T], value: Any, where: Path | str, do_this: str | None = None) -> T:
     """Return plain data, as it is, after checking that it has a shape.
 
     Args:
@@ -289,7 +265,6 @@ def as_shape(
             for an object. Members that it does not name are not looked at.
         value: Plain data.
         where: Its file, for messages.
-        doing: What the caller is doing, for messages.
         do_this: Last part of the error.
 
     Raises:
@@ -304,7 +279,7 @@ def as_shape(
         at = ".".join(str(part) for part in first["loc"]) or "the document"
         wanted = first["msg"].replace("Input should be", "wanted")
         found = "missing" if first["type"] == "missing" else f"{kind_of(first['input'])}, {wanted}"
-        raise InputError(doing, str(where), f"{at}: {found}", do_this or FETCH_AGAIN) from None
+        raise InputError(f"{where}: {at}: {found}", do_this or FETCH_AGAIN) from None
     return cast("T", value)
 
 
@@ -331,7 +306,7 @@ def kind_of(value: Any) -> str:
     return f"a {type(value).__name__}"
 
 
-def _check(document: Any, where: Path | str, doing: str, do_this: str) -> None:
+def _check(document: Any, where: Path | str, do_this: str) -> None:
     """Refuse depth beyond the bound, numbers that are not finite and broken text; level by level,
     so that depth costs no stack.
     """
@@ -339,13 +314,11 @@ def _check(document: Any, where: Path | str, doing: str, do_this: str) -> None:
     while level:
         depth += 1
         if depth > DEPTH.high:
-            raise InputError(
-                doing, str(where), f"nested deeper than {DEPTH.high:.0f} levels", do_this
-            )
+            raise InputError(f"{where}: nested deeper than {DEPTH.high:.0f} levels", do_this)
         below: list[Any] = []
         for node in level:
             if type(node) is dict and not all(map(str.isascii, node)):
-                _check_text("".join(node), where, doing, do_this)
+                _check_text("".join(node), where, do_this)
             for child in (
                 node.values() if type(node) is dict else node if type(node) is list else (node,)
             ):
@@ -354,24 +327,26 @@ def _check(document: Any, where: Path | str, doing: str, do_this: str) -> None:
                     if child is not node:
                         below.append(child)
                 elif kind is str and not child.isascii():
-                    _check_text(child, where, doing, do_this)
+                    _check_text(child, where, do_this)
                 elif kind is float and not math.isfinite(child):
                     raise InputError(
-                        doing, str(where), f"the number {child}, which JSON does not have", do_this
+                        f"{where}: the number {child}, which JSON does not have", do_this
                     )
         level = below
 
 
-def _check_text(text: str, where: Path | str, doing: str, do_this: str) -> None:
+def _check_text(text: str, where: Path | str, do_this: str) -> None:
     """Refuse half a surrogate pair, which JSON can escape and no file can be written with."""
     try:
         text.encode("utf-8")
     except UnicodeEncodeError as error:
-        found = f"the escape \\u{ord(text[error.start]):04x} alone, half a surrogate pair"
-        raise InputError(doing, str(where), found, do_this) from None
+        raise InputError(
+            f"{where}: the escape \\u{ord(text[error.start]):04x} alone, half a surrogate pair",
+            do_this,
+        ) from None
 
 
-def parse_xml(data: bytes, where: Path | str, doing: str) -> ElementTree.Element:
+def parse_xml(data: bytes, where: Path | str) -> ElementTree.Element:
     """Return the root of an XML document; a DOCTYPE is refused, so no entity can be defined or
     expanded.
 
@@ -383,9 +358,7 @@ def parse_xml(data: bytes, where: Path | str, doing: str) -> ElementTree.Element
 
     def refuse(*_: Any) -> None:
         raise InputError(
-            doing,
-            str(where),
-            "a DOCTYPE declaration",
+            f"{where}: a DOCTYPE declaration",
             "remove it: entities are not accepted in scenario files",
         )
 
@@ -393,14 +366,10 @@ def parse_xml(data: bytes, where: Path | str, doing: str) -> ElementTree.Element
         nonlocal depth, count
         depth, count = depth + 1, count + 1
         if depth > DEPTH.high:
-            raise InputError(
-                doing, str(where), f"nested deeper than {DEPTH.high:.0f} levels", FETCH_AGAIN
-            )
+            raise InputError(f"{where}: nested deeper than {DEPTH.high:.0f} levels", FETCH_AGAIN)
         if count > XML_ELEMENTS.high:
             raise InputError(
-                doing,
-                str(where),
-                f"more than {XML_ELEMENTS.high:.0f} elements",
+                f"{where}: more than {XML_ELEMENTS.high:.0f} elements",
                 "give a smaller map",
             )
 
@@ -415,7 +384,7 @@ def parse_xml(data: bytes, where: Path | str, doing: str) -> ElementTree.Element
         end,
     )
     try:
-        with parsing(doing, where, FETCH_AGAIN, "malformed XML"):
+        with parsing(where, FETCH_AGAIN, "malformed XML"):
             scout.Parse(data, True)
             return ElementTree.fromstring(data)
     except InputError as error:
@@ -423,9 +392,7 @@ def parse_xml(data: bytes, where: Path | str, doing: str) -> ElementTree.Element
             error.__cause__, ElementTree.ParseError
         ):
             raise InputError(
-                doing,
-                str(where),
-                f"an unreadable text encoding: {error.__cause__}",
+                f"{where}: an unreadable text encoding: {error.__cause__}",
                 "save the file as UTF-8",
             ) from error
         raise
@@ -434,9 +401,7 @@ def parse_xml(data: bytes, where: Path | str, doing: str) -> ElementTree.Element
 GZIP = 16 + zlib.MAX_WBITS
 
 
-def gunzip(
-    data: bytes, most: int, where: Path | str, doing: str, do_this: str = FETCH_AGAIN
-) -> bytes:
+def gunzip(data: bytes, most: int, where: Path | str, do_this: str = FETCH_AGAIN) -> bytes:
     """Unpack gzip data.
 
     Args:
@@ -444,26 +409,23 @@ def gunzip(
         most: Bytes that the caller can use; `alpasim_plugin.core.limits.UNPACKED_BYTES` holds in
             any case.
         where: The file, for messages.
-        doing: What the caller is doing, for messages.
         do_this: Last part of the errors.
 
     Raises:
         InputError: Damaged data, data that end too early, or more than ``most``.
     """
     most = min(most, int(UNPACKED_BYTES.high))
-    with parsing(doing, where, do_this, "damaged gzip data"):
+    with parsing(where, do_this, "damaged gzip data"):
         unpacker = zlib.decompressobj(GZIP)
         out = unpacker.decompress(data, most + 1)
     if len(out) > most:
-        raise InputError(doing, str(where), f"gzip data of more than {most} bytes", do_this)
+        raise InputError(f"{where}: gzip data of more than {most} bytes", do_this)
     if not unpacker.eof:
-        raise InputError(doing, str(where), f"gzip data that end after {len(out)} bytes", do_this)
+        raise InputError(f"{where}: gzip data that end after {len(out)} bytes", do_this)
     return out
 
 
-def unzstd(
-    data: bytes, expected: int, where: Path | str, doing: str, do_this: str = FETCH_AGAIN
-) -> bytes:
+def unzstd(data: bytes, expected: int, where: Path | str, do_this: str = FETCH_AGAIN) -> bytes:
     """Unpack a zstd frame of a size that is known; see `gunzip`.
 
     Raises:
@@ -471,8 +433,8 @@ def unzstd(
     """
     import zstandard
 
-    UNPACKED_BYTES.check(expected, doing, where)
-    with parsing(doing, where, do_this, "damaged zstd data"):
+    UNPACKED_BYTES.check(expected, where)
+    with parsing(where, do_this, "damaged zstd data"):
         out = (
             zstandard.ZstdDecompressor(max_window_size=1 << 27)
             .stream_reader(data)
@@ -486,28 +448,26 @@ def unzstd(
             if len(out) > expected
             else f"{len(out)} of {expected} bytes"
         )
-        raise InputError(doing, str(where), f"zstd data of {found}", do_this)
+        raise InputError(f"{where}: zstd data of {found}", do_this)
     return out
 
 
-def check_names(names: list[str], where: Path | str, doing: str, bound: Bound = MEMBERS) -> None:
+def check_names(names: list[str], where: Path | str, bound: Bound = MEMBERS) -> None:
     """Refuse the members of an archive if one could leave it, two share a name, or there are too
     many.
 
     Raises:
         InputError: They do.
     """
-    bound.check(len(names), doing, where)
+    bound.check(len(names), where)
     seen: set[str] = set()
     for name in names:
         parts = name.replace("\\", "/").split("/")
         if name.startswith("/") or "\\" in name or ".." in parts or "\0" in name:
             raise InputError(
-                doing,
-                str(where),
-                f"a member named {name!r}, outside the archive",
+                f"{where}: a member named {name!r}, outside the archive",
                 "do not use this file",
             )
         if name in seen:
-            raise InputError(doing, str(where), f"member {name!r} twice", "write the archive again")
+            raise InputError(f"{where}: member {name!r} twice", "write the archive again")
         seen.add(name)

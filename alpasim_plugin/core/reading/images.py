@@ -102,7 +102,7 @@ def _segments(data: bytes) -> Iterator[int]:
         )
 
 
-def check_image(data: bytes, where: Path | str, doing: str, do_this: str = GIVE) -> tuple[int, int]:
+def check_image(data: bytes, where: Path | str, do_this: str = GIVE) -> tuple[int, int]:
     """Return width and height of an encoded picture.
 
     Raises:
@@ -111,23 +111,20 @@ def check_image(data: bytes, where: Path | str, doing: str, do_this: str = GIVE)
     size = image_size(data)
     if size is None:
         raise InputError(
-            doing, str(where), f"{len(data)} bytes beginning {data[:4]!r}, no PNG or JPEG", do_this
+            f"{where}: {len(data)} bytes beginning {data[:4]!r}, no PNG or JPEG", do_this
         )
-    PICTURE_SIDE_PX.check(max(size), doing, where)
-    PICTURE_SIDE_PX.check(min(size), doing, where)
-    PICTURE_PIXELS.check(size[0] * size[1], doing, where)
+    PICTURE_SIDE_PX.check(max(size), where)
+    PICTURE_SIDE_PX.check(min(size), where)
+    PICTURE_PIXELS.check(size[0] * size[1], where)
     return size
 
 
-def decode_image(
-    data: bytes, where: Path | str, doing: str, do_this: str = GIVE, flag: int = 1
-) -> Any:
+def decode_image(data: bytes, where: Path | str, do_this: str = GIVE, flag: int = 1) -> Any:
     """Decode a PNG or JPEG as OpenCV does.
 
     Args:
         data: The encoded picture.
         where: Its file, for messages.
-        doing: What the caller is doing, for messages.
         do_this: Last part of the errors.
         flag: ``cv2.IMREAD_...``; by default colour, ``(H, W, 3)`` uint8 BGR.
 
@@ -136,14 +133,14 @@ def decode_image(
     """
     import cv2
 
-    check_image(data, where, doing, do_this)
-    with parsing(doing, where, do_this, "no readable picture"):
+    check_image(data, where, do_this)
+    with parsing(where, do_this, "no readable picture"):
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flag)
     if image is None:
-        raise InputError(doing, str(where), f"{len(data)} bytes that do not decode", do_this)
+        raise InputError(f"{where}: {len(data)} bytes that do not decode", do_this)
     return image
 
 
-def read_image(path: Path | str, doing: str, do_this: str = GIVE, flag: int = 1) -> Any:
+def read_image(path: Path | str, do_this: str = GIVE, flag: int = 1) -> Any:
     """Read and decode a picture file; see `decode_image`."""
-    return decode_image(read_bytes(path, doing, SOURCE_BYTES, do_this), path, doing, do_this, flag)
+    return decode_image(read_bytes(path, SOURCE_BYTES, do_this), path, do_this, flag)

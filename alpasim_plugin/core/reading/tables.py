@@ -16,7 +16,6 @@ Kind = Literal["text", "integer", "number", "flag"]
 
 def read_parquet(
     path: Path | str,
-    doing: str,
     columns: Mapping[str, Kind] | None = None,
     do_this: str = FETCH_AGAIN,
     only: bool = False,
@@ -25,7 +24,6 @@ def read_parquet(
 
     Args:
         path: File.
-        doing: What the caller is doing, for messages.
         columns: Columns that must be there, by type; null values are allowed. None checks none.
         do_this: Last part of the errors.
         only: Read these columns alone.
@@ -34,26 +32,24 @@ def read_parquet(
         InputError: Unreadable or no parquet, more rows or bytes than the bounds, a column missing
             or of another type.
     """
-    check_regular(path, doing, FILE_BYTES, do_this)
-    return _read(str(path), path, doing, columns, do_this, only)
+    check_regular(path, FILE_BYTES, do_this)
+    return _read(str(path), path, columns, do_this, only)
 
 
 def parse_parquet(
     data: bytes,
     where: Path | str,
-    doing: str,
     columns: Mapping[str, Kind] | None = None,
     do_this: str = FETCH_AGAIN,
 ) -> Any:
     """Return a parquet document as an Arrow table; see `read_parquet`."""
-    return _read(io.BytesIO(data), where, doing, columns, do_this, False)
+    return _read(io.BytesIO(data), where, columns, do_this, False)
 
 
 def check_columns(
     table: Any,
     columns: Mapping[str, Kind],
     where: Path | str,
-    doing: str,
     do_this: str = FETCH_AGAIN,
 ) -> None:
     """Refuse a table that lacks a column or has one of another type.
@@ -70,12 +66,10 @@ def check_columns(
                 if name not in names
                 else f"column {name!r} {names.count(name)} times"
             )
-            raise InputError(doing, str(where), found, do_this)
+            raise InputError(f"{where}: {found}", do_this)
         type_ = table.schema.field(name).type
         if not _is(type_, kind):
-            raise InputError(
-                doing, str(where), f"column {name!r} of {type_}, wanted {kind}", do_this
-            )
+            raise InputError(f"{where}: column {name!r} of {type_}, wanted {kind}", do_this)
 
 
 def _is(type_: Any, kind: Kind) -> bool:
@@ -97,7 +91,7 @@ def _is(type_: Any, kind: Kind) -> bool:
 
 
 def check_parquet(
-    path: Path | str, doing: str, columns: Mapping[str, Kind], do_this: str = FETCH_AGAIN
+    path: Path | str, columns: Mapping[str, Kind], do_this: str = FETCH_AGAIN
 ) -> list[str]:
     """Check the header of a parquet file that is read in parts later, and return its columns; see
     `read_parquet` for what is refused.
@@ -105,44 +99,43 @@ def check_parquet(
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    check_regular(path, doing, FILE_BYTES, do_this)
-    _check_size(str(path), path, doing, do_this)
-    with parsing(doing, path, do_this, "no readable parquet"):
+    check_regular(path, FILE_BYTES, do_this)
+    _check_size(str(path), path, do_this)
+    with parsing(path, do_this, "no readable parquet"):
         empty = pq.read_schema(str(path)).empty_table()
     assert isinstance(empty, pa.Table)
-    check_columns(empty, columns, path, doing, do_this)
+    check_columns(empty, columns, path, do_this)
     return list(empty.column_names)
 
 
 def _read(
     source: Any,
     where: Path | str,
-    doing: str,
     columns: Mapping[str, Kind] | None,
     do_this: str,
     only: bool,
 ) -> Any:
     import pyarrow.parquet as pq
 
-    _check_size(source, where, doing, do_this)
-    with parsing(doing, where, do_this, "no readable parquet"):
+    _check_size(source, where, do_this)
+    with parsing(where, do_this, "no readable parquet"):
         if hasattr(source, "seek"):
             source.seek(0)
         table = pq.ParquetFile(source).read(columns=list(columns) if only and columns else None)
         table.validate(full=True)
     if columns is not None:
-        check_columns(table, columns, where, doing, do_this)
+        check_columns(table, columns, where, do_this)
     return table
 
 
-def _check_size(source: Any, where: Path | str, doing: str, do_this: str) -> None:
+def _check_size(source: Any, where: Path | str, do_this: str) -> None:
     """Refuse more rows, columns or unpacked bytes than the bounds, by the header."""
     import pyarrow.parquet as pq
 
-    with parsing(doing, where, do_this, "no readable parquet"):
+    with parsing(where, do_this, "no readable parquet"):
         facts = pq.read_metadata(source)
-        TABLE_ROWS.check(facts.num_rows, doing, where)
-        TABLE_COLUMNS.check(facts.num_columns, doing, where)
+        TABLE_ROWS.check(facts.num_rows, where)
+        TABLE_COLUMNS.check(facts.num_columns, where)
         chunks = [
             facts.row_group(i).column(j)
             for i in range(facts.num_row_groups)
@@ -151,6 +144,5 @@ def _check_size(source: Any, where: Path | str, doing: str, do_this: str) -> Non
         # Runs of equal values take no space in the file: what they become in memory counts.
         TABLE_BYTES.check(
             sum(max(chunk.total_uncompressed_size, 8 * chunk.num_values) for chunk in chunks),
-            doing,
             where,
         )

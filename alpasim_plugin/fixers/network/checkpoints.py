@@ -54,11 +54,12 @@ def load_weights(
             than tensors.
     """
     path = Path(path)
-    doing = "reading network weights"
-    check_regular(path, doing, WEIGHT_BYTES)
+    check_regular(path, WEIGHT_BYTES)
     if sha256 is not None and (found := file_sha256(path)) != sha256.lower():
-        do = "download the file again or correct the expected digest"
-        raise InputError(doing, str(path), f"sha256 {found}, not {sha256.lower()}", do)
+        raise InputError(
+            f"{path}: sha256 {found}, not {sha256.lower()}",
+            "download the file again or correct the expected digest",
+        )
     with path.open("rb") as file:
         head = file.read(9)
     # A safetensors file begins with a length of 8 bytes and a JSON object; the length may look like
@@ -70,7 +71,7 @@ def load_weights(
             f"not a complete safetensors file of {path.stat().st_size} bytes",
             "download or copy the file again",
         )
-        with parsing(doing, path, f"{do}; it is truncated or of another format", what):
+        with parsing(path, f"{do}; it is truncated or of another format", what):
             content = load_file(path, device=device)
     tensors = unwrap(content, str(path))
     if dtype is None:
@@ -94,18 +95,15 @@ def unwrap(content: object, source: str) -> StateDict:
     for wrapper in WRAPPERS:
         if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
             content = content[wrapper]
-    doing, do = (
-        "reading network weights",
-        "give a dictionary of tensors, alone or under the key 'model' or 'state_dict'",
-    )
+    do = "give a dictionary of tensors, alone or under the key 'model' or 'state_dict'"
     if not isinstance(content, Mapping) or not any(
         isinstance(value, Tensor) for value in content.values()
     ):
-        raise InputError(doing, source, f"a {type(content).__name__} without tensors", do)
+        raise InputError(f"{source}: a {type(content).__name__} without tensors", do)
     tensors = {str(key): value for key, value in content.items() if not _is_bookkeeping(str(key))}
     for key, value in tensors.items():
         if not isinstance(value, Tensor):
-            raise InputError(doing, source, f"{key} is a {type(value).__name__}", do)
+            raise InputError(f"{source}: {key} is a {type(value).__name__}", do)
     return tensors
 
 
@@ -137,9 +135,9 @@ def convert(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
         return value
     out = value.detach().to(dtype, copy=True)
     if value.device.type != "meta" and bool((~out.isfinite() & value.isfinite()).any()):
-        found = f"{key} holds {float(value.abs().max()):.4g}, beyond {dtype}"
         raise InputError(
-            "converting network weights", source, found, "use torch.bfloat16 or torch.float32"
+            f"{source}: {key} holds {float(value.abs().max()):.4g}, beyond {dtype}",
+            "use torch.bfloat16 or torch.float32",
         )
     return out
 
@@ -150,17 +148,16 @@ def weight(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
     Raises:
         InputError: An integer tensor, or values that are not finite before or after the conversion.
     """
-    doing = "loading network weights"
     if not value.is_floating_point():
         raise InputError(
-            doing,
-            source,
-            f"{key} holds {value.dtype}",
+            f"{source}: {key} holds {value.dtype}",
             "give floating-point weights; quantise after loading",
         )
     if value.device.type != "meta" and not bool(value.isfinite().all()):
-        found = f"{key} holds {int((~value.isfinite()).sum())} values that are not finite, of {value.numel()}"
-        raise InputError(doing, source, found, "use a checkpoint from before training diverged")
+        raise InputError(
+            f"{source}: {key} holds {int((~value.isfinite()).sum())} values that are not finite, of {value.numel()}",
+            "use a checkpoint from before training diverged",
+        )
     return convert(key, value, dtype, source)
 
 
@@ -184,15 +181,12 @@ def _load_pickle(path: Path, device: str) -> object:
         reason = (
             str(error).split("WeightsUnpickler error:")[-1].strip().split(". ")[0].split("\n")[0]
         )
-        found = f"a pickle that holds more than tensors ({reason}); loading it could run code"
         raise InputError(
-            "reading network weights",
-            str(path),
-            found,
+            f"{path}: a pickle that holds more than tensors ({reason}); loading it could run code",
             "save the tensors alone, best as safetensors",
         ) from error
     except Exception as error:  # whatever the unpickler raises on damaged bytes
-        found = f"a truncated or damaged torch file: {(str(error).splitlines() or [type(error).__name__])[0]}"
         raise InputError(
-            "reading network weights", str(path), found, "download or copy the file again"
+            f"{path}: a truncated or damaged torch file: {(str(error).splitlines() or [type(error).__name__])[0]}",
+            "download or copy the file again",
         ) from error

@@ -201,16 +201,14 @@ def choose_precision(
     )
 
 
-def require_device(device: str, doing: str) -> None:
+def require_device(device: str) -> None:
     """Refuse a CUDA device on a machine without one.
 
     Raises:
         FixerError: torch sees no such device.
     """
     if device.split(":")[0] == "cuda" and not torch.cuda.is_available():
-        raise FixerError(
-            doing, f"device {device!r}", "torch sees no CUDA device", "use --device cpu"
-        )
+        raise FixerError(f"device {device!r}: torch sees no CUDA device", "use --device cpu")
 
 
 def take_threads(threads: int | None) -> dict[str, Any]:

@@ -430,7 +430,7 @@ class PixelGenerator(nn.Module):
         )
         if found:
             raise InputError(
-                DOING, source, found, "give the weights of one generator in pixels, all of them"
+                f"{source}: {found}", "give the weights of one generator in pixels, all of them"
             )
         net.load_state_dict(
             {key: weight(key, value, torch.float32, source) for key, value in tensors.items()}
@@ -451,7 +451,7 @@ def _sizes_of(tensors: Mapping[str, Tensor], source: str) -> PixelSizes:
     def width(key: str) -> int:
         if key not in tensors or tensors[key].ndim < 2:
             raise InputError(
-                DOING, source, f"no kernel {key}", "give the weights of a generator in pixels"
+                f"{source}: no kernel {key}", "give the weights of a generator in pixels"
             )
         return int(tensors[key].shape[0])
 

@@ -50,9 +50,7 @@ def named(step: float) -> NoiseLevel:
     """
     if not 0 < step <= TABLE:
         raise InputError(
-            "choosing denoising steps",
-            "named step",
-            f"{step:g}",
+            f"named step: {step:g}",
             f"use steps above 0 and up to {TABLE}",
         )
     sigma = shifted(step / TABLE)
@@ -67,9 +65,7 @@ def names(count: int) -> tuple[float, ...]:
         ((1000.0,), (1000.0, 500.0), (1000.0, 750.0, 500.0, 250.0))
     """
     if count < 1:
-        raise InputError(
-            "choosing denoising steps", "step count", str(count), "take at least one step"
-        )
+        raise InputError(f"step count: {count}", "take at least one step")
     return tuple(TABLE * (count - i) / count for i in range(count))
 
 
@@ -86,9 +82,7 @@ def from_names(names: Sequence[float]) -> tuple[NoiseLevel, ...]:
     """
     if not names or any(b >= a for a, b in pairwise(names)):
         raise InputError(
-            "choosing denoising steps",
-            "named steps",
-            str(list(names)),
+            f"named steps: {list(names)}",
             "give at least one step, strictly falling from 1000",
         )
     return tuple(named(step) for step in names)

@@ -132,9 +132,8 @@ def kernel_camera(camera: MapCamera) -> KernelCamera:
             whose radius does not grow.
     """
     if camera.width < 1 or camera.height < 1:
-        size = f"{camera.width} x {camera.height} pixels"
         raise InputError(
-            "drawing the semantic map", f"camera {camera.name}", size, "give at least one"
+            f"camera {camera.name}: {camera.width} x {camera.height} pixels", "give at least one"
         )
     if isinstance(camera, FThetaCamera):
         return _ftheta(camera)
@@ -142,9 +141,7 @@ def kernel_camera(camera: MapCamera) -> KernelCamera:
     if k.shape != (3, 3) or not np.isfinite(k).all() or k[0, 0] <= 0 or k[1, 1] <= 0:
         found = np.array2string(k, separator=", ").replace("\n", "")
         raise InputError(
-            "drawing the semantic map",
-            f"camera {camera.name}",
-            f"K = {found}",
+            f"camera {camera.name}: K = {found}",
             "give intrinsics with positive focal lengths",
         )
     corners = (
@@ -189,7 +186,7 @@ def _ftheta(camera: FThetaCamera) -> KernelCamera:
 
 def _no_lens(camera: FThetaCamera, found: str) -> InputError:
     do_this = "give a lens whose radius grows up to max_angle_rad"
-    return InputError("drawing the semantic map", f"f-theta camera {camera.name}", found, do_this)
+    return InputError(f"f-theta camera {camera.name}: {found}", do_this)
 
 
 DOING = "drawing the semantic map"
@@ -346,7 +343,7 @@ def _checked(actors: Sequence[ActorBox]) -> tuple[F64, F64]:
         if all_rigid(poses) and np.isfinite(sizes).all() and (sizes >= 0).all():
             return poses, sizes
     for actor in actors:
-        require_box(f"actor box ({actor.label})", actor.T_world_box, actor.box, DOING)
+        require_box(f"actor box ({actor.label})", actor.T_world_box, actor.box)
     return np.stack([actor.T_world_box for actor in actors]), sizes
 
 

@@ -96,9 +96,7 @@ def actor_boxes(poses: Mapping[str, F64], actors: Sequence[Actor]) -> tuple[Acto
     missing = [key for key in poses if key not in known]
     if missing:
         raise InputError(
-            "drawing the semantic map",
-            f"actor {missing[0]}",
-            "a pose without a box",
+            f"actor {missing[0]}: a pose without a box",
             "give the scenario's actors",
         )
     return tuple(ActorBox(pose, known[key].box, known[key].label) for key, pose in poses.items())
@@ -198,7 +196,7 @@ def prepare_map(
     for name, xyz in everything:
         _require_points(name, xyz)
     for name, pose, box in boxes:
-        require_box(name, pose, box, DOING)
+        require_box(name, pose, box)
     points = [xyz for _, xyz in everything if len(xyz)] + [
         pose[None, :3, 3] for _, pose, _ in boxes
     ]
@@ -238,13 +236,13 @@ def box_corners(pose: F64, box: Box, origin: F64) -> F64:
     return np.asarray((CORNERS * sizes) @ pose[:3, :3].T + (pose[:3, 3] - origin))
 
 
-def require_box(name: str, pose: F64, box: Box, doing: str) -> None:
+def require_box(name: str, pose: F64, box: Box) -> None:
     """Raise `InputError` unless a box has a rigid pose and finite sizes that are not negative."""
-    require_rigid(pose, f"{doing}, {name}")
+    require_rigid(pose, name)
     sizes = (box.length_m, box.width_m, box.height_m)
     if not np.isfinite(sizes).all() or min(sizes) < 0:
         raise InputError(
-            doing, name, f"a box of {sizes} m", "give finite sizes, length, width and height"
+            f"{name}: a box of {sizes} m", "give finite sizes, length, width and height"
         )
 
 
@@ -263,13 +261,11 @@ def _flat(bias_m: float, colour: Rgb, n: int) -> F64:
 def _require_points(name: str, xyz: F64) -> None:
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise InputError(
-            DOING, name, f"an array of shape {xyz.shape}", "give points (N, 3), metres, world"
+            f"{name}: an array of shape {xyz.shape}", "give points (N, 3), metres, world"
         )
     if not np.isfinite(xyz).all():
         at = int(np.flatnonzero(~np.isfinite(xyz).all(axis=1))[0])
-        raise InputError(
-            DOING, name, f"point {at} is {xyz[at].tolist()}", "repair or drop this line"
-        )
+        raise InputError(f"{name}: point {at} is {xyz[at].tolist()}", "repair or drop this line")
 
 
 def _pole(line: F64) -> F64:
@@ -379,9 +375,7 @@ def triangulate(name: str, ring: F64) -> F64:
     if len(ring) > 1 and np.array_equal(ring[0], ring[-1]):
         ring = ring[:-1]
     if len(ring) < 3:
-        raise InputError(
-            DOING, name, f"an outline of {len(ring)} points", "give at least three corners"
-        )
+        raise InputError(f"{name}: an outline of {len(ring)} points", "give at least three corners")
     outline = shapely.make_valid(shapely.Polygon(ring))
     parts = shapely.get_parts(shapely.constrained_delaunay_triangles(outline))
     corners = shapely.get_coordinates(parts, include_z=True).reshape(

@@ -42,7 +42,7 @@ def read_gaussians(
     Example:
         >>> cloud, report = read_gaussians("garden.spz")  # doctest: +SKIP
     """
-    with parsing(DOING, path):
+    with parsing(path):
         return build_cloud(_read_arrays(Path(path), element))
 
 
@@ -58,13 +58,11 @@ def _read_arrays(path: Path, element: str | None) -> GaussianArrays:
     if path.suffix.lower() == ".splat":
         return read_splat(path)
     raise InputError(
-        "reading a Gaussian model",
-        str(path),
-        f"suffix {path.suffix!r} with first bytes {head!r}",
+        f"{path}: suffix {path.suffix!r} with first bytes {head!r}",
         f"give one of {', '.join(SUPPORTED)}; training checkpoints must be converted first",
     )
 
 
 def _first_bytes(path: Path) -> bytes:
-    with open_regular(path, DOING) as stream:
+    with open_regular(path) as stream:
         return stream.read(4)

@@ -114,9 +114,7 @@ def _read_sh(header: PlyHeader, n: int) -> NDArray[np.float64]:
     n_rest = len(rows.dtype.names or ())
     if n_rest not in (9, 24, 45, 72) or len(rows) != n:
         raise InputError(
-            "reading a compressed PLY file",
-            f"{header.path}, element 'sh'",
-            f"{len(rows)} rows of {n_rest} values for {n} Gaussians",
+            f"{header.path}, element 'sh': {len(rows)} rows of {n_rest} values for {n} Gaussians",
             "export the file again",
         )
     table = np.stack([rows[f"f_rest_{i}"] for i in range(n_rest)], axis=1).astype(np.float64)
@@ -140,9 +138,7 @@ def _check(header: PlyHeader, chunks: NDArray[np.void], rows: NDArray[np.void]) 
             if missing
             else f"{len(chunks)} chunks where {need} are needed"
         )
-        raise InputError(
-            "reading a compressed PLY file", str(header.path), found, "export the file again"
-        )
+        raise InputError(f"{header.path}: {found}", "export the file again")
 
 
 _ROW = np.dtype(
@@ -157,15 +153,13 @@ def read_splat(path: Path | str) -> GaussianArrays:
         InputError: Missing or empty file, or a size that is not a multiple of 32 bytes.
     """
     path = Path(path)
-    data = read_bytes(path, "reading a .splat file")
+    data = read_bytes(path)
     if not data or len(data) % _ROW.itemsize:
         raise InputError(
-            "reading a .splat file",
-            str(path),
-            f"{len(data)} bytes, not a whole number of {_ROW.itemsize}-byte rows",
+            f"{path}: {len(data)} bytes, not a whole number of {_ROW.itemsize}-byte rows",
             "copy or export the file again; it has no header, so a cut file shows only in its size",
         )
-    GAUSSIANS.check(len(data) // _ROW.itemsize, "reading a .splat file", path)
+    GAUSSIANS.check(len(data) // _ROW.itemsize, path)
     rows = np.frombuffer(data, dtype=_ROW)
     rgba = rows["rgba"].astype(np.float64) / 255.0
     return GaussianArrays(
@@ -196,7 +190,7 @@ def write_splat(path: Path | str, cloud: GaussianCloud) -> None:
     rows["rotation"] = np.clip(
         np.rint(np.asarray(cloud.quats, dtype=np.float64) * 128.0 + 128.0), 0, 255
     )
-    with atomic_file(path, "writing a .splat file") as partial:
+    with atomic_file(path) as partial:
         partial.write_bytes(rows.tobytes())
 
 
@@ -245,7 +239,7 @@ def read_spz(path: Path | str, axes: Axes = "rdf") -> GaussianArrays:
             fit the count.
     """
     path = Path(path)
-    data = read_bytes(path, DOING)
+    data = read_bytes(path)
     if data[:2] == _GZIP:
         data = _gunzip(path, data)
     header = _parse_header(path, data)
@@ -340,7 +334,7 @@ def _parse_header(path: Path, data: bytes) -> SpzHeader:
             f"version {version}; versions 2, 3 and 4 are known",
             "export the file as version 3 or 4",
         )
-    GAUSSIANS.check(count, DOING, path)
+    GAUSSIANS.check(count, path)
     if degree > 4 or bits > 24:
         raise _failure(
             path, f"{count} Gaussians of degree {degree} with {bits} fractional bits", _EXPORT_AGAIN
@@ -392,9 +386,9 @@ def _zstd_streams(path: Path, data: bytes, header: SpzHeader) -> list[NDArray[np
 
 def _unzstd(path: Path, index: int, packed: bytes, need: int) -> NDArray[np.uint8]:
     return np.frombuffer(
-        unzstd(packed, need, f"{path}, stream {index}", DOING, _EXPORT_AGAIN), dtype=np.uint8
+        unzstd(packed, need, f"{path}, stream {index}", _EXPORT_AGAIN), dtype=np.uint8
     )
 
 
 def _failure(path: Path, found: str, do_this: str) -> InputError:
-    return InputError(DOING, str(path), found, do_this)
+    return InputError(f"{path}: {found}", do_this)

@@ -106,7 +106,7 @@ def write_ply(path: Path | str, cloud: GaussianCloud, precision: Precision = "fl
     word = {"float32": "float", "float64": "double"}[precision]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     lines += [f"property {word} {name}" for name in rows.dtype.names or ()]
-    with atomic_file(path, "writing a PLY file") as partial, partial.open("wb") as stream:
+    with atomic_file(path) as partial, partial.open("wb") as stream:
         stream.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii"))
         stream.write(rows.tobytes())
 
@@ -165,15 +165,11 @@ def _only_gaussian_element(header: PlyHeader) -> PlyElement:
     names = [e.name for e in header.elements]
     if not candidates:
         raise InputError(
-            "reading Gaussians from a PLY file",
-            str(header.path),
-            f"no vertex element, only {names}",
+            f"{header.path}: no vertex element, only {names}",
             "give a 3DGS PLY",
         )
     raise InputError(
-        "reading Gaussians from a PLY file",
-        str(header.path),
-        f"{len(candidates)} models in one file: {[e.name for e in candidates]}",
+        f"{header.path}: {len(candidates)} models in one file: {[e.name for e in candidates]}",
         f"name one with element=, for example element={candidates[0].name!r}",
     )
 
@@ -185,9 +181,7 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> int:
     if missing:
         compressed = "packed_position" in have
         raise InputError(
-            "reading Gaussians from a PLY file",
-            f"{header.path}, element {element.name!r}",
-            f"missing properties {missing}" + (" (it is a compressed PLY)" if compressed else ""),
+            f"{header.path}, element {element.name!r}: {f'missing properties {missing}' + (' (it is a compressed PLY)' if compressed else '')}",
             "use read_gaussians, which knows compressed PLY"
             if compressed
             else "give a 3DGS PLY, not a mesh or points",
@@ -195,9 +189,7 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> int:
     time_terms = sorted(name for name in have if name.startswith("f_dc_") and name not in _REQUIRED)
     if time_terms:
         raise InputError(
-            "reading Gaussians from a PLY file",
-            f"{header.path}, element {element.name!r}",
-            f"colours that change over time (Fourier terms {time_terms[0]}..{time_terms[-1]})",
+            f"{header.path}, element {element.name!r}: colours that change over time (Fourier terms {time_terms[0]}..{time_terms[-1]})",
             "bake the colours at one time before export: only three f_dc values a Gaussian are supported",
         )
     n_rest = sum(name.startswith("f_rest_") for name in have)
@@ -205,9 +197,7 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> int:
     complete = all(f"f_rest_{i}" in have for i in range(n_rest))
     if left_over or not complete or math.isqrt(per_channel + 1) ** 2 != per_channel + 1:
         raise InputError(
-            "reading Gaussians from a PLY file",
-            f"{header.path}, element {element.name!r}",
-            f"{n_rest} f_rest properties; a degree L has 3 ((L + 1)^2 - 1): 0, 9, 24, 45, 72",
+            f"{header.path}, element {element.name!r}: {n_rest} f_rest properties; a degree L has 3 ((L + 1)^2 - 1): 0, 9, 24, 45, 72",
             "export the file again with whole bands of spherical harmonics",
         )
     return per_channel
@@ -301,9 +291,7 @@ class PlyHeader:
             if element.name == name:
                 return element
         raise InputError(
-            "reading a PLY file",
-            f"{self.path}, element {name!r}",
-            f"no such element; the file has {[e.name for e in self.elements]}",
+            f"{self.path}, element {name!r}: no such element; the file has {[e.name for e in self.elements]}",
             "name one of the elements of the file",
         )
 
@@ -335,7 +323,7 @@ def read_ply_header(path: Path | str) -> PlyHeader:
         else:
             raise _bad_line(path, number, line)
     if not byte_order:
-        raise InputError("reading a PLY header", str(path), "no format line", _EXPORT_AGAIN)
+        raise InputError(f"{path}: no format line", _EXPORT_AGAIN)
     return PlyHeader(path, _place(pending, body_offset), tuple(comments))
 
 
@@ -351,11 +339,7 @@ def read_ply_element(header: PlyHeader, name: str) -> NDArray[np.void]:
     element = header.element(name)
     if element.dtype is None or element.offset is None:
         raise InputError(
-            "reading a PLY file",
-            f"{header.path}, element {name!r}",
-            "list properties, so rows have no fixed size"
-            if element.dtype is None
-            else "it follows list properties",
+            f"{header.path}, element {name!r}: {'list properties, so rows have no fixed size' if element.dtype is None else 'it follows list properties'}",
             "give a Gaussian model; meshes with faces are not one",
         )
     have = header.path.stat().st_size - element.offset
@@ -363,9 +347,7 @@ def read_ply_element(header: PlyHeader, name: str) -> NDArray[np.void]:
     if need > have:
         rows = max(have, 0) // element.dtype.itemsize
         raise InputError(
-            "reading a PLY file",
-            f"{header.path}, element {name!r}",
-            f"the header announces {element.count} rows of {element.dtype.itemsize} bytes, the file ends after {rows}",
+            f"{header.path}, element {name!r}: the header announces {element.count} rows of {element.dtype.itemsize} bytes, the file ends after {rows}",
             _EXPORT_AGAIN,
         )
     return np.fromfile(header.path, dtype=element.dtype, count=element.count, offset=element.offset)
@@ -373,22 +355,18 @@ def read_ply_element(header: PlyHeader, name: str) -> NDArray[np.void]:
 
 def _header_lines(path: Path) -> tuple[list[str], int]:
     """Return the header's lines and the byte position after it."""
-    with open_regular(path, "reading a PLY file") as stream:
+    with open_regular(path) as stream:
         head = stream.read(_MAX_HEADER_BYTES)
     if head[:3] != b"ply" or head[3:4] not in (b"\n", b"\r"):
         raise InputError(
-            "reading a PLY file",
-            str(path),
-            f"first bytes {head[:4]!r}, expected b'ply'",
+            f"{path}: first bytes {head[:4]!r}, expected b'ply'",
             "give a PLY file",
         )
     marker = head.find(b"\nend_header")
     end = head.find(b"\n", marker + 1) if marker >= 0 else -1
     if end < 0:
         raise InputError(
-            "reading a PLY header",
-            str(path),
-            f"no end_header in the first {len(head)} bytes",
+            f"{path}: no end_header in the first {len(head)} bytes",
             _EXPORT_AGAIN,
         )
     return head[:end].decode("ascii", errors="replace").splitlines(), end + 1
@@ -398,9 +376,7 @@ def _byte_order(path: Path, word: str) -> str:
     if word in _ENDIAN:
         return _ENDIAN[word]
     raise InputError(
-        "reading a PLY file",
-        str(path),
-        f"format {word!r}; only {', '.join(_ENDIAN)} can hold Gaussians without loss",
+        f"{path}: format {word!r}; only {', '.join(_ENDIAN)} can hold Gaussians without loss",
         "export the file again as a binary PLY",
     )
 
@@ -408,13 +384,11 @@ def _byte_order(path: Path, word: str) -> str:
 def _count(path: Path, number: int, word: str) -> int:
     if not (word.isascii() and word.isdigit()):
         raise InputError(
-            "reading a PLY header",
-            f"{path}, line {number}",
-            f"element count {word!r}, not a whole number",
+            f"{path}, line {number}: element count {word!r}, not a whole number",
             _EXPORT_AGAIN,
         )
     count = int(word) if len(word) <= 20 else 10**20
-    GAUSSIANS.check(count, "reading a PLY header", f"{path}, line {number}", "element count")
+    GAUSSIANS.check(count, f"{path}, line {number}", "element count")
     return count
 
 
@@ -454,8 +428,6 @@ def _place(
 
 def _bad_line(path: Path, number: int, line: str) -> InputError:
     return InputError(
-        "reading a PLY header",
-        f"{path}, line {number}",
-        f"a line that means nothing here: {line[:80]!r}",
+        f"{path}, line {number}: a line that means nothing here: {line[:80]!r}",
         _EXPORT_AGAIN,
     )

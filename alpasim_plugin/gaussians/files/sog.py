@@ -80,12 +80,10 @@ def read_sog(path: Path) -> GaussianArrays:
     """
     if path.is_dir() or path.name == META:
         folder = path if path.is_dir() else path.parent
-        return _read(
-            lambda name: read_bytes(folder / Path(name).name, DOING, SOURCE_BYTES), folder / META
-        )
-    data = read_bytes(path, DOING, SOURCE_BYTES)
+        return _read(lambda name: read_bytes(folder / Path(name).name, SOURCE_BYTES), folder / META)
+    data = read_bytes(path, SOURCE_BYTES)
     with (
-        parsing(DOING, path, DO_THIS, "a damaged zip"),
+        parsing(path, DO_THIS, "a damaged zip"),
         zipfile.ZipFile(io.BytesIO(data)) as archive,
     ):
         names = {
@@ -97,19 +95,17 @@ def read_sog(path: Path) -> GaussianArrays:
 
 
 def _read(get: Get, where: Path) -> GaussianArrays:
-    document = parse_json(get(META), where, DOING)
-    meta = as_shape(_Meta, document, where, DOING, DO_THIS)
+    document = parse_json(get(META), where)
+    meta = as_shape(_Meta, document, where, DO_THIS)
     if meta["version"] != 2:
-        raise InputError(DOING, str(where), f"version {meta['version']}", DO_THIS)
+        raise InputError(f"{where}: version {meta['version']}", DO_THIS)
     n = meta["count"]
-    GAUSSIANS.check(n, DOING, where)
+    GAUSSIANS.check(n, where)
 
     def plane(name: str, least: int) -> U8:
         pixels = _plane(get(name), f"{where}, {name}").reshape(-1, 4)
         if len(pixels) < least:
-            raise InputError(
-                DOING, f"{where}, {name}", f"{len(pixels)} pixels for {least} values", DO_THIS
-            )
+            raise InputError(f"{where}, {name}: {len(pixels)} pixels for {least} values", DO_THIS)
         return pixels[:least]
 
     low, high = (plane(name, n)[:, :3].astype(np.float64) for name in meta["means"]["files"])
@@ -132,14 +128,12 @@ def _plane(data: bytes, where: str) -> U8:
     """Return a plane as RGBA ``(H, W, 4)``, after looking at the size that its header claims."""
     size = _webp_size(data)
     if size is None:
-        raise InputError(
-            DOING, where, f"{len(data)} bytes beginning {data[:4]!r}, no WebP", DO_THIS
-        )
-    PICTURE_PIXELS.check(size[0] * size[1], DOING, where)
-    with parsing(DOING, where, DO_THIS, "no readable WebP"):
+        raise InputError(f"{where}: {len(data)} bytes beginning {data[:4]!r}, no WebP", DO_THIS)
+    PICTURE_PIXELS.check(size[0] * size[1], where)
+    with parsing(where, DO_THIS, "no readable WebP"):
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 3:
-        raise InputError(DOING, where, "a plane that does not decode", DO_THIS)
+        raise InputError(f"{where}: a plane that does not decode", DO_THIS)
     code = cv2.COLOR_BGR2RGBA if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
     return np.asarray(cv2.cvtColor(image, code), dtype=np.uint8)
 

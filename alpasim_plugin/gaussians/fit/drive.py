@@ -96,7 +96,7 @@ def fit_drive(
     tell = report or (lambda stage, done, all, numbers: None)
     if not views:
         raise InputError(
-            DOING, scene_id, "no photograph", "give at least some ten photographs along the way"
+            f"{scene_id}: no photograph", "give at least some ten photographs along the way"
         )
     recipe = replace(recipe or SplatRecipe.street(), seed=seed)
     known = {view.name for view in views}
@@ -212,9 +212,9 @@ def _start(
     given = [] if points is None else [points]
     if share < LEAST_MEASURED:
         if points is None:
-            do = "give points (structure from motion or LiDAR), or photographs that overlap, in order along the way, with their own poses"
             raise InputError(
-                DOING, f"{len(views)} photographs", "nothing whose distance they measure", do
+                f"{len(views)} photographs: nothing whose distance they measure",
+                "give points (structure from motion or LiDAR), or photographs that overlap, in order along the way, with their own poses",
             )
         return points
     more = [_unmeasured(view, guess) for view, guess in zip(views, guesses, strict=True)]

@@ -45,7 +45,7 @@ class Lens:
     distortion: F64 = field(default_factory=lambda: np.zeros(5))
     model: Literal["opencv", "fisheye"] = "opencv"
 
-    def check(self, doing: str, where: str, do_this: str) -> Lens:
+    def check(self, where: str, do_this: str) -> Lens:
         """Return it, or refuse numbers that are no lens.
 
         Raises:
@@ -55,9 +55,7 @@ class Lens:
         if not finite or min(self.K[0, 0], self.K[1, 1]) <= 0 or min(self.width, self.height) < 1:
             found = f"{self.width} x {self.height} pixels, focal lengths {self.K[0, 0]:g} and {self.K[1, 1]:g}"
             raise InputError(
-                doing,
-                where,
-                found if finite else "intrinsics that are not finite, or no focal length",
+                f"{where}: {found if finite else 'intrinsics that are not finite, or no focal length'}",
                 do_this,
             )
         return self

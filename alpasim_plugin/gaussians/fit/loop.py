@@ -86,15 +86,11 @@ def fit(
             it.
     """
     if not views:
-        raise InputError(
-            "fitting Gaussians", "no view", "nothing to learn from", "give at least one posed view"
-        )
+        raise InputError("no view: nothing to learn from", "give at least one posed view")
     begin = Start(start, {}) if isinstance(start, GaussianCloud) else start
     if len(begin.background) == 0:
         raise InputError(
-            "fitting Gaussians",
-            "a start cloud",
-            "no Gaussian in the background",
+            "a start cloud: no Gaussian in the background",
             "start from points that the views see",
         )
     run = SplatFit(views, begin, recipe, scene_id, device, threads, folder)
@@ -275,9 +271,9 @@ class SplatFit:
     def _stop(self, target: _Target, found: str) -> None:
         if self.folder is not None:
             self.save()
-        do = "look at this view and its pose, or lower the recipe's rates; a folder that was given keeps the state before this update"
         raise InfrastructureError(
-            "fitting Gaussians", f"view {target.name!r}, update {self.step}", found, do
+            f"view {target.name!r}, update {self.step}: {found}",
+            "look at this view and its pose, or lower the recipe's rates; a folder that was given keeps the state before this update",
         )
 
 
@@ -409,10 +405,10 @@ def load_state(
         InputError: The folder was begun with other views, another start or another recipe, or its
             file is damaged.
     """
-    path, doing = folder / STATE_FILE, "continuing a fit"
-    meta, stored = read_checkpoint(path, doing, facts)
+    path = folder / STATE_FILE
+    meta, stored = read_checkpoint(path, facts)
     device = model.node.device
-    with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
+    with parsing(path, START_ANEW, "not a whole checkpoint"):
         tensors = {name: t.to(device) for name, t in stored.items()}
         model.node = tensors["node"]
         model.params = {name: tensors[f"value.{name}"].requires_grad_() for name in NAMES}

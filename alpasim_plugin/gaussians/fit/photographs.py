@@ -148,8 +148,10 @@ def read_pictures(folder: Path, axes: str | None = None) -> tuple[dict[str, Any]
     document, frames = _frames(path)
     meant = document.get("axes", axes)
     if not isinstance(meant, str) or meant not in AXES:
-        do = 'write "axes": "opencv" (y down, z forward) or "axes": "opengl" (y up, z back)'
-        raise InputError(DOING, f"{path}, key 'axes'", repr(meant), do)
+        raise InputError(
+            f"{path}, key 'axes': {meant!r}",
+            'write "axes": "opencv" (y down, z forward) or "axes": "opengl" (y up, z back)',
+        )
     return document, [
         _picture(folder, frame, f"{path}, frame {i}", AXES[meant]) for i, frame in enumerate(frames)
     ]
@@ -176,7 +178,7 @@ def read_views(
     """
     document, pictures = read_pictures(folder)
     if not pictures:
-        raise InputError(DOING, str(folder / FILE), "no frames", "list at least one frame")
+        raise InputError(f"{folder / FILE}: no frames", "list at least one frame")
     views = []
     for picture in pictures:
         sky, mask = (_flags(folder, picture, key) for key in ("sky_path", "mask_path"))
@@ -205,9 +207,7 @@ def read_photographs(folder: Path, width: int = 256) -> Photographs:
     """
     if width < SIDE_PX or width % SIDE_PX:
         raise InputError(
-            DOING,
-            f"width {width}",
-            f"not a multiple of {SIDE_PX}",
+            f"width {width}: not a multiple of {SIDE_PX}",
             f"choose for example {16 * SIDE_PX}",
         )
     _, pictures = read_pictures(folder, "opengl")
@@ -234,9 +234,7 @@ def present(folder: Path, pictures: Sequence[Picture]) -> tuple[list[Picture], t
     )
     if len(there) < 2:
         raise InputError(
-            DOING,
-            str(folder),
-            f"{len(there)} of {len(pictures)} listed images exist",
+            f"{folder}: {len(there)} of {len(pictures)} listed images exist",
             "give the images that the file names",
         )
     return there, missing
@@ -277,9 +275,7 @@ def read_points(path: Path) -> GaussianCloud:
     rows = read_ply_element(read_ply_header(path), "vertex")
     names = rows.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
-        raise InputError(
-            "reading start points", str(path), f"properties {list(names)}", "give x, y and z"
-        )
+        raise InputError(f"{path}: properties {list(names)}", "give x, y and z")
     points = np.stack([rows[n].astype(np.float64) for n in ("x", "y", "z")], axis=1)
     coloured = {"red", "green", "blue"} <= set(names)
     rgb = (
@@ -290,9 +286,7 @@ def read_points(path: Path) -> GaussianCloud:
     good = np.isfinite(points).all(axis=1)
     if not good.any():
         raise InputError(
-            "reading start points",
-            str(path),
-            f"{len(points)} points, none finite",
+            f"{path}: {len(points)} points, none finite",
             "give points in metres",
         )
     return cloud_from_points(points[good], rgb[good])
@@ -316,19 +310,15 @@ def resized(view: PosedView, width: int) -> PosedView:
 def _frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Return the document, and its frames with what it says for all of them."""
     document = read_json_object(
-        path, DOING, do_this=f"give a folder with images and their {FILE} (docs/reconstruction.md)"
+        path, do_this=f"give a folder with images and their {FILE} (docs/reconstruction.md)"
     )
-    frames = as_shape(
-        list[dict[str, Any]], document.get("frames") or [], f"{path}, key 'frames'", DOING
-    )
+    frames = as_shape(list[dict[str, Any]], document.get("frames") or [], f"{path}, key 'frames'")
     return document, [{**document, **frame} for frame in frames]
 
 
 def _picture(folder: Path, frame: Mapping[str, Any], where: str, axes: F64) -> Picture:
     file, camera = _file(folder, frame, "file_path", where), frame.get("camera")
-    t_us = (
-        None if frame.get("t_us") is None else as_shape(int, frame["t_us"], f"{where}, t_us", DOING)
-    )
+    t_us = None if frame.get("t_us") is None else as_shape(int, frame["t_us"], f"{where}, t_us")
     pose = rigid_pose(frame.get("transform_matrix"), f"{where}, transform_matrix") @ axes
     return Picture(
         file,
@@ -345,14 +335,16 @@ def _lens(frame: Mapping[str, Any], file: Path, where: str) -> Lens:
     model = frame.get("camera_model", "OPENCV")
     if model not in COEFFICIENTS or (frame.get("k4") and model != "OPENCV_FISHEYE"):
         found = f"lens model {model}" if model not in COEFFICIENTS else "a coefficient k4"
-        do = "give OpenCV's k1, k2, p1, p2, k3, or undistort the images first (ns-process-data, colmap image_undistorter)"
-        raise InputError(DOING, where, found, do)
+        raise InputError(
+            f"{where}: {found}",
+            "give OpenCV's k1, k2, p1, p2, k3, or undistort the images first (ns-process-data, colmap image_undistorter)",
+        )
     do = "give w, h, fl_x, fl_y, cx and cy in pixels, and k1, k2, p1, p2 where the lens bends lines (docs/reconstruction.md)"
     try:
         size = (
             (frame["w"], frame["h"])
             if "w" in frame or not file.is_file()
-            else check_image(read_bytes(file, DOING, SOURCE_BYTES), file, DOING)
+            else check_image(read_bytes(file, SOURCE_BYTES), file)
         )
         width, height = int(size[0]), int(size[1])
         if "fl_x" not in frame and "camera_angle_x" in frame:
@@ -370,42 +362,38 @@ def _lens(frame: Mapping[str, Any], file: Path, where: str) -> Lens:
             [float(frame.get(key) or 0.0) for key in COEFFICIENTS[model]] or [0.0]
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(DOING, where, f"{type(error).__name__}: {error}", do) from error
+        raise InputError(f"{where}: {type(error).__name__}: {error}", do) from error
     few = np.zeros(max(0, 4 - len(distortion)))  # OpenCV takes four at least
     fisheye = model == "OPENCV_FISHEYE"
     return Lens(
         width, height, K, np.concatenate([distortion, few]), "fisheye" if fisheye else "opencv"
-    ).check(DOING, where, do)
+    ).check(where, do)
 
 
-def rigid_pose(value: Any, where: str, doing: str = DOING) -> F64:
+def rigid_pose(value: Any, where: str) -> F64:
     """Return a pose ``(4, 4)`` whose rotation is exact, of a matrix written with a few digits.
 
     Raises:
         InputError: It is no finite matrix of 4 x 4 (or 3 x 4), or no rotation: scaled, sheared or
             left-handed.
     """
-    T = np.asarray(as_shape(list[list[float]], value, where, doing), dtype=np.float64)
+    T = np.asarray(as_shape(list[list[float]], value, where), dtype=np.float64)
     if T.shape == (3, 4):
         T = np.vstack([T, [0.0, 0.0, 0.0, 1.0]])
     if T.shape != (4, 4) or not np.isfinite(T).all():
         found = "a number that is not finite" if T.shape == (4, 4) else f"shape {T.shape}"
-        raise InputError(doing, where, found, "give a finite matrix of 4 x 4")
+        raise InputError(f"{where}: {found}", "give a finite matrix of 4 x 4")
     u, _, vt = np.linalg.svd(T[:3, :3])
     rotation = u @ vt
     if np.linalg.det(rotation) < 0:
         raise InputError(
-            doing,
-            where,
-            "its axes are left-handed (determinant -1)",
+            f"{where}: its axes are left-handed (determinant -1)",
             "mirror one axis of the poses, and say in 'axes' how they lie",
         )
     off = np.abs(T[:3, :3] - rotation).max()
     if off > 1e-3:
         raise InputError(
-            doing,
-            where,
-            f"its first three columns are no rotation (off by {off:.2g})",
+            f"{where}: its first three columns are no rotation (off by {off:.2g})",
             "give a rigid transform",
         )
     if off > RIGID:  # what is written with a few digits is not quite a rotation
@@ -429,7 +417,7 @@ def _cut(view: PosedView, width: int, where: str) -> PosedView:
     kept = height // SIDE_PX * SIDE_PX
     if kept < SIDE_PX:
         raise InputError(
-            DOING, where, f"{height} pixels high at {width} across", "choose a larger width"
+            f"{where}: {height} pixels high at {width} across", "choose a larger width"
         )
     top = (height - kept) // 2
     K = small.camera.K.copy()
@@ -453,9 +441,7 @@ def _flags(folder: Path, picture: Picture, key: str) -> Bool | None:
 def _file(folder: Path, frame: Mapping[str, Any], key: str, where: str) -> Path:
     name = frame.get(key)
     if not isinstance(name, str):
-        raise InputError(
-            DOING, f"{where}, {key}", repr(name), "name a file, relative to the folder"
-        )
+        raise InputError(f"{where}, {key}: {name!r}", "name a file, relative to the folder")
     path = folder / name
     if (
         not path.suffix and (folder / f"{name}.png").is_file()
@@ -472,16 +458,16 @@ def whole_photograph(path: Path, lens: Lens, where: str) -> bytes:
         InputError: The file is missing, cut off, of another size, too large, or not in grey or RGB.
     """
     do = "check the path, which is relative to the folder, and the file"
-    data = read_bytes(path, DOING, SOURCE_BYTES, do)
-    width, height = check_image(data, f"{where}, {path}", DOING, do)
+    data = read_bytes(path, SOURCE_BYTES, do)
+    width, height = check_image(data, f"{where}, {path}", do)
     if (width, height) != (lens.width, lens.height):
-        found = f"{width}x{height} pixels, the file says {lens.width}x{lens.height}"
-        raise InputError(DOING, f"{where}, {path}", found, "give the photographs as they were")
+        raise InputError(
+            f"{where}, {path}: {width}x{height} pixels, the file says {lens.width}x{lens.height}",
+            "give the photographs as they were",
+        )
     fault = picture_fault(data)
     if fault:
-        raise InputError(
-            DOING, f"{where}, {path}", fault, "give a whole PNG or JPEG in grey or RGB"
-        )
+        raise InputError(f"{where}, {path}: {fault}", "give a whole PNG or JPEG in grey or RGB")
     return data
 
 
@@ -490,7 +476,7 @@ def read_photograph(path: Path, lens: Lens, where: str, flag: int = cv2.IMREAD_C
     data = whole_photograph(path, lens, where)
     do = "give a whole PNG or JPEG in grey or RGB"
     return np.asarray(
-        decode_image(data, f"{where}, {path}", DOING, do, flag | cv2.IMREAD_IGNORE_ORIENTATION),
+        decode_image(data, f"{where}, {path}", do, flag | cv2.IMREAD_IGNORE_ORIENTATION),
         dtype=np.uint8,
     )
 
@@ -499,8 +485,6 @@ def _write_image(path: Path, image: U8) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     if not cv2.imwrite(str(path), image):
         raise InputError(
-            "writing posed views",
-            str(path),
-            "the image could not be written",
+            f"{path}: the image could not be written",
             "check the folder and the space on the disk",
         )

@@ -69,9 +69,7 @@ def summary(rows: Sequence[Comparison]) -> dict[str, Any]:
     """
     if not rows:
         raise InputError(
-            "measuring a reconstruction",
-            "no view",
-            "nothing to measure",
+            "no view: nothing to measure",
             "hold views out, or leave the measurement out",
         )
     by_view = {row.name: round(row.psnr_db, 3) for row in rows}

@@ -118,11 +118,8 @@ class SplatRecipe:
         }
         for name, good in checks.items():
             if not good:
-                found = f"{name}={getattr(self, name)}"
                 raise InputError(
-                    "reading a recipe",
-                    found,
-                    "outside its range",
+                    f"{name}={getattr(self, name)}: outside its range",
                     "see SplatRecipe for what it means",
                 )
 

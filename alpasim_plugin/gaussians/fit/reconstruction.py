@@ -98,16 +98,15 @@ class Reconstruction:
         """
         path = folder / INDEX_FILE
         if not path.exists():
-            do = "make it with 'simrun train splat SCENARIO --out FOLDER'"
-            raise InputError(DOING, str(folder), f"no {INDEX_FILE}", do)
-        files = read_json_as(_Index, path, DOING)["actors"]
-        image = read_image(folder / SKY_FILE, DOING)
-        if image.shape != (HEIGHT, WIDTH, 3):
-            found = f"an image of shape {image.shape}"
             raise InputError(
-                DOING,
-                str(folder / SKY_FILE),
-                found,
+                f"{folder}: no {INDEX_FILE}",
+                "make it with 'simrun train splat SCENARIO --out FOLDER'",
+            )
+        files = read_json_as(_Index, path)["actors"]
+        image = read_image(folder / SKY_FILE)
+        if image.shape != (HEIGHT, WIDTH, 3):
+            raise InputError(
+                f"{folder / SKY_FILE}: an image of shape {image.shape}",
                 f"give {WIDTH} x {HEIGHT} pixels, or make it again",
             )
         actors = {name: read_ply(folder / file) for name, file in files.items()}

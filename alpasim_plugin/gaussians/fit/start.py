@@ -102,8 +102,10 @@ def start_from_depth(
         free[share:] = False  # the sample is in random order: its first part is a sample too
         rest.append((points[free], rgb[free]))
     if not sum(len(points) for points, _ in rest):
-        do = "give views with depth, or a file of points to start from"
-        raise InputError("drawing a start cloud", f"{len(views)} views", "no pixel with depth", do)
+        raise InputError(
+            f"{len(views)} views: no pixel with depth",
+            "give views with depth, or a file of points to start from",
+        )
     actors = {}
     for name, pieces in owned.items():
         points, rgb = _thinned(pieces, actor_points, stream(scene_id, seed, f"fit.start.{name}"))
@@ -286,11 +288,8 @@ def triangulated(
     points, colours = _joined(parts)
     count = len(points)
     if count < 10:
-        found_text = f"{count} points that two photographs place consistently"
         raise InputError(
-            "starting from photographs",
-            f"{len(used)} photographs",
-            found_text,
+            f"{len(used)} photographs: {count} points that two photographs place consistently",
             "give photographs that overlap, in order along the way",
         )
     kept = rng.permutation(count)[:most]

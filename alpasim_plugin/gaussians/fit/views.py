@@ -53,9 +53,7 @@ class PosedView:
             value = getattr(self, name)
             if value is not None and value.shape != shape:
                 raise InputError(
-                    "building a posed view",
-                    f"{self.name!r}, {name}",
-                    f"shape {value.shape}, the camera has {shape}",
+                    f"{self.name!r}, {name}: shape {value.shape}, the camera has {shape}",
                     "give images of the camera's size",
                 )
 

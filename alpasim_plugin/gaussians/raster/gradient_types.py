@@ -57,9 +57,7 @@ class Splats:
         )
         if n < 0 or any(found[name] != shape for name, shape in wanted.items()) or not sh_ok:
             raise InputError(
-                "building splats for training",
-                f"{n} means",
-                ", ".join(f"{name} {shape}" for name, shape in found.items()),
+                f"{n} means: {', '.join((f'{name} {shape}' for name, shape in found.items()))}",
                 "give means (N,3), log_scales (N,3), quaternions (N,4), logit_opacities (N,) and sh (N,K,3) with K in 1, 4, 9, 16",
             )
 
@@ -77,7 +75,7 @@ class Splats:
         Raises:
             InputError: The cloud holds Gaussians that cannot be drawn.
         """
-        cloud.require_drawable("copying a cloud for training")
+        cloud.require_drawable()
         scales = np.log(np.maximum(cloud.scales.astype(np.float64), np.exp(-LOG_SCALE_LIMIT)))
         logits = logit(
             np.clip(cloud.opacities.astype(np.float64), _OPACITY_LIMIT, 1 - _OPACITY_LIMIT)

@@ -65,16 +65,12 @@ def background_image(background: Background, camera: PinholeCamera) -> F32:
         value = value.reshape(1, 1, 3)
     elif value.shape != (camera.height, camera.width, 3):
         raise InputError(
-            "reading a background",
-            f"an array of shape {value.shape}",
-            f"a camera of {camera.width} x {camera.height} pixels",
+            f"an array of shape {value.shape}: a camera of {camera.width} x {camera.height} pixels",
             f"give (r, g, b) or an image of shape ({camera.height}, {camera.width}, 3)",
         )
     if not np.isfinite(value).all():
         raise InputError(
-            "reading a background",
-            "its values",
-            "NaN or infinity",
+            "its values: NaN or infinity",
             "give finite numbers, 0..1 for sRGB",
         )
     # Read-only arrays are another type to compiled code and would be compiled for again.

@@ -101,7 +101,7 @@ def prepare(cloud: GaussianCloud, *, sh_frame: ShFrame = "object") -> PreparedCl
     Raises:
         InputError: The cloud holds Gaussians that cannot be drawn.
     """
-    cloud.require_drawable("preparing a Gaussian cloud")
+    cloud.require_drawable()
     index = np.flatnonzero(cloud.opacities >= ALPHA_MIN)
     index = index[np.argsort(_morton_codes(cloud.means[index]), kind="stable")]
     n, size = len(index), cloud.sh.shape[1]

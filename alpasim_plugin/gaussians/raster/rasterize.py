@@ -67,8 +67,6 @@ def rasterize(
 
         return rasterize_gsplat(cloud, camera, background, near_m=near_m, lod_px=lod_px)
     raise InputError(
-        "rendering Gaussians",
-        f"backend {backend!r}",
-        "no such backend",
+        f"backend {backend!r}: no such backend",
         f"choose one of {', '.join(get_args(Backend))}",
     )

@@ -259,7 +259,7 @@ def node_poses(
         for T in (
             given
         ):  # the precise message is composed only where the cheap test of all nodes at once fails
-            require_rigid(T, "placing a node")
+            require_rigid(T)
     T_world_node = np.array(given)
     rotation = T_world_node[:, :3, :3]
     placed = np.empty((len(given), POSE_SIZE))
@@ -327,9 +327,7 @@ def thread_count(threads: int | None) -> int:
         return int(numba.get_num_threads())
     if threads < 1:
         raise InputError(
-            "rendering Gaussians",
-            f"threads={threads}",
-            "no thread to work with",
+            f"threads={threads}: no thread to work with",
             "give at least 1, or None for the default",
         )
     return threads

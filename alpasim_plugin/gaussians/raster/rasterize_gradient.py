@@ -50,7 +50,6 @@ from alpasim_plugin.gaussians.raster.rasterize_cpu import (
     thread_count,
 )
 
-_DOING = "rendering splats for training"
 _LANES = 16
 F32 = npt.NDArray[np.float32]
 
@@ -165,9 +164,7 @@ def _refuse(p: _Parameters, bad: int) -> None:
             "a colour that is not finite",
         )
     raise InputError(
-        _DOING,
-        f"{len(p.means)} splats",
-        f"number {bad} has {cause}",
+        f"{len(p.means)} splats: number {bad} has {cause}",
         "lower the learning rate, or drop such splats",
     )
 
@@ -372,18 +369,14 @@ def _checked_background(
     }
     if len(devices) > 1:
         raise InputError(
-            _DOING,
-            f"{len(splats)} splats",
-            f"tensors on {', '.join(sorted(devices))}",
+            f"{len(splats)} splats: tensors on {', '.join(sorted(devices))}",
             "move them all to one device",
         )
     if background is None:
         return None
     if background.shape not in ((3,), (camera.height, camera.width, 3)):
         raise InputError(
-            _DOING,
-            f"a background of shape {tuple(background.shape)}",
-            f"a camera of {camera.width} x {camera.height} pixels",
+            f"a background of shape {tuple(background.shape)}: a camera of {camera.width} x {camera.height} pixels",
             f"give a tensor of shape (3,) or ({camera.height}, {camera.width}, 3)",
         )
     return background.to(splats.sh.device, torch.float32)

@@ -30,8 +30,6 @@ from alpasim_plugin.gaussians.sh import SH_SIZES
 if TYPE_CHECKING:
     from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput, Splats
 
-_DOING = "rendering Gaussians with gsplat"
-
 
 def view_arguments(camera: PinholeCamera, near_m: float, device: str) -> dict[str, Any]:
     """Return those keyword arguments of ``gsplat.rasterization`` that describe one view, with the
@@ -110,21 +108,17 @@ def require_gsplat(device: str = "cuda") -> Any:
         import gsplat
     except ImportError as error:
         raise RendererError(
-            _DOING,
-            "the package gsplat",
-            f"it does not import ({error})",
+            f"the package gsplat: it does not import ({error})",
             "install the extra [gpu], or choose --device cpu (backend='cpu' in code)",
         ) from error
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise RendererError(
-            _DOING,
-            f"device {device!r}",
-            "torch sees no CUDA device",
+            f"device {device!r}: torch sees no CUDA device",
             "run on a machine with an NVIDIA GPU, or choose --device cpu (backend='cpu' in code)",
         )
     cloud = GaussianCloud(
-        [[0, 0, 5.0]], [[1.0, 0, 0, 0]], [[0.5, 0.5, 0.5]], [0.9], np.zeros((1, 1, 3))
-    )  # type: ignore[arg-type]
+        [[0, 0, 5.0]], [[1.0, 0, 0, 0]], [[0.5, 0.5, 0.5]], [0.9], np.zeros((1, 1, 3))  # type: ignore[arg-type]
+    )
     K = np.array([[20.0, 0, 8.5], [0, 20, 8.5], [0, 0, 1]])
     try:
         out = _draw(
@@ -134,17 +128,13 @@ def require_gsplat(device: str = "cuda") -> Any:
     # attached.
     except Exception as error:
         raise RendererError(
-            _DOING,
-            "a test image of one Gaussian",
-            f"{type(error).__name__}: {error}",
+            f"a test image of one Gaussian: {type(error).__name__}: {error}",
             "check that gsplat's CUDA kernels match torch and the driver, or choose --device cpu (backend='cpu' in code)",
         ) from error
     centre = (float(out.alpha[8, 8]), float(out.rgb[8, 8, 0]), float(out.depth[8, 8]))
     if not np.allclose(centre, (0.9, 0.45, 5.0), atol=0.01):
         raise RendererError(
-            _DOING,
-            "a test image of one Gaussian",
-            f"alpha, red and depth {centre} at its centre instead of (0.9, 0.45, 5.0)",
+            f"a test image of one Gaussian: alpha, red and depth {centre} at its centre instead of (0.9, 0.45, 5.0)",
             "install a gsplat build that matches this GPU, or choose --device cpu (backend='cpu' in code)",
         )
     return gsplat
@@ -168,13 +158,11 @@ def rasterize_gsplat(
     """
     if lod_px:
         raise InputError(
-            _DOING,
-            f"lod_px={lod_px}",
-            "gsplat has no level of detail of this meaning",
+            f"lod_px={lod_px}: gsplat has no level of detail of this meaning",
             "leave lod_px at 0, or choose --device cpu (backend='cpu' in code)",
         )
     gsplat = require_gsplat(device)
-    cloud.require_drawable(_DOING)
+    cloud.require_drawable()
     if len(cloud) == 0:
         shape = (camera.height, camera.width)
         rgb = np.broadcast_to(

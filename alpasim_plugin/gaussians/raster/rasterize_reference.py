@@ -80,7 +80,7 @@ def project_gaussians(
     Raises:
         InputError: The cloud holds Gaussians that cannot be drawn.
     """
-    cloud.require_drawable("projecting Gaussians")
+    cloud.require_drawable()
     T = camera.T_camera_world
     # Subtracting the camera's centre first keeps UTM-sized coordinates exact: the difference is
     # small and rounds once.

@@ -253,7 +253,7 @@ def rasterize_torch(
     Raises:
         InputError: The cloud holds Gaussians that cannot be drawn, or the background does not fit.
     """
-    cloud.require_drawable("rendering with torch")
+    cloud.require_drawable()
     behind = torch.as_tensor(background_image(background, camera), device=device)
     with torch.no_grad():
         out = rasterize_tensors(

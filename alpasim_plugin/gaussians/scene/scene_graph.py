@@ -226,9 +226,7 @@ class SceneGraph:
         unknown = sorted(set(actor_poses) - set(self.actors))
         if unknown:
             raise RendererError(
-                "rendering a scene",
-                f"poses of {len(actor_poses)} actors",
-                f"actor {unknown[0]!r} has no model in this scene",
+                f"poses of {len(actor_poses)} actors: actor {unknown[0]!r} has no model in this scene",
                 "pass poses of the scenario's own actors only",
             )
         eye, f = camera.centre_world, max(camera.fx, camera.fy)

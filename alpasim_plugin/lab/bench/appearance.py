@@ -122,9 +122,9 @@ def judges_of(judging: Judging) -> dict[str, str]:
     digests = check_digests(judging.folder)
     names = [file_name(name, seed) for name in ("style", "lane") for seed in judging.seeds]
     if missing := [name for name in names if name not in digests]:
-        do = "choose other seeds with --judges, or name the folder of your frozen judges with --judge-folder (docs/lab/judges.md)"
         raise InputError(
-            "judging appearances", ", ".join(missing), "not among the frozen judges", do
+            f"{', '.join(missing)}: not among the frozen judges",
+            "choose other seeds with --judges, or name the folder of your frozen judges with --judge-folder (docs/lab/judges.md)",
         )
     return {name: digests[name] for name in names}
 

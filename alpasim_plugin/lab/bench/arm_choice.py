@@ -119,9 +119,7 @@ def cycle_renders(pairs: Path, clips: int | None) -> list[PairSequence]:
     ]
     if not found:
         raise InputError(
-            DOING,
-            f"{pairs}, split {SPLIT}",
-            "no cycle render",
+            f"{pairs}, split {SPLIT}: no cycle render",
             "make such pairs: 'simrun train pairs SCENES --split val'",
         )
     return evenly(found, clips)
@@ -135,8 +133,10 @@ def take(candidate: Path, arm: Path, choice: Choice) -> None:
         InputError: The arm's folder was trained in itself.
     """
     if (arm / STATE_FILE).exists():
-        do = "choose another folder, or remove that of the arm"
-        raise InputError(DOING, str(arm), "an arm that was trained without a sweep", do)
+        raise InputError(
+            f"{arm}: an arm that was trained without a sweep",
+            "choose another folder, or remove that of the arm",
+        )
     for path in [candidate / BUNDLE_FILE, *sorted((candidate / SNAPSHOTS).glob("*.safetensors"))]:
         _link(path, arm / path.relative_to(candidate))
     write_bytes(arm / LOG_FILE, (candidate / LOG_FILE).read_bytes())
@@ -146,7 +146,7 @@ def take(candidate: Path, arm: Path, choice: Choice) -> None:
 def write_card(candidate: Path, arm: Path, choice: Choice) -> None:
     """Write the card of a candidate as that of the arm, with the choice."""
     name = Path(BUNDLE_FILE).with_suffix(".card.json")
-    write_json(arm / name, {**read_json_object(candidate / name, DOING), "sweep": choice.facts()})
+    write_json(arm / name, {**read_json_object(candidate / name), "sweep": choice.facts()})
 
 
 def _link(path: Path, to: Path) -> None:

@@ -101,15 +101,15 @@ def measure_blocks(
 
 def require_memory(settings: OneFixerSettings, work: BlockWork, device: str) -> None:
     """Raise `FixerError` with what is needed and what there is if a GPU is absent or too small."""
-    doing = f"measuring {settings.name}"
     if not torch.cuda.is_available():
-        do = "run it on a machine with a GPU and a CUDA build of torch, or use --device cpu with a smaller fixer"
         raise FixerError(
-            doing, f"device {device!r}", f"torch {torch.__version__} sees no CUDA device", do
+            f"device {device!r}: torch {torch.__version__} sees no CUDA device",
+            "run it on a machine with a GPU and a CUDA build of torch, or use --device cpu with a smaller fixer",
         )
     free, total = torch.cuda.mem_get_info(device)
     need = work.memory_bytes + CONTEXT_BYTES
     if need > free:
-        found = f"{need / 1e9:.1f} GB needed, {free / 1e9:.1f} GB free of {total / 1e9:.1f} GB"
-        do = "lower --set fixer.window=, --size or precision, use vae.base=24, or free the device"
-        raise FixerError(doing, torch.cuda.get_device_name(device), found, do)
+        raise FixerError(
+            f"{torch.cuda.get_device_name(device)}: {need / 1000000000.0:.1f} GB needed, {free / 1000000000.0:.1f} GB free of {total / 1000000000.0:.1f} GB",
+            "lower --set fixer.window=, --size or precision, use vae.base=24, or free the device",
+        )

@@ -46,21 +46,15 @@ def cost_curves(folders: Sequence[Path]) -> tuple[list[Curve], list[Variant]]:
         trained = arms_of(arms)
         chosen = [arm for arm in ARMS if arm in trained]
         if not chosen:
-            found = f"none of {', '.join(ARMS)}"
             raise InputError(
-                DOING,
-                str(arms),
-                found,
+                f"{arms}: none of {', '.join(ARMS)}",
                 "train them: 'simrun train arms --only V9,self-forcing,one-forcing'",
             )
         for arm in chosen:
             seed = _seed(arms / arm)
             if any((curve.arm, curve.seed) == (arm, seed) for curve in curves):
-                found = f"{arm} of seed {seed}, which another folder has too"
                 raise InputError(
-                    DOING,
-                    str(arms),
-                    found,
+                    f"{arms}: {arm} of seed {seed}, which another folder has too",
                     "train it with another --seed, or name one of the folders",
                 )
             curve, snapshots = _curve(
@@ -76,8 +70,8 @@ def _seed(training: Path) -> int:
         (training / BUNDLE_FILE).with_suffix(".card.json"),
         "train the arm again with 'simrun train arms'",
     )
-    card = read_json_object(path, DOING, do_this=do)
-    with parsing(DOING, path, do, "no card of a training"):
+    card = read_json_object(path, do_this=do)
+    with parsing(path, do, "no card of a training"):
         return int(card["training"]["batches"]["seed"])
 
 
@@ -120,11 +114,8 @@ def cost_clips(
     ]
     chosen = evenly(sequences, clips or CLIPS)
     if len(chosen) < 2:
-        found = f"{len(chosen)} cycle renders, two are needed"
         raise InputError(
-            DOING,
-            f"{pairs}, split {SPLIT}",
-            found,
+            f"{pairs}, split {SPLIT}: {len(chosen)} cycle renders, two are needed",
             "make such pairs: 'simrun train pairs SCENES --split val'",
         )
     shortest = min(len(sequence.clip) for sequence in chosen)

@@ -62,9 +62,7 @@ def write_into(page: Path, made: dict[str, str]) -> None:
         begin, end = f"<!-- begin {name} -->\n", f"<!-- end {name} -->"
         if begin not in text or end not in text:
             raise InputError(
-                "writing tables into a page",
-                str(page),
-                f"no markers for {name!r}",
+                f"{page}: no markers for {name!r}",
                 f"add {begin.strip()} and {end}",
             )
         text = text[: text.index(begin) + len(begin)] + table + text[text.index(end) :]

@@ -161,11 +161,8 @@ def fixed_scenes(distance: float, spread: float, power: float, tail: float) -> i
     """
     found = scenes_needed(distance, spread, power, tail)
     if found is None:
-        why = "too many scenes, or none would do"
         raise EvaluatorError(
-            "planning a fixed design",
-            f"distance {distance:g}, spread {spread:g}",
-            why,
+            f"distance {distance:g}, spread {spread:g}: too many scenes, or none would do",
             "plan for a larger difference",
         )
     return found

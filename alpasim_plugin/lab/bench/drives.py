@@ -36,11 +36,8 @@ def read_drives(folders: Iterable[Path], arms: Path) -> dict[str, Driven]:
     for folder in folders:
         run = read_run(folder)
         if BASELINE not in run.renderers:
-            found = f"renderers {', '.join(run.renderers)}"
             raise InputError(
-                DOING,
-                f"--drives {folder}",
-                found,
+                f"--drives {folder}: renderers {', '.join(run.renderers)}",
                 f"drive {BASELINE} too: it is what the arms are compared with",
             )
         names = {renderer: _arm(renderer, run, bundles) for renderer in run.renderers}
@@ -49,9 +46,7 @@ def read_drives(folders: Iterable[Path], arms: Path) -> dict[str, Driven]:
         ):
             same = ", ".join(renderer for renderer, name in names.items() if name in twice)
             raise InputError(
-                DOING,
-                f"--drives {folder}",
-                f"{same} have the same weights",
+                f"--drives {folder}: {same} have the same weights",
                 "drive each arm behind one renderer",
             )
         for policy in run.policies:
@@ -60,9 +55,9 @@ def read_drives(folders: Iterable[Path], arms: Path) -> dict[str, Driven]:
                 [_row(one, names[one.renderer]) for one in run.rollouts if one.policy == policy],
             )
             if driven.protocol in out:
-                found = f"policy {policy} drove in a folder before it"
                 raise InputError(
-                    DOING, f"--drives {folder}", found, "name one folder for each policy"
+                    f"--drives {folder}: policy {policy} drove in a folder before it",
+                    "name one folder for each policy",
                 )
             out[driven.protocol] = driven
     return out
@@ -79,9 +74,7 @@ def _arm(renderer: str, run: Run, bundles: Mapping[str, str]) -> str:
     name = renderer.partition("@")[0]
     if name in bundles.values():
         raise InputError(
-            DOING,
-            f"--drives {run.folder}",
-            f"{renderer} drove with weights that are not those of {name} in --arms",
+            f"--drives {run.folder}: {renderer} drove with weights that are not those of {name} in --arms",
             f"drive with --set {renderer}:fixer.weights.bundle=ARMS/{name}/{BUNDLE_FILE}, or name the folder whose arms drove",
         )
     return renderer

@@ -98,7 +98,7 @@ def patiently(start: Callable[[], Any]) -> Any:
                 raise
             last = error
     raise InfrastructureError(
-        "starting a Ray node", "this machine", str(last), "try again when the machine is less busy"
+        f"this machine: {last}", "try again when the machine is less busy"
     ) from last
 
 
@@ -107,7 +107,7 @@ def local_nodes(nodes: int, cores: int) -> Iterator[Executor]:
     """Start a Ray cluster on this machine, whose nodes say that they have so many cores each, for
     the block.
     """
-    require_library("ray", DOING, f"--nodes {nodes}", "pip install 'alpasim-onefixer[ray]'")
+    require_library("ray", f"--nodes {nodes}", "pip install 'alpasim-onefixer[ray]'")
     from ray.cluster_utils import Cluster
 
     cluster = patiently(
@@ -143,9 +143,7 @@ def bench_executor(
     """
     if executor.kind != "ray":
         raise InputError(
-            DOING,
-            f"--executor {executor}",
-            "its workers cannot be started before the clock",
+            f"--executor {executor}: its workers cannot be started before the clock",
             "measure --executor ray",
         )
     with kept_open(executor), TemporaryDirectory(prefix="simrun-bench-") as scratch:
@@ -171,7 +169,7 @@ def _row(
         for item, got in run_jobs(backend, items, noticed.append):
             if isinstance(got, Lost):
                 raise InfrastructureError(
-                    DOING, f"rollout {item}", got.found, "look at the nodes, then measure again"
+                    f"rollout {item}: {got.found}", "look at the nodes, then measure again"
                 )
             unpack(got, root)
         wall_s, cpu_s = time.perf_counter() - began_s, time.process_time() - began_cpu_s
@@ -187,9 +185,7 @@ def _all_ready(backend: Backend[Any], count: int, noticed: Sequence[str]) -> Non
         if time.perf_counter() > until_s:
             found = "; ".join([f"{ready} were ready after {READY_S:g} s", *noticed])
             raise InfrastructureError(
-                DOING,
-                f"{count} workers",
-                found,
+                f"{count} workers: {found}",
                 "ask for no more workers than the cluster has cores",
             )
         backend.wait(0.1)

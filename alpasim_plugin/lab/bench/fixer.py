@@ -219,9 +219,7 @@ class CaseSettings:
         settings = fixer_settings(self.options.name, (*self.options.overrides, *overrides))
         if not isinstance(settings, OneFixerSettings):
             raise InputError(
-                "measuring a fixer",
-                self.options.name,
-                "it has no networks",
+                f"{self.options.name}: it has no networks",
                 "name one of the onefixer family",
             )
         return settings
@@ -235,7 +233,7 @@ def _row(of: CaseSettings, case: Case, clip: Clip, base: U8 | None, own_process:
         timing = measured(of.options, settings, given, own_process)
         exact = whole_clip(settings, given, SCENE, of.options.seed)
     except SimrunError as error:
-        return replace(row, problem=error.found)
+        return replace(row, problem=error.message)
     n, fixed = len(timing.images), ~timing.guarded
     return replace(
         row,
@@ -268,7 +266,7 @@ def _loop_row(of: CaseSettings, case: Case, frames: int, size: tuple[int, int]) 
         exact = whole_clip(settings, sample.clip, SCENE, options.seed)
         whole = whole_clip(of.over_all(case, 1 + len(exact) // 4), sample.clip, SCENE, options.seed)
     except SimrunError as error:
-        return replace(row, problem=error.found)
+        return replace(row, problem=error.message)
     predicted = sample.facts.get("predicted")
     return replace(
         row,

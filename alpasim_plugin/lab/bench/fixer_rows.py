@@ -160,5 +160,7 @@ def in_own_process(name: str, run: Callable[..., Timing], *arguments: object) ->
         try:
             return pool.submit(run, *arguments).result()
         except BrokenProcessPool as error:
-            do = "see its message above; a process without one ran out of memory"
-            raise FixerError("measuring a fixer", name, "its process ended early", do) from error
+            raise FixerError(
+                f"{name}: its process ended early",
+                "see its message above; a process without one ran out of memory",
+            ) from error

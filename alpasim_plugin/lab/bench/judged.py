@@ -77,8 +77,10 @@ class Judging:
         digests = check_digests(self.folder)
         wanted = [file_name(name, seed) for name in NAMES if name != "style" for seed in self.seeds]
         if missing := [name for name in wanted if name not in digests]:
-            do = "choose other seeds with --judges, or name the folder of your frozen judges with --judge-folder (docs/lab/judges.md)"
-            raise InputError(DOING, ", ".join(missing), "not among the frozen judges", do)
+            raise InputError(
+                f"{', '.join(missing)}: not among the frozen judges",
+                "choose other seeds with --judges, or name the folder of your frozen judges with --judge-folder (docs/lab/judges.md)",
+            )
         return {
             "judges": {name: digests[name] for name in wanted},
             "detections": str(self.detections),
@@ -175,11 +177,8 @@ def _external(folder: Path, variant: str, name: str, frames: int) -> dict[str, f
         return {}
     made, true = read_detections(made_file, frames), read_detections(true_file, frames)
     if (made.detector, made.weights) != (true.detector, true.weights):
-        found = f"{made.detector} {made.weights[:8]} and {true.detector} {true.weights[:8]}"
         raise InputError(
-            DOING,
-            str(made_file),
-            f"another detector than on the clean frames: {found}",
+            f"{made_file}: another detector than on the clean frames: {made.detector} {made.weights[:8]} and {true.detector} {true.weights[:8]}",
             "run one detector on both",
         )
     out: dict[str, float | None] = {}

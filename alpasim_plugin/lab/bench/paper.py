@@ -149,9 +149,7 @@ def arms_in(
     """
     if not folder.is_dir():
         raise InputError(
-            DOING,
-            f"{option} {folder}",
-            "no such folder",
+            f"{option} {folder}: no such folder",
             "train arms into it: 'simrun train arms PAIRS --vae VAE --out ARMS'",
         )
     found: list[Variant] = []
@@ -268,8 +266,10 @@ def _by_history(run: PaperRun) -> tuple[Variant, ...]:
     for i, folder in enumerate((run.arms, *run.other_seeds)):
         arms = [arm for arm in arms_in(folder) if arm.label in (TRAINED_ON_OWN, TRAINED_ON_CLEAN)]
         if len(arms) == 1:
-            do = f"train {TRAINED_ON_OWN} and {TRAINED_ON_CLEAN} ('simrun train per-frame --variant')"
-            raise InputError(DOING, f"{folder}, protocol regime", f"{arms[0].label} alone", do)
+            raise InputError(
+                f"{folder}, protocol regime: {arms[0].label} alone",
+                f"train {TRAINED_ON_OWN} and {TRAINED_ON_CLEAN} ('simrun train per-frame --variant')",
+            )
         found += [replace(arm, label=f"{arm.label}, seed {i}") if i else arm for arm in arms]
     return tuple(found)
 
@@ -338,7 +338,7 @@ def training_memory(path: Path) -> list[MemoryCell]:
         "versions": versions(),
     }
     if path.is_file():
-        kept = read_json_object(path, DOING, do_this="remove it, and the memory is measured again")
+        kept = read_json_object(path, do_this="remove it, and the memory is measured again")
         if kept.get("facts") == facts:
             return [MemoryCell(**cell) for cell in kept["cells"]]
     cells = measure_memory(settings, MEMORY_LATENTS, MEMORY_HORIZONS, clips=1, rows=18, columns=32)
@@ -375,9 +375,7 @@ def _sequences(run: PaperRun, protocol: str) -> list[PairSequence]:
     chosen = [s for s in everything if (s.info["degradation"]["kind"] == "cycle") == cycle]
     if not chosen:
         raise InputError(
-            DOING,
-            f"{folder}, split {run.split}",
-            f"no clip of the protocol {protocol}",
+            f"{folder}, split {run.split}: no clip of the protocol {protocol}",
             "make such pairs, or leave it out with --only",
         )
     return evenly(chosen, run.clips)

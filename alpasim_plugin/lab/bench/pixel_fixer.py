@@ -88,7 +88,7 @@ def bench_clip(
                 else measure(*arguments)
             )
         except SimrunError as error:
-            rows.append(replace(row, problem=error.found))
+            rows.append(replace(row, problem=error.message))
         else:
             fixed = ~timing.guarded
             rows.append(

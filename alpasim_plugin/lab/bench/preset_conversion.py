@@ -64,7 +64,7 @@ def convert(
         try:
             reduced = reduce_rollout(score(rollout, scene, chosen), chosen).values
         except EvaluatorError as error:
-            refused[chosen.name] = error.found
+            refused[chosen.name] = error.message
             continue
         values[chosen.name] = {
             metric: one.value if one.valid else None for metric, one in reduced.items()

@@ -168,9 +168,7 @@ def _loop(folder: Path) -> Callable[[], object]:
         manifest = run_cell(plan.cells[0], plan.options, folder, 1)
         if manifest["status"] != "ok":
             raise InfrastructureError(
-                "profiling the loop",
-                SCENE,
-                str(manifest["error"]),
+                f"{SCENE}: {manifest['error']}",
                 "see the traceback in its manifest",
             )
 

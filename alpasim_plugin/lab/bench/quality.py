@@ -78,8 +78,9 @@ class Variant:
 
     def __post_init__(self) -> None:
         if self.spec is None and self.label not in (RAW, TRUTH):
-            do = f"name a fixer, or one of {RAW}, {TRUTH}"
-            raise InputError("choosing what to measure", f"variant {self.label!r}", "no fixer", do)
+            raise InputError(
+                f"variant {self.label!r}: no fixer", f"name a fixer, or one of {RAW}, {TRUTH}"
+            )
 
     def content(self) -> dict[str, Any]:
         """Return everything that determines its images."""
@@ -140,9 +141,7 @@ def run_variant(clip: QualityClip, variant: Variant, fixer: Fixer | None) -> Var
     """
     if (fixer is None) != (variant.spec is None):
         raise InputError(
-            "running a variant",
-            f"variant {variant.label!r}",
-            "a missing or superfluous fixer",
+            f"variant {variant.label!r}: a missing or superfluous fixer",
             "give a session exactly for a fixer's variant",
         )
     if (

@@ -250,7 +250,7 @@ def features_of(work: Work) -> dict[str, Any]:
     """
     do = "remove the clip's row and start the command again"
     with (
-        parsing(DOING, work.features_file, do, "not whole features"),
+        parsing(work.features_file, do, "not whole features"),
         np.load(work.features_file) as stored,
     ):
         return {key: stored[key] for key in stored.files}
@@ -354,7 +354,7 @@ def film_of(work: Work) -> list[bytes]:
         InputError: They are not whole.
     """
     do = "remove the clip's film and start the command again"
-    with parsing(DOING, work.film_file, do, "not whole frames"), np.load(work.film_file) as stored:
+    with parsing(work.film_file, do, "not whole frames"), np.load(work.film_file) as stored:
         return [stored[key].tobytes() for key in sorted(stored.files)]
 
 
@@ -462,9 +462,7 @@ def _picture(path: Path) -> Any:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
         raise InputError(
-            DOING,
-            str(path),
-            "no readable image",
+            f"{path}: no readable image",
             "remove the clip's row and start the command again",
         )
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

@@ -78,12 +78,16 @@ def unseen_cameras(scenario: Scenario) -> list[str]:
         InputError: The scenario is no imported drive, or its fit saw every photograph.
     """
     if scenario.model is None:
-        do = "give a drive that was imported: simrun import drive FOLDER -o OUT"
-        raise InputError(DOING, scenario.scene_id, "no recorded drive: it has no photographs", do)
+        raise InputError(
+            f"{scenario.scene_id}: no recorded drive: it has no photographs",
+            "give a drive that was imported: simrun import drive FOLDER -o OUT",
+        )
     cameras = sorted({one.camera for one in scenario.recording if one.use in SETS})
     if not cameras or sum(one.use == "fitted" for one in scenario.recording) < 2:
-        do = "import it again: every eighth photograph is held out where there are eight"
-        raise InputError(DOING, scenario.scene_id, "no photograph that the fit did not see", do)
+        raise InputError(
+            f"{scenario.scene_id}: no photograph that the fit did not see",
+            "import it again: every eighth photograph is held out where there are eight",
+        )
     return cameras
 
 
@@ -154,8 +158,8 @@ def measure_drive(
                 scenario,
                 make(),
                 taken,
-                lambda done, r=renderer, c=camera, n=len(taken): tell(f"{r}, {c}", done, n),
-            )  # type: ignore[misc]
+                lambda done, r=renderer, c=camera, n=len(taken): tell(f"{r}, {c}", done, n),  # type: ignore[misc]
+            )
             for use in SETS:
                 rows += _rows(name, renderer, camera, use, taken, made, judges)
     return rows
@@ -169,9 +173,7 @@ def _refuse_blocks(renderer: Renderer) -> None:
     """
     if renderer.block is not None or renderer.lookahead:
         raise InputError(
-            DOING,
-            type(renderer).__name__,
-            "a renderer of blocks of frames",
+            f"{type(renderer).__name__}: a renderer of blocks of frames",
             "name renderers that make one frame at a time",
         )
 
@@ -293,10 +295,10 @@ def _of_drive(rows: Sequence[Row], drive: object, metric: str) -> float | None:
     it.
     """
     found = [
-        (float(row[metric]), float(row["n_frames"]))
+        (float(row[metric]), float(row["n_frames"]))  # type: ignore[arg-type]
         for row in rows
         if row["drive"] == drive and row[metric] is not None
-    ]  # type: ignore[arg-type]
+    ]
     return (
         float(np.average([v for v, _ in found], weights=[n for _, n in found])) if found else None
     )

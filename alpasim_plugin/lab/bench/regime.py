@@ -75,9 +75,7 @@ def lateral_shift_m(sequence: PairSequence) -> F64:
     recorded = open_references(sequence)
     if recorded is None or len(recorded.rgb_T_world_camera) < 2:
         raise InputError(
-            DOING,
-            str(sequence.folder),
-            "fewer than two recorded poses",
+            f"{sequence.folder}: fewer than two recorded poses",
             "make the pairs with 'simrun train pairs'",
         )
     path, here = (
@@ -94,8 +92,10 @@ def lateral_shift_m(sequence: PairSequence) -> F64:
 def _generator(arm: Variant) -> PixelGenerator:
     settings = arm.spec and arm.spec.settings
     if not isinstance(settings, PixelFixerSettings) or settings.holes != "render":
-        do = "give arms of 'simrun train per-frame --variant V9-still' or 'V3b-still'"
-        raise InputError(DOING, arm.label, "no generator in pixels whose source is the render", do)
+        raise InputError(
+            f"{arm.label}: no generator in pixels whose source is the render",
+            "give arms of 'simrun train per-frame --variant V9-still' or 'V3b-still'",
+        )
     return load_generator(settings).net
 
 

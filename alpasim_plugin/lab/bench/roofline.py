@@ -97,10 +97,12 @@ def device_of(name: str) -> Device:
     try:
         half, single, bandwidth, memory = (float(part) for part in name.split(":"))
     except ValueError:
-        do = "write four numbers, half:float32:bandwidth:memory in TFLOP/s, TFLOP/s, GB/s, GB, or a known name"
-        raise InputError(DOING, name, f"known are {', '.join(DEVICES)}", do) from None
+        raise InputError(
+            f"{name}: known are {', '.join(DEVICES)}",
+            "write four numbers, half:float32:bandwidth:memory in TFLOP/s, TFLOP/s, GB/s, GB, or a known name",
+        ) from None
     if min(half, single, bandwidth, memory) <= 0:
-        raise InputError(DOING, name, "a number that is not positive", "give positive numbers")
+        raise InputError(f"{name}: a number that is not positive", "give positive numbers")
     return Device(
         name, half * 1e12, single * 1e12, bandwidth * 1e9, memory * 1e9, "given by the user"
     )

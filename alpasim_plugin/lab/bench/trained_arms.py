@@ -76,8 +76,8 @@ def within_budget(trained: Sequence[TrainedArm], folder: Path) -> tuple[TrainedA
 def _trained(folder: Path, arm: str, trainings: list[str]) -> TrainedArm:
     times = {name: core_seconds(folder / name) for name in trainings}
     path = (folder / arm / BUNDLE_FILE).with_suffix(".card.json")
-    card = read_json_object(path, DOING, do_this=DO)
-    with parsing(DOING, path, DO, "no card of a training"):
+    card = read_json_object(path, do_this=DO)
+    with parsing(path, DO, "no card of a training"):
         rate = float(card["training"]["schedule"]["peak_lr"])
         scores = card.get("sweep", {}).get("scores", {})
         swept = {float(at): float(values[PERCEPTUAL]) for at, values in scores.items()}

@@ -14,7 +14,6 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.cli import training_options as options
-from alpasim_plugin.lab.training.adapt import DOING
 from alpasim_plugin.lab.training.adapt import adapt as adapt_to
 from scenarios.load import load_scenario
 
@@ -51,7 +50,7 @@ def adapt(
     """
     del debug
     if out.exists():
-        raise InputError(DOING, f"--out {out}", "it exists", "name another file, or remove it")
+        raise InputError(f"--out {out}: it exists", "name another file, or remove it")
     progress = options.Progress(updates, every=10)
     scenario = load_scenario(str(drive / "scenario.yaml" if drive.is_dir() else drive))
     begin = weights or _shipped()

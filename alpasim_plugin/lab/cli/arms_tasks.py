@@ -169,8 +169,10 @@ def work(task: StageTask | ChoiceTask, send: Send) -> None:
         choice = read_choice(record)
         rate = choice.rate
     elif task.name == task.training.name and record.exists():
-        found = f"its learning rate was chosen by a sweep ({record.name})"
-        raise InputError(DOING, str(folder), found, "give the same --sweep, or another folder")
+        raise InputError(
+            f"{folder}: its learning rate was chosen by a sweep ({record.name})",
+            "give the same --sweep, or another folder",
+        )
 
     def report(step: int, numbers: Mapping[str, float]) -> None:
         send(Updated(step, numbers["loss"], numbers["s"]))
@@ -209,8 +211,8 @@ def read_choice(path: Path) -> Choice:
     Raises:
         InputError: No such file, or another one.
     """
-    found = read_json_object(path, DOING)
-    with parsing(DOING, path, "remove it and start the command again", "not a choice of a rate"):
+    found = read_json_object(path)
+    with parsing(path, "remove it and start the command again", "not a choice of a rate"):
         scores = {
             float(rate): Score(*(float(value) for value in values.values()))
             for rate, values in found["scores"].items()
@@ -227,9 +229,7 @@ def chosen_rates(folder: Path) -> dict[str, float]:
     records = sorted((folder / SWEEP).glob("*.json"))
     if not records:
         raise InputError(
-            DOING,
-            f"--rates {folder}",
-            "no rates that a sweep chose",
+            f"--rates {folder}: no rates that a sweep chose",
             "name a folder of 'simrun train arms --sweep RATES'",
         )
     return {path.stem: read_choice(path).rate for path in records}

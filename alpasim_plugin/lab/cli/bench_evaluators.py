@@ -136,9 +136,7 @@ def _counts(option: str, text: str) -> list[int]:
         values = []
     if not values or min(values) < 1:
         raise InputError(
-            f"reading {option}",
-            f"{option} {text}",
-            "not a list of positive numbers",
+            f"{option} {text}: not a list of positive numbers",
             "write for example 10,40,200",
         )
     return values

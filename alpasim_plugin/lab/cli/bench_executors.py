@@ -71,8 +71,10 @@ def executors(
     counts = parse_workers(workers)
     if executor is None:
         if max(counts) > nodes * cores:
-            found = f"{nodes} nodes of {cores} cores hold {nodes * cores}"
-            raise InputError(DOING, f"--workers {workers}", found, "raise --nodes or --cores")
+            raise InputError(
+                f"--workers {workers}: {nodes} nodes of {cores} cores hold {nodes * cores}",
+                "raise --nodes or --cores",
+            )
         with local_nodes(nodes, cores) as made:
             rows = _heard(bench_executor(made, counts, rollouts, seconds, int(1e3 * result_kb)))
     else:
@@ -107,7 +109,5 @@ def parse_workers(text: str) -> list[int]:
     """
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() and int(part) > 0 for part in parts):
-        raise InputError(
-            DOING, f"--workers {text}", "no numbers from 1 up", "write for example 1,4,16"
-        )
+        raise InputError(f"--workers {text}: no numbers from 1 up", "write for example 1,4,16")
     return [int(part) for part in parts]

@@ -93,9 +93,7 @@ def fixer(
     del debug
     if docs and not PAGE.is_file():
         raise InputError(
-            "writing the fixer's bench into the docs",
-            str(PAGE),
-            "no such file",
+            f"{PAGE}: no such file",
             "run it at the root of the repository",
         )
     own = tuple(fixer_overrides(overrides or []))
@@ -144,9 +142,7 @@ def parse_groups(text: str) -> tuple[str, ...]:
     unknown = [group for group in groups if group not in MARKERS]
     if unknown:
         raise InputError(
-            "reading --only",
-            f"--only {text}",
-            f"no group {unknown[0]!r}",
+            f"--only {text}: no group {unknown[0]!r}",
             f"known: {', '.join(MARKERS)}",
         )
     return groups

@@ -48,5 +48,5 @@ def loop(
         PAGE.write_text(put_between_marks(PAGE.read_text(), "loop", markdown(record)))
     for path in (RECORD if docs else None, out):
         if path is not None:
-            write_json(path, record, "writing the record of speed")
+            write_json(path, record)
     print(json.dumps(record) if as_json else markdown(record))

@@ -16,7 +16,7 @@ from rich.console import Console
 from alpasim_plugin.core.atomic import write_json, write_text
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.bench.judged import Judging
-from alpasim_plugin.lab.bench.paper import DOING, PaperRun, compare_arms
+from alpasim_plugin.lab.bench.paper import PaperRun, compare_arms
 from alpasim_plugin.lab.bench.quality_run import Work
 from alpasim_plugin.lab.bench.transfer import TransferData
 from alpasim_plugin.lab.cli.training_options import whole_numbers
@@ -177,16 +177,12 @@ def paper(
     protocols = tuple(name.strip() for name in only.split(",") if name.strip())
     if unknown := [name for name in protocols if name not in PROTOCOLS]:
         raise InputError(
-            DOING,
-            f"--only {only}",
-            f"unknown: {', '.join(unknown)}",
+            f"--only {only}: unknown: {', '.join(unknown)}",
             f"choose from {', '.join(PROTOCOLS)}",
         )
     if other_seeds and not {"cost", "regime"} & set(protocols):
         raise InputError(
-            DOING,
-            f"--other-seed {other_seeds[0]}",
-            f"--only {only}",
+            f"--other-seed {other_seeds[0]}: --only {only}",
             "add the protocol cost or regime to --only, or leave --other-seed out",
         )
     judging = None

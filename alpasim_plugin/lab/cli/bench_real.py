@@ -17,7 +17,6 @@ from alpasim_plugin.core.parts import RendererSpec, resolve_renderer, split_name
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.lab.bench.colour_video_vdp import load_metric
 from alpasim_plugin.lab.bench.real import (
-    DOING,
     Judges,
     Row,
     intervals,
@@ -93,8 +92,8 @@ def real(
     print_rows(rows, False)
     if over:
         print_rows(
-            [{**row, "ci95": "{:.3g} to {:.3g}".format(*row["ci95"])} for row in over], False
-        )  # type: ignore[misc]
+            [{**row, "ci95": "{:.3g} to {:.3g}".format(*row["ci95"])} for row in over], False  # type: ignore[misc]
+        )
 
 
 def _loaded(drives: Sequence[Path]) -> dict[str, Scenario]:
@@ -104,9 +103,7 @@ def _loaded(drives: Sequence[Path]) -> dict[str, Scenario]:
         name = file.parent.name
         if name in out:
             raise InputError(
-                DOING,
-                str(drive),
-                f"two drives called {name!r}",
+                f"{drive}: two drives called {name!r}",
                 "name each folder once, and give folders different names",
             )
         out[name] = load_scenario(str(file))
@@ -117,9 +114,7 @@ def _names(text: str) -> list[str]:
     names = split_names(text)
     if not names or len(set(names)) < len(names):
         raise InputError(
-            DOING,
-            f"--renderer {text}",
-            "no renderer, or one twice",
+            f"--renderer {text}: no renderer, or one twice",
             "write for example 3dgs,onefixer",
         )
     return names

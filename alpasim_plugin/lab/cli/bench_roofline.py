@@ -81,9 +81,7 @@ def roofline(
     settings = fixer_settings(name, fixer_overrides(overrides or []))
     if not isinstance(settings, OneFixerSettings):
         raise InputError(
-            "counting a fixer's work",
-            f"--fixer {name}",
-            "it has no networks to count",
+            f"--fixer {name}: it has no networks to count",
             "take one of the onefixer family",
         )
     width, height = parse_size(size, multiple=SIDE)

@@ -81,9 +81,7 @@ def parse_counts(text: str) -> list[int]:
     parts = text.split(",")
     if not all(part.strip().isdigit() and 0 < int(part) <= 256 for part in parts):
         raise InputError(
-            "reading the command line",
-            f"--rollouts {text}",
-            "no numbers from 1 to 256",
+            f"--rollouts {text}: no numbers from 1 to 256",
             "write for example 1,4,16",
         )
     return [int(part) for part in parts]

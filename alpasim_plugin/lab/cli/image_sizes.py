@@ -22,8 +22,8 @@ def parse_size(text: str, option: str = "--size", multiple: int = 1) -> tuple[in
     """
     sides = [int(part) if part.strip().isdecimal() else 0 for part in text.lower().split("x")]
     if len(sides) != 2 or any(side < 1 or side % multiple for side in sides):
-        found = f"not two positive {f'multiples of {multiple}' if multiple > 1 else 'integers'}"
         raise InputError(
-            f"reading {option}", f"{option} {text}", found, "write WIDTHxHEIGHT, such as 256x144"
+            f"{option} {text}: not two positive {f'multiples of {multiple}' if multiple > 1 else 'integers'}",
+            "write WIDTHxHEIGHT, such as 256x144",
         )
     return sides[0], sides[1]

@@ -120,16 +120,12 @@ def check(
     del debug
     if name not in CHECKED:
         raise InputError(
-            "checking a judge",
-            f"--judge {name}",
-            "no such judge",
+            f"--judge {name}: no such judge",
             f"choose one of {', '.join(CHECKED)}",
         )
     if weights is not None and split not in ("train", "val"):
         raise InputError(
-            "checking a judge",
-            f"--split {split}",
-            "a judge that is not frozen",
+            f"--split {split}: a judge that is not frozen",
             "freeze it first; test splits are for frozen judges",
         )
     torch.set_num_threads(1)
@@ -137,10 +133,10 @@ def check(
     net = (
         None
         if name == "fvmd_lk"
-        else read_judge(weights, name)
+        else read_judge(weights, name)  # type: ignore[arg-type]
         if weights
         else load_judge(name, seed, folder)
-    )  # type: ignore[arg-type]
+    )
     where = kept or Path("runs/judges/labels")
     card: dict[str, Any] = {"judge": name, "seed": seed, "split": split}
     if net is not None:

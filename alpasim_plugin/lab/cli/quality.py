@@ -17,7 +17,6 @@ from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.lab.bench.judged import Judging
 from alpasim_plugin.lab.bench.quality import RAW, Variant
 from alpasim_plugin.lab.bench.quality_run import (
-    DOING,
     Given,
     QualityRun,
     Work,
@@ -136,9 +135,7 @@ def quality(
     variants = parse_variants(fixers, overrides or [])
     if baseline not in {variant.label for variant in variants}:
         raise InputError(
-            DOING,
-            f"--baseline {baseline}",
-            f"variants {', '.join(a.label for a in variants)}",
+            f"--baseline {baseline}: variants {', '.join(a.label for a in variants)}",
             "name one of the variants",
         )
     judging = (
@@ -219,9 +216,9 @@ def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:
             label, equals = part, ""
         fixer = named if equals else label
         if label in variants or label == TRUTH or "/" in label:
-            found = f"label {label!r} is taken, or no name of a folder"
             raise InputError(
-                DOING, f"--fixer {text}", found, "write LABEL=NAME with labels of your own"
+                f"--fixer {text}: label {label!r} is taken, or no name of a folder",
+                "write LABEL=NAME with labels of your own",
             )
         if fixer == RAW:
             variants[label] = Variant(label)
@@ -235,9 +232,7 @@ def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:
         )
     if own or not variants:
         raise InputError(
-            DOING,
-            f"--set {next(iter(own), '')}",
-            "no fixer of this label",
+            f"--set {next(iter(own), '')}: no fixer of this label",
             f"the variants are {', '.join(variants) or 'none'}",
         )
     return tuple(variants.values())

@@ -22,7 +22,6 @@ from alpasim_plugin.lab.bench.arm_choice import Choice
 from alpasim_plugin.lab.bench.trained_arms import trained_arms
 from alpasim_plugin.lab.cli import training_options as options
 from alpasim_plugin.lab.cli.arms_tasks import (
-    DOING,
     ChoiceTask,
     StageTask,
     Sweep,
@@ -159,9 +158,7 @@ def arms(
     del debug
     if jobs > 1 and threads > 1:
         raise InputError(
-            DOING,
-            f"--jobs {jobs} --threads {threads}",
-            "several threads in several processes",
+            f"--jobs {jobs} --threads {threads}: several threads in several processes",
             "leave one of them out",
         )
     if (minutes is None) == (budget == "minutes"):
@@ -170,7 +167,7 @@ def arms(
             if minutes is None
             else "a number of minutes for a budget of updates"
         )
-        raise InputError(DOING, f"--budget {budget}", found, "write --budget minutes --minutes 60")
+        raise InputError(f"--budget {budget}: {found}", "write --budget minutes --minutes 60")
     options.use_threads(threads)
     schedule = Schedule(steps, peak_lr=lr, accumulate=accumulate, ema=ema).of_length(steps)
     run = ArmsRun(
@@ -204,16 +201,12 @@ def arms(
     swept = None if sweep is None else Sweep(rates_of(sweep), sweep_steps, sweep_clips)
     if swept is None and (sweep_steps, sweep_clips) != (None, None):
         raise InputError(
-            DOING,
-            "--sweep-steps, --sweep-clips",
-            "no rates to choose from",
+            "--sweep-steps, --sweep-clips: no rates to choose from",
             "give --sweep 1e-4,3e-4,1e-3",
         )
     if swept is not None and rates is not None:
         raise InputError(
-            DOING,
-            "--sweep, --rates",
-            "rates to choose from, and chosen ones",
+            "--sweep, --rates: rates to choose from, and chosen ones",
             "leave one of them out",
         )
     known = {} if rates is None else chosen_rates(rates)
@@ -287,9 +280,7 @@ def rates_of(text: str) -> tuple[float, ...]:
         or not all(0 < rate < math.inf for rate in rates)
     ):
         raise InputError(
-            DOING,
-            f"--sweep {text}",
-            "not at least two different learning rates",
+            f"--sweep {text}: not at least two different learning rates",
             "write for example --sweep 1e-4,3e-4,1e-3",
         )
     return rates

@@ -45,9 +45,7 @@ def onefixer_settings(name: str) -> OneFixerSettings:
     settings = fixer_settings(name)
     if not isinstance(settings, OneFixerSettings):
         raise InputError(
-            "choosing a fixer to train",
-            f"--fixer {name}",
-            "it has no networks",
+            f"--fixer {name}: it has no networks",
             "choose a block generator, such as onefixer-dit-tiny",
         )
     return settings
@@ -61,9 +59,9 @@ def trainable_settings(name: str) -> TrainableSettings:
     """
     settings = fixer_settings(name)
     if not isinstance(settings, TrainableSettings):
-        do = "leave it out, or choose a block generator, such as onefixer-dit-tiny"
         raise InputError(
-            "choosing a fixer to train", f"--fixer {name}", "it has no networks on latents", do
+            f"--fixer {name}: it has no networks on latents",
+            "leave it out, or choose a block generator, such as onefixer-dit-tiny",
         )
     return settings
 
@@ -173,9 +171,9 @@ def train_fixer_command(
     chosen = with_attention(with_objective(chosen, objective or []), block, window, sink)
     settings = trainable_settings(fixer or chosen.fixer)
     if not isinstance(settings, OneFixerSettings) and (block, window, sink) != (None, None, None):
-        do = "leave out --block, --window and --sink"
         raise InputError(
-            "choosing what to train", f"recipe {recipe}", "it has no blocks and no history", do
+            f"recipe {recipe}: it has no blocks and no history",
+            "leave out --block, --window and --sink",
         )
     schedule = Schedule(steps, peak_lr=lr, accumulate=accumulate, ema=ema).of_length(steps)
     form = ClipForm(latents, stride, class_colour_augmentation)
@@ -216,9 +214,7 @@ def named_weights(init: Path | None, pairs: Sequence[str]) -> dict[str, Path]:
         if not equals or not path or name in found:
             wrong = "a name that has a file already" if equals and path else "not NAME=FILE"
             raise InputError(
-                "reading --weights",
-                f"--weights {text}",
-                wrong,
+                f"--weights {text}: {wrong}",
                 "write for example --weights teacher=runs/t/fixer.safetensors",
             )
         found[name] = Path(path)

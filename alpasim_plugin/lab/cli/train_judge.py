@@ -104,9 +104,7 @@ def judge(
     del debug
     if name not in NAMES:
         raise InputError(
-            "training a judge",
-            f"name {name!r}",
-            "no such judge",
+            f"name {name!r}: no such judge",
             f"choose one of {', '.join(NAMES)}",
         )
     torch.set_num_threads(threads)

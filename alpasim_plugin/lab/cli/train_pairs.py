@@ -146,9 +146,7 @@ def pairs(
         work += [_Scene(path, name) for path in scene_files(scenes, name)[:count]]
     if not work:
         raise InputError(
-            "making training pairs",
-            str(scenes),
-            f"no scenario in {split}",
+            f"{scenes}: no scenario in {split}",
             "make some with 'simrun train scenes'",
         )
     console, began = Console(stderr=True), time.perf_counter()
@@ -232,9 +230,7 @@ def pairs_sheet(
     )
     if not names:
         raise InputError(
-            "measuring pairs",
-            str(data),
-            "no finished sequence",
+            f"{data}: no finished sequence",
             "make some with 'simrun train pairs'",
         )
     datasets = {name: PairDataset(data, name) for name in names}
@@ -291,12 +287,9 @@ def import_pairs(
     """
     del debug
     if split not in SPLITS or not name or Path(name).name != name or name.startswith("."):
-        asked = f"--split {split} --name {name}"
         known = ", ".join(SPLITS)
         raise InputError(
-            "importing training pairs",
-            asked,
-            "not a valid split and name",
+            f"--split {split} --name {name}: not a valid split and name",
             f"give one of {known}, and a plain name",
         )
     sources = PairSources(rgb_input, rgb_gt, opacity, sdmap, poses)

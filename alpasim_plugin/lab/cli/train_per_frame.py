@@ -151,9 +151,9 @@ def per_frame(
     progress = options.Progress(steps, every=25)
     settings = fixer_settings(fixer, ["weights.bundle=null", *fixer_overrides(overrides or [])])
     if not isinstance(settings, PixelFixerSettings):
-        do = "choose onefixer; 'simrun train fixer' trains the block generators"
         raise InputError(
-            "choosing a fixer to train", f"--fixer {fixer}", "it is no generator in pixels", do
+            f"--fixer {fixer}: it is no generator in pixels",
+            "choose onefixer; 'simrun train fixer' trains the block generators",
         )
     chosen = choose_precision(precision)
     progress.console.print(f"precision: {chosen.name} ({chosen.why})", highlight=False)

@@ -96,9 +96,7 @@ def _read(path: Path) -> F32:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
         raise InputError(
-            "reading example images",
-            str(path),
-            "not an image",
+            f"{path}: not an image",
             f"give a folder with {', '.join(EXAMPLES)} as PNG",
         )
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)[None], dtype=np.float32) / np.float32(

@@ -82,17 +82,13 @@ def policy_data(
     del debug
     if split not in SPLITS or split in TEST_SPLITS:
         raise InputError(
-            "writing demonstrations",
-            f"--split {split}",
-            "not a training split",
+            f"--split {split}: not a training split",
             "give train or val",
         )
     paths = scene_files(scenes, split)
     if not paths:
         raise InputError(
-            "writing demonstrations",
-            str(scenes / split),
-            "no scenarios",
+            f"{scenes / split}: no scenarios",
             "write some with 'simrun train scenes'",
         )
     console = Console(stderr=True)

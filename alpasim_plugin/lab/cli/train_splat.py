@@ -196,9 +196,7 @@ def _given(
     views, start = read_views(folder, partial(log_actors, scenario))
     if start is None:
         raise InputError(
-            "fitting Gaussians to images",
-            str(folder),
-            "no points to start from",
+            f"{folder}: no points to start from",
             "name a PLY of points in transforms.json as 'ply_file_path' (structure from motion or LiDAR)",
         )
     train, kept = held_out(views, recipe.hold_out_every)

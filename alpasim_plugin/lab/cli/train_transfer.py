@@ -170,9 +170,7 @@ def splits_of(text: str) -> list[Split]:
     known: list[Split] = [name for name in SPLITS if name in names]
     if len(known) != len(names):
         raise InputError(
-            "making pairs beyond driving",
-            f"--split {text}",
-            "no such split, or one twice",
+            f"--split {text}: no such split, or one twice",
             f"choose from {', '.join(SPLITS)}",
         )
     return sorted(known, key=names.index)

@@ -104,11 +104,8 @@ def whole_numbers(option: str, text: str, least: int) -> list[int]:
     """
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() and int(part) >= least for part in parts):
-        found = f"not a list of integers of at least {least}"
         raise InputError(
-            f"reading {option}",
-            f"{option} {text}",
-            found,
+            f"{option} {text}: not a list of integers of at least {least}",
             f"write for example {option} {least + 1},{least + 3}",
         )
     return [int(part) for part in parts]

@@ -110,9 +110,7 @@ class ImageFixer(MaplessFixer):
                 " for whole clips" if settings.is_offline else ""
             )
             raise InputError(
-                "making a fixer of single frames",
-                settings.name,
-                found,
+                f"{settings.name}: {found}",
                 "take them from fixer_settings(name)",
             )
         self.settings = settings

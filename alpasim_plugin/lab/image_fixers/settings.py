@@ -46,11 +46,8 @@ class RenderLevel:
 
     def __post_init__(self) -> None:
         if not (self.alpha > 0 and self.sigma > 0):
-            found = f"alpha {self.alpha:g}, sigma {self.sigma:g}"
             raise InputError(
-                "choosing the noise level of a render",
-                "alpha and sigma",
-                found,
+                f"alpha and sigma: alpha {self.alpha:g}, sigma {self.sigma:g}",
                 "give values above 0",
             )
 

@@ -106,11 +106,8 @@ class WindowFixer(MaplessFixer):
         threads: int | None = None,
     ) -> None:
         if not isinstance(settings, NoiseWindowSettings):
-            found = f"settings of type {type(settings).__name__}"
             raise InputError(
-                "making a fixer of whole clips",
-                settings.name,
-                found,
+                f"{settings.name}: settings of type {type(settings).__name__}",
                 "take them from fixer_settings(name)",
             )
         self.settings = settings
@@ -136,11 +133,8 @@ class WindowFixer(MaplessFixer):
             RendererError: An opacity that is not a number or outside [0, 1].
         """
         if self._is_done:
-            found = "a second block: windows reach over a whole clip"
             raise InputError(
-                "fixing a whole clip",
-                self.settings.name,
-                found,
+                f"{self.settings.name}: a second block: windows reach over a whole clip",
                 "give all frames of a clip in one block, or reset for another",
             )
         out = list(block)

@@ -51,9 +51,7 @@ def damaged(frames: U8, kind: Kind, strength: float, seed: int = 0) -> U8:
         kept = np.arange(0, len(frames), 1 + round(strength))
         there_and_back = np.concatenate([kept, kept[-2:0:-1]]) if len(kept) > 1 else kept
         return np.asarray(frames[np.resize(there_and_back, len(frames))])
-    raise EvaluatorError(
-        "damaging a clip", f"kind {kind!r}", "no such kind", f"choose one of {', '.join(KINDS)}"
-    )
+    raise EvaluatorError(f"kind {kind!r}: no such kind", f"choose one of {', '.join(KINDS)}")
 
 
 def in_order(values: list[float], lower_is_better: bool, slack: float = 0.0) -> bool:

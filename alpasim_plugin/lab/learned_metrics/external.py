@@ -60,8 +60,8 @@ def read_detections(path: Path, frames: int) -> Detections:
     Raises:
         InputError: Not of this form, or a frame twice or beyond the clip.
     """
-    document = read_json_object(path, DOING, do_this=DO)
-    with parsing(DOING, path, DO, "not a detector's results"):
+    document = read_json_object(path, do_this=DO)
+    with parsing(path, DO, "not a detector's results"):
         rows: list[Mapping[str, Any]] = list(document["frames"])
         numbers = [int(row["frame"]) for row in rows]
         bottom = document.get("origin", "middle") == "bottom"
@@ -78,8 +78,10 @@ def read_detections(path: Path, frames: int) -> Detections:
         size = (int(document["size"][1]), int(document["size"][0])) if "size" in document else None
         detector, weights = str(document["detector"]), str(document["weights_sha256"])
     if len(by_frame) != len(rows) or any(not 0 <= n < frames for n in numbers):
-        found = f"frames {sorted(numbers)[:3]} ... {max(numbers, default=0)} of a clip of {frames}"
-        raise InputError(DOING, str(path), found, "list every frame once, counted from 0")
+        raise InputError(
+            f"{path}: frames {sorted(numbers)[:3]} ... {max(numbers, default=0)} of a clip of {frames}",
+            "list every frame once, counted from 0",
+        )
     return Detections(detector, weights, cuboids, lanes, K, size)
 
 
@@ -97,16 +99,16 @@ def read_tracks(path: Path, frames: int) -> F64:
         InputError: Not of this form, other windows than the clip has, or a value that is not
             finite.
     """
-    doing, do = (
+    _, do = (
         "reading tracks",
         "write one window of 16 frames for every 25, 400 points each, as docs/lab/judges.md describes",
     )
-    with parsing(doing, path, do, "not an archive with tracks"), np.load(path) as stored:
+    with parsing(path, do, "not an archive with tracks"), np.load(path) as stored:
         tracks = np.asarray(stored["tracks"], dtype=np.float64)
     wanted = (len(range(0, frames - FRAMES + 1, EVERY)), FRAMES, GRID * GRID, 2)
     if tracks.shape != wanted or not np.isfinite(tracks).all():
         found = f"shape {tracks.shape}" if tracks.shape != wanted else "a value that is not finite"
-        raise InputError(doing, str(path), f"{found}, a clip of {frames} frames has {wanted}", do)
+        raise InputError(f"{path}: {found}, a clip of {frames} frames has {wanted}", do)
     return tracks
 
 

@@ -63,14 +63,14 @@ def check_features(a: F64, b: F64) -> None:
     Raises:
         EvaluatorError: With what was found.
     """
-    doing, do = (
+    _, do = (
         "computing a Frechet distance",
         "give at least two finite vectors (n, d) on each side",
     )
     if a.ndim != 2 or b.ndim != 2 or a.shape[1:] != b.shape[1:] or min(len(a), len(b)) < 2:
-        raise EvaluatorError(doing, "two sets of features", f"shapes {a.shape} and {b.shape}", do)
+        raise EvaluatorError(f"two sets of features: shapes {a.shape} and {b.shape}", do)
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        raise EvaluatorError(doing, "two sets of features", "a value that is not finite", do)
+        raise EvaluatorError("two sets of features: a value that is not finite", do)
 
 
 def halves(clips: Sequence[F64]) -> float | None:

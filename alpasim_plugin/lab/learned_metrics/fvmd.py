@@ -41,7 +41,7 @@ def motion_features(video: U8) -> F64:
     Raises:
         EvaluatorError: Not a stack of frames.
     """
-    check_stack("tracking points", "made", video)
+    check_stack("made", video)
     rows = [
         histograms(lk_tracks(video[s : s + FRAMES]))
         for s in range(0, len(video) - FRAMES + 1, EVERY)
@@ -80,9 +80,7 @@ def _prepared(frame: U8) -> U8:
     )
     if not done:
         raise EvaluatorError(
-            "tracking points",
-            f"a frame of shape {frame.shape}",
-            "it cannot be coded as JPEG",
+            f"a frame of shape {frame.shape}: it cannot be coded as JPEG",
             "give images",
         )
     small = cv2.resize(

@@ -67,11 +67,8 @@ def swap_test(
     """
     n = len(first)
     if not n == len(second) == len(reference):
-        found = f"{n}, {len(second)}, {len(reference)} clips"
         raise EvaluatorError(
-            "testing a Frechet distance",
-            "two variants",
-            found,
+            f"two variants: {n}, {len(second)}, {len(reference)} clips",
             "give the same clips of both and of the reference",
         )
     truth = np.concatenate(list(reference))

@@ -221,11 +221,8 @@ class Measured:
         sides = [self.clips(arm, metric) for arm in arms]
         shared = [clip for clip in sides[0] if all(clip in side for side in sides[1:])]
         if len(shared) < 2:
-            found = f"{len(shared)} clips in common"
             raise EvaluatorError(
-                "comparing arms",
-                f"{metric} of {', '.join(arms)}",
-                found,
+                f"{metric} of {', '.join(arms)}: {len(shared)} clips in common",
                 "measure at least two clips of each",
             )
         return shared

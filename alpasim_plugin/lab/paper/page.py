@@ -47,18 +47,18 @@ def render_side_by_side(clips: Sequence[ShownClip], size: tuple[int, int]) -> st
     Raises:
         EvaluatorError: No clip, clips with other arms, or films of other lengths.
     """
-    doing, do = (
+    _, do = (
         "laying out arms side by side",
         "give clips with the same arms, each with every frame of every arm",
     )
     if not clips:
-        raise EvaluatorError(doing, "clips", "none", do)
+        raise EvaluatorError("clips: none", do)
     arms = list(clips[0].films)
     for clip in clips:
         lengths = {len(film) for film in clip.films.values()}
         if list(clip.films) != arms or len(lengths) != 1:
             raise EvaluatorError(
-                doing, clip.name, f"arms {', '.join(clip.films)}, lengths {sorted(lengths)}", do
+                f"{clip.name}: arms {', '.join(clip.films)}, lengths {sorted(lengths)}", do
             )
     environment = Environment(
         loader=PackageLoader("evaluators.report"),

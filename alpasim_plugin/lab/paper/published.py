@@ -68,13 +68,11 @@ def published(path: Path | None = None) -> Published:
             number, or an unknown metric.
     """
     path = path or Path(str(resources.files("configs.paper"))) / "published.yaml"
-    file = validate(Published, load_yaml(path, DOING), DOING)
+    file = validate(Published, load_yaml(path))
     for name, table in file.tables.items():
         if unknown := [metric for metric in table.metrics if metric not in file.metrics]:
             raise InputError(
-                DOING,
-                f"{path}, table {name}",
-                f"metrics {', '.join(unknown)}",
+                f"{path}, table {name}: metrics {', '.join(unknown)}",
                 "describe them under 'metrics'",
             )
         for arm in table.rows:
@@ -84,13 +82,11 @@ def published(path: Path | None = None) -> Published:
                     f"{len(cells)} cells for {len(table.metrics)} metrics",
                     "give one cell for each metric, '-' for none",
                 )
-                raise InputError(DOING, where, found, do)
+                raise InputError(f"{where}: {found}", do)
             for metric, cell in zip(table.metrics, cells, strict=True):
                 if cell != "-" and not CELL.fullmatch(cell):
                     raise InputError(
-                        DOING,
-                        f"{where}, {metric}",
-                        f"cell {cell!r}",
+                        f"{where}, {metric}: cell {cell!r}",
                         "write VALUE, VALUE±HALF-WIDTH or '-'",
                     )
     return file

@@ -89,7 +89,7 @@ class Recorded:
         """
         if share or not self.compares(metric, first, second):
             raise EvaluatorError(
-                DOING, f"{metric} of {first} and {second}", "no such difference", "measure it again"
+                f"{metric} of {first} and {second}: no such difference", "measure it again"
             )
         if (metric, first, second) in self.pairs:
             return self.pairs[metric, first, second]
@@ -122,9 +122,9 @@ def recorded(path: Path) -> dict[str, Recorded]:
         InputError: No such file, or something else.
     """
     do = "give a paper.json of 'simrun bench paper'"
-    document = read_json_object(path, DOING, do_this=do)
+    document = read_json_object(path, do_this=do)
     names = [field.name for field in fields(Difference)]
-    with parsing(DOING, path, do, "no record of protocols"):
+    with parsing(path, do, "no record of protocols"):
         return {
             protocol: Recorded(
                 kept["means"],

@@ -95,7 +95,7 @@ def adapt(
         after = _psnr(judge, trained, seed)
         found = compared(before, after)
         if found.accepted:
-            write_bytes(out, read_bytes(trained, DOING), DOING)
+            write_bytes(out, read_bytes(trained))
     return found
 
 
@@ -121,9 +121,10 @@ def _pairs(scenario: Scenario, root: Path, seed: int) -> PairSequence:
     )
     count = {use: sum(one.use == use for one in taken) for use in ("fitted", "held-out")}
     if scenario.model is None or count["fitted"] < FEWEST or count["held-out"] < ENOUGH:
-        found = f"{count['fitted']} fitted and {count['held-out']} held-out photographs of camera {camera!r}"
-        do = f"give an imported drive (simrun import drive) with at least {FEWEST} and {ENOUGH} of them"
-        raise InputError(DOING, scenario.scene_id, found, do)
+        raise InputError(
+            f"{scenario.scene_id}: {count['fitted']} fitted and {count['held-out']} held-out photographs of camera {camera!r}",
+            f"give an imported drive (simrun import drive) with at least {FEWEST} and {ENOUGH} of them",
+        )
     shots = [Shot.read(one, WIDTH_PX) for one in taken]
     fitted = [shot for shot in shots if shot.photograph.use == "fitted"]
     held = [shot for shot in shots if shot.photograph.use == "held-out"]
@@ -166,7 +167,7 @@ def _trained(
     name, overrides = bundle_fixer(weights)
     settings = resolve("fixer", name, overrides).settings
     if not isinstance(settings, PixelFixerSettings):
-        raise InputError(DOING, str(weights), f"weights of {name}", "give those of onefixer")
+        raise InputError(f"{weights}: weights of {name}", "give those of onefixer")
     width, height = PairSequence(root / "pairs" / "train" / "drive_0").size
     crop = min(CROP[0], height), min(CROP[1], width)
     shares = StreamShares(pairs=0.93, identity=0.07, video=0.0, damaged_video=0.0)

@@ -91,9 +91,7 @@ class AdversarialHead(nn.Module):
         super().__init__()
         if width % heads:
             raise InputError(
-                "building an adversarial head",
-                f"{heads} heads",
-                f"width {width}",
+                f"{heads} heads: width {width}",
                 "choose heads that divide it",
             )
         with torch.device("meta"):  # layers would draw initial values from the global generator

@@ -60,9 +60,7 @@ def restyle(frame: SeenFrame, style: str, scene_id: str, seed: int) -> U8:
         return np.array(frame.rgb)
     if style not in _FORMULAS:
         raise InputError(
-            "restyling a frame",
-            f"style {style!r}",
-            "no such style",
+            f"style {style!r}: no such style",
             f"choose one of {', '.join(STYLES)}",
         )
     image = frame.rgb.astype(np.float32) / np.float32(255)

@@ -42,9 +42,7 @@ def swap_class_colours(sdmap: U8, kind: str) -> U8:
     """
     if kind not in BOX_COLOURS:
         raise InputError(
-            "augmenting class colours",
-            f"class {kind!r}",
-            "it has no colours",
+            f"class {kind!r}: it has no colours",
             f"choose one of {', '.join(BOX_COLOURS)}",
         )
     old, new = (

@@ -70,9 +70,7 @@ class BatchForm:
     def __post_init__(self) -> None:
         if self.columns is not None and self.columns % PATCH:
             raise InputError(
-                "setting up training batches",
-                f"columns {self.columns}",
-                "half a token",
+                f"columns {self.columns}: half a token",
                 "give an even number of latents",
             )
 

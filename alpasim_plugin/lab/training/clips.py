@@ -86,9 +86,7 @@ def read_video(path: Path, width: int, height: int, first: float = 0.0, last: fl
     frames = read_mp4(path).frames
     frames = frames[round(first * len(frames)) : round(last * len(frames))]
     if not len(frames):
-        raise InputError(
-            DOING, str(path), f"no frame between shares {first} and {last}", "widen the share"
-        )
+        raise InputError(f"{path}: no frame between shares {first} and {last}", "widen the share")
     return fitted(frames, width, height)
 
 
@@ -123,9 +121,7 @@ def _window(
     free = [shape[0] - size.frames, shape[1] - size.height, shape[2] - size.width]
     if min(free) < 0:
         raise InputError(
-            DOING,
-            f"frames {list(shape[:3])}",
-            f"no room for {size}",
+            f"frames {list(shape[:3])}: no room for {size}",
             "make larger sequences, or draw smaller clips",
         )
     start, top, left = (int(rng.integers(f + 1)) for f in free)

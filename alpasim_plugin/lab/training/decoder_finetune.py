@@ -110,7 +110,7 @@ class Rollouts:
                     block_latents=block_latents,
                     window=window,
                 )
-                write_array(path, z[0].half().numpy(), "writing training data")
+                write_array(path, z[0].half().numpy())
             if report is not None:
                 report(index + 1, len(clips))
 
@@ -160,9 +160,9 @@ class DecoderTask:
     ) -> None:
         size = tuple(rollouts[0][1].shape[2:])
         if recipe.rows > size[0] or recipe.columns > size[1]:
-            found = f"a crop of {recipe.rows} x {recipe.columns} latents from {size[0]} x {size[1]}"
             raise InputError(
-                "setting up the decoder's training", "its crop", found, "choose a smaller crop"
+                f"its crop: a crop of {recipe.rows} x {recipe.columns} latents from {size[0]} x {size[1]}",
+                "choose a smaller crop",
             )
         self.vae, self.rollouts, self.recipe, self.distance = vae, rollouts, recipe, distance
         vae.requires_grad_(False)

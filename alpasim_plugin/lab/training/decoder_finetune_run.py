@@ -120,9 +120,7 @@ def bundle_settings(bundle: Path) -> OneFixerSettings:
     settings = fixer_settings(name, overrides)
     if not isinstance(settings, OneFixerSettings):
         raise InputError(
-            DOING,
-            str(bundle),
-            f"it is for {name}, which has no networks",
+            f"{bundle}: it is for {name}, which has no networks",
             "give a bundle of 'simrun train fixer'",
         )
     found = [
@@ -142,9 +140,7 @@ def bundle_settings(bundle: Path) -> OneFixerSettings:
     ]
     if found:
         raise InputError(
-            DOING,
-            str(bundle),
-            "; ".join(found),
+            f"{bundle}: {'; '.join(found)}",
             "give a bundle that 'simrun train fixer' made with a history",
         )
     return settings

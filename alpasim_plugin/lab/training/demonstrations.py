@@ -123,8 +123,7 @@ def write_demonstrations(
     path = folder / DEMONSTRATIONS_FILE
     if (
         path.exists()
-        and {k: v for k, v in read_json_object(path, READING, do_this=GIVE).items() if k in info}
-        == info
+        and {k: v for k, v in read_json_object(path, do_this=GIVE).items() if k in info} == info
     ):
         return False
     camera = wide_camera(front_camera(scenario))
@@ -134,7 +133,7 @@ def write_demonstrations(
         "T_rig_camera": camera.T_rig_camera.tolist(),
         "samples": len(arrays["frame"]),
     }
-    with atomic_folder(folder, "writing demonstrations") as partial:
+    with atomic_folder(folder) as partial:
         for name, array in arrays.items():
             np.save(partial / f"{name}.npy", array)
         write_json(partial / DEMONSTRATIONS_FILE, {**info, **facts})
@@ -237,9 +236,7 @@ class Demonstrations:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.info = read_json_as(
-            DemonstrationFacts, folder / DEMONSTRATIONS_FILE, READING, do_this=GIVE
-        )
+        self.info = read_json_as(DemonstrationFacts, folder / DEMONSTRATIONS_FILE, do_this=GIVE)
 
     def __len__(self) -> int:
         return self.info["samples"]
@@ -262,13 +259,10 @@ class Demonstrations:
         out = {}
         for name, (axes, dtype) in _FORMS.items():
             path = self.folder / f"{name}.npy"
-            out[name] = open_npy(path, READING, "write the demonstrations again")
+            out[name] = open_npy(path, "write the demonstrations again")
             if out[name].ndim != axes or out[name].dtype != np.dtype(dtype):
-                found = f"{out[name].dtype} with {out[name].ndim} axes"
                 raise InputError(
-                    READING,
-                    str(path),
-                    found,
+                    f"{path}: {out[name].dtype} with {out[name].ndim} axes",
                     f"{dtype} with {axes} axes is needed: write the demonstrations again",
                 )
         return out
@@ -296,9 +290,7 @@ def read_demonstrations(root: Path, split: str) -> Sequence[Demonstrations]:
     )
     if not folders:
         raise InputError(
-            READING,
-            str(root / split),
-            "no complete scene",
+            f"{root / split}: no complete scene",
             "write some with 'simrun train policy-data'",
         )
     return [one for one in map(Demonstrations, folders) if len(one)]

@@ -236,11 +236,8 @@ class DistillationTask:
             "logit_fake": float(fake.detach().mean()),
         }
         if abs(numbers["logit_real"]) > term.most:
-            found = f"real clips have the mean logit {numbers['logit_real']:.3g}, beyond {term.most:g}: the head no longer teaches"
             raise InfrastructureError(
-                "training",
-                "the adversarial head",
-                found,
+                f"the adversarial head: real clips have the mean logit {numbers['logit_real']:.3g}, beyond {term.most:g}: the head no longer teaches",
                 "lower the learning rate, and begin in another folder",
             )
         return loss + adversarial, numbers

@@ -42,7 +42,7 @@ from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.lab.training.pair_store import Pair, PairSequence, is_made, write_sequence
-from alpasim_plugin.lab.training.photograph_pairs import DOING, PhotographPairs, PhotographRecipe
+from alpasim_plugin.lab.training.photograph_pairs import PhotographPairs, PhotographRecipe
 from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_references
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.recorded import posed_photograph
@@ -104,11 +104,8 @@ def make_drive_pairs(
             (one for one in scenario.recording if one.camera == camera), key=lambda one: one.t_us
         )
         if len(taken) < 2 * recipe.every:
-            few = f"{len(taken)} photographs for every {recipe.every}th to be held out"
             raise InputError(
-                DOING,
-                f"{name}, camera {camera}",
-                few,
+                f"{name}, camera {camera}: {len(taken)} photographs for every {recipe.every}th to be held out",
                 "give more photographs, or hold out more of them",
             )
         for phase in range(recipe.every):

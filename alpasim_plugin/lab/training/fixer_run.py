@@ -90,11 +90,8 @@ class FixerRun:
     def __post_init__(self) -> None:
         names = {*GIVEN, *(stage.name for stage in self.recipe.stages[:-1])}
         if unknown := sorted(set(self.weights) - names):
-            found = f"no weights of that name in recipe {self.recipe.name}"
             raise InputError(
-                "training a fixer",
-                f"--weights {', '.join(unknown)}",
-                found,
+                f"--weights {', '.join(unknown)}: no weights of that name in recipe {self.recipe.name}",
                 f"name one of {', '.join(sorted(names))}",
             )
 
@@ -410,9 +407,7 @@ def deployed_settings(run: FixerRun, stage: Stage) -> TrainableSettings:
         return type(run.settings).model_validate({**run.settings.model_dump(), **said})
     except ValueError as error:
         raise InputError(
-            "deploying a recipe",
-            f"{run.recipe.name}, stage {stage.name}",
-            str(error),
+            f"{run.recipe.name}, stage {stage.name}: {error}",
             "correct the recipe",
         ) from error
 
@@ -427,11 +422,8 @@ def half(tensor: Tensor) -> Tensor:
         return tensor
     rounded = tensor.detach().half()
     if not torch.isfinite(rounded).all():
-        found = f"values up to {float(tensor.abs().max()):.3g}"
         raise InputError(
-            "rounding weights to float16",
-            f"shape {list(tensor.shape)}",
-            found,
+            f"shape {list(tensor.shape)}: values up to {float(tensor.abs().max()):.3g}",
             "train with a smaller learning rate",
         )
     return rounded
@@ -451,8 +443,9 @@ def _weights(files: Mapping[str, Path], source: str) -> Weights | None:
     if part == "dit" and "dit" not in parts:
         return tensors  # a transformer alone
     if part not in parts:
-        do = f"give a bundle of 'simrun train fixer' as {name}"
-        raise InputError("starting a stage of training", str(files[name]), f"no part {part!r}", do)
+        raise InputError(
+            f"{files[name]}: no part {part!r}", f"give a bundle of 'simrun train fixer' as {name}"
+        )
     return parts[part]
 
 

@@ -55,9 +55,7 @@ def hash_scenes(folder: Path) -> FrozenSplit:
     }
     if not scenes:
         raise InputError(
-            DOING,
-            str(folder),
-            "no scenario",
+            f"{folder}: no scenario",
             f"write them with 'simrun train scenes --split {folder.name}'",
         )
     lines = "".join(f"{name} {digest}\n" for name, digest in scenes.items())
@@ -74,9 +72,7 @@ def freeze_scenes(
     """
     if record.exists():
         raise InputError(
-            "freezing test scenes",
-            str(record),
-            "it exists",
+            f"{record}: it exists",
             "remove it if the scenes are really to change",
         )
     found = {split: hash_scenes(folder / split) for split in splits}
@@ -94,7 +90,7 @@ def check_scenes(folder: Path, record: Path = RECORD) -> dict[str, FrozenSplit]:
         InputError: Another scene, one too few or one too many, or no readable record.
     """
     do_this = "give the record that 'simrun train check-scenes --freeze' wrote"
-    entries = read_json_as(dict[str, FrozenEntry], record, DOING, do_this=do_this)
+    entries = read_json_as(dict[str, FrozenEntry], record, do_this=do_this)
     known = {split: FrozenSplit(**entry) for split, entry in entries.items()}
     for split, frozen in known.items():
         found = hash_scenes(folder / split)
@@ -102,9 +98,7 @@ def check_scenes(folder: Path, record: Path = RECORD) -> dict[str, FrozenSplit]:
         if differ or found.sha256 != frozen.sha256:
             shown = ", ".join(differ[:5]) or "the hash of all scenes"
             raise InputError(
-                DOING,
-                f"{folder / split} against {record}",
-                f"{max(len(differ), 1)} differ: {shown}",
+                f"{folder / split} against {record}: {max(len(differ), 1)} differ: {shown}",
                 f"write the scenes again with 'simrun train scenes --split {split}', into an empty folder",
             )
     return known

@@ -42,11 +42,8 @@ class SharedRollout:
 
     def __post_init__(self) -> None:
         if len(self.shares) != len(self.objectives) or abs(sum(self.shares) - 1) > 1e-9:
-            found = f"shares {self.shares} of {len(self.objectives)} objectives"
             raise InputError(
-                "choosing objectives in sequence",
-                "their shares",
-                found,
+                f"their shares: shares {self.shares} of {len(self.objectives)} objectives",
                 "give one a stage, with sum 1",
             )
 
@@ -99,9 +96,7 @@ class SharedRolloutTask:
     def __init__(self, config: SharedRollout, inputs: StageInputs) -> None:
         if inputs.distance is None and config.perceptual:
             raise InputError(
-                "setting up the generator's training",
-                str(config),
-                "a perceptual term without a distance",
+                f"{config}: a perceptual term without a distance",
                 "give one",
             )
         self.config, self.inputs, self.vae = config, inputs, inputs.vae

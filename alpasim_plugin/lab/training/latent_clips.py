@@ -122,12 +122,12 @@ class LatentClips:
         report: Callable[[int, int], None] | None = None,
     ) -> None:
         if not sequences:
-            raise InputError(
-                DOING, "the pairs", "no finished sequence", "run 'simrun train pairs' first"
-            )
+            raise InputError("the pairs: no finished sequence", "run 'simrun train pairs' first")
         if len({sequence.size for sequence in sequences}) > 1:
-            found = f"images of several sizes, which make no batch: {listed_sizes(sequences)}"
-            raise InputError(DOING, "the pairs", found, "choose one with --size WIDTHxHEIGHT")
+            raise InputError(
+                f"the pairs: images of several sizes, which make no batch: {listed_sizes(sequences)}",
+                "choose one with --size WIDTHxHEIGHT",
+            )
         encoder = digest(vae, form)
         self.form, self.digest = form, f"{encoder}-{pairs_digest(sequences)}"
         self.folder = folder / encoder
@@ -153,7 +153,7 @@ class LatentClips:
     def _latents(self, sequence: PairSequence, vae: TinyVAE) -> F16:
         path = self.folder / f"{sequence.name}-{sequence.content[:12]}.npy"
         if not path.exists():
-            write_array(path, encode_sequence(sequence, vae, self.form), "writing training data")
+            write_array(path, encode_sequence(sequence, vae, self.form))
         return np.asarray(np.load(path, mmap_mode="r"))
 
 
@@ -163,9 +163,9 @@ def encode_sequence(sequence: PairSequence, vae: TinyVAE, form: ClipForm) -> F16
     """
     starts = range(0, len(sequence.clip) - form.frames + 1, form.stride)
     if not starts:
-        found = f"{len(sequence.clip)} frames, a clip has {form.frames}"
         raise InputError(
-            DOING, str(sequence.folder), found, "make longer sequences, or train on fewer latents"
+            f"{sequence.folder}: {len(sequence.clip)} frames, a clip has {form.frames}",
+            "make longer sequences, or train on fewer latents",
         )
     return np.stack(
         [

@@ -79,7 +79,7 @@ def curves(log: Path, points: int = 25) -> tuple[list[Mapping[str, float]], floa
     Returns:
         Rows with ``step`` (the last of the interval) and the means of all values; hours.
     """
-    rows = read_json_lines(log, "reading a training log")
+    rows = read_json_lines(log)
     size = max(len(rows) // points, 1)
     parts = [rows[i : i + size] for i in range(0, len(rows), size)]
     out: list[Mapping[str, float]] = []

@@ -81,11 +81,8 @@ class NoiseWindowTask:
     def __init__(self, config: NoiseWindowLoss, inputs: StageInputs) -> None:
         settings = inputs.settings
         if not isinstance(settings, NoiseWindowSettings):
-            found = f"{'a fixer' if settings is None else settings.name} that does not sample windows from noise"
             raise InputError(
-                "setting up training from noise",
-                "--fixer",
-                found,
+                f"--fixer: {'a fixer' if settings is None else settings.name} that does not sample windows from noise",
                 "leave it out, or name gsfix3d or 3dgs-enhancer",
             )
         self.config, self.vae, self.latents = config, inputs.vae, settings.latents

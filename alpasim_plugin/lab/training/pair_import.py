@@ -83,15 +83,13 @@ def import_sequence(
         if len(set(shapes.values())) > 1:
             listed = ", ".join(f"{name} {w} x {h}" for name, (w, h) in shapes.items())
             raise InputError(
-                DOING,
-                folder.name,
-                f"channels of different size: {listed}",
+                f"{folder.name}: channels of different size: {listed}",
                 "give --size WIDTHxHEIGHT to scale them to one",
             )
     length = min(len(T), *(count for _, count in found.values()))
     if length == 0:
         raise InputError(
-            DOING, folder.name, "no frame that every channel has", "give channels of the same drive"
+            f"{folder.name}: no frame that every channel has", "give channels of the same drive"
         )
     counts = {**{name: count for name, (_, count) in found.items()}, "poses": len(T)}
     info = {
@@ -111,21 +109,17 @@ def read_poses(path: Path, fps: float) -> tuple[F64, list[int]]:
         InputError: Not a readable file of poses, or a matrix that is not a rigid transform.
     """
     if fps <= 0:
-        raise InputError(DOING, "--fps", f"{fps}", "give a positive rate")
-    with parsing(
-        DOING, path, "give .npy (T, 4, 4), or JSON with a 4 x 4 matrix a frame", "no poses"
-    ):
+        raise InputError(f"--fps: {fps}", "give a positive rate")
+    with parsing(path, "give .npy (T, 4, 4), or JSON with a 4 x 4 matrix a frame", "no poses"):
         if path.suffix == ".npy":
-            T, times = np.asarray(open_npy(path, DOING), dtype=np.float64), None
+            T, times = np.asarray(open_npy(path), dtype=np.float64), None
         else:
-            rows = read_json(path, DOING)
+            rows = read_json(path)
             with_times = bool(rows) and isinstance(rows[0], dict)
             T = np.array([r["T_world_camera"] if with_times else r for r in rows], dtype=np.float64)
             times = [int(r["t_us"]) for r in rows] if with_times and "t_us" in rows[0] else None
     if T.ndim != 3 or T.shape[1:] != (4, 4) or not len(T):
-        raise InputError(
-            DOING, str(path), f"an array of shape {T.shape}", "give one 4 x 4 matrix a frame"
-        )
+        raise InputError(f"{path}: an array of shape {T.shape}", "give one 4 x 4 matrix a frame")
     off = np.abs(T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     bad = (
         ~np.isfinite(T).all(axis=(1, 2))
@@ -137,20 +131,15 @@ def read_poses(path: Path, fps: float) -> tuple[F64, list[int]]:
             np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) < ORTHONORMAL
         )  # a transposed pose has its translation in this row
     if bad.any():
-        found = f"pose {int(np.argmax(bad))} is not a rigid transform"
         raise InputError(
-            DOING,
-            str(path),
-            found,
+            f"{path}: pose {int(np.argmax(bad))} is not a rigid transform",
             "give T_world_camera (columns: axes, then position), metres, OpenCV axes",
         )
     if times is None:
         times = [round(i / fps * 1e6) for i in range(len(T))]
     if any(b <= a for a, b in pairwise(times)):
         raise InputError(
-            DOING,
-            str(path),
-            "times that do not increase",
+            f"{path}: times that do not increase",
             "sort the poses by time, or remove the times",
         )
     return T, times
@@ -166,13 +155,11 @@ def read_frames(path: Path) -> Iterator[U8]:
         files = sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
         if not files:
             raise InputError(
-                DOING,
-                str(path),
-                "a folder without images",
+                f"{path}: a folder without images",
                 f"put {', '.join(IMAGE_SUFFIXES)} there, named in order",
             )
         for file in files:
-            image = read_image(file, DOING, "write it again as PNG or JPEG")
+            image = read_image(file, "write it again as PNG or JPEG")
             yield np.ascontiguousarray(image[..., ::-1]).astype(np.uint8)
     elif path.suffix == ".npy":
         yield from _array_frames(path)
@@ -182,22 +169,20 @@ def read_frames(path: Path) -> Iterator[U8]:
                 yield frame.image
     else:
         raise InputError(
-            DOING,
-            str(path),
-            "no such file or folder",
+            f"{path}: no such file or folder",
             "give a video, a folder of images or a .npy array",
         )
 
 
 def _array_frames(path: Path) -> Iterator[U8]:
-    array = open_npy(path, DOING, "give a complete .npy array")
+    array = open_npy(path, "give a complete .npy array")
     if (
         array.dtype != np.uint8
         or array.ndim not in (3, 4)
         or (array.ndim == 4 and array.shape[3] not in (1, 3))
     ):
         raise InputError(
-            DOING, str(path), f"{array.dtype} {array.shape}", "give uint8 (T, H, W) or (T, H, W, 3)"
+            f"{path}: {array.dtype} {array.shape}", "give uint8 (T, H, W) or (T, H, W, 3)"
         )
     for image in array:
         colour = image if image.ndim == 3 else image[..., None]
@@ -211,7 +196,7 @@ def _first_and_count(path: Path) -> tuple[U8, int]:
     frames = read_frames(path)
     first = next(frames, None)
     if first is None:
-        raise InputError(DOING, str(path), "no frame", "give a channel with images")
+        raise InputError(f"{path}: no frame", "give a channel with images")
     return first, 1 + sum(1 for _ in frames)
 
 

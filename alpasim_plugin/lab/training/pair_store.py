@@ -74,9 +74,7 @@ class PairClip:
         """
         if not 0 <= start <= len(self) - frames:
             raise InputError(
-                READING,
-                f"frames {start} to {start + frames}",
-                f"the sequence has {len(self)}",
+                f"frames {start} to {start + frames}: the sequence has {len(self)}",
                 "ask for fewer frames",
             )
         return type(self)(
@@ -106,7 +104,7 @@ class PairSequence:
         self.folder = folder
         path = folder / SEQUENCE_FILE
         self.info: dict[str, Any] = read_json_object(
-            path, READING, do_this="give a folder that 'simrun train pairs' finished"
+            path, do_this="give a folder that 'simrun train pairs' finished"
         )
 
     @property
@@ -135,11 +133,11 @@ class PairSequence:
     def _open(self, name: str) -> Any:
         path = self.folder / f"{name}.npy"
         axes, dtype = _FORMS[name]
-        array = open_npy(path, READING, "give a complete .npy file of this channel")
+        array = open_npy(path, "give a complete .npy file of this channel")
         if array.ndim != axes or array.dtype != np.dtype(dtype):
-            found = f"{array.dtype} with {array.ndim} axes"
             raise InputError(
-                READING, str(path), found, f"give {dtype} with {axes} axes (docs/lab/pairs.md)"
+                f"{path}: {array.dtype} with {array.ndim} axes",
+                f"give {dtype} with {axes} axes (docs/lab/pairs.md)",
             )
         return array
 
@@ -150,14 +148,14 @@ def _opened(sequence: PairSequence) -> PairClip:
     size = arrays["rgb_gt"].shape[1:3]
     for name in ("rgb_input", "opacity", "sdmap"):
         if arrays[name].shape[1:3] != size:
-            found = f"{name} is {arrays[name].shape[1:3]}, rgb_gt {size}"
-            raise InputError(READING, str(sequence.folder), found, "make all of one size")
+            raise InputError(
+                f"{sequence.folder}: {name} is {arrays[name].shape[1:3]}, rgb_gt {size}",
+                "make all of one size",
+            )
     length = min(len(a) for a in arrays.values())
     if length == 0:
         raise InputError(
-            READING,
-            str(sequence.folder),
-            "no frame that every channel has",
+            f"{sequence.folder}: no frame that every channel has",
             "remove the folder and run 'simrun train pairs' again",
         )
     return PairClip(**{name: a[:length] for name, a in arrays.items()})
@@ -170,7 +168,7 @@ def is_made(folder: Path, info: Mapping[str, Any]) -> bool:
     path = folder / SEQUENCE_FILE
     if not path.exists():
         return False
-    document = read_json_object(path, READING, do_this=f"remove {folder}; it is made again")
+    document = read_json_object(path, do_this=f"remove {folder}; it is made again")
     return all(document.get(key) == value for key, value in info.items())
 
 
@@ -201,18 +199,16 @@ class PairDataset:
         )
         if not finished:
             raise InputError(
-                READING,
-                str(self.folder),
-                "no finished sequence",
+                f"{self.folder}: no finished sequence",
                 "make some with 'simrun train pairs'",
             )
         complete = tuple(known.get(f.name) or PairSequence(f) for f in finished)
         self.sequences = tuple(s for s in complete if self.size in (None, s.size))
         if self.size is not None and not self.sequences:
-            found = (
-                f"no sequence of {self.size[0]}x{self.size[1]}; there are {listed_sizes(complete)}"
+            raise InputError(
+                f"{self.folder}: no sequence of {self.size[0]}x{self.size[1]}; there are {listed_sizes(complete)}",
+                "choose one of these sizes",
             )
-            raise InputError(READING, str(self.folder), found, "choose one of these sizes")
 
     def __len__(self) -> int:
         return len(self.sequences)
@@ -253,7 +249,7 @@ def write_sequence(
         InputError: No frame, or frames of changing size.
         InfrastructureError: The disk refuses.
     """
-    with atomic_folder(folder, "writing training pairs") as partial:
+    with atomic_folder(folder) as partial:
         count = _write_arrays(partial, frames, length)
         if beside is not None:
             beside(partial)
@@ -271,9 +267,7 @@ def _content(folder: Path) -> str:
                 out.update(hashlib.file_digest(file, "sha256").digest())
         except OSError as error:
             raise InputError(
-                READING,
-                str(folder / f"{name}.npy"),
-                str(error),
+                f"{folder / f'{name}.npy'}: {error}",
                 "give a complete .npy file of this channel",
             ) from error
     return out.hexdigest()
@@ -291,16 +285,13 @@ def _write_arrays(folder: Path, frames: Iterable[Pair], length: int) -> int:
                     folder / f"{name}.npy", mode="w+", dtype=_FORMS[name][1], shape=shape
                 )
             if arrays[name].shape[1:] != item.shape or count > length:
-                found = f"frame {count} of {length}: {name} {item.shape}, the first is {arrays[name].shape[1:]}"
                 raise InputError(
-                    "writing training pairs",
-                    str(folder),
-                    found,
+                    f"{folder}: frame {count} of {length}: {name} {item.shape}, the first is {arrays[name].shape[1:]}",
                     "give frames of one size, no more than announced",
                 )
             arrays[name][count - 1] = item
     if not count:
-        raise InputError("writing training pairs", str(folder), "no frames", "give at least one")
+        raise InputError(f"{folder}: no frames", "give at least one")
     for name, array in arrays.items():
         array.flush()
         if count < length:  # the header has ``length``: write the array again with its true length

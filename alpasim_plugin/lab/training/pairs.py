@@ -137,9 +137,7 @@ def pair_frames(
         damaged = source.render(request)
         if damaged.alpha is None or damaged.depth is None:
             raise InputError(
-                DOING,
-                f"renderer {recipe.source!r}",
-                "frames without opacity or depth",
+                f"renderer {recipe.source!r}: frames without opacity or depth",
                 "choose a renderer that gives both",
             )
         geometry.append(FrameGeometry(damaged.depth.astype(np.float16), actors))
@@ -185,5 +183,5 @@ def _camera(scenario: Scenario, name: str | None) -> CameraSpec:
             return camera
     known = sorted(c.name for c in scenario.cameras)
     raise InputError(
-        DOING, f"camera {name!r}", f"scene {scenario.scene_id!r} has {known}", "name one of them"
+        f"camera {name!r}: scene {scenario.scene_id!r} has {known}", "name one of them"
     )

@@ -58,9 +58,7 @@ class PhotographRecipe:
     def __post_init__(self) -> None:
         if self.every < 2:
             raise InputError(
-                DOING,
-                f"every {self.every}",
-                "no photograph would be left to fit",
+                f"every {self.every}: no photograph would be left to fit",
                 "hold out every second at most",
             )
 
@@ -109,8 +107,10 @@ def make_photograph_pairs(
         InputError: Too few photographs, or none that overlap.
     """
     if len(photographs.views) < 2 * recipe.every:
-        few = f"{len(photographs.views)} photographs for every {recipe.every}th to be held out"
-        raise InputError(DOING, name, few, "give more photographs, or hold out more of them")
+        raise InputError(
+            f"{name}: {len(photographs.views)} photographs for every {recipe.every}th to be held out",
+            "give more photographs, or hold out more of them",
+        )
     matched: list[Match] | None = None
     for phase in range(recipe.every):
         folder = out / recipe.split / f"{name}_{phase}"

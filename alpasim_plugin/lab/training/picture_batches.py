@@ -36,12 +36,9 @@ class PictureBatches:
     def __init__(self, inputs: StageInputs, frames: int) -> None:
         have = inputs.clips.form.frames
         if have < frames:
-            do = f"train on clips of at least {1 + -(-(frames - 1) // 4)} latents (--latents)"
             raise InputError(
-                "setting up training batches",
-                f"{frames} frames of a clip",
-                f"clips of {have} frames",
-                do,
+                f"{frames} frames of a clip: clips of {have} frames",
+                f"train on clips of at least {1 + -(-(frames - 1) // 4)} latents (--latents)",
             )
         self.frames, self._latest = frames, have - frames
         self._clips = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.seen)

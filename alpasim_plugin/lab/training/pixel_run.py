@@ -130,9 +130,7 @@ def initial_generator(run: PixelRun) -> PixelGenerator:
     tensors = parts_of(load_weights(run.init, dtype=torch.float32)).get("generator")
     if tensors is None:
         raise InputError(
-            DOING,
-            str(run.init),
-            "no part generator.*",
+            f"{run.init}: no part generator.*",
             "give a checkpoint or a bundle of 'simrun train per-frame'",
         )
     own = net.state_dict()
@@ -145,8 +143,10 @@ def initial_generator(run: PixelRun) -> PixelGenerator:
         if not _fits(tensors.get(key), own.get(key))
     )
     if wrong:
-        found = f"{len(wrong)} tensors of other sizes than {net.facts}, such as {wrong[0]}"
-        raise InputError(DOING, str(run.init), found, "choose the fixer of the same widths")
+        raise InputError(
+            f"{run.init}: {len(wrong)} tensors of other sizes than {net.facts}, such as {wrong[0]}",
+            "choose the fixer of the same widths",
+        )
     identity = {key: torch.zeros_like(own[key]) for key in lacking if key.endswith("second.weight")}
     net.load_state_dict({**own, **tensors, **identity})
     return net

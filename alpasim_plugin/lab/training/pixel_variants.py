@@ -118,6 +118,7 @@ def pixel_variant(name: str) -> PixelVariant:
         InputError: No such variant.
     """
     if name not in PIXEL_VARIANTS:
-        do = f"choose one of {', '.join(PIXEL_VARIANTS)}"
-        raise InputError("choosing what to train", f"variant {name!r}", "no such variant", do)
+        raise InputError(
+            f"variant {name!r}: no such variant", f"choose one of {', '.join(PIXEL_VARIANTS)}"
+        )
     return PIXEL_VARIANTS[name]

@@ -79,9 +79,7 @@ class Ranks:
         """
         if batch % self.count:
             raise InputError(
-                DOING,
-                f"{batch} rows in {self.count} processes",
-                "they cannot be divided equally",
+                f"{batch} rows in {self.count} processes: they cannot be divided equally",
                 "choose a divisor",
             )
         size = batch // self.count
@@ -150,7 +148,7 @@ def in_ranks(
                 raise
             rank, found = failures.get()
             raise InfrastructureError(
-                DOING, f"process {rank + 1} of {count}", found, "run again: training resumes"
+                f"process {rank + 1} of {count}: {found}", "run again: training resumes"
             ) from error
         finally:
             for process in others:

@@ -27,7 +27,7 @@ from alpasim_plugin.core.types import F64, I64, U8, Actor, Box, RecordedFrame
 from alpasim_plugin.fixers.ground import carry, with_users
 from alpasim_plugin.fixers.references import ReferenceIndex
 from alpasim_plugin.fixers.warp import Picture, WarpTarget
-from alpasim_plugin.lab.training.pair_store import READING, PairSequence
+from alpasim_plugin.lab.training.pair_store import PairSequence
 
 FOLDER = "references"
 F16 = npt.NDArray[np.float16]
@@ -152,16 +152,13 @@ def open_references(sequence: PairSequence) -> SequenceReferences | None:
         *(f"{FOLDER}/{name}" for name in ("rgb", "depth", "T_world_camera", "t_us", "actors")),
     )
     opened = [
-        np.asarray(open_npy(folder / f"{name}.npy", READING, "run 'simrun train pairs' again"))
+        np.asarray(open_npy(folder / f"{name}.npy", "run 'simrun train pairs' again"))
         for name in names
     ]  # plain: faster
     clip = sequence.clip
     if len(opened[0]) < len(clip) or len({len(array) for array in opened[3:]}) != 1:
-        found = f"{len(opened[0])} depths of {len(clip)} frames, recorded frames {[len(array) for array in opened[3:]]}"
         raise InputError(
-            READING,
-            str(folder / FOLDER),
-            found,
+            f"{folder / FOLDER}: {len(opened[0])} depths of {len(clip)} frames, recorded frames {[len(array) for array in opened[3:]]}",
             "remove the folder and run 'simrun train pairs' again",
         )
     K, T_rig_camera = (

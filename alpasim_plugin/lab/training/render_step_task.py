@@ -80,15 +80,12 @@ class RenderStepTask:
 
     def __init__(self, config: RenderStepLoss, inputs: StageInputs) -> None:
         if not isinstance(inputs.settings, RenderStepSettings):
-            found = f"{'a fixer' if inputs.settings is None else inputs.settings.name} that takes no step from the render"
             raise InputError(
-                DOING,
-                "--fixer",
-                found,
+                f"--fixer: {'a fixer' if inputs.settings is None else inputs.settings.name} that takes no step from the render",
                 "leave it out, or name difix, harmonizer or harmonizer-temporal",
             )
         if inputs.distance is None:
-            raise InputError(DOING, str(config), "a perceptual term without a distance", "give one")
+            raise InputError(f"{config}: a perceptual term without a distance", "give one")
         self.config, self.distance = config, inputs.distance[1]
         self.batches = PictureBatches(inputs, 1 if config.references is None else ROLLOUT)
         net = transformer_of(inputs, "dit")

@@ -153,8 +153,6 @@ def _write_drivable(
         write_text(path, text)
         return
     raise InputError(
-        "sampling a training scene",
-        f"{scene_id}, seeds {first_seed} to {first_seed + DRAWS - 1}",
-        f"no sample can be driven; the last: {last}",
+        f"{scene_id}, seeds {first_seed} to {first_seed + DRAWS - 1}: no sample can be driven; the last: {last}",
         f"change the family {family!r} in training/scene_families.py",
     )

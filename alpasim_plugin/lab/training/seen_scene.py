@@ -49,9 +49,9 @@ def scene_of(sequence: PairSequence, scenes: Path | None) -> Scenario:
         else scenes / str(sequence.info.get("split")) / f"{sequence.name}.yaml"
     )
     if path is None or not path.is_file():
-        found = "its scene, or the mounting of its camera, is asked for, and there is no scene"
         raise InputError(
-            DOING, str(sequence.folder), found, "name the folder of its scenes with --scenes"
+            f"{sequence.folder}: its scene, or the mounting of its camera, is asked for, and there is no scene",
+            "name the folder of its scenes with --scenes",
         )
     return load_scenario(path)
 
@@ -98,9 +98,7 @@ class SeenScene:
         )
         if made.depth is None:
             raise InputError(
-                "rendering depth",
-                "renderer 'clean'",
-                "frames without depth",
+                "renderer 'clean': frames without depth",
                 "choose a renderer that gives it",
             )
         vehicles = vehicle_lamps(
@@ -142,11 +140,8 @@ def seen_frames(
             else float(np.abs(again.astype(np.float32) - kept).mean())
         )
         if off > SAME_FRAME:
-            found = f"frame {start + i} rendered again differs by {off:.1f} levels from the pairs' clean frame"
             raise InputError(
-                DOING,
-                str(sequence.folder),
-                found,
+                f"{sequence.folder}: frame {start + i} rendered again differs by {off:.1f} levels from the pairs' clean frame",
                 "give the scenes that the pairs were rendered from, with renderer 'clean'",
             )
     return out

@@ -55,15 +55,13 @@ class Objectives:
     def __post_init__(self) -> None:
         if self.flow is None and not self.horizon:
             raise InputError(
-                "choosing objectives",
-                "flow None, horizon 0",
-                "nothing to minimise",
+                "flow None, horizon 0: nothing to minimise",
                 "switch one of them on",
             )
         if self.horizon < 0 or self.weight < 0:
-            found = f"horizon {self.horizon}, weight {self.weight}"
             raise InputError(
-                "choosing objectives", "the perceptual term", found, "give values of at least 0"
+                f"the perceptual term: horizon {self.horizon}, weight {self.weight}",
+                "give values of at least 0",
             )
 
 
@@ -145,16 +143,12 @@ def losses(
     n = sample.z_0.shape[2]
     if objectives.horizon and perceptual is None:
         raise InputError(
-            "training on a shared rollout",
-            "the perceptual term",
-            "no distance function",
+            "the perceptual term: no distance function",
             "give one, or horizon=0",
         )
     if not 0 <= sample.w < n:
         raise InputError(
-            "training on a shared rollout",
-            f"w = {sample.w}",
-            f"{n} latents",
+            f"w = {sample.w}: {n} latents",
             "sample w within the clip",
         )
     rollout = _Rollout(net, sample, text, objectives, block_latents, window)

@@ -53,19 +53,15 @@ def core_seconds(folder: Path) -> list[float]:
         InputError: No log, or one without times of the processor.
     """
     path = folder / LOG_FILE
-    rows = read_json_lines(path, DOING)
+    rows = read_json_lines(path)
     if [row.get("step") for row in rows] != list(range(1, len(rows) + 1)):
         raise InputError(
-            DOING,
-            str(path),
-            "rows that are not one for each update in order",
+            f"{path}: rows that are not one for each update in order",
             "train in another folder",
         )
     if not rows or any(CORE_S not in row for row in rows):
         raise InputError(
-            DOING,
-            str(path),
-            f"updates without {CORE_S!r}",
+            f"{path}: updates without {CORE_S!r}",
             "train again: the log of an earlier version has no processor time",
         )
     return list(accumulate(float(row[CORE_S]) for row in rows))
@@ -85,5 +81,5 @@ def snapshots_of(folder: Path) -> list[Snapshot]:
             if not paths
             else f"a snapshot of update {int(paths[-1].stem)} and a log of {len(times)}"
         )
-        raise InputError(DOING, str(folder / SNAPSHOTS), found, "train with --snapshots 8")
+        raise InputError(f"{folder / SNAPSHOTS}: {found}", "train with --snapshots 8")
     return [Snapshot(int(path.stem), times[int(path.stem) - 1], path) for path in paths]

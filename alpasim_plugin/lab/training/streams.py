@@ -97,9 +97,7 @@ class StreamShares:
         values = [getattr(self, f.name) for f in fields(self)]
         if min(values) < 0 or abs(sum(values) - 1) > 1e-9:
             raise InputError(
-                DOING,
-                f"shares {values}",
-                f"they add up to {sum(values):g}",
+                f"shares {values}: they add up to {sum(values):g}",
                 "give shares of at least 0 that add up to 1",
             )
 
@@ -223,11 +221,8 @@ class TrainingStreams:
             episode,
         )
         if min(batch, frames, episode, *crop) < 1 or crop[0] % SIDE or crop[1] % SIDE:
-            asked = f"batch {batch}, frames {frames}, episode {episode}, crop {crop}"
             raise InputError(
-                DOING,
-                asked,
-                "no batch",
+                f"batch {batch}, frames {frames}, episode {episode}, crop {crop}: no batch",
                 f"give at least one of each, and a crop in multiples of {SIDE}",
             )
         self.pairs = _in_order(PairDataset(pairs, split).sequences)[:count]
@@ -237,9 +232,7 @@ class TrainingStreams:
         needs_video = self.shares.video + self.shares.damaged_video > 0
         if needs_video and video is None:
             raise InputError(
-                DOING,
-                f"{self.shares}",
-                "no folder of videos",
+                f"{self.shares}: no folder of videos",
                 "make one with 'simrun train video', or give them no share",
             )
         self.videos = (
@@ -248,8 +241,10 @@ class TrainingStreams:
         for sequence in (*self.pairs, *self.videos):
             size = sequence.clip.rgb_gt.shape[1:3]
             if size[0] < crop[0] or size[1] < crop[1]:
-                found = f"frames of {size[1]}x{size[0]}, smaller than the crop {crop[1]}x{crop[0]}"
-                raise InputError(DOING, str(sequence.folder), found, "crop less")
+                raise InputError(
+                    f"{sequence.folder}: frames of {size[1]}x{size[0]}, smaller than the crop {crop[1]}x{crop[0]}",
+                    "crop less",
+                )
 
     def update(self, i: int, some: slice = slice(None)) -> StreamBatch:
         """Return the batch of update ``i``, counted from 0, or ``some`` of its slots."""

@@ -43,9 +43,7 @@ class StyledLatents:
         if scenes is None or not scenes.is_dir():
             found = "no folder of scenes" if scenes is None else f"{scenes} is no folder"
             raise InputError(
-                "setting up styled targets",
-                "--scenes",
-                found,
+                f"--scenes: {found}",
                 "name the scenes of the pairs: fog, lamps and snow need their depth",
             )
         self.form, self.vae, self.scenes = clips.form, vae, scenes
@@ -62,9 +60,7 @@ class StyledLatents:
             return clip.z_0
         if style not in FORMULAS:
             raise InputError(
-                "encoding a styled target",
-                f"style {style!r}",
-                "no such style",
+                f"style {style!r}: no such style",
                 f"choose one of {', '.join(STYLES)}",
             )
         stored = self._of(clip)[FORMULAS.index(style), int(clip.mirrored)]
@@ -75,7 +71,7 @@ class StyledLatents:
         name = f"{sequence.name}-{sequence.content[:12]}-{clip.start}-{str(sequence.info.get('scene_hash'))[:12]}.npy"
         path = self._folder / name
         if not path.exists():
-            write_array(path, self._encode(clip), "writing training data")
+            write_array(path, self._encode(clip))
         return np.asarray(np.load(path, mmap_mode="r"))
 
     @torch.inference_mode()

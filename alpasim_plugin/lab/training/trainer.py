@@ -179,9 +179,7 @@ class Trainer(Generic[Batch]):
             set(self.parameters) - {key for _, _, own in self._parts for key in own}
         ):
             found = listed("trained without a schedule", nobodys)
-            raise InputError(
-                "setting up a training run", str(folder), found, "freeze them, or name their part"
-            )
+            raise InputError(f"{folder}: {found}", "freeze them, or name their part")
         groups = [group for _, part, own in self._parts for group in _groups(part, own, schedule)]
         self.optimiser = torch.optim.AdamW([g for g in groups if g["params"]], lr=schedule.peak_lr)
         self.average = {name: p.detach().clone() for name, p in self.parameters.items()}
@@ -247,9 +245,7 @@ class Trainer(Generic[Batch]):
                 filter(None, (listed("no weights of", missing), listed("another shape of", wrong)))
             )
             raise InputError(
-                "beginning a training run",
-                str(checkpoint),
-                found,
+                f"{checkpoint}: {found}",
                 f"give the {STATE_FILE} of a run with the same network",
             )
         self._take(tensors)
@@ -358,8 +354,10 @@ class Trainer(Generic[Batch]):
         with atomic_file(path) as partial:
             torch.save(batch, partial)
         self.save()
-        do = f"inspect the batch in {path}; lower the learning rate or repair the data, then run again: training resumes"
-        raise InfrastructureError("training", str(self.folder), found, do)
+        raise InfrastructureError(
+            f"{self.folder}: {found}",
+            f"inspect the batch in {path}; lower the learning rate or repair the data, then run again: training resumes",
+        )
 
     def _write_log(self, numbers: Mapping[str, float]) -> None:
         row = {"step": self.step, **{k: float(f"{v:.6g}") for k, v in numbers.items()}}
@@ -368,12 +366,12 @@ class Trainer(Generic[Batch]):
             with path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
         except OSError as error:
-            raise disk_error(path, error, "writing a training log") from error
+            raise disk_error(path, error) from error
 
     def _resume(self) -> None:
-        path, doing = self.folder / STATE_FILE, "continuing a training run"
-        meta, tensors = read_checkpoint(path, doing, self._facts)
-        with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
+        path = self.folder / STATE_FILE
+        meta, tensors = read_checkpoint(path, self._facts)
+        with parsing(path, START_ANEW, "not a whole checkpoint"):
             self.step = int(meta["step"])
             steps, decay_from = json.loads(meta.get("end", "[null, null]"))
         if (
@@ -381,14 +379,11 @@ class Trainer(Generic[Batch]):
             and self.step > decay_from
             and [steps, decay_from] != [self.schedule.steps, self.schedule.decay_from]
         ):
-            found = f"its decay from {decay_from} to {steps} has begun: it is at {self.step}"
             raise InputError(
-                doing,
-                str(path),
-                found,
+                f"{path}: its decay from {decay_from} to {steps} has begun: it is at {self.step}",
                 "give the same steps and decay, or begin a run from its weights",
             )
-        with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
+        with parsing(path, START_ANEW, "not a whole checkpoint"):
             self._kept = {
                 key.removeprefix(CARRIED): value
                 for key, value in tensors.items()
@@ -428,15 +423,11 @@ class Trainer(Generic[Batch]):
         """Drop log rows of updates after the checkpoint (without one, all), which are repeated, and
         a last row that a kill cut short.
         """
-        path, doing = self.folder / LOG_FILE, "continuing a training log"
+        path = self.folder / LOG_FILE
         if path.is_file():
-            lines = read_text(path, doing).split("\n")[:-1]
-            with parsing(
-                doing, path, f"remove {path}; only the curves are lost", "not a training log"
-            ):
-                kept = [
-                    line for line in lines if parse_json(line, path, doing)["step"] <= self.step
-                ]
+            lines = read_text(path).split("\n")[:-1]
+            with parsing(path, f"remove {path}; only the curves are lost", "not a training log"):
+                kept = [line for line in lines if parse_json(line, path)["step"] <= self.step]
             write_text(path, "".join(line + "\n" for line in kept))
 
 

@@ -125,9 +125,7 @@ def freeze(record: Path = RECORD) -> None:
         InputError: The record exists: what is frozen stays.
     """
     if record.exists():
-        raise InputError(
-            DOING, str(record), "it exists", "remove it if the scenes are really to change"
-        )
+        raise InputError(f"{record}: it exists", "remove it if the scenes are really to change")
     write_json(record, {split: asdict(frozen_split(split)) for split in SPLITS})
 
 
@@ -137,18 +135,11 @@ def check_frozen(record: Path = RECORD) -> None:
     Raises:
         InputError: A scene is defined otherwise now, or no readable record.
     """
-    entries = read_json_as(
-        dict[str, FrozenEntry], record, DOING, do_this="take the record of the package"
-    )
+    entries = read_json_as(dict[str, FrozenEntry], record, do_this="take the record of the package")
     for split in SPLITS:
         known, now = entries[split]["scenes"], frozen_split(split)
         if differ := sorted({name for name, _ in known.items() ^ now.scenes.items()}):
-            found = (
-                f"{len(differ)} of split {split} are defined otherwise now: {', '.join(differ[:5])}"
-            )
             raise InputError(
-                DOING,
-                str(record),
-                found,
+                f"{record}: {len(differ)} of split {split} are defined otherwise now: {', '.join(differ[:5])}",
                 "undo the change of what is drawn, or freeze anew and measure everything again",
             )

@@ -57,11 +57,8 @@ def split_frames(count: int, recipe: VideoRecipe) -> dict[str, range]:
         round((recipe.train_share + recipe.gap_share) * count),
     )
     if not 0 < first <= last < count:
-        shares = f"shares {recipe.train_share} and {recipe.gap_share}"
         raise InputError(
-            DOING,
-            f"{count} frames, {shares}",
-            "a part without frames",
+            f"{count} frames, shares {recipe.train_share} and {recipe.gap_share}: a part without frames",
             "give a longer video or other shares",
         )
     return {TRAIN: range(first), HELD_OUT: range(last, count)}

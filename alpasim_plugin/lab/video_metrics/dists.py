@@ -26,7 +26,6 @@ ROOT = 1e-12  # under the pooling's root
 SMALLEST_PX = 32
 HEADS = "dists.pt"
 HEADS_SHA256 = "f5e65c96230b7f6ca995691647d482237e4cab8a50c5c4a5784f219ef0748218"
-LOADING = "loading DISTS"
 
 
 class DISTS(nn.Module):
@@ -119,15 +118,15 @@ def load_dists(
     folder, net = Path(folder), DISTS(plan)
     if missing := missing_files(folder, plan):
         raise InputError(
-            LOADING,
-            str(folder),
-            f"not there: {', '.join(missing)}",
+            f"{folder}: not there: {', '.join(missing)}",
             "put the files there (docs/lab/judges.md)",
         )
     digest = file_sha256(folder / plan.file)
     if not digest.startswith(plan.digest_start):
-        found = f"sha256 {digest}, which does not begin with {plan.digest_start}"
-        raise InputError(LOADING, str(folder / plan.file), found, "copy the file again")
+        raise InputError(
+            f"{folder / plan.file}: sha256 {digest}, which does not begin with {plan.digest_start}",
+            "copy the file again",
+        )
     trunk, heads = (
         load_weights(folder / plan.file),
         load_weights(folder / HEADS, sha256=heads_sha256),
@@ -147,9 +146,7 @@ def load_dists(
         if value is None or value.numel() != own[key].numel():
             found = "it is missing" if value is None else f"its shape is {tuple(value.shape)}"
             raise InputError(
-                LOADING,
-                f"{key} in {folder}",
-                found,
+                f"{key} in {folder}: {found}",
                 f"give the published weights, where it has {own[key].numel()} numbers",
             )
         state[key] = weight(key, value.reshape(own[key].shape), torch.float32, str(folder))

@@ -15,7 +15,7 @@ def psnr_db(made: U8, truth: U8) -> F64:
     Raises:
         EvaluatorError: Stacks that do not belong together.
     """
-    check_stacks("computing PSNR", made, truth)
+    check_stacks(made, truth)
     return np.array([image_metrics.psnr_db(a, b) for a, b in zip(made, truth, strict=True)])
 
 
@@ -26,7 +26,7 @@ def ssim(made: U8, truth: U8) -> F64:
     Raises:
         EvaluatorError: Stacks that do not belong together.
     """
-    check_stacks("computing SSIM", made, truth)
+    check_stacks(made, truth)
     return np.array([image_metrics.ssim(a, b) for a, b in zip(made, truth, strict=True)])
 
 
@@ -34,28 +34,26 @@ def identical_frames(made: U8, truth: U8) -> int:
     """Return how many frames are equal in every value; their PSNR is the cap, which a mean should
     not hide.
     """
-    check_stacks("counting identical frames", made, truth)
+    check_stacks(made, truth)
     return int(np.sum(np.all(made == truth, axis=(1, 2, 3))))
 
 
-def check_stacks(doing: str, made: U8, truth: U8) -> None:
+def check_stacks(made: U8, truth: U8) -> None:
     """Refuse anything but two equal stacks ``(T, H, W, 3)`` uint8 with at least one frame.
 
     Raises:
         EvaluatorError: With what was found.
     """
     for name, frames in (("made", made), ("truth", truth)):
-        check_stack(doing, name, frames)
+        check_stack(name, frames)
     if made.shape != truth.shape:
         raise EvaluatorError(
-            doing,
-            "two videos",
-            f"shapes {made.shape} and {truth.shape}",
+            f"two videos: shapes {made.shape} and {truth.shape}",
             "give videos of the same frames at one size",
         )
 
 
-def check_stack(doing: str, name: str, frames: U8) -> None:
+def check_stack(name: str, frames: U8) -> None:
     """Refuse anything but ``(T, H, W, 3)`` uint8 with at least one frame.
 
     Raises:
@@ -63,8 +61,6 @@ def check_stack(doing: str, name: str, frames: U8) -> None:
     """
     if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or not len(frames):
         raise EvaluatorError(
-            doing,
-            f"the video {name!r}",
-            f"{frames.dtype} {frames.shape}",
+            f"the video {name!r}: {frames.dtype} {frames.shape}",
             "give (T, H, W, 3) uint8, at least one frame",
         )

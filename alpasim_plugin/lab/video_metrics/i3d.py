@@ -47,16 +47,14 @@ def load_i3d(folder: str | Path) -> tuple[VideoFeatures, str]:
     path = Path(folder) / FILE
     do = f"put the TorchScript I3D of the StyleGAN-V protocol there as {FILE} (docs/lab/judges.md)"
     if not path.is_file():
-        raise InputError(DOING, str(path), "no such file", do)
+        raise InputError(f"{path}: no such file", do)
     try:
         net = torch.jit.load(str(path), map_location="cpu").eval()  # type: ignore[no-untyped-call]
         with torch.inference_mode():
             made = net(torch.zeros(PROBE), rescale=True, resize=True, return_features=True)
     except (RuntimeError, ValueError, TypeError) as error:
         raise InputError(
-            DOING,
-            str(path),
-            f"not a network of this form: {str(error).splitlines()[-1].strip()[:120]}",
+            f"{path}: not a network of this form: {str(error).splitlines()[-1].strip()[:120]}",
             do,
         ) from error
     if not isinstance(made, Tensor) or tuple(made.shape) != (1, LOGITS):
@@ -65,7 +63,7 @@ def load_i3d(folder: str | Path) -> tuple[VideoFeatures, str]:
             if isinstance(made, Tensor)
             else f"a {type(made).__name__}"
         )
-        raise InputError(DOING, str(path), f"{found}, not (1, {LOGITS})", do)
+        raise InputError(f"{path}: {found}, not (1, {LOGITS})", do)
     return net, file_sha256(path)
 
 
@@ -83,11 +81,8 @@ def i3d_features(net: VideoFeatures, video: U8, frames: int | None = None) -> F6
     """
     length = len(video) if frames is None else frames
     if length < LEAST_FRAMES or len(video) < length:
-        found = f"{len(video)} frames, windows of {length}"
         raise InputError(
-            "computing FVD's features",
-            "a clip",
-            found,
+            f"a clip: {len(video)} frames, windows of {length}",
             f"give at least {LEAST_FRAMES} frames a window",
         )
     rows = []

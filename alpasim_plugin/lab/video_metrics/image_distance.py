@@ -60,15 +60,15 @@ def load_distance(name: str, folder: str | Path | None = None) -> ImageDistance:
         return load_perceptual()
     if name not in (*_KINDS, DISTS):
         raise InputError(
-            "choosing a perceptual distance",
-            f"name {name!r}",
-            "no such distance",
+            f"name {name!r}: no such distance",
             f"choose one of {get_args(DistanceName)}",
         )
     found = weights_folder(folder)
     if found is None:
-        do = f"set {FOLDER_VARIABLE} to the folder that holds the files named in docs/lab/video-metrics.md, or use {NAME}"
-        raise InputError("loading a perceptual distance", name, "no folder of weights is set", do)
+        raise InputError(
+            f"{name}: no folder of weights is set",
+            f"set {FOLDER_VARIABLE} to the folder that holds the files named in docs/lab/video-metrics.md, or use {NAME}",
+        )
     return dists.load_dists(found) if name == DISTS else load_lpips(_KINDS[name], found)
 
 

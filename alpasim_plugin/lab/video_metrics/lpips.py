@@ -25,7 +25,6 @@ Kind = Literal["alex", "vgg"]
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 LENGTH_EPS = 1e-10  # added to the length of a feature
 SMALLEST_PX = 32  # four poolings by two
-LOADING = "loading LPIPS"
 
 
 @dataclass(frozen=True)
@@ -171,20 +170,22 @@ def load_lpips(kind: Kind, folder: str | Path) -> LPIPS:
     """
     if kind not in get_args(Kind):
         raise InputError(
-            LOADING, f"kind {kind!r}", "no such trunk", f"choose one of {', '.join(get_args(Kind))}"
+            f"kind {kind!r}: no such trunk", f"choose one of {', '.join(get_args(Kind))}"
         )
     net = LPIPS(kind)
     plan, folder = net.plan, Path(folder)
     missing = missing_files(kind, folder)
     if missing:
-        do = "put the files there (docs/lab/video-metrics.md says where they come from), or use perceptual-syn"
         raise InputError(
-            LOADING, f"lpips_{kind} from {folder}", f"not there: {', '.join(missing)}", do
+            f"lpips_{kind} from {folder}: not there: {', '.join(missing)}",
+            "put the files there (docs/lab/video-metrics.md says where they come from), or use perceptual-syn",
         )
     digest = file_sha256(folder / plan.file)
     if not digest.startswith(plan.digest_start):
-        found = f"sha256 {digest}, which does not begin with {plan.digest_start}"
-        raise InputError(LOADING, str(folder / plan.file), found, "copy the file again")
+        raise InputError(
+            f"{folder / plan.file}: sha256 {digest}, which does not begin with {plan.digest_start}",
+            "copy the file again",
+        )
     trunk = load_weights(folder / plan.file)
     heads = load_weights(folder / plan.heads_file, sha256=plan.heads_sha256)
     net.load_state_dict(_state(plan, trunk, heads, str(folder)), strict=False)
@@ -225,7 +226,7 @@ def _tensor(tensors: StateDict, key: str, shape: tuple[int, ...], source: str) -
     if value is None or tuple(value.shape) != shape:
         found = "it is missing" if value is None else f"its shape is {tuple(value.shape)}"
         raise InputError(
-            LOADING, f"{key} in {source}", found, f"give the published weights, where it is {shape}"
+            f"{key} in {source}: {found}", f"give the published weights, where it is {shape}"
         )
     return weight(key, value, torch.float32, source)
 

@@ -43,7 +43,7 @@ def picture_distances(net: ImageDistance, made: U8, truth: U8) -> F64:
     """
     import torch
 
-    check_stacks("computing a perceptual distance", made, truth)
+    check_stacks(made, truth)
 
     def pictures(frames: U8) -> Tensor:
         return torch.from_numpy(np.array(frames)).permute(0, 3, 1, 2).float() / 127.5 - 1

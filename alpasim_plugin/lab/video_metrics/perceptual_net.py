@@ -127,14 +127,15 @@ def load_perceptual(path: str | Path | None = None) -> PerceptualDistance:
         InputError: No such file, or weights of another network.
     """
     source = Path(path) if path is not None else shipped_weights()
-    doing, do = "loading the perceptual network", "give a file that 'simrun train perceptual' wrote"
+    _, do = (
+        "loading the perceptual network",
+        "give a file that 'simrun train perceptual' wrote",
+    )
     if not source.is_file():
-        raise InputError(doing, str(source), "no such file", do)
+        raise InputError(f"{source}: no such file", do)
     if read_metadata(source).get("format") != FORMAT:
         raise InputError(
-            doing,
-            str(source),
-            f"format {read_metadata(source).get('format')!r}, not {FORMAT!r}",
+            f"{source}: format {read_metadata(source).get('format')!r}, not {FORMAT!r}",
             do,
         )
     tensors = {
@@ -144,9 +145,7 @@ def load_perceptual(path: str | Path | None = None) -> PerceptualDistance:
     heads = [tensors.get(f"heads.{i}") for i in range(len(WIDTHS))]
     if any(head is None for head in heads):
         raise InputError(
-            doing,
-            str(source),
-            f"{len(tensors)} tensors without the heads of {len(WIDTHS)} stages",
+            f"{source}: {len(tensors)} tensors without the heads of {len(WIDTHS)} stages",
             do,
         )
     one, two, three, four = (head.numel() for head in heads if head is not None)
@@ -154,7 +153,7 @@ def load_perceptual(path: str | Path | None = None) -> PerceptualDistance:
     try:
         net.load_state_dict(tensors)
     except RuntimeError as error:
-        raise InputError(doing, str(source), str(error).splitlines()[-1].strip(), do) from error
+        raise InputError(f"{source}: {str(error).splitlines()[-1].strip()}", do) from error
     return net.requires_grad_(False).eval()
 
 
@@ -174,9 +173,9 @@ def check_images(a: Tensor, b: Tensor, smallest_px: int) -> None:
         InputError: Another shape.
     """
     if a.shape != b.shape or a.ndim != 4 or a.shape[1] != 3 or min(a.shape[2:]) < smallest_px:
-        do = f"give two tensors (B, 3, H, W) of one shape, sides of at least {smallest_px}"
         raise InputError(
-            DOING, "two batches of images", f"shapes {tuple(a.shape)} and {tuple(b.shape)}", do
+            f"two batches of images: shapes {tuple(a.shape)} and {tuple(b.shape)}",
+            f"give two tensors (B, 3, H, W) of one shape, sides of at least {smallest_px}",
         )
 
 

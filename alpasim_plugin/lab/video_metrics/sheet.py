@@ -25,11 +25,8 @@ def sheet(columns: Mapping[str, Sequence[U8]], rows: Sequence[str]) -> U8:
     """
     sizes = {picture.shape for column in columns.values() for picture in column}
     if len(sizes) != 1 or any(len(column) != len(rows) for column in columns.values()):
-        found = f"sizes {sorted(sizes)}, lengths {[len(column) for column in columns.values()]} for {len(rows)} rows"
         raise EvaluatorError(
-            "laying out pictures",
-            ", ".join(columns),
-            found,
+            f"{', '.join(columns)}: sizes {sorted(sizes)}, lengths {[len(column) for column in columns.values()]} for {len(rows)} rows",
             "give each column one picture of one size per row",
         )
     parts = []

@@ -47,11 +47,8 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
     """
     names = list(dict.fromkeys(str(row["arm"]) for row in rows))
     if baseline not in names:
-        found = f"variants {', '.join(names) or 'none'}"
         raise EvaluatorError(
-            "summarising clips",
-            f"baseline {baseline!r}",
-            found,
+            f"baseline {baseline!r}: variants {', '.join(names) or 'none'}",
             "name one of the variants as the baseline",
         )
     by_variant = {name: [row for row in rows if row["arm"] == name] for name in names}

@@ -37,10 +37,9 @@ def warp_l1(video: U8, road: Bool | None = None) -> F64:
     Raises:
         EvaluatorError: Fewer than two frames, or no stack of frames.
     """
-    doing = "computing Warp L1"
-    check_stack(doing, "made", video)
+    check_stack("made", video)
     if len(video) < 2:
-        raise EvaluatorError(doing, "a video", "one frame", "give at least two")
+        raise EvaluatorError("a video: one frame", "give at least two")
     grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in video]
     counts = np.ones(video.shape[:3], dtype=bool) if road is None else road
     flows = (backward_flow(grey[i], grey[i - 1]) for i in range(1, len(video)))
@@ -96,9 +95,7 @@ def _pair(previous: U8, frame: U8, flow: F32, counts: Bool) -> float:
     valid = (x >= 0) & (x <= w - 1) & (y >= 0) & (y <= h - 1)
     if not valid.any():
         raise EvaluatorError(
-            "computing Warp L1",
-            "two neighbouring frames",
-            "flow that leaves the picture everywhere",
+            "two neighbouring frames: flow that leaves the picture everywhere",
             "look at the video",
         )
     valid = valid & counts if (valid & counts).any() else valid

@@ -27,7 +27,6 @@ from alpasim_plugin.log.run_folder.manifests import (
 )
 from alpasim_plugin.log.run_folder.schema import (
     CONTENTS,
-    DOING,
     MANIFEST,
     ROLLOUTS_FOLDER,
     RUN_INFO,
@@ -106,9 +105,7 @@ def inspect_run(
     """
     if not (root / RUN_INFO).exists() and not (root / CONTENTS).exists():
         raise InputError(
-            DOING,
-            str(root / RUN_INFO),
-            "no such file",
+            f"{root / RUN_INFO}: no such file",
             "give a folder written by simrun run or simrun score",
         )
     info, contents, damage = _descriptions(root)
@@ -143,19 +140,17 @@ def _descriptions(root: Path) -> tuple[Mapping[str, Any], Contents | None, list[
         info = read_run_json(root)
     except InputError as error:
         errors.append(error)
-        damage.append(Damage("", RUN_INFO, error.found))
+        damage.append(Damage("", RUN_INFO, error.message))
     try:
         contents = read_contents(root)
     except InputError as error:
         errors.append(error)
         damage.append(
-            Damage("", CONTENTS, error.found if (root / CONTENTS).exists() else NOT_FINISHED)
+            Damage("", CONTENTS, error.message if (root / CONTENTS).exists() else NOT_FINISHED)
         )
     if info is None and contents is None:
         raise InputError(
-            DOING,
-            str(root),
-            f"{RUN_INFO}: {errors[0].found}; {CONTENTS}: {errors[1].found}",
+            f"{root}: {RUN_INFO}: {errors[0].message}; {CONTENTS}: {errors[1].message}",
             f"{AGAIN} (with --out {root})",
         )
     return info or (contents.run if contents else {}), contents, damage
@@ -219,9 +214,9 @@ def prepare_reading(
             )
         return
     if not os.access(root, os.W_OK):
-        do_this = "copy the folder to where it can be written, and repair the copy: simrun check COPY --repair"
         raise InputError(
-            DOING, str(root), f"{found.of_run[0]}, and the folder is read-only", do_this
+            f"{root}: {found.of_run[0]}, and the folder is read-only",
+            "copy the folder to where it can be written, and repair the copy: simrun check COPY --repair",
         )
     with writing(root):  # whoever writes it now is named here
         found = inspect_run(root)
@@ -234,11 +229,8 @@ def prepare_reading(
 
 def _check_remakable(found: Inspection) -> None:
     if found.unfinished:
-        there = f"{len(found.cells) - len(found.unfinished)} of {len(found.cells)} rollouts are finished"
         raise InputError(
-            DOING,
-            str(found.root),
-            f"the run is not finished: {there}",
+            f"{found.root}: the run is not finished: {len(found.cells) - len(found.unfinished)} of {len(found.cells)} rollouts are finished",
             f"give its command again: {command_of(found)}",
         )
     if not found.is_remakable:
@@ -248,9 +240,7 @@ def _check_remakable(found: Inspection) -> None:
             *found.of_run,
         ][0]
         raise InputError(
-            DOING,
-            str(found.root),
-            str(problem),
+            f"{found.root}: {problem}",
             f"simrun check {shlex.quote(str(found.root))} --repair",
         )
 
@@ -269,7 +259,6 @@ def restore_run(found: Inspection) -> tuple[list[dict[str, Any]], dict[str, Any]
         dict[str, Any],
         found.info["config"],
         f"{found.root / RUN_INFO}, config",
-        DOING,
         "make the run again",
     )
     lost = {

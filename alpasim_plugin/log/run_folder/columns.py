@@ -103,11 +103,11 @@ class RolloutTable:
             InputError: A file is no such table.
         """
         for path in paths:
-            ROLLOUTS_TABLE.check(path, DOING, AGAIN)
+            ROLLOUTS_TABLE.check(path, AGAIN)
         where = ", ".join(map(str, paths[:3])) + (
             f" and {len(paths) - 3} more" if len(paths) > 3 else ""
         )
-        with parsing(DOING, where, AGAIN, "no tables that fit together"):
+        with parsing(where, AGAIN, "no tables that fit together"):
             schema = pa.unify_schemas(
                 [pq.read_schema(path) for path in paths], promote_options="permissive"
             )
@@ -184,7 +184,7 @@ class RolloutTable:
         if columns and isinstance(self._data, pa.Table):
             yield from self._data.select(columns).to_batches(BATCH_ROWS)
         elif columns:
-            with parsing(DOING, self._where, AGAIN, "no readable parquet"):
+            with parsing(self._where, AGAIN, "no readable parquet"):
                 yield from self._data.scanner(
                     columns=list(columns), batch_size=BATCH_ROWS
                 ).to_batches()

@@ -27,7 +27,6 @@ from alpasim_plugin.log.run_folder.schema import (
     AGGREGATE,
     CONTENTS,
     DERIVED,
-    DOING,
     DRIVEN,
     MANIFEST,
     RUN_INFO,
@@ -113,7 +112,7 @@ def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
         InfrastructureError: The disk refuses.
     """
     files = checksums_of(folder, [*DRIVEN, *DERIVED]) if manifest.get("status") == "ok" else {}
-    write_sealed(folder / MANIFEST, {**manifest, "files": files}, "writing a rollout's manifest")
+    write_sealed(folder / MANIFEST, {**manifest, "files": files})
 
 
 def read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
@@ -123,15 +122,13 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
         InputError: It is missing, damaged, or lacks what every manifest has.
     """
     path = folder / MANIFEST
-    manifest, checksum = read_sealed(path, DOING_ROLLOUT, DRIVE_AGAIN)
-    as_shape(ManifestFile, manifest, path, DOING_ROLLOUT, DRIVE_AGAIN)
+    manifest, checksum = read_sealed(path, DRIVE_AGAIN)
+    as_shape(ManifestFile, manifest, path, DRIVE_AGAIN)
     others = sorted(set(manifest["files"]) - {*DRIVEN, *DERIVED})
     if others:
-        raise InputError(
-            DOING_ROLLOUT, str(path), f"it states {others[0]!r}, which no rollout has", DRIVE_AGAIN
-        )
+        raise InputError(f"{path}: it states {others[0]!r}, which no rollout has", DRIVE_AGAIN)
     if manifest["status"] == "ok" and STEPS_NAME not in manifest["files"]:
-        raise InputError(DOING_ROLLOUT, str(path), f"it does not state {STEPS_NAME}", DRIVE_AGAIN)
+        raise InputError(f"{path}: it does not state {STEPS_NAME}", DRIVE_AGAIN)
     return manifest, checksum
 
 
@@ -150,13 +147,13 @@ def inspect_rollout(root: Path, cell: str, full: bool = False, known: bool = Fal
     try:
         manifest, checksum = read_manifest(folder)
     except InputError as error:
-        return RolloutState(None, "", (Damage(cell, MANIFEST, error.found),))
+        return RolloutState(None, "", (Damage(cell, MANIFEST, error.message),))
     return RolloutState(manifest, checksum, tuple(_damage(folder, cell, manifest["files"], full)))
 
 
 def write_run_json(root: Path, info: Mapping[str, Any]) -> None:
     """Write ``run.json`` with its checksum."""
-    write_sealed(root / RUN_INFO, info, "writing a run")
+    write_sealed(root / RUN_INFO, info)
 
 
 def read_run_json(root: Path) -> dict[str, Any]:
@@ -166,11 +163,11 @@ def read_run_json(root: Path) -> dict[str, Any]:
         InputError: It is missing, damaged, or a member is missing or has another type.
     """
     path = root / RUN_INFO
-    info, _ = read_sealed(path, DOING, AGAIN)
-    as_shape(RunInfo, info, path, DOING, AGAIN)
+    info, _ = read_sealed(path, AGAIN)
+    as_shape(RunInfo, info, path, AGAIN)
     missing = [name for name in REQUIRED_OF_RUN if name not in info]
     if missing:
-        raise InputError(DOING, str(path), f"{missing[0]}: missing", AGAIN)
+        raise InputError(f"{path}: {missing[0]}: missing", AGAIN)
     return info
 
 
@@ -190,9 +187,9 @@ def write_contents(root: Path, rollouts: Mapping[str, str]) -> None:
         for name in (SCENES, AGGREGATE)
         for path in (root / name).glob("*.*")
     )
-    run, _ = read_sealed(root / RUN_INFO, DOING, AGAIN)
+    run, _ = read_sealed(root / RUN_INFO, AGAIN)
     stated = {"files": checksums_of(root, [*TABLES, *more]), "rollouts": dict(rollouts), "run": run}
-    write_sealed(root / CONTENTS, stated, "writing the contents of a run")
+    write_sealed(root / CONTENTS, stated)
 
 
 def read_contents(root: Path) -> Contents:
@@ -202,11 +199,11 @@ def read_contents(root: Path) -> Contents:
         InputError: It is missing or damaged.
     """
     path = root / CONTENTS
-    found, _ = read_sealed(path, DOING, AGAIN)
-    contents = as_shape(ContentsFile, cast(ContentsFile, found), path, DOING, AGAIN)
+    found, _ = read_sealed(path, AGAIN)
+    contents = as_shape(ContentsFile, cast(ContentsFile, found), path, AGAIN)
     for name in (*contents["files"], *contents["rollouts"]):
         if not (root / name).resolve().is_relative_to(root.resolve()):
-            raise InputError(DOING, str(path), f"{name!r} leads out of the run folder", AGAIN)
+            raise InputError(f"{path}: {name!r} leads out of the run folder", AGAIN)
     return Contents(contents["files"], contents["rollouts"], contents["run"])
 
 

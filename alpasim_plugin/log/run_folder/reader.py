@@ -24,7 +24,6 @@ from alpasim_plugin.log.run_folder.rows import Rollout, StoredRollouts, rollouts
 from alpasim_plugin.log.run_folder.schema import (
     AGAIN,
     CONTENTS,
-    DOING,
     KEYS,
     MANIFEST,
     ROLLOUTS,
@@ -128,7 +127,7 @@ class Run:
     def scene_data(self, scene: str) -> Mapping[str, Any] | None:
         """Read a scene's map and logged drive; None where the run has no such file."""
         path = self.scene_path(scene)
-        return None if path is None else read_json_as(SceneFile, path, DOING, do_this=AGAIN)
+        return None if path is None else read_json_as(SceneFile, path, do_this=AGAIN)
 
     def manifest(self, rollout: Rollout) -> Mapping[str, Any]:
         """Read a rollout's manifest; empty where the rollout did not get so far."""
@@ -196,7 +195,7 @@ class Run:
         if path not in self._steps_checked:
             STEPS_TABLE.check(path)
             self._steps_checked.add(path)
-        with parsing(DOING, path, AGAIN, "no readable parquet"):
+        with parsing(path, AGAIN, "no readable parquet"):
             return pads.dataset(path, format=TEXT_AS_CODES if coded else "parquet").to_table(
                 columns=list(columns), filter=keep
             )
@@ -249,14 +248,14 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         InputError: Absent, not JSON, or not an object.
     """
-    return read_json_object(path, DOING, do_this=AGAIN)
+    return read_json_object(path, do_this=AGAIN)
 
 
 def reporting(run: Run) -> AbstractContextManager[None]:
     """Give what makes a report of a run that says something impossible an error of that run, and
     not a traceback.
     """
-    return parsing("writing a report", run.folder, AGAIN, "a run from which no report can be made")
+    return parsing(run.folder, AGAIN, "a run from which no report can be made")
 
 
 def read_run(run_dir: Path | str) -> Run:
@@ -271,8 +270,8 @@ def read_run(run_dir: Path | str) -> Run:
             `ROLLOUTS_TABLE` says.
     """
     folder = Path(run_dir)
-    info: Mapping[str, Any] = read_json_as(RunInfo, folder / RUN_INFO, DOING, do_this=AGAIN)
-    summary: Mapping[str, Any] = read_json_as(Summary, folder / SUMMARY, DOING, do_this=AGAIN)
+    info: Mapping[str, Any] = read_json_as(RunInfo, folder / RUN_INFO, do_this=AGAIN)
+    summary: Mapping[str, Any] = read_json_as(Summary, folder / SUMMARY, do_this=AGAIN)
     path = folder / ROLLOUTS
     return Run(folder, info, summary, StoredRollouts(path), metrics_in(ROLLOUTS_TABLE.check(path)))
 
@@ -290,7 +289,7 @@ def read_so_far(root: Path) -> RunSoFar[Run]:
     info = read_run_json(root)
     cells = planned_cells(info)
     states = [inspect_rollout(root, cell) for cell in cells]
-    with parsing(DOING, root, AGAIN, "manifests from which no table can be made"):
+    with parsing(root, AGAIN, "manifests from which no table can be made"):
         table = rollout_table(
             [state.manifest for state in states if state.manifest is not None and not state.damage]
         )

@@ -189,9 +189,7 @@ class TableSchema:
             [(column.name, types[column.kind]) for column in (*own, *columns_of(metrics))]
         )
 
-    def check(
-        self, path: Path, doing: str = DOING, do_this: str = AGAIN, rates: Container[str] = ()
-    ) -> list[str]:
+    def check(self, path: Path, do_this: str = AGAIN, rates: Container[str] = ()) -> list[str]:
         """Compare a file with the schema before any of it is used, and return the names of its
         columns.
 
@@ -204,34 +202,31 @@ class TableSchema:
         """
         import pyarrow.parquet as pq
 
-        names = check_parquet(path, doing, self.required, do_this)
+        names = check_parquet(path, self.required, do_this)
         stated = [
             *(c for c in self.columns if c.name in names),
             *columns_of(metrics_in(names), rates),
         ]
-        with parsing(doing, path, do_this, "no readable parquet"):
+        with parsing(path, do_this, "no readable parquet"):
             facts = pq.read_metadata(path)
             empty = pq.read_schema(path).empty_table()
-        check_columns(empty, {column.name: column.kind for column in stated}, path, doing, do_this)
+        check_columns(empty, {column.name: column.kind for column in stated}, path, do_this)
         for column in stated:
             if _is_suspicious(facts, column):
-                _check_values(path, column, doing, do_this)
+                _check_values(path, column, do_this)
         if identity := [name for name in self.identity if name in names]:
             kinds = {column.name: column.kind for column in self.columns if column.name in identity}
-            _check_identity(
-                read_parquet(path, doing, kinds, do_this, only=True), path, doing, do_this
-            )
+            _check_identity(read_parquet(path, kinds, do_this, only=True), path, do_this)
         return names
 
     def read(
         self,
         path: Path,
-        doing: str = DOING,
         do_this: str = AGAIN,
         only: Sequence[str] | None = None,
     ) -> pa.Table:
         """Return a file, or ``only`` the named columns of it, after `check`."""
-        names = self.check(path, doing, do_this)
+        names = self.check(path, do_this)
         wanted = names if only is None else only
         kinds = {
             column.name: column.kind
@@ -239,7 +234,6 @@ class TableSchema:
         }
         return read_parquet(
             path,
-            doing,
             {name: kinds[name] for name in wanted if name in kinds},
             do_this,
             only=only is not None,
@@ -324,13 +318,13 @@ def _is_suspicious(facts: Any, column: Column) -> bool:
     return False
 
 
-def _check_values(path: Path, column: Column, doing: str, do_this: str) -> None:
+def _check_values(path: Path, column: Column, do_this: str) -> None:
     """Refuse a column with a value that is missing or out of range; the first row with one is
     named, counted from 0.
     """
     import pyarrow.compute as pc
 
-    values = read_parquet(path, doing, {column.name: column.kind}, do_this, only=True)[column.name]
+    values = read_parquet(path, {column.name: column.kind}, do_this, only=True)[column.name]
     checks = [(pc.is_null(values), f"nothing, wanted {column.kind}")] if column.is_required else []
     if column.least is not None:
         # Arrow compares an integer with a float as floats, and refuses integers that a float does
@@ -353,12 +347,10 @@ def _check_values(path: Path, column: Column, doing: str, do_this: str) -> None:
     for wrong, found in checks:
         row = pc.index(wrong, True).as_py()
         if row >= 0:
-            raise InputError(
-                doing, f"{path}, row {row}", f"column {column.name!r}: {found}", do_this
-            )
+            raise InputError(f"{path}, row {row}: column {column.name!r}: {found}", do_this)
 
 
-def _check_identity(keys: pa.Table, path: Path, doing: str, do_this: str) -> None:
+def _check_identity(keys: pa.Table, path: Path, do_this: str) -> None:
     """Refuse rows that are named alike: each would count as a rollout of its own."""
     counted = keys.group_by(keys.column_names).aggregate([([], "count_all")])
     if counted.num_rows == keys.num_rows:
@@ -366,9 +358,7 @@ def _check_identity(keys: pa.Table, path: Path, doing: str, do_this: str) -> Non
     often = counted.sort_by([("count_all", "descending")]).slice(0, 1).to_pylist()[0]
     times = often.pop("count_all")
     raise InputError(
-        doing,
-        str(path),
-        f"{times} rows of {', '.join(f'{key} {value!r}' for key, value in often.items())}, wanted one",
+        f"{path}: {times} rows of {', '.join((f'{key} {value!r}' for key, value in often.items()))}, wanted one",
         do_this,
     )
 

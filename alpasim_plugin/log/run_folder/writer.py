@@ -58,7 +58,7 @@ def writing(
     Raises:
         InfrastructureError: Another process writes the folder, or it is read-only.
     """
-    with one_writer(root / LOCK, "writing a run folder", f"folder {root}", wait, waiting) as held:
+    with one_writer(root / LOCK, f"folder {root}", wait, waiting) as held:
         remove_left_overs(root, held.since_ns)
         yield
 
@@ -109,7 +109,7 @@ def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             **{key: manifest[key] for key in (*KEYS, "status", "path", "wall_s")},
             **{key: manifest.get(key) for key in ("rollout", "frames", "steps")},
             "failure_class": error.get("failure_class"),
-            "failure": error.get("found"),
+            "failure": error.get("message"),
         }
         for name, entry in manifest.get("metrics", {}).items():
             row[name] = None if entry["value"] is None else float(entry["value"])

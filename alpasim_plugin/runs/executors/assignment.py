@@ -187,9 +187,7 @@ def place(sha256: str, name: str, node: Node) -> Path:
         found = hashlib.sha256(data).hexdigest()
         if found != sha256:
             raise InfrastructureError(
-                "placing a file on a node",
-                f"{name} on {node.name}",
-                f"SHA-256 {found}, not {sha256}",
+                f"{name} on {node.name}: SHA-256 {found}, not {sha256}",
                 "try again",
             )
         write_bytes(folder / name, data)
@@ -197,9 +195,7 @@ def place(sha256: str, name: str, node: Node) -> Path:
     def read(folder: Path) -> Path:
         if sha_of_unchanged(folder / name) != sha256:
             raise InputError(
-                "reading a placed file",
-                str(folder / name),
-                "not the content of its name",
+                f"{folder / name}: not the content of its name",
                 "it is fetched again",
             )
         return folder / name
@@ -297,9 +293,7 @@ def scratch_root() -> Path:
             if found.path is None
             else "it cannot be made, or another user could write it"
         )
-        raise InfrastructureError(
-            "choosing a scratch folder", str(found), reason, f"name a folder in {places.SCRATCH}"
-        )
+        raise InfrastructureError(f"{found}: {reason}", f"name a folder in {places.SCRATCH}")
     return found.path
 
 
@@ -331,7 +325,7 @@ def sweep(pids: Sequence[int] = ()) -> None:
     remove_left_overs(root)
 
 
-def private_folder(path: Path, doing: str) -> Path:
+def private_folder(path: Path) -> Path:
     """Make a folder that only this user can read and write, and return it: what is unpickled may
     lie in such a folder alone.
 
@@ -342,7 +336,7 @@ def private_folder(path: Path, doing: str) -> Path:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
         state = path.lstat()
     except OSError as error:
-        raise disk_error(path, error, doing) from error
+        raise disk_error(path, error) from error
     owned = stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid()
     if not owned or state.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
         found = (
@@ -351,9 +345,7 @@ def private_folder(path: Path, doing: str) -> Path:
             else f"a link, or of user {state.st_uid}"
         )
         raise InfrastructureError(
-            doing,
-            str(path),
-            f"not private to this user ({found})",
+            f"{path}: not private to this user ({found})",
             "remove it, or name another folder",
         )
     return path

@@ -68,12 +68,9 @@ def parse_executor(text: str) -> Executor:
     kind, _, where = named.partition(":")
     if kind == "local" and not where:
         if query:
-            do_this = "use --workers, or another executor"
             raise InputError(
-                DOING,
-                f"--executor {text}",
-                "local divides this machine's cores among --workers",
-                do_this,
+                f"--executor {text}: local divides this machine's cores among --workers",
+                "use --workers, or another executor",
             )
         return LOCAL
     if kind == "ray":
@@ -81,9 +78,7 @@ def parse_executor(text: str) -> Executor:
     if kind == "slurm":
         return Executor("slurm", where, _resources(text, query))
     raise InputError(
-        DOING,
-        f"--executor {text}",
-        "no such executor",
+        f"--executor {text}: no such executor",
         "write local, ray, ray:HOST:PORT, slurm, or slurm:PARTITION",
     )
 
@@ -98,11 +93,9 @@ def _resources(text: str, query: str) -> Resources:
         memory = needs.get("memory")
         if cores >= 1 and 0 <= gpus < math.inf and (memory is None or 0 < memory < math.inf):
             return Resources(cores, gpus, memory)
-    do_this = (
-        "write for example ray?cores=2&gpus=0.5&memory=7.5: whole cores, a share of a GPU, GiB"
-    )
     raise InputError(
-        DOING, f"--executor {text}", f"{query!r} is not what a worker can need", do_this
+        f"--executor {text}: {query!r} is not what a worker can need",
+        "write for example ray?cores=2&gpus=0.5&memory=7.5: whole cores, a share of a GPU, GiB",
     )
 
 

@@ -65,7 +65,7 @@ class RolloutWork:
         cell = job
         share_measurements(measured_folder(self.run))
         try:
-            with scratch_folder(scratch_root() / "rollout", "driving on a node") as scratch:
+            with scratch_folder(scratch_root() / "rollout") as scratch:
                 here = self._placed(cell, node)
                 self._drive(here, scratch, node)
                 result = pack(scratch / cell.folder, node.name)
@@ -77,7 +77,7 @@ class RolloutWork:
             result.manifest["status"] != "ok"
             and result.manifest["error"]["failure_class"] == InfrastructureError.failure_class
         ):
-            return Faulty(result, result.manifest["error"]["found"])
+            return Faulty(result, result.manifest["error"]["message"])
         return result
 
     def _drive(self, cell: Cell, scratch: Path, node: Node) -> None:
@@ -108,7 +108,7 @@ class RolloutWork:
 
     def _faulty(self, cell: Cell, node: Node, error: SimrunError) -> Faulty[RolloutResult]:
         manifest = failed_manifest(cell, error) | {"node": node.name, "files": {}}
-        return Faulty(RolloutResult(manifest, {}), error.found)
+        return Faulty(RolloutResult(manifest, {}), error.message)
 
     def _scenario(self, scene: str, node: Node) -> Scenario:
         """Return a scene, whose background file is one of this node."""
@@ -162,11 +162,8 @@ def _part(spec: PartSpec, node: Node) -> PartSpec:
     named = paths_in(spec.settings)
     for path, sha256 in spec.files.items():
         if path not in named and not is_here(path, sha256):
-            what = f"{path} of {spec.kind} {spec.name} on {node.name}"
             raise InfrastructureError(
-                "driving on a node",
-                what,
-                "not there, or another content",
+                f"{path} of {spec.kind} {spec.name} on {node.name}: not there, or another content",
                 "install the part's files on the nodes",
             )
     if spec.settings is None:
@@ -190,11 +187,8 @@ def place_model(scenario: Scenario, files: Mapping[str, str], node: Node) -> Non
         for name, sha256 in files.items():
             data = node.fetch(sha256)
             if hashlib.sha256(data).hexdigest() != sha256:
-                what = f"reconstruction of {scenario.scene_id}"
                 raise InfrastructureError(
-                    "placing a reconstruction on a node",
-                    what,
-                    f"{name} is not what was sent",
+                    f"reconstruction of {scenario.scene_id}: {name} is not what was sent",
                     "try again",
                 )
             (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -217,9 +217,7 @@ def _indices_before(tasks: Sequence[Task]) -> dict[int, list[int]]:
 
 def _kept(got: R | Lost, name: str) -> R:
     if isinstance(got, Lost):
-        raise InfrastructureError(
-            "working in several processes", name, got.found, f"{DYING} --jobs 1"
-        )
+        raise InfrastructureError(f"{name}: {got.found}", f"{DYING} --jobs 1")
     return got
 
 
@@ -382,9 +380,7 @@ def _serve(pipe: Connection, work: Callable[..., Any], sends: bool) -> None:
                 (
                     "answer",
                     InfrastructureError(
-                        "working in a process",
-                        getattr(work, "__name__", "a function"),
-                        found,
+                        f"{getattr(work, '__name__', 'a function')}: {found}",
                         "report it",
                     ),
                 )

@@ -136,9 +136,7 @@ def _sendable(error: Exception) -> Exception:
         pickle.loads(pickle.dumps(error))
     except Exception:  # whatever an exception's own pickling raises
         return InfrastructureError(
-            "working on a node",
-            type(error).__name__,
-            str(error),
+            f"{type(error).__name__}: {error}",
             "read the traceback with --executor local",
         )
     return error

@@ -65,16 +65,11 @@ def connected(address: str | None) -> Iterator[None]:
         InfrastructureError: There is no cluster at the address, or it has another version of Ray or
             Python.
     """
-    ray = require_library(
-        "ray", "choosing an executor", "--executor ray", "pip install 'alpasim-onefixer[ray]'"
-    )
+    ray = require_library("ray", "--executor ray", "pip install 'alpasim-onefixer[ray]'")
     if address is not None and address.startswith("ray://"):
-        do_this = "start simrun on a node of the cluster, with --executor ray"
         raise InputError(
-            "choosing an executor",
-            f"--executor ray:{address}",
-            "a Ray client cannot place workers on nodes",
-            do_this,
+            f"--executor ray:{address}: a Ray client cannot place workers on nodes",
+            "start simrun on a node of the cluster, with --executor ray",
         )
     if ray.is_initialized():
         with _signals_as_raised():
@@ -97,9 +92,9 @@ def connected(address: str | None) -> Iterator[None]:
                 **quiet,
             )
     except (ConnectionError, RuntimeError, ValueError) as error:
-        do_this = "start the cluster (ray start --head), or correct the address"
         raise InfrastructureError(
-            "connecting to a Ray cluster", address or "this machine", str(error), do_this
+            f"{address or 'this machine'}: {error}",
+            "start the cluster (ray start --head), or correct the address",
         ) from error
     finally:
         for (
@@ -275,14 +270,12 @@ class RayBackend(Backend[J]):
         if alive and not room:
             found = "; ".join(f"{name}: {why}" for name, why in self._refused.items())
             raise InfrastructureError(
-                DOING, "all of its nodes", f"no node takes the work: {found}", self._do_this
+                f"all of its nodes: no node takes the work: {found}", self._do_this
             )
         if (room and not any(room.values())) or now - self._alive_s > BARREN_S:
             found = "no node has that much" if room else f"no node for {BARREN_S:g} s"
             raise InfrastructureError(
-                DOING,
-                str(self._given.resources),
-                found,
+                f"{self._given.resources}: {found}",
                 "ask for less behind --executor, or add nodes",
             )
         on = {name: sum(one.node == name for one in self._workers.values()) for name in room}

@@ -67,7 +67,6 @@ class SlurmBackend(Backend[J]):
     def __init__(self, assignment: Assignment[J], partition: str, folder: Path) -> None:
         submitit = require_library(
             "submitit",
-            "choosing an executor",
             "--executor slurm",
             "pip install 'alpasim-onefixer[slurm]'",
         )
@@ -75,15 +74,17 @@ class SlurmBackend(Backend[J]):
         self._is_local = partition == LOCAL
         sessions = sessions_folder(folder)
         self._inherited = _take_over(sessions, assignment.notify)
-        self._session = private_folder(sessions / f"{os.getpid()}.{os.urandom(4).hex()}", DOING)
+        self._session = private_folder(sessions / f"{os.getpid()}.{os.urandom(4).hex()}")
         self._blob = self._placed(assignment.contents.add_bytes(pickle.dumps(assignment.work)))
         try:
             self._executor = submitit.AutoExecutor(
                 folder=str(self._session), cluster="local" if self._is_local else "slurm"
             )
         except RuntimeError as error:
-            do_this = f"start simrun where sbatch is, or try --executor slurm:{LOCAL}"
-            raise InfrastructureError(DOING, "submitit", str(error), do_this) from error
+            raise InfrastructureError(
+                f"submitit: {error}",
+                f"start simrun where sbatch is, or try --executor slurm:{LOCAL}",
+            ) from error
         self._executor.update_parameters(**self._parameters("" if self._is_local else partition))
         self._jobs: dict[int, Any] = {}  # slot -> job
         self._ended_s: dict[
@@ -161,9 +162,7 @@ class SlurmBackend(Backend[J]):
         ):
             found = "; ".join(f"{name}: {reason}" for name, reason in self._refused.items())
             raise InfrastructureError(
-                DOING,
-                "its nodes",
-                f"no node takes the work: {found}",
+                f"its nodes: no node takes the work: {found}",
                 "install the same versions on the nodes",
             )
 
@@ -197,7 +196,7 @@ class SlurmBackend(Backend[J]):
     def _placed(self, sha256: str) -> Path:
         path = self._session / "placed" / sha256
         if not path.exists():
-            write_bytes(path, self._given.contents.read(sha256), "placing a file for Slurm's nodes")
+            write_bytes(path, self._given.contents.read(sha256))
         return path
 
     def _look(self, slot: int) -> Event | None:
@@ -239,8 +238,8 @@ def sessions_folder(run: Path) -> Path:
     Raises:
         InfrastructureError: Another user could write there, or it cannot be made.
     """
-    base = private_folder(places.state(), DOING)
-    return private_folder(base / hashlib.sha256(os.fsencode(run.resolve())).hexdigest()[:16], DOING)
+    base = private_folder(places.state())
+    return private_folder(base / hashlib.sha256(os.fsencode(run.resolve())).hexdigest()[:16])
 
 
 def _forget(folder: Path, job_id: str) -> None:

@@ -130,9 +130,7 @@ class OpenRun:
                 f"name policy, scene and seed too: {shown}" if found else f"there are: {shown}"
             )
             raise InputError(
-                "choosing a rollout",
-                f"{self.folder}: {asked}",
-                f"{len(found)} rollouts fit",
+                f"{self.folder}: {asked}: {len(found)} rollouts fit",
                 do_this,
             )
         return OpenRollout(self, found[0])
@@ -225,14 +223,12 @@ def require(library: str) -> Any:
     """
     if library not in LIBRARIES:
         raise InputError(
-            DOING,
-            f"frames={library!r}",
-            "no such library",
+            f"frames={library!r}: no such library",
             f"the libraries are {' and '.join(LIBRARIES)}",
         )
     other = next(name for name in LIBRARIES if name != library)
     do_this = f"install the extra [notebook], or pip install {library}; frames={other!r} gives frames of {other}"
-    return require_library(library, DOING, f"frames={library!r}", do_this)
+    return require_library(library, f"frames={library!r}", do_this)
 
 
 def frame_of(table: pa.Table, library: Library) -> Any:

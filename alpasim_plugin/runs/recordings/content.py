@@ -134,9 +134,7 @@ def media_type_of(data: bytes, what: str) -> str:
         if data.startswith(head):
             return media_type
     raise InputError(
-        DOING,
-        what,
-        f"an image that begins with {data[:4].hex()}",
+        f"{what}: an image that begins with {data[:4].hex()}",
         "store PNG or JPEG images in the log",
     )
 
@@ -169,17 +167,13 @@ def collect(run: Run, cell: WatchedCell, logs: Logs) -> Recording:
             notes.append(f"{rollout.renderer}: its log is not there, so it is left out")
     if not found:
         raise InputError(
-            DOING,
-            cell.name,
-            "; ".join(notes) or "no rollout",
+            f"{cell.name}: {'; '.join(notes) or 'no rollout'}",
             "export a run whose rollouts have finished, with their logs",
         )
     early = [rollout.renderer for rollout, log in found if int(log.ego.t_us[0]) < 0]
     if early:
         raise InputError(
-            DOING,
-            f"{cell.name}, {early[0]}",
-            "times before zero",
+            f"{cell.name}, {early[0]}: times before zero",
             "give a log whose clock begins at zero or later",
         )
     labels = distinct_labels([rollout.renderer for rollout, _ in found])

@@ -21,7 +21,6 @@ from alpasim_plugin.core.geometry import quat_from_matrix
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.types import F64, Box, CameraSpec, Trajectory
 from alpasim_plugin.runs.recordings.content import (
-    DOING,
     MAP,
     ROAD_USER,
     Camera,
@@ -145,7 +144,7 @@ def write_mcap(recording: Recording, path: Path) -> dict[str, int]:
     """
     writer_of = require_mcap()
     counts: dict[str, int] = {}
-    with atomic_file(path, "writing an MCAP file") as partial, partial.open("wb") as stream:
+    with atomic_file(path) as partial, partial.open("wb") as stream:
         writer = writer_of.Writer(stream, chunk_size=CHUNK_BYTES)
         writer.start(profile="", library=f"simrun {recording.facts.get('simrun', '')}".strip())
         writer.add_metadata(
@@ -174,9 +173,7 @@ def write_mcap(recording: Recording, path: Path) -> dict[str, int]:
 
 def require_mcap() -> Any:
     """Import the library; see `require_library`."""
-    return require_library(
-        "mcap.writer", DOING, "--mcap", "install the extra [mcap], or pip install mcap"
-    )
+    return require_library("mcap.writer", "--mcap", "install the extra [mcap], or pip install mcap")
 
 
 def _streams(recording: Recording) -> Iterator[Iterator[Item]]:

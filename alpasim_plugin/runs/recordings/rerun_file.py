@@ -17,7 +17,6 @@ from alpasim_plugin.core.geometry import quat_from_matrix
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.types import I64, Box, Trajectory
 from alpasim_plugin.runs.recordings.content import (
-    DOING,
     MAP,
     ROAD_USER,
     Camera,
@@ -53,7 +52,7 @@ def write_rrd(recording: Recording, path: Path) -> dict[str, int]:
         InfrastructureError: The disk refuses.
     """
     rr = require_rerun()
-    with atomic_file(path, "writing a Rerun file") as partial:
+    with atomic_file(path) as partial:
         facts = json.dumps([recording.name, *recording.facts.items()])
         stream = rr.RecordingStream(
             "simrun", recording_id=hashlib.sha256(facts.encode()).hexdigest()[:32]
@@ -72,7 +71,6 @@ def require_rerun() -> Any:
     """Import the library; see `require_library`."""
     return require_library(
         "rerun",
-        DOING,
         "--rrd",
         "install the extra [rerun], or pip install rerun-sdk (half a gigabyte)",
     )

@@ -129,9 +129,9 @@ def of_rows(
     }
     known = [scene for scene in scenes if all(scene in values for values in found.values())]
     if not found or len(known) < LEAST_KNOWN * len(scenes):
-        said = f"{len(known) if found else 0} of {len(scenes)} scenes have {metric} of {baseline} or {candidate}"
         raise InputError(
-            DOING, where, said, "name a run of the same suite with one of the two renderers"
+            f"{where}: {len(known) if found else 0} of {len(scenes)} scenes have {metric} of {baseline} or {candidate}",
+            "name a run of the same suite with one of the two renderers",
         )
     middle = {
         name: float(np.mean([values[scene] for scene in known])) for name, values in found.items()

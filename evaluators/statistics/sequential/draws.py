@@ -233,11 +233,8 @@ def families_of(paths: Mapping[str, str], with_what: str) -> dict[str, str]:
     family = grouped(paths)
     names = sorted(set(family.values()))
     if len(names) < 2:
-        found = f"all {len(paths)} scenes are of one family, {names[0]}"
         raise InputError(
-            DOING,
-            with_what,
-            found,
+            f"{with_what}: all {len(paths)} scenes are of one family, {names[0]}",
             "leave it out, or give a suite with scenes of several files or folders",
         )
     return family

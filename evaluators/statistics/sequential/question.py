@@ -146,9 +146,7 @@ def metric_question(
     chosen = margin if margin is not None else facts.accepted if asked == "non-inferior" else 0.0
     if chosen < 0.0 or not math.isfinite(chosen):
         raise InputError(
-            DOING,
-            f"margin {chosen:g} for {metric}",
-            "not a number from 0 up",
+            f"margin {chosen:g} for {metric}: not a number from 0 up",
             "give how much worse is accepted, as 0.05",
         )
     if direction == "none" and (asked == "better" or chosen == 0.0):
@@ -158,18 +156,14 @@ def metric_question(
             else "it has no better side and a margin of 0"
         )
         raise InputError(
-            DOING,
-            metric,
-            found,
+            f"{metric}: {found}",
             "ask whether it is non-inferior, with a margin: the change to either side that is accepted",
         )
     low, high = facts.difference_range
     bounded = math.isfinite(low) and math.isfinite(high)
     if method == "betting" and not bounded:
         raise InputError(
-            DOING,
-            f"--method betting for {metric}",
-            "its differences have no bounds",
+            f"--method betting for {metric}: its differences have no bounds",
             "leave --method out",
         )
     sign = -1.0 if direction == "higher" else 1.0
@@ -282,7 +276,7 @@ def write_decision(root: Path, decision: Decision) -> None:
     Raises:
         InfrastructureError: The disk refuses.
     """
-    write_sealed(root / DECISION, decision, "writing a decision")
+    write_sealed(root / DECISION, decision)
 
 
 def stopping_note(root: Path) -> str | None:
@@ -303,6 +297,6 @@ def read_decision(root: Path) -> Decision | None:
     path = root / DECISION
     if not path.exists():
         return None
-    found, _ = read_sealed(path, DOING, AGAIN)
-    shaped: Mapping[str, Any] = as_shape(Decision, found, path, DOING, AGAIN)
+    found, _ = read_sealed(path, AGAIN)
+    shaped: Mapping[str, Any] = as_shape(Decision, found, path, AGAIN)
     return shaped  # type: ignore[return-value]

@@ -55,9 +55,9 @@ def test_every_bound_has_a_range_a_reason_and_a_name_of_its_own() -> None:
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -0.3, 0.3])
 def test_values_outside_a_bound_are_refused_with_number_range_and_reason(value: float) -> None:
     with pytest.raises(InputError) as error:
-        bounds.CURVATURE_PER_M.check(value, "reading a road", "a.xml, road 3")
-    assert "-0.2 to 0.2 1/m" in error.value.found
-    assert "radius" in error.value.do_this
+        bounds.CURVATURE_PER_M.check(value, "a.xml, road 3")
+    assert "-0.2 to 0.2 1/m" in error.value.message
+    assert "radius" in error.value.hint
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -65,7 +65,7 @@ def test_what_once_gave_way_is_refused(tmp_path: Path, name: str) -> None:
     arguments = seen.SEEN[name](tmp_path)
     with pytest.raises(InputError) as error:
         load_scenario(arguments[-1])
-    parts = (error.value.doing, error.value.with_what, error.value.found, error.value.do_this)
+    parts = (error.value.doing, error.value.message, error.value.message, error.value.hint)
     assert all(0 < len(part) <= 300 for part in parts)
 
 

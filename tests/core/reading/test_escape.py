@@ -39,14 +39,14 @@ def test_xml_holds_any_text() -> None:
 
 
 def test_parts_of_errors_are_short_and_cannot_act() -> None:
-    error = InputError("reading", "a" * 10_000, f"found {HOSTILE}" + "b" * 7_500_000, "do")
+    error = InputError(f"{'a' * 10000}: {f'found {HOSTILE}' + 'b' * 7500000}", "do")
     assert all(
         len(part) <= MAX_PART and part.isprintable()
-        for part in (error.doing, error.with_what, error.found, error.do_this)
+        for part in (error.doing, error.message, error.message, error.hint)
     )
-    assert "10000" not in error.with_what
-    assert error.with_what.startswith("aaa")
-    assert "more" in error.with_what
+    assert "10000" not in error.message
+    assert error.message.startswith("aaa")
+    assert "more" in error.message
     assert str(error).count("\n") == 3
 
 

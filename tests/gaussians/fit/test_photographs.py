@@ -136,7 +136,7 @@ def test_what_cannot_be_a_set_of_photographs_is_refused(
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
     with pytest.raises(InputError) as caught:
         read_photographs(tmp_path, 256)
-    assert found in caught.value.found
+    assert found in caught.value.message
 
 
 def test_points_that_two_views_place_are_kept_and_wrong_matches_are_not() -> None:

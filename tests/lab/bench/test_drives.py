@@ -98,14 +98,14 @@ def test_policies_may_share_a_folder_or_have_their_own(tmp_path: Path, arms: Pat
     alone = driven(tmp_path / "alone", arms, ("clean", "3dgs"), {}, policies=("learned",))
     with pytest.raises(InputError) as caught:
         read_drives([both, alone], arms)
-    assert "policy learned" in caught.value.found
+    assert "policy learned" in caught.value.message
 
 
 def test_another_arm_by_the_same_name_is_refused(tmp_path: Path, arms: Path) -> None:
     run = driven(tmp_path / "run", arms, ("3dgs", "difix"), {})
     with pytest.raises(InputError) as caught:
         read_drives([run], arms)
-    assert "difix drove with weights that are not those" in caught.value.found
+    assert "difix drove with weights that are not those" in caught.value.message
 
 
 def test_two_renderers_with_one_arms_weights_are_refused(tmp_path: Path, arms: Path) -> None:
@@ -117,13 +117,13 @@ def test_two_renderers_with_one_arms_weights_are_refused(tmp_path: Path, arms: P
     )
     with pytest.raises(InputError) as caught:
         read_drives([run], arms)
-    assert "onefixer-dit-tiny, onefixer" in caught.value.found
+    assert "onefixer-dit-tiny, onefixer" in caught.value.message
 
 
 def test_a_run_without_the_raw_render_is_refused(tmp_path: Path, arms: Path) -> None:
     with pytest.raises(InputError) as caught:
         read_drives([driven(tmp_path / "run", arms, ("clean", "onefixer"), {})], arms)
-    assert "drive 3dgs too" in caught.value.do_this
+    assert "drive 3dgs too" in caught.value.hint
 
 
 def test_a_folder_without_a_finished_run_is_refused(tmp_path: Path, arms: Path) -> None:

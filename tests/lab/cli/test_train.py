@@ -222,7 +222,7 @@ def test_errors_are_documents_and_tracebacks_are_shown_on_request(
         run_command(["train", "vae-quality", "untrained", str(tmp_path), "--json", "--debug"]) == 2
     )
     out, err = capsys.readouterr()
-    assert "no finished sequence" in json.loads(out)["error"]["found"]
+    assert "no finished sequence" in json.loads(out)["error"]["message"]
     assert "Traceback" in err
     assert run_command(["train", "memory", "--latents", "6,x"]) == 2
     assert "--latents 6,x" in capsys.readouterr().err

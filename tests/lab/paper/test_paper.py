@@ -51,8 +51,8 @@ def test_a_row_that_is_not_a_row_is_named(tmp_path: Path, row: str, found: str) 
     )
     with pytest.raises(InputError) as caught:
         published(path)
-    assert found in caught.value.found
-    assert "row difix" in caught.value.with_what
+    assert found in caught.value.message
+    assert "row difix" in caught.value.message
 
 
 def test_a_difference_is_paired_and_says_whom_it_favours() -> None:

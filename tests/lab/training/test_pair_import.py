@@ -82,9 +82,9 @@ def test_other_sizes_are_refused_or_scaled_on_request(sources: PairSources, tmp_
     mixed, folder = replace(sources, sdmap=large), tmp_path / "pairs" / "train" / "own"
     with pytest.raises(InputError) as caught:
         import_sequence(mixed, folder, fps=10)
-    assert "sdmap 96 x 64" in caught.value.found
-    assert "rgb_gt 48 x 32" in caught.value.found
-    assert "--size" in caught.value.do_this
+    assert "sdmap 96 x 64" in caught.value.message
+    assert "rgb_gt 48 x 32" in caught.value.message
+    assert "--size" in caught.value.hint
     assert not folder.exists()
     import_sequence(mixed, folder, fps=10, size=(W, H))
     clip = PairSequence(folder).clip

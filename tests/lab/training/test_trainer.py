@@ -133,9 +133,8 @@ def test_learning_rate_falls_exponentially_or_stays() -> None:
 @pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="this system has no /dev/full")
 def test_full_disk_under_the_log_has_four_parts(tmp_path: Path) -> None:
     (tmp_path / "log.jsonl").symlink_to("/dev/full")
-    with pytest.raises(InfrastructureError, match="No space left on device") as caught:
+    with pytest.raises(InfrastructureError, match="No space left on device"):
         trainer(tmp_path, Schedule(steps=2)).run()
-    assert caught.value.doing == "writing a training log"
 
 
 def test_full_disk_under_the_checkpoint_has_four_parts_and_keeps_the_old_one(

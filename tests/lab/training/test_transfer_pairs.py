@@ -53,7 +53,7 @@ def test_a_scene_that_is_defined_otherwise_is_named(tmp_path: Path) -> None:
     record.write_text(json.dumps(entries))
     with pytest.raises(InputError) as caught:
         check_frozen(record)
-    assert "room_000" in caught.value.found
+    assert "room_000" in caught.value.message
 
 
 def test_a_hand_is_that_of_its_key_and_two_takes_stay_near_each_other() -> None:

@@ -44,9 +44,9 @@ def find_cuboids(net: nn.Module, frames: U8, K: F64) -> list[list[Cuboid]]:
         InputError: Sides that are no multiples of 16.
     """
     if frames.shape[1] % MULTIPLE or frames.shape[2] % MULTIPLE:
-        found = f"frames of {frames.shape[2]}x{frames.shape[1]}"
         raise InputError(
-            "looking for vehicles", "a clip", found, f"give sides that are multiples of {MULTIPLE}"
+            f"a clip: frames of {frames.shape[2]}x{frames.shape[1]}",
+            f"give sides that are multiples of {MULTIPLE}",
         )
     out = []
     with torch.inference_mode():
@@ -62,7 +62,7 @@ def find_cuboids(net: nn.Module, frames: U8, K: F64) -> list[list[Cuboid]]:
 
 def _require_size(frames: U8, width: int, height: int) -> None:
     if frames.shape[1:3] != (height, width):
-        found = f"frames of {frames.shape[2]}x{frames.shape[1]}, a camera of {width}x{height}"
         raise InputError(
-            "looking for lanes", "a clip", found, "give the camera that took the frames"
+            f"a clip: frames of {frames.shape[2]}x{frames.shape[1]}, a camera of {width}x{height}",
+            "give the camera that took the frames",
         )

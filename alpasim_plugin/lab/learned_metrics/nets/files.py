@@ -59,9 +59,7 @@ def untrained(name: str) -> nn.Module:
     }
     if name not in nets:
         raise InputError(
-            "choosing a judge",
-            f"name {name!r}",
-            "no such judge",
+            f"name {name!r}: no such judge",
             f"choose one of {', '.join(nets)}",
         )
     return nets[name]()
@@ -81,17 +79,17 @@ def read_judge(path: Path, name: JudgeName) -> nn.Module:
     """
     do = f"give a file that 'simrun train judge {name}' wrote"
     if not path.is_file():
-        raise InputError(DOING, str(path), "no such file", do)
+        raise InputError(f"{path}: no such file", do)
     facts = read_metadata(path)
     if (facts.get("format"), facts.get("judge")) != (FORMAT, name):
         raise InputError(
-            DOING, str(path), f"format {facts.get('format')!r} of judge {facts.get('judge')!r}", do
+            f"{path}: format {facts.get('format')!r} of judge {facts.get('judge')!r}", do
         )
     net = untrained(name)
     try:
         net.load_state_dict({key: value.float() for key, value in load_weights(path).items()})
     except RuntimeError as error:
-        raise InputError(DOING, str(path), str(error).splitlines()[-1].strip(), do) from error
+        raise InputError(f"{path}: {str(error).splitlines()[-1].strip()}", do) from error
     return net.requires_grad_(False).eval()
 
 
@@ -111,17 +109,13 @@ def load_judge(name: JudgeName, seed: int = 0, folder: Path | None = None) -> nn
     file, digest = file_name(name, seed), frozen_digests(folder).get(file_name(name, seed))
     if digest is None:
         raise InputError(
-            DOING,
-            f"{file} in {folder}",
-            f"{RECORD} does not hold it",
+            f"{file} in {folder}: {RECORD} does not hold it",
             "freeze it first: 'simrun judge freeze'",
         )
     found = file_sha256(folder / file)
     if found != digest:
         raise InputError(
-            DOING,
-            str(folder / file),
-            f"sha256 {found[:16]}, frozen was {digest[:16]}",
+            f"{folder / file}: sha256 {found[:16]}, frozen was {digest[:16]}",
             "restore the frozen file",
         )
     return read_judge(folder / file, name)
@@ -134,7 +128,7 @@ def frozen_digests(folder: Path | None = None) -> dict[str, str]:
     path = (folder or judges_folder()) / RECORD
     if not path.is_file():
         return {}
-    record = read_json_object(path, DOING, do_this="restore the record of the frozen judges")
+    record = read_json_object(path, do_this="restore the record of the frozen judges")
     return {str(name): str(digest) for name, digest in record["sha256"].items()}
 
 
@@ -151,9 +145,7 @@ def check_digests(folder: Path | None = None) -> dict[str, str]:
         found = file_sha256(folder / file) if (folder / file).is_file() else "missing"
         if found != digest:
             raise InputError(
-                "checking the frozen judges",
-                str(folder / file),
-                f"sha256 {found[:16]}, frozen was {digest[:16]}",
+                f"{folder / file}: sha256 {found[:16]}, frozen was {digest[:16]}",
                 "restore it",
             )
     return digests

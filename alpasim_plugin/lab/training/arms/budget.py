@@ -68,9 +68,9 @@ def in_equal_time(
         left_s = 60 * minutes - sum(updates[name] * seconds[name] for name in inner)
         count = int(left_s / seconds[last])
         if count < 1:
-            found = f"{max(left_s, 0):.0f} s are left for the last stage, whose update takes {seconds[last]:.2g} s"
             raise InputError(
-                DOING, f"{recipe.name} in {minutes:g} minutes", found, "give more --minutes"
+                f"{recipe.name} in {minutes:g} minutes: {max(left_s, 0):.0f} s are left for the last stage, whose update takes {seconds[last]:.2g} s",
+                "give more --minutes",
             )
         counts = [*(updates[name] for name in inner), count]
         stages = (

@@ -98,12 +98,10 @@ def plan(recipes: Sequence[Recipe], chosen: Collection[str], given: Collection[s
     """
     known = {recipe.name: recipe for recipe in recipes}
     if unknown := sorted(set(chosen) - set(known)):
-        raise InputError(
-            DOING, ", ".join(unknown), "no such arm", f"name some of {', '.join(known)}"
-        )
+        raise InputError(f"{', '.join(unknown)}: no such arm", f"name some of {', '.join(known)}")
     if unknown := sorted(set(given) - set(INITIAL.values())):
         raise InputError(
-            DOING, ", ".join(unknown), "no initial network", f"give {' or '.join(INITIAL.values())}"
+            f"{', '.join(unknown)}: no initial network", f"give {' or '.join(INITIAL.values())}"
         )
     every = {training.name: training for training in _trainings(recipes)}
     names = training_names(recipes)

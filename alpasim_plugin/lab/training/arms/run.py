@@ -206,12 +206,10 @@ def probe(
     }
     known: dict[str, Any] = {"options": options, "seconds_of_update": {}}
     if path.exists():
-        known = read_json_object(path, DOING)
+        known = read_json_object(path)
         if (begun := known.get("options")) != options:
             raise InputError(
-                DOING,
-                str(path),
-                f"times measured with {begun}, this is {options}",
+                f"{path}: times measured with {begun}, this is {options}",
                 "choose another folder",
             )
     seconds = dict(known["seconds_of_update"])
@@ -244,9 +242,9 @@ def arms_of(folder: Path) -> dict[str, list[str]]:
         InputError: It was not made by `simrun train arms`.
     """
     path = folder / PLAN_FILE
-    found = read_json_object(path, READING, do_this=DO).get("arms")
+    found = read_json_object(path, do_this=DO).get("arms")
     if not isinstance(found, dict):
-        raise InputError(READING, str(path), "no arms", DO)
+        raise InputError(f"{path}: no arms", DO)
     return {str(name): [str(one) for one in trainings] for name, trainings in found.items()}
 
 
@@ -257,7 +255,7 @@ def minutes_of(folder: Path) -> float | None:
     Raises:
         InputError: It was not made by `simrun train arms`.
     """
-    minutes = read_json_object(folder / PLAN_FILE, READING, do_this=DO).get("minutes")
+    minutes = read_json_object(folder / PLAN_FILE, do_this=DO).get("minutes")
     return None if minutes is None else float(minutes)
 
 

@@ -33,11 +33,8 @@ class LabelledFrames:
     def __post_init__(self) -> None:
         for_training(self.sequences)
         if len(self.sequences) != len(self.labels) or not self.sequences:
-            found = f"{len(self.sequences)} sequences, {len(self.labels)} labels"
             raise InputError(
-                "joining frames and labels",
-                "a judge's training data",
-                found,
+                f"a judge's training data: {len(self.sequences)} sequences, {len(self.labels)} labels",
                 "label every sequence, and give at least one",
             )
 
@@ -86,11 +83,8 @@ def chosen(
         if int(s.info.get("camera", {}).get("width", 0)) == WIDTH_PX
     ]
     if not fitting:
-        found = f"no sequence {WIDTH_PX} pixels wide among {len(sequences)}"
         raise InputError(
-            "choosing frames for a judge",
-            "pairs",
-            found,
+            f"pairs: no sequence {WIDTH_PX} pixels wide among {len(sequences)}",
             "render pairs with the default camera (docs/lab/pairs.md)",
         )
     return tuple(sorted(fitting, key=lambda s: (s.name.rsplit("_", 1)[-1], s.name))[:count])

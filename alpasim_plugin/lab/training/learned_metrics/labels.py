@@ -96,7 +96,7 @@ def sequence_labels(sequence: PairSequence, scenes: Path, kept: Path, every: int
                 size=np.array([camera.width, camera.height]),
             )
     with (
-        parsing(DOING, path, f"remove {path}; it is made again", "not whole labels"),
+        parsing(path, f"remove {path}; it is made again", "not whole labels"),
         np.load(path) as stored,
     ):
         width, height = (int(v) for v in stored["size"])
@@ -137,9 +137,9 @@ def for_training(sequences: Sequence[PairSequence]) -> tuple[PairSequence, ...]:
     """
     for sequence in sequences:
         if sequence.info.get("split", "train") not in TRAINING_SPLITS:
-            found = f"split {sequence.info.get('split')!r}"
             raise InputError(
-                DOING, str(sequence.folder), found, "train judges on the splits train and val only"
+                f"{sequence.folder}: split {sequence.info.get('split')!r}",
+                "train judges on the splits train and val only",
             )
     return tuple(sequences)
 
@@ -147,9 +147,7 @@ def for_training(sequences: Sequence[PairSequence]) -> tuple[PairSequence, ...]:
 def _make(sequence: PairSequence, path: Path, every: int) -> Labels:
     if not path.is_file():
         raise InputError(
-            DOING,
-            str(path),
-            "no such scene",
+            f"{path}: no such scene",
             "give the folder of scenes that the pairs were rendered from",
         )
     scenario = load_scenario(path)
@@ -198,9 +196,9 @@ def _require_same_scene(
     recorded = interpolate(scenario.ego_log, clip.t_us)
     away = float(np.linalg.norm(rig[:, :3, 3] - recorded[:, :3, 3], axis=1).max())
     if (lens is not None and not np.allclose(lens, camera.K)) or away > AWAY_M:
-        found = f"a camera of another lens, or up to {away:.1f} m from the recorded drive"
         raise InputError(
-            DOING, str(path), found, "give the folder of scenes that the pairs were rendered from"
+            f"{path}: a camera of another lens, or up to {away:.1f} m from the recorded drive",
+            "give the folder of scenes that the pairs were rendered from",
         )
 
 

@@ -111,9 +111,7 @@ def styled_frames(
     for done, path in enumerate(scenes, start=1):
         if path.parent.name not in TRAINING_SPLITS:
             raise InputError(
-                "rendering frames for a judge",
-                str(path),
-                "not a training split",
+                f"{path}: not a training split",
                 "give scenes of the splits train and val",
             )
         file = kept / path.parent.name / f"{path.stem}-style-{VERSION}.npz"
@@ -129,7 +127,7 @@ def styled_frames(
                 np.savez_compressed(out, frames=frames)
         do = f"remove {file}; it is made again"
         with (
-            parsing("reading frames for a judge", file, do, "not whole frames"),
+            parsing(file, do, "not whole frames"),
             np.load(file) as stored,
         ):
             if stored["frames"].shape[1]:
@@ -138,9 +136,7 @@ def styled_frames(
             report(done, len(scenes))
     if not parts:
         raise InputError(
-            "rendering frames for a judge",
-            f"{len(scenes)} scenes",
-            f"none with a camera {WIDTH_PX} pixels wide",
+            f"{len(scenes)} scenes: none with a camera {WIDTH_PX} pixels wide",
             "give others",
         )
     return np.concatenate(parts, axis=1)

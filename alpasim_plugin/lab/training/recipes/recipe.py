@@ -213,9 +213,9 @@ class Recipe:
         known = list(GIVEN)
         for stage in self.stages:
             if unknown := [source for source in stage.sources if source not in known]:
-                found = f"stage {stage.name!r} starts from {', '.join(unknown)}"
                 raise InputError(
-                    "defining a recipe", self.name, found, f"name one of {', '.join(known)}"
+                    f"{self.name}: stage {stage.name!r} starts from {', '.join(unknown)}",
+                    f"name one of {', '.join(known)}",
                 )
             known.append(stage.name)
 

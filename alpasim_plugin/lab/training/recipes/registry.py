@@ -32,9 +32,7 @@ def by_name(recipes: Iterable[Recipe]) -> Mapping[str, Recipe]:
     for recipe in recipes:
         if recipe.name in found:
             raise InputError(
-                "registering a recipe",
-                recipe.name,
-                "a recipe of that name already",
+                f"{recipe.name}: a recipe of that name already",
                 "choose another name",
             )
         found[recipe.name] = recipe
@@ -52,9 +50,7 @@ def recipe_of(name: str) -> Recipe:
     """
     if name not in RECIPES:
         raise InputError(
-            "choosing what to train",
-            f"recipe {name!r}",
-            "no such recipe",
+            f"recipe {name!r}: no such recipe",
             f"choose one of {', '.join(RECIPES)}",
         )
     return RECIPES[name]
@@ -116,28 +112,24 @@ def _with_field(recipe: Recipe, text: str) -> Recipe:
     chosen = [
         name for name, known in fields.items() if key in known and (not dot or name == stage_name)
     ]
-    doing, given = "changing an objective", f"--objective {text}"
+    given = f"--objective {text}"
     if not equals or not chosen:
         known = sorted({f"{name}.{field}" for name, types in fields.items() for field in types})
         raise InputError(
-            doing,
-            given,
-            f"no such field in recipe {recipe.name}",
+            f"{given}: no such field in recipe {recipe.name}",
             f"write KEY=VALUE with one of {', '.join(known)}",
         )
     try:
         read = TypeAdapter(fields[chosen[0]][key]).validate_python(yaml.safe_load(value))
     except (ValueError, yaml.YAMLError) as error:
         raise InputError(
-            doing,
-            given,
-            f"not a value of {key}: {str(error).splitlines()[-1].strip()}",
+            f"{given}: not a value of {key}: {str(error).splitlines()[-1].strip()}",
             "write it as YAML",
         ) from error
     stages = (
-        replace(s, objective=replace(s.objective, **{key: read})) if s.name in chosen else s
+        replace(s, objective=replace(s.objective, **{key: read})) if s.name in chosen else s  # type: ignore[type-var]
         for s in recipe.stages
-    )  # type: ignore[type-var]
+    )
     return replace(recipe, stages=tuple(stages))
 
 

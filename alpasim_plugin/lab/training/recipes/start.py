@@ -78,11 +78,8 @@ def widen_map(weights: Mapping[str, Tensor], channels: int) -> dict[str, Tensor]
     old = weights[MAP_KEY]
     width, have = old.shape[0], old.shape[1] // AREA
     if have > channels:
-        found = f"they take {have} channels"
         raise InputError(
-            "widening a map input",
-            f"to {channels} channels",
-            found,
+            f"to {channels} channels: they take {have} channels",
             "start from weights that take no more",
         )
     new = torch.zeros(width, channels * AREA)
