@@ -188,12 +188,16 @@ def trials(camera_x_m: float) -> Iterator[Trial]:
     ):
         what = f"its plan has the wrong unit ({unit}): it goes {1 / factor:.2g} times as far as it should"
         yield Trial(
-            f"plan scaled by {factor:.3g}", what, answer=moved(lambda p, a, _, k=factor: (p * k, a))  # type: ignore[misc]
+            f"plan scaled by {factor:.3g}",
+            what,
+            answer=moved(lambda p, a, _, k=factor: (p * k, a)),  # type: ignore[misc]
         )
     for factor in (0.5, 2.0):
         what = f"the time step of its plan is wrong: poses come after {1 / factor:g} times as long as they should"
         yield Trial(
-            f"plan in {factor:g} times the time", what, answer=lambda p, _, k=factor: later(p, k)  # type: ignore[misc]
+            f"plan in {factor:g} times the time",
+            what,
+            answer=lambda p, _, k=factor: later(p, k),  # type: ignore[misc]
         )
     world = moved(lambda p, a, o: _turned(p, a, -yaw_of(o.ego.T_world_rig)))
     yield Trial(

@@ -209,7 +209,11 @@ def make_example(
     weak, strong = np.sort(rng.uniform(0.02, 1.0, 2) ** 1.5)
     damaged = first(clean, weak), first(clean, strong), second(clean, float(rng.uniform(0.02, 1.0)))
     return Example(
-        clean, tuple(d[0] for d in damaged), tuple(d[1] for d in damaged), classes, labelled  # type: ignore[arg-type]
+        clean,
+        tuple(d[0] for d in damaged),
+        tuple(d[1] for d in damaged),
+        classes,
+        labelled,  # type: ignore[arg-type]
     )
 
 
