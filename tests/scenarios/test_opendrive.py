@@ -22,7 +22,7 @@ from scenarios.opendrive_road import Cubic, Geometry, OdrMap, cubics_at, parse_m
 from scenarios.recorded import SourceFiles
 from scenarios.usdz import alpasim_map
 
-FILES = SourceFiles("reading OpenDRIVE")
+FILES = SourceFiles()
 
 
 def lane(
