@@ -98,7 +98,7 @@ class Clip:
 def read_clip(folder: Path) -> Clip:
     """Read the clip and its renders' lenses, resized to the renders' size."""
     log = read_cosmos(folder / "example")
-    files = SourceFiles("comparing maps")
+    files = SourceFiles()
     lenses = read_lenses(files, folder / "example")
     waits = read_layer(files, folder / "example", "3d_wait_lines")
     lane_map = replace(

@@ -57,7 +57,7 @@ def test_a_wrong_mount_is_noticed(clip):
 
 
 def test_projection_equals_the_reader_s(clip, shared_data):
-    lenses = read_lenses(SourceFiles("testing"), shared_data / "cosmos-drive-dreams" / "example")
+    lenses = read_lenses(SourceFiles(), shared_data / "cosmos-drive-dreams" / "example")
     rays = np.random.Generator(np.random.Philox(3)).normal((0, 0, 2), 1.0, size=(400, 3))
     for name, camera in clip.cameras.items():
         inside = (

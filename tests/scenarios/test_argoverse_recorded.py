@@ -92,7 +92,7 @@ FACTS = {
 def real(request, shared_data):
     """One recorded log: (facts, folder, raw poses, what the reader made of it)."""
     folder = shared_data / "av2" / request.param
-    raw = read_ego_poses(SourceFiles("testing"), folder / "city_SE3_egovehicle.feather")
+    raw = read_ego_poses(SourceFiles(), folder / "city_SE3_egovehicle.feather")
     return FACTS[request.param], folder, raw, read_argoverse(folder)
 
 
@@ -267,7 +267,7 @@ def test_real_calibration(shared_data):
     )  # image down is world down
     assert front.T_rig_camera[2, 3] == pytest.approx(1.398 + 0.33, abs=1e-3)
     sweep = folder / "sensors" / "lidar" / "315966265259836000.feather"
-    assert len(SourceFiles("testing").read_feather(sweep, {"x": "number"})["x"]) == 99229
+    assert len(SourceFiles().read_feather(sweep, {"x": "number"})["x"]) == 99229
 
 
 def test_rotations_stay_rigid(real):

@@ -379,7 +379,7 @@ FACTS = {
 
 def check_file(path, facts):
     """Compare one recorded file with what was measured on it with other software."""
-    files = SourceFiles("testing")
+    files = SourceFiles()
     root = files.read_xml(path)
     assert (root.get("commonRoadVersion"), root.get("timeStepSize")) == ("2018b", "0.1")
     assert len(root.findall("planningProblem")) == 1

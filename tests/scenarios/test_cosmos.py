@@ -268,7 +268,7 @@ def real(clip):
 
 
 def test_real_poses(clip, real):
-    drive, name = read_poses(SourceFiles("testing"), clip)
+    drive, name = read_poses(SourceFiles(), clip)
     assert (len(drive), name) == (300, "2d23a1f4-c269-46aa-8e7d-1bb595d1e421")
     np.testing.assert_allclose(se3(drive.xyz, drive.quat)[0], np.eye(4), atol=1e-15)
     assert np.linalg.norm(np.diff(drive.xyz, axis=0), axis=1).sum() == pytest.approx(
@@ -286,7 +286,7 @@ def test_real_poses(clip, real):
 
 
 def test_real_layers(clip, real):
-    files = SourceFiles("testing")
+    files = SourceFiles()
     found = {
         name: read_layer(files, clip, f"3d_{name}")
         for name in ("lanes", "lanelines", "road_boundaries", "wait_lines", "poles")
@@ -370,7 +370,7 @@ def test_real_reference_point_is_at_ground_level(real):
 
 
 def test_real_lenses(clip):
-    lenses = read_lenses(SourceFiles("testing"), clip)
+    lenses = read_lenses(SourceFiles(), clip)
     assert len(lenses) == 7
     front = lenses[FRONT_WIDE]
     assert (front.cx, front.cy, front.width, front.height) == (
@@ -413,8 +413,8 @@ def test_map_poses_lens_and_mount_fall_on_the_publisher_s_own_render(clip, real)
     )
     frames, count, rate, size = read_frames(path, {0, 28, 56})
     assert (count, rate, size) == (57, 30.0, (1280, 704))
-    lens = read_lenses(SourceFiles("testing"), clip)[FRONT_WIDE]
-    files = SourceFiles("testing")
+    lens = read_lenses(SourceFiles(), clip)[FRONT_WIDE]
+    files = SourceFiles()
     lines = [
         x.lines[0]
         for name in ("3d_lanelines", "3d_road_boundaries")
