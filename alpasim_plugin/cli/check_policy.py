@@ -40,7 +40,7 @@ BROKEN = 1
 ATTEMPTS = 2  # at a scene in which the driver is lost
 KNOWN = (
     LIBRARY / "suites" / "known_drivers.json"
-)  # which shipped scenes known drivers passed; docs/scripts/known_drivers.py records it
+)  # which shipped scenes known drivers passed
 
 CHECK_POLICY_EPILOG = """
 Examples:

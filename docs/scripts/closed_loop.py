@@ -28,7 +28,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import yaml
-from results import DOCS, number, replace
+from headline import DOCS, replace
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.training.frozen_scenes import check_scenes
@@ -55,6 +55,19 @@ def drive(out: Path, arguments: list[str]) -> None:
     code = subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode
     if code not in (0, *VERDICTS):
         sys.exit(f"exit code {code}; see {out}")
+
+
+def number(entry: dict[str, Any], rate: bool) -> str:
+    """Return a mean with the paper's half width and the interval over scenes."""
+    if entry["mean"] is None:
+        return "-"
+    scale, digits = (100.0, 1) if rate else (1.0, 3)
+    half = "" if entry["ci95"] is None else f" ± {scale * entry['ci95']:.{digits}f}"
+    bounds = ""
+    if entry["ci95_clustered"] is not None:
+        low, high = entry["ci95_clustered"]
+        bounds = f" [{scale * low:.{digits}f}, {scale * high:.{digits}f}]"
+    return f"{scale * entry['mean']:.{digits}f}{half}{bounds}"
 
 
 def paired_cell(entry: dict[str, Any] | None, rate: bool) -> str:
@@ -109,45 +122,6 @@ def families(rows: list[dict[str, Any]], renderers: Sequence[str]) -> str:
             cells.append(f"{int(sum(known))} of {len(known)}")
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
-
-
-def events(rows: list[dict[str, Any]], renderers: Sequence[str]) -> str:
-    """Return the rollouts with an event behind ``onefixer``, and what happened in the same rollout
-    behind the others.
-    """
-    happened = {(row["scene"], row["seed"], row["renderer"]): word(row) for row in rows}
-    named = sorted(
-        {
-            (scene, seed)
-            for scene, seed, renderer in happened
-            if renderer == "onefixer" and happened[scene, seed, renderer]
-        }
-    )
-    lines = [
-        "| scene | seed | " + " | ".join(renderers) + " |",
-        "|---" * (len(renderers) + 2) + "|",
-    ]
-    for scene, seed in named:
-        lines.append(
-            f"| `{scene}` | {seed} | "
-            + " | ".join(happened[scene, seed, name] or "-" for name in renderers)
-            + " |"
-        )
-    return "\n".join(lines) if named else "No rollout behind `onefixer` has an event."
-
-
-def word(row: dict[str, Any]) -> str:
-    """Return what happened in a rollout; empty for nothing."""
-    if row[EVENT] is None:
-        return "failed"
-    return " and ".join(
-        text
-        for metric, text in (
-            ("offroad", "off the road"),
-            ("collision_at_fault", "contact at fault"),
-        )
-        if row[metric]
-    )
 
 
 def family(row: dict[str, Any]) -> str:
@@ -226,9 +200,7 @@ def main() -> None:
         summary = json.loads((run / "summary.json").read_text())
         rows = pq.read_table(run / "rollouts.parquet").to_pylist()
         head = f"**{policy}**: {len(scenes)} scenes x {seeds} seeds"
-        parts.append(
-            "\n\n".join((head, table(summary, shown), families(rows, shown), events(rows, shown)))
-        )
+        parts.append("\n\n".join((head, table(summary, shown), families(rows, shown))))
     page = DOCS / "experiments" / "fixer-closed-loop.md"
     page.write_text(replace(page.read_text(), "closed-loop", "\n\n".join(parts)))
 

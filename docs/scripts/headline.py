@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from results import DOCS, replace
 
 from evaluators.statistics.families import family_bounds
 
+DOCS = Path(__file__).resolve().parents[1]
 RECORD = DOCS / "experiments" / "fixer-closed-loop.md"
 DRAWN_S = 19.8  # length of the test sets' drives
 SETS = "the two frozen test sets"
@@ -28,7 +28,6 @@ POLICY = "learned"
 BASELINE = "3dgs"
 TRUE = "clean"
 FIXED, BARE = "onefixer", "onefixer[references=0]"
-OTHER = "not in this record"  # the block generator's cell
 EVENT, DISTANCE = "offroad_or_collision_at_fault", "lateral_distance_m"
 SAFER, KEEPS = (
     "| Does it make driving safer? ",
@@ -103,6 +102,14 @@ class Record:
         return name, rest(name)
 
 
+def replace(text: str, marker: str, content: str) -> str:
+    """Replace what stands between a marker's two comments."""
+    pattern = re.compile(rf"(<!-- begin {marker} -->\n).*?(<!-- end {marker} -->)", re.S)
+    if not pattern.search(text):
+        raise SystemExit(f"the page has no marker {marker}")
+    return pattern.sub(lambda match: f"{match[1]}{content}\n{match[2]}", text)
+
+
 def read_record(text: str) -> Record:
     """Read the tables of a record's page."""
     made = re.search(r"<!-- begin closed-loop -->\n(.*?)<!-- end closed-loop -->", text, re.S)
@@ -162,7 +169,7 @@ def sentence(record: Record, renderer: str = FIXED) -> str:
     diff, low, high = record.difference(renderer)
     wide, (family, rest) = record.over_families(renderer), record.without(renderer)
     return (
-        f"In {record.scenes * record.seeds} drives of the policy `{POLICY}`, {record.length} ({record.scenes} scenes of {SETS}, "
+        f"In {record.scenes * record.seeds} rollouts of the policy `{POLICY}`, {record.length} ({record.scenes} scenes of {SETS}, "
         f"{len(record.events)} families, {record.seeds} seeds), the share that\nleaves the road or is at fault in a contact is "
         f"{record.share(BASELINE)} behind `{BASELINE}`, {record.share(renderer)} behind `{renderer}` and {record.share(TRUE)} behind "
         f"`{TRUE}`. `{renderer}` minus `{BASELINE}`: {diff} points, 95 % interval {low} to {high} over scenes and {wide[0]:+.1f} to "
@@ -186,8 +193,8 @@ def rows(record: Record) -> dict[str, str]:
     true, base = (float(record.means[DISTANCE][name].split()[0]) for name in (TRUE, BASELINE))
     head = f"{SAFER}`{POLICY}`, {of}: off-road or at-fault contact, `{TRUE}` {record.share(TRUE)}, `{BASELINE}` {record.share(BASELINE)}"
     return {
-        SAFER: f"{head} | {safer} | {OTHER} | {link} |",
-        KEEPS: f"{KEEPS}The same drives: mean distance, `{TRUE}` {true:.2f} m, `{BASELINE}` {base:.2f} m | {keeps} | {OTHER} | {link} |",
+        SAFER: f"{head} | {safer} | {link} |",
+        KEEPS: f"{KEEPS}The same rollouts: mean distance, `{TRUE}` {true:.2f} m, `{BASELINE}` {base:.2f} m | {keeps} | {link} |",
     }
 
 

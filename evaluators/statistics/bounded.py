@@ -7,7 +7,7 @@ the worst value that is possible for a scene that was not drawn: it is the 97.5 
 weighted mean of the values and of that one, with random weights that are uniform on the simplex. Of
 0 and 1 it is the bound of Clopper and Pearson, of n values that are all alike it is the rule of
 three, of many it is the normal one. That it is too low in 2.5 % of draws at most is proved for two
-values; for others no exception is known, and docs/experiments/verdicts.md found none.
+values; for others no exception is known, and docs/experiments/verdict-error.md found none.
 
 Source: Gaffke, Three test statistics for a nonparametric one-sided hypothesis on the mean of a
     nonnegative variable, Mathematical Methods

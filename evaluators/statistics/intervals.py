@@ -3,7 +3,7 @@
 `normal_half_width` is the paper's formula. It treats the seeds of one scene as independent, which
 makes it too short where scenes differ; `clustered` takes the scene as the unit. A quantity that
 does not exist is None and comes with a reason. The measured coverage of each is in
-docs/experiments/interval-coverage.md.
+docs/experiments/verdict-error.md.
 """
 
 from __future__ import annotations
@@ -297,7 +297,7 @@ def cluster_bootstrap(
 ) -> Interval:
     """Return the percentile interval of the mean over scenes.
 
-    Too short where scenes are few (docs/experiments/interval-coverage.md); it is a second opinion
+    Too short where scenes are few (docs/experiments/verdict-error.md); it is a second opinion
     that assumes no shape, not the default.
 
     Args:

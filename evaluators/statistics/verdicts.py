@@ -128,7 +128,7 @@ def verdict(
     of no difference rejects too (p < 0.05). Undecided: neither. A metric without a better side
     needs a margin, and a change to either side counts as worse. If the bounds hold the guarded ones
     (`evaluators.statistics.bounded`), each answer is wrong in at most 2.5 % of runs, also where a
-    few scenes differ greatly and none was drawn (docs/experiments/verdicts.md).
+    few scenes differ greatly and none was drawn (docs/experiments/verdict-error.md).
 
     Args:
         bounds: [low, high] of renderer minus baseline, or None.

@@ -1,7 +1,6 @@
 """Hard inputs and long rollouts: finite, bounded, and how far reduced precision drifts.
 
 The long ones at real size: ``pytest -m slow -s tests/fixers/test_fixer_hard_cases.py``.
-Their numbers: docs/experiments/block-exactness.md.
 """
 
 from __future__ import annotations

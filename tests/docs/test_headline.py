@@ -67,7 +67,7 @@ def test_a_sentence_has_the_length_of_the_drives_the_sets_and_the_families(
 ) -> None:
     said = headline.sentence(headline.read_record(RECORD.format(length="8 s each; `one` 9 s.")))
     for part in (
-        "12 drives of the policy `learned`",
+        "12 rollouts of the policy `learned`",
         "cut to its first 8 of 19.8 s",
         "two frozen test sets, 3 families, 2 seeds",
     ):

@@ -1,4 +1,4 @@
-"""The pages of docs/: links resolve, pages are short, and every page is reachable from the index.
+"""The pages of docs/: links resolve, and every page is reachable from the index.
 
 The laboratory's pages, and what leads to them, are those of `tests/lab/docs`.
 """
@@ -14,9 +14,7 @@ import pytest
 
 from tests.docs import commands
 
-MAX_LINES = 200
 PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios")
-RECORDS = "experiments"
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 MENTION = re.compile(r"\bdocs/[\w./-]+\.(?:md|png|jpg|py)\b")
 OF_LAB = re.compile(r"\blab[/.]")  # files and modules of the laboratory
@@ -91,23 +89,6 @@ def test_pages_of_the_docs_that_code_and_pages_name_exist(repo: Path, pages: lis
             if not (repo / mention).is_file()
         ]
     assert missing == []
-
-
-def too_long(repo: Path, pages: list[Path]) -> dict[str, int]:
-    """Return the pages of too many lines; records of experiments may be longer."""
-    lengths = {
-        str(page.relative_to(repo)): len(page.read_text(encoding="utf-8").splitlines())
-        for page in pages
-    }
-    return {
-        page: length
-        for page, length in lengths.items()
-        if length > MAX_LINES and not page.startswith(f"docs/{RECORDS}/")
-    }
-
-
-def test_pages_are_short(repo: Path, pages: list[Path]) -> None:
-    assert too_long(repo, pages) == {}
 
 
 def reachable(docs: Path) -> set[Path]:

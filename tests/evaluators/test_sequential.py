@@ -319,7 +319,7 @@ def test_the_asymptotic_bound_is_where_the_evidence_reaches_the_bar_and_bounds_a
 
 
 def test_normal_scenes_are_wrongly_judged_in_about_the_promised_share_of_runs():
-    """The full grid is in docs/experiments/sequential.md; the standard error is 0.9 points."""
+    """The full grid is in docs/experiments/verdict-error.md; the standard error is 0.9 points."""
     draws = independent(rng(5).standard_normal((600, 120)), -np.inf, np.inf)
     wrong = asymptotic.log_evidence(draws, 0.0, Plan(0.3, 120, 0.05)).max(axis=1) >= -math.log(0.05)
     assert 0.01 < wrong.mean() < 0.07

@@ -5,9 +5,7 @@ how episodes end.
 from __future__ import annotations
 
 import importlib
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -244,20 +242,6 @@ def test_the_example_of_the_page_runs() -> None:
     space: dict[str, Any] = {}
     exec(compile(blocks("gym.md")[0], "docs/gym.md", "exec"), space)
     assert space["seen"]["camera"].shape == (54, 96, 3)
-
-
-@pytest.mark.slow
-def test_the_training_script_of_the_page_runs(tmp_path: Path) -> None:
-    pytest.importorskip("stable_baselines3")
-    (tmp_path / "train_ppo.py").write_text(blocks("experiments/ppo.md")[0])
-    repo = Path(__file__).resolve().parents[2]
-    environment = os.environ | {"PYTHONPATH": str(repo)}
-    words = [sys.executable, "train_ppo.py", "0.05"]
-    done = subprocess.run(
-        words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
-    )
-    assert re.search(r"^\d+ steps in 0\.\d minutes$", done.stdout, re.M)
-    assert (tmp_path / "ppo_curve.zip").exists()
 
 
 @pytest.mark.slow

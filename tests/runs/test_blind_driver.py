@@ -1,5 +1,5 @@
 """A driver that ignores pixels fails every shipped suite: what a suite passes has looked
-(docs/experiments/power.md).
+(docs/experiments/verdict-error.md).
 """
 
 from __future__ import annotations

@@ -14,8 +14,7 @@ class SplatRecipe:
     What is done is 3D Gaussian Splatting (Kerbl et al. 2023, Sec. 5 and its published code) with
     its schedule as shares of the steps. A CPU takes hundreds of steps where they take 30,000, so
     Gaussians start more opaque and smaller, and rates are higher: centres and scales four times
-    (theirs: 1.6e-4 to 1.6e-6 extents, 5e-3), rotations five times, colours twice; see
-    docs/experiments/reconstruction.md.
+    (theirs: 1.6e-4 to 1.6e-6 extents, 5e-3), rotations five times, colours twice.
 
     Attributes:
         steps: Updates; each sees one view.
@@ -131,7 +130,7 @@ class SplatRecipe:
     @classmethod
     def street(cls) -> SplatRecipe:
         """Return the recipe of a recorded street: what three minutes of two cores allow
-        (docs/experiments/real-fit.md).
+        (docs/experiments/references.md).
         """
         return cls(
             steps=1300,

@@ -1,4 +1,4 @@
-"""The tables of docs/experiments/interval-coverage.md, from the study of the intervals.
+"""The tables of docs/experiments/verdict-error.md, from the study of the intervals.
 
 ``python -m alpasim_plugin.lab.bench.coverage`` prints the tables; ``--write PAGE`` puts them
 between the markers of that page.

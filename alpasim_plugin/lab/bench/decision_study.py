@@ -33,7 +33,7 @@ from evaluators.statistics.sequential.line import Plan
 from evaluators.statistics.verdicts import scenes_needed
 
 ALPHA = 0.05
-GAP = RATES[0] - RATES[1]  # the difference of docs/experiments/interval-coverage.md
+GAP = RATES[0] - RATES[1]  # the difference of docs/experiments/verdict-error.md
 LOOK_EVERY = 5
 BLOCK = 250  # runs at a time, so that memory stays small
 NEVER = 1 << 40

@@ -2,7 +2,7 @@
 often it is wrong.
 
 ``python -m alpasim_plugin.lab.bench.verdict_study`` prints the tables of
-docs/experiments/verdicts.md; ``--write PAGE`` puts them between the markers of that page. The
+docs/experiments/verdict-error.md; ``--write PAGE`` puts them between the markers of that page. The
 families are adverse: a few scenes go very wrong, or most get a little better and a few much worse;
 for the verdict "worse" the other way round. Beside them the worst of many random distributions is
 looked for.

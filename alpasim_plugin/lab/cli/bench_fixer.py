@@ -26,7 +26,7 @@ from alpasim_plugin.lab.bench.fixer_table import (
 )
 from alpasim_plugin.lab.cli.image_sizes import parse_size
 
-PAGE, PICTURE = Path("docs/experiments/speed-and-error.md"), Path("docs/img/speed-and-error.png")
+PAGE, PICTURE = Path("docs/experiments/speed.md"), Path("docs/img") / "speed.png"
 EPILOG = """
 Examples:
 

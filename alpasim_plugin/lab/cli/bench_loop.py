@@ -14,7 +14,7 @@ from alpasim_plugin.lab.bench.fixer_table import put_between_marks
 EPILOG = (
     "Examples: `simrun bench loop`, `simrun bench loop --renderer 3dgs,onefixer@2 --out loop.json`"
 )
-PAGE, RECORD = Path("docs/experiments/speed-and-error.md"), Path("docs/experiments/loop.json")
+PAGE, RECORD = Path("docs/experiments/speed.md"), Path("docs/experiments/loop.json")
 
 
 def loop(

@@ -10,7 +10,7 @@ import typer
 from alpasim_plugin.lab.bench.profile import PARTS, profile
 from alpasim_plugin.lab.cli.bench_rows import print_rows
 
-EPILOG = "Examples: `simrun bench profile`, `simrun bench profile raster --passes 20`. What follows: docs/experiments/profiles.md."
+EPILOG = "Examples: `simrun bench profile`, `simrun bench profile raster --passes 20`."
 
 
 def profiles(

@@ -19,7 +19,7 @@ from evaluators.statistics.sequential import line
 from evaluators.statistics.sequential.draws import Draws
 from evaluators.statistics.sequential.line import Plan
 
-# scenes before the first statement; the error by first look is in docs/experiments/sequential.md
+# scenes before the first statement; the error by first look is in docs/experiments/verdict-error.md
 FIRST_LOOK = 20
 # of the planned distance: scenes that are all alike show no spread, which is not the absence of one
 LEAST_SPREAD = 0.25

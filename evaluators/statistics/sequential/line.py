@@ -6,7 +6,7 @@ has variance 1 there. The test refutes "no drift" where W reaches ``height + slo
 chance of that, given W now, is a martingale; over alpha it begins at 1 and is 1 / alpha on the
 line. So it is the e-process that spends all of alpha before the ceiling: far from it a bet on the
 drift 2 slope (Wald's test), near it bolder where little is left. Wald's line with a ceiling needs
-about as few scenes as any group-sequential test of equal power (docs/experiments/sequential.md).
+about as few scenes as any group-sequential test of equal power (docs/experiments/verdict-error.md).
 
 Source: Siegmund, Sequential Analysis, 1985, equation 3.15 (first passage of Brownian motion to a
     line).

@@ -1,6 +1,6 @@
 """Coverage and power by simulation: 95 % intervals must hold the truth in 93 to 97 % of runs.
 
-The full grid is in docs/experiments/interval-coverage.md.
+The full grid is in docs/experiments/verdict-error.md.
 """
 
 from __future__ import annotations

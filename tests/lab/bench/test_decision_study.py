@@ -1,5 +1,5 @@
 """The study of sequential decisions on a small grid; the whole is in
-docs/experiments/sequential.md.
+docs/experiments/verdict-error.md.
 """
 
 from __future__ import annotations
