@@ -38,9 +38,7 @@ from scenarios.suite import LIBRARY, expand
 
 BROKEN = 1
 ATTEMPTS = 2  # at a scene in which the driver is lost
-KNOWN = (
-    LIBRARY / "suites" / "known_drivers.json"
-)  # which shipped scenes known drivers passed
+KNOWN = LIBRARY / "suites" / "known_drivers.json"  # which shipped scenes known drivers passed
 
 CHECK_POLICY_EPILOG = """
 Examples:
