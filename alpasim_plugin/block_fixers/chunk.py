@@ -43,12 +43,13 @@ class ChunkRenderer(Renderer):
     def facts(self) -> dict[str, Any]:
         """Return the fixer's label and the counts so far."""
         fixer = self.fixer
-        counts = {"frames": self.frames, "blocks": self.blocks}
-        return (
-            {"label": fixer.label, "trained": fixer.trained, "mode": "chunk"}
-            | counts
-            | {"chosen": dict(fixer.chosen)}
-        )
+        return {
+            "label": fixer.label,
+            "trained": fixer.trained,
+            "mode": "chunk",
+            "frames": self.frames,
+            "blocks": self.blocks,
+        }
 
     def render(self, request: RenderRequest) -> Frame:
         """Render a block of one frame; see `render_batch`."""

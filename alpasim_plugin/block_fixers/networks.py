@@ -34,7 +34,7 @@ from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import parts_of, read_bundle, weights_to_give
 from alpasim_plugin.fixers.network import checkpoints
 from alpasim_plugin.fixers.network.checkpoints import load_weights
-from alpasim_plugin.fixers.network.machine_probe import require_device
+from alpasim_plugin.fixers.pixel_network import require_device
 from alpasim_plugin.fixers.settings import FixerSettings
 
 Precision = Literal["fp32", "bf16", "fp16"]

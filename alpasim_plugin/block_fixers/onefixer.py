@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -34,7 +33,6 @@ from alpasim_plugin.core.interfaces import BlockRule, Fixer
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import guard
-from alpasim_plugin.fixers.network.machine_probe import take_threads
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import Views, group_views
 
@@ -103,8 +101,7 @@ class OneFixer(Fixer):
         settings: Sizes, weights, window, steps, precision.
         scene_id, seed: Key of the noise, with the camera and the latent's index.
         device: ``cpu`` or ``cuda``.
-        threads: Torch threads that this process may use; as many are used as pay. None leaves their
-            number.
+        threads: Torch threads of this process; None leaves their number.
 
     Raises:
         InputError: Settings of another fixer, or weights that are missing or do not fit.
@@ -123,12 +120,8 @@ class OneFixer(Fixer):
                 f"{settings.name}: settings of type {type(settings).__name__}",
                 "take them from fixer_settings(name)",
             )
-        self.chosen: dict[str, Any] = take_threads(threads)
-        self.chosen["precision"] = {
-            "name": settings.precision,
-            "codec": settings.codec_precision,
-            "why": "as set",
-        }
+        if threads is not None:
+            torch.set_num_threads(threads)
         self.settings, self.scene_id, self.seed = settings, scene_id, seed
         self.networks = load_networks(settings, device)
         # On an accelerator timing a stage waits for the device and prevents recordings; there the

@@ -148,7 +148,6 @@ class SpeculativeRenderer(Renderer):
             self._spare.trained,
             self._spare.blocks,
         )
-        self.chosen = dict(self._spare.chosen)
         self.lookahead = max(
             1, max(blocks.first, blocks.then) - 1
         )  # at least the next frame, which tells cameras of other rates apart
@@ -167,7 +166,6 @@ class SpeculativeRenderer(Renderer):
             "label": self.label,
             "trained": self.trained,
             "mode": "speculative",
-            "chosen": self.chosen,
         } | self.stats.as_dict()
 
     def render(self, request: RenderRequest) -> Frame:

@@ -1,8 +1,7 @@
-"""What a generator in pixels reads and writes, and how it compares references, for processors: one
-pass instead of one for each operation.
+"""The operations of the generator in pixels for processors: each is one compiled pass over memory,
+where torch makes one for every addition.
 
-`gather_cells_cpu` is that of `nets.pixel_generator`, the others are those of
-`nets.reference_blend`.
+Equal to `network.pixel_generator.TORCH` to rounding, on float32 tensors without gradients.
 """
 
 # Numba's decorators are untyped.
@@ -10,6 +9,7 @@ pass instead of one for each operation.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -21,80 +21,39 @@ from alpasim_plugin.fixers.network.pixel_generator import (
     GatheredCells,
     PixelState,
 )
-from alpasim_plugin.fixers.network.pixel_layers import cpu_operator
 from alpasim_plugin.fixers.network.reference_blend import (
     CELL,
     CHANNELS,
     DETAIL,
+    HALF,
     MATCH_CELLS,
     NOWHERE,
     OFFSET_PX,
-    BesideCells,
     BlendHeads,
+    Operations,
+    ReferenceCells,
 )
-from alpasim_plugin.fixers.views import HALF
 
 LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow, and change nothing
 
 
-def gather_cells_cpu(
-    render: Tensor,
-    opacity: Tensor,
-    sdmap: Tensor,
-    state: PixelState,
-    source: Tensor,
-    dtype: torch.dtype,
+def _array(x: Tensor) -> np.ndarray:
+    """Return a tensor's values as a contiguous array; float32 where they are floats."""
+    return np.ascontiguousarray((x.float() if x.is_floating_point() else x).numpy())
+
+
+def gather_cells(
+    render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor
 ) -> GatheredCells:
-    """Return the same as `nets.pixel_generator.gather_cells`, of float32 tensors on the CPU, bit
-    for bit, rounded to ``dtype``.
-    """
+    """Return the same as `network.pixel_generator.gather_cells`, bit for bit."""
     b, h, w, _ = render.shape
     images = render, opacity, sdmap, state.output, state.render, source, state.hidden
-    rows = [np.ascontiguousarray(x.numpy()).reshape(*x.shape[:2], -1) for x in images]
-    coarse = torch.empty(
-        b, h // CELL, w // CELL, CELL * CELL * IMAGES + state.hidden.shape[-1], dtype=dtype
-    )
-    fine = torch.empty(b, h // DETAIL, w // DETAIL, DETAIL * DETAIL * DETAIL_IMAGES, dtype=dtype)
-    _gather_coarse(*rows, source is not render, _array(coarse))
-    _gather_fine(rows[0], rows[1], rows[3], _array(fine))
+    rows = [_array(x).reshape(*x.shape[:2], -1) for x in images]
+    coarse = torch.empty(b, h // CELL, w // CELL, CELL * CELL * IMAGES + state.hidden.shape[-1])
+    fine = torch.empty(b, h // DETAIL, w // DETAIL, DETAIL * DETAIL * DETAIL_IMAGES)
+    _gather_coarse(*rows, source is not render, coarse.numpy())
+    _gather_fine(rows[0], rows[1], rows[3], fine.numpy())
     return GatheredCells(coarse, fine)
-
-
-def _array(x: Tensor) -> np.ndarray:
-    """Return a tensor's values without copying; those of bfloat16, which NumPy does not know, as
-    their bits in uint16.
-    """
-    array: np.ndarray = (x.view(torch.uint16) if x.dtype == torch.bfloat16 else x).numpy()
-    return array
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _float(x):
-    """Return a float32 of one, or of the bits of a bfloat16."""
-    return (
-        np.uint32(np.uint32(x) << np.uint32(16)).view(np.float32) if isinstance(x, np.uint16) else x
-    )
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _write(values, out):
-    """Write a line of float32, as the bits of bfloat16 where ``out`` is of uint16: the nearest, of
-    two as near the even one.
-    """
-    if out.itemsize == 4:
-        for i in range(len(values)):
-            out[i] = values[i]
-        return
-    bits = values.view(np.uint32)
-    for i in range(len(values)):
-        rounded = (
-            bits[i] + np.uint32(0x7FFF) + ((bits[i] >> np.uint32(16)) & np.uint32(1))
-        ) >> np.uint32(16)
-        out[i] = (
-            rounded
-            if bits[i] & np.uint32(0x7FFFFFFF) <= np.uint32(0x7F800000)
-            else np.uint32(0x7FC0)
-        )  # or not a number
 
 
 @njit(cache=True, nogil=True)
@@ -105,10 +64,10 @@ def _gather_coarse(render, opacity, sdmap, output, last_render, source, hidden, 
     batch, rows, columns, size = coarse.shape
     side, run = CELL, 3 * CELL  # pixels and values of a cell's row
     one, three = side * side, side * run  # values of a cell of one and of three channels
-    cell = np.zeros(size, np.float32)
     for b in range(batch):
         for i in range(rows):
             for j in range(columns):
+                cell = coarse[b, i, j]
                 for r in range(side):
                     y = side * i + r
                     x = run * j
@@ -122,27 +81,24 @@ def _gather_coarse(render, opacity, sdmap, output, last_render, source, hidden, 
                         cell[three + one + at + k] = sdmap[b, y, x + k]
                         cell[2 * three + one + at + k] = output[b, y, x + k]
                         cell[3 * three + one + at + k] = last_render[b, y, x + k]
-                        if noise:
-                            cell[4 * three + one + at + k] = (
-                                source[b, y, x + k] - render[b, y, x + k]
-                            )
+                        cell[4 * three + one + at + k] = (
+                            source[b, y, x + k] - render[b, y, x + k] if noise else np.float32(0.0)
+                        )
                 channels = size - 5 * three - one
                 for c in range(channels):
                     cell[5 * three + one + c] = hidden[b, i, channels * j + c]
-                _write(cell, coarse[b, i, j])
 
 
 @njit(cache=True, nogil=True)
 def _gather_fine(render, opacity, output, fine):
     """Write the cells of 2 x 2 pixels of rows ``(B, H, W C)``."""
-    batch, rows, columns, size = fine.shape
+    batch, rows, columns, _ = fine.shape
     side, run = DETAIL, 3 * DETAIL
     one, three = side * side, side * run
-    cells = np.empty((columns, size), np.float32)
     for b in range(batch):
         for i in range(rows):
             for j in range(columns):
-                cell = cells[j]
+                cell = fine[b, i, j]
                 for r in range(side):
                     y = side * i + r
                     x = run * j
@@ -154,32 +110,23 @@ def _gather_fine(render, opacity, output, fine):
                     for k in range(run):
                         cell[at + k] = render[b, y, x + k]
                         cell[three + one + at + k] = output[b, y, x + k]
-            _write(cells.reshape(-1), fine[b, i].reshape(-1))
 
 
-def gather_beside_cpu(
-    references: Tensor, render: Tensor, scale: int = 1, dtype: torch.dtype = torch.float32
-) -> BesideCells:
-    """Return the same as `nets.reference_blend.gather_beside`, to rounding, of references of bytes
-    ``scale`` times larger than the render.
-
-    They are ``(B, K, scale H, scale W, 4)`` uint8, and averaged over squares of pixels.
-    """
+def gather_references(references: Tensor, render: Tensor, scale: int = 1) -> ReferenceCells:
+    """Return the same as `network.reference_blend.gather_references`, of references as bytes."""
     (b, k), (_, h, w, _) = references.shape[:2], render.shape
     sizes = [
         (n, h // side, w // side, side * side * CHANNELS)
         for n, side in ((b, CELL), (b, DETAIL), (b * k, CELL), (b * k, DETAIL))
     ]
-    made = BesideCells(*(torch.empty(size, dtype=dtype) for size in sizes))
-    lines = np.ascontiguousarray(references.numpy()).reshape(b, k, scale * h, -1)
-    _gather_beside(
-        lines, np.ascontiguousarray(render.numpy()), scale, *(_array(part) for part in made)
-    )
+    made = ReferenceCells(*(torch.empty(size) for size in sizes))
+    lines = _array(references).reshape(b, k, scale * h, -1)
+    _gather_references(lines, _array(render), scale, *(part.numpy() for part in made))
     return made
 
 
 @njit(cache=True, nogil=True)
-def _gather_beside(references, render, scale, mean4, mean2, each4, each2):
+def _gather_references(references, render, scale, mean4, mean2, each4, each2):
     batch = references.shape[0]
     count = references.shape[1]
     height = render.shape[1]
@@ -191,7 +138,6 @@ def _gather_beside(references, render, scale, mean4, mean2, each4, each2):
     size = CHANNELS * width
     row = np.empty(size, np.float32)
     mean = np.empty(size, np.float32)
-    said = np.empty(size, mean4.dtype)
     for b in range(batch):
         for y in range(height):
             i4 = y // CELL
@@ -220,12 +166,10 @@ def _gather_beside(references, render, scale, mean4, mean2, each4, each2):
                     row[CHANNELS * x + 3] = holds
                 for i in range(len(row)):
                     mean[i] += row[i] * share
-                _write(row, said)
-                _put_runs(said, each4[b * count + k, i4], at4, CELL * CHANNELS)
-                _put_runs(said, each2[b * count + k, i2], at2, DETAIL * CHANNELS)
-            _write(mean, said)
-            _put_runs(said, mean4[b, i4], at4, CELL * CHANNELS)
-            _put_runs(said, mean2[b, i2], at2, DETAIL * CHANNELS)
+                _put_runs(row, each4[b * count + k, i4], at4, CELL * CHANNELS)
+                _put_runs(row, each2[b * count + k, i2], at2, DETAIL * CHANNELS)
+            _put_runs(mean, mean4[b, i4], at4, CELL * CHANNELS)
+            _put_runs(mean, mean2[b, i2], at2, DETAIL * CHANNELS)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -241,15 +185,12 @@ def _put_runs(row, cells, at, run):
             cell[at + i] = row[run * j + i]
 
 
-@cpu_operator("likeness(Tensor sought, Tensor shown) -> Tensor")
-def likeness_cpu(sought: Tensor, shown: Tensor) -> Tensor:
-    """Return the same as `nets.reference_blend.likeness`, of float32 or bfloat16 tensors on the
-    CPU, to rounding; it has no gradient.
-    """
+def likeness(sought: Tensor, shown: Tensor) -> Tensor:
+    """Return the same as `network.reference_blend.likeness`."""
     reach = 2 * MATCH_CELLS + 1
-    out = torch.empty(*shown.shape[:3], reach * reach, dtype=sought.dtype)
-    _likeness(*(np.ascontiguousarray(_array(x)) for x in (sought, shown)), _array(out))
-    return out
+    out = torch.empty(*shown.shape[:3], reach * reach)
+    _likeness(_array(sought), _array(shown), out.numpy())
+    return out.to(sought.dtype)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
@@ -262,20 +203,17 @@ def _likeness(sought, shown, out):
     count = images // sought.shape[0]
     around = np.zeros((height + 2 * border, channels, width + 2 * border), np.float32)
     own = np.empty((channels, width), np.float32)
-    alike, row = (
-        np.empty((reach * reach, width), np.float32),
-        np.empty((width, reach * reach), np.float32),
-    )
+    alike = np.empty((reach * reach, width), np.float32)
     share = np.float32(1.0) / np.float32(channels)
     for n in range(images):
         for i in range(height):
             for j in range(width):
                 for c in range(channels):
-                    around[i + border, c, j + border] = _float(shown[n, i, j, c])
+                    around[i + border, c, j + border] = shown[n, i, j, c]
         for i in range(height):
             for j in range(width):
                 for c in range(channels):
-                    own[c, j] = _float(sought[n // count, i, j, c]) * share
+                    own[c, j] = sought[n // count, i, j, c] * share
             alike[:] = np.float32(0.0)
             for di in range(reach):
                 for c in range(channels):
@@ -286,19 +224,13 @@ def _likeness(sought, shown, out):
                             sums[j] += mine[j] * line[j + dj]
             for j in range(width):
                 for place in range(reach * reach):
-                    row[j, place] = alike[place, j]
-            _write(row.reshape(-1), out[n, i].reshape(-1))
+                    out[n, i, j, place] = alike[place, j]
 
 
-@cpu_operator("offsets(Tensor at2, Tensor at4) -> Tensor")
-def offsets_cpu(at2: Tensor, at4: Tensor) -> Tensor:
-    """Return the same as `nets.reference_blend.offsets`, of float32 or bfloat16 tensors on the CPU,
-    to rounding; it has no gradient.
-    """
+def offsets(at2: Tensor, at4: Tensor) -> Tensor:
+    """Return the same as `network.reference_blend.offsets`."""
     out = torch.empty(at2.shape)
-    _offsets(
-        _array(at2), np.ascontiguousarray(_array(at4)), out.flatten(2).numpy()
-    )  # the first: part of what the head says, in place
+    _offsets(_array(at2), _array(at4), out.flatten(2).numpy())
     return out
 
 
@@ -320,18 +252,14 @@ def _offsets(at2, at4, out):
             other = max(i - 1, 0) if y % 2 == 0 else min(i + 1, at4.shape[1] - 1)
             for j in range(columns):
                 for c in range(axes):
-                    rows[j, c] = own * _float(at4[n, i, j, c]) + next_to * _float(
-                        at4[n, other, j, c]
-                    )
+                    rows[j, c] = own * at4[n, i, j, c] + next_to * at4[n, other, j, c]
             for j in range(columns):
                 before, after = max(j - 1, 0), min(j + 1, columns - 1)
                 for c in range(axes):
                     half = own * rows[j, c]
-                    row[2 * axes * j + c] = (
-                        half + next_to * rows[before, c] + _float(at2[n, y, 2 * j, c])
-                    )
+                    row[2 * axes * j + c] = half + next_to * rows[before, c] + at2[n, y, 2 * j, c]
                     row[2 * axes * j + axes + c] = (
-                        half + next_to * rows[after, c] + _float(at2[n, y, 2 * j + 1, c])
+                        half + next_to * rows[after, c] + at2[n, y, 2 * j + 1, c]
                     )
             for x in range(len(row)):
                 fallen[x] = -two * abs(row[x])
@@ -340,31 +268,23 @@ def _offsets(at2, at4, out):
                 out[n, y, x] = np.copysign(most * (one - fallen[x]) / (one + fallen[x]), row[x])
 
 
-def mix_cpu(
+def blend(
     repaired: Tensor, references: Tensor, heads: BlendHeads, scale: int = 1
 ) -> tuple[Tensor, Tensor]:
-    """Return the same as `nets.reference_blend.mix` of `sources_of`, on the CPU, to rounding;
-    references are bytes.
-    """
+    """Return the same as `network.reference_blend.blend`, of references as bytes."""
     out, recorded = torch.empty_like(repaired), torch.empty_like(repaired[..., :1])
-    pixels = np.ascontiguousarray(references.numpy()).view(np.uint32)[..., 0]
-    _mix(
-        np.ascontiguousarray(repaired.numpy()),
-        pixels,
-        *(_array(part) for part in heads),
-        scale,
-        out.numpy(),
-        recorded.numpy(),
-    )
+    pixels = _array(references).view(np.uint32)[..., 0]
+    parts = (_array(part) for part in heads)
+    _blend(_array(repaired), pixels, *parts, scale, out.numpy(), recorded.numpy())
     return out, recorded
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _mix(repaired, references, weight, offset_px, correction, scale, out, recorded):
+def _blend(repaired, references, weight, offset_px, correction, scale, out, recorded):
     """Blend a row at a time: where each pixel is looked up, what is found there, its share; channel
     by channel, so that rows are vectors.
 
-    What the heads say is ``scale`` times coarser than the picture, offsets twice that, and is
+    What the heads say is ``scale`` times coarser than the image, offsets twice that, and is
     interpolated between the middles. A pixel of a reference is one number, its first channel the
     lowest byte.
     """
@@ -508,8 +428,8 @@ def _said(weight, correction, row, out):
     for j in range(weight.shape[1]):
         for half in range(DETAIL):
             for c in range(3):
-                out[c, DETAIL * j + half] = _float(correction[i, j, 3 * (into + half) + c])
-            out[3, DETAIL * j + half] = _float(weight[i, j, into + half])
+                out[c, DETAIL * j + half] = correction[i, j, 3 * (into + half) + c]
+            out[3, DETAIL * j + half] = weight[i, j, into + half]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
@@ -536,3 +456,27 @@ def _exponentials(values):
         values[i] = p * f + np.float32(1.0)
     for i in range(len(values)):
         values[i] *= scale[i]
+
+
+def smaller(x: Tensor, scale: int) -> Tensor:
+    """Average images ``(B, H, W, C)`` of at most four channels over squares of ``scale`` pixels."""
+    return _resize(x, 1 / scale, cv2.INTER_AREA)
+
+
+def larger(x: Tensor, scale: int) -> Tensor:
+    """Enlarge images ``(B, H, W, C)`` of at most four channels bilinearly."""
+    return _resize(x, scale, cv2.INTER_LINEAR)
+
+
+def _resize(x: Tensor, factor: float, method: int) -> Tensor:
+    if factor == 1:
+        return x
+    out = torch.empty(
+        x.shape[0], round(x.shape[1] * factor), round(x.shape[2] * factor), x.shape[3]
+    )
+    for image, resized in zip(_array(x), out.numpy(), strict=True):
+        cv2.resize(image, resized.shape[1::-1], dst=resized, interpolation=method)
+    return out
+
+
+CPU = Operations(gather_cells, gather_references, likeness, offsets, blend, smaller, larger)

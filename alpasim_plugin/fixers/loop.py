@@ -174,7 +174,6 @@ class PerFrameRenderer(Renderer):
             "trained": fixer.trained,
             "mode": "frame",
             "frames": self.frames,
-            "chosen": dict(fixer.chosen),
         }
 
     def render(self, request: RenderRequest) -> Frame:

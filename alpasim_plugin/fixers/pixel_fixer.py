@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +21,6 @@ from alpasim_plugin.core.interfaces import BlockRule, Fixer
 from alpasim_plugin.core.types import F32, I64, U8, Frame
 from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.guard import keep_render
-from alpasim_plugin.fixers.network.machine_probe import take_threads
 from alpasim_plugin.fixers.network.pixel_generator import (
     GRID_PX,
     PixelState,
@@ -46,7 +44,7 @@ class PixelInputs:
     opacity: Tensor  # (B, H, W, 1), 0 to 1
     sdmap: Tensor  # (B, H, W, 3) in [-1, 1]; black where there is no map
     references: Tensor | None = None  # (B, K, H, W, 4) uint8, colour and where it holds
-    scale: int = 1  # the network looks at pictures that are this many times smaller
+    scale: int = 1  # the network looks at images that are this many times smaller
 
 
 @torch.inference_mode()
@@ -71,17 +69,18 @@ def fix_frame(
         is this one.
     """
     render = inputs.render
-    images = render, inputs.opacity, inputs.sdmap, state
-    out, after = generator.step(*images, source(0), inputs.references, scale=inputs.scale)
+
+    def predict(z: Tensor, t: Tensor | None) -> tuple[Tensor, PixelState]:
+        images = render, inputs.opacity, inputs.sdmap
+        predicted: tuple[Tensor, PixelState] = generator.net(
+            *images, state, z, t, inputs.references, inputs.scale, generator.operations
+        )
+        return predicted
+
+    out, after = predict(source(0), None)
     for index, level in enumerate(from_names(settings.steps)[1:], start=1):
         t = render.new_full((len(render),), level.sigma)
-        out, after = generator.step(
-            *images,
-            interpolant(out, source(index), level.sigma),
-            inputs.references,
-            t,
-            inputs.scale,
-        )
+        out, after = predict(interpolant(out, source(index), level.sigma), t)
     if settings.keep_render:
         kept = keep_render(out, render, inputs.opacity, inputs.sdmap, state.output, after.recorded)
         if kept is not None:
@@ -109,8 +108,7 @@ class PixelFixer(Fixer):
         scene_id, seed: Key of the noise, with camera, frame (its index or its content, see
             `PixelFixerSettings.noise`) and pixel.
         device: ``cpu`` or ``cuda``.
-        threads: Torch threads that this process may use; as many are used as pay. None leaves their
-            number.
+        threads: Torch threads of this process; None leaves their number.
 
     Raises:
         InputError: Settings of another fixer, or weights that are missing or do not fit.
@@ -131,13 +129,13 @@ class PixelFixer(Fixer):
                 f"{settings.name}: settings of type {type(settings).__name__}",
                 "take them from fixer_settings(name)",
             )
-        self.chosen: dict[str, Any] = take_threads(threads)
+        if threads is not None:
+            torch.set_num_threads(threads)
         self.settings, self.scene_id = settings, scene_id
         self.generator = load_generator(settings, device)
-        self.chosen["precision"] = self.generator.precision.as_dict()
         self.trained = self.generator.trained
         at = f"@{len(settings.steps)}" if len(settings.steps) > 1 else ""
-        self.label = f"{settings.name}{at}, {self.generator.note}, {self.generator.precision.name}"
+        self.label = f"{settings.name}{at}, {self.generator.note}, {settings.precision}"
         self.reset(seed)
 
     def reset(self, seed: int) -> None:
@@ -212,7 +210,7 @@ class PixelFixer(Fixer):
         """Return per camera its name, the places of its frames in the block, its history after the
         frame, and the guard's event.
         """
-        start, device = self.generator.step.start, self.generator.device
+        start, device = self.generator.net.start, self.generator.device
         inputs = to_inputs(view, device, self.settings.scale_of(*view.shape))
         pasts = [histories.get(camera) for camera in view.cameras]
         states = [
@@ -274,7 +272,7 @@ class PixelFixer(Fixer):
 
 
 def _trust(made: CameraHistory) -> dict[str, float | str]:
-    """Return where a camera's last picture comes from, without the padding below and to the right
+    """Return where a camera's last image comes from, without the padding below and to the right
     of it.
     """
     height, width = made.fixed.shape[:2]

@@ -35,19 +35,14 @@ class PixelSizesSettings(Part):
     )
     detail: Positive = Field(default=16, description="Channels of the detail path at 1/2.")
     hidden: int = Field(default=16, ge=0, description="Recurrent channels at 1/4.")
-    memory: int = Field(
-        default=0,
-        ge=0,
-        description="Past frames, every fourth, that are attended to at 1/16; 0: none.",
-    )
     blend: int = Field(
         default=0,
         ge=0,
-        description="Channels of the head that blends references with the picture; 0: none are read.",
+        description="Channels of the head that blends references with the image; 0: none are read.",
     )
 
 
-USUAL_PX = 256 * 144  # of most pictures of the training
+USUAL_PX = 256 * 144  # of most images of the training
 PER_FRAME = BundleKind(
     "per-frame",
     frozenset({"generator"}),
@@ -99,16 +94,16 @@ class PixelFixerSettings(FrameByFrameSettings, WeightedSettings):
     )
     scale: Literal["auto"] | Positive = Field(
         default="auto",
-        description="The network looks at a picture this many times smaller; render and references are blended at full size. "
+        description="The network looks at a image this many times smaller; render and references are blended at full size. "
         "auto: the largest that leaves as many pixels as 256x144 has, the usual size of the training.",
     )
-    precision: Literal["auto", "fp32", "bf16"] = Field(
-        default="auto",
-        description="Of the network. auto: bf16 on a GPU and where a probe finds it at least 1.5 times as fast, else fp32.",
+    precision: Literal["fp32", "bf16"] = Field(
+        default="fp32",
+        description="Of the network. bf16 is faster where the processor multiplies matrices of it.",
     )
 
     def scale_of(self, height: int, width: int) -> int:
-        """Return how many times smaller the network looks at pictures of a size.
+        """Return how many times smaller the network looks at images of a size.
 
         Example:
             >>> [PixelFixerSettings(name="onefixer").scale_of(*size) for size in ((144, 256), (270, 480), (288, 512), (1080, 1920))]

@@ -1,6 +1,4 @@
-"""Carry a recorded frame into another view by that view's depth: a compiled kernel, and the plain
-arithmetic that it is held to.
-"""
+"""Carry a recorded frame into another view by that view's depth."""
 
 # Numba's decorators are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
@@ -18,7 +16,6 @@ import numpy as np
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.core.types import F32, F64, I64, U8, Bool, Box
-from alpasim_plugin.gaussians.raster import simd as v
 
 INFINITY_M = 1e5  # how far a pixel without depth is: nothing moves by parallax there
 NEAREST_M = (
@@ -78,18 +75,6 @@ class Picture:
     actors: Mapping[str, F64]
     users: Bool | None = None
 
-    @cached_property
-    def bordered(self) -> U8:
-        """Four bytes a pixel ``(H + 4, W + 4, 4)``, the outermost pixels twice more on each side:
-        what `_look_up` reads.
-        """
-        return np.asarray(
-            cv2.copyMakeBorder(
-                cv2.cvtColor(self.rgb, cv2.COLOR_RGB2RGBA), 2, 2, 2, 2, cv2.BORDER_REPLICATE
-            ),
-            np.uint8,
-        )
-
 
 class Lookup(NamedTuple):
     """What says where the pixels of a view lie in a recorded frame.
@@ -147,65 +132,8 @@ def warp(picture: Picture, target: WarpTarget, free_share: float = np.inf) -> U8
     )
     lookup = Lookup(*view, *then, T_box_world, T_then_box, sizes, free_share, seen)
     x, y, held = warp_coordinates(lookup)
-    out = np.empty((*held.shape, 4), np.uint8)
-    _look_up(picture.bordered, x, y, held, out)
-    return out
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _weights(t):
-    """Return the weights of four pixels in a row, ``t`` behind the second (Keys, 1981, with the
-    slope -3/4 that OpenCV has).
-    """
-    one = np.float32(1.0)
-    before = t + np.float32(1.0)
-    after = np.float32(1.0) - t
-    first = (
-        (np.float32(-0.75) * before + np.float32(3.75)) * before - np.float32(6.0)
-    ) * before + np.float32(3.0)
-    second = (np.float32(1.25) * t - np.float32(2.25)) * t * t + one
-    third = (np.float32(1.25) * after - np.float32(2.25)) * after * after + one
-    return first, second, third, one - first - second - third
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _look_up(bordered, x, y, held, out):
-    """Write what lies at ``x`` and ``y``, to rounding as ``cv2.remap`` does: four rows of four
-    pixels, a row as one vector.
-    """
-    height, width = x.shape
-    flat, step = bordered.reshape(-1), 4 * bordered.shape[1]
-    w, place = np.empty((8, width), np.float32), np.empty(width, np.int64)
-    sums, line = np.empty(v.LANES, np.float32), np.empty(4 * width, np.float32)
-    for row in range(height):
-        for i in range(width):
-            left, top = np.floor(x[row, i]), np.floor(y[row, i])
-            place[i] = np.int64(np.int32(top) + 1) * step + 4 * np.int64(np.int32(left) + 1)
-            w[0, i], w[1, i], w[2, i], w[3, i] = _weights(x[row, i] - left)
-            w[4, i], w[5, i], w[6, i], w[7, i] = _weights(y[row, i] - top)
-        for i in range(width):
-            at = place[i]
-            rows = v.load_bytes(flat, at) * v.splat(w[4, i])
-            rows = v.fma(v.load_bytes(flat, at + step), v.splat(w[5, i]), rows)
-            rows = v.fma(v.load_bytes(flat, at + 2 * step), v.splat(w[6, i]), rows)
-            v.store(sums, 0, v.fma(v.load_bytes(flat, at + 3 * step), v.splat(w[7, i]), rows))
-            a = w[0, i]
-            b = w[1, i]
-            c = w[2, i]
-            d = w[3, i]
-            # All four are computed before one is written, so that they become one vector.
-            red = a * sums[0] + b * sums[4] + c * sums[8] + d * sums[12]
-            green = a * sums[1] + b * sums[5] + c * sums[9] + d * sums[13]
-            blue = a * sums[2] + b * sums[6] + c * sums[10] + d * sums[14]
-            rest = a * sums[3] + b * sums[7] + c * sums[11] + d * sums[15]
-            line[4 * i], line[4 * i + 1], line[4 * i + 2], line[4 * i + 3] = red, green, blue, rest
-        into = out[row].reshape(-1)
-        for i in range(len(line)):
-            into[i] = np.uint8(
-                np.int32(np.rint(min(max(line[i], np.float32(0.0)), np.float32(255.0))))
-            )
-        for i in range(width):
-            out[row, i, 3] = held[row, i]
+    rgb = cv2.remap(picture.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.dstack([rgb, held])
 
 
 class PlacedBoxes(NamedTuple):
@@ -444,88 +372,3 @@ def _add_box(ray, eye, walls, pixels, out):
                 a, b = (walls[0, axis] - eye[axis]) / along, (walls[1, axis] - eye[axis]) / along
                 near, far = max(near, min(a, b)), min(far, max(a, b))
             out[row, column] |= near < far
-
-
-def plain_on_boxes(
-    shape: tuple[int, int], K: F64, T_world_camera: F64, T_box_world: F64, sizes: F64
-) -> Bool:
-    """Return the same as `on_boxes` of `PlacedBoxes`, array by array: the reference of its
-    kernel.
-    """
-    rays = plain_points(np.ones(shape), K, T_world_camera) - T_world_camera[:3, 3]
-    out: Bool = np.zeros(shape, dtype=bool)
-    for T_box, size in zip(T_box_world, sizes, strict=True):
-        with np.errstate(divide="ignore"):
-            hits = (_walls(size) - _moved(T_box, T_world_camera[:3, 3]))[:, None, None] / (
-                rays @ T_box[:3, :3].T
-            )
-        out |= np.maximum(hits.min(axis=0).max(axis=-1), 0) < hits.max(axis=0).min(axis=-1)
-    return out
-
-
-def plain_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
-    """Return the same as `warp_coordinates`, array by array: the reference of its kernel."""
-    (
-        depth,
-        K,
-        T_world_camera,
-        K_then,
-        T_then_world,
-        depth_then,
-        T_box_world,
-        T_then_box,
-        sizes,
-        free_share,
-        _,
-    ) = lookup
-    height, width = depth.shape
-    points = plain_points(np.where(depth > 0, depth, INFINITY_M), K, T_world_camera)
-    out = points.copy()
-    there = np.ones((height, width), dtype=bool)
-    free = np.ones((height, width), dtype=bool)
-    for T_box, T_then, size in zip(T_box_world, T_then_box, sizes, strict=True):
-        q = _moved(T_box, points)
-        low, high = _walls(size)
-        inside = (
-            free
-            & (np.abs(q[..., :2]) < high[:2]).all(-1)
-            & (q[..., 2] >= low[2])
-            & (q[..., 2] < high[2])
-        )
-        out[inside] = _moved(T_then, q[inside])
-        there[inside] = bool(np.isfinite(T_then).all())
-        free &= ~inside
-    local = _moved(T_then_world, out)
-    rz = local[..., 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        x = local[..., 0] / rz * K_then[0, 0] + K_then[0, 2]
-        y = local[..., 1] / rz * K_then[1, 1] + K_then[1, 2]
-        rows, columns = depth_then.shape
-        seen = there & (rz > NEAREST_M) & (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
-    at = depth_then[np.where(seen, y, 0).astype(int), np.where(seen, x, 0).astype(int)]
-    then = np.where(at > 0, at, INFINITY_M)
-    far = (then > INFINITY_M / 2) & (rz > INFINITY_M / 2)
-    agrees = far | (then >= free_share * rz) | (np.abs(then - rz) < SLACK * rz + SLACK_M)
-    held = np.where(seen, np.where(agrees, VALID, INCONSISTENT), 0).astype(np.uint8)
-    return (
-        np.where(seen, x - 0.5, 0).astype(np.float32),
-        np.where(seen, y - 0.5, 0).astype(np.float32),
-        held,
-    )
-
-
-def plain_points(depth: F64 | F32, K: F64, T_world_camera: F64) -> F64:
-    """Return the points of the world ``(H, W, 3)`` that pixels show at a depth ``(H, W)``."""
-    height, width = depth.shape
-    v, u = np.mgrid[:height, :width] + 0.5
-    z = depth.astype(np.float64)
-    return _moved(
-        T_world_camera,
-        np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], axis=-1),
-    )
-
-
-def _moved(T: F64, points: F64) -> F64:
-    """Map points ``(..., 3)`` by ``T (4, 4)``."""
-    moved: F64 = points @ T[:3, :3].T + T[:3, 3]
-    return moved

@@ -1,6 +1,4 @@
-"""What a run folder says of its making: versions, machine and source, and what was chosen by
-measuring it.
-"""
+"""What a run folder says of its making: versions, machine and source."""
 
 from __future__ import annotations
 
@@ -9,7 +7,7 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -231,36 +229,6 @@ def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
             }
         out[name] = entry
     return out
-
-
-def chosen(manifests: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Return for each renderer with a fixer what was chosen by measuring the machines, for
-    ``run.json``.
-
-    One entry for each node (``node``; null: the machine that the command ran on) and choice, with
-    what was measured and the number of rollouts. A node has several entries only where the run was
-    continued, or its processes share no temporary folder.
-    """
-    out: dict[str, list[dict[str, Any]]] = {}
-    for manifest in manifests:
-        facts = (manifest.get("fixer") or {}).get("chosen")
-        if not facts:
-            continue
-        node, entries = manifest.get("node"), out.setdefault(manifest["renderer"], [])
-        same = [
-            entry for entry in entries if (entry["node"], _picked(entry)) == (node, _picked(facts))
-        ]
-        if same:
-            same[0]["rollouts"] += 1
-        else:
-            entries.append({"node": node, **facts, "rollouts": 1})
-    return out
-
-
-def _picked(facts: Mapping[str, Any]) -> tuple[Any, Any]:
-    return facts["precision"]["name"] if "precision" in facts else None, facts["threads"][
-        "number"
-    ] if "threads" in facts else None
 
 
 def _largest(spreads: Iterable[dict[str, dict[str, float] | None]]) -> dict[str, float | None]:

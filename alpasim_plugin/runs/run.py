@@ -37,7 +37,7 @@ from alpasim_plugin.runs.commits import opened
 from alpasim_plugin.runs.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runs.executors.choice import LOCAL, Executor
 from alpasim_plugin.runs.plan import LOOP, SCORING, RunPlan
-from alpasim_plugin.runs.provenance import chosen, hardware, project, versions
+from alpasim_plugin.runs.provenance import hardware, project, versions
 from alpasim_plugin.runs.summary import pool_of, write_summary
 from evaluators.metrics import MetricTable, table_of
 from evaluators.statistics.families import grouped
@@ -207,7 +207,7 @@ def finish_run(
         "n_rollouts": len(manifests),
         "n_failed": sum(m["status"] != "ok" for m in manifests),
     }  # for lists of many runs
-    write_run_json(root, info | dict(more) | {"outcome": outcome, "chosen": chosen(manifests)})
+    write_run_json(root, info | dict(more) | {"outcome": outcome})
     baseline, bases = info["config"].get("baseline"), info.get("bases") or {}
     paths = {
         scene: str((facts.get("ref") or {}).get("path") or scene)

@@ -6,23 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from alpasim_plugin.fixers.gather import (
-    gather_beside_cpu,
-    gather_cells_cpu,
-    likeness_cpu,
-    mix_cpu,
-    offsets_cpu,
-)
-from alpasim_plugin.fixers.network.pixel_generator import PixelState, gather_cells
-from alpasim_plugin.fixers.network.reference_blend import (
-    BlendHeads,
-    gather_beside,
-    likeness,
-    mix,
-    offsets,
-    sources_of,
-)
-from alpasim_plugin.fixers.pixel_network import in_floats, smaller
+from alpasim_plugin.fixers.gather import CPU
+from alpasim_plugin.fixers.network.pixel_generator import TORCH, PixelState
+from alpasim_plugin.fixers.network.reference_blend import BlendHeads, in_floats, mix, sources_of
 
 
 def images(
@@ -38,8 +24,6 @@ def images(
         output,
         last,
         image(height // 4, width // 4, hidden),
-        render.new_zeros(batch, 0, 1, 0),
-        render.new_zeros(batch, 1, 1, 1),
         render.new_zeros(batch, height, width, 1),
     )
     return render, image(height, width, 1).abs(), sdmap, state
@@ -65,35 +49,9 @@ def test_one_pass_gathers_the_same_bits(
     render, opacity, sdmap, state = images(batch, height, width, hidden)
     source = render * 0.25 if noisy else render
     given = render, opacity, sdmap, state, source
-    fast, plain = gather_cells_cpu(*given, torch.float32), gather_cells(*given)
+    fast, plain = CPU.gather_cells(*given), TORCH.gather_cells(*given)
     assert torch.equal(fast.coarse, plain.coarse)
     assert torch.equal(fast.fine, plain.fine)
-    half = gather_cells_cpu(*given, torch.bfloat16)
-    assert torch.equal(half.coarse, plain.coarse.bfloat16())
-    assert torch.equal(half.fine, plain.fine.bfloat16())
-
-
-def test_values_are_rounded_to_bfloat16_as_torch_rounds_them() -> None:
-    bits = torch.tensor(
-        [
-            0x3F808000,
-            0x3F818000,
-            0x3F808001,
-            0x3F807FFF,
-            0x7F7FFFFF,
-            0x80000001,
-            0x7F800000,
-            0x7F800001,
-            -1,
-        ],
-        dtype=torch.int64,
-    )
-    render, opacity, sdmap, state = images(1, 16, 16, 16)
-    state.hidden[0, 0, 0, : len(bits)] = bits.to(torch.int32).view(torch.float32)
-    half = gather_cells_cpu(render, opacity, sdmap, state, render, torch.bfloat16).coarse[
-        0, 0, 0, -16:
-    ]
-    assert torch.equal(half.nan_to_num(7.0), state.hidden[0, 0, 0].bfloat16().nan_to_num(7.0))
 
 
 def test_views_of_larger_images_and_values_that_are_not_numbers_pass_through() -> None:
@@ -108,7 +66,7 @@ def test_views_of_larger_images_and_values_that_are_not_numbers_pass_through() -
             output=state.output[half], render=state.render[half], hidden=state.hidden[:, :4, :8]
         ),
     )
-    fast, plain = gather_cells_cpu(*views, views[2], torch.float32), gather_cells(*views, views[2])
+    fast, plain = CPU.gather_cells(*views, views[2]), TORCH.gather_cells(*views, views[2])
     assert torch.equal(fast.coarse.nan_to_num(7.0), plain.coarse.nan_to_num(7.0))
     assert torch.equal(fast.fine.nan_to_num(7.0), plain.fine.nan_to_num(7.0))
 
@@ -138,18 +96,14 @@ def test_one_pass_mixes_as_the_operations_one_by_one(
         )
     )
     seen, floats = repaired[:, : height // scale, : width // scale], in_floats(images)
-    beside = gather_beside(
-        smaller(floats.flatten(0, 1), scale).unflatten(0, images.shape[:2]), seen
-    )
-    for dtype, share in ((torch.float32, 0.0), (torch.bfloat16, 2**-8)):
-        for one, other in zip(gather_beside_cpu(images, seen, scale, dtype), beside, strict=True):
-            assert one.dtype == dtype
-            assert torch.allclose(one.float(), other, atol=2e-6, rtol=share)
+    exact_cells = TORCH.gather_references(images, seen, scale)
+    for one, other in zip(CPU.gather_references(images, seen, scale), exact_cells, strict=True):
+        assert torch.allclose(one, other, atol=2e-6)
     exact = BlendHeads(
         *(part.double() for part in heads)
     )  # in float32 the operations one by one are less exact
     fast, plain = (
-        mix_cpu(repaired, images, heads, scale),
+        CPU.blend(repaired, images, heads, scale),
         mix(sources_of(repaired.double(), floats.double(), exact, scale)),
     )
     for one, other in zip(
@@ -161,7 +115,7 @@ def test_one_pass_mixes_as_the_operations_one_by_one(
         heads.weight.bfloat16(), heads.offset_px, heads.correction.bfloat16()
     )  # read as they are
     for one, other in zip(
-        mix_cpu(repaired, images, half, scale),
+        CPU.blend(repaired, images, half, scale),
         mix(sources_of(repaired, floats, half, scale)),
         strict=True,
     ):
@@ -176,7 +130,7 @@ def test_a_reference_with_an_enormous_weight_is_the_picture_and_nothing_overflow
     heads = BlendHeads(
         torch.full((1, 2, 8, 8, 4), 200.0), torch.zeros(1, 2, 8, 8, 2), torch.zeros(1, 2, 8, 8, 12)
     )
-    out, recorded = mix_cpu(repaired, images, heads)
+    out, recorded = CPU.blend(repaired, images, heads, 1)
     assert torch.allclose(out, torch.ones_like(out), atol=1e-5)
     assert torch.equal(recorded, torch.ones_like(recorded))
 
@@ -191,12 +145,12 @@ def test_features_are_compared_as_the_operations_one_by_one_do(
     draw = torch.Generator().manual_seed(width)
     sought = torch.randn(batch, height, width, channels, generator=draw)
     shown = torch.randn(batch * references, height, width, channels, generator=draw)
-    assert torch.allclose(likeness_cpu(sought, shown), likeness(sought, shown), atol=1e-6)
+    assert torch.allclose(CPU.likeness(sought, shown), TORCH.likeness(sought, shown), atol=1e-6)
     coarse = sought.bfloat16(), shown.bfloat16()
-    exact = likeness(*(x.double() for x in coarse))
-    assert likeness_cpu(*coarse).dtype == torch.bfloat16
+    exact = TORCH.likeness(*(x.double() for x in coarse))
+    assert CPU.likeness(*coarse).dtype == torch.bfloat16
     assert torch.allclose(
-        likeness_cpu(*coarse).double(), exact, rtol=2**-8, atol=1e-6
+        CPU.likeness(*coarse).double(), exact, rtol=2**-8, atol=1e-6
     )  # rounded once, where operations round each product
 
 
@@ -210,7 +164,7 @@ def test_offsets_are_joined_as_the_operations_one_by_one_do(
     at2[0, 0, 0], at2[0, 1, 1] = torch.tensor([300.0, -300.0]), torch.tensor([1e-4, -0.0])
     for dtype in (torch.float32, torch.bfloat16):
         said = at2.to(dtype), at4.to(dtype)
-        assert torch.allclose(offsets_cpu(*said), offsets(*said), atol=2e-5)
+        assert torch.allclose(CPU.offsets(*said), TORCH.offsets(*said), atol=2e-5)
 
 
 def test_weights_over_all_magnitudes_blend_as_in_float64() -> None:
@@ -218,7 +172,7 @@ def test_weights_over_all_magnitudes_blend_as_in_float64() -> None:
     draw = torch.Generator().manual_seed(5)
     repaired, images = torch.rand(1, 16, 16, 3, generator=draw), recordings(1, 1, 16, 16)
     heads = BlendHeads(weight, torch.zeros(1, 1, 8, 8, 2), torch.zeros(1, 1, 8, 8, 12))
-    out, recorded = mix_cpu(repaired, images, heads)
+    out, recorded = CPU.blend(repaired, images, heads, 1)
     exact = mix(
         sources_of(
             repaired.double(),

@@ -26,10 +26,9 @@ from alpasim_plugin.fixers.warp import (
     WarpTarget,
     on_boxes,
     place_boxes,
-    plain_on_boxes,
-    plain_points,
     warp,
 )
+from tests.fixers.warp_reference import plain_on_boxes, plain_points
 
 WIDTH = 64
 HEIGHT = 48

@@ -9,9 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from alpasim_plugin.fixers.gather import CPU
 from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes, PixelState
-from alpasim_plugin.fixers.network.reference_blend import _sampled
-from alpasim_plugin.fixers.pixel_network import GeneratorStep, RecordedStep, in_floats
+from alpasim_plugin.fixers.network.reference_blend import _sampled, in_floats
 
 SIZES = PixelSizes((16, 16, 16), blend=8)
 HEIGHT, WIDTH = 32, 64
@@ -72,15 +72,13 @@ def test_an_untrained_head_leaves_most_of_the_picture_to_the_generator() -> None
 
 
 @pytest.mark.parametrize(("batch", "references"), [(1, 0), (1, 1), (2, 3)])
-def test_a_recorded_step_equals_the_network(batch: int, references: int) -> None:
+def test_the_operations_of_a_processor_give_the_same_frame(batch: int, references: int) -> None:
     net = trained_like()
     render, opacity, sdmap, images = inputs(references, batch)
     given = (images.abs() * 255).byte() if references else None
-    step = RecordedStep(net, after=1)
-    for _ in range(3):
-        fast, after = step(render, opacity, sdmap, net.start(render), render, given)
+    start = net.start(render)
+    fast, after = net(render, opacity, sdmap, start, None, None, given, operations=CPU)
     plain, state = call(net, render, opacity, sdmap, None if given is None else in_floats(given))
-    assert len(step.recorded) == 1
     # Where a reference ends, an offset that differs by rounding weighs more than the rounding
     # itself.
     for a, b in ((fast, plain), (after.recorded, state.recorded)):
@@ -89,17 +87,16 @@ def test_a_recorded_step_equals_the_network(batch: int, references: int) -> None
 
 
 @pytest.mark.parametrize("references", [0, 2])
-def test_a_network_that_looks_at_smaller_pictures_blends_at_full_size(references: int) -> None:
+def test_a_network_that_sees_smaller_images_blends_at_full_size(references: int) -> None:
     net = trained_like()
     render, opacity, sdmap, images = inputs(references, 2)
     given = (images.abs() * 255).byte() if references else None
-    plain, fast = GeneratorStep(net), RecordedStep(net, after=1)
-    start = plain.start(render, 2)
+    start = net.start(render, 2)
     assert start.hidden.shape[1] * 2 == net.start(render).hidden.shape[1]
     assert torch.equal(start.output, render)
-    one, after = plain(render, opacity, sdmap, start, render, given, scale=2)
-    for _ in range(3):
-        other, _ = fast(render, opacity, sdmap, start, render, given, scale=2)
+    frame = render, opacity, sdmap, start, None, None, given, 2
+    one, after = net(*frame)
+    other, _ = net(*frame, CPU)
     assert one.shape == after.render.shape == render.shape
     assert float((one - other).abs().quantile(0.99)) < 1e-4
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -33,11 +32,10 @@ from alpasim_plugin.fixers.warp import (
     Lookup,
     Picture,
     WarpTarget,
-    _look_up,
-    plain_coordinates,
     warp,
     warp_coordinates,
 )
+from tests.fixers.warp_reference import plain_coordinates
 
 WIDTH, HEIGHT = 64, 32
 K = np.array([[40.0, 0, 32], [0, 40.0, 16], [0, 0, 1]])
@@ -183,28 +181,6 @@ def test_the_kernel_agrees_with_the_plain_arithmetic(seed: int) -> None:
     assert differs.mean() <= 1e-3
     for a, b in zip(fast[:2], plain[:2], strict=True):
         assert np.abs(a - b)[~differs].max(initial=0) < 1e-2
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_a_picture_is_looked_up_as_opencv_does_to_rounding(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    rgb = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-    x, y = (rng.uniform(-0.5, side - 0.5, (37, 53)).astype(np.float32) for side in (WIDTH, HEIGHT))
-    x[0, :4], y[0, :4] = (-0.5, 0.0, WIDTH - 1, WIDTH - 0.5), (HEIGHT - 0.5, HEIGHT - 1, 0.0, -0.5)
-    held, out = (
-        rng.choice([0, 128, 255], x.shape).astype(np.uint8),
-        np.empty((*x.shape, 4), np.uint8),
-    )
-    _look_up(
-        Picture(K, at(0.0), rgb, np.zeros(rgb.shape[:2], np.float32), {}).bordered, x, y, held, out
-    )
-    differs = np.abs(
-        out[..., :3].astype(int)
-        - cv2.remap(rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    )
-    assert differs.max() <= 1
-    assert differs.mean() <= 1e-3
-    assert np.array_equal(out[..., 3], held)
 
 
 def recorded(

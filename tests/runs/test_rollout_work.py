@@ -12,7 +12,6 @@ from alpasim_plugin.runs.commits import RolloutResult
 from alpasim_plugin.runs.executors.assignment import measured_folder
 from alpasim_plugin.runs.executors.base import Node
 from alpasim_plugin.runs.executors.job import rollout_work
-from alpasim_plugin.runs.provenance import chosen
 from tests.runs.test_decide import plan_of
 
 
@@ -33,25 +32,3 @@ def test_workers_of_a_run_on_a_node_share_their_measurements(tmp_path: Path, mon
             assert (folder / "speed.json").exists()
     finally:
         cache.share_measurements(None)
-
-
-def test_the_record_of_a_run_says_what_was_chosen_on_each_node() -> None:
-    def manifest(node: str | None, precision: str) -> dict:
-        facts = {"precision": {"name": precision}, "threads": {"number": 1}}
-        return {"renderer": "onefixer", "fixer": {"chosen": facts}} | (
-            {"node": node} if node else {}
-        )
-
-    found = chosen(
-        [
-            manifest("a", "bf16"),
-            manifest("b", "fp32"),
-            manifest("a", "bf16"),
-            manifest(None, "bf16"),
-            {"renderer": "clean"},
-        ]
-    )
-    assert [
-        (one["node"], one["precision"]["name"], one["rollouts"]) for one in found["onefixer"]
-    ] == [("a", "bf16", 2), ("b", "fp32", 1), (None, "bf16", 1)]
-    assert list(found) == ["onefixer"]

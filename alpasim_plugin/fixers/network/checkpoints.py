@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 from safetensors.torch import load_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import WEIGHT_BYTES
@@ -67,11 +67,9 @@ def load_weights(
     if not head.endswith(b"{") and head.startswith((ZIP_MAGIC, PICKLE_MAGIC)):
         content = _load_pickle(path, device)
     else:
-        what, do = (
-            f"not a complete safetensors file of {path.stat().st_size} bytes",
-            "download or copy the file again",
-        )
-        with parsing(path, f"{do}; it is truncated or of another format", what):
+        what = f"not a complete safetensors file of {path.stat().st_size} bytes"
+        hint = "download or copy the file again; it is truncated or of another format"
+        with parsing(path, hint, what):
             content = load_file(path, device=device)
     tensors = unwrap(content, str(path))
     if dtype is None:
@@ -159,6 +157,60 @@ def weight(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
             "use a checkpoint from before training diverged",
         )
     return convert(key, value, dtype, source)
+
+
+def load_checked(
+    net: nn.Module,
+    tensors: Mapping[str, Tensor],
+    dtype: torch.dtype,
+    source: str,
+    hint: str = "give the weights of this network, all of them",
+    float32: tuple[str, ...] = (),
+) -> None:
+    """Give a network copies of tensors in one precision; kernels become channels-last.
+
+    Args:
+        net: Its state dict gives the expected keys and shapes; it may be on the meta device.
+        tensors: Half, single or double precision, also mixed.
+        dtype: Precision of the parameters; buffers are float32.
+        source, hint: For messages.
+        float32: Parameters whose key contains one of these stay float32.
+
+    Raises:
+        InputError: Keys that are missing, unexpected or of another shape (all in one message), or
+            values that are integers, not finite, or beyond ``dtype``.
+    """
+    expected = {key: tuple(value.shape) for key, value in net.state_dict().items()}
+    wrong = []
+    for key in sorted(expected.keys() & tensors.keys()):
+        shape = tuple(tensors[key].shape)
+        if shape != expected[key]:
+            transposed = ", transposed" if sorted(shape) == sorted(expected[key]) else ""
+            wrong.append(f"{key} is {list(shape)} for {list(expected[key])}{transposed}")
+    problems = [
+        listed("missing", sorted(expected.keys() - tensors.keys())),
+        listed("unexpected", sorted(tensors.keys() - expected.keys())),
+        listed("wrong shape", wrong),
+    ]
+    if any(problems):
+        counts = f"{len(tensors)} tensors, {len(expected)} expected"
+        raise InputError(f"{source} ({counts}): {'; '.join(filter(None, problems))}", hint)
+    buffers = {key for key, _ in net.named_buffers()}
+    kept = {}
+    for key in expected:
+        is_float32 = key in buffers or any(part in key for part in float32)
+        value = weight(key, tensors[key], torch.float32 if is_float32 else dtype, source)
+        kept[key] = channels_last(value)
+    net.load_state_dict(kept, assign=True)
+
+
+def channels_last(kernel: Tensor) -> Tensor:
+    """Return the kernel of a 2D or 3D convolution in channels-last memory; others unchanged."""
+    if kernel.ndim == 4:
+        return kernel.contiguous(memory_format=torch.channels_last)
+    if kernel.ndim == 5:
+        return kernel.contiguous(memory_format=torch.channels_last_3d)
+    return kernel
 
 
 def listed(what: str, keys: Sequence[str]) -> str:

@@ -28,13 +28,10 @@ from torch.random import fork_rng
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.core.types import F32, I64, U8
-from alpasim_plugin.fixers.network.checkpoints import listed, weight
+from alpasim_plugin.fixers.network.checkpoints import load_checked
 from alpasim_plugin.fixers.network.pixel_layers import (
     Conv3,
-    Dense,
     Downsample,
-    FrameMemory,
-    MemoryState,
     ResidualBlock,
     Upsample,
     activation,
@@ -46,15 +43,20 @@ from alpasim_plugin.fixers.network.pixel_layers import (
 from alpasim_plugin.fixers.network.reference_blend import (
     CELL,
     DETAIL,
-    BesideCells,
     BlendHeads,
+    Operations,
     ReferenceBlend,
-    Sources,
-    gather_beside,
-    mix,
-    sources_of,
+    blend,
+    gather_references,
+    larger,
+    likeness,
+    offsets,
+    smaller,
 )
 
+GRID_PX = 16  # sides are multiples of it
+IMAGES = 16  # render 3, opacity 1, map 3, last output 3, last render 3, source minus render 3
+DETAIL_IMAGES = 7  # render 3, opacity 1, last output 3
 HOLE = 0.5  # opacity below which noise enters the source
 ODD = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Steele et al., 2014, SplitMix64)
 MIX = (
@@ -69,7 +71,7 @@ def hole_mask(opacity: Tensor) -> Tensor:
     """Return the mask m of Eq. 1, hardened: 1 above half opacity, falling to 0 where nothing is
     drawn.
 
-    With m = opacity, noise would enter the half of a picture that is nearly opaque, and a small
+    With m = opacity, noise would enter the half of a image that is nearly opaque, and a small
     network would have to take it out again.
     """
     return (opacity / HOLE).clamp(max=1)
@@ -128,20 +130,17 @@ def pixel_noise(scene_id: str, seed: int, camera: str, draw: int, frame: int, pi
     index = (pixels[:, None] * CHANNELS + np.arange(CHANNELS)).astype(np.uint64) * np.uint64(2)
     with np.errstate(over="ignore"):  # arithmetic modulo 2^64
         u, v = (_uniform(key + (index + np.uint64(i + 1)) * ODD) for i in range(2))
-    normal: F32 = (np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)).astype(
-        np.float32
-    )  # Box and Muller, 1958
-    return normal
+    normal = np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)  # Box and Muller, 1958
+    return np.asarray(normal, np.float32)
 
 
 def content_key(t_us: int, rgb: U8) -> int:
     """Return a frame's number as its content gives it: the same render at the same time has the
     same noise in every rollout.
     """
-    return int.from_bytes(
-        hashlib.blake2b(rgb.tobytes(), digest_size=8, salt=t_us.to_bytes(8, "little")).digest(),
-        "little",
-    )
+    salt = t_us.to_bytes(8, "little")
+    digest = hashlib.blake2b(rgb.tobytes(), digest_size=8, salt=salt).digest()
+    return int.from_bytes(digest, "little")
 
 
 def _uniform(x: np.ndarray) -> np.ndarray:
@@ -150,12 +149,6 @@ def _uniform(x: np.ndarray) -> np.ndarray:
         x = (x ^ (x >> shift)) * factor
     x = x ^ (x >> LAST)
     return ((x >> np.uint64(11)).astype(np.float64) + 1) * 2.0**-53
-
-
-GRID_PX = 16  # sides are multiples of it
-IMAGES = 16  # render 3, opacity 1, map 3, last output 3, last render 3, source minus render 3
-DETAIL_IMAGES = 7  # render 3, opacity 1, last output 3
-DOING = "building a generator in pixels"
 
 
 @dataclass(frozen=True)
@@ -167,16 +160,14 @@ class PixelSizes:
         blocks: Residual blocks at 1/4, 1/8, 1/16, and on the way back at 1/8 and 1/4.
         detail: Channels of the detail path at 1/2.
         hidden: Recurrent channels at 1/4; 0: none.
-        memory: Past frames that are attended to at 1/16 (`nets.pixel_layers`); 0: none.
-        blend: Channels of the head that blends references with the picture
-            (`nets.reference_blend`); 0: references are not read.
+        blend: Channels of the head that blends references with the image (`reference_blend`); 0:
+            references are not read.
     """
 
     widths: tuple[int, int, int] = (48, 80, 160)
     blocks: tuple[int, int, int, int, int] = (0, 1, 1, 1, 1)
     detail: int = 16
     hidden: int = 16
-    memory: int = 0
     blend: int = 0
 
 
@@ -186,8 +177,6 @@ class PixelState(NamedTuple):
     output: Tensor  # (B, H, W, 3) its last output, in [-1, 1]
     render: Tensor  # (B, H, W, 3) what that was made from
     hidden: Tensor  # (B, H / 4, W / 4, hidden) in (-1, 1)
-    kept: Tensor  # (B, memory, cells at 1/16, channels) keys and values of past frames
-    frames: Tensor  # (B, 1, 1, 1) how many came so far
     recorded: Tensor  # (B, H, W, 1) share of the references in the last output, 0 to 1
 
     def detached(self) -> PixelState:
@@ -202,13 +191,11 @@ class PixelState(NamedTuple):
         )
 
 
-class BeforeBlend(NamedTuple):
+class Repaired(NamedTuple):
     """What the network made of a frame, before references are blended in."""
 
-    repaired: Tensor  # (B, H, W, 3) render plus change
-    hidden: Tensor  # as in `PixelState`, as are the next two
-    kept: Tensor
-    frames: Tensor
+    image: Tensor  # (B, H, W, 3) render plus change
+    hidden: Tensor  # as in `PixelState`
     heads: BlendHeads | None  # None without references
 
 
@@ -220,7 +207,7 @@ class GatheredCells(NamedTuple):
 
 
 def gather_cells(
-    render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor | None = None
+    render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor
 ) -> GatheredCells:
     """Put what the network reads side by side; arguments as in `PixelGenerator.forward`, result in
     float32.
@@ -230,11 +217,13 @@ def gather_cells(
     and last output.
     """
     cover = 2 * opacity - 1
-    noise = torch.zeros_like(render) if source is None else source - render
-    images = render, cover, sdmap, state.output, state.render, noise
+    images = render, cover, sdmap, state.output, state.render, source - render
     coarse = torch.cat([*(cells(image, CELL) for image in images), state.hidden], dim=-1)
     fine = torch.cat([cells(image, DETAIL) for image in (render, cover, state.output)], dim=-1)
     return GatheredCells(coarse, fine)
+
+
+TORCH = Operations(gather_cells, gather_references, likeness, offsets, blend, smaller, larger)
 
 
 class PixelGenerator(nn.Module):
@@ -256,22 +245,21 @@ class PixelGenerator(nn.Module):
         self.sizes = sizes
         at4, at8, at16 = sizes.widths
         depth = sizes.blocks
-        self.stem = Dense(CELL**2 * IMAGES + sizes.hidden, at4)
+        self.stem = nn.Linear(CELL**2 * IMAGES + sizes.hidden, at4)
         self.mix = Conv3(at4, at4)
         self.encode4 = _blocks(at4, depth[0])
         self.down8 = Downsample(at4, at8)
-        self.time = Dense(2, at8, bias=False)
+        self.time = nn.Linear(2, at8, bias=False)
         self.encode8 = _blocks(at8, depth[1])
         self.down16 = Downsample(at8, at16)
         self.middle = _blocks(at16, depth[2])
-        self.memory = FrameMemory(at16, sizes.memory) if sizes.memory else None
         self.up8 = Upsample(at16, at8)
         self.decode8 = _blocks(at8, depth[3])
         self.up4 = Upsample(at8, at4)
         self.decode4 = _blocks(at4, depth[4])
-        self.remember = Dense(at4, sizes.hidden) if sizes.hidden else None
+        self.remember = nn.Linear(at4, sizes.hidden) if sizes.hidden else None
         self.up2 = Upsample(at4, sizes.detail)
-        self.read = Dense(DETAIL**2 * DETAIL_IMAGES, sizes.detail)
+        self.read = nn.Linear(DETAIL**2 * DETAIL_IMAGES, sizes.detail)
         self.refine = Conv3(sizes.detail, sizes.detail)
         self.write = small(Conv3(sizes.detail, DETAIL**2 * 3))
         repeat_per_pixel(self.write, DETAIL)
@@ -287,18 +275,17 @@ class PixelGenerator(nn.Module):
             torch.manual_seed(seed % 2**63)
             return cls(sizes)
 
-    def start(self, render: Tensor) -> PixelState:
+    def start(self, render: Tensor, scale: int = 1) -> PixelState:
         """Return the state before a rollout: the first render stands for the past.
 
         Args:
             render: ``(B, H, W, 3)`` the first frame.
+            scale: As in `forward`.
         """
         b, h, w, _ = render.shape
-        hidden = render.new_zeros(b, h // CELL, w // CELL, self.sizes.hidden)
-        at16 = (h // GRID_PX) * (w // GRID_PX)
-        empty = MemoryState(render.new_zeros(b, 0, at16, 0), render.new_zeros(b, 1, 1, 1))
-        memory = empty if self.memory is None else self.memory.start(render, at16)
-        return PixelState(render, render, hidden, *memory, render.new_zeros(b, h, w, 1))
+        side = CELL * scale
+        hidden = render.new_zeros(b, h // side, w // side, self.sizes.hidden)
+        return PixelState(render, render, hidden, torch.zeros_like(render[..., :1]))
 
     def forward(
         self,
@@ -309,11 +296,13 @@ class PixelGenerator(nn.Module):
         source: Tensor | None = None,
         t: Tensor | None = None,
         references: Tensor | None = None,
+        scale: int = 1,
+        operations: Operations = TORCH,
     ) -> tuple[Tensor, PixelState]:
         """Predict the clean frame.
 
         Args:
-            render: ``(B, H, W, 3)`` in [-1, 1]; sides are multiples of 16.
+            render: ``(B, H, W, 3)`` in [-1, 1]; sides are multiples of 16 ``scale``.
             opacity: ``(B, H, W, 1)``, 0 to 1.
             sdmap: ``(B, H, W, 3)`` in [-1, 1]; black (-1) where there is no map.
             state: From `start` or the last call.
@@ -321,16 +310,25 @@ class PixelGenerator(nn.Module):
                 transparent.
             t: ``(B,)`` flow time; None is 1, the deployed step.
             references: ``(B, K, H, W, 4)`` recorded frames in this view, colour in [-1, 1] and
-                where it holds, 0 to 1; None: there is none. A network without a blending head does
-                not read them.
+                where it holds, 0 to 1, or both as bytes; None: there is none. A network without a
+                blending head does not read them.
+            scale: The network sees images that are this many times smaller; its change of the
+                render and the heads of the references are enlarged, and render and references are
+                blended at their own size (joint upsampling; Kopf et al., 2007).
+            operations: For the device.
 
         Returns:
             ``(B, H, W, 3)`` the clean frame x_0, float32, not clipped, and the state after it.
         """
-        out, after, _ = self.with_sources(render, opacity, sdmap, state, source, t, references)
-        return out, after
+        repaired = self.repair(
+            render, opacity, sdmap, state, source, t, references, scale, operations
+        )
+        out, recorded = repaired.image, torch.zeros_like(render[..., :1])
+        if repaired.heads is not None and references is not None:
+            out, recorded = operations.blend(out, references, repaired.heads, scale)
+        return out, PixelState(out.clamp(-1, 1), render, repaired.hidden, recorded)
 
-    def with_sources(
+    def repair(
         self,
         render: Tensor,
         opacity: Tensor,
@@ -339,66 +337,45 @@ class PixelGenerator(nn.Module):
         source: Tensor | None = None,
         t: Tensor | None = None,
         references: Tensor | None = None,
-    ) -> tuple[Tensor, PixelState, Sources | None]:
-        """Predict the clean frame and say what it was blended of; None without references. See
-        `forward`.
-        """
-        gathered = gather_cells(render, opacity, sdmap, state, source)
-        beside = (
-            None if self.blend is None or references is None else gather_beside(references, render)
-        )
-        made = self.before_blend(gathered, render, state, t, beside)
-        out = made.repaired
-        recorded = torch.zeros_like(render[..., :1])
-        sources = None
-        if made.heads is not None and references is not None:
-            sources = sources_of(made.repaired, references, made.heads)
-            out, recorded = mix(sources)
-        return (
-            out,
-            PixelState(out.clamp(-1, 1), render, made.hidden, made.kept, made.frames, recorded),
-            sources,
-        )
-
-    def before_blend(
-        self,
-        gathered: GatheredCells,
-        render: Tensor,
-        state: PixelState,
-        t: Tensor | None = None,
-        beside: BesideCells | None = None,
-    ) -> BeforeBlend:
-        """Run the network up to the blend of its picture with the references, which `gather_beside`
-        gathered; see `forward`.
-        """
+        scale: int = 1,
+        operations: Operations = TORCH,
+    ) -> Repaired:
+        """Run the network up to the blend of its image with the references; see `forward`."""
         dtype = self.stem.weight.dtype
-        stem, read = self.stem(gathered.coarse.to(dtype)), self.read(gathered.fine.to(dtype))
-        if self.blend is not None and beside is not None:
-            at4, at2 = self.blend.features(beside)
-            stem, read = stem + at4, read + at2
+        smaller = operations.smaller
+        shown = smaller(render, scale)
+        noised = shown if source is None or source is render else smaller(source, scale)
+        past = state._replace(
+            output=smaller(state.output, scale), render=smaller(state.render, scale)
+        )
+        read = operations.gather_cells(
+            shown, smaller(opacity, scale), smaller(sdmap, scale), past, noised
+        )
+        stem, detail = self.stem(read.coarse.to(dtype)), self.read(read.fine.to(dtype))
+        seen = None
+        if self.blend is not None and references is not None:
+            seen = operations.gather_references(references, shown, scale)
+            at4, at2 = self.blend.features(seen)
+            stem, detail = stem + at4, detail + at2
+
         x4 = self.encode4(self.mix(activation(stem, inplace=True)))
         x8 = self.down8(activation(x4))
         if t is not None:
-            x8 = (
-                x8
-                + self.time(torch.stack([1 - t, (1 - t).square()], dim=-1).to(dtype))[:, None, None]
-            )
+            times = torch.stack([1 - t, (1 - t).square()], dim=-1).to(dtype)
+            x8 = x8 + self.time(times)[:, None, None]
         x8 = self.encode8(x8)
         y = self.middle(self.down16(activation(x8)))
-        kept, frames = state.kept, state.frames
-        if self.memory is not None:
-            y, (kept, frames) = self.memory(y, MemoryState(kept, frames))
         y = self.decode8(self.up8(y).add_(x8))
         y = activation(self.decode4(self.up4(y).add_(x4)), inplace=True)
         hidden = state.hidden if self.remember is None else torch.tanh(self.remember(y)).float()
-        fine = activation(read.add_(self.up2(y)), inplace=True)
-        fine = self.refine(fine, activated=True)
-        heads = (
-            self.blend(y, fine, beside) if self.blend is not None and beside is not None else None
-        )
-        return BeforeBlend(
-            pixels(self.write(fine), DETAIL).float() + render, hidden, kept, frames, heads
-        )
+        fine = activation(detail.add_(self.up2(y)), inplace=True)
+        fine = activation(self.refine(fine), inplace=True)
+
+        change = pixels(self.write(fine), DETAIL).float()
+        heads = None
+        if self.blend is not None and seen is not None:
+            heads = self.blend(y, fine, seen, operations)
+        return Repaired(render + operations.larger(change, scale), hidden, heads)
 
     @classmethod
     def from_state_dict(cls, tensors: Mapping[str, Tensor], source: str = "weights") -> Self:
@@ -408,33 +385,7 @@ class PixelGenerator(nn.Module):
             InputError: Tensors that are missing, unknown, of another shape or not finite.
         """
         net = cls(_sizes_of(tensors, source))
-        mine = net.state_dict()
-        missing, unknown = (
-            sorted(mine.keys() - tensors.keys()),
-            sorted(tensors.keys() - mine.keys()),
-        )
-        wrong = [
-            f"{key} {list(tensors[key].shape)} for {list(mine[key].shape)}"
-            for key in mine.keys() & tensors.keys()
-            if tensors[key].shape != mine[key].shape
-        ]
-        found = "; ".join(
-            filter(
-                None,
-                (
-                    listed("missing", missing),
-                    listed("unknown", unknown),
-                    listed("shape", sorted(wrong)),
-                ),
-            )
-        )
-        if found:
-            raise InputError(
-                f"{source}: {found}", "give the weights of one generator in pixels, all of them"
-            )
-        net.load_state_dict(
-            {key: weight(key, value, torch.float32, source) for key, value in tensors.items()}
-        )
+        load_checked(net, tensors, torch.float32, source)
         return net
 
     @property
@@ -458,15 +409,11 @@ def _sizes_of(tensors: Mapping[str, Tensor], source: str) -> PixelSizes:
     def depth(stage: str) -> int:
         return len({key.split(".")[1] for key in tensors if key.startswith(f"{stage}.")})
 
-    hidden = width("remember.weight") if "remember.weight" in tensors else 0
-    widths = (width("stem.weight"), width("down8.weight"), width("down16.weight"))
-    blocks = (
-        depth("encode4"),
-        depth("encode8"),
-        depth("middle"),
-        depth("decode8"),
-        depth("decode4"),
+    stages = ("encode4", "encode8", "middle", "decode8", "decode4")
+    return PixelSizes(
+        (width("stem.weight"), width("down8.weight"), width("down16.weight")),
+        tuple(depth(stage) for stage in stages),  # type: ignore[arg-type]
+        width("refine.weight"),
+        width("remember.weight") if "remember.weight" in tensors else 0,
+        width("blend.head.weight") if "blend.head.weight" in tensors else 0,
     )
-    memory = width("memory.age") if "memory.age" in tensors else 0
-    blend = width("blend.head.weight") if "blend.head.weight" in tensors else 0
-    return PixelSizes(widths, blocks, width("refine.weight"), hidden, memory, blend)

@@ -1,8 +1,8 @@
-"""What a generator in pixels does with references: recorded frames that were warped into the view
+"""How the generator in pixels uses references: recorded frames that were warped into the view
 (`alpasim_plugin.fixers.references`).
 
-    s_k       = act(y + C_k)                                        C_k: what reference k shows beside the render, at 1/4; y: the U-Net
-    m_k(p, q) = <Q y(p), N s_k(p + q)>, |q| <= 2 cells              how alike the picture here and the reference there are
+    s_k       = act(y + C_k)                                        C_k: what reference k shows beyond the render, at 1/4; y: the U-Net
+    m_k(p, q) = <Q y(p), N s_k(p + q)>, |q| <= 2 cells              how alike the image here and the reference there are
                                                                     (cost volume; Sun et al., 2018,
                                                                     PWC-Net, Sec. 3)
     a_k       = A (s_k, m_k)
@@ -21,7 +21,8 @@ network gives it no weight.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -29,27 +30,28 @@ from torch import Tensor, nn
 
 from alpasim_plugin.fixers.network.pixel_layers import (
     Conv3,
-    Dense,
     Upsample,
     activation,
     cells,
     pixels,
 )
 
+if TYPE_CHECKING:
+    from alpasim_plugin.fixers.network.pixel_generator import GatheredCells, PixelState
+
 CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail path
+HALF = 127.5  # grey levels from 0 to 1 on the scale of [-1, 1]
 # of a reference: colour minus that of the render where the reference holds, and where it holds
 CHANNELS = 4
 OFFSET_PX = 8.0  # largest learned offset
 NOWHERE = 1e-6  # the share of a pixel that holds, at least, so that its logarithm is finite
-MATCH_CELLS, MATCH_CHANNELS = (
-    2,
-    16,
-)  # how far a reference is compared with the picture, in cells; of the features compared
+MATCH_CELLS = 2  # how far a reference is compared with the image, in cells
+MATCH_CHANNELS = 16  # of the features compared
 DOUBT = -2.5  # initial logarithm of a reference's weight over that of the render
 
 
-class BesideCells(NamedTuple):
-    """What references show beside the render, ``(ref - render) v`` and ``v``, as `cells`;
+class ReferenceCells(NamedTuple):
+    """What references show beyond the render, ``(ref - render) v`` and ``v``, as `cells`;
     float32.
     """
 
@@ -60,19 +62,44 @@ class BesideCells(NamedTuple):
 
 
 class BlendHeads(NamedTuple):
-    """How references enter the picture, at half its resolution; offsets in float32."""
+    """How references enter the image, at half its resolution; offsets in float32."""
 
     # (B, K, H / 2, W / 2, 4) logarithm of each pixel's weight over that of the repaired render,
     # `cells` of one channel
     weight: Tensor
     offset_px: Tensor  # (B, K, H / 2, W / 2, 2) x and y of where it is looked up
-    correction: (
-        Tensor  # (B, K, H / 2, W / 2, 12) what is added to its colour, `cells` of three channels
-    )
+    # (B, K, H / 2, W / 2, 12) what is added to its colour, `cells` of three channels
+    correction: Tensor
+
+
+@dataclass(frozen=True)
+class Operations:
+    """What the generator computes besides its layers; one implementation per kind of device.
+
+    `pixel_generator.TORCH` runs on any device and has gradients; `alpasim_plugin.fixers.gather.CPU`
+    is the same to rounding, fused for processors.
+
+    Attributes:
+        gather_cells: See `pixel_generator.gather_cells`.
+        gather_references: See `gather_references`.
+        likeness: See `likeness`.
+        offsets: See `offsets`.
+        blend: See `blend`.
+        smaller: Average images ``(B, H, W, C)`` over squares of a number of pixels.
+        larger: Enlarge images ``(B, H, W, C)`` bilinearly by a whole number.
+    """
+
+    gather_cells: Callable[[Tensor, Tensor, Tensor, PixelState, Tensor], GatheredCells]
+    gather_references: Callable[[Tensor, Tensor, int], ReferenceCells]
+    likeness: Callable[[Tensor, Tensor], Tensor]
+    offsets: Callable[[Tensor, Tensor], Tensor]
+    blend: Callable[[Tensor, Tensor, BlendHeads, int], tuple[Tensor, Tensor]]
+    smaller: Callable[[Tensor, int], Tensor]
+    larger: Callable[[Tensor, int], Tensor]
 
 
 class ReferenceBlend(nn.Module):
-    """Read references; `mix` then blends them with the generator's own picture.
+    """Read references; `mix` then blends them with the generator's own image.
 
     Args:
         coarse: Channels of the generator at 1/4.
@@ -82,21 +109,18 @@ class ReferenceBlend(nn.Module):
 
     def __init__(self, coarse: int, detail: int, width: int) -> None:
         super().__init__()
-        self.stem = Dense(CELL**2 * CHANNELS, coarse, bias=False)
-        self.read = Dense(DETAIL**2 * CHANNELS, detail, bias=False)
-        self.coarse = Dense(CELL**2 * CHANNELS, coarse)
-        self.sought = Dense(coarse, MATCH_CHANNELS, bias=False)
+        self.stem = nn.Linear(CELL**2 * CHANNELS, coarse, bias=False)
+        self.read = nn.Linear(DETAIL**2 * CHANNELS, detail, bias=False)
+        self.coarse = nn.Linear(CELL**2 * CHANNELS, coarse)
+        self.sought = nn.Linear(coarse, MATCH_CHANNELS, bias=False)
         self.shown = Conv3(coarse, MATCH_CHANNELS)
-        self.match = Dense((2 * MATCH_CELLS + 1) ** 2, width, bias=False)
+        self.match = nn.Linear((2 * MATCH_CELLS + 1) ** 2, width, bias=False)
         self.align = nn.ModuleList([Conv3(coarse, width), Conv3(width, width)])
-        self.shift = Dense(width, 2)
+        self.shift = nn.Linear(width, 2)
         self.up = Upsample(width, detail)
-        self.own = Dense(DETAIL**2 * CHANNELS, detail)
+        self.own = nn.Linear(DETAIL**2 * CHANNELS, detail)
         self.head = Conv3(detail, width)
-        self.write = Dense(width, DETAIL**2 + 2 + DETAIL**2 * 3)
-        # Where no gradient is asked for, faster ones may stand here.
-        self.likeness: Callable[[Tensor, Tensor], Tensor] = likeness
-        self.offsets: Callable[[Tensor, Tensor], Tensor] = offsets
+        self.write = nn.Linear(width, DETAIL**2 + 2 + DETAIL**2 * 3)
         for layer in (self.stem, self.read, self.match, self.shift, self.up, self.write):
             nn.init.zeros_(layer.weight)
             if layer.bias is not None:
@@ -105,37 +129,36 @@ class ReferenceBlend(nn.Module):
         with torch.no_grad():
             self.write.bias[: DETAIL**2] = DOUBT
 
-    def features(self, beside: BesideCells) -> tuple[Tensor, Tensor]:
+    def features(self, seen: ReferenceCells) -> tuple[Tensor, Tensor]:
         """Return what the references add to the first layers: ``(B, H / 4, W / 4, coarse)`` and
         ``(B, H / 2, W / 2, detail)``.
         """
         dtype = self.stem.weight.dtype
-        return self.stem(beside.mean4.to(dtype)), self.read(beside.mean2.to(dtype))
+        return self.stem(seen.mean4.to(dtype)), self.read(seen.mean2.to(dtype))
 
-    def forward(self, y: Tensor, fine: Tensor, beside: BesideCells) -> BlendHeads:
-        """Say how every reference enters the picture.
+    def forward(
+        self, y: Tensor, fine: Tensor, seen: ReferenceCells, operations: Operations
+    ) -> BlendHeads:
+        """Return how every reference enters the image.
 
         Args:
             y: ``(B, H / 4, W / 4, coarse)`` the U-Net's features.
             fine: ``(B, H / 2, W / 2, detail)`` the detail path's features.
-            beside: What the references show beside the render.
+            seen: What the references show.
+            operations: For the device.
         """
         b = y.shape[0]
-        k = beside.each4.shape[0] // b
-        side = activation(_added(self.coarse(beside.each4.to(y.dtype)), y), inplace=True)
-        alike = self.likeness(self.sought(y), self.shown(side))
+        k = seen.each4.shape[0] // b
+        side = activation(_add_to_each(self.coarse(seen.each4.to(y.dtype)), y), inplace=True)
+        alike = operations.likeness(self.sought(y), self.shown(side))
         at4 = activation(self.align[0](side) + self.match(alike), inplace=True)
-        at4 = self.align[1](at4, activated=True)
-        joined = _added(self.own(beside.each2.to(fine.dtype)).add_(self.up(at4)), fine)
-        said = self.write(self.head(activation(joined, inplace=True), activated=True))
-        weight, offset, correction = said.view(b, k, *said.shape[1:]).split(
-            [DETAIL**2, 2, DETAIL**2 * 3], dim=-1
-        )
-        return BlendHeads(
-            weight,
-            self.offsets(offset.flatten(0, 1), self.shift(at4)).view(offset.shape),
-            correction,
-        )
+        at4 = activation(self.align[1](at4), inplace=True)
+        joined = _add_to_each(self.own(seen.each2.to(fine.dtype)).add_(self.up(at4)), fine)
+        features = activation(self.head(activation(joined, inplace=True)), inplace=True)
+        heads = self.write(features).unflatten(0, (b, k))
+        weight, offset, correction = heads.split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
+        moved = operations.offsets(offset.flatten(0, 1), self.shift(at4))
+        return BlendHeads(weight, moved.view(offset.shape), correction)
 
 
 def likeness(sought: Tensor, shown: Tensor) -> Tensor:
@@ -152,9 +175,8 @@ def likeness(sought: Tensor, shown: Tensor) -> Tensor:
     reach = 2 * MATCH_CELLS + 1
     around = F.pad(shown, (0, 0, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS))
     each = sought[:, None].expand(-1, len(shown) // len(sought), -1, -1, -1).flatten(0, 1)
-    mean = sought.new_full(
-        (sought.shape[-1], 1), 1 / sought.shape[-1]
-    )  # as a product: a sum over few channels is slow on a CPU
+    # The mean as a product: a sum over few channels is slow on a CPU.
+    mean = sought.new_full((sought.shape[-1], 1), 1 / sought.shape[-1])
     return torch.cat(
         [
             (each * around[:, i : i + h, j : j + w]) @ mean
@@ -166,7 +188,7 @@ def likeness(sought: Tensor, shown: Tensor) -> Tensor:
 
 
 def offsets(at2: Tensor, at4: Tensor) -> Tensor:
-    """Return the offsets ``(N, H / 2, W / 2, 2)`` in pixels that are said at half the resolution
+    """Return the offsets ``(N, H / 2, W / 2, 2)`` in pixels that are given at half the resolution
     and, coarser, at a quarter of it.
     """
     finer = F.interpolate(
@@ -176,7 +198,7 @@ def offsets(at2: Tensor, at4: Tensor) -> Tensor:
 
 
 class Sources(NamedTuple):
-    """What a picture is blended of: the generator's own, then each reference."""
+    """What a image is blended of: the generator's own, then each reference."""
 
     colour: Tensor  # (B, 1 + K, H, W, 3)
     logit: Tensor  # (B, 1 + K, H, W, 1) their softmax over the sources is the blend
@@ -184,19 +206,19 @@ class Sources(NamedTuple):
 
 
 def sources_of(repaired: Tensor, references: Tensor, heads: BlendHeads, scale: int = 1) -> Sources:
-    """Return what the picture is blended of.
+    """Return what the image is blended of.
 
     Args:
         repaired: ``(B, H, W, 3)`` render plus change, in [-1, 1].
         references: ``(B, K, H, W, 4)`` colour in [-1, 1], and where it holds, 0 to 1.
-        heads: Of the same, or of pictures ``scale`` times smaller; what they say is then
-            interpolated, and offsets are as much longer.
+        heads: Of the same, or of images ``scale`` times smaller; they are then interpolated, and
+            offsets are as much longer.
         scale: How many times.
     """
     b, k, h, w, _ = references.shape
     weight, offset_px, correction = (part.flatten(0, 1) for part in heads)
     weight, correction = (
-        enlarged(pixels(part, DETAIL).to(repaired.dtype), scale) for part in (weight, correction)
+        larger(pixels(part, DETAIL).to(repaired.dtype), scale) for part in (weight, correction)
     )
     moved = _sampled(references.flatten(0, 1), scale * offset_px)
     colour = (moved[..., :3] + correction).view(b, k, h, w, 3)
@@ -210,8 +232,24 @@ def sources_of(repaired: Tensor, references: Tensor, heads: BlendHeads, scale: i
     )
 
 
-def enlarged(x: Tensor, scale: int) -> Tensor:
-    """Enlarge pictures ``(B, H, W, C)`` bilinearly, a whole number of times."""
+def in_floats(references: Tensor) -> Tensor:
+    """Return references of bytes ``(..., 4)`` as the network reads them: colour in [-1, 1], and
+    where it holds, 0 to 1; those of floats unchanged.
+    """
+    if references.dtype != torch.uint8:
+        return references
+    return torch.cat([references[..., :3] / HALF - 1, references[..., 3:] / (2 * HALF)], dim=-1)
+
+
+def smaller(x: Tensor, scale: int) -> Tensor:
+    """Average images ``(B, H, W, C)`` over squares of ``scale`` pixels."""
+    if scale == 1:
+        return x
+    return F.avg_pool2d(x.permute(0, 3, 1, 2), scale).permute(0, 2, 3, 1)
+
+
+def larger(x: Tensor, scale: int) -> Tensor:
+    """Enlarge images ``(B, H, W, C)`` bilinearly, a whole number of times."""
     if scale == 1:
         return x
     return F.interpolate(
@@ -219,32 +257,44 @@ def enlarged(x: Tensor, scale: int) -> Tensor:
     ).permute(0, 2, 3, 1)
 
 
-def mix(sources: Sources) -> tuple[Tensor, Tensor]:
-    """Blend the sources of a picture.
+def blend(
+    repaired: Tensor, references: Tensor, heads: BlendHeads, scale: int = 1
+) -> tuple[Tensor, Tensor]:
+    """Blend the generator's own image with its references; arguments as of `sources_of`,
+    references also as bytes.
 
     Returns:
         ``(B, H, W, 3)`` float32, and ``(B, H, W, 1)`` the weight of all references together.
     """
+    return mix(sources_of(repaired, in_floats(references), heads, scale))
+
+
+def mix(sources: Sources) -> tuple[Tensor, Tensor]:
+    """Blend the sources of an image; see `blend`."""
     shares = sources.logit.softmax(dim=1)
     return (shares * sources.colour).sum(dim=1), 1 - shares[:, 0]
 
 
-def gather_beside(references: Tensor, render: Tensor) -> BesideCells:
+def gather_references(references: Tensor, render: Tensor, scale: int = 1) -> ReferenceCells:
     """Put what the network reads of references side by side.
 
     Args:
-        references: ``(B, K, H, W, 4)`` colour in [-1, 1], and where it holds v, 0 to 1.
+        references: ``(B, K, scale H, scale W, 4)`` colour in [-1, 1], and where it holds v, 0 to 1;
+            or the same as bytes.
         render: ``(B, H, W, 3)`` in [-1, 1].
+        scale: References are averaged over squares of so many pixels.
     """
-    holds = references[..., 3:]
-    each = torch.cat([(references[..., :3] - render[:, None]) * holds, holds], dim=-1)
+    b, k = references.shape[:2]
+    seen = smaller(in_floats(references).flatten(0, 1), scale).unflatten(0, (b, k))
+    holds = seen[..., 3:]
+    each = torch.cat([(seen[..., :3] - render[:, None]) * holds, holds], dim=-1)
     mean, flat = each.mean(dim=1), each.flatten(0, 1)
-    return BesideCells(
+    return ReferenceCells(
         cells(mean, CELL), cells(mean, DETAIL), cells(flat, CELL), cells(flat, DETAIL)
     )
 
 
-def _added(each: Tensor, one: Tensor) -> Tensor:
+def _add_to_each(each: Tensor, one: Tensor) -> Tensor:
     """Add an image ``(B, ...)`` to each of K: ``(B K, ...)``, in place."""
     parts = each.view(one.shape[0], -1, *one.shape[1:])
     return parts.add_(one[:, None]).flatten(0, 1)

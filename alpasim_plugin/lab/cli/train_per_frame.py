@@ -12,7 +12,6 @@ import typer
 from alpasim_plugin.cli.options import fixer_overrides
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings
-from alpasim_plugin.fixers.network.machine_probe import choose_precision
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.cli import training_options as options
 from alpasim_plugin.lab.cli.image_sizes import parse_size
@@ -123,9 +122,8 @@ def per_frame(
         ),
     ] = 1000,
     precision: Annotated[
-        Literal["auto", "fp32", "bf16"],
-        typer.Option("--precision", help="Of the forward passes; auto: what pays on this machine."),
-    ] = "auto",
+        Literal["fp32", "bf16"], typer.Option("--precision", help="Of the forward passes.")
+    ] = "fp32",
     threads: options.Threads = None,
     processes: Annotated[
         int,
@@ -155,8 +153,6 @@ def per_frame(
             f"--fixer {fixer}: it is no generator in pixels",
             "choose onefixer; 'simrun train fixer' trains the block generators",
         )
-    chosen = choose_precision(precision)
-    progress.console.print(f"precision: {chosen.name} ({chosen.why})", highlight=False)
     width, height = parse_size(crop, "--crop", 16)
     shares = StreamShares() if video is not None else WITHOUT_VIDEO
     source = TrainingStreams(
@@ -184,7 +180,7 @@ def per_frame(
     )
     needs_distance = any(stage.perceptual for stage in chosen_variant.stages)
     distance = progress.perceptual_term(metric_weights) if needs_distance else None
-    dtype = torch.bfloat16 if chosen.name == "bf16" else None
+    dtype = torch.bfloat16 if precision == "bf16" else None
     run = PixelRun(settings, source, chosen_variant, schedule, init, seed, dtype, keep_every)
     work = partial(train_per_frame, run, out, distance, stop_at)
     progress.wrote(in_ranks(work, processes, progress.update), as_json)

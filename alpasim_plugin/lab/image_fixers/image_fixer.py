@@ -22,7 +22,6 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import guard
-from alpasim_plugin.fixers.network.machine_probe import take_threads
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import Views, check_continues, group_views
 from alpasim_plugin.lab.image_fixers.pipeline import fix_images, sample_window
@@ -64,7 +63,8 @@ class MaplessFixer(Fixer):
     def __init__(
         self, settings: MaplessSettings, scene_id: str, seed: int, device: str, threads: int | None
     ) -> None:
-        self.chosen = take_threads(threads)
+        if threads is not None:
+            torch.set_num_threads(threads)
         self.scene_id = scene_id
         self.networks = load_networks(settings, device)
         self.clock = StageClock(device)

@@ -29,7 +29,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelState, pixel_source
-from alpasim_plugin.fixers.network.reference_blend import Sources
+from alpasim_plugin.fixers.network.reference_blend import Sources, mix, sources_of
 from alpasim_plugin.fixers.network.schedule import interpolant
 from alpasim_plugin.lab.training.grid_term import grid_term
 
@@ -175,8 +175,8 @@ def pixel_losses(
             state = state.detached()
         before, source = state, _source(render, opacity, sample.eps[:, i], objectives)
         with torch.set_grad_enabled(objectives.in_pixels):
-            out, state, sources = net.with_sources(
-                render, opacity, sdmap, before, source, None, references
+            out, state, sources = with_sources(
+                net, render, opacity, sdmap, before, source, references
             )
         outputs.append(out)
         if objectives.choice and sources is not None:
@@ -223,6 +223,24 @@ def pixel_losses(
     return PixelLosses(
         total, picture, perceptual, temporal, flow, grid, choice, made, state.detached()
     )
+
+
+def with_sources(
+    net: PixelGenerator,
+    render: Tensor,
+    opacity: Tensor,
+    sdmap: Tensor,
+    state: PixelState,
+    source: Tensor,
+    references: Tensor | None,
+) -> tuple[Tensor, PixelState, Sources | None]:
+    """Predict the clean frame as the generator does, and return what it was blended of."""
+    made = net.repair(render, opacity, sdmap, state, source, None, references)
+    out, recorded, sources = made.image, torch.zeros_like(opacity), None
+    if made.heads is not None and references is not None:
+        sources = sources_of(out, references, made.heads)
+        out, recorded = mix(sources)
+    return out, PixelState(out.clamp(-1, 1), render, made.hidden, recorded), sources
 
 
 def choice_term(sources: Sources, truth: Tensor) -> Tensor:

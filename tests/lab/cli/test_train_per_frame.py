@@ -66,7 +66,6 @@ def test_pairs_become_a_bundle_with_its_card(
     captured = capsys.readouterr()
     document = json.loads(captured.out.splitlines()[-1])
     assert document["steps"] == 2
-    assert "precision: fp32 (as set)" in captured.err
     card = json.loads(Path(document["card"]).read_text())
     assert card["data"]["pairs"] == 1
     assert card["training"]["updates"] == 2
