@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 from alpasim_plugin.alpasim.client.driver import AlpasimPolicy
@@ -31,14 +30,12 @@ from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout
 from evaluators import reduce_rollout, score
 from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT, in_words
-from evaluators.statistics.ability import ability_of, calibrate, chances
 from policies.conformance import check_policy as run_checks
 from scenarios.load import load_scenario
-from scenarios.suite import LIBRARY, expand
+from scenarios.suite import expand
 
 BROKEN = 1
 ATTEMPTS = 2  # at a scene in which the driver is lost
-KNOWN = LIBRARY / "suites" / "known_drivers.json"  # which shipped scenes known drivers passed
 
 CHECK_POLICY_EPILOG = """
 Examples:
@@ -106,7 +103,7 @@ def check_driver(
         str, Positional("The driver, with options as after alpasim://.", metavar="HOST:PORT")
     ],
     scenario: Annotated[
-        str, Flag("What it drives through: a scenario, or a suite for a score of its ability.")
+        str, Flag("What it drives through: a scenario, or a suite.")
     ] = "smoke/curve",
     renderer: Annotated[str, Flag("Renderer of its frames.")] = "clean",
     overrides: Overrides = (),
@@ -143,22 +140,17 @@ def check_driver(
         *over_scenes(drives),
     ]
     found += [*tolerances(policy.service, scene.scene_id), *outside_view()]
-    changed = [key for key in overrides if not key.startswith("cameras")]
-    other = f"behind {renderer}" if renderer != "clean" else f"with {changed[0]}" if changed else ""
-    ability = ability_over(drives, other)
     worst = 1 if any(one.result == "failed" for one in found) else 0
     if as_json:
         facts = {
             "driver": policy.facts()["driver"],
             "checks": [one.__dict__ for one in found],
-            "ability": ability,
         }
         print(json.dumps({**facts, "scenes": [one.facts() for one in drives], "exit_code": worst}))
     else:
         print(f"driver  {policy.facts()['driver']}")
         for one in found:
             print(f"{one.result:7} {one.name}: {one.text}")
-        print(f"ability {ability['text']}")
     raise typer.Exit(worst)
 
 
@@ -238,66 +230,3 @@ def over_scenes(drives: Sequence[Drive]) -> list[Finding]:
         text = f"{seen[0]:.0f} MiB after the first scene, {max(seen):.0f} at most, {seen[-1]:.0f} after the last; without children and GPU"
         found.append(Finding("memory of the driver", "noted", text))
     return found
-
-
-def ability_over(drives: Sequence[Drive], other: str = "") -> dict[str, Any]:
-    """Return the ability of the driver on the scale of the known ones, with its interval, in
-    numbers and in words.
-
-    Args:
-        drives: What it drove.
-        other: What makes the scenes others than the known drivers drove, and their difficulties
-            unknown.
-    """
-    known = json.loads(KNOWN.read_text())["passed"]
-    scenes, names = list(known), sorted({driver for ends in known.values() for driver in ends})
-    scale = calibrate(
-        np.array(
-            [[known[scene].get(name, np.nan) for scene in scenes] for name in names],
-            dtype=np.float64,
-        )
-    )
-    drove = [
-        (scenes.index(one.scene), not one.outcomes)
-        for one in drives
-        if one.outcomes is not None and one.scene in known
-    ]
-    out: dict[str, Any] = {
-        "n_scenes": len(drove),
-        "n_passed": sum(ok for _, ok in drove),
-        "estimate": None,
-        "ci95": [None, None],
-    }
-    out["known"] = {
-        name: round(float(value), 2) for name, value in zip(names, scale.ability, strict=True)
-    }
-    if other or not drove:
-        return {**out, "text": f"no score: no known driver drove these scenes {other}".rstrip()}
-    at = [index for index, _ in drove]
-    one = ability_of(out["n_passed"], scale.difficulty[at], scale.spread[at])
-    out |= {"estimate": one.estimate, "ci95": [one.low, one.high], "reason": one.reason}
-    share = [
-        None if a is None else float(chances(a, scale.difficulty, scale.spread).mean())
-        for a in (one.estimate, one.low, one.high)
-    ]
-    out |= {
-        "expected_share": share[0],
-        "expected_share_ci95": share[1:],
-        "n_known_scenes": len(scenes),
-    }
-    if one.estimate is None:
-        side, bound, part = (
-            ("above", one.low, share[1]) if one.low is not None else ("below", one.high, share[2])
-        )
-        text = f"no score, {one.reason}; {side} {bound:+.2f} logits with 95 %, that is {part:.0%} of all {len(scenes)} known scenes"
-    else:
-        text = f"{one.estimate:+.2f} logits [{one.low:+.2f}, {one.high:+.2f}]: passes {out['n_passed']} of {len(drove)} known scenes, "
-        text += f"would pass {share[0]:.0%} [{share[1]:.0%}, {share[2]:.0%}] of all {len(scenes)}"
-    others = ", ".join(f"{name} {value:+.2f}" for name, value in out["known"].items())
-    left = len(drives) - len(drove)
-    return {
-        **out,
-        "text": text
-        + (f"; {left} scenes without a known difficulty or an outcome" if left else "")
-        + f" ({others})",
-    }

@@ -24,8 +24,8 @@ from evaluators.report import render_table
 from evaluators.report.numbers import plural
 from evaluators.report.tables import PairRow, pair_rows
 from evaluators.statistics.across import Comparison, compare_runs, compare_within
+from evaluators.statistics.decision import stopping_note
 from evaluators.statistics.gate import load_gate
-from evaluators.statistics.sequential.question import stopping_note
 
 COMPARE_EPILOG = """
 Examples:

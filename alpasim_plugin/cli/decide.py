@@ -6,10 +6,10 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
@@ -30,9 +30,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.signals import Stopped
 from alpasim_plugin.log.run_folder.schema import slug
-from alpasim_plugin.runs.decide import Decided, Design, arms_asked, execute_decision, key_of
+from alpasim_plugin.runs.decide import Decided, Design, execute_decision, key_of
 from alpasim_plugin.runs.plan import RunOptions, RunPlan
-from evaluators.opening import read_run
 from evaluators.report.numbers import plural
 from evaluators.report.verdict import metric_lines, verdict_line
 from evaluators.statistics.arms import Arm, arms_of, base_named, usual_base
@@ -40,25 +39,18 @@ from evaluators.statistics.baselines import (
     StoredSide,
     check_made_alike,
     read_baseline,
-    rows_of_run,
     stored_side,
 )
-from evaluators.statistics.gate import GateSpec, load_gate
-from evaluators.statistics.sequential import control as variance
-from evaluators.statistics.sequential.asymptotic import FIRST_LOOK
-from evaluators.statistics.sequential.control import Control
-from evaluators.statistics.sequential.decision import State
-from evaluators.statistics.sequential.question import (
-    Method,
+from evaluators.statistics.decision import (
     MetricQuestion,
-    Order,
     Population,
     Question,
+    State,
     metric_question,
 )
+from evaluators.statistics.gate import GateSpec, load_gate
 
 DOING = "planning a decision"
-AUTO = "auto:"
 
 EPILOG = """
 Examples:
@@ -69,17 +61,13 @@ Examples:
 
 - `simrun decide --renderer clean,onefixer --metric lateral_distance_m=0.1,progress=0.05 suites/all --budget 200`
 
-- `simrun decide --renderer clean,3dgs --population suite --order stratified suites/all`: about the mean of this suite, family by family
-
-- `simrun decide --renderer 3dgs,onefixer --ask better --metric lateral_distance_m=0.05 suites/all`: at least 5 cm better?
-
-- `simrun decide --renderer clean,3dgs --population suite --control family --control runs/last-week suites/all`
+- `simrun decide --renderer clean,3dgs --population suite suites/all`: about the mean of this suite
 
 - `simrun decide --renderer 3dgs --baseline-file runs/last-week suites/all`: drives the change alone, against the same renderer last week
 
 - `simrun decide --renderer clean,3dgs --executor ray --look-every 50 --store s3://bucket/night suites/all`: 100 rollouts at a time
 
-Exit codes: 0 non-inferior (or better), 1 worse (or not better), 2 bad input or a broken policy, 3 undecided at the ceiling,
+Exit codes: 0 non-inferior, 1 worse, 2 bad input or a broken policy, 3 undecided at the ceiling,
 4 rollouts could not be run, 5 could not be scored. docs/sequential.md says what is guaranteed.
 """
 
@@ -107,25 +95,8 @@ def decide(
     gate: Annotated[
         str, Flag("Gate whose margins are asked about where no --metric is named.")
     ] = "default",
-    ask: Annotated[
-        Literal["non-inferior", "better"], Flag("At most MARGIN worse, or at least MARGIN better?")
-    ] = "non-inferior",
-    expect: Annotated[
-        float | None,
-        Flag("Expected difference, which makes the decision fast. Default: that nothing changes."),
-    ] = None,
     alpha: Alpha = 0.05,
-    method: Annotated[
-        Method | None, Flag("Default: betting where differences are bounded.")
-    ] = None,
     population: Asked = "scenes",
-    control: Annotated[
-        tuple[str, ...],
-        Flag("With --population suite: take out known variance. Repeatable.", metavar="family|RUN"),
-    ] = (),
-    first_look: Annotated[
-        int, Flag("Scenes before the first look of asymptotic metrics.", min=5)
-    ] = FIRST_LOOK,
     min_scenes: Annotated[
         int | None, Flag("Scenes before any decision. Default: the gate's, else 2.", min=2)
     ] = None,
@@ -138,46 +109,28 @@ def decide(
     than another.
 
     `--renderer` or `--policy` names the baseline and the one in question; with `--baseline-file`
-    the latter alone. `--seeds auto:N` takes up to N seeds of a scene, chosen by cost against
-    variance. An interrupted decision continues when the same command is given again, and decides
-    the same.
+    the latter alone. An interrupted decision continues when the same command is given again, and
+    decides the same.
     """
     check_preset(options.preset)
     spec = None if metric else load_gate(gate)[0]
-    if spec is not None and (ask != "non-inferior" or expect is not None):
-        raise InputError(
-            f"{f'--ask {ask}' if ask != 'non-inferior' else '--expect'}: no metric is named",
-            "name it with --metric",
-        )
-    asked = questions_of(metric, ask, expect, method) if spec is None else questions_of_gate(spec)
+    asked = questions_of(metric) if spec is None else questions_of_gate(spec)
     least = min_scenes or (2 if spec is None else spec.min_scenes)
     population = population_of(
         population, design.max_missing, f"--max-missing {design.max_missing:g}"
     )
-    question = Question(asked, alpha, population, first_look, least)
-    is_auto = what.seeds.startswith(AUTO)
-    if is_auto and population == "suite":
-        raise InputError(
-            f"--seeds {what.seeds}: the suite's mean is over the same seeds in every scene",
-            "give a number of seeds",
-        )
+    question = Question(asked, alpha, population, least)
     how = where.arguments() | care.arguments()
-    plan = plan_of(
-        replace(what, seeds=what.seeds.removeprefix(AUTO)),
-        options,
-        stored=baseline_file is not None,
-    )
+    plan = plan_of(what, options, stored=baseline_file is not None)
     stored = (
         None
         if baseline_file is None
         else side_of_baseline(baseline_file, plan, options.baseline, design.max_missing)
     )
-    controls = controls_of(control, plan, question, design.order, stored)
     decided = decide_into(
         plan,
         question,
-        replace(design, auto_seeds=is_auto),
-        controls,
+        design,
         out,
         quiet or as_json,
         stored,
@@ -312,9 +265,7 @@ def side_of_baseline(
     return stored_side(stored.rows, arm.renderer, arm.policy, planned, max_missing, path)
 
 
-def questions_of(
-    metrics: Sequence[str], asked: Any, expected: float | None, method: Method | None
-) -> tuple[MetricQuestion, ...]:
+def questions_of(metrics: Sequence[str]) -> tuple[MetricQuestion, ...]:
     """Read ``--metric NAME[=MARGIN]``, repeatable or comma-separated.
 
     Raises:
@@ -330,7 +281,7 @@ def questions_of(
                 f"--metric {text}: margin {margin!r} is no number",
                 "write NAME=MARGIN, as progress=0.05",
             ) from None
-        found.append(metric_question(name, value, asked, expected, method=method))
+        found.append(metric_question(name, value))
     names = [one.metric for one in found]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
@@ -345,7 +296,7 @@ def questions_of_gate(spec: GateSpec) -> tuple[MetricQuestion, ...]:
         InputError: The gate has no margin.
     """
     found = tuple(
-        metric_question(name, rule.margin, "non-inferior", binding=rule.must_decide)
+        metric_question(name, rule.margin, binding=rule.must_decide)
         for name, rule in spec.metrics.items()
         if rule.margin is not None
     )
@@ -357,66 +308,10 @@ def questions_of_gate(spec: GateSpec) -> tuple[MetricQuestion, ...]:
     return found
 
 
-def controls_of(
-    texts: Sequence[str],
-    plan: RunPlan,
-    question: Question,
-    order: Order,
-    stored: StoredSide | None = None,
-) -> dict[str, Control]:
-    """Read ``--control``: ``family``, or run folders.
-
-    Args:
-        texts: What was given.
-        plan: What may be driven.
-        question: What is to be decided.
-        order: Of the scenes.
-        stored: The baseline's side, where it was driven earlier.
-
-    Raises:
-        InputError: Controls for the population ``scenes``, families that the order takes out
-            already, or one that cannot be had.
-    """
-    if not texts:
-        return {}
-    if question.population != "suite":
-        raise InputError(
-            f"--control {texts[0]}: the mean of a control over a population of scenes is not known",
-            "ask about the suite itself with --population suite, or leave it out",
-        )
-    if "family" in texts and order == "stratified":
-        raise InputError(
-            "--control family: with --order stratified, families are taken out by the order",
-            "leave out one of the two",
-        )
-    base, asked = arms_asked(plan, stored is not None)
-    if base.policy != asked.policy and any(text != "family" for text in texts):
-        raise InputError(
-            "--control RUN: two policies are compared",
-            "take --control family: an earlier run is of two renderers",
-        )
-    scenes = list(plan.scenarios)
-    baseline = base.renderer if stored is None else stored.renderer
-    candidate = asked.renderer
-    paths = {cell.scene: cell.ref.path for cell in plan.cells}
-    out: dict[str, Control] = {}
-    for text in texts:
-        rows = None if text == "family" else rows_of_run(read_run(Path(text)))
-        for one in question.metrics:
-            made = (
-                variance.of_families(paths)
-                if rows is None
-                else variance.of_rows(rows, one.metric, scenes, candidate, baseline, text)
-            )
-            out[one.metric] = variance.join(out[one.metric], made) if one.metric in out else made
-    return out
-
-
 def decide_into(
     plan: RunPlan,
     question: Question,
     design: Design,
-    controls: Mapping[str, Control],
     root: Path | None,
     quiet: bool,
     stored: StoredSide | None = None,
@@ -428,7 +323,6 @@ def decide_into(
         plan: From `plan_of`.
         question: What is to be decided.
         design: How scenes are drawn.
-        controls: From `controls_of`.
         root: Run folder; None: named after the command.
         quiet: No progress.
         stored: The baseline's side, where it was driven earlier.
@@ -444,7 +338,7 @@ def decide_into(
             f"{plural(scenes, 'scene')}: nothing is decided on fewer than {least} (min_scenes)",
             "name more scenes, or drive these and judge all of them: simrun --renderer A,B SCENARIO..., then simrun gate RUN",
         )
-    plan = replace(plan, question=key_of(question, design, controls, stored))
+    plan = replace(plan, question=key_of(question, design, stored))
     folder = root or Path(
         "runs", f"decide-{slug(next(iter(plan.scenarios)))}-{plan.command_key}"
     )  # by the command alone
@@ -457,7 +351,6 @@ def decide_into(
             folder,
             command=["simrun", *sys.argv[1:]],
             progress=progress,
-            controls=controls,
             stored=stored,
             **how,
         )

@@ -47,8 +47,8 @@ from evaluators.statistics.baselines import (
     table_of_run,
     write_baseline,
 )
+from evaluators.statistics.decision import Question, stopping_note
 from evaluators.statistics.gate import GateSpec, GateVerdict, judge, judge_table, load_gate
-from evaluators.statistics.sequential.question import Question, stopping_note
 from evaluators.statistics.verdicts import Outcome, outcome_of_failures, worst
 from scenarios.suite import load_suite
 
@@ -209,7 +209,7 @@ class UntilDecided:
 def gate(
     until: UntilDecided,
     what: Annotated[What, Only("policy", "seeds", "overrides")],
-    design: Annotated[Design, Only("order", "budget")],
+    design: Annotated[Design, Only("budget")],
     where: Where,
     run: Annotated[
         Path | None, Positional("A run folder; with --until-decided it is written.")
@@ -336,7 +336,7 @@ def _until_decided(
         questions_of_gate(spec), until.alpha, population, min_scenes=spec.min_scenes
     )
     design = replace(design, max_failed=spec.max_failed, max_missing=spec.max_missing)
-    decided = decide_into(plan, question, design, {}, run, as_json, stored, **how)
+    decided = decide_into(plan, question, design, run, as_json, stored, **how)
     found = read_run(run)
     rows = rows_of_run(found)
     driven = {(str(row["scene"]), int(row["seed"])) for row in rows}

@@ -1,22 +1,17 @@
-"""Drive scenes in random or stratified order until a question is decided, into an ordinary run
-folder.
+"""Drive scenes in random order until a question is decided, into an ordinary run folder.
 
 Scenes are driven in batches. After each, the state follows from the scenes so far and their order
-alone (`statistics.sequential`), and so does what is driven next: never from workers, times or
-interruptions. The same command therefore reaches the same decision after any kill.
+alone (`evaluators.statistics.decision`), never from workers, times or interruptions. The same command therefore reaches the same decision after any kill.
 """
 
 from __future__ import annotations
 
-import math
 import time
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Protocol
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import stream
@@ -40,24 +35,21 @@ from alpasim_plugin.runs.run import (
 from alpasim_plugin.runs.summary import pool_of
 from evaluators.statistics.arms import Arm, arms_of, as_policy, short_name, usual_base
 from evaluators.statistics.baselines import StoredSide
-from evaluators.statistics.gate import failures_of
-from evaluators.statistics.sequential.control import Control, adjusted_draws
-from evaluators.statistics.sequential.decision import State, look_as_dict, outcome_of, state_after
-from evaluators.statistics.sequential.differences import (
-    SceneDifferences,
-    next_seeds,
-    scene_differences,
-)
-from evaluators.statistics.sequential.draws import Strata, families_of
-from evaluators.statistics.sequential.question import (
-    OPPOSITE,
+from evaluators.statistics.decision import (
     SCHEMA_VERSION,
+    WORDS,
     Decision,
-    Order,
     Question,
+    SceneDifferences,
+    State,
+    look_as_dict,
+    outcome_of,
     question_as_dict,
+    scene_differences,
+    state_after,
     write_decision,
 )
+from evaluators.statistics.gate import failures_of
 from evaluators.statistics.verdicts import Outcome, outcome_of_failures
 
 KIND = "decide"  # of run.json
@@ -77,34 +69,18 @@ class Design:
     """How scenes are drawn.
 
     Attributes:
-        order: ``random``, or ``stratified``: every batch holds the families of scenes in proportion
-            (`sequential.draws`).
         order_seed: Key of the order.
         look_every: Scenes between looks.
         budget: Most rollouts; None: as many as the plan has.
-        auto_seeds: Choose the seeds of a scene by cost against variance; otherwise all of the plan
-            are driven.
-        scene_cost: What a new scene costs, in pairs of rollouts.
         max_failed: Share of rollouts that may fail.
         max_missing: Share of pairs of a metric that may lack.
     """
 
-    order: Annotated[
-        Order,
-        Flag(
-            "With --population suite, stratified: between looks every family of scenes in proportion."
-        ),
-    ] = "random"
     order_seed: Annotated[int, Flag("Key of the order of scenes.", min=0)] = 0
     look_every: Annotated[int, Flag("Scenes between looks.", min=1)] = 5
     budget: Annotated[
         int | None, Flag("Most rollouts; then undecided. Default: all of the suite.", min=2)
     ] = None
-    auto_seeds: bool = False
-    scene_cost: Annotated[
-        float,
-        Flag("What a new scene costs (a reconstruction, say), in pairs of rollouts.", min=0.0),
-    ] = 0.0
     max_failed: float = 0.0
     max_missing: Annotated[
         float, Flag("Share of pairs that may lack a value.", min=0.0, max=0.99)
@@ -121,14 +97,9 @@ class Decided:
     outcome: Outcome
 
 
-def key_of(
-    question: Question,
-    design: Design,
-    controls: Mapping[str, Control],
-    stored: StoredSide | None = None,
-) -> str:
+def key_of(question: Question, design: Design, stored: StoredSide | None = None) -> str:
     """Return the digest of what decides which rollouts are driven, besides the plan."""
-    asked = [asdict(question), asdict(design), {name: one.digest for name, one in controls.items()}]
+    asked = [asdict(question), asdict(design)]
     return digest(asked if stored is None else [*asked, stored.digest])
 
 
@@ -140,32 +111,6 @@ def drawing_order(scenes: Sequence[str], order_seed: int) -> list[str]:
     return [names[i] for i in stream("decide", order_seed, "decide/order").permutation(len(names))]
 
 
-def strata_of(plan: RunPlan, question: Question, design: Design, most: int) -> Strata | None:
-    """Return families and batches of a stratified order, None for a random one.
-
-    Args:
-        plan: All cells that may be driven.
-        question: What is to be decided.
-        design: How scenes are drawn.
-        most: Scenes that can be driven: a batch ends there.
-
-    Raises:
-        InputError: The guarantee would not hold, or there is only one family.
-    """
-    if design.order == "random":
-        return None
-    if question.population != "suite":
-        raise InputError(
-            f"--order {design.order}: the shares of families in a population of scenes are not known",
-            "ask about the suite itself with --population suite, or leave it out",
-        )
-    sizes = [min(design.look_every, most - begun) for begun in range(0, most, design.look_every)]
-    return Strata(
-        families_of({cell.scene: cell.ref.path for cell in plan.cells}, f"--order {design.order}"),
-        tuple(sizes),
-    )
-
-
 def execute_decision(
     plan: RunPlan,
     question: Question,
@@ -174,7 +119,6 @@ def execute_decision(
     workers: int | None,
     command: Sequence[str],
     progress: DecisionProgress,
-    controls: Mapping[str, Control],
     stored: StoredSide | None = None,
     *,
     certificate: Certify = "one",
@@ -195,7 +139,6 @@ def execute_decision(
         workers: As for a run; the results do not depend on them.
         command: For ``run.json``.
         progress: Shows rollouts and looks.
-        controls: METRIC -> what takes out variance; for the population ``suite`` only.
         stored: The baseline's rollouts where they were driven earlier; the plan then has the
             renderer in question alone.
         certificate: Whether to repeat a rollout.
@@ -205,11 +148,10 @@ def execute_decision(
         executor, store: As for a run; the decision does not depend on them.
 
     Raises:
-        InputError: The folder holds another run, or the question cannot be asked in this order of
-            scenes.
+        InputError: The folder holds another run.
         InfrastructureError: Another process writes the folder.
     """
-    drawing = _Drawing(plan, question, design, controls, stored)
+    drawing = _Drawing(plan, question, design, stored)
     threads = thread_budget(
         workers, design.look_every * drawing.per_seed * len(plan.seeds), executor
     )
@@ -279,33 +221,24 @@ class _Drawing:
         plan: RunPlan,
         question: Question,
         design: Design,
-        controls: Mapping[str, Control],
         stored: StoredSide | None,
     ) -> None:
-        self.plan, self.question, self.design, self.controls, self.stored = (
-            plan,
-            question,
-            design,
-            controls,
-            stored,
-        )
+        self.plan = plan
+        self.question = question
+        self.design = design
+        self.stored = stored
         self.base, self.asked = arms_asked(plan, stored is not None)
         self.baseline = stored.name if stored is not None else short_name(self.base, self.asked)
         self.candidate = short_name(self.asked, self.base)
         self.per_seed = 1 if stored is not None else 2
         self.ceiling = min(design.budget or len(plan.cells), len(plan.cells))
-        seeds = 1 if design.auto_seeds else len(plan.seeds)
-        self.horizon = max(1, min(len(plan.scenarios), self.ceiling // (self.per_seed * seeds)))
-        self.strata = strata_of(plan, question, design, self.horizon)
-        self.order = (
-            drawing_order(list(plan.scenarios), design.order_seed)
-            if self.strata is None
-            else self.strata.order(stream("decide", design.order_seed, "decide/strata"))
-        )
+        self.per_scene = self.per_seed * len(plan.seeds)
+        self.horizon = max(1, min(len(plan.scenarios), self.ceiling // self.per_scene))
+        self.order = drawing_order(list(plan.scenarios), design.order_seed)
         self._of_scene: dict[str, list[Cell]] = {}
         for cell in plan.cells:
             self._of_scene.setdefault(cell.scene, []).append(cell)
-        self._chosen: dict[str, int] = {}  # scene -> seeds
+        self._n_chosen = 0
         self.manifests: dict[str, dict[str, Any]] = {}
         self.looks: list[Any] = []
         self.differences: dict[str, SceneDifferences] = {}
@@ -320,7 +253,7 @@ class _Drawing:
     @property
     def scenes(self) -> list[str]:
         """Give the scenes driven so far, in their order."""
-        return self.order[: len(self._chosen)]
+        return self.order[: self._n_chosen]
 
     @property
     def cells(self) -> list[Cell]:
@@ -333,19 +266,17 @@ class _Drawing:
         """
         if self.stopped:
             return []
-        left = self.order[len(self._chosen) :]
+        left = self.order[self._n_chosen :]
         if not left:
             self.stopped = f"all {len(self.order)} scenes are driven"
             return []
-        seeds = self._next_seeds()
-        affordable = (self.ceiling - self.rollouts) // (self.per_seed * seeds)
+        affordable = (self.ceiling - self.rollouts) // self.per_scene
         batch = left[: min(self.design.look_every, affordable)]
         if not batch:
             self.stopped = f"the budget of {self.ceiling} rollouts is spent"
             return []
-        self._chosen |= dict.fromkeys(batch, seeds)
-        chosen = set(self.plan.seeds[:seeds])
-        return [cell for scene in batch for cell in self._of_scene[scene] if cell.seed in chosen]
+        self._n_chosen += len(batch)
+        return [cell for scene in batch for cell in self._of_scene[scene]]
 
     def add(self, cells: Sequence[Cell], manifests: Sequence[dict[str, Any]]) -> None:
         """Take in a batch and look."""
@@ -363,17 +294,13 @@ class _Drawing:
             else RendererRows.of(self.stored.of_cells(driven))
         )
         base = as_policy(there, self.asked.policy)
-        values, adjusted = {}, {}
-        for one in self.question.metrics:
-            found = scene_differences(candidate, base, one.metric, self.scenes)
-            self.differences[one.metric] = found
-            values[one.metric] = found.harm(one.direction)
-            if self.question.population == "suite":
-                adjusted[one.metric] = adjusted_draws(
-                    values[one.metric], one, self.order, self.controls.get(one.metric), self.strata
-                )
-        self.state = state_after(self.question, values, self.horizon, adjusted, len(self.order))
-        self.looks.append(look_as_dict(self.state, self.rollouts, self._chosen[self.scenes[-1]]))
+        values = {}
+        for asked in self.question.metrics:
+            differences = scene_differences(candidate, base, asked.metric, self.scenes)
+            self.differences[asked.metric] = differences
+            values[asked.metric] = differences.harm(asked.facts.direction)
+        self.state = state_after(self.question, values, self.horizon, len(self.order))
+        self.looks.append(look_as_dict(self.state, self.rollouts))
         self.stopped = self._reason_to_stop()
 
     @property
@@ -383,8 +310,8 @@ class _Drawing:
             one.metric
             for one in self.question.metrics
             if one.binding
-            and self.differences[one.metric].missing
-            > self.design.max_missing * self.differences[one.metric].pairs.sum()
+            and self.differences[one.metric].n_missing
+            > self.design.max_missing * self.differences[one.metric].n_pairs
         ]
 
     @property
@@ -398,13 +325,8 @@ class _Drawing:
 
     def record(self) -> Decision:
         """Return ``decision.json``."""
-        outcome, asked = self.outcome, self.question.metrics[0].asked
-        words = {"pass": asked, "regression": OPPOSITE[asked]}
-        chosen_by = (
-            "cost against variance of earlier scenes"
-            if self.design.auto_seeds
-            else "all that were asked for"
-        )
+        outcome = self.outcome
+        words = {"pass": WORDS["good"], "regression": WORDS["bad"]}
         return {
             "schema_version": SCHEMA_VERSION,
             "question": question_as_dict(self.question),
@@ -414,18 +336,6 @@ class _Drawing:
             "order_seed": self.design.order_seed,
             "look_every": self.design.look_every,
             "ceiling": {"scenes": len(self.order), "rollouts": self.ceiling},
-            "seeds": {
-                "most": len(self.plan.seeds),
-                "chosen_by": chosen_by,
-                "scene_cost": self.design.scene_cost,
-            },
-            "controls": {name: one.facts for name, one in self.controls.items()},
-            "drawn": {"order": self.design.order}
-            | (
-                {}
-                if self.strata is None
-                else {"families": dict(Counter(self.strata.family_of.values()))}
-            ),
             "order": self.scenes,
             "looks": self.looks,
             "verdict": words.get(outcome.cause, "undecided"),
@@ -440,27 +350,8 @@ class _Drawing:
         if self.state.answer != "open":
             return "decided"
         if self.lacking:
-            lost = ", ".join(f"{self.differences[name].missing} of {name}" for name in self.lacking)
+            lost = ", ".join(
+                f"{self.differences[name].n_missing} of {name}" for name in self.lacking
+            )
             return f"pairs lack a value: {lost}; more than the share of {self.design.max_missing:g} that is allowed"
         return ""
-
-    def _next_seeds(self) -> int:
-        most = len(self.plan.seeds)
-        if not self.design.auto_seeds:
-            return most
-        if not self.differences:
-            return min(2, most)
-        log_bar, scenes = -math.log(self.question.alpha), len(self.order)
-        wanted = [
-            next_seeds(
-                self.differences[one.metric],
-                one.distance,
-                log_bar,
-                self.design.scene_cost,
-                scenes,
-                most,
-            )
-            for one, now in zip(self.question.metrics, self.state.metrics, strict=True)
-            if one.binding and now.answer == "undecided"
-        ]
-        return max(wanted, default=1)

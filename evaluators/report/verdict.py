@@ -25,9 +25,9 @@ from evaluators.report.numbers import decimals, fixed, short
 from evaluators.report.terminal import LABEL, labelled
 from evaluators.statistics.arms import Arm, short_name
 from evaluators.statistics.baselines import rows_of_run
+from evaluators.statistics.decision import CAUSES, Decision, read_decision
 from evaluators.statistics.gate import Check, GateSpec, GateVerdict, judge
-from evaluators.statistics.sequential.question import Decision, read_decision
-from evaluators.statistics.verdicts import WORDS, Cause, Outcome, outcome_of_failures, worst
+from evaluators.statistics.verdicts import WORDS, Outcome, outcome_of_failures, worst
 
 GATE_NAME = "gate.json"
 WORST = 5  # scenes of a check that are named
@@ -220,7 +220,6 @@ class MetricRow:
     margin: str
     evidence: str
     n_scenes: int
-    guarantee: str
     binding: bool
 
 
@@ -259,13 +258,9 @@ def guarantee(decision: Decision) -> list[str]:
         "scenes": "about the population that the scenes were drawn from",
         "suite": f"about the mean over the {decision['ceiling']['scenes']} scenes of this suite with these seeds",
     }[asked["population"]]
-    families = decision.get("drawn", {}).get("families", {})
-    order = f", in stratified order of {len(families)} families" if families else ""
-    first = f"wrong in at most {100 * asked['alpha']:g} % of runs, over all looks; {of_what}{order}"
-    kinds: dict[str, list[str]] = {}
-    for name, one in asked["metrics"].items():
-        kinds.setdefault(one["guarantee"], []).append(name)
-    return [first, *(f"{', '.join(names)}: {kind}" for kind, names in kinds.items()), asked["rule"]]
+    percent = 100 * asked["alpha"]
+    first = f"wrong in at most {percent:g} % of runs, over all interim analyses; {of_what}"
+    return [first, asked["rule"]]
 
 
 def metric_rows(decision: Decision, known: MetricTable = METRICS) -> list[MetricRow]:
@@ -280,9 +275,7 @@ def metric_rows(decision: Decision, known: MetricTable = METRICS) -> list[Metric
             known.info(name), [now["diff"], one["margin"], *now["interval"]]
         )
         ends = [None if v is None else fixed(scale * v, places, sign=True) for v in now["interval"]]
-        tone = {"non-inferior": "better", "better": "better", "undecided": "unclear"}.get(
-            now["verdict"], "worse"
-        )
+        tone = TONES[CAUSES[now["verdict"]]]
         rows.append(
             MetricRow(
                 name,
@@ -297,7 +290,6 @@ def metric_rows(decision: Decision, known: MetricTable = METRICS) -> list[Metric
                 f"{scale * one['margin']:g}",
                 f"{now['e_good']:.3g} and {now['e_bad']:.3g}",
                 now["n_scenes"],
-                one["guarantee"],
                 one["binding"],
             )
         )
@@ -347,7 +339,7 @@ def chart(decision: Decision, metric: MetricInfo) -> Any:
         scale * np.array([[one["diff"], *one["interval"]] for one in seen], dtype=np.float64).T
     )  # None becomes NaN
     sign = -1.0 if metric.direction == "higher" else 1.0
-    threshold = scale * sign * one["threshold"]
+    threshold = scale * sign * one["margin"]
     limits = [threshold, -threshold] if metric.direction == "none" else [threshold]
     axes = Axes()
     axes.band(n, low, high, VARIANT[1], 0.2)
@@ -382,9 +374,6 @@ def _print_as(metric: MetricInfo, values: Sequence[float | None]) -> tuple[float
     if metric.in_percent:
         return 100.0, " points", decimals(*(None if v is None else 100.0 * v for v in values))
     return 1.0, f" {unit}" if unit else "", decimals(*values)
-
-
-CAUSES: dict[str, Cause] = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}
 
 
 def judge_decided(
@@ -445,6 +434,6 @@ def _decided(check: Check, row: MetricRow, spec: GateSpec, decision: Decision) -
     told = {
         "interval": look["interval"],
         "verdict": look["verdict"],
-        "method": decision["question"]["metrics"][check.metric]["method"],
+        "method": "betting",
     }
     return replace(check, cause=cause, text=text, entry=kept | told)

@@ -1,66 +1,14 @@
 from __future__ import annotations
 
-import json
 from types import SimpleNamespace
 
 import pytest
 
 from alpasim_plugin.alpasim.client.preflight import DriveTimes
 from alpasim_plugin.cli import check_policy
-from alpasim_plugin.cli.check_policy import KNOWN, Drive, ability_over, over_scenes, rehearse
+from alpasim_plugin.cli.check_policy import over_scenes, rehearse
 from alpasim_plugin.core.errors import InfrastructureError
 from scenarios.load import load_scenario
-
-PASSED: dict[str, dict[str, bool]] = json.loads(KNOWN.read_text())["passed"]
-
-
-def drives_of(driver: str) -> list[Drive]:
-    return [
-        Drive(scene, 1, () if ends[driver] else ("offroad",))
-        for scene, ends in PASSED.items()
-        if driver in ends
-    ]
-
-
-def test_a_driver_that_sees_is_abler_than_one_that_follows_the_route_and_that_than_one_that_goes_straight_on() -> (
-    None
-):
-    found = [
-        ability_over(drives_of(name)) for name in ("constant-velocity", "pure-pursuit", "learned")
-    ]
-    estimates = [one["estimate"] for one in found]
-    assert estimates == sorted(estimates)
-    for one in found:
-        low, high = one["ci95"]
-        assert low < one["estimate"] < high
-        assert one["expected_share_ci95"][0] < one["expected_share"] < one["expected_share_ci95"][1]
-        assert f"{one['estimate']:+.2f} logits" in one["text"]
-
-
-def test_passes_everywhere_give_one_bound_and_no_score() -> None:
-    found = ability_over([Drive(scene, 1, ()) for scene in list(PASSED)[:6]])
-    assert found["estimate"] is None
-    assert found["ci95"][0] is not None
-    assert found["ci95"][1] is None
-    assert found["text"].startswith(
-        "no score, it passes all 6 scenes: there is one bound, and no score; above "
-    )
-
-
-def test_scenes_that_no_known_driver_drove_give_no_score() -> None:
-    assert (
-        ability_over([Drive("nowhere", 1, ())])["text"]
-        == "no score: no known driver drove these scenes"
-    )
-    found = ability_over(drives_of("learned"), "behind 3dgs")
-    assert found["estimate"] is None
-    assert found["text"] == "no score: no known driver drove these scenes behind 3dgs"
-    mixed = ability_over([*drives_of("learned"), Drive("nowhere", 1, ()), Drive("lost", 1)])
-    assert "; 2 scenes without a known difficulty or an outcome" in mixed["text"]
-
-
-def test_known_scenes_are_shipped_ones() -> None:
-    assert {load_scenario(name).scene_id for name in ("smoke/curve", "hard/cut_in")} <= set(PASSED)
 
 
 @pytest.mark.parametrize(("times_lost", "outcomes"), [(1, ()), (2, None)])

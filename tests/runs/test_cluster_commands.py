@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from evaluators.statistics.sequential.question import read_decision
+from evaluators.statistics.decision import read_decision
 from tests.runs.cluster_nodes import Nodes
 from tests.runs.grey_policy import BY_GREY
 from tests.runs.grey_renderer import GREY

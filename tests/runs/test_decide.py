@@ -27,12 +27,7 @@ from alpasim_plugin.runs.decide import (
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from evaluators.opening import read_run
 from evaluators.report.html import render_report
-from evaluators.statistics.sequential.question import (
-    DECISION,
-    Question,
-    metric_question,
-    read_decision,
-)
+from evaluators.statistics.decision import DECISION, Question, metric_question, read_decision
 from scenarios.suite import ScenarioRef, expand
 from tests.runs.grey_policy import BY_GREY
 from tests.runs.grey_renderer import GREY
@@ -40,14 +35,13 @@ from tests.runs.test_runs import Announced
 
 DARKER = GREY.replace("Grey", "Darker")
 SHORT = ("timing.duration_us=700000", "timing.warmup_us=100000")
-SAME = Question((metric_question("offroad", 0.6, "non-inferior"),), alpha=0.2)
+SAME = Question((metric_question("offroad", 0.6),), alpha=0.2)
 WORSE = Question(
     (
-        metric_question("lateral_distance_m", 0.01, "non-inferior"),
-        metric_question("offroad", 0.6, "non-inferior"),
+        metric_question("offroad_margin_m", 0.0001),
+        metric_question("offroad", 0.6),
     ),
     population="suite",  # of others a few might be far better, which eight scenes cannot exclude
-    first_look=4,
 )
 
 
@@ -84,7 +78,7 @@ def decide(
     report: bool = False,
 ) -> tuple[Decided, Looks]:
     announced = Looks()
-    asked = replace(plan, question=key_of(question, design, {}))
+    asked = replace(plan, question=key_of(question, design))
     return execute_decision(
         asked,
         question,
@@ -93,7 +87,6 @@ def decide(
         workers,
         ["simrun"],
         announced,
-        {},
         certificate="none",
         report=report,
     ), announced
@@ -117,14 +110,14 @@ def test_a_renderer_that_is_worse_is_found_before_all_scenes_are_driven(worse) -
         "worse",
         "decided",
     )
-    assert decided.outcome.reasons == ("lateral_distance_m is worse",)
-    assert announced.looks == [(2, "open"), (4, "bad")]
-    assert decided.record["order"] == drawing_order(list(plan_of().scenarios), 0)[:4]
+    assert decided.outcome.reasons == ("offroad_margin_m is worse",)
+    assert announced.looks == [(2, "open"), (4, "open"), (6, "bad")]
+    assert decided.record["order"] == drawing_order(list(plan_of().scenarios), 0)[:6]
     assert (decided.record["rollouts"], decided.record["ceiling"]) == (
-        8,
+        12,
         {"scenes": 8, "rollouts": 16},
     )
-    assert len(read_run(root).rollouts) == 8
+    assert len(read_run(root).rollouts) == 12
 
 
 def test_the_order_depends_on_the_seed_and_the_names_alone() -> None:
@@ -132,33 +125,6 @@ def test_the_order_depends_on_the_seed_and_the_names_alone() -> None:
     assert drawing_order(names, 3) == drawing_order(names[::-1], 3)
     assert drawing_order(names, 3) != drawing_order(names, 4)
     assert sorted(drawing_order(names, 3)) == sorted(names)
-
-
-@pytest.mark.slow
-def test_in_stratified_order_every_batch_has_both_families_and_the_record_names_them(
-    tmp_path: Path,
-) -> None:
-    listed = [ref for name in ("smoke/straight", "smoke/curve") for ref in expand(name, SHORT)]
-    refs = [ScenarioRef(ref.path, seed, ref.overrides) for ref in listed for seed in (1, 2)]
-    plan = make_plan(
-        refs, (GREY, DARKER), (BY_GREY,), (0,), RunOptions(images="none", baseline=GREY)
-    )
-    suite = replace(SAME, population="suite", alpha=0.02)
-    decided, announced = decide(tmp_path / "run", suite, plan, Design("stratified", look_every=2))
-    file_of = {cell.scene: cell.ref.path for cell in plan.cells}
-    order = decided.record["order"]
-    assert [len({file_of[scene] for scene in order[at : at + 2]}) for at in (0, 2)] == [2, 2]
-    assert (announced.looks[-1], decided.record["stopped"]) == (
-        (4, "good"),
-        "decided",
-    )  # of all scenes the answer is exact
-    assert list(decided.record["drawn"]["families"].values()) == [2, 2]
-    assert "in stratified order of 2 families" in render_report(read_run(tmp_path / "run"))
-    with pytest.raises(InputError, match="shares of families in a population"):
-        decide(tmp_path / "scenes", SAME, plan, Design("stratified"))
-    with pytest.raises(InputError, match="are of one family"):
-        decide(tmp_path / "one", suite, plan_of(4), Design("stratified"))
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 def test_an_interrupted_decision_continues_and_decides_the_same(worse, tmp_path: Path) -> None:
@@ -171,7 +137,7 @@ def test_an_interrupted_decision_continues_and_decides_the_same(worse, tmp_path:
             manifest.unlink()
             break
     decided, announced = decide(root, WORSE, plan_of(), Design(look_every=2))
-    assert sorted(announced.results) == [("ok", False)] * 2 + [("ok", True)] * 6
+    assert sorted(announced.results) == [("ok", False)] * 4 + [("ok", True)] * 8
     assert told(root) == before
     assert decided.record == before
 
@@ -190,8 +156,8 @@ def test_other_commands_read_the_run_and_the_report_shows_the_decision(worse, ca
     assert "was driven until it was decided" in said.err
     page = render_report(read_run(worse[0]))
     assert 'id="decision"' in page
-    assert "after 4 of 8 scenes, 8 of at most 16 rollouts" in page
-    assert "wrong in at most 5 % of runs, over all looks" in page
+    assert "after 6 of 8 scenes, 12 of at most 16 rollouts" in page
+    assert "wrong in at most 5 % of runs, over all interim analyses" in page
     assert page.count("<svg") >= 2
 
 
@@ -261,7 +227,7 @@ def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path: Path, c
     out = capsys.readouterr().out
     assert out.startswith("verdict  ")
     assert "non-inferior, after 2 of 2 scenes" in out
-    assert "wrong in at most 40 % of runs, over all looks" in out
+    assert "wrong in at most 40 % of runs, over all interim analyses" in out
     assert run_command([*words, str(tmp_path / "run"), "--json"]) == 0
     both = json.loads(capsys.readouterr().out)["decision"]
     assert both["verdict"] == "non-inferior"
@@ -290,11 +256,6 @@ def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path: Path, c
         (["--renderer", f"{GREY},{DARKER}", "--metric", "progress=much"], "no number"),
         (["--renderer", f"{GREY},{DARKER}", "--metric", "progress,progress"], "named twice"),
         (
-            ["--renderer", f"{GREY},{DARKER}", "--metric", "progress", "--control", "family"],
-            "--population suite",
-        ),
-        (["--renderer", f"{GREY},{DARKER}", "--ask", "better"], "no metric is named"),
-        (
             [
                 "--renderer",
                 f"{GREY},{DARKER}",
@@ -306,38 +267,6 @@ def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path: Path, c
                 "0.1",
             ],
             "left out of the suite",
-        ),
-        (
-            [
-                "--renderer",
-                f"{GREY},{DARKER}",
-                "--metric",
-                "progress",
-                "--population",
-                "suite",
-                "--seeds",
-                "auto:3",
-            ],
-            "same seeds in every scene",
-        ),
-        (
-            ["--renderer", f"{GREY},{DARKER}", "--metric", "progress", "--order", "stratified"],
-            "--population suite",
-        ),
-        (
-            [
-                "--renderer",
-                f"{GREY},{DARKER}",
-                "--metric",
-                "progress",
-                "--population",
-                "suite",
-                "--order",
-                "stratified",
-                "--control",
-                "family",
-            ],
-            "taken out by the order",
         ),
     ],
 )
@@ -431,7 +360,7 @@ def test_a_gate_drives_until_its_margins_are_decided(tmp_path: Path, capsys) -> 
     assert "1 of the 3 scenes and seeds that may be driven are not in it" in capsys.readouterr().err
     assert run_command([*words, "--baseline-file", str(tmp_path / "run")]) == 2
     assert "renderers and 1 policies beside a stored baseline" in capsys.readouterr().err
-    # Of the suite itself, family by family: each file with two seeds.
+    # Of the suite itself: each file with two seeds.
     suite = tmp_path / "suite.yaml"
     entries = "".join(
         f"  - {{path: smoke/{name}, seeds: [1, 2]}}\n" for name in ("straight", "curve")
@@ -450,13 +379,8 @@ def test_a_gate_drives_until_its_margins_are_decided(tmp_path: Path, capsys) -> 
         for at, word in enumerate(asked)
         if word != "smoke/curve" and not (word == "--scenes" and asked[at + 1] == "smoke/curve")
     ]
-    assert (
-        run_command([*asked, "--population", "suite", "--order", "stratified"]) == 1
-    )  # exact after the last scene
+    assert run_command([*asked, "--population", "suite"]) == 1  # exact after the last scene
     assert "about the mean over the 4 scenes of this suite" in capsys.readouterr().out
-    assert (read_decision(tmp_path / "suite") or {})["drawn"]["order"] == "stratified"
-    assert run_command([*words, "--order", "stratified"]) == 2
-    assert "shares of families in a population" in capsys.readouterr().err
     assert run_command(["gate", str(tmp_path / "run"), "--scenes", "smoke/curve"]) == 2
     assert run_command(["gate", str(tmp_path / "run"), "--until-decided"]) == 2
     capsys.readouterr()
@@ -468,20 +392,6 @@ def test_a_gate_drives_until_its_margins_are_decided(tmp_path: Path, capsys) -> 
 def test_one_and_two_workers_reach_the_same_decision(worse, tmp_path: Path) -> None:
     decide(tmp_path / "two", WORSE, plan_of(), Design(look_every=2), workers=2)
     assert told(tmp_path / "two") == told(worse[0])
-
-
-@pytest.mark.slow
-def test_seeds_are_chosen_as_the_run_goes(tmp_path: Path) -> None:
-    design = Design(look_every=3, auto_seeds=True, scene_cost=4.0)
-    question = Question(
-        (metric_question("lateral_distance_m", 10.0, "non-inferior"),), first_look=9, min_scenes=9
-    )
-    decided, _ = decide(tmp_path, question, plan_of(12, seeds=(0, 1, 2)), design)
-    seeds = [look["seeds"] for look in decided.record["looks"]]
-    assert seeds[0] == 2  # the pilot
-    assert all(1 <= m <= 3 for m in seeds)
-    assert decided.record["rollouts"] == 2 * sum(3 * m for m in seeds)
-    assert decided.outcome.exit_code == 0
 
 
 @pytest.mark.slow

@@ -1,0 +1,539 @@
+"""Sequential decisions: whether one variant is worse than another, after any number of scenes.
+
+After every scene the state follows from the differences so far and their order alone. Each metric
+has an e-process by betting for each of its two answers (`evaluators.statistics.betting`).
+
+The average of e-processes is an e-process however they depend on each other, so the hypothesis that
+none of a set of metrics is worse is refuted where the average over the set reaches 1 / alpha.
+Metric i is worse if every set that holds it is refuted (closed testing; Vovk and Wang, E-values:
+calibration, combination and applications, Annals of Statistics 49, 2021). This refutes whatever
+Bonferroni does. All metrics are non-inferior if each is (intersection-union test).
+
+``decision.json`` keeps the question, every interim analysis and the answer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from typing_extensions import TypedDict
+
+from alpasim_plugin.core.checksums import read_sealed, write_sealed
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.reading.files import as_shape
+from alpasim_plugin.core.types import F64, I64, Bool, Direction, MetricInfo
+from alpasim_plugin.log.run_folder.sides import Side
+from evaluators.metrics import METRICS
+from evaluators.statistics.betting import (
+    Draws,
+    Plan,
+    bet_sizes,
+    independent,
+    log_capital,
+    lower_bound,
+    without_replacement,
+)
+from evaluators.statistics.paired import reach_of
+from evaluators.statistics.verdicts import Cause, Outcome
+
+Population = Literal["scenes", "suite"]
+Answer = Literal["good", "bad", "open"]
+
+DECISION = "decision.json"
+SCHEMA_VERSION = 2
+AGAIN = "give the command of the run again: finished rollouts are kept"
+WORDS: dict[Answer, str] = {"good": "non-inferior", "bad": "worse", "open": "undecided"}
+CAUSES: dict[str, Cause] = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}
+
+
+@dataclass(frozen=True)
+class MetricQuestion:
+    """The question about one metric: is it at most ``margin`` worse?
+
+    Attributes:
+        facts: The metric.
+        margin: How much worse is accepted, in the metric's unit.
+        binding: The decision waits for this metric; otherwise the metric counts only if it is shown
+            to be worse.
+    """
+
+    facts: MetricInfo
+    margin: float
+    binding: bool = True
+
+    @property
+    def metric(self) -> str:
+        """Give the metric's name."""
+        return self.facts.name
+
+    @property
+    def reach(self) -> float:
+        """Give the greatest difference of a scene that counts."""
+        return reach_of(self.facts, self.margin)
+
+
+@dataclass(frozen=True)
+class Question:
+    """Everything that is to be decided, and how sure.
+
+    Attributes:
+        metrics: One or several.
+        alpha: Probability that the decision is wrong, over all interim analyses.
+        population: ``scenes``: scenes are draws from a population, and its mean is asked about;
+            ``suite``: the mean over this suite's scenes.
+        min_scenes: Scenes before any decision.
+    """
+
+    metrics: tuple[MetricQuestion, ...]
+    alpha: float = 0.05
+    population: Population = "scenes"
+    min_scenes: int = 2
+
+    @property
+    def rule(self) -> str:
+        """Say how several metrics are joined."""
+        bar = f"{1 / self.alpha:g}"
+        if len(self.metrics) == 1:
+            return f"one metric; each answer is given at an e-value of {bar}"
+        n_binding = sum(question.binding for question in self.metrics)
+        return (
+            f"non-inferior if all {n_binding} binding metrics are, each at an e-value of {bar} "
+            f"(intersection-union test: no correction); worse if any of {len(self.metrics)} "
+            "metrics is, by closed testing with averages of e-values"
+        )
+
+
+def metric_question(
+    metric: str, margin: float | None = None, binding: bool = True
+) -> MetricQuestion:
+    """Make the question about one metric.
+
+    Args:
+        metric: Its name.
+        margin: In its unit; None: the metric's own.
+        binding: As in `MetricQuestion`.
+
+    Raises:
+        InputError: A negative margin, or one of 0 where the metric has no better side or where
+            nothing else bounds how much a scene can differ.
+    """
+    facts = METRICS.info(metric)
+    accepted = facts.accepted if margin is None else margin
+    if accepted < 0.0 or not math.isfinite(accepted):
+        raise InputError(
+            f"--metric {metric}={accepted:g}: the margin must be >= 0.", "Give for example 0.05."
+        )
+    question = MetricQuestion(facts, accepted, binding)
+    if accepted == 0.0 and facts.direction == "none":
+        raise InputError(
+            f"--metric {metric}: the metric has no better side and the margin is 0.",
+            "Give a margin: the change to either side that is accepted.",
+        )
+    if question.reach == 0.0:
+        raise InputError(
+            f"--metric {metric}: nothing bounds how much a scene can differ.", "Give a margin."
+        )
+    return question
+
+
+@dataclass(frozen=True)
+class SceneDifferences:
+    """Paired differences of one metric, scene by scene in the order of the drawing.
+
+    Attributes:
+        diff: ``(n,)`` candidate minus baseline, mean over the scene's pairs, in the metric's own
+            sign; NaN where a pair is missing.
+        n_pairs: Pairs planned.
+        n_missing: Of these, pairs without a difference.
+    """
+
+    diff: F64
+    n_pairs: int
+    n_missing: int
+
+    def harm(self, direction: Direction) -> F64:
+        """Return the differences with the sign that makes positive worse; without a better side as
+        they are.
+        """
+        return -self.diff if direction == "higher" else self.diff
+
+
+def scene_differences(
+    candidate: Side, baseline: Side, metric: str, scenes: Sequence[str]
+) -> SceneDifferences:
+    """Return the differences of the scenes named, in their order.
+
+    A scene with a rollout that lacks its pair has no difference: which pairs are lost may depend
+    on how the rollout went.
+
+    Args:
+        candidate: Rollouts of the variant in question, of one policy.
+        baseline: Those of the variant that it is compared with.
+        metric: Its name.
+        scenes: In the order in which they were drawn.
+    """
+    mine = dict(zip(candidate.cells, candidate.values(metric).tolist(), strict=True))
+    base = dict(zip(baseline.cells, baseline.values(metric).tolist(), strict=True))
+    of_scene: dict[str, list[float]] = {scene: [] for scene in scenes}
+    for cell in dict.fromkeys([*mine, *base]):
+        of_scene.setdefault(cell[1], []).append(mine.get(cell, np.nan) - base.get(cell, np.nan))
+    diff = [np.mean(of_scene[scene]) if of_scene[scene] else np.nan for scene in scenes]
+    every = np.concatenate([of_scene[scene] or [np.nan] for scene in scenes])
+    return SceneDifferences(np.array(diff), len(every), int(np.isnan(every).sum()))
+
+
+def closed(log_e: F64) -> F64:
+    """Return the log of the adjusted e-values ``(k, ...)``: for each metric the least average over
+    all sets that hold it.
+
+    The least average of i and any others takes the smallest others, so prefixes of the sorted
+    values are enough.
+
+    Args:
+        log_e: ``(k, ...)`` log e-values of k metrics.
+
+    Example:
+        >>> [round(float(e), 3) for e in np.exp(closed(np.log([60.0, 1.0])))]
+        [30.5, 1.0]
+    """
+    top = np.maximum(np.max(log_e, axis=0), 0.0)
+    scale = np.where(np.isfinite(top), top, 0.0)
+    e = np.exp(np.minimum(log_e - scale, 700.0))  # scaled by the largest, so that none overflows
+    ordered = np.sort(e, axis=0)
+    sums = np.cumsum(ordered, axis=0)
+    least = e.copy()
+    for size in range(2, len(log_e) + 1):
+        # i with the size - 1 smallest others: if i is among the smallest, the size smallest of all.
+        is_among = e <= ordered[size - 2]
+        total = np.where(is_among, sums[size - 1], e + sums[size - 2])
+        least = np.minimum(least, total / size)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(least) + scale)
+
+
+@dataclass(frozen=True)
+class MetricState:
+    """What is known of one metric after n scenes.
+
+    Attributes:
+        metric: Its name.
+        answer: ``non-inferior``, ``worse`` or ``undecided``.
+        n_scenes: Scenes with a difference.
+        diff: Mean difference in the metric's own sign; None without scenes.
+        interval: Bounds in the metric's own sign; each is wrong in at most a share alpha of runs,
+            over all interim analyses. None: no bound yet.
+        e_good: Greatest e-value so far against what the good answer denies.
+        e_bad: The same for the bad answer, adjusted for several metrics.
+    """
+
+    metric: str
+    answer: str
+    n_scenes: int
+    diff: float | None
+    interval: tuple[float | None, float | None]
+    e_good: float
+    e_bad: float
+
+
+@dataclass(frozen=True)
+class State:
+    """What is known after n scenes.
+
+    Attributes:
+        n_scenes: Scenes driven.
+        answer: Over all metrics.
+        metrics: One each, in the order of the question.
+    """
+
+    n_scenes: int
+    answer: Answer
+    metrics: tuple[MetricState, ...]
+
+
+def state_after(
+    question: Question, values: Mapping[str, F64], horizon: int, size: int | None = None
+) -> State:
+    """Return the state after the scenes so far, however often one looked before.
+
+    Args:
+        question: What is to be decided.
+        values: METRIC -> ``(n,)`` differences in the order drawn, positive is worse; NaN where a
+            scene has none.
+        horizon: Most scenes that can be driven: the ceiling that bets are made for.
+        size: Scenes of the suite; None: all can be driven.
+    """
+    n = len(next(iter(values.values())))
+    evidence = [
+        _Evidence.of(asked, question, values[asked.metric], horizon, size or horizon)
+        for asked in question.metrics
+    ]
+    paths = [one_metric.paths(len(question.metrics), n) for one_metric in evidence]
+    log_good = np.maximum.accumulate(np.array([good for good, _ in paths]), axis=1)
+    log_bad = np.maximum.accumulate(closed(np.array([bad for _, bad in paths])), axis=1)
+    bar = -math.log(question.alpha)
+    is_good = log_good >= bar
+    is_bad = log_bad >= bar
+    answer: Answer = "open"
+    if n >= question.min_scenes:
+        binding = [asked.binding for asked in question.metrics]
+        all_good = is_good[binding].all(axis=0) & any(binding)
+        answer = _first(all_good, is_bad.any(axis=0))
+    states = []
+    for i, (asked, metric_evidence) in enumerate(zip(question.metrics, evidence, strict=True)):
+        x = values[asked.metric]
+        center = float(np.nanmean(x)) if np.isfinite(x).any() else None
+        low, high = metric_evidence.interval()
+        if asked.facts.direction == "higher":
+            center, low, high = (None if end is None else -end for end in (center, high, low))
+        e_good, e_bad = (
+            float(np.exp(min(path[i, -1], 700.0))) if n else 0.0 for path in (log_good, log_bad)
+        )
+        word = WORDS[_first(is_good[i], is_bad[i])]
+        n_known = metric_evidence.draws.n
+        states.append(MetricState(asked.metric, word, n_known, center, (low, high), e_good, e_bad))
+    return State(n, answer, tuple(states))
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """The evidence on one metric.
+
+    Attributes:
+        question: What is asked about it.
+        draws: The differences that are known.
+        places: ``(k,)`` scenes to which they belong.
+        plan: Of the bets.
+        suite_mean: The mean of a suite all of whose scenes are driven, else None.
+    """
+
+    question: MetricQuestion
+    draws: Draws
+    places: I64
+    plan: Plan
+    suite_mean: float | None
+
+    @classmethod
+    def of(
+        cls, asked: MetricQuestion, question: Question, x: F64, horizon: int, size: int
+    ) -> _Evidence:
+        known = np.flatnonzero(np.isfinite(x))
+        reach = asked.reach
+        kept = np.clip(x[known], -reach, reach)
+        draws = independent(kept, reach)
+        if question.population == "suite":
+            # Scenes without a difference are left out of the suite.
+            draws = without_replacement(kept, reach, size - len(x) + len(known))
+        is_whole = question.population == "suite" and len(known) == len(x) == size
+        plan = Plan(asked.margin or None, horizon, question.alpha)
+        return cls(asked, draws, known, plan, float(x.mean()) if is_whole else None)
+
+    def paths(self, sharing: int, n: int) -> tuple[F64, F64]:
+        """Return the log e-processes for the good and for the bad answer after each of n scenes.
+
+        Args:
+            sharing: Metrics of which one is enough for the bad answer: its evidence is averaged
+                over them.
+            n: Scenes.
+        """
+        margin = self.question.margin
+        mirror = self.draws.mirrored()
+        if self.question.facts.direction == "none":
+            # A change to either side counts: the size is within the margin if both ends are, and
+            # beyond it if either is.
+            below = np.maximum.accumulate(self._above(mirror, -margin))
+            above = np.maximum.accumulate(self._above(self.draws, -margin))
+            good = np.minimum(below, above)
+            beyond = self._above(self.draws, margin, 2 * sharing)
+            bad = np.logaddexp(beyond, self._above(mirror, margin, 2 * sharing)) - math.log(2.0)
+        else:
+            good = self._above(mirror, -margin)
+            bad = self._above(self.draws, margin, sharing)
+        if self.suite_mean is not None:
+            is_two_sided = self.question.facts.direction == "none"
+            harm = abs(self.suite_mean) if is_two_sided else self.suite_mean
+            answered = good if harm <= margin else bad
+            answered[-1] = np.inf
+        return self._over_scenes(good, n), self._over_scenes(bad, n)
+
+    def _above(self, draws: Draws, mean: float, sharing: int = 1) -> F64:
+        """Return the log e-process against "the mean is at most ``mean``", aimed at ``sharing`` /
+        alpha.
+        """
+        plan = Plan(self.plan.distance, self.plan.horizon, self.plan.alpha / sharing)
+        return log_capital(draws, mean, bet_sizes(draws, mean, plan))
+
+    def _over_scenes(self, path: F64, n: int) -> F64:
+        """Spread a path over n scenes: it stays between the scenes that it knows, and is -inf
+        (nothing said) before the first.
+        """
+        count = np.searchsorted(self.places, np.arange(n), side="right")
+        return np.append(-np.inf, path)[count]
+
+    def interval(self) -> tuple[float | None, float | None]:
+        """Return the bounds of the mean, positive is worse."""
+        if self.suite_mean is not None:
+            return self.suite_mean, self.suite_mean
+        if self.draws.n == 0:
+            return None, None
+        return self._bound(self.draws, 1.0), -self._bound(self.draws.mirrored(), -1.0)
+
+    def _bound(self, draws: Draws, sign: float) -> float:
+        sizes = bet_sizes(draws, sign * self.question.margin, self.plan)
+        return float(lower_bound(draws, sizes, self.plan.log_bar))
+
+
+def _first(good: Bool, bad: Bool) -> Answer:
+    """Return which answer was given first; the bad one of two at once."""
+    when_good = int(np.argmax(good)) if good.any() else len(good)
+    when_bad = int(np.argmax(bad)) if bad.any() else len(bad)
+    if when_good == when_bad == len(good):
+        return "open"
+    return "good" if when_good < when_bad else "bad"
+
+
+def outcome_of(question: Question, state: State, ceiling: str) -> Outcome:
+    """Return the outcome of a decision, with one sentence a metric.
+
+    Args:
+        question: What was asked.
+        state: At the end.
+        ceiling: Why no more scenes are driven, for an undecided end.
+    """
+    if state.answer == "good":
+        return Outcome("pass")
+    if state.answer == "bad":
+        worse = [metric.metric for metric in state.metrics if metric.answer == WORDS["bad"]]
+        return Outcome("regression", tuple(f"{name} is worse" for name in worse))
+    left = [
+        asked.metric
+        for asked, metric in zip(question.metrics, state.metrics, strict=True)
+        if asked.binding and metric.answer == WORDS["open"]
+    ]
+    return Outcome("undecided", (f"{', '.join(left) or 'nothing'} undecided: {ceiling}",))
+
+
+class MetricAsked(TypedDict):
+    """One metric of the question."""
+
+    margin: float  # in the metric's unit
+    binding: bool
+
+
+class AskedRecord(TypedDict):
+    """The question."""
+
+    population: str  # scenes or suite
+    alpha: float  # probability of a wrong decision over all interim analyses
+    rule: str  # how several metrics are joined
+    min_scenes: int
+    metrics: dict[str, MetricAsked]
+
+
+class MetricLook(TypedDict):
+    """One metric at one interim analysis."""
+
+    verdict: str
+    n_scenes: int
+    diff: float | None
+    interval: list[float | None]  # each end holds over all analyses with probability 1 - alpha
+    e_good: float
+    e_bad: float
+
+
+class Look(TypedDict):
+    """One interim analysis."""
+
+    n_scenes: int
+    rollouts: int
+    answer: str  # good, bad or open
+    metrics: dict[str, MetricLook]
+
+
+class Decision(TypedDict):
+    """The file ``decision.json``."""
+
+    schema_version: int
+    question: AskedRecord
+    candidate: str
+    baseline: str
+    policy: str
+    order_seed: int
+    look_every: int
+    ceiling: dict[str, int]  # scenes, rollouts
+    order: list[str]  # scenes driven, in their order
+    looks: list[Look]
+    verdict: str
+    stopped: str  # why no more scenes are driven; empty while the run goes on
+    outcome: dict[str, Any]
+    rollouts: int
+
+
+def question_as_dict(question: Question) -> AskedRecord:
+    """Return a question for JSON."""
+    return {
+        "population": question.population,
+        "alpha": question.alpha,
+        "rule": question.rule,
+        "min_scenes": question.min_scenes,
+        "metrics": {
+            asked.metric: {"margin": asked.margin, "binding": asked.binding}
+            for asked in question.metrics
+        },
+    }
+
+
+def look_as_dict(state: State, rollouts: int) -> Look:
+    """Return an interim analysis for JSON."""
+    metrics: dict[str, MetricLook] = {
+        metric.metric: {
+            "verdict": metric.answer,
+            "n_scenes": metric.n_scenes,
+            "diff": metric.diff,
+            "interval": list(metric.interval),
+            "e_good": metric.e_good,
+            "e_bad": metric.e_bad,
+        }
+        for metric in state.metrics
+    }
+    answer = state.answer
+    return {"n_scenes": state.n_scenes, "rollouts": rollouts, "answer": answer, "metrics": metrics}
+
+
+def write_decision(root: Path, decision: Decision) -> None:
+    """Write ``decision.json`` into a run folder.
+
+    Raises:
+        InfrastructureError: The disk refuses.
+    """
+    write_sealed(root / DECISION, decision)
+
+
+def read_decision(root: Path) -> Decision | None:
+    """Read ``decision.json`` of a run folder; None where the run was no decision.
+
+    Raises:
+        InputError: It is damaged.
+    """
+    path = root / DECISION
+    if not path.exists():
+        return None
+    value, _ = read_sealed(path, AGAIN)
+    shaped: Mapping[str, Any] = as_shape(Decision, value, path, AGAIN)
+    return shaped  # type: ignore[return-value]
+
+
+def stopping_note(root: Path) -> str | None:
+    """Say that the intervals of a fixed number of scenes do not hold for a run that stopped when it
+    was decided; None of any other run.
+    """
+    if read_decision(root) is None:
+        return None
+    return (
+        f"note: {root} was driven until it was decided: only the intervals of {DECISION} and of "
+        "the report's first section hold for it"
+    )
