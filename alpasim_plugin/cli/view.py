@@ -15,7 +15,6 @@ from alpasim_plugin.cli.options import Json, Overwrite, Run, refuse_existing
 from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.core.signals import Stopped
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
 from alpasim_plugin.log.run_folder.reader import read_json
 from alpasim_plugin.log.run_folder.schema import CONTENTS, MANIFEST, RUN_INFO, SUMMARY
@@ -39,9 +38,7 @@ Examples:
 
 - `simrun view runs/us101/rollouts/3dgs/lane-camera/smoke-curve/0`: the same by a rollout's folder
 
-- `simrun view runs/us101 --serve 8000`: at http://127.0.0.1:8000/ while the run goes on; Ctrl-C ends it
-
-Exit codes: 0 the page is written, or the server was stopped by a signal; 2 no such run or rollout; 4 the disk or the port refuses.
+Exit codes: 0 the page is written; 2 no such run or rollout; 4 the disk refuses.
 """
 
 
@@ -54,9 +51,6 @@ def view(
     out: Annotated[
         Path | None, Flag("The page; by default view.html in the run folder.", also="-o")
     ] = None,
-    serve: Annotated[
-        str | None, Flag("Serve a running run on this machine instead.", metavar="HOST:PORT")
-    ] = None,
     camera: Annotated[str | None, Flag("Keep this camera alone.")] = None,
     cells: Annotated[int | None, Flag("Most scene-policy-seed cells in the page.", min=1)] = None,
     max_mb: Annotated[float, Flag("Size of the page, megabytes.", min=1.0)] = DEFAULT_MB,
@@ -64,16 +58,11 @@ def view(
     as_json: Json = False,
 ) -> None:
     """Replay rollouts in a browser: cameras side by side, a map from above, metrics over time,
-    events; offline, or of a running run.
+    events.
     """
     root, of_rollout = find_cell(what)
     wanted = narrowed(what, of_rollout, asked)
     options = Options(int(max_mb * MB), camera=camera)
-    if serve is not None:
-        if out is not None:
-            raise InputError("--serve and --out: both", "give one of them")
-        _serve(root, serve, wanted, options, as_json)
-        return
     if (root / CONTENTS).exists():
         use_run(root, warn)
     so_far = read_so_far(root)
@@ -86,7 +75,7 @@ def view(
     if not so_far.run.rollouts:
         raise InputError(
             f"{root}: no rollout has finished",
-            "wait for the first, or watch with --serve 8000",
+            "wait for the first",
         )
     path = out or root / PAGE
     refuse_existing(out, overwrite, "--out")
@@ -112,22 +101,6 @@ def view(
     print(
         f"page     {shlex.quote(str(path))}, {made.size / MB:.1f} MB, {len(made.shown)} of {len(made.known)} cells"
     )
-
-
-def _serve(root: Path, address: str, wanted: Wanted, options: Options, as_json: bool) -> None:
-    from evaluators.viewer.serve import RunServer, loopback  # a page needs no web server
-
-    with RunServer(loopback(address), lambda: read_so_far(root), wanted, options) as server:
-        print(
-            json.dumps({"serving": str(root), "at": server.url})
-            if as_json
-            else f"watch    {server.url}   # Ctrl-C ends it",
-            flush=True,
-        )
-        try:
-            server.serve_forever()
-        except Stopped:  # how a server ends
-            return
 
 
 def is_run(what: Path) -> bool:

@@ -420,8 +420,7 @@ def index_data(
         run: The run.
         cells: All cells that were asked for, the most telling first.
         here: Those whose documents the page has or can get.
-        state: ``live``, ``notes`` (what was left out, one sentence each), ``report`` (its address,
-            or "") and, of a run that goes on, ``done`` and ``planned``.
+        state: ``notes`` (what was left out, one sentence each) and ``report`` (its address, or "").
     """
     ids, by_policy = {cell.id for cell in here}, any(cell.by_policy for cell in cells)
     units = {

@@ -191,26 +191,25 @@ def make_page(
     """
     shell = len(
         render(
-            as_json(index_data(run, cells, (), {"live": False, "notes": [], "report": report})), {}
+            as_json(index_data(run, cells, (), {"notes": [], "report": report})), {}
         )
     )
     fitted = fit(run, shown, options.max_bytes - shell - NOTES_BYTES, options.fine, options.camera)
     notes = _notes(cells, shown, fitted.too_many, fitted.fine)
-    index = index_data(run, cells, fitted.cells, {"live": False, "notes": notes, "report": report})
+    index = index_data(run, cells, fitted.cells, {"notes": notes, "report": report})
     documents = dict(zip((cell.id for cell in fitted.cells), fitted.documents, strict=True))
     return Page(render(as_json(index), documents), fitted.cells, tuple(notes))
 
 
-def render(index: str, documents: Mapping[str, str], live: bool = False) -> str:
+def render(index: str, documents: Mapping[str, str]) -> str:
     """Fill the template.
 
     Args:
         index: JSON of `index_data`.
         documents: Cell id -> JSON of `cell_data`.
-        live: The page asks its own server for documents.
     """
     filled = {name: Markup(text) for name, text in documents.items()}
-    return fill("viewer.html.j2", SCRIPTS, STYLES, index=Markup(index), documents=filled, live=live)
+    return fill("viewer.html.j2", SCRIPTS, STYLES, index=Markup(index), documents=filled)
 
 
 def fill(template: str, scripts: Sequence[str], styles: Sequence[str], **values: Any) -> str:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import pytest
 import typer
 
-from alpasim_plugin.cli import decide, gate, run, serve, view
+from alpasim_plugin.cli import decide, gate, run, serve
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.cli.options import Json, Only, command_of
 from alpasim_plugin.core.flags import Flag, Positional
@@ -165,17 +165,6 @@ def test_a_gate_that_drives_takes_the_options_of_a_decision(called: Any, tmp_pat
     assert [cell.ref.overrides for cell in given["plan"].cells] == [
         ("timing.duration_us=1000000",)
     ] * 2
-
-
-def test_a_page_of_drives_gets_its_limits(
-    called: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(view, "find_cell", lambda what, doing: (what, None))
-    more = ("--camera", "front", "--cells", "3", "--max-mb", "5", "--seed", "1", "--serve", "0")
-    given = called(view, "_serve", "view", str(tmp_path), *more)
-    options = given["options"]
-    assert (options.camera, options.max_bytes) == ("front", 5_000_000)
-    assert given["wanted"].seeds == (1,)
 
 
 def test_a_server_gets_its_bounds_and_whom_it_trusts(called: Any, tmp_path: Path) -> None:

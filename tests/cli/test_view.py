@@ -65,8 +65,6 @@ def test_what_cannot_be_shown_is_refused(
         ([str(tmp_path)], "no run.json and no manifest.json"),
         ([str(run), "--scene", "nowhere"], "it has smoke-straight, urban-left_turn"),
         ([str(run), "--seed", "7"], "it has 0"),
-        ([str(run), "--serve", "0.0.0.0:80"], "not an address of this machine alone"),
-        ([str(run), "--serve", "80", "--out", "x.html"], "give one of them"),
         (
             [str(run), "--scene", "urban-left_turn", "--renderer", "3dgs"],
             "no finished rollout that was asked for",

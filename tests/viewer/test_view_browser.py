@@ -1,4 +1,4 @@
-"""The replay page in a real browser, from disk and from its server. Slow: needs an installed
+"""The replay page in a real browser, Slow: needs an installed
 Chromium.
 """
 
@@ -12,11 +12,10 @@ from urllib.parse import quote
 
 import pytest
 
-from evaluators.opening import read_run, read_so_far
+from evaluators.opening import read_run
 from evaluators.report import write_report
 from evaluators.viewer.cells import Wanted
 from evaluators.viewer.page import Options, write_page
-from evaluators.viewer.serve import RunServer
 from tests.report.browser import Browser
 from tests.report.make_run import Plan
 from tests.viewer.axe import MISSING, SERIOUS, find_axe, findings
@@ -288,34 +287,6 @@ def test_a_page_without_frames_says_so(browser: Browser, tmp_path: Path) -> None
         )
         == 2
     )
-
-
-def test_a_running_run_fills_up(browser: Browser, watched_run: Path, tmp_path: Path) -> None:
-    root = Path(shutil.copytree(watched_run, tmp_path / "run"))
-    every = [rollout.path for rollout in read_run(root).rollouts]
-    later = unfinished(root, every)
-    browser.complaints.clear()
-    with RunServer(("127.0.0.1", 0), lambda: read_so_far(root), Wanted(), Options()) as server:
-        thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
-        thread.start()
-        browser.visit(server.url)
-        said = "document.getElementById('live').textContent"
-        assert browser.evaluate(said) == f"Live: 0 of {len(every)} rollouts"
-        assert (
-            browser.evaluate("document.getElementById('empty').textContent")
-            == "Waiting for the first rollout to finish."
-        )
-        for path in (every[0], *every[1:]):
-            (root / path / "manifest.json").write_bytes(later[path])
-            if path == every[0]:
-                wait(browser, "player.cell !== null && player.cell.drives.length === 1")
-        wait(browser, f"{said} === 'Live: {len(every)} of {len(every)} rollouts'")
-        wait(browser, "player.cell.drives.length === 3")
-        settled(browser)
-        assert len(browser.evaluate(SEEN)) == 3
-        server.shutdown()
-        thread.join()
-    assert browser.complaints == []
 
 
 def wait(browser: Browser, condition: str) -> None:

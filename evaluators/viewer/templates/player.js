@@ -2,7 +2,6 @@
 // The page: which cell is shown, the clock, and the controls. Everything that depends on time is set by `seek`.
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
-const POLL_MS = 2000;
 const LAYERS = [["plan", ["plan"]], ["plan and map", ["plan", "samples", "lanes", "recorded", "users"]], ["where it comes from (blue: recorded, orange: made up)", ["trust"]], ["nothing", []]];
 
 const player = {
@@ -22,7 +21,6 @@ const player = {
     this.showIndex();
     window.addEventListener("hashchange", () => this.openFromAddress());
     if (!this.openFromAddress() && this.here().length) this.open(this.here()[0].id);
-    if (index.live) this.poll();
   },
 
   // Cells.
@@ -33,14 +31,10 @@ const player = {
     this.moments.loadFlips(this.index.cells);
     this.moments.loadNotes(this.index.notes);
     this.fillPickers();
-    const { live, done, planned, finished } = this.index;
-    byId("live").hidden = !live;
-    if (live) byId("live").textContent = !finished ? `Live: ${done} of ${planned} rollouts` : `Finished: ${done} rollouts`;
     byId("report").hidden = !this.index.report;
     byId("report").href = this.index.report;
     byId("empty").hidden = this.here().length > 0;
-    const nothing = "No rollout of this run ran to its end, so there is nothing to watch.";
-    byId("empty").textContent = live ? "Waiting for the first rollout to finish." : nothing;
+    byId("empty").textContent = "No rollout of this run ran to its end, so there is nothing to watch.";
     byId("main").hidden = !this.here().length;
   },
 
@@ -70,10 +64,10 @@ const player = {
     if (fitting.length) this.open(fitting[0].id); else this.fillPickers();
   },
 
-  async open(id, { renderer = null, t = null, again = false } = {}) {
+  async open(id, { renderer = null, t = null } = {}) {
     this.opening = id;
     const stored = byId("cell-" + id);
-    const cell = stored ? JSON.parse(stored.textContent) : await this.fetchJson(`cells/${id}.json`);
+    const cell = stored ? JSON.parse(stored.textContent) : null;
     if (!cell || this.opening !== id) return;
     const { index } = this, entry = this.entry(id), driven = cell.drives.filter((drive) => drive.ego);
     const changed = renderer ?? entry.flips[0]?.renderer ?? driven[0]?.renderer;
@@ -97,8 +91,8 @@ const player = {
     byId("total").textContent = seconds(this.to);
     this.legend();
     const parts = cell.parts.find((one) => one.renderer === changed) ?? this.moments.all[0];
-    this.seek(t ?? (again ? this.t : parts ? parts.t - 1000 : 0));
-    if (!again) this.say(`${entry.scene}, ${entry.policy}, seed ${entry.seed}`);
+    this.seek(t ?? (parts ? parts.t - 1000 : 0));
+    this.say(`${entry.scene}, ${entry.policy}, seed ${entry.seed}`);
   },
 
   fillCameraPicker() {
@@ -234,30 +228,6 @@ const player = {
     if (!cell?.here) { this.say("That rollout is not in this page."); byId("missing").hidden = false; return false; }
     this.open(cell.id, { renderer: words.get("renderer"), t: words.has("t") ? Number(words.get("t")) * 1000 : null });
     return true;
-  },
-
-  // A run that goes on: what has finished since is picked up.
-  async fetchJson(path) {
-    try {
-      const answer = await fetch(path, { cache: "no-store" });
-      if (answer.ok) return await answer.json();
-      this.say(`${path}: ${answer.status}`);
-    } catch { this.say("The server does not answer; is simrun view still running?"); }
-    return null;
-  },
-
-  async poll() {
-    const next = await this.fetchJson("index.json");
-    byId("live").classList.toggle("lost", !next);
-    if (next) {
-      const before = this.entry(this.cell?.id), after = next.cells.find((cell) => cell.id === before?.id);
-      this.index.renderers.splice(0, Infinity, ...next.renderers);
-      Object.assign(this.index, { ...next, renderers: this.index.renderers });
-      this.showIndex();
-      if (!this.cell && this.here().length) await this.open(this.here()[0].id);
-      else if (after && JSON.stringify(after.outcomes) !== JSON.stringify(before.outcomes)) await this.open(after.id, { again: true });
-    }
-    if (!next?.finished) setTimeout(() => this.poll(), POLL_MS);
   },
 
   bind() {
