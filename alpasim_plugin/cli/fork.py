@@ -1,5 +1,5 @@
-"""``simrun fork``, ``simrun probe`` and ``simrun why``: counterfactuals of a logged rollout, and
-the page that shows why a drive failed.
+"""``simrun fork``: continue a logged rollout with another part. ``simrun why``: the page of evidence
+for a rollout that failed.
 """
 
 from __future__ import annotations
@@ -12,80 +12,84 @@ from typing import Annotated
 
 import typer
 
-from alpasim_plugin.cli.options import Json, Run
+from alpasim_plugin.cli.options import Json, run_and_cell
 from alpasim_plugin.cli.progress import warn
-from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.cli.run import last_lines
+from alpasim_plugin.core.errors import InputError, error_text
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.parts import resolve, resolve_renderer, split_names
 from alpasim_plugin.log.run_folder.reader import read_json
-from alpasim_plugin.log.run_folder.schema import PROBE_JSON, RUN_INFO, slug
+from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME, slug
 from alpasim_plugin.runs.fork import Change, fork_rollout
-from alpasim_plugin.runs.logged_rollout import find_rollout
-from alpasim_plugin.runs.probe import probe_rollout, write_probe
+from alpasim_plugin.runs.logged_rollout import find_rollout, named_row
 from alpasim_plugin.runs.repair import use_run
-from alpasim_plugin.runs.why import explain
+from alpasim_plugin.runs.why import explain, worst_failure
 from evaluators.opening import read_run
 from evaluators.viewer.cause import write_cause
 
 FORK_EPILOG = """
 Examples:
 
-- `simrun fork runs/us101 --cell 3dgs/lane-camera/us101/0 --at 2.2 --renderer clean`
+- `simrun fork runs/us101/3dgs/lane-camera/us101/0 --at 2.2 --renderer clean`
 
-- `simrun fork runs/us101 --cell 3dgs/lane-camera/us101/0 --at 2.2` continues unchanged and checks that the result equals the log
+- `simrun fork runs/us101/3dgs/lane-camera/us101/0 --at 2.2`: continue unchanged and check that the result equals the log
 """
-PROBE_EPILOG = (
-    "Example: `simrun probe runs/us101 --cell clean/lane-camera/us101/0 --renderers clean,3dgs`"
-)
+WHY_EPILOG = """
+Examples:
 
-Name = Annotated[str, Flag("RENDERER/POLICY/SCENE/SEED as in the tables, or the rollout's folder.")]
-Moved = Annotated[str | None, Flag("The rollout's scenario, if it has moved.")]
+- `simrun why`: the worst failure of the newest run
+
+- `simrun why runs/us101`: the worst failure of that run
+
+- `simrun why runs/us101/3dgs/lane-camera/us101/0`
+"""
 
 
 def fork(
-    run: Run,
-    cell: Name,
+    cell: Annotated[
+        Path, Positional("The rollout: RUN/RENDERER/POLICY/SCENE/SEED.", metavar="RUN/CELL")
+    ],
     at: Annotated[float, Flag("Seconds after the first frame at which the change takes effect.")],
     renderer: Annotated[str | None, Flag("Renderer after the change.")] = None,
     policy: Annotated[
-        str | None, Flag("Policy after the change; it has the history of observations.")
+        str | None, Flag("Policy after the change; it has seen the frames before it.")
     ] = None,
     seed: Annotated[int | None, Flag("Seed of the new parts.", min=0)] = None,
     out: Annotated[
         Path | None, Flag("Run folder to write; by default one below RUN/forks/.")
     ] = None,
-    video: Annotated[bool, Flag("Write front.mp4 of the continuation.")] = False,
-    scenario: Moved = None,
     as_json: Json = False,
 ) -> None:
     """Continue a logged rollout from an instant on with another renderer, policy or seed.
 
     Writes a run folder with the original and the continuation, scored and reported like any run.
     """
-    _check_names([renderer] if renderer else [], policy)
+    if renderer is not None:
+        if len(split_names(renderer)) > 1:
+            raise InputError(f"--renderer {renderer}: several names", "Name one renderer.")
+        resolve_renderer(renderer)
+    if policy is not None:
+        resolve("policy", policy)
+    run, name = run_and_cell(cell)
+    if not name:
+        raise InputError(f"{cell}: a run, not a rollout", "Name RUN/RENDERER/POLICY/SCENE/SEED.")
     use_run(run, warn)
-    past = find_rollout(run, cell, scenario)
+    past = find_rollout(run, name)
     change = Change(round(at * 1e6), renderer, policy, seed)
     root = out or run / "forks" / slug(f"{past.name} {change.label}")
-    result = fork_rollout(past, change, root, "all" if video else "none", ["simrun", *sys.argv[1:]])
+    result = fork_rollout(past, change, root, ["simrun", *sys.argv[1:]])
     fork_facts = read_json(root / "run.json")["fork"]
     if as_json:
-        print(
-            json.dumps(
-                {
-                    "out": str(root),
-                    "fork": fork_facts,
-                    "exit_code": result.exit_code,
-                    "summary": result.summary,
-                }
-            )
-        )
+        facts = {
+            "out": str(root),
+            "fork": fork_facts,
+            "exit_code": result.exit_code,
+            "summary": result.summary,
+        }
+        print(json.dumps(facts))
         raise typer.Exit(result.exit_code)
     for failed in result.summary["failures"]["cells"]:
-        print(
-            f"failed: {failed['path']}: {failed['error']['message']} -> {failed['error']['hint']}",
-            file=sys.stderr,
-        )
+        print(f"{failed['path']}\n{error_text(failed['error'])}", file=sys.stderr)
     if fork_facts:
         print(f"replay to {at:g} s   equal to the log, bit for bit")
         after = fork_facts.get("continuation")
@@ -99,108 +103,45 @@ def fork(
     raise typer.Exit(result.exit_code)
 
 
-def probe(
-    run: Run,
-    cell: Name,
-    renderers: Annotated[str, Flag("Two or more, comma-separated; the first is the reference.")],
-    out: Annotated[
-        Path | None, Flag("Folder to write; by default below RUN/probes/, where the report looks.")
-    ] = None,
-    scenario: Moved = None,
-    as_json: Json = False,
-) -> None:
-    """Query the policy at a logged rollout's poses behind several renderers and measure the
-    distance between its plans.
-    """
-    names = tuple(split_names(renderers))
-    _check_names(names, None)
-    use_run(run, warn)
-    past = find_rollout(run, cell, scenario)
-    folder = write_probe(probe_rollout(past, names), past, names, out)
-    found = read_json(folder / PROBE_JSON)
-    if as_json:
-        print(json.dumps({"out": str(folder), "probe": found}))
-        return
-    for pair in found["pairs"]:
-        gaps = [
-            f"{key[4:-2]} ahead median {gap['median']:.3f} m, 95 % {gap['p95']:.3f} m"
-            for key in pair
-            if (gap := _gap(pair, key))
-        ]
-        first = pair["first_divergence"]
-        divergence = (
-            f"diverges by {first['gap_m']:.2f} m at {first['after_us'] * 1e-6:.1f} s"
-            if first
-            else "never diverges by the threshold"
-        )
-        print(
-            f"{pair['renderer']} compared with {pair['reference']}: {'; '.join(gaps)}; {divergence} ({found['threshold_m']} m)"
-        )
-    print(f"probe  {folder}")
-
-
-def _gap(pair: dict[str, dict[str, float]], key: str) -> dict[str, float] | None:
-    return pair[key] if key.startswith("gap_") else None
-
-
-def _check_names(renderers: list[str] | tuple[str, ...], policy: str | None) -> None:
-    for name in renderers:
-        resolve_renderer(name)
-    if policy is not None:
-        resolve("policy", policy)
-    if any("," in name for name in renderers):
-        raise InputError(f"--renderer {renderers[0]}: several names", "name one")
-
-
-WHY_EPILOG = """
-Examples:
-
-- `simrun why runs/us101/3dgs/lane-camera/us101/0`
-
-- `simrun why runs/us101/rollouts/3dgs/lane-camera/us101/0`: the same by its folder
-
-The drive is repeated, its policy is asked again with one thing changed at a time, and changes that would mend it are driven.
-"""
-
-
 def why(
     cell: Annotated[
-        Path,
+        Path | None,
         Positional(
-            "RUN/RENDERER/POLICY/SCENE/SEED, or the folder of a rollout.", metavar="RUN/CELL"
+            "A rollout, or a run whose worst failure is shown; by default the newest run.",
+            metavar="RUN|RUN/CELL",
         ),
-    ],
-    scenario: Moved = None,
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Show why a drive failed, on one offline page: what the policy saw, planned and said, and
-    which single change mends it.
+    """Show how a rollout failed, on one offline page.
+
+    The page holds camera images with plan, route and road users, what the run's other renderers
+    show at the same poses, where plans part, and behind which renderers the same rollout ends well.
     """
-    root = next((folder for folder in cell.parents if (folder / RUN_INFO).exists()), None)
-    if root is None:
-        raise InputError(
-            f"{cell}: no run folder above it",
-            "give RUN/RENDERER/POLICY/SCENE/SEED as in the tables of the run",
-        )
+    root, name = run_and_cell(cell)
     use_run(root, warn)
-    past = find_rollout(root, cell.relative_to(root).as_posix(), scenario)
     run = read_run(root)
-    cause = explain(past, run, warn)
-    page = write_cause(run, cause)
+    if name:
+        row = named_row(root, name)
+        rollout = next(one for one in run.rollouts if one.path == row["path"])
+    else:
+        rollout = worst_failure(run)
+    cause = explain(run, rollout)
+    page = None if cause is None else write_cause(run, cause)
+    facts = {
+        "rollout": rollout.path,
+        "page": None if page is None else str(page),
+        "outcome": rollout.failure if cause is None or not rollout.ok else cause.outcome,
+        "found": [] if cause is None else list(cause.sentences),
+    }
+    if not rollout.ok:
+        facts["found"] = [*facts["found"], *last_lines(root / rollout.path / OUTPUT_NAME)]
     if as_json:
-        found = [{"how": how, "text": text} for how, text in cause.sentences]
-        print(
-            json.dumps(
-                {
-                    "page": str(page),
-                    "outcome": cause.outcome,
-                    "found": found,
-                    "tried": [list(row) for row in cause.tried],
-                }
-            )
-        )
+        print(json.dumps(facts))
         return
-    print(f"outcome  {cause.outcome}")
-    for how, text in cause.sentences:
-        print(f"{how:8} {text}")
-    print(f"page     {shlex.quote(str(page))}")
+    print(f"rollout  {rollout.path}")
+    print(f"outcome  {facts['outcome']}")
+    for text in facts["found"]:
+        print(f"         {text}")
+    if page is not None:
+        print(f"page     {shlex.quote(str(page))}")

@@ -41,7 +41,6 @@ GROUPS: dict[str, dict[str, str]] = {
         "run": "run:run",
         "decide": "decide:decide",
         "fork": "fork:fork",
-        "probe": "fork:probe",
         "refine": "refine:refine",
     },
     "Read results": {

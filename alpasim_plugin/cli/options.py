@@ -17,10 +17,11 @@ import typer
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.limits import SEED, SEEDS
+from alpasim_plugin.log.run_folder.schema import RUN_INFO
 
 FIXER_PREFIX = "fixer."
 
-Run = Annotated[Path, Positional("A run folder.")]
+Run = Annotated[Path | None, Positional("A run folder; by default the newest below runs/.")]
 Json = Annotated[bool, Flag("Print one JSON document on stdout.", "--json")]
 Debug = Annotated[bool, Flag("Show tracebacks.")]
 Quiet = Annotated[bool, Flag("No progress, only the result.")]
@@ -394,3 +395,36 @@ def refuse_existing(path: Path | None, overwrite: bool, option: str) -> None:
             f"{f'{option} {path}'.strip()}: it exists already",
             "name another file, or pass --overwrite",
         )
+
+
+def run_or_newest(run: Path | None) -> Path:
+    """Return the run folder that was named, or the newest one below ``runs/``.
+
+    Raises:
+        InputError: None was named and there is none.
+    """
+    if run is not None and run != Path("."):
+        return run
+    if run is not None and (run / RUN_INFO).exists():
+        return run
+    found = [*Path("runs").glob(f"*/{RUN_INFO}"), *Path("runs").glob(f"*/*/{RUN_INFO}")]
+    if not found:
+        raise InputError("runs/: no run folder below it", "Name a run folder, or drive one first.")
+    return max(found, key=lambda path: path.stat().st_mtime_ns).parent
+
+
+def run_and_cell(path: Path | None) -> tuple[Path, str]:
+    """Return the run folder of ``RUN/CELL`` and the cell, which is empty where a run was named.
+
+    Raises:
+        InputError: No run folder is at or above the path.
+    """
+    folder = run_or_newest(path)
+    root = next((one for one in (folder, *folder.parents) if (one / RUN_INFO).exists()), None)
+    if root is None:
+        raise InputError(
+            f"{folder}: no run folder at it or above it",
+            "Name RUN or RUN/RENDERER/POLICY/SCENE/SEED, as in the tables of the run.",
+        )
+    cell = folder.relative_to(root).as_posix()
+    return root, "" if cell == "." else cell

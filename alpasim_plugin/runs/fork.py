@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.interfaces import Controller, Policy, Renderer
@@ -46,7 +46,6 @@ from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan, score_key
 from alpasim_plugin.runs.run import RunResult, finish_run, write_run_info
 from alpasim_plugin.runs.summary import pool_of
 
-DOING = "continuing a logged rollout"
 UNCHANGED = "replay"
 
 
@@ -196,11 +195,7 @@ class Change:
 
 
 def fork_rollout(
-    past: LoggedRollout,
-    change: Change,
-    root: Path,
-    video: Literal["none", "all"],
-    command: Sequence[str],
+    past: LoggedRollout, change: Change, root: Path, command: Sequence[str]
 ) -> RunResult:
     """Continue a rollout and write a run folder with the original and the continuation side by
     side.
@@ -214,7 +209,6 @@ def fork_rollout(
         past: The logged rollout.
         change: Which parts are replaced, and when.
         root: Run folder to write; must not hold a run.
-        video: Whether to write the continuation's video.
         command: For ``run.json``.
 
     Raises:
@@ -224,19 +218,13 @@ def fork_rollout(
     """
     _check(past, change, root)
     with writing(root):
-        return _fork(past, change, root, video, command)
+        return _fork(past, change, root, command)
 
 
-def _fork(
-    past: LoggedRollout,
-    change: Change,
-    root: Path,
-    video: Literal["none", "all"],
-    command: Sequence[str],
-) -> RunResult:
+def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str]) -> RunResult:
     _check(past, change, root)  # once more: another process may have been first
     began = time.perf_counter()
-    options = replace(past.options, video=video, baseline=past.cell.renderer.name)
+    options = replace(past.options, baseline=past.cell.renderer.name)
     then = change.apply(past.cell, options.fixer)
     original = _copied(past, root)
     key = digest(

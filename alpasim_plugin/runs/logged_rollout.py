@@ -49,8 +49,6 @@ class LoggedRollout:
     def check_repeatable(self) -> None:
         """Refuse a rollout that cannot be replayed.
 
-        Args:
-
         Raises:
             InputError: Its latency is measured, or a service moved its road users.
         """
@@ -66,19 +64,22 @@ class LoggedRollout:
             )
 
 
-def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRollout:
+def find_rollout(root: Path, name: str) -> LoggedRollout:
     """Find a finished rollout in a run folder and load its scenario and parts.
 
     Args:
         root: Run folder.
         name: ``RENDERER/POLICY/SCENE/SEED`` as in the tables, or the rollout's folder below the run
             folder.
-        scenario: Path of its scenario; by default the path in ``run.json``.
 
     Raises:
         InputError: No such rollout, it did not finish, or its scenario or its parts have changed.
     """
-    row = _row(root, name)
+    row = named_row(root, name)
+    if row["status"] != "ok":
+        raise InputError(
+            f"{name}: the rollout did not finish: {row['failure']}", "Name a finished rollout."
+        )
     info = read_run_json(root)
     state = inspect_rollout(root, row["path"], full=True, known=True)
     if state.damage or state.manifest is None:
@@ -93,13 +94,12 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRo
             f"name that rollout: {manifest['fork']['of']}",
         )
     stated: Mapping[str, Any] = (info["scenes"].get(row["scene"]) or {}).get("ref") or {}
-    where = scenario or stated.get("path")
-    if where is None:
+    if stated.get("path") is None:
         raise InputError(
-            f"{root / RUN_INFO}: it has no path of the scenario",
-            "name it with --scenario PATH",
+            f"{root / RUN_INFO}: no path of the scenario {row['scene']!r}",
+            "Drive the rollout again with simrun run.",
         )
-    ref = ref_of({**stated, "path": where})
+    ref = ref_of(dict(stated))
     options = replace(options_of(info), baseline=None, video="none")
     refuse_commands([row["policy"]], str(root))
     # Fixer settings may belong to another renderer of the run; a plan refuses settings without a
@@ -117,12 +117,17 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRo
         )
         raise InputError(
             f"{name}: {what}: the scenario, a part or the version has changed since the log was written",
-            "run the rollout again, or name its scenario with --scenario PATH",
+            "Run the rollout again.",
         )
     return LoggedRollout(root, cell, options, loaded, manifest)
 
 
-def _row(root: Path, name: str) -> dict[str, Any]:
+def named_row(root: Path, name: str) -> dict[str, Any]:
+    """Return the row of ``rollouts.parquet`` of a rollout, by its name or its folder.
+
+    Raises:
+        InputError: The run has no such rollout.
+    """
     path = root / ROLLOUTS
     rows = ROLLOUTS_TABLE.read(
         path, "name a folder written by simrun run", (*KEYS, "status", "path", "failure")
@@ -135,12 +140,5 @@ def _row(root: Path, name: str) -> dict[str, Any]:
     if row is None:
         near = difflib.get_close_matches(wanted, by_name, 3, 0.0)
         do_this = f"did you mean {' or '.join(near)}?" if near else "name a run that has rollouts"
-        raise InputError(
-            f"--cell {name}: the run has no such rollout among its {len(rows)}", do_this
-        )
-    if row["status"] != "ok":
-        raise InputError(
-            f"--cell {name}: it did not finish: {row['failure']}",
-            "name a finished rollout",
-        )
+        raise InputError(f"{name}: the run has no such rollout among its {len(rows)}", do_this)
     return dict(row)

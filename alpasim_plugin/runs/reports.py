@@ -12,7 +12,7 @@ from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import decode_image, encode_image
 from alpasim_plugin.log.run_folder.reader import read_json
 from alpasim_plugin.log.run_folder.rows import Rollout
-from alpasim_plugin.log.run_folder.schema import LOG_NAME, PAGES, PROBE_JSON, WHY_NAME, probe_folder
+from alpasim_plugin.log.run_folder.schema import LOG_NAME, PAGES, WHY_NAME
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, first_divergence
 from evaluators.opening import Run, read_run
@@ -54,17 +54,24 @@ MAX_CAUSES = 12  # a run must not wait for its pages; `simrun why` writes any ot
 
 
 def write_causes(run: Run) -> None:
-    """Write the page of a cause for the first drives that failed, one a scene and arm; those of
-    `simrun why` are kept.
+    """Write the page of evidence for the first rollouts that failed, one a scene and variant; those
+    of `simrun why` are kept.
     """
-    told = read_json(run.folder / FLIPS_NAME)["cells"]
     failed = {one.cell[:3]: one for one in reversed(run.rollouts) if one.ok and outcomes_of(one)}
     for rollout in list(failed.values())[::-1][:MAX_CAUSES]:
         if run.file_of(rollout, WHY_NAME) is None:
-            own = [entry for entry in told if key_of_entry(entry)[:4] == rollout.cell]
-            cause = cause_of_log(run, rollout, own)
+            cause = cause_of_log(run, rollout, divergences_of(run, rollout))
             if cause is not None:
                 write_cause(run, cause)
+
+
+def divergences_of(run: Run, rollout: Rollout) -> list[Mapping[str, Any]]:
+    """Return the entries of ``flips.json`` about a rollout; none where the file is absent."""
+    path = run.folder / FLIPS_NAME
+    if not path.is_file():
+        return []
+    entries = read_json(path).get("cells") or []
+    return [entry for entry in entries if key_of_entry(entry)[:4] == rollout.cell]
 
 
 MAX_FLIPS = 60  # cells whose logs are read
@@ -75,8 +82,7 @@ def write_flips(run_dir: Path | Run) -> Path:
     """Find the first plan divergence of every flipped cell of a run folder and write
     ``flips.json``.
 
-    A probe of the same cell and renderers is used where it exists: it renders both at identical
-    poses. Otherwise the two logs are compared; their poses are equal until the plans diverge.
+    The two logs are compared; their poses are equal until the plans diverge.
 
     Raises:
         InputError: The run folder is not complete enough to be read.
@@ -108,13 +114,6 @@ def write_flips(run_dir: Path | Run) -> Path:
 
 
 def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
-    probe = (
-        find_probe(root, flip.base, flip.other.renderer)
-        if flip.base.policy == flip.other.policy
-        else None
-    )
-    if probe is not None:
-        return dict(probe) | {"source": "probe"}
     if not (flip.base.ok and flip.other.ok):
         return {"t_us": None, "reason": "the policy broke off one of the drives"}
     try:
@@ -148,27 +147,6 @@ def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
         "ahead_us": found.ahead_us,
         "frames": {side: path for side, path in frames.items() if path},
     }
-
-
-def find_probe(root: Path, driven: Rollout, other: str) -> Mapping[str, Any] | None:
-    """Return the first divergence that a probe along a rollout found between its renderer and
-    another; None without such a probe.
-    """
-    for path in sorted((root / probe_folder(*driven.cell)).glob(f"*/{PROBE_JSON}")):
-        for pair in read_json(path)["pairs"]:
-            if pair["reference"] == driven.renderer and pair["renderer"] == other:
-                first = pair["first_divergence"]
-                if first is None:
-                    return {
-                        "t_us": None,
-                        "reason": "a probe at identical poses found no divergence",
-                    }
-                frames = {
-                    r: (path.parent / name).relative_to(root).as_posix()
-                    for r, name in first["frames"].items()
-                }
-                return dict(first) | {"frames": frames}
-    return None
 
 
 def _picture(root: Path, log: RolloutLog, t_us: int, name: str) -> str | None:

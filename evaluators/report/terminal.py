@@ -249,20 +249,17 @@ def next_command(run: Run, finding: Finding) -> tuple[list[str], str]:
 
 
 def _of_pair(run: Run, base: Rollout, other: Rollout) -> tuple[list[str], str]:
-    """Return what shows why two drives differ: a probe of two renderers; of two policies a fork of
-    the first drive to the second policy.
+    """Return what shows why two rollouts differ: the page of evidence for two renderers; for two
+    policies a fork of the first rollout to the second policy.
     """
     if base.renderer != other.renderer:
-        names = ",".join(dict.fromkeys([base.renderer, other.renderer]))
-        words = ["simrun", "probe", str(run.folder), "--cell", _named(other), "--renderers", names]
+        words = ["simrun", "why", f"{run.folder}/{_named(other)}"]
         return words, "the same poses behind both: where the plans part"
     if base.policy != other.policy:
         words = [
             "simrun",
             "fork",
-            str(run.folder),
-            "--cell",
-            _named(other),
+            f"{run.folder}/{_named(other)}",
             "--at",
             f"{FORK_AT_S:g}",
             "--policy",

@@ -1,5 +1,5 @@
-"""The page of one drive's cause, offline: what the policy saw, planned and said of itself, what was
-tried, what to ask next.
+"""The page of evidence for one rollout, a self-contained HTML file: how it ended, what the policy
+saw, planned and said of itself, where plans part, and what to ask next.
 """
 
 from __future__ import annotations
@@ -77,15 +77,15 @@ class Parting:
     Attributes:
         name: The renderer or the policy.
         kind: ``renderer`` or ``policy``.
-        t_us: The first query at which they are apart; None: never.
-        gap_m: How far apart they are then, or at most.
+        t_us: The first query at which they are apart.
+        gap_m: How far apart they are then.
         frames: The other's picture and the own one at that query, ``(H, W, 3)`` each; none of a
             policy, which sees the same.
     """
 
     name: str
     kind: str
-    t_us: int | None
+    t_us: int
     gap_m: float
     frames: tuple[U8, U8] | None = None
 
@@ -98,12 +98,8 @@ class Cause:
         outcome: In words.
         failed_us: When it failed first; None where it did not.
         start_us: The first camera frame.
-        sentences: What was found, the surest first: how sure ("shown", "seen", "not found"), and
-            what.
+        sentences: What the run shows, the most telling first.
         looks: Queries to show, in order of time.
-        tried: A row a change: what was changed, how far plans are from the recorded drive with it,
-            how the drive ends with it.
-        depends: A row an input: what was done to it, whether the plans changed, by how much.
         partings: When plans part from others'.
         commands: What can be asked next: a key, what it shows, the command.
         notes: What is missing, a sentence each.
@@ -113,10 +109,8 @@ class Cause:
     outcome: str
     failed_us: int | None
     start_us: int
-    sentences: Sequence[tuple[str, str]]
+    sentences: Sequence[str]
     looks: Sequence[Look]
-    tried: Sequence[tuple[str, str, str]]
-    depends: Sequence[tuple[str, str, str]]
     partings: Sequence[Parting]
     commands: Sequence[tuple[str, str, str]]
     notes: Sequence[str] = ()
@@ -356,17 +350,13 @@ def cause_of_log(run: Run, rollout: Rollout, told: Sequence[Mapping[str, Any]]) 
             *_seen_before(run, rollout, failed_us),
         ],
         looks=looks_of(log, rollout.renderer, failed_us),
-        tried=[],
-        depends=[],
         partings=partings,
         commands=commands(run, rollout, log.render_start_us, failed_us, partings),
     )
 
 
-def behind_others(run: Run, rollout: Rollout) -> list[tuple[str, str]]:
-    """Say behind which renderers of the run the same drive ends without an event: what they show
-    differently is then what made it fail.
-    """
+def behind_others(run: Run, rollout: Rollout) -> list[str]:
+    """Say behind which renderers of the run the same rollout ends without an event."""
     same = [
         r
         for r in run.rollouts
@@ -375,26 +365,19 @@ def behind_others(run: Run, rollout: Rollout) -> list[tuple[str, str]]:
     better = [r.renderer for r in same if r.ok and not outcomes_of(r)]
     if not better or not outcomes_of(rollout):
         return []
-    told = f"Behind {' and '.join(better)} the same drive ends without an event"
-    return [("shown", f"{told}: the pictures of {rollout.renderer} make the difference.")]
+    return [f"Behind {' and '.join(better)} the same rollout ends without an event."]
 
 
-def _seen_before(run: Run, rollout: Rollout, failed_us: int | None) -> list[tuple[str, str]]:
+def _seen_before(run: Run, rollout: Rollout, failed_us: int | None) -> list[str]:
     text = "" if failed_us is None else seen_before(frame_rows(run, rollout), failed_us)
-    return [("seen", f"{text}.")] if text else []
+    return [f"{text}."] if text else []
 
 
-def sentence(one: Parting, start_us: int) -> tuple[str, str]:
-    """Say when plans part, and how sure that is."""
-    if one.t_us is None:
-        return (
-            "seen",
-            f"Plans never part from those of the {one.kind} {one.name}: they are the same within {one.gap_m:.2f} m.",
-        )
+def sentence(one: Parting, start_us: int) -> str:
+    """Say when plans part."""
     at_s = (one.t_us - start_us) * 1e-6
     return (
-        "seen",
-        f"Plans part from those of the {one.kind} {one.name} at {at_s:.1f} s, by {one.gap_m:.2f} m.",
+        f"Plans part from those of the {one.kind} {one.name} at {at_s:.1f} s, by {one.gap_m:.2f} m."
     )
 
 
@@ -403,7 +386,7 @@ def commands(
 ) -> list[tuple[str, str, str]]:
     """Return what can be asked next: a key, what it shows, the command."""
     root, name = shlex.quote(str(run.folder)), shlex.quote(cell_name(*rollout.cell))
-    parted = next((one.t_us for one in partings if one.t_us is not None), failed_us or start_us)
+    parted = next((one.t_us for one in partings), failed_us or start_us)
     own, at = rollout.renderer, max(0.0, (parted - start_us) * 1e-6)
     other = next(
         (one.name for one in partings if one.kind == "renderer"),
@@ -412,18 +395,13 @@ def commands(
     return [
         (
             "w",
-            "try single changes of what the policy sees and answers",
+            "replay the rollout: other renderers at the same poses, and the policy's own debug output",
             f"simrun why {shlex.quote(str(run.folder / rollout.path))}",
         ),
         (
             "f",
             f"drive on from there behind {other}",
-            f"simrun fork {root} --cell {name} --at {at:.1f} --renderer {other}",
-        ),
-        (
-            "p",
-            "compare plans at the same poses",
-            f"simrun probe {root} --cell {name} --renderers {other},{own}",
+            f"simrun fork {root}/{name} --at {at:.1f} --renderer {other}",
         ),
         ("v", "watch the drive", f"simrun view {shlex.quote(str(run.folder / rollout.path))}"),
     ]
@@ -444,7 +422,7 @@ def most_different(one: U8, other: U8) -> tuple[int, int, int, int]:
 
 
 def _parting(one: Parting, start_us: int) -> dict[str, Any]:
-    at = None if one.t_us is None else (one.t_us - start_us) * 1e-6
+    at = (one.t_us - start_us) * 1e-6
     entry: dict[str, Any] = {
         "name": one.name,
         "kind": one.kind,

@@ -189,11 +189,7 @@ def make_page(
     Raises:
         InputError: A rollout's files are damaged.
     """
-    shell = len(
-        render(
-            as_json(index_data(run, cells, (), {"notes": [], "report": report})), {}
-        )
-    )
+    shell = len(render(as_json(index_data(run, cells, (), {"notes": [], "report": report})), {}))
     fitted = fit(run, shown, options.max_bytes - shell - NOTES_BYTES, options.fine, options.camera)
     notes = _notes(cells, shown, fitted.too_many, fitted.fine)
     index = index_data(run, cells, fitted.cells, {"notes": notes, "report": report})

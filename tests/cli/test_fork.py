@@ -1,8 +1,7 @@
-"""``simrun fork`` and ``simrun probe`` as a user meets them."""
+"""``simrun fork`` as a user meets it."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -16,23 +15,13 @@ from tests.runs.test_runs import Announced
 
 
 @pytest.mark.slow
-def test_the_verbs_report_what_they_did(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_verb_reports_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = tmp_path / "run"
     plan = make_plan(
         expand("smoke/lead_car", SHORT), ("clean",), ("lane-camera",), (0,), RunOptions()
     )
     execute_run(plan, root, 1, ["simrun"], Announced(), certificate="none", report=False)
-    assert (
-        run_command(
-            ["fork", str(root), "--cell", CELL, "--at", "0.6", "--out", str(tmp_path / "fork")]
-        )
-        == 0
-    )
+    assert run_command(["fork", f"{root}/{CELL}", "--at", "0.6", "--out", str(tmp_path / "f")]) == 0
     assert "continuation      equal to the log, bit for bit" in capsys.readouterr().out
-    asked = ["--renderers", "clean,broken-frozen", "--out", str(tmp_path / "p"), "--json"]
-    assert run_command(["probe", str(root), "--cell", CELL, *asked]) == 0
-    assert json.loads(capsys.readouterr().out)["probe"]["along"] == CELL
-    assert (
-        run_command(["fork", str(root), "--cell", CELL, "--at", "0.6", "--renderer", "clena"]) == 2
-    )
-    assert "did you mean 'clean'" in capsys.readouterr().err
+    assert run_command(["fork", f"{root}/{CELL}", "--at", "0.6", "--renderer", "clena"]) == 2
+    assert run_command(["fork", str(root), "--at", "0.6"]) == 2

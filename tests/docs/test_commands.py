@@ -241,7 +241,6 @@ def test_the_command_works_from_an_empty_folder_with_the_wheel(
     words = shortened(command.words)
     if command.words[0] in (
         "fork",
-        "probe",
         "compare",
         "report",
         "score",

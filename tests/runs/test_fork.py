@@ -1,6 +1,4 @@
-"""Going back into a logged rollout: continue it, or ask at its poses what another renderer would
-have done.
-"""
+"""Going back into a logged rollout: continue it, or show what another renderer gives at its poses."""
 
 from __future__ import annotations
 
@@ -14,7 +12,6 @@ import pytest
 
 from alpasim_plugin.core.checksums import SEAL
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.core.parts import resolve
 from alpasim_plugin.core.types import SensorSpec
 from alpasim_plugin.log import read_asl, read_facts, write_facts
 from alpasim_plugin.log.run_folder.manifests import write_run_json
@@ -23,9 +20,9 @@ from alpasim_plugin.runs.certificate import rollout_trace
 from alpasim_plugin.runs.fork import Change, fork_rollout, merge_sensors
 from alpasim_plugin.runs.logged_rollout import LoggedRollout, find_rollout
 from alpasim_plugin.runs.plan import RunOptions, make_plan
-from alpasim_plugin.runs.probe import probe_rollout, write_probe
 from alpasim_plugin.runs.reports import write_flips
 from alpasim_plugin.runs.run import RunResult, execute_run
+from alpasim_plugin.runs.why import replay
 from scenarios.suite import expand
 from tests.examples import first_of
 from tests.runs.test_certificate import BARE
@@ -74,7 +71,7 @@ def changed(past: LoggedRollout, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def go(past: LoggedRollout, root: Path, **change: object) -> RunResult:
-    return fork_rollout(past, Change(AT_US, **change), root, "none", ["simrun", "fork"])  # type: ignore[arg-type]
+    return fork_rollout(past, Change(AT_US, **change), root, ["simrun", "fork"])  # type: ignore[arg-type]
 
 
 def forked(root: Path) -> Path:
@@ -165,7 +162,7 @@ def test_a_replay_that_leaves_the_log_names_component_and_step(
         go(moved, tmp_path / "out")
     assert not (tmp_path / "out" / "run.json").exists()
     with pytest.raises(InfrastructureError, match=r"frames at step 3"):
-        probe_rollout(moved, ["clean", "3dgs"])
+        replay(moved, ["3dgs"])
 
 
 def test_instants_outside_and_folders_in_use_are_refused(
@@ -173,9 +170,9 @@ def test_instants_outside_and_folders_in_use_are_refused(
 ) -> None:
     for after_us in (-1, 1_200_000, 10**12):
         with pytest.raises(InputError, match=r"the rollout lasts 1\.2 s"):
-            fork_rollout(past, Change(after_us), tmp_path, "none", [])
+            fork_rollout(past, Change(after_us), tmp_path, [])
     with pytest.raises(InputError, match="it holds a run already"):
-        fork_rollout(past, Change(AT_US), root, "none", [])
+        fork_rollout(past, Change(AT_US), root, [])
 
 
 def test_rollouts_are_found_by_name_or_folder_and_near_names_are_offered(
@@ -201,37 +198,13 @@ def test_a_scenario_that_has_changed_is_refused(
         find_rollout(tmp_path, CELL)
 
 
-@pytest.mark.slow
-def test_a_probe_of_one_renderer_against_itself_finds_nothing_and_against_another_something(
-    past: LoggedRollout, root: Path
-) -> None:
-    probe = probe_rollout(past, ["clean", "broken-frozen", "3dgs"])
-    frozen, surrogate = probe.pairs
-    assert len(probe.queries) == 12
-    assert frozen.levels[0] == 0.0  # the first frame is the true one
-    np.testing.assert_array_equal(frozen.gap_m[0], 0.0)
-    assert (frozen.levels[1:] > 0).all()
-    assert frozen.gap_m[-1, 0] > 0.0
-    assert surrogate.levels[0] > 0.0
-    folder = write_probe(probe, past, ("clean", "broken-frozen", "3dgs"))
-    told = read_json(folder / "probe.json")
-    table = pq.read_table(folder / "probe.parquet").to_pylist()
-    assert [row["gap_1s_m"] for row in table[:12]] == frozen.gap_m[:, 0].tolist()
-    assert told["pairs"][0]["gap_1s_m"]["max"] == pytest.approx(
-        np.nanmax(frozen.gap_m[:, 0]), abs=1e-4
-    )
-    assert (folder / "probe.png").stat().st_size > 10_000
-    backwards = probe_rollout(past, ["broken-frozen", "clean"]).pairs[0]
-    np.testing.assert_array_equal(backwards.gap_m, frozen.gap_m)
-    np.testing.assert_allclose(backwards.turn_rad, -frozen.turn_rad, atol=1e-12)
-
-
-def test_a_probe_needs_a_policy_that_sees_and_two_renderers(past: LoggedRollout) -> None:
-    with pytest.raises(InputError, match="fewer than two"):
-        probe_rollout(past, ["clean"])
-    blind = replace(past, cell=replace(past.cell, policy=resolve("policy", "pure-pursuit")))
-    with pytest.raises(InputError, match="has no camera"):
-        probe_rollout(blind, ["clean", "3dgs"])
+def test_a_replay_shows_every_renderer_at_the_same_poses(past: LoggedRollout) -> None:
+    looks = replay(past, ["broken-frozen"])
+    assert len(looks) == 12
+    assert set(looks[0].frames) == set(looks[0].plans) == {"clean", "broken-frozen"}
+    first, last = ([rgb for _, rgb in looks[number].frames.values()] for number in (0, -1))
+    np.testing.assert_array_equal(*first)  # the first frame is the true one
+    assert not np.array_equal(*last)
 
 
 def test_two_policies_share_a_camera_at_the_shorter_period() -> None:

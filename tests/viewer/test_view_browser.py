@@ -4,8 +4,6 @@ Chromium.
 
 from __future__ import annotations
 
-import shutil
-import threading
 import time
 from pathlib import Path
 from urllib.parse import quote
@@ -19,7 +17,7 @@ from evaluators.viewer.page import Options, write_page
 from tests.report.browser import Browser
 from tests.report.make_run import Plan
 from tests.viewer.axe import MISSING, SERIOUS, find_axe, findings
-from tests.viewer.make_watched import BARS, make_watched, unfinished
+from tests.viewer.make_watched import BARS, make_watched
 
 pytestmark = pytest.mark.slow
 ACTORS, FRAMES_MEASURED = 200, 120

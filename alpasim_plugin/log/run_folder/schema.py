@@ -63,12 +63,8 @@ STEPS = "steps.parquet"
 SCENES = "scenes"
 ROLLOUTS_FOLDER = "rollouts"
 AGGREGATE = "aggregate"
-PROBES = "probes"
 PAGES = ("report.html", "flips.html")
 REPORTS = (*PAGES, "summary.md", "junit.xml")  # made from the tables; nothing reads them
-PROBE_JSON = "probe.json"
-PROBE_TABLE = "probe.parquet"
-PROBE_PLOT = "probe.png"
 
 ROLLOUT_FILES = (
     File(LOG_NAME, "the log", "drive"),
@@ -115,7 +111,6 @@ RUN_FILES = (
     File(CONTENTS, "digests of the tables and of all manifests, a copy of run.json", "end"),
     File("view.html", "drives side by side", "command", is_required=False),
     File("gate.json", "what the last gate found, for the report", "command", is_required=False),
-    File(f"{PROBES}/", "probes of logged rollouts", "command", is_required=False),
     File("forks/", "forks of logged rollouts", "command", is_required=False),
 )
 TABLES = tuple(
@@ -398,13 +393,3 @@ def rollout_folder(renderer: str, policy: str, scene: str, seed: int | str) -> P
         slug(scene),
         slug(seed) if isinstance(seed, str) else str(seed),
     )
-
-
-def probe_folder(
-    renderer: str, policy: str, scene: str, seed: int, renderers: Sequence[str] = ()
-) -> Path:
-    """Return the folder of a probe of ``renderers`` along a rollout, or of all its probes, below
-    the run folder.
-    """
-    folder = Path(PROBES, *rollout_folder(renderer, policy, scene, seed).parts[1:])
-    return folder / slug("--".join(renderers)) if renderers else folder
