@@ -39,7 +39,6 @@ GROUPS: dict[str, dict[str, str]] = {
     "Bring in": {"import": "import_drive:app"},
     "Drive": {
         "run": "run:run",
-        "decide": "decide:decide",
         "fork": "fork:fork",
         "refine": "refine:refine",
     },

@@ -112,21 +112,13 @@ class What:
 
 @dataclass(frozen=True)
 class Where:
-    """Where rollouts run and where they are kept."""
+    """Where rollouts run."""
 
     workers: Workers = None
     executor: Annotated[
         str,
-        Flag(
-            "`local`, `ray[:HOST:PORT]` or `slurm[:PARTITION]`; behind it what a worker needs: `ray?cores=2&gpus=0.5&memory=8` (GiB)."
-        ),
+        Flag("`local`, or `ray[:HOST:PORT]` with what a worker needs: `ray?cores=2&memory=8`."),
     ] = "local"
-    store: Annotated[
-        str | None,
-        Flag(
-            "Also keep every rollout in a store: a folder, or `s3://BUCKET/PREFIX`.", metavar="URL"
-        ),
-    ] = None
 
     def arguments(self) -> dict[str, Any]:
         """Return the arguments of the same meaning of `execute_run` and `execute_decision`.
@@ -136,35 +128,26 @@ class Where:
         """
         from alpasim_plugin.runs.executors.choice import parse_executor
 
-        return {
-            "workers": self.workers,
-            "executor": parse_executor(self.executor),
-            "store": self.store,
-        }
+        return {"workers": self.workers, "executor": parse_executor(self.executor)}
 
 
 @dataclass(frozen=True)
 class Care:
-    """How a run is kept, checked and reported."""
+    """How a run is kept and reported."""
 
-    certify: Annotated[
-        Literal["one", "none"], Flag("Repeat one rollout and compare bit for bit.")
-    ] = "one"
     report: Report = True
-    wait: Wait = False
+    wait: Annotated[
+        bool,
+        Flag("If another process is writing the run folder, wait instead of failing."),
+    ] = False
     time_limit: Annotated[
         float | None,
-        Flag("Seconds that a rollout may take; one that hangs is ended and reported.", min=0.001),
+        Flag("Seconds after which a rollout that hangs is ended and reported.", min=0.001),
     ] = None
 
     def arguments(self) -> dict[str, Any]:
         """Return the arguments of the same meaning of `execute_run` and `execute_decision`."""
-        return {
-            "certificate": self.certify,
-            "report": self.report,
-            "wait": self.wait,
-            "limit_s": self.time_limit,
-        }
+        return {"report": self.report, "wait": self.wait, "limit_s": self.time_limit}
 
 
 class Only:

@@ -23,6 +23,7 @@ from evaluators.report.numbers import plural
 if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its kernels
     from alpasim_plugin.runs.execute import Threads
     from alpasim_plugin.runs.plan import RunPlan
+    from evaluators.statistics.decision import State
 
 SHOWN_CHANGES, SHOWN_SCENES = 4, 5
 MAX_LINES = 1000
@@ -35,6 +36,9 @@ class Silent:
         """Ignore."""
 
     def rollout_done(self, manifest: dict[str, Any], reused: bool) -> None:
+        """Ignore."""
+
+    def looked(self, state: State, rollouts: int, ceiling: int) -> None:
         """Ignore."""
 
     def noticed(self, text: str) -> None:
@@ -72,6 +76,10 @@ class Lines:
                 flush=True,
             )
 
+    def looked(self, state: State, rollouts: int, ceiling: int) -> None:
+        """Print an interim analysis."""
+        print(look_line(state, rollouts, ceiling), file=sys.stderr, flush=True)
+
     def noticed(self, text: str) -> None:
         """Print it."""
         print(f"warning: {text}", file=sys.stderr, flush=True)
@@ -108,6 +116,12 @@ class Bar:
         if self._progress.finished:
             self._progress.stop()
 
+    def looked(self, state: State, rollouts: int, ceiling: int) -> None:
+        """Print an interim analysis above the bar."""
+        self._progress.console.print(look_line(state, rollouts, ceiling), highlight=False)
+        if state.answer != "open":
+            self._progress.stop()
+
     def noticed(self, text: str) -> None:
         """Print it above the bar."""
         self._progress.console.print(f"warning: {text}", highlight=False, markup=False)
@@ -129,6 +143,20 @@ def report_line(root: Path) -> str:
         else f"report   not written; simrun report {run}"
     )
     return f"{report}\nwatch    simrun view {run}"
+
+
+def look_line(state: State, rollouts: int, ceiling: int) -> str:
+    """Return one line for an interim analysis: scenes, and each metric's interval and verdict."""
+
+    def bound(value: float | None) -> str:
+        return "unbounded" if value is None else f"{value:+.4g}"
+
+    parts = []
+    for one in state.metrics:
+        low, high = one.interval
+        parts.append(f"{one.metric} {bound(low)} to {bound(high)} {one.answer}")
+    scenes = plural(state.n_scenes, "scene").replace("\u00a0", " ")
+    return f"{scenes}, {rollouts} of at most {ceiling} rollouts: {'; '.join(parts)}"
 
 
 def make_progress(quiet: bool) -> Silent | Lines | Bar:

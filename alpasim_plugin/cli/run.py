@@ -30,17 +30,22 @@ from alpasim_plugin.cli.progress import (
     report_line,
     varied_lines,
 )
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.limits import SOURCE_BYTES
 from alpasim_plugin.core.reading import read_bytes
 from alpasim_plugin.core.signals import Stopped
 from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME
-from alpasim_plugin.runs.certificate import certificate_line, foreseen
+from alpasim_plugin.runs.certificate import certificate_line
+from alpasim_plugin.runs.decide import Decided, execute_decision, plan_of_two
 from alpasim_plugin.runs.execute import Threads, thread_budget
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runs.run import RunResult, default_folder, execute_run
+from evaluators.report.verdict import metric_lines, verdict_line
 from evaluators.statistics.arms import arms_of, base_named
+from evaluators.statistics.decision import Question, metric_question
+from evaluators.statistics.gate import load_gate
 from scenarios.suite import expand, shipped_names
 
 TRACEBACK_LINES = 4  # of a failure, in the terminal
@@ -58,7 +63,7 @@ Examples:
 
 - `simrun --renderer clean,3dgs --executor 'ray?cores=2' suites/urban`
 
-- `simrun --renderer clean,3dgs --executor slurm:cpu --workers 64 --store s3://bucket/night suites/urban`
+- `simrun --renderer clean,3dgs --until-decided suites/urban`: stop as soon as it is decided whether 3dgs is worse than clean
 """
 
 
@@ -68,66 +73,115 @@ def run(
     where: Where,
     care: Care,
     out: RunFolder = None,
-    resume: Annotated[bool, Flag("Continue in a folder of another command.")] = False,
-    retry: Annotated[
-        bool, Flag("Drive again also rollouts that failed by the policy's own fault.")
+    resume: Annotated[bool, Flag("Continue in a folder that another command has written.")] = False,
+    until_decided: Annotated[
+        bool,
+        Flag("Sequential test: drive scenes in random order and stop as soon as it is decided."),
     ] = False,
+    metric: Annotated[
+        tuple[str, ...],
+        Flag(
+            "With --until-decided: test this metric instead of the default gate's. Repeatable.",
+            metavar="NAME[=MARGIN]",
+        ),
+    ] = (),
     dry_run: Annotated[bool, Flag("Resolve and print the plan, run nothing.")] = False,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Drive scenarios behind one or more renderers, score the drives, and write a run folder with a
-    report.
+    """Drive scenarios behind one or more renderers, score the rollouts and write a report.
 
     An interrupted run continues when the same command is given again.
     """
     how = where.arguments() | care.arguments()
     check_preset(options.preset)
-    plan = planned(what, what.renderers, split_policies(what.policy), options)
+    refs = [ref for item in what.scenarios for ref in expand(item, what.of_scene, what.source)]
+    plan = make_plan(
+        refs,
+        what.renderers,
+        split_policies(what.policy),
+        parse_seeds(what.seeds),
+        replace(options, fixer=what.of_fixer),
+    )
+    plan = replace(plan, asked=what.scenarios)
     if options.baseline is not None:
-        arms = arms_of(
-            (renderer.name, policy.name) for policy in plan.policies for renderer in plan.renderers
-        )
-        base_named(options.baseline, arms, "the run")
+        variants = arms_of((cell.renderer.name, cell.policy.name) for cell in plan.cells)
+        base_named(options.baseline, variants, "the run")
+    question = None
+    if until_decided:
+        question = question_of(metric)
+        plan = plan_of_two(plan, question)
+    elif metric:
+        raise InputError("--metric: without --until-decided", "Add --until-decided.")
     root = out or default_folder(plan)
     if dry_run:
-        repeats = foreseen(plan, care.certify) is not None
-        _print_plan(
-            plan,
-            root,
-            thread_budget(where.workers, len(plan.cells), how["executor"], repeats),
-            as_json,
-        )
+        threads = thread_budget(where.workers, len(plan.cells), how["executor"])
+        _print_plan(plan, root, threads, as_json)
         return
-    progress, command = make_progress(quiet or as_json), ["simrun", *sys.argv[1:]]
+    progress = make_progress(quiet or as_json)
+    command = ["simrun", *sys.argv[1:]]
     try:
-        result = execute_run(
-            plan, root, command=command, progress=progress, resume=resume, retry=retry, **how
-        )
+        if question is not None:
+            decided = execute_decision(
+                plan, question, root, command=command, progress=progress, **how
+            )
+            _print_decision(decided, as_json)
+            raise typer.Exit(decided.outcome.exit_code)
+        result = execute_run(plan, root, command=command, progress=progress, resume=resume, **how)
     except Stopped as stop:
         stop.kept = f"finished rollouts are kept in {root}; the same command continues"
         raise
     _print_result(result, as_json, options.video)
     if plan.undigested and not as_json:
+        names = ", ".join(plan.undigested)
         print(
-            f"not reused by the next command: {', '.join(plan.undigested)} has no digest (--resume reuses its rollouts)"
+            f"not reused by the next command: {names} has no digest (--resume reuses its rollouts)"
         )
     raise typer.Exit(result.exit_code)
 
 
-def planned(
-    what: What, renderers: Sequence[str], policies: Sequence[str], options: RunOptions
-) -> RunPlan:
-    """Plan what is asked for, with the settings of fixers among its overrides.
+def question_of(metrics: Sequence[str]) -> Question:
+    """Return the question of ``--until-decided``: is the other variant non-inferior in the metrics of
+    ``--metric NAME[=MARGIN]``, or within the margins of the default gate?
 
     Raises:
-        InputError: A scenario, a part or a seed is invalid.
+        InputError: A margin is no number, or a metric is named twice.
     """
-    refs = [ref for item in what.scenarios for ref in expand(item, what.of_scene, what.source)]
-    plan = make_plan(
-        refs, renderers, policies, parse_seeds(what.seeds), replace(options, fixer=what.of_fixer)
-    )
-    return replace(plan, asked=what.scenarios)
+    if not metrics:
+        spec, _ = load_gate("default")
+        asked = tuple(
+            metric_question(name, rule.margin, rule.must_decide)
+            for name, rule in spec.metrics.items()
+            if rule.margin is not None
+        )
+        return Question(asked, min_scenes=spec.min_scenes)
+    questions = {}
+    for text in metrics:
+        name, _, margin = text.partition("=")
+        try:
+            value = float(margin) if margin else None
+        except ValueError:
+            raise InputError(
+                f"--metric {text}: the margin is not a number", "Write for example progress=0.05."
+            ) from None
+        if name in questions:
+            raise InputError(f"--metric {name}: named twice", "Name every metric once.")
+        questions[name] = metric_question(name, value)
+    return Question(tuple(questions.values()))
+
+
+def _print_decision(decided: Decided, as_json: bool) -> None:
+    if as_json:
+        facts = {
+            "out": str(decided.run.root),
+            "exit_code": decided.outcome.exit_code,
+            "decision": decided.record,
+        }
+        print(json.dumps(facts))
+        return
+    for line in (verdict_line(decided.record), *metric_lines(decided.record)):
+        print(line)
+    print(report_line(decided.run.root))
 
 
 def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> None:
@@ -226,5 +280,5 @@ def _failed_line(result: RunResult) -> str:
     if not by_policy:
         return f"{said}; the same command runs them again"
     whose = "all" if by_policy == result.n_failed else f"{by_policy} of them"
-    cure = "simrun check-policy tests the policy; after a change of it the same command runs them again"
+    cure = "simrun check policy tests the policy; after a change of it the same command runs them again"
     return f"{said}, {whose} by the policy's own fault; {cure}"

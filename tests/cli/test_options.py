@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import pytest
 import typer
 
-from alpasim_plugin.cli import decide, gate, run, serve
+from alpasim_plugin.cli import run, serve
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.cli.options import Json, Only, command_of
 from alpasim_plugin.core.flags import Flag, Positional
@@ -40,51 +40,14 @@ def called(monkeypatch: pytest.MonkeyPatch) -> Any:
     return watch
 
 
-def test_a_run_gets_its_cluster_its_store_its_limit_and_its_retries(
-    called: Any, tmp_path: Path
-) -> None:
-    cluster = ("--executor", "slurm:cpu?cores=2&gpus=0.5&memory=7.5", "--store", str(tmp_path))
-    more = (
-        "--time-limit",
-        "90",
-        "--retry",
-        "--certify",
-        "none",
-        "--no-report",
-        "--wait",
-        "--workers",
-        "3",
-    )
-    given = called(
-        run,
-        "execute_run",
-        "--renderer",
-        "clean",
-        *cluster,
-        *more,
-        "--out",
-        str(tmp_path / "out"),
-        "smoke/straight",
-    )
+def test_a_run_gets_its_cluster_and_its_limit(called: Any, tmp_path: Path) -> None:
+    words = ["--executor", "ray?cores=2&gpus=0.5&memory=7.5", "--time-limit", "90", "--no-report"]
+    words += ["--wait", "--workers", "3", "--out", str(tmp_path / "out"), "smoke/straight"]
+    given = called(run, "execute_run", "--renderer", "clean", *words)
     resources = given["executor"].resources
-    assert (str(given["executor"]), resources.cores, resources.gpus, resources.memory_gib) == (
-        "slurm:cpu",
-        2,
-        0.5,
-        7.5,
-    )
-    assert (given["store"], given["workers"], given["limit_s"], given["retry"]) == (
-        str(tmp_path),
-        3,
-        90.0,
-        True,
-    )
-    assert (given["certificate"], given["report"], given["wait"], given["resume"]) == (
-        "none",
-        False,
-        True,
-        False,
-    )
+    assert (resources.cores, resources.gpus, resources.memory_gib) == (2, 0.5, 7.5)
+    assert (given["workers"], given["limit_s"]) == (3, 90.0)
+    assert (given["report"], given["wait"], given["resume"]) == (False, True, False)
 
 
 def test_what_a_worker_of_a_cluster_needs_is_refused_without_one(
@@ -97,74 +60,6 @@ def test_what_a_worker_of_a_cluster_needs_is_refused_without_one(
         == 2
     )
     assert "--executor local?cores=1" in capsys.readouterr().err
-
-
-def test_a_decision_gets_its_question_and_its_design(called: Any) -> None:
-    asked = (
-        "--metric",
-        "progress=0.05",
-        "--alpha",
-        "0.01",
-    )
-    scenes = (
-        "--min-scenes",
-        "7",
-        "--order-seed",
-        "5",
-        "--max-missing",
-        "0.1",
-        "--budget",
-        "40",
-    )
-    given = called(
-        decide,
-        "decide_into",
-        "decide",
-        "--renderer",
-        "clean,3dgs",
-        *asked,
-        *scenes,
-        "--seeds",
-        "3",
-        "smoke/straight",
-    )
-    question = given["question"]
-    design = given["design"]
-    plan = given["plan"]
-    (metric,) = question.metrics
-    assert (metric.metric, metric.margin) == ("progress", 0.05)
-    assert (question.alpha, question.min_scenes) == (0.01, 7)
-    assert (design.order_seed, design.max_missing, design.budget) == (5, 0.1, 40)
-    assert (plan.seeds, plan.options.baseline, plan.asked) == (
-        (0, 1, 2),
-        "clean",
-        ("smoke/straight",),
-    )
-
-
-def test_a_gate_that_drives_takes_the_options_of_a_decision(called: Any, tmp_path: Path) -> None:
-    words = (
-        "gate",
-        str(tmp_path),
-        "--until-decided",
-        "--scenes",
-        "smoke/straight",
-        "--renderer",
-        "clean,3dgs",
-    )
-    given = called(
-        gate,
-        "decide_into",
-        *words,
-        "--budget",
-        "12",
-        "--set",
-        "timing.duration_us=1000000",
-    )
-    assert given["design"].budget == 12
-    assert [cell.ref.overrides for cell in given["plan"].cells] == [
-        ("timing.duration_us=1000000",)
-    ] * 2
 
 
 def test_a_server_gets_its_bounds_and_whom_it_trusts(called: Any, tmp_path: Path) -> None:
