@@ -37,7 +37,7 @@ from alpasim_plugin.drives.build import (
     import_drive,
     key_of,
     shown_photographs,
-    working_folders,
+    working_folder,
     write_folder,
     write_photographs,
 )
@@ -88,12 +88,9 @@ def import_splat(
             left behind then.
     """
     tell = report or (lambda stage, done, all: None)
-    with working_folders(out) as (found, work):
+    with working_folder(out) as work:
         drive = read_source(
-            poses.parent if poses.name == "transforms.json" else poses,
-            found,
-            tell,
-            photographs=False,
+            poses.parent if poses.name == "transforms.json" else poses, photographs=False
         )
         has_photographs = all(one.file.is_file() for one in drive.pictures)
         drive = checked(drive, poses, has_photographs)
@@ -221,7 +218,7 @@ Examples:
 
 - `simrun import drive recordings/street -o street`: then `simrun --renderer 3dgs street/scenario.yaml`
 
-- `simrun import drive walk.mp4 -o walk --camera-height 1.4`: a video without poses (needs the extra `sfm`)
+- `simrun import drive walk -o walk --camera-height 1.4`: poses without a unit, such as a COLMAP model
 """
 SPLAT_EPILOG = "Example: `simrun import splat street.ply --poses transforms.json -o street`: then `simrun --renderer 3dgs street/scenario.yaml`"
 
@@ -237,9 +234,7 @@ Out = Annotated[
 def drive(
     folder: Annotated[
         Path,
-        Positional(
-            "Folder of photographs with poses, or a video (docs/real-drives.md).", metavar="FOLDER"
-        ),
+        Positional("Folder of photographs with poses (docs/real-drives.md).", metavar="FOLDER"),
     ],
     out: Out,
     camera_height: Annotated[

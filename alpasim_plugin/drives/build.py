@@ -19,15 +19,13 @@ import torch
 
 from alpasim_plugin.core.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.reading import read_bytes, read_json
-from alpasim_plugin.core.types import F64, Actor, Box, CameraSpec, LaneMap, Vehicle
+from alpasim_plugin.core.types import F64, CameraSpec, LaneMap, Vehicle
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import NO_MAP, PlacedDrive, corridor, given_map, place
 from alpasim_plugin.drives.points import road_points, triangulated, with_corrected_poses
 from alpasim_plugin.drives.quality import measure, write_page
-from alpasim_plugin.drives.sfm import forget
 from alpasim_plugin.drives.source import Points, SourceDrive, checked
 from alpasim_plugin.gaussians.files.ply import write_points
 from alpasim_plugin.gaussians.fit.drive import fit_drive
@@ -52,7 +50,6 @@ RENDER_PX, SIDE_PX = (
     16,
 )  # most of the longer side of the scenario's cameras; what their sides are multiples of, as fixers need
 SEED = 0  # of the fit
-HELD_US = 150_000  # cameras and the sensor that tracks are not triggered at once
 SHORT_US = 2_000_000  # a shorter log is driven from its first pose on
 Report = Callable[[str, int, int], None]  # stage, how much is done, how much there is
 
@@ -67,7 +64,6 @@ class Shown:
         use: ``fitted``, ``held-out`` or ``never-fitted``.
         T_world_camera: ``(4, 4)``.
         file: Where it lies in the imported folder.
-        actors: Poses of the tracked road users when it was taken, ``T_world_box (4, 4)``.
     """
 
     picture: Picture
@@ -75,7 +71,6 @@ class Shown:
     use: str
     T_world_camera: F64
     file: str
-    actors: Mapping[str, F64]
 
     def view(self) -> PosedView:
         """Return it as a view of the width that is fitted."""
@@ -83,7 +78,7 @@ class Shown:
         whole = full.camera.width
         width = max(min(whole, FIT_PX * whole // max(whole, full.camera.height)), -(-whole // 2))
         small = resized(full, width + width % 2) if width < full.camera.width else full
-        return replace(small, name=f"{self.camera}-{self.picture.file.stem}", actors=self.actors)
+        return replace(small, name=f"{self.camera}-{self.picture.file.stem}")
 
 
 def import_drive(
@@ -114,8 +109,8 @@ def import_drive(
         InfrastructureError: The disk refuses.
     """
     tell = report or (lambda stage, done, all: None)
-    with working_folders(out) as (found, work):
-        drive = checked(read_source(folder, found, tell), folder)
+    with working_folder(out) as work:
+        drive = checked(read_source(folder), folder)
         key = key_of(drive, camera_height_m, lane_map)
         if out.exists():
             return finished(out, key)
@@ -123,23 +118,20 @@ def import_drive(
 
 
 @contextmanager
-def working_folders(out: Path) -> Iterator[tuple[Path, Path]]:
-    """Give the folders for poses that are found and for the unfinished scenario, which becomes
-    ``out`` at the end.
+def working_folder(out: Path) -> Iterator[Path]:
+    """Yield the folder of the unfinished scenario, which becomes ``out`` at the end.
 
-    After an `InputError`, which would come again, both are removed; after an interruption they are
-    kept to go on from.
+    After an `InputError`, which would come again, it is removed; after an interruption it is kept,
+    so that the same import goes on from it.
     """
-    found, work = out.with_name(f".{out.name}.poses"), out.with_name(f".{out.name}.unfinished")
+    work = out.with_name(f".{out.name}.unfinished")
     try:
-        yield found, work
+        yield work
     except InputError:
-        forget(found)
-        forget(work)
+        shutil.rmtree(work, ignore_errors=True)
         raise
     if not out.exists():
         work.replace(out)
-    forget(found)
 
 
 def _built(
@@ -169,12 +161,10 @@ def _built(
         use: [one.view() for one in shown if one.use == use]
         for use in ("fitted", "held-out", "never-fitted")
     }
-    boxes = {actor.actor_id: actor.box for actor in placed.tracks}
     model, exposures = fitted(
         views["fitted"],
         views["held-out"],
         placed.points,
-        boxes,
         scene_id_of(drive),
         work / FIT_FOLDER,
         tell,
@@ -226,7 +216,7 @@ def write_folder(
     write_drive(
         work,
         log,
-        [_from_start(one, int(placed.ego.t_us[0])) for one in placed.tracks],
+        [],
         standing.obstacles,
     )
     quality = write_page(
@@ -316,7 +306,6 @@ def shown_photographs(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
             )
             ending = one.file.suffix.lower() if not one.lens.bends else ".png"
             picture = replace(one, t_us=int(one.t_us or 0) - first_us)
-            there = _tracked_at(placed.tracks, int(one.t_us or 0))
             out.append(
                 Shown(
                     picture,
@@ -324,25 +313,9 @@ def shown_photographs(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
                     use,
                     placed.poses[camera][i],
                     f"photographs/{name}/{i:06d}{ending}",
-                    there,
                 )
             )
     return out
-
-
-def _tracked_at(tracks: Sequence[Actor], t_us: int) -> dict[str, F64]:
-    """Return where tracked road users are; just before and after what was tracked they stand where
-    they were.
-    """
-    near = [
-        one for one in tracks if one.track.t_us[0] - HELD_US <= t_us <= one.track.t_us[-1] + HELD_US
-    ]
-    return {
-        one.actor_id: interpolate(
-            one.track, int(np.clip(t_us, one.track.t_us[0], one.track.t_us[-1]))
-        )
-        for one in near
-    }
 
 
 def write_photographs(work: Path, shown: Sequence[Shown], tell: Report) -> None:
@@ -416,10 +389,6 @@ def _log(drive: SourceDrive, placed: PlacedDrive, roads: LaneMap, scene_id: str)
     )
 
 
-def _from_start(actor: Actor, first_us: int) -> Actor:
-    return replace(actor, track=replace(actor.track, t_us=actor.track.t_us - first_us))
-
-
 def _camera(drive: SourceDrive, placed: PlacedDrive, name: str) -> CameraSpec:
     """Return a camera of the rig at the size that it is rendered in: reduced, its height cut at the
     middle.
@@ -463,7 +432,6 @@ def fitted(
     views: Sequence[PosedView],
     kept: Sequence[PosedView],
     points: Points,
-    boxes: Mapping[str, Box],
     scene_id: str,
     folder: Path,
     tell: Report,
@@ -474,7 +442,6 @@ def fitted(
         views: To fit to.
         kept: Held out, to measure with on the way.
         points: To start from.
-        boxes: Sizes of the road users that views may show.
         scene_id: Key of the random streams.
         folder: Keeps the fit's state; the same call goes on from it.
         tell: Called as the fit goes on.
@@ -489,7 +456,6 @@ def fitted(
         views,
         start,
         kept=kept,
-        boxes=boxes,
         scene_id=scene_id,
         folder=folder,
         seed=SEED,

@@ -71,16 +71,12 @@ def model_folder(folder: Path) -> Path | None:
     )
 
 
-def read_colmap(
-    folder: Path, pictures_at: Path | None = None, kind: str = "colmap", photographs: bool = True
-) -> SourceDrive:
+def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
     """Read a model. Pictures in folders of their own are cameras of their own; they are taken in
     the order of their names.
 
     Args:
         folder: Holds the model, here or in ``sparse/0``.
-        pictures_at: Folder of the pictures; None looks for ``images``.
-        kind: What it is called.
         photographs: Whether they must be there.
 
     Raises:
@@ -105,7 +101,7 @@ def read_colmap(
         xyz, rgb = _points_bin(data["points3D"]) if binary else _points_txt(data["points3D"])
     if not images:
         raise InputError(f"{model}: no image with a pose", DO_THIS)
-    root = pictures_at or _pictures_root(folder, model, images[0].name, photographs)
+    root = _pictures_root(folder, model, images[0].name, photographs)
     shots = [
         Picture(
             root / one.name,
@@ -134,12 +130,8 @@ def read_colmap(
         else np.zeros(0)
     )
     points = Points(xyz, rgb, np.eye(3) * ((SPREAD * near) ** 2)[:, None, None])
-    notes = (
-        (f"no times: {1_000_000 // PERIOD_US} photographs a second are assumed",)
-        if kind == "colmap"
-        else ()
-    )
-    return SourceDrive(kind, folder.resolve().name, every, front, points=points, notes=notes)
+    notes = (f"no times: {1_000_000 // PERIOD_US} photographs a second are assumed",)
+    return SourceDrive("colmap", folder.resolve().name, every, front, points=points, notes=notes)
 
 
 def _camera(name: str) -> str:

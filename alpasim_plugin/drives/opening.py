@@ -10,10 +10,8 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import read_json_object
 from alpasim_plugin.drives.colmap import model_folder, read_colmap
-from alpasim_plugin.drives.dgp import is_dgp, read_dgp
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
 from alpasim_plugin.drives.points import agreeing
-from alpasim_plugin.drives.sfm import Report, is_unposed, read_unposed
 from alpasim_plugin.drives.source import Points, SourceDrive, timed
 from alpasim_plugin.gaussians.fit.photographs import (
     AXES,
@@ -31,16 +29,14 @@ PAIRS, FEWEST, CLEARLY = (
     40,
     1.5,
 )  # pairs that the axes are tried on; matches that tell; by how much one must be better
-FORMS = "transforms.json, a KITTI odometry folder, a DGP scene, a COLMAP model, a video, or a folder of photographs"
+FORMS = "a folder with transforms.json, a KITTI odometry folder, or a COLMAP model"
 
 
-def read_source(folder: Path, work: Path, tell: Report, photographs: bool = True) -> SourceDrive:
+def read_source(folder: Path, photographs: bool = True) -> SourceDrive:
     """Read a recorded drive.
 
     Args:
-        folder: A folder, or a video.
-        work: Receives what structure from motion finds; only made where there are no poses.
-        tell: Called as the work goes on.
+        folder: Holds poses and photographs.
         photographs: Whether they must be there; poses and lenses alone are enough for a model that
             is trained already.
 
@@ -53,12 +49,8 @@ def read_source(folder: Path, work: Path, tell: Report, photographs: bool = True
         return _transforms(folder, photographs)
     if folder.is_dir() and is_kitti(folder):
         return read_kitti(folder)
-    if folder.is_dir() and is_dgp(folder):
-        return read_dgp(folder)
     if folder.is_dir() and model_folder(folder) is not None:
         return read_colmap(folder, photographs=photographs)
-    if is_unposed(folder):
-        return read_unposed(folder, work, tell)
     inside = (
         ", ".join(sorted(path.name for path in folder.iterdir())[:5])
         if folder.is_dir()

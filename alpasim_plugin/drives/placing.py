@@ -16,10 +16,9 @@ from alpasim_plugin.core.geometry import (
     arc_lengths,
     inverse,
     matrix_from_quat,
-    se3,
     trajectory_from_poses,
 )
-from alpasim_plugin.core.types import F64, Actor, HeightField, Lane, LaneMap, Trajectory
+from alpasim_plugin.core.types import F64, HeightField, Lane, LaneMap, Trajectory
 from alpasim_plugin.drives.ground import GroundStrip, fit_ground
 from alpasim_plugin.drives.source import Points, SourceDrive
 from alpasim_plugin.world.ground import from_points, height_at
@@ -50,7 +49,6 @@ class PlacedDrive:
         ego: Rig poses.
         mounts: Camera to its pose on the rig.
         poses: Camera to its poses ``(N, 4, 4)``, in the order of the drive's pictures.
-        tracks: Road users.
         facts: How up, scale and ground were found, for the page of quality.
         notes: What was assumed.
     """
@@ -62,7 +60,6 @@ class PlacedDrive:
     ego: Trajectory
     mounts: Mapping[str, F64]
     poses: Mapping[str, F64]
-    tracks: tuple[Actor, ...]
     facts: Mapping[str, object]
     notes: tuple[str, ...]
 
@@ -96,8 +93,9 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
         field.x0_m + shift[0, 3], field.y0_m + shift[1, 3], field.cell_m, field.z + shift[2, 3]
     )
     strip = fit_ground(moved, poses[drive.front][:, :3, 3]) if strip else None
-    ego, mounts, mount_notes = _rig(drive, T, poses, field)
-    notes = [found_up, scale_note, *mount_notes]
+    ego, mounts = _rig(drive, poses, field)
+    mount_note = f"the front camera is taken to stand {AHEAD_OF_AXLE_M:g} m ahead of the rear axle"
+    notes = [found_up, scale_note, mount_note]
     if strip is None:
         notes.append(
             f"the ground below the path was not seen: it is taken {height:g} m below the camera. Renderers can be judged by these "
@@ -111,47 +109,36 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
         ego,
         mounts,
         poses,
-        tuple(_moved_actor(T, one) for one in drive.tracks),
         {"up": found_up, "scale": scale_note, "ground": _ground_facts(strip)},
         tuple(notes),
     )
 
 
 def _levelled(drive: SourceDrive, points: Points) -> tuple[F64, GroundStrip | None, str]:
-    """Return the transform that puts the drive's up along z (and, without a given up, its first
-    heading along x), and the ground found.
+    """Return the transform that puts the drive's up along z and its first heading along x, the
+    ground, and how up was determined.
     """
     front = np.array([one.T_world_camera for one in drive.of(drive.front)])
-    given = drive.up is not None
-    up = (
-        np.asarray(drive.up, dtype=np.float64)
-        if drive.up is not None
-        else -front[:, :3, 1].mean(axis=0)
-    )
-    T = _upright(up, None if given else front)
+    T = _upright(-front[:, :3, 1].mean(axis=0), front)
     strip = None
-    for _ in range(1 if given else 3):
+    for _ in range(3):
         strip = fit_ground(points.moved(T), front[:, :3, 3] @ T[:3, :3].T + T[:3, 3])
-        if strip is None or given:
+        if strip is None:
             break
         T = _upright(_normal(strip) @ T[:3, :3], front)
-    if given:
-        return T, strip, "up as the files say it"
     if strip is None:
         return T, None, "up from the camera, which is taken to stand upright on the mean"
     return T, strip, "up from the ground: the road's mean plane is taken as level"
 
 
-def _upright(up: F64, front: F64 | None) -> F64:
-    """Return a rotation ``(4, 4)`` that puts ``up`` along z; the first heading of cameras ``(N, 4,
-    4)`` along x, or the least turn.
+def _upright(up: F64, front: F64) -> F64:
+    """Return a rotation ``(4, 4)`` that puts ``up`` along z and the first heading of cameras ``(N,
+    4, 4)`` along x.
     """
     z = up / np.linalg.norm(up)
-    forward = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    if front is not None:
-        forward = front[min(len(front) - 1, 3), :3, 3] - front[0, :3, 3]
-        if np.linalg.norm(np.cross(z, forward)) < 1e-9 or float(forward @ front[0, :3, 2]) < 0:
-            forward = front[0, :3, 2]
+    forward = front[min(len(front) - 1, 3), :3, 3] - front[0, :3, 3]
+    if np.linalg.norm(np.cross(z, forward)) < 1e-9 or float(forward @ front[0, :3, 2]) < 0:
+        forward = front[0, :3, 2]
     x = forward - z * float(forward @ z)
     x /= np.linalg.norm(x)
     T = np.eye(4)
@@ -197,16 +184,6 @@ def _moved(T: F64, T_world_camera: F64) -> F64:
     return np.asarray(out)
 
 
-def _moved_actor(T: F64, actor: Actor) -> Actor:
-    track = actor.track
-    poses = np.array([_moved(T, pose) for pose in _matrices(track)])
-    return replace(actor, track=trajectory_from_poses(track.t_us, poses))
-
-
-def _matrices(track: Trajectory) -> F64:
-    return np.array([se3(xyz, quat) for xyz, quat in zip(track.xyz, track.quat, strict=True)])
-
-
 def _below(path: F64, height: float) -> HeightField:
     """Return the ground at a height below a path that saw none: the path's own heights, nearest
     first.
@@ -218,19 +195,9 @@ def _below(path: F64, height: float) -> HeightField:
 
 
 def _rig(
-    drive: SourceDrive, T: F64, poses: Mapping[str, F64], field: HeightField
-) -> tuple[Trajectory, dict[str, F64], list[str]]:
+    drive: SourceDrive, poses: Mapping[str, F64], field: HeightField
+) -> tuple[Trajectory, dict[str, F64]]:
     """Return the rig's poses and the cameras' mounts; the rig's origin stands on the ground."""
-    if drive.ego is not None and drive.mounts is not None:
-        rig = np.array([_moved(T, pose) for pose in _matrices(drive.ego)])
-        above = float(np.median(rig[:, 2, 3] - height_at(field, rig[:, :3, 3])))
-        lower = np.eye(4)
-        lower[2, 3] = -above
-        mounts = {
-            name: inverse(lower) @ mount for name, mount in drive.mounts.items() if name in poses
-        }
-        note = f"the rig's origin lies {above:.2f} m above the ground that was found, and was put on it"
-        return trajectory_from_poses(drive.ego.t_us, rig @ lower), mounts, [note]
     front, pictures = poses[drive.front], drive.of(drive.front)
     mount = _front_mount(front, field)
     ego = trajectory_from_poses(
@@ -244,11 +211,7 @@ def _rig(
         if common:
             i, j = common[len(common) // 2]
             mounts[name] = mount @ inverse(front[i]) @ poses[name][j]
-    return (
-        ego,
-        mounts,
-        [f"the front camera is taken to stand {AHEAD_OF_AXLE_M:g} m ahead of the rear axle"],
-    )
+    return ego, mounts
 
 
 def _front_mount(front: F64, field: HeightField) -> F64:

@@ -333,15 +333,9 @@ def with_corrected_poses(drive: SourceDrive) -> SourceDrive:
     """Return the drive with the front camera's poses adjusted to its photographs, and its other
     cameras moved along, as a rig is rigid.
 
-    Poses in metres are held to what they were; a drive whose points or ego poses were measured
-    apart keeps its own.
+    Poses in metres are held to what they were; a drive that has points of its own keeps its poses.
     """
-    if (
-        drive.metric is None
-        or drive.points is not None
-        or drive.ego is not None
-        or drive.kind in ("colmap", "sfm")
-    ):
+    if drive.metric is None or drive.points is not None or drive.kind == "colmap":
         return drive
     front = drive.of(drive.front)
     found = corrected([_small(picture) for picture in front])

@@ -171,7 +171,6 @@ def write_page(
         "source": drive.kind,
         "photographs": {use: len(rows) for use, rows in measured.rows.items()},
         "fitted": measured.fitted,
-        "tracks": len(placed.tracks),
         **{
             use: {"psnr_db": _mean(rows, "psnr_db"), "ssim": _mean(rows, "ssim")}
             for use, rows in measured.rows.items()
@@ -212,7 +211,7 @@ def _page(
 ) -> str:
     lines = [f"# Quality of {drive.scene_id}", "", "## What is missing or assumed", ""]
     lines += [f"- {note}" for note in quality["notes"]]
-    lines += ["- no tracks of other road users: nobody moves"] if not quality["tracks"] else []
+    lines += ["- no tracks of other road users: nobody moves"]
     lines += [
         "",
         f"## Photographs that the fit never saw, of {quality['fitted']} that it saw",

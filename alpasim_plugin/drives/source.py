@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F64, Actor, Bool, Trajectory
+from alpasim_plugin.core.types import F64, Bool
 from alpasim_plugin.gaussians.fit.photographs import Picture, whole_photograph
 
 DOING = "importing a drive"
@@ -74,18 +74,13 @@ class SourceDrive:
     """A recorded drive as its files say it.
 
     Attributes:
-        kind: Of the files: ``kitti``, ``transforms``, ``dgp``, ``colmap`` or ``sfm``.
+        kind: Of the files: ``kitti``, ``transforms`` or ``colmap``.
         scene_id: A name for the scenario.
         pictures: All photographs, camera by camera in order of time; each has its time and camera.
         front: The camera that looks ahead and is driven by.
         never_fitted: Cameras whose photographs are kept for judging.
         metric: What makes lengths metres; None where the unit is arbitrary.
-        up: ``(3,)`` against gravity; None where the files do not say it.
-        points: Of LiDAR or of structure from motion; None where there are none.
-        ego: Rig poses, where the files have them.
-        mounts: Camera to its pose on the rig ``(4, 4)``, where the files have them; belongs to
-            ``ego``.
-        tracks: Recorded road users.
+        points: Points that come with the poses; None where there are none.
         notes: What was assumed or left out.
     """
 
@@ -95,11 +90,7 @@ class SourceDrive:
     front: str
     never_fitted: tuple[str, ...] = ()
     metric: str | None = None
-    up: F64 | None = None
     points: Points | None = None
-    ego: Trajectory | None = None
-    mounts: dict[str, F64] | None = None
-    tracks: tuple[Actor, ...] = ()
     notes: tuple[str, ...] = ()
 
     def of(self, camera: str) -> list[Picture]:
@@ -134,7 +125,7 @@ def checked(drive: SourceDrive, folder: Path, photographs: bool = True) -> Sourc
             others; too few; two units of length in one file; a camera that stands or only turns.
     """
     pictures = drive.of(drive.front)
-    if len(pictures) < 2 or (drive.kind != "dgp" and len(pictures) < FEWEST):
+    if len(pictures) < FEWEST:
         raise InputError(
             f"{folder}: {len(pictures)} photographs of the camera {drive.front!r}",
             f"give at least {FEWEST} photographs with poses along a drive",
@@ -156,7 +147,7 @@ def checked(drive: SourceDrive, folder: Path, photographs: bool = True) -> Sourc
     steps = np.linalg.norm(np.diff(drive.path, axis=0), axis=1)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     length = float(steps.sum())
-    if length == 0 or (drive.metric and length < LEAST_M and len(pictures) >= FEWEST):
+    if length == 0 or (drive.metric and length < LEAST_M):
         raise InputError(
             f"{folder}: the camera {drive.front!r} moves {length:.2f} m over {len(pictures)} photographs: it stands, or only turns",
             "give a part of the drive in which the car moves: depth comes from moving",

@@ -116,7 +116,7 @@ def test_scale_without_metres_comes_from_the_cameras_height(
 def test_where_no_road_is_below_the_cameras_every_fifth_photograph_is_held_out(
     walk: Path, tmp_path: Path
 ) -> None:
-    drive = read_source(walk, tmp_path, lambda stage, done, whole: None)
+    drive = read_source(walk)
     placed = place(
         replace(drive, metric=None), Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     )
@@ -128,7 +128,7 @@ def test_where_no_road_is_below_the_cameras_every_fifth_photograph_is_held_out(
 def test_views_are_half_as_wide_and_their_longer_side_is_not_small(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drive = read_source(walk, tmp_path, lambda stage, done, whole: None)
+    drive = read_source(walk)
     shown = build.Shown(drive.pictures[0], "front", "fitted", np.eye(4), "a.png", {})
     monkeypatch.setattr(build, "FIT_PX", 200)
     assert shown.view().rgb.shape == (80, 200, 3)  # of 320 x 128
