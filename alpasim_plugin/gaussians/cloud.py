@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ from alpasim_plugin.gaussians.constants import LOG_SCALE_LIMIT
 from alpasim_plugin.gaussians.sh import SH_SIZES, rotate_sh
 
 FloatArray = npt.NDArray[np.floating]
-FEW = 4  # transforms that are tested one by one
 LARGEST_SCALE_M = np.exp(LOG_SCALE_LIMIT) * 1.0001  # room for float32 rounding
 
 
@@ -319,8 +317,6 @@ def require_rigid(T: npt.ArrayLike, name: str = "a transform") -> None:
     """
     m = np.asarray(T, dtype=np.float64)
     fault = None
-    if m.shape == (4, 4) and _clearly_rigid(m):
-        return
     if m.shape != (4, 4):
         fault = f"shape {m.shape}"
     elif not np.isfinite(m).all():
@@ -338,31 +334,8 @@ def require_rigid(T: npt.ArrayLike, name: str = "a transform") -> None:
         )
 
 
-def _clearly_rigid(T: F64) -> bool:
-    """Return whether ``(4, 4)`` passes `require_rigid` beyond rounding: numbers one by one, a tenth
-    of the time of arrays so small.
-    """
-    (a, b, c, x), (d, e, f, y), (g, h, i, z), last = T.tolist()
-    products = (
-        a * a + b * b + c * c - 1,
-        d * d + e * e + f * f - 1,
-        g * g + h * h + i * i - 1,
-        a * d + b * e + c * f,
-        a * g + b * h + c * i,
-    )
-    near = all(-9e-6 < value < 9e-6 for value in (*products, d * g + e * h + f * i))
-    return (
-        near
-        and last == [0, 0, 0, 1]
-        and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
-        and isfinite(x + y + z)
-    )
-
-
 def all_rigid(T: F64) -> bool:
     """Return whether all of ``(N, 4, 4)`` pass `require_rigid`; cheap for many."""
-    if len(T) <= FEW and all(map(_clearly_rigid, T)):
-        return True
     rotation = T[:, :3, :3]
     gram = rotation @ rotation.transpose(0, 2, 1)
     turns = np.all(np.abs(gram - np.eye(3)) <= 1e-5) and np.all(np.linalg.det(rotation) > 0)

@@ -57,18 +57,6 @@ GEO_SIZE = 12
 BUNDLE = 256
 SPHERE_SIZE = 5
 
-# One prepared cloud among those of a frame, one int64 row: addresses of its arrays, and numbers.
-PART_MEANS = 0
-PART_GEOMETRY = 1
-PART_SH = 2
-PART_INDEX = 3
-PART_SPHERES = 4
-PART_SPHERE = 5
-PART_GROUPS = 6
-PART_SH_SIZE = 7
-PART_INPUT = 8
-PART_SIZE = 9
-
 # One visible splat: sixteen float32, one cache line. With d = pixel - (u, v) the exponent is s^2 +
 # t^2 where s = L11 dx + L12 dy and t = L22 dy: a sum of squares, which keeps its precision for
 # needles where the usual quadratic form cancels.

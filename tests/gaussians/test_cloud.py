@@ -7,7 +7,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud
-from alpasim_plugin.gaussians.cloud import FEW, all_rigid, require_rigid
+from alpasim_plugin.gaussians.cloud import all_rigid, require_rigid
 from tests.gaussians.gaussian_scenes import random_cloud, random_rigid
 
 
@@ -156,7 +156,7 @@ def test_arrays_of_a_cloud_cannot_be_written_and_those_given_stay_writable():
 def test_one_transform_is_rigid_where_many_are(entry: tuple[int, int], by: float) -> None:
     T = random_rigid(7)
     T[entry] += by
-    many = np.stack([T, *[np.eye(4)] * FEW])
+    many = np.stack([T, *[np.eye(4)] * 4])
     assert all_rigid(T[None]) == all_rigid(many)
     if all_rigid(many):
         require_rigid(T, "testing")

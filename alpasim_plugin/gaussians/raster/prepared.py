@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.core.types import F64, I64
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MIN,
@@ -46,7 +46,6 @@ class PreparedCloud:
         index: int64, position of each lane's Gaussian in the cloud given.
         spheres: float64, bounding sphere per bundle.
         sphere: float64 ``(SPHERE_SIZE,)``, bounding sphere of all.
-        row: What the kernels read of it, see `part_row`.
     """
 
     n_input: int
@@ -59,33 +58,14 @@ class PreparedCloud:
     index: npt.NDArray[np.int64]
     spheres: F64
     sphere: F64
-    row: I64 = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Write the row."""
-        arrays = (self.means, self.geometry, self.sh, self.index, self.spheres, self.sphere)
-        object.__setattr__(self, "row", part_row(arrays, self.sh_size, self.n_input))
-
-    def __reduce__(self) -> tuple[type[PreparedCloud], tuple[Any, ...]]:
-        """Pickle without the row: addresses hold in one process."""
-        return PreparedCloud, tuple(
-            getattr(self, field.name) for field in fields(self) if field.init
-        )
 
     def __len__(self) -> int:
         """Return the number of Gaussians kept."""
         return self.n_kept
 
-
-def part_row(arrays: tuple[npt.NDArray[Any], ...], sh_size: int, n_input: int) -> I64:
-    """Return a cloud as the kernels read it, columns ``PART_*``: addresses of its means, geometry,
-    colours, index, spheres and sphere.
-
-    The arrays have the types of `PreparedCloud`, and must live as long as the row is used.
-    """
-    return np.array(
-        [*(array.ctypes.data for array in arrays), len(arrays[3]) // _LANES, sh_size, n_input]
-    )
+    def arrays(self) -> tuple[F64, F32, F32, int, npt.NDArray[np.int64], F64]:
+        """Return what `project_part` reads of it."""
+        return self.means, self.geometry, self.sh, self.sh_size, self.index, self.spheres
 
 
 def prepare(cloud: GaussianCloud, *, sh_frame: ShFrame = "object") -> PreparedCloud:

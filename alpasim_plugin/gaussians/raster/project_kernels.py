@@ -36,14 +36,6 @@ from alpasim_plugin.gaussians.constants import (
     L11,
     L12,
     L22,
-    PART_GEOMETRY,
-    PART_GROUPS,
-    PART_INDEX,
-    PART_MEANS,
-    PART_SH,
-    PART_SH_SIZE,
-    PART_SPHERE,
-    PART_SPHERES,
     PEAK,
     POSE_CENTRE,
     POSE_COLOUR,
@@ -135,19 +127,14 @@ def colours_in_lanes(coefficients, width, index, out):
 
 
 @njit(cache=True, nogil=True)
-def bundles_in_view(parts, poses, camera):
-    """Return where each part's bundles begin in the row of all that are looked at, and where the
-    last end; none of a part out of view.
+def spheres_in_view(spheres, poses, camera):
+    """Return for each part, given the bounding sphere of all its Gaussians, whether it may be
+    seen.
     """
-    first = np.zeros(parts.shape[0] + 1, np.int64)
-    for i in range(parts.shape[0]):
-        seen = not bundle_is_out_of_view(
-            v.array_at(parts[i, PART_SPHERE], np.float64), np.int64(0), poses[i], camera
-        )
-        first[i + 1] = first[i] + (
-            (parts[i, PART_GROUPS] * 16 + BUNDLE - 1) // BUNDLE if seen else 0
-        )
-    return first
+    seen = np.zeros(poses.shape[0], np.bool_)
+    for i in range(poses.shape[0]):
+        seen[i] = not bundle_is_out_of_view(spheres, i * SPHERE_SIZE, poses[i], camera)
+    return seen
 
 
 @njit(cache=True, nogil=True)
@@ -352,18 +339,37 @@ def _colour_group(group, d, sh, sh_size, pose, basis, lanes):
 
 
 @njit(cache=True, nogil=True)
-def project_parts(cursor, parts, first_bundles, first_ids, poses, camera, records, ids):
-    """Project the Gaussians of all parts and append those that reach the image; called by each
-    thread until no bundle is left.
+def project_part(
+    cursor,
+    part,
+    means,
+    geometry,
+    sh,
+    sh_size,
+    index,
+    spheres,
+    first_id,
+    pose,
+    camera,
+    records,
+    ids,
+):
+    """Project the Gaussians of one part and append those that reach the image; called by each
+    thread, which takes bundles until none is left.
 
     Args:
-        cursor: int64 ``(2,)``: the next bundle, the number of records written; shared by all
-            threads.
-        parts: int64 ``(N, PART_SIZE)``, see `constants`.
-        first_bundles: int64 ``(N + 1,)``, from `bundles_in_view`.
-        first_ids: int64 ``(N,)``, added to a Gaussian's position in its cloud; makes identities
-            unique and ordered by part.
-        poses: float64 ``(N, POSE_SIZE)``, see `constants`.
+        cursor: int64: the number of records written, then the next bundle of each part; shared by
+            all threads.
+        part: Which part this is.
+        means: See `PreparedCloud`, also for the next ones.
+        geometry: See above.
+        sh: See above.
+        sh_size: See above.
+        index: See above.
+        spheres: See above.
+        first_id: Added to a Gaussian's position in its cloud; makes identities unique and ordered
+            by part.
+        pose: float64 ``(POSE_SIZE,)``, see `constants`.
         camera: See `constants`.
         records: float32 output, RECORD per splat.
         ids: int64 output, one per splat.
@@ -372,42 +378,25 @@ def project_parts(cursor, parts, first_bundles, first_ids, poses, camera, record
     basis = np.empty(16 * 16, np.float32)
     kept = np.empty(BUNDLE * RECORD, np.float32)
     kept_ids = np.empty(BUNDLE, np.int64)
-    i, end = -1, 0  # the part in hand, and the first bundle behind it
+    groups = index.shape[0] // 16
     while True:
-        bundle = v.fetch_add(cursor, 0, 1)
-        if bundle >= first_bundles[parts.shape[0]]:
+        bundle = v.fetch_add(cursor, part + 1, 1)
+        if bundle * BUNDLE >= index.shape[0]:
             return
-        if bundle >= end:  # bundles come in ascending order
-            i += 1
-            while first_bundles[i + 1] <= bundle:
-                i += 1
-            end = first_bundles[i + 1]
-            pose = poses[i]
-            sh_size = parts[i, PART_SH_SIZE]
-            means, spheres = (
-                v.array_at(parts[i, PART_MEANS], np.float64),
-                v.array_at(parts[i, PART_SPHERES], np.float64),
-            )
-            geometry, sh = (
-                v.array_at(parts[i, PART_GEOMETRY], np.float32),
-                v.array_at(parts[i, PART_SH], np.float32),
-            )
-            index = v.array_at(parts[i, PART_INDEX], np.int64)
-        at = bundle - first_bundles[i]
-        if bundle_is_out_of_view(spheres, at * SPHERE_SIZE, pose, camera):
+        if bundle_is_out_of_view(spheres, bundle * SPHERE_SIZE, pose, camera):
             continue
         count = 0
-        first = at * (BUNDLE // 16)
-        for group in range(first, min(first + BUNDLE // 16, parts[i, PART_GROUPS])):
+        first = bundle * (BUNDLE // 16)
+        for group in range(first, min(first + BUNDLE // 16, groups)):
             chosen = _project_group(group, means, geometry, sh, sh_size, pose, camera, basis, lanes)
             while chosen != 0:
                 lane = v.lowest_bit(chosen)
                 chosen &= chosen - 1
                 for field in range(RECORD):
                     kept[count * RECORD + field] = lanes[field * 16 + lane]
-                kept_ids[count] = index[group * 16 + lane] + first_ids[i]
+                kept_ids[count] = index[group * 16 + lane] + first_id
                 count += 1
-        out = v.fetch_add(cursor, 1, count)
+        out = v.fetch_add(cursor, 0, count)
         for j in range(
             count * RECORD
         ):  # no slices: numba would compile the text of an error about their shapes for seconds

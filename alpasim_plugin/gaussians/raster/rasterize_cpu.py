@@ -27,8 +27,6 @@ from alpasim_plugin.gaussians.constants import (
     BUNDLE,
     FAR_M,
     NEAR_M,
-    PART_INPUT,
-    PART_SIZE,
     POSE_CENTRE,
     POSE_COLOUR,
     POSE_FAR,
@@ -36,6 +34,7 @@ from alpasim_plugin.gaussians.constants import (
     POSE_ROTATION,
     POSE_SIZE,
     RECORD,
+    SPHERE_SIZE,
     TILE,
 )
 from alpasim_plugin.gaussians.raster.binning import (
@@ -46,7 +45,7 @@ from alpasim_plugin.gaussians.raster.binning import (
 )
 from alpasim_plugin.gaussians.raster.output import F32, Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
-from alpasim_plugin.gaussians.raster.project_kernels import bundles_in_view, project_parts
+from alpasim_plugin.gaussians.raster.project_kernels import project_part, spheres_in_view
 from alpasim_plugin.gaussians.raster.raster_kernels import raster_tiles
 
 
@@ -66,6 +65,7 @@ class Buffers(threading.local):
         return array
 
 
+Part = tuple[Any, ...]
 _IDENTITY = np.eye(4)
 WORTH_THREADS = 4096  # splats; below, waking a second thread costs more than it saves
 _buffers = Buffers()
@@ -103,20 +103,19 @@ def rasterize_prepared(
     view = camera_numbers(camera, lod_px)
     turned = np.array([prepared.sh_frame == "world" for prepared, _ in nodes], dtype=bool)
     poses = node_poses([T for _, T in nodes], turned, camera, near_m)
-    parts = np.array([prepared.row for prepared, _ in nodes], np.int64).reshape(-1, PART_SIZE)
-    first_bundles = bundles_in_view(parts, poses, view)
-    first_ids = np.cumsum(parts[:, PART_INPUT]) - parts[:, PART_INPUT]
-    room = int(first_bundles[-1]) * BUNDLE
-    records, ids = (
-        _buffers.get("records", room * RECORD, np.float32),
-        _buffers.get("ids", room, np.int64),
-    )
-    cursor = np.zeros(2, np.int64)
+    spheres = np.array([prepared.sphere for prepared, _ in nodes], np.float64).reshape(-1)
+    ends = np.cumsum([prepared.n_input for prepared, _ in nodes])
+    parts: list[Part] = []
+    room = 0
+    for i in np.flatnonzero(spheres_in_view(spheres, poses, view)):
+        prepared = nodes[i][0]
+        room += len(prepared.spheres) // SPHERE_SIZE * BUNDLE
+        first_id = ends[i] - prepared.n_input
+        parts.append((*prepared.arrays(), first_id, poses[i]))
+    records = _buffers.get("records", room * RECORD, np.float32)
+    ids = _buffers.get("ids", room, np.int64)
     workers = threads if room > WORTH_THREADS else 1
-    run_on_threads(
-        workers, project_parts, cursor, parts, first_bundles, first_ids, poses, view, records, ids
-    )
-    count = int(cursor[1])
+    count = project_parts(workers, parts, view, records, ids)
 
     keys, spare = _buffers.get("keys", count, np.int64), _buffers.get("spare", count, np.int64)
     order = depth_order(count, records, ids, records.view(np.int32), keys, spare)
@@ -125,7 +124,7 @@ def rasterize_prepared(
     rgb = np.empty((*shape, 3), np.float32)
     alpha = np.empty(shape, np.float32)
     depth = np.empty(shape, np.float32)
-    cursor[:] = 0
+    cursor = np.zeros(2, np.int64)
     run_on_threads(
         threads,
         raster_tiles,
@@ -140,12 +139,38 @@ def rasterize_prepared(
         depth,
     )
     stats = {
-        "gaussians": int(parts[:, PART_INPUT].sum()),
+        "gaussians": sum(prepared.n_input for prepared, _ in nodes),
         "visible": count,
         "pairs": tiles.pairs,
         "pairs_looked_at": int(cursor[1]),
     }
     return RasterOutput(rgb, alpha, depth, stats)
+
+
+def project_parts(
+    workers: int,
+    parts: Sequence[Part],
+    view: F32,
+    records: npt.NDArray[np.generic],
+    ids: npt.NDArray[np.generic],
+) -> int:
+    """Project prepared parts on several threads, and return how many records were written.
+
+    Args:
+        workers: Threads.
+        parts: What `project_part` takes of each part, from its means to its pose.
+        view: The camera, see `camera_numbers`.
+        records: float32 output, RECORD per splat.
+        ids: int64 output, one per splat.
+    """
+    cursor = np.zeros(len(parts) + 1, np.int64)
+
+    def project() -> None:
+        for number, part in enumerate(parts):
+            project_part(cursor, number, *part, view, records, ids)
+
+    run_on_threads(workers, project)
+    return int(cursor[0])
 
 
 def camera_numbers(camera: PinholeCamera, lod_px: float = 0.0) -> F32:

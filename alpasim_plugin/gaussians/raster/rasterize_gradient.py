@@ -37,8 +37,6 @@ from alpasim_plugin.gaussians.raster.gradient_kernels import (
 )
 from alpasim_plugin.gaussians.raster.gradient_project import pack, splat_gradients, sum_pairs
 from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput, ScreenStatistics, Splats
-from alpasim_plugin.gaussians.raster.prepared import part_row
-from alpasim_plugin.gaussians.raster.project_kernels import project_parts
 from alpasim_plugin.gaussians.raster.rasterize_cpu import (
     WORTH_THREADS,
     Buffers,
@@ -46,6 +44,7 @@ from alpasim_plugin.gaussians.raster.rasterize_cpu import (
     camera_numbers,
     list_per_tile,
     node_poses,
+    project_parts,
     run_on_threads,
     thread_count,
 )
@@ -115,25 +114,11 @@ def _project(p: _Parameters, view: _View) -> tuple[TileLists, F32, npt.NDArray[n
     # bounding spheres worth a test.
     plain = np.zeros(groups * 3 * _LANES, np.float32)
     everywhere = np.tile([0.0, 0.0, 0.0, np.inf, 0.0], -(-n // BUNDLE))
-    cursor = np.zeros(2, np.int64)
     index = np.arange(groups * _LANES, dtype=np.int64)
     workers = view.threads if n > WORTH_THREADS else 1
-    parts = part_row((lane_means, geometry, plain, index, everywhere, everywhere), 1, n)[None]
-    bundles, first = np.array([0, -(-n // BUNDLE)]), np.zeros(1, np.int64)
-    run_on_threads(
-        workers,
-        project_parts,
-        cursor,
-        parts,
-        bundles,
-        first,
-        view.pose[None],
-        view.numbers,
-        records,
-        ids,
-    )
-    count = int(cursor[1])
-    cursor[:] = 0
+    part = (lane_means, geometry, plain, 1, index, everywhere, np.int64(0), view.pose)
+    count = project_parts(workers, [part], view.numbers, records, ids)
+    cursor = np.zeros(2, np.int64)
     centre = view.pose[POSE_CENTRE : POSE_CENTRE + 3]
     run_on_threads(
         workers, colour_splats, cursor, _chunk(count), count, ids, p.means, centre, p.sh, records

@@ -20,12 +20,10 @@ import operator
 from typing import Any
 
 from llvmlite import ir
-from numba import carray, types
+from numba import types
 from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
-
-from alpasim_plugin.core.kernels import njit
 
 LANES = 16
 _I32 = ir.IntType(32)
@@ -151,22 +149,6 @@ def load_bytes(typingctx, array, index):
         return builder.uitofp(builder.load(pointer, align=1), _VECTORS["f32"])
 
     return F32X16(array, types.intp), codegen
-
-
-@intrinsic
-def _pointer(typingctx, address, dtype):
-    def codegen(context, builder, sig, args):
-        return builder.inttoptr(args[0], context.get_value_type(sig.return_type))
-
-    return types.CPointer(dtype.dtype)(types.int64, dtype), codegen
-
-
-@njit(cache=True, nogil=True)
-def array_at(address, dtype):
-    """Return the array that begins at an address, of unknown length; its owner must live as long as
-    it is read.
-    """
-    return carray(_pointer(address, dtype), 1 << 40)
 
 
 @intrinsic

@@ -135,7 +135,7 @@ def _kernels(run: Callable[[], object], passes: int) -> list[Share]:
 
 @contextmanager
 def _timed_kernels(spent: dict[str, float]) -> Iterator[None]:
-    names = ("run_on_threads", "bundles_in_view", "depth_order", "tile_offsets")
+    names = ("run_on_threads", "spheres_in_view", "depth_order", "tile_offsets")
     plain = {name: getattr(rasterize_cpu, name) for name in names}
 
     def timed(name: str, *args: Any) -> Any:
