@@ -141,13 +141,13 @@ def test_sizes_that_are_no_multiple_of_the_tile(backend, width, height):
 
 
 def test_unknown_backend_is_an_error():
-    with pytest.raises(InputError, match="choose one of cpu, reference, torch, gsplat"):
+    with pytest.raises(InputError):
         rasterize(splats([0, 0, 1]), camera(), backend="metal")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("background", [(0.1, 0.2), np.zeros((3, 3, 3)), (np.nan, 0, 0)])
 def test_background_that_does_not_fit_is_an_error(background):
-    with pytest.raises(InputError, match="reading a background"):
+    with pytest.raises(InputError):
         rasterize(splats([0, 0, 1]), camera(), background)
 
 

@@ -154,7 +154,7 @@ def test_farther_nodes_use_coarser_levels() -> None:
 
 def test_pose_of_an_actor_without_a_model_is_an_error() -> None:
     graph = SceneGraph([], [node("a", blobs((0, 0, 0)), "actor")], SKY)
-    with pytest.raises(RendererError, match="actor 'b' has no model") as caught:
+    with pytest.raises(RendererError) as caught:
         graph.render(camera(), {"b": np.eye(4)})
     assert "scenario's own actors" in str(caught.value)
 

@@ -106,7 +106,7 @@ def test_no_actors_at_all() -> None:
 def test_time_must_go_forwards_until_a_reset() -> None:
     actors = Actors([Actor("a", "car", BOX, line_track(0, 5))], Vehicle(), 0)
     actors.step(500_000, FAR_AWAY)
-    with pytest.raises(InputError, match="step forwards, or reset first"):
+    with pytest.raises(InputError):
         actors.step(500_000, FAR_AWAY)
     actors.reset()
     assert actors.step(0, FAR_AWAY)["a"][0, 3] == 0.0

