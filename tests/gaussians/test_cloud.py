@@ -33,10 +33,10 @@ def arrays(n: int = 8) -> dict[str, np.ndarray]:
 )
 def test_each_cause_is_dropped_and_counted_under_its_name(field, row, value, cause):
     data = arrays()
-    GaussianCloud(**data).require_drawable("testing")
+    GaussianCloud(**data).require_drawable()
     data[field][row] = value
     with pytest.raises(InputError):
-        GaussianCloud(**data).require_drawable("testing")
+        GaussianCloud(**data).require_drawable()
     cloud, report = GaussianCloud.cleaned(**data)
     assert report.dropped == {**dict.fromkeys(report.dropped, 0), cause: 1}
     assert (report.n_input, report.n_kept, len(cloud)) == (8, 7, 7)
