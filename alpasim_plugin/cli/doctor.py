@@ -33,7 +33,6 @@ def doctor(
         "disk": _disk,
         "cache": lambda: _writable(places.cache()),
         "kernels": lambda: _writable(places.kernels()),
-        "scratch": lambda: _writable(places.scratch()),
     }
     needed = {"rasteriser (cpu)", "fixer", "video", "log messages", "disk", "kernels"}
     rows = []

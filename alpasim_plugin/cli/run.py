@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -46,7 +47,7 @@ from evaluators.report.verdict import metric_lines, verdict_line
 from evaluators.statistics.arms import arms_of, base_named
 from evaluators.statistics.decision import Question, metric_question
 from evaluators.statistics.gate import load_gate
-from scenarios.suite import expand, shipped_names
+from scenarios.suite import ScenarioRef, expand, shipped_names
 
 TRACEBACK_LINES = 4  # of a failure, in the terminal
 
@@ -73,6 +74,9 @@ def run(
     where: Where,
     care: Care,
     out: RunFolder = None,
+    shard: Annotated[
+        str | None, Flag("Drive only this part of the scenes, for job arrays.", metavar="I/N")
+    ] = None,
     resume: Annotated[bool, Flag("Continue in a folder that another command has written.")] = False,
     until_decided: Annotated[
         bool,
@@ -96,6 +100,8 @@ def run(
     how = where.arguments() | care.arguments()
     check_preset(options.preset)
     refs = [ref for item in what.scenarios for ref in expand(item, what.of_scene, what.source)]
+    if shard is not None:
+        refs = shard_of(refs, shard)
     plan = make_plan(
         refs,
         what.renderers,
@@ -138,6 +144,23 @@ def run(
             f"not reused by the next command: {names} has no digest (--resume reuses its rollouts)"
         )
     raise typer.Exit(result.exit_code)
+
+
+def shard_of(refs: Sequence[ScenarioRef], shard: str) -> list[ScenarioRef]:
+    """Return every N-th scene, from the I-th on, for a shard ``I/N``.
+
+    Raises:
+        InputError: ``shard`` is not I/N with 1 <= I <= N, or there are fewer than I scenes.
+    """
+    match = re.fullmatch(r"([0-9]+)/([0-9]+)", shard)
+    number, count = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not 1 <= number <= count:
+        raise InputError(f"--shard {shard}: not I/N with 1 <= I <= N", "Write for example 3/16.")
+    if number > len(refs):
+        raise InputError(
+            f"--shard {shard}: there are only {len(refs)} scenes", "Use at most as many shards."
+        )
+    return list(refs[number - 1 :: count])
 
 
 def question_of(metrics: Sequence[str]) -> Question:

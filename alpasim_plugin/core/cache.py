@@ -10,6 +10,7 @@ FOLDER / NAME.json         what was measured by one process of a run on a node: 
 from __future__ import annotations
 
 import shutil
+import socket
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -114,6 +115,15 @@ def _make(folder: Path, make: Callable[[Path], None], what: str) -> None:
     with atomic_folder(folder, DO_THIS) as partial:
         make(partial)
     print(f"{what}: {time.perf_counter() - began:.1f} s", file=sys.stderr, flush=True)
+
+
+def measured_folder(run: str) -> Path | None:
+    """Return where the processes of a run on this machine share what they measure; None: nowhere,
+    since no private folder can be written.
+    """
+    kept = places.cache().path
+    root = None if kept is None else kept / "measured" / socket.gethostname()
+    return root / run if root is not None and places.is_private(root) else None
 
 
 def share_measurements(folder: Path | None) -> None:

@@ -2,10 +2,8 @@
 
 cache    $SIMRUN_CACHE; simrun below $XDG_CACHE_HOME or ~/.cache; a private temporary folder; nowhere
 kernels  those in the wheel; $NUMBA_CACHE_DIR; beside their source; numba below the cache
-scratch  $SIMRUN_SCRATCH/simrun-USER-HOST; below the system's temporary folder, by a name that only this user's cache holds
-state    $SIMRUN_SLURM; simrun/slurm below $XDG_STATE_HOME or ~/.local/state
 
-Kernels, and the results of Slurm's jobs, are pickles, which run code when they are read. So a
+Kernels are pickles, which run code when they are read. So a
 folder that nobody named must be this user's own, as must the folder that it is made in: ``sudo``
 leaves the home of another user in the environment.
 """
@@ -15,7 +13,6 @@ from __future__ import annotations
 import atexit
 import os
 import shutil
-import socket
 import stat
 import sys
 from contextlib import suppress
@@ -34,10 +31,7 @@ MADE = (
 )  # compiled kernels and reconstructions that lie in a wheel, as in a cache; nothing is written there
 CACHE = "SIMRUN_CACHE"
 KERNELS = "NUMBA_CACHE_DIR"
-SCRATCH = "SIMRUN_SCRATCH"
-STATE = "SIMRUN_SLURM"
 TEMPORARY = "simrun-cache-"  # then the process that made it
-SECRET = "scratch-name"  # file of the cache
 INTERPRETED = "NUMBA_DISABLE_JIT"
 DO_THIS = f"name a writable folder in {CACHE}, and one for temporary files in TMPDIR"
 
@@ -75,31 +69,6 @@ def kernels() -> Place:
         or beside
         or Place(None, "no folder can be written: kernels are not compiled")
     )
-
-
-def scratch() -> Place:
-    """Return the folder in which rollouts of other nodes are driven.
-
-    Raises:
-        InfrastructureError: There is no folder for temporary files.
-    """
-    named, kept = os.environ.get(SCRATCH), cache().path
-    if named:
-        return Place(Path(named, f"simrun-{os.getuid()}-{socket.gethostname()}"), SCRATCH)
-    if kept is None:
-        return Place(None, "no folder can be written")
-    return Place(
-        _temporary_root() / f"simrun-{_secret(kept)}",
-        "below the temporary folder, by a name that is kept in the cache",
-    )
-
-
-def state() -> Path:
-    """Return the folder that Slurm's jobs answer through, which must be on a file system that all
-    nodes see.
-    """
-    root = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
-    return Path(os.environ.get(STATE) or Path(root, "simrun", "slurm"))
 
 
 def prepare() -> None:
@@ -270,28 +239,3 @@ def _make_temporary() -> Path | None:
 def _remove(folder: Path, maker: int) -> None:
     if os.getpid() == maker:  # not a child that was forked
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _secret(kept: Path) -> str:
-    """Return what this user's scratch folders are called, drawn once for each cache.
-
-    Raises:
-        InfrastructureError: The cache cannot be written.
-    """
-    from alpasim_plugin.core.atomic import disk_error, temporary_path
-
-    path = kept / SECRET
-    try:
-        if not path.exists():
-            kept.mkdir(parents=True, exist_ok=True)
-            drawn = temporary_path(path)
-            drawn.write_text(os.urandom(8).hex())
-            with suppress(FileExistsError):
-                os.link(drawn, path)  # the first of several processes decides
-            drawn.unlink()
-        text = path.read_text()
-    except OSError as error:
-        raise disk_error(path, error, DO_THIS) from error
-    if not text.isalnum():
-        raise InfrastructureError(f"{path}: not what simrun wrote", "remove the file")
-    return text

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import ctypes
 import io
 import multiprocessing
 import os
@@ -20,19 +19,16 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from multiprocessing import forkserver, resource_tracker
-from multiprocessing.context import ForkServerContext, ForkServerProcess, SpawnContext, SpawnProcess
 from pathlib import Path
 from typing import TextIO
 
 from alpasim_plugin.core.errors import InputError
 
-PR_SET_PDEATHSIG = 1  # linux/prctl.h
-ORPHANED = 70  # exit code of a worker whose parent is gone (EX_SOFTWARE)
 SAFE_PATH, OURS = (
     "PYTHONSAFEPATH",
     "simrun",
 )  # variable that keeps Python from importing from the working directory; our value of it
+ORPHANED = 70  # exit code of a worker whose parent is gone (EX_SOFTWARE)
 SUPERVISOR = Path(__file__).with_name("supervisor.py")
 GRACE_S = 5.0  # between asking the command to end and ending it
 LAST_LINES = 20
@@ -63,8 +59,7 @@ def own_path_only() -> None:
     """Take the working directory off this worker's import path, unless the user's ``PYTHONPATH``
     names it; undo `safe_path`.
     """
-    if os.environ.get(SAFE_PATH) == OURS:
-        del os.environ[SAFE_PATH]
+    forget_safe_path()
     given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     here = os.path.realpath(os.getcwd())
     sys.path[:] = [
@@ -72,98 +67,17 @@ def own_path_only() -> None:
     ]
 
 
-class _Process(SpawnProcess):
-    def start(self) -> None:
-        with safe_path():
-            resource_tracker.ensure_running()
-            super().start()
-
-    def run(self) -> None:
-        _forget_safe_path()
-        super().run()
-
-
-class _Copy(ForkServerProcess):
-    def run(self) -> None:
-        _forget_safe_path()
-        super().run()
-
-
-class _Context(SpawnContext):
-    Process = _Process
-
-
-class _CopyContext(ForkServerContext):
-    Process = _Copy
-
-
-def _forget_safe_path() -> None:
+def forget_safe_path() -> None:
+    """Undo `safe_path` in the process that was started, for those that it starts itself."""
     if os.environ.get(SAFE_PATH) == OURS:
         del os.environ[SAFE_PATH]
 
 
-def spawn_context() -> SpawnContext:
-    """Return how worker processes are started: anew, by a Python that imports nothing from the
-    working directory.
-    """
-    return _Context()
-
-
-def copy_context() -> ForkServerContext | None:
-    """Return how worker processes are started as copies of the process that `load_for_copies` has
-    started; None: there is none.
-    """
-    return _CopyContext() if _model_pid() is not None else None
-
-
-def load_for_copies(modules: Sequence[str]) -> None:
-    """Start a process without threads of its own that loads modules, while this one goes on; it
-    ends with this one.
-
-    Call it once, at the start of a command: copies have the environment and the working directory
-    of this moment. Only on Linux, where a fork is safe with the libraries that are loaded.
-    """
-    if sys.platform != "linux":
-        return
-    context = _CopyContext()
-    context.set_forkserver_preload(list(modules))
-    with safe_path():
-        forkserver.ensure_running()
-    atexit.register(_end_model)
-
-
-def _model_pid() -> int | None:
-    return getattr(forkserver._forkserver, "_forkserver_pid", None)
-
-
-def _end_model() -> None:
-    pid = _model_pid()
-    if pid is not None:
-        with contextlib.suppress(ProcessLookupError, ChildProcessError):
-            os.kill(pid, signal.SIGKILL)
-            os.waitpid(pid, 0)  # its processor time counts as ours
-
-
 def end_with_parent() -> None:
-    """End this worker process as soon as its parent is gone, by whatever signal; call it first, in
-    the worker's main thread.
-
-    A thread waits for the end of a pipe that only the parent holds open, which works on every
-    system. Linux kills the worker as well, so that one inside a long call that never returns to
-    Python ends too. A parent that died before the request was made is noticed by the change of the
-    parent's number. A copy is killed with the process that it is a copy of, which ends with the
-    parent.
-    """
+    """End this worker process as soon as its parent is gone, however that ended."""
     parent = multiprocessing.parent_process()
     if parent is None:
         return
-    is_copy = isinstance(multiprocessing.current_process(), _Copy)
-    if is_copy:
-        os.close(forkserver._forkserver._forkserver_alive_fd)  # type: ignore[attr-defined]  # what the model waits for the end of
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if not is_copy and os.getppid() != parent.pid:
-        os._exit(ORPHANED)
 
     def watch() -> None:
         parent.join()

@@ -21,7 +21,7 @@ from alpasim_plugin.log.run_folder.manifests import find_contents, read_run_json
 from alpasim_plugin.log.run_folder.sides import RendererRows
 from alpasim_plugin.log.run_folder.writer import rollout_rows, writing
 from alpasim_plugin.runs.execute import HowToRun, execute, thread_budget
-from alpasim_plugin.runs.executors.choice import LOCAL, Executor, kept_open
+from alpasim_plugin.runs.executors.choice import LOCAL, Executor
 from alpasim_plugin.runs.plan import Cell, RunPlan, part_of
 from alpasim_plugin.runs.run import (
     Progress,
@@ -153,7 +153,7 @@ def execute_decision(
     test = _SequentialTest(plan, question)
     threads = thread_budget(workers, SCENES_PER_LOOK * 2 * len(plan.seeds), executor)
     how = HowToRun(threads, limit_s=limit_s, executor=executor)
-    with writing(root, wait, progress.noticed), kept_open(executor):
+    with writing(root, wait, progress.noticed):
         contents = find_contents(root)
         held = claim(root, plan, command, threads, False, contents, progress.noticed)
         # The kind is written at once: the plan's scenes are not all wanted.

@@ -19,20 +19,16 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core import kernels
-from alpasim_plugin.core.cache import cache_root, cached, share_measurements
+from alpasim_plugin.core.cache import cache_root, cached, measured_folder, share_measurements
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import write_manifest
 from alpasim_plugin.renderers.reconstruction_key import is_reconstructed
 from alpasim_plugin.runs.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
 from alpasim_plugin.runs.certificate import Repeat
-from alpasim_plugin.runs.commits import KnownCommits, opened, run_stored_cell, unpack
-from alpasim_plugin.runs.executors.assignment import assignment_as_here, measured_folder, targets_of
-from alpasim_plugin.runs.executors.base import Lost
-from alpasim_plugin.runs.executors.choice import LOCAL, Executor, opened_backend
-from alpasim_plugin.runs.executors.local import run_in_processes, run_or_retry
-from alpasim_plugin.runs.executors.pool import run_jobs
-from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
+from alpasim_plugin.runs.executors.choice import LOCAL, Executor
+from alpasim_plugin.runs.executors.local import Lost, run_jobs
+from alpasim_plugin.runs.plan import Cell, RunPlan
 from alpasim_plugin.runs.provenance import hardware
 
 KERNELS = "kernels"
@@ -53,10 +49,10 @@ def compile_for(todo: Sequence[Cell], scenarios: Mapping[str, Scenario], workers
     cold = [one for one in needed(todo, scenarios) if is_cold(one)]
     if not cold:
         return
-    for subject, got in run_in_processes(compile_kernels, cold, min(workers, len(cold)), 1):
+    for subject, got in run_jobs(compile_kernels, cold, min(workers, len(cold))):
         if isinstance(got, Lost):
             print(
-                f"warning: compiling {subject} kernels: {got.found}; the rollouts compile them",
+                f"warning: compiling {subject} kernels: {got.reason}; the rollouts compile them",
                 file=sys.stderr,
                 flush=True,
             )
@@ -130,7 +126,7 @@ def thread_budget(
         repeats: A worker of this machine drives one of them again.
     """
     if not executor.is_local:
-        return Threads(max(1, min(workers or n_cells, n_cells)), executor.resources.cores)
+        return Threads(max(1, min(workers or n_cells, n_cells)), executor.cores)
     cores = (
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     )
@@ -151,8 +147,6 @@ class HowToRun:
         limit_s: Seconds that one rollout may take; a worker that exceeds them is killed. None: no
             limit.
         executor: Where rollouts run.
-        store: URL of a store in which rollouts are looked up and committed; None: the run folder
-            alone.
         run: Token by which the processes of the run know each other.
     """
 
@@ -162,19 +156,12 @@ class HowToRun:
     limit_s: float | None = None
     retry: bool = False
     executor: Executor = LOCAL
-    store: str | None = None
     run: str = field(default_factory=lambda: os.urandom(8).hex())
 
     @property
     def stated(self) -> dict[str, Any]:
-        """Give what ``run.json`` says of executor and store; nothing for a run on this machine
-        alone.
-        """
-        return (
-            {}
-            if self.executor.is_local and self.store is None
-            else {"executor": str(self.executor), "store": self.store}
-        )
+        """Give what ``run.json`` says of the executor; nothing for a run on this machine."""
+        return {} if self.executor.is_local else {"executor": str(self.executor)}
 
     @property
     def cores_here(self) -> int:
@@ -210,11 +197,6 @@ def execute(
     share_measurements(measured_folder(how.run))
     manifests: dict[Path, dict[str, Any]] = {}
     todo: list[Cell] = []
-    store = (
-        None
-        if how.store is None
-        else KnownCommits(opened(how.store), plan.options, how.reuse_undigested)
-    )
     for cell in plan.cells:
         folder = cell.folder.as_posix()
         action, state = find_rollout_state(
@@ -230,43 +212,21 @@ def execute(
             doing = "driving again" if action == "drive" else "scoring again"
             notify(f"damaged: {'; '.join(map(str, state.damage))}; {doing}")
         if action == "drive" or state.manifest is None:
-            stored = store and store.find(cell)
-            if not stored:
-                todo.append(cell)
-                continue
-            manifest = _scored(cell, plan.options, root, unpack(stored, root))
-        else:
-            manifest = (
-                state.manifest
-                if action == "none"
-                else rescore_cell(cell, plan.options, root, state.manifest)
-            )
+            todo.append(cell)
+            continue
+        manifest = state.manifest
+        if action == "score":
+            manifest = rescore_cell(cell, plan.options, root, manifest)
         manifests[cell.folder] = manifest
         on_done(manifest, True)
     if how.executor.is_local:
-        driven = _run_local(todo, plan, root, how, store, repeat)
+        driven = _run_local(todo, plan, root, how, repeat)
     else:
-        driven = _run_elsewhere(todo, plan, root, how, store, notify)
+        driven = _run_on_ray(todo, plan, root, how)
     for cell, manifest in driven:
-        manifest = _scored(cell, plan.options, root, manifest)
         manifests[cell.folder] = manifest
         on_done(manifest, False)
-        if store is not None:
-            store.add(cell, manifest)
-    if store is not None:
-        store.commits.index.flush()
     return [manifests[cell.folder] for cell in plan.cells]
-
-
-def _scored(
-    cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any]
-) -> dict[str, Any]:
-    """Score a rollout that comes from a store, or from an earlier driver, again if its scores are
-    another preset's.
-    """
-    if manifest["status"] != "ok" or manifest["score_key"] == cell.score_key:
-        return manifest
-    return rescore_cell(cell, options, root, manifest)
 
 
 Done = Iterator[tuple[Cell, dict[str, Any]]]
@@ -277,24 +237,14 @@ def _run_local(
     plan: RunPlan,
     root: Path,
     how: HowToRun,
-    store: KnownCommits | None,
     repeat: Repeat | None,
 ) -> Done:
     """Run cells in this process, or in workers that write the run folder themselves."""
     if how.threads.workers > 1 or how.limit_s is not None:
         compile_for(todo, plan.scenarios, how.threads.workers)
     threads = how.threads.per_worker
-    drive: Callable[..., dict[str, Any]] = partial(run_cell, options=plan.options, threads=threads)
-    work: Callable[..., dict[str, Any]] = drive
-    if how.store is not None and store is not None:
-        work = partial(
-            run_stored_cell,
-            options=plan.options,
-            threads=threads,
-            store=how.store,
-            fresh=store.fresh,
-        )
-    jobs = [_Job(cell, root, work) for cell in todo]
+    drive = partial(run_cell, options=plan.options, threads=threads)
+    jobs = [_Job(cell, root, drive) for cell in todo]
     if how.threads.workers > 1:
         if repeat is not None and repeat.cell is not None and repeat.cell in todo:
             jobs.append(_Job(repeat.cell, repeat.root, drive))
@@ -308,7 +258,7 @@ def _run_local(
         action, state = find_rollout_state(job.cell, job.root, reuse_undigested=True)
         return state.manifest if action == "none" else None
 
-    for job, got in run_or_retry(
+    for job, got in run_jobs(
         partial(_of_run, how.run), jobs, how.threads.workers, threads, how.limit_s, known
     ):
         if repeat is not None and job.root is repeat.root:
@@ -332,38 +282,22 @@ def _of_run(run: str, job: _Job) -> dict[str, Any]:
     return job.work(job.cell, root=job.root)
 
 
-def _run_elsewhere(
-    todo: Sequence[Cell],
-    plan: RunPlan,
-    root: Path,
-    how: HowToRun,
-    store: KnownCommits | None,
-    notify: Callable[[str], None],
-) -> Done:
-    """Run cells on other nodes; only this process writes the run folder."""
+def _run_on_ray(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done:
+    """Run cells on the nodes of a cluster; only this process writes the run folder."""
     if not todo:
         return
-    from alpasim_plugin.runs.executors.job import (
-        rollout_work,
-    )  # a run on this machine needs none of it
+    from alpasim_plugin.runs.executors.ray_backend import run_on_ray
 
-    work, contents = rollout_work(
-        plan, how.run, todo, how.threads.per_worker, how.store, store.fresh if store else ""
-    )
-    workers = min(how.threads.workers, len(todo))
-    assignment = assignment_as_here(
-        work, contents, targets_of(plan.parts), how.executor.resources, workers, notify
-    )
-    with opened_backend(how.executor, assignment, root) as backend:
-        for cell, got in run_jobs(backend, todo, notify, how.limit_s):
-            yield cell, _lost(cell, root, got) if isinstance(got, Lost) else unpack(got, root)
+    workers = how.threads.workers
+    for cell, got in run_on_ray(plan, todo, root, how.executor, workers, how.limit_s):
+        yield cell, _lost(cell, root, got) if isinstance(got, Lost) else got
 
 
 def _lost(cell: Cell, root: Path, lost: Lost) -> dict[str, Any]:
     """Write the manifest of a rollout whose workers died, or that was ended since it took too
     long.
     """
-    error = InfrastructureError(f"{cell.folder.as_posix()}: {lost.found}", lost.do_this)
+    error = InfrastructureError(f"{cell.folder.as_posix()}: {lost.reason}", lost.hint)
     manifest = failed_manifest(cell, error)
     write_manifest(root / cell.folder, manifest)
     return manifest

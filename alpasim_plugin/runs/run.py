@@ -21,19 +21,17 @@ from alpasim_plugin.log.run_folder.manifests import (
     Contents,
     damaged_files,
     find_contents,
-    read_contents,
     read_manifest,
     read_run_json,
     write_contents,
     write_run_json,
 )
 from alpasim_plugin.log.run_folder.reader import read_json
-from alpasim_plugin.log.run_folder.schema import CONTENTS, REPORTS, RUN_INFO, SUMMARY, TABLES, slug
+from alpasim_plugin.log.run_folder.schema import CONTENTS, RUN_INFO, SUMMARY, TABLES, slug
 from alpasim_plugin.log.run_folder.writer import write_scene, writing
 from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runs.cell import find_rollout_state
 from alpasim_plugin.runs.certificate import Certify, certify, foreseen, repeating
-from alpasim_plugin.runs.commits import opened
 from alpasim_plugin.runs.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runs.executors.choice import LOCAL, Executor
 from alpasim_plugin.runs.plan import LOOP, SCORING, RunPlan
@@ -117,7 +115,6 @@ def execute_run(
     limit_s: float | None = None,
     retry: bool = False,
     executor: Executor = LOCAL,
-    store: str | None = None,
 ) -> RunResult:
     """Run a plan into a folder, and repeat one of its rollouts as the certificate says.
 
@@ -136,8 +133,6 @@ def execute_run(
         limit_s: Seconds that one rollout may take.
         retry: Drive again also what failed by the policy's own fault.
         executor: Where rollouts run; the results do not depend on it.
-        store: URL of a store in which rollouts are looked up and committed, and to which the tables
-            go.
 
     Raises:
         InputError: The folder holds the run of another command and ``resume`` is not set.
@@ -154,7 +149,7 @@ def execute_run(
         held = claim(root, plan, command, threads, resume, contents, progress.noticed)
         progress.started(plan, root, threads)
         began = time.perf_counter()
-        how = HowToRun(threads, resume, full, limit_s, retry, executor, store)
+        how = HowToRun(threads, resume, full, limit_s, retry, executor)
         if threads.workers > 1:
             Thread(target=_load_ending, daemon=True).start()
         try:
@@ -179,7 +174,6 @@ def execute_run(
         finally:
             end_children()
         summary = finish_run(root, manifests, {"pool": pool, "determinism": determinism}, report)
-        publish(root, store)
     return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
 
 
@@ -228,16 +222,6 @@ def finish_run(
     write_reports(root, flips=info.get("kind") != "score", page=report)
     write_contents(root, {m["path"]: read_manifest(root / m["path"])[1] for m in manifests})
     return summary
-
-
-def publish(root: Path, store: str | None) -> None:
-    """Copy the description, tables and reports of a finished run folder to its store, if it has
-    one.
-    """
-    if store is None:
-        return
-    pages = [name for name in REPORTS if (root / name).exists()]
-    opened(store).publish(root, [*read_contents(root).files, RUN_INFO, *pages, CONTENTS])
 
 
 def _finished_already(plan: RunPlan, root: Path) -> RunResult:

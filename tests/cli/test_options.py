@@ -16,6 +16,7 @@ from alpasim_plugin.cli import run, serve
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.cli.options import Json, Only, command_of
 from alpasim_plugin.core.flags import Flag, Positional
+from alpasim_plugin.runs.executors.choice import Executor
 
 
 class Reached(Exception):
@@ -44,8 +45,7 @@ def test_a_run_gets_its_cluster_and_its_limit(called: Any, tmp_path: Path) -> No
     words = ["--executor", "ray?cores=2&gpus=0.5&memory=7.5", "--time-limit", "90", "--no-report"]
     words += ["--wait", "--workers", "3", "--out", str(tmp_path / "out"), "smoke/straight"]
     given = called(run, "execute_run", "--renderer", "clean", *words)
-    resources = given["executor"].resources
-    assert (resources.cores, resources.gpus, resources.memory_gib) == (2, 0.5, 7.5)
+    assert given["executor"] == Executor("ray", "", 2, 0.5, 7.5)
     assert (given["workers"], given["limit_s"]) == (3, 90.0)
     assert (given["report"], given["wait"], given["resume"]) == (False, True, False)
 

@@ -13,7 +13,7 @@ import pytest
 from alpasim_plugin.core import cache as module
 from alpasim_plugin.core.cache import measured, share_measurements
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.runs.executors.local import run_in_processes
+from alpasim_plugin.runs.executors.local import run_jobs
 
 
 @pytest.fixture(autouse=True)
@@ -46,9 +46,7 @@ def test_of_two_processes_at_once_one_measures_and_both_have_its_values(tmp_path
     log = tmp_path / "log"
     answers = [
         got
-        for _, got in run_in_processes(
-            partial(work, tmp_path / "measured" / "run", log), [0, 1, 2, 3], 2, 1
-        )
+        for _, got in run_jobs(partial(work, tmp_path / "measured" / "run", log), [0, 1, 2, 3], 2)
     ]
     assert len({pid for pid, _ in answers}) == 2
     (measurer,) = log.read_text().split()

@@ -118,14 +118,3 @@ def test_where_nothing_can_be_written_nothing_is_compiled_and_it_is_said(
     assert os.environ["NUMBA_DISABLE_JIT"] == "1"
     with pytest.raises(InfrastructureError, match="no folder can be written"):
         places.require_kernels()
-
-
-def test_the_scratch_folder_has_a_name_of_its_own_that_is_kept(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first = places.scratch().path
-    assert first is not None
-    assert first == places.scratch().path
-    assert str(os.getuid()) not in first.name.split("-")
-    monkeypatch.setenv("SIMRUN_CACHE", str(home / "another"))
-    assert places.scratch().path != first

@@ -124,8 +124,6 @@ def yaml_tags(folder: Path, bait: Bait) -> list[list[str]]:
 
 def pickles_of_a_run(folder: Path, bait: Bait) -> list[list[str]]:
     for name in (
-        ".slurm/s/1_0_result.pkl",
-        ".slurm/s/1_submitted.pkl",
         "results.pkl",
         "rollouts.pkl",
     ):

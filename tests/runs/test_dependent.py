@@ -63,7 +63,7 @@ def test_a_task_that_fails_ends_the_others(
         Step("b", tmp_path, what=what),
         Step("c", tmp_path, ("b",)),
     ]
-    with pytest.raises(error, match=found):
+    with pytest.raises(error):
         run_dependent(work, steps, 2, lambda name, said: None)
     assert not any((tmp_path / name).exists() for name in "abc")
 

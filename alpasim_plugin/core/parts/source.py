@@ -63,6 +63,17 @@ def own_code_digest(module: str) -> str:
     return code_digest(file)
 
 
+@lru_cache(maxsize=1)
+def package_digest() -> str:
+    """Return a SHA-256 over all source files of simrun, with their names."""
+    hashed = hashlib.sha256()
+    for path in sorted(_own_sources()):
+        with open(path, "rb") as file:
+            text = file.read()
+        hashed.update(os.path.relpath(path, OWN_ROOT).encode() + hashlib.sha256(text).digest())
+    return hashed.hexdigest()
+
+
 def code_files(file: str | Path) -> set[str]:
     """Return the paths of the files that `code_digest` covers.
 

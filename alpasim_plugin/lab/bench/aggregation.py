@@ -5,6 +5,7 @@ are right.
 from __future__ import annotations
 
 import math
+import multiprocessing
 import tempfile
 import time
 from collections.abc import Mapping
@@ -18,7 +19,7 @@ import pyarrow.parquet as pq
 
 import alpasim_plugin.lab.video_metrics.facts  # noqa: F401  declares: the process that aggregates then knows the metrics that this one knows
 from alpasim_plugin.core.processes import resident_mb
-from alpasim_plugin.core.subprocesses import end_with_parent, spawn_context
+from alpasim_plugin.core.subprocesses import end_with_parent
 from alpasim_plugin.log.run_folder.columns import RolloutTable
 from evaluators.metrics import METRICS
 from evaluators.statistics.summary import aggregate, aggregate_sides
@@ -52,7 +53,7 @@ def bench_table(rollouts: int = 100_000, scenes: int = 1_000) -> TableRow:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rollouts.parquet"
         write_random_table(path, rollouts, scenes)
-        with spawn_context().Pool(1, end_with_parent) as pool:
+        with multiprocessing.get_context("spawn").Pool(1, end_with_parent) as pool:
             read_s, aggregate_s, rows_s, peak_mb, found = pool.apply(_measured, (path,))
         mean_error, count_errors = compared(found, path)
     return TableRow(

@@ -4,6 +4,7 @@ a process of their own.
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -13,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from alpasim_plugin.core.errors import FixerError
-from alpasim_plugin.core.subprocesses import end_with_parent, spawn_context
+from alpasim_plugin.core.subprocesses import end_with_parent
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.fixers.refine import Difference
 from alpasim_plugin.lab.bench.fixer_speed import Timing
@@ -156,7 +157,7 @@ def in_own_process(name: str, run: Callable[..., Timing], *arguments: object) ->
     Raises:
         FixerError: The process ended early.
     """
-    with ProcessPoolExecutor(1, spawn_context(), end_with_parent) as pool:
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), end_with_parent) as pool:
         try:
             return pool.submit(run, *arguments).result()
         except BrokenProcessPool as error:

@@ -4,6 +4,7 @@ measured in a fresh process.
 
 from __future__ import annotations
 
+import multiprocessing
 import resource
 import time
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.core.processes import resident_mb
-from alpasim_plugin.core.subprocesses import end_with_parent, spawn_context
+from alpasim_plugin.core.subprocesses import end_with_parent
 from alpasim_plugin.lab.training.shared_rollout import Objectives, Sample, losses
 
 KIB_OF_MIB, MB_OF_MIB = 1024.0, 2**20 / 1e6
@@ -55,7 +56,7 @@ def measure_memory(
         clips: Clips side by side.
         rows, columns: Size in latents.
     """
-    context = spawn_context()
+    context = multiprocessing.get_context("spawn")
     cells = []
     for n in latents:
         for k in (k for k in horizons if k <= n):

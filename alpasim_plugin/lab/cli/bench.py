@@ -10,7 +10,6 @@ import typer
 from alpasim_plugin.lab.bench.raster import bench_raster
 from alpasim_plugin.lab.cli import (
     bench_evaluators,
-    bench_executors,
     bench_fixer,
     bench_loop,
     bench_presets,
@@ -34,7 +33,6 @@ def bench() -> None:
 
 
 app.command("evaluators", epilog=bench_evaluators.EPILOG)(bench_evaluators.evaluators)
-app.command("executors", epilog=bench_executors.EPILOG)(bench_executors.executors)
 app.command("loop", epilog=bench_loop.EPILOG)(bench_loop.loop)
 app.command("presets", epilog=bench_presets.EPILOG)(bench_presets.presets)
 app.command("fixer", epilog=bench_fixer.EPILOG)(bench_fixer.fixer)

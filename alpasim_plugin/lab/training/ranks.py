@@ -8,6 +8,7 @@ checkpoint continues with any other.
 
 from __future__ import annotations
 
+import multiprocessing
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
-from alpasim_plugin.core.subprocesses import end_with_parent, spawn_context
+from alpasim_plugin.core.subprocesses import end_with_parent
 
 T = TypeVar("T")
 Report = Callable[[int, Mapping[str, float]], None]
@@ -125,7 +126,7 @@ def in_ranks(
     """
     if count == 1:
         return work(ALONE, report)
-    context = spawn_context()
+    context = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory(prefix="simrun-ranks-") as folder:
         meeting = Path(folder) / "meeting"
         failures = context.SimpleQueue()

@@ -1,3 +1,1 @@
-"""Where work runs: processes of this machine, the nodes of a Ray cluster, jobs of Slurm. Results do
-not depend on it.
-"""
+"""Where rollouts run: processes of this machine, or a Ray cluster. Results do not depend on it."""

@@ -1,96 +1,82 @@
-"""Workers that are processes of this machine: the pool's backend, and what runs jobs in them.
+"""Rollouts in worker processes of this machine (`concurrent.futures`).
 
-Parent and worker talk over one pipe each. There is nothing else to share, so nothing is left behind
-when both are killed at once.
+A worker that dies breaks its pool: what ran then is done again, each job alone in a pool of its
+own, since nobody knows which job it was.
 """
 
 from __future__ import annotations
 
+import faulthandler
+import multiprocessing
 import os
 import signal
+import sys
 import time
-import traceback
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing.context import BaseContext
 from typing import Any, Protocol, TypeVar
 
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.core.subprocesses import (
-    copy_context,
-    end_with_parent,
-    load_for_copies,
-    spawn_context,
-)
-from alpasim_plugin.runs.executors.base import (
-    THREAD_VARIABLES,
-    Backend,
-    Died,
-    Done,
-    Event,
-    Lost,
-    Place,
-    Rules,
-)
-from alpasim_plugin.runs.executors.pool import run_jobs
+from alpasim_plugin.core.subprocesses import end_with_parent, forget_safe_path, safe_path
 
 J = TypeVar("J")
 R = TypeVar("R")
-Send = Callable[[Any], None]
 
-GRACE_S = 5.0  # between asking a worker to end and ending it
-DYING = "look for the out-of-memory killer in the system log, or use"
-AHEAD = "alpasim_plugin.runs.executors.ahead"  # loads what rollouts need
-RULES = Rules(chunk_s=0.0, most_losses=1, copies=False, after_hanging="", after_dying="")
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+)
+# Loaded once, by the process that workers are forked from.
+PRELOAD = (
+    "alpasim_plugin.control.tracker",
+    "alpasim_plugin.renderers.gaussian",
+    "alpasim_plugin.runs.execute",
+    "evaluators.metrics.image_health",
+    "evaluators.metrics.motion",
+    "evaluators.metrics.offroad",
+    "evaluators.metrics.outcomes",
+    "evaluators.metrics.plan",
+    "policies.lane_camera",
+    "pyarrow.dataset",
+)
 
 
-def run_in_processes(
+@dataclass(frozen=True)
+class Lost:
+    """Stands for the result of a job whose workers died.
+
+    Attributes:
+        reason: What became of them.
+        hint: What to do about it.
+    """
+
+    reason: str
+    hint: str
+
+
+def run_jobs(
     work: Callable[[J], R],
     jobs: Sequence[J],
     workers: int,
     threads: int = 1,
     limit_s: float | None = None,
+    known: Callable[[J], R | None] = lambda job: None,
 ) -> Iterator[tuple[J, R | Lost]]:
-    """Yield every job with its result, as they finish; a worker that dies or hangs costs only its
-    own job.
-
-    Workers end with this process, however it ends. Call it from the main thread: Linux takes the
-    end of the thread that started a worker for the end of its parent.
+    """Yield every job with its result, as they finish; results do not depend on the workers.
 
     Args:
-        work: A module-level function.
+        work: A module-level function, or a partial of one; pickled.
         jobs: Its arguments; pickled.
-        workers: Number of processes.
-        threads: Threads of each, for numerical libraries.
-        limit_s: Seconds that one job may take before its worker is killed; None: no limit.
-
-    Raises:
-        The first exception of ``work``; what still runs is ended.
-    """
-    backend: LocalBackend[J] = LocalBackend(work, workers, threads)
-    with closing(backend):
-        yield from run_jobs(backend, jobs, _ignore, limit_s)
-
-
-def run_or_retry(
-    work: Callable[[J], R],
-    jobs: Sequence[J],
-    workers: int,
-    threads: int,
-    limit_s: float | None,
-    known: Callable[[J], R | None],
-) -> Iterator[tuple[J, R | Lost]]:
-    """Yield every job with its result, as they finish: in this process for one worker without a
-    time limit.
-
-    A job whose worker died runs again at the end, alone: it may have been the victim of another's
-    memory.
-
-    Args:
-        work, jobs, workers, threads, limit_s: As for `run_in_processes`.
+        workers: Processes. One, without a time limit, is this process.
+        threads: Threads of each worker, for numerical libraries.
+        limit_s: Seconds that one job may take before its worker is ended; None: no limit.
         known: Returns the result of a job whose worker died, if it was finished before.
 
     Raises:
@@ -100,56 +86,43 @@ def run_or_retry(
         for job in jobs:
             yield job, work(job)
         return
-    victims: list[J] = []
-    for job, got in run_in_processes(work, jobs, workers, threads, limit_s):
-        if isinstance(got, Lost) and not got.hung:
+    victims = []
+    for job, future in _in_pools(work, jobs, workers, threads, limit_s):
+        if _is_lost(future):
             victims.append(job)
         else:
-            yield job, _advised(got)
+            yield job, future.result()
+    if victims:
+        print(
+            f"warning: a worker process ended; {len(victims)} jobs run again, one at a time",
+            file=sys.stderr,
+            flush=True,
+        )
     for job in victims:
         result = known(job)
         if result is not None:
             yield job, result
             continue
-        for _, got in run_in_processes(work, [job], 1, threads, limit_s):
-            yield job, _advised(got)
-
-
-def _advised(got: R | Lost) -> R | Lost:
-    if not isinstance(got, Lost):
-        return got
-    if got.hung:
-        return replace(got, do_this="look at what hangs with --workers 1, or raise --time-limit")
-    return Lost(f"{got.found}, twice, without an error message", do_this=f"{DYING} --workers 1")
-
-
-def load_early() -> None:
-    """Load what rollouts need, while this process finds out what to do: workers of one thread are
-    then copies that have it.
-    """
-    with _thread_environment(1):
-        load_for_copies([AHEAD])
+        began_s = time.monotonic()
+        for _, future in _in_pools(work, [job], 1, threads, limit_s):
+            is_late = limit_s is not None and time.monotonic() - began_s >= limit_s
+            yield (
+                job,
+                (_lost(limit_s if is_late else None) if _is_lost(future) else future.result()),
+            )
 
 
 def map_jobs(work: Callable[[J], R], jobs: Sequence[J], workers: int) -> Iterator[tuple[J, R]]:
-    """Yield every job with its result, as they finish; in order for one worker. Results do not
-    depend on the number of workers.
-
-    Args:
-        work: A module-level function. One worker is this process.
-        jobs: Its arguments; pickled for other processes.
-        workers: Processes, one thread each.
+    """Yield every job with its result, as they finish; see `run_jobs`.
 
     Raises:
-        InfrastructureError: A process ended without a result.
-        The first exception of ``work``; jobs that wait are dropped.
+        InfrastructureError: The worker of a job died twice.
+        The first exception of ``work``.
     """
-    if workers <= 1:
-        for job in jobs:
-            yield job, work(job)
-        return
-    for job, got in run_in_processes(work, jobs, workers):
-        yield job, _kept(got, str(job))
+    for job, got in run_jobs(work, jobs, workers):
+        if isinstance(got, Lost):
+            raise InfrastructureError(f"{job}: {got.reason}", got.hint)
+        yield job, got
 
 
 class Task(Protocol):
@@ -167,6 +140,7 @@ class Task(Protocol):
 
 
 T = TypeVar("T", bound=Task)
+Send = Callable[[Any], None]
 
 
 def run_dependent(
@@ -175,13 +149,12 @@ def run_dependent(
     workers: int,
     on_message: Callable[[str, Any], None],
 ) -> None:
-    """Do all tasks, each after those it depends on; results do not depend on the number of workers.
+    """Do all tasks, each after those it depends on; results do not depend on the workers.
 
     Args:
-        work: A module-level function of a task and of what sends a message here.
+        work: A module-level function of a task and of what sends a message to this process.
         tasks: Every one behind those it depends on.
-        workers: Processes, one thread each. One is this process, which does the tasks in their
-            order.
+        workers: Processes. One is this process.
         on_message: Called with the name of a task and what its work sent.
 
     Raises:
@@ -189,214 +162,149 @@ def run_dependent(
         ValueError: A task before one that it depends on.
         The first exception of ``work``; what still runs is ended.
     """
-    after = _indices_before(tasks)
+    names = [task.name for task in tasks]
+    for n, task in enumerate(tasks):
+        early = sorted(set(task.after) & set(names[n:]))
+        if early:
+            raise ValueError(f"task {task.name} comes before {', '.join(early)}, its condition")
     if workers <= 1:
         for task in tasks:
-            work(task, partial(on_message, task.name))
+            work(task, lambda message, name=task.name: on_message(name, message))  # type: ignore[misc]
         return
-    backend: LocalBackend[T] = LocalBackend(
-        work, workers, 1, lambda task, message: on_message(task.name, message)
-    )
-    with closing(backend):
-        for task, got in run_jobs(backend, tasks, _ignore, after=after):
-            _kept(got, task.name)
+    with _environment(1):
+        manager = _context(1).Manager()
+    with manager, _pool(workers, 1) as pool:
+        messages = manager.Queue()
+        waiting = list(tasks)
+        running: dict[Future[None], str] = {}
+        while waiting or running:
+            unfinished = {*running.values(), *(task.name for task in waiting)}
+            for task in [one for one in waiting if not unfinished & set(one.after)]:
+                running[_submit(pool, 1, _send_from, work, task, messages)] = task.name
+                waiting.remove(task)
+            done, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
+            while not messages.empty():
+                on_message(*messages.get())
+            for future in done:
+                name = running.pop(future)
+                if _is_lost(future):
+                    raise InfrastructureError(f"{name}: its worker process ended", "use --jobs 1")
+                future.result()
 
 
-def _indices_before(tasks: Sequence[Task]) -> dict[int, list[int]]:
-    names = {task.name: index for index, task in enumerate(tasks)}
-    after = {}
-    for index, task in enumerate(tasks):
-        before = [names[name] for name in task.after if name in names]
-        if early := sorted(tasks[i].name for i in before if i >= index):
-            raise ValueError(
-                f"task {task.name} comes before {', '.join(early)}, which it depends on"
-            )
-        after[index] = before
-    return after
+def _send_from(work: Callable[[T, Send], None], task: T, messages: Any) -> None:
+    work(task, lambda message: messages.put((task.name, message)))
 
 
-def _kept(got: R | Lost, name: str) -> R:
-    if isinstance(got, Lost):
-        raise InfrastructureError(f"{name}: {got.found}", f"{DYING} --jobs 1")
-    return got
-
-
-def _ignore(text: str) -> None:
-    """Say nothing: what is lost here is a result."""
-
-
-@dataclass
-class _Worker:
-    process: BaseProcess
-    pipe: Connection
-    ready: bool = False
-    job: Any = None
-    busy: bool = False
-    reached: bool = True  # whether its job was sent
-
-
-class LocalBackend(Backend[J]):
-    """Processes of this machine; see `alpasim_plugin.runs.executors.base.Backend`.
-
-    Args:
-        work: A module-level function of a job; with ``on_message`` also of what sends a message.
-        workers: Most processes.
-        threads: Of each, for numerical libraries.
-        on_message: Called with a job and what its work sent.
-    """
-
-    rules = RULES
-
-    def __init__(
-        self,
-        work: Callable[..., Any],
-        workers: int,
-        threads: int,
-        on_message: Callable[[J, Any], None] | None = None,
-    ) -> None:
-        self._work, self._most, self._threads, self._on_message = work, workers, threads, on_message
-        self._workers: dict[int, _Worker] = {}
-        self._next = 0
-
-    def free(self, wanted: int) -> list[Place]:
-        """Start as many workers as are wanted and allowed, and return those that are ready and
-        idle.
-        """
-        idle = sum(not one.busy for one in self._workers.values())
-        for _ in range(min(self._most - len(self._workers), wanted - idle)):
-            self._open()
-        return [
-            Place(number, "") for number, one in self._workers.items() if one.ready and not one.busy
-        ]
-
-    def start(self, worker: int, jobs: Sequence[J]) -> None:
-        """Hand one job to a free worker."""
-        one = self._workers[worker]
-        (one.job,), one.busy = jobs, True
-        try:
-            one.pipe.send(one.job)
-        except OSError:
-            one.reached = False  # it is gone: its pipe says so next
-
-    def wait(self, timeout_s: float) -> list[Event]:
-        """Wait until workers answer, send a message, or end."""
-        pipes = {one.pipe: number for number, one in self._workers.items()}
-        speaking = set(wait(list(pipes), timeout_s))
-        events = [self._receive(number) for pipe, number in pipes.items() if pipe in speaking]
-        return [event for event in events if event is not None]
-
-    def end(self, worker: int) -> None:
-        """Kill a worker."""
-        one = self._workers.pop(worker)
-        one.process.kill()
-        one.process.join()
-        one.pipe.close()
-
-    def close(self) -> None:
-        """End all workers: idle ones by closing their pipes, busy ones by signal."""
-        for one in self._workers.values():
-            one.pipe.close()
-            if one.busy or not one.ready:
-                one.process.terminate()
-        end_s = time.monotonic() + GRACE_S
-        for one in self._workers.values():
-            one.process.join(max(0.0, end_s - time.monotonic()))
-            if one.process.is_alive():
-                one.process.kill()
-                one.process.join()
-        self._workers.clear()
-
-    def _open(self) -> None:
-        context = (copy_context() if self._threads == 1 else None) or spawn_context()
-        ours, theirs = context.Pipe()
-        process = context.Process(
-            target=_serve, args=(theirs, self._work, self._on_message is not None), daemon=False
-        )
-        with _thread_environment(self._threads):
-            process.start()
-        theirs.close()  # so that the pipe ends when the worker does
-        self._workers[self._next] = _Worker(process, ours)
-        self._next += 1
-
-    def _receive(self, number: int) -> Event | None:
-        one = self._workers[number]
-        try:
-            kind, value = one.pipe.recv()
-        except (EOFError, OSError):
-            del self._workers[number]
-            one.process.join(GRACE_S)
-            return Died(
-                number,
-                "",
-                f"its worker process ended ({_exit_reason(one.process.exitcode)})",
-                of_node=not one.reached,
-            )
-        if kind == "ready":
-            one.ready = True
-        elif kind == "message" and self._on_message is not None:
-            self._on_message(one.job, value)
-        elif kind == "answer":
-            one.job, one.busy = None, False
-            return Done(number, "", [value])
-        return None
-
-
-def _exit_reason(code: int | None) -> str:
-    if code is not None and code < 0:
-        name = (
-            signal.Signals(-code).name
-            if -code in [int(one) for one in signal.Signals]
-            else f"signal {-code}"
-        )
-        return f"killed by {name}"
-    return "its pipe broke" if code is None else f"exit code {code}"
-
-
-def _serve(pipe: Connection, work: Callable[..., Any], sends: bool) -> None:
-    """Answer jobs until the pipe ends; the main function of a worker."""
-    end_with_parent()
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # Ctrl-C reaches the whole process group, and the parent handles it
-    more = [lambda message: pipe.send(("message", message))] if sends else []
-    pipe.send(("ready", None))
-    while True:
-        try:
-            job = pipe.recv()
-        except EOFError:
-            return
-        try:
-            answer: Any = work(job, *more)
-        except Exception as error:
-            error.add_note(traceback.format_exc())
-            answer = error
-        try:
-            pipe.send(("answer", answer))
-        except BrokenPipeError:
-            return
-        except Exception as error:  # what cannot be pickled
-            found = f"{type(answer).__name__} cannot be sent to the parent: {error}"
-            pipe.send(
-                (
-                    "answer",
-                    InfrastructureError(
-                        f"{getattr(work, '__name__', 'a function')}: {found}",
-                        "report it",
-                    ),
-                )
-            )
+def _in_pools(
+    work: Callable[[J], R], jobs: Sequence[J], workers: int, threads: int, limit_s: float | None
+) -> Iterator[tuple[J, Future[R]]]:
+    """Yield every job with its finished future; a pool that broke is followed by another one."""
+    waiting = deque(jobs)
+    while waiting:
+        with _pool(workers, threads) as pool:
+            running: dict[Future[R], J] = {}
+            is_broken = False
+            while running or (waiting and not is_broken):
+                while waiting and len(running) < workers and not is_broken:
+                    try:
+                        future = _submit(pool, threads, limited, work, waiting[0], limit_s)
+                    except BrokenProcessPool:
+                        is_broken = True
+                    else:
+                        running[future] = waiting.popleft()
+                done, _ = wait(running, return_when=FIRST_COMPLETED)
+                for future in done:
+                    is_broken = is_broken or _is_lost(future)
+                    yield running.pop(future), future
 
 
 @contextmanager
-def _thread_environment(threads: int) -> Iterator[None]:
-    """Set the thread variables that numerical libraries read when a worker imports them."""
+def _pool(workers: int, threads: int) -> Iterator[ProcessPoolExecutor]:
+    """Open a pool for the block; when the block raises, or is left early, its workers are ended."""
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(workers, _context(threads), _begin)
+    try:
+        yield pool
+    except BaseException:
+        for worker in set(multiprocessing.active_children()) - others:
+            worker.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _context(threads: int) -> BaseContext:
+    """Return how workers begin: forked from a process that has loaded what rollouts need, with
+    numerical libraries of one thread; otherwise anew.
+    """
+    if threads > 1 or sys.platform != "linux":
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(PRELOAD))
+    return context
+
+
+def _submit(
+    pool: ProcessPoolExecutor, threads: int, work: Callable[..., R], *arguments: Any
+) -> Future[R]:
+    """Hand over a job, for which the pool may start a process."""
+    with _environment(threads):
+        future = pool.submit(work, *arguments)
+        # The pool watches the processes that it had before it started another one for this job;
+        # any further job makes it watch that one too.
+        with suppress(BrokenProcessPool):
+            pool.submit(os.getpid)
+    return future
+
+
+@contextmanager
+def _environment(threads: int) -> Iterator[None]:
+    """Set what a process that is started in the block reads first: the number of threads, and that
+    nothing is imported from the working directory.
+    """
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
     try:
-        yield
+        with safe_path():
+            yield
     finally:
         for name, value in before.items():
             if value is None:
-                os.environ.pop(name, None)
+                del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+def _begin() -> None:
+    """Prepare a worker: it ignores Ctrl-C, which the parent handles, and ends with its parent."""
+    forget_safe_path()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
+
+
+def limited(work: Callable[[J], R], job: J, limit_s: float | None) -> R:
+    """Do a job; at the time limit the worker prints where it hangs and ends."""
+    if limit_s is None:
+        return work(job)
+    faulthandler.dump_traceback_later(limit_s, exit=True)
+    try:
+        return work(job)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+def _is_lost(future: Future[Any]) -> bool:
+    return isinstance(future.exception(), BrokenProcessPool)
+
+
+def _lost(limit_s: float | None) -> Lost:
+    if limit_s is not None:
+        return Lost(
+            f"it did not finish within {limit_s:g} s",
+            "find out what hangs with --workers 1, or raise --time-limit",
+        )
+    return Lost(
+        "its worker process ended, twice, without an error message",
+        "look for the out-of-memory killer in the system log, or use --workers 1",
+    )

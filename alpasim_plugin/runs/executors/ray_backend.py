@@ -1,417 +1,270 @@
-"""Workers on the nodes of a Ray cluster: one actor each, placed by us, so that a node that was
-refused or set aside stays unused.
+"""Rollouts on a Ray cluster, one task each. Ray places the tasks, and runs one again whose worker
+or node died.
+
+A task drives in a temporary folder of its node and returns the rollout's files, which the driver
+writes. Nodes need the same libraries, the same code, and the files of the parts at the same paths;
+a node that differs ends the run with an error that names it.
 """
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
-import pickle
 import signal
-import time
-from collections import OrderedDict
+import socket
+import tempfile
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from functools import cache
+from pathlib import Path
+from typing import Any
 
-from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin import OWN_PACKAGES
+from alpasim_plugin.core.atomic import disk_error
+from alpasim_plugin.core.errors import InfrastructureError, SimrunError
 from alpasim_plugin.core.lazy import require_library
-from alpasim_plugin.runs.executors.assignment import Assignment, sweep
-from alpasim_plugin.runs.executors.base import Backend, Died, Done, Event, Place, Rules
-from alpasim_plugin.runs.executors.node import Serving
+from alpasim_plugin.core.parts import PartSpec
+from alpasim_plugin.core.parts.source import code_digest, file_of, package_digest
+from alpasim_plugin.core.subprocesses import own_path_only
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.log.run_folder.manifests import read_manifest, write_manifest
+from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME
+from alpasim_plugin.runs.cell import run_cell
+from alpasim_plugin.runs.executors.choice import Executor
+from alpasim_plugin.runs.executors.local import Lost, limited
+from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
+from alpasim_plugin.runs.provenance import versions
 
-J = TypeVar("J")
-
-DOING = "working on a Ray cluster"
-LOOK_S = 1.0  # between looks at the nodes
-BARREN_S = 60.0  # without any node before giving up
-FAILED_STARTS = 3  # of workers on a node that never had one
-START_S = 300.0  # for a worker to start, and again for it to compare versions and take the work
-AGAIN_S = 2.0  # after a failed start
-HELD_CONTENTS = (
-    256  # references that the driver keeps, so that a scene is sent once for all its rollouts
-)
-SWEEP_S = 20.0  # that nodes may take to remove what killed workers left
+RETRIES = 2  # of a rollout whose worker or node died
 GIB = 2**30
-SAME_VERSIONS = "install the same versions on the nodes"
-LOOK_THERE = (
-    "look at Ray's logs and the file systems of these nodes, then give the same command again"
-)
+MISSING = "not there"
 
 
-@dataclass
-class _Worker:
-    actor: Any
-    node: str
-    begun: Any  # answered when its process runs
-    ref: Any  # what it is asked: to accept the work, or to do jobs; None: idle
-    since_s: float  # when it was asked for, then when its process was seen to run
-    has_begun: bool = False
-    pid: int = 0
-    ready: bool = False
+@dataclass(frozen=True)
+class DrivenRollout:
+    """A rollout that a node has driven: its manifest, and its files by name."""
+
+    manifest: dict[str, Any]
+    files: Mapping[str, bytes]
 
 
 @contextmanager
-def connected(address: str | None) -> Iterator[None]:
-    """Be connected to a Ray cluster during the block; one inside another stays with the outer's.
+def connected(address: str) -> Iterator[Any]:
+    """Be connected to a Ray cluster during the block, and yield the library.
 
     Args:
-        address: HOST:PORT of its head. None: the one that ``RAY_ADDRESS`` names or that runs on
-            this machine; where there is none, one of this machine's cores is started for the block.
+        address: HOST:PORT of its head. Empty: the one that ``RAY_ADDRESS`` names or that runs on
+            this machine; where there is none, one of this machine's cores is started.
 
     Raises:
-        InputError: Ray is not installed, or the address is that of a Ray client server.
+        InputError: Ray is not installed.
         InfrastructureError: There is no cluster at the address, or it has another version of Ray or
             Python.
     """
     ray = require_library("ray", "--executor ray", "pip install 'alpasim-onefixer[ray]'")
-    if address is not None and address.startswith("ray://"):
-        raise InputError(
-            f"--executor ray:{address}: a Ray client cannot place workers on nodes",
-            "start simrun on a node of the cluster, with --executor ray",
-        )
     if ray.is_initialized():
-        with _signals_as_raised():
-            yield
+        yield ray
         return
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    held = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
     try:
         try:
             ray.init(address=address or "auto", **quiet)
         except ConnectionError:
-            if address is not None:
+            if address:
                 raise
-            ray.init(
-                address="local",
-                num_cpus=len(os.sched_getaffinity(0)),
-                include_dashboard=False,
-                **quiet,
-            )
+            cores = len(os.sched_getaffinity(0))
+            ray.init(address="local", num_cpus=cores, include_dashboard=False, **quiet)
     except (ConnectionError, RuntimeError, ValueError) as error:
         raise InfrastructureError(
-            f"{address or 'this machine'}: {error}",
+            f"--executor ray: no cluster at {address or 'this machine'}: {error}",
             "start the cluster (ray start --head), or correct the address",
         ) from error
     finally:
-        for (
-            number,
-            handler,
-        ) in held.items():  # Ray puts its own in place, which would end the run without a word
+        for number, handler in handlers.items():  # Ray's own would end the run without a word
             signal.signal(number, handler)
     try:
-        with _signals_as_raised():
-            yield
+        yield ray
     finally:
         ray.shutdown()
 
 
-@contextmanager
-def _signals_as_raised() -> Iterator[None]:
-    """Raise what a signal's handler has raised: out of Ray's compiled code it comes as the cause of
-    a `SystemError`.
-    """
-    try:
-        yield
-    except SystemError as error:
-        if error.__cause__ is None or isinstance(error.__cause__, Exception):
-            raise
-        raise error.__cause__ from None
-
-
-class RayBackend(Backend[J]):
-    """Workers on a Ray cluster; see `alpasim_plugin.runs.executors.base.Backend`.
+def run_on_ray(
+    plan: RunPlan,
+    todo: Sequence[Cell],
+    root: Path,
+    executor: Executor,
+    workers: int,
+    limit_s: float | None,
+) -> Iterator[tuple[Cell, dict[str, Any] | Lost]]:
+    """Yield every rollout with its manifest, as they finish; only this process writes ``root``.
 
     Args:
-        assignment: What the workers do.
-        start_s: Seconds for a worker to start, and again for it to be ready. A node that fails this
-            without another worker is set aside.
+        plan: The run.
+        todo: Its rollouts that are to be driven.
+        root: The run folder.
+        executor: Which cluster, and what each rollout needs.
+        workers: Most rollouts at a time.
+        limit_s: Seconds that a rollout may take before its worker is ended; None: no limit.
+
+    Raises:
+        InfrastructureError: There is no cluster, no node has what a rollout needs, or a node
+            differs from this machine.
     """
-
-    rules = Rules(chunk_s=1.0)
-
-    def __init__(self, assignment: Assignment[J], start_s: float = START_S) -> None:
-        import ray
-
-        self._ray, self._given, self._start_s = ray, assignment, start_s
-        self._blob = ray.put(pickle.dumps(assignment.work))
-        self._refs: OrderedDict[str, Any] = OrderedDict()
-        self._workers: dict[int, _Worker] = {}
-        self._next = 0
-        self._events: list[Event] = []
-        self._refused: dict[str, str] = {}  # node -> why
-        self._do_this = SAME_VERSIONS  # against the last refusal
-        self._pings: dict[
-            str, tuple[Any, float]
-        ] = {}  # node -> a process there that needs no core, when it was asked for
-        self._accepted: set[str] = set()
-        self._failed: dict[str, tuple[int, float]] = {}  # node -> failed starts, time of the last
-        self._ended: dict[str, list[int]] = {}  # node -> processes that were killed
-        self._ids: dict[str, str] = {}  # name -> Ray's id of living nodes
-        self._usable: frozenset[str] = frozenset()  # living nodes with room for a worker
-        self._looked_s = -LOOK_S
-        self._alive_s = time.monotonic()
-
-    def free(self, wanted: int) -> list[Place]:
-        """Start workers where there is room and return those without work.
-
-        Raises:
-            InfrastructureError: Every node was refused, none has the resources, or none has been
-                there for a minute.
-        """
-        if time.monotonic() - self._looked_s >= LOOK_S:
-            self._look()
-        return [
-            Place(number, one.node)
-            for number, one in self._workers.items()
-            if one.ready and one.ref is None
-        ]
-
-    def start(self, worker: int, jobs: Sequence[J]) -> None:
-        """Hand jobs to a free worker."""
-        needed = dict.fromkeys(sha256 for job in jobs for sha256 in self._given.work.needs(job))
-        refs = {sha256: self._reference(sha256) for sha256 in needed}
-        one = self._workers[worker]
-        one.ref = one.actor.do.remote(pickle.dumps(list(jobs)), refs)
-
-    def wait(self, timeout_s: float) -> list[Event]:
-        """Wait until workers answer or end."""
-        asked = {one.ref: number for number, one in self._workers.items() if one.ref is not None}
-        if not self._events:
-            if not asked:
-                time.sleep(min(timeout_s, 0.1))
-            else:
-                self._ray.wait(list(asked), num_returns=1, timeout=timeout_s)
-        if asked:
-            for ref in self._ray.wait(list(asked), num_returns=len(asked), timeout=0)[0]:
-                self._receive(asked[ref])
-        events, self._events = self._events, []
-        return events
-
-    def end(self, worker: int) -> None:
-        """End a worker and what it does."""
-        one = self._workers.pop(worker)
-        if one.ready and one.ref is not None:  # at work: it may have left something
-            self._ended.setdefault(one.node, []).append(one.pid)
-        self._ray.kill(one.actor)
-
-    def nodes(self) -> frozenset[str]:
-        """Return the nodes that are in use."""
-        return self._usable - self._refused.keys()
-
-    def set_aside(self, node: str, why: str) -> None:
-        """Use a node no more."""
-        self._refuse(node, why, LOOK_THERE)
-
-    def _refuse(self, node: str, why: str, do_this: str) -> None:
-        if node in self._refused:
-            return
-        self._refused[node], self._do_this = why, do_this
-        self._given.notify(f"node {node} is set aside: {why}")
-        for number in [n for n, one in self._workers.items() if one.node == node]:
-            if self._workers[number].ready and self._workers[number].ref is not None:
-                self._events.append(Died(number, node, "its node was set aside", of_node=True))
-            self.end(number)
-
-    def close(self) -> None:
-        """End all workers, and remove what those that were at work have left on their nodes."""
-        for number in list(self._workers):
-            self.end(number)
-        sweeps = [
-            self._sweep(node, pids) for node, pids in self._ended.items() if node in self._ids
-        ]
-        if sweeps:
-            self._ray.wait(sweeps, num_returns=len(sweeps), timeout=SWEEP_S)
-
-    def _sweep(self, node: str, pids: list[int]) -> Any:
-        return (
-            self._ray.remote(sweep)
-            .options(num_cpus=0, max_retries=0, scheduling_strategy=self._on(node))
-            .remote(pids)
-        )
-
-    def _on(self, node: str) -> Any:
-        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
-        return NodeAffinitySchedulingStrategy(self._ids[node], soft=False)
-
-    def _reference(self, sha256: str) -> Any:
-        """Return Ray's reference to a content; Ray copies it to a node once, for all workers
-        there.
-        """
-        if sha256 not in self._refs:
-            self._refs[sha256] = self._ray.put(self._given.contents.read(sha256))
-            while len(self._refs) > HELD_CONTENTS:
-                self._refs.popitem(last=False)
-        self._refs.move_to_end(sha256)
-        return self._refs[sha256]
-
-    def _look(self) -> None:
-        """Look at the nodes and start workers where there is room, evenly."""
-        self._looked_s = now = time.monotonic()
-        alive = {
-            f"{node['NodeManagerHostname']}/{node['NodeID'][:8]}": node
-            for node in self._ray.nodes()
-            if node["Alive"]
-        }
-        self._ids = {name: node["NodeID"] for name, node in alive.items()}
-        self._end_overdue(now)
-        room = {
-            name: self._room(node["Resources"])
-            for name, node in alive.items()
-            if name not in self._refused
-        }
-        self._usable = frozenset(name for name, workers in room.items() if workers)
-        if alive:
-            self._alive_s = now
-        if alive and not room:
-            found = "; ".join(f"{name}: {why}" for name, why in self._refused.items())
+    with connected(executor.address) as ray:
+        needs = {"CPU": executor.cores, "GPU": executor.gpus, "memory": executor.memory_gib * GIB}
+        held = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        if not any(all(one.get(name, 0) >= need for name, need in needs.items()) for one in held):
             raise InfrastructureError(
-                f"all of its nodes: no node takes the work: {found}", self._do_this
-            )
-        if (room and not any(room.values())) or now - self._alive_s > BARREN_S:
-            found = "no node has that much" if room else f"no node for {BARREN_S:g} s"
-            raise InfrastructureError(
-                f"{self._given.resources}: {found}",
+                f"--executor {executor}: no node has {executor.cores} cores, {executor.gpus:g} "
+                f"GPUs and {executor.memory_gib:g} GiB",
                 "ask for less behind --executor, or add nodes",
             )
-        on = {name: sum(one.node == name for one in self._workers.values()) for name in room}
-        while len(self._workers) < self._given.workers:
-            open_ = [name for name in room if on[name] < room[name] and not self._rests(name, now)]
-            if not open_:
-                return
-            chosen = min(open_, key=lambda name: on[name])
-            on[chosen] += 1
-            self._open(chosen)
-
-    def _end_overdue(self, now_s: float) -> None:
-        """End workers that do not become ready, unless they wait for cores that another driver's
-        workers hold.
-        """
-        starting = {number: one for number, one in self._workers.items() if not one.ready}
-        new = {one.begun: one for one in starting.values() if not one.has_begun}
-        if new:
-            for ref in self._ray.wait(list(new), num_returns=len(new), timeout=0)[0]:
-                new[ref].has_begun, new[ref].since_s = True, now_s
-        for number, one in starting.items():
-            if number not in self._workers or now_s - one.since_s < self._start_s:
-                continue
-            if not one.has_begun and self._may_wait_for_cores(one.node, now_s):
-                one.since_s = now_s
-                continue
-            self.end(number)
-            if any(other.node == one.node and other.ready for other in self._workers.values()):
-                self._failed[one.node] = self._failed.get(one.node, (0, 0.0))[0] + 1, now_s
-            else:
-                what = (
-                    "its worker has started, but was not ready"
-                    if one.has_begun
-                    else "no process has started there"
-                )
-                self._refuse(one.node, f"{what} within {self._start_s:g} s", LOOK_THERE)
-
-    def _may_wait_for_cores(self, node: str, now_s: float) -> bool:
-        """Tell whether a process that needs no core starts on a node where a worker does not; true
-        until there was time to see.
-        """
-        if node not in self._pings:
-            options = {"num_cpus": 0, "max_retries": 0, "scheduling_strategy": self._on(node)}
-            self._pings[node] = self._ray.remote(_ping).options(**options).remote(), now_s
-            self._given.notify(
-                f"node {node} has started no worker for {self._start_s:g} s; others may hold its cores"
-            )
-            return True
-        ping, asked_s = self._pings[node]
-        if not self._ray.wait([ping], timeout=0)[0]:
-            return now_s - asked_s < self._start_s
-        del self._pings[node]  # if it stays so, the node is asked again: it may break later
-        return True
-
-    def _room(self, held: Mapping[str, float]) -> int:
-        """Return how many workers fit on a node."""
-        fits = [held.get("CPU", 0.0) / self._given.resources.cores]
-        if self._given.resources.gpus:
-            fits.append(held.get("GPU", 0.0) / self._given.resources.gpus)
-        if self._given.resources.memory_gib:
-            fits.append(held.get("memory", 0.0) / (self._given.resources.memory_gib * GIB))
-        return int(min(fits) + 1e-9)
-
-    def _rests(self, node: str, now_s: float) -> bool:
-        times, last_s = self._failed.get(node, (0, 0.0))
-        return times > 0 and now_s - last_s < AGAIN_S
-
-    def _open(self, node: str) -> None:
-        memory = (
-            {"memory": int(self._given.resources.memory_gib * GIB)}
-            if self._given.resources.memory_gib
-            else {}
+        drive = ray.remote(drive_on_node).options(
+            num_cpus=executor.cores,
+            num_gpus=executor.gpus,
+            memory=int(executor.memory_gib * GIB) or None,
+            max_retries=RETRIES,
         )
-        made = self._ray.remote(Serving).options(
-            num_cpus=self._given.resources.cores,
-            num_gpus=self._given.resources.gpus,
-            max_restarts=0,
-            max_task_retries=0,
-            scheduling_strategy=self._on(node),
-            **memory,
-        )
-        actor = made.remote(
-            node, self._given.resources.cores, dict(self._given.expected), self._given.targets
-        )
-        self._workers[self._next] = _Worker(
-            actor, node, actor.begun.remote(), actor.accept.remote(self._blob), time.monotonic()
-        )
-        self._next += 1
-
-    def _receive(self, number: int) -> None:
-        """Take what a worker answers."""
-        one = self._workers[number]
-        errors = self._ray.exceptions
+        expected = ray.put(identity_of(plan.parts))
+        scenarios = {name: ray.put(plan.scenarios[name]) for name in {cell.scene for cell in todo}}
+        waiting = deque(todo)
+        running: dict[Any, Cell] = {}
         try:
-            answer = self._ray.get(one.ref)
-        except errors.RayTaskError as error:
-            self._gone(
-                number, one, f"{type(error.cause or error).__name__}: {error.cause or error}", error
-            )
-        except errors.RayError as error:
-            self._gone(number, one, reason_of(error), error)
-        else:
-            one.ref = None
-            if one.ready:
-                self._events.append(Done(number, one.node, pickle.loads(answer)))
-                return
-            one.pid, reasons = answer
-            if reasons:
-                self._refuse(one.node, "; ".join(reasons), SAME_VERSIONS)
-                return
-            one.ready = True
-            self._accepted.add(one.node)
+            while waiting or running:
+                while waiting and len(running) < workers:
+                    cell = waiting.popleft()
+                    scenario = scenarios[cell.scene]
+                    task = drive.remote(
+                        cell, plan.options, executor.cores, scenario, plan.parts, expected, limit_s
+                    )
+                    running[task] = cell
+                for task in ray.wait(list(running), num_returns=1)[0]:
+                    yield running.pop(task), _result(ray, task, root)
+        finally:
+            for task in running:
+                ray.cancel(task, force=True)
 
-    def _gone(self, number: int, one: _Worker, found: str, error: Exception) -> None:
-        """Strike a worker that is gone off the list."""
-        was_ready = one.ready
-        self.end(number)
-        self._looked_s = -LOOK_S
-        alive = {node["NodeID"] for node in self._ray.nodes() if node["Alive"]}
-        of_node = self._ids.get(one.node) not in alive or isinstance(
-            error, self._ray.exceptions.NodeDiedError
+
+def _result(ray: Any, task: Any, root: Path) -> dict[str, Any] | Lost:
+    """Write a finished rollout into the run folder and return its manifest.
+
+    Raises:
+        SimrunError: The node could not drive.
+    """
+    try:
+        result = ray.get(task)
+    except ray.exceptions.RayTaskError:
+        raise
+    except ray.exceptions.RayError as error:
+        return Lost(
+            f"{RETRIES + 1} workers died of it, or hung: {str(error).splitlines()[0]}",
+            "run it alone with --executor local --workers 1, or raise --time-limit",
         )
-        if was_ready:
-            self._events.append(Died(number, one.node, found, of_node))
-            return
-        times = self._failed.get(one.node, (0, 0.0))[0] + 1
-        self._failed[one.node] = times, time.monotonic()
-        if times >= FAILED_STARTS and one.node not in self._accepted and not of_node:
-            self.set_aside(one.node, f"no worker starts there: {found}")
+    if isinstance(result, SimrunError):
+        raise result
+    return write_rollout(result, root)
 
 
-def _ping() -> None:
-    """Run at all."""
+def drive_on_node(
+    cell: Cell,
+    options: RunOptions,
+    threads: int,
+    scenario: Scenario,
+    parts: Sequence[PartSpec],
+    expected: Mapping[str, str],
+    limit_s: float | None,
+) -> DrivenRollout | SimrunError:
+    """Drive a rollout on this node; an error of the node is returned, since Ray would wrap it."""
+    own_path_only()  # Ray adds the driver's working directory
+    name = socket.gethostname()
+    differences = differences_of(expected, identity_of(tuple(parts)))
+    if differences:
+        return InfrastructureError(
+            f"node {name} differs from this machine: {'; '.join(differences)}",
+            "install the same versions and files on all nodes",
+        )
+    try:
+        with tempfile.TemporaryDirectory(prefix="simrun-rollout-") as scratch:
+            root = Path(scratch)
+
+            def drive(cell: Cell) -> DrivenRollout:
+                run_cell(cell, options, root, threads, load=lambda ref: scenario)
+                return read_rollout(root / cell.folder, name)
+
+            return limited(drive, cell, limit_s)
+    except OSError as error:
+        return disk_error(Path(tempfile.gettempdir()), error)
 
 
-def reason_of(error: Exception) -> str:
-    """Return the first telling line of one of Ray's errors, which are pages long."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return f"{type(error).__name__}: {lines[0] if lines else 'no reason given'}"[:200]
+def identity_of(parts: Sequence[PartSpec]) -> dict[str, str]:
+    """Return what must be the same on all machines of a run: name -> version or digest."""
+    own = {}
+    for part in parts:
+        if part.target.partition(".")[0] not in OWN_PACKAGES:
+            own[f"code of {part.target}"] = _code_of(part.target)
+        own |= {path: _sha256_of(path) for path in part.files}
+    return versions() | {"code of simrun": package_digest()[:12]} | own
+
+
+def _code_of(target: str) -> str:
+    try:
+        file = file_of(target)
+    except ImportError:
+        return MISSING
+    return "compiled" if file is None else code_digest(file)[:12]
+
+
+@cache
+def _sha256_of(path: str) -> str:
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()[:12]
+    except OSError:
+        return MISSING
+
+
+def differences_of(expected: Mapping[str, str], present: Mapping[str, str]) -> list[str]:
+    """Say what a node has that the driver has not, one text each.
+
+    Example:
+        >>> differences_of({"numpy": "2.1.0"}, {"numpy": "2.2.0"})
+        ['numpy is 2.2.0, the driver has 2.1.0']
+    """
+    return [
+        f"{name} is {present.get(name, MISSING)}, the driver has {value}"
+        for name, value in expected.items()
+        if present.get(name, MISSING) != value
+    ]
+
+
+def read_rollout(folder: Path, node: str) -> DrivenRollout:
+    """Read the folder of a rollout that was just driven; of a failed one what its parts printed."""
+    manifest, _ = read_manifest(folder)
+    names = [*manifest["files"]] or [OUTPUT_NAME]
+    files = {name: (folder / name).read_bytes() for name in names if (folder / name).exists()}
+    return DrivenRollout({"node": node, **manifest}, files)
+
+
+def write_rollout(rollout: DrivenRollout, root: Path) -> dict[str, Any]:
+    """Write a rollout below a run folder, its manifest last, and return the manifest.
+
+    Raises:
+        InfrastructureError: The disk refuses.
+    """
+    folder = root / rollout.manifest["path"]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in folder.iterdir():
+            path.unlink()
+        for name, data in rollout.files.items():
+            (folder / name).write_bytes(data)
+    except OSError as error:
+        raise disk_error(folder, error) from error
+    manifest = {name: value for name, value in rollout.manifest.items() if name != "files"}
+    write_manifest(folder, manifest)
+    return manifest
