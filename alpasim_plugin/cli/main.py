@@ -11,14 +11,11 @@ import ast
 import contextlib
 import difflib
 import errno
-import gc
 import json
 import os
-import re
 import select
 import sys
 import traceback
-from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -27,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from alpasim_plugin.core import places
 from alpasim_plugin.core.errors import InfrastructureError, InputError, InternalError, SimrunError
-from alpasim_plugin.core.lazy import arrow_without_pandas, installed_names
+from alpasim_plugin.core.lazy import installed_names
 from alpasim_plugin.core.signals import Stopped, leave_at_once, stoppable
 
 if TYPE_CHECKING:
@@ -157,12 +154,7 @@ def make_app(verb: str | None) -> typer.Typer:
         from alpasim_plugin.cli.options import command_of
 
         module_name, _, name = verbs()[verb].partition(":")
-        with (
-            arrow_without_pandas()
-            if module_name.startswith(f"{__package__}.")
-            else contextlib.nullcontext()
-        ):
-            module = import_module(module_name)
+        module = import_module(module_name)
         found = getattr(module, name)
         if isinstance(found, typer.Typer):
             app.add_typer(found, name=verb)
@@ -216,9 +208,6 @@ def _run(args: list[str]) -> int:
     import typer
 
     command = typer.main.get_command(make_app(next(iter(args), None)))
-    if not gc.isenabled():
-        gc.freeze()
-        gc.enable()
     usage_error: Any = typer.BadParameter.__bases__[
         0
     ]  # its module is another one in other versions of typer
@@ -346,30 +335,9 @@ def _complete() -> None:
     make_app(verb if number > 1 or verb == "run" else None)(prog_name="simrun")
 
 
-def load_workers_early(args: Sequence[str]) -> None:
-    """Let what rollouts need be loaded beside this process, if it is about to have some driven by
-    workers of this machine.
-    """
-    is_run = bool(args) and (args[0] == "run" or args[0].startswith("-") or args[0] not in verbs())
-    if (
-        is_run
-        and not re.search(r"--(help|version|dry-run|executor|workers[= ]1\b)", " ".join(args))
-        and (os.cpu_count() or 1) > 1
-    ):
-        from alpasim_plugin.runs.executors.local import load_early
-
-        load_early()
-
-
 def main() -> None:
     """Run the process's command line and exit with its code."""
     leave_at_once()
-    # until a verb is imported: that stays, and the collector need not look through it again and
-    # again
-    gc.disable()
-    if "_SIMRUN_COMPLETE" not in os.environ:
-        with contextlib.suppress(SimrunError):  # it is raised again where errors are printed
-            load_workers_early(sys.argv[1:])
     if "_SIMRUN_COMPLETE" in os.environ:
         _complete()
     sys.exit(run_command(sys.argv[1:]))

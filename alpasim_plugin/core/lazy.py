@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -54,39 +53,6 @@ def require_library(module: str, with_what: str, do_this: str) -> Any:
             f"{with_what}: the library {module.partition('.')[0]} cannot be imported: {error}",
             do_this,
         ) from error
-
-
-class _NoPandas:
-    """A finder by which pandas is not installed; nothing in its place in `sys.modules`, where
-    libraries look for its classes.
-    """
-
-    @staticmethod
-    def find_spec(name: str, path: Any = None, target: Any = None) -> None:
-        if name == "pandas":
-            raise ImportError("not needed")
-
-
-@contextmanager
-def arrow_without_pandas() -> Iterator[None]:
-    """Let pyarrow not load pandas, where a block of imports loads pyarrow: 0.1 s, to recognise
-    objects that nobody hands it.
-
-    Other people's code may: `arrow_with_pandas` comes before it.
-    """
-    sys.meta_path.insert(0, _NoPandas)
-    try:
-        yield
-        if "pyarrow" in sys.modules:
-            sys.modules["pyarrow"].array([0])  # looks for it, and then no more
-    finally:
-        sys.meta_path.remove(_NoPandas)
-
-
-def arrow_with_pandas() -> None:
-    """Let pyarrow look for pandas again."""
-    if "pyarrow" in sys.modules:
-        sys.modules["pyarrow"].lib._pandas_api.__init__()
 
 
 def installed(group: str) -> Mapping[str, EntryPoint]:

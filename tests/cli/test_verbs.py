@@ -80,18 +80,6 @@ def test_every_option_of_the_core_is_in_a_test_and_on_a_page(folder: str, ending
     assert absent == []
 
 
-def test_pandas_is_loaded_for_other_peoples_code_alone() -> None:
-    code = (
-        "import sys; from alpasim_plugin.cli.main import make_app; make_app('report')\n"
-        "import pyarrow; table = pyarrow.table({'a': ['b']}); print('pandas' in sys.modules)\n"
-        "from alpasim_plugin.core.parts.source import load; load('json:loads', 'policy')\n"
-        "print(table.to_pandas().a[0], 'pandas' in sys.modules)"
-    )
-    assert subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    ).stdout.split() == ["False", "b", "True"]
-
-
 def test_a_listing_loads_no_numerical_library() -> None:
     code = "import sys; from alpasim_plugin.cli.main import run_command; run_command(['--help']); print('numpy' in sys.modules)"
     assert (
@@ -110,19 +98,6 @@ def test_a_run_is_planned_and_reported_without_plots_networks_or_kernels() -> No
         ).stdout.strip()
         == "set()"
     )
-
-
-def test_the_collector_is_off_while_a_verb_is_imported_and_on_while_it_runs() -> None:
-    code = (
-        "import gc, sys; from alpasim_plugin.cli import main\n"
-        "def make_app(verb, own=main.make_app):\n    print(gc.isenabled())\n    return own(verb)\n"
-        "main.make_app, sys.argv = make_app, ['simrun', 'list', 'renderers']\n"
-        "try:\n    main.main()\nfinally:\n    print(gc.isenabled(), gc.get_freeze_count() > 1000)"
-    )
-    lines = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    ).stdout.splitlines()
-    assert (lines[0], lines[-1]) == ("False", "True True")
 
 
 def test_the_listing_shows_every_verb_with_the_first_line_of_its_own_help() -> None:

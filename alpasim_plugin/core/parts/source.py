@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 
 from alpasim_plugin import OWN_PACKAGES
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.lazy import arrow_with_pandas
 
 OWN_ROOT = str(Path(__file__).resolve().parents[3])
 PARTS = os.path.join(OWN_ROOT, "alpasim_plugin", "plugins", "parts") + os.sep
@@ -301,8 +300,6 @@ def load(target: str, kind: str) -> Any:
         InputError: The import fails, or the module has no such attribute.
     """
     name, _, attribute = target.rpartition(":")
-    if name.partition(".")[0] not in OWN_PACKAGES:
-        arrow_with_pandas()
     try:
         module = _from_file(Path(name)) if name.endswith(".py") else importlib.import_module(name)
         return getattr(module, attribute)
