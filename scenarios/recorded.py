@@ -7,8 +7,6 @@ Every failure names the file, and every byte read enters one hash.
 from __future__ import annotations
 
 import hashlib
-import io
-import tarfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -22,7 +20,7 @@ from pyarrow import feather
 
 from alpasim_plugin.core import reading
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.limits import COORDINATE_M, MEMBERS, SOURCE_BYTES
+from alpasim_plugin.core.limits import COORDINATE_M, SOURCE_BYTES
 from alpasim_plugin.core.reading.arrays import parse_npy
 from alpasim_plugin.core.reading.files import parse_xml
 from alpasim_plugin.core.reading.tables import Kind, check_columns
@@ -148,36 +146,6 @@ class SourceFiles:
         """Parse a NumPy array without pickles."""
         return parse_npy(data, where, "fetch the file again; it may be truncated")
 
-    def read_tar(self, path: Path) -> dict[str, bytes]:
-        """Read the regular files of an uncompressed tar, in memory, by member name."""
-        data = self.read_bytes(path)
-        damaged = reading.parsing(
-            path, "fetch the file again; it may be truncated", "a damaged tar"
-        )
-        members: dict[str, bytes] = {}
-        with damaged, tarfile.open(fileobj=io.BytesIO(data), mode="r:") as archive:
-            for info in archive:
-                MEMBERS.check(len(members), path)
-                handle = archive.extractfile(info) if info.isfile() else None
-                if handle is not None:
-                    content = handle.read()
-                    if len(content) != info.size:
-                        raise tarfile.ReadError(
-                            f"member {info.name} has {len(content)} of {info.size} bytes"
-                        )
-                    members[info.name] = content
-        # A cut between two members leaves a readable tar: only the two empty blocks at its end show
-        # that it is complete.
-        if any(data[-2 * tarfile.BLOCKSIZE :]):
-            raise self.fail(
-                path,
-                "a damaged tar: no end-of-archive blocks",
-                "fetch the file again; it may be truncated",
-            )
-        if not members:
-            raise self.fail(path, "a tar without files", "fetch the file again")
-        return members
-
     def read_xml(self, path: Path) -> ElementTree.Element:
         """Parse an XML document; a DOCTYPE is refused, so no entity can be defined or expanded.
 
@@ -201,7 +169,7 @@ class RecordedLog:
     """
 
     scene_id: str
-    source: str  # yaml | argoverse | commonroad | cosmos | drive | usdz
+    source: str  # yaml | argoverse | commonroad | drive | usdz
     lane_map: LaneMap
     ground: HeightField
     ego_log: Trajectory  # rig poses, world

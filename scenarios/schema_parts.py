@@ -181,7 +181,7 @@ class RoadSpec(Part):
     )
 
 
-SHIPPED = ("argoverse", "commonroad", "cosmos", "drive", "usdz")
+SHIPPED = ("argoverse", "commonroad", "drive", "usdz")
 
 
 class LogSpec(Part):
@@ -193,9 +193,6 @@ class LogSpec(Part):
         default=None, min_length=1, description="Folder of one Argoverse 2 log."
     )
     commonroad: str | None = Field(default=None, min_length=1, description="CommonRoad XML file.")
-    cosmos: str | None = Field(
-        default=None, min_length=1, description="Folder of one Cosmos-Drive-Dreams clip."
-    )
     drive: str | None = Field(
         default=None, min_length=1, description="Folder that simrun import has written."
     )

@@ -55,24 +55,6 @@ class CommonRoad(Source):
         return read_commonroad(path, ego)
 
 
-class Cosmos(Source):
-    """Cosmos-Drive-Dreams clips."""
-
-    help = "Cosmos-Drive-Dreams clip folder"
-
-    def matches(self, path: Path) -> bool:
-        """Look for one of the dataset's folders."""
-        return path.is_dir() and any(
-            (path / name).is_dir() for name in ("vehicle_pose", "3d_lanes", "pinhole_intrinsic")
-        )
-
-    def read(self, path: Path, ego: str | None) -> RecordedLog:
-        """Read a clip; the ego is the recording vehicle."""
-        from scenarios.cosmos import read_cosmos
-
-        return read_cosmos(path)
-
-
 class ImportedDrive(Source):
     """Recorded drives that ``simrun import`` has written."""
 

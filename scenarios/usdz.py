@@ -36,7 +36,7 @@ import shapely
 from alpasim_plugin.core.geometry import quat_from_matrix, transform_points
 from alpasim_plugin.core.types import F64, Actor, Box, Lane, LaneMap, Scene, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
-from scenarios.cosmos_camera import FRONT_WIDE, front_wide
+from scenarios.ftheta import FRONT_WIDE, front_wide
 from scenarios.map_lines import lane_edges, with_vertices
 from scenarios.opendrive import T_local_map, lane_map_of
 from scenarios.opendrive_road import MAX_ROAD_M, Cubic, OdrMap, Road, beside, cubics_at, parse_map

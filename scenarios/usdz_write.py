@@ -32,7 +32,7 @@ from alpasim_plugin.core.types import (
     Vehicle,
 )
 from alpasim_plugin.world.ground import height_at
-from scenarios.cosmos_camera import FRONT_WIDE, calibration_table
+from scenarios.ftheta import FRONT_WIDE, calibration_table
 from scenarios.usdz_tables import map_tables
 
 DOING = "writing an AlpaSim scene"

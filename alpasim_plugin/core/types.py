@@ -369,7 +369,7 @@ class Scenario:
     """A complete test case, the same type for every source."""
 
     scene_id: str
-    source: str  # yaml | argoverse | commonroad | cosmos | drive | usdz
+    source: str  # yaml | argoverse | commonroad | drive | usdz
     seed: int  # scene seed: geometry, textures, scripted actors
     lane_map: LaneMap
     ground: HeightField

@@ -52,7 +52,7 @@ from alpasim_plugin.runs.loop_state import shutter_poses
 from alpasim_plugin.runs.plan import options_of, ref_of
 from alpasim_plugin.runs.score_logs import check_vouched
 from evaluators.alpasim import EvalSettings
-from scenarios.cosmos_camera import FRONT_WIDE
+from scenarios.ftheta import FRONT_WIDE
 from scenarios.load import find, load_scenario
 from scenarios.suite import ScenarioRef, expand
 from scenarios.usdz_write import alpasim_cameras, rig_box, write_usdz

@@ -24,7 +24,6 @@ from evaluators.metrics.contact import find_contacts
 from evaluators.metrics.footprint import ActorTable, ego_footprints
 from scenarios.argoverse import read_argoverse
 from scenarios.commonroad import read_commonroad
-from scenarios.cosmos import read_cosmos
 from scenarios.recorded import RecordedLog
 from tests.evaluators.eval_build import by_name
 from tests.examples import first_of
@@ -32,15 +31,13 @@ from tests.scenarios.real_drive import ruling
 
 PAPER = PRESETS["paper"]
 ARGOVERSE = ("7fab2350", "adcf7d18", "3bffdcff")
-LOGS = (*ARGOVERSE, "USA_US101-3_3_T-1", "USA_Lanker-1_1_T-1", "cosmos")
+LOGS = (*ARGOVERSE, "USA_US101-3_3_T-1", "USA_Lanker-1_1_T-1")
 
 
 @lru_cache(maxsize=6)
 def read(folder: Path, name: str) -> RecordedLog:
     if name in ARGOVERSE:
         return read_argoverse(folder / "av2" / name)
-    if name == "cosmos":
-        return read_cosmos(folder / "cosmos-drive-dreams" / "example")
     return read_commonroad(folder / "commonroad" / f"{name}.xml")
 
 

@@ -36,9 +36,9 @@ from alpasim_plugin.fixers.semantic_map.prepare import (
     prepare_map,
 )
 from alpasim_plugin.fixers.semantic_map.style import COLOURS, LUDUS, OPENGL, MapStyle
-from scenarios.cosmos import read_cosmos, read_layer
-from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, orthonormal, read_lenses
+from scenarios.ftheta import FRONT_WIDE, orthonormal
 from scenarios.recorded import SourceFiles
+from tests.fixers.cosmos_clip import T_RIG_FRONT_WIDE, read_cosmos, read_layer, read_lenses
 
 SIZE = (1280, 704)
 N_FRAMES = 57

@@ -16,12 +16,13 @@ from alpasim_plugin.core.types import Box
 from alpasim_plugin.fixers.semantic_map.draw import draw_map, kernel_camera
 from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, prepare_map
 from alpasim_plugin.fixers.semantic_map.style import BOX_COLOURS, COLOURS
-from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, orthonormal, read_lenses
+from scenarios.ftheta import FRONT_WIDE, orthonormal
 from scenarios.recorded import SourceFiles
 from tests.examples import first_of
 from tests.fixers.cosmos_agreement import AS_PUBLISHED, OPENGL, SOLID, compare, mounts, read_clip
+from tests.fixers.cosmos_clip import T_RIG_FRONT_WIDE, read_lenses
 from tests.fixers.draw_reference import project_points
-from tests.scenarios.ftheta import project_ftheta
+from tests.scenarios.ftheta_projection import project_ftheta
 
 
 @pytest.fixture(scope="module")

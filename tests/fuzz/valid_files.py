@@ -90,12 +90,6 @@ def make_argoverse(folder: Path) -> None:
     write_argoverse(folder / "log")
 
 
-def make_cosmos(folder: Path) -> None:
-    from tests.scenarios.make_cosmos import write_cosmos
-
-    write_cosmos(folder / "clip")
-
-
 def make_commonroad(folder: Path) -> None:
     from tests.scenarios.make_commonroad import write_commonroad
 

@@ -250,7 +250,7 @@ def test_actors_beside_a_recording_are_refused(tmp_path: Path, repo: Path) -> No
     [
         ("{commonroad: none.xml}", ":2:7", "none.xml does not exist"),
         ("{argoverse: nowhere}", ":2:7", "nowhere does not exist"),
-        ("{commonroad: a.xml, cosmos: b}", ":2:1", "2 sources (commonroad, cosmos)"),
+        ("{commonroad: a.xml, usdz: b}", ":2:1", "2 sources (commonroad, usdz)"),
         ("{commonrode: a.xml}", ":2:7", "unknown key 'commonrode'"),
     ],
 )

@@ -19,7 +19,6 @@ from scenarios.sources import detect
 FOLDERS = {
     "argoverse": "av2/7fab2350",
     "commonroad": "commonroad/USA_Lanker-1_1_T-1.xml",
-    "cosmos": "cosmos-drive-dreams/example",
 }
 
 
@@ -83,13 +82,11 @@ def test_other_recorded_car_as_ego(shared_data: Path, tmp_path: Path) -> None:
     assert one.content_hash != two.content_hash
 
 
-def test_cameras_of_a_file_replace_those_of_the_recording(
-    shared_data: Path, tmp_path: Path
-) -> None:
+def test_cameras_of_a_file_are_those_of_the_scene(shared_data: Path, tmp_path: Path) -> None:
     path = tmp_path / "scene.yaml"
-    clip = shared_data / FOLDERS["cosmos"]
+    log = shared_data / FOLDERS["commonroad"]
     path.write_text(
-        f"version: 1\nlog: {{cosmos: {clip}}}\ncameras: [{{name: wide, width: 320, hfov_deg: 100}}]\n"
+        f"version: 1\nlog: {{commonroad: {log}}}\ncameras: [{{name: wide, width: 320, hfov_deg: 100}}]\n"
     )
     camera = load_scenario(path).cameras[0]
     assert (camera.name, camera.width) == ("wide", 320)
@@ -108,5 +105,5 @@ def test_default_camera_looks_ahead_and_a_little_down() -> None:
 
 
 def test_every_source_has_help_and_a_reader() -> None:
-    assert list(names("source")) == ["argoverse", "commonroad", "cosmos", "drive", "usdz"]
+    assert list(names("source")) == ["argoverse", "commonroad", "drive", "usdz"]
     assert all(names("source").values())

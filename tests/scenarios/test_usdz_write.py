@@ -19,7 +19,7 @@ import shapely
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import Actor, Box, Lane, LaneMap, Scenario, Trajectory
-from scenarios.cosmos_camera import pixel_to_angle
+from scenarios.ftheta import pixel_to_angle
 from scenarios.load import load_scenario
 from scenarios.map_lines import alpasim_view, rails, with_vertices
 from scenarios.usdz import read_usdz

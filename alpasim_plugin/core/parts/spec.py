@@ -381,7 +381,6 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
     "source": {
         "argoverse": ("scenarios.sources:Argoverse", "Argoverse 2 log folder"),
         "commonroad": ("scenarios.sources:CommonRoad", "CommonRoad XML"),
-        "cosmos": ("scenarios.sources:Cosmos", "Cosmos-Drive-Dreams clip folder"),
         "drive": ("scenarios.sources:ImportedDrive", "folder that simrun import has written"),
         "usdz": ("scenarios.sources:Usdz", "AlpaSim scene"),
     },

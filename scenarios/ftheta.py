@@ -1,5 +1,4 @@
-"""Cameras of a Cosmos-Drive-Dreams clip and of an AlpaSim scene: f-theta lenses, and the pinhole
-that is rendered.
+"""F-theta lenses of AlpaSim scenes, and the pinhole cameras that are rendered inside them.
 
 What is written to the calibration table of an AlpaSim scene are the pinholes that are rendered, as
 the f-theta lenses that AlpaSim's renderers expect.
@@ -11,7 +10,6 @@ import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,23 +17,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from alpasim_plugin.core.types import F64, CameraSpec, FTheta
-from scenarios.recorded import SourceFiles
 from scenarios.usdz_archive import Archive
 
 FRONT_WIDE = "camera_front_wide_120fov"
 WIDTH, HEIGHT = 512, 288  # rendered size; the recorded frames are 1920 x 1080
 HORIZONTAL_FOV_RAD = np.pi / 2
-# Nominal mount of the front wide camera (camera to rig). The clip has no extrinsics. This is the
-# calibration of another car of the same fleet; with it the clip's own map falls on the publisher's
-# renders of this clip.
-T_RIG_FRONT_WIDE = np.array(
-    [
-        [-0.0110549, -0.0181034, 0.9997750, 1.849283],
-        [-0.9999387, 0.0007966, -0.0110423, -0.0541688],
-        [-0.0005965, -0.9998358, -0.0181111, 1.3234164],
-        [0.0, 0.0, 0.0, 1.0],
-    ]
-)
 
 
 @dataclass(frozen=True)
@@ -54,39 +40,13 @@ class RecordedLens:
     )
 
 
-def read_lenses(files: SourceFiles, folder: Path) -> dict[str, RecordedLens]:
-    """Read ``ftheta_intrinsic``: one array of 11 numbers a camera.
-
-    Layout: cx, cy, width, height, six coefficients from the constant upwards, and a flag: 1 where
-        they map pixel radius to angle, 0 where
-    they map angle to radius.
-
-    Raises:
-        InputError: The tar is missing or damaged, or an array is not a lens.
-    """
-    path = files.only(folder / "ftheta_intrinsic", ("*.tar",), "the f-theta intrinsics")
-    lenses: dict[str, RecordedLens] = {}
-    for name, data in files.read_tar(path).items():
-        if not name.endswith(".npy"):
-            continue
-        where = f"{path}, {name}"
-        values = np.asarray(files.parse_npy(data, where), dtype=np.float64)
-        if (
-            values.shape != (11,)
-            or not np.isfinite(values).all()
-            or values[2] < 1
-            or values[3] < 1
-            or values[10] not in (0.0, 1.0)
-        ):
-            found = f"an array of shape {values.shape} that is not an f-theta lens"
-            raise files.fail(where, found, "give cx, cy, width, height, 6 coefficients, flag")
-        lenses[name.rsplit(".", 2)[-2]] = lens_of(values)
-    return lenses
-
-
 def lens_of(values: F64) -> RecordedLens:
-    """Make a lens of the 11 numbers ``(11,)`` of `read_lenses`; the direction that is not given is
-    fitted over the image's reach.
+    """Make a lens of its calibration; the direction that is not given is fitted over the image.
+
+    Args:
+        values: ``(11,)``: cx, cy, width, height in pixels, six coefficients from the constant
+            upwards, and a flag: 1 where they map pixel radius to angle (rad), 0 where they map
+            angle to radius.
     """
     cx, cy, width, height = values[:4]
     corners = np.array([[0, 0], [width, 0], [0, height], [width, height]]) - (cx, cy)
@@ -124,7 +84,7 @@ def _fit(x: F64, y: F64) -> F64:
     return np.concatenate([[0.0], coefficients / scale ** np.arange(1, 6)])
 
 
-def front_camera(lens: RecordedLens, T_rig_camera: F64 = T_RIG_FRONT_WIDE) -> CameraSpec:
+def front_camera(lens: RecordedLens, T_rig_camera: F64) -> CameraSpec:
     """Return the pinhole of 90 degrees width inside the front wide lens.
 
     Its principal point is the recorded one scaled to the rendered size, so every rendered pixel
@@ -132,7 +92,7 @@ def front_camera(lens: RecordedLens, T_rig_camera: F64 = T_RIG_FRONT_WIDE) -> Ca
 
     Args:
         lens: The calibrated lens.
-        T_rig_camera: ``(4, 4)`` mount; by default that of another car of the fleet.
+        T_rig_camera: ``(4, 4)`` mount, camera to rig.
     """
     focal = WIDTH / 2 / np.tan(HORIZONTAL_FOV_RAD / 2)
     cx, cy = lens.cx * WIDTH / lens.width, lens.cy * HEIGHT / lens.height

@@ -1,4 +1,4 @@
-"""Cosmos-Drive-Dreams clips in RDS-HQ form: lane map, ego poses, f-theta calibration.
+"""Read Cosmos-Drive-Dreams clips in RDS-HQ form: lane map, ego poses, f-theta calibration.
 
 Layout and facts: the public data set description of NVIDIA Cosmos-Drive-Dreams (arXiv 2506.09042);
 data CC-BY-4.0, (c) NVIDIA. The world is the rig frame of frame 0.
@@ -6,7 +6,9 @@ data CC-BY-4.0, (c) NVIDIA. The world is the rig frame of frame 0.
 
 from __future__ import annotations
 
+import io
 import re
+import tarfile
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,9 +27,62 @@ from alpasim_plugin.core.geometry import (
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Marking, Paint, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
-from scenarios.cosmos_camera import FRONT_WIDE, front_camera, read_lenses
+from scenarios.ftheta import FRONT_WIDE, RecordedLens, front_camera, lens_of
 from scenarios.map_lines import is_left_of, lane_edges
 from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory
+
+# Nominal mount of the front wide camera (camera to rig). The clip has no extrinsics. This is the
+# calibration of another car of the same fleet; with it the clip's own map falls on the publisher's
+# renders of this clip.
+T_RIG_FRONT_WIDE = np.array(
+    [
+        [-0.0110549, -0.0181034, 0.9997750, 1.849283],
+        [-0.9999387, 0.0007966, -0.0110423, -0.0541688],
+        [-0.0005965, -0.9998358, -0.0181111, 1.3234164],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+
+
+def read_tar(files: SourceFiles, path: Path) -> dict[str, bytes]:
+    """Read the regular files of an uncompressed tar, by member name."""
+    members: dict[str, bytes] = {}
+    with tarfile.open(fileobj=io.BytesIO(files.read_bytes(path)), mode="r:") as archive:
+        for info in archive:
+            handle = archive.extractfile(info)
+            if handle is not None:
+                members[info.name] = handle.read()
+    return members
+
+
+def read_lenses(files: SourceFiles, folder: Path) -> dict[str, RecordedLens]:
+    """Read ``ftheta_intrinsic``: one array of 11 numbers a camera.
+
+    Layout: cx, cy, width, height, six coefficients from the constant upwards, and a flag: 1 where
+        they map pixel radius to angle, 0 where
+    they map angle to radius.
+
+    Raises:
+        InputError: The tar is missing or damaged, or an array is not a lens.
+    """
+    path = files.only(folder / "ftheta_intrinsic", ("*.tar",), "the f-theta intrinsics")
+    lenses: dict[str, RecordedLens] = {}
+    for name, data in read_tar(files, path).items():
+        if not name.endswith(".npy"):
+            continue
+        where = f"{path}, {name}"
+        values = np.asarray(files.parse_npy(data, where), dtype=np.float64)
+        if (
+            values.shape != (11,)
+            or not np.isfinite(values).all()
+            or values[2] < 1
+            or values[3] < 1
+            or values[10] not in (0.0, 1.0)
+        ):
+            found = f"an array of shape {values.shape} that is not an f-theta lens"
+            raise files.fail(where, found, "give cx, cy, width, height, 6 coefficients, flag")
+        lenses[name.rsplit(".", 2)[-2]] = lens_of(values)
+    return lenses
 
 
 @dataclass(frozen=True)
@@ -66,7 +121,7 @@ def read_layer(files: SourceFiles, folder: Path, layer: str) -> tuple[Label, ...
             finite geometry.
     """
     path = files.only(folder / layer, ("*.tar",), f"layer {layer}")
-    members = {name: data for name, data in files.read_tar(path).items() if name.endswith(".json")}
+    members = {name: data for name, data in read_tar(files, path).items() if name.endswith(".json")}
     if len(members) != 1:
         raise files.fail(path, f"{len(members)} JSON members", "give a tar with one JSON member")
     name, data = next(iter(members.items()))
@@ -384,7 +439,7 @@ def read_cosmos(path: str | Path) -> RecordedLog:
         ego_log=ego_log,
         vehicle=Vehicle(),
         actors=(),
-        cameras=(front_camera(lenses[FRONT_WIDE]),),
+        cameras=(front_camera(lenses[FRONT_WIDE], T_RIG_FRONT_WIDE),),
         world_origin=(0.0, 0.0, 0.0),
         content_hash=files.content_hash,
         notes=notes,
@@ -402,7 +457,7 @@ def read_poses(files: SourceFiles, folder: Path) -> tuple[Trajectory, str]:
     """
     path = files.only(folder / "vehicle_pose", ("*.tar",), "the ego poses")
     frames: dict[int, F64] = {}
-    for name, data in files.read_tar(path).items():
+    for name, data in read_tar(files, path).items():
         match = re.search(r"\.(\d+)\.vehicle_pose\.npy$", name)
         if match is None:
             continue

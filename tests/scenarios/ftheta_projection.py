@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from alpasim_plugin.core.types import F64
-from scenarios.cosmos_camera import RecordedLens
+from scenarios.ftheta import RecordedLens
 
 
 def project_ftheta(camera: RecordedLens, points: F64) -> F64:

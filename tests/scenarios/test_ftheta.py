@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scenarios.ftheta import front_camera, lens_of
+from tests.scenarios.ftheta_projection import project_ftheta
+
+WIDE = [960.0, 740.0, 1920.0, 1080.0, 0.0, 1.0576e-3, 8.2e-9, -3.4e-11, 8.1e-14, -2.9e-17, 1.0]
+
+
+def test_every_rendered_pixel_was_recorded():
+    lens = lens_of(np.array(WIDE))
+    camera = front_camera(lens, np.eye(4))
+    u, v = np.meshgrid(np.arange(camera.width + 1.0), np.arange(camera.height + 1.0))
+    rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1) @ np.linalg.inv(camera.K).T
+    pixels = project_ftheta(lens, rays)
+    assert (pixels >= 0).all()
+    assert (pixels <= [lens.width, lens.height]).all()
+    assert np.degrees(2 * np.arctan(camera.width / 2 / camera.K[0, 0])) == pytest.approx(90.0)
+
+
+@pytest.mark.parametrize(
+    "values", [WIDE, [970.0, 600.0, 1920.0, 1080.0, 0.0, 3675.7, 178.8, -387.4, -11.4, 18.0, 0.0]]
+)
+def test_both_directions_of_a_lens_undo_each_other(values):
+    camera = lens_of(np.array(values))
+    polynomial = np.polynomial.polynomial.polyval
+    theta = np.linspace(0, camera.lens.max_angle_rad, 200)
+    np.testing.assert_allclose(
+        polynomial(polynomial(theta, camera.lens.angle_to_pixel), camera.lens.pixel_to_angle),
+        theta,
+        atol=1e-4,
+    )
+    # The projection itself is as exact as the calibrated polynomial.
+    rays = np.column_stack([np.sin(theta) * 0.6, np.sin(theta) * 0.8, np.cos(theta)])
+    radius = np.linalg.norm(project_ftheta(camera, rays) - (camera.cx, camera.cy), axis=1)
+    back = polynomial(radius, camera.lens.pixel_to_angle)
+    np.testing.assert_allclose(back, theta, atol=1e-9 if camera.backward_given else 1e-4)
+
+
+def test_nothing_is_seen_beyond_the_lens():
+    assert np.isnan(project_ftheta(lens_of(np.array(WIDE)), np.array([[1.0, 0.0, -1.0]]))).all()
