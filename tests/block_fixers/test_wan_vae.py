@@ -163,7 +163,7 @@ def test_one_and_five_frames_give_one_and_two_latents(vae: WanVAE) -> None:
 def test_six_frames_are_refused_with_both_ways_out(vae: WanVAE) -> None:
     with pytest.raises(InputError) as error:
         vae.encode(clip(6, 16, 16))
-    assert error.value.message == "6 frames at the start of a video"
+    assert "6 frames at the start of a video" in error.value.message
     assert "1 + 4k" in error.value.message
     assert "give 5 or 9 frames (pad_clip" in error.value.hint
 

@@ -54,7 +54,7 @@ def error_of(tmp_path: Path, text: str, model: type[BaseModel] = Car) -> InputEr
     path = write(tmp_path, text)
     with pytest.raises(InputError) as e:
         validate(model, load_yaml(path))
-    assert str(path) in e.value.with_what
+    assert str(path) in e.value.message
     return e.value
 
 
@@ -107,9 +107,9 @@ def test_bad_yaml_is_refused_where_it_stands(
     path = write(tmp_path, text)
     with pytest.raises(InputError) as e:
         load_yaml(path)
-    assert f"{path.name}{where}" in e.value.with_what
-    assert found in e.value.found
-    assert e.value.do_this
+    assert f"{path.name}{where}" in e.value.message
+    assert found in e.value.message
+    assert e.value.hint
 
 
 def test_object_tags_are_never_constructed(tmp_path: Path) -> None:
@@ -131,7 +131,7 @@ def test_alias_bomb_is_stopped(tmp_path: Path) -> None:
 def test_deep_nesting_is_stopped(tmp_path: Path, before: str, after: str, levels: int) -> None:
     with pytest.raises(InputError, match="nested deeper") as caught:
         load_yaml(write(tmp_path, before * levels + after * levels))
-    assert caught.value.hint == "flatten the file"
+    assert "flatten the file" in caught.value.hint
 
 
 def test_missing_folder_and_binary_files_are_refused(tmp_path: Path) -> None:
@@ -165,7 +165,7 @@ def test_an_error_in_an_extended_file_names_that_file(tmp_path: Path) -> None:
     path = write(tmp_path, "extends: base.yaml\n")
     with pytest.raises(InputError) as e:
         validate(Car, load_yaml(path))
-    assert "base.yaml:2:1" in e.value.with_what
+    assert "base.yaml:2:1" in e.value.message
 
 
 def test_extends_in_a_circle_or_to_nowhere_is_refused(tmp_path: Path) -> None:
@@ -216,7 +216,7 @@ def test_wrong_content_is_named_with_position_and_hint(
 
 def test_all_problems_are_listed_in_file_order(tmp_path: Path) -> None:
     e = error_of(tmp_path, "doors: x\nversion: 1\nlength_m: -1\nwings: 2\n")
-    assert e.message.endswith(":1:1")
+    assert ":1:1" in e.message
     assert "and 2 more" in e.message
     assert "a.yaml:3:1: length_m = -1" in e.message
     assert "a.yaml:4:1: unknown key 'wings'" in e.message
@@ -255,7 +255,7 @@ def test_an_error_in_an_override_names_the_override(tmp_path: Path) -> None:
     document = load_yaml(write(tmp_path, "version: 1\nlength_m: 3\n"))
     with pytest.raises(InputError) as e:
         validate(Car, apply_overrides(document, ["length_m=-2"]))
-    assert e.value.with_what == "--set length_m=-2"
+    assert "--set length_m=-2" in e.value.message
 
 
 @pytest.mark.parametrize(
@@ -273,16 +273,16 @@ def test_bad_overrides_are_refused(tmp_path: Path, text: str, found: str) -> Non
     document = load_yaml(write(tmp_path, "length_m: 3\nc: [{id: lead}]\n"))
     with pytest.raises(InputError) as e:
         apply_overrides(document, [text])
-    assert found in e.value.found
-    assert f"--set {text}" in e.value.with_what
+    assert found in e.value.message
+    assert f"--set {text}" in e.value.message
 
 
 @settings(deadline=None, max_examples=examples(80))
 @given(st.text(max_size=60))
-def test_any_text_gives_data_or_a_four_part_error(text: str) -> None:
+def test_any_text_gives_data_or_a_clear_error(text: str) -> None:
     error = None
     try:
-        parse_scalar(text, "reading", "text")
+        parse_scalar(text, "text")
     except InputError as e:
         error = e
     assert error is None or (error.message and error.hint)

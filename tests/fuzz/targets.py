@@ -96,7 +96,7 @@ def check(target: Target, files: Files, folder: Path) -> str:
     else:
         return "accepted"
     out_of_memory(refusal)
-    parts = (refusal.doing, refusal.with_what, refusal.found, refusal.do_this)
+    parts = (refusal.message, refusal.hint)
     if refusal.exit_code != 2:
         raise refusal
     assert all(part.strip() and len(part) <= 300 and part.isprintable() for part in parts), (

@@ -31,7 +31,7 @@ def refused(folder):
 
 
 def test_folder_that_is_not_there(tmp_path):
-    assert refused(tmp_path / "nowhere").found == "no such folder"
+    assert "no such folder" in refused(tmp_path / "nowhere").message
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_missing_file_is_named_by_its_pattern(tmp_path, name):
     folder = write_argoverse(tmp_path / "x")
     (folder / name).unlink()
     error = refused(folder)
-    assert error.message.startswith("no file ")
+    assert "no file " in error.message
     assert Path(name).stem.split("_x_")[0].removeprefix("x___") in error.message
 
 
@@ -57,7 +57,7 @@ def test_truncated_feather(tmp_path, name, keep):
     path = write_argoverse(tmp_path / "x") / name
     path.write_bytes(path.read_bytes()[:keep])
     error = refused(path.parent)
-    assert error.message == str(path)
+    assert str(path) in error.message
     assert "empty file" in error.message or "no readable Arrow IPC file" in error.message
     assert "fetch the file again" in error.hint
 
@@ -67,7 +67,7 @@ def test_truncated_map(tmp_path):
     path = next(folder.glob("map/log_map_archive_*.json"))
     path.write_bytes(path.read_bytes()[:500])
     error = refused(folder)
-    assert error.message == str(path)
+    assert str(path) in error.message
     assert "broken JSON" in error.message
 
 
@@ -75,14 +75,14 @@ def test_truncated_raster(tmp_path):
     folder = write_argoverse(tmp_path / "x")
     path = next(folder.glob("map/*.npy"))
     path.write_bytes(path.read_bytes()[:4000])
-    assert "no readable NumPy array" in refused(folder).found
+    assert "no readable NumPy array" in refused(folder).message
 
 
 def test_text_that_is_no_utf_8_in_a_feather(tmp_path):
     path = write_argoverse(tmp_path / "x") / "annotations.feather"
     path.write_bytes(path.read_bytes().replace(b"REGULAR", b"REG\xff\xfeAR", 1))
     error = refused(path.parent)
-    assert error.message == str(path)
+    assert str(path) in error.message
     assert "no readable Arrow IPC file" in error.message
 
 
@@ -101,7 +101,7 @@ def test_raster_with_a_broken_header(tmp_path, header):
         b"\x93NUMPY\x01\x00" + (len(header) + 1).to_bytes(2, "little") + header + b"\n"
     )
     error = refused(folder)
-    assert error.message == str(path)
+    assert str(path) in error.message
     assert "no readable NumPy array" in error.message
 
 
@@ -111,7 +111,7 @@ def test_one_point_on_another_continent(tmp_path):
             tmp_path / "x", document=vector_map() | {"lane_segments": {"1": lane(1, 0, 4e6, 0)}}
         )
     )
-    assert error.message == "a point 4000.0 km from the drive"
+    assert "a point 4000.0 km from the drive" in error.message
     assert "lane 1" in error.message
 
 
@@ -122,14 +122,14 @@ def test_drive_that_jumps_across_the_world(tmp_path):
             write_argoverse(
                 tmp_path / "x", ego=bad_poses("tx_m", 4, 9e6), annotations=cuboids(TRACKS)
             )
-        ).found
+        ).message
     )
 
 
 def test_two_maps_are_ambiguous(tmp_path):
     folder = write_argoverse(tmp_path / "x")
     (folder / "map" / "log_map_archive_y____PIT_city_2.json").write_text("{}")
-    assert refused(folder).found.startswith("2 files match")
+    assert "2 files match" in refused(folder).message
 
 
 def without(document, layer, key=None):
@@ -172,13 +172,13 @@ def test_map_without_what_every_map_has(tmp_path, document, found):
 def test_log_without_cuboids(tmp_path):
     empty = {k: np.array(v)[:0] for k, v in cuboids(TRACKS).items()}
     error = refused(write_argoverse(tmp_path / "x", annotations=empty))
-    assert error.message == "no cuboids of other road users"
-    assert error.message.endswith("annotations.feather")
+    assert "no cuboids of other road users" in error.message
+    assert "annotations.feather" in error.message
 
 
 def test_log_of_one_pose(tmp_path):
     assert (
-        refused(write_argoverse(tmp_path / "x", ego=poses(1), annotations=cuboids(TRACKS))).found
+        refused(write_argoverse(tmp_path / "x", ego=poses(1), annotations=cuboids(TRACKS))).message
         == "1 pose"
     )
 
@@ -207,7 +207,7 @@ def bad_poses(name, row, value):
 def test_poses_that_are_no_drive(tmp_path, ego, found):
     error = refused(write_argoverse(tmp_path / "x", ego=ego, annotations=cuboids(TRACKS)))
     assert found in error.message
-    assert error.message.endswith("city_SE3_egovehicle.feather")
+    assert "city_SE3_egovehicle.feather" in error.message
 
 
 def bad_cuboids(name, row, value):

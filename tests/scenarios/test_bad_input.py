@@ -34,7 +34,7 @@ def fails(tmp_path: Path, text: str) -> InputError:
     path.write_text(text)
     with pytest.raises(InputError) as e:
         load_scenario(path)
-    for part in (e.value.doing, e.value.with_what, e.value.found, e.value.do_this):
+    for part in (e.value.message, e.value.hint):
         assert part.strip()
         assert "Traceback" not in part
     return e.value
@@ -263,15 +263,15 @@ def test_bad_log_sections(tmp_path: Path, log: str, at: str, found: str) -> None
 def test_a_duration_beyond_the_recording_is_refused(repo: Path) -> None:
     with pytest.raises(InputError) as e:
         load_scenario("real/us101", overrides=["timing.duration_us=9000000"])
-    assert "--set timing.duration_us=9000000" in e.value.with_what
-    assert "of a log 3.10 s long" in e.value.found
+    assert "--set timing.duration_us=9000000" in e.value.message
+    assert "of a log 3.10 s long" in e.value.message
 
 
 def test_missing_file_gives_the_nearest_shipped_names() -> None:
     with pytest.raises(InputError) as e:
         load_scenario("smoke/strait")
-    assert "no such file or folder" in e.value.found
-    assert "did you mean smoke/straight" in e.value.do_this
+    assert "no such file or folder" in e.value.message
+    assert "did you mean smoke/straight" in e.value.hint
     with pytest.raises(InputError, match="simrun list scenarios"):
         load_scenario("qqqqqq.yaml")
 
@@ -283,8 +283,8 @@ def test_usdz_and_unknown_files_are_refused_with_what_can_be_read(tmp_path: Path
     (tmp_path / "a.bin").write_bytes(b"?")
     with pytest.raises(InputError) as e:
         load_scenario(tmp_path / "a.bin")
-    assert "no reader recognises" in e.value.found
-    assert "CommonRoad XML" in e.value.do_this
+    assert "no reader recognises" in e.value.message
+    assert "CommonRoad XML" in e.value.hint
     with pytest.raises(InputError, match="a folder with"):
         load_scenario(tmp_path)
 
@@ -296,7 +296,7 @@ def test_a_map_without_lanes_is_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError) as e:
         load_scenario(path)
-    assert "empty.xml" in e.value.with_what
+    assert "empty.xml" in e.value.message
 
 
 def test_truncated_xml_is_refused(tmp_path: Path, repo: Path) -> None:
@@ -304,4 +304,4 @@ def test_truncated_xml_is_refused(tmp_path: Path, repo: Path) -> None:
     path.write_bytes((repo / "scenarios" / "data" / "USA_US101-3_3_T-1.xml").read_bytes()[:50_000])
     with pytest.raises(InputError) as e:
         load_scenario(path)
-    assert "cut.xml" in e.value.with_what
+    assert "cut.xml" in e.value.message

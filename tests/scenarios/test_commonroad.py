@@ -276,7 +276,7 @@ def test_truncated_file(tmp_path, keep):
 
 
 def test_empty_file(tmp_path):
-    assert refused(tmp_path, text=b"").found == "an empty file"
+    assert "an empty file" in refused(tmp_path, text=b"").message
 
 
 BOMB = b'<!DOCTYPE commonRoad [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]>'
@@ -288,13 +288,13 @@ def test_doctype_is_refused_before_any_entity_counts(tmp_path, encoding):
     text = BOMB + rest.replace(b"ZAM_Test", b"&b;")
     text = head + text if encoding == "utf-8" else text.decode().encode("utf-16")
     error = refused(tmp_path, text=text)
-    assert error.message == "a DOCTYPE declaration"
+    assert "a DOCTYPE declaration" in error.message
     assert "entities are not accepted" in error.hint
 
 
 def test_unknown_encoding(tmp_path):
     assert (
-        "encoding" in refused(tmp_path, text=document().replace("utf-8", "klingon").encode()).found
+        "encoding" in refused(tmp_path, text=document().replace("utf-8", "klingon").encode()).message
     )
 
 
@@ -327,7 +327,7 @@ def test_unknown_encoding(tmp_path):
     ],
 )
 def test_documents_that_are_no_scenario(tmp_path, text, found):
-    assert found in refused(tmp_path, text=text).found
+    assert found in refused(tmp_path, text=text).message
 
 
 def test_times_that_do_not_increase(tmp_path):
@@ -340,13 +340,13 @@ def test_times_that_do_not_increase(tmp_path):
 
 def test_ego_of_one_state(tmp_path):
     error = refused(tmp_path, ego="11", traffic=obstacle(11, drive(20, 0, steps=[0])))
-    assert error.message == "1 state"
+    assert "1 state" in error.message
 
 
 def test_unknown_ego(tmp_path):
     error = refused(tmp_path, ego="99")
-    assert error.message == "no moving obstacle '99'"
-    assert error.hint == "choose the ego among 11, 12, 13"
+    assert "no moving obstacle '99'" in error.message
+    assert "choose the ego among 11, 12, 13" in error.hint
 
 
 # --- the facts of two recorded files

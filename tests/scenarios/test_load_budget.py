@@ -20,7 +20,7 @@ def test_files_that_extend_the_next_one_four_times_are_refused(tmp_path: Path) -
         (tmp_path / f"{i}.yaml").write_text(f"extends: [{', '.join([f'{i + 1}.yaml'] * 4)}]\n")
     (tmp_path / f"{DEPTH}.yaml").write_text("a: 1\n")
     with pytest.raises(InputError, match=r"more than 64 files to read, 13 different ones"):
-        load_yaml(tmp_path / "0.yaml", "reading")
+        load_yaml(tmp_path / "0.yaml")
 
 
 def test_suites_that_name_the_next_one_four_times_are_refused(tmp_path: Path) -> None:
@@ -38,4 +38,4 @@ def test_a_base_named_by_several_files_is_no_cycle_and_is_taken(tmp_path: Path) 
     for name in ("x", "y"):
         (tmp_path / f"{name}.yaml").write_text(f"extends: base.yaml\n{name}: 2\n")
     (tmp_path / "top.yaml").write_text("extends: [x.yaml, y.yaml]\n")
-    assert load_yaml(tmp_path / "top.yaml", "reading").data == {"a": 1, "x": 2, "y": 2}
+    assert load_yaml(tmp_path / "top.yaml").data == {"a": 1, "x": 2, "y": 2}

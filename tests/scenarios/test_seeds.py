@@ -185,8 +185,8 @@ def test_an_override_wins_over_variation_and_jitter(tmp_path: Path) -> None:
 def test_a_variation_of_an_unknown_key_names_the_variation(tmp_path: Path) -> None:
     with pytest.raises(InputError) as e:
         load_scenario(write(tmp_path, "variations: {ego.cruse_mps: {low: 9, high: 10}}\n"))
-    assert "variation ego.cruse_mps" in e.value.with_what
-    assert "did you mean 'cruise_mps'" in e.value.do_this
+    assert "variation ego.cruse_mps" in e.value.message
+    assert "did you mean 'cruise_mps'" in e.value.hint
 
 
 def test_words_for_people_and_places_of_files_do_not_change_the_hash(tmp_path: Path) -> None:

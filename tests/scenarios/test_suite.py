@@ -64,8 +64,8 @@ def test_an_unknown_entry_is_placed_in_the_suite(folder: Path) -> None:
     (folder / "bad.yaml").write_text("version: 1\nscenarios:\n  - one.yaml\n  - smoke/strait\n")
     with pytest.raises(InputError) as e:
         load_suite(folder / "bad.yaml")
-    assert "bad.yaml:4:5" in e.value.with_what
-    assert "did you mean smoke/straight" in e.value.do_this
+    assert "bad.yaml:4:5" in e.value.message
+    assert "did you mean smoke/straight" in e.value.hint
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_bad_suites_are_refused(folder: Path, text: str, found: str) -> None:
     (folder / "bad.yaml").write_text(text)
     with pytest.raises(InputError) as e:
         load_suite(folder / "bad.yaml")
-    assert found in e.value.found
+    assert found in e.value.message
 
 
 def test_an_empty_folder_and_a_missing_name_are_refused(tmp_path: Path) -> None:

@@ -40,14 +40,11 @@ def test_xml_holds_any_text() -> None:
 
 def test_parts_of_errors_are_short_and_cannot_act() -> None:
     error = InputError(f"{'a' * 10000}: {f'found {HOSTILE}' + 'b' * 7500000}", "do")
-    assert all(
-        len(part) <= MAX_PART and part.isprintable()
-        for part in (error.doing, error.message, error.message, error.hint)
-    )
+    assert all(len(part) <= MAX_PART and part.isprintable() for part in (error.message, error.hint))
     assert "10000" not in error.message
-    assert error.message.startswith("aaa")
+    assert "aaa" in error.message
     assert "more" in error.message
-    assert str(error).count("\n") == 3
+    assert str(error).count("\n") == 1
 
 
 @pytest.mark.parametrize("length", [299, 300, 301, 5000])
