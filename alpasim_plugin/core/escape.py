@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 
-MAX_PART = 300  # characters of one part of an error
+MAX_PART = 600  # characters of the message of an error, and of its hint
 
 # What a terminal acts upon: C0 and C1 controls, and the marks that turn the direction of text.
 _CONTROLS = re.compile(
