@@ -200,7 +200,11 @@ def _check_timing(drawn: Drawn, scenario: Scenario) -> None:
         clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
     except InputError as e:
         key = next(
-            (k for k in ("control_us", "camera_us", "policy_us") if e.message.startswith(f"rates.{k}")),
+            (
+                k
+                for k in ("control_us", "camera_us", "policy_us")
+                if e.message.startswith(f"rates.{k}")
+            ),
             None,
         )
         loc: tuple[str, ...] = ("rates", key) if key else ("timing", "duration_us")

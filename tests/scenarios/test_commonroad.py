@@ -294,7 +294,8 @@ def test_doctype_is_refused_before_any_entity_counts(tmp_path, encoding):
 
 def test_unknown_encoding(tmp_path):
     assert (
-        "encoding" in refused(tmp_path, text=document().replace("utf-8", "klingon").encode()).message
+        "encoding"
+        in refused(tmp_path, text=document().replace("utf-8", "klingon").encode()).message
     )
 
 
