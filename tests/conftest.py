@@ -21,6 +21,7 @@ from tests.durations import (
     kept_seconds,
 )
 from tests.examples import PROFILE, examples
+from tests.laboratory import NOT_COLLECTED, laboratory_is_installed
 from tests.report.browser import Browser, find_chromium
 
 settings.register_profile(
@@ -46,6 +47,12 @@ def pytest_configure(config: pytest.Config) -> None:
         folder = tempfile.mkdtemp(prefix="simrun-tests-")
         os.environ["SIMRUN_CACHE"] = folder
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say that the laboratory's tests were not collected."""
+    if not laboratory_is_installed():
+        terminalreporter.write_line(NOT_COLLECTED)
 
 
 # A kernel's first call compiles it, for half a minute, and leaves it on disk for every later
