@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 LAB = "docs/lab"
-LAB_VERBS = ("adapt", "bench", "judge", "train")
+LAB_VERBS = ("bench", "train")
 SHELL = ("bash", "sh", "console", "")
 SIMRUN = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?simrun\s+(.*)$")
 OTHER = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(?:python3?(?:\.\d+)?|pip|pytest)\s")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tests.fuzz.seen import Make
-from tests.fuzz.uses import Target, one_of
+from tests.fuzz.uses import Target
 
 
 def toy_training(folder: Path) -> Any:
@@ -55,17 +54,6 @@ def use_pairs(folder: Path) -> None:
         assert len(np.asarray(clip.t_us)) == len(clip) > 0
 
 
-def make_poses(folder: Path) -> None:
-    rows = [{"T_world_camera": np.eye(4).tolist(), "t_us": 100_000 * i} for i in range(3)]
-    (folder / "poses.json").write_text(json.dumps(rows))
-
-
-def use_poses(path: Path) -> None:
-    from alpasim_plugin.lab.training.pair_import import read_poses
-
-    read_poses(path, 10.0)
-
-
 def pairs_header(shape: tuple[int, ...]) -> Make:
     def make(folder: Path) -> list[str]:
         sequence = folder / "pairs" / "train" / "one"
@@ -88,7 +76,15 @@ def pairs_header(shape: tuple[int, ...]) -> Make:
             (sequence / f"{name}.npy").write_bytes(
                 b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head.encode() + b"\0" * 64
             )
-        return ["train", "pairs-sheet", str(folder / "pairs"), "--out", str(folder / "sheet.png")]
+        return [
+            "train",
+            "per-frame",
+            str(folder / "pairs"),
+            "--out",
+            str(folder / "run"),
+            "--steps",
+            "1",
+        ]
 
     return make
 
@@ -96,6 +92,5 @@ def pairs_header(shape: tuple[int, ...]) -> Make:
 TARGETS = (
     Target("training run", make_training_run, use_training_run),
     Target("pairs", make_pairs, use_pairs),
-    Target("poses", make_poses, one_of("*.json", use_poses)),
 )
 SEEN = {"pairs of 999999999999 frames": pairs_header((999_999_999_999, 8, 8, 3))}

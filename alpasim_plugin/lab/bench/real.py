@@ -24,7 +24,7 @@ from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.lab.bench.colour_video_vdp import ColourVideoVDP
 from alpasim_plugin.lab.bench.lane_paint import PaintCounts, Road, compare_paint, road_of
-from alpasim_plugin.lab.video_metrics.perceptual import ImageDistance, picture_distances
+from alpasim_plugin.lab.video_metrics.image_distance import ImageDistance, image_distances
 from alpasim_plugin.lab.video_metrics.warp import warp_l1
 from alpasim_plugin.renderers.recorded import posed_photograph
 
@@ -239,7 +239,7 @@ def _values(taken: Sequence[Shot], made: Sequence[U8], part: Sequence[int], judg
     return {
         "psnr_db": _mean([psnr_db(a, b) for a, b in zip(shown, truth, strict=True)]),
         "ssim": _mean([ssim(a, b) for a, b in zip(shown, truth, strict=True)]),
-        "perceptual_syn": _mean(picture_distances(judges.perceptual, shown, truth)),
+        "perceptual_syn": _mean(image_distances(judges.perceptual, shown, truth)),
         "cvvdp_jod": None if judges.vdp is None else _mean(judges.vdp.jod(shown, truth)),
         "warp_l1": _mean(pairs),
         "paint_precision": None if paint.precision is None else round(paint.precision, 4),

@@ -1,4 +1,4 @@
-"""``simrun adapt``: train a fixer a little further on one recorded street's own photographs."""
+"""``simrun train adapt``: train a fixer a little further on one recorded street's own photographs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scenarios.load import load_scenario
 EPILOG = """
 Examples:
 
-- `simrun adapt street --out street/onefixer.safetensors`
+- `simrun train adapt street --out street/onefixer.safetensors`
 
 - `simrun --renderer "onefixer[weights.bundle=street/onefixer.safetensors]" street/scenario.yaml`
 """

@@ -9,12 +9,10 @@ from typing import Annotated
 import typer
 
 from alpasim_plugin.core.atomic import write_json
-from alpasim_plugin.lab.bench.fixer_table import put_between_marks
 
 EPILOG = (
     "Examples: `simrun bench loop`, `simrun bench loop --renderer 3dgs,onefixer@2 --out loop.json`"
 )
-PAGE, RECORD = Path("docs/experiments/speed.md"), Path("docs/experiments/loop.json")
 
 
 def loop(
@@ -28,9 +26,6 @@ def loop(
     out: Annotated[
         Path | None, typer.Option("--out", help="Write the record, with ratios, to this JSON file.")
     ] = None,
-    docs: Annotated[
-        bool, typer.Option("--docs", help=f"Write tables and record into {PAGE}, run in a clone.")
-    ] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON document on stdout.")
     ] = False,
@@ -44,9 +39,6 @@ def loop(
     from alpasim_plugin.lab.bench.loop import bench_loop, markdown
 
     record = bench_loop(renderers.split(","), repeats, seconds)
-    if docs:
-        PAGE.write_text(put_between_marks(PAGE.read_text(), "loop", markdown(record)))
-    for path in (RECORD if docs else None, out):
-        if path is not None:
-            write_json(path, record)
+    if out is not None:
+        write_json(out, record)
     print(json.dumps(record) if as_json else markdown(record))

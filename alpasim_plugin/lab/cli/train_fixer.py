@@ -1,10 +1,7 @@
-"""``simrun train fixer``: train a recipe from pairs; ``simrun train memory``: its memory and
-time.
-"""
+"""``simrun train fixer``: train a recipe from pairs, the autoencoder, or a fixer's decoder."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -16,10 +13,11 @@ import typer
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings
-from alpasim_plugin.lab.bench.training_memory import measure_memory, memory_table
 from alpasim_plugin.lab.cli import training_options as options
 from alpasim_plugin.lab.cli.image_sizes import parse_size
 from alpasim_plugin.lab.training.clip_batches import BatchForm
+from alpasim_plugin.lab.training.decoder_finetune import DecoderRecipe
+from alpasim_plugin.lab.training.decoder_finetune_run import finetune_decoder
 from alpasim_plugin.lab.training.fixer_run import FixerRun, TrainableSettings, train_fixer
 from alpasim_plugin.lab.training.latent_clips import ClipForm
 from alpasim_plugin.lab.training.recipes.recipe import INIT
@@ -32,23 +30,20 @@ from alpasim_plugin.lab.training.recipes.registry import (
     with_source_share,
 )
 from alpasim_plugin.lab.training.trainer import Schedule
+from alpasim_plugin.lab.training.vae import train_vae
 
+EPILOG = """
+Examples:
+
+- `simrun train fixer data/pairs --recipe vae --video data/video --out runs/vae --steps 4000`
+
+- `simrun train fixer data/pairs --size 256x144 --vae runs/vae/vae.safetensors --init runs/base/fixer.safetensors --out runs/v9`
+
+- `simrun train fixer data/pairs --size 256x144 --recipe decoder --init runs/v9/fixer.safetensors --out runs/v9-decoder --steps 800 --lr 5e-4`
+"""
+VAE = "vae"
+DECODER = "decoder"
 PRECISIONS: Mapping[str, torch.dtype | None] = {"fp32": None, "bf16": torch.bfloat16}
-
-
-def onefixer_settings(name: str) -> OneFixerSettings:
-    """Return the settings of a shipped fixer that can be trained.
-
-    Raises:
-        InputError: Unknown, or a fixer without networks.
-    """
-    settings = fixer_settings(name)
-    if not isinstance(settings, OneFixerSettings):
-        raise InputError(
-            f"--fixer {name}: it has no networks",
-            "choose a block generator, such as onefixer-dit-tiny",
-        )
-    return settings
 
 
 def trainable_settings(name: str) -> TrainableSettings:
@@ -66,18 +61,24 @@ def trainable_settings(name: str) -> TrainableSettings:
     return settings
 
 
-def train_fixer_command(
+def fixer(
     data: options.Pairs,
-    vae: Annotated[
-        Path,
-        typer.Option(
-            "--vae", help="Trained autoencoder ('simrun train vae'), or a fixer's bundle."
-        ),
-    ],
     out: options.RunFolder,
     recipe: Annotated[
-        str, typer.Option("--recipe", "--variant", help=f"One of {', '.join(RECIPES)}.")
+        str,
+        typer.Option(
+            "--recipe",
+            help=f"{VAE}: the autoencoder; {DECODER}: the decoder of --init; or {', '.join(RECIPES)}.",
+        ),
     ] = "V9",
+    vae: Annotated[
+        Path | None,
+        typer.Option("--vae", help="Trained autoencoder (recipe vae), or a fixer's bundle."),
+    ] = None,
+    video: Annotated[
+        Path | None,
+        typer.Option("--video", help="Recipe vae: folder of driving video, as further clips."),
+    ] = None,
     init: Annotated[
         Path | None,
         typer.Option(
@@ -89,13 +90,6 @@ def train_fixer_command(
         typer.Option(
             "--weights",
             help="NAME=FILE, repeatable: init-bi, of bidirectional networks; or a stage, which is then not trained.",
-        ),
-    ] = None,
-    scenes: Annotated[
-        Path | None,
-        typer.Option(
-            "--scenes",
-            help="Folder of the pairs' scenes; recipe appearance renders their depth for its targets.",
         ),
     ] = None,
     size: options.Size = None,
@@ -151,10 +145,9 @@ def train_fixer_command(
         typer.Option("--stop-at", min=1, help="Stop after this update and write the weights."),
     ] = None,
     precision: options.Precision = "fp32",
-    snapshots: options.Snapshots = 0,
     threads: options.Threads = None,
     seed: options.Seed = 0,
-    fixer: Annotated[
+    sizes_of: Annotated[
         str | None,
         typer.Option("--fixer", help="Fixer that gives the sizes; by default the recipe's."),
     ] = None,
@@ -163,36 +156,57 @@ def train_fixer_command(
     debug: options.Debug = False,
 ) -> None:
     """Train a recipe: one system of the paper's tables; writes OUT/fixer.safetensors (averaged
-    weights, float16) and its card.
+    weights, float16) and its card. Recipe vae writes OUT/vae.safetensors.
     """
     del debug
     options.use_threads(threads)
+    own_size = None if size is None else parse_size(size)
+    if recipe == VAE:
+        progress = options.Progress(steps)
+        progress.wrote(train_vae(data, video, out, steps, seed, init, progress.update), as_json)
+        return
+    form = ClipForm(latents, stride, class_colour_augmentation)
+    if recipe == DECODER:
+        if init is None:
+            raise InputError("--recipe decoder: no trained fixer", "Give one with --init.")
+        progress = options.Progress(steps)
+        path = finetune_decoder(
+            init,
+            data,
+            out,
+            form,
+            DecoderRecipe(clips, columns=columns or DecoderRecipe.columns, seed=seed),
+            Schedule(steps, peak_lr=lr, warmup=max(steps // 20, 1), ema=ema, save_every=50),
+            progress.perceptual_term(metric_weights),
+            partial(progress.prepared, every=50),
+            progress.update,
+            own_size,
+        )
+        progress.wrote(path, as_json)
+        return
+    if vae is None:
+        raise InputError(
+            f"--recipe {recipe}: no autoencoder", "Give one with --vae; --recipe vae trains it."
+        )
     chosen = with_perceptual_weight(with_source_share(recipe_of(recipe), source_share), perceptual)
     chosen = with_attention(with_objective(chosen, objective or []), block, window, sink)
-    settings = trainable_settings(fixer or chosen.fixer)
+    settings = trainable_settings(sizes_of or chosen.fixer)
     if not isinstance(settings, OneFixerSettings) and (block, window, sink) != (None, None, None):
         raise InputError(
             f"recipe {recipe}: it has no blocks and no history",
             "leave out --block, --window and --sink",
         )
-    schedule = Schedule(steps, peak_lr=lr, accumulate=accumulate, ema=ema).of_length(steps)
-    form = ClipForm(latents, stride, class_colour_augmentation)
-    batches = BatchForm(clips, None, columns, seed)
-    own_size = None if size is None else parse_size(size)
-    files, equal = named_weights(init, weights or []), channels == "equal"
     run = FixerRun(
         settings,
         chosen,
         data,
         vae,
-        files,
+        named_weights(init, weights or []),
         form,
-        batches,
-        schedule,
-        equal,
+        BatchForm(clips, None, columns, seed),
+        Schedule(steps, peak_lr=lr, accumulate=accumulate, ema=ema).of_length(steps),
+        channels == "equal",
         PRECISIONS[precision],
-        snapshots,
-        scenes,
         own_size,
     )
     progress = options.Progress(run.updates)
@@ -219,31 +233,3 @@ def named_weights(init: Path | None, pairs: Sequence[str]) -> dict[str, Path]:
             )
         found[name] = Path(path)
     return found
-
-
-def memory_command(
-    latents: Annotated[
-        str, typer.Option("--latents", help="Latents of a clip, comma-separated.")
-    ] = "6,12,24",
-    horizon: Annotated[str, typer.Option("--horizon", help="k, comma-separated.")] = "0,1,2,4,8",
-    clips: Annotated[int, typer.Option("--clips", min=1, help="Clips per batch.")] = 1,
-    columns: Annotated[int, typer.Option("--columns", min=2, help="Width in latents.")] = 32,
-    rows: Annotated[int, typer.Option("--rows", min=2, help="Height in latents.")] = 18,
-    fixer: Annotated[
-        str, typer.Option("--fixer", help="Fixer that gives the sizes.")
-    ] = "onefixer-dit-tiny",
-    as_json: options.AsJson = False,
-    debug: options.Debug = False,
-) -> None:
-    """Measure peak memory and time of one training sample by clip length and horizon, each in its
-    own process.
-    """
-    del debug
-    counts, horizons = (
-        options.whole_numbers("--latents", latents, 2),
-        options.whole_numbers("--horizon", horizon, 0),
-    )
-    cells = measure_memory(onefixer_settings(fixer), counts, horizons, clips, rows, columns)
-    print(
-        json.dumps([cell._asdict() for cell in cells], indent=1) if as_json else memory_table(cells)
-    )

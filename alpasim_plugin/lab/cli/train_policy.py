@@ -1,10 +1,7 @@
-"""``simrun train policy-data`` and ``simrun train policy``: imitation learning of the policy
-``learned``.
-"""
+"""``simrun train policy``: imitation learning of the policy ``learned``."""
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -26,23 +23,22 @@ from alpasim_plugin.lab.cli.training_options import (
 )
 from alpasim_plugin.lab.training.demonstrations import (
     DemonstrationRecipe,
-    Demonstrations,
     read_demonstrations,
     write_demonstrations,
 )
 from alpasim_plugin.lab.training.model_card import ModelCard, curves
 from alpasim_plugin.lab.training.policy import PolicyRecipe, PolicyTask, measure
-from alpasim_plugin.lab.training.scenes import SPLITS, TEST_SPLITS
 from alpasim_plugin.lab.training.trainer import LOG_FILE, Schedule, Trainer
 from policies.learned_net import LearnedNet, save_net
 from scenarios.load import load_scenario
 
-WEIGHTS_FILE, CARD_FILE = "learned.safetensors", "learned.json"
+WEIGHTS_FILE = "learned.safetensors"
+CARD_FILE = "learned.json"
+DEMONSTRATIONS = "demonstrations"
 WHAT = (
     "Network of the policy learned: a path and speeds from camera frames, speed and route command"
 )
-POLICY_DATA_EPILOG = "Example: `simrun train policy-data data/scenes --out data/demonstrations`"
-POLICY_EPILOG = "Example: `simrun train policy data/demonstrations --out runs/policy --steps 4000`"
+EPILOG = "Example: `simrun train policy data/scenes --out runs/policy --steps 3600`"
 
 
 @dataclass(frozen=True)
@@ -61,66 +57,10 @@ class PolicyCard(ModelCard):
     held_out: Mapping[str, float] | None
 
 
-def policy_data(
-    scenes: Annotated[
-        Path,
-        typer.Argument(help="Folder that 'simrun train scenes' wrote: SPLIT/FAMILY_NUMBER.yaml."),
-    ],
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder to write to; complete scenes are kept.")
-    ],
-    split: Annotated[
-        str, typer.Option("--split", help="'train', or 'val' to measure on; never a test split.")
-    ] = "train",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the perturbed rollouts.")] = 0,
-    as_json: AsJson = False,
-    debug: Debug = False,
-) -> None:
-    """Render perturbed rollouts off the logged paths, with the path and speeds of a privileged
-    expert as labels.
-    """
-    del debug
-    if split not in SPLITS or split in TEST_SPLITS:
-        raise InputError(
-            f"--split {split}: not a training split",
-            "give train or val",
-        )
-    paths = scene_files(scenes, split)
-    if not paths:
-        raise InputError(
-            f"{scenes / split}: no scenarios",
-            "write some with 'simrun train scenes'",
-        )
-    console = Console(stderr=True)
-    rows: list[dict[str, Any]] = []
-    for i, path in enumerate(paths, start=1):
-        folder = out / split / path.stem
-        made = write_demonstrations(load_scenario(path), folder, DemonstrationRecipe(), seed)
-        rows.append(
-            {
-                "scene": path.stem,
-                "folder": str(folder),
-                "made": made,
-                "samples": len(Demonstrations(folder)),
-            }
-        )
-        console.print(
-            f"[{i}/{len(paths)}] {path.stem}{'' if made else ' (exists)'}",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
-        )
-    if as_json:
-        totals = {
-            "scenes": len(rows),
-            "made": sum(row["made"] for row in rows),
-            "samples": sum(row["samples"] for row in rows),
-        }
-        print(json.dumps({"split": split, **totals, "rows": rows}))
-
-
 def policy(
-    data: Annotated[Path, typer.Argument(help="Folder that 'simrun train policy-data' wrote.")],
+    scenes: Annotated[
+        Path, typer.Argument(help="Folder that 'simrun train scenes' wrote, splits train and val.")
+    ],
     out: Annotated[
         Path, typer.Option("--out", help="Folder of the run; the same command resumes it.")
     ],
@@ -132,9 +72,14 @@ def policy(
 ) -> None:
     """Train the network of the policy 'learned'; writes OUT/learned.safetensors (averaged, float16)
     and its card, OUT/learned.json.
+
+    Before the first update, perturbed rollouts off the logged paths are rendered into
+    OUT/demonstrations, with the path and speeds of a privileged expert as labels.
     """
     del debug
     torch.set_num_threads(threads)
+    data = out / DEMONSTRATIONS
+    write_splits(scenes, data, seed)
     net = LearnedNet(seed).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     task = PolicyTask(net, read_demonstrations(data, "train"), PolicyRecipe(seed=seed))
     schedule = Schedule(
@@ -159,6 +104,26 @@ def policy(
         WHAT, demonstration_facts(task), training, rows, hours, steps, seed, parameters, held_out
     ).write(path)
     progress.wrote(path, as_json, card.replace(out / CARD_FILE))  # the name of the shipped card
+
+
+def write_splits(scenes: Path, data: Path, seed: int) -> None:
+    """Write the demonstrations of the splits ``train`` and ``val``; complete scenes are kept.
+
+    Raises:
+        InputError: No scenario to train on.
+    """
+    files = {split: scene_files(scenes, split) for split in ("train", "val")}
+    if not files["train"]:
+        raise InputError(
+            f"{scenes / 'train'}: no scenarios", "Write some with 'simrun train scenes'."
+        )
+    console = Console(stderr=True)
+    for split, paths in files.items():
+        for i, path in enumerate(paths, start=1):
+            folder = data / split / path.stem
+            is_new = write_demonstrations(load_scenario(path), folder, DemonstrationRecipe(), seed)
+            note = "" if is_new else " (exists)"
+            console.print(f"[{i}/{len(paths)}] {split}/{path.stem}{note}", highlight=False)
 
 
 def demonstration_facts(task: PolicyTask) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""``simrun train scenes | check-scenes``: scenarios of the splits, and the frozen test scenes."""
+"""``simrun train scenes``: draw the scenarios of a split, or check the frozen test scenes."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from alpasim_plugin.lab.cli.training_options import AsJson, Debug, RunFolder
-from alpasim_plugin.lab.training.frozen_scenes import RECORD, check_scenes, freeze_scenes
-from alpasim_plugin.lab.training.scenes import SPLITS, TEST_SPLITS, Split, write_scenes
+from alpasim_plugin.lab.cli.training_options import AsJson, Debug
+from alpasim_plugin.lab.training.frozen_scenes import check_scenes
+from alpasim_plugin.lab.training.scenes import SPLITS, Split, write_scenes
 
-SCENES_EPILOG = "Example: `simrun train scenes --out data/scenes --split train`"
-CHECK_EPILOG = "Example: `simrun train check-scenes data/scenes`"
+EPILOG = "Examples: `simrun train scenes --out data/scenes --split train`, `simrun train scenes --out data/scenes --check`"
 
 
 def scenes(
-    out: RunFolder,
+    out: Annotated[Path, typer.Option("--out", help="Folder of scenes: SPLIT/FAMILY_NUMBER.yaml.")],
     split: Annotated[Split, typer.Option("--split", help="Split to write.")] = "train",
     count: Annotated[
         int | None,
@@ -32,48 +31,31 @@ def scenes(
             help="Length of every drive, seconds; by default 6, for tests 19.8.",
         ),
     ] = None,
-    as_json: AsJson = False,
-    debug: Debug = False,
-) -> None:
-    """Sample scenarios; test-unseen has families of roads and traffic, looks and damage that no
-    other split has.
-    """
-    del debug
-    console = Console(stderr=True)
-    paths = []
-    recipe = SPLITS[split]
-    for path in write_scenes(out, split, count or recipe.count, duration_s or recipe.duration_s):
-        paths.append(str(path))
-        console.print(str(path), highlight=False, markup=False, soft_wrap=True)
-    if as_json:
-        print(json.dumps({"split": split, "scenes": len(paths), "paths": paths}))
-
-
-def check_frozen(
-    scenes: Annotated[
-        Path, typer.Argument(help="Folder that 'simrun train scenes' wrote, with both test splits.")
-    ],
-    record: Annotated[
-        Path, typer.Option("--record", help="File with the hashes; by default the shipped one.")
-    ] = RECORD,
-    splits: Annotated[
-        str, typer.Option("--split", help="Splits to freeze, comma-separated.")
-    ] = ",".join(TEST_SPLITS),
-    freeze: Annotated[
+    check: Annotated[
         bool,
         typer.Option(
-            "--freeze", help="Write the record, which must not exist yet, instead of checking."
+            "--check", help="Only check that OUT holds the test scenes frozen before training."
         ),
     ] = False,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Check that the test scenes are those that were frozen before training began."""
+    """Draw scenarios; test-unseen has families of roads and traffic, looks and damage that no other
+    split has.
+    """
     del debug
-    names = [name.strip() for name in splits.split(",")]
-    found = freeze_scenes(scenes, record, names) if freeze else check_scenes(scenes, record)
-    for name, split in found.items():
-        line = f"{name}: {len(split.scenes)} scenes, {split.sha256[:16]} {'frozen' if freeze else 'as frozen'}"
-        Console(stderr=True).print(line, highlight=False, markup=False)
+    console = Console(stderr=True)
+    if check:
+        digests = {name: frozen.sha256 for name, frozen in check_scenes(out).items()}
+        for name, digest in digests.items():
+            console.print(f"{name}: {digest[:16]}, as frozen", highlight=False)
+        if as_json:
+            print(json.dumps(digests))
+        return
+    recipe = SPLITS[split]
+    paths = []
+    for path in write_scenes(out, split, count or recipe.count, duration_s or recipe.duration_s):
+        paths.append(str(path))
+        console.print(str(path), highlight=False, markup=False, soft_wrap=True)
     if as_json:
-        print(json.dumps({name: split.sha256 for name, split in found.items()}))
+        print(json.dumps({"split": split, "scenes": len(paths), "paths": paths}))

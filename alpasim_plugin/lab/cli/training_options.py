@@ -12,7 +12,6 @@ import torch
 import typer
 from rich.console import Console
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.checkpoints import file_sha256
 from alpasim_plugin.lab.training.model_card import curves
 from alpasim_plugin.lab.training.perceptual_term import Distance
@@ -40,14 +39,6 @@ Stride = Annotated[
 ]
 PeakLr = Annotated[float, typer.Option("--lr", min=1e-7, help="Peak learning rate.")]
 Threads = Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads.")]
-Snapshots = Annotated[
-    int,
-    typer.Option(
-        "--snapshots",
-        min=0,
-        help="Bundles of every stage to keep, at equal intervals of its updates.",
-    ),
-]
 Unit = Annotated[int, typer.Option("--steps", min=1, help="U: updates of a stage of share 1.")]
 Accumulate = Annotated[int, typer.Option("--accumulate", min=1, help="Batches per update.")]
 Columns = Annotated[
@@ -94,21 +85,6 @@ def scene_files(scenes: Path, split: str) -> list[Path]:
     return sorted(
         (scenes / split).glob("*.yaml"), key=lambda path: (path.stem.rsplit("_", 1)[-1], path.stem)
     )
-
-
-def whole_numbers(option: str, text: str, least: int) -> list[int]:
-    """Parse a comma-separated list of integers.
-
-    Raises:
-        InputError: Other values than integers of at least ``least``.
-    """
-    parts = [part.strip() for part in text.split(",")]
-    if not all(part.isdecimal() and int(part) >= least for part in parts):
-        raise InputError(
-            f"{option} {text}: not a list of integers of at least {least}",
-            f"write for example {option} {least + 1},{least + 3}",
-        )
-    return [int(part) for part in parts]
 
 
 class Progress:

@@ -26,8 +26,7 @@ from alpasim_plugin.core.reading import read_bytes
 from alpasim_plugin.core.types import F64, Scenario
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
-from alpasim_plugin.lab.bench.quality import Variant, run_variant
-from alpasim_plugin.lab.bench.quality_run import quality_clip
+from alpasim_plugin.lab.bench.quality import Variant, quality_clip, run_variant
 from alpasim_plugin.lab.training.drive_pairs import DRIVE, Shot, write_drive_sequence
 from alpasim_plugin.lab.training.pair_store import PairSequence
 from alpasim_plugin.lab.training.pixel_rollout import Distance
@@ -36,7 +35,6 @@ from alpasim_plugin.lab.training.pixel_variants import pixel_variant
 from alpasim_plugin.lab.training.streams import StreamShares, TrainingStreams
 from alpasim_plugin.lab.training.trainer import Schedule
 
-DOING = "adapting a fixer"
 FEWEST, ENOUGH = 12, 4  # fitted photographs to train on; held-out ones to judge by
 WIDTH_PX = 512  # of the photographs, at most
 LR = 2e-4

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,9 +16,6 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.lab.training.pair_store import PairClip, PairSequence
-from alpasim_plugin.log.video import read_mp4
-
-DOING = "drawing a training clip"
 
 
 @dataclass(frozen=True)
@@ -74,20 +70,6 @@ def draw_video_clip(videos: Sequence[U8], size: CropSize, seed: int, index: int)
     start, rows, columns = _window(rng, video.shape, size)
     cut = video[start : start + size.frames, rows, columns]
     return Clip(to_tensor(cut[::-1] if rng.random() < 0.3 else cut, bool(rng.random() < 0.5)))
-
-
-def read_video(path: Path, width: int, height: int, first: float = 0.0, last: float = 1.0) -> U8:
-    """Read a video's frames from share ``first`` to share ``last`` of its length, scaled to cover
-    ``width x height`` and centre-cropped.
-
-    Raises:
-        InputError: Not a readable video, or no frame in that share.
-    """
-    frames = read_mp4(path).frames
-    frames = frames[round(first * len(frames)) : round(last * len(frames))]
-    if not len(frames):
-        raise InputError(f"{path}: no frame between shares {first} and {last}", "widen the share")
-    return fitted(frames, width, height)
 
 
 def fitted(frames: U8, width: int, height: int) -> U8:

@@ -37,10 +37,8 @@ from alpasim_plugin.lab.training.recipes.recipe import (
     Recipe,
     Stage,
     StageInputs,
-    Task,
     Weights,
 )
-from alpasim_plugin.lab.training.snapshots import snapshot_file, snapshot_steps
 from alpasim_plugin.lab.training.trainer import LOG_FILE, Schedule, Trainer
 
 BUNDLE_FILE = "fixer.safetensors"
@@ -67,9 +65,6 @@ class FixerRun:
         equal_channels: Whether flow matching weights all latent channels alike.
         precision: Of the forward passes: None is float32. A stage that is always trained in float32
             ignores it.
-        snapshots: Weights that are kept of every stage at equal intervals (`snapshots`); equal
-            weights come out with any number.
-        scenes: Folder of the scenes behind the pairs; recipes whose targets need depth ask for it.
         size: Width and height of the sequences to train on, pixels; None: all are of one size.
     """
 
@@ -83,8 +78,6 @@ class FixerRun:
     schedule: Schedule
     equal_channels: bool = False
     precision: torch.dtype | None = None
-    snapshots: int = 0
-    scenes: Path | None = None
     size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
@@ -253,17 +246,7 @@ def train_stage(
     )
     if trainer.step == schedule.steps and is_written(run, stage, folder, schedule):
         return folder / BUNDLE_FILE
-    kept = snapshot_steps(schedule.steps, run.snapshots)
-
-    def reported(step: int, numbers: Mapping[str, float]) -> None:
-        if step in kept:
-            path = snapshot_file(folder, step)
-            path.parent.mkdir(exist_ok=True)
-            _write_weights(run, stage, path, trainer.averaged(), step, schedule)
-        if report is not None:
-            report(step, numbers)
-
-    trainer.run(reported, until)
+    trainer.run(report, until)
     return write_bundle(run, stage, folder, trainer.averaged(), facts, trainer.step, schedule)
 
 
@@ -307,7 +290,6 @@ def stage_inputs(
         run.equal_channels,
         distance,
         run.settings,
-        run.scenes,
     )
 
 
@@ -463,16 +445,3 @@ def _digest(weights: Weights | None) -> str | None:
 
 def _from(report: Report | None, before: int) -> Report | None:
     return None if report is None else lambda step, numbers: report(before + step, numbers)
-
-
-__all__ = [
-    "BUNDLE_FILE",
-    "FixerRun",
-    "Task",
-    "deployed_settings",
-    "half",
-    "stage_inputs",
-    "train_fixer",
-    "train_stage",
-    "write_bundle",
-]

@@ -8,18 +8,15 @@ and one of all of them. Numbers on other scenes are not comparable with publishe
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from typing_extensions import TypedDict
 
-from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import read_json_as
-from alpasim_plugin.lab.training.scenes import TEST_SPLITS
 
-DOING = "checking test scenes"
 RECORD = Path(__file__).parents[3] / "configs" / "fixers" / "test-scenes.json"
 
 
@@ -62,24 +59,6 @@ def hash_scenes(folder: Path) -> FrozenSplit:
     return FrozenSplit(hashlib.sha256(lines.encode()).hexdigest(), scenes)
 
 
-def freeze_scenes(
-    folder: Path, record: Path, splits: Iterable[str] = TEST_SPLITS
-) -> dict[str, FrozenSplit]:
-    """Write the hashes of the splits below a folder of scenes.
-
-    Raises:
-        InputError: A split without scenes, or a record that exists already: what is frozen stays.
-    """
-    if record.exists():
-        raise InputError(
-            f"{record}: it exists",
-            "remove it if the scenes are really to change",
-        )
-    found = {split: hash_scenes(folder / split) for split in splits}
-    write_json(record, {split: asdict(frozen) for split, frozen in found.items()})
-    return found
-
-
 def check_scenes(folder: Path, record: Path = RECORD) -> dict[str, FrozenSplit]:
     """Compare the splits below a folder of scenes with the record.
 
@@ -89,7 +68,7 @@ def check_scenes(folder: Path, record: Path = RECORD) -> dict[str, FrozenSplit]:
     Raises:
         InputError: Another scene, one too few or one too many, or no readable record.
     """
-    do_this = "give the record that 'simrun train check-scenes --freeze' wrote"
+    do_this = "give the record that ships: configs/fixers/test-scenes.json"
     entries = read_json_as(dict[str, FrozenEntry], record, do_this=do_this)
     known = {split: FrozenSplit(**entry) for split, entry in entries.items()}
     for split, frozen in known.items():

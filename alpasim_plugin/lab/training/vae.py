@@ -8,21 +8,33 @@ to the latents, since those of a generator have errors.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.codec_weights import LatentStats
+from alpasim_plugin.block_fixers.networks import load_tiny_vae
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import LATENT
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
-from alpasim_plugin.lab.training.clips import Clip, CropSize, draw_pair_clip, draw_video_clip
-from alpasim_plugin.lab.training.pair_store import PairSequence, pairs_digest
-from alpasim_plugin.lab.training.trainer import Loss
+from alpasim_plugin.lab.training.clips import (
+    Clip,
+    CropSize,
+    draw_pair_clip,
+    draw_video_clip,
+    to_tensor,
+)
+from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence, pairs_digest
+from alpasim_plugin.lab.training.trainer import Loss, Schedule, Trainer
+
+VAE_FILE = "vae.safetensors"
+MEASURED_FRAMES = 97  # of every sequence, for mean and deviation of the latents
 
 
 @dataclass(frozen=True)
@@ -144,6 +156,48 @@ class VaeTask:
             z.shape, dtype="float32"
         )
         return z, z + self.recipe.latent_noise * torch.from_numpy(noise).to(z)
+
+
+def train_vae(
+    data: Path,
+    video: Path | None,
+    out: Path,
+    steps: int,
+    seed: int,
+    init: Path | None,
+    report: Callable[[int, Mapping[str, float]], None] | None = None,
+) -> Path:
+    """Train the tiny autoencoder; write OUT/vae.safetensors with averaged weights and measured
+    latent statistics.
+
+    Args:
+        data: Folder of pairs; its ``train`` split is used.
+        video: Folder of video pairs, whose clean frames are further clips.
+        out: Folder of the run; the same call resumes.
+        steps, seed: Updates; seed of weights and draws.
+        init: Initial weights: an autoencoder, or a fixer's bundle.
+        report: Called after every update with its number and the logged values.
+    """
+    vae = load_tiny_vae(init).requires_grad_(True) if init else TinyVAE.random(seed=seed)
+    sequences = PairDataset(data, "train").sequences
+    videos: list[U8] = []
+    if video is not None:
+        videos = [sequence.clip.rgb_gt for sequence in PairDataset(video, "train").sequences]
+    recipe = VaeRecipe(seed=seed, video_clips=1 if videos else 0)
+    task = VaeTask(vae, sequences, videos, recipe)
+    trainer = Trainer(vae, out, Schedule(steps), task.batch, task.loss, task.facts)
+    trainer.run(report)
+    vae.load_state_dict(trainer.averaged())
+    clips = [to_tensor(s.clip.rgb_gt[:MEASURED_FRAMES])[None] for s in sequences]
+    mean, std = measure_stats(vae, clips)
+    vae.stats = LatentStats(
+        (mean * vae.stats.std + vae.stats.mean).tolist(),
+        (std * vae.stats.std).tolist(),
+        stored=True,
+    )
+    path = out / VAE_FILE
+    vae.save(path, {"made_by": "simrun train fixer", "steps": str(steps), "seed": str(seed)})
+    return path
 
 
 def reconstruction_loss(made: Tensor, wanted: Tensor, edge_weight: float) -> Tensor:

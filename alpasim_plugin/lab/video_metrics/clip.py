@@ -9,22 +9,14 @@ import numpy as np
 
 from alpasim_plugin.core.image_metrics import grid_ratio
 from alpasim_plugin.core.types import F64, U8
-from alpasim_plugin.lab.video_metrics.facts import (
-    DRIFT,
-    GRID,
-    PSNR,
-    SSIM,
-    WARP,
-    WARP_LATE,
-    WARP_ROAD,
-)
-from alpasim_plugin.lab.video_metrics.frames import identical_frames, psnr_db, ssim
-from alpasim_plugin.lab.video_metrics.perceptual import ImageDistance, picture_distances
-from alpasim_plugin.lab.video_metrics.warp import late_window, road_mask, warp_l1
+from alpasim_plugin.lab.video_metrics.facts import DRIFT, GRID, PSNR, SSIM, WARP, WARP_LATE
+from alpasim_plugin.lab.video_metrics.frames import psnr_db, ssim
+from alpasim_plugin.lab.video_metrics.image_distance import ImageDistance, image_distances
+from alpasim_plugin.lab.video_metrics.warp import late_window, warp_l1
 
-SETTLED = slice(50, 100)  # frames that the end of a long clip is held against
+SETTLED = slice(50, 100)  # frames with which the end of a long clip is compared
 END = 50  # frames at the end
-GRID_EVERY = 4  # frames: a grid stands still
+GRID_EVERY = 4  # frames: a grid does not move
 
 
 @dataclass(frozen=True)
@@ -42,9 +34,8 @@ class ClipQuality:
         """One value a metric: the mean over the clip; the late window of Warp L1; the drift of
         clips that are long enough for it.
         """
-        out = {name: float(values.mean()) for name, values in self.series.items()} | dict(
-            self.whole
-        )
+        out = {name: float(values.mean()) for name, values in self.series.items()}
+        out |= self.whole
         if WARP in self.series:
             pairs = self.series[WARP]
             out[WARP_LATE] = float(pairs[late_window(len(pairs))].mean())
@@ -52,38 +43,29 @@ class ClipQuality:
         return out if drift is None else {**out, DRIFT: drift}
 
 
-def clip_quality(
-    made: U8, truth: U8 | None, networks: Mapping[str, ImageDistance], sdmap: U8 | None = None
-) -> ClipQuality:
+def clip_quality(made: U8, truth: U8 | None, networks: Mapping[str, ImageDistance]) -> ClipQuality:
     """Measure one clip.
 
     Args:
         made: ``(T, H, W, 3)``, at least two frames.
         truth: The ground-truth frames; None computes only the metrics without a reference.
         networks: Perceptual distances by name.
-        sdmap: Semantic maps like the frames, which say where the road is; None leaves the metric of
-            the road out.
 
     Raises:
         EvaluatorError: Videos that do not belong together.
     """
-    series: dict[str, F64] = {}
-    whole: dict[str, float] = {}
-    if truth is not None:
-        series = {PSNR: psnr_db(made, truth), SSIM: ssim(made, truth)}
-        series |= {name: picture_distances(net, made, truth) for name, net in networks.items()}
-        ratios = {
-            name: grid_ratio(made[::GRID_EVERY], truth[::GRID_EVERY], side)
-            for side, name in GRID.items()
-        }
-        whole = {name: ratio for name, ratio in ratios.items() if ratio is not None}
+    if truth is None:
+        return ClipQuality({WARP: warp_l1(made)}, 0)
+    series = {PSNR: psnr_db(made, truth), SSIM: ssim(made, truth)}
+    series |= {name: image_distances(net, made, truth) for name, net in networks.items()}
     series[WARP] = warp_l1(made)
-    if sdmap is not None:
-        late = slice(late_window(len(made) - 1).start, None)  # a pair begins with the frame before
-        whole[WARP_ROAD] = float(
-            warp_l1(made[late], np.array([road_mask(drawn) for drawn in sdmap[late]])).mean()
-        )
-    return ClipQuality(series, 0 if truth is None else identical_frames(made, truth), whole)
+    whole = {}
+    for side, name in GRID.items():
+        ratio = grid_ratio(made[::GRID_EVERY], truth[::GRID_EVERY], side)
+        if ratio is not None:
+            whole[name] = ratio
+    identical = int(np.sum(np.all(made == truth, axis=(1, 2, 3))))
+    return ClipQuality(series, identical, whole)
 
 
 def drift_of(psnr: F64 | None) -> float | None:

@@ -30,14 +30,6 @@ def ssim(made: U8, truth: U8) -> F64:
     return np.array([image_metrics.ssim(a, b) for a, b in zip(made, truth, strict=True)])
 
 
-def identical_frames(made: U8, truth: U8) -> int:
-    """Return how many frames are equal in every value; their PSNR is the cap, which a mean should
-    not hide.
-    """
-    check_stacks(made, truth)
-    return int(np.sum(np.all(made == truth, axis=(1, 2, 3))))
-
-
 def check_stacks(made: U8, truth: U8) -> None:
     """Refuse anything but two equal stacks ``(T, H, W, 3)`` uint8 with at least one frame.
 

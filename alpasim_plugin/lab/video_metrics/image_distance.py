@@ -1,24 +1,26 @@
-"""Perceptual image distances by name: `perceptual-syn`, shipped with the package; LPIPS and DISTS,
-with weights from the user.
+"""Perceptual image distances by name: `perceptual-syn`, shipped with the package; LPIPS, with
+weights from the user.
 """
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal, Protocol, get_args
+from typing import Protocol
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.lab.video_metrics import dists
+from alpasim_plugin.core.types import F64, U8
+from alpasim_plugin.lab.video_metrics.frames import check_stacks
 from alpasim_plugin.lab.video_metrics.lpips import Kind, load_lpips, missing_files
 from alpasim_plugin.lab.video_metrics.perceptual_net import NAME, load_perceptual
 
-DistanceName = Literal["perceptual-syn", "lpips_alex", "lpips_vgg", "dists"]
 FOLDER_VARIABLE = "SIMRUN_METRIC_WEIGHTS"
-DISTS = "dists"
-_KINDS: dict[str, Kind] = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
+KINDS: dict[str, Kind] = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
+BATCH = 8  # frames at a time
 
 
 class ImageDistance(Protocol):
@@ -37,17 +39,12 @@ def weights_folder(folder: str | Path | None = None) -> Path | None:
     return Path(named) if named else None
 
 
-def available(folder: str | Path | None = None) -> tuple[DistanceName, ...]:
+def available(folder: str | Path | None = None) -> tuple[str, ...]:
     """Return the names of the distances whose weights are on disk."""
-    found = weights_folder(folder)
-    names: tuple[DistanceName, ...] = get_args(DistanceName)
-    return tuple(
-        name for name in names if name == NAME or (found is not None and not _missing(name, found))
-    )
-
-
-def _missing(name: str, folder: Path) -> list[str]:
-    return dists.missing_files(folder) if name == DISTS else missing_files(_KINDS[name], folder)
+    weights = weights_folder(folder)
+    if weights is None:
+        return (NAME,)
+    return (NAME, *(name for name, kind in KINDS.items() if not missing_files(kind, weights)))
 
 
 def load_distance(name: str, folder: str | Path | None = None) -> ImageDistance:
@@ -58,23 +55,37 @@ def load_distance(name: str, folder: str | Path | None = None) -> ImageDistance:
     """
     if name == NAME:
         return load_perceptual()
-    if name not in (*_KINDS, DISTS):
+    weights = weights_folder(folder)
+    if name not in KINDS or weights is None:
         raise InputError(
-            f"name {name!r}: no such distance",
-            f"choose one of {get_args(DistanceName)}",
+            f"perceptual distance {name!r}: no such distance, or no folder of weights",
+            f"choose {NAME}, or one of {', '.join(KINDS)} with {FOLDER_VARIABLE} set to the folder of its weights",
         )
-    found = weights_folder(folder)
-    if found is None:
-        raise InputError(
-            f"{name}: no folder of weights is set",
-            f"set {FOLDER_VARIABLE} to the folder that holds the files named in docs/lab/video-metrics.md, or use {NAME}",
-        )
-    return dists.load_dists(found) if name == DISTS else load_lpips(_KINDS[name], found)
+    return load_lpips(KINDS[name], weights)
 
 
-def distance_for_training(folder: str | Path | None = None) -> tuple[DistanceName, ImageDistance]:
+def distance_for_training(folder: str | Path | None = None) -> tuple[str, ImageDistance]:
     """Return LPIPS with VGG where its weights are on disk, else `perceptual-syn`, with its name,
     which every result must state.
     """
-    name: DistanceName = "lpips_vgg" if "lpips_vgg" in available(folder) else "perceptual-syn"
+    name = "lpips_vgg" if "lpips_vgg" in available(folder) else NAME
     return name, load_distance(name, folder)
+
+
+def image_distances(net: ImageDistance, made: U8, truth: U8) -> F64:
+    """Return a network's distance ``(T,)`` of every frame to the true one, ``(T, H, W, 3)`` each.
+
+    Raises:
+        EvaluatorError: Stacks that do not belong together.
+    """
+    check_stacks(made, truth)
+    with torch.inference_mode():
+        parts = [
+            net.distance(_images(made[i : i + BATCH]), _images(truth[i : i + BATCH]))
+            for i in range(0, len(made), BATCH)
+        ]
+    return np.asarray(torch.cat(parts).double().numpy())
+
+
+def _images(frames: U8) -> Tensor:
+    return torch.from_numpy(np.array(frames)).permute(0, 3, 1, 2).float() / 127.5 - 1

@@ -1,30 +1,24 @@
-"""From clips to a table: means with t intervals over clips, paired differences, quality by frame
-index, speed.
+"""From clips to a table: means with t intervals over clips, and differences from a baseline clip by
+clip.
 
-A row is one clip under one variant: ``arm``, ``clip``, ``seed``, ``values`` (metric -> number),
-``series`` (metric -> per frame), ``ms_per_frame`` (of later blocks; absent where no fixer ran),
-``identical``, ``events``.
+A row is one clip under one variant: ``arm``, ``clip``, ``values`` (metric -> number),
+``ms_per_frame`` (of later blocks; empty where no fixer ran), ``frames``, ``identical``, ``events``.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from alpasim_plugin.core.errors import EvaluatorError
-from alpasim_plugin.lab.video_metrics.facts import FACTS, KNOWN, MS, SOMETIMES, WARP
-from alpasim_plugin.log.run_folder.sides import by_renderer
+from alpasim_plugin.lab.video_metrics.facts import FACTS, MS
 from evaluators.statistics.intervals import t_interval
-from evaluators.statistics.paired import compare
 
 Row = Mapping[str, Any]
-# the variant of the ground-truth frames: only metrics without a reference are measured on it
-TRUTH = "truth"
-BINS = 20  # windows of frames
-LEAST_BIN = 5  # frames
+TRUTH = "truth"  # the variant of the clean frames: it has only metrics without a reference
 
 
 def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
@@ -35,129 +29,69 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
         baseline: Variant that the others are compared with, clip by clip.
 
     Returns:
-        ``arms``: VARIANT -> METRIC -> ``mean``, ``ci95`` ([low, high], t over clips, or None with
-            ``reason``), ``n``, ``unit`` and
-        ``direction``; ``paired``: VARIANT -> METRIC -> what `evaluators.statistics.paired.compare`
-        gives; ``by_frame``: VARIANT -> METRIC -> ``first`` and ``last`` frame of each window,
-        ``mean``, ``low``, ``high`` over clips; ``identical``, ``events``, ``frames``, ``clips``: by
-        variant.
+        ``baseline``; ``arms``: VARIANT -> METRIC -> ``mean``, ``ci95`` ([low, high], t over clips,
+        or None with ``reason``), ``n``, ``unit``, ``direction``; ``paired``: VARIANT -> METRIC ->
+        ``diff``, ``ci95``, ``n``; ``identical``, ``events``, ``frames``, ``clips`` by variant.
 
     Raises:
-        EvaluatorError: No row, or none of the baseline.
+        EvaluatorError: No row of the baseline.
     """
-    names = list(dict.fromkeys(str(row["arm"]) for row in rows))
-    if baseline not in names:
+    variants: dict[str, dict[str, Row]] = {}
+    for row in rows:
+        variants.setdefault(str(row["arm"]), {})[str(row["clip"])] = row
+    if baseline not in variants:
         raise EvaluatorError(
-            f"baseline {baseline!r}: variants {', '.join(names) or 'none'}",
+            f"baseline {baseline!r}: the variants are {', '.join(variants) or 'none'}",
             "name one of the variants as the baseline",
         )
-    by_variant = {name: [row for row in rows if row["arm"] == name] for name in names}
-    return {
-        "baseline": baseline,
-        "arms": {
-            name: {m: _mean(mine, m) for m in metrics_of(mine)} for name, mine in by_variant.items()
-        },
-        "paired": _paired(rows, baseline),
-        "by_frame": {
-            name: {m: _windows(mine, m) for m in mine[0]["series"]}
-            for name, mine in by_variant.items()
-        },
-        "clips": {name: len(mine) for name, mine in by_variant.items()},
-        "frames": {
-            name: sorted({int(row["frames"]) for row in mine}) for name, mine in by_variant.items()
-        },
-        "identical": {
-            name: sum(int(row["identical"]) for row in mine) for name, mine in by_variant.items()
-        },
-        "events": {name: _events(mine) for name, mine in by_variant.items()},
-    }
+    arms: dict[str, Any] = {}
+    paired: dict[str, Any] = {}
+    facts: dict[str, dict[str, Any]] = {"clips": {}, "frames": {}, "identical": {}, "events": {}}
+    for name, by_clip in variants.items():
+        mine = list(by_clip.values())
+        arms[name] = {
+            metric: _mean([value_of(row, metric) for row in mine], metric)
+            for metric in metrics_of(mine)
+        }
+        if name not in (baseline, TRUTH):
+            paired[name] = _paired(by_clip, variants[baseline])
+        events: Counter[str] = Counter()
+        for row in mine:
+            events.update(row["events"])
+        facts["clips"][name] = len(mine)
+        facts["frames"][name] = sorted({int(row["frames"]) for row in mine})
+        facts["identical"][name] = sum(int(row["identical"]) for row in mine)
+        facts["events"][name] = dict(events)
+    return {"baseline": baseline, "arms": arms, "paired": paired, **facts}
 
 
 def metrics_of(rows: Sequence[Row]) -> list[str]:
-    """Return the metrics that every row carries, and those that may be undefined and any row
-    carries, in the order of the tables.
-    """
-    return [name for name in FACTS if _carried(rows, name)]
+    """Return the metrics that every row carries, in the order of the tables."""
+    return [metric for metric in FACTS if all(_carries(row, metric) for row in rows)]
 
 
-def _carried(rows: Sequence[Row], metric: str) -> bool:
-    found = [value_of(row, metric) is not None for row in rows]
-    return any(found) if metric in SOMETIMES else all(found)
-
-
-def value_of(row: Row, metric: str) -> float | None:
+def value_of(row: Row, metric: str) -> float:
     """Return a clip's value; the time is the median over blocks."""
-    if metric == MS:
-        return None if not row.get(MS) else float(np.median(row[MS]))
-    value = row["values"].get(metric)
-    return None if value is None else float(value)
+    return float(np.median(row[MS])) if metric == MS else float(row["values"][metric])
 
 
-def _mean(rows: Sequence[Row], metric: str) -> dict[str, Any]:
-    values = [value_of(row, metric) for row in rows]
-    known = [v for v in values if v is not None]
-    found = t_interval(known, "clips")
-    entry: dict[str, Any] = {"mean": found.centre, "ci95": found.bounds, "n": len(known)}
-    entry |= {"excluded": len(values) - len(known)} if len(known) < len(values) else {}
-    entry |= {"unit": FACTS[metric].unit, "direction": FACTS[metric].direction}
-    return (
-        entry
-        | ({"reason": found.reason} if found.reason else {})
-        | ({"note": found.note} if found.note else {})
-    )
+def _carries(row: Row, metric: str) -> bool:
+    return bool(row[MS]) if metric == MS else metric in row["values"]
 
 
-def _paired(rows: Sequence[Row], baseline: str) -> dict[str, dict[str, Any]]:
-    flat = [
-        {
-            "renderer": row["arm"],
-            "policy": "open-loop",
-            "scene": row["clip"],
-            "seed": row["seed"],
-            "status": "ok",
-        }
-        | {m: v for m in FACTS if (v := value_of(row, m)) is not None}
-        for row in rows
-        if row["arm"] != TRUTH
-    ]
-    split = by_renderer(flat)
-    out: dict[str, dict[str, Any]] = {}
-    for name, side in split.items():
-        shared = [
-            m
-            for m in FACTS
-            if all(any(m in row for row in s.rows) for s in (side, split[baseline]))
-        ]
-        if name != baseline:
-            out[name] = {m: compare(side, split[baseline], KNOWN[m], baseline, 0.0) for m in shared}
-    return out
+def _mean(values: Sequence[float], metric: str) -> dict[str, Any]:
+    interval = t_interval(values, "clips")
+    fact = FACTS[metric]
+    entry: dict[str, Any] = {"mean": interval.centre, "ci95": interval.bounds, "n": len(values)}
+    entry |= {"unit": fact.unit, "direction": fact.direction}
+    return entry | ({"reason": interval.reason} if interval.reason else {})
 
 
-def _windows(rows: Sequence[Row], metric: str) -> dict[str, list[Any]]:
-    """Average each window of frames per clip, then over clips; up to the length of the shortest
-    clip.
-    """
-    offset = 1 if metric == WARP else 0  # the first pair ends at frame 1
-    length = min(len(row["series"][metric]) for row in rows)
-    bins = max(1, min(BINS, length // LEAST_BIN))
-    edges = np.linspace(0, length, bins + 1).round().astype(int)
-    out: dict[str, list[Any]] = {"first": [], "last": [], "mean": [], "low": [], "high": []}
-    for low, high in pairwise(edges):
-        found = t_interval(
-            [float(np.mean(row["series"][metric][low:high])) for row in rows], "clips"
-        )
-        for key, value in zip(
-            out,
-            (int(low) + offset, int(high) - 1 + offset, found.centre, found.low, found.high),
-            strict=True,
-        ):
-            out[key].append(value)
-    return out
-
-
-def _events(rows: Sequence[Row]) -> dict[str, int]:
-    out: dict[str, int] = {}
-    for row in rows:
-        for name, count in row.get("events", {}).items():
-            out[name] = out.get(name, 0) + int(count)
+def _paired(mine: Mapping[str, Row], baseline: Mapping[str, Row]) -> dict[str, Any]:
+    pairs = [(mine[clip], baseline[clip]) for clip in mine if clip in baseline]
+    out: dict[str, Any] = {}
+    for metric in metrics_of([row for pair in pairs for row in pair]):
+        differences = [value_of(a, metric) - value_of(b, metric) for a, b in pairs]
+        interval = t_interval(differences, "clips")
+        out[metric] = {"diff": interval.centre, "ci95": interval.bounds, "n": len(differences)}
     return out

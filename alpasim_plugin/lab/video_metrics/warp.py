@@ -1,8 +1,7 @@
 """Warp L1: how much a video changes beyond its own motion.
 
 The flow from every frame to the one before is estimated on the video itself, so a blurred video
-scores better: read it beside a distance to the truth. The paper takes the late frames of a clip,
-and the road alone where it knows where that is.
+scores better: read it beside a distance to the truth. The paper takes the late frames of a clip.
 """
 
 from __future__ import annotations
@@ -11,14 +10,13 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.errors import EvaluatorError
-from alpasim_plugin.core.types import F32, F64, U8, Bool
-from alpasim_plugin.lab.training.semantics import CLASSES, class_masks
+from alpasim_plugin.core.types import F32, F64, U8
 from alpasim_plugin.lab.video_metrics.frames import check_stack
 
 LATE_SHARE, LATE_LEAST = 3, 30  # the late window is the last third of the pairs, at least 30
 
 
-def warp_l1(video: U8, road: Bool | None = None) -> F64:
+def warp_l1(video: U8) -> F64:
     """Return the warp error of every pair of neighbouring frames.
 
     Farneback flow on grey frames (pyramid 0.5, 3 levels, window 21, 3 iterations, poly_n 5,
@@ -28,8 +26,6 @@ def warp_l1(video: U8, road: Bool | None = None) -> F64:
 
     Args:
         video: ``(T, H, W, 3)``, at least two frames.
-        road: ``(T, H, W)`` pixels that count; frames of which none does count whole, as all do
-            without it.
 
     Returns:
         ``(T - 1,)``, 0 to 1.
@@ -41,33 +37,12 @@ def warp_l1(video: U8, road: Bool | None = None) -> F64:
     if len(video) < 2:
         raise EvaluatorError("a video: one frame", "give at least two")
     grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in video]
-    counts = np.ones(video.shape[:3], dtype=bool) if road is None else road
-    flows = (backward_flow(grey[i], grey[i - 1]) for i in range(1, len(video)))
     return np.array(
-        [_pair(video[i - 1], video[i], flow, counts[i]) for i, flow in enumerate(flows, start=1)]
+        [
+            _pair(video[i - 1], video[i], backward_flow(grey[i], grey[i - 1]))
+            for i in range(1, len(video))
+        ]
     )
-
-
-def road_mask(sdmap: U8) -> Bool:
-    """Return the road ahead in a semantic map ``(H, W, 3)``: in every row what lies between its
-    borders, from the bottom of the picture up to a thirtieth of its height below the farthest
-    border, where rows show none of the near ones.
-
-    Returns:
-        ``(H, W)``; nothing where the map shows no border.
-    """
-    border = class_masks(sdmap, 1)[CLASSES.index("boundary")] > 0
-    out, middle = np.zeros(border.shape, dtype=bool), border.shape[1] // 2
-    farthest = (
-        int(np.argmax(border.any(axis=1))) + len(border) // 30 if border.any() else len(border)
-    )
-    for row in range(len(border) - 1, farthest, -1):
-        columns = np.flatnonzero(border[row])
-        left = max(columns[columns < middle], default=-1)
-        right = min(columns[columns >= middle], default=border.shape[1])
-        out[row, left + 1 : right] = True
-        middle = (left + 1 + right) // 2
-    return out
 
 
 def backward_flow(grey: U8, previous: U8) -> F32:
@@ -88,7 +63,7 @@ def late_window(pairs: int) -> slice:
     return slice(max(pairs - max(-(-pairs // LATE_SHARE), LATE_LEAST), 0), None)
 
 
-def _pair(previous: U8, frame: U8, flow: F32, counts: Bool) -> float:
+def _pair(previous: U8, frame: U8, flow: F32) -> float:
     h, w = frame.shape[:2]
     rows, columns = np.indices((h, w), dtype=np.float32)
     x, y = columns + flow[..., 0], rows + flow[..., 1]
@@ -98,7 +73,6 @@ def _pair(previous: U8, frame: U8, flow: F32, counts: Bool) -> float:
             "two neighbouring frames: flow that leaves the picture everywhere",
             "look at the video",
         )
-    valid = valid & counts if (valid & counts).any() else valid
     warped = cv2.remap(
         previous.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )

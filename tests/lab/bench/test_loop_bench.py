@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
 from alpasim_plugin.lab.bench import loop as module
 from alpasim_plugin.lab.bench.loop import STAGES, bench_loop, fastest, markdown, reference_ms
-from alpasim_plugin.lab.cli import bench_loop as command
-
-REPO = Path(__file__).resolve().parents[3]
 
 
 def test_each_pass_counts_with_its_least_time() -> None:
@@ -38,7 +34,6 @@ def test_a_record_has_stages_errors_commands_and_the_ratios_of_its_times(
     assert frame["ratio"] == pytest.approx(frame["ms"] / record["reference_ms"])
     assert start["ratio"] == pytest.approx(1e3 * start["processor_s"] / record["reference_ms"])
     assert frame["psnr_db"] == 100  # the scene as built, against itself
-    assert frame["raster_levels"] <= 1
     rows = [line.split("|") for line in markdown(record).splitlines() if line.startswith("|")]
     assert {len(row) for row in rows[:3]} == {len(rows[0])}
     assert [row[1].strip() for row in rows] == [
@@ -50,8 +45,3 @@ def test_a_record_has_stages_errors_commands_and_the_ratios_of_its_times(
         "---",
         "start",
     ]
-
-
-def test_the_page_holds_the_record_that_lies_beside_it() -> None:
-    record = json.loads((REPO / command.RECORD).read_text())
-    assert markdown(record) in (REPO / command.PAGE).read_text()

@@ -6,12 +6,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from alpasim_plugin.block_fixers.networks import load_tiny_vae
@@ -20,7 +17,7 @@ from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.bundle import save_bundle
-from alpasim_plugin.lab.cli.training_options import scene_files, whole_numbers
+from alpasim_plugin.lab.cli.training_options import scene_files
 from policies.learned_net import load_net
 from tests.block_fixers.fixer_cases import small_settings
 from tests.lab.training.pair_files import make
@@ -95,31 +92,12 @@ def test_pairs_made_and_kept_are_counted(
     assert Path(first["rows"][0]["folder"], "sequence.json").is_file()
 
 
-def test_imported_pairs_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rgb, grey = np.zeros((4, 32, 48, 3), dtype=np.uint8), np.zeros((4, 32, 48), dtype=np.uint8)
-    channels = {
-        "rgb-input": rgb,
-        "rgb-gt": rgb,
-        "opacity": grey,
-        "sdmap": rgb,
-        "poses": np.tile(np.eye(4), (4, 1, 1)),
-    }
-    options: list[str | Path] = []
-    for name, array in channels.items():
-        np.save(tmp_path / f"{name}.npy", array)
-        options += [f"--{name}", tmp_path / f"{name}.npy"]
-    document, _ = run_train(capsys, "import-pairs", tmp_path / "pairs", "--name", "drive", *options)
-    assert document == {
-        "folder": str(tmp_path / "pairs" / "train" / "drive"),
-        "split": "train",
-        "frames": 4,
-    }
-
-
 def test_weights_come_with_digest_updates_and_time(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    document, err = run_train(capsys, "vae", data, "--out", tmp_path, "--steps", 1)
+    document, err = run_train(
+        capsys, "fixer", data, "--recipe", "vae", "--out", tmp_path, "--steps", 1
+    )
     weights = tmp_path / "vae.safetensors"
     assert document["weights"] == str(weights)
     assert document["sha256"] == hashlib.sha256(weights.read_bytes()).hexdigest()
@@ -132,73 +110,6 @@ def test_weights_come_with_digest_updates_and_time(
     assert document["last"]["loss"] > 0
     assert "1/1" in err
     assert f"wrote {weights}" in err.replace("\n", "")
-
-
-def demonstrations(folder: Path) -> None:
-    """Write two demonstrations on a grey road."""
-    folder.mkdir(parents=True)
-    numbers = ("yaw", "yaw_before", "speed", "desired_speed", "gap", "leader")
-    arrays = {
-        "frames": np.full((2, 114, 352, 3), 128, dtype=np.uint8),
-        "points": np.ones((2, 9, 2), dtype=np.float32),
-        "headings": np.zeros((2, 9), dtype=np.float32),
-        "speeds": np.zeros((2, 8), dtype=np.float32),
-        "frame": np.array([0, 1], dtype=np.int32),
-        "before": np.array([0, 0], dtype=np.int32),
-        "command": np.zeros(2, dtype=np.int64),
-        **{name: np.full(2, 0.1, dtype=np.float32) for name in numbers},
-    }
-    for name, array in arrays.items():
-        np.save(folder / f"{name}.npy", array)
-    lens = {"K": [[176.0, 0, 176], [0, 176.0, 57], [0, 0, 1]], "T_rig_camera": np.eye(4).tolist()}
-    (folder / "demonstrations.json").write_text(
-        json.dumps({**lens, "samples": 2, "recipe": {"renderer": "clean"}})
-    )
-
-
-def test_a_policys_card_says_what_made_it_and_how_well_it_does(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for split, name in (
-        ("train", "street_000"),
-        ("train", "street_003"),
-        ("train", "bend_001"),
-        ("val", "street_000"),
-    ):
-        demonstrations(tmp_path / "demonstrations" / split / name)
-    monkeypatch.setattr(
-        sys, "argv", ["simrun", "train", "policy", "demonstrations", "--threads", "1"]
-    )
-    document, _ = run_train(
-        capsys, "policy", tmp_path / "demonstrations", "--out", tmp_path / "run", "--steps", 1
-    )
-    card = json.loads(Path(document["card"]).read_text())
-    load_net(Path(document["weights"]))
-    assert Path(document["card"]).name == "learned.json"
-    assert card["command"] == "simrun train policy demonstrations --threads 1"
-    assert card["machine"]["cores"] == os.cpu_count()
-    assert card["sha256"] == document["sha256"]
-    assert card["data"] == {
-        "frames": 6,
-        "samples": 6,
-        "scenes": {"bend": 1, "street": 2},
-        "renderer": "clean",
-    }
-    assert card["held_out"]["samples"] == 2
-    assert card["curves"][-1]["step"] == card["steps"] == 1
-
-
-def test_a_bundle_is_measured_as_its_autoencoder_is(
-    data: Path, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    TinyVAE.random(seed=3).save(tmp_path / "vae.safetensors")
-    (whole, err), (alone, _) = (
-        run_train(capsys, "vae-quality", path, data)
-        for path in (bundle, tmp_path / "vae.safetensors")
-    )
-    assert whole["rows"] == alone["rows"]
-    assert [row["from"] for row in whole["rows"]] == ["latent", "latent and render", "render alone"]
-    assert "[1/1] a: " in err
 
 
 def test_a_file_without_an_autoencoder_is_refused(bundle: Path, tmp_path: Path) -> None:
@@ -219,13 +130,27 @@ def test_errors_are_documents_and_tracebacks_are_shown_on_request(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert (
-        run_command(["train", "vae-quality", "untrained", str(tmp_path), "--json", "--debug"]) == 2
+        run_command(
+            [
+                "train",
+                "fixer",
+                str(tmp_path),
+                "--recipe",
+                "vae",
+                "--out",
+                str(tmp_path / "run"),
+                "--json",
+                "--debug",
+            ]
+        )
+        == 2
     )
     out, err = capsys.readouterr()
     assert "no finished sequence" in json.loads(out)["error"]["message"]
     assert "Traceback" in err
-    assert run_command(["train", "memory", "--latents", "6,x"]) == 2
-    assert "--latents 6,x" in capsys.readouterr().err
+    for recipe in ("V9", "decoder"):
+        command = ["train", "fixer", str(tmp_path), "--recipe", recipe, "--out", str(tmp_path)]
+        assert run_command(command) == 2
 
 
 def test_scenes_of_any_name_are_in_order_of_their_numbers(
@@ -240,12 +165,24 @@ def test_scenes_of_any_name_are_in_order_of_their_numbers(
         "street_001",
         "foo",
     ]
-    assert run_command(["train", "policy-data", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert run_command(["train", "policy", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert "roda" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("text", ["", "a", "1,,2", "-1", "1.5"])
-def test_what_is_no_list_of_whole_numbers_is_refused(text: str) -> None:
-    assert whole_numbers("--horizon", "0, 4", 0) == [0, 4]
-    with pytest.raises(InputError, match="--horizon"):
-        whole_numbers("--horizon", text, 0)
+def test_a_policys_card_says_what_made_it_and_how_well_it_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for split in ("train", "val"):
+        folder = tmp_path / "scenes" / split
+        folder.mkdir(parents=True)
+        (folder / "street_000.yaml").write_text(BARE)
+    document, _ = run_train(
+        capsys, "policy", tmp_path / "scenes", "--out", tmp_path / "run", "--steps", 1
+    )
+    card = json.loads(Path(document["card"]).read_text())
+    load_net(Path(document["weights"]))
+    assert Path(document["card"]).name == "learned.json"
+    assert card["sha256"] == document["sha256"]
+    assert (card["data"]["scenes"], card["data"]["renderer"]) == ({"street": 1}, "clean")
+    assert card["held_out"]["samples"] > 0
+    assert card["curves"][-1]["step"] == card["steps"] == 1

@@ -25,12 +25,6 @@ from alpasim_plugin.core.reading.arrays import read_metadata
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.fixers.network.checkpoints import load_weights
-from alpasim_plugin.lab.bench.training_memory import (
-    MemoryCell,
-    measure_memory,
-    memory_table,
-    monotone,
-)
 from alpasim_plugin.lab.training.clip_batches import BatchForm, ClipBatches, Seen
 from alpasim_plugin.lab.training.fixer_run import FixerRun, stage_inputs, train_fixer
 from alpasim_plugin.lab.training.generator import SharedRollout
@@ -399,22 +393,3 @@ def test_a_widened_map_input_changes_nothing_at_first() -> None:
         )
     with pytest.raises(InputError, match="they take 32"):
         widen_map(wide, 16)
-
-
-@pytest.mark.slow
-def test_memory_grows_with_the_clip_and_the_horizon() -> None:
-    cells = measure_memory(small_settings(), [4, 12], [1, 4], 1, 8, 16)
-    by = {(c.latents, c.horizon): c.extra_mib for c in cells}
-    assert by[12, 4] > by[4, 4] > 0
-    assert "| 12 |" in memory_table(cells)
-    assert monotone(cells)
-
-
-def test_memory_that_falls_with_the_horizon_is_not_monotone() -> None:
-    cells = [
-        MemoryCell(8, 1, 100.0, 1.0),
-        MemoryCell(8, 4, 95.0, 1.0),
-        MemoryCell(16, 4, 300.0, 1.0),
-    ]
-    assert monotone(cells)
-    assert not monotone([*cells, MemoryCell(16, 8, 200.0, 1.0)])

@@ -21,12 +21,12 @@ from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.bundle import bundle_fixer, read_bundle
 from alpasim_plugin.fixers.refine import refine_frames
 from alpasim_plugin.fixers.settings import Unit
-from alpasim_plugin.lab.bench.whole_clip_images import whole_clip_images
 from alpasim_plugin.lab.image_fixers.image_fixer import ImageFixer
 from alpasim_plugin.lab.image_fixers.settings import NoiseWindowSettings, RenderStepSettings
 from alpasim_plugin.lab.image_fixers.window_fixer import WindowFixer, fade_weights, windows
 from tests.fixers.clip_cases import moving_picture, pixels
 from tests.lab.training.image_cases import busy_settings, image_settings
+from tests.lab.training.whole_clip_images import whole_clip_images
 
 Settings = RenderStepSettings | NoiseWindowSettings
 STREAMED = ("difix", "harmonizer", "harmonizer-temporal", "gsfix3d")

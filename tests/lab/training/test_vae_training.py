@@ -15,7 +15,6 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.training.clips import CropSize, draw_pair_clip, draw_video_clip
 from alpasim_plugin.lab.training.trainer import Schedule, Trainer
 from alpasim_plugin.lab.training.vae import VaeRecipe, VaeTask, channel_amplitudes, measure_stats
-from alpasim_plugin.lab.training.vae_quality import quality, round_trip
 from tests.lab.training.pair_files import make
 
 SIZE = CropSize(5, 16, 32)
@@ -67,17 +66,6 @@ def test_a_few_updates_lower_the_loss_of_every_kind(tmp_path: Path) -> None:
         assert after[kind] < before[kind]
 
 
-def test_quality_of_a_known_error() -> None:
-    wanted = torch.full((1, 3, 4, 8, 8), 100 / 127.5 - 1)
-    made = (
-        wanted + 3 / 127.5 * torch.tensor([1.0, -1.0, 1.0, -1.0])[None, None, :, None, None]
-    )  # three grey levels up and down
-    q = quality(made, wanted)
-    assert q.psnr_db == pytest.approx(20 * np.log10(255 / 3))
-    assert (q.flicker, q.copy_flicker) == (pytest.approx(6.0), 0.0)
-    assert quality(wanted, wanted).flicker == 0
-
-
 def test_stats_of_random_latents_are_those_of_their_sample() -> None:
     vae = TinyVAE.random()
     clips = [
@@ -88,11 +76,6 @@ def test_stats_of_random_latents_are_those_of_their_sample() -> None:
     z = torch.cat([vae.encode(c).flatten(2)[0] for c in clips], dim=1)
     torch.testing.assert_close(mean, z.mean(1))
     torch.testing.assert_close(std, z.std(1))
-
-
-def test_round_trip_pads_and_crops_any_size() -> None:
-    video = torch.zeros(1, 3, 6, 20, 30)
-    assert round_trip(TinyVAE.random(), video).shape == video.shape
 
 
 def test_channel_amplitudes_are_what_an_error_of_a_channel_does_to_pixels() -> None:

@@ -9,8 +9,7 @@ import pytest
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
-from alpasim_plugin.fixers.semantic_map.style import COLOURS
-from alpasim_plugin.lab.video_metrics.warp import backward_flow, late_window, road_mask, warp_l1
+from alpasim_plugin.lab.video_metrics.warp import backward_flow, late_window, warp_l1
 
 RNG = stream("video", 0, "warp")
 
@@ -69,21 +68,3 @@ def test_late_window_is_the_last_third_but_at_least_thirty(pairs: int, first: in
 def test_one_frame_has_no_motion_to_follow() -> None:
     with pytest.raises(EvaluatorError, match="one frame"):
         warp_l1(texture(32, 32)[None])
-
-
-def test_the_road_lies_between_its_borders_and_alone_counts() -> None:
-    border = COLOURS["road_boundary"]
-    drawn = np.zeros((60, 80, 3), dtype=np.uint8)
-    for row in range(20, 60):
-        drawn[row, 40 - (row - 20)] = border
-        drawn[row, min(40 + 2 * (row - 20), 79)] = border if 2 * (row - 20) < 40 else (0, 0, 0)
-    road = road_mask(drawn)
-    assert not road[:22].any()
-    assert road[50, 11:80].all()
-    assert not road[50, :11].any()
-    assert np.flatnonzero(road[30]).tolist() == list(range(31, 60))
-    assert not road_mask(np.zeros_like(drawn)).any()
-    still = np.repeat(texture(60, 80)[None], 2, axis=0)
-    still[1, :20] = 255 - still[1, :20]
-    assert warp_l1(still, np.stack([road, road]))[0] < 0.2 * warp_l1(still)[0]
-    assert warp_l1(still, np.zeros((2, 60, 80), dtype=bool)) == pytest.approx(warp_l1(still))

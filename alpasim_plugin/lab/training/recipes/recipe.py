@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, Protocol
 
@@ -110,7 +109,6 @@ class StageInputs:
         equal_channels: Whether flow matching weights all latent channels alike.
         distance: Name and function of the perceptual term; None where the recipe has none.
         settings: Of the fixer that is trained.
-        scenes: Folder of the scenes behind the pairs, for objectives that need their depth.
     """
 
     dit: DiTSettings
@@ -126,7 +124,6 @@ class StageInputs:
     equal_channels: bool = False
     distance: tuple[str, Distance] | None = None
     settings: LatentFixerSettings | None = None
-    scenes: Path | None = None
 
 
 class Objective(Protocol):

@@ -15,11 +15,9 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.training.flow_matching import FlowMatching
 from alpasim_plugin.lab.training.generator import SharedRollout
 from alpasim_plugin.lab.training.recipes.ablation import ABLATION
-from alpasim_plugin.lab.training.recipes.appearance import APPEARANCE
 from alpasim_plugin.lab.training.recipes.causal_arms import CAUSAL_ARMS
 from alpasim_plugin.lab.training.recipes.image_arms import IMAGE_ARMS
 from alpasim_plugin.lab.training.recipes.recipe import Attention, Objective, Recipe, whole_clip
-from alpasim_plugin.lab.training.styled_rollout import StyledRollout
 
 
 def by_name(recipes: Iterable[Recipe]) -> Mapping[str, Recipe]:
@@ -39,7 +37,7 @@ def by_name(recipes: Iterable[Recipe]) -> Mapping[str, Recipe]:
     return MappingProxyType(found)
 
 
-RECIPES = by_name((*ABLATION, *CAUSAL_ARMS, *IMAGE_ARMS, APPEARANCE))
+RECIPES = by_name((*ABLATION, *CAUSAL_ARMS, *IMAGE_ARMS))
 
 
 def recipe_of(name: str) -> Recipe:
@@ -65,11 +63,7 @@ def with_perceptual_weight(recipe: Recipe, weight: float) -> Recipe:
     """
 
     def weighted(objective: Objective) -> Objective:
-        return (
-            objective.weighted(weight)
-            if isinstance(objective, SharedRollout | StyledRollout)
-            else objective
-        )
+        return objective.weighted(weight) if isinstance(objective, SharedRollout) else objective
 
     return _with_objectives(recipe, weighted)
 

@@ -14,17 +14,14 @@ from alpasim_plugin.cli.options import fixer_overrides
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import resolve, split_names, split_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer
-from alpasim_plugin.lab.bench.judged import Judging
-from alpasim_plugin.lab.bench.quality import RAW, Variant
-from alpasim_plugin.lab.bench.quality_run import (
+from alpasim_plugin.lab.bench.quality import (
+    RAW,
     Given,
-    QualityRun,
+    Variant,
     Work,
     evenly,
-    write_results,
+    measure_quality,
 )
-from alpasim_plugin.lab.cli.training_options import whole_numbers
-from alpasim_plugin.lab.learned_metrics.table import judged_markdown
 from alpasim_plugin.lab.training.pair_store import PairDataset
 from alpasim_plugin.lab.video_metrics.image_distance import FOLDER_VARIABLE, weights_folder
 from alpasim_plugin.lab.video_metrics.summary import TRUTH
@@ -81,27 +78,6 @@ def quality(
         Path | None,
         typer.Option("--metric-weights", help=f"Folder of LPIPS weights; also {FOLDER_VARIABLE}."),
     ] = None,
-    judges: Annotated[
-        str | None,
-        typer.Option(
-            "--judges",
-            help="Also ask the judges of these training seeds, as 0,1 (docs/lab/judges.md).",
-        ),
-    ] = None,
-    scenes: Annotated[
-        Path | None,
-        typer.Option(
-            "--scenes",
-            help="Folder of the pairs' scenes: judges of lanes need the camera's mounting.",
-        ),
-    ] = None,
-    judge_folder: Annotated[
-        Path | None, typer.Option("--judge-folder", help="Folder of judges that you froze.")
-    ] = None,
-    detections: Annotated[
-        Path | None,
-        typer.Option("--detections", help="Folder of a detector's results, VARIANT/CLIP.json."),
-    ] = None,
     pictures: Annotated[
         int, typer.Option("--pictures", min=0, help="Clips that are shown side by side.")
     ] = 4,
@@ -128,8 +104,8 @@ def quality(
     """Measure fixers on recorded clips: PSNR, SSIM, perceptual distances, Warp L1, drift and time,
     with 95 % intervals over clips.
 
-    Writes quality.json, quality.md, by-frame.png, speed.png and pictures side by side; rows of
-    finished clips are kept.
+    Writes quality.json, quality.md and sheets of images side by side; rows of finished clips are
+    kept.
     """
     del debug
     variants = parse_variants(fixers, overrides or [])
@@ -138,60 +114,34 @@ def quality(
             f"--baseline {baseline}: variants {', '.join(a.label for a in variants)}",
             "name one of the variants",
         )
-    judging = (
-        None if judges is None else _judging(judges, scenes, detections, weights, judge_folder)
-    )
     sequences = evenly(PairDataset(data, split).sequences, clips)
-    shown = frozenset(s.name for s in evenly(sequences, pictures)) if pictures else frozenset()
-    run = QualityRun(
-        sequences,
-        variants,
-        out,
-        given,
-        frames,
-        seed,
-        device,
-        jobs,
-        threads,
-        weights,
-        shown,
-        judging=judging,
-        scenes=scenes,
-    )
+    shown = {sequence.name for sequence in evenly(sequences, pictures)} if pictures else set()
+    works = [
+        Work(
+            sequence.folder,
+            given,
+            variant,
+            frames,
+            seed,
+            device,
+            threads if jobs == 1 else 1,
+            weights_folder(weights),
+            out,
+            sequence.name in shown,
+        )
+        for sequence in sequences
+        for variant in (*variants, Variant(TRUTH))
+    ]
     console = Console(stderr=True)
 
-    def told(i: int, n: int, work: Work, row: Mapping[str, Any]) -> None:
+    def report(i: int, n: int, work: Work, row: Mapping[str, Any]) -> None:
         psnr = row["values"].get("psnr_db")
+        value = "" if psnr is None else f" {psnr:.2f} dB"
         if not as_json:
-            console.print(
-                f"{i}/{n} {work.variant.label} {work.folder.name}"
-                + ("" if psnr is None else f" {psnr:.2f} dB")
-            )
+            console.print(f"{i}/{n} {work.variant.label} {work.folder.name}{value}")
 
-    summary, works = run.measure(baseline, told)
-    summary["run"] = {"data": str(data), "split": split, **run.facts()}
-    write_results(summary, works, out)
-    print(
-        json.dumps(summary)
-        if as_json
-        else markdown(summary) + judged_markdown(summary) + f"\nwrote {out / 'quality.json'}"
-    )
-
-
-def _judging(
-    seeds: str,
-    scenes: Path | None,
-    detections: Path | None,
-    weights: Path | None,
-    folder: Path | None,
-) -> Judging:
-    return Judging(
-        tuple(whole_numbers("--judges", seeds, 0)),
-        scenes,
-        detections,
-        weights_folder(weights),
-        folder,
-    )
+    summary = measure_quality(works, baseline, jobs, out, report)
+    print(json.dumps(summary) if as_json else f"{markdown(summary)}\nwrote {out / 'quality.json'}")
 
 
 def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:

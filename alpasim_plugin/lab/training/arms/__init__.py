@@ -1,1 +1,0 @@
-"""The arms of the paper's comparison, trained as one whole."""
