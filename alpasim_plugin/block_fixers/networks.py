@@ -334,7 +334,7 @@ class Parts:
             do = (
                 "choose one of these"
                 if known
-                else "leave fixer.prompt out, or give a bundle of 'simrun train fixer --recipe appearance'"
+                else "leave fixer.prompt out, or give a bundle that holds prompts"
             )
             raise InputError(f"{source}, fixer.prompt={name}: {found}", do)
         text = known[name]

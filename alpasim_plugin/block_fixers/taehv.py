@@ -50,7 +50,7 @@ DROPPED = GROUP - 1  # frames dropped at the start of a video
 STAGE = 6  # entries of one stage: three memory blocks, upsampling, growth, convolution
 FIRST = 3  # entry of the first stage
 DOING = "loading tiny decoder weights"
-DO = "give the state dict of TAEHV or LightTAE for Wan 2.1 (keys decoder.*; docs/lab/vae.md lists shapes)"
+DO = "give the state dict of TAEHV or LightTAE for Wan 2.1 (keys decoder.*)"
 
 
 class SoftClamp(nn.Module):

@@ -39,7 +39,7 @@ STAGES = 4
 ENCODER_TIME = (False, True, True)  # which of the three halvings also halve the frame rate
 DECODER_TIME = (True, True, False)
 DOING = "loading Wan VAE weights"
-DO = "give the state dict of a Wan 2.1 VAE or LightVAE (keys encoder.*, decoder.*, conv1.*, conv2.*, no prefix; shapes: docs/lab/vae.md)"
+DO = "give the state dict of a Wan 2.1 VAE or LightVAE (keys encoder.*, decoder.*, conv1.*, conv2.*, no prefix)"
 SQUARE_FLOOR = 1e-24  # added to the mean square of a channel vector
 TAPS = 3  # of every temporal kernel: the frame and its two predecessors
 

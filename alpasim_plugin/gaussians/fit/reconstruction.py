@@ -100,7 +100,7 @@ class Reconstruction:
         if not path.exists():
             raise InputError(
                 f"{folder}: no {INDEX_FILE}",
-                "make it with 'simrun train splat SCENARIO --out FOLDER'",
+                "make it with 'simrun import drive FOLDER -o OUT'",
             )
         files = read_json_as(_Index, path)["actors"]
         image = read_image(folder / SKY_FILE)

@@ -314,7 +314,9 @@ def measure_quality(
     for i, (work, row) in enumerate(map_jobs(finish, works, jobs), start=1):
         report(i, len(works), work, row)
         rows.append(row)
-    variants = {work.variant.label: work.variant.spec for work in works}
+    variants = {
+        work.variant.label: work.variant.spec for work in works if work.variant.label != TRUTH
+    }
     first = works[0]
     summary = summarise(rows, baseline)
     summary["run"] = {

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import scipy
@@ -251,13 +252,13 @@ def _mean(values: Sequence[float] | F64) -> float | None:
     return round(float(np.mean(values)), 5) if len(values) else None
 
 
-def intervals(rows: Sequence[Row]) -> list[dict[str, object]]:
+def intervals(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return mean and 95 % interval (Student) over drives of every metric, by renderer and set;
     none of what one drive alone measured.
 
     The drives are the sample: frames of one drive are not independent.
     """
-    out: list[dict[str, object]] = []
+    out: list[dict[str, Any]] = []
     for renderer, use in dict.fromkeys((row["renderer"], row["set"]) for row in rows):
         mine = [row for row in rows if (row["renderer"], row["set"]) == (renderer, use)]
         for metric in METRICS:

@@ -92,8 +92,7 @@ def real(
     print_rows(rows, False)
     if over:
         print_rows(
-            [{**row, "ci95": "{:.3g} to {:.3g}".format(*row["ci95"])} for row in over],
-            False,  # type: ignore[misc]
+            [{**row, "ci95": "{:.3g} to {:.3g}".format(*row["ci95"])} for row in over], False
         )
 
 

@@ -83,7 +83,7 @@ def pairs(
     if len(sources) == 1 and sources[0].is_dir():
         scenes = scenes_of(sources[0], split, count)
         maker = _Maker(out, PairRecipe(source, max_offset_m=max_offset_m), seed)
-        made = map_jobs(maker, scenes, jobs)
+        made = (result for _, result in map_jobs(maker, scenes, jobs))
     else:
         sizes = [parse_size(text) for text in size or ["256x144"]]
         made = (
