@@ -18,7 +18,6 @@ from alpasim_plugin.core.lazy import lazy_names
 if TYPE_CHECKING:
     from alpasim_plugin.alpasim.server.driver_service import serve_policy
     from alpasim_plugin.runs.cell import make_renderer
-    from alpasim_plugin.runs.notebook import open_run
     from alpasim_plugin.runs.rollout import run_rollout
     from policies import make_policy
     from scenarios.load import load_scenario
@@ -33,7 +32,6 @@ __all__ = [
     "load_scenario",
     "make_policy",
     "make_renderer",
-    "open_run",
     "run_rollout",
     "serve_policy",
 ]
@@ -80,7 +78,6 @@ __getattr__ = lazy_names(
         "load_scenario": "scenarios.load",
         "make_policy": "policies",
         "make_renderer": ".runs.cell",
-        "open_run": ".runs.notebook",
         "run_rollout": ".runs.rollout",
         "serve_policy": ".alpasim.server.driver_service",
     },

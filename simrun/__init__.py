@@ -30,7 +30,6 @@ if TYPE_CHECKING:
         Trajectory,
     )
     from alpasim_plugin.runs.cell import make_renderer
-    from alpasim_plugin.runs.notebook import open_run
     from alpasim_plugin.runs.rollout import run_rollout
     from evaluators import (
         aggregate,
@@ -65,7 +64,6 @@ HOMES = {
         "Trajectory",
         "U8",
     ],
-    "alpasim_plugin.runs.notebook": ["open_run"],
     "alpasim_plugin.runs.cell": ["make_renderer"],
     "alpasim_plugin.runs.rollout": ["run_rollout"],
     "evaluators": [
@@ -106,7 +104,6 @@ __all__ = [
     "load_scenario",
     "make_policy",
     "make_renderer",
-    "open_run",
     "paired",
     "plan_times",
     "reduce_rollout",

@@ -1,12 +1,10 @@
-"""``simrun export``: runs and rollouts for other people's tools: AlpaSim's evaluation, Foxglove,
-Rerun.
-"""
+"""``simrun export``: runs and rollouts for AlpaSim's evaluation, Foxglove and Rerun."""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,18 +15,11 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.log.run_folder.schema import CONTENTS
 from alpasim_plugin.runs.export import Export, export_run, export_scenes
-from alpasim_plugin.runs.recordings.content import Recording, collect
-from alpasim_plugin.runs.recordings.mcap_file import require_mcap, write_mcap
-from alpasim_plugin.runs.recordings.rerun_file import require_rerun, write_rrd
+from alpasim_plugin.runs.recordings import Recording, collect, require_mcap, write_mcap
 from alpasim_plugin.runs.repair import use_run
 from evaluators.opening import read_so_far
 from evaluators.viewer.cells import Wanted, cells_of, check_wanted, read_logs
 
-DOING = "exporting"
-FORMATS: dict[str, tuple[Callable[[], object], Callable[[Recording, Path], Mapping[str, int]]]] = {
-    "mcap": (require_mcap, write_mcap),
-    "rrd": (require_rerun, write_rrd),
-}
 NAMED = 4  # cells in the message that there are several
 
 EPILOG = """
@@ -40,9 +31,7 @@ Examples:
 
 - `simrun export runs/smoke --scene smoke/curve --seed 0 --mcap curve.mcap`: one scene and seed behind every renderer, for Foxglove
 
-- `simrun export runs/smoke/rollouts/3dgs/lane-camera/smoke-curve/0 --rrd curve.rrd`, then `rerun curve.rrd`
-
-- `simrun export runs/smoke --scene smoke/curve --renderer 3dgs --mcap curve.mcap --rrd curve.rrd`
+- `simrun export runs/smoke/rollouts/3dgs/lane-camera/smoke-curve/0 --mcap curve.mcap`
 
 Exit codes: 0 written; 2 no such run or rollout, several cells where one was needed, or a library is not installed; 4 the disk refuses.
 """
@@ -61,34 +50,29 @@ def export(
         Path | None, Flag("Write AlpaSim run folders; new or empty.", metavar="DIR")
     ] = None,
     mcap: Annotated[
-        Path | None, Flag("Write a recording for Foxglove; extra [mcap].", metavar="FILE")
-    ] = None,
-    rrd: Annotated[
-        Path | None, Flag("Write a recording for Rerun; extra [rerun].", metavar="FILE")
+        Path | None, Flag("Write a recording for Foxglove and Rerun; extra [mcap].", metavar="FILE")
     ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Write a run for other tools: AlpaSim run folders and scenes, or one scene, policy and seed as
-    a recording for Foxglove or Rerun.
+    a recording for Foxglove and Rerun.
 
     With `--alpasim`, one run folder for each renderer and policy: logs, `_complete` marks, metadata
     and settings, so that `alpasim-eval`, `alpasim-aggregation` and `alpasim-reeval` take them as
     they are, and `simrun score --preset alpasim` gives the same numbers.
 
-    With `--mcap` or `--rrd`, camera frames, boxes, map, driven path, plans and metrics behind every
+    With `--mcap`, camera frames, boxes, map, driven path, plans and metrics behind every
     renderer on one time line.
     """
-    files = {name: path for name, path in (("mcap", mcap), ("rrd", rrd)) if path is not None}
-    if (alpasim is None) == (not files):
-        found = "nothing to write" if alpasim is None else "--alpasim beside --mcap or --rrd"
-        raise InputError(
-            f"{' '.join(items)}: {found}", "give --alpasim DIR, or --mcap FILE and --rrd FILE"
-        )
-    if alpasim is None:
-        _print_recording(*export_recording(items, wanted, files, overwrite), as_json)
+    if (alpasim is None) == (mcap is None):
+        problem = "nothing to write" if alpasim is None else "--alpasim and --mcap together"
+        raise InputError(f"{' '.join(items)}: {problem}", "give --alpasim DIR or --mcap FILE")
+    if mcap is not None:
+        _print_recording(*export_recording(items, wanted, mcap, overwrite), as_json)
         return
+    assert alpasim is not None
     if not wanted.is_all:
         raise InputError(
             "--alpasim: --scene, --policy, --seed or --renderer beside it",
@@ -113,23 +97,23 @@ def export(
 
 
 def export_recording(
-    items: Sequence[str], asked: Wanted, files: Mapping[str, Path], overwrite: bool
-) -> tuple[Recording, list[dict[str, Any]]]:
-    """Write a recording of one scene, policy and seed, in each format that was asked for.
+    items: Sequence[str], asked: Wanted, path: Path, overwrite: bool
+) -> tuple[Recording, dict[str, Any]]:
+    """Write an MCAP recording of one scene, policy and seed.
 
     Args:
         items: The run folder or the rollout's folder; one.
         asked: Which cell of a run, and which renderers.
-        files: Format -> file.
-        overwrite: Replace files that are there.
+        path: The file.
+        overwrite: Replace a file that is there.
 
     Returns:
-        The recording, and for each file ``format``, ``file``, ``bytes``, ``messages``, and
-        ``channels`` with the messages of each.
+        The recording, and ``file``, ``bytes``, ``messages``, and ``channels`` with the messages of
+        each.
 
     Raises:
         InputError: Not one run or rollout, several cells, a file that is there already, a damaged
-            log, or a library is not installed.
+            log, or the library is not installed.
         InfrastructureError: The disk refuses.
     """
     if len(items) > 1:
@@ -137,9 +121,8 @@ def export_recording(
             f"{' '.join(items)}: several items",
             "give one run folder, or the folder of one rollout",
         )
-    for name, path in files.items():
-        refuse_existing(path, overwrite, "")
-        FORMATS[name][0]()  # the library, before anything is read
+    refuse_existing(path, overwrite, "")
+    require_mcap()  # before anything is read
     what = Path(items[0])
     root, of_rollout = find_cell(what)
     if (root / CONTENTS).exists():
@@ -148,48 +131,37 @@ def export_recording(
     wanted = narrowed(what, of_rollout, asked)
     check_wanted(run, wanted)
     cells = cells_of(run, wanted)
-    if len(cells) != 1:
-        some = "; ".join(cell.name for cell in cells[:NAMED]) + (
-            f"; {len(cells) - NAMED} more" if len(cells) > NAMED else ""
-        )
-        found = (
-            f"{len(cells)} cells of scene, policy and seed: {some}"
-            if cells
-            else "no finished rollout that was asked for"
-        )
+    if not cells:
         raise InputError(
-            f"{root}: {found}",
+            f"{root}: no finished rollout that was asked for",
+            "choose others by --scene, --policy and --seed",
+        )
+    if len(cells) > 1:
+        names = "; ".join(cell.name for cell in cells[:NAMED])
+        raise InputError(
+            f"{root}: {len(cells)} cells of scene, policy and seed: {names}",
             "choose one by --scene, --policy and --seed, or name a rollout's folder",
         )
     recording = collect(run, cells[0], read_logs(run, cells[0]))
-    written = []
-    for name, path in files.items():
-        counts = dict(FORMATS[name][1](recording, path))
-        facts = {
-            "format": name,
-            "file": str(path),
-            "bytes": path.stat().st_size,
-            "messages": sum(counts.values()),
-            "channels": counts,
-        }
-        written.append(facts)
-    return recording, written
+    counts = write_mcap(recording, path)
+    facts = {
+        "file": str(path),
+        "bytes": path.stat().st_size,
+        "messages": sum(counts.values()),
+        "channels": counts,
+    }
+    return recording, facts
 
 
-def _print_recording(recording: Recording, files: Sequence[dict[str, Any]], as_json: bool) -> None:
+def _print_recording(recording: Recording, file: dict[str, Any], as_json: bool) -> None:
     if as_json:
-        print(
-            json.dumps(
-                {"recording": recording.name, "files": files, "notes": list(recording.notes)}
-            )
-        )
+        facts = {"recording": recording.name, **file, "notes": list(recording.notes)}
+        print(json.dumps(facts))
         return
     for note in recording.notes:
         print(f"note     {note}")
-    for one in files:
-        print(
-            f"{one['format']:<8} {one['file']}  {one['bytes'] / 1e6:.1f} MB, {one['messages']} messages: {recording.name}"
-        )
+    size = f"{file['bytes'] / 1e6:.1f} MB, {file['messages']} messages"
+    print(f"mcap     {file['file']}  {size}: {recording.name}")
 
 
 def _print(done: Export, as_json: bool) -> None:

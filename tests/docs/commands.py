@@ -34,7 +34,6 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     ),
     (r"path/to/|rollouts/|--scene scenes|runs/RUN", "names a file of the reader's"),
     (r"^why ", "names a drive of the reader's; tests/runs/test_why.py runs it"),
-    (r"--rrd", "needs rerun-sdk, half a gigabyte; tests/runs/test_rrd.py reads what it writes"),
     (
         r"^serve|127\.0\.0\.1:|can://|scene\.usdz",
         "needs a service or a bus, or goes on until it is stopped: test_service_commands.py beside this file; AlpaSim's own: tests/alpasim",

@@ -366,7 +366,7 @@ def require_unedited(file: Path, digest: str) -> None:
     if _imported_code.setdefault(file, digest) != digest:
         raise InputError(
             f"{file}: it, or a module that it imports, was edited after this process had imported it",
-            "start a new process (in a notebook: restart the kernel)",
+            "start a new process",
         )
 
 

@@ -1,1 +1,0 @@
-"""Logged rollouts as recordings of other people's viewers: MCAP for Foxglove, .rrd for Rerun."""
