@@ -11,48 +11,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core import checksums
-from alpasim_plugin.core.checksums import checksums_of, problem_of, read_sealed, write_sealed
-from alpasim_plugin.core.errors import InputError
-
-CONTENT = {"metrics": {"progress": 0.5}, "files": [1, 2], "name": "é"}
-
-
-def read(path: Path) -> object:
-    return read_sealed(path, "reading", "run again")[0]
-
-
-def test_what_is_sealed_is_read_back_without_the_seal(tmp_path: Path) -> None:
-    seal = write_sealed(tmp_path / "a.json", CONTENT, "writing")
-    assert read_sealed(tmp_path / "a.json", "reading", "run again") == (CONTENT, seal)
-
-
-def test_every_cut_and_every_changed_byte_of_a_sealed_file_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    write_sealed(path, CONTENT, "writing")
-    whole = path.read_bytes()
-    for length in range(len(whole)):
-        path.write_bytes(whole[:length])
-        with pytest.raises(InputError):
-            read(path)
-    for at in range(len(whole)):
-        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
-        with pytest.raises(InputError):
-            read(path)
-    path.write_bytes(whole)
-    assert read(path) == CONTENT
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", "{}", "[1]", '{"sha256": "0"}', "5"])
-def test_json_without_a_seal_is_refused(tmp_path: Path, text: str) -> None:
-    (tmp_path / "a.json").write_text(text)
-    with pytest.raises(InputError, match="seal"):
-        read(tmp_path / "a.json")
-
-
-def test_an_object_that_has_no_room_for_a_seal_is_a_mistake_of_the_caller(tmp_path: Path) -> None:
-    for value in ({}, {"sha256": "x"}):
-        with pytest.raises(ValueError, match="sealed object"):
-            write_sealed(tmp_path / "a.json", value, "writing")
+from alpasim_plugin.core.checksums import checksums_of, problem_of
 
 
 def test_missing_cut_and_changed_files_are_told_apart(tmp_path: Path) -> None:

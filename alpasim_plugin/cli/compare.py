@@ -16,8 +16,8 @@ from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.runs.repair import use_run
 from alpasim_plugin.runs.summary import aggregate_runs, joined_metrics
+from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics import MetricTable
 from evaluators.opening import read_run
 from evaluators.report import render_table
@@ -62,7 +62,7 @@ def compare(
     if len(runs) > 2:
         raise InputError(f"{len(runs)} folders: more than two", "name one run, or two")
     for run in runs:
-        use_run(run, warn)
+        ensure_tables(run, warn)
         if note := stopping_note(run):
             warn(note)
     found = [read_run(run) for run in runs]

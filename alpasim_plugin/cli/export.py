@@ -13,10 +13,10 @@ from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.cli.view import find_cell, is_run, narrowed
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.log.run_folder.schema import CONTENTS
+from alpasim_plugin.log.run_folder.schema import SUMMARY
 from alpasim_plugin.runs.export import Export, export_run, export_scenes
 from alpasim_plugin.runs.recordings import Recording, collect, require_mcap, write_mcap
-from alpasim_plugin.runs.repair import use_run
+from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.opening import read_so_far
 from evaluators.viewer.cells import Wanted, cells_of, check_wanted, read_logs
 
@@ -85,7 +85,7 @@ def export(
             "export one run at a time",
         )
     if runs:
-        use_run(Path(runs[0]), warn)
+        ensure_tables(Path(runs[0]), warn)
         done = export_run(
             Path(runs[0]),
             alpasim,
@@ -125,8 +125,8 @@ def export_recording(
     require_mcap()  # before anything is read
     what = Path(items[0])
     root, of_rollout = find_cell(what)
-    if (root / CONTENTS).exists():
-        use_run(root, warn)
+    if (root / SUMMARY).exists():
+        ensure_tables(root, warn)
     run = read_so_far(root).run
     wanted = narrowed(what, of_rollout, asked)
     check_wanted(run, wanted)

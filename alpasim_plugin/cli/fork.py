@@ -22,7 +22,7 @@ from alpasim_plugin.log.run_folder.reader import read_json
 from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME, slug
 from alpasim_plugin.runs.fork import Change, fork_rollout
 from alpasim_plugin.runs.logged_rollout import find_rollout, named_row
-from alpasim_plugin.runs.repair import use_run
+from alpasim_plugin.runs.tables import ensure_tables
 from alpasim_plugin.runs.why import explain, worst_failure
 from evaluators.opening import read_run
 from evaluators.viewer.cause import write_cause
@@ -73,7 +73,7 @@ def fork(
     run, name = run_and_cell(cell)
     if not name:
         raise InputError(f"{cell}: a run, not a rollout", "Name RUN/RENDERER/POLICY/SCENE/SEED.")
-    use_run(run, warn)
+    ensure_tables(run, warn)
     past = find_rollout(run, name)
     change = Change(round(at * 1e6), renderer, policy, seed)
     root = out or run / "forks" / slug(f"{past.name} {change.label}")
@@ -119,7 +119,7 @@ def why(
     show at the same poses, where plans part, and behind which renderers the same rollout ends well.
     """
     root, name = run_and_cell(cell)
-    use_run(root, warn)
+    ensure_tables(root, warn)
     run = read_run(root)
     if name:
         row = named_row(root, name)

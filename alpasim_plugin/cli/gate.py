@@ -21,9 +21,9 @@ from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.schema import PAGES
 from alpasim_plugin.log.run_folder.sides import Row
 from alpasim_plugin.runs.plan import RunOptions, make_plan
-from alpasim_plugin.runs.repair import use_run
 from alpasim_plugin.runs.reports import write_reports
 from alpasim_plugin.runs.run import Progress, execute_run
+from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics.presets import DEFAULT
 from evaluators.opening import read_run
 from evaluators.report.ci import write_gate_files
@@ -114,10 +114,7 @@ def run_self_test(
     plan = make_plan(load_suite(SUITE), [REFERENCE, *broken], [POLICY], [SEED], options)
     control = make_plan(load_suite(SUITE), [REFERENCE], [POLICY], [OTHER_SEED], options)
     runs = [(plan, root), (control, root / "control")]
-    results = [
-        execute_run(one, folder, None, command, progress(), certificate="none")
-        for one, folder in runs
-    ]
+    results = [execute_run(one, folder, None, command, progress()) for one, folder in runs]
     rows = rows_of_run(read_run(root))
     # The rollouts of the other seed get the first seed, so that they are paired with its rollouts.
     again = [
@@ -191,7 +188,7 @@ def gate(
             )
         raise typer.Exit(_self_test(gate_file, out, as_json))
     run = run_or_newest(run)
-    use_run(run, warn)
+    ensure_tables(run, warn)
     stored_run = read_run(run)
     if approve is not None:
         write_baseline(stored_run, approve)

@@ -38,10 +38,10 @@ from alpasim_plugin.core.limits import SOURCE_BYTES
 from alpasim_plugin.core.reading import read_bytes
 from alpasim_plugin.core.signals import Stopped
 from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME
-from alpasim_plugin.runs.certificate import certificate_line
 from alpasim_plugin.runs.decide import Decided, execute_decision, plan_of_two
 from alpasim_plugin.runs.execute import Threads, thread_budget
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import RunResult, default_folder, execute_run
 from evaluators.report.verdict import metric_lines, verdict_line
 from evaluators.statistics.arms import arms_of, base_named
@@ -89,6 +89,9 @@ def run(
             metavar="NAME[=MARGIN]",
         ),
     ] = (),
+    repeat: Annotated[
+        bool, Flag("Drive one rollout twice and say whether the policy is repeatable.")
+    ] = False,
     dry_run: Annotated[bool, Flag("Resolve and print the plan, run nothing.")] = False,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -133,7 +136,9 @@ def run(
             )
             _print_decision(decided, as_json)
             raise typer.Exit(decided.outcome.exit_code)
-        result = execute_run(plan, root, command=command, progress=progress, resume=resume, **how)
+        result = execute_run(
+            plan, root, command=command, progress=progress, resume=resume, repeat=repeat, **how
+        )
     except Stopped as stop:
         stop.kept = f"finished rollouts are kept in {root}; the same command continues"
         raise
@@ -270,7 +275,8 @@ def _print_result(result: RunResult, as_json: bool, video: str) -> None:
         print(
             f"videos   {videos} of {result.n_rollouts} rollouts have a front.mp4 below {result.root}/rollouts"
         )
-    print(f"repeat   {certificate_line(result.summary['determinism'])}")
+    if "repeat" in result.summary:
+        print(f"repeat   {repeat_line(result.summary['repeat'])}")
     for line in ending_lines(run):
         print(line)
     print(report_line(result.root))

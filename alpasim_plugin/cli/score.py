@@ -22,12 +22,11 @@ from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.parts import PartSpec, digest
 from alpasim_plugin.core.parts.source import own_code_digest
 from alpasim_plugin.log.run_folder.manifests import (
-    find_contents,
     read_run_json,
     write_manifest,
     write_run_json,
 )
-from alpasim_plugin.log.run_folder.schema import AGGREGATE, CONTENTS, slug
+from alpasim_plugin.log.run_folder.schema import AGGREGATE, SUMMARY, slug
 from alpasim_plugin.log.run_folder.writer import write_parquet, write_scene, writing
 from alpasim_plugin.runs.execute import Threads
 from alpasim_plugin.runs.plan import SCORING
@@ -111,7 +110,7 @@ def execute_score(
                 f"folder {root}: it holds other results (key {held})",
                 "choose another --out",
             )
-        (root / CONTENTS).unlink(missing_ok=True)  # from here on the folder is unfinished
+        (root / SUMMARY).unlink(missing_ok=True)  # from here on the folder is unfinished
         scores = score_logs(logs, scenes, preset, evaluators, root, on_done)
         aggregation: dict[str, Any] | None = None
         error: EvaluatorError | None = None
@@ -141,11 +140,10 @@ def _held_key(root: Path) -> str | None:
     """Return the key of the results that a folder holds; None for a new one, or where ``run.json``
     is damaged: it is written again.
     """
-    contents = find_contents(root)
     try:
         return str(read_run_json(root)["key"])
     except InputError:
-        return None if contents is None else str(contents.run.get("key"))
+        return None
 
 
 def _aggregate(

@@ -17,9 +17,9 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
 from alpasim_plugin.log.run_folder.reader import read_json
-from alpasim_plugin.log.run_folder.schema import CONTENTS, MANIFEST, RUN_INFO, SUMMARY
-from alpasim_plugin.runs.repair import use_run
+from alpasim_plugin.log.run_folder.schema import MANIFEST, RUN_INFO, SUMMARY
 from alpasim_plugin.runs.reports import write_reports
+from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics import MetricTable
 from evaluators.opening import read_so_far
 from evaluators.report import render_table
@@ -63,8 +63,8 @@ def view(
     root, of_rollout = find_cell(what)
     wanted = narrowed(what, of_rollout, asked)
     options = Options(int(max_mb * MB), camera=camera)
-    if (root / CONTENTS).exists():
-        use_run(root, warn)
+    if (root / SUMMARY).exists():
+        ensure_tables(root, warn)
     so_far = read_so_far(root)
     for line in so_far.damage:
         warn(f"warning: damaged: {line}")
@@ -105,7 +105,7 @@ def view(
 
 def is_run(what: Path) -> bool:
     """Tell whether a folder is a run folder."""
-    return (what / RUN_INFO).exists() or (what / CONTENTS).exists()
+    return (what / RUN_INFO).exists()
 
 
 def find_cell(what: Path) -> tuple[Path, Wanted | None]:
@@ -158,7 +158,7 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Write report.html, summary.md and junit.xml of a run again and print its table."""
-    use_run(run, warn)
+    ensure_tables(run, warn)
     summary = read_json(run / SUMMARY)
     page = write_reports(run, flips=read_run_json(run).get("kind") != "score")
     if as_json:

@@ -1,11 +1,11 @@
-"""Digests of a rollout by component: compare two rollouts and name the first difference."""
+"""Digests of a rollout by component and time, and the first difference of two rollouts."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,13 @@ from alpasim_plugin.core.reading import read_json_lines
 from alpasim_plugin.log.asl import AslReader
 from alpasim_plugin.log.schema import EGO
 
-# In the order in which the loop makes them at one instant: where the ego got to, where the others
-# are, what the cameras saw, what the policy answered. Scores come last of all: they are made from
-# the finished log.
-COMPONENTS = ("ego", "actors", "frames", "plans", "scores")
+# In the order in which the loop makes them at one instant: poses of the ego and of the other road
+# users, frames of the cameras, plans of the policy.
+COMPONENTS = ("ego", "actors", "frames", "plans")
 
 Fact = str | int | float | bool | None
+Key = tuple[int, str]  # time in microseconds, part of the component, such as a camera
+Trace = Mapping[str, Mapping[Key, str]]  # component -> key -> SHA-256
 
 
 def write_facts(path: Path | str, rows: Iterable[Mapping[str, Fact]]) -> None:
@@ -58,12 +59,6 @@ def read_facts(path: Path | str) -> list[dict[str, Fact]]:
     return rows
 
 
-Key = tuple[
-    int, str
-]  # time in microseconds, and which part of the component: a camera, a metric, ...
-Trace = Mapping[str, Mapping[Key, str]]  # component -> key -> SHA-256
-
-
 @dataclass(frozen=True)
 class Difference:
     """The first place where two rollouts are not the same."""
@@ -75,12 +70,7 @@ class Difference:
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for JSON."""
-        return {
-            "component": self.component,
-            "t_us": self.t_us,
-            "step": self.step,
-            "what": self.what,
-        }
+        return asdict(self)
 
     def __str__(self) -> str:
         at = f"step {self.step}" if self.step is not None else "before the first frame"
@@ -102,7 +92,7 @@ def trace_log(path: Path, facts: Iterable[Mapping[str, Fact]] = ()) -> dict[str,
     Raises:
         InputError: The log is missing or damaged.
     """
-    parts: dict[str, dict[Key, str]] = {name: {} for name in COMPONENTS if name != "scores"}
+    parts: dict[str, dict[Key, str]] = {name: {} for name in COMPONENTS}
     asked_us = 0
     for entry in AslReader(path):
         kind = entry.WhichOneof("log_entry")
@@ -143,11 +133,6 @@ def trace_log(path: Path, facts: Iterable[Mapping[str, Fact]] = ()) -> dict[str,
     return parts
 
 
-def digests(trace: Trace) -> dict[str, str]:
-    """Return one SHA-256 per component."""
-    return {name: sha256(repr(sorted(part.items())).encode()) for name, part in trace.items()}
-
-
 def first_difference(
     one: Trace,
     other: Trace,
@@ -155,46 +140,33 @@ def first_difference(
     control_us: int,
     until_us: Mapping[str, int] | None = None,
 ) -> Difference | None:
-    """Return the earliest difference, or None; what only one of the two has is a difference as
-    well.
+    """Return the earliest difference of two rollouts, or None.
 
-    At equal times the component that the loop makes first is named; scores are named only where
-    nothing else differs.
+    An entry that only one of them has is a difference too. At equal times the component that the
+    loop makes first is named.
 
     Args:
         one: A rollout.
         other: Another one.
         start_us: Time of the first frame, from which steps are counted.
         control_us: Length of a step.
-        until_us: Component -> first time that is not compared; components without one are left out.
-            None compares everything.
+        until_us: Component -> first time that is not compared. None compares everything.
     """
-    found: list[tuple[bool, int, int, str]] = []  # scores?, time, rank, which part
-    for rank, name in enumerate(COMPONENTS):
-        if until_us is not None and name not in until_us:
-            continue
-        a, b = one.get(name, {}), other.get(name, {})
-        keys = [
-            key
-            for key in {**a, **b}
-            if a.get(key) != b.get(key) and (until_us is None or key[0] < until_us[name])
-        ]
-        if keys:
-            t_us, what = min(keys)
-            found.append(
-                (
-                    name == "scores",
-                    t_us,
-                    rank,
-                    what if (t_us, what) in a and (t_us, what) in b else f"{what}, in one only",
-                )
-            )
-    if not found:
+    differences = []
+    for rank, component in enumerate(COMPONENTS):
+        a = one.get(component, {})
+        b = other.get(component, {})
+        for t_us, part in {**a, **b}:
+            compared = until_us is None or t_us < until_us[component]
+            if compared and a.get((t_us, part)) != b.get((t_us, part)):
+                in_both = (t_us, part) in a and (t_us, part) in b
+                text = part if in_both else f"{part}, in one only"
+                differences.append((t_us, rank, text))
+    if not differences:
         return None
-    _, t_us, rank, what = min(found)
-    return Difference(
-        COMPONENTS[rank], t_us, (t_us - start_us) // control_us if t_us >= start_us else None, what
-    )
+    t_us, rank, text = min(differences)
+    step = (t_us - start_us) // control_us if t_us >= start_us else None
+    return Difference(COMPONENTS[rank], t_us, step, text)
 
 
 def sha256(data: bytes) -> str:

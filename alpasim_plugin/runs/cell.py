@@ -22,7 +22,7 @@ from alpasim_plugin.core.places import require_kernels
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.log.run_folder.manifests import (
-    RepairAction,
+    Action,
     RolloutState,
     inspect_rollout,
     write_manifest,
@@ -268,24 +268,20 @@ def find_rollout_state(
     cell: Cell,
     root: Path,
     reuse_undigested: bool = False,
-    full: bool = False,
-    known: bool = False,
-    retry: bool = False,
     video: str = "none",
-) -> tuple[RepairAction, RolloutState]:
+) -> tuple[Action, RolloutState]:
     """Return what a cell needs, and the rollout as it is found on disk.
 
     A rollout with another content key is driven again; so are those with a part that has no digest
     unless ``reuse_undigested`` is set, and failed ones, except where the policy is at fault: the
-    same policy would fail again (``retry`` drives these too). One that was driven without the
-    ``video`` that is asked for now is driven again as well. See
-    `alpasim_plugin.log.run_folder.manifests.inspect_rollout` for ``full`` and ``known``.
+    same policy would fail again. One that was driven without the
+    ``video`` that is asked for now is driven again as well.
     """
-    state = inspect_rollout(root, cell.folder.as_posix(), full, known)
+    state = inspect_rollout(root, cell.folder.as_posix())
     manifest = state.manifest
     if manifest is None or manifest.get("rollout_key") != cell.rollout_key:
         return "drive", state
-    if manifest["status"] != "ok" and (retry or not manifest.get("final")):
+    if manifest["status"] != "ok" and not manifest.get("final"):
         return "drive", state
     if cell.undigested and not reuse_undigested:
         return "drive", state

@@ -17,7 +17,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.subprocesses import end_children
-from alpasim_plugin.log.run_folder.manifests import find_contents, read_run_json, write_run_json
+from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
 from alpasim_plugin.log.run_folder.sides import RendererRows
 from alpasim_plugin.log.run_folder.writer import rollout_rows, writing
 from alpasim_plugin.runs.execute import HowToRun, execute, thread_budget
@@ -154,17 +154,15 @@ def execute_decision(
     threads = thread_budget(workers, SCENES_PER_LOOK * 2 * len(plan.seeds), executor)
     how = HowToRun(threads, limit_s=limit_s, executor=executor)
     with writing(root, wait, progress.noticed):
-        contents = find_contents(root)
-        held = claim(root, plan, command, threads, False, contents, progress.noticed)
+        held = claim(root, plan, command, threads, False, progress.noticed)
         # The kind is written at once: the plan's scenes are not all wanted.
         write_run_json(root, read_run_json(root) | {"kind": KIND})
         progress.started(plan, root, threads)
         began = time.perf_counter()
-        known = contents.rollouts if contents else ()
         try:
             while cells := test.next_cells():
                 part = part_of(plan, cells)
-                manifests = execute(part, root, how, on_done(progress), progress.noticed, known)
+                manifests = execute(part, root, how, on_done(progress), progress.noticed)
                 test.add(cells, manifests)
                 progress.looked(test.state, len(test.manifests), len(plan.cells))
                 write_decision(root, test.record())

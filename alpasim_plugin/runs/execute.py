@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import version
@@ -25,10 +25,9 @@ from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import write_manifest
 from alpasim_plugin.renderers.reconstruction_key import is_reconstructed
 from alpasim_plugin.runs.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
-from alpasim_plugin.runs.certificate import Repeat
 from alpasim_plugin.runs.executors.choice import LOCAL, Executor
 from alpasim_plugin.runs.executors.local import Lost, run_jobs
-from alpasim_plugin.runs.plan import Cell, RunPlan
+from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
 from alpasim_plugin.runs.provenance import hardware
 
 KERNELS = "kernels"
@@ -112,9 +111,7 @@ class Threads:
     per_worker: int
 
 
-def thread_budget(
-    workers: int | None, n_cells: int, executor: Executor = LOCAL, repeats: bool = False
-) -> Threads:
+def thread_budget(workers: int | None, n_cells: int, executor: Executor = LOCAL) -> Threads:
     """Divide the cores that this process may use among the workers; those of other nodes have the
     cores that the executor asks for.
 
@@ -123,14 +120,13 @@ def thread_budget(
             is the most, and None is no bound.
         n_cells: Number of cells to run.
         executor: Where rollouts run.
-        repeats: A worker of this machine drives one of them again.
     """
     if not executor.is_local:
         return Threads(max(1, min(workers or n_cells, n_cells)), executor.cores)
     cores = (
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     )
-    chosen = max(1, min(workers or cores, max(n_cells, 1) + repeats))
+    chosen = max(1, min(workers or cores, max(n_cells, 1)))
     return Threads(chosen, max(1, cores // chosen))
 
 
@@ -141,9 +137,6 @@ class HowToRun:
     Attributes:
         threads: Workers, and threads of each.
         reuse_undigested: Also reuse rollouts with parts that have no digest.
-        full: Read every file of a finished rollout before it is reused, even if size and time are
-            as written.
-        retry: Drive again also what failed by the policy's own fault.
         limit_s: Seconds that one rollout may take; a worker that exceeds them is killed. None: no
             limit.
         executor: Where rollouts run.
@@ -152,9 +145,7 @@ class HowToRun:
 
     threads: Threads
     reuse_undigested: bool = False
-    full: bool = False
     limit_s: float | None = None
-    retry: bool = False
     executor: Executor = LOCAL
     run: str = field(default_factory=lambda: os.urandom(8).hex())
 
@@ -176,8 +167,6 @@ def execute(
     how: HowToRun,
     on_done: OnDone,
     notify: Callable[[str], None],
-    known: Collection[str] = (),
-    repeat: Repeat | None = None,
 ) -> list[dict[str, Any]]:
     """Run every unfinished cell and return all manifests in the plan's order.
 
@@ -191,23 +180,12 @@ def execute(
         how: Workers, checks, limits.
         on_done: Called with each manifest.
         notify: Called with one line for each damaged rollout.
-        known: Folders of rollouts that were finished once.
-        repeat: Driven again beside the others, if workers of this machine drive it now.
     """
     share_measurements(measured_folder(how.run))
     manifests: dict[Path, dict[str, Any]] = {}
     todo: list[Cell] = []
     for cell in plan.cells:
-        folder = cell.folder.as_posix()
-        action, state = find_rollout_state(
-            cell,
-            root,
-            how.reuse_undigested,
-            how.full,
-            folder in known,
-            how.retry,
-            plan.options.video,
-        )
+        action, state = find_rollout_state(cell, root, how.reuse_undigested, plan.options.video)
         if state.damage:
             doing = "driving again" if action == "drive" else "scoring again"
             notify(f"damaged: {'; '.join(map(str, state.damage))}; {doing}")
@@ -220,7 +198,7 @@ def execute(
         manifests[cell.folder] = manifest
         on_done(manifest, True)
     if how.executor.is_local:
-        driven = _run_local(todo, plan, root, how, repeat)
+        driven = _run_local(todo, plan, root, how)
     else:
         driven = _run_on_ray(todo, plan, root, how)
     for cell, manifest in driven:
@@ -232,54 +210,29 @@ def execute(
 Done = Iterator[tuple[Cell, dict[str, Any]]]
 
 
-def _run_local(
-    todo: Sequence[Cell],
-    plan: RunPlan,
-    root: Path,
-    how: HowToRun,
-    repeat: Repeat | None,
-) -> Done:
+def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done:
     """Run cells in this process, or in workers that write the run folder themselves."""
-    if how.threads.workers > 1 or how.limit_s is not None:
-        compile_for(todo, plan.scenarios, how.threads.workers)
+    workers = how.threads.workers
+    if workers > 1 or how.limit_s is not None:
+        compile_for(todo, plan.scenarios, workers)
+    if workers > 1:  # the slowest rollouts come first, so that all workers end together
+        todo = sorted(todo, key=lambda cell: cell.renderer.fixer is None)
     threads = how.threads.per_worker
-    drive = partial(run_cell, options=plan.options, threads=threads)
-    jobs = [_Job(cell, root, drive) for cell in todo]
-    if how.threads.workers > 1:
-        if repeat is not None and repeat.cell is not None and repeat.cell in todo:
-            jobs.append(_Job(repeat.cell, repeat.root, drive))
-        jobs.sort(
-            key=lambda job: job.cell.renderer.fixer is None
-        )  # what takes longest comes first, so that all workers end together
+    drive = partial(_drive, how.run, plan.options, root, threads)
 
-    def known(
-        job: _Job,
-    ) -> dict[str, Any] | None:  # a worker may have died after writing its rollout
-        action, state = find_rollout_state(job.cell, job.root, reuse_undigested=True)
+    def written(cell: Cell) -> dict[str, Any] | None:
+        """Return the manifest of a rollout whose worker died after it had written it."""
+        action, state = find_rollout_state(cell, root, reuse_undigested=True)
         return state.manifest if action == "none" else None
 
-    for job, got in run_jobs(
-        partial(_of_run, how.run), jobs, how.threads.workers, threads, how.limit_s, known
-    ):
-        if repeat is not None and job.root is repeat.root:
-            repeat.manifest = None if isinstance(got, Lost) else got
-        else:
-            yield job.cell, _lost(job.cell, root, got) if isinstance(got, Lost) else got
+    for cell, result in run_jobs(drive, todo, workers, threads, how.limit_s, written):
+        yield cell, _lost(cell, root, result) if isinstance(result, Lost) else result
 
 
-@dataclass(frozen=True)
-class _Job:
-    """One rollout for a worker of this machine: where it is written, and by what it is driven."""
-
-    cell: Cell
-    root: Path
-    work: Callable[..., dict[str, Any]]
-
-
-def _of_run(run: str, job: _Job) -> dict[str, Any]:
+def _drive(run: str, options: RunOptions, root: Path, threads: int, cell: Cell) -> dict[str, Any]:
     """Run a cell in a worker of this machine."""
     share_measurements(measured_folder(run))
-    return job.work(job.cell, root=job.root)
+    return run_cell(cell, options, root, threads)
 
 
 def _run_on_ray(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done:

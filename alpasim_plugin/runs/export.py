@@ -41,7 +41,8 @@ from alpasim_plugin.core.types import (
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.asl import Renaming, Stage, copy_log
 from alpasim_plugin.log.images import encode_image
-from alpasim_plugin.log.run_folder.manifests import read_contents, read_manifest
+from alpasim_plugin.log.run_folder.check import cells_of_run
+from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, slug
 from alpasim_plugin.log.schema import session_uuid, wire_camera, wire_image, wire_render_request
 from alpasim_plugin.log.wire import logging_pb2, sensorsim_pb2
@@ -267,14 +268,13 @@ def export_run(root: Path, out: Path, say: Callable[[str], None]) -> Export:
             changed, or ``out`` is not empty.
     """
     _check_free(out)
-    contents = read_contents(root)
-    info = contents.run
+    info = read_run_json(root)
     if info.get("kind") == "score":
         raise InputError(
             f"{root}: scores of logs, without the logs",
             "export the run folder that holds them",
         )
-    manifests = [read_manifest(root / cell)[0] for cell in contents.rollouts]
+    manifests = [read_manifest(root / cell) for cell in cells_of_run(info)]
     loaded = scenes_of(info)
     runs: dict[tuple[str, str], ExportedRun] = {}
     with atomic_folder(out) as partial:

@@ -39,10 +39,10 @@ from alpasim_plugin.log.run_folder.schema import LOG_NAME, MANIFEST, RUN_INFO
 from alpasim_plugin.log.run_folder.writer import writing
 from alpasim_plugin.log.trace import Difference, Trace, first_difference
 from alpasim_plugin.runs.cell import RolloutParts, build_parts, run_cell
-from alpasim_plugin.runs.certificate import log_trace
 from alpasim_plugin.runs.execute import thread_budget
 from alpasim_plugin.runs.logged_rollout import LoggedRollout
 from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan, score_key
+from alpasim_plugin.runs.repeat import log_trace
 from alpasim_plugin.runs.run import RunResult, finish_run, write_run_info
 from alpasim_plugin.runs.summary import pool_of
 

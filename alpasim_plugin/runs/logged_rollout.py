@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -81,11 +80,11 @@ def find_rollout(root: Path, name: str) -> LoggedRollout:
             f"{name}: the rollout did not finish: {row['failure']}", "Name a finished rollout."
         )
     info = read_run_json(root)
-    state = inspect_rollout(root, row["path"], full=True, known=True)
+    state = inspect_rollout(root, row["path"], full=True)
     if state.damage or state.manifest is None:
         raise InputError(
-            f"{name}: {'; '.join(f'{one.file}: {one.problem}' for one in state.damage)}",
-            f"simrun check {shlex.quote(str(root))} --repair runs it again",
+            f"{name}: {'; '.join(f'{one.file}: {one.problem}' for one in state.damage) or 'unfinished'}",
+            "Give the command of the run again: it drives this rollout.",
         )
     manifest = state.manifest
     if manifest.get("fork"):

@@ -17,25 +17,18 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.parts.source import own_code_digest
 from alpasim_plugin.core.subprocesses import end_children
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.log.run_folder.manifests import (
-    Contents,
-    damaged_files,
-    find_contents,
-    read_manifest,
-    read_run_json,
-    write_contents,
-    write_run_json,
-)
+from alpasim_plugin.log.run_folder.check import cells_of_run
+from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
 from alpasim_plugin.log.run_folder.reader import read_json
-from alpasim_plugin.log.run_folder.schema import CONTENTS, RUN_INFO, SUMMARY, TABLES, slug
+from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY, slug
 from alpasim_plugin.log.run_folder.writer import write_scene, writing
 from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runs.cell import find_rollout_state
-from alpasim_plugin.runs.certificate import Certify, certify, foreseen, repeating
 from alpasim_plugin.runs.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runs.executors.choice import LOCAL, Executor
 from alpasim_plugin.runs.plan import LOOP, SCORING, RunPlan
 from alpasim_plugin.runs.provenance import hardware, project, versions
+from alpasim_plugin.runs.repeat import repeat_rollout
 from alpasim_plugin.runs.summary import pool_of, write_summary
 from evaluators.metrics import MetricTable, table_of
 from evaluators.statistics.families import grouped
@@ -43,6 +36,7 @@ from evaluators.statistics.verdicts import Outcome, outcome_of_failures
 from scenarios.suite import ScenarioRef
 
 SCHEMA_VERSION = 1
+IN_SUMMARY = ("pool", "repeat", "exit_code", "alpasim")  # members of run.json in the summary too
 
 
 class Progress(Protocol):
@@ -107,16 +101,14 @@ def execute_run(
     command: Sequence[str],
     progress: Progress,
     resume: bool = False,
-    certificate: Certify = "one",
+    repeat: bool = False,
     report: bool = True,
     *,
     wait: bool = False,
-    full: bool = False,
     limit_s: float | None = None,
-    retry: bool = False,
     executor: Executor = LOCAL,
 ) -> RunResult:
-    """Run a plan into a folder, and repeat one of its rollouts as the certificate says.
+    """Run a plan into a folder.
 
     Args:
         plan: The run.
@@ -125,13 +117,10 @@ def execute_run(
         command: The command line, for ``run.json``.
         progress: Shows the run.
         resume: Continue in the folder of another command.
-        certificate: Whether to repeat a rollout.
+        repeat: Drive one rollout a second time to see whether the policy is repeatable.
         report: Write ``report.html``; otherwise `write_reports` makes it later.
         wait: Wait for a process that writes the folder; otherwise refuse.
-        full: Read every file of a finished rollout before it is reused, even if size and time are
-            as written.
         limit_s: Seconds that one rollout may take.
-        retry: Drive again also what failed by the policy's own fault.
         executor: Where rollouts run; the results do not depend on it.
 
     Raises:
@@ -139,41 +128,27 @@ def execute_run(
         InfrastructureError: Another process writes the folder, or it is read-only and the run is
             not finished.
     """
-    threads = thread_budget(
-        workers, len(plan.cells), executor, foreseen(plan, certificate) is not None
-    )
+    threads = thread_budget(workers, len(plan.cells), executor)
     if root.exists() and not os.access(root, os.W_OK):
         return _finished_already(plan, root)
     with writing(root, wait, progress.noticed):
-        contents = find_contents(root)
-        held = claim(root, plan, command, threads, resume, contents, progress.noticed)
+        held = claim(root, plan, command, threads, resume, progress.noticed)
         progress.started(plan, root, threads)
         began = time.perf_counter()
-        how = HowToRun(threads, resume, full, limit_s, retry, executor)
+        how = HowToRun(threads, resume, limit_s, executor)
         if threads.workers > 1:
             Thread(target=_load_ending, daemon=True).start()
         try:
-            with repeating(plan, root, certificate) as repeat:
-                known = contents.rollouts if contents else ()
-                manifests = execute(
-                    plan, root, how, on_done(progress), progress.noticed, known, repeat
-                )
-                pool = {
-                    **how.stated,
-                    **pool_of(manifests, threads, time.perf_counter() - began, held.get("pool")),
-                }
-                determinism = certify(
-                    plan,
-                    root,
-                    manifests,
-                    how.cores_here,
-                    certificate,
-                    held.get("determinism"),
-                    repeat,
-                )
+            manifests = execute(plan, root, how, on_done(progress), progress.noticed)
+            wall_s = time.perf_counter() - began
+            more: dict[str, Any] = {
+                "pool": {**how.stated, **pool_of(manifests, threads, wall_s, held.get("pool"))}
+            }
+            if repeat:
+                more["repeat"] = repeat_rollout(plan, root, manifests, how.cores_here)
         finally:
             end_children()
-        summary = finish_run(root, manifests, {"pool": pool, "determinism": determinism}, report)
+        summary = finish_run(root, manifests, more, report)
     return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
 
 
@@ -186,23 +161,27 @@ def _load_ending() -> None:
 def finish_run(
     root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[str, Any], report: bool = True
 ) -> dict[str, Any]:
-    """Write the tables, the reports and the contents of a run whose rollouts are done; return the
-    summary.
+    """Write the tables and the reports of a run whose rollouts are done; return the summary.
+
+    ``summary.json`` is the last of the tables: a run folder without it is unfinished.
 
     Args:
         root: The run folder.
         manifests: One per rollout, in the order of the tables.
-        more: What the rollouts do not tell; kept in ``run.json``, so that the tables can be made
-            again.
+        more: Facts of the run that its manifests do not hold; kept in ``run.json``, so that the
+            tables can be made again.
         report: Write ``report.html``.
     """
-    info = read_run_json(root)
-    outcome = {
+    info = read_run_json(root) | dict(more)
+    info["outcome"] = {  # for lists of many runs
         "n_rollouts": len(manifests),
-        "n_failed": sum(m["status"] != "ok" for m in manifests),
-    }  # for lists of many runs
-    write_run_json(root, info | dict(more) | {"outcome": outcome})
-    baseline, bases = info["config"].get("baseline"), info.get("bases") or {}
+        "n_failed": sum(manifest["status"] != "ok" for manifest in manifests),
+    }
+    folders = [manifest["path"] for manifest in manifests]
+    info.pop("rollouts", None)
+    if tuple(folders) != cells_of_run(info):
+        info["rollouts"] = folders
+    write_run_json(root, info)
     paths = {
         scene: str((facts.get("ref") or {}).get("path") or scene)
         for scene, facts in (info.get("scenes") or {}).items()
@@ -211,16 +190,15 @@ def finish_run(
         root,
         manifests,
         info["preset"],
-        baseline,
-        more,
-        bases,
+        info["config"].get("baseline"),
+        {name: info[name] for name in IN_SUMMARY if name in info},
+        info.get("bases") or {},
         MetricTable.of_run(info),
         grouped(paths),
     )
     from alpasim_plugin.runs.reports import write_reports  # `_load_ending` has loaded it
 
     write_reports(root, flips=info.get("kind") != "score", page=report)
-    write_contents(root, {m["path"]: read_manifest(root / m["path"])[1] for m in manifests})
     return summary
 
 
@@ -230,28 +208,17 @@ def _finished_already(plan: RunPlan, root: Path) -> RunResult:
     Raises:
         InfrastructureError: It is not finished, or damaged.
     """
-    contents = find_contents(root)
-    left = [
-        cell
-        for cell in plan.cells
-        if find_rollout_state(cell, root, reuse_undigested=True)[0] != "none"
-    ]
-    problems = (
-        [f"{len(left)} of {len(plan.cells)} rollouts are missing or out of date"] if left else []
-    )
-    if (
-        contents is None
-        or contents.run.get("content") != plan.content
-        or damaged_files(root, contents)
-    ):
-        problems.append("its tables are missing or those of another run")
-    if problems:
+    summary = root / SUMMARY
+    actions = [find_rollout_state(cell, root, reuse_undigested=True)[0] for cell in plan.cells]
+    left = sum(action != "none" for action in actions)
+    if left or not summary.is_file() or read_run_json(root).get("content") != plan.content:
         raise InfrastructureError(
-            f"folder {root}: it is read-only, and {' and '.join(problems)}",
-            "name another --out, or copy the folder to where it can be written",
+            f"The folder {root} is read-only, and {left} of {len(plan.cells)} rollouts or its "
+            "tables are missing or out of date.",
+            "Name another --out, or copy the folder to where it can be written.",
         )
-    summary = read_json(root / SUMMARY)
-    return RunResult(root, summary, len(plan.cells), summary["failures"]["n_failed"])
+    facts = read_json(summary)
+    return RunResult(root, facts, len(plan.cells), facts["failures"]["n_failed"])
 
 
 def claim(
@@ -260,48 +227,32 @@ def claim(
     command: Sequence[str],
     threads: Threads,
     resume: bool,
-    contents: Contents | None,
     noticed: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Write run.json and the scene files, or check that the folder holds this run; changed parts
-    are written again.
+    """Write ``run.json`` and the scene files, or check that the folder holds this run.
 
     Returns:
-        What ``run.json`` said before; empty for a new folder.
+        What ``run.json`` said before; empty for a new folder, or where it was damaged.
     """
-    held, lost = _held(root, contents, noticed)
+    held: dict[str, Any] = {}
+    if (root / RUN_INFO).exists():
+        try:
+            held = read_run_json(root)
+        except InputError as error:
+            noticed(f"damaged: {error.message}; writing it again")
     if held and held.get("key") != plan.command_key and not resume:
         raise InputError(
-            f"folder {root}: it holds another run (key {held.get('key')}; this command has {plan.command_key})",
-            "choose another --out, or pass --resume to reuse its matching rollouts and replace its tables",
+            f"The folder {root} holds another run: its key is {held.get('key')}, this command's "
+            f"is {plan.command_key}.",
+            "Choose another --out, or pass --resume to reuse its matching rollouts and replace "
+            "its tables.",
         )
-    damage = [] if contents is None else damaged_files(root, contents)
-    for one in damage:
-        noticed(f"damaged: {one}; writing it again")
-    (root / CONTENTS).unlink(missing_ok=True)  # from here on the folder is unfinished
+    (root / SUMMARY).unlink(missing_ok=True)  # from here on the folder is unfinished
     if held.get("content") != plan.content:
         write_run_info(root, plan, command, threads)
-        return held
-    if lost:
-        write_run_json(root, held)
-    if contents is None or any(one.file not in TABLES for one in damage):
+    else:
         _write_scenes(root, plan)
     return held
-
-
-def _held(
-    root: Path, contents: Contents | None, noticed: Callable[[str], None]
-) -> tuple[dict[str, Any], bool]:
-    """Return what ``run.json`` says, empty for a new folder, and whether it is lost and its copy in
-    the contents stands for it.
-    """
-    if contents is None and not (root / RUN_INFO).exists():
-        return {}, False
-    try:
-        return read_run_json(root), False
-    except InputError as error:
-        noticed(f"damaged: {RUN_INFO}: {error.message}; writing it again")
-        return {} if contents is None else dict(contents.run), True
 
 
 def _write_scenes(root: Path, plan: RunPlan) -> None:

@@ -181,7 +181,7 @@ def check_vouched(log: Path) -> None:
     if log.name != LOG_NAME or not (log.parent / MANIFEST).exists():
         return
     try:
-        facts = read_manifest(log.parent)[0]["files"].get(LOG_NAME)
+        facts = read_manifest(log.parent)["files"].get(LOG_NAME)
         problem = None if facts is None else problem_of(log, facts, full=True)
     except InputError as error:
         problem = f"its {MANIFEST} is damaged: {error.message}"
@@ -189,10 +189,10 @@ def check_vouched(log: Path) -> None:
         run = next(
             (folder for folder in log.resolve().parents if (folder / RUN_INFO).exists()), None
         )
-        do_this = (
-            "run the rollout again" if run is None else f"simrun check {run} --repair runs it again"
+        raise InputError(
+            f"{log}: {problem}",
+            f"Give the command of the run {run or ''} again: it drives the rollout.",
         )
-        raise InputError(f"{log}: {problem}", do_this)
 
 
 def check_complete(log: Path, rollout: RolloutLog) -> None:

@@ -15,7 +15,7 @@ from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.columns import AGAIN, RolloutTable
-from alpasim_plugin.log.run_folder.manifests import damaged_files, find_contents, read_run_json
+from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS, ROLLOUTS_TABLE, SUMMARY
 from alpasim_plugin.log.run_folder.writer import write_tables
 from alpasim_plugin.runs.execute import Threads
@@ -256,16 +256,8 @@ def _info_of(run: Path) -> dict[str, Any]:
         InputError: The run is not finished, or damaged.
     """
     info = read_run_json(run)
-    contents = find_contents(run)
-    damaged = (
-        None
-        if contents is None
-        else next((one for one in damaged_files(run, contents) if one.file == ROLLOUTS), None)
-    )
-    if contents is None or damaged is not None:
-        raise InputError(
-            f"{run}: {'the run is not finished' if damaged is None else str(damaged)}", AGAIN
-        )
+    if not (run / SUMMARY).is_file():
+        raise InputError(f"The run {run} is not finished.", AGAIN)
     ROLLOUTS_TABLE.check(run / ROLLOUTS, AGAIN, MetricTable.of_run(info).rates)
     return info
 

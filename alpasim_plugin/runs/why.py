@@ -17,11 +17,11 @@ from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import cell_name
 from alpasim_plugin.log.trace import first_difference
 from alpasim_plugin.runs.cell import build_parts
-from alpasim_plugin.runs.certificate import log_trace
 from alpasim_plugin.runs.execute import thread_budget
 from alpasim_plugin.runs.guards import checked_frames, checked_plan
 from alpasim_plugin.runs.logged_rollout import LoggedRollout, find_rollout
 from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.repeat import log_trace
 from alpasim_plugin.runs.reports import divergences_of
 from alpasim_plugin.runs.rollout import run_rollout
 from evaluators.metrics.outcomes import OUTCOMES, outcomes_of

@@ -16,7 +16,7 @@ from alpasim_plugin.log.run_folder.shapes import pair_tables
 from evaluators.opening import Run
 from evaluators.report.fixers import fixer_cautions
 from evaluators.report.numbers import count_of, decimals, finite, fixed, interval, plural, short
-from evaluators.report.provenance import certificate_caution
+from evaluators.report.provenance import repeat_caution
 from evaluators.statistics.outcomes import outcome_table, sentence
 from evaluators.statistics.verdicts import holm
 
@@ -464,7 +464,7 @@ def _cautions(run: Run) -> tuple[str, ...]:
         said.append(
             f"{len(failed)} of {plural(len(run.rollouts), 'rollout')} could not be run ({causes}); they are in no average. See Failures."
         )
-    said += certificate_caution(run)
+    said += repeat_caution(run)
     scenes = {r.scene for r in run.rollouts if r.ok}
     if len(scenes) == 1:
         said.append(

@@ -40,7 +40,6 @@ from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, fixed, plural
 from evaluators.report.provenance import (
     LEDGER_COLUMNS,
-    certificate,
     failure_rows,
     invalid_rows,
     ledger,
@@ -220,7 +219,6 @@ def context(run: Run) -> dict[str, Any]:
         "strata": [(one, stratum_rows(one), strata_chart(one)) for one in split],
         "strata_heads": heads(),
         "speed_charts": speed_against_error(run, colours),
-        "certificate": certificate(run),
         "invalid": invalid_rows(run),
         "headline_rows": headline,
         "other_rows": [row for row in rows if row not in headline],

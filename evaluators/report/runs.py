@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from fnmatch import fnmatchcase
@@ -14,12 +13,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from alpasim_plugin.core.checksums import read_sealed
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lock import holder_of
-from alpasim_plugin.core.reading.files import as_shape, read_json_as
+from alpasim_plugin.core.reading.files import read_json_as
 from alpasim_plugin.log.run_folder.schema import (
-    CONTENTS,
     LOCK,
     ROLLOUTS,
     RUN_INFO,
@@ -45,8 +42,7 @@ class RunEntry:
         state: ``finished``; ``running`` where a process writes it; ``unfinished`` where none does
             any more; ``damaged`` where it cannot be read.
         problem: Why it is damaged, else empty.
-        info: ``run.json``, or its copy in ``contents.json`` where it is damaged; empty where there
-            is neither.
+        info: ``run.json``; empty where it cannot be read.
     """
 
     folder: Path
@@ -191,17 +187,13 @@ def read_entry(folder: Path, with_summary: bool = False) -> RunEntry:
         with_summary: Read ``summary.json`` too, so that damage of it is noticed here; its size
             makes it five times slower.
     """
-    finished = os.path.isfile(
-        folder / CONTENTS
-    )  # False too where the folder may not be looked into
+    finished = os.path.isfile(folder / SUMMARY)  # False too in a folder that cannot be read
     info: Mapping[str, Any] = {}
     problem = ""
     try:
-        info = _run_info(folder / RUN_INFO, is_copy=False)
+        info = read_json_as(RunInfo, folder / RUN_INFO, do_this=CHECK)
     except InputError as error:
         problem = f"{RUN_INFO}: {error.message}"
-        with suppress(InputError):  # the copy may be damaged too
-            info = _run_info(folder / CONTENTS, is_copy=True) if finished else info
     if problem or not finished:
         if holder_of(folder / LOCK) is not None:
             return RunEntry(folder, "running", "", info)
@@ -218,15 +210,7 @@ def read_entry(folder: Path, with_summary: bool = False) -> RunEntry:
     return entry
 
 
-def _run_info(path: Path, is_copy: bool) -> Mapping[str, Any]:
-    content, _ = read_sealed(path, CHECK)
-    shaped: Mapping[str, Any] = as_shape(
-        RunInfo, (content.get("run") or {}) if is_copy else content, path, CHECK
-    )
-    return shaped
-
-
-MARKS = frozenset((RUN_INFO, CONTENTS, LOCK))  # the first file of a run folder is its lock
+MARKS = frozenset((RUN_INFO, LOCK))  # the first file of a run folder is its lock
 SKIPPED = frozenset(("node_modules", "__pycache__", "site-packages"))
 
 

@@ -164,8 +164,6 @@ def test_a_run_behind_a_renderer_service_says_which_one(
                 [
                     *given,
                     "--no-report",
-                    "--certify",
-                    "none",
                     "--set",
                     "timing.duration_us=700000",
                     scene,

@@ -28,8 +28,6 @@ REPO = Path(__file__).resolve().parents[2]
 SHORT = (
     "--set",
     "timing.duration_us=600000",
-    "--certify",
-    "none",
     "--no-report",
     "--images",
     "none",

@@ -95,8 +95,6 @@ def test_a_policy_that_cannot_be_made_is_a_finding_and_one_that_is_not_there_an_
 SHORT = [
     "--workers",
     "1",
-    "--certify",
-    "none",
     "--no-report",
     "--set",
     "timing.duration_us=600000",

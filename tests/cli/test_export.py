@@ -46,8 +46,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "timing.warmup_us=200000",
         "--preset",
         "alpasim",
-        "--certify",
-        "none",
     ]
     assert run_command([*command, *timing, "--out", str(root), "smoke/straight"]) == 0
     return root

@@ -20,7 +20,7 @@ def test_the_verb_reports_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixt
     plan = make_plan(
         expand("smoke/lead_car", SHORT), ("clean",), ("lane-camera",), (0,), RunOptions()
     )
-    execute_run(plan, root, 1, ["simrun"], Announced(), certificate="none", report=False)
+    execute_run(plan, root, 1, ["simrun"], Announced(), report=False)
     assert run_command(["fork", f"{root}/{CELL}", "--at", "0.6", "--out", str(tmp_path / "f")]) == 0
     assert "continuation      equal to the log, bit for bit" in capsys.readouterr().out
     assert run_command(["fork", f"{root}/{CELL}", "--at", "0.6", "--renderer", "clena"]) == 2

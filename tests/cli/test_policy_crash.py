@@ -53,8 +53,6 @@ def test_the_terminal_has_file_line_and_the_end_of_the_traceback(
         late,
         "--set",
         "timing.duration_us=2000000",
-        "--certify",
-        "none",
         "--workers",
         "1",
     ]

@@ -42,8 +42,6 @@ DRIVE = (
     "clean",
     "--images",
     "none",
-    "--certify",
-    "none",
     "--no-report",
     "--seeds",
     "2",

@@ -31,8 +31,6 @@ QUICK = (
     "1",
     "--images",
     "none",
-    "--certify",
-    "none",
     "--no-report",
     "--json",
 )

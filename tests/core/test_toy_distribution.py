@@ -71,8 +71,6 @@ class Installed:
             out,
             "--images",
             "none",
-            "--certify",
-            "none",
             "--no-report",
             "--workers",
             str(workers),

@@ -17,7 +17,7 @@ from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.manifests import inspect_rollout
 
 # Members of summary.json that say how long something took, or how it was run.
-OF_THE_MACHINE = ("speed", "pool", "determinism")
+OF_THE_MACHINE = ("speed", "pool")
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,6 @@ DRIVE = (
     "clean",
     "--images",
     "none",
-    "--certify",
-    "none",
     "--no-report",
     "--policy",
     "constant-velocity",

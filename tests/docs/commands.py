@@ -49,7 +49,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
         "a record of six runs; tests/cli/test_gate_and_compare.py runs each of its cases",
     ),
 )
-SHORT = ("--set", "timing.duration_us=1200000", "--certify", "none", "--workers", "2")
+SHORT = ("--set", "timing.duration_us=1200000", "--workers", "2")
 LONGER = (
     "--set",
     "timing.duration_us=3000000",

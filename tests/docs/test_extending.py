@@ -18,8 +18,6 @@ REST = (
     "1",
     "--images",
     "none",
-    "--certify",
-    "none",
     "--no-report",
     "--json",
 )

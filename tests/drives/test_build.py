@@ -222,8 +222,6 @@ def test_policies_drive_behind_the_reconstruction_and_clean_is_refused(
     short = [
         "--set",
         "timing.duration_us=700000",
-        "--certify",
-        "none",
         "--workers",
         "1",
         "--no-report",

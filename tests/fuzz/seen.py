@@ -61,8 +61,6 @@ def surroundings(text: str) -> Make:
             "--images",
             "none",
             "--quiet",
-            "--certify",
-            "none",
         ],
     )
 
@@ -205,8 +203,6 @@ def background(name: str, data: bytes) -> Make:
             "--images",
             "none",
             "--quiet",
-            "--certify",
-            "none",
         ]
         return yaml(text, [*quick, "--workers", "1", "--out", str(folder / "out")])(folder)
 

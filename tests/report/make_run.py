@@ -65,7 +65,6 @@ class Plan:
     pictures: bool = True
     clips: bool = True
     flip_frames: bool = False
-    certificate: str = "equal"  # equal | different | skipped
     picture_px: tuple[int, int] = (256, 144)
     harm: dict[str, float] = field(
         default_factory=lambda: {"clean": 0.15, "3dgs": 2.6, "onefixer": 0.45}
@@ -463,7 +462,6 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
             "cells": [_failed(r) for r in failed],
         },
         "speed": speed,
-        "determinism": _certificate(plan),
         "pool": {
             "workers": 2,
             "threads_per_worker": 1,
@@ -471,27 +469,6 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
             "wall_s": sum(r["wall_s"] for r in rows) / 2,
         },
     }
-
-
-def _certificate(plan: Plan) -> dict[str, Any]:
-    if plan.certificate == "skipped":
-        return {"status": "skipped", "reason": "no rollout finished"}
-    digests = {
-        name: f"{k}a" * 32 for k, name in enumerate(("ego", "actors", "frames", "plans", "scores"))
-    }
-    cell = {"renderer": "clean", "policy": "lane-camera", "scene": "smoke/straight", "seed": 0}
-    entry = {
-        "status": plan.certificate,
-        "cell": cell,
-        "path": "rollouts/x",
-        "steps": 120,
-        "digests": digests,
-        "wall_s": 3.2,
-    }
-    if plan.certificate == "equal":
-        return entry | {"repeated": digests, "first_difference": None}
-    first = {"component": "frames", "t_us": 400_000, "step": 4, "what": "camera <b>front</b>"}
-    return entry | {"repeated": digests | {"frames": "ff" * 32}, "first_difference": first}
 
 
 def _failed(row: dict[str, Any]) -> dict[str, Any]:

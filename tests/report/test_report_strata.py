@@ -10,10 +10,7 @@ import pytest
 from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.metrics import METRICS
 from evaluators.opening import Run, read_run
-from evaluators.report import write_report
 from evaluators.report.charts import _line, forest, speed_against_error
-from evaluators.report.headline import find
-from evaluators.report.provenance import certificate
 from evaluators.report.strata import strata, strata_chart, stratum_rows
 from tests.report.make_run import Plan, make_run
 
@@ -189,34 +186,3 @@ def test_chart_labels_keep_their_digits(usual_run: Path) -> None:
     chart = strata_chart(one)
     assert chart is not None
     assert one.strata[0].label.replace("below ", "") in chart.svg
-
-
-@pytest.mark.parametrize(
-    ("status", "word", "said"),
-    [
-        ("equal", "equal", "is the same to the bit"),
-        (
-            "different",
-            "different",
-            "differs first in frames at step 4 (camera &lt;b&gt;front&lt;/b&gt;)",
-        ),
-        ("skipped", "not made", "No rollout was repeated: no rollout finished."),
-    ],
-)
-def test_the_certificate_is_shown_and_a_difference_stands_at_the_head(
-    tmp_path: Path, status: str, word: str, said: str
-) -> None:
-    folder = make_run(
-        tmp_path, Plan(renderers=("clean",), scenes=("a",), seeds=(0,), steps=5, certificate=status)
-    )
-    run = read_run(folder)
-    assert certificate(run).word == word
-    text = write_report(folder).read_text()
-    assert said in text
-    assert any("not deterministic" in caution for caution in find(run).cautions) == (
-        status == "different"
-    )
-
-
-def test_a_run_without_a_certificate_says_so(tmp_path: Path) -> None:
-    assert certificate(Run(tmp_path, {}, {}, (), ())).word == "none"

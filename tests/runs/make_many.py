@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.atomic import write_json
-from alpasim_plugin.log.run_folder.manifests import write_contents, write_run_json
+from alpasim_plugin.log.run_folder.manifests import write_run_json
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS_TABLE
 from alpasim_plugin.log.run_folder.writer import write_table
 from evaluators import aggregate
@@ -68,7 +68,6 @@ def make_one(root: Path, one: Many) -> Path:
         "failures": {"n_rollouts": len(rows), "n_failed": 0, "by_class": {}, "cells": []},
     }
     write_json(folder / "summary.json", summary)
-    write_contents(folder, {})
     return folder
 
 
@@ -167,7 +166,7 @@ def info_of(one: Many) -> dict[str, Any]:
 
 def unfinish(folder: Path) -> Path:
     """Turn a finished run folder into one that was stopped."""
-    for name in ("contents.json", "summary.json", "rollouts.parquet"):
+    for name in ("summary.json", "rollouts.parquet"):
         (folder / name).unlink()
     return folder
 

@@ -12,7 +12,6 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.log.run_folder.manifests import write_contents
 from alpasim_plugin.runs.summary import aggregate_runs
 from tests.runs.make_many import SCENES, Many, make_one
 
@@ -29,7 +28,6 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
             root, replace(whole, name=name, scenes={scene: SCENES[scene] for scene in mine})
         )
         pq.write_table(table.filter(pc.field("scene").isin(mine)), part / "rollouts.parquet")
-        write_contents(part, {})
     return root
 
 
@@ -80,6 +78,6 @@ def test_runs_that_do_not_belong_together_are_refused(night: Path, tmp_path: Pat
         aggregate_runs([night / "whole", night / "." / "whole"])
     with pytest.raises(InputError, match="choose one of clean, onefixer"):
         aggregate_runs([night / "whole"], "3dgs")
-    (strict / "contents.json").unlink()
+    (strict / "summary.json").unlink()
     with pytest.raises(InputError, match="not finished"):
         aggregate_runs([strict])

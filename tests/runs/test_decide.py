@@ -14,7 +14,7 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.log.run_folder.schema import CONTENTS, MANIFEST
+from alpasim_plugin.log.run_folder.schema import MANIFEST, SUMMARY
 from alpasim_plugin.runs import decide as decide_module
 from alpasim_plugin.runs.decide import Decided, drawing_order, execute_decision, plan_of_two
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
@@ -114,7 +114,7 @@ def test_an_interrupted_decision_continues_and_decides_the_same(
     before = told(decided_run[0])
     root = tmp_path / "again"
     shutil.copytree(decided_run[0], root)
-    (root / CONTENTS).unlink()
+    (root / SUMMARY).unlink()
     for scene in before["order"][2:]:  # as after a kill during the second batch
         for manifest in root.glob(f"rollouts/*/*/{scene}/0/{MANIFEST}"):
             manifest.unlink()

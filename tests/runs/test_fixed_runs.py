@@ -166,8 +166,6 @@ def test_the_terminal_names_the_fixer_before_and_after(
         "lane-camera",
         "--workers",
         "1",
-        "--certify",
-        "none",
         "--out",
         str(tmp_path),
     ]

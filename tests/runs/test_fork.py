@@ -10,26 +10,25 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from alpasim_plugin.core.checksums import SEAL
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.types import SensorSpec
 from alpasim_plugin.log import read_asl, read_facts, write_facts
 from alpasim_plugin.log.run_folder.manifests import write_run_json
 from alpasim_plugin.log.run_folder.reader import read_json
-from alpasim_plugin.runs.certificate import rollout_trace
 from alpasim_plugin.runs.fork import Change, fork_rollout, merge_sensors
 from alpasim_plugin.runs.logged_rollout import LoggedRollout, find_rollout
 from alpasim_plugin.runs.plan import RunOptions, make_plan
+from alpasim_plugin.runs.repeat import log_trace
 from alpasim_plugin.runs.reports import write_flips
 from alpasim_plugin.runs.run import RunResult, execute_run
 from alpasim_plugin.runs.why import replay
 from scenarios.suite import expand
 from tests.examples import first_of
-from tests.runs.test_certificate import BARE
 from tests.runs.test_runs import Announced
 
 pytestmark = pytest.mark.slow
 
+BARE = ("environment.buildings=0", "environment.trees_per_100m=0", "environment.poles_spacing_m=0")
 SHORT = (
     "timing.duration_us=1200000",
     "timing.warmup_us=200000",
@@ -53,7 +52,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (0,),
         RunOptions(),
     )
-    execute_run(plan, folder, 1, ["simrun"], Announced(), certificate="none", report=False)
+    execute_run(plan, folder, 1, ["simrun"], Announced(), report=False)
     return folder
 
 
@@ -88,8 +87,8 @@ def test_an_untouched_continuation_is_the_log_to_the_byte(
         past.folder / "rollout.asl"
     ).read_bytes()
     one, other = (
-        rollout_trace(past.folder, past.manifest),
-        rollout_trace(forked(tmp_path), read_json(forked(tmp_path) / "manifest.json")),
+        log_trace(past.folder),
+        log_trace(forked(tmp_path)),
     )
     assert one == other
 
@@ -192,7 +191,6 @@ def test_a_scenario_that_has_changed_is_refused(
     for name in ("rollouts.parquet", str(past.manifest["path"])):
         copy = shutil.copytree if (root / name).is_dir() else shutil.copy2
         copy(root / name, tmp_path / name)
-    del info[SEAL]
     write_run_json(tmp_path, info)
     with pytest.raises(InputError, match="has changed since the log was written"):
         find_rollout(tmp_path, CELL)

@@ -15,9 +15,7 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.log.run_folder.manifests import (
-    read_manifest,
     read_run_json,
-    write_contents,
     write_run_json,
 )
 from evaluators import resolve_evaluators
@@ -53,7 +51,7 @@ ALIKE = {
 LEAST_STEPS = 20
 # standard deviation of what one series leaves unexplained of the other, as a share of the other's
 SAME = 0.25
-ONLY = ("--images", "none", "--no-report", "--certify", "none", "--workers", "1", "smoke/curve")
+ONLY = ("--images", "none", "--no-report", "--workers", "1", "smoke/curve")
 
 
 @pytest.fixture(scope="module")
@@ -97,11 +95,6 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copytree(root / "first", root / name)
         table = table_of(resolve_evaluators([f"{plugin}:Height"]))
         write_run_json(root / name, read_run_json(root / "first") | {"metrics": table.as_dict()})
-        manifests = {
-            one.parent.relative_to(root / name).as_posix(): read_manifest(one.parent)[1]
-            for one in (root / name).rglob("manifest.json")
-        }
-        write_contents(root / name, manifests)
     return root
 
 

@@ -113,9 +113,7 @@ def test_alpasims_preset_drives_on_and_only_what_passed_the_end_is_driven_again(
 
     scene = load_scenario("smoke/straight", overrides=("timing.duration_us=2000000",))
     assert scene.stop_at_path_end
-    execute_run(
-        plan("paper"), tmp_path, 1, ["simrun"], Announced(), certificate="none", report=False
-    )
+    execute_run(plan("paper"), tmp_path, 1, ["simrun"], Announced(), report=False)
     remedies = {
         cell.policy.name: find_rollout_state(cell, tmp_path)[0] for cell in plan("alpasim").cells
     }

@@ -34,9 +34,7 @@ def cluster(repo: Path):
 
 def drive(plan, root: Path, executor: Executor):
     announced = Announced()
-    run = execute_run(
-        plan, root, 2, ["simrun"], announced, certificate="none", report=False, executor=executor
-    )
+    run = execute_run(plan, root, 2, ["simrun"], announced, report=False, executor=executor)
     return run, announced
 
 

@@ -64,9 +64,7 @@ def run(
     plan: RunPlan, root: Path, workers: int = 1, resume: bool = False
 ) -> tuple[RunResult, Announced]:
     announced = Announced()
-    return execute_run(
-        plan, root, workers, ["simrun"], announced, resume, certificate="none", report=False
-    ), announced
+    return execute_run(plan, root, workers, ["simrun"], announced, resume, report=False), announced
 
 
 def comparable(root: Path) -> dict[str, object]:
@@ -77,7 +75,7 @@ def comparable(root: Path) -> dict[str, object]:
     summary = {
         k: v
         for k, v in json.loads((root / "summary.json").read_text()).items()
-        if k not in ("speed", "pool", "determinism")
+        if k not in ("speed", "pool")
     }
     return {"rows": repr(rows), "logs": logs, "steps": repr(steps), "summary": summary}
 
@@ -158,9 +156,7 @@ def test_a_failing_policy_is_the_policys_fault_and_not_driven_again_unasked(tmp_
         ("ok", True),
     ]
     announced = Announced()
-    execute_run(
-        plan, tmp_path, 1, ["simrun"], announced, certificate="none", report=False, retry=True
-    )
+    execute_run(plan, tmp_path, 1, ["simrun"], announced, report=False, retry=True)
     assert sorted(announced.results) == [
         ("failed", False),
         ("failed", False),
@@ -216,8 +212,6 @@ def test_a_killed_run_loses_no_finished_rollout(tmp_path: Path) -> None:
         SHORT[0],
         "--workers",
         "1",
-        "--certify",
-        "none",
         "--no-report",
         "--out",
         str(tmp_path),
@@ -264,8 +258,6 @@ def test_a_full_disk_fails_the_rollout_and_keeps_the_finished_ones(tmp_path: Pat
         "1",
         "--set",
         SHORT[0],
-        "--certify",
-        "none",
         "--resume",
     ]
     common += ["--out", str(tmp_path)]

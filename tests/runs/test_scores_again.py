@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.core.checksums import SEAL
 from alpasim_plugin.log.run_folder.manifests import write_manifest
 from alpasim_plugin.log.run_folder.reader import read_json
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, MANIFEST
@@ -26,7 +25,7 @@ def one_rollout() -> RunPlan:
 
 def run(of: RunPlan, root: Path) -> list[tuple[str, bool]]:
     announced = Announced()
-    execute_run(of, root, 1, ["simrun"], announced, certificate="none", report=False)
+    execute_run(of, root, 1, ["simrun"], announced, report=False)
     return announced.results
 
 
@@ -41,7 +40,6 @@ def test_rollouts_are_scored_again_when_the_evaluators_changed_and_only_then(
     older = scored["metrics"] | {
         "progress": scored["metrics"]["progress"] | {"value": -7.0}
     }  # as if other evaluators had made it
-    del scored[SEAL]
     write_manifest(folder, scored | {"metrics": older})
 
     assert run(one_rollout(), tmp_path) == [("ok", True)]

@@ -103,7 +103,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (0,),
         RunOptions(),
     )
-    execute_run(plan, folder / "run", 1, ["simrun"], Announced(), certificate="none")
+    execute_run(plan, folder / "run", 1, ["simrun"], Announced())
     return folder / "run"
 
 
@@ -153,7 +153,7 @@ def test_a_rollout_that_broke_off_shows_its_error(
     plan = make_plan(
         expand(str(tmp_path / "bend.yaml")), (GREY,), (f"{HERE}:Raises",), (0,), RunOptions()
     )
-    execute_run(plan, tmp_path / "run", 1, ["simrun"], Announced(), certificate="none")
+    execute_run(plan, tmp_path / "run", 1, ["simrun"], Announced())
     assert run_command(["why", str(tmp_path / "run"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert any("seven" in text for text in found["found"])
@@ -170,7 +170,7 @@ def test_where_a_drive_ends_well_behind_another_renderer_the_pictures_are_named_
         (0,),
         RunOptions(),
     )
-    execute_run(plan, tmp_path / "run", 1, ["simrun"], Announced(), certificate="none")
+    execute_run(plan, tmp_path / "run", 1, ["simrun"], Announced())
     failed = next((tmp_path / "run").glob("rollouts/*/*/*/*/why.html")).parent
     words = "Behind clean the same rollout ends without an event."
     assert words in (failed / "why.html").read_text()

@@ -18,12 +18,11 @@ import pyarrow.compute as pc
 import pyarrow.dataset as pads
 
 from alpasim_plugin.core.reading import parsing, read_json_as, read_json_object
-from alpasim_plugin.log.run_folder.check import planned_cells
-from alpasim_plugin.log.run_folder.manifests import inspect_rollout, read_run_json
+from alpasim_plugin.log.run_folder.check import inspect_run
+from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.rows import Rollout, StoredRollouts, rollouts_of_table
 from alpasim_plugin.log.run_folder.schema import (
     AGAIN,
-    CONTENTS,
     KEYS,
     MANIFEST,
     ROLLOUTS,
@@ -277,26 +276,20 @@ def read_run(run_dir: Path | str) -> Run:
 
 
 def read_so_far(root: Path) -> RunSoFar[Run]:
-    """Read a run folder that may still be written: a manifest is written last, so a rollout that
-    has one is whole.
+    """Read a run folder that may be unfinished: with the finished rollouts alone.
 
     Raises:
         InputError: It holds no run, or its description or its tables are damaged.
     """
-    if (root / CONTENTS).exists():
+    if (root / SUMMARY).exists():
         run = read_run(root)
         return RunSoFar(run, len(run.rollouts), (), True)
-    info = read_run_json(root)
-    cells = planned_cells(info)
-    states = [inspect_rollout(root, cell) for cell in cells]
+    found = inspect_run(root)
+    damaged = {one.cell for one in found.damage}
     with parsing(root, AGAIN, "manifests from which no table can be made"):
-        table = rollout_table(
-            [state.manifest for state in states if state.manifest is not None and not state.damage]
-        )
-    damage = tuple(str(one) for state in states for one in state.damage)
-    return RunSoFar(
-        Run(root, info, {}, rollouts_of_table(table), metrics_in(table.column_names)),
-        len(cells),
-        damage,
-        False,
+        whole = [manifest for manifest in found.manifests if manifest["path"] not in damaged]
+        table = rollout_table(whole)
+    run = Run(
+        root, read_run_json(root), {}, rollouts_of_table(table), metrics_in(table.column_names)
     )
+    return RunSoFar(run, len(found.cells), tuple(map(str, found.damage)), False)

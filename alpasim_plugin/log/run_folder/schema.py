@@ -56,7 +56,6 @@ MANIFEST = "manifest.json"
 WHY_NAME = "why.html"
 LOCK = ".simrun.lock"
 RUN_INFO = "run.json"
-CONTENTS = "contents.json"
 SUMMARY = "summary.json"
 ROLLOUTS = "rollouts.parquet"
 STEPS = "steps.parquet"
@@ -108,7 +107,6 @@ RUN_FILES = (
         File(name, "reports for people and for CI", "report", is_required=False)
         for name in reversed(REPORTS)
     ),
-    File(CONTENTS, "digests of the tables and of all manifests, a copy of run.json", "end"),
     File("view.html", "drives side by side", "command", is_required=False),
     File("gate.json", "what the last gate found, for the report", "command", is_required=False),
     File("forks/", "forks of logged rollouts", "command", is_required=False),

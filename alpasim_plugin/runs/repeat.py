@@ -1,0 +1,96 @@
+"""Drive one rollout of a run a second time, to see whether the policy is repeatable."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.core.atomic import scratch_folder
+from alpasim_plugin.log import read_facts
+from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME
+from alpasim_plugin.log.trace import Key, first_difference, trace_log
+from alpasim_plugin.runs.cell import run_cell
+from alpasim_plugin.runs.plan import RunPlan
+
+
+def log_trace(folder: Path) -> dict[str, dict[Key, str]]:
+    """Read the components of a finished rollout from its log and its per-frame facts."""
+    return trace_log(folder / LOG_NAME, read_facts(folder / FRAMES_NAME))
+
+
+def repeat_rollout(
+    plan: RunPlan, root: Path, manifests: Sequence[Mapping[str, Any]], threads: int
+) -> dict[str, Any]:
+    """Drive the shortest finished rollout of a run again and compare the two logs.
+
+    Times that depend on the clock are no part of the comparison. Rollouts whose latency is measured
+    depend on the machine, so none of them is repeated.
+
+    Args:
+        plan: The run.
+        root: Its folder.
+        manifests: One per cell, in the plan's order.
+        threads: Threads of the second rollout.
+
+    Returns:
+        ``repeatable`` (None where nothing could be compared), ``reason`` for None, ``cell``,
+        ``digests`` of the two logs, and ``first_difference`` (component, t_us, step, what) or None.
+    """
+    finished = [
+        cell
+        for cell, manifest in zip(plan.cells, manifests, strict=True)
+        if manifest["status"] == "ok" and plan.scenarios[cell.scene].latency.kind != "measured"
+    ]
+    if not finished:
+        return _not_compared("no rollout with a fixed latency has finished")
+    cell = min(
+        finished,
+        key=lambda cell: (
+            plan.scenarios[cell.scene].end_us - plan.scenarios[cell.scene].start_us,
+            cell.rollout_key,
+        ),
+    )
+    folder = root / cell.folder
+    with scratch_folder(root / "repeat") as scratch:
+        again = run_cell(cell, plan.options, scratch, threads)
+        if again["status"] != "ok":
+            return _not_compared(f"the second rollout failed: {again['error']['message']}")
+        first = log_trace(folder)
+        second = log_trace(scratch / cell.folder)
+        digests = [_digest(path / LOG_NAME) for path in (folder, scratch / cell.folder)]
+    scenario = plan.scenarios[cell.scene]
+    difference = first_difference(first, second, scenario.start_us, scenario.rates.control_us)
+    return {
+        "repeatable": difference is None and digests[0] == digests[1],
+        "cell": dict(cell.names),
+        "digests": digests,
+        "first_difference": None if difference is None else difference.as_dict(),
+    }
+
+
+def repeat_line(repeat: Mapping[str, Any]) -> str:
+    """Return the result of a repeated rollout as one line of text.
+
+    Example:
+        >>> repeat_line({"repeatable": None, "reason": "no rollout has finished"})
+        'not compared: no rollout has finished'
+    """
+    if repeat["repeatable"] is None:
+        return f"not compared: {repeat['reason']}"
+    cell = "/".join(map(str, repeat["cell"].values()))
+    if repeat["repeatable"]:
+        return f"repeatable: {cell} was driven twice with equal logs"
+    difference = repeat["first_difference"] or {"component": "log", "step": None}
+    step = "" if difference["step"] is None else f" at step {difference['step']}"
+    return f"NOT repeatable: {cell} was driven twice and differs first in {difference['component']}{step}"
+
+
+def _not_compared(reason: str) -> dict[str, Any]:
+    return {"repeatable": None, "reason": reason}
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,60 @@
+"""`run --repeat`: one rollout is driven twice and the two logs are compared."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runs.repeat import repeat_line
+from alpasim_plugin.runs.run import execute_run
+from scenarios.suite import expand
+from tests.runs.test_runs import Announced
+
+BARE = ("environment.buildings=0", "environment.trees_per_100m=0", "environment.poles_spacing_m=0")
+SHORT, LONGER = "timing.duration_us=800000", "timing.duration_us=1200000"
+FORGETFUL = "tests.runs.broken_policies:RemembersEarlierRollouts"
+
+
+def plan_of(policy: str, *overrides: str) -> RunPlan:
+    refs = [
+        *expand("smoke/lead_car", (LONGER, *BARE, *overrides)),
+        *expand("smoke/straight", (SHORT, *BARE, *overrides)),
+    ]
+    return make_plan(refs, ("clean",), (policy,), (0,), RunOptions(images="none"))
+
+
+def repeated(plan: RunPlan, root: Path) -> dict:
+    result = execute_run(plan, root, 1, ["simrun"], Announced(), repeat=True, report=False)
+    found = json.loads((root / "run.json").read_text())["repeat"]
+    assert result.summary["repeat"] == found
+    assert not list(root.glob("*repeat*"))
+    return found
+
+
+@pytest.mark.parametrize("policy", ["constant-velocity", "lane-camera"])
+def test_the_shortest_rollout_is_repeatable(tmp_path: Path, policy: str) -> None:
+    found = repeated(plan_of(policy), tmp_path)
+    assert found["repeatable"]
+    assert found["cell"]["scene"] == "smoke-straight"
+    assert len(set(found["digests"])) == 1
+
+
+def test_a_policy_that_remembers_is_not_repeatable(tmp_path: Path) -> None:
+    found = repeated(plan_of(FORGETFUL), tmp_path)
+    assert found["repeatable"] is False
+    assert found["first_difference"]["component"] == "plans"
+    assert "NOT" in repeat_line(found)
+
+
+def test_measured_latency_is_not_repeated(tmp_path: Path) -> None:
+    found = repeated(plan_of("constant-velocity", "latency.kind=measured"), tmp_path)
+    assert found["repeatable"] is None
+
+
+def test_a_run_is_not_repeated_unless_it_is_asked_for(tmp_path: Path) -> None:
+    plan = plan_of("constant-velocity")
+    summary = execute_run(plan, tmp_path, 1, ["simrun"], Announced(), report=False).summary
+    assert "repeat" not in summary
