@@ -16,6 +16,7 @@ from typing import Any, Literal, get_args
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lock import holder_of
 from alpasim_plugin.core.reading.files import read_json_as
+from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.schema import (
     LOCK,
     ROLLOUTS,
@@ -23,7 +24,7 @@ from alpasim_plugin.log.run_folder.schema import (
     SUMMARY,
     cell_name,
 )
-from alpasim_plugin.log.run_folder.shapes import RunInfo, Summary
+from alpasim_plugin.log.run_folder.shapes import Summary
 from evaluators.metrics import MetricTable
 
 DOING = "listing runs"
@@ -191,16 +192,15 @@ def read_entry(folder: Path, with_summary: bool = False) -> RunEntry:
     info: Mapping[str, Any] = {}
     problem = ""
     try:
-        info = read_json_as(RunInfo, folder / RUN_INFO, do_this=CHECK)
+        info = read_run_json(folder)
     except InputError as error:
-        problem = f"{RUN_INFO}: {error.message}"
+        problem = error.message
     if problem or not finished:
         if holder_of(folder / LOCK) is not None:
             return RunEntry(folder, "running", "", info)
         return RunEntry(folder, "damaged" if problem else "unfinished", problem, info)
-    lost = [name for name in (SUMMARY, ROLLOUTS) if not os.path.isfile(folder / name)]
-    if lost:
-        return RunEntry(folder, "damaged", f"{lost[0]}: missing", info)
+    if not os.path.isfile(folder / ROLLOUTS):
+        return RunEntry(folder, "damaged", f"{ROLLOUTS}: missing", info)
     entry = RunEntry(folder, "finished", "", info)
     try:
         if with_summary or "outcome" not in info:

@@ -126,7 +126,7 @@ def test_an_interrupted_decision_continues_and_decides_the_same(
 
 
 def test_another_question_in_the_same_folder_is_refused(decided_run) -> None:
-    with pytest.raises(InputError, match="it holds another run"):
+    with pytest.raises(InputError):
         decide(decided_run[0], CLOSER, plan_of())
 
 
