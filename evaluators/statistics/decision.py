@@ -23,9 +23,9 @@ from typing import Any, Literal
 import numpy as np
 from typing_extensions import TypedDict
 
-from alpasim_plugin.core.checksums import read_sealed, write_sealed
+from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.reading.files import as_shape
+from alpasim_plugin.core.reading import read_json_as
 from alpasim_plugin.core.types import F64, I64, Bool, Direction, MetricInfo
 from alpasim_plugin.log.run_folder.sides import Side
 from evaluators.metrics import METRICS
@@ -510,7 +510,7 @@ def write_decision(root: Path, decision: Decision) -> None:
     Raises:
         InfrastructureError: The disk refuses.
     """
-    write_sealed(root / DECISION, decision)
+    write_json(root / DECISION, decision)
 
 
 def read_decision(root: Path) -> Decision | None:
@@ -522,9 +522,7 @@ def read_decision(root: Path) -> Decision | None:
     path = root / DECISION
     if not path.exists():
         return None
-    value, _ = read_sealed(path, AGAIN)
-    shaped: Mapping[str, Any] = as_shape(Decision, value, path, AGAIN)
-    return shaped  # type: ignore[return-value]
+    return read_json_as(Decision, path, do_this=AGAIN)
 
 
 def stopping_note(root: Path) -> str | None:

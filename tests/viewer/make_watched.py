@@ -166,7 +166,7 @@ def picture(k: int) -> np.ndarray:
     return np.repeat(np.tile(row, (CAMERA.height, 1))[..., None], 3, axis=2)
 
 
-def write_sealed_manifests(folder: Path) -> None:
+def write_manifests(folder: Path) -> None:
     """Give every rollout the manifest that a run writes, as far as readers of a running run need
     it.
     """
@@ -195,7 +195,7 @@ def unfinished(folder: Path, without: Sequence[str]) -> dict[str, bytes]:
     Returns:
         Path of such a rollout -> the manifest that it gets when it finishes.
     """
-    write_sealed_manifests(folder)
+    write_manifests(folder)
     info = json.loads((folder / "run.json").read_text())
     write_run_json(folder, {"key": "k", "content": "c"} | info)
     for name in ("summary.json", "rollouts.parquet", "steps.parquet", "flips.json"):
