@@ -155,14 +155,6 @@ def test_a_failing_policy_is_the_policys_fault_and_not_driven_again_unasked(tmp_
         ("ok", True),
         ("ok", True),
     ]
-    announced = Announced()
-    execute_run(plan, tmp_path, 1, ["simrun"], announced, report=False, retry=True)
-    assert sorted(announced.results) == [
-        ("failed", False),
-        ("failed", False),
-        ("ok", True),
-        ("ok", True),
-    ]
 
 
 def test_a_policy_without_its_file_is_tried_again(tmp_path: Path) -> None:
