@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from alpasim_plugin.core.shutter import at_share, bands
+from alpasim_plugin.core.shutter import bands
 from alpasim_plugin.core.types import F64, RenderRequest
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.raster.output import RasterOutput
@@ -45,23 +45,6 @@ def draw_request(request: RenderRequest, draw: Draw, backend: Backend) -> Raster
             band.put(whole, drawn[at])
         stats = {name: max(count, stats.get(name, 0)) for name, count in part.stats.items()}
     return RasterOutput(out.rgb, out.alpha, out.depth, stats)
-
-
-def plain_draw_request(request: RenderRequest, draw: Draw) -> RasterOutput:
-    """Return the same as `draw_request`, by the definition: for each time of exposure the whole
-    picture, of which its pixels are taken.
-    """
-    assert request.exposure is not None, "a frame without exposure has no reference but itself"
-    spec = request.camera
-    share = np.broadcast_to(request.exposure.share, (spec.height, spec.width))
-    out = _blank(spec.height, spec.width)
-    for time in np.unique(share[~np.isnan(share)]):
-        T, actors = at_share(request, float(time))
-        part = draw(camera_at(request, T), actors)
-        mine = share == time
-        for whole, drawn in ((out.rgb, part.rgb), (out.alpha, part.alpha), (out.depth, part.depth)):
-            whole[mine] = drawn[mine]
-    return out
 
 
 def camera_at(request: RenderRequest, T_world_camera: F64) -> PinholeCamera:

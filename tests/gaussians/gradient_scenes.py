@@ -20,7 +20,7 @@ from alpasim_plugin.gaussians.raster.rasterize_reference import (
     composite_reference,
     project_gaussians,
 )
-from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, rasterize_tensors
+from tests.gaussians.torch_rasterizer import GaussianTensors, rasterize_tensors
 
 
 def cloud_of(splats: Splats) -> GaussianCloud:

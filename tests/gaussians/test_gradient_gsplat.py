@@ -17,9 +17,9 @@ from alpasim_plugin.gaussians.raster import rasterize_gsplat
 from alpasim_plugin.gaussians.raster.gradient_types import Splats
 from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.raster.rasterize_gsplat import rasterize_gradient_gsplat
-from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, rasterize_tensors
 from tests.gaussians.gaussian_scenes import camera, random_cloud, random_rigid
 from tests.gaussians.gradient_scenes import FIELDS
+from tests.gaussians.torch_rasterizer import GaussianTensors, rasterize_tensors
 
 
 def stand_in(

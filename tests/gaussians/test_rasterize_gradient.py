@@ -17,8 +17,8 @@ from alpasim_plugin.gaussians.raster.rasterize_reference import (
     project_gaussians,
     rasterize_reference,
 )
-from alpasim_plugin.gaussians.sample_scene import driving_camera, driving_like_scene
 from alpasim_plugin.gaussians.sh import dc_from_rgb
+from tests.gaussians.driving_scene import driving_camera, driving_like_scene
 from tests.gaussians.gaussian_scenes import camera, random_cloud, random_rigid
 from tests.gaussians.gradient_scenes import (
     FIELDS,

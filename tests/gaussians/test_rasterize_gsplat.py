@@ -15,7 +15,6 @@ from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
 from alpasim_plugin.gaussians.raster import rasterize_gsplat
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
-from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, rasterize_tensors
 from tests.gaussians.gaussian_scenes import (
     assert_same_image,
     camera,
@@ -23,6 +22,7 @@ from tests.gaussians.gaussian_scenes import (
     random_rigid,
     splats,
 )
+from tests.gaussians.torch_rasterizer import GaussianTensors, rasterize_tensors
 
 
 def stand_in(**changes):

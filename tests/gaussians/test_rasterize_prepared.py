@@ -16,7 +16,7 @@ from alpasim_plugin.gaussians.raster import rasterize_cpu as cpu
 from alpasim_plugin.gaussians.raster.binning import depth_order
 from alpasim_plugin.gaussians.raster.raster_kernels import CUT, P0, P1, P2, P3, P4, P5, raster_tiles
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
-from alpasim_plugin.gaussians.sample_scene import driving_camera, driving_like_scene
+from tests.gaussians.driving_scene import driving_camera, driving_like_scene
 from tests.gaussians.gaussian_scenes import (
     assert_same_image,
     camera,

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
-from alpasim_plugin.gaussians.raster.rasterize_torch import (
+from alpasim_plugin.gaussians.sh import sh_colours
+from tests.gaussians.gaussian_scenes import assert_same_image, camera, random_cloud, random_rigid
+from tests.gaussians.torch_rasterizer import (
     GaussianTensors,
     rasterize_tensors,
     rasterize_torch,
     sh_colours_torch,
 )
-from alpasim_plugin.gaussians.sh import sh_colours
-from tests.gaussians.gaussian_scenes import assert_same_image, camera, random_cloud, random_rigid
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 

@@ -115,14 +115,3 @@ def test_counter_returns_what_it_held():
     cells = np.array([0, 10], np.int64)
     assert _counter(cells) == (10, 15)
     assert cells.tolist() == [0, 22]
-
-
-@njit
-def _bytes(x, out):
-    v.store(out, 0, v.load_bytes(x, 3))
-
-
-def test_bytes_become_floats_wherever_they_begin() -> None:
-    x, out = np.arange(240, 260).astype(np.uint8), np.empty(16, np.float32)
-    _bytes(x, out)
-    assert np.array_equal(out, x[3:19])

@@ -13,17 +13,37 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.core.shutter import bands_of, rolling
+from alpasim_plugin.core.shutter import at_share, bands_of, rolling
 from alpasim_plugin.core.types import F64, Behaviour, Exposure, RenderRequest, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.gaussian import clear_cache, scene_of
-from alpasim_plugin.renderers.rolling import Draw, draw_request, plain_draw_request
+from alpasim_plugin.renderers.rolling import Draw, camera_at, draw_request
 from tests.gaussians.scene_maps import parked, straight
 
 SHUTTER_S = 0.03
 STANDS = se2(20.0, -1.8, 0.0)
+
+
+def plain_draw_request(request: RenderRequest, draw: Draw) -> RasterOutput:
+    """Return the same as `draw_request`, by the definition: for each time of exposure the whole
+    picture, of which its pixels are taken.
+    """
+    assert request.exposure is not None, "a frame without exposure has no reference but itself"
+    spec = request.camera
+    share = np.broadcast_to(request.exposure.share, (spec.height, spec.width))
+    shape = (spec.height, spec.width)
+    out = RasterOutput(
+        np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32), np.zeros(shape, np.float32)
+    )
+    for time in np.unique(share[~np.isnan(share)]):
+        T, actors = at_share(request, float(time))
+        part = draw(camera_at(request, T), actors)
+        mine = share == time
+        for whole, drawn in ((out.rgb, part.rgb), (out.alpha, part.alpha), (out.depth, part.depth)):
+            whole[mine] = drawn[mine]
+    return out
 
 
 @pytest.fixture(scope="module")

@@ -31,9 +31,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.limits import SOURCE_BYTES
 from alpasim_plugin.core.reading import read_bytes, read_json_object
 from alpasim_plugin.core.reading.files import as_shape
@@ -238,32 +236,6 @@ def present(folder: Path, pictures: Sequence[Picture]) -> tuple[list[Picture], t
             "give the images that the file names",
         )
     return there, missing
-
-
-def write_views(folder: Path, views: Sequence[PosedView]) -> None:
-    """Write views in the form that `read_views` reads: images as PNG, axes of OpenCV; depth and
-    actors are not written.
-    """
-    frames = []
-    for i, view in enumerate(views):
-        camera = view.camera
-        frame: dict[str, Any] = {
-            "file_path": f"images/{i:04d}.png",
-            "transform_matrix": inverse(camera.T_camera_world).tolist(),
-            "w": camera.width,
-            "h": camera.height,
-            "fl_x": camera.fx,
-            "fl_y": camera.fy,
-            "cx": camera.cx,
-            "cy": camera.cy,
-        }
-        _write_image(folder / frame["file_path"], view.rgb[..., ::-1])
-        for key, image in (("sky", view.sky), ("mask", view.mask)):
-            if image is not None:
-                frame[f"{key}_path"] = f"{key}/{i:04d}.png"
-                _write_image(folder / frame[f"{key}_path"], image.astype(np.uint8) * 255)
-        frames.append(frame)
-    write_json(folder / FILE, {"axes": "opencv", "frames": frames})
 
 
 def read_points(path: Path) -> GaussianCloud:
@@ -479,12 +451,3 @@ def read_photograph(path: Path, lens: Lens, where: str, flag: int = cv2.IMREAD_C
         decode_image(data, f"{where}, {path}", do, flag | cv2.IMREAD_IGNORE_ORIENTATION),
         dtype=np.uint8,
     )
-
-
-def _write_image(path: Path, image: U8) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), image):
-        raise InputError(
-            f"{path}: the image could not be written",
-            "check the folder and the space on the disk",
-        )

@@ -9,30 +9,22 @@ through convolutions takes ten times as long on the CPU.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.image_metrics import (
     C1,
     C2,
     SIGMA_PX,
     WINDOW_PX,
     gaussian_blur,
-    psnr_db,
-    ssim,
 )
-from alpasim_plugin.gaussians.fit.views import PosedView
-from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,57 +44,6 @@ class Comparison:
     truth: npt.NDArray[np.uint8]
     psnr_db: float
     ssim: float
-
-
-def compare(
-    model: SceneGraph, views: Sequence[PosedView], threads: int | None = None
-) -> list[Comparison]:
-    """Render a model where views were taken; actors that it lacks are left out."""
-    return [_compare(model, view, threads) for view in views]
-
-
-def summary(rows: Sequence[Comparison]) -> dict[str, Any]:
-    """Return mean PSNR (dB) and SSIM over views, and PSNR by view.
-
-    Raises:
-        InputError: There is none.
-    """
-    if not rows:
-        raise InputError(
-            "no view: nothing to measure",
-            "hold views out, or leave the measurement out",
-        )
-    by_view = {row.name: round(row.psnr_db, 3) for row in rows}
-    return {
-        "views": len(rows),
-        "psnr_db": float(np.mean([r.psnr_db for r in rows])),
-        "ssim": float(np.mean([r.ssim for r in rows])),
-        "psnr_db_by_view": by_view,
-    }
-
-
-def write_pictures(folder: Path, rows: Sequence[Comparison]) -> None:
-    """Write one PNG a view: truth left, model right."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for row in rows:
-        cv2.imwrite(
-            str(folder / f"{row.name}.png"),
-            np.concatenate([row.truth, row.shown], axis=1)[..., ::-1],
-        )
-
-
-def _compare(model: SceneGraph, view: PosedView, threads: int | None) -> Comparison:
-    known = {name: T for name, T in view.actors.items() if name in model.actors}
-    shown = model.render(view.camera, known, threads).to_uint8()
-    counted = shown if view.mask is None else np.where(view.mask[..., None], shown, view.rgb)
-    share = 1.0 if view.mask is None else max(float(view.mask.mean()), 1e-9)
-    return Comparison(
-        view.name,
-        shown,
-        view.rgb,
-        psnr_db(counted, view.rgb) + 10 * float(np.log10(share)),
-        ssim(counted, view.rgb),
-    )
 
 
 class SsimTarget:

@@ -123,11 +123,6 @@ class SplatRecipe:
                 )
 
     @classmethod
-    def full(cls) -> SplatRecipe:
-        """Return the recipe of a reconstruction as good as some minutes on two cores allow."""
-        return cls(steps=1500)
-
-    @classmethod
     def street(cls) -> SplatRecipe:
         """Return the recipe of a recorded street: what three minutes of two cores allow
         (docs/experiments/references.md).
@@ -142,26 +137,6 @@ class SplatRecipe:
             needle_weight=0.02,
             lr_exposure=1e-3,
             sky_weight=0.2,
-        )
-
-    @classmethod
-    def under_trained(cls, seed: int = 0) -> SplatRecipe:
-        """Return the recipe of an under-trained reconstruction (paper, App. A): few Gaussians and
-        views, stopped early.
-
-        Recognisable as the scene on the logged path: soft, without thin things, with floaters;
-        holes and needles beside it.
-        """
-        return cls(
-            steps=200,
-            views=60,
-            points=9_000,
-            cap=12_000,
-            hold_out_every=0,
-            sh_degree=1,
-            densify_until=0.8,
-            densify_every=30,
-            seed=seed,
         )
 
     def lr_means_at(self, step: int) -> float:

@@ -29,7 +29,7 @@ def rasterize(
         camera: From where.
         background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything, 0..1.
         backend: ``cpu`` (fast), ``reference`` (float64, slow, the definition), ``torch``
-            (differentiable) or ``gsplat`` (GPU).
+            (that of the differentiable `rasterize_gradient`) or ``gsplat`` (GPU).
         near_m: Gaussians whose centre is nearer are left out.
         lod_px: Gaussians whose screen radius before the low-pass is smaller are left out; 0 draws
             all.
@@ -59,7 +59,7 @@ def rasterize(
 
         return rasterize_reference(cloud, camera, background, near_m=near_m, lod_px=lod_px)
     if backend == "torch":
-        from alpasim_plugin.gaussians.raster.rasterize_torch import rasterize_torch
+        from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_torch
 
         return rasterize_torch(cloud, camera, background, near_m=near_m, lod_px=lod_px)
     if backend == "gsplat":

@@ -2,7 +2,7 @@
 compiled CPU kernels.
 
 On a GPU the same function goes through gsplat (`alpasim_plugin.gaussians.raster.rasterize_gsplat`).
-`rasterize_torch` is the reference implementation.
+`rasterize_reference` is the definition.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from torch import Tensor
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import (
     BUNDLE,
     GEO_SIZE,
@@ -37,6 +38,7 @@ from alpasim_plugin.gaussians.raster.gradient_kernels import (
 )
 from alpasim_plugin.gaussians.raster.gradient_project import pack, splat_gradients, sum_pairs
 from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput, ScreenStatistics, Splats
+from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.rasterize_cpu import (
     WORTH_THREADS,
     Buffers,
@@ -274,6 +276,7 @@ def rasterize_gradient(
     *,
     background: Tensor | None = None,
     near_m: float = NEAR_M,
+    lod_px: float = 0.0,
     threads: int | None = None,
 ) -> GradientOutput:
     """Render splats by the rule of `rasterize_reference`, with gradients of every parameter and of
@@ -288,6 +291,8 @@ def rasterize_gradient(
         camera: From where.
         background: ``(3,)`` or ``(H, W, 3)``, 0..1; None is black. May require gradients.
         near_m: Gaussians whose centre is nearer are left out.
+        lod_px: On the CPU, Gaussians whose radius before the low-pass is smaller are left out; 0
+            draws all.
         threads: CPU threads; None takes ``numba.get_num_threads()``. Neither image nor gradients
             depend on it.
 
@@ -318,7 +323,7 @@ def rasterize_gradient(
 
         return rasterize_gradient_gsplat(splats, camera, behind, near_m)
     pose = node_poses([None], np.array([False]), camera, near_m)[0]
-    view = _View(camera, camera_numbers(camera), pose, thread_count(threads))
+    view = _View(camera, camera_numbers(camera, lod_px), pose, thread_count(threads))
     screen = ScreenStatistics(torch.zeros(len(splats), dtype=torch.int32))
     colour, alpha, depth_sum = _Rasterize.apply(
         splats.means,
@@ -332,6 +337,32 @@ def rasterize_gradient(
     rgb = colour if behind is None else colour + (1 - alpha)[..., None] * behind
     depth = torch.where(alpha > 0, depth_sum / torch.where(alpha > 0, alpha, 1.0), 0.0)
     return GradientOutput(rgb, alpha, depth, screen)
+
+
+def rasterize_torch(
+    cloud: GaussianCloud,
+    camera: PinholeCamera,
+    background: Background = (0.0, 0.0, 0.0),
+    *,
+    near_m: float = NEAR_M,
+    lod_px: float = 0.0,
+) -> RasterOutput:
+    """Render a cloud by `rasterize_gradient`, without gradients.
+
+    Raises:
+        InputError: The cloud holds Gaussians that cannot be drawn, or the background does not fit.
+    """
+    cloud.require_drawable()
+    behind = torch.as_tensor(background_image(background, camera)).expand(
+        camera.height, camera.width, 3
+    )
+    with torch.no_grad():
+        out = rasterize_gradient(
+            Splats.from_cloud(cloud), camera, background=behind, near_m=near_m, lod_px=lod_px
+        )
+    return RasterOutput(
+        out.rgb.clamp(0, 1).numpy(), out.alpha.numpy(), out.depth.numpy(), {"gaussians": len(cloud)}
+    )
 
 
 def _checked_background(

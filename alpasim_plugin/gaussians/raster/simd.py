@@ -137,21 +137,6 @@ def load(typingctx, array, index):
 
 
 @intrinsic
-def load_bytes(typingctx, array, index):
-    """Return sixteen consecutive uint8 of a one-dimensional contiguous array as float32, without
-    bounds check.
-    """
-
-    def codegen(context, builder, sig, args):
-        pointer = _element_pointer(
-            context, builder, sig.args[0], args[0], args[1], ir.VectorType(ir.IntType(8), LANES)
-        )
-        return builder.uitofp(builder.load(pointer, align=1), _VECTORS["f32"])
-
-    return F32X16(array, types.intp), codegen
-
-
-@intrinsic
 def store(typingctx, array, index, value):
     """Write sixteen consecutive elements of a one-dimensional contiguous array, without bounds
     check.

@@ -10,9 +10,9 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
 from alpasim_plugin.gaussians.scene.build_actors import build_actors
-from alpasim_plugin.gaussians.scene.build_facades import build_facades, place_houses
+from alpasim_plugin.gaussians.scene.build_facades import build_facades
 from alpasim_plugin.gaussians.scene.build_road import build_road
-from alpasim_plugin.gaussians.scene.build_street import build_street, lamp_posts
+from alpasim_plugin.gaussians.scene.build_street import build_street
 from alpasim_plugin.gaussians.scene.paint import paint_strokes
 from alpasim_plugin.gaussians.scene.scene_graph import (
     SceneGraph,
@@ -54,16 +54,6 @@ def build_scene(scenario: Scenario, height_at: HeightAt) -> SceneGraph:
     return SceneGraph(
         [lit(node, light) for node in (*nodes, *facades, *build_street(site, houses))], actors, sky
     )
-
-
-def street_lights(scenario: Scenario, height_at: HeightAt) -> F64:
-    """Return where a scene's street lights hang ``(N, 3)``, metres, world; none where a background
-    file replaces the street.
-    """
-    if scenario.background is not None:
-        return np.zeros((0, 3))
-    site = make_site(scenario, height_at)
-    return lamp_posts(site, place_houses(site)).tip
 
 
 def with_background(graph: SceneGraph, cloud: GaussianCloud, T_world_file: F64) -> SceneGraph:

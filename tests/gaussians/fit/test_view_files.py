@@ -11,8 +11,9 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.gaussians.fit.photographs import FILE, read_points, read_views, write_views
+from alpasim_plugin.gaussians.fit.photographs import FILE, read_points, read_views
 from tests.gaussians.fit.conftest import Posed
+from tests.gaussians.fit.view_files import write_views
 
 
 def change(folder: Path, **keys: object) -> None:
