@@ -23,7 +23,6 @@ from alpasim_plugin.world.idm import (
     bodies_from,
     concatenate,
     find_leader,
-    find_leaders,
     idm_acceleration,
     moved_on,
     nearest_ahead,
@@ -246,17 +245,10 @@ def drive(
         own_row = {
             id(car): row for row, car in enumerate(driving, start=len(everybody.xy) - len(driving))
         }
-        for path_of, rows in _by_path(cars):
-            group = [cars[i] for i in rows]
-            fronts, halves = (
-                np.array([car.front_s for car in group]),
-                np.array([car.f.box.width_m / 2 for car in group]),
-            )
-            own_rows = np.array([own_row.get(id(car), -1) for car in group])
-            for car, leader in zip(
-                group, find_leaders(path_of, fronts, halves, everybody, own_rows), strict=True
-            ):
-                car.decide(leader)
+        for car in cars:
+            half_width_m = car.f.box.width_m / 2
+            row = own_row.get(id(car), -1)
+            car.decide(find_leader(car.f.path, car.front_s, half_width_m, everybody, own_row=row))
         for _ in range(DECISION_US // LOG_STEP_US):
             expert.advance(wanted, sub_s)
             log_s.append(expert.s)

@@ -3,7 +3,6 @@ scenario's degradation instead.
 
 background.ply, actors/*.ply, sky.png, reconstruction.json      what `Reconstruction.save` writes
 sky_views.npz       cameras of the views and, bit by bit, where they show sky
-hashes.json         file name to SHA-256; written last
 
 An imported drive has the reconstruction that was fitted to its photographs, shown as it is. Its sky
 is a layer of its own: where the model is transparent above the horizon a frame is opaque, because
@@ -179,16 +178,24 @@ def scene_from(scenario: Scenario, model: Reconstruction, sky_views: Sequence[Sk
     """Join a reconstruction's parts; actors that it lacks are spliced in from the scene as built
     (paper, App. A).
     """
-    tile = tile_numbers(model.background.means[:, :2], TILE_M, 1_000_003)
-    background = nodes_by_tile("fit", [(0.0, model.background, tile)])
     light = np.array(LIGHT[scenario.environment.sky])
-    actors = [
-        SceneNode(a.actor_id, "actor", (Level(0.0, model.actors[a.actor_id]),))
-        if a.actor_id in model.actors
-        else lit(build_actor(a, scenario.scene_id, scenario.seed), light)
-        for a in scenario.actors
+    missing = [
+        lit(build_actor(actor, scenario.scene_id, scenario.seed), light)
+        for actor in scenario.actors
+        if actor.actor_id not in model.actors
     ]
-    return Model(SceneGraph(background, actors, model.sky), SkyMask(sky_views))
+    return Model(_graph(model, missing), SkyMask(sky_views))
+
+
+def _graph(model: Reconstruction, missing: Sequence[SceneNode]) -> SceneGraph:
+    """Join a model and the actors that it lacks; its background is cut into tiles."""
+    tile = tile_numbers(model.background.means[:, :2], TILE_M, 1_000_003)
+    fitted = [
+        SceneNode(name, "actor", (Level(0.0, cloud),)) for name, cloud in model.actors.items()
+    ]
+    return SceneGraph(
+        nodes_by_tile("fit", [(0.0, model.background, tile)]), [*fitted, *missing], model.sky
+    )
 
 
 class ImportedRenderer(Renderer):
@@ -250,24 +257,12 @@ def graph_of(scenario: Scenario) -> SceneGraph:
 
     def read() -> SceneGraph:
         model = Reconstruction.load(folder)
-        background = nodes_by_tile(
-            "fit",
-            [
-                (
-                    0.0,
-                    model.background,
-                    tile_numbers(model.background.means[:, :2], TILE_M, 1_000_003),
-                )
-            ],
-        )
-        actors = [
-            SceneNode(a.actor_id, "actor", (Level(0.0, model.actors[a.actor_id]),))
-            if a.actor_id in model.actors
-            else build_actor(a, scenario.scene_id, scenario.seed)
-            for a in scenario.actors
-            if not a.actor_id.startswith(STANDING_ID)
+        missing = [
+            build_actor(actor, scenario.scene_id, scenario.seed)
+            for actor in scenario.actors
+            if actor.actor_id not in model.actors and not actor.actor_id.startswith(STANDING_ID)
         ]
-        return SceneGraph(background, actors, model.sky)
+        return _graph(model, missing)
 
     return in_memory(f"imported:{scene_key(scenario)}:{folder}", read)
 

@@ -5,19 +5,17 @@ the code), and keep its files.
 from __future__ import annotations
 
 import hashlib
+import json
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from alpasim_plugin.core.atomic import write_json
-from alpasim_plugin.core.checksums import sha256_of
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts.source import own_code_digest
-from alpasim_plugin.core.reading import read_json_as
 from alpasim_plugin.core.types import Degradation, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
@@ -139,14 +137,6 @@ _NO_MATTER = frozenset(
 )
 
 
-class Sink(Protocol):
-    """What takes bytes: a hash."""
-
-    def update(self, data: bytes, /) -> object:
-        """Take more bytes."""
-        ...
-
-
 def reconstruction_key(scenario: Scenario, recipe: object) -> str:
     """Return 32 hexadecimal digits that two reconstructions share only if they are the same.
 
@@ -160,7 +150,8 @@ def reconstruction_key(scenario: Scenario, recipe: object) -> str:
         OSError: The scenario's background file cannot be read.
     """
     digest = hashlib.blake2b(digest_size=16)
-    feed(digest, [own_code_digest(BUILD), recipe, scenario], skip=_NO_MATTER)
+    content = [own_code_digest(BUILD), _content(recipe), _content(scenario)]
+    digest.update(json.dumps(content, sort_keys=True).encode())
     if scenario.background is not None:
         with Path(scenario.background.path).open("rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
@@ -181,48 +172,26 @@ def model_key(scenario: Scenario) -> str | None:
     return reconstruction_key(scenario, recipe_of(scenario))
 
 
-def feed(sink: Sink, value: Any, skip: frozenset[str] = frozenset()) -> None:
-    """Feed a value to a hash, every part with its type and length in front, so that different
-    values give different bytes.
-
-    Args:
-        sink: The hash.
-        value: See `reconstruction_key`.
-        skip: Names of dataclass fields to leave out, wherever they stand.
+def _content(value: object) -> object:
+    """Return what JSON can write of a value, without the fields that do not matter; arrays by their
+    digest.
     """
-
-    def begin(kind: str, length: int) -> None:
-        sink.update(f"{kind}:{length};".encode())
-
     if isinstance(value, np.ndarray):
-        begin(f"{value.dtype.str}{value.shape}", value.nbytes)
-        sink.update(np.ascontiguousarray(value).tobytes())
-    elif is_dataclass(value) and not isinstance(value, type):
-        named = [(f.name, getattr(value, f.name)) for f in fields(value) if f.name not in skip]
-        begin(type(value).__name__, len(named))
-        for name, part in named:
-            feed(sink, name)
-            feed(sink, part, skip)
-    elif isinstance(value, Mapping):
-        begin("mapping", len(value))
-        for name in sorted(value):
-            feed(sink, name)
-            feed(sink, value[name], skip)
-    elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        begin("sequence", len(value))
-        for part in value:
-            feed(sink, part, skip)
-    elif value is None or isinstance(value, bool | int | float | str | np.number):
-        plain = value.item() if isinstance(value, np.number) else value
-        text = f"{type(plain).__name__}={plain!r}".encode()
-        begin("value", len(text))
-        sink.update(text)
-    else:
-        raise TypeError(f"no rule to hash a {type(value).__name__}")
+        digest = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+        return [value.dtype.str, value.shape, digest]
+    if is_dataclass(value):
+        named = {field.name: getattr(value, field.name) for field in fields(value)}
+        kept = {name: part for name, part in named.items() if name not in _NO_MATTER}
+        return [type(value).__name__, _content(kept)]
+    if isinstance(value, Mapping):
+        return {name: _content(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_content(part) for part in value]
+    return value.item() if isinstance(value, np.number) else value
 
 
-HASHES, SKY_VIEWS = "hashes.json", "sky_views.npz"
-DOING, DO_THIS = "reading a reconstruction", "remove its folder; it is made again when it is needed"
+SKY_VIEWS = "sky_views.npz"
+DO_THIS = "remove its folder; it is made again when it is needed"
 
 
 def write_model(
@@ -244,37 +213,17 @@ def write_model(
         T_camera_world=np.array([v.camera.T_camera_world for v in sky_views]).reshape(-1, 4, 4),
         sky=np.concatenate(bits) if bits else np.zeros(0, np.uint8),
     )
-    write_json(folder / HASHES, {name: sha256_of(folder / name) for name in _files(folder)})
 
 
 def read_model(folder: Path) -> tuple[Reconstruction, list[SkyView]]:
-    """Read what `write_model` wrote: exactly the files that it lists, each with the hash it was
-    written with.
+    """Read what `write_model` wrote.
 
     Raises:
-        InputError: A file is missing or is another one than was written.
+        InputError: A file is missing or damaged.
     """
-    from alpasim_plugin.gaussians.fit.reconstruction import (
-        Reconstruction,
-    )  # it loads the rasteriser, which a key needs not
+    # Imported on use: it loads the rasteriser, which a key does not need.
+    from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 
-    hashes = read_json_as(dict[str, str], folder / HASHES, do_this=DO_THIS)
-    there = set(_files(folder)) - {HASHES}
-    odd = sorted(there ^ set(hashes))
-    if odd or not hashes:  # a list that names other files than are there checks nothing
-        found = (
-            f"{odd[0]} is {'not listed' if odd[0] in there else 'missing'}"
-            if odd
-            else "it lists no file"
-        )
-        raise _damaged(folder / HASHES, found)
-    for name, expected in hashes.items():
-        try:
-            content = sha256_of(folder / name)
-        except OSError as error:
-            raise _damaged(folder / name, error.strerror or str(error)) from error
-        if content != expected:
-            raise _damaged(folder / name, "not the content that was written")
     return Reconstruction.load(folder), _read_sky_views(folder / SKY_VIEWS)
 
 
@@ -288,7 +237,7 @@ def _read_sky_views(path: Path) -> list[SkyView]:
             Ts = file["T_camera_world"]
             bits = file["sky"]
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise _damaged(path, str(error)) from error
+        raise InputError(f"{path}: {error}", DO_THIS) from error
     views, first = [], 0
     for (width, height), K, T in zip(sizes.tolist(), Ks, Ts, strict=True):
         length = -(-width * height // 8)
@@ -298,13 +247,3 @@ def _read_sky_views(path: Path) -> list[SkyView]:
         views.append(SkyView(PinholeCamera(width, height, K, T), sky.astype(np.float32)))
         first += length
     return views
-
-
-def _files(folder: Path) -> list[str]:
-    return sorted(
-        path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
-    )
-
-
-def _damaged(path: Path, found: str) -> InputError:
-    return InputError(f"{path}: {found}", DO_THIS)

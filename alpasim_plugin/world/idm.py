@@ -1,9 +1,4 @@
-"""The Intelligent Driver Model and the choice of the leader it follows, for one driver and for all
-drivers on one line at once.
-
-`find_leader` is the plain version for one driver. `find_leaders` places every body on the line a
-single time, not once for every driver; where a line passes the same body twice (a loop, a crossing
-with itself) the plain version decides, since there the place of a body depends on who asks.
+"""The Intelligent Driver Model and the choice of the leader that a driver follows.
 
 Source: M. Treiber, A. Hennecke, D. Helbing, "Congested traffic states in empirical observations and
     microscopic simulations",
@@ -100,10 +95,6 @@ class Bodies:
     half_length_m: F64  # (M,)
     half_width_m: F64  # (M,)
     velocity: F64  # (M, 2) metres per second, world
-
-    def only(self, rows: I64) -> Bodies:
-        """Return the rows ``(m,)`` of these numbers."""
-        return Bodies(*(column[rows] for column in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -254,81 +245,3 @@ def concatenate(parts: Sequence[Bodies]) -> Bodies:
             for columns in zip(*(vars(part).values() for part in parts), strict=True)
         )
     )
-
-
-COARSE_M = 4.0  # the line is looked at this often to find which bodies are near it
-
-
-def find_leaders(
-    path: Path,
-    front_s_m: F64,
-    half_width_m: F64,
-    bodies: Bodies,
-    own_row: I64,
-    horizon_m: float = 120.0,
-    margin_m: float = 0.2,
-) -> list[Leader]:
-    """Return for each of ``(K,)`` drivers on a path what `find_leader` returns for it.
-
-    Args:
-        path: Their line.
-        front_s_m: ``(K,)`` arc length of the front bumpers.
-        half_width_m: ``(K,)``.
-        bodies: Everybody.
-        own_row: ``(K,)`` each driver's own row in ``bodies``, -1 where it has none.
-        horizon_m: How far they look.
-        margin_m: Beside their bodies.
-    """
-    touching, twice = near_line(path, bodies, float(half_width_m.max()) + margin_m, horizon_m)
-    if twice:
-        drivers = zip(front_s_m.tolist(), half_width_m.tolist(), own_row.tolist(), strict=True)
-        return [
-            find_leader(path, front, half, bodies, horizon_m, margin_m, row)
-            for front, half, row in drivers
-        ]
-    placed = (
-        spans(path, path.length_m / 2, bodies.only(touching), np.inf, window=False)
-        if len(touching)
-        else None
-    )
-    if placed is None:
-        return [NO_LEADER] * len(front_s_m)
-    index, reach = touching[placed.index], (half_width_m + margin_m)[:, None]
-    ahead = (placed.low < reach) & (placed.high > -reach) & (index != own_row[:, None])  # (K, m)
-    ahead &= (placed.rear > front_s_m[:, None] - 2.0) & (
-        placed.rear < front_s_m[:, None] + horizon_m
-    )
-    first = np.argmin(np.where(ahead, placed.rear, np.inf), axis=1)
-    leaders = []
-    for k, front, any_ahead in zip(
-        first, front_s_m.tolist(), ahead.any(axis=1).tolist(), strict=True
-    ):
-        leaders.append(
-            Leader(float(placed.rear[k] - front), float(placed.speed[k]), int(index[k]))
-            if any_ahead
-            else NO_LEADER
-        )
-    return leaders
-
-
-def near_line(path: Path, bodies: Bodies, reach_m: float, horizon_m: float) -> tuple[I64, bool]:
-    """Return the rows of bodies that may reach into a corridor along a path, and whether the path
-    passes one of them twice.
-
-    A body that touches the corridor has its centre within its half diagonal and the corridor's
-    reach of the line; the tangents at the line's ends belong to it.
-    """
-    s = np.arange(-horizon_m, path.length_m + horizon_m + COARSE_M, COARSE_M)
-    xyz, yaw = path.at(s)
-    beyond = s - np.clip(s, 0.0, path.length_m)
-    x, y = xyz[:, 0] + beyond * np.cos(yaw), xyz[:, 1] + beyond * np.sin(yaw)
-    within = (
-        2.0 * np.hypot(bodies.half_length_m, bodies.half_width_m) + reach_m + 0.5 * COARSE_M + 1.0
-    )
-    touches: Bool = (bodies.xy[:, 0, None] - x) ** 2 + (bodies.xy[:, 1, None] - y) ** 2 <= within[
-        :, None
-    ] ** 2  # (M, S)
-    runs = touches[:, 0].astype(np.int64) + np.count_nonzero(
-        touches[:, 1:] & ~touches[:, :-1], axis=1
-    )
-    return np.flatnonzero(runs), bool((runs > 1).any())

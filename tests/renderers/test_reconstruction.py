@@ -4,7 +4,6 @@ pixels.
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -34,7 +33,6 @@ from alpasim_plugin.renderers.gaussian import (
 from alpasim_plugin.renderers.reconstruction import KIND, ReconstructionRenderer, ensure
 from alpasim_plugin.renderers.reconstruction_build import misplaced
 from alpasim_plugin.renderers.reconstruction_key import (
-    HASHES,
     read_model,
     recipe_of,
     reconstruction_key,
@@ -183,22 +181,13 @@ def test_damaged_file_is_noticed_and_the_same_model_made_again_by_more_threads(
 ) -> None:
     scenario = fitted.scenario
     folder = cache / KIND / reconstruction_key(scenario, recipe_of(scenario))
-    before = json.loads((folder / HASHES).read_text())
-    assert set(before) == {
-        "background.ply",
-        "actors/000.ply",
-        "reconstruction.json",
-        "sky.png",
-        "sky_views.npz",
-    }
-    data = bytearray((folder / "background.ply").read_bytes())
-    data[-10] ^= 255
-    (folder / "background.ply").write_bytes(data)
+    data = (folder / "background.ply").read_bytes()
+    (folder / "background.ply").write_bytes(data[:-10])
     with pytest.raises(InputError):
         read_model(folder)
     ensure(scenario, recipe_of(scenario), threads=2)
     assert "is damaged" in capfd.readouterr().err
-    assert json.loads((folder / HASHES).read_text()) == before
+    assert (folder / "background.ply").read_bytes() == data
 
 
 def test_a_reconstruction_of_the_wheel_is_not_fitted(

@@ -16,8 +16,8 @@ from alpasim_plugin.core import limits as bounds
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import Bound
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.world.idm import Bodies, find_leader, find_leaders
-from alpasim_plugin.world.path import FEW_DISTANCES, nearest, polyline_path
+from alpasim_plugin.world.idm import Bodies
+from alpasim_plugin.world.path import FEW_DISTANCES, nearest
 from scenarios.budget import check_scenario
 from scenarios.load import load_scenario
 from tests.fuzz import seen
@@ -116,34 +116,6 @@ def queue(n: int, seed: int) -> tuple[Bodies, np.ndarray]:
     yaw = random.uniform(-0.3, 0.3, n)
     velocity = random.uniform(0, 10, (n, 1)) * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
     return Bodies(xy, yaw, np.full(n, 2.3), np.full(n, 0.9), velocity), s
-
-
-@pytest.mark.parametrize("bend", [0.0, 0.004, -0.006])
-def test_leaders_of_a_queue_are_those_that_each_driver_finds_alone(bend: float) -> None:
-    bodies, s = queue(40, 5)
-    x = np.arange(0, 420.0)
-    heading = bend * x
-    path = polyline_path(np.column_stack([np.cumsum(np.cos(heading)), np.cumsum(np.sin(heading))]))
-    xyz, yaw = path.at(s, bodies.xy[:, 1])
-    bodies = replace(bodies, xy=xyz[:, :2], yaw=yaw + bodies.yaw)
-    fronts, half = s + 2.3, np.full(len(s), 0.9)
-    together = find_leaders(path, fronts, half, bodies, np.arange(len(s)))
-    alone = [find_leader(path, front, 0.9, bodies, own_row=i) for i, front in enumerate(fronts)]
-    assert together == alone
-    assert sum(leader.index >= 0 for leader in alone) > 20
-
-
-def test_on_a_loop_the_place_of_a_body_depends_on_who_asks() -> None:
-    angle = np.linspace(0, 2 * np.pi, 300)
-    path = polyline_path(np.column_stack([60 * np.sin(angle), 60 - 60 * np.cos(angle)]))
-    places, yaw = path.at(np.array([5.0, 30.0, path.length_m - 4.0]))
-    bodies = Bodies(places[:, :2], yaw, np.full(3, 2.3), np.full(3, 0.9), np.zeros((3, 2)))
-    fronts, rows = np.array([7.3, 32.3, path.length_m - 1.7]), np.arange(3)
-    alone = [
-        find_leader(path, front, 0.9, bodies, own_row=row)
-        for front, row in zip(fronts, rows, strict=True)
-    ]
-    assert find_leaders(path, fronts, np.full(3, 0.9), bodies, rows) == alone
 
 
 def test_the_tree_names_the_station_that_comparing_all_names() -> None:
