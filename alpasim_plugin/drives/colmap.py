@@ -24,7 +24,6 @@ from alpasim_plugin.drives.source import Points, SourceDrive, timed
 from alpasim_plugin.gaussians.fit.lens import Lens
 from alpasim_plugin.gaussians.fit.photographs import Picture
 
-DOING = "reading a COLMAP model"
 DO_THIS = "give a whole model: cameras, images and points3D, all .txt or all .bin"
 PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0")  # of the model below the folder
 PICTURES = (

@@ -94,8 +94,6 @@ class GroundStrip:
         knots, below: ``(K,)`` stations, and how far the surface lies below the path there
             (negative).
         tilt_knots, tilt: ``(L,)`` stations, and the slope to the left there.
-        cross_knots, cross: ``(M,)`` offsets to the left, and the cross section there, the same
-            along the whole drive: gutters and kerbs.
         used: How many points carry it.
         section_errors: ``(S,)`` medians of what the points of each section with enough of them say
             against it.
@@ -107,8 +105,6 @@ class GroundStrip:
     below: F64
     tilt_knots: F64
     tilt: F64
-    cross_knots: F64
-    cross: F64
     used: int
     section_errors: F64
 
@@ -171,10 +167,7 @@ def fit_ground(points: Points, path: F64) -> GroundStrip | None:
     errors = _section_errors(
         s[near], left[near], h[near] - fitted.value(s[near], left[near], coefficients), spread[near]
     )
-    offsets: F64 = np.asarray(CROSS_AT * height, dtype=np.float64)
-    below, tilt, cross = np.split(
-        coefficients, np.cumsum([len(fitted.knots), len(fitted.tilt_knots)])
-    )
+    below, tilt, _ = np.split(coefficients, np.cumsum([len(fitted.knots), len(fitted.tilt_knots)]))
     own = np.interp(PathFrame(path, height).place(path)[0] / height, fitted.knots, below)
     return GroundStrip(
         frame,
@@ -183,8 +176,6 @@ def fit_ground(points: Points, path: F64) -> GroundStrip | None:
         below * height,
         fitted.tilt_knots * height,
         tilt,
-        offsets,
-        cross * height,
         int(kept.sum()),
         errors * height,
     )

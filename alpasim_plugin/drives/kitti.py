@@ -21,7 +21,6 @@ from alpasim_plugin.drives.source import SourceDrive
 from alpasim_plugin.gaussians.fit.lens import Lens
 from alpasim_plugin.gaussians.fit.photographs import Picture, rigid_pose
 
-DOING = "reading a KITTI drive"
 PAIRS = (
     ("image_2", "image_3"),
     ("image_0", "image_1"),

@@ -14,7 +14,6 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, Bool
 from alpasim_plugin.gaussians.fit.photographs import Picture, whole_photograph
 
-DOING = "importing a drive"
 JUMP = (
     12.0  # a step so many times the usual one is no driving: two units, or two drives in one file
 )

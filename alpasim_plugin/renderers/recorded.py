@@ -27,7 +27,6 @@ from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe
 
-DOING = "reading a recorded photograph"
 SIDE_PX = 16
 INTERVAL_US, FIRST_US = (
     500_000,

@@ -16,7 +16,6 @@ from alpasim_plugin.gaussians.files.packed import (
 from alpasim_plugin.gaussians.files.ply import read_ply_arrays, read_ply_header
 from alpasim_plugin.gaussians.files.sog import is_sog, read_sog
 
-DOING = "reading a Gaussian model"
 SUPPORTED = (".ply", ".compressed.ply", ".splat", ".spz", ".sog (also as a folder with meta.json)")
 
 

@@ -82,7 +82,14 @@ def unpack_rotation(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
     fractions = np.stack([(packed >> shift) & 1023 for shift in (20, 10, 0)], axis=1) / 1023.0
     others = (fractions - 0.5) * np.sqrt(2.0)
     largest = (packed >> 30).astype(np.intp)
-    quats = np.empty((len(packed), 4))
+    return with_largest(others, largest)
+
+
+def with_largest(others: NDArray[np.float64], largest: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return unit quaternions ``(N, 4)`` of three components each ``(N, 3)``, in order, and the
+    place ``(N,)`` of the largest one, which was left out.
+    """
+    quats = np.empty((len(others), 4))
     slots = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
     np.put_along_axis(quats, slots, others, axis=1)
     # Rounding can bring the three slightly above length 1.
@@ -196,7 +203,6 @@ def write_splat(path: Path | str, cloud: GaussianCloud) -> None:
 
 MAGIC = 0x5053474E  # "NGSP" in file order
 _GZIP = b"\x1f\x8b"
-DOING = "reading an SPZ file"
 _COLOUR_SCALE = 0.15
 _EXPORT_AGAIN = "copy or export the file again"
 Axes = Literal["rdf", "rub"]
@@ -263,12 +269,7 @@ def unpack_smallest_three(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
     fields = np.stack([(words >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
     magnitude = (fields & 511) / 511.0 * np.sqrt(0.5)
     others = np.where(fields & 512, -magnitude, magnitude)
-    xyzw = np.empty((len(words), 4))
-    slots = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
-    np.put_along_axis(xyzw, slots, others, axis=1)
-    left_out = np.sqrt(np.maximum(1.0 - np.sum(others**2, axis=1), 0.0))
-    np.put_along_axis(xyzw, largest[:, None], left_out[:, None], axis=1)
-    return xyzw[:, [3, 0, 1, 2]]
+    return with_largest(others, largest)[:, [3, 0, 1, 2]]
 
 
 def _decode(header: SpzHeader, streams: list[NDArray[np.uint8]], axes: Axes) -> GaussianArrays:

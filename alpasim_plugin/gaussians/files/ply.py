@@ -275,11 +275,10 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """Hold what a PLY header says: the file, its elements in order and its comments."""
+    """Hold what a PLY header says: the file and its elements in order."""
 
     path: Path
     elements: tuple[PlyElement, ...]
-    comments: tuple[str, ...]
 
     def element(self, name: str) -> PlyElement:
         """Return the element called `name`.
@@ -306,15 +305,12 @@ def read_ply_header(path: Path | str) -> PlyHeader:
     path = Path(path)
     lines, body_offset = _header_lines(path)
     byte_order = ""
-    comments: list[str] = []
     pending: list[tuple[str, int, list[tuple[str, str]] | None]] = []
     for number, line in enumerate(lines, start=1):
         words = line.split()
-        if not words or words[0] in ("ply", "end_header", "obj_info"):
+        if not words or words[0] in ("ply", "end_header", "obj_info", "comment"):
             continue
-        if words[0] == "comment":
-            comments.append(line[len("comment") :].strip())
-        elif words[0] == "format" and len(words) == 3:
+        if words[0] == "format" and len(words) == 3:
             byte_order = _byte_order(path, words[1])
         elif words[0] == "element" and len(words) == 3:
             pending.append((words[1], _count(path, number, words[2]), []))
@@ -324,7 +320,7 @@ def read_ply_header(path: Path | str) -> PlyHeader:
             raise _bad_line(path, number, line)
     if not byte_order:
         raise InputError(f"{path}: no format line", _EXPORT_AGAIN)
-    return PlyHeader(path, _place(pending, body_offset), tuple(comments))
+    return PlyHeader(path, _place(pending, body_offset))
 
 
 def read_ply_element(header: PlyHeader, name: str) -> NDArray[np.void]:

@@ -24,18 +24,12 @@ from alpasim_plugin.core.reading import parse_json, read_bytes
 from alpasim_plugin.core.reading.files import as_shape, parsing
 from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.gaussians.cloud import GaussianArrays
+from alpasim_plugin.gaussians.files.packed import with_largest
 
-DOING = "reading a SOG model"
 META = "meta.json"
 DO_THIS = "write it again as SOG of version 2 (splat-transform), or give the PLY"
 BANDS = {1: 3, 2: 8, 3: 15}  # of harmonics above the constant one to coefficients
 PALETTE_WIDTH = 64  # palette entries a row of the centroids' plane
-_LARGEST = (
-    (1, 2, 3, 0),
-    (0, 2, 3, 1),
-    (0, 1, 3, 2),
-    (0, 1, 2, 3),
-)  # where the three stored components and the largest go, wxyz
 Get = Callable[[str], bytes]
 
 
@@ -154,11 +148,7 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
 
 def _rotations(pixels: U8) -> F64:
     three = (pixels[:, :3] / 255.0 - 0.5) * np.sqrt(2.0)
-    largest = np.sqrt(np.maximum(0.0, 1.0 - (three**2).sum(axis=1)))
-    which = np.clip(pixels[:, 3].astype(np.int64) - 252, 0, 3)
-    out = np.empty((len(pixels), 4))
-    np.put_along_axis(out, np.array(_LARGEST)[which], np.column_stack([three, largest]), axis=1)
-    return out
+    return with_largest(three, np.clip(pixels[:, 3].astype(np.intp) - 252, 0, 3))
 
 
 def _harmonics(facts: dict[str, Any], plane: Callable[[str, int], U8], n: int) -> F64:

@@ -265,18 +265,15 @@ SMOOTH_LEVELS = 5.0  # largest step of brightness to a neighbouring pixel
 SMALLEST_SHARE = 0.002  # of the picture, of a region
 SOLID_SHARE = 0.25  # of a region's measured pixels that have a depth: then it is a wall
 COLOUR_LEVELS = 40.0  # by which the sky's colour may differ from its median in all photographs
-LOW_RAD = np.radians(0.0)  # no sky below the horizon
 
 
-def sky_masks(views: Sequence[PosedView], up: F64 | None = None) -> list[Bool]:
+def sky_masks(views: Sequence[PosedView]) -> list[Bool]:
     """Return where each view shows sky, ``(H, W)`` bool.
 
     Args:
         views: With depth where it is known: a region that has one is no sky.
-        up: ``(3,)`` in the world; None is +z.
     """
-    above = np.array([0.0, 0.0, 1.0]) if up is None else up
-    regions = [_regions(view, above) for view in views]
+    regions = [_regions(view) for view in views]
     seen = [
         view.rgb[region > 0] for view, region in zip(views, regions, strict=True) if region.any()
     ]
@@ -287,7 +284,7 @@ def sky_masks(views: Sequence[PosedView], up: F64 | None = None) -> list[Bool]:
     return [_of_colour(view, region, usual) for view, region in zip(views, regions, strict=True)]
 
 
-def _regions(view: PosedView, up: F64) -> I32:
+def _regions(view: PosedView) -> I32:
     """Label smooth regions that reach the top of the picture and are not solid."""
     grey = cv2.GaussianBlur(
         cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), (3, 3), 0
@@ -298,7 +295,7 @@ def _regions(view: PosedView, up: F64) -> I32:
         )
         / 4
     )
-    smooth = (step < SMOOTH_LEVELS) & (_elevation(view, up) > LOW_RAD)
+    smooth = (step < SMOOTH_LEVELS) & _above_horizon(view.camera)
     if view.mask is not None:
         smooth &= view.mask
     _, label = cv2.connectedComponents(smooth.astype(np.uint8), connectivity=4)
@@ -333,10 +330,9 @@ def _of_colour(view: PosedView, label: I32, usual: F32) -> Bool:
     return np.asarray(cv2.morphologyEx(out, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0)
 
 
-def _elevation(view: PosedView, up: F64) -> F32:
-    camera = view.camera
+def _above_horizon(camera: PinholeCamera) -> Bool:
+    """Return which pixels ``(H, W)`` look up, towards +z of the world."""
     v, u = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    direction = camera.T_camera_world[:3, :3] @ up
-    along = x * direction[0] + y * direction[1] + direction[2]
-    return np.asarray(np.arcsin(along / np.sqrt(x * x + y * y + 1)), np.float32)
+    up = camera.T_camera_world[:3, 2]
+    return np.asarray(x * up[0] + y * up[1] + up[2] > 0)

@@ -23,7 +23,6 @@ from alpasim_plugin.gaussians.fit.start import Start, start_from_maps, start_in_
 from alpasim_plugin.gaussians.fit.tracks import Tracks, follow, place
 from alpasim_plugin.gaussians.fit.views import PosedView
 
-DOING = "fitting a recorded drive"
 LEAST_WAY_M = 10.0  # a camera that moves less is not driven along a street under a sky
 LEAST_MEASURED = 0.02  # share of the measured pixels that must have a depth for a start from them
 Report = Callable[
@@ -44,20 +43,6 @@ class FittedDrive:
 
     model: Reconstruction
     exposures: Mapping[str, tuple[float, float, float]]
-
-
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """Views with what they say before a fit.
-
-    Attributes:
-        views: With depth, sky and gain.
-        guesses: ``(H, W)`` for each view: depth interpolated between the points that tracks place;
-            None where there are too few.
-    """
-
-    views: tuple[PosedView, ...]
-    guesses: tuple[F32 | None, ...]
 
 
 def fit_drive(
@@ -100,22 +85,14 @@ def fit_drive(
         )
     recipe = replace(recipe or SplatRecipe.street(), seed=seed)
     known = {view.name for view in views}
-    prepared = prepared_views([*views, *kept], tell)
-    train = [view for view in prepared.views if view.name in known]
-    guesses = [
-        guess
-        for view, guess in zip(prepared.views, prepared.guesses, strict=True)
-        if view.name in known
-    ]
+    every, depths = prepared_views([*views, *kept], tell)
+    train = [view for view in every if view.name in known]
+    guesses = [depth for view, depth in zip(every, depths, strict=True) if view.name in known]
     start = Start(
         _start(train, guesses, points, recipe, scene_id),
         _actors(train, boxes or {}, recipe, scene_id),
     )
-    held = [
-        replace(view, gain=_between(train, view))
-        for view in prepared.views
-        if view.name not in known
-    ]
+    held = [replace(view, gain=_between(train, view)) for view in every if view.name not in known]
     model = fit(
         train,
         start,
@@ -133,9 +110,15 @@ def fit_drive(
     return FittedDrive(model, exposures)
 
 
-def prepared_views(views: Sequence[PosedView], tell: Report) -> Prepared:
+def prepared_views(
+    views: Sequence[PosedView], tell: Report
+) -> tuple[list[PosedView], list[F32 | None]]:
     """Measure depth, sky and exposure of photographs, camera by camera, in the order of their
     names.
+
+    Returns:
+        Views with depth, sky and gain; and for each of them depth ``(H, W)`` interpolated between
+        the points that tracks place, None where there are too few.
     """
     ordered: list[PosedView] = []
     guesses: list[F32 | None] = []
@@ -146,9 +129,10 @@ def prepared_views(views: Sequence[PosedView], tell: Report) -> Prepared:
             (view for view in views if camera_of(view) == camera), key=lambda view: view.name
         )
         done, guess = _of_one_camera(mine)
-        ordered, guesses = [*ordered, *done], [*guesses, *guess]
+        ordered += done
+        guesses += guess
     tell("measuring depth, sky and exposure", len(cameras), len(cameras), {})
-    return Prepared(tuple(ordered), tuple(guesses))
+    return ordered, guesses
 
 
 def camera_of(view: PosedView) -> str:

@@ -45,7 +45,6 @@ from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
 
 FILE = "transforms.json"
-DOING = "reading photographs"
 AXES = {
     "opencv": np.eye(4),
     "opengl": np.diag([1.0, -1.0, -1.0, 1.0]),

@@ -31,7 +31,6 @@ from alpasim_plugin.gaussians.scene.builder import with_background
 from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneNode
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, HIGH_RAD, LOW_RAD, WIDTH, Sky
 
-DOING = "reading a reconstruction"
 INDEX_FILE = "reconstruction.json"
 BACKGROUND_FILE = "background.ply"
 SKY_FILE = "sky.png"
