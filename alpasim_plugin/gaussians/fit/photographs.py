@@ -57,10 +57,6 @@ COEFFICIENTS = {  # of each lens model, in the order of OpenCV
     "RADIAL": ("k1", "k2"),
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
-# structure from motion has no unit: the camera that is farthest from their middle is put so far
-# from it
-EXTENT_M = 4.0
-SIDE_PX = 16  # sides are multiples of this, as fixers need
 RIGID = 1e-12  # a rotation this exact is taken as it is written
 
 ActorsAt = Callable[[int], Mapping[str, F64]]  # time in microseconds -> actor id to T_world_box
@@ -109,21 +105,6 @@ class Picture:
             self.rgb(),
             self.file.stem,
         )
-
-
-@dataclass(frozen=True)
-class Photographs:
-    """Photographs in the order of the file.
-
-    Attributes:
-        views: Those that exist, without distortion, of one size.
-        missing: Names that the file lists and the folder lacks.
-        listed: How many the file lists.
-    """
-
-    views: tuple[PosedView, ...]
-    missing: tuple[str, ...]
-    listed: int
 
 
 def read_pictures(folder: Path, axes: str | None = None) -> tuple[dict[str, Any], list[Picture]]:
@@ -185,36 +166,6 @@ def read_views(
         views.append(replace(picture.view(), sky=sky, mask=mask, actors=actors))
     points = document.get("ply_file_path")
     return views, None if points is None else read_points(folder / points)
-
-
-def read_photographs(folder: Path, width: int = 256) -> Photographs:
-    """Read a folder of photographs from structure from motion: axes of OpenGL, an arbitrary unit,
-    and not all images there.
-
-    A picture is freed of its distortion at full size, then reduced by averaging, and its height is
-    cut at the middle to a multiple of 16.
-
-    Args:
-        folder: Holds ``transforms.json`` and the images that it names.
-        width: Pixels across of the views, a multiple of 16.
-
-    Raises:
-        InputError: No such file, a key is missing, another lens model than OpenCV's, or fewer than
-            two images exist.
-    """
-    if width < SIDE_PX or width % SIDE_PX:
-        raise InputError(
-            f"width {width}: not a multiple of {SIDE_PX}",
-            f"choose for example {16 * SIDE_PX}",
-        )
-    _, pictures = read_pictures(folder, "opengl")
-    there, missing = present(folder, pictures)
-    poses = _scaled(np.array([picture.T_world_camera for picture in there]))
-    views = [
-        _cut(replace(one, T_world_camera=pose).view(), width, one.where)
-        for one, pose in zip(there, poses, strict=True)
-    ]
-    return Photographs(tuple(views), missing, len(pictures))
 
 
 def present(folder: Path, pictures: Sequence[Picture]) -> tuple[list[Picture], tuple[str, ...]]:
@@ -370,31 +321,6 @@ def rigid_pose(value: Any, where: str) -> F64:
     if off > RIGID:  # what is written with a few digits is not quite a rotation
         T[:3, :3] = rotation
     return T
-
-
-def _scaled(poses: F64) -> F64:
-    out = poses.copy()
-    middle = out[:, :3, 3].mean(axis=0)
-    farthest = float(np.linalg.norm(out[:, :3, 3] - middle, axis=1).max())
-    if farthest > 0:
-        out[:, :3, 3] = (out[:, :3, 3] - middle) * (EXTENT_M / farthest)
-    return out
-
-
-def _cut(view: PosedView, width: int, where: str) -> PosedView:
-    """Reduce a view to a width, and cut its height at the middle to a multiple of `SIDE_PX`."""
-    small = resized(view, width)
-    height = small.camera.height
-    kept = height // SIDE_PX * SIDE_PX
-    if kept < SIDE_PX:
-        raise InputError(
-            f"{where}: {height} pixels high at {width} across", "choose a larger width"
-        )
-    top = (height - kept) // 2
-    K = small.camera.K.copy()
-    K[1, 2] -= top
-    camera = PinholeCamera(width, kept, K, small.camera.T_camera_world)
-    return PosedView(camera, np.ascontiguousarray(small.rgb[top : top + kept]), view.name)
 
 
 def _flags(folder: Path, picture: Picture, key: str) -> Bool | None:

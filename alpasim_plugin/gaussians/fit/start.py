@@ -1,11 +1,10 @@
-"""Draw the Gaussians that a fit starts from: sparse, noisy surface points, from depth or from
-matched photographs.
+"""Draw the Gaussians that a fit starts from: sparse, noisy surface points from depth.
 
 Published fits start from LiDAR returns (driving) or structure-from-motion points. Rendered views
 carry depth; points sampled from it, evenly over the image, with a range error along the ray, stand
 for LiDAR returns accumulated over the drive. Returns inside an actor's box are carried to the
-actor's frame and belong to it, as in Street Gaussians. Photographs without depth are matched (SIFT)
-and triangulated.
+actor's frame and belong to it, as in Street Gaussians. Photographs without depth are matched
+(SIFT).
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, transform_points
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Bool, Box
-from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.sh import dc_from_rgb
@@ -45,11 +43,6 @@ NEIGHBOURS, FEATURES, RATIO = (
     2500,
     0.75,
 )  # of the next photographs; SIFT keypoints; Lowe's ratio test
-LARGEST_ERROR_PX, LEAST_ANGLE_DEG = (
-    1.5,
-    1.5,
-)  # of a triangulated point: reprojection, and between its rays
-
 _Points = tuple[F64, F64]  # (N, 3) places, metres; (N, 3) colours 0..1
 
 
@@ -255,65 +248,3 @@ def matches(views: Sequence[PosedView]) -> list[Match]:
                 if best.distance < RATIO * second.distance and back[best.trainIdx] == best.queryIdx:
                     out.append(Match(i, j, at_i[best.queryIdx], at_j[best.trainIdx]))
     return out
-
-
-def triangulated(
-    views: Sequence[PosedView],
-    found: Sequence[Match],
-    used: Sequence[int],
-    most: int,
-    rng: np.random.Generator,
-) -> GaussianCloud:
-    """Return start Gaussians at the points that views place consistently.
-
-    Args:
-        views: That were matched.
-        found: Their matches.
-        used: Indices of the views that may be looked at; matches with others are left out.
-        most: Points at most, drawn from all.
-        rng: Draws them.
-
-    Raises:
-        InputError: Fewer than ten such points.
-    """
-    may = set(used)
-    parts: list[_Points] = []
-    pairs = sorted({(m.first, m.second) for m in found if m.first in may and m.second in may})
-    for i, j in pairs:
-        mine = [m for m in found if (m.first, m.second) == (i, j)]
-        a, b = np.array([m.at_first for m in mine]), np.array([m.at_second for m in mine])
-        place, good = _triangulate(views[i].camera, views[j].camera, a, b)
-        at = a[good].astype(np.int64)
-        parts.append((place[good], views[i].rgb[at[:, 1], at[:, 0]] / 255.0))
-    points, colours = _joined(parts)
-    count = len(points)
-    if count < 10:
-        raise InputError(
-            f"{len(used)} photographs: {count} points that two photographs place consistently",
-            "give photographs that overlap, in order along the way",
-        )
-    kept = rng.permutation(count)[:most]
-    return cloud_from_points(points[kept], colours[kept])
-
-
-def _triangulate(first: PinholeCamera, second: PinholeCamera, a: F64, b: F64) -> tuple[F64, Bool]:
-    """Return points ``(N, 3)`` and which are good: before both cameras, near both rays, and seen at
-    an angle.
-    """
-    P = [camera.K @ camera.T_camera_world[:3] for camera in (first, second)]
-    homogeneous = cv2.triangulatePoints(P[0], P[1], a.T, b.T)
-    w = np.where(np.abs(homogeneous[3]) < 1e-12, 1e-12, homogeneous[3])
-    points = (homogeneous[:3] / w).T
-    good = np.ones(len(points), dtype=bool)
-    for camera, at in ((first, a), (second, b)):
-        local = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
-        pixel = local @ camera.K.T
-        error = np.linalg.norm(
-            pixel[:, :2] / np.where(np.abs(local[:, 2:]) < 1e-9, 1e-9, local[:, 2:]) - at, axis=1
-        )
-        good &= (local[:, 2] > 1e-3) & (error < LARGEST_ERROR_PX)
-    rays = [points - camera.centre_world for camera in (first, second)]
-    cosine = np.einsum("ij,ij->i", *rays) / np.maximum(
-        np.linalg.norm(rays[0], axis=1) * np.linalg.norm(rays[1], axis=1), 1e-12
-    )
-    return points, good & (cosine < np.cos(np.radians(LEAST_ANGLE_DEG)))

@@ -10,10 +10,10 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.drives.build import SCENARIO_FILE
-from alpasim_plugin.gaussians.fit.photographs import read_photographs
 from alpasim_plugin.lab.cli.training_options import AsJson, Debug
 from alpasim_plugin.lab.training.drive_pairs import make_drive_pairs
 from alpasim_plugin.lab.training.photograph_pairs import PhotographRecipe, make_photograph_pairs
+from alpasim_plugin.lab.training.photographs import read_photographs
 from scenarios.drive import DRIVE_FILE
 from scenarios.load import load_scenario
 

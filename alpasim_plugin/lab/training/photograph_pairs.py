@@ -22,11 +22,12 @@ from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.gaussians.fit.loop import fit
-from alpasim_plugin.gaussians.fit.photographs import Photographs, resized
+from alpasim_plugin.gaussians.fit.photographs import resized
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
-from alpasim_plugin.gaussians.fit.start import Match, matches, triangulated
+from alpasim_plugin.gaussians.fit.start import Match, matches
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.lab.training.pair_store import Pair, PairSequence, is_made, write_sequence
+from alpasim_plugin.lab.training.photographs import Photographs, triangulated
 
 DOING = "making pairs of photographs"
 PERIOD_US = 100_000  # photographs have no clock

@@ -14,9 +14,10 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.fit.photographs import read_photographs, read_views
-from alpasim_plugin.gaussians.fit.start import Match, triangulated
+from alpasim_plugin.gaussians.fit.photographs import read_views
+from alpasim_plugin.gaussians.fit.start import Match
 from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.lab.training.photographs import read_photographs, triangulated
 
 LENS = {
     "fl_x": 300.0,
