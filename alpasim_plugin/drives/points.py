@@ -110,7 +110,9 @@ def _colour(view: PosedView, at: F64) -> F64:
 
 def _covariance(xyz: F64, tracks: Tracks, cameras: Sequence[PinholeCamera]) -> F64:
     """Return the covariance ``(P, 3, 3)`` of each point for a usual error in its photographs."""
-    _, J, _ = residuals(xyz, tracks, *pose_arrays(cameras))
+    R, t, K = pose_arrays(cameras)
+    _, slope, _ = residuals(xyz, tracks, R, t, K)
+    J = slope @ R[tracks.view]
     H = np.zeros((tracks.count, 3, 3))
     np.add.at(H, tracks.point, J.transpose(0, 2, 1) @ J)
     return np.asarray(np.linalg.pinv(H, hermitian=True) * PIXEL_SPREAD**2)

@@ -163,7 +163,8 @@ def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
     )
     xyz: F64 = np.asarray(np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0], np.float64)
     for _ in range(ROUNDS):
-        e, J, _ = residuals(xyz, tracks, R, t, K)
+        e, slope, _ = residuals(xyz, tracks, R, t, K)
+        J = slope @ R[tracks.view]
         w = huber(e)
         JT = J.transpose(0, 2, 1) * w[:, None, None]
         H, g = (
@@ -178,8 +179,8 @@ def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
         xyz = np.asarray(
             xyz - step * np.minimum(1.0, 0.5 * (away + 1.0) / np.maximum(length, 1e-12)), np.float64
         )
-    e, _, z = residuals(xyz, tracks, R, t, K)
-    error = np.where(z > 1e-3, np.linalg.norm(e, axis=1), np.inf)
+    e, _, local = residuals(xyz, tracks, R, t, K)
+    error = np.where(local[:, 2] > 1e-3, np.linalg.norm(e, axis=1), np.inf)
     return Placed(xyz, error, _angles(xyz, tracks, centre))
 
 
@@ -192,26 +193,19 @@ def pose_arrays(cameras: Sequence[PinholeCamera]) -> tuple[F64, F64, F64]:
 
 
 def residuals(xyz: F64, tracks: Tracks, R: F64, t: F64, K: F64) -> tuple[F64, F64, F64]:
-    """Return projection minus observation ``(M, 2)`` in pixels, its derivative by the point ``(M,
-    2, 3)``, and the depth ``(M,)``.
+    """Return projection minus observation ``(M, 2)`` in pixels, its derivative by the point in the
+    camera's axes ``(M, 2, 3)``, and that point ``(M, 3)``.
     """
     local = np.einsum("nij,nj->ni", R[tracks.view], xyz[tracks.point]) + t[tracks.view]
-    z = local[:, 2]
-    safe = np.where(np.abs(z) < 1e-6, 1e-6, z)
-    f = np.stack([K[tracks.view, 0, 0], K[tracks.view, 1, 1]], axis=1)
-    c = np.stack([K[tracks.view, 0, 2], K[tracks.view, 1, 2]], axis=1)
-    by_local = projection_slope(local, safe, f)
-    return f * local[:, :2] / safe[:, None] + c - tracks.at, by_local @ R[tracks.view], z
-
-
-def projection_slope(local: F64, z: F64, f: F64) -> F64:
-    """Return the derivative ``(M, 2, 3)`` of pixels by camera coordinates ``(M, 3)``; ``z (M,)``
-    their safe depth, ``f (M, 2)`` pixels.
-    """
-    J = np.zeros((len(local), 2, 3))
-    J[:, 0, 0], J[:, 1, 1] = f[:, 0] / z, f[:, 1] / z
-    J[:, :, 2] = -f * local[:, :2] / (z**2)[:, None]
-    return J
+    z = np.where(np.abs(local[:, 2]) < 1e-6, 1e-6, local[:, 2])
+    focal = np.stack([K[tracks.view, 0, 0], K[tracks.view, 1, 1]], axis=1)
+    middle = np.stack([K[tracks.view, 0, 2], K[tracks.view, 1, 2]], axis=1)
+    error = focal * local[:, :2] / z[:, None] + middle - tracks.at
+    slope = np.zeros((len(local), 2, 3))
+    slope[:, 0, 0] = focal[:, 0] / z
+    slope[:, 1, 1] = focal[:, 1] / z
+    slope[:, :, 2] = -focal * local[:, :2] / (z**2)[:, None]
+    return error, slope, local
 
 
 def summed(values: F64, index: I64, count: int) -> F64:
@@ -323,29 +317,27 @@ def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) ->
     """Return changes of the poses ``(V, 6)`` (turn and shift in the camera's frame) and of the
     points ``(P, 3)``.
     """
-    v = tracks.view
-    p = tracks.point
-    views = len(R)
-    local = np.einsum("nij,nj->ni", R[v], xyz[p]) + t[v]
-    z = np.where(np.abs(local[:, 2]) < 1e-6, 1e-6, local[:, 2])
-    f, c = np.stack([K[v, 0, 0], K[v, 1, 1]], axis=1), np.stack([K[v, 0, 2], K[v, 1, 2]], axis=1)
-    e = f * local[:, :2] / z[:, None] + c - tracks.at
-    slope = projection_slope(local, z, f)
-    A = np.concatenate([-slope @ _cross(local), slope], axis=2)  # by the pose
-    B = slope @ R[v]  # by the point
-    w = huber(e)[:, None, None]
-    AT, BT = A.transpose(0, 2, 1) * w, B.transpose(0, 2, 1) * w
-    U, ga = (summed(values, v, views) for values in (AT @ A, (AT @ e[..., None])[..., 0]))
-    V, gb = (summed(values, p, len(xyz)) for values in (BT @ B, (BT @ e[..., None])[..., 0]))
-    off, weight = _from_given(R, t, R0, t0), np.repeat([SIGMA_RAD**-2, SIGMA_M**-2], 3)
-    U += np.diag(weight)
-    ga += weight * off
-    W = AT @ B  # (M, 6, 3)
-    inverse: F64 = np.asarray(np.linalg.inv(V + 1e-6 * np.eye(3)), np.float64)
-    H, g = _reduced(U, ga, W, inverse, gb, v, p)
+    view, point = tracks.view, tracks.point
+    views, points = len(R), len(xyz)
+    error, slope, local = residuals(xyz, tracks, R, t, K)
+    by_pose = np.concatenate([-slope @ _cross(local), slope], axis=2)  # (M, 2, 6)
+    by_point = slope @ R[view]  # (M, 2, 3)
+    weight = huber(error)[:, None, None]
+    weighted_pose = by_pose.transpose(0, 2, 1) * weight
+    weighted_point = by_point.transpose(0, 2, 1) * weight
+    of_poses = summed(weighted_pose @ by_pose, view, views)
+    pull_poses = summed((weighted_pose @ error[..., None])[..., 0], view, views)
+    of_points = summed(weighted_point @ by_point, point, points)
+    pull_points = summed((weighted_point @ error[..., None])[..., 0], point, points)
+    prior = np.repeat([SIGMA_RAD**-2, SIGMA_M**-2], 3)
+    of_poses += np.diag(prior)
+    pull_poses += prior * _from_given(R, t, R0, t0)
+    between = weighted_pose @ by_point  # (M, 6, 3)
+    inverse: F64 = np.asarray(np.linalg.inv(of_points + 1e-6 * np.eye(3)), np.float64)
+    H, g = _reduced(of_poses, pull_poses, between, inverse, pull_points, view, point)
     step: F64 = np.asarray(-np.linalg.solve(H, g).reshape(views, 6), np.float64)
-    back = summed(np.einsum("nij,ni->nj", W, step[v]), p, len(xyz))
-    return step, np.asarray(-np.einsum("nij,nj->ni", inverse, gb + back), np.float64)
+    back = summed(np.einsum("nij,ni->nj", between, step[view]), point, points)
+    return step, np.asarray(-np.einsum("nij,nj->ni", inverse, pull_points + back), np.float64)
 
 
 def _reduced(U: F64, ga: F64, W: F64, inverse: F64, gb: F64, v: I64, p: I64) -> tuple[F64, F64]:
