@@ -17,23 +17,15 @@ Block-causal mask: a token attends to every token of its own block and of earlie
 window restricts this to the last ``window - sink`` latents up to the end of the own block, plus the
 first ``sink`` latents of the rollout (attention sink); the own block is always visible, even when
 the window is smaller.
-
-Select torch's attention kernel, for benchmarks; the networks work with any.
-
-No mask is built (`attention`), so every kernel applies: flash, cuDNN, memory-efficient, and `math`
-(plain matrix products that hold all scores), which is the reference of the others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Literal, get_args
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from alpasim_plugin.block_fixers.layers import RMSNorm
 from alpasim_plugin.core.errors import InputError
@@ -43,13 +35,6 @@ RopeTable = tuple[Tensor, Tensor]  # cos, sin: (L, head_width / 2) float32
 Attend = Callable[
     [Tensor, Tensor, Tensor], Tensor
 ]  # q, k, v (B, L, heads, head_width) -> (B, L, heads * head_width)
-Kernel = Literal["auto", "flash", "cudnn", "efficient", "math"]
-BACKENDS = {
-    "flash": SDPBackend.FLASH_ATTENTION,
-    "cudnn": SDPBackend.CUDNN_ATTENTION,
-    "efficient": SDPBackend.EFFICIENT_ATTENTION,
-    "math": SDPBackend.MATH,
-}
 
 
 def axis_widths(head_width: int) -> tuple[int, int, int]:
@@ -102,20 +87,6 @@ class Rope3D:
             frequencies(width, ratio) for width, ratio in pairs
         )
 
-    def angles(self, start: int, frames: int, rows: int, columns: int) -> Tensor:
-        """Return the angle of every token and channel.
-
-        Args:
-            start: Absolute latent index of the first frame in its rollout.
-            frames, rows, columns: Token grid of the block.
-
-        Returns:
-            ``(frames, rows, columns, head_width)`` float64 radians, the second half repeating the
-            first.
-        """
-        half = self._half(start, frames, rows, columns)
-        return torch.cat([half, half], dim=-1)
-
     def table(
         self, start: int, frames: int, rows: int, columns: int, device: torch.device | str = "cpu"
     ) -> RopeTable:
@@ -124,19 +95,6 @@ class Rope3D:
         """
         half = self._half(start, frames, rows, columns).reshape(-1, self.head_width // 2)
         return half.cos().float().to(device), half.sin().float().to(device)
-
-    def move(self, table: RopeTable, start: int, frames: int) -> None:
-        """Update a table of `table` to another start, in place: only the time columns change.
-
-        Bit-identical to a new table, with less arithmetic and less data moved to the device.
-        """
-        angle = (
-            torch.arange(start, start + frames, dtype=torch.float64, device="cpu")[:, None]
-            * self.freq_t
-        )
-        for kept, new in zip(table, (angle.cos(), angle.sin()), strict=True):
-            columns = kept.view(frames, -1, self.head_width // 2)[..., : len(self.freq_t)]
-            columns.copy_(new.float().to(kept.device)[:, None].expand(columns.shape))
 
     def _half(self, start: int, frames: int, rows: int, columns: int) -> Tensor:
         t = (
@@ -239,10 +197,7 @@ def block_causal_attention(
 
 
 class SelfAttention(nn.Module):
-    """Attention of latent tokens on latent tokens, with RMS-normed and rotated queries and keys.
-
-    After folding (`fuse`) the three projections are one linear with bias.
-    """
+    """Attention of latent tokens on latent tokens, with RMS-normed and rotated queries and keys."""
 
     def __init__(self, width: int, head_width: int) -> None:
         super().__init__()
@@ -253,26 +208,13 @@ class SelfAttention(nn.Module):
         self.output_proj = nn.Linear(width, width, bias=False)
         self.q_norm = RMSNorm(head_width)
         self.k_norm = RMSNorm(head_width)
-        self.qkv_proj: nn.Linear | None = None
-
-    def fuse(self, qkv: nn.Linear) -> None:
-        """Replace the three projections by one."""
-        self.qkv_proj = qkv
-        del self.q_proj, self.k_proj, self.v_proj
 
     def project(self, x: Tensor, added: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Map tokens ``(B, L, width)`` to normed queries and keys, and values, each ``(B, L, heads,
-        head_width)``.
-
-        ``added (B, L, width)`` is added to the tokens; once the projections are fused it is ``(B,
-        L, 3 * width)``, already projected.
+        head_width)``; ``added (B, L, width)`` is added to the tokens.
         """
-        if self.qkv_proj is None:
-            x = x if added is None else x + added
-            parts = self.q_proj(x), self.k_proj(x), self.v_proj(x)
-        else:
-            qkv = self.qkv_proj(x)
-            parts = (qkv if added is None else qkv + added).chunk(3, dim=-1)
+        x = x if added is None else x + added
+        parts = self.q_proj(x), self.k_proj(x), self.v_proj(x)
         q, k, v = (part.unflatten(-1, (-1, self.head_width)) for part in parts)
         return self.q_norm(q), self.k_norm(k), v
 
@@ -328,39 +270,3 @@ class CrossAttention(nn.Module):
         q = self.q_norm(self.q_proj(x.flatten(1, 2)).unflatten(-1, (-1, self.head_width)))
         out: Tensor = self.output_proj(attend(q, k, v))
         return out.view(x.shape)
-
-
-@contextmanager
-def attention_kernel(
-    name: Kernel,
-    device: torch.device | str = "cpu",
-    dtype: torch.dtype = torch.float32,
-    head_width: int = 64,
-) -> Iterator[None]:
-    """Run attention with one kernel and no other; ``auto`` leaves the choice to torch.
-
-    Args:
-        name: The kernel.
-        device, dtype, head_width: Of the inputs; the kernel is tried on them once.
-
-    Raises:
-        InputError: The kernel is unknown or does not support these inputs.
-    """
-    if name not in get_args(Kernel):
-        raise InputError(
-            f"{name}: no such kernel",
-            f"take one of {', '.join(get_args(Kernel))}",
-        )
-    if name == "auto":
-        yield
-        return
-    with sdpa_kernel(BACKENDS[name]):
-        x = torch.zeros(1, 2, 16, head_width, device=device, dtype=dtype)
-        try:
-            F.scaled_dot_product_attention(x, x, x)
-        except RuntimeError as error:
-            raise InputError(
-                f"{name}: {str(error).splitlines()[0]} ({device}, {dtype}, head width {head_width})",
-                "use auto, or another precision",
-            ) from error
-        yield

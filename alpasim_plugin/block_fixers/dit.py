@@ -14,7 +14,6 @@ checkpoints load; docs/block-fixers.md lists them.
 
 from __future__ import annotations
 
-import copy
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -34,7 +33,7 @@ from alpasim_plugin.block_fixers.layers import (
     sinusoid,
     unpatchify,
 )
-from alpasim_plugin.block_fixers.sizes import MASK_CHANNELS, DiTSizes, read_sizes
+from alpasim_plugin.block_fixers.sizes import HINT, MASK_CHANNELS, DiTSizes, read_sizes
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network import checkpoints
 
@@ -62,23 +61,16 @@ class CosmosCausalDiT(nn.Module):
     Args:
         sizes: All sizes; `DiTSizes()` is OmniDreams single view.
         rope_ratios: NTK stretch of the rotary positions: height, width, time.
-        time_rounding: ``torch.bfloat16`` rounds time steps as the original training code does;
-            float32 does not round.
-
-    Attributes:
-        folded_t: The only valid time step of a network from `folded`.
     """
 
     def __init__(
         self,
         sizes: DiTSizes,
         rope_ratios: tuple[float, float, float] = RELEASED_ROPE_RATIOS,
-        time_rounding: torch.dtype = torch.float32,
     ) -> None:
         super().__init__()
-        self.sizes, self.rope_ratios, self.time_rounding = sizes, rope_ratios, time_rounding
+        self.sizes, self.rope_ratios = sizes, rope_ratios
         self.rope = Rope3D(sizes.head_width, rope_ratios)
-        self.folded_t: float | None = None
         self.x_embedder = PatchEmbed(sizes.latent_channels + MASK_CHANNELS, sizes.width)
         self.additional_patch_embedding = PatchEmbed(sizes.map_channels, sizes.width)
         self.t_embedder = nn.ModuleList([nn.Identity(), TimeMap(sizes.width)])
@@ -96,7 +88,6 @@ class CosmosCausalDiT(nn.Module):
         rope_ratios: tuple[float, float, float] = RELEASED_ROPE_RATIOS,
         *,
         dtype: torch.dtype = torch.float32,
-        time_rounding: torch.dtype = torch.float32,
         source: str = "state dict",
     ) -> Self:
         """Build a network with sizes read from the tensors, and copy them.
@@ -107,7 +98,6 @@ class CosmosCausalDiT(nn.Module):
             rope_ratios: Height, width, time; not stored in checkpoints.
             dtype: Precision of the weights; half-precision tensors are widened by the default. Time
                 embedding and modulation stay float32.
-            time_rounding: See the class.
             source: Name for error messages.
 
         Raises:
@@ -115,14 +105,10 @@ class CosmosCausalDiT(nn.Module):
                 tensors, all listed.
         """
         tensors = checkpoints.clean(checkpoints.unwrap(sd, source))
-        sizes = read_sizes({key: tuple(value.shape) for key, value in tensors.items()}, source)
+        sizes = read_sizes(tensors, source)
         with torch.device("meta"):
-            net = cls(sizes, rope_ratios, time_rounding)
-        kept = {}
-        for key, value in tensors.items():
-            pinned = any(part in key for part in FLOAT32_KEYS)
-            kept[key] = checkpoints.weight(key, value, torch.float32 if pinned else dtype, source)
-        net.load_state_dict(kept, strict=True, assign=True)
+            net = cls(sizes, rope_ratios)
+        checkpoints.load_checked(net, tensors, dtype, source, HINT, FLOAT32_KEYS)
         return net
 
     @property
@@ -144,7 +130,6 @@ class CosmosCausalDiT(nn.Module):
         condition_mask: Tensor | None = None,
         block_latents: int | None = 2,
         *,
-        padding_mask: Tensor | None = None,
         window: int | None = None,
         sink: int = 0,
         start: int = 0,
@@ -160,7 +145,6 @@ class CosmosCausalDiT(nn.Module):
             condition_mask: ``(B, 1, T, H, W)``, 1 where the latent is given; None is 0 everywhere.
             block_latents: Latents of a causal block (the last may be shorter); None for
                 bidirectional attention, as in the teacher.
-            padding_mask: ``(B, 1, h, w)`` at any resolution; None is 0 everywhere.
             window, sink: Sliding window and attention sink in latents, as in a cache; None for the
                 whole past, as in training.
             start: Absolute latent index of the first frame.
@@ -180,9 +164,7 @@ class CosmosCausalDiT(nn.Module):
             window=window,
             sink=sink,
         )
-        return self._run(
-            x, t, text, hdmap, condition_mask, padding_mask, table, lambda layer: attention
-        )
+        return self._run(x, t, text, hdmap, condition_mask, table, lambda layer: attention)
 
     def step(
         self,
@@ -193,8 +175,6 @@ class CosmosCausalDiT(nn.Module):
         cache: BlockCache,
         write: bool = True,
         condition_mask: Tensor | None = None,
-        *,
-        padding_mask: Tensor | None = None,
     ) -> Tensor:
         """Predict the velocity of one block from its cached past.
 
@@ -203,7 +183,7 @@ class CosmosCausalDiT(nn.Module):
         kept.
 
         Args:
-            x_block, t_block, text, hdmap_block, condition_mask, padding_mask: As in `forward`, for
+            x_block, t_block, text, hdmap_block, condition_mask: As in `forward`, for
                 the T latents of the block.
             cache: From `new_cache`; one per rollout.
             write: Keep this forward's keys and values and advance to the next block.
@@ -219,9 +199,7 @@ class CosmosCausalDiT(nn.Module):
             def attention(layer: int) -> Attend:
                 return functools.partial(cache.attend, layer)
 
-            v = self._run(
-                x_block, t_block, text, hdmap_block, condition_mask, padding_mask, table, attention
-            )
+            v = self._run(x_block, t_block, text, hdmap_block, condition_mask, table, attention)
         if write:
             cache.commit()
         return v
@@ -271,34 +249,11 @@ class CosmosCausalDiT(nn.Module):
         """Project a prompt ``(B or 1, tokens, text_width)`` to the cross-attention keys and values
         of every block.
         """
-        self._check_text(text)
+        self._check_text(text, len(text))
         context = self.crossattn_proj(text.to(self.dtype))
         return TextContext(
             tuple(cast(Block, block).cross_attn.keys_values(context) for block in self.blocks)
         )
-
-    def folded(self, t: float) -> Self:
-        """Return a copy for one time step, with shift, scale and gate folded into the neighbouring
-        linears.
-
-        Exact (see `adaln`): the result is a plain pre-norm transformer without modulation. It takes
-            the same caches. Later changes of
-        these weights do not reach the copy.
-        """
-        if self.folded_t is not None:
-            raise InputError(
-                f"t={t}: already folded for t={self.folded_t}",
-                "fold the original network",
-            )
-        net = copy.deepcopy(self).requires_grad_(False)
-        with torch.no_grad():
-            time = self._time(t)
-            assert time is not None, "not folded yet"
-            for block in net.blocks:
-                cast(Block, block).fold(time)
-            net.final_layer.fold(time)
-        net.folded_t = float(t)
-        return net
 
     def _run(
         self,
@@ -307,15 +262,12 @@ class CosmosCausalDiT(nn.Module):
         text: Tensor | TextContext,
         hdmap: Tensor,
         condition_mask: Tensor | None,
-        padding_mask: Tensor | None,
         table: RopeTable,
         attention: Callable[[int], Attend],
     ) -> Tensor:
         time = self._time(t)
         text = text if isinstance(text, TextContext) else self.encode_text(text)
-        tokens = embed_latents(
-            self.x_embedder.linear, x.to(self.dtype), condition_mask, padding_mask
-        )
+        tokens = embed_latents(self.x_embedder.linear, x.to(self.dtype), condition_mask)
         condition = hdmap.to(self.dtype)
         tokens = tokens + self.additional_patch_embedding.linear.embed(
             condition[:, : self.sizes.map_channels]
@@ -325,24 +277,10 @@ class CosmosCausalDiT(nn.Module):
             tokens = block(tokens, time, text.keys_values[layer], table, attention(layer), opacity)
         return unpatchify(self.final_layer(tokens, time), x.shape[3], x.shape[4]).to(x.dtype)
 
-    def _time(self, t: Tensor | float) -> TimeSignal | None:
-        """Return emb ``(b, T, width)`` and lora ``(b, T, 3 * width)``; None when folded (after
-        checking ``t``).
-        """
-        if self.folded_t is not None:
-            same = (
-                t == self.folded_t
-                if not isinstance(t, Tensor)
-                else t.is_meta or bool((t == self.folded_t).all())
-            )
-            if not same:
-                raise InputError(
-                    f"folded for t={self.folded_t}: t={t if not isinstance(t, Tensor) else t.flatten()[:4].tolist()}",
-                    f"pass t={self.folded_t}, or use the network that is not folded",
-                )
-            return None
+    def _time(self, t: Tensor | float) -> TimeSignal:
+        """Return emb ``(b, T, width)`` and lora ``(b, T, 3 * width)``."""
         steps = t if isinstance(t, Tensor) else torch.full((1, 1), float(t), device=self.device)
-        s = sinusoid(steps, self.sizes.width, self.time_rounding)
+        s = sinusoid(steps, self.sizes.width)
         return self.t_embedding_norm(s), self.t_embedder[1](s)
 
     def _check(
@@ -354,24 +292,15 @@ class CosmosCausalDiT(nn.Module):
         block_latents: int | None,
     ) -> None:
         sizes = self.sizes
-        if (
-            x.ndim != 5
-            or x.shape[1] != sizes.latent_channels
-            or x.shape[2] < 1
-            or x.shape[3] % 2
-            or x.shape[4] % 2
-            or 0 in x.shape
-        ):
+        is_latent = x.ndim == 5 and x.shape[1] == sizes.latent_channels and 0 not in x.shape
+        if not is_latent or x.shape[3] % 2 or x.shape[4] % 2:
             raise InputError(
                 f"x: shape {list(x.shape)}",
-                f"give (batch, {sizes.latent_channels}, latents, height, width) with even height and width (pixels in multiples of 16)",
+                f"give (batch, {sizes.latent_channels}, latents, height, width) with even height and width",
             )
         expected = [x.shape[0], sizes.condition_channels, *x.shape[2:]]
         if list(hdmap.shape) != expected:
-            raise InputError(
-                f"hdmap: shape {list(hdmap.shape)}",
-                f"give {expected}, the map at the latents of x",
-            )
+            raise InputError(f"hdmap: shape {list(hdmap.shape)}", f"give {expected}")
         if isinstance(t, Tensor) and (
             t.ndim != 2 or t.shape[0] not in (1, x.shape[0]) or t.shape[1] not in (1, x.shape[2])
         ):
@@ -380,48 +309,26 @@ class CosmosCausalDiT(nn.Module):
                 f"give one step per latent, [{x.shape[0]}, {x.shape[2]}], or one number",
             )
         if block_latents is not None and block_latents < 1:
-            raise InputError(
-                f"block_latents: {block_latents}",
-                "give at least one latent a block, or None for no causality",
-            )
+            raise InputError(f"block_latents: {block_latents}", "give at least one latent, or None")
         if isinstance(text, Tensor):
             self._check_text(text, x.shape[0])
 
-    def _check_text(self, text: Tensor, batch: int | None = None) -> None:
-        alone = batch is None or (text.ndim == 3 and text.shape[0] in (1, batch))
-        if (
-            not alone
-            or text.ndim != 3
-            or text.shape[2] != self.sizes.text_width
-            or text.shape[1] < 1
-        ):
+    def _check_text(self, text: Tensor, batch: int = 1) -> None:
+        fits = text.ndim == 3 and text.shape[1] > 0 and text.shape[2] == self.sizes.text_width
+        if not fits or text.shape[0] not in (1, batch):
             raise InputError(
                 f"text: shape {list(text.shape)}",
                 f"give (batch or 1, tokens, {self.sizes.text_width})",
             )
 
     def _check_cache(self, x: Tensor, cache: BlockCache) -> None:
-        made: tuple[object, ...] = (
-            cache.batch,
-            cache.height,
-            cache.width,
-            cache.rope.head_width,
-            cache.rope.ratios,
-        )
-        expected: tuple[object, ...] = (
-            x.shape[0],
-            x.shape[3],
-            x.shape[4],
-            self.sizes.head_width,
-            self.rope_ratios,
-        )
+        found = [cache.batch, cache.height, cache.width, cache.rope.head_width, cache.rope.ratios]
+        expected = [x.shape[0], x.shape[3], x.shape[4], self.sizes.head_width, self.rope_ratios]
         if isinstance(cache, RollingCache):
-            made, expected = (
-                (*made, *cache.layout),
-                (*expected, self.sizes.blocks, self.sizes.heads, self.dtype),
-            )
-        if made != expected:
+            found += cache.layout
+            expected += [self.sizes.blocks, self.sizes.heads, self.dtype]
+        if found != expected:
             raise InputError(
-                f"batch, height, width, head width, rope ratios, layers, heads, dtype: cache {made}, block and network {expected}",
+                f"a cache for batch, sizes and network {found}, not {expected}",
                 "make the cache with this network's new_cache for this batch and latent size",
             )

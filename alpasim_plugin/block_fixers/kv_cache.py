@@ -65,7 +65,7 @@ class BlockCache(ABC):
         # latents committed since reset; differs from position in a rollout that does not start at 0
         self.filled = 0
         self.open_latents = 0  # length of the open block; 0 between blocks
-        self._tables: dict[int, tuple[int, RopeTable]] = {}
+        self._table: tuple[int, int, RopeTable] | None = None  # position, latents and rotation
 
     def reset(self, position: int = 0) -> None:
         """Clear the cache and start at an absolute latent index."""
@@ -74,24 +74,12 @@ class BlockCache(ABC):
     def begin(self, latents: int) -> RopeTable:
         """Open or reopen the block at the current position, and return the rotary table of its
         tokens.
-
-        In a rolling cache the returned tensors keep their storage for all blocks of one length.
         """
         self.open_latents = latents
-        at, table = self._tables.get(latents, (-1, None))
-        with torch.inference_mode(
-            False
-        ):  # tensors created in inference mode cannot be written to outside of it
-            if table is None or (
-                at != self.position and self.keeps_graph
-            ):  # the backward pass of earlier blocks needs their tables
-                table = self.rope.table(
-                    self.position, latents, self.rows, self.columns, self.device
-                )
-            elif at != self.position:
-                self.rope.move(table, self.position, latents)
-        self._tables[latents] = (self.position, table)
-        return table
+        if self._table is None or self._table[:2] != (self.position, latents):
+            table = self.rope.table(self.position, latents, self.rows, self.columns, self.device)
+            self._table = self.position, latents, table
+        return self._table[2]
 
     def commit(self) -> None:
         """Keep the keys and values of the last forward and advance by its block.
@@ -141,28 +129,13 @@ class RollingCache(BlockCache):
         with torch.inference_mode(False):
             self.keys = torch.zeros(shape, device=device, dtype=dtype)
             self.values = torch.zeros(shape, device=device, dtype=dtype)
-            self._rows = torch.zeros(
-                0, dtype=torch.long, device=device
-            )  # buffer rows of the open block's tokens
-        self._source: Tensor | None = None  # the block's tokens in those rows; None for all
-        self._chosen = (0, 0)  # filled latents and block length that the rows belong to
-        self._fits = True
+        self._rows = self._source = torch.zeros(0, dtype=torch.long, device=device)
+        self._fits = True  # whether the open block fits in the window
 
     @property
     def nbytes(self) -> int:
         """Bytes of the buffers."""
         return 2 * self.keys.numel() * self.keys.element_size()
-
-    @property
-    def visible(self) -> tuple[int, int, bool]:
-        """Visible latents, visible sinks, and whether the block fits in the window; constant once
-        the window is full.
-        """
-        return (
-            min(self.size, self.filled + self.open_latents),
-            min(self.sink, self.filled),
-            self._fits,
-        )
 
     def begin(self, latents: int) -> RopeTable:
         """Open the block and choose the slots of its latents.
@@ -178,9 +151,6 @@ class RollingCache(BlockCache):
                 "repeat a block with its first length (its forwards share slots), or write it, or reset the cache",
             )
         table = super().begin(latents)
-        if self._chosen == (self.filled, latents):  # reopened: no transfer to the device
-            return table
-        self._chosen = (self.filled, latents)
         ring = self.size - self.sink
         own = range(self.filled, self.filled + latents)
         rolling = [i for i in own if i >= self.sink]
@@ -188,13 +158,8 @@ class RollingCache(BlockCache):
         # A block longer than the ring attends to all of itself; only its newest latents are cached.
         kept = [i for i in own if i < self.sink] + rolling[max(0, len(rolling) - ring) :]
         slots = [i if i < self.sink else self.sink + (i - self.sink) % ring for i in kept]
-        with torch.inference_mode(False):
-            self._rows = self._keep_in_place(self._rows, slots)
-            self._source = (
-                None
-                if self._fits
-                else self._keep_in_place(self._source, [i - self.filled for i in kept])
-            )
+        self._rows = self._token_rows(slots)
+        self._source = self._token_rows([i - self.filled for i in kept])
         return table
 
     def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
@@ -202,25 +167,20 @@ class RollingCache(BlockCache):
         keys, values = self.keys[layer], self.values[layer]
         own_k, own_v = (part.to(keys.dtype) for part in (k, v))
         for buffer, own in ((keys, own_k), (values, own_v)):
-            buffer.index_copy_(1, self._rows, own if self._source is None else own[:, self._source])
+            buffer.index_copy_(1, self._rows, own[:, self._source])
         if self._fits:
-            end = self.visible[0] * self.tokens
+            end = min(self.size, self.filled + self.open_latents) * self.tokens
             return attend(q, keys[:, :end], values[:, :end])
-        past = self.visible[1] * self.tokens
+        past = min(self.sink, self.filled) * self.tokens
         return attend(
             q,
             torch.cat([keys[:, :past], own_k], dim=1),
             torch.cat([values[:, :past], own_v], dim=1),
         )
 
-    def _keep_in_place(self, old: Tensor | None, latents: list[int]) -> Tensor:
-        """Return the rows of these latents, in the old tensor's storage if the shape is equal."""
-        rows = self._token_rows(latents)
-        return rows.to(self.device) if old is None or old.shape != rows.shape else old.copy_(rows)
-
     def _token_rows(self, latents: list[int]) -> Tensor:
-        first = torch.tensor(latents, dtype=torch.long, device="cpu")[:, None] * self.tokens
-        return (first + torch.arange(self.tokens, device="cpu")).flatten()
+        first = torch.tensor(latents, dtype=torch.long, device=self.device)[:, None] * self.tokens
+        return (first + torch.arange(self.tokens, device=self.device)).flatten()
 
 
 class GraphCache(BlockCache):

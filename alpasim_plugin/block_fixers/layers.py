@@ -104,15 +104,6 @@ class PatchLinear(nn.Linear):
     def __init__(self, channels: int, width: int) -> None:
         super().__init__(channels * PATCH * PATCH, width, bias=False)
 
-    def follow(self, weight: Tensor) -> None:
-        """Become the embedding followed by a linear with this weight ``(outputs, width)``, in
-        place; product in float64.
-        """
-        self.weight = nn.Parameter(
-            (weight.double() @ self.weight.double()).to(self.weight.dtype), requires_grad=False
-        )
-        self.out_features = len(weight)
-
     def embed(self, video: Tensor, first_channel: int = 0) -> Tensor:
         """Embed ``video (B, C, T, H, W)`` as the channels from ``first_channel`` on; return ``(B,
         T, N, width)``.
@@ -122,25 +113,23 @@ class PatchLinear(nn.Linear):
         return F.linear(patches, self.weight[:, start : start + patches.shape[-1]])
 
 
-def sinusoid(t: Tensor, width: int, rounding: torch.dtype = torch.float32) -> Tensor:
+def sinusoid(t: Tensor, width: int) -> Tensor:
     """Embed time steps as cosines then sines.
 
     Args:
         t: ``(...)`` time steps, 0 to 1000.
         width: Channels, even.
-        rounding: Precision in which the original training code holds time: with ``torch.bfloat16``,
-            the step, its scaled value and the result are each rounded (937.5 becomes 936).
 
     Returns:
         ``(..., width)`` float32.
     """
-    scaled = (t.to(rounding) * TIME_SCALE).float()
+    scaled = t.float() * TIME_SCALE
     half = width // 2
     frequency = torch.exp(
         -math.log(MAX_PERIOD) * torch.arange(half, device=t.device, dtype=torch.float32) / half
     )
     angle = scaled[..., None] * frequency
-    return torch.cat([angle.cos(), angle.sin()], dim=-1).to(rounding).float()
+    return torch.cat([angle.cos(), angle.sin()], dim=-1)
 
 
 class TimeMap(nn.Module):
@@ -174,20 +163,15 @@ class PatchEmbed(nn.Module):
         return layer
 
 
-def embed_latents(
-    embed: PatchLinear, x: Tensor, condition_mask: Tensor | None, padding_mask: Tensor | None
-) -> Tensor:
-    """Embed latents together with their masks.
-
-    Without a mask it is zero, so its columns of the embedding are skipped.
+def embed_latents(embed: PatchLinear, x: Tensor, condition_mask: Tensor | None) -> Tensor:
+    """Embed latents with their condition mask; that of padding is zero, as is the other where it is
+    None, so its columns of the embedding are skipped.
 
     Args:
         embed: Embedding of C + 2 channels.
         x: ``(B, C, T, H, W)``.
         condition_mask: ``(B, 1, T, H, W)`` or anything that broadcasts to it, 1 where the latent is
             given.
-        padding_mask: ``(B, 1, h, w)`` at any resolution; resized to the latent's by nearest
-            neighbour.
 
     Returns:
         ``(B, T, N, width)``.
@@ -196,7 +180,4 @@ def embed_latents(
     tokens = embed.embed(x)
     if condition_mask is not None:
         tokens = tokens + embed.embed(condition_mask.to(x.dtype).expand(b, 1, t, h, w), c)
-    if padding_mask is not None:
-        resized = F.interpolate(padding_mask.to(x.dtype), size=(h, w), mode="nearest")
-        tokens = tokens + embed.embed(resized[:, :, None].expand(b, 1, t, h, w), c + 1)
     return tokens

@@ -1,16 +1,13 @@
-"""Cast a trained network to another precision for inference.
+"""The networks of a fixer, from weights or untrained, loaded once per process.
 
 In bf16 and fp16 the token stream and the linear layers have that type; the time embedding, the
-modulation, the rotary angles and the arithmetic inside norms stay float32. Cast last: fold at
-float32 and cast the folded network, so that each weight is rounded once.
-
-The networks of a fixer, from weights or untrained, loaded once per process.
+modulation, the rotary angles and the arithmetic inside norms stay float32.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -20,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from alpasim_plugin.block_fixers.dit import FLOAT32_KEYS, CosmosCausalDiT, TextContext
-from alpasim_plugin.block_fixers.sampling import CONTEXT_STEP, OPACITY_CHANNELS
+from alpasim_plugin.block_fixers.sampling import OPACITY_CHANNELS
 from alpasim_plugin.block_fixers.settings import LatentFixerSettings, OneFixerSettings
 from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.block_fixers.streaming import State
@@ -44,57 +41,24 @@ DTYPES: Mapping[Precision, torch.dtype] = {
     "fp16": torch.float16,
 }
 Net = TypeVar("Net", bound=nn.Module)
-DOING = "loading the networks of a fixer"
 TAEHV_WIDTHS = (256, 128, 64, 64)
 LATENT = 16
 Codec = TinyVAE | WanVAE
 
 
-def at_precision(net: CosmosCausalDiT, precision: Precision) -> CosmosCausalDiT:
-    """Return a frozen copy of a transformer, folded or not, at another precision.
-
-    Equal bit for bit to loading the same tensors with ``dtype=``.
-
-    Args:
-        net: At float32, for one rounding only.
-        precision: See the module.
+def at_precision(net: Net, precision: Precision, float32: Sequence[str] = ()) -> Net:
+    """Return a frozen copy of a network at another precision; buffers, and parameters whose key
+    contains one of ``float32``, stay float32.
 
     Raises:
-        InputError: A weight that overflows the precision, named.
+        InputError: A weight that overflows the precision.
     """
-    return _cast(net, DTYPES[precision], lambda key: any(part in key for part in FLOAT32_KEYS))
-
-
-def codec_at_precision(codec: Net, precision: Precision) -> Net:
-    """Return a frozen copy of a video autoencoder or decoder at another precision; its constants
-    stay float32.
-
-    Raises:
-        InputError: A weight that overflows the precision, named.
-    """
-    return _cast(codec, DTYPES[precision], lambda key: False)
-
-
-def text_at_precision(text: TextContext, precision: Precision) -> TextContext:
-    """Return a prompt's keys and values at another precision."""
-    dtype = DTYPES[precision]
-    return TextContext(tuple((k.to(dtype), v.to(dtype)) for k, v in text.keys_values))
-
-
-def weight_bytes(net: nn.Module) -> int:
-    """Return the bytes of all parameters and buffers."""
-    parts: list[Tensor] = [*net.parameters(), *net.buffers()]
-    return sum(part.numel() * part.element_size() for part in parts)
-
-
-def _cast(net: Net, dtype: torch.dtype, stays: Callable[[str], bool]) -> Net:
-    """Copy ``net`` without ever holding a second copy at the old precision."""
     cast: dict[int, object] = {}
     for key, value in net.named_parameters():
-        kept = torch.float32 if stays(key) else dtype
-        cast[id(value)] = nn.Parameter(
-            checkpoints.convert(key, value.detach(), kept, "network"), requires_grad=False
-        )
+        is_float32 = any(part in key for part in float32)
+        dtype = torch.float32 if is_float32 else DTYPES[precision]
+        converted = checkpoints.convert(key, value.detach(), dtype, "network")
+        cast[id(value)] = nn.Parameter(converted, requires_grad=False)
     return copy.deepcopy(net, cast)
 
 
@@ -102,8 +66,7 @@ def _cast(net: Net, dtype: torch.dtype, stays: Callable[[str], bool]) -> Net:
 class Networks:
     """The networks of a fixer; read-only and stateless, so rollouts share them."""
 
-    dit: CosmosCausalDiT  # folded where there is one step
-    finalise_dit: CosmosCausalDiT  # the same weights for the cache write
+    dit: CosmosCausalDiT
     vae: Codec
     decoder: Codec | TinyDecoder
     text: TextContext
@@ -210,28 +173,20 @@ def _load(settings: LatentFixerSettings, device: str) -> Networks:
 
 
 def build_networks(parts: Parts, dit_device: str, codec_device: str) -> Networks:
-    """Build, fold and cast the networks; nothing is kept for the next call."""
-    settings, precision = parts.settings, parts.settings.precision
+    """Build and cast the networks; nothing is kept for the next call."""
+    settings = parts.settings
+    codec_precision = settings.codec_precision
     plain = parts.dit().to(dit_device)
+    dtype = DTYPES[settings.precision]
     with torch.no_grad():
-        text = text_at_precision(
-            plain.encode_text(parts.prompt(plain.sizes).to(dit_device)), precision
-        )
-    times = settings.network_times
-    fold = settings.fold and len(times) == 1
-    # Folded at float32 and cast after that, so that every weight is rounded once.
-    dit = at_precision(plain.folded(times[0]) if fold else plain, precision)
-    finalise = (
-        at_precision(plain.folded(CONTEXT_STEP), precision) if fold and settings.finalises else dit
-    )
-    vae = codec_at_precision(parts.vae(), settings.codec_precision).to(codec_device)
-    own = settings.decoder.kind != "taehv"
-    decoder = (
-        vae
-        if own
-        else codec_at_precision(parts.decoder(), settings.codec_precision).to(codec_device)
-    )
-    return Networks(dit, finalise, vae, decoder, text, parts.trained, parts.note)
+        text = plain.encode_text(parts.prompt(plain.sizes).to(dit_device))
+    text = TextContext(tuple((k.to(dtype), v.to(dtype)) for k, v in text.keys_values))
+    dit = at_precision(plain, settings.precision, FLOAT32_KEYS)
+    vae = at_precision(parts.vae(), codec_precision).to(codec_device)
+    decoder: Codec | TinyDecoder = vae
+    if settings.decoder.kind == "taehv":
+        decoder = at_precision(parts.decoder(), codec_precision).to(codec_device)
+    return Networks(dit, vae, decoder, text, parts.trained, parts.note)
 
 
 class Parts:
@@ -283,65 +238,24 @@ class Parts:
     def prompt(self, sizes: DiTSizes) -> Tensor:
         """Return the prompt's features ``(1, tokens, text_width)``; a zero token for untrained
         weights.
-        """
-        given, name = self.tensors("prompt"), self.prompt_name
-        if name is not None:
-            return self.named_prompt(name, sizes)
-        if given is None:
-            if self.trained and self.bundle is None:
-                self.refuse(
-                    "prompt",
-                    "its transformer needs the features of the prompt that it was trained with",
-                )
-            return torch.zeros(1, 1, sizes.text_width)
-        text = given[0].get("text")
-        if text is None and given[0]:
-            raise InputError(
-                f"{given[1]}: its weights learned several prompts: {', '.join(sorted(given[0]))}",
-                f"choose one: --set fixer.prompt={min(given[0])}",
-            )
-        if text is None or text.ndim != 2 or text.shape[1] != sizes.text_width:
-            found = "no tensor 'text'" if text is None else f"text is {list(text.shape)}"
-            raise InputError(
-                f"{given[1]}: {found}", f"give 'text' of shape [tokens, {sizes.text_width}]"
-            )
-        return text.float()[None]
-
-    @property
-    def prompt_name(self) -> str | None:
-        """Name of the learned prompt that is asked for."""
-        return self.settings.prompt if isinstance(self.settings, OneFixerSettings) else None
-
-    def named_prompt(self, name: str, sizes: DiTSizes) -> Tensor:
-        """Return a learned prompt ``(1, tokens, text_width)`` by its name.
 
         Raises:
-            InputError: The weights have learned none, or none of that name.
+            InputError: The weights have no prompt of the name that the settings ask for.
         """
+        settings = self.settings
+        name = settings.prompt if isinstance(settings, OneFixerSettings) else None
         given = self.tensors("prompt")
-        known = (
-            {}
-            if given is None
-            else {key: value for key, value in given[0].items() if key != "text"}
-        )
-        if name not in known:
-            source = self.settings.name if given is None else given[1]
-            found = (
-                f"its weights learned the prompts {', '.join(sorted(known))}"
-                if known
-                else "its weights learned no prompts"
-            )
-            do = (
-                "choose one of these"
-                if known
-                else "leave fixer.prompt out, or give a bundle that holds prompts"
-            )
-            raise InputError(f"{source}, fixer.prompt={name}: {found}", do)
-        text = known[name]
-        if text.ndim != 2 or text.shape[1] != sizes.text_width:
+        if given is None and name is None:
+            if self.trained and self.bundle is None:
+                self.refuse("prompt", "its transformer needs the features of its prompt")
+            return torch.zeros(1, 1, sizes.text_width)
+        prompts, source = given or ({}, settings.name)
+        text = prompts.get(name or "text")
+        if text is None or text.ndim != 2 or text.shape[1] != sizes.text_width:
+            known = ", ".join(sorted(prompts)) or "none"
             raise InputError(
-                f"prompt {name}: shape {list(text.shape)}",
-                f"give [tokens, {sizes.text_width}]",
+                f"{source}: no prompt {name or 'text'} of shape [tokens, {sizes.text_width}]; prompts: {known}",
+                "choose a prompt by --set fixer.prompt=NAME, or give weights that have learned it",
             )
         return text.float()[None]
 

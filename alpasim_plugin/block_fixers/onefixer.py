@@ -1,7 +1,4 @@
-"""Noise for the transparent parts of a render: one random stream per scene, seed, camera, draw and
-latent.
-
-OneFixer as a streaming session: one causal flow step per block, a history per rollout and camera,
+"""OneFixer as a streaming session: one causal flow step per block, a history per rollout and camera,
 every frame guarded.
 
 Frames are grouped into views (`views`), run through the networks (`pipeline`), checked (`guard`)
@@ -20,13 +17,7 @@ from torch import Tensor
 
 from alpasim_plugin.block_fixers.clips import SIDE, TOKEN_PX, crop_clip, to_clip, to_images
 from alpasim_plugin.block_fixers.networks import LATENT, load_networks
-from alpasim_plugin.block_fixers.pipeline import (
-    TIMED,
-    BlockPipeline,
-    PipelineState,
-    StageClock,
-    no_clock,
-)
+from alpasim_plugin.block_fixers.pipeline import BlockPipeline, PipelineState
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer
@@ -124,10 +115,7 @@ class OneFixer(Fixer):
             torch.set_num_threads(threads)
         self.settings, self.scene_id, self.seed = settings, scene_id, seed
         self.networks = load_networks(settings, device)
-        # On an accelerator timing a stage waits for the device and prevents recordings; there the
-        # block is timed as a whole.
-        self._clock = StageClock(device) if self.networks.device.type == "cpu" else None
-        self.pipeline = BlockPipeline(self.networks, settings, self._clock or no_clock)
+        self.pipeline = BlockPipeline(self.networks, settings)
         self.blocks = (
             BlockRule(1, 1)
             if settings.history == "none"
@@ -138,15 +126,6 @@ class OneFixer(Fixer):
         prompt = "" if settings.prompt is None else f", prompt {settings.prompt}"
         self.label = f"{settings.name}{at}, {self.networks.note}{prompt}"
         self.reset(seed)
-
-    @property
-    def stage_ms(self) -> dict[str, float]:  # type: ignore[override]  # computed when it is read
-        """Total wall time by stage since the session was made, milliseconds; empty where stages are
-        not timed.
-        """
-        return (
-            {} if self._clock is None else {name: self._clock.ms.get(name, 0.0) for name in TIMED}
-        )
 
     def reset(self, seed: int) -> None:
         """Drop the history and use the noise of another seed."""

@@ -3,26 +3,17 @@ Tensors in, tensors out.
 
 A run leaves the history unchanged: it may be repeated from the same state, with other frames, any
 number of times. `BlockPipeline.keep` adds its result to the history. Only one draft is open at a
-time, for the cache has one open block. A `StageClock` adds up the time of each stage.
-
-On a GPU a block is recorded as CUDA graphs once its shapes repeat, and replayed from then on
-(`block_fixers.graphs`): one recording for the block, one for the cache write, per rollout. Timing
-the stages runs them one by one, so it disables recordings.
+time, for the cache has one open block.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from alpasim_plugin.block_fixers.graphs import CudaRecorder, Function, GraphedFunction, Recorder
 from alpasim_plugin.block_fixers.kv_cache import RollingCache
 from alpasim_plugin.block_fixers.networks import Networks, decode
 from alpasim_plugin.block_fixers.sampling import (
@@ -38,50 +29,6 @@ from alpasim_plugin.block_fixers.streaming import State
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.schedule import from_names
 
-STAGES = ("encode", "source", "dit", "decode", "cache write")  # of `BlockPipeline`, in order
-TIMED = (
-    "encode",
-    "dit",
-    "decode",
-    "cache write",
-)  # what tables show: mixing noise into the source takes next to nothing
-Stage = Callable[[str], AbstractContextManager[object]]
-
-
-class StageClock:
-    """Add up the wall time of named stages; what `BlockPipeline` takes as its ``stage``.
-
-    Args:
-        device: On an accelerator, queued work is waited for at both ends of a stage.
-    """
-
-    def __init__(self, device: torch.device | str = "cpu") -> None:
-        self._device = torch.device(device)
-        self.ms: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        """Time one pass through a stage."""
-        begin = self.now()
-        yield
-        self.ms[name] = self.ms.get(name, 0.0) + (self.now() - begin) * 1e3
-
-    def now(self) -> float:
-        """Return seconds, with the device's queue empty."""
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
-        return time.perf_counter()
-
-    def take(self) -> dict[str, float]:
-        """Return the milliseconds by stage since the last call."""
-        ms, self.ms = self.ms, {}
-        return ms
-
-
-def no_clock(name: str) -> AbstractContextManager[object]:
-    """Run a stage untimed."""
-    return nullcontext()
-
 
 def condition_of(
     settings: OneFixerSettings, z_map: Tensor, z_render: Tensor, opacity: Tensor | None
@@ -93,12 +40,12 @@ def condition_of(
         z_map, z_render: ``(B, 16, T, h, w)``.
         opacity: From `opacity_input`.
     """
-    parts = [
-        z_map,
-        *([z_render] if settings.render_input else []),
-        *([] if opacity is None else [opacity]),
-    ]
-    return torch.cat(parts, dim=1) if len(parts) > 1 else z_map
+    parts = [z_map]
+    if settings.render_input:
+        parts.append(z_render)
+    if opacity is not None:
+        parts.append(opacity)
+    return torch.cat(parts, dim=1)
 
 
 def opacity_input(
@@ -124,8 +71,6 @@ class History:
     """The transformer's cache, the state at its end, and the open block."""
 
     cache: RollingCache
-    fix: Function  # the block, as it is or through a recording
-    finalise: Function  # the cache write
     kept: PipelineState | None = None
     draft: PipelineState | None = None
     write: Callable[[], None] = field(
@@ -152,24 +97,11 @@ class BlockPipeline:
     Args:
         networks: Shared, never written to.
         settings: Window, steps, history, source, decoder.
-        stage: Called as ``with stage(name):`` around ``encode``, ``source``, ``dit``, ``decode``
-            and ``cache write``, for timing.
-        recorder: Makes recordings; None takes CUDA graphs on a GPU unless the settings say
-            ``graphs: off``, and nothing elsewhere.
     """
 
-    def __init__(
-        self,
-        networks: Networks,
-        settings: OneFixerSettings,
-        stage: Stage = no_clock,
-        recorder: Recorder | None = None,
-    ) -> None:
-        self.networks, self.settings, self.stage = networks, settings, stage
+    def __init__(self, networks: Networks, settings: OneFixerSettings) -> None:
+        self.networks, self.settings = networks, settings
         self.schedule = from_names(settings.steps)
-        if recorder is None and settings.graphs != "off" and networks.device.type == "cuda":
-            recorder = CudaRecorder(networks.device)
-        self.recorder = recorder
 
     @property
     def draws(self) -> int:
@@ -187,13 +119,7 @@ class BlockPipeline:
             batch, height // 8, width // 8, self.settings.window, self.settings.sink
         )
         assert isinstance(cache, RollingCache), "a cache for inference"
-        parts = partial(self._fix, cache), partial(self._finalise, cache)
-        fix, finalise = (
-            parts
-            if self.recorder is None
-            else (GraphedFunction(part, self.recorder) for part in parts)
-        )
-        history = History(cache, fix, finalise)
+        history = History(cache)
         history.kept = PipelineState(0, None, None, None, history)
         return history.kept
 
@@ -237,98 +163,45 @@ class BlockPipeline:
                 f"latent {state.latent}: {found}",
                 "give the map in every block of a rollout, or in none",
             )
-        with self.stage("source"):
-            mask = (
-                None
-                if alpha is None or settings.holes == "render"
-                else opacity_mask(alpha, first=state.latent == 0)
-            )
-            opacity = opacity_input(settings, rgb, alpha, first=state.latent == 0)
-        cache, history = state.history.cache, state.history
+        nets, cache, history = self.networks, state.history.cache, state.history
+        is_first = state.latent == 0
+        opacity = opacity_input(settings, rgb, alpha, first=is_first)
         shown = map_video(settings, rgb, sdmap)
-        block = (
-            rgb,
-            alpha,
-            shown,
-            mask,
-            opacity,
-            list(noise[: len(self.schedule)]),
-            state.encoder,
-            state.decoder,
+        views = rgb if shown is None else torch.cat([rgb, shown])
+        latents, encoder = nets.vae.encode_next(views, state.encoder)
+        z_render, z_map = latents[: len(rgb)].float(), latents[len(rgb) :].float()
+        if shown is None:
+            z_map = torch.zeros_like(z_render)
+        sources = list(noise[: len(self.schedule)])
+        if settings.holes == "render" or (alpha is None and settings.holes != "everywhere"):
+            sources = [z_render] * len(sources)
+        elif settings.holes == "noise":
+            assert alpha is not None
+            mask = opacity_mask(alpha, first=is_first)
+            sources = [mixed_source(z_render, mask, eps) for eps in sources]
+        condition = condition_of(settings, z_map, z_render, opacity)
+        z_0 = sample_block(
+            nets.dit,
+            sources,
+            nets.text,
+            condition,
+            cache,
+            self.schedule,
+            "last-forward",
+            commit=False,
         )
-        out, z_0, condition, encoder, decoder = self._call(history, history.fix, *block)
+        out, decoder = decode(nets, settings, z_0, rgb, alpha, state.decoder)
         new = PipelineState(
             state.latent + z_0.shape[2], encoder, decoder, sdmap is not None, history
         )
 
         def write() -> None:
             if settings.history == "finalise":
-                self._call(history, history.finalise, z_0, noise[-1], condition)
+                finalise(nets.dit, z_0, noise[-1], nets.text, condition, cache, commit=False)
             cache.commit()
 
         history.draft, history.write = new, write
         return out, new
-
-    def _call(self, history: History, function: Function, *args: object) -> Any:
-        """Run a part of the block that is open in the cache, through its recording where there is
-        one.
-        """
-        if not isinstance(function, GraphedFunction):
-            return function(*args)
-        if self.stage is not no_clock:
-            return function.eagerly(*args)
-        history.cache.begin(self.settings.block_latents)
-        return function(*args, key=history.cache.visible)
-
-    def _fix(
-        self,
-        cache: RollingCache,
-        rgb: Tensor,
-        alpha: Tensor | None,
-        sdmap: Tensor | None,
-        mask: Tensor | None,
-        opacity: Tensor | None,
-        noise: Sequence[Tensor],
-        encoder: State | None,
-        decoder: State | None,
-    ) -> tuple[Tensor, Tensor, Tensor, State, State]:
-        """Fix the frames of a block; writes only to the open block of the cache.
-
-        Returns:
-            Frames, latents, the condition, and both codecs' states after the block.
-        """
-        nets = self.networks
-        with self.stage("encode"):
-            views = rgb if sdmap is None else torch.cat([rgb, sdmap])
-            latents, encoder = nets.vae.encode_next(views, encoder)
-            z_render, z_map = latents[: len(rgb)].float(), latents[len(rgb) :].float()
-            z_map = torch.zeros_like(z_render) if sdmap is None else z_map
-        with self.stage("source"):
-            if self.settings.holes == "everywhere":
-                sources = list(noise)
-            else:
-                sources = [
-                    z_render if mask is None else mixed_source(z_render, mask, eps) for eps in noise
-                ]
-            condition = condition_of(self.settings, z_map, z_render, opacity)
-        with self.stage("dit"):
-            z_0 = sample_block(
-                nets.dit,
-                sources,
-                nets.text,
-                condition,
-                cache,
-                self.schedule,
-                "last-forward",
-                commit=False,
-            )
-        with self.stage("decode"):
-            out, decoder = decode(nets, self.settings, z_0, rgb, alpha, decoder)
-        return out, z_0, condition, encoder, decoder
-
-    def _finalise(self, cache: RollingCache, z_0: Tensor, eps: Tensor, z_map: Tensor) -> None:
-        nets = self.networks
-        finalise(nets.finalise_dit, z_0, eps, nets.text, z_map, cache, commit=False)
 
     @torch.inference_mode()
     def keep(self, state: PipelineState) -> PipelineState:
@@ -340,8 +213,7 @@ class BlockPipeline:
         """
         history = state.history
         if state is history.draft:
-            with self.stage("cache write"):
-                history.write()
+            history.write()
             history.kept, history.draft, history.write = state, None, lambda: None
         elif state is not history.kept:
             raise InputError(

@@ -1,22 +1,14 @@
-"""The noise schedule: time steps of a sampler and their noise levels.
-
-With shift 5, ``sigma(u) = 5 u / (1 + 4 u)`` for ``u`` in (0, 1], tabulated at 1000 points; the
-network takes ``1000 sigma``. A *named* step, as in "1000, 750, 500, 250", is ``1000 u``, before the
-shift. The cache write at 128 is after the shift: it is the network's time input, and its noise
-level is that of the nearest entry in the table (0.12993).
-
-Source: OmniDreams' flow-matching scheduler and self-forcing sampler.
-
-Sampling: from the latents of a render to clean latents (paper, Eq. 1 and 2), and the extension to
-    several steps.
+"""Sampling: from the latents of a render to clean latents (paper, Eq. 1 and 2), and the extension to
+several steps.
 
 Noise is an argument. All functions take normalised latents ``(B, C, T, H, W)`` and are
-differentiable.
+differentiable. The cache write at t = 128 is after the shift of the schedule: its noise level is
+that of the nearest entry in the table (0.12993; OmniDreams' self-forcing sampler).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Literal, Protocol
 
 import torch
@@ -66,7 +58,7 @@ class BlockNet(Protocol):
         ...
 
 
-def opacity_mask(opacity: Tensor, first: bool = True, nan_as: float | None = None) -> Tensor:
+def opacity_mask(opacity: Tensor, first: bool = True) -> Tensor:
     """Max-pool a renderer's opacity to latent size: the mask ``m`` of Eq. 1.
 
     A latent covers 4 frames of 8 x 8 pixels. The first frame of a rollout is repeated three times,
@@ -76,7 +68,6 @@ def opacity_mask(opacity: Tensor, first: bool = True, nan_as: float | None = Non
         opacity: ``(B, 1, frames, H, W)``, 0 to 1; ``1 + 4 n`` frames if ``first``, else ``4 n``; H
             and W in multiples of 8.
         first: Whether the rollout starts here.
-        nan_as: Value that replaces NaN; None refuses NaN.
 
     Returns:
         ``(B, 1, latents, H / 8, W / 8)``.
@@ -84,7 +75,7 @@ def opacity_mask(opacity: Tensor, first: bool = True, nan_as: float | None = Non
     Raises:
         InputError: Wrong shape, NaN, or values outside [0, 1].
     """
-    return F.max_pool3d(_checked_opacity(opacity, first, nan_as), POOL, POOL)
+    return F.max_pool3d(_checked_opacity(opacity, first), POOL, POOL)
 
 
 def opacity_values(opacity: Tensor, first: bool = True) -> Tensor:
@@ -100,7 +91,7 @@ def opacity_values(opacity: Tensor, first: bool = True) -> Tensor:
     Raises:
         InputError: As `opacity_mask`.
     """
-    cells = F.avg_pool3d(_checked_opacity(opacity, first, None), (1, 4, 4))
+    cells = F.avg_pool3d(_checked_opacity(opacity, first), (1, 4, 4))
     b, _, frames, rows, columns = cells.shape
     split = cells.view(b, frames // 4, 4, rows // 2, 2, columns // 2, 2)
     return split.permute(0, 2, 4, 6, 1, 3, 5).flatten(
@@ -108,47 +99,25 @@ def opacity_values(opacity: Tensor, first: bool = True) -> Tensor:
     )  # (B, frame row column, latents, H / 8, W / 8)
 
 
-def _checked_opacity(opacity: Tensor, first: bool, nan_as: float | None) -> Tensor:
+def _checked_opacity(opacity: Tensor, first: bool) -> Tensor:
     """Return opacity in [0, 1], four frames a latent."""
-    frames = opacity.shape[2] if opacity.ndim == 5 else 0
-    if (
-        opacity.ndim != 5
-        or opacity.shape[1] != 1
-        or frames < 1
-        or (frames - first) % 4
-        or opacity.shape[3] % 8
-        or opacity.shape[4] % 8
-    ):
+    fits = opacity.ndim == 5 and opacity.shape[1] == 1 and opacity.shape[2] > 0
+    if not fits or (opacity.shape[2] - first) % 4 or opacity.shape[3] % 8 or opacity.shape[4] % 8:
         raise InputError(
             f"opacity: shape {list(opacity.shape)}",
             f"give (B, 1, {'1 + 4 n' if first else '4 n'} frames, H, W) with H and W in multiples of 8",
         )
     if not opacity.is_meta:
-        opacity = _without_nan(opacity, nan_as)
+        low, high = float(opacity.min()), float(opacity.max())
+        if not (low >= -SLACK and high <= 1 + SLACK):  # also refuses NaN
+            raise InputError(
+                f"opacity: values from {low:.4g} to {high:.4g}",
+                "give accumulated alpha between 0 and 1",
+            )
     video = opacity.clamp(0, 1)
     if first:
         video = torch.cat([video[:, :, :1].expand(-1, -1, 3, -1, -1), video], dim=2)
     return video
-
-
-def _without_nan(opacity: Tensor, nan_as: float | None) -> Tensor:
-    """Replace NaN, if allowed, and refuse values outside [0, 1]."""
-    unknown = opacity.isnan()
-    count = int(unknown.sum())
-    if count and nan_as is None:
-        raise InputError(
-            f"opacity: {count} of {opacity.numel()} values are NaN",
-            "repair the renderer, or give a replacement with nan_as (0 treats those pixels as empty)",
-        )
-    if count:
-        opacity = opacity.masked_fill(unknown, nan_as if nan_as is not None else 0.0)
-    low, high = float(opacity.min()), float(opacity.max())
-    if low < -SLACK or high > 1 + SLACK:
-        raise InputError(
-            f"opacity: values from {low:.4g} to {high:.4g}",
-            "give accumulated alpha between 0 and 1",
-        )
-    return opacity
 
 
 def mixed_source(z_r: Tensor, m: Tensor, eps: Tensor) -> Tensor:
@@ -188,8 +157,6 @@ def sample_block(
     cache: BlockCache,
     schedule: Sequence[NoiseLevel],
     history: History = "finalise",
-    given: Tensor | None = None,
-    finalise_net: BlockNet | None = None,
     commit: bool = True,
 ) -> Tensor:
     """Sample one block of clean latents and write its keys and values into the cache.
@@ -210,9 +177,6 @@ def sample_block(
         cache: KV cache of this rollout.
         schedule: Noise levels, the first with sigma 1; see `schedule.steps`.
         history: What the cache keeps.
-        given: ``(B, C, n, H, W)`` known clean latents of the first n of the block: they replace the
-            input of every forward, the cache write included, and the prediction.
-        finalise_net: Network for the cache write, when ``net`` is folded for another time step.
         commit: False leaves the block open: run it again (for example with its true poses), or keep
             it with ``cache.commit()``.
 
@@ -223,31 +187,20 @@ def sample_block(
         InputError: A wrong number of sources.
     """
     if len(sources) != sources_needed(schedule, history) or not schedule:
-        do = f"give {sources_needed(schedule, history)}: one per step" + (
-            ", one for the cache write" if history == "finalise" else ""
-        )
         raise InputError(
-            f"sources: {len(sources)} sources for {len(schedule)} steps with history {history!r}",
-            do,
+            f"{len(sources)} sources for {len(schedule)} steps with history {history!r}",
+            "give one per step, and one for the cache write of finalise",
         )
-    fixed, mask = _given(given, sources[0])
     z = sources[0]
     for i, level in enumerate(schedule):
         last = i == len(schedule) - 1
-        v = net.step(
-            fixed(z),
-            level.t,
-            text,
-            hdmap,
-            cache,
-            commit and last and history == "last-forward",
-            mask,
-        )
-        z_0 = fixed(flow_step(z, v, level.sigma))
+        is_write = commit and last and history == "last-forward"
+        v = net.step(z, level.t, text, hdmap, cache, is_write)
+        z_0 = flow_step(z, v, level.sigma)
         if not last:
             z = interpolant(z_0, sources[i + 1], schedule[i + 1].sigma)
     if history == "finalise":
-        finalise(finalise_net or net, z_0, sources[-1], text, hdmap, cache, given, commit)
+        finalise(net, z_0, sources[-1], text, hdmap, cache, commit)
     return z_0
 
 
@@ -258,27 +211,14 @@ def finalise(
     text: Tensor | TextContext,
     hdmap: Tensor,
     cache: BlockCache,
-    given: Tensor | None = None,
     commit: bool = True,
 ) -> None:
     """Write clean latents into the cache by a forward over them, slightly noised, at t = 128.
 
     Args:
-        net, text, hdmap, cache, given, commit: As in `sample_block`.
+        net, text, hdmap, cache, commit: As in `sample_block`.
         z_0: ``(B, C, T, H, W)`` clean latents of the open block.
         eps: Standard normal noise like ``z_0``.
     """
     level = context_level()
-    fixed, mask = _given(given, z_0)
-    net.step(fixed(interpolant(z_0, eps, level.sigma)), level.t, text, hdmap, cache, commit, mask)
-
-
-def _given(given: Tensor | None, like: Tensor) -> tuple[Callable[[Tensor], Tensor], Tensor | None]:
-    """Return a function that overwrites the first latents of a block with known ones, and the
-    condition mask.
-    """
-    if given is None:
-        return lambda z: z, None
-    n = given.shape[2]
-    mask = torch.cat([torch.ones_like(given[:, :1]), torch.zeros_like(like[:, :1, n:])], dim=2)
-    return lambda z: torch.cat([given, z[:, :, n:]], dim=2), mask
+    net.step(interpolant(z_0, eps, level.sigma), level.t, text, hdmap, cache, commit)

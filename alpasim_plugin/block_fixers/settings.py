@@ -5,7 +5,7 @@ appearances that learned prompts ask for.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -19,9 +19,6 @@ from alpasim_plugin.fixers.settings import (
     check_steps,
     counted_steps,
 )
-
-if TYPE_CHECKING:
-    pass
 
 CLEAR = "clear"  # the appearance of the render: the identity
 STYLES = (CLEAR, "night", "fog", "snow")
@@ -88,9 +85,6 @@ class LatentFixerSettings(WeightedSettings):
     )
     codec_precision: Literal["fp32", "bf16", "fp16"] = Field(
         default="fp32", description="Of the autoencoder."
-    )
-    fold: bool = Field(
-        default=True, description="Fold the modulation into the linears where there is one step."
     )
 
     @property
@@ -184,10 +178,6 @@ class OneFixerSettings(LatentFixerSettings):
     prompt: str | None = Field(
         default=None,
         description="Name of a prompt that its weights learned, such as night; recipe appearance has clear, night, fog, snow.",
-    )
-    graphs: Literal["auto", "off"] = Field(
-        default="auto",
-        description="auto: on a GPU, blocks are recorded as CUDA graphs and replayed.",
     )
 
     @property

@@ -1,14 +1,9 @@
-"""Sizes of the causal transformer, the checkpoint keys and shapes that follow, and reading sizes
-from a checkpoint.
-
-Initial weights for training: truncated normal linears, unit gains, zero last modulation.
-"""
+"""Sizes of the causal transformer, the checkpoint keys and shapes that follow, and initial weights."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -16,7 +11,6 @@ from torch import Tensor, nn
 
 from alpasim_plugin.block_fixers.layers import PATCH
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.network.checkpoints import listed
 
 Shape = tuple[int, ...]
 AREA = PATCH * PATCH
@@ -24,6 +18,7 @@ MASK_CHANNELS = 2  # condition mask, padding mask
 ATTENTIONS = ("self_attn", "cross_attn")
 SUBLAYERS = (*ATTENTIONS, "mlp")
 CUT = 3.0  # standard deviations
+HINT = "give the weights of a causal single-view network with a semantic-map embedding (docs/block-fixers.md)"
 
 
 @dataclass(frozen=True)
@@ -96,100 +91,36 @@ class DiTSizes:
         return out
 
 
-def read_sizes(shapes: Mapping[str, Shape], source: str) -> DiTSizes:
-    """Read all sizes from the tensors of a checkpoint and check every key against them.
-
-    Each size is the majority vote of the tensors that depend on it, so that a single wrong tensor
-    is reported, not all others. A transposed square matrix cannot be detected.
-
-    Args:
-        shapes: Shape of every tensor by key, already cleaned (see `checkpoints.clean`).
-        source: Where the tensors come from, for the error.
+def read_sizes(tensors: Mapping[str, Tensor], source: str) -> DiTSizes:
+    """Read all sizes off the tensors of a checkpoint.
 
     Raises:
-        InputError: Missing, unexpected or mis-shaped (also transposed) keys, all named.
+        InputError: A tensor that gives a size is missing, or its sizes are impossible.
     """
-    depth = 1 + max((int(key.split(".")[1]) for key in shapes if _is_block(key)), default=-1)
-    if depth == 0:
-        raise _refusal(source, len(shapes), ["no key like blocks.0.self_attn.q_proj.weight"])
-    embeds = [key for key in shapes if key.endswith("opacity_embed.weight")]
-    names = set(DiTSizes(blocks=depth, opacity_channels=bool(embeds)).shapes())
-    missing, extra = sorted(names - set(shapes)), sorted(set(shapes) - names)
-    if missing or extra:
-        raise _refusal(
-            source, len(shapes), [listed("missing", missing), listed("unexpected", extra)]
-        )
-    sizes = _vote_sizes(shapes, depth, source)
-    wrong = []
-    for key, expected in sizes.shapes().items():
-        found = shapes[key]
-        if found != expected:
-            hint = ", transposed" if len(found) == 2 and found == expected[::-1] else ""
-            wrong.append(f"{key} is {list(found)} for {list(expected)}{hint}")
-    if wrong:
-        raise _refusal(source, len(shapes), [listed("wrong shape", wrong)])
-    return sizes
 
+    def shape(key: str, axes: int = 2) -> torch.Size:
+        if key not in tensors or tensors[key].ndim != axes:
+            raise InputError(f"{source}: no tensor {key} of {axes} axes", HINT)
+        return tensors[key].shape
 
-def _vote_sizes(shapes: Mapping[str, Shape], depth: int, source: str) -> DiTSizes:
-    blocks = range(depth)
-
-    def mode(values: Iterable[int]) -> int:
-        return Counter(values).most_common(1)[0][0]
-
-    def other_side(keys: Iterable[str], known: int) -> list[int]:
-        """Return the second side of matrices of which one side is known; transposition does not
-        matter.
-        """
-        return [math.prod(shapes[key]) // known for key in keys]
-
-    squares = [
-        f"blocks.{i}.self_attn.{part}_proj.weight"
-        for i in blocks
-        for part in ("q", "k", "v", "output")
-    ]
-    width = mode(n for key in ("t_embedding_norm.weight", *squares) for n in shapes[key])
-    gains = [
-        f"blocks.{i}.{name}.{part}_norm.weight"
-        for i in blocks
-        for name in ATTENTIONS
-        for part in "qk"
-    ]
-    head_width = mode(n for key in gains for n in shapes[key])
-    if width < 2 or head_width < 2 or width % head_width or head_width % 2:
-        found = f"width {width} (self_attn) with head width {head_width} (q_norm, k_norm): no whole number of even heads"
-        raise _refusal(source, len(shapes), [found])
-    contexts = [f"blocks.{i}.cross_attn.{part}_proj.weight" for i in blocks for part in "kv"]
-    context_width = max(mode([*shapes["crossattn_proj.0.bias"], *other_side(contexts, width)]), 1)
-    ranks = [f"blocks.{i}.adaln_modulation_{name}.1.weight" for i in blocks for name in SUBLAYERS]
-    opacities = [key for key in shapes if key.endswith("opacity_embed.weight")]
-    (of_output,) = other_side(["final_layer.linear.weight"], width * AREA)
-    (of_input,) = other_side(["x_embedder.proj.1.weight"], width * AREA)
+    (width,) = shape("t_embedding_norm.weight", 1)
+    (head_width,) = shape("blocks.0.self_attn.q_norm.weight", 1)
+    (context_width,) = shape("crossattn_proj.0.bias", 1)
+    if head_width < 2 or head_width % 2 or width % head_width:
+        raise InputError(f"{source}: width {width} with head width {head_width}", HINT)
+    opacity = "blocks.0.opacity_embed.weight"
     return DiTSizes(
         width=width,
-        blocks=depth,
+        blocks=len({key.split(".")[1] for key in tensors if key.startswith("blocks.")}),
         head_width=head_width,
-        mlp_width=mode(
-            other_side([f"blocks.{i}.mlp.layer{n}.weight" for i in blocks for n in (1, 2)], width)
-        ),
-        adaln_rank=mode(other_side([*ranks, "final_layer.adaln_modulation.1.weight"], width)),
-        text_width=mode(other_side(["crossattn_proj.0.weight"], context_width)),
+        mlp_width=shape("blocks.0.mlp.layer1.weight")[0],
+        adaln_rank=shape("final_layer.adaln_modulation.1.weight")[0],
+        text_width=shape("crossattn_proj.0.weight")[1],
         context_width=context_width,
-        latent_channels=mode([of_output, of_input - MASK_CHANNELS]),
-        map_channels=mode(other_side(["additional_patch_embedding.proj.1.weight"], width * AREA)),
-        opacity_channels=mode(other_side(opacities, width * AREA)) if opacities else 0,
+        latent_channels=shape("final_layer.linear.weight")[0] // AREA,
+        map_channels=shape("additional_patch_embedding.proj.1.weight")[1] // AREA,
+        opacity_channels=shape(opacity)[1] // AREA if opacity in tensors else 0,
     )
-
-
-def _is_block(key: str) -> bool:
-    parts = key.split(".")
-    return len(parts) > 2 and parts[0] == "blocks" and parts[1].isdigit()
-
-
-def _refusal(source: str, count: int, parts: list[str]) -> InputError:
-    found = "; ".join(part for part in parts if part)
-    do = "give the weights of a causal single-view network with a semantic-map embedding (docs/block-fixers.md lists keys and shapes)"
-    return InputError(f"{source} ({count} tensors): {found}", do)
 
 
 def initial_weights(sizes: DiTSizes, seed: int, zero_velocity: bool = False) -> dict[str, Tensor]:

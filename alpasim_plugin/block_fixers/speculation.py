@@ -1,7 +1,4 @@
-"""Differences between a predicted render request and the true one: whether a frame rendered ahead
-of time may be shown.
-
-Speculative rendering: frames are returned one by one from blocks that were fixed along predicted
+"""Speculative rendering: frames are returned one by one from blocks that were fixed along predicted
 poses.
 
 At a block's first frame the rest of the block is predicted from the plan in force, rendered and

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from typing import Any, Protocol, Self, runtime_checkable
 
 import torch
@@ -92,28 +91,6 @@ class StreamingState:
             if joined.shape[1] > x.shape[1]
             else torch.cat([torch.zeros_like(x[:, :1]), x[:, :-1]], dim=1)
         )
-
-
-class Stream:
-    """Feed a pure step function block by block and hold its state.
-
-    Args:
-        step: ``step(x, state, ...) -> (y, state)``.
-        state: Where to start; None is before the first frame.
-    """
-
-    def __init__(self, step: Step, state: State | None = None) -> None:
-        self._step = step
-        self.state = state
-
-    def push(self, x: Tensor, *args: Any, **options: Any) -> Tensor:
-        """Take the next frames or latents and return the outputs that they complete."""
-        out, self.state = self._step(x, self.state, *args, **options)
-        return out
-
-    def fork(self) -> Stream:
-        """Return an independent stream at the same point."""
-        return Stream(self._step, self.state)
 
 
 def in_passes(
@@ -285,12 +262,6 @@ class StreamingDecoder(nn.Module, ABC):
         """
         return self.decode_next(z, None, **options)[0]
 
-    def decoder_stream(self, *, detach: bool = True) -> Stream:
-        """Start a stream: ``push(latents, ...) -> frames`` as `decode_next`; its ``state`` is all
-        it holds.
-        """
-        return Stream(partial(self.decode_next, detach=detach))
-
 
 class StreamingCodec(StreamingDecoder):
     """Encode and decode clips and streams."""
@@ -315,9 +286,3 @@ class StreamingCodec(StreamingDecoder):
             InputError: Another shape.
         """
         return self.encode_next(video, None)[0]
-
-    def encoder_stream(self, *, detach: bool = True) -> Stream:
-        """Start a stream: ``push(frames) -> latents`` as `encode_next`; its ``state`` is all it
-        holds.
-        """
-        return Stream(partial(self.encode_next, detach=detach))

@@ -26,7 +26,6 @@ from alpasim_plugin.block_fixers.codec_weights import (
     WAN_STD,
     LatentStats,
     fill_random,
-    load_checked,
 )
 from alpasim_plugin.block_fixers.streaming import (
     FrameConv,
@@ -42,7 +41,7 @@ from alpasim_plugin.block_fixers.streaming import (
     run_layers,
 )
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.network.checkpoints import StateDict, unwrap
+from alpasim_plugin.fixers.network.checkpoints import StateDict, load_checked, unwrap
 
 GROWTH = (1, 2, 2)  # temporal upsampling factor of each stage
 COLOURS = 3

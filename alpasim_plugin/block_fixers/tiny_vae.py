@@ -40,7 +40,7 @@ from alpasim_plugin.block_fixers.clips import (
     group_ends,
     pass_ends,
 )
-from alpasim_plugin.block_fixers.codec_weights import LatentStats, fill_random, load_checked
+from alpasim_plugin.block_fixers.codec_weights import LatentStats, fill_random
 from alpasim_plugin.block_fixers.streaming import (
     State,
     StreamingCodec,
@@ -65,7 +65,7 @@ from alpasim_plugin.block_fixers.tiny_vae_nets import (
 )
 from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.network.checkpoints import load_weights, unwrap
+from alpasim_plugin.fixers.network.checkpoints import load_checked, load_weights, unwrap
 
 DOING = "loading tiny VAE weights"
 DO = "give a file that TinyVAE.save wrote (keys encoder.*, decoder.*, stats.*)"

@@ -20,7 +20,6 @@ from alpasim_plugin.block_fixers.codec_weights import (
     WAN_STD,
     LatentStats,
     fill_random,
-    load_checked,
 )
 from alpasim_plugin.block_fixers.streaming import (
     PointwiseConv,
@@ -46,7 +45,7 @@ from alpasim_plugin.block_fixers.wan_vae_blocks import (
     read_layout,
 )
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.network.checkpoints import unwrap
+from alpasim_plugin.fixers.network.checkpoints import load_checked, unwrap
 
 
 def residual_blocks(inputs: int, outputs: int, count: int) -> list[nn.Module]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,3 +50,29 @@ def golden(
         load_file(folder / f"{stem}.io.safetensors"),
         config,
     )
+
+
+class Stream:
+    """Feed a codec's pure step block by block."""
+
+    def __init__(self, step: Any, state: Any = None) -> None:
+        self.step, self.state = step, state
+
+    def push(self, x: Tensor, *args: Any, **options: Any) -> Tensor:
+        """Return the outputs that the next frames or latents complete."""
+        out, self.state = self.step(x, self.state, *args, **options)
+        return out
+
+    def fork(self) -> Stream:
+        """Return an independent stream at the same point."""
+        return Stream(self.step, self.state)
+
+
+def encoder_stream(codec: Any) -> Stream:
+    """Return a stream of frames to latents, gradients cut at every pass."""
+    return Stream(partial(codec.encode_next, detach=True))
+
+
+def decoder_stream(codec: Any) -> Stream:
+    """Return a stream of latents to frames, gradients cut at every pass."""
+    return Stream(partial(codec.decode_next, detach=True))

@@ -9,9 +9,9 @@ import torch
 
 from alpasim_plugin.block_fixers.onefixer import OneFixer
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
-from alpasim_plugin.block_fixers.stand_in import save_stand_in
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import fixer_settings
+from tests.block_fixers.stand_in import save_stand_in
 
 SMALL_DIT = (
     "weights.bundle=null",

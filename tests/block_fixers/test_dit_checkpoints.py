@@ -12,78 +12,47 @@ import torch
 from safetensors.torch import save_file
 
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
-from alpasim_plugin.block_fixers.sizes import DiTSizes
 from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.checkpoints import file_sha256, load_weights
 from tests.block_fixers.dit_cases import SMALL, clip, furthest
 from tests.block_fixers.dit_reference import random_weights, velocity
 
-KEYS = sorted(SMALL.shapes())
-SQUARE = {key for key, shape in SMALL.shapes().items() if len(shape) < 2 or shape[0] == shape[1]}
-
 
 def load(sd, **options):
     return CosmosCausalDiT.from_state_dict(sd, **options)
 
 
-@pytest.mark.parametrize("key", KEYS)
-def test_missing_tensor_is_named(key):
-    sd = random_weights(SMALL)
-    del sd[key]
+def changed(key, value):
+    """Return small weights with one tensor replaced, or left out (None)."""
+    sd = random_weights(SMALL) | {key: value}
+    return {key: tensor for key, tensor in sd.items() if tensor is not None}
+
+
+@pytest.mark.parametrize(
+    ("sd", "text"),
+    [
+        (changed("t_embedding_norm.weight", None), "t_embedding_norm.weight"),
+        (changed("blocks.1.mlp.layer1.weight", None), "missing: blocks.1.mlp.layer1.weight"),
+        (changed("blocks.0.more.weight", torch.zeros(2)), "unexpected: blocks.0.more.weight"),
+        (changed("blocks.1.mlp.layer2.weight", torch.zeros(3, 4)), "blocks.1.mlp.layer2.weight is"),
+        ({"conv.weight": torch.zeros(3)}, "t_embedding_norm.weight"),
+        (changed("blocks.0.self_attn.q_norm.weight", torch.ones(10)), "head width 10"),
+    ],
+)
+def test_weights_that_do_not_fit_are_named(sd, text):
     with pytest.raises(InputError) as caught:
         load(sd, source="weights.safetensors")
-    assert f"missing: {key}" in caught.value.message
+    assert text in caught.value.message
     assert "weights.safetensors" in caught.value.message
-    assert "docs/block-fixers.md" in caught.value.hint
 
 
-@pytest.mark.parametrize("key", [key for key in KEYS if key not in SQUARE])
-def test_transposed_tensor_is_named_alone(key):
+def test_a_transposed_tensor_is_named():
     sd = random_weights(SMALL)
-    sd[key] = sd[key].T.contiguous()
-    shape = SMALL.shapes()[key]
+    sd["blocks.1.mlp.layer1.weight"] = sd["blocks.1.mlp.layer1.weight"].T.contiguous()
     with pytest.raises(InputError) as caught:
         load(sd)
-    assert (
-        caught.value.message
-        == f"wrong shape: {key} is {list(shape[::-1])} for {list(shape)}, transposed"
-    )
-
-
-@pytest.mark.parametrize("key", KEYS)
-def test_mis_shaped_tensor_is_named(key):
-    sd = random_weights(SMALL)
-    sd[key] = torch.cat([sd[key], sd[key][:1]])
-    with pytest.raises(InputError) as caught:
-        load(sd)
-    assert key in caught.value.message
-
-
-def test_whole_missing_block_and_extra_tensors_are_listed_and_counted():
-    sd = random_weights(DiTSizes(**{**SMALL.__dict__, "blocks": 3}))
-    for key in [key for key in sd if key.startswith("blocks.1.")]:
-        del sd[key]
-    sd["blocks.0.cross_view_attn.q_proj.weight"] = torch.zeros(2, 2)
-    with pytest.raises(InputError) as caught:
-        load(sd)
-    assert "missing: blocks.1.adaln_modulation_cross_attn.1.weight" in caught.value.message
-    assert "and 12 more" in caught.value.message
-    assert "unexpected: blocks.0.cross_view_attn.q_proj.weight" in caught.value.message
-
-
-def test_foreign_tensors_are_refused():
-    with pytest.raises(InputError, match=r"no key like blocks\.0"):
-        load({"conv.weight": torch.zeros(3)})
-
-
-def test_heads_that_do_not_divide_the_width_are_refused():
-    sd = random_weights(SMALL)
-    for key in sd:
-        if key.endswith(("q_norm.weight", "k_norm.weight")):
-            sd[key] = torch.ones(10)
-    with pytest.raises(InputError, match=r"width 24 .* with head width 10"):
-        load(sd)
+    assert "transposed" in caught.value.message
 
 
 def dressed(sd):

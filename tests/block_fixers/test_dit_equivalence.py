@@ -179,30 +179,6 @@ def test_a_number_is_a_time_step_for_every_latent():
         assert furthest(net(x, torch.full((1, 1), 357.0), text, hdmap), by_latent) < 1e-5
 
 
-@pytest.mark.parametrize("sizes", SIZES, ids=lambda s: f"{s.width}x{s.blocks}x{s.head_width}")
-@pytest.mark.parametrize("t", [1000.0, 803.5714, 128.0])
-def test_folded_network_is_an_exact_rewrite(sizes, t):
-    net = network(sizes)
-    folded = net.folded(t)
-    x, _, text, hdmap = clip(4, sizes)
-    with torch.no_grad():
-        assert furthest(folded(x, t, text, hdmap), net(x, t, text, hdmap)) < 1e-5
-    assert not any("adaln" in name for name, _ in folded.named_parameters())
-
-
-def test_folded_and_plain_network_share_a_cache():
-    net, (x, _, text, hdmap) = network(), clip(4)
-    folded = net.folded(1000.0)
-    plain_cache, cache = (net.new_cache(1, 4, 6, window=4) for _ in range(2))
-    for start in (0, 2):
-        cut = slice(start, start + 2)
-        v = net.step(x[:, :, cut], 1000.0, text, hdmap[:, :, cut], plain_cache, False)
-        w = folded.step(x[:, :, cut], 1000.0, text, hdmap[:, :, cut], cache, False)
-        assert furthest(v, w) < 1e-5
-        for c in (plain_cache, cache):
-            net.step(x[:, :, cut], 128.0, text, hdmap[:, :, cut], c, True)
-
-
 def test_gradients_reach_back_as_far_as_the_history_is_not_cut():
     net, (x, t, text, hdmap) = network(), clip(6)
     for cut_after, reached in ((None, [True, True]), (1, [False, True]), (2, [False, False])):

@@ -11,9 +11,9 @@ import torch
 from alpasim_plugin.block_fixers.clips import to_clip
 from alpasim_plugin.block_fixers.networks import load_networks
 from alpasim_plugin.block_fixers.onefixer import latent_noise
-from alpasim_plugin.block_fixers.whole_clip import refine_clip, whole_clip
 from alpasim_plugin.fixers.views import group_views
 from tests.block_fixers.fixer_cases import Recorded, busy_settings, fixer, record_videos, run_blocks
+from tests.block_fixers.whole_clip import refine_clip, whole_clip
 from tests.examples import first_of
 from tests.fixers.clip_cases import maps_of, moving_picture, pixels
 

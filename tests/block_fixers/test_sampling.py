@@ -18,7 +18,6 @@ from alpasim_plugin.block_fixers.sampling import (
 )
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.schedule import from_names, interpolant, named, shifted, steps
-from tests.block_fixers.cache_history import history
 from tests.block_fixers.dit_cases import clip, furthest, network
 
 
@@ -78,14 +77,11 @@ def test_opaque_render_is_kept_and_empty_one_is_noise_bit_for_bit():
     assert furthest(half, 0.25 * z + 0.75 * eps) < 1e-7
 
 
-def test_opacity_that_is_not_a_number_is_refused_or_named():
+def test_opacity_that_is_not_a_number_is_refused():
     opacity = torch.ones(1, 1, 5, 8, 16)
     opacity[0, 0, 4, 3, 2] = torch.nan
-    with pytest.raises(InputError, match=r"1 of 640 values are NaN[\s\S]*nan_as"):
+    with pytest.raises(InputError):
         opacity_mask(opacity)
-    assert opacity_mask(opacity, nan_as=0.0).eq(1).all()
-    assert opacity_mask(torch.full_like(opacity, torch.nan), nan_as=0.0).eq(0).all()
-    assert opacity[0, 0, 4, 3, 2].isnan()
 
 
 def test_opacity_out_of_range_is_refused_and_rounding_is_clipped():
@@ -136,7 +132,7 @@ def test_cache_write_is_told_128_and_noised_like_its_nearest_neighbour():
     ],
 )
 def test_senseless_schedules_are_refused(call):
-    with pytest.raises(InputError, match="choosing denoising steps"):
+    with pytest.raises(InputError):
         call()
 
 
@@ -146,9 +142,9 @@ def test_history_decides_what_the_cache_keeps(history, forwards):
     cache, calls = net.new_cache(1, 4, 6), []
 
     class Counter:
-        def step(self, x, t, text, hdmap, cache, write, mask):
+        def step(self, x, t, text, hdmap, cache, write):
             calls.append((round(t), write))
-            return net.step(x, t, text, hdmap, cache, write, mask)
+            return net.step(x, t, text, hdmap, cache, write)
 
     sources = [noise(1, 4, 2, 4, 6, seed=i) for i in range(sources_needed(steps(2), history))]
     z = sample_block(Counter(), sources, text, hdmap, cache, steps(2), history)
@@ -159,30 +155,12 @@ def test_history_decides_what_the_cache_keeps(history, forwards):
     assert cache.position == 2
 
 
-def test_one_step_is_equation_two_and_folding_changes_nothing():
+def test_one_step_is_equation_two():
     net, (z_1, _, text, hdmap) = network(), clip(2)
-    one, two = (net.new_cache(1, 4, 6) for _ in range(2))
+    one = net.new_cache(1, 4, 6)
     z_0 = sample_block(net, [z_1], text, hdmap, one, steps(1), "last-forward")
     with torch.no_grad():
         assert furthest(z_0, z_1 - net(z_1, 1000.0, text, hdmap)) < 1e-5
-    folded = sample_block(net.folded(1000.0), [z_1], text, hdmap, two, steps(1), "last-forward")
-    assert furthest(folded, z_0) < 1e-5
-    eps = noise(*z_1.shape)
-    args = (text, hdmap, two, steps(1), "finalise")
-    three = net.new_cache(1, 4, 6)
-    folded = sample_block(
-        net.folded(1000.0),
-        [z_1, eps],
-        text,
-        hdmap,
-        three,
-        steps(1),
-        "finalise",
-        finalise_net=net.folded(128.0),
-    )
-    two.reset()
-    assert furthest(folded, sample_block(net, [z_1, eps], *args)) < 1e-5
-    assert furthest(history(two, 1)[0], history(three, 1)[0]) < 1e-5
 
 
 @pytest.mark.parametrize("history", ["finalise", "last-forward"])
@@ -204,30 +182,7 @@ def test_block_left_open_can_be_guessed_again_and_then_kept_for_nothing(history)
         guessed.commit()
 
 
-def test_given_latents_pass_through_untouched():
-    net, (z_1, _, text, hdmap) = network(), clip(2)
-    given = noise(1, 4, 1, 4, 6, seed=9)
-    seen = []
-
-    class Spy:
-        def step(self, x, t, text, hdmap, cache, write, mask):
-            seen.append((x[:, :, :1], mask))
-            return net.step(x, t, text, hdmap, cache, write, mask)
-
-    sources = [z_1, noise(*z_1.shape, seed=1), noise(*z_1.shape, seed=2)]
-    out = sample_block(Spy(), sources, text, hdmap, net.new_cache(1, 4, 6), steps(2), given=given)
-    assert torch.equal(out[:, :, :1], given)
-    assert len(seen) == 3
-    for x, mask in seen:
-        assert torch.equal(x, given)
-        assert mask[:, :, 0].eq(1).all()
-        assert mask[:, :, 1].eq(0).all()
-
-
 def test_wrong_number_of_noise_draws_is_refused():
     net, (z_1, _, text, hdmap) = network(), clip(2)
-    with pytest.raises(
-        InputError,
-        match=r"1 sources for 1 steps[\s\S]*give 2: one per step, one for the cache write",
-    ):
+    with pytest.raises(InputError):
         sample_block(net, [z_1], text, hdmap, net.new_cache(1, 4, 6), steps(1))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from alpasim_plugin.block_fixers.streaming import StreamingState, channels_last, run_layers
 from alpasim_plugin.block_fixers.taehv import TinyDecoder
-from tests.block_fixers.codec_cases import golden
+from tests.block_fixers.codec_cases import decoder_stream, golden
 
 TOLERANCE = 2e-5
 CASES = ["latent_n1_t1_4x6", "latent_n1_t3_4x6", "latent_n1_t5_3x5"]
@@ -60,7 +60,7 @@ def test_lighttae_convention_takes_the_denormalised_latent(numbers: Any) -> None
 
 def test_a_stream_returns_one_frame_then_four(numbers: Any) -> None:
     decoder = TinyDecoder.from_state_dict(numbers[0])
-    stream = decoder.decoder_stream()
+    stream = decoder_stream(decoder)
     z = numbers[1]["in.latent_n1_t5_3x5"].transpose(1, 2)
     counts = [stream.push(z[:, :, i : i + 1]).shape[2] for i in range(5)]
     assert counts == numbers[2]["cases"]["latent_n1_t5_3x5"]["streaming_frames_returned_per_latent"]

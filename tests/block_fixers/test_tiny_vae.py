@@ -20,7 +20,7 @@ from alpasim_plugin.block_fixers.tiny_vae_nets import (
 )
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.checkpoints import load_weights
-from tests.block_fixers.codec_cases import clip, noise
+from tests.block_fixers.codec_cases import clip, decoder_stream, encoder_stream, noise
 
 SIZES = TinySizes(
     encoder_quarter=8, encoder_eighth=12, decoder_eighth=16, decoder_quarter=10, decoder_frame=6
@@ -154,7 +154,7 @@ def test_a_hole_in_the_render_is_filled_by_the_latent_alone() -> None:
 def test_encoding_in_any_blocks_is_bit_equal_to_the_whole_clip(
     vae: TinyVAE, counts: list[int]
 ) -> None:
-    video, stream = clip(13, 16, 24, batch=2), vae.encoder_stream()
+    video, stream = clip(13, 16, 24, batch=2), encoder_stream(vae)
     assert torch.equal(
         torch.cat([stream.push(part) for part in video.split(counts, dim=2)], dim=2),
         vae.encode(video),
@@ -167,7 +167,7 @@ def test_decoding_in_any_blocks_is_bit_equal_to_the_whole_clip(
     vae: TinyVAE, counts: list[int], seen: str
 ) -> None:
     z = noise(2, 16, 4, 2, 3)
-    stream = vae.decoder_stream()
+    stream = decoder_stream(vae)
     start = 0
     parts = []
     given = {} if seen == "nothing" else {"render": clip(13, 16, 24, batch=2)}
@@ -210,7 +210,7 @@ def test_the_latent_before_is_remembered(vae: TinyVAE) -> None:
 
 def test_interleaved_and_forked_streams_equal_each_alone(vae: TinyVAE) -> None:
     z = [noise(1, 16, 3, 2, 2, seed=seed) for seed in (1, 2)]
-    streams = [vae.decoder_stream() for _ in z]
+    streams = [decoder_stream(vae) for _ in z]
     parts = [
         [stream.push(x[:, :, i : i + 1]) for stream, x in zip(streams, z, strict=True)]
         for i in range(2)
@@ -225,8 +225,8 @@ def test_interleaved_and_forked_streams_equal_each_alone(vae: TinyVAE) -> None:
 @pytest.mark.slow
 def test_900_frames_stream_in_constant_memory_and_stay_finite() -> None:
     vae = trained_like()
-    encoder = vae.encoder_stream()
-    decoder = vae.decoder_stream()
+    encoder = encoder_stream(vae)
+    decoder = decoder_stream(vae)
     sizes = set()
     with torch.inference_mode():
         for step in range(226):

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -16,11 +17,18 @@ from alpasim_plugin.block_fixers.wan_vae import WanVAE
 from alpasim_plugin.block_fixers.wan_vae_blocks import (
     WanLayout,
     causal_conv,
-    causal_conv3d,
     read_layout,
 )
 from alpasim_plugin.core.errors import InputError
-from tests.block_fixers.codec_cases import DEEPER, SMALL, UNEVEN, clip, noise
+from tests.block_fixers.codec_cases import (
+    DEEPER,
+    SMALL,
+    UNEVEN,
+    clip,
+    decoder_stream,
+    encoder_stream,
+    noise,
+)
 from tests.examples import examples, first_of
 
 pytestmark = pytest.mark.slow
@@ -46,7 +54,7 @@ def test_encoding_in_any_blocks_is_bit_equal_to_the_whole_clip(
     vae: WanVAE, counts: list[int]
 ) -> None:
     video = clip(13, 16, 24, batch=2)
-    assert torch.equal(push_all(vae.encoder_stream(), video, counts), vae.encode(video))
+    assert torch.equal(push_all(encoder_stream(vae), video, counts), vae.encode(video))
 
 
 @pytest.mark.parametrize("counts", first_of([[1, 1, 1, 1, 1], [2, 2, 1], [5], [1, 4], [3, 2]], 2))
@@ -54,7 +62,7 @@ def test_decoding_in_any_blocks_is_bit_equal_to_the_whole_clip(
     vae: WanVAE, counts: list[int]
 ) -> None:
     z = noise(2, 16, 5, 2, 3)
-    assert torch.equal(push_all(vae.decoder_stream(), z, counts), vae.decode(z))
+    assert torch.equal(push_all(decoder_stream(vae), z, counts), vae.decode(z))
 
 
 @pytest.mark.parametrize("layout", first_of([UNEVEN, SMALL]), ids=["uneven", "small"])
@@ -80,7 +88,7 @@ def test_frames_never_depend_on_later_ones(vae: WanVAE) -> None:
 
 def test_two_streams_interleaved_equal_each_alone(vae: WanVAE) -> None:
     videos = [clip(9, 16, 16, seed=seed) for seed in (1, 2)]
-    streams = [vae.encoder_stream() for _ in videos]
+    streams = [encoder_stream(vae) for _ in videos]
     mixed = [
         [stream.push(video[:, :, a:b]) for stream, video in zip(streams, videos, strict=True)]
         for a, b in ((0, 1), (1, 5), (5, 9))
@@ -91,7 +99,7 @@ def test_two_streams_interleaved_equal_each_alone(vae: WanVAE) -> None:
 
 def test_a_fork_and_a_rolled_back_stream_start_from_the_same_point(vae: WanVAE) -> None:
     z = noise(1, 16, 3, 2, 2)
-    stream = vae.decoder_stream()
+    stream = decoder_stream(vae)
     stream.push(z[:, :, :1])
     fork, remembered = stream.fork(), stream.state
     first = stream.push(z[:, :, 1:2])
@@ -113,7 +121,7 @@ def test_detached_streams_cut_gradients_and_whole_clips_do_not(vae: WanVAE) -> N
     assert z.grad is not None
     assert z.grad[:, :, 1].abs().max() > 0
     cut = z.detach().clone().requires_grad_()
-    push_all(vae.decoder_stream(), cut, [1, 1, 1])[:, :, -1].sum().backward()
+    push_all(decoder_stream(vae), cut, [1, 1, 1])[:, :, -1].sum().backward()
     assert cut.grad is not None
     assert cut.grad[:, :, 2].abs().max() > 0
     assert cut.grad[:, :, :2].abs().max() == 0
@@ -121,7 +129,7 @@ def test_detached_streams_cut_gradients_and_whole_clips_do_not(vae: WanVAE) -> N
 
 @pytest.mark.slow
 def test_900_frames_stream_in_constant_memory_and_stay_finite(vae: WanVAE) -> None:
-    encoder, decoder = vae.encoder_stream(), vae.decoder_stream()
+    encoder, decoder = encoder_stream(vae), decoder_stream(vae)
     sizes = set()
     with torch.inference_mode():
         for step in range(226):
@@ -139,7 +147,7 @@ def test_900_frames_stream_in_constant_memory_and_stay_finite(vae: WanVAE) -> No
 
 
 def test_a_state_holds_no_more_than_its_own_frames(vae: WanVAE) -> None:
-    stream = vae.encoder_stream()
+    stream = encoder_stream(vae)
     push_all(stream, clip(9, 32, 32), [5, 4])
     assert stream.state is not None
     assert len(stream.state) == 24
@@ -184,7 +192,7 @@ def test_six_frames_padded_encode_as_nine_and_crop_back(vae: WanVAE) -> None:
 def test_odd_counts_in_the_middle_of_a_stream_are_refused_and_leave_it_alone(
     vae: WanVAE, frames: int, text: str
 ) -> None:
-    stream = vae.encoder_stream()
+    stream = encoder_stream(vae)
     stream.push(clip(1, 16, 16))
     before = stream.state
     with pytest.raises(InputError, match=text):
@@ -203,7 +211,7 @@ def test_sides_that_are_no_multiple_of_eight_are_refused(
 
 
 def test_a_stream_whose_frame_size_changes_is_refused(vae: WanVAE) -> None:
-    stream = vae.encoder_stream()
+    stream = encoder_stream(vae)
     stream.push(clip(1, 16, 16))
     with pytest.raises(InputError, match="keep batch and frame size"):
         stream.push(clip(4, 16, 24))
@@ -268,7 +276,11 @@ def test_summed_2d_convolutions_equal_the_3d_one(
 ) -> None:
     joined = noise(2, past + frames, 4, 5, inputs, seed=past)
     weight, bias = noise(outputs, inputs, 3, side, side), noise(outputs)
-    expected = causal_conv3d(joined, weight, bias, frames)
+    past_and_padding = F.pad(joined, (0, 0, 0, 0, 0, 0, 2 - past, 0)).permute(0, 4, 1, 2, 3)
+    pad = side // 2
+    expected = F.conv3d(past_and_padding, weight, bias, padding=(0, pad, pad)).permute(
+        0, 2, 3, 4, 1
+    )
     torch.testing.assert_close(
         causal_conv(joined, weight, bias, frames), expected, atol=1e-5, rtol=1e-5
     )

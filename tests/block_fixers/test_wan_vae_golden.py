@@ -12,7 +12,7 @@ from torch import Tensor
 from alpasim_plugin.block_fixers.codec_weights import WAN_MEAN, WAN_STD
 from alpasim_plugin.block_fixers.streaming import StreamingState, channels_first, channels_last
 from alpasim_plugin.block_fixers.wan_vae import WanVAE
-from tests.block_fixers.codec_cases import golden
+from tests.block_fixers.codec_cases import decoder_stream, golden
 
 TOLERANCE = 3e-5  # a third of what is promised; the original itself moves by 4e-6 between machines
 CLIPS = ["clip_b1_t1_32x48", "clip_b1_t9_32x48", "clip_b1_t17_40x64"]
@@ -97,7 +97,7 @@ def test_every_chunk_leaves_the_original_encoder_output_and_state(
 def test_decoder_state_has_the_original_slots(vae: WanVAE, numbers: Any) -> None:
     _, io, config = numbers
     name = "clip_b1_t9_32x48"
-    stream = vae.decoder_stream()
+    stream = decoder_stream(vae)
     for index, slots in enumerate(config["cases"][name]["decoder_cache_slots_after_each_chunk"]):
         frames = stream.push(io[f"out.{name}.latent_normalised"][:, :, index : index + 1])
         assert frames.shape[2] == config["cases"][name]["decoder_frames_per_chunk"][index]

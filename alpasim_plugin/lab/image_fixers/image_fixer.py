@@ -17,7 +17,6 @@ from torch import Tensor
 from alpasim_plugin.block_fixers.clips import SIDE, Clip, crop_clip, to_clip, to_images
 from alpasim_plugin.block_fixers.networks import LATENT, load_networks
 from alpasim_plugin.block_fixers.onefixer import latent_noise
-from alpasim_plugin.block_fixers.pipeline import TIMED, StageClock
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer
 from alpasim_plugin.core.types import U8, Frame
@@ -67,16 +66,10 @@ class MaplessFixer(Fixer):
             torch.set_num_threads(threads)
         self.scene_id = scene_id
         self.networks = load_networks(settings, device)
-        self.clock = StageClock(device)
         self.trained = self.networks.trained
         count = len(settings.network_times)
         self.label = f"{settings.name}{f'@{count}' if count > 1 else ''}, {self.networks.note}"
         self.reset(seed)
-
-    @property
-    def stage_ms(self) -> dict[str, float]:  # type: ignore[override]  # computed when it is read
-        """Total wall time by stage since the session was made, milliseconds."""
-        return {name: self.clock.ms.get(name, 0.0) for name in TIMED}
 
 
 class ImageFixer(MaplessFixer):
@@ -169,7 +162,6 @@ class ImageFixer(MaplessFixer):
                 clip.rgb,
                 clip.alpha,
                 self._noise(view, clip, pasts),
-                self.clock,
             )
         out = torch.empty_like(clip.rgb)
         wanted = self.settings.references
@@ -187,7 +179,7 @@ class ImageFixer(MaplessFixer):
                 )
                 alpha = None if clip.alpha is None else clip.alpha[rows]
                 out[rows] = fix_images(
-                    self.networks, self.settings, clip.rgb[rows], alpha, references, self.clock
+                    self.networks, self.settings, clip.rgb[rows], alpha, references
                 )
         return out
 

@@ -35,7 +35,6 @@ from torch import Tensor
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, TextContext
 from alpasim_plugin.block_fixers.layers import PATCH
 from alpasim_plugin.block_fixers.networks import Networks, decode
-from alpasim_plugin.block_fixers.pipeline import Stage, no_clock
 from alpasim_plugin.block_fixers.sampling import flow_step
 from alpasim_plugin.fixers.network.schedule import TABLE
 from alpasim_plugin.lab.image_fixers.settings import (
@@ -99,7 +98,7 @@ def fixed_step(
     no map.
 
     Args:
-        net: The network, or a copy folded at ``level.network_t``.
+        net: The network.
         z_r: ``(B, C, T, H, W)``; T is 1 for a single image, 2 for an image with its references.
         level: The render's noise level.
         text: Prompt.
@@ -119,7 +118,6 @@ def fix_images(
     rgb: Tensor,
     alpha: Tensor | None,
     references: Tensor | None = None,
-    stage: Stage = no_clock,
 ) -> Tensor:
     """Fix one frame of B cameras in one step from the render.
 
@@ -133,21 +131,17 @@ def fix_images(
         rgb: ``(B, 3, 1, H, W)`` render in [-1, 1].
         alpha: ``(B, 1, 1, H, W)`` its opacity; None: opaque everywhere.
         references: ``(B, 3, 4, H, W)`` last outputs, newest first; None: none.
-        stage: See `BlockPipeline`.
 
     Returns:
         Like ``rgb``, not clipped to [-1, 1].
     """
-    with stage("encode"):
-        z_r = networks.vae.encode(
-            rgb if references is None else torch.cat([rgb, references], dim=2)
-        ).float()
-    with stage("dit"):
-        z_0 = fixed_step(networks.dit, z_r, settings.level, networks.text)
-    with stage("decode"):
-        return decode(
-            networks, settings, z_0[:, :, :1], rgb, alpha if settings.opacity_to_decoder else None
-        )[0]
+    z_r = networks.vae.encode(
+        rgb if references is None else torch.cat([rgb, references], dim=2)
+    ).float()
+    z_0 = fixed_step(networks.dit, z_r, settings.level, networks.text)
+    return decode(
+        networks, settings, z_0[:, :, :1], rgb, alpha if settings.opacity_to_decoder else None
+    )[0]
 
 
 @torch.inference_mode()
@@ -157,7 +151,6 @@ def sample_window(
     rgb: Tensor,
     alpha: Tensor | None,
     eps: Tensor,
-    stage: Stage = no_clock,
 ) -> Tensor:
     """Sample the frames of a window from noise, with the render as a condition; the window is
     encoded from its own first frame.
@@ -168,16 +161,10 @@ def sample_window(
         rgb: ``(B, 3, T, H, W)`` render in [-1, 1].
         alpha: ``(B, 1, T, H, W)`` its opacity; None: opaque everywhere.
         eps: ``(B, 16, latents, H / 8, W / 8)`` standard normal.
-        stage: See `BlockPipeline`.
 
     Returns:
         Like ``rgb``, not clipped to [-1, 1].
     """
-    with stage("encode"):
-        z_r = networks.vae.encode(rgb).float()
-    with stage("dit"):
-        z_0 = euler(networks.dit, eps, z_r, settings.steps, networks.text)
-    with stage("decode"):
-        return decode(networks, settings, z_0, rgb, alpha if settings.opacity_to_decoder else None)[
-            0
-        ]
+    z_r = networks.vae.encode(rgb).float()
+    z_0 = euler(networks.dit, eps, z_r, settings.steps, networks.text)
+    return decode(networks, settings, z_0, rgb, alpha if settings.opacity_to_decoder else None)[0]

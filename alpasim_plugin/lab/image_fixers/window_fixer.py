@@ -186,6 +186,6 @@ class WindowFixer(MaplessFixer):
             self.scene_id, self.seed, view.cameras, 1, range(first, first + settings.latents), shape
         )
         made = sample_window(
-            self.networks, settings, clip.rgb, clip.alpha, eps.to(self.networks.device), self.clock
+            self.networks, settings, clip.rgb, clip.alpha, eps.to(self.networks.device)
         )
         return crop_clip(made, cut.size).cpu()
