@@ -142,9 +142,6 @@ class Fixer(Protocol):
     blocks: BlockRule = BlockRule(1, 1)  # frames of the first block and of each later one
     trained: bool = False  # whether the weights were learned
     label: str = ""  # what this is, for tables and reports: "onefixer, trained"
-    stage_ms: Mapping[str, float] = (
-        EMPTY  # wall time by stage since the session was made: sums that only grow
-    )
 
     @abstractmethod
     def reset(self, seed: int) -> None:

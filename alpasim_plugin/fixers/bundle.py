@@ -29,12 +29,9 @@ if TYPE_CHECKING:
     from alpasim_plugin.fixers.network.checkpoints import StateDict
 
 FORMAT = "simrun-fixer-1"
-DOING = "loading a fixer's weights"
-RENAMED = {
-    "onefixer-tiny": "onefixer-dit-tiny",
-    "onefixer-s": "onefixer-dit-s",
-}  # former names in the headers of older bundles
-OLDEST_KIND = "block"  # of bundles whose header names none
+# what the headers of shipped bundles have beside the settings of their weights
+RENAMED = {"onefixer-tiny": "onefixer-dit-tiny"}
+NOT_OF_WEIGHTS = ("precision", "codec_precision", "graphs", "fold", "generator.memory")
 FILES = ("bundle", "dit", "vae", "decoder", "prompt")  # of `WeightsSettings`
 S = TypeVar("S", bound=WeightedSettings)
 
@@ -71,11 +68,8 @@ class FixerFactory(Generic[S]):
         Raises:
             InputError: Weights that are named but not there.
         """
-        files = {
-            f"weights.{part}": path
-            for part in FILES
-            if (path := settings.weights.path(part)) is not None
-        }
+        paths = {f"weights.{part}": settings.weights.path(part) for part in FILES}
+        files = {key: path for key, path in paths.items() if path is not None}
         for key, path in files.items():
             if not path.is_file():
                 raise InputError(
@@ -175,24 +169,22 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
     """
     header, trained_with = _header(path)
     kind = settings.bundle_kind
-    found_kind = header.get("kind", OLDEST_KIND)
+    found_kind = header.get("kind", "block")
     if found_kind != kind.name:
         raise InputError(
             f"{path} with the settings of {settings.name}: a bundle of the kind {found_kind!r}, not {kind.name!r}",
             f"take a fixer of that kind: `simrun list fixers`, this bundle is for {trained_with['name']}",
         )
-    # A header written before a setting existed lacks it: its weights were trained at what is now
-    # the default.
+    # A header written before a setting existed lacks it: its weights were trained at its default.
+    used = settings.model_dump(mode="json")
     trained_with = {**_defaults(settings), **trained_with}
-    differs = [
-        (key, _at(trained_with, key), _at(settings.model_dump(mode="json"), key))
-        for key in (*kind.must_match, *kind.may_differ)
-    ]
-    wrong = [
-        f"{key} is {used} for {due}"
-        for key, due, used in differs
-        if due != used and key in kind.must_match
-    ]
+    wrong, others = [], []
+    for key in (*kind.must_match, *kind.may_differ):
+        due, found = _at(trained_with, key), _at(used, key)
+        if due != found and key in kind.must_match:
+            wrong.append(f"{key} is {found} for {due}")
+        elif due != found:
+            others.append(f"{key} {found} instead of {due}")
     if wrong:
         raise InputError(
             f"{path} with the settings of {settings.name}: {'; '.join(wrong)}",
@@ -208,11 +200,6 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
             f"write it with save_bundle (parts {', '.join(sorted(kind.needed | kind.optional))})",
         )
     trained = header.get("trained") == "true"
-    others = [
-        f"{key} {used} instead of {due}"
-        for key, due, used in differs
-        if due != used and key in kind.may_differ
-    ]
     note = ", ".join(
         text for text in ("" if trained else "untrained", header.get("note", ""), *others) if text
     )
@@ -234,7 +221,7 @@ def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
             "give a file that save_bundle wrote",
         )
     return RENAMED.get(name, name), (
-        *_flat(trained_with),
+        *(f"{key}={json.dumps(value)}" for key, value in _leaves(trained_with).items()),
         f"weights.bundle={json.dumps(str(Path(path).absolute()))}",
     )
 
@@ -267,22 +254,20 @@ def _header(path: str | Path) -> tuple[Mapping[str, str], dict[str, object]]:
 def _defaults(settings: WeightedSettings) -> dict[str, object]:
     """Return the settings that have a default, at it, as JSON has them."""
     fields = type(settings).model_fields.items()
+    plain = {key: field.get_default() for key, field in fields}
     return {
-        key: field.get_default()
-        for key, field in fields
-        if isinstance(field.get_default(), str | bool | int | float)
+        key: value for key, value in plain.items() if isinstance(value, str | bool | int | float)
     }
 
 
-def _flat(data: Mapping[str, object], prefix: str = "") -> list[str]:
-    """Return ``KEY=VALUE`` for every leaf of nested settings."""
-    out: list[str] = []
+def _leaves(data: Mapping[str, object], prefix: str = "") -> dict[str, object]:
+    """Return the leaves of nested settings by dotted key, but those that are not of weights."""
+    out: dict[str, object] = {}
     for key, value in data.items():
-        out += (
-            _flat(value, f"{prefix}{key}.")
-            if isinstance(value, Mapping)
-            else [f"{prefix}{key}={json.dumps(value)}"]
-        )
+        if isinstance(value, Mapping):
+            out |= _leaves(value, f"{prefix}{key}.")
+        elif f"{prefix}{key}" not in NOT_OF_WEIGHTS:
+            out[f"{prefix}{key}"] = value
     return out
 
 

@@ -26,7 +26,6 @@ from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.gaussians.raster.rasterize_cpu import thread_count
 
 Call = Callable[[Sequence[Frame], Sequence[U8]], Sequence[Frame]]
-DOING = "fixing a block of frames"
 ONE_BY_ONE = BlockRule(1, 1)
 
 
@@ -87,7 +86,7 @@ class BlockRunner:
         """Fix a block and check the result.
 
         Args:
-            fixer: Gives its name for messages, and the stages it timed itself (``stage_ms``).
+            fixer: Gives its name for messages.
             call: Its ``preview`` or ``step``.
             block: Frames with their maps.
 
@@ -100,7 +99,6 @@ class BlockRunner:
             [item.map for item in block if item.map is not None],
         )
         name = f"{type(fixer).__name__}, {len(frames)} frames of {frames[0].t_us} to {frames[-1].t_us} us"
-        before = dict(fixer.stage_ms)
         with self._timed("fix"):
             try:
                 fixed = list(call(frames, maps))
@@ -111,7 +109,6 @@ class BlockRunner:
                     f"{name}: {type(error).__name__}: {error}",
                     "see the traceback in the rollout's manifest",
                 ) from error
-        self._add_fixer_stages(before, fixer.stage_ms)
         problem = _problem(frames, fixed)
         if problem:
             raise FixerError(
@@ -125,16 +122,6 @@ class BlockRunner:
         began = time.perf_counter()
         yield
         self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + 1e3 * (time.perf_counter() - began)
-
-    def _add_fixer_stages(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
-        """Add what a fixer timed itself (running sums) as ``fix: STAGE``, and the rest of its call
-        as ``fix``.
-        """
-        for stage, total_ms in after.items():
-            part_ms = total_ms - before.get(stage, 0.0)
-            name = f"fix: {stage}"
-            self.stage_ms[name] = self.stage_ms.get(name, 0.0) + part_ms
-            self.stage_ms["fix"] -= part_ms
 
 
 def _problem(given: Sequence[Frame], fixed: Sequence[Frame]) -> str:

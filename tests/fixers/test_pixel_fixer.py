@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError, RendererError
@@ -19,7 +18,7 @@ from alpasim_plugin.core.interfaces import BlockRule
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import fixer_settings, guard, make_fixer
 from alpasim_plugin.fixers.bundle import bundle_fixer, read_bundle, save_bundle
-from alpasim_plugin.fixers.guard import keep_render, render_share
+from alpasim_plugin.fixers.guard import render_share
 from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.fixers.pixel_fixer import PixelFixer
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
@@ -222,44 +221,6 @@ def test_an_invention_on_an_opaque_road_is_taken_back() -> None:
     kept = share(invented())
     assert float(kept[0, 32, 32]) > 0.9
     assert float(kept[0, :8].max()) == 0
-
-
-def test_the_guard_on_a_processor_does_what_its_reference_says() -> None:
-    source = torch.Generator().manual_seed(0)
-    render = torch.rand(3, 32, 48, 3, generator=source) * 2 - 1
-    patches = (
-        F.interpolate(torch.rand(3, 3, 4, 6, generator=source), scale_factor=8).permute(0, 2, 3, 1)
-        * 2
-        - 1
-    )
-    out = (
-        torch.where(patches[..., :1] > 0, patches, render)
-        * torch.tensor([1.2, 1.0, 0.0])[:, None, None, None]
-    )
-    out[2] = render[2]  # nothing changes: nothing is put back
-    opacity, recorded = (torch.rand(3, 32, 48, 1, generator=source) for _ in range(2))
-    opacity = (opacity + 0.9).clamp(max=1)
-    sdmap = (
-        torch.where(torch.rand(3, 32, 48, 1, generator=source) > 0.999, 1.0, -1.0)
-        .expand(-1, -1, -1, 3)
-        .contiguous()
-    )
-    before = (
-        F.interpolate(torch.rand(3, 3, 1, 1, generator=source), size=(32, 48))
-        .permute(0, 2, 3, 1)
-        .contiguous()
-    )
-    kept, weight = (
-        how(out, render, opacity, sdmap, before, *more)
-        for how, more in ((keep_render, [recorded]), (render_share, []))
-    )
-    assert kept is not None
-    assert weight is not None
-    assert 0.01 < float((weight > 0).float().mean()) < 0.9
-    torch.testing.assert_close(
-        kept, torch.lerp(out, render, weight * (1 - recorded)), atol=1e-6, rtol=0
-    )
-    assert keep_render(render, render, opacity, sdmap, before, recorded) is None
 
 
 def test_a_change_with_support_stays() -> None:
