@@ -22,7 +22,7 @@ import shapely
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.geometry import wrap_angle, yaw_from_quat
-from alpasim_plugin.core.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene
+from alpasim_plugin.core.types import F64, Bool, MetricSeries, RolloutLog, Scene
 from evaluators.metrics.footprint import Footprints, ego_footprints, origin_of, pairs_of
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.road import Road, road_of
@@ -56,53 +56,19 @@ def containment(road: Road, ego: Footprints, xyz: F64) -> Containment:
     shapes = ego.shapes()
     step, lane = pairs_of(near)
     areas = road.areas(lane)
-    vertices, owner = shapely.get_coordinates(shapes, return_index=True)
-    vertex = vertices[
-        np.searchsorted(owner, np.arange(len(shapes)))
-    ]  # one of each footprint: a lane without it cannot contain the rest
-    holds_vertex = shapely.intersects_xy(areas, *vertex[step].T)
+    held = shapely.contains(areas, shapes[step])
     in_one = np.zeros(len(near), dtype=np.bool_)
-    in_one[
-        step[holds_vertex][shapely.contains(areas[holds_vertex], shapes[step[holds_vertex]])]
-    ] = True
-    sets, group = _distinct(near)
-    in_union, gap_m = np.zeros_like(in_one), np.zeros(len(near))
-    rows = np.flatnonzero(near.any(axis=1))
-    borders = road.borders(sets) if ego.roundness == 0 and not ego.float32 else None
-    if borders is not None:
-        vertex_held = np.zeros_like(in_one)
-        vertex_held[step[holds_vertex]] = True
-        touched = vertex_held.copy()
-        open_ = np.flatnonzero(~vertex_held[step])
-        touched[step[open_][shapely.intersects(areas[open_], shapes[step[open_]])]] = True
-        single = near[rows].sum(axis=1) == 1
-        held = borders.held(sets, group[rows], ego.take(rows))
-        # Where the border stays clear of a footprint, all of it is in the union or nothing, as its
-        # one vertex is.
-        inside = np.where(single, in_one[rows], vertex_held[rows] & ~held.crossed)
-        sure = held.sure & (single | held.crossed | (vertex_held == touched)[rows])
-        in_union[rows[sure & inside]] = True
-        gap_m[rows[sure & inside]] = held.gap_m[sure & inside]
-        rows = rows[~sure]
-    for g in np.unique(group[rows]):
-        mine = rows[group[rows] == g]
+    in_one[step[held]] = True
+    in_union = np.zeros_like(in_one)
+    gap_m = np.zeros(len(near))
+    sets, group = np.unique(near, axis=0, return_inverse=True)
+    for g in np.flatnonzero(sets.any(axis=1)):
         union = road.union(sets[g])
-        inside = mine[shapely.contains(union, shapes[mine])]
+        rows = np.flatnonzero(group.reshape(-1) == g)
+        inside = rows[shapely.contains(union, shapes[rows])]
         in_union[inside] = True
         gap_m[inside] = shapely.distance(shapely.boundary(union), shapes[inside])
     return Containment(near, in_one, in_union, gap_m)
-
-
-def _distinct(near: Bool) -> tuple[Bool, I64]:
-    """Return the distinct rows ``(G, L)`` of ``(T, L)``, and which of them each row is ``(T,)``;
-    most rows are as the one before.
-    """
-    packed = np.packbits(near, axis=1)
-    fresh = np.concatenate([[True], (packed[1:] != packed[:-1]).any(axis=1)])
-    number: dict[bytes, int] = {}
-    of_run = np.array([number.setdefault(row.tobytes(), len(number)) for row in packed[fresh]])
-    first = np.unique(of_run, return_index=True)[1]
-    return near[fresh][first], of_run[np.cumsum(fresh) - 1]
 
 
 def wrong_lane(road: Road, near: Bool, xy: F64, yaw: F64, preset: Preset) -> Bool:

@@ -1,6 +1,6 @@
 """The road as evaluators see it: lane areas, lane centres and road edges of one map.
 
-Areas, borders and unions are built where a drive comes, and kept for the next drive.
+Areas and unions are built where a rollout comes, and kept for the next rollout.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import shapely
 
 from alpasim_plugin.core.lane_areas import lane_polygons, ring_area
 from alpasim_plugin.core.types import F64, I64, Bool, LaneMap
-from evaluators.metrics.border import Borders
 from evaluators.metrics.footprint import Geometries, pairs_of, spans
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.surface import Surface, segment_distance
@@ -136,10 +135,6 @@ class Polylines:
         return out
 
 
-MOST_SEAM_M = 1e-4  # wider seams change the shape of gaps, not only rounding
-MOST_XY_M = 1e5  # farther from the origin, rounding comes near the seam
-
-
 class Road:
     """Lanes and edges of one map, metres relative to ``origin``."""
 
@@ -153,7 +148,6 @@ class Road:
         self._areas: Geometries = np.full(len(self._lanes), None, dtype=object)
         self._centres: Geometries = np.full(len(self._lanes), None, dtype=object)
         self._unions: dict[bytes, Any] = {}
-        self._borders: Borders | None = None
         self._rings = lane_map.drivable_areas
 
     def areas(self, lane: I64) -> Geometries:
@@ -212,23 +206,6 @@ class Road:
             shapely.prepare(shape)
             self._unions[key] = shape
         return self._unions[key]
-
-    def borders(self, sets: Bool) -> Borders | None:
-        """Return borders that know the union of each set of lanes ``(G, L)``; None where only
-        `union` knows it.
-
-        That is where no seam is closed: rounding then decides whether lanes that share an edge are
-        joined there.
-        """
-        if (
-            not 0 < self._preset.seam_m <= MOST_SEAM_M
-            or float(np.abs(self._centre.vertices).max(initial=0.0)) > MOST_XY_M
-        ):
-            return None
-        if self._borders is None or not self._borders.know(sets):
-            lanes = np.flatnonzero(sets.any(axis=0))
-            self._borders = Borders(self.areas(lanes), lanes, sets, self._preset.seam_m)
-        return self._borders
 
     def touches_edge(self, footprints: Geometries, xyz: F64) -> Bool:
         """Return whether footprints ``(T,)`` with box centres ``(T, 3)`` lie nearer than the
