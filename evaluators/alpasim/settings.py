@@ -11,8 +11,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from alpasim_plugin.core.config import load_yaml, validate
 from evaluators.metrics.presets import ALPASIM, Preset
 
-DOING = "reading evaluation settings"
-
 
 class _Part(BaseModel):
     """A section: frozen, and no key that AlpaSim does not know."""

@@ -35,6 +35,10 @@ LATERAL = 2
 # Slack of the distance filter: far above rounding, far below any size, so that the filter never
 # rules out a touching pair.
 _SLACK_M = 1e-6
+_SLACK_S = 1e-9  # far below the microsecond of the logs, far above the rounding of seconds
+_STRETCH = 16  # logged poses per box of the tree: few boxes, and little of the road in each
+# Where two bodies touch is read off their overlap when the ego is this much larger on every side.
+PLACE_M = 1e-6
 
 
 @dataclass(frozen=True)
@@ -113,13 +117,6 @@ def last_per_step(contacts: Contacts, ego: Footprints, actors: ActorTable, t_us:
         rows = np.flatnonzero(contacts.step == step)
         keep[rows[contacts.actor[rows] != present[order[-1] - 1]]] = False
     return Contacts(contacts.step[keep], contacts.actor[keep], contacts.side[keep])
-
-
-# where two bodies touch is read off their overlap when the ego is this much larger on every side
-PLACE_M = 1e-6
-_STRETCH = 16  # logged poses per box of the tree: few boxes, and little of the road in each
-_SLACK_M = 1e-6
-_SLACK_S = 1e-9  # far below the microsecond of the logs, far above the rounding of seconds
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,6 @@ from evaluators.statistics.baselines import check_scenes, scene_hashes, table_of
 from evaluators.statistics.paired import LISTED, compare
 from evaluators.statistics.summary import paired_arms
 
-DOING = "comparing runs"
-
 
 @dataclass(frozen=True)
 class Comparison:

@@ -21,6 +21,10 @@ from alpasim_plugin.log.run_folder.schema import ROLLOUTS
 from alpasim_plugin.log.run_folder.sides import Row, is_ok
 from evaluators.opening import Run, read_run
 
+SCHEMA_VERSION = 1
+APPROVE = "make the run again as the baseline was made, or approve a new baseline with simrun gate RUN --write-baseline FILE"
+NAMED = 3  # missing rollouts in an error
+
 
 def table_of_run(run: Run) -> RolloutTable:
     """Return the rollouts of a run as columns, read from its folder one metric at a time.
@@ -63,11 +67,6 @@ def of_policy(rows: Sequence[Row], policy: str) -> list[Row]:
 def policies_of(rows: Sequence[Row]) -> list[str]:
     """Return the policies in order of appearance."""
     return list(dict.fromkeys(str(row["policy"]) for row in rows))
-
-
-SCHEMA_VERSION = 1
-DOING = "comparing with a stored baseline"
-APPROVE = "make the run again as the baseline was made, or approve a new baseline with simrun gate RUN --write-baseline FILE"
 
 
 class StoredBaseline(TypedDict):
@@ -263,10 +262,6 @@ def scene_hashes(run: Run) -> dict[str, str]:
 
 def _preset(run: Run) -> str:
     return str(run.summary.get("preset") or run.info.get("preset") or "")
-
-
-DOING = "comparing with a stored baseline"
-NAMED = 3  # missing rollouts in an error
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,6 @@ from evaluators.statistics.verdicts import (
     worst,
 )
 
-DOING, DOING_JUDGE = "reading a gate", "judging a run"
 LIBRARY = Path(__file__).resolve().parents[2] / "configs" / "gates"
 
 
