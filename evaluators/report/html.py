@@ -46,7 +46,6 @@ from evaluators.report.provenance import (
     provenance,
 )
 from evaluators.report.rollouts import drift_charts, read_series, rollout_block
-from evaluators.report.strata import heads, strata, strata_chart, stratum_rows
 from evaluators.report.tables import SCENE_METRICS, scene_rows
 from evaluators.report.verdict import decision_section, gate_section
 
@@ -188,7 +187,6 @@ def context(run: Run) -> dict[str, Any]:
         colours[variant] = i if first is None else variant_of[first.renderer, first.policy][0]
     by_policy = len(run.renderers) == 1 and len(run.policies) > 1
     flips, more_flips, flip_pairs = flip_rows(run, FLIP_BUDGET_BYTES)
-    split = strata(run, sample)
     of_sample = (
         ""
         if sample is None
@@ -216,8 +214,6 @@ def context(run: Run) -> dict[str, Any]:
         "flip_pairs": flip_pairs,
         "baseline": " or ".join(base.name for base in flip_bases(run)),
         "baselines": [base.name for base in flip_bases(run)],
-        "strata": [(one, stratum_rows(one), strata_chart(one)) for one in split],
-        "strata_heads": heads(),
         "speed_charts": speed_against_error(run, colours),
         "invalid": invalid_rows(run),
         "headline_rows": headline,

@@ -92,17 +92,6 @@ def test_flips_sort_by_when_the_plans_parted_with_unknown_ones_last(
         assert times[-1] == "\u2014"
 
 
-def test_folds_open_and_close(browser: Browser, usual_run: Path) -> None:
-    browser.open(write_report(usual_run))
-    table = "document.getElementById('table-strata-0').checkVisibility()"
-    assert not browser.evaluate(table)
-    for seen in (True, False):
-        browser.evaluate(
-            "document.getElementById('table-strata-0').closest('details').querySelector('summary').click()"
-        )
-        assert browser.evaluate(table) is seen
-
-
 def test_missing_values_stay_last_both_ways(browser: Browser, usual_run: Path) -> None:
     browser.open(write_report(usual_run))
     browser.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true; })")

@@ -145,7 +145,6 @@ def test_verdict_comes_first(usual_run: Path, usual_page: Page) -> None:
     ]
     heads += [
         "Every rollout",
-        "By distance and by opacity",
         "Speed",
         "Failures",
         "What the numbers leave out",
