@@ -31,7 +31,6 @@ from alpasim_plugin.runs.provenance import hardware, project, versions
 from alpasim_plugin.runs.repeat import repeat_rollout
 from alpasim_plugin.runs.summary import pool_of, write_summary
 from evaluators.metrics import MetricTable, table_of
-from evaluators.statistics.families import grouped
 from evaluators.statistics.verdicts import Outcome, outcome_of_failures
 from scenarios.suite import ScenarioRef
 
@@ -182,10 +181,6 @@ def finish_run(
     if tuple(folders) != cells_of_run(info):
         info["rollouts"] = folders
     write_run_json(root, info)
-    paths = {
-        scene: str((facts.get("ref") or {}).get("path") or scene)
-        for scene, facts in (info.get("scenes") or {}).items()
-    }
     summary = write_summary(
         root,
         manifests,
@@ -194,7 +189,6 @@ def finish_run(
         {name: info[name] for name in IN_SUMMARY if name in info},
         info.get("bases") or {},
         MetricTable.of_run(info),
-        grouped(paths),
     )
     from alpasim_plugin.runs.reports import write_reports  # `_load_ending` has loaded it
 

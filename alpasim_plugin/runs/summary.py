@@ -36,7 +36,6 @@ def write_summary(
     more: Mapping[str, Any],
     bases: Mapping[str, str] = NO_BASES,
     known: MetricTable = METRICS,
-    family_of: Mapping[str, str] = NO_BASES,
 ) -> dict[str, Any]:
     """Write the tables and ``summary.json`` of a run folder and return the summary.
 
@@ -50,14 +49,13 @@ def write_summary(
         bases: Renderer with a fixer -> the renderer below it; where the run has both and it is not
             the baseline, the two are paired too.
         known: What the metrics are.
-        family_of: SCENE -> its family.
     """
     rollouts = write_tables(root, manifests)
     done = [m for m in manifests if m["status"] == "ok"]
     summary = {
         "preset": preset,
         "outcomes": outcome_table(*rollouts_of(manifests)),
-        **numbers(RolloutTable.of_table(rollouts), baseline, bases, known, family_of),
+        **numbers(RolloutTable.of_table(rollouts), baseline, bases, known),
         "censoring": by_policy(_of_policies(manifests), lambda some: censoring(some, known)),
         "failures": _failures(manifests),
         "fixers": by_policy(_of_policies(done), fixers),

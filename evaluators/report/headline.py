@@ -376,31 +376,11 @@ def _difference(run: Run, variant: str, metric: str, entry: Mapping[str, Any], b
     text = f"{facts.words}: {here} against {there} ({fixed(difference, places, sign=True)}{tail}"
     if ends:
         text += f", 95\u00a0% interval {fixed(ends[0], places, sign=True)} to {fixed(ends[1], places, sign=True)}"
-    text += families_text(entry, scale, places, unit)
     needed = more_scenes_text(entry.get("more_scenes"))
     margin = finite(entry.get("margin"))
     if needed and margin is not None:
         text += f"; {needed} on the margin of {short(margin * scale, unit)}"
     return f"{text})"
-
-
-def families_text(entry: Mapping[str, Any], scale: float, places: int, unit: str) -> str:
-    """Say what families of scenes make of a difference; empty where there are too few."""
-    found = entry.get("families") or {}
-    rest, tail = found.get("without") or {}, f"\u00a0{unit}" if unit else ""
-    ends, others = interval(found.get("ci95")), interval(rest.get("ci95"))
-    if ends is None or finite(rest.get("diff")) is None:
-        return ""
-    low, high = (fixed(end * scale, places, sign=True) for end in ends)
-    text = f"; {found['n']} families as the unit {low} to {high}{tail}"
-    text += (
-        f"; without {rest['family']} {fixed(float(rest['diff']) * scale, places, sign=True)}{tail}"
-    )
-    return text + (
-        f", {' to '.join(fixed(end * scale, places, sign=True) for end in others)}"
-        if others
-        else ""
-    )
 
 
 def _baseline_variant(run: Run, variant: str, baseline: str) -> str:

@@ -15,7 +15,7 @@ from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.outcomes import POLICY_FAULT, in_words, outcomes_of, told
 from evaluators.opening import Run
 from evaluators.report.flips import colours_of
-from evaluators.report.headline import families_text, more_scenes_text, tone_of
+from evaluators.report.headline import more_scenes_text, tone_of
 from evaluators.report.numbers import (
     ARROW_WORDS,
     ARROWS,
@@ -43,8 +43,6 @@ class Span:
     centre: float
     low: float | None = None
     high: float | None = None
-    family_low: float | None = None  # with families of scenes as the unit
-    family_high: float | None = None
     zero: float | None = None
 
 
@@ -240,7 +238,7 @@ def _pair_row(
     reason = str(entry.get("reason") or "")
     diff_cell = missing(reason or "no pair has this metric valid on both sides")
     bounds_cell = missing(reason or "it needs at least two scenes")
-    span, families_said = None, ""
+    span = None
     if diff is not None:
         ends = bounds or ()
         places = 1 if scale == 100.0 else decimals(*(v * scale for v in (diff, *ends)), digits=3)
@@ -248,13 +246,8 @@ def _pair_row(
         if bounds is not None:
             low, high = (fixed(v * scale, places, sign=True) for v in bounds)
             bounds_cell = Cell(f"{low} to {high}", note, sort=bounds[1] - bounds[0])
-            families_said = families_text(entry, scale, places, unit).removeprefix("; ")
-            families = interval((entry.get("families") or {}).get("ci95"))
-            reach = max(map(abs, (diff, *bounds, *(families or ())))) or 1.0
-            at = [round(50 + 46 * v / reach, 2) for v in (diff, *bounds, *(families or ()))]
-            span = Span(
-                at[0], at[1], at[2], at[3] if families else None, at[4] if families else None, 50.0
-            )
+            reach = max(map(abs, (diff, *bounds))) or 1.0
+            span = Span(*(round(50 + 46 * v / reach, 2) for v in (diff, *bounds)), zero=50.0)
     p = finite(entry.get("p_value"))
     p_cell = (
         missing(reason or "no test was made")
@@ -276,7 +269,7 @@ def _pair_row(
     )
     base, hint = (
         str(entry.get("baseline") or "\u2014"),
-        "; ".join([*said, *([more] if more else []), *([families_said] if families_said else [])]),
+        "; ".join([*said, *([more] if more else [])]),
     )
     return PairRow(
         variant,

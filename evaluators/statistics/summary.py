@@ -26,7 +26,6 @@ from alpasim_plugin.log.run_folder.sides import (
 )
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.statistics.arms import Arm, axis_bases
-from evaluators.statistics.families import by_family
 from evaluators.statistics.intervals import (
     cluster_bootstrap,
     clustered,
@@ -283,7 +282,6 @@ def numbers(
     baseline: str | None = None,
     bases: Mapping[str, str] = NO_BASES,
     known: MetricTable = METRICS,
-    family_of: Mapping[str, str] = NO_BASES,
 ) -> dict[str, Any]:
     """Return the blocks ``metrics``, ``paired``, ``paired_with_base`` and ``paired_arms`` of
     ``summary.json`` (docs/statistics.md).
@@ -295,8 +293,6 @@ def numbers(
         bases: Renderer with a fixer -> the renderer below it; where both were driven and it is not
             the baseline, the two are paired too.
         known: What the metrics are.
-        family_of: SCENE -> its family; where it has three or more, differences of headline metrics
-            say what families say (`by_family`).
     """
     sides = {policy: table.sides(policy) for policy in table.policies}
     arms = [Arm(renderer, policy) for policy, here in sides.items() for renderer in here]
@@ -317,33 +313,10 @@ def numbers(
             {} if base is None else paired_sides(here, table.metrics, base, known=known)
         )
         with_base[policy] = base_pairs(here, table.metrics, base, bases, known)
-        for name, entries in paired[policy].items():
-            _add_families(entries, here[name], here[str(base)], family_of, known)
     parts = {"metrics": metrics, "paired": paired, "paired_with_base": with_base}
     arm_pairs = [] if by_policy_base is None else by_policy_base.pairs(arms)
     across = paired_arms(table, arm_pairs, known)
-    for arm, other in arm_pairs:
-        pair = (
-            table.sides(arm.policy)[arm.renderer],
-            table.sides(other.policy, arm.policy)[other.renderer],
-        )
-        _add_families(across[arm.name], *pair, family_of, known)
     return {name: by_policy(part, dict) for name, part in parts.items()} | {"paired_arms": across}
-
-
-def _add_families(
-    entries: dict[str, Any],
-    here: Side,
-    there: Side,
-    family_of: Mapping[str, str],
-    known: MetricTable,
-) -> None:
-    """Add ``families`` to the differences of headline metrics that have an interval."""
-    for metric in known.headline if family_of else ():
-        entry = entries.get(metric) or {}
-        if entry.get("ci95") is not None:
-            found = by_family(here, there, known.info(metric), family_of, entry["margin"])
-            entry |= {} if found is None else {"families": found}
 
 
 def paired_arms(

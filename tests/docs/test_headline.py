@@ -12,8 +12,6 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from evaluators.statistics.families import family_bounds
-
 
 @pytest.fixture
 def headline(repo: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
@@ -86,7 +84,7 @@ def test_the_interval_over_families_is_that_of_the_scenes_whatever_they_are_with
         [0.0, -0.5, -1.0, -1.0, 0.5, -0.5]
     )  # sums of two: -1 of 4, -4 of 4 and 0 of 4 rollouts
     assert record.over_families("onefixer") == pytest.approx(
-        [100 * end for end in family_bounds(scenes, np.array([0, 0, 1, 1, 2, 2]))]
+        [100 * end for end in headline.family_bounds(scenes, np.array([0, 0, 1, 1, 2, 2]))]
     )
     assert record.without("onefixer") == ("hills", pytest.approx(-12.5))
 
