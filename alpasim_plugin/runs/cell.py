@@ -5,11 +5,11 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 
@@ -46,9 +46,6 @@ from alpasim_plugin.runs.scoring import score_log
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
 
-if TYPE_CHECKING:
-    from alpasim_plugin.alpasim.client.world_services import RemoteActors
-
 
 @dataclass(frozen=True)
 class RolloutParts:
@@ -58,7 +55,6 @@ class RolloutParts:
         session: Identifies the rollout in its log; equal rollouts have equal ids.
         names: Name of each service, for the log's header.
         controller: Moves the ego.
-        actors: Road users behind a service; None: the scenario's own.
     """
 
     renderer: Renderer
@@ -66,16 +62,6 @@ class RolloutParts:
     session: str
     names: Mapping[str, str]
     controller: Controller
-    actors: RemoteActors | None = None
-
-
-def remote_actors(scenario: Scenario, address: str, seed: int) -> RemoteActors:
-    """Connect a rollout's road users to a traffic service."""
-    from alpasim_plugin.alpasim.client.world_services import (
-        RemoteActors,
-    )  # gRPC is loaded where a service is called
-
-    return RemoteActors(scenario, address, seed)
 
 
 PartsBuilder = Callable[[Cell, RunOptions, Scenario, int], RolloutParts]
@@ -93,7 +79,6 @@ def build_parts(cell: Cell, options: RunOptions, scenario: Scenario, threads: in
             "egodriver": cell.policy.name,
         },
         build(cell.controller, vehicle=scenario.vehicle, scene_id=scenario.scene_id),
-        remote_actors(scenario, options.traffic, cell.seed) if options.traffic else None,
     )
 
 
@@ -180,24 +165,10 @@ def _drive(
         options.video != "none",
         parts.names,
     )
-    held: list[Policy | Controller | RemoteActors] = [
-        complete(parts.policy, Policy),
-        complete(parts.controller, Controller),
-    ]
-    if parts.actors is not None:
-        held.append(parts.actors)
-    with recorder, ExitStack() as stack:
-        for part in held:
-            stack.enter_context(_closing(part))
-        run_rollout(
-            scenario,
-            parts.renderer,
-            parts.policy,
-            cell.seed,
-            recorder,
-            parts.controller,
-            parts.actors,
-        )
+    policy = complete(parts.policy, Policy)
+    controller = complete(parts.controller, Controller)
+    with recorder, _closing(policy), _closing(controller):
+        run_rollout(scenario, parts.renderer, policy, cell.seed, recorder, controller)
     return recorder
 
 
@@ -317,7 +288,7 @@ def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) ->
 
 
 @contextmanager
-def _closing(part: Policy | Controller | RemoteActors) -> Iterator[None]:
+def _closing(part: Policy | Controller) -> Iterator[None]:
     """Close a part after its rollout."""
     try:
         yield

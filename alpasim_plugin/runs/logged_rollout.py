@@ -49,13 +49,8 @@ class LoggedRollout:
         """Refuse a rollout that cannot be replayed.
 
         Raises:
-            InputError: Its latency is measured, or a service moved its road users.
+            InputError: Its latency is measured.
         """
-        if self.options.traffic is not None:
-            raise InputError(
-                f"{self.name}: the traffic service {self.options.traffic} moved its road users: nothing here can move them so again",
-                "run it without --traffic",
-            )
         if self.scenario.latency.kind == "measured":
             raise InputError(
                 f"{self.name}: its latency is measured: the delay of its plans depended on the machine",

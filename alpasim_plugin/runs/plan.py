@@ -50,10 +50,6 @@ class RunOptions:
         tuple[str, ...],
         Flag("A further evaluator, package.module:Class. Repeatable.", "--evaluator"),
     ] = ()
-    traffic: Annotated[
-        str | None,
-        Flag("AlpaSim's traffic service moves the other road users.", metavar="HOST:PORT"),
-    ] = None
 
 
 def options_of(info: Mapping[str, Any]) -> RunOptions:
@@ -336,8 +332,6 @@ def _cell(
         f"controller {controller.name}": controller.digest,
         f"source of {scenario.scene_id}": code.sources[scenario.scene_id],
     }
-    if options.traffic is not None:
-        content[f"traffic service {options.traffic}"] = None
     rollout_key = digest(
         [code.loop, scenario.content_hash, content, seed, options.images, options.device]
     )

@@ -86,7 +86,7 @@ def test_presets_are_of_the_group_renderer_and_name_one_endpoint(staged: Path) -
         assert preset["runtime"]["simulation_config"]["physics_update_mode"] == "NONE"
         assert preset["wizard"]["debug_flags"]["use_localhost"]
         assert "driver" in preset["wizard"]["run_sim_services"]
-    assert kinds == {"onefixer": "sensorsim", "onefixer_world_model": "video_model"}
+    assert kinds == {"onefixer": "sensorsim"}
 
 
 LINES = [

@@ -25,7 +25,7 @@ from tests.docs.commands import SHORT, Command, commands, pages
 REPO = Path(__file__).resolve().parents[2]
 PAGES = ("docs/alpasim.md", "docs/alpasim-drivers.md", "docs/can.md")
 # services of AlpaSim's own; long measurements; other pages' subjects
-ELSEWHERE = r"vdc://|--traffic|^bench |FILE|^score|^export"
+ELSEWHERE = r"^bench |FILE|^score|^export"
 CLEAN = ("serve", "--renderer", "clean", "--scenes", "scenes", "--threads", "1", "--listen")
 BESIDE = {  # address in a command -> what answers there
     "--upstream 127.0.0.1:6789": (*CLEAN, "127.0.0.1:6789"),

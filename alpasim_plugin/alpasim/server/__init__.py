@@ -1,3 +1,1 @@
-"""Services that AlpaSim's runtime calls: the renderer's (`sensorsim`) and the video model's
-(`world_model`).
-"""
+"""Services that AlpaSim's runtime calls: the renderer's (`sensorsim`) and the driver's (`driver_service`)."""

@@ -25,7 +25,6 @@ from alpasim_plugin.alpasim.server.sources import (
     UpstreamSource,
     read_masks,
 )
-from alpasim_plugin.alpasim.server.world_model import WorldModel
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import RendererSpec
 from alpasim_plugin.core.parts.spec import digest, file_digest
@@ -169,10 +168,9 @@ class Settings:
 
 @dataclass(frozen=True)
 class Assembled:
-    """A service with what belongs to it. The video model's is there where we render ourselves."""
+    """A service with what belongs to it."""
 
     service: Sensorsim
-    world_model: WorldModel | None
     scenes: SceneCache | None
     fixers: FixerCache | None
     tree: HistoryTree[Answered]
@@ -182,9 +180,8 @@ class Assembled:
 
     @property
     def services(self) -> dict[str, object]:
-        """All services by name, for one port."""
-        both = {"SensorsimService": self.service, "WorldModelService": self.world_model}
-        return {name: service for name, service in both.items() if service is not None}
+        """The service by its name, for one port."""
+        return {"SensorsimService": self.service}
 
     def close(self) -> None:
         """Close the channel to the upstream: its threads must be gone before the interpreter ends,
@@ -196,8 +193,6 @@ class Assembled:
     def expire(self) -> None:
         """Forget what nobody used for long."""
         self.tree.expire()
-        if self.world_model is not None:
-            self.world_model.sessions.expire()
 
 
 def assemble(settings: Settings) -> Assembled:
@@ -286,9 +281,4 @@ def assemble(settings: Settings) -> Assembled:
         stub,
         verbatim=stub is not None and fixers is None,
     )
-    world_model = None
-    if stub is None:
-        assert scenes is not None
-        version = version_of(spec, shaping)
-        world_model = WorldModel(scenes, fixers, busy, version, settings.threads, settings.expiry_s)
-    return Assembled(service, world_model, scenes, fixers, tree, busy, spec, channel)
+    return Assembled(service, scenes, fixers, tree, busy, spec, channel)

@@ -335,10 +335,6 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
             "alpasim_plugin.control.tracker:PlanTracker",
             "kinematic bicycle that follows the plan with preview, within the vehicle's limits",
         ),
-        "vdc://": (
-            "alpasim_plugin.alpasim.client.world_services:VdcController",
-            "an AlpaSim controller, and physics: vdc://HOST:PORT[?physics=HOST:PORT&scene=ID]",
-        ),
         "perfect": (
             "alpasim_plugin.control.tracker:PerfectController",
             "the ego is exactly where its plan says",
