@@ -39,7 +39,7 @@ Examples:
 
 
 def quality(
-    data: Annotated[Path, typer.Argument(help="Folder of pairs (docs/lab/pairs.md).")],
+    data: Annotated[Path, typer.Argument(help="Folder of pairs (docs/lab/training.md).")],
     out: Annotated[
         Path, typer.Option("--out", help="Folder for results; the same command continues there.")
     ],

@@ -52,6 +52,12 @@ def pairs(
             "--max-offset-m", min=0.0, help="Largest lateral offset from the log, metres."
         ),
     ] = 2.5,
+    offset_m: Annotated[
+        float | None,
+        typer.Option(
+            "--offset-m", help="One lateral offset for all frames, metres, left positive."
+        ),
+    ] = None,
     count: Annotated[
         int | None, typer.Option("--count", min=1, help="Only the first N scenes of each split.")
     ] = None,
@@ -82,7 +88,7 @@ def pairs(
     made: Iterable[tuple[Path, bool]]  # folder of a sequence, and whether it is new
     if len(sources) == 1 and sources[0].is_dir():
         scenes = scenes_of(sources[0], split, count)
-        maker = _Maker(out, PairRecipe(source, max_offset_m=max_offset_m), seed)
+        maker = _Maker(out, PairRecipe(source, max_offset_m=max_offset_m, offset_m=offset_m), seed)
         made = (result for _, result in map_jobs(maker, scenes, jobs))
     else:
         sizes = [parse_size(text) for text in size or ["256x144"]]

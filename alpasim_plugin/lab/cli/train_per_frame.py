@@ -37,7 +37,7 @@ def per_frame(
     data: options.Pairs,
     out: options.RunFolder,
     video: Annotated[
-        Path | None, typer.Option("--video", help="Folder of driving video (docs/lab/pairs.md).")
+        Path | None, typer.Option("--video", help="Folder of driving video (docs/lab/training.md).")
     ] = None,
     sequences: Annotated[
         int | None,

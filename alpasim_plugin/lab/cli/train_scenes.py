@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.lab.cli.training_options import AsJson, Debug
-from alpasim_plugin.lab.training.frozen_scenes import check_scenes
+from alpasim_plugin.lab.training.frozen_scenes import RECORD, check_scenes
 from alpasim_plugin.lab.training.scenes import SPLITS, Split, write_scenes
 
 EPILOG = "Examples: `simrun train scenes --out data/scenes --split train`, `simrun train scenes --out data/scenes --check`"
@@ -37,6 +37,9 @@ def scenes(
             "--check", help="Only check that OUT holds the test scenes frozen before training."
         ),
     ] = False,
+    record: Annotated[
+        Path, typer.Option("--record", help="File with the hashes that --check compares with.")
+    ] = RECORD,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
@@ -46,7 +49,7 @@ def scenes(
     del debug
     console = Console(stderr=True)
     if check:
-        digests = {name: frozen.sha256 for name, frozen in check_scenes(out).items()}
+        digests = {name: frozen.sha256 for name, frozen in check_scenes(out, record).items()}
         for name, digest in digests.items():
             console.print(f"{name}: {digest[:16]}, as frozen", highlight=False)
         if as_json:

@@ -137,7 +137,7 @@ class PairSequence:
         if array.ndim != axes or array.dtype != np.dtype(dtype):
             raise InputError(
                 f"{path}: {array.dtype} with {array.ndim} axes",
-                f"give {dtype} with {axes} axes (docs/lab/pairs.md)",
+                f"give {dtype} with {axes} axes (docs/lab/training.md)",
             )
         return array
 

@@ -4,7 +4,7 @@
 The definition is that of LPIPS (Zhang et al., CVPR 2018, Eq. 1): features of every stage, scaled to
 unit length over the channels, squared difference, a non-negative weight per channel, mean over the
 image, sum over the stages. Values cannot be compared with published LPIPS numbers.
-docs/lab/perceptual-syn.md describes training and validation.
+docs/lab/video-metrics.md says how far it can be trusted.
 """
 
 from __future__ import annotations
