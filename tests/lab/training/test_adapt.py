@@ -56,7 +56,12 @@ def test_the_command_trains_judges_and_keeps_what_there_was(
 ) -> None:
     monkeypatch.setattr(command, "load_scenario", lambda _: drive(tmp_path, 20))
     out = tmp_path / "new.safetensors"
-    assert run_command(["train", "adapt", str(tmp_path), "--out", str(out), "--updates", "1", "--json"]) == 0
+    assert (
+        run_command(
+            ["train", "adapt", str(tmp_path), "--out", str(out), "--updates", "1", "--json"]
+        )
+        == 0
+    )
     document = json.loads(capsys.readouterr().out)
     assert len(document["before"]) == len(document["after"]) == 5
     assert document["accepted"] == (document["ci95_db"][0] > 0) == out.exists()
