@@ -18,7 +18,7 @@ from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.subprocesses import end_children
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
-from alpasim_plugin.log.run_folder.sides import RendererRows
+from alpasim_plugin.log.run_folder.sides import Side
 from alpasim_plugin.log.run_folder.writer import rollout_rows, writing
 from alpasim_plugin.runs.execute import HowToRun, execute, thread_budget
 from alpasim_plugin.runs.executors.choice import LOCAL, Executor
@@ -180,9 +180,9 @@ def execute_decision(
     return Decided(result, test.record(), test.state, test.outcome)
 
 
-def _side(rows: Sequence[Mapping[str, Any]], variant: Arm) -> RendererRows:
+def _side(rows: Sequence[Mapping[str, Any]], variant: Arm) -> Side:
     names = (variant.renderer, variant.policy)
-    return RendererRows.of([row for row in rows if (row["renderer"], row["policy"]) == names])
+    return Side.of([row for row in rows if (row["renderer"], row["policy"]) == names])
 
 
 @dataclass

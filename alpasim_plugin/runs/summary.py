@@ -14,9 +14,9 @@ import numpy as np
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.log.run_folder.columns import AGAIN, RolloutTable
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS, ROLLOUTS_TABLE, SUMMARY
+from alpasim_plugin.log.run_folder.sides import AGAIN, RolloutTable
 from alpasim_plugin.log.run_folder.writer import write_tables
 from alpasim_plugin.runs.execute import Threads
 from alpasim_plugin.runs.provenance import fixers

@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import Any
 
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS, ROLLOUTS_TABLE, columns_of
-from alpasim_plugin.log.run_folder.sides import RendererRows, Row
+from alpasim_plugin.log.run_folder.sides import Row, Side
 from evaluators.report.runs import CHECK, RunEntry, as_time
 from evaluators.statistics.paired import compare
 from evaluators.statistics.verdicts import difference
@@ -390,13 +390,13 @@ class _Tables:
     def __init__(self, metrics: Sequence[str]) -> None:
         self._metrics = metrics
         self._read: dict[int, dict[tuple[str, str], list[Row]]] = {}
-        self._sides: dict[tuple[int, str, str], RendererRows] = {}
+        self._sides: dict[tuple[int, str, str], Side] = {}
 
-    def rows(self, entry: RunEntry, renderer: str, policy: str) -> RendererRows:
+    def rows(self, entry: RunEntry, renderer: str, policy: str) -> Side:
         """Return the rollouts of a renderer and policy, sorted into cells."""
         key = (id(entry), renderer, policy)
         if key not in self._sides:
-            self._sides[key] = RendererRows.of(self._split(entry)[renderer, policy])
+            self._sides[key] = Side.of(self._split(entry)[renderer, policy])
         return self._sides[key]
 
     def has(self, entry: RunEntry, renderer: str, policy: str, metric: str) -> bool:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.log.run_folder.columns import RolloutTable
 from alpasim_plugin.log.run_folder.schema import cell_name
+from alpasim_plugin.log.run_folder.sides import RolloutTable
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.opening import Run
 from evaluators.statistics.arms import arms_of, axis_bases, base_named, choices

@@ -8,9 +8,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.log.run_folder.columns import RendererColumns
 from alpasim_plugin.log.run_folder.schema import cell_name
-from alpasim_plugin.log.run_folder.sides import RendererRows, Side
+from alpasim_plugin.log.run_folder.sides import Side
 
 
 @dataclass(frozen=True)
@@ -69,11 +68,8 @@ def as_policy(side: Side, policy: str) -> Side:
     """Return rollouts as if a policy of that name had driven them, so that they pair with that
     policy's.
     """
-    if isinstance(side, RendererColumns):
-        return replace(side, cells=replace(side.cells, policy=policy))
-    if isinstance(side, RendererRows):
-        return RendererRows.of([{**row, "policy": policy} for row in side.rows])
-    raise TypeError(f"rollouts of an unknown layout, {type(side).__name__}")
+    cells = tuple((policy, scene, seed) for _, scene, seed in side.cells)
+    return replace(side, cells=cells)
 
 
 def arms_of(cells: Iterable[tuple[str, str]]) -> list[Arm]:

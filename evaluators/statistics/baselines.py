@@ -16,9 +16,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.reading import read_json_object
 from alpasim_plugin.core.reading.files import as_shape, kind_of
-from alpasim_plugin.log.run_folder.columns import RolloutTable
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS
-from alpasim_plugin.log.run_folder.sides import Row, is_ok
+from alpasim_plugin.log.run_folder.sides import RolloutTable, Row, is_ok
 from evaluators.opening import Run, read_run
 
 SCHEMA_VERSION = 1

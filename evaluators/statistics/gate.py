@@ -15,8 +15,14 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from alpasim_plugin.core.config import load_yaml, validate
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.yaml_positions import Document
-from alpasim_plugin.log.run_folder.columns import RolloutTable
-from alpasim_plugin.log.run_folder.sides import Row, Side, by_renderer, failure_of, is_ok
+from alpasim_plugin.log.run_folder.sides import (
+    RolloutTable,
+    Row,
+    Side,
+    by_renderer,
+    failure_of,
+    is_ok,
+)
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.presets import PRESETS
 from evaluators.statistics.arms import Arm, Base, as_policy, base_named, short_name, usual_base

@@ -13,10 +13,9 @@ import numpy as np
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, I64
-from alpasim_plugin.log.run_folder.columns import RolloutTable
 from alpasim_plugin.log.run_folder.schema import cell_name
 from alpasim_plugin.log.run_folder.sides import (
-    RendererRows,
+    RolloutTable,
     Row,
     Side,
     by_renderer,
@@ -191,7 +190,7 @@ def censoring(rows: Sequence[Row], known: MetricTable = METRICS) -> dict[str, di
     return {name: _of_renderer(side, names, known) for name, side in by_renderer(rows).items()}
 
 
-def _of_renderer(side: RendererRows, names: Sequence[str], known: MetricTable) -> dict[str, Any]:
+def _of_renderer(side: Side, names: Sequence[str], known: MetricTable) -> dict[str, Any]:
     done = [row for row, ok in zip(side.rows, side.ok, strict=True) if ok]
     ledgers = [row["censored"] for row in done if row.get("censored")]
     events: Counter[str] = Counter()

@@ -15,9 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.log.run_folder import columns
-from alpasim_plugin.log.run_folder.columns import RolloutTable
-from alpasim_plugin.log.run_folder.sides import RendererRows, by_renderer, metric_names
+from alpasim_plugin.log.run_folder.sides import RolloutTable, Side, by_renderer, metric_names
 from evaluators import aggregate, paired
 from evaluators.statistics.gate import GateSpec, judge, judge_table
 from evaluators.statistics.paired import base_pairs
@@ -125,7 +123,6 @@ def by_rows(
 )
 def test_columns_give_what_rows_give(
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     renderers: tuple[str, ...],
     policies: tuple[str, ...],
     scenes: int,
@@ -143,8 +140,6 @@ def test_columns_give_what_rows_give(
         }
 
     assert numbers_by_renderer(RolloutTable.of_table(table_of(rows))) == wanted
-    monkeypatch.setattr(columns, "BATCH_ROWS", 7)
-    monkeypatch.setattr(columns, "KEPT_BYTES", 1)  # every metric is read again for every statistic
     pq.write_table(table_of(rows), tmp_path / "rollouts.parquet", row_group_size=5)
     assert numbers_by_renderer(RolloutTable.of_files([tmp_path / "rollouts.parquet"])) == wanted
 
@@ -225,14 +220,11 @@ def test_a_gate_of_rows_and_of_columns_refuses_a_baseline_that_is_not_there():
 def test_cells_of_rows_are_those_of_columns():
     rows = [row for row in rows_like_a_run(("clean",), ("p",), 9, (3, 2**62, 5), 14)]
     there = RolloutTable.of_table(table_of(rows)).sides("p")["clean"]
-    found = columns.Cells.of(RendererRows.of(rows).cells)
-    assert (found.policy, found.scenes, found.seeds.tolist(), found.keys.tolist()) == (
-        there.cells.policy,
-        there.cells.scenes,
-        there.cells.seeds.tolist(),
-        there.cells.keys.tolist(),
-    )
-    assert len(columns.Cells.of(())) == 0
+    side = Side.of(rows)
+    assert side.cells == there.cells
+    assert side.cell.tolist() == there.cell.tolist()
+    assert side.scene.tolist() == there.scene.tolist()
+    assert side.place_in(there).tolist() == list(range(len(side.cells)))
 
 
 def test_the_reason_for_a_missing_value_is_asked_for_by_renderer_and_metric():

@@ -15,7 +15,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.log.run_folder.columns import RolloutTable
 from alpasim_plugin.log.run_folder.manifests import write_manifest
 from alpasim_plugin.log.run_folder.schema import (
     ROLLOUT_FILES,
@@ -26,6 +25,7 @@ from alpasim_plugin.log.run_folder.schema import (
     cell_name,
     rollout_folder,
 )
+from alpasim_plugin.log.run_folder.sides import RolloutTable
 from alpasim_plugin.runs.summary import aggregate_runs
 from evaluators.opening import read_run, read_so_far
 from tests.core.checksum_files import vouch_for

@@ -1,19 +1,24 @@
-"""Rollouts laid out by cell, for statistics; here from rows in memory, flat (rollouts.parquet) or
-nested (manifests).
-"""
+"""Rollouts laid out by cell, for statistics: from rows in memory, or from ``rollouts.parquet``."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.dataset as pads
+import pyarrow.parquet as pq
 
+from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, I64, Bool
-from alpasim_plugin.log.run_folder.schema import VALID, metrics_in
+from alpasim_plugin.log.run_folder.schema import ROLLOUTS_TABLE, VALID, metrics_in
+
+AGAIN = "Write the tables of this run again with its own command."
 
 Row = Mapping[str, Any]
 Cell = tuple[str, str, int]  # policy, scene, seed: what two renderers share
@@ -72,7 +77,8 @@ def is_ok(row: Row) -> bool:
     return bool(row.get("status", "ok") == "ok")
 
 
-class Side(ABC):
+@dataclass(frozen=True, eq=False)
+class Side:
     """The rollouts of one renderer, laid out by cell: what every statistic over rollouts reads.
 
     Attributes:
@@ -80,131 +86,233 @@ class Side(ABC):
         cells: ``(C,)`` of all rollouts, sorted.
         cell: ``(R,)`` index into ``cells``.
         scene: ``(C,)`` number of the cell's scene, in the order of names.
+        raw: Metric -> its value in every rollout ``(R,)``, NaN where the rollout failed or the
+            value is not valid or not finite.
+        reason: (rollout, metric) -> why the metric is not valid, as far as it is known.
+        failure: Rollout -> failure class of one that did not run to its end.
+        rows: ``(R,)`` the rollouts themselves; empty for a side that was read from a table.
     """
 
     ok: Bool
-    cells: Sequence[Cell]
+    cells: tuple[Cell, ...]
     cell: I64
     scene: I64
+    raw: Callable[[str], F64]
+    reason: Callable[[int, str], str]
+    failure: Callable[[int], str]
+    rows: tuple[Row, ...] = ()
+    _places: dict[Side, I64] = field(default_factory=dict, init=False)
 
-    @abstractmethod
-    def raw(self, metric: str) -> F64:
-        """Return the metric of every rollout ``(R,)``, NaN where it failed or the value is not
-        valid or not finite.
-        """
+    @classmethod
+    def laid_out(
+        cls,
+        keys: Sequence[Cell],
+        ok: Bool,
+        raw: Callable[[str], F64],
+        reason: Callable[[int, str], str],
+        failure: Callable[[int], str],
+        rows: tuple[Row, ...] = (),
+    ) -> Side:
+        """Lay out rollouts by their cells; ``keys`` ``(R,)`` may repeat."""
+        cells = tuple(sorted(set(keys)))
+        number = {cell: i for i, cell in enumerate(cells)}
+        names = sorted({scene for _, scene, _ in cells})
+        scene_number = {scene: i for i, scene in enumerate(names)}
+        return cls(
+            ok,
+            cells,
+            np.array([number[key] for key in keys], dtype=np.int64),
+            np.array([scene_number[scene] for _, scene, _ in cells], dtype=np.int64),
+            raw,
+            reason,
+            failure,
+            rows,
+        )
+
+    @classmethod
+    def of(cls, rows: Sequence[Row]) -> Side:
+        """Lay out rows of one renderer, flat (``rollouts.parquet``) or nested (manifests)."""
+        keys = [(str(row["policy"]), str(row["scene"]), int(row["seed"])) for row in rows]
+        ok = np.array([is_ok(row) for row in rows], dtype=bool)
+
+        def raw(metric: str) -> F64:
+            values = np.array([value_of(row, metric) for row in rows], dtype=np.float64)
+            return np.where(ok & np.isfinite(values), values, np.nan)
+
+        return cls.laid_out(
+            keys,
+            ok,
+            raw,
+            lambda row, metric: reason_of(rows[row], metric),
+            lambda row: failure_of(rows[row]),
+            tuple(rows),
+        )
 
     def place_in(self, other: Side) -> I64:
         """Return the index ``(C,)`` of each cell among another side's cells, -1 where it has no
         such cell.
         """
-        if id(other) not in self._places:
-            self._places[id(other)] = self._placed(other)
-        return self._places[id(other)]
+        if other not in self._places:
+            number = {cell: i for i, cell in enumerate(other.cells)}
+            places = [number.get(cell, -1) for cell in self.cells]
+            self._places[other] = np.array(places, dtype=np.int64)
+        return self._places[other]
 
     @cached_property
-    def _places(self) -> dict[int, I64]:
-        return {}
-
-    @abstractmethod
-    def _placed(self, other: Side) -> I64: ...
-
-    @abstractmethod
-    def first_row(self, cell: Cell) -> int | None:
-        """Return the first rollout of a cell; None where none was planned."""
-
-    @abstractmethod
-    def reason(self, row: int, metric: str) -> str:
-        """Return why a metric of a rollout is not valid, as far as it is known."""
-
-    @abstractmethod
-    def failure(self, row: int) -> str:
-        """Return the failure class of a rollout that did not run to its end."""
+    def first_row(self) -> Mapping[Cell, int]:
+        """Give the first rollout of each cell."""
+        numbers, rows = np.unique(self.cell, return_index=True)
+        return {self.cells[i]: row for i, row in zip(numbers.tolist(), rows.tolist(), strict=True)}
 
     def values(self, metric: str) -> F64:
         """Return the metric of every cell ``(C,)``, NaN where missing; repeats of a cell are
         averaged first, as the paper does.
         """
-        found = self.raw(metric)
-        known = np.isfinite(found)
+        values = self.raw(metric)
+        known = np.isfinite(values)
         count = np.bincount(self.cell[known], minlength=len(self.cells))
-        total = np.bincount(self.cell[known], weights=found[known], minlength=len(self.cells))
+        total = np.bincount(self.cell[known], weights=values[known], minlength=len(self.cells))
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
     def why_missing(self, cell: Cell, metric: str, values: F64) -> str:
         """Return why there is no value for a cell, or "" where there is one; ``values`` as
         `Side.values` gives them.
         """
-        row = self.first_row(cell)
+        row = self.first_row.get(cell)
         if row is None:
             return "not planned"
         if np.isfinite(values[self.cell[row]]):
             return ""
-        return (
-            f"not valid ({self.reason(row, metric)})"
-            if self.ok[row]
-            else f"failed ({self.failure(row)})"
-        )
+        if not self.ok[row]:
+            return f"failed ({self.failure(row)})"
+        return f"not valid ({self.reason(row, metric)})"
 
 
-@dataclass(frozen=True)
-class RendererRows(Side):
-    """A side made of rows in memory: for small tables, and the reference of
-    `alpasim_plugin.log.run_folder.columns`.
-    """
-
-    rows: tuple[Row, ...]
-    ok: Bool
-    cells: tuple[Cell, ...]
-    cell: I64
-    scene: I64
-
-    @classmethod
-    def of(cls, rows: Sequence[Row]) -> RendererRows:
-        """Sort rows of one renderer."""
-        keys = [(str(row["policy"]), str(row["scene"]), int(row["seed"])) for row in rows]
-        cells = tuple(sorted(set(keys)))
-        place = {cell: i for i, cell in enumerate(cells)}
-        scenes = {name: i for i, name in enumerate(sorted({c[1] for c in cells}))}
-        return cls(
-            tuple(rows),
-            np.array([is_ok(row) for row in rows], dtype=bool),
-            cells,
-            np.array([place[key] for key in keys], dtype=np.int64),
-            np.array([scenes[c[1]] for c in cells], dtype=np.int64),
-        )
-
-    def raw(self, metric: str) -> F64:
-        """Return the metric of every row; see `Side.raw`."""
-        found = np.array([value_of(row, metric) for row in self.rows], dtype=np.float64)
-        return np.where(self.ok & np.isfinite(found), found, np.nan)
-
-    def _placed(self, other: Side) -> I64:
-        place = {cell: i for i, cell in enumerate(other.cells)}
-        return np.array([place.get(cell, -1) for cell in self.cells], dtype=np.int64)
-
-    def first_row(self, cell: Cell) -> int | None:
-        """Return the first row of a cell."""
-        return self._first_rows.get(cell)
-
-    def reason(self, row: int, metric: str) -> str:
-        """Return why a metric of a row is not valid."""
-        return reason_of(self.rows[row], metric)
-
-    def failure(self, row: int) -> str:
-        """Return the failure class of a row."""
-        return failure_of(self.rows[row])
-
-    @cached_property
-    def _first_rows(self) -> Mapping[Cell, int]:
-        found: dict[Cell, int] = {}
-        for i, c in enumerate(self.cell.tolist()):
-            found.setdefault(self.cells[c], i)
-        return found
-
-
-def by_renderer(rows: Sequence[Row]) -> dict[str, RendererRows]:
+def by_renderer(rows: Sequence[Row]) -> dict[str, Side]:
     """Return each renderer's rollouts, in order of appearance."""
     split: dict[str, list[Row]] = {}
     for row in rows:
         split.setdefault(str(row["renderer"]), []).append(row)
-    return {name: RendererRows.of(mine) for name, mine in split.items()}
+    return {name: Side.of(mine) for name, mine in split.items()}
+
+
+class RolloutTable:
+    """The rollouts of one or several runs; a metric is read when a statistic asks for it.
+
+    Args:
+        data: Rows with the columns of ``rollouts.parquet``, in memory or in files.
+        where: What is read, for messages.
+        reasons: (renderer, metric) -> why values are not valid; empty where that is unknown.
+
+    Attributes:
+        metrics: Names, in the order of the columns.
+        renderers, policies: Names, in order of appearance.
+        n_rollouts: Rows.
+    """
+
+    def __init__(
+        self,
+        data: pa.Table | pads.Dataset,
+        where: str,
+        reasons: Callable[[str, str], str] = lambda renderer, metric: "",
+    ) -> None:
+        self._data = data
+        self._where = where
+        self.reasons = reasons
+        names = data.schema.names
+        self.metrics = list(metrics_in(names))
+        self._columns: dict[str, F64] = {}
+        wanted = [*ROLLOUTS_TABLE.required]
+        if "failure_class" in names:
+            wanted.append("failure_class")
+        keys = {name: column.to_pylist() for name, column in self._read(wanted).items()}
+        self._keys = list(
+            zip(keys["renderer"], keys["policy"], keys["scene"], keys["seed"], strict=True)
+        )
+        self.n_rollouts = len(self._keys)
+        self.renderers = list(dict.fromkeys(keys["renderer"]))
+        self.policies = list(dict.fromkeys(keys["policy"]))
+        self._ok = np.array([status == "ok" for status in keys["status"]], dtype=bool)
+        self._failure_class = keys.get("failure_class") or [None] * self.n_rollouts
+
+    @classmethod
+    def of_files(
+        cls,
+        paths: Sequence[Path],
+        reasons: Callable[[str, str], str] = lambda renderer, metric: "",
+    ) -> RolloutTable:
+        """Open ``rollouts.parquet`` of one or several runs; a metric that a run lacks is missing in
+        all its rollouts.
+
+        Raises:
+            InputError: A file is no such table.
+        """
+        for path in paths:
+            ROLLOUTS_TABLE.check(path, AGAIN)
+        where = ", ".join(map(str, paths))
+        with parsing(where, AGAIN, "no tables that fit together"):
+            schema = pa.unify_schemas(
+                [pq.read_schema(path) for path in paths], promote_options="permissive"
+            )
+            data = pads.dataset([str(path) for path in paths], schema=schema, format="parquet")
+        return cls(data, where, reasons)
+
+    @classmethod
+    def of_table(cls, table: pa.Table) -> RolloutTable:
+        """Take a table in memory."""
+        return cls(table, "a table of rollouts")
+
+    def sides(self, policy: str, named: str | None = None) -> dict[str, Side]:
+        """Return RENDERER -> its rollouts with a policy, in order of appearance.
+
+        Args:
+            policy: Its name in the table.
+            named: What cells call it; None: the same.
+        """
+        rows: dict[str, list[int]] = {}
+        for row, (renderer, own, _, _) in enumerate(self._keys):
+            if own == policy:
+                rows.setdefault(renderer, []).append(row)
+        return {
+            name: self._side(name, named or policy, np.array(mine)) for name, mine in rows.items()
+        }
+
+    def failures(self) -> dict[str, int]:
+        """Return how many rollouts did not run to their end, by failure class."""
+        return dict(Counter(self._failure(row) for row in np.flatnonzero(~self._ok).tolist()))
+
+    def column(self, metric: str) -> F64:
+        """Return a metric of every rollout ``(N,)``, NaN where the rollout failed or the value is
+        not valid or not finite.
+        """
+        if metric not in self._columns:
+            values = np.full(self.n_rollouts, np.nan)
+            if metric in self.metrics:
+                columns = self._read([metric, metric + VALID])
+                number = columns[metric].cast(pa.float64()).to_numpy()
+                valid = columns[metric + VALID].cast(pa.bool_()).fill_null(False).to_numpy()
+                known = valid & self._ok & np.isfinite(number)
+                values[known] = number[known]
+            self._columns[metric] = values
+        return self._columns[metric]
+
+    def _failure(self, row: int) -> str:
+        return self._failure_class[row] or "unknown"
+
+    def _read(self, names: Sequence[str]) -> dict[str, pa.ChunkedArray]:
+        if isinstance(self._data, pa.Table):
+            table = self._data.select(names)
+        else:
+            with parsing(self._where, AGAIN, "no readable parquet"):
+                table = self._data.to_table(columns=list(names))
+        return dict(zip(names, table.columns, strict=True))
+
+    def _side(self, renderer: str, policy: str, rows: I64) -> Side:
+        keys = [(policy, *self._keys[row][2:]) for row in rows.tolist()]
+        return Side.laid_out(
+            keys,
+            self._ok[rows],
+            lambda metric: self.column(metric)[rows],
+            lambda row, metric: self.reasons(renderer, metric) or "not given",
+            lambda row: self._failure(int(rows[row])),
+        )
