@@ -16,7 +16,20 @@ from typing_extensions import TypedDict
 from alpasim_plugin.core.checksums import FileFacts
 from alpasim_plugin.core.types import Aggregation, Direction
 
-Number = float | None
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+Line = list[Annotated[list[Coordinate], Field(min_length=2, max_length=3)]]
+Facts = dict[str, Any]
+
+REQUIRED_OF_RUN = (  # every run.json has them
+    "key",
+    "command",
+    "config",
+    "preset",
+    "renderers",
+    "policies",
+    "seeds",
+    "scenes",
+)
 
 
 class SceneFacts(TypedDict, total=False):
@@ -25,24 +38,7 @@ class SceneFacts(TypedDict, total=False):
     source: str
     content_hash: str
     notes: list[str]
-    ref: dict[str, Any]
-
-
-class ProjectFacts(TypedDict, total=False):
-    """The user's own project, in ``run.json``."""
-
-    commit: str | None
-    committed_at: str | None
-    branch: str | None
-    dirty: bool | None
-    reason: str
-
-
-class OutcomeFacts(TypedDict):
-    """How many rollouts a finished run has, in ``run.json``."""
-
-    n_rollouts: int
-    n_failed: int
+    ref: Facts
 
 
 class MetricFacts(TypedDict):
@@ -61,40 +57,30 @@ class RunInfo(TypedDict, total=False):
 
     key: str
     kind: str
-    project: ProjectFacts
+    project: dict[str, str | bool | None]
     asked: list[str]
-    parts: dict[str, dict[str, Any]]
+    parts: dict[str, Facts]
     metrics: dict[str, MetricFacts]
-    fixers: dict[str, dict[str, Any]]
+    fixers: dict[str, Facts]
     code: dict[str, str]
-    outcome: OutcomeFacts
+    outcome: dict[str, int]
+    rollouts: list[str]
+    repeat: Facts
     command: list[str]
     version: str
     started_at: str
     preset: str
     suite: str | None
-    config: dict[str, Any]
+    config: Facts
     scenes: dict[str, SceneFacts]
     renderers: list[str]
     policies: list[str]
     seeds: list[int]
-    hardware: dict[str, Any]
+    hardware: Facts
     versions: dict[str, str | None]
-    weights: dict[str, Any]
+    weights: Facts
     left_out: list[str]
     bases: dict[str, str]
-
-
-REQUIRED_OF_RUN = (
-    "key",
-    "command",
-    "config",
-    "preset",
-    "renderers",
-    "policies",
-    "seeds",
-    "scenes",
-)  # every run.json has them
 
 
 class ManifestFile(TypedDict):
@@ -108,208 +94,58 @@ class ManifestFile(TypedDict):
     status: str
 
 
-class ContentsFile(TypedDict):
-    """``contents.json``."""
-
-    files: dict[str, FileFacts]
-    rollouts: dict[str, str]
-    run: dict[str, Any]
-
-
 class Mean(TypedDict, total=False):
-    """A metric of a renderer over rollouts."""
+    """A metric of a variant over rollouts, or its paired difference from the baseline."""
 
-    mean: Number
-    ci95: Number
-    ci95_clustered: list[Number] | None
+    mean: float | None
+    diff: float | None
+    p_value: float | None
+    verdict: str | None
+    baseline: str
+    ci95: float | list[float | None] | None
+    ci95_clustered: list[float | None] | None
     n_rollouts: int
     n_scenes: int
     unit: str
     direction: str
 
 
-class Difference(TypedDict, total=False):
-    """A paired difference of a renderer from the baseline."""
-
-    baseline: str
-    diff: Number
-    ci95: list[Number] | None
-    p_value: Number
-    verdict: str | None
-    n_cells: int
-    n_scenes: int
-
-
-class Invalid(TypedDict, total=False):
-    """Why values of a metric are not valid."""
-
-    reasons: dict[str, int]
-
-
-class Censoring(TypedDict, total=False):
-    """What is not in a renderer's numbers."""
-
-    rollouts: int
-    failed: dict[str, Any]
-    dropped: dict[str, Any]
-    invalid: dict[str, Invalid]
-
-
-class Stage(TypedDict, total=False):
-    """Milliseconds of one stage of the loop."""
-
-    per_frame_ms: Number
-    p50_ms: Number
-    p95_ms: Number
-    share: Number
-
-
-class Speed(TypedDict, total=False):
-    """Milliseconds per frame of one renderer."""
-
-    ms_per_frame_mean: Number
-    ms_per_frame_p50: Number
-    ms_per_frame_p95: Number
-    frames_per_s: Number
-    first_frame_ms: Number
-    stages: dict[str, Stage]
-
-
-class FailedCell(TypedDict):
-    """The key of a rollout that failed."""
-
-    renderer: str
-    policy: str
-    scene: str
-    seed: int
-
-
-class Determinism(TypedDict, total=False):
-    """The rollout that was repeated."""
-
-    status: str
-    cell: dict[str, Any]
-    digests: dict[str, str]
-    repeated: dict[str, str]
-    first_difference: dict[str, Any] | None
-
-
-class Failures(TypedDict, total=False):
-    """Rollouts that did not run to their end."""
-
-    n_failed: int
-    n_rollouts: int
-    by_class: dict[str, int]
-    cells: list[FailedCell]
-
-
-class Place(TypedDict):
-    """A drive with an outcome."""
-
-    scene: str
-    seed: int
-    t_s: Number
-
-
-class Counted(TypedDict):
-    """How often an outcome came."""
-
-    n: int
-    cells: list[Place]
-
-
-class Ended(TypedDict):
-    """How the drives of an arm ended."""
-
-    n_rollouts: int
-    n_ended: int
-    n_failed: int
-    n_reached_end: int
-    outcomes: dict[str, Counted]
-
-
 class Summary(TypedDict, total=False):
     """``summary.json``."""
 
     preset: str
-    outcomes: dict[str, Ended]
+    outcomes: dict[str, Facts]
     metrics: dict[str, dict[str, Mean]]
-    paired: dict[str, dict[str, Difference]]
-    paired_with_base: dict[str, dict[str, Difference]]
-    paired_arms: dict[str, dict[str, Difference]]
-    censoring: dict[str, Censoring]
-    failures: Failures
-    speed: dict[str, Speed]
-    determinism: Determinism | None
-    pool: dict[str, Any]
-    fixers: dict[str, dict[str, Any]]
-    plans: dict[str, dict[str, Any]]
-
-
-Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
-Line = list[Annotated[list[Coordinate], Field(min_length=2, max_length=3)]]
-
-
-class DrawnLane(TypedDict, total=False):
-    """A lane in a scene's file."""
-
-    left: Line | None
-    right: Line | None
-    paint: Annotated[list[str], Field(min_length=2, max_length=2)]
-
-
-class DrawnDrive(TypedDict):
-    """The recorded drive in a scene's file."""
-
-    x_m: list[Coordinate]
-    y_m: list[Coordinate]
-
-
-class Body(TypedDict, total=False):
-    """The ego's body in a scene's file."""
-
-    length_m: Coordinate
-    width_m: Coordinate
-    rear_axle_to_centre_m: Coordinate
-
-
-class DrawnActor(TypedDict, total=False):
-    """A road user in a scene's file; tracks as recorded or scripted."""
-
-    id: str
-    label: str
-    static: bool
-    reacts: bool
-    length_m: Coordinate
-    width_m: Coordinate
-    t_us: list[int]
-    x_m: list[Coordinate]
-    y_m: list[Coordinate]
-    yaw_rad: list[Coordinate]
+    paired: dict[str, dict[str, Mean]]
+    paired_with_base: dict[str, dict[str, Mean]]
+    paired_arms: dict[str, dict[str, Mean]]
+    censoring: dict[str, Facts]
+    failures: Facts
+    speed: dict[str, Facts]
+    pool: Facts
+    fixers: dict[str, Facts]
+    plans: dict[str, Facts]
 
 
 class SceneFile(TypedDict, total=False):
-    """``scenes/SCENE.json``: what the bird's-eye view draws."""
+    """``scenes/SCENE.json``: the map, the recorded drive and the road users that reports draw."""
 
     scene_id: str
     source: str
     start_us: int
-    lanes: list[DrawnLane]
+    lanes: list[Facts]
     road_edges: list[Line]
     crosswalks: list[Line]
-    ego_log: DrawnDrive
-    vehicle: Body
-    actors: list[DrawnActor]
+    ego_log: dict[str, list[Coordinate] | list[int]]
+    vehicle: dict[str, Coordinate]
+    actors: list[Facts]
 
 
 def pair_tables(summary: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
     """List the tables of paired differences with the variant of each: renderers, fixers against
     their base, then policies.
     """
-    keys = ("paired", "paired_with_base", "paired_arms")
-    return [
-        (variant, pairs)
-        for key in keys
-        for variant, pairs in (summary.get(key) or {}).items()
-        if pairs
-    ]
+    tables = []
+    for key in ("paired", "paired_with_base", "paired_arms"):
+        tables += [item for item in (summary.get(key) or {}).items() if item[1]]
+    return tables
