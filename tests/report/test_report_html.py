@@ -149,7 +149,7 @@ def test_verdict_comes_first(usual_run: Path, usual_page: Page) -> None:
         "Failures",
         "What the numbers leave out",
     ]
-    heads += ["Repeatability", "Provenance"]
+    heads += ["Provenance"]
     assert re.findall(r"<h2>([^<]*)</h2>", (usual_run / "report.html").read_text()) == heads
     assert page.text.index("No difference shown between 3dgs and clean") < page.text.index(
         "One value per rollout"
