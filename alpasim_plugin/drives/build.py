@@ -219,9 +219,8 @@ def write_folder(
         [],
         standing.obstacles,
     )
-    quality = write_page(
-        work, drive, placed, measure(model, views, exposures, placed, standing, tell)
-    )
+    comparisons, coverage = measure(model, views, exposures, tell)
+    quality = write_page(work, drive, placed, standing, len(views["fitted"]), comparisons, coverage)
     write_text(work / SCENARIO_FILE, _scenario_text(scene_id, log, drive.scene_id))
     return quality
 

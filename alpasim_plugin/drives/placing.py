@@ -278,7 +278,11 @@ def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
     for i in range(1, len(xy)):
         if np.linalg.norm(xy[i] - xy[keep[-1]]) > 0.5:
             keep.append(i)
-    line = xy[keep] if len(keep) > 1 else np.stack([xy[0], xy[0] + _heading(ego)])
+    line = (
+        xy[keep]
+        if len(keep) > 1
+        else np.stack([xy[0], xy[0] + matrix_from_quat(ego.quat[0])[:2, 0]])
+    )
     first, last = line[1] - line[0], line[-1] - line[-2]
     line = np.concatenate(
         [
@@ -299,10 +303,6 @@ def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
     return LaneMap(
         {"corridor": Lane("corridor", middle, one, other, left_paint="none", right_paint="none")}
     )
-
-
-def _heading(ego: Trajectory) -> F64:
-    return np.asarray(matrix_from_quat(ego.quat[0])[:2, 0])
 
 
 def given_map(

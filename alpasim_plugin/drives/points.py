@@ -42,10 +42,10 @@ FEWEST_VIEWS, LEAST_ANGLE_RAD = 3, np.radians(0.7)  # that place a point; betwee
 FEWEST_POINTS = 60
 
 
-def small_view(picture: Picture) -> PosedView:
-    """Return a photograph without distortion, at most `WIDTH_PX` wide."""
+def small_view(picture: Picture, width: int = WIDTH_PX) -> PosedView:
+    """Return a photograph without distortion, at most ``width`` pixels wide."""
     view = picture.view()
-    return resized(view, WIDTH_PX) if view.camera.width > WIDTH_PX else view
+    return resized(view, width) if view.camera.width > width else view
 
 
 def triangulated(pictures: Sequence[Picture], folder: str) -> Points:
@@ -340,7 +340,7 @@ def with_corrected_poses(drive: SourceDrive) -> SourceDrive:
     if drive.metric is None or drive.points is not None or drive.kind == "colmap":
         return drive
     front = drive.of(drive.front)
-    found = corrected([_small(picture) for picture in front])
+    found = corrected([small_view(picture, CORRECTING_PX) for picture in front])
     if not found.after_px < LEAST_GAIN * found.before_px:  # also where there is nothing to say: NaN
         return drive
     poses = np.array([inverse(camera.T_camera_world) for camera in found.cameras])
@@ -352,21 +352,13 @@ def with_corrected_poses(drive: SourceDrive) -> SourceDrive:
     ]
     if max(shifted) > FARTHEST_M or max(turned) > FARTHEST_RAD:
         return drive
-    at = {picture.t_us: move for picture, move in zip(front, moves, strict=True)}
-    pictures = tuple(_moved(picture, at.get(picture.t_us)) for picture in drive.pictures)
+    moved = {picture.t_us: move for picture, move in zip(front, moves, strict=True)}
+    pictures = tuple(
+        replace(picture, T_world_camera=moved.get(picture.t_us, np.eye(4)) @ picture.T_world_camera)
+        for picture in drive.pictures
+    )
     note = (
         f"poses were corrected by the photographs, by up to {100 * max(shifted):.0f} cm and {np.degrees(max(turned)):.2f} degrees: "
         f"points are met to {found.after_px:.2f} instead of {found.before_px:.2f} pixels"
     )
     return replace(drive, pictures=pictures, notes=(*drive.notes, note))
-
-
-def _small(picture: Picture) -> PosedView:
-    full = picture.view()
-    return resized(full, CORRECTING_PX) if full.camera.width > CORRECTING_PX else full
-
-
-def _moved(picture: Picture, move: F64 | None) -> Picture:
-    return (
-        picture if move is None else replace(picture, T_world_camera=move @ picture.T_world_camera)
-    )

@@ -5,7 +5,7 @@ path, ground, what is missing.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,36 +37,18 @@ PICTURES = "pictures"
 Report = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """What was measured.
-
-    Attributes:
-        rows: Use of the photographs to their comparisons.
-        coverage: Metres beside the path to the share of the lower half of the picture that the
-            model covers.
-        plan: ``(H, W, 3)`` uint8, the drive from above.
-        standing: Obstacles.
-        fitted: How many photographs the model was fitted to.
-    """
-
-    rows: Mapping[str, Sequence[Comparison]]
-    coverage: Mapping[float, float]
-    plan: U8
-    standing: Standing
-    fitted: int
-
-
 def measure(
     model: Reconstruction,
     views: Mapping[str, Sequence[PosedView]],
     exposures: Mapping[str, tuple[float, float, float]],
-    placed: PlacedDrive,
-    standing: Standing,
     tell: Report,
-) -> Measured:
+) -> tuple[dict[str, list[Comparison]], dict[float, float]]:
     """Render the model where photographs were taken that it did not see, in the exposure of those
     near by, and beside the path.
+
+    Returns:
+        Use of the photographs to their comparisons; and metres to the left of the path to the share
+        of the lower half of the image that the model covers.
     """
     graph = model.graph()
     known = [view for view in views["fitted"] if view.name in exposures]
@@ -85,9 +67,7 @@ def measure(
     coverage = {
         aside: float(np.mean([_covered(graph, view, aside) for view in some])) for aside in ASIDE_M
     }
-    return Measured(
-        rows, coverage, _plan(placed, standing.obstacles), standing, len(views["fitted"])
-    )
+    return rows, coverage
 
 
 def _compared(graph: SceneGraph, view: PosedView, gain: F32) -> Comparison:
@@ -154,32 +134,51 @@ def _plan(placed: PlacedDrive, obstacles: Sequence[Obstacle]) -> U8:
 
 
 def write_page(
-    folder: Path, drive: SourceDrive, placed: PlacedDrive, measured: Measured
+    folder: Path,
+    drive: SourceDrive,
+    placed: PlacedDrive,
+    standing: Standing,
+    fitted: int,
+    comparisons: Mapping[str, Sequence[Comparison]],
+    coverage: Mapping[float, float],
 ) -> dict[str, Any]:
-    """Write ``quality.json``, ``quality.md`` and the pictures, and return what ``quality.json``
-    holds.
+    """Write ``quality.json``, ``quality.md`` and the images.
+
+    Args:
+        folder: Of the imported drive.
+        drive, placed: The recording, as read and in the world.
+        standing: Obstacles.
+        fitted: How many photographs the model was fitted to.
+        comparisons, coverage: From `measure`.
+
+    Returns:
+        What ``quality.json`` holds.
     """
     (folder / PICTURES).mkdir(exist_ok=True)
     shown = []
-    for use, rows in measured.rows.items():
+    for use, rows in comparisons.items():
         for row in [rows[i] for i in _spread(len(rows), SHOWN // 2)]:
             name = f"{PICTURES}/{use}-{row.name}.jpg"
             _write(folder / name, np.concatenate([row.truth, row.shown], axis=0))
             shown.append((use, row, name))
-    _write(folder / PICTURES / "plan.png", measured.plan)
+    _write(folder / PICTURES / "plan.png", _plan(placed, standing.obstacles))
+    spread = [one.uncertainty_m for one in standing.obstacles]
     quality = {
         "source": drive.kind,
-        "photographs": {use: len(rows) for use, rows in measured.rows.items()},
-        "fitted": measured.fitted,
+        "photographs": {use: len(rows) for use, rows in comparisons.items()},
+        "fitted": fitted,
         **{
             use: {"psnr_db": _mean(rows, "psnr_db"), "ssim": _mean(rows, "ssim")}
-            for use, rows in measured.rows.items()
+            for use, rows in comparisons.items()
         },
         "coverage": [
-            {"aside_m": aside, "share": round(share, 4)}
-            for aside, share in measured.coverage.items()
+            {"aside_m": aside, "share": round(share, 4)} for aside, share in coverage.items()
         ],
-        "obstacles": _obstacle_facts(measured.standing),
+        "obstacles": {
+            "boxes": len(spread),
+            "uncertainty_m": round(float(np.median(spread)), 2) if spread else None,
+            "cleared_cells": standing.cleared,
+        },
         **placed.facts,
         "T_world_source": placed.T_world_source.tolist(),
         "notes": [*drive.notes, *placed.notes],
@@ -187,15 +186,6 @@ def write_page(
     write_json(folder / "quality.json", quality)
     write_text(folder / "quality.md", _page(drive, quality, shown))
     return quality
-
-
-def _obstacle_facts(standing: Standing) -> dict[str, Any]:
-    spread = [one.uncertainty_m for one in standing.obstacles]
-    return {
-        "boxes": len(spread),
-        "uncertainty_m": round(float(np.median(spread)), 2) if spread else None,
-        "cleared_cells": standing.cleared,
-    }
 
 
 def _mean(rows: Sequence[Comparison], name: str) -> float:

@@ -176,10 +176,7 @@ def _advice(cloud: GaussianCloud, path: F64) -> str:
     guess = suggested_transform(cloud, path)
     if coverage_of(placed_cloud(cloud, guess), path).covered < LEAST:
         return "give background.transform; the file is too small or too sparse for the route as it stands, its scale may be wrong"
-    rows = ", ".join("[" + ", ".join(_short(v) for v in row) + "]" for row in guess)
+    # With fewer digits the rotation would be refused.
+    numbers = np.round(guess, 7) + 0.0
+    rows = ", ".join("[" + ", ".join(f"{value:.8g}" for value in row) + "]" for row in numbers)
     return f"a transform to start from: transform: [{rows}]"
-
-
-def _short(value: float) -> str:
-    """Print a number of a matrix; a rotation with fewer digits would be refused."""
-    return f"{np.round(value, 7) + 0.0:.8g}"

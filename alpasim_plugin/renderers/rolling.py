@@ -34,7 +34,10 @@ def draw_request(request: RenderRequest, draw: Draw, backend: Backend) -> Raster
     spec = request.camera
     if request.exposure is None:
         return draw(camera_at(request, request.T_world_camera[1]), request.actors)
-    out = _blank(spec.height, spec.width)
+    shape = (spec.height, spec.width)
+    out = RasterOutput(
+        np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32), np.zeros(shape, np.float32)
+    )
     stats: dict[str, int] = {}
     windows = backend != "gsplat"
     for band in bands(request):
@@ -51,10 +54,3 @@ def camera_at(request: RenderRequest, T_world_camera: F64) -> PinholeCamera:
     """Return the request's camera at a pose."""
     spec = request.camera
     return PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_camera)
-
-
-def _blank(height: int, width: int) -> RasterOutput:
-    shape = height, width
-    return RasterOutput(
-        np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32), np.zeros(shape, np.float32)
-    )

@@ -142,9 +142,9 @@ class LaneIndex:
         line = self.lane_map.lanes[lane_id].centre
         begin = 0.0 if start is None else project(line, np.asarray(start, dtype=np.float64))[0]
         ids = [lane_id]
-        parts = [_from(line, begin)]
-        left = distance_m
-        left -= float(arc_lengths(parts[0])[-1])
+        rest = line[arc_lengths(line) > begin + 1e-9]
+        parts = [np.concatenate([resample(line, [begin]), rest])]
+        left = distance_m - float(arc_lengths(parts[0])[-1])
         current: str | None = lane_id
         while left > 0:
             current = self.straightest_successor(ids[-1])
@@ -163,12 +163,6 @@ class LaneIndex:
             inside = s < distance_m
             xyz = np.concatenate([xyz[inside], resample(xyz, [distance_m])])
         return LanePath(tuple(ids), xyz)
-
-
-def _from(line: F64, begin_m: float) -> F64:
-    """Return the rest of a polyline from an arc length on."""
-    s = arc_lengths(line)
-    return np.concatenate([resample(line, [begin_m]), line[s > begin_m + 1e-9]])
 
 
 def _end_heading(line: F64, last: bool) -> float:
@@ -191,6 +185,7 @@ MATCH_RADIUS_M = (
 )
 MAX_HEADING_ERROR_RAD = np.pi / 3
 HEADING_WEIGHT_M = 3.0
+POINTS, SPACING_M = 20, 80 / 19  # of the route that a policy sees
 
 
 def route_from_log(
@@ -216,7 +211,7 @@ def route_from_log(
         driven = np.concatenate([driven, driven])
         heading = float(yaw_from_quat(ego_log.quat[-1]))
     else:
-        heading = _heading_at_end(driven)
+        heading = _end_heading(driven, last=True)
     ids = match_lanes(index, driven, float(yaw_from_quat(ego_log.quat[0])))
     if not ids or extension_m <= 0:
         return Route(driven, ids)
@@ -308,21 +303,21 @@ def _change_cost(index: LaneIndex, old: str, new: str) -> float:
     return 4.0 if new in (lane.left_neighbour, lane.right_neighbour) else 12.0
 
 
-def route_in_rig(route: Route, T_world_rig: F64, n: int = 20, spacing_m: float = 80 / 19) -> F64:
-    """Return the route ahead ``(n, 3)`` in the rig frame, z = 0, with NaN rows after the route's
+def route_in_rig(route: Route, T_world_rig: F64) -> F64:
+    """Return the route ahead ``(20, 3)``, 80 m of it, in the rig frame, z = 0, with NaN rows after the route's
     end.
 
     The first point is the ego's projection on the route. Where the route passes the same place
     twice, the pass that runs in the ego's direction counts: one radian of heading error weighs as
     much as `HEADING_WEIGHT_M` of distance.
     """
-    out = np.full((n, 3), np.nan)
+    out = np.full((POINTS, 3), np.nan)
     line = route.xyz
     if len(line) < 2:
         return out
     along = arc_lengths(line)
     begin = _project_ahead(line, along, T_world_rig[:2, 3], yaw_of(T_world_rig))
-    at = begin + spacing_m * np.arange(n)
+    at = begin + SPACING_M * np.arange(POINTS)
     seen = at <= along[-1] + 1e-9
     out[seen] = transform_points(inverse(T_world_rig), resample(line, at[seen], along))
     out[seen, 2] = 0.0
@@ -359,9 +354,3 @@ def _thin(xyz: F64) -> F64:
     if kept[-1] != len(xyz) - 1 and np.linalg.norm(xyz[-1, :2] - xyz[kept[-1], :2]) > 0.05:
         kept.append(len(xyz) - 1)
     return np.asarray(xyz[kept], dtype=np.float64)
-
-
-def _heading_at_end(line: F64) -> float:
-    s = arc_lengths(line)
-    a, b = resample(line, [max(s[-1] - 1.0, 0.0), s[-1]])
-    return float(np.arctan2(b[1] - a[1], b[0] - a[0]))

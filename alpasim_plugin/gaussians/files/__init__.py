@@ -48,7 +48,8 @@ def read_gaussians(
 def _read_arrays(path: Path, element: str | None) -> GaussianArrays:
     if is_sog(path):
         return read_sog(path)
-    head = _first_bytes(path)
+    with open_regular(path) as stream:
+        head = stream.read(4)
     if head[:3] == b"ply":
         compressed = is_compressed_ply(read_ply_header(path))
         return read_compressed_ply(path) if compressed else read_ply_arrays(path, element)
@@ -60,8 +61,3 @@ def _read_arrays(path: Path, element: str | None) -> GaussianArrays:
         f"{path}: suffix {path.suffix!r} with first bytes {head!r}",
         f"give one of {', '.join(SUPPORTED)}; training checkpoints must be converted first",
     )
-
-
-def _first_bytes(path: Path) -> bytes:
-    with open_regular(path) as stream:
-        return stream.read(4)

@@ -60,7 +60,8 @@ def read_compressed_ply(path: Path | str) -> GaussianArrays:
 
     means = spread(_unpack_11_10_11(rows["packed_position"]), ("x", "y", "z"))
     log_scales = spread(_unpack_11_10_11(rows["packed_scale"]), ("scale_x", "scale_y", "scale_z"))
-    rgba = _unpack_8888(rows["packed_color"])
+    colours = rows["packed_color"]
+    rgba = np.stack([(colours >> shift) & 255 for shift in (24, 16, 8, 0)], axis=1) / 255.0
     # Files from before the colour bounds were introduced store colours over 0..1.
     rgb = spread(rgba[:, :3], ("r", "g", "b")) if "min_r" in bounds else rgba[:, :3]
     dc = (rgb - 0.5) / C0
@@ -104,11 +105,6 @@ def _unpack_11_10_11(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
         [(packed >> 21) / 2047.0, ((packed >> 11) & 1023) / 1023.0, (packed & 2047) / 2047.0],
         axis=1,
     )
-
-
-def _unpack_8888(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Return fractions ``(N, 4)`` in 0..1."""
-    return np.stack([(packed >> shift) & 255 for shift in (24, 16, 8, 0)], axis=1) / 255.0
 
 
 def _read_sh(header: PlyHeader, n: int) -> NDArray[np.float64]:

@@ -77,10 +77,13 @@ def read_ply_arrays(path: Path | str, element: str | None = None) -> GaussianArr
     chosen = header.element(element) if element is not None else _only_gaussian_element(header)
     n_rest = _check_properties(header, chosen)
     rows = read_ply_element(header, chosen.name)
+    log_scales = _columns(rows, [f"scale_{i}" for i in range(3)]).astype(np.float64)
+    with np.errstate(over="ignore"):  # overflow becomes infinity, which cleaning drops and counts
+        scales = np.exp(log_scales)
     return GaussianArrays(
         means=_columns(rows, ("x", "y", "z")),
         quats=_columns(rows, [f"rot_{i}" for i in range(4)]),
-        scales=_exp(_columns(rows, [f"scale_{i}" for i in range(3)])),
+        scales=scales,
         opacities=sigmoid(_columns(rows, ["opacity"])[:, 0]),
         sh=_sh_from_columns(rows, n_rest),
     )
@@ -218,12 +221,6 @@ def _sh_from_columns(rows: NDArray[np.void], n_rest: int) -> NDArray[np.floating
         return dc[:, None, :]
     rest = _columns(rows, [f"f_rest_{i}" for i in range(3 * n_rest)]).reshape(len(rows), 3, n_rest)
     return np.concatenate([dc[:, None, :], np.swapaxes(rest, 1, 2)], axis=1)
-
-
-def _exp(log_scales: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return exp in float64; overflow becomes infinity, which cleaning drops and counts."""
-    with np.errstate(over="ignore"):
-        return np.exp(log_scales.astype(np.float64))
 
 
 _MAX_HEADER_BYTES = 1 << 20

@@ -88,9 +88,11 @@ def fit_drive(
     every, depths = prepared_views([*views, *kept], tell)
     train = [view for view in every if view.name in known]
     guesses = [depth for view, depth in zip(every, depths, strict=True) if view.name in known]
+    seen = {name for view in train for name in view.actors}
+    shown = {name: box for name, box in (boxes or {}).items() if name in seen}
     start = Start(
         _start(train, guesses, points, recipe, scene_id),
-        _actors(train, boxes or {}, recipe, scene_id),
+        start_in_boxes(shown, recipe.actor_points, scene_id, recipe.seed),
     )
     held = [replace(view, gain=_between(train, view)) for view in every if view.name not in known]
     model = fit(
@@ -224,18 +226,6 @@ def _unmeasured(view: PosedView, guess: F32 | None) -> PosedView:
         depth=np.zeros_like(view.depth)
         if guess is None
         else np.where(free, guess, 0).astype(np.float32),
-    )
-
-
-def _actors(
-    views: Sequence[PosedView], boxes: Mapping[str, Box], recipe: SplatRecipe, scene_id: str
-) -> dict[str, GaussianCloud]:
-    seen = {name for view in views for name in view.actors}
-    return start_in_boxes(
-        {name: box for name, box in boxes.items() if name in seen},
-        recipe.actor_points,
-        scene_id,
-        recipe.seed,
     )
 
 

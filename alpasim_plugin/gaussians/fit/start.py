@@ -101,9 +101,11 @@ def start_from_depth(
         )
     actors = {}
     for name, pieces in owned.items():
-        points, rgb = _thinned(pieces, actor_points, stream(scene_id, seed, f"fit.start.{name}"))
-        if len(points) >= FEWEST_POINTS:
-            actors[name] = cloud_from_points(points, rgb, size)
+        points, rgb = _joined(pieces)
+        rng = stream(scene_id, seed, f"fit.start.{name}")
+        chosen = rng.permutation(len(points))[:actor_points]
+        if len(chosen) >= FEWEST_POINTS:
+            actors[name] = cloud_from_points(points[chosen], rgb[chosen], size)
     return Start(cloud_from_points(*_joined(rest), size), actors)
 
 
@@ -201,12 +203,6 @@ def _joined(parts: Sequence[_Points]) -> _Points:
     return np.concatenate([none, *(points for points, _ in parts)]), np.concatenate(
         [none, *(rgb for _, rgb in parts)]
     )
-
-
-def _thinned(parts: Sequence[_Points], most: int, rng: np.random.Generator) -> _Points:
-    points, rgb = _joined(parts)
-    chosen = rng.permutation(len(points))[:most]
-    return points[chosen], rgb[chosen]
 
 
 def _inside(local: F64, box: Box) -> Bool:

@@ -107,7 +107,7 @@ def rasterize_prepared(
     ends = np.cumsum([prepared.n_input for prepared, _ in nodes])
     parts: list[Part] = []
     room = 0
-    for i in np.flatnonzero(spheres_in_view(spheres, poses, view)):
+    for i in np.flatnonzero(spheres_in_view(spheres, poses, view)).tolist():
         prepared = nodes[i][0]
         room += len(prepared.spheres) // SPHERE_SIZE * BUNDLE
         first_id = ends[i] - prepared.n_input

@@ -117,11 +117,11 @@ def require_gsplat(device: str = "cuda") -> Any:
             "run on a machine with an NVIDIA GPU, or choose --device cpu (backend='cpu' in code)",
         )
     cloud = GaussianCloud(
-        [[0, 0, 5.0]],
-        [[1.0, 0, 0, 0]],
-        [[0.5, 0.5, 0.5]],
-        [0.9],
-        np.zeros((1, 1, 3)),  # type: ignore[arg-type]
+        np.array([[0, 0, 5.0]]),
+        np.array([[1.0, 0, 0, 0]]),
+        np.array([[0.5, 0.5, 0.5]]),
+        np.array([0.9]),
+        np.zeros((1, 1, 3)),
     )
     K = np.array([[20.0, 0, 8.5], [0, 20, 8.5], [0, 0, 1]])
     try:

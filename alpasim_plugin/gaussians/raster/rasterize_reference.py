@@ -66,14 +66,12 @@ def project_gaussians(
     camera: PinholeCamera,
     near_m: float = NEAR_M,
     lod_px: float = 0.0,
-    on_screen_only: bool = False,
 ) -> Projection:
     """Project a cloud and sort it by depth.
 
-    Dropped: centres nearer than ``near_m`` or beyond 1e10 m, opacities below 1/255, with ``lod_px``
-        also splats whose radius before the
-    low-pass (`Projection.extent` times the larger of the two axis-aligned deviations) is below it,
-    and with ``on_screen_only`` those whose box misses every pixel centre. Depth order is that of
+    Dropped: centres nearer than ``near_m`` or beyond 1e10 m, opacities below 1/255, and with
+    ``lod_px`` splats whose radius before the low-pass (`Projection.extent` times the larger of the
+    two axis-aligned deviations) is below it. Depth order is that of
     the float32 depths, ties in input order: two surfaces that coincide then keep one order while
     the camera moves, instead of one decided by rounding.
 
@@ -119,12 +117,6 @@ def project_gaussians(
     uv = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
 
     keep = extent * np.sqrt(np.maximum(raw[:, 0], raw[:, 2])) >= lod_px
-    if on_screen_only:
-        radii = extent[:, None] * np.sqrt(cov[:, [0, 2]])
-        keep &= np.all(
-            (uv + radii >= 0.5) & (uv - radii <= np.array([camera.width, camera.height]) - 0.5),
-            axis=1,
-        )
     order = np.flatnonzero(keep)
     order = order[np.argsort(z[order].astype(np.float32), kind="stable")]
     direction = relative[order] / np.linalg.norm(relative[order], axis=1, keepdims=True)

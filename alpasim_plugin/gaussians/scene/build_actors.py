@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F32, F64, Actor, Box, Scenario
+from alpasim_plugin.core.types import F64, Actor, Box, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.actor_shapes import STATIONS, Loft
 from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneNode
@@ -97,18 +98,15 @@ def _lofted(box: Box, draw: F64, noise: F64, cell_m: float, loft: Loft, body: F6
     quads = corners * scale + np.array([0.0, 0.0, -height / 2])
     cloud, owner, normals = quad_surfels(quads, rgb, cell_m, noise, 0.72)
     # Light from above: roofs bright, flanks in between, undersides dark.
-    shade = 0.80 + 0.24 * normals[:, 2]
-    cloud = replace(cloud, sh=_shaded(cloud.sh, shade[owner]))
+    shade = (0.80 + 0.24 * normals[:, 2])[owner][:, None, None]
+    sh = ((cloud.sh * C0 + 0.5) * shade - 0.5) / C0
+    cloud = replace(cloud, sh=sh.astype(np.float32))
     parts = [
         with_sheen(cloud, normals[owner], gloss[owner], SKY_RGB),
         _wheels(box, loft, cell_m),
         _lights(box, loft, cell_m),
     ]
     return GaussianCloud.concatenate(parts)
-
-
-def _shaded(sh: npt.NDArray[np.floating], shade: F64) -> F32:
-    return np.asarray(((sh * C0 + 0.5) * shade[:, None, None] - 0.5) / C0, dtype=np.float32)
 
 
 def _wheels(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
@@ -263,14 +261,6 @@ def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) ->
     return GaussianCloud.concatenate([tyres, frame, rider])
 
 
-def _cyclist(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
-    return _two_wheeler(box, draw, noise, cell_m, False)
-
-
-def _motorcycle(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
-    return _two_wheeler(box, draw, noise, cell_m, True)
-
-
 def _other(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
     """Draw a traffic cone where the box is small and slim, else a crate with warning stripes."""
     length = box.length_m
@@ -315,7 +305,7 @@ _SHAPES: dict[str, Callable[[Box, F64, F64, float], GaussianCloud]] = {
     "truck": _truck,
     "bus": _bus,
     "pedestrian": _pedestrian,
-    "cyclist": _cyclist,
-    "motorcycle": _motorcycle,
+    "cyclist": partial(_two_wheeler, heavy=False),
+    "motorcycle": partial(_two_wheeler, heavy=True),
     "other": _other,
 }
