@@ -96,27 +96,21 @@ def check_frames(
     Raises:
         InputError: The found size, with the nearest valid one.
     """
-    shape = list(video.shape)
-    if video.ndim != 5 or shape[1] != channels or not video.is_floating_point():
+    if video.ndim != 5 or video.shape[1] != channels or not video.is_floating_point():
         raise InputError(
-            f"a tensor {shape} of {video.dtype}: not a floating-point video",
+            f"a tensor {list(video.shape)} of {video.dtype} is not a floating-point video",
             f"give (B, {channels}, T, H, W) with values in [-1, 1]",
         )
-    frames, height, width = shape[2:]
-    if height < side or width < side or height % side or width % side:
+    frames, height, width = video.shape[2:]
+    if not height or not width or height % side or width % side:
         raise InputError(
-            f"frames of {height} x {width} pixels (height x width): height and width must be multiples of {side}",
-            f"pad to {max(side, height + -height % side)} x {max(side, width + -width % side)} (pad_clip), crop the result (crop_clip)",
+            f"frames of {height} x {width} pixels: height and width must be multiples of {side}",
+            "pad them with pad_clip and crop the result with crop_clip",
         )
-    if first and (frames < 1 or (frames - 1) % group):
+    if frames < 1 or (frames - first) % group:
         raise InputError(
-            f"{frames} frames at the start of a video: the first latent holds 1 frame and every later one {group}: 1 + {group}k frames are needed",
-            f"give {max(1, 1 + (frames - 1) // group * group)} or {on_grid(max(1, frames), group)} frames (pad_clip repeats the last one)",
-        )
-    if not first and (frames < 1 or frames % group):
-        raise InputError(
-            f"{frames} frames in the middle of a stream: every latent after the first holds {group} frames",
-            f"push a multiple of {group} frames, or start a new stream for a new video",
+            f"{frames} frames at the {'start' if first else 'middle'} of a stream, not {'1 + ' if first else ''}{group}k",
+            "pad them with pad_clip, which repeats the last frame",
         )
 
 

@@ -345,11 +345,10 @@ def _percentiles(errors: Sequence[Deviation]) -> dict[str, dict[str, float] | No
     """
     out: dict[str, dict[str, float] | None] = {}
     for name in ("camera_m", "camera_deg", "actor_m"):
-        values = [value for error in errors if math.isfinite(value := getattr(error, name))]
-        p50, p95, top = (
-            (round(float(v), 6) for v in np.percentile(values, (50, 95, 100)))
-            if values
-            else (0.0, 0.0, 0.0)
-        )
-        out[name] = {"p50": p50, "p95": p95, "max": top} if values else None
+        values = [getattr(error, name) for error in errors]
+        finite = [value for value in values if math.isfinite(value)]
+        out[name] = None
+        if finite:
+            p50, p95, top = (round(float(v), 6) for v in np.percentile(finite, (50, 95, 100)))
+            out[name] = {"p50": p50, "p95": p95, "max": top}
     return out

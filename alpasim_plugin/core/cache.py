@@ -1,37 +1,29 @@
 """What is made once, by the first process that needs it, while the others wait: folders by their
-content, and measurements of a machine.
+content.
 
 CACHE / KIND / KEY/        what was made; it appears atomically
              / KEY.lock     held by the process that makes it
-FOLDER / NAME.json         what was measured by one process of a run on a node: others would slow it down, and could choose differently
-       / NAME.lock
 """
 
 from __future__ import annotations
 
 import shutil
-import socket
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from alpasim_plugin.core import places
-from alpasim_plugin.core.atomic import atomic_folder, write_json
+from alpasim_plugin.core.atomic import atomic_folder
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.lock import one_writer
-from alpasim_plugin.core.reading.files import read_json_object
 
 T = TypeVar("T")
 DOING, DO_THIS = (
     "writing to the cache",
     "free disk space, or name a writable folder in SIMRUN_CACHE",
 )
-KEPT_S = 7 * 86400.0  # a folder of an earlier run, which nobody else removes
-
-_taken: dict[tuple[Path | None, str], Mapping[str, Any]] = {}
-_folder: Path | None = None
 
 
 def cache_root() -> Path:
@@ -115,61 +107,3 @@ def _make(folder: Path, make: Callable[[Path], None], what: str) -> None:
     with atomic_folder(folder, DO_THIS) as partial:
         make(partial)
     print(f"{what}: {time.perf_counter() - began:.1f} s", file=sys.stderr, flush=True)
-
-
-def measured_folder(run: str) -> Path | None:
-    """Return where the processes of a run on this machine share what they measure; None: nowhere,
-    since no private folder can be written.
-    """
-    kept = places.cache().path
-    root = None if kept is None else kept / "measured" / socket.gethostname()
-    return root / run if root is not None and places.is_private(root) else None
-
-
-def share_measurements(folder: Path | None) -> None:
-    """Share what this process measures from now on with the others that name the same folder; None:
-    with nobody.
-
-    Args:
-        folder: Of the run, on a file system of this node.
-    """
-    global _folder
-    _folder = folder
-
-
-def measured(name: str, measure: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Return a measurement, taken by this process unless another one of the run on this node has.
-
-    Args:
-        name: What is measured; part of a file name.
-        measure: Takes it; its values must fit into JSON.
-
-    Raises:
-        InfrastructureError: The folder cannot be written.
-        InputError: The file was damaged.
-    """
-    folder = _folder
-    if (folder, name) not in _taken:
-        _taken[folder, name] = measure() if folder is None else _once(folder, name, measure)
-    return _taken[folder, name]
-
-
-def _once(folder: Path, name: str, measure: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
-    path = folder / f"{name}.json"
-    with one_writer(
-        folder / f"{name}.lock",
-        f"{name} of this machine",
-        wait=True,
-        waiting=lambda said: None,
-    ):
-        if not path.exists():
-            _forget(folder.parent)
-            write_json(path, measure())
-        return read_json_object(path)
-
-
-def _forget(root: Path) -> None:
-    """Remove folders of runs that began long ago."""
-    for folder in root.iterdir():
-        if folder.is_dir() and time.time() - folder.stat().st_mtime > KEPT_S:
-            shutil.rmtree(folder, ignore_errors=True)  # another process may do the same

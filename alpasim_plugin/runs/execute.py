@@ -12,14 +12,14 @@ import hashlib
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core import kernels
-from alpasim_plugin.core.cache import cache_root, cached, measured_folder, share_measurements
+from alpasim_plugin.core.cache import cache_root, cached
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import write_manifest
@@ -140,14 +140,12 @@ class HowToRun:
         limit_s: Seconds that one rollout may take; a worker that exceeds them is killed. None: no
             limit.
         executor: Where rollouts run.
-        run: Token by which the processes of the run know each other.
     """
 
     threads: Threads
     reuse_undigested: bool = False
     limit_s: float | None = None
     executor: Executor = LOCAL
-    run: str = field(default_factory=lambda: os.urandom(8).hex())
 
     @property
     def stated(self) -> dict[str, Any]:
@@ -181,7 +179,6 @@ def execute(
         on_done: Called with each manifest.
         notify: Called with one line for each damaged rollout.
     """
-    share_measurements(measured_folder(how.run))
     manifests: dict[Path, dict[str, Any]] = {}
     todo: list[Cell] = []
     for cell in plan.cells:
@@ -218,7 +215,7 @@ def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -
     if workers > 1:  # the slowest rollouts come first, so that all workers end together
         todo = sorted(todo, key=lambda cell: cell.renderer.fixer is None)
     threads = how.threads.per_worker
-    drive = partial(_drive, how.run, plan.options, root, threads)
+    drive = partial(_drive, plan.options, root, threads)
 
     def written(cell: Cell) -> dict[str, Any] | None:
         """Return the manifest of a rollout whose worker died after it had written it."""
@@ -229,9 +226,8 @@ def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -
         yield cell, _lost(cell, root, result) if isinstance(result, Lost) else result
 
 
-def _drive(run: str, options: RunOptions, root: Path, threads: int, cell: Cell) -> dict[str, Any]:
+def _drive(options: RunOptions, root: Path, threads: int, cell: Cell) -> dict[str, Any]:
     """Run a cell in a worker of this machine."""
-    share_measurements(measured_folder(run))
     return run_cell(cell, options, root, threads)
 
 

@@ -134,10 +134,6 @@ def test_hits_and_pose_errors_are_in_the_tables(finished: Path) -> None:
         "render",
         "map",
         "fix",
-        "fix: encode",
-        "fix: dit",
-        "fix: decode",
-        "fix: cache write",
     } <= set(stages)
     assert sum(stage["share"] for stage in stages.values()) == pytest.approx(1.0, abs=0.001)
     steps = pq.read_table(finished / "steps.parquet").to_pylist()
