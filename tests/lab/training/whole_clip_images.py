@@ -1,7 +1,7 @@
 """Reference implementations of the image and window sessions: a whole clip at once in float32, as
 the equations are written.
 
-Nothing is streamed, folded, batched by camera, cropped early or left undecoded. Images are padded
+Nothing is streamed, batched by camera, cropped early or left undecoded. Images are padded
 to multiples of 16 like the sessions'.
 """
 
@@ -45,7 +45,7 @@ def whole_clip_images(
         ``(T, H, W, 3)`` uint8.
     """
     exact = settings.model_copy(
-        update={"precision": "fp32", "codec_precision": "fp32", "fold": False}
+        update={"precision": "fp32", "codec_precision": "fp32"}
     )
     networks = load_networks(exact)
     (views,) = group_views(frames, (), len(frames))
