@@ -44,9 +44,7 @@ def whole_clip_images(
     Returns:
         ``(T, H, W, 3)`` uint8.
     """
-    exact = settings.model_copy(
-        update={"precision": "fp32", "codec_precision": "fp32"}
-    )
+    exact = settings.model_copy(update={"precision": "fp32", "codec_precision": "fp32"})
     networks = load_networks(exact)
     (views,) = group_views(frames, (), len(frames))
     clip = to_clip(
