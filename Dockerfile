@@ -15,7 +15,7 @@ RUN if ! command -v python3 >/dev/null || ! python3 -c "import ensurepip"; then 
 RUN python3 -m venv /opt/simrun
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 # torch first, in a layer of its own: it is large, and changes seldom
-RUN /opt/simrun/bin/pip install ${TORCH_INDEX:+--index-url "${TORCH_INDEX}"} "torch>=2.8,<2.14"
+RUN /opt/simrun/bin/pip install ${TORCH_INDEX:+--index-url "${TORCH_INDEX}"} "torch>=2.8,<3"
 WORKDIR /source
 COPY pyproject.toml README.md LICENSE ./
 COPY alpasim_plugin alpasim_plugin
@@ -26,8 +26,8 @@ COPY scenarios scenarios
 COPY simrun simrun
 COPY docs docs
 RUN /opt/simrun/bin/pip install .
-# Kernels for the levels of processors that the building machine runs; other processors compile theirs at their first run.
-RUN /opt/simrun/bin/python -P -m alpasim_plugin.core.kernels
+# Kernels for the processor of the building machine; another kind compiles its own at the first run.
+RUN NUMBA_CACHE_DIR=/opt/simrun/numba /opt/simrun/bin/simrun doctor
 
 FROM ${BASE}
 SHELL ["/bin/sh", "-euc"]
@@ -38,6 +38,7 @@ RUN if ! command -v python3 >/dev/null; then \
     fi
 RUN useradd --create-home --uid 10001 simrun && mkdir /work && chown simrun /work
 COPY --from=build /opt/simrun /opt/simrun
+RUN mkdir -p /home/simrun/.cache && mv /opt/simrun/numba /home/simrun/.cache/numba && chown -R simrun /home/simrun/.cache
 # Compiled kernels and fitted scenes go to the user's home: what is installed is read-only. Mount it to keep them.
 ENV PATH=/opt/simrun/bin:$PATH \
     NUMBA_CACHE_DIR=/home/simrun/.cache/numba \

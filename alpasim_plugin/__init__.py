@@ -7,10 +7,9 @@ rasteriser.
 
 from __future__ import annotations
 
-import sys
-from importlib.machinery import ModuleSpec, PathFinder
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from alpasim_plugin.core import places
 from alpasim_plugin.core.lazy import lazy_names
@@ -37,38 +36,25 @@ __all__ = [
 ]
 
 
-class _OwnPackages:
-    """Find our packages beside this one, whatever else on the import path bears their names.
+def _refuse_hidden_packages() -> None:
+    """Refuse to run where another folder on Python's path hides one of our packages: ``policies``
+    and ``scenarios`` are ordinary names in a user's project.
 
-    ``policies`` and ``scenarios`` are ordinary names for folders in a user's project, and ``python
-    -m`` puts the working folder first.
+    Raises:
+        ImportError: It does.
     """
-
-    root = str(Path(__file__).resolve().parents[1])
-
-    @classmethod
-    def find_spec(cls, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        """Return the spec of one of our packages; None leaves every other module to the finders
-        that follow.
-        """
-        return PathFinder.find_spec(name, [cls.root], target) if name in OWN_PACKAGES else None
-
-
-def _claim_packages() -> None:
+    root = Path(__file__).resolve().parents[1]
     for name in OWN_PACKAGES[1:]:
-        file = getattr(sys.modules.get(name), "__file__", None)
-        if name in sys.modules and (
-            file is None or not Path(file).resolve().is_relative_to(_OwnPackages.root)
-        ):
-            found = f"the package {name!r} was imported from {file or 'a folder without __init__.py'} before alpasim_plugin"
+        spec = find_spec(name)
+        if spec is None or spec.origin is None or root not in Path(spec.origin).resolve().parents:
+            places_found = spec and (spec.origin or list(spec.submodule_search_locations or ()))
             raise ImportError(
-                f"importing alpasim_plugin: {found}; import alpasim_plugin first, or rename that package"
+                f"the package {name!r} of simrun is hidden by {places_found}: rename that folder, "
+                "or take the folder that it lies in off Python's path (run simrun, not python -m)"
             )
-    if _OwnPackages not in sys.meta_path:
-        sys.meta_path.insert(0, _OwnPackages)
 
 
-_claim_packages()
+_refuse_hidden_packages()
 places.prepare()
 
 

@@ -8,9 +8,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.errors import InputError, PolicyError
-from alpasim_plugin.core.geometry import CubicSpline, arc_lengths, resample
+from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.parts import build, unidentified
 from alpasim_plugin.core.types import F64, I64, CameraSpec, Frame, Observation, Scenario
@@ -146,7 +147,8 @@ def smooth_line(points: F64, spacing_m: float = 1.0) -> F64:
     at = np.arange(0.0, max(float(s[-1]), spacing_m) + 1e-9, spacing_m)
     if keep.sum() < 3:
         return resample(points, at, s)
-    return CubicSpline(s[keep], points[keep])(np.minimum(at, s[-1]))
+    spline = scipy.interpolate.CubicSpline(s[keep], points[keep])
+    return np.asarray(spline(np.minimum(at, s[-1])))
 
 
 def extended(points: F64, length_m: float) -> F64:

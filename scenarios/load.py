@@ -15,7 +15,7 @@ import numpy as np
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import speeds
-from alpasim_plugin.core.parts.source import own_code_digest
+from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.parts.spec import digest
 from alpasim_plugin.core.reading import check_regular
 from alpasim_plugin.core.types import (
@@ -92,7 +92,7 @@ def code_digest_of(scenario: Scenario) -> str | None:
     """Return what identifies the code that made a scenario: this package's, and that of its source;
     None where it has no digest.
     """
-    own = own_code_digest("scenarios.load")
+    own = package_digest()
     if scenario.source_part is None:
         return own
     source = source_digest(scenario.source_part)

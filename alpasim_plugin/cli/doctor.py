@@ -14,7 +14,9 @@ import typer
 from alpasim_plugin.cli.options import Json
 from alpasim_plugin.core import places
 from alpasim_plugin.core.errors import InfrastructureError, SimrunError
+from alpasim_plugin.core.kernels import SUBJECTS
 from alpasim_plugin.core.places import temporary_folder
+from alpasim_plugin.runs.execute import compile_kernels
 from alpasim_plugin.runs.provenance import hardware, versions
 
 EPILOG = "Example: `simrun doctor --json`"
@@ -32,7 +34,7 @@ def doctor(
         "log messages": _wire,
         "disk": _disk,
         "cache": lambda: _writable(places.cache()),
-        "kernels": lambda: _writable(places.kernels()),
+        "kernels": _kernels,
     }
     needed = {"rasteriser (cpu)", "fixer", "video", "log messages", "disk", "kernels"}
     rows = []
@@ -128,3 +130,11 @@ def _writable(place: places.Place) -> str:
 def _disk() -> str:
     free = shutil.disk_usage(Path.cwd()).free / 2**30
     return f"{free:.1f} GiB free here"
+
+
+def _kernels() -> str:
+    """Compile the kernels of every renderer and of the fixer, unless that was done."""
+    where = _writable(places.kernels())
+    for subject in SUBJECTS:
+        compile_kernels(subject)
+    return f"compiled in {where}"

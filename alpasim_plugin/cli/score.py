@@ -20,7 +20,7 @@ from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import EvaluatorError, InputError, error_text
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.parts import PartSpec, digest
-from alpasim_plugin.core.parts.source import own_code_digest
+from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.log.run_folder.manifests import (
     read_run_json,
     write_manifest,
@@ -29,7 +29,6 @@ from alpasim_plugin.log.run_folder.manifests import (
 from alpasim_plugin.log.run_folder.schema import AGGREGATE, SUMMARY, slug
 from alpasim_plugin.log.run_folder.writer import write_parquet, write_scene, writing
 from alpasim_plugin.runs.execute import Threads
-from alpasim_plugin.runs.plan import SCORING
 from alpasim_plugin.runs.provenance import hardware, versions
 from alpasim_plugin.runs.run import SCHEMA_VERSION, finish_run, origin_of
 from alpasim_plugin.runs.score_logs import KnownScenes, LogScore, exit_code, find_logs, score_logs
@@ -277,7 +276,7 @@ def _write_info(
                 }
                 for name, one in used.items()
             },
-            "code": {"scoring": own_code_digest(SCORING)[:12]},
+            "code": {"scoring": package_digest()[:12]},
             "metrics": metrics.as_dict(),
             "weights": {},
             "hardware": hardware(),

@@ -1,5 +1,4 @@
-"""What is made once, by the first process that needs it, while the others wait: folders by their
-content.
+"""Folders of the cache, each made once, by the first process that needs it, while the others wait.
 
 CACHE / KIND / KEY/        what was made; it appears atomically
              / KEY.lock     held by the process that makes it

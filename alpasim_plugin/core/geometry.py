@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, EgoState, Trajectory, Vehicle
@@ -254,108 +253,6 @@ def resample(line: F64, s_m: npt.ArrayLike, along: F64 | None = None) -> F64:
     for d in range(line.shape[1]):
         out[..., d] = np.interp(at, s, line[:, d])
     return out
-
-
-class CubicSpline:
-    """The cubic spline through points over a parameter, whose ends are not knots; through three
-    points a parabola, through two a line.
-
-    It is ``scipy.interpolate.CubicSpline`` to the last bit, without its checks; its module takes
-    longer to load than a drive to begin.
-
-    Args:
-        at: ``(N,)`` increasing, N at least two.
-        points: ``(N, D)``.
-    """
-
-    def __init__(self, at: F64, points: F64) -> None:
-        n, step = len(at), np.diff(at)
-        over = step[:, None]
-        slope = np.diff(points, axis=0) / over
-        if n == 2:
-            tangent = np.concatenate([slope, slope])
-        elif n == 3:
-            matrix = np.array(
-                [[1.0, 1.0, 0.0], [step[1], 2 * (step[0] + step[1]), step[0]], [0.0, 1.0, 1.0]]
-            )
-            right = np.stack(
-                [2 * slope[0], 3 * (step[0] * slope[1] + step[1] * slope[0]), 2 * slope[1]]
-            )
-            tangent = scipy.linalg.solve(matrix, right)
-        else:
-            right = np.empty_like(points)
-            right[1:-1] = 3 * (over[1:] * slope[:-1] + over[:-1] * slope[1:])
-            first, last = at[2] - at[0], at[-1] - at[-3]
-            right[0] = (
-                (step[0] + 2 * first) * step[1] * slope[0] + step[0] ** 2 * slope[1]
-            ) / first
-            right[-1] = (
-                step[-1] ** 2 * slope[-2] + (2 * last + step[-1]) * step[-2] * slope[-1]
-            ) / last
-            diagonal = np.concatenate([[step[1]], 2 * (step[:-1] + step[1:]), [step[-2]]])
-            below, above = np.concatenate([step[1:], [last]]), np.concatenate([[first], step[:-1]])
-            tangent = solve_tridiagonal(below, diagonal, above, right)
-        bend = (tangent[:-1] + tangent[1:] - 2 * slope) / over
-        self._at = at
-        self._terms = np.stack(
-            [points[:-1], tangent[:-1], (slope - tangent[:-1]) / over - bend, bend / over]
-        )  # (4, N - 1, D)
-
-    def __call__(self, at: F64, derivative: int = 0) -> F64:
-        """Return points ``(M, D)``, or their first or second derivative, at ``(M,)``; outside,
-        those of the outermost piece.
-        """
-        i = np.minimum(
-            np.maximum(np.searchsorted(self._at, at, side="right") - 1, 0), len(self._at) - 2
-        )
-        along = (at - self._at[i])[:, None]
-        terms, power = self._terms[derivative:, i], along
-        total = terms[0] * float(math.factorial(derivative))
-        for k, term in enumerate(terms[1:], derivative + 1):
-            total += term * power * float(math.perm(k, derivative))
-            power = power * along
-        return np.asarray(total)
-
-
-def solve_tridiagonal(below: F64, diagonal: F64, above: F64, right: F64) -> F64:
-    """Return X ``(N, D)`` of A X = right, A having the diagonals ``(N - 1,)``, ``(N,)``, ``(N -
-    1,)``; N at least two.
-
-    Elimination with exchange of neighbouring rows, operation by operation LAPACK's ``dgtsv``;
-    ``scipy.linalg`` takes longer to load.
-    """
-    low = below.tolist()
-    mid = diagonal.tolist()
-    up = above.tolist()
-    rows = right.tolist()
-    for i in range(len(low)):
-        if abs(mid[i]) >= abs(low[i]):
-            factor, low[i] = low[i] / mid[i], 0.0
-            mid[i + 1] -= factor * up[i]
-        else:
-            factor, mid[i], up[i], mid[i + 1] = (
-                mid[i] / low[i],
-                low[i],
-                mid[i + 1],
-                up[i] - mid[i] / low[i] * mid[i + 1],
-            )
-            rows[i], rows[i + 1] = rows[i + 1], rows[i]
-            if i + 1 < len(up):
-                low[i], up[i + 1] = (
-                    up[i + 1],
-                    -factor * up[i + 1],
-                )  # from here on the second diagonal above
-        rows[i + 1] = [y - factor * x for x, y in zip(rows[i], rows[i + 1], strict=True)]
-    low[-1:] = [0.0, 0.0]
-    up.append(0.0)
-    after = after_next = [0.0] * right.shape[1]
-    for i in reversed(range(len(mid))):
-        solved = [
-            (x - up[i] * y - low[i] * z) / mid[i]
-            for x, y, z in zip(rows[i], after, after_next, strict=True)
-        ]
-        rows[i], after, after_next = solved, solved, after
-    return np.array(rows)
 
 
 def project(line: F64, xy: F64) -> tuple[float, float]:

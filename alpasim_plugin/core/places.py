@@ -1,7 +1,7 @@
 """Where files go that nobody named: one choice, made when the package is imported, before numba is.
 
 cache    $SIMRUN_CACHE; simrun below $XDG_CACHE_HOME or ~/.cache; a private temporary folder; nowhere
-kernels  those in the wheel; $NUMBA_CACHE_DIR; beside their source; numba below the cache
+kernels  $NUMBA_CACHE_DIR; beside their source; numba below the cache
 
 Kernels are pickles, which run code when they are read. So a
 folder that nobody named must be this user's own, as must the folder that it is made in: ``sudo``
@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from tempfile import TemporaryDirectory
 
 PACKAGE = Path(__file__).resolve().parents[1]
-MADE = (
-    PACKAGE / "made"
-)  # compiled kernels and reconstructions that lie in a wheel, as in a cache; nothing is written there
 CACHE = "SIMRUN_CACHE"
 KERNELS = "NUMBA_CACHE_DIR"
 TEMPORARY = "simrun-cache-"  # then the process that made it

@@ -12,9 +12,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
-from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.fixers.network.pixel_generator import (
     DETAIL_IMAGES,
     IMAGES,

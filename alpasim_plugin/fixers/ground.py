@@ -20,8 +20,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
-from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.core.types import F32, F64, U8, Box
 from alpasim_plugin.fixers.warp import Picture, WarpTarget, on_boxes, place_boxes, warp
 from alpasim_plugin.gaussians.raster.rasterize_cpu import run_on_threads

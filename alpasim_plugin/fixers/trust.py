@@ -8,9 +8,9 @@ fixer itself.
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.core.types import F32, GUESSED_SHARE, RECORDED_SHARE, TRUST_CELLS, U8
 
 # a pixel that differs from the render by so much, of a range of 2, is the fixer's own altogether

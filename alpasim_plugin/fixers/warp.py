@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numba import njit
 
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.core.types import F32, F64, I64, U8, Bool, Box
 
 INFINITY_M = 1e5  # how far a pixel without depth is: nothing moves by parallax there

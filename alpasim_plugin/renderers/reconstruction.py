@@ -22,7 +22,6 @@ import numpy as np
 from alpasim_plugin.core.cache import cached
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.places import MADE
 from alpasim_plugin.core.types import (
     F32,
     F64,
@@ -158,12 +157,10 @@ def ensure(
     *,
     again: bool = False,
 ) -> tuple[Reconstruction, list[SkyView]]:
-    """Return a reconstruction and its sky views from wheel or cache; it is fitted first if neither
-    has it, or if ``again``.
+    """Return a reconstruction and its sky views from the cache; it is fitted first if it is
+    not there, or if ``again``.
     """
     key = reconstruction_key(scenario, recipe)
-    if not again and (MADE / KIND / key).is_dir():
-        return read_model(MADE / KIND / key)
     from alpasim_plugin.renderers.reconstruction_build import (
         build,
     )  # needs torch, which a cached reconstruction does not

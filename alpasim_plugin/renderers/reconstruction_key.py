@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.parts.source import own_code_digest
+from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Degradation, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
@@ -111,7 +111,6 @@ def recipe_for(amount: Degradation, watched_s: float) -> ReconstructionRecipe:
 
 
 # what it imports decides, with the scene and the recipe, what the model is
-BUILD = "alpasim_plugin.renderers.reconstruction_build"
 
 # What neither the frames of the logged drive nor the fit depend on. The source's hash is left out
 # because everything it stands for is here, the path of a background file because its bytes are.
@@ -150,7 +149,7 @@ def reconstruction_key(scenario: Scenario, recipe: object) -> str:
         OSError: The scenario's background file cannot be read.
     """
     digest = hashlib.blake2b(digest_size=16)
-    content = [own_code_digest(BUILD), _content(recipe), _content(scenario)]
+    content = [package_digest(), _content(recipe), _content(scenario)]
     digest.update(json.dumps(content, sort_keys=True).encode())
     if scenario.background is not None:
         with Path(scenario.background.path).open("rb") as file:

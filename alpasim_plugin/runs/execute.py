@@ -8,7 +8,6 @@ therefore run cells in any order.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -21,6 +20,8 @@ from typing import Any
 from alpasim_plugin.core import kernels
 from alpasim_plugin.core.cache import cache_root, cached
 from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.parts import digest
+from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import write_manifest
 from alpasim_plugin.renderers.reconstruction_key import is_reconstructed
@@ -59,7 +60,7 @@ def compile_for(todo: Sequence[Cell], scenarios: Mapping[str, Scenario], workers
 
 def is_cold(subject: str) -> bool:
     """Tell whether the kernels of a subject are still to be compiled."""
-    return not kernels.covers(subject) and not (cache_root() / KERNELS / _key(subject)).exists()
+    return not (cache_root() / KERNELS / _key(subject)).exists()
 
 
 def needed(todo: Iterable[Cell], scenarios: Mapping[str, Scenario]) -> list[str]:
@@ -93,11 +94,10 @@ def compile_kernels(subject: str) -> None:
 
 
 def _key(subject: str) -> str:
-    """Name what is compiled as numba does: by the code, numba's version, its folder, the
-    processor.
-    """
-    facts = repr((version("numba"), os.environ.get("NUMBA_CACHE_DIR"), hardware()["cpu"]))
-    return f"{kernels.subject_name(subject)}-{hashlib.blake2b(facts.encode(), digest_size=8).hexdigest()}"
+    """Name what is compiled: by the code, numba's version, its folder and the processor."""
+    folder = os.environ.get("NUMBA_CACHE_DIR")
+    facts = [package_digest(), version("numba"), folder, hardware()["cpu"]]
+    return f"{subject}-{digest(facts)[:16]}"
 
 
 OnDone = Callable[[dict[str, Any], bool], None]  # (manifest, reused)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
-from alpasim_plugin.core.parts.source import COMMAND, own_code_digest
+from alpasim_plugin.core.parts.source import COMMAND, package_digest
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.schema import rollout_folder
 from alpasim_plugin.renderers.background import background_note
@@ -312,7 +312,7 @@ class _Code:
             if scenario.source_part not in by_source:
                 by_source[scenario.source_part] = code_digest_of(scenario)
             sources[scenario.scene_id] = by_source[scenario.source_part]
-        return cls(own_code_digest(LOOP), scoring_content(preset_name, evaluators), sources)
+        return cls(package_digest(), scoring_content(preset_name, evaluators), sources)
 
 
 def _cell(
@@ -366,6 +366,6 @@ def scoring_content(preset_name: str, evaluators: Sequence[PartSpec]) -> tuple[A
     """
     return (
         preset(preset_name).as_dict(),
-        own_code_digest(SCORING),
+        package_digest(),
         [(spec.name, spec.digest) for spec in evaluators],
     )

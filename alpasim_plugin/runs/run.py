@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from alpasim_plugin import __version__
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.core.parts.source import own_code_digest
+from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.subprocesses import end_children
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.check import cells_of_run
@@ -26,7 +26,7 @@ from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runs.cell import find_rollout_state
 from alpasim_plugin.runs.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runs.executors.choice import LOCAL, Executor
-from alpasim_plugin.runs.plan import LOOP, SCORING, RunPlan
+from alpasim_plugin.runs.plan import RunPlan
 from alpasim_plugin.runs.provenance import hardware, project, versions
 from alpasim_plugin.runs.repeat import repeat_rollout
 from alpasim_plugin.runs.summary import pool_of, write_summary
@@ -279,7 +279,7 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
             "bases": {spec.name: spec.base.name for spec in fixed},
             "fixers": {spec.name: spec.fixer.as_dict() for spec in fixed if spec.fixer is not None},
             "parts": {f"{part.kind} {part.name}": part.as_dict() for part in parts},
-            "code": {"loop": own_code_digest(LOOP)[:12], "scoring": own_code_digest(SCORING)[:12]},
+            "code": {"loop": package_digest()[:12], "scoring": package_digest()[:12]},
             "metrics": table_of(parts).as_dict(),
             "weights": {file: sha for part in parts for file, sha in part.files.items()},
             "hardware": hardware(),

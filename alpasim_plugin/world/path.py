@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import scipy
+import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import CubicSpline, arc_lengths
+from alpasim_plugin.core.geometry import arc_lengths
 from alpasim_plugin.core.types import F64, I64
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -281,7 +281,7 @@ def smooth_path(xyz: F64, step_m: float = 0.25) -> Path:
     ``step_m``.
     """
     coarse = polyline_path(xyz)
-    spline = CubicSpline(coarse.s, coarse.xyz)
+    spline = scipy.interpolate.CubicSpline(coarse.s, coarse.xyz)
     fine = np.linspace(0.0, coarse.length_m, max(2, int(np.ceil(coarse.length_m / step_m)) + 1))
     d, dd = spline(fine, 1), spline(fine, 2)
     speed2 = d[:, 0] ** 2 + d[:, 1] ** 2

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.lock import holder_of
+from alpasim_plugin.core.lock import is_locked
 from alpasim_plugin.core.reading.files import read_json_as
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.schema import (
@@ -196,7 +196,7 @@ def read_entry(folder: Path, with_summary: bool = False) -> RunEntry:
     except InputError as error:
         problem = error.message
     if problem or not finished:
-        if holder_of(folder / LOCK) is not None:
+        if is_locked(folder / LOCK):
             return RunEntry(folder, "running", "", info)
         return RunEntry(folder, "damaged" if problem else "unfinished", problem, info)
     if not os.path.isfile(folder / ROLLOUTS):

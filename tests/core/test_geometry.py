@@ -6,15 +6,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import lapack
 from scipy.spatial.transform import Rotation, Slerp
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import (
-    CubicSpline,
     interpolate,
     inverse,
     matrix_from_quat,
@@ -26,7 +23,6 @@ from alpasim_plugin.core.geometry import (
     se2,
     se3,
     slerp,
-    solve_tridiagonal,
     trajectory_from_poses,
     wrap_angle,
     yaw_from_quat,
@@ -121,34 +117,6 @@ def test_projection_left_of_a_line_is_positive_and_clamps_at_the_ends() -> None:
 def test_resampling_skips_repeated_points() -> None:
     line = np.array([[0.0, 0], [1.0, 0], [1.0, 0], [2.0, 0]])
     np.testing.assert_allclose(resample(line, [0.0, 0.5, 1.5, 9.0])[:, 0], [0.0, 0.5, 1.5, 2.0])
-
-
-@pytest.mark.parametrize("points", [2, 3, 4, 5, 30])
-@pytest.mark.parametrize("derivative", [0, 1, 2])
-def test_a_spline_is_scipys_to_the_last_bit(points: int, derivative: int) -> None:
-    random = np.random.default_rng(points)
-    at = np.cumsum(random.uniform(0.01, 5.0, points))
-    line = 1e4 * random.normal(size=(points, 3))
-    asked = np.concatenate(
-        [at, random.uniform(at[0], at[-1], 40), [at[0] - 1.0, at[-1] + 1.0]]
-    )  # knots, between them, outside
-    np.testing.assert_array_equal(
-        CubicSpline(at, line)(asked, derivative),
-        scipy.interpolate.CubicSpline(at, line)(asked, derivative),
-    )
-
-
-@pytest.mark.parametrize("n", [2, 3, 4, 50])
-def test_tridiagonal_systems_are_solved_as_lapack_does_where_rows_are_exchanged_too(n: int) -> None:
-    random = np.random.default_rng(n)
-    for _ in range(20):
-        below, diagonal, above, right = (
-            random.normal(size=size) for size in (n - 1, n, n - 1, (n, 3))
-        )
-        np.testing.assert_array_equal(
-            solve_tridiagonal(below, diagonal, above, right),
-            lapack.dgtsv(below, diagonal, above, right)[3],
-        )
 
 
 def test_one_quaternion_is_that_of_many_to_the_last_bit() -> None:

@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import simrun
-from alpasim_plugin.core.parts.source import reached
 
 
 def test_every_public_name_is_there_and_has_one_home(repo: Path) -> None:
@@ -19,11 +18,3 @@ def test_every_public_name_is_there_and_has_one_home(repo: Path) -> None:
     )
     assert told.stdout.strip() == "set()"
     assert simrun.load_scenario.__module__ == "scenarios.load"
-
-
-def test_code_that_imports_a_name_is_digested_with_its_home(tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_text("from simrun import Plan, plan_times\n")
-    files = {Path(path).as_posix() for path in reached(tmp_path / "mine.py")}
-    assert any(path.endswith("policies/base.py") for path in files)
-    assert any(path.endswith("core/types.py") for path in files)
-    assert not any("/runtime/" in path for path in files)

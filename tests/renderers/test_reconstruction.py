@@ -4,7 +4,6 @@ pixels.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -188,21 +187,6 @@ def test_damaged_file_is_noticed_and_the_same_model_made_again_by_more_threads(
     ensure(scenario, recipe_of(scenario), threads=2)
     assert "is damaged" in capfd.readouterr().err
     assert (folder / "background.ply").read_bytes() == data
-
-
-def test_a_reconstruction_of_the_wheel_is_not_fitted(
-    fitted: ReconstructionRenderer, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scenario, made = fitted.scenario, tmp_path / "made"
-    shutil.copytree(cache / KIND, made / KIND)
-    monkeypatch.setattr("alpasim_plugin.renderers.reconstruction.MADE", made)
-    monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path / "empty"))
-    model, _ = ensure(scenario, recipe_of(scenario))
-    assert len(model.background) > 0
-    assert not (tmp_path / "empty").exists()
-    (made / KIND / reconstruction_key(scenario, recipe_of(scenario)) / "sky.png").write_bytes(b"")
-    with pytest.raises(InputError):
-        ensure(scenario, recipe_of(scenario))
 
 
 def test_cycle_is_fitted_one_metre_aside_and_takes_all_actors_from_the_scene(cache: Path) -> None:

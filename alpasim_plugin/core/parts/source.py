@@ -1,98 +1,71 @@
 """The code of a part: imported from what a target names (``package.module:attribute`` or
 ``path/to/file.py:attribute``), and its digest.
 
-A folder that is not installed is never on Python's path. A finder of its own (`_NamedFolders`)
-serves the file that was named and what its import statements reach in its folder; nothing else
-there can be imported, whoever asks for it.
+A folder that is not installed is never on Python's path: only the file that was named, and the
+files that it imports beside it, can be imported.
 """
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import importlib
 import importlib.util
 import os
-import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
-from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 from alpasim_plugin import OWN_PACKAGES
 from alpasim_plugin.core.errors import InputError
 
 OWN_ROOT = str(Path(__file__).resolve().parents[3])
-PARTS = os.path.join(OWN_ROOT, "alpasim_plugin", "plugins", "parts") + os.sep
 INSTALLED = {"site-packages", "dist-packages"}  # folders that hold packages of many distributions
-
-# Import statements wherever they stand: at the top, inside functions, under conditions. A line of a
-# docstring that looks like one only adds a file. Imports for type checkers alone do not run.
-_FROM = re.compile(
-    rb"^[ \t]*from[ \t]+(\.*[\w.]*)[ \t]+import[ \t]+(\([^)]*\)|[^\n#]+)", re.MULTILINE
+COMMAND = "exec:"  # what follows is a command line
+DO_THIS = (
+    "write package.module:Class with the package installed or in the working directory, "
+    "or file.py:Class"
 )
-_IMPORT = re.compile(rb"^[ \t]*import[ \t]+([^\n#]+)", re.MULTILINE)
-_TYPES_ONLY = re.compile(rb"^if (?:typing\.)?TYPE_CHECKING:\n(?:[ \t]+[^\n]*\n|\n)+", re.MULTILINE)
-_COMMENT = re.compile(rb"#[^\n]*")
-PACKAGE = os.sep + "__init__.py"  # the file of a package, in its folder
-
-
-def code_digest(file: str | Path) -> str:
-    """Return a SHA-256 over a module and all modules that it reaches by imports.
-
-    Followed are imports of modules in the part's own top-level package, in simrun's packages, and,
-    for code that is not installed, of files beside it. Installed third-party libraries and the
-    standard library are not: ``run.json`` lists the versions of those that matter.
-
-    Args:
-        file: Source file of the part's module.
-    """
-    digests = sorted(_read(path).digest for path in code_files(file))
-    return hashlib.sha256("\n".join(digests).encode()).hexdigest()
-
-
-def own_code_digest(module: str) -> str:
-    """Return the `code_digest` of one of simrun's own modules, by its dotted name. Nothing is
-    imported.
-    """
-    file = _own_file(tuple(module.split(".")))
-    assert file is not None, module
-    return code_digest(file)
+_imported_code: dict[Path, str] = {}  # file -> its code digest when a part of it was first resolved
+_served: dict[str, str] = {}  # module -> file, of modules that no folder on Python's path has
 
 
 @lru_cache(maxsize=1)
 def package_digest() -> str:
-    """Return a SHA-256 over all source files of simrun, with their names."""
+    """Return a SHA-256 over all source files of simrun, with their names: its version."""
     hashed = hashlib.sha256()
-    for path in sorted(_own_sources()):
-        with open(path, "rb") as file:
-            text = file.read()
-        hashed.update(os.path.relpath(path, OWN_ROOT).encode() + hashlib.sha256(text).digest())
+    for package in OWN_PACKAGES:
+        for path in sorted(Path(OWN_ROOT, package).rglob("*.py")):
+            name = path.relative_to(OWN_ROOT).as_posix().encode()
+            hashed.update(name + hashlib.sha256(path.read_bytes()).digest())
     return hashed.hexdigest()
 
 
-def code_files(file: str | Path) -> set[str]:
-    """Return the paths of the files that `code_digest` covers.
+def code_digest(file: str | Path) -> str:
+    """Return a SHA-256 over simrun, and over a module that is not simrun's with all that it imports
+    beside it.
 
-    Code of other people that reaches `alpasim_plugin.core.parts` may name any of our parts by a
-    string, so all of ours counts for it.
+    Installed third-party libraries and the standard library are left out: ``run.json`` lists the
+    versions of those that matter.
+
+    Args:
+        file: Source file of the part's module.
     """
-    found = reached(file)
-    is_ours = os.path.realpath(file) in _own_sources()
-    may_name_parts = any(path.startswith(PARTS) for path in found)
-    return found | _own_sources() if may_name_parts and not is_ours else found
-
-
-@lru_cache(maxsize=1)
-def _own_sources() -> frozenset[str]:
-    packages = (Path(OWN_ROOT, package) for package in OWN_PACKAGES)
-    return frozenset(str(path) for package in packages for path in package.rglob("*.py"))
+    path = os.path.realpath(file)
+    if Path(os.path.relpath(path, OWN_ROOT)).parts[0] in OWN_PACKAGES:
+        return package_digest()
+    texts = [Path(one).read_bytes() for one in sorted(reached(path))]
+    digests = [hashlib.sha256(text).hexdigest() for text in texts]
+    return hashlib.sha256("\n".join([package_digest(), *digests]).encode()).hexdigest()
 
 
 def reached(file: str | Path) -> set[str]:
-    """Return the paths of a module and of all that it reaches by imports."""
+    """Return the paths of a module and of all that it imports below the folder of its outermost
+    package; of installed ones only those of its own package.
+    """
     start = os.path.realpath(file)
     root = top_folder(start)
     seen: set[str] = set()
@@ -101,7 +74,7 @@ def reached(file: str | Path) -> set[str]:
         path = todo.pop()
         if path not in seen:
             seen.add(path)
-            todo += imported_files(path, root)
+            todo += _imported_files(path, root)
     return seen
 
 
@@ -113,139 +86,45 @@ def top_folder(file: str) -> str:
     return folder
 
 
-class _Source(NamedTuple):
-    digest: str  # SHA-256 of the text
-    imports: tuple[str, ...]  # dotted names
-    lazy: dict[
-        str, str
-    ]  # public name -> module, of a package that imports its names on first use (`alpasim_plugin.core.lazy`)
-
-
-def _read(path: str) -> _Source:
-    stat = os.stat(path)
-    return _parsed(path, stat.st_mtime_ns, stat.st_size)
-
-
-@lru_cache(maxsize=4096)
-def _parsed(path: str, mtime_ns: int, size: int) -> _Source:
-    with open(path, "rb") as file:
-        text = file.read()
-    lazy: dict[str, str] = {}
-    for match in _FROM.finditer(
-        b"".join(_TYPES_ONLY.findall(text)) if b"lazy_names(" in text else b""
-    ):
-        lazy |= {
-            item.split(" as ")[0].strip(): match[1].decode()
-            for item in match[2].decode().strip("()").split(",")
-        }
-    return _Source(
-        hashlib.sha256(text).hexdigest(),
-        tuple(dict.fromkeys(_names(_TYPES_ONLY.sub(b"", text)))),
-        lazy,
-    )
-
-
-def _names(text: bytes) -> Iterator[str]:
-    """Give every dotted name that a module may import; ``from a import b`` gives ``a`` and
-    ``a.b``.
-    """
-    for match in _FROM.finditer(text):
-        module = match[1].decode()
-        yield module
-        for item in _COMMENT.sub(b"", match[2]).decode(errors="replace").strip("()").split(","):
-            name = item.split(" as ")[0].strip()
-            if name.isidentifier():
-                yield f"{module}{'' if module.endswith('.') else '.'}{name}"
-    for match in _IMPORT.finditer(text):
-        for item in match[1].decode(errors="replace").split(","):
-            yield item.split(" as ")[0].strip()
-
-
-def imported_files(path: str, root: str) -> Iterable[str]:
-    """Return the files that a module imports; of our own modules once, because our files do not
-    come and go while a process runs.
-    """
-    if root != OWN_ROOT:
-        return _find_imported(path, root)
-    stat = os.stat(path)
-    return _own_imported(path, stat.st_mtime_ns, stat.st_size)
-
-
-@lru_cache(maxsize=4096)
-def _own_imported(path: str, mtime_ns: int, size: int) -> tuple[str, ...]:
-    return tuple(_find_imported(path, OWN_ROOT))
-
-
-def _find_imported(path: str, root: str) -> Iterator[str]:
-    base = next((base for base in (root, OWN_ROOT) if path.startswith(base + os.sep)), root)
-    here = os.path.relpath(os.path.dirname(path), base).split(os.sep)
-    top = here[0] if here != ["."] else os.path.basename(path).removesuffix(".py")
-    is_shared = not INSTALLED.isdisjoint(root.split(os.sep))
-    for dotted in _read(path).imports:
-        dots = len(dotted) - len(dotted.lstrip("."))
-        rest = [part for part in dotted[dots:].split(".") if part]
-        parts = (
-            [*(part for part in here[: len(here) - dots + 1] if part != "."), *rest]
-            if dots
-            else rest
-        )
-        own = bool(parts) and parts[0] in OWN_PACKAGES
-        if not parts or not (own or parts[0] == top or not is_shared):
-            continue
-        for depth in range(1, len(parts) + 1):
-            found = _own_file(tuple(parts[:depth])) if own else module_file(root, parts[:depth])
-            if found is not None:
-                yield found
-                if not found.endswith(PACKAGE):
-                    # what is in a file is no module: two looks at the disk less for most names
-                    break
-        face = _own_file(tuple(parts[:-1])) if own and len(parts) > 1 else None
-        home = None if face is None else _read(face).lazy.get(parts[-1])
-        found = None if home is None else _own_file(tuple(home.split(".")))
-        if found is not None:
-            yield found
-
-
-@lru_cache(maxsize=8192)
-def _own_file(parts: tuple[str, ...]) -> str | None:
-    return module_file(OWN_ROOT, parts)
-
-
 def module_file(root: str, parts: Sequence[str]) -> str | None:
     """Return the file of a module below a folder, ``__init__.py`` of a package; None where there is
     none.
     """
     path = os.path.join(root, *parts)
-    package = path + PACKAGE
-    if os.path.isfile(package):
-        return package
-    return path + ".py" if os.path.isfile(path + ".py") else None
+    candidates = (os.path.join(path, "__init__.py"), f"{path}.py")
+    return next((file for file in candidates if os.path.isfile(file)), None)
 
 
-COMMAND = "exec:"  # what follows is a command line
-DO_THIS = "write package.module:Class with the package installed or in the working directory, or file.py:Class"
-_imported_code: dict[
-    Path, str
-] = {}  # file of a module -> its code digest when a part of it was first resolved
+def _imported_files(path: str, root: str) -> Iterator[str]:
+    package = list(Path(os.path.relpath(path, root)).parent.parts)
+    top = package[0] if package else Path(path).stem
+    is_shared = not INSTALLED.isdisjoint(Path(root).parts)
+    for level, dotted in _imports(path):
+        parts = [*package[: len(package) - level + 1], *dotted] if level else dotted
+        first = module_file(root, parts[:1]) if parts else None
+        if first is None or parts[0] in OWN_PACKAGES or (is_shared and parts[0] != top):
+            continue
+        if parts[0] == top or not _is_hidden(parts[0], first):
+            for depth in range(1, len(parts) + 1):
+                file = module_file(root, parts[:depth])
+                if file is not None:
+                    yield file
 
 
-class _NamedFolders:
-    """Find modules of folders in which a user has named one; installed modules come first, since
-    this is the last finder.
-
-    Attributes:
-        files: Name of a module without dots -> its file, ``__init__.py`` of a package.
-    """
-
-    files: dict[str, str] = {}  # noqa: RUF012 - one for the process, as `sys.modules` is
-
-    @classmethod
-    def find_spec(cls, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        """Return the spec of a module that is served; parts of a package are found by the package
-        itself.
-        """
-        file = cls.files.get(name)
-        return None if file is None else importlib.util.spec_from_file_location(name, file)
+def _imports(path: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number of leading dots and the name of everything that a module may import."""
+    try:
+        tree = ast.parse(Path(path).read_bytes())
+    except (SyntaxError, ValueError):  # the import itself will say so
+        return
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield 0, alias.name.split(".")
+        elif isinstance(node, ast.ImportFrom):
+            module = node.module.split(".") if node.module else []
+            for alias in node.names:
+                yield node.level, [*module, alias.name]
 
 
 def is_target(name: str) -> bool:
@@ -301,8 +180,9 @@ def load(target: str, kind: str) -> Any:
     """
     name, _, attribute = target.rpartition(":")
     try:
-        module = _from_file(Path(name)) if name.endswith(".py") else importlib.import_module(name)
-        return getattr(module, attribute)
+        if name.endswith(".py") and not os.path.isfile(name):
+            raise FileNotFoundError(f"no such file: {name}")
+        return getattr(importlib.import_module(make_importable(target)), attribute)
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # whatever a user's module raises while it is imported
@@ -310,32 +190,61 @@ def load(target: str, kind: str) -> Any:
 
 
 def make_importable(target: str) -> str:
-    """Let the modules that a target names and reaches be imported in this process, and return the
-    name of the first one.
+    """Let the modules that a target names and imports beside it be imported in this process, and
+    return the name of the first one.
 
     Nothing is run. A process that receives objects of such a module calls this before it unpickles
     them.
 
     Args:
         target: As `absolute_target` returns it.
+
+    Raises:
+        InputError: A module of the same name was imported from another folder.
     """
-    name, _, _ = target.rpartition(":")
-    if not name.endswith(".py"):
-        return name
-    if _NamedFolders not in sys.meta_path:
-        sys.meta_path.append(_NamedFolders)
-    root = top_folder(name)
-    within = Path(os.path.relpath(name, root)).with_suffix("").parts
+    file, _, _ = target.rpartition(":")
+    if not file.endswith(".py"):
+        return file
+    root = top_folder(file)
+    own_name = os.path.basename(file)
     if INSTALLED.isdisjoint(Path(root).parts):
-        _serve_reached(name, root)
-    in_package = within[:-1] if within[-1] == "__init__" else within
-    if len(within) > 1 and _NamedFolders.files.get(in_package[0]) == module_file(
-        root, in_package[:1]
-    ):
+        for path in sorted(reached(file) - {os.path.join(os.path.realpath(root), own_name)}):
+            top = Path(os.path.relpath(path, os.path.realpath(root))).parts[0].removesuffix(".py")
+            if top not in OWN_PACKAGES and not _is_installed(top):
+                _serve(top, module_file(root, [top]))
+    parts = Path(os.path.relpath(file, root)).with_suffix("").parts
+    in_package = parts[:-1] if parts[-1] == "__init__" else parts
+    if len(parts) > 1 and _served.get(in_package[0]) == module_file(root, in_package[:1]):
         return ".".join(in_package)
-    own = f"simrun_file_{hashlib.sha256(name.encode()).hexdigest()[:12]}"
-    _NamedFolders.files[own] = name
+    own = f"simrun_file_{hashlib.sha256(file.encode()).hexdigest()[:12]}"
+    _serve(own, file)
     return own
+
+
+def _serve(name: str, file: str | None) -> None:
+    """Make a module of a file importable; it is run when it is used first.
+
+    Raises:
+        InputError: A module of that name was imported from another folder.
+    """
+    if file is None or not os.path.isfile(file):
+        return
+    other = _served.get(name, file)
+    if other != file:
+        raise InputError(
+            f"{file}: a module named {name} was imported from {other} before",
+            "rename one of the two",
+        )
+    if name in sys.modules:
+        return
+    spec = importlib.util.spec_from_file_location(name, file)
+    assert spec is not None
+    assert spec.loader is not None
+    spec.loader = importlib.util.LazyLoader(spec.loader)
+    module: ModuleType = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    _served[name] = file
 
 
 def file_of(target: str) -> Path | None:
@@ -346,11 +255,9 @@ def file_of(target: str) -> Path | None:
     if name.endswith(".py"):
         return Path(name)
     spec = importlib.util.find_spec(name)
-    return (
-        Path(spec.origin)
-        if spec is not None and spec.has_location and spec.origin is not None
-        else None
-    )
+    if spec is None or spec.origin is None or not spec.has_location:
+        return None
+    return Path(spec.origin)
 
 
 def require_unedited(file: Path, digest: str) -> None:
@@ -358,62 +265,27 @@ def require_unedited(file: Path, digest: str) -> None:
 
     Args:
         file: The module's source file; it has been imported.
-        digest: Its `alpasim_plugin.core.parts.source.code_digest` now.
+        digest: Its `code_digest` now.
 
     Raises:
         InputError: The digest is another than when the part was first resolved in this process.
     """
     if _imported_code.setdefault(file, digest) != digest:
         raise InputError(
-            f"{file}: it, or a module that it imports, was edited after this process had imported it",
+            f"{file}: it, or a module that it imports, was edited after this process imported it",
             "start a new process",
         )
 
 
-def _from_file(file: Path) -> ModuleType:
-    if not file.is_file():
-        raise FileNotFoundError(f"no such file: {file}")
-    return importlib.import_module(make_importable(f"{file}:"))
-
-
-def _serve_reached(file: str, root: str) -> None:
-    """Serve the modules of a folder that a file's import statements reach, as far as nothing
-    installed bears their names.
-    """
-    seen, todo = set[str](), [file]
-    while todo:
-        path = todo.pop()
-        if path in seen:
-            continue
-        seen.add(path)
-        top = os.path.relpath(path, root).split(os.sep)[0].removesuffix(".py")
-        if top not in OWN_PACKAGES and not _is_installed(top):
-            _serve(top, module_file(root, [top]))
-        elif path != file:
-            continue
-        todo += [found for found in imported_files(path, root) if found.startswith(root + os.sep)]
-
-
-def _serve(name: str, file: str | None) -> None:
-    """Serve a module from a file.
-
-    Raises:
-        InputError: A module of that name was imported from another folder.
-    """
-    other = _NamedFolders.files.get(name, file)
-    if file is None:
-        return
-    if other != file and name in sys.modules:
-        raise InputError(
-            f"{file}: a module named {name} was imported from {other} before",
-            "rename one of the two",
-        )
-    _NamedFolders.files[name] = file
+def _is_hidden(name: str, file: str) -> bool:
+    """Tell whether another file than this one is imported under its name."""
+    spec = None if name in _served or not _is_installed(name) else importlib.util.find_spec(name)
+    return spec is not None and os.path.realpath(spec.origin or "") != os.path.realpath(file)
 
 
 def _is_installed(name: str) -> bool:
     """Tell whether Python finds a module without the folders that were named."""
-    if name in _NamedFolders.files:
+    if name in _served:
         return False
     try:
         return importlib.util.find_spec(name) is not None

@@ -13,8 +13,8 @@ and no crack opens.
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
-from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.fixers.semantic_map.prepare import GROUP
 
 BEND_PX = 0.1

@@ -11,8 +11,8 @@ depend on the number of threads.
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
-from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.fixers.semantic_map.kernels import (
     BACK,
     BIAS,

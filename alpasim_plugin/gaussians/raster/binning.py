@@ -10,8 +10,8 @@ CPU this beats the sort of all (tile, depth) pairs that GPU rasterisers use.
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
-from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.gaussians.constants import (
     HALF_WIDTH,
     RADIUS_X,

@@ -21,8 +21,8 @@ whitened coordinates ``s, t`` of the exponent, which stay small for needles.
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
-from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.gaussians.constants import ALPHA_MAX, PEAK, RECORD, TILE, B, G, R, Z
 from alpasim_plugin.gaussians.raster import simd as v
 from alpasim_plugin.gaussians.raster.raster_kernels import (

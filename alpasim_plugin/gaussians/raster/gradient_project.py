@@ -16,8 +16,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import njit
 
-from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MIN,
     CAM_FX,

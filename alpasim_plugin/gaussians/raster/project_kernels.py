@@ -8,8 +8,8 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
-from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MIN,
     BLOCK_REACH,

@@ -18,9 +18,9 @@ below 2e-6, without range reduction.
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.polynomial import chebyshev
 
-from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MAX,
     ALPHA_MIN,

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.kernels import njit
 from alpasim_plugin.core.types import F32, F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 

@@ -1,5 +1,4 @@
-"""Inputs that once gave way: each is a command line over files that it writes. ``python -m
-tests.fuzz.seen`` prints what each does now.
+"""Inputs that once gave way: each is a command line over files that it writes.
 
 A case passes if it ends within the limits of time and memory, without a traceback: refused with
 code 2 and four parts, or accepted.
@@ -19,7 +18,6 @@ import tempfile
 import time
 import zlib
 from collections.abc import Callable
-from importlib.metadata import entry_points
 from pathlib import Path
 
 from tests.core.checksum_files import vouch_for
@@ -381,20 +379,3 @@ def outcome(make: Make) -> tuple[str, float]:
     note = f", a line of {longest} characters" if longest > 400 else ""
     kind = {0: "accepted", 2: "refused"}.get(process.returncode, f"code {process.returncode}")
     return f"{kind}{note}", took
-
-
-def main() -> None:
-    """Print one line a case."""
-    wanted, cases = sys.argv[1:], dict(SEEN)
-    if entry_points(group="simrun.commands", name="train"):
-        from tests.lab import fuzz_targets
-
-        cases.update(fuzz_targets.SEEN)
-    for name, make in cases.items():
-        if not wanted or any(word in name for word in wanted):
-            result, took = outcome(make)
-            print(f"| {name} | {result} | {took:.1f} |", flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,87 @@
+"""Private names of other libraries, and names bound twice: docs/architecture.md has the rule."""
+
+from __future__ import annotations
+
+import ast
+from collections import Counter
+
+from tests.test_layers import PACKAGES, Module, modules
+
+# Module -> why a user would wait a fifth longer without it. `goes`: it is on its way out.
+ALLOWED: dict[str, str] = {}
+DEPRECATED = ("torch.jit",)
+STANDARD = ("os._exit", "sys._getframe")  # documented, whatever their names
+
+
+def is_private(name: str) -> bool:
+    return any(part.startswith("_") and not part.startswith("__") for part in name.split("."))
+
+
+def dotted(node: ast.AST) -> str:
+    """Return ``a.b.c`` of nested attributes; empty where the innermost is no name."""
+    if isinstance(node, ast.Attribute):
+        inner = dotted(node.value)
+        return f"{inner}.{node.attr}" if inner else ""
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def foreign_names(module: Module) -> dict[str, str]:
+    """Return the names that a module imports from other distributions: name -> what it stands
+    for.
+    """
+    found: dict[str, str] = {}
+    for node in module.nodes:
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                first = alias.name.split(".")[0]
+                found[alias.asname or first] = alias.name if alias.asname else first
+        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            for alias in node.names:
+                found[alias.asname or alias.name] = f"{node.module}.{alias.name}"
+    return {name: what for name, what in found.items() if what.split(".")[0] not in PACKAGES}
+
+
+def private_uses(module: Module) -> set[str]:
+    foreign = foreign_names(module)
+    used = set(foreign.values())
+    for node in module.nodes:
+        name = dotted(node) if isinstance(node, ast.Attribute) else ""
+        first, _, rest = name.partition(".")
+        if rest and first in foreign:
+            used.add(f"{foreign[first]}.{rest}")
+    return {
+        name
+        for name in used - set(STANDARD)
+        if is_private(name) or any(f"{name}.".startswith(f"{one}.") for one in DEPRECATED)
+    }
+
+
+def test_private_and_deprecated_names_of_other_libraries_are_used_only_where_it_is_said() -> None:
+    found = {module.name: sorted(private_uses(module)) for module in modules()}
+    used = {name: uses for name, uses in found.items() if uses}
+    assert {name: uses for name, uses in used.items() if name not in ALLOWED} == {}
+    assert [name for name in ALLOWED if name not in used and name in found] == []
+
+
+def names_bound(statement: ast.stmt) -> list[str]:
+    if isinstance(statement, ast.FunctionDef | ast.ClassDef):
+        return [] if statement.decorator_list else [statement.name]
+    if isinstance(statement, ast.AnnAssign) and statement.value is None:
+        return []
+    targets = statement.targets if isinstance(statement, ast.Assign) else []
+    if isinstance(statement, ast.AnnAssign):
+        targets = [statement.target]
+    nodes = [inner for target in targets for inner in ast.walk(target)]
+    return [
+        node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+    ]
+
+
+def test_no_module_binds_a_name_twice() -> None:
+    twice = {}
+    for module in modules():
+        counts = Counter(name for one in module.top for name in names_bound(one))
+        names = [name for name, count in counts.items() if count > 1]
+        if names:
+            twice[module.name] = names
+    assert twice == {}
