@@ -6,7 +6,7 @@ reader returned, `check_scenario` at the finished scenario of either kind. Range
 quantities are in `alpasim_plugin.core.limits`.
 
 The cost of the Gaussians follows what was counted on built roads of 0.1 to 5 km
-(docs/reliability.md): ground and kerbs by the drive's length, trees and walls by the surroundings.
+(docs/runs.md): ground and kerbs by the drive's length, trees and walls by the surroundings.
 """
 
 from __future__ import annotations

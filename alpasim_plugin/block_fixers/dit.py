@@ -9,7 +9,7 @@ Conventions: ``x`` and ``hdmap`` are ``(B, C, T, H, W)`` normalised latents, tim
     to 1000, the output is the velocity
 ``noise - clean`` (source minus target) in the shape and dtype of ``x``. Keys, shapes and order of
 operations are those of OmniDreams single view (the causal student of Cosmos-Predict2.5), so its
-checkpoints load; docs/block-fixers.md lists them.
+checkpoints load; docs/fixers.md lists them.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class CosmosCausalDiT(nn.Module):
         """Build a network with sizes read from the tensors, and copy them.
 
         Args:
-            sd: Tensors under the original's keys (docs/block-fixers.md), with or without the prefix
+            sd: Tensors under the original's keys (docs/fixers.md), with or without the prefix
                 ``net.`` and an outer ``model`` or ``state_dict``.
             rope_ratios: Height, width, time; not stored in checkpoints.
             dtype: Precision of the weights; half-precision tensors are widened by the default. Time

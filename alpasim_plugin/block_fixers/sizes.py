@@ -18,7 +18,7 @@ MASK_CHANNELS = 2  # condition mask, padding mask
 ATTENTIONS = ("self_attn", "cross_attn")
 SUBLAYERS = (*ATTENTIONS, "mlp")
 CUT = 3.0  # standard deviations
-HINT = "give the weights of a causal single-view network with a semantic-map embedding (docs/block-fixers.md)"
+HINT = "give the weights of a causal single-view network with a semantic-map embedding (docs/fixers.md)"
 
 
 @dataclass(frozen=True)

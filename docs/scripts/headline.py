@@ -3,10 +3,8 @@ docs/experiments/fixer-closed-loop.md.
 
     python docs/scripts/headline.py [--check]
 
-The record holds the tables that ``docs/scripts/closed_loop.py`` makes. A sentence says how long the
-drives are, of which sets and how many families, and gives the difference with scenes and with
-families as the unit. With ``--check`` nothing is written, and the exit code is 1 where a page
-differs. The record need not be repeated for that: what it says is on the page.
+``docs/scripts/closed_loop.py`` makes the record's tables. With ``--check`` nothing is written, and
+the exit code is 1 where a page is stale.
 """
 
 from __future__ import annotations
@@ -17,41 +15,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import scipy  # its submodules load on first use
-
-from alpasim_plugin.core.types import F64, I64
+from scipy.special import stdtrit
 
 DOCS = Path(__file__).resolve().parents[1]
 RECORD = DOCS / "experiments" / "fixer-closed-loop.md"
-DRAWN_S = 19.8  # length of the test sets' drives
-SETS = "the two frozen test sets"
 POLICY = "learned"
 BASELINE = "3dgs"
 TRUE = "clean"
 FIXED, BARE = "onefixer", "onefixer[references=0]"
 EVENT, DISTANCE = "offroad_or_collision_at_fault", "lateral_distance_m"
-SAFER, KEEPS = (
-    "| Does it make driving safer? ",
-    "| Does it keep the car on its path? ",
-)  # rows of docs/results.md
-
-
-def family_bounds(means: F64, family: I64) -> list[float]:
-    """Return [low, high] of the mean ``(G,)`` of scenes with their families ``(G,)`` as clusters: t
-    with one degree less than families.
-
-    The variance is that of sums of families' residuals (Liang and Zeger, Biometrika 73, 1986),
-    times F / (F - 1).
-
-    >>> [round(end, 3) for end in family_bounds(np.array([0.0, 0.0, 1.0, 1.0, 2.0, 2.0]), np.array([0, 0, 1, 1, 2, 2]))]
-    [-1.484, 3.484]
-    """
-    centre, sums = float(np.mean(means)), np.bincount(family, means - np.mean(means))
-    n = len(sums)
-    half = float(
-        scipy.special.stdtrit(n - 1, 0.975) * np.sqrt(n / (n - 1) * np.sum(sums**2)) / len(means)
-    )
-    return [centre - half, centre + half]
+SAFER = "| Does it make driving safer? "  # how rows of docs/results.md begin
+KEEPS = "| Does it keep the car on its path? "
 
 
 @dataclass(frozen=True)
@@ -59,7 +33,7 @@ class Record:
     """What the record says of one policy.
 
     Attributes:
-        length: How long the drives are, in words.
+        length: How long the rollouts are, such as ``19.8 s each``.
         scenes, seeds: Their numbers.
         means, minus: METRIC -> renderer -> the cell; ``minus`` is against the baseline.
         events: Family -> renderer -> rollouts with the event, and rollouts.
@@ -73,147 +47,117 @@ class Record:
     events: dict[str, dict[str, tuple[int, int]]]
 
     def share(self, renderer: str) -> str:
-        """Return the share of drives with the event, as ``2.3 %``."""
+        """Return the share of rollouts with the event, as ``2.3 %``."""
         return f"{self.means[EVENT][renderer].split()[0]} %"
+
+    def metres(self, renderer: str) -> str:
+        """Return the mean distance from the path, as ``0.36 m``."""
+        return f"{float(self.means[DISTANCE][renderer].split()[0]):.2f} m"
 
     def difference(self, renderer: str) -> tuple[str, str, str]:
         """Return the difference in points with its bounds over scenes."""
-        found = re.match(r"([-+\d.]+) \[([-+\d.]+), ([-+\d.]+)\]", self.minus[EVENT][renderer])
-        assert found, self.minus[EVENT][renderer]
-        return found[1], found[2], found[3]
+        cell = re.match(r"([-+\d.]+) \[([-+\d.]+), ([-+\d.]+)\]", self.minus[EVENT][renderer])
+        assert cell, self.minus[EVENT][renderer]
+        return cell[1], cell[2], cell[3]
 
     def over_families(self, renderer: str) -> tuple[float, float]:
         """Return the bounds of the difference in points with families as the unit.
 
-        The tables hold a family's sum and not its scenes, which is all that the variance of sums of
-        residuals asks for.
+        The variance of the mean is that of the sums of families' residuals (Liang and Zeger,
+        Biometrika 73, 1986), times F / (F - 1), which needs a family's sum and not its scenes.
         """
-        means, family = [], []
-        for k, (name, cells) in enumerate(self.events.items()):
-            here, there = cells[renderer], cells[BASELINE]
-            n = here[1] // self.seeds
-            assert here[1] == there[1] == n * self.seeds, (
-                f"{name}: {here[1]} and {there[1]} rollouts of {self.seeds} seeds"
-            )
-            means += [(here[0] - there[0]) / here[1]] * n
-            family += [k] * n
-        low, high = family_bounds(np.array(means), np.array(family))
-        return 100.0 * low, 100.0 * high
+        change = np.array([c[renderer][0] - c[BASELINE][0] for c in self.events.values()])
+        rollouts = np.array([c[BASELINE][1] for c in self.events.values()])
+        mean = change.sum() / rollouts.sum()
+        n = len(change)
+        variance = n / (n - 1) * np.sum((change - mean * rollouts) ** 2) / rollouts.sum() ** 2
+        half = float(stdtrit(n - 1, 0.975) * np.sqrt(variance))
+        return 100.0 * (mean - half), 100.0 * (mean + half)
 
     def without(self, renderer: str) -> tuple[str, float]:
         """Return the family that moves the difference most, and the difference in points without
         it.
         """
-
-        def rest(left_out: str | None) -> float:
-            pairs = [
-                (cells[renderer], cells[BASELINE])
-                for name, cells in self.events.items()
-                if name != left_out
-            ]
-            return (
-                100.0
-                * sum(here[0] - there[0] for here, there in pairs)
-                / sum(here[1] for here, _ in pairs)
-            )
-
-        name = max(self.events, key=lambda one: abs(rest(one) - rest(None)))
-        return name, rest(name)
+        changes = {
+            name: (cells[renderer][0] - cells[BASELINE][0], cells[BASELINE][1])
+            for name, cells in self.events.items()
+        }
+        events = sum(change for change, _ in changes.values())
+        rollouts = sum(count for _, count in changes.values())
+        rest = {
+            name: 100.0 * (events - change) / (rollouts - count)
+            for name, (change, count) in changes.items()
+        }
+        name = max(rest, key=lambda family: abs(rest[family] - 100.0 * events / rollouts))
+        return name, rest[name]
 
 
 def replace(text: str, marker: str, content: str) -> str:
     """Replace what stands between a marker's two comments."""
     pattern = re.compile(rf"(<!-- begin {marker} -->\n).*?(<!-- end {marker} -->)", re.S)
-    if not pattern.search(text):
-        raise SystemExit(f"the page has no marker {marker}")
+    assert pattern.search(text), f"the page has no marker {marker}"
     return pattern.sub(lambda match: f"{match[1]}{content}\n{match[2]}", text)
 
 
 def read_record(text: str) -> Record:
     """Read the tables of a record's page."""
-    made = re.search(r"<!-- begin closed-loop -->\n(.*?)<!-- end closed-loop -->", text, re.S)
-    assert made, "the record has no tables"
-    length, rest = made[1].split("\n", 1)
+    made = re.search(
+        r"<!-- begin closed-loop -->\n([\d.]+ s each)\.\n(.*)<!-- end closed-loop -->", text, re.S
+    )
+    assert made, "the record has no tables, or does not say how long its rollouts are"
     part = re.search(
-        rf"\*\*{POLICY}\*\*: (\d+) scenes x (\d+) seeds\n(.*?)(?=\n\*\*|\Z)", rest, re.S
+        rf"\*\*{POLICY}\*\*: (\d+) scenes x (\d+) seeds\n(.*?)(?=\n\*\*|\Z)", made[2], re.S
     )
     assert part, f"the record has no policy {POLICY}"
     tables: dict[str, dict[str, dict[str, str]]] = {}
-    rows: dict[str, dict[str, str]] = {}
-    columns: list[str] = []
-    for line in part[3].splitlines():
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        if not line.startswith("|"):
-            columns = []
-        elif not columns:
-            columns = cells[1:]
-            rows = tables[cells[0]] = {}
-        elif not cells[0].startswith("-"):
-            rows[re.sub(r"`(\w+)`.*", r"\1", cells[0])] = dict(zip(columns, cells[1:], strict=True))
-    counts = tables["left the road or at fault, rollouts"]
+    for block in re.findall(r"(?:^\|.*\n?)+", part[3], re.M):
+        head, _, *lines = [
+            [cell.strip() for cell in line.strip("|").split("|")] for line in block.splitlines()
+        ]
+        tables[head[0]] = {
+            re.sub(r"`(\w+)`.*", r"\1", name): dict(zip(head[1:], cells, strict=True))
+            for name, *cells in lines
+        }
     events = {
-        name: {key: _counted(cell) for key, cell in cells.items()} for name, cells in counts.items()
+        name: {key: (int(cell.split()[0]), int(cell.split()[-1])) for key, cell in cells.items()}
+        for name, cells in tables["left the road or at fault, rollouts"].items()
     }
-    return Record(
-        _length(length),
-        int(part[1]),
-        int(part[2]),
-        tables["metric"],
-        tables[f"minus {BASELINE}"],
-        events,
-    )
+    numbers = int(part[1]), int(part[2])
+    return Record(made[1], *numbers, tables["metric"], tables[f"minus {BASELINE}"], events)
 
 
-def _counted(cell: str) -> tuple[int, int]:
-    had, of = cell.split(" of ")
-    return int(had), int(of)
-
-
-def _length(line: str) -> str:
-    """Return the length of the drives in words, from the record's first line: ``8 s each; `scene` 9
-    s.``.
-    """
-    found = re.match(r"([\d.]+) s each", line)
-    assert found, f"the record does not say how long its drives are: {line!r}"
-    seconds = float(found[1])
-    return (
-        f"{seconds:g} s each"
-        if seconds >= np.floor(DRAWN_S)
-        else f"each cut to its first {seconds:g} of {DRAWN_S:g} s"
-    )
-
-
-def sentence(record: Record, renderer: str = FIXED) -> str:
+def sentence(record: Record) -> str:
     """Return README's sentence."""
-    diff, low, high = record.difference(renderer)
-    wide, (family, rest) = record.over_families(renderer), record.without(renderer)
+    diff, low, high = record.difference(FIXED)
+    wide = record.over_families(FIXED)
+    family, rest = record.without(FIXED)
     return (
-        f"In {record.scenes * record.seeds} rollouts of the policy `{POLICY}`, {record.length} ({record.scenes} scenes of {SETS}, "
-        f"{len(record.events)} families, {record.seeds} seeds), the share that\nleaves the road or is at fault in a contact is "
-        f"{record.share(BASELINE)} behind `{BASELINE}`, {record.share(renderer)} behind `{renderer}` and {record.share(TRUE)} behind "
-        f"`{TRUE}`. `{renderer}` minus `{BASELINE}`: {diff} points, 95 % interval {low} to {high} over scenes and {wide[0]:+.1f} to "
-        f"{wide[1]:+.1f}\nover families; {rest:+.1f} points without the family that moves it most, {family} "
+        f"In {record.scenes * record.seeds} rollouts of the policy `{POLICY}`, {record.length} "
+        f"({record.scenes} scenes of the two frozen test sets, {len(record.events)} families, "
+        f"{record.seeds} seeds), the share that\nleaves the road or is at fault in a contact is "
+        f"{record.share(BASELINE)} behind `{BASELINE}`, {record.share(FIXED)} behind `{FIXED}` "
+        f"and {record.share(TRUE)} behind `{TRUE}`. `{FIXED}` minus `{BASELINE}`: {diff} points, "
+        f"95 % interval {low} to {high} over scenes and {wide[0]:+.1f} to {wide[1]:+.1f}\n"
+        f"over families; {rest:+.1f} points without the family that moves it most, {family} "
         "([closed loop](docs/experiments/fixer-closed-loop.md))."
     )
 
 
 def rows(record: Record) -> dict[str, str]:
     """Return the rows of docs/results.md, by how they begin."""
-    of = f"{record.scenes} test scenes x {record.seeds} seeds, {record.length}"
-    link = "[closed loop](experiments/fixer-closed-loop.md)"
     diff, low, high = record.difference(FIXED)
-    wide, (family, rest) = record.over_families(FIXED), record.without(FIXED)
-    bare = f"; without references {record.share(BARE)}" if BARE in record.means[EVENT] else ""
-    safer = (
-        f"{record.share(FIXED)}; minus `{BASELINE}` {diff} points ({low} to {high}; {wide[0]:+.1f} to {wide[1]:+.1f} over "
-        f"{len(record.events)} families; {rest:+.1f} without {family}){bare}"
-    )
-    keeps = f"{float(record.means[DISTANCE][FIXED].split()[0]):.2f} m"
-    true, base = (float(record.means[DISTANCE][name].split()[0]) for name in (TRUE, BASELINE))
-    head = f"{SAFER}`{POLICY}`, {of}: off-road or at-fault contact, `{TRUE}` {record.share(TRUE)}, `{BASELINE}` {record.share(BASELINE)}"
+    wide = record.over_families(FIXED)
+    family, rest = record.without(FIXED)
+    link = "[closed loop](experiments/fixer-closed-loop.md)"
     return {
-        SAFER: f"{head} | {safer} | {link} |",
-        KEEPS: f"{KEEPS}The same rollouts: mean distance, `{TRUE}` {true:.2f} m, `{BASELINE}` {base:.2f} m | {keeps} | {link} |",
+        SAFER: f"{SAFER}`{POLICY}`, {record.scenes} test scenes x {record.seeds} seeds, "
+        f"{record.length}: off-road or at-fault contact, `{TRUE}` {record.share(TRUE)}, "
+        f"`{BASELINE}` {record.share(BASELINE)} | {record.share(FIXED)}; minus `{BASELINE}` "
+        f"{diff} points ({low} to {high}; {wide[0]:+.1f} to {wide[1]:+.1f} over "
+        f"{len(record.events)} families; {rest:+.1f} without {family}); without references "
+        f"{record.share(BARE)} | {link} |",
+        KEEPS: f"{KEEPS}The same rollouts: mean distance, `{TRUE}` {record.metres(TRUE)}, "
+        f"`{BASELINE}` {record.metres(BASELINE)} | {record.metres(FIXED)} | {link} |",
     }
 
 

@@ -343,7 +343,7 @@ METRICS = MetricTable(
             is_headline=True,
             label="off-road rollouts",
             reference=FOOTPRINT,
-            formula="[contact and off-road](contact-and-road.md)",
+            formula="[contact and off-road](metrics.md#off-road)",
             invalid="no lanes; or an edge is needed and the map has none",
         ),
         "offroad_margin_m": _metres(
@@ -438,14 +438,14 @@ METRICS = MetricTable(
             label="stalled rollouts",
             reference=CENTRE,
             invalid=_SHORT,
-            formula="[stalled and braked without a cause](outcomes.md#stalled)",
+            formula="[stalled and braked without a cause](report.md#how-a-rollout-ends)",
         ),
         "braked_without_cause": _flag(
             "the ego drives at less than half the speed of the recording there, which it had before, although nothing is in its way",
             label="rollouts that braked without a cause",
             reference=CENTRE,
             invalid=_SHORT,
-            formula="[stalled and braked without a cause](outcomes.md#stalled)",
+            formula="[stalled and braked without a cause](report.md#how-a-rollout-ends)",
         ),
         "hard_brake": _flag(
             "the ego brakes harder than 4.05 m/s2",

@@ -39,7 +39,7 @@ pytestmark = pytest.mark.slow
 
 REPO = Path(__file__).resolve().parents[2]
 HEAVY = "torch numba scipy shapely pydantic yaml pyarrow typer av matplotlib"
-PAGE = (REPO / "docs" / "policy-commands.md").read_text(encoding="utf-8")
+PAGE = (REPO / "docs" / "policies.md").read_text(encoding="utf-8")
 SHORT = (
     "--set",
     "timing.duration_us=600000",
@@ -54,7 +54,7 @@ SHORT = (
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Give a folder with the script of the page and worse ones."""
-    (script,) = re.findall(r"^```python\n(.*?)^```", PAGE, re.M | re.S)
+    (script,) = re.findall(r"^```python\n([^`]*serve_policy\(.*?)^```", PAGE, re.M | re.S)
     light = f"    import sys\n    print('heavy:', sorted({set(HEAVY.split())!r} & sys.modules.keys()))\n"
     (tmp_path / "remote_policy.py").write_text(
         script.replace("    serve_policy(Cruise)", f"{light}    serve_policy(Cruise)")

@@ -1,7 +1,7 @@
 """The transformer written out once more from the published description: plain functions, float64,
 one explicit mask.
 
-Shares no code with the package. Slow and meant to be read beside docs/block-fixers.md.
+Shares no code with the package. Slow and meant to be read beside docs/fixers.md.
 """
 
 from __future__ import annotations

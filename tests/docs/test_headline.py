@@ -1,27 +1,17 @@
-"""The headline about driving is what its record says: how long the drives are, of which sets, over
-scenes and over families.
-"""
+"""The headline about driving is what its record says: over scenes and over families."""
 
 from __future__ import annotations
 
 import importlib
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
 
-
-@pytest.fixture
-def headline(repo: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(repo / "docs" / "scripts"))
-    return importlib.import_module("headline")
-
-
 RECORD = """
 <!-- begin closed-loop -->
-{length}
+19.8 s each.
 
 **learned**: 6 scenes x 2 seeds
 
@@ -49,70 +39,41 @@ RECORD = """
 """
 
 
-def test_readme_and_results_say_what_the_record_says(
-    headline: ModuleType, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def headline(repo: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(repo / "docs" / "scripts"))
+    return importlib.import_module("headline")
+
+
+def test_readme_and_results_say_what_the_record_says(headline: ModuleType) -> None:
     pages = headline.written(headline.read_record(headline.RECORD.read_text(encoding="utf-8")))
     assert {path.name for path in pages} == {"README.md", "results.md"}
     for path, text in pages.items():
-        assert path.read_text(encoding="utf-8") == text, (
-            f"{path.name}: run python docs/scripts/headline.py"
-        )
+        assert path.read_text(encoding="utf-8") == text, "run python docs/scripts/headline.py"
 
 
-def test_a_sentence_has_the_length_of_the_drives_the_sets_and_the_families(
+def test_the_sentence_has_the_numbers_of_the_policy(headline: ModuleType) -> None:
+    text = headline.sentence(headline.read_record(RECORD)).replace("\n", " ")
+    assert "12 rollouts of the policy `learned`, 19.8 s each" in text
+    assert "two frozen test sets, 3 families, 2 seeds" in text
+    assert "50.0 % behind `3dgs`, 8.3 % behind `onefixer` and 0.0 % behind `clean`" in text
+
+
+def test_the_interval_over_families_is_t_on_the_sums_of_their_residuals(
     headline: ModuleType,
 ) -> None:
-    said = headline.sentence(headline.read_record(RECORD.format(length="8 s each; `one` 9 s.")))
-    for part in (
-        "12 rollouts of the policy `learned`",
-        "cut to its first 8 of 19.8 s",
-        "two frozen test sets, 3 families, 2 seeds",
-    ):
-        assert part in said.replace("\n", " ")
-    assert "50.0 % behind `3dgs`, 8.3 % behind `onefixer` and 0.0 % behind `clean`" in said
-    whole = headline.sentence(headline.read_record(RECORD.format(length="19.8 s each.")))
-    assert "19.8 s each" in whole
-    assert "cut" not in whole
-
-
-def test_the_interval_over_families_is_that_of_the_scenes_whatever_they_are_within_a_family(
-    headline: ModuleType,
-) -> None:
-    record = headline.read_record(RECORD.format(length="19.8 s each."))
-    scenes = np.array(
-        [0.0, -0.5, -1.0, -1.0, 0.5, -0.5]
-    )  # sums of two: -1 of 4, -4 of 4 and 0 of 4 rollouts
+    record = headline.read_record(RECORD)
+    # -1, -4 and 0 of 4 rollouts: mean -5/12, residuals 2/3, -7/3 and 5/3, t of 2 degrees 4.3027
+    half = 100 * 4.3027 * np.sqrt(3 / 2 * (4 / 9 + 49 / 9 + 25 / 9)) / 12
     assert record.over_families("onefixer") == pytest.approx(
-        [100 * end for end in headline.family_bounds(scenes, np.array([0, 0, 1, 1, 2, 2]))]
+        (-500 / 12 - half, -500 / 12 + half), rel=1e-4
     )
     assert record.without("onefixer") == ("hills", pytest.approx(-12.5))
 
 
-def test_a_record_without_what_is_claimed_is_refused(headline: ModuleType) -> None:
-    for text, found in (
-        ("no tables", "no tables"),
-        (RECORD.format(length="60 scenes"), "how long"),
-        (RECORD.replace("learned", "other"), "learned"),
-    ):
-        with pytest.raises(AssertionError, match=found):
-            headline.read_record(text.format(length="8 s each."))
-
-
-def test_the_command_compares_and_fails_where_a_page_differs(
-    headline: ModuleType,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    page = tmp_path / "README.md"
-    page.write_text("stale\n")
-    monkeypatch.setattr(headline, "written", lambda record: {page: "as it should be\n"})
-    monkeypatch.setattr(sys, "argv", ["headline.py", "--check"])
-    with pytest.raises(SystemExit, match="1"):
-        headline.main()
-    assert "run docs/scripts/headline.py" in capsys.readouterr().out
-    assert page.read_text() == "stale\n"
-    monkeypatch.setattr(sys, "argv", ["headline.py"])
-    headline.main()
-    assert page.read_text() == "as it should be\n"
+@pytest.mark.parametrize(
+    "text", ["no tables", RECORD.replace("19.8 s each.", ""), RECORD.replace("learned", "other")]
+)
+def test_a_record_without_what_is_claimed_is_refused(headline: ModuleType, text: str) -> None:
+    with pytest.raises(AssertionError):
+        headline.read_record(text)

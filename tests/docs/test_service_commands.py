@@ -2,8 +2,7 @@
 address, with what it needs beside it.
 
 Slow: ``pytest -m slow`` on this file. AlpaSim's renderer, driver and control unit are stood for by
-    ours; its vehicle, physics and
-traffic services are in `tests/alpasim/test_remote_services.py`.
+    ours.
 """
 
 from __future__ import annotations
@@ -23,15 +22,16 @@ import pytest
 from tests.docs.commands import SHORT, Command, commands, pages
 
 REPO = Path(__file__).resolve().parents[2]
-PAGES = ("docs/alpasim.md", "docs/alpasim-drivers.md", "docs/can.md")
-# services of AlpaSim's own; long measurements; other pages' subjects
-ELSEWHERE = r"^bench |FILE|^score|^export"
+PAGES = ("docs/alpasim.md", "docs/policies.md", "docs/renderers.md", "docs/can.md")
+# other pages' subjects
+ELSEWHERE = r"^(?!.*(127\.0\.0\.1:|can://|^serve)).*$|exec:"
 CLEAN = ("serve", "--renderer", "clean", "--scenes", "scenes", "--threads", "1", "--listen")
 BESIDE = {  # address in a command -> what answers there
     "--upstream 127.0.0.1:6789": (*CLEAN, "127.0.0.1:6789"),
     "nre://127.0.0.1:50051": (*CLEAN, "127.0.0.1:50051"),
     "127.0.0.1:6000": (
-        "serve-policy",
+        "serve",
+        "--policy",
         "lane-camera",
         "--scenes",
         "scenes",
@@ -109,14 +109,14 @@ def test_the_command_works_beside_what_it_needs(
     ]
     with ExitStack() as beside:
         for address, service in BESIDE.items():
-            if address in line and words[0] != "serve-policy":
+            if address in line and "--policy" not in words[:2]:
                 beside.enter_context(running(service, folder))
         if CONTROL_UNIT[0] in line:
             beside.enter_context(control_unit(CONTROL_UNIT[2], CONTROL_UNIT[1]))
-        if words[0] in ("serve", "serve-policy"):
+        if words[0] == "serve":
             with running(words, folder):
                 return
-        more = () if words[0] == "check-driver" else (*SHORT, "--seeds", "1")
+        more = () if words[0] == "check" else (*SHORT, "--seeds", "1")
         done = subprocess.run(
             [sys.executable, "-m", "alpasim_plugin.cli.main", *words, *more],
             cwd=folder,
@@ -125,9 +125,7 @@ def test_the_command_works_beside_what_it_needs(
             check=False,
         )
         # A check of 100 ms a call says what it found, not whether this machine was busy.
-        assert done.returncode in ((0, 1) if words[0] == "check-driver" else (0,)), done.stderr[
-            -3000:
-        ]
+        assert done.returncode in ((0, 1) if words[0] == "check" else (0,)), done.stderr[-3000:]
         assert "Traceback" not in done.stderr
 
 

@@ -141,7 +141,7 @@ def test_what_the_schema_writes_it_also_reads(tmp_path: Path) -> None:
 def test_the_page_of_tables_names_every_column_in_its_order_with_its_type(
     table: TableSchema,
 ) -> None:
-    page = (DOCS / "tables.md").read_text()
+    page = (DOCS / "runs.md").read_text()
     (line,) = [line for line in page.splitlines() if line.startswith(f"| `{table.name}` |")]
     assert "`rollout`" in page
     # Names of one kind stand together, followed by the kind in brackets.

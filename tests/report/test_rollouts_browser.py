@@ -1,10 +1,9 @@
-"""The table of every rollout in a real browser, small and with 100,000 rows. Slow: needs an
+"""The table of every rollout in a real browser. Slow: needs an
 installed Chromium.
 """
 
 from __future__ import annotations
 
-import runpy
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,9 +17,6 @@ from tests.report.browser import Browser
 pytestmark = pytest.mark.slow
 
 ROWS = "[...document.querySelectorAll('#table-rollouts tr[data-row]')]"
-DRAW = Path(__file__).resolve().parents[2] / "docs" / "scripts" / "scale_rows.py"
-LARGE = 100_000
-MOST_BYTES = 15_000_000
 
 
 def opened(browser: Browser, page: Path, width: int = 1400) -> float:
@@ -60,13 +56,6 @@ def choose(browser: Browser, element: str, value: str, event: str) -> None:
 
 def count(browser: Browser) -> str:
     return str(browser.evaluate("document.getElementById('rollouts-count').textContent"))
-
-
-@pytest.fixture(scope="module")
-def large_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("large") / "drawn"
-    runpy.run_path(str(DRAW))["write_drawn_run"](folder, LARGE)
-    return folder
 
 
 def test_rows_sort_filter_and_open(browser: Browser, usual_run: Path) -> None:
@@ -113,44 +102,3 @@ def test_names_that_are_markup_stay_text(browser: Browser, hostile_run: Path) ->
     assert "<img src=x" in "".join(column(browser, "scene"))
     assert browser.evaluate("document.querySelectorAll('#rollouts img').length") == 0
     assert browser.complaints == []
-
-
-def test_a_hundred_thousand_rollouts_load_scroll_sort_and_open(
-    browser: Browser, large_run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    page = write_report(large_run)
-    size = page.stat().st_size
-    assert size < MOST_BYTES
-    took = {"load": opened(browser, page)}
-    assert count(browser) == "100000 rollouts"
-    assert len(column(browser, "seed")) < 100  # drawn where it is looked at
-    for name, expression in {
-        "scroll to the end": "document.getElementById('rollouts-box').scrollTop = 1e9",
-        "sort": "[...document.querySelectorAll('#table-rollouts thead .sort')].find(b => b.textContent === 'lateral_distance_m').click()",
-    }.items():
-        took[name] = browser.evaluate(
-            f"(async () => {{ const began = performance.now(); {expression};"
-            " await new Promise(done => requestAnimationFrame(() => setTimeout(done))); return (performance.now() - began) / 1000; })()"
-        )
-        if name == "scroll to the end":
-            until(lambda: column(browser, "scene")[-1] == "drawn-004999")
-            assert column(browser, "seed")[-1] == "9"
-    shortest = [float(text.split()[0]) for text in column(browser, "lateral_distance_m")]
-    assert shortest == sorted(shortest)
-    began = time.monotonic()
-    choose(browser, "rollouts-words", "drawn-001234 3dgs", "input")
-    took["filter"] = time.monotonic() - began
-    assert count(browser) == "10 of 100000 rollouts"
-    browser.evaluate(f"{ROWS}[3].click()")
-    assert "drawn-001234, 3dgs" in browser.evaluate(
-        "document.querySelector('#rollouts-picked h3').textContent"
-    )
-    choose(browser, "rollouts-words", "", "input")
-    choose(browser, "rollouts-state", "4", "change")
-    assert 300 < int(count(browser).split()[0]) < 700  # half a percent failed
-    assert browser.complaints == []
-    with capsys.disabled():
-        print(
-            f"\n{size / 1e6:.1f} MB; "
-            + ", ".join(f"{name} {seconds:.2f} s" for name, seconds in took.items())
-        )

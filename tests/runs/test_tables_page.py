@@ -1,4 +1,4 @@
-"""The queries of docs/tables.md, run as they stand there and compared with the run's own
+"""The queries of docs/runs.md, run as they stand there and compared with the run's own
 statistics.
 """
 
@@ -45,7 +45,7 @@ def run(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
 def blocks(repo: Path, language: str) -> list[str]:
     return re.findall(
         rf"^```{language}\n(.*?)^```",
-        (repo / "docs" / "tables.md").read_text(encoding="utf-8"),
+        (repo / "docs" / "runs.md").read_text(encoding="utf-8"),
         re.S | re.M,
     )
 

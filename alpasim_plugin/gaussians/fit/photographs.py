@@ -232,7 +232,7 @@ def resized(view: PosedView, width: int) -> PosedView:
 def _frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Return the document, and its frames with what it says for all of them."""
     document = read_json_object(
-        path, do_this=f"give a folder with images and their {FILE} (docs/reconstruction.md)"
+        path, do_this=f"give a folder with images and their {FILE} (docs/renderers.md)"
     )
     frames = as_shape(list[dict[str, Any]], document.get("frames") or [], f"{path}, key 'frames'")
     return document, [{**document, **frame} for frame in frames]
@@ -261,7 +261,7 @@ def _lens(frame: Mapping[str, Any], file: Path, where: str) -> Lens:
             f"{where}: {found}",
             "give OpenCV's k1, k2, p1, p2, k3, or undistort the images first (ns-process-data, colmap image_undistorter)",
         )
-    do = "give w, h, fl_x, fl_y, cx and cy in pixels, and k1, k2, p1, p2 where the lens bends lines (docs/reconstruction.md)"
+    do = "give w, h, fl_x, fl_y, cx and cy in pixels, and k1, k2, p1, p2 where the lens bends lines (docs/renderers.md)"
     try:
         size = (
             (frame["w"], frame["h"])

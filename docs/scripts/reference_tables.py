@@ -1,0 +1,203 @@
+"""Write the tables of options, metrics and scenario keys into docs/cli.md, docs/metrics.md and
+docs/scenario-files.md, from the code.
+
+    python docs/scripts/reference_tables.py [--check]
+
+With ``--check`` nothing is written, and the exit code is 1 where a page is stale.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+import typer
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from alpasim_plugin.cli.main import GROUPS, make_app
+from evaluators.metrics.table import METRICS
+from evaluators.scores.table import BENCHMARKS
+from scenarios.schema import models
+from scenarios.schema_parts import Part
+
+DOCS = Path(__file__).resolve().parents[1]
+EVERY_VERB = ("--json", "--debug", "--help")
+OBSTACLES_UNKNOWN = METRICS["collision_any"].invalid  # long, and of every contact
+TYPES = {float: "number", int: "integer", str: "text", bool: "`true`, `false`"}
+SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table; bars inside of cells are escaped."""
+    lines = [["---"] * len(head), *(tuple(row) for row in rows)]
+    cells = [[str(cell).replace("|", r"\|") for cell in line] for line in lines]
+    return "\n".join(f"|{'|'.join(line)}|" for line in [list(head), *cells]) + "\n"
+
+
+def commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """Yield a command, or the commands of a group, each with its whole name."""
+    if not hasattr(command, "commands"):
+        yield name, command
+        return
+    for word, inner in command.commands.items():
+        yield from commands(inner, f"{name} {word}")
+
+
+def verb_section(name: str, command: Any) -> str:
+    """Return a verb's heading, what it does, and its options."""
+    rows = []
+    for option in command.params:
+        is_argument = option.param_type_name == "argument"
+        names = (
+            [option.metavar or option.name.upper()]
+            if is_argument
+            else [*option.opts, *option.secondary_opts]
+        )
+        if getattr(option, "hidden", False) or set(names) & set(EVERY_VERB):
+            continue
+        rows.append((", ".join(f"`{name}`" for name in names), option.help or ""))
+    text = " ".join((command.help or "").partition("\n\n")[0].split())
+    options = "\n" + table(("option", "meaning"), rows) if rows else ""
+    return f"## {name}\n{text}\n{options}"
+
+
+def cli_tables() -> str:
+    """Return a section for each verb of this package, in the order of the help page."""
+    sections = []
+    for verb in (verb for group in GROUPS.values() for verb in group):
+        app = typer.main.get_command(make_app(verb))
+        found = getattr(app, "commands", {}).get(verb, app)
+        sections += [verb_section(*one) for one in commands(found, f"simrun {verb}")]
+    return "\n".join(sections)
+
+
+def metric_table() -> str:
+    """Return one row for each metric, in the order of reports; metrics that differ in their names
+    alone share a row.
+    """
+    names: dict[tuple[str, ...], list[str]] = {}
+    for name in METRICS.ordered(METRICS):
+        metric = METRICS[name]
+        if name in BENCHMARKS:
+            continue
+        row = (
+            metric.formula or metric.help,
+            metric.reference.removesuffix(", plan view"),
+            metric.unit,
+            {"none": "neither"}.get(metric.direction, metric.direction),
+            metric.aggregation,
+            f"{metric.accepted:g}" if metric.accepted else "",
+            metric.invalid.replace(OBSTACLES_UNKNOWN, "obstacles unknown"),
+        )
+        names.setdefault(row, []).append(f"`{name}`")
+    head = ("metric", "per step", "measured at", "unit", "better", "over a rollout", "accepted")
+    return table((*head, "invalid"), ((", ".join(some), *row) for row, some in names.items()))
+
+
+def score_table() -> str:
+    """Return one row for each score of another benchmark; bounds stand with their score."""
+    bounds = ("_least", "_most")
+    rows = []
+    for name, score in BENCHMARKS.items():
+        if name.endswith(bounds):
+            continue
+        names = [name, *(name + end for end in bounds if name + end in BENCHMARKS)]
+        rows.append((", ".join(f"`{one}`" for one in names), score.formula or score.help))
+    return table(("score or part", "of a rollout"), rows)
+
+
+def type_name(annotation: Any) -> str:
+    """Return the words for a key's type."""
+    origin, options = get_origin(annotation), get_args(annotation)
+    if origin is Literal:
+        return ", ".join(f"`{option}`" for option in options)
+    if hasattr(annotation, "__metadata__"):
+        return type_name(options[0])
+    if origin is dict:
+        return "keys"
+    names = [type_name(option) for option in options if option not in (type(None), Ellipsis)]
+    if origin is tuple:
+        return f"list of {min(names)}" if Ellipsis in options else f"{len(options)} x {min(names)}"
+    if names:
+        return " or ".join(dict.fromkeys(names))
+    if isinstance(annotation, type) and issubclass(annotation, Part):
+        return "section"
+    return TYPES.get(annotation, "any value")
+
+
+def key_row(name: str, field: FieldInfo) -> tuple[str, str, str, str]:
+    """Return a key's name, type with bounds, default and meaning."""
+    bounds = {sign: getattr(item, sign) for item in field.metadata for sign in SIGNS
+              if getattr(item, sign, None) is not None}  # fmt: skip
+    kind = ", ".join(
+        [type_name(field.annotation), *(f"{SIGNS[sign]} {end}" for sign, end in bounds.items())]
+    )
+    if {"ge", "le"} <= bounds.keys():
+        kind = f"{type_name(field.annotation)}, {bounds['ge']}..{bounds['le']}"
+    value = field.default
+    default = f"`{str(value).lower() if isinstance(value, bool) else value}`"
+    if value is PydanticUndefined or value is None or isinstance(value, Part) or value in ("", {}):
+        default = "required" if value is PydanticUndefined else ""
+    elif isinstance(value, tuple):
+        default = f"`[{', '.join(map(str, value))}]`"
+    return f"`{name}`", kind, default, field.description or ""
+
+
+def key_tables() -> str:
+    """Return one table for each section of the schema; keys that several kinds of a list have alike
+    stand in the table of the first one.
+    """
+    sections = []
+    shown: dict[str, set[tuple[str, ...]]] = {}
+    for where, model in models().items():
+        owner, _, kind = where.partition(" kind: ")
+        rows = [key_row(name, field) for name, field in model.model_fields.items()
+                if not (kind and name == "kind")]  # fmt: skip
+        new = [row for row in rows if row not in shown.setdefault(owner, set())]
+        alike = "" if len(new) == len(rows) else " Other keys as above."
+        shown[owner] |= set(rows)
+        summary = " ".join((model.__doc__ or "").partition("\n\n")[0].split())
+        keys = "\n" + table(("key", "type", "default", "meaning"), new) if new else ""
+        sections.append(f"## {f'`{where}`' if where else 'Top level'}\n{summary}{alike}\n{keys}")
+    return "\n".join(sections)
+
+
+def written() -> dict[Path, str]:
+    """Return the pages as they should be."""
+    tables = {
+        "cli.md": {"options": cli_tables()},
+        "metrics.md": {"metrics": metric_table(), "scores": score_table()},
+        "scenario-files.md": {"keys": key_tables()},
+    }
+    pages = {}
+    for page, parts in tables.items():
+        text = (DOCS / page).read_text(encoding="utf-8")
+        for name, content in parts.items():
+            pattern = rf"(<!-- begin {name}\b[^\n]*-->\n).*?(<!-- end {name} -->)"
+            text, found = re.subn(
+                pattern, lambda match, new=content: match[1] + new + match[2], text, flags=re.S
+            )
+            assert found == 1, f"{page} has {found} blocks called {name}"
+        pages[DOCS / page] = text
+    return pages
+
+
+def main() -> None:
+    """Write the pages, or compare them."""
+    stale = {
+        path: text for path, text in written().items() if path.read_text(encoding="utf-8") != text
+    }
+    if "--check" in sys.argv[1:]:
+        for path in stale:
+            print(f"{path} is stale: run docs/scripts/reference_tables.py")
+        sys.exit(1 if stale else 0)
+    for path, text in stale.items():
+        path.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,19 @@
+"""The tables of options, metrics and scenario keys on the pages are those of the code."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+
+def test_the_tables_on_the_pages_are_those_of_the_code(
+    repo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(repo / "docs" / "scripts"))
+    pages = importlib.import_module("reference_tables").written()
+    assert {path.name for path in pages} == {"cli.md", "metrics.md", "scenario-files.md"}
+    for path, text in pages.items():
+        stale = f"{path.name} is stale: run python docs/scripts/reference_tables.py"
+        assert path.read_text(encoding="utf-8") == text, stale
