@@ -20,7 +20,7 @@ STEP = re.compile(r"^\s*- run: (.*)$", re.M)
 NO_COMMAND = (
     r"──",  # a picture of the order of commands
     r"^view$|^gate --gate default$",
-    r"--(repeat|from|shard|vary)\b",
+    r"--(repeat|from|vary)\b",
     r"^check (policy|driver|run|renderer)|^serve --policy|^list runs",
 )
 NOT_RUN: tuple[tuple[str, str], ...] = (  # the first rule that fits counts
