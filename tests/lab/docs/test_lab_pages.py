@@ -59,6 +59,7 @@ def test_files_and_modules_that_pages_name_exist(repo: Path, everywhere: list[Pa
 
 def test_every_command_is_understood_and_needs_no_checkout(repo: Path) -> None:
     every = commands(repo, [*pages(repo), *lab_pages(repo)])
+    every = [one for one in every if "docs/experiments" not in one.page]  # of an older commit
     assert not_understood([one for one in every if one.is_of_lab or one.page.startswith(LAB)]) == []
     assert sum(one.is_of_lab for one in every) > 20
     assert needing_the_checkout(lab_pages(repo)) == []
