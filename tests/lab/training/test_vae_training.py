@@ -36,9 +36,9 @@ def test_a_draw_repeats_and_its_channels_belong_together(tmp_path: Path) -> None
 
 
 def test_clip_larger_than_the_frames_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no room"):
+    with pytest.raises(InputError):
         draw_pair_clip([make(tmp_path)], CropSize(5, 64, 64), 0, 0)
-    with pytest.raises(InputError, match="no room"):
+    with pytest.raises(InputError):
         draw_video_clip([np.zeros((4, 32, 48, 3), np.uint8)], SIZE, 0, 0)
 
 

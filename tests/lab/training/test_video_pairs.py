@@ -109,7 +109,7 @@ def test_parts_of_a_video_do_not_meet() -> None:
         parts = split_frames(count, VideoRecipe())
         assert parts[TRAIN].stop < parts[HELD_OUT].start
         assert parts[HELD_OUT].stop == count
-    with pytest.raises(InputError, match="a part without frames"):
+    with pytest.raises(InputError):
         split_frames(1, VideoRecipe())
 
 

@@ -66,5 +66,5 @@ def test_late_window_is_the_last_third_but_at_least_thirty(pairs: int, first: in
 
 
 def test_one_frame_has_no_motion_to_follow() -> None:
-    with pytest.raises(EvaluatorError, match="one frame"):
+    with pytest.raises(EvaluatorError):
         warp_l1(texture(32, 32)[None])
