@@ -138,7 +138,7 @@ def gather_and_mix() -> None:
     CPU.gather_references(references, image, 1)
     at2, at4 = image[:, ::DETAIL, ::DETAIL], image[:, ::CELL, ::CELL]
     heads = at2[:, None, ..., :1].repeat(1, 1, 1, 1, 18)
-    weight, offset, correction = heads.split([4, 2, 12], dim=-1)
+    weight, offset, correction = heads.split([4, 2, 12], dim=-1)  # type: ignore[no-untyped-call]
     moved = CPU.offsets(offset[:, 0], at4[..., :2])[:, None]
     CPU.likeness(at4, at4)
     CPU.blend(image, references, BlendHeads(weight, moved, correction), 1)

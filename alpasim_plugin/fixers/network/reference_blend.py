@@ -285,7 +285,7 @@ def gather_references(references: Tensor, render: Tensor, scale: int = 1) -> Ref
         scale: References are averaged over squares of so many pixels.
     """
     b, k = references.shape[:2]
-    seen = smaller(in_floats(references).flatten(0, 1), scale).unflatten(0, (b, k))
+    seen = smaller(in_floats(references).flatten(0, 1), scale).unflatten(0, (b, k))  # type: ignore[no-untyped-call]
     holds = seen[..., 3:]
     each = torch.cat([(seen[..., :3] - render[:, None]) * holds, holds], dim=-1)
     mean, flat = each.mean(dim=1), each.flatten(0, 1)
