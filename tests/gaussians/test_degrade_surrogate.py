@@ -204,7 +204,7 @@ def test_severity_scales_the_faults() -> None:
 
 def test_degraded_clouds_can_be_drawn_even_at_high_severity() -> None:
     for w in (0.0, 1.0):
-        degraded(w, 3.0).require_drawable("test")
+        degraded(w, 3.0).require_drawable()
 
 
 def test_same_reconstruction_for_every_rollout_and_another_for_another_scene_seed() -> None:
