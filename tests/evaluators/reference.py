@@ -14,8 +14,8 @@ from alpasim_plugin.core.geometry import arc_lengths, interpolate, rectangle_cor
 from alpasim_plugin.core.types import F64, RolloutLog
 from evaluators.metrics.footprint import origin_of
 from evaluators.metrics.presets import PRESETS, Preset
-from evaluators.metrics.reference import actor_corners, exact, point_to_segment, sides_of, touch
 from evaluators.metrics.route import moving, recorded_path
+from tests.evaluators.reference_rules import actor_corners, exact, point_to_segment, sides_of, touch
 
 
 def convex_contains(ring: F64, body: F64) -> bool:

@@ -18,7 +18,7 @@ from itertools import pairwise
 import numpy as np
 
 from alpasim_plugin.core.types import F64
-from evaluators.metrics.reference import point_to_segment
+from tests.evaluators.reference_rules import point_to_segment
 
 _C = Context(prec=40)
 _TWO_PI = Decimal("6.283185307179586476925286766559005768394338798750")

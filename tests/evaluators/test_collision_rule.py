@@ -16,8 +16,8 @@ from alpasim_plugin.core.types import Box
 from evaluators import PRESETS, score
 from evaluators.metrics.contact import FRONT, LATERAL, REAR, find_contacts
 from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
-from evaluators.metrics.reference import contacts_by_step
 from tests.evaluators.eval_build import CAR, TWO_LANES, by_name, car, rollout, scene, track
+from tests.evaluators.reference_rules import contacts_by_step
 from tests.examples import examples
 
 PAPER = PRESETS["paper"]

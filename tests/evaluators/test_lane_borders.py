@@ -11,9 +11,9 @@ from alpasim_plugin.core.types import Lane
 from evaluators import PRESETS
 from evaluators.metrics.footprint import ego_footprints, origin_of
 from evaluators.metrics.offroad import containment
-from evaluators.metrics.reference import road_by_step
 from evaluators.metrics.road import Road
 from tests.evaluators.eval_build import lane, road_map, rollout, scene, track
+from tests.evaluators.reference_rules import road_by_step
 from tests.examples import examples
 
 PAPER = PRESETS["paper"]

@@ -16,10 +16,10 @@ from alpasim_plugin.core.types import Lane
 from evaluators import PRESETS, rollout_values, score
 from evaluators.metrics.footprint import ego_footprints, origin_of
 from evaluators.metrics.offroad import containment
-from evaluators.metrics.reference import ego_corners, road_by_step
 from evaluators.metrics.road import road_of
 from tests.evaluators.eval_build import TWO_LANES, by_name, lane, road_map, rollout, scene, track
 from tests.evaluators.reference import convex_contains
+from tests.evaluators.reference_rules import ego_corners, road_by_step
 from tests.examples import examples
 
 PAPER = PRESETS["paper"]

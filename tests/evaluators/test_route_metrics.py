@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluators import rollout_values, score
-from evaluators.metrics.reference import point_to_segment
 from evaluators.metrics.route import beside, moving, progress_so_far, to_path
 from tests.evaluators.eval_build import TWO_LANES, by_name, rollout, scene, track
 from tests.evaluators.reference import route_by_step
+from tests.evaluators.reference_rules import point_to_segment
 from tests.examples import examples
 
 

@@ -20,8 +20,8 @@ from evaluators import PRESETS, reduce_rollout, score
 from evaluators.metrics.collision import SIDES, contact_events
 from evaluators.metrics.contact import PLACE_M, find_contacts, find_swept
 from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
-from evaluators.metrics.reference import contacts_by_step
 from tests.evaluators.eval_build import CAR, TWO_LANES, by_name, car, rollout, scene, track
+from tests.evaluators.reference_rules import contacts_by_step
 from tests.evaluators.reference_strict import Motion, first_touch, side_at
 from tests.examples import examples
 

@@ -20,9 +20,6 @@ import shapely
 
 from alpasim_plugin.core.geometry import (
     interpolate,
-    inverse,
-    offset_trajectory,
-    quat_from_yaw,
     rectangle_corners,
     yaw_from_quat,
     yaw_of,
@@ -31,20 +28,14 @@ from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import (
     F64,
     Actor,
-    Box,
     Lane,
-    LaneMap,
     RolloutLog,
     Scene,
-    Trajectory,
-    Vehicle,
 )
 from evaluators.metrics.footprint import origin_of
 from evaluators.metrics.presets import Preset
 
 Point = tuple[Fraction, Fraction]
-STEP_US = 100_000
-LANE_M = 3.5
 
 
 # --- contact
@@ -248,62 +239,3 @@ def _touches(edge: F64, body: Any, z: float, preset: Preset) -> bool:
         ):
             return True
     return False
-
-
-# --- a drive to try both on
-
-
-def busy_road(n_actors: int, n_steps: int) -> tuple[RolloutLog, Scene]:
-    """Return a drive that weaves along and off a winding four-lane road, with others everywhere on
-    and beside it. Always the same.
-    """
-    rng = np.random.Generator(np.random.Philox(1))
-    s = np.cumsum(rng.uniform(0.5, 1.5, n_steps))
-    lane_map = winding_road(float(s[-1]) + 50.0)
-    ego = _along(s, 8.0 * np.sin(s / 40.0) + 1.75, rng.uniform(-0.05, 0.05, n_steps))
-    others = []
-    for k in range(n_actors):
-        at = rng.uniform(0, s[-1]) + np.cumsum(rng.uniform(-1, 2, n_steps))
-        track = _along(at, np.full(n_steps, rng.uniform(-12, 12)), rng.uniform(-3, 3, n_steps))
-        others.append(Actor(f"a{k}", "car", Box(4.5, 1.8, 1.5), track))
-    vehicle = Vehicle()
-    T_rig_box = np.eye(4)
-    T_rig_box[:3, 3] = [vehicle.rear_axle_to_centre_m, 0.0, vehicle.box.height_m / 2]
-    recorded = offset_trajectory(ego, inverse(T_rig_box))
-    by_id = {one.actor_id: one for one in others}
-    log = RolloutLog(
-        "bench", "bench", vehicle.box, T_rig_box, ego, by_id, (), (), recorded, 0, 0, 0, STEP_US
-    )
-    return log, Scene("bench", lane_map, recorded, vehicle)
-
-
-def winding_road(length_m: float) -> LaneMap:
-    """Return four lanes in pieces of about 40 m along a sine, with road edges."""
-    lanes = {}
-    s = np.arange(-50.0, length_m, 2.0)
-    for k in range(4):
-        y = (k - 1) * LANE_M
-        for i in range(0, len(s) - 1, 20):
-            piece = s[i : i + 21]
-            line = {
-                side: _along(piece, np.full(len(piece), y + d), np.zeros(len(piece))).xyz
-                for side, d in _OFFSETS.items()
-            }
-            lanes[f"l{k}-{i}"] = Lane(f"l{k}-{i}", line["centre"], line["left"], line["right"])
-    edges = tuple(
-        _along(s, np.full(len(s), y), np.zeros(len(s))).xyz for y in (-1.5 * LANE_M, 2.5 * LANE_M)
-    )
-    return LaneMap(lanes, edges)
-
-
-_OFFSETS = {"centre": 0.0, "left": LANE_M / 2, "right": -LANE_M / 2}
-
-
-def _along(s: F64, y: F64, yaw: F64) -> Trajectory:
-    """Return poses at lengths along and offsets from a sine of 300 m, 0.1 s apart."""
-    bend = 15.0 * np.sin(s * 2 * np.pi / 300.0)
-    heading = np.arctan(15.0 * 2 * np.pi / 300.0 * np.cos(s * 2 * np.pi / 300.0))
-    xyz = np.stack([s - y * np.sin(heading), bend + y * np.cos(heading), np.zeros(len(s))], axis=1)
-    return Trajectory(
-        np.arange(len(s), dtype=np.int64) * STEP_US, xyz, quat_from_yaw(heading + yaw)
-    )
