@@ -44,5 +44,5 @@ def read_so_far(root: Path) -> RunSoFar[Run]:
     """Read a run folder that may still be written; see
     `alpasim_plugin.log.run_folder.reader.read_so_far`.
     """
-    found = reader.read_so_far(root)
-    return RunSoFar(Run.of(found.run), found.planned, found.damage, found.finished)
+    progress = reader.read_so_far(root)
+    return RunSoFar(Run.of(progress.run), progress.planned, progress.damage, progress.finished)

@@ -55,7 +55,7 @@ class ReducedRollout:
     @property
     def values(self) -> dict[str, float | None]:
         """Return the value of every metric."""
-        return {name: one.value for name, one in self.reduction.values.items()}
+        return {name: value.value for name, value in self.reduction.values.items()}
 
 
 def reduce_run(rollouts: Sequence[ScoredRollout], preset: Preset) -> list[ReducedRollout]:
@@ -69,7 +69,11 @@ def reduce_run(rollouts: Sequence[ScoredRollout], preset: Preset) -> list[Reduce
         EvaluatorError: No rollout has a camera image: AlpaSim's aggregation needs the black-image
             test in at least one.
     """
-    names = {one.name: one.metric for rollout in rollouts for one in rollout.series}
+    names = {
+        metric_series.name: metric_series.metric
+        for rollout in rollouts
+        for metric_series in rollout.series
+    }
     if rollouts and "img_is_black" not in names:
         raise EvaluatorError(
             f"{len(rollouts)} rollouts: no image of camera {preset.image_camera!r} in any log",
@@ -81,8 +85,12 @@ def reduce_run(rollouts: Sequence[ScoredRollout], preset: Preset) -> list[Reduce
 def _reduce(
     rollout: ScoredRollout, names: Mapping[str, MetricInfo], preset: Preset
 ) -> ReducedRollout:
-    own = {one.name for one in rollout.series}
-    line = next(one.t_us for one in rollout.series if one.name == "eval_relevant")
+    own = {metric_series.name for metric_series in rollout.series}
+    line = next(
+        metric_series.t_us
+        for metric_series in rollout.series
+        if metric_series.name == "eval_relevant"
+    )
     added = []
     if "offroad" not in own:
         known = "offroad" not in names
@@ -122,7 +130,9 @@ def over_sweeps(rollouts: Sequence[ReducedRollout]) -> dict[str, float | int | N
     """
     ranks = _ranks(rollouts)
     kept = [
-        (rank, one.values) for rank, one in zip(ranks, rollouts, strict=True) if not one.dropped
+        (rank, rollout.values)
+        for rank, rollout in zip(ranks, rollouts, strict=True)
+        if not rollout.dropped
     ]
     if not kept:
         return {}
@@ -143,8 +153,8 @@ def over_sweeps(rollouts: Sequence[ReducedRollout]) -> dict[str, float | int | N
 def _ranks(rollouts: Sequence[ReducedRollout]) -> list[int]:
     """Return each rollout's rank among the names of its scene, dropped ones included."""
     names: dict[str, list[str]] = {}
-    for one in rollouts:
-        names.setdefault(one.of.scene, []).append(one.of.rollout)
+    for rollout in rollouts:
+        names.setdefault(rollout.of.scene, []).append(rollout.of.rollout)
     for scene, own in names.items():
         twice = next((name for name in own if own.count(name) > 1), None)
         if twice is not None:
@@ -153,7 +163,7 @@ def _ranks(rollouts: Sequence[ReducedRollout]) -> list[int]:
                 "score the runs apart, or rename the folder of one log",
             )
         own.sort()
-    return [names[one.of.scene].index(one.of.rollout) for one in rollouts]
+    return [names[rollout.of.scene].index(rollout.of.rollout) for rollout in rollouts]
 
 
 def _sweep(rows: Sequence[dict[str, float | None]]) -> dict[str, float | None]:
@@ -201,7 +211,7 @@ def scene_score(values: Mapping[str, float | None], settings: SceneScoreSettings
     Raises:
         EvaluatorError: A metric that is needed is missing or not finite; AlpaSim stops there too.
     """
-    found: dict[str, float] = {}
+    scores: dict[str, float] = {}
     faults = (
         LATER_FAULTS if LATER_FAULTS[-1] in values else FAULTS
     )  # only a preset that has the rule has the metric
@@ -209,21 +219,21 @@ def scene_score(values: Mapping[str, float | None], settings: SceneScoreSettings
     for name in needed:
         value = values.get(name)
         if name not in values or value is None or not np.isfinite(value):
-            what = (
+            kind = (
                 f"missing metric {name!r}" if name not in values else f"metric {name!r} is {value}"
             )
             raise EvaluatorError(
-                f"metrics {', '.join(needed)}: {what}",
+                f"metrics {', '.join(needed)}: {kind}",
                 "give the scene a map with road edges, or set scene_score.enabled: false in --settings",
             )
-        found[name] = float(value)
+        scores[name] = float(value)
     progress = min(
-        min(max(found["progress_clipped_rel"], 0.0), 1.0) / settings.progress_saturation_threshold,
+        min(max(scores["progress_clipped_rel"], 0.0), 1.0) / settings.progress_saturation_threshold,
         1.0,
     )
-    if found["gt_dist_traveled_m"] < settings.min_gt_distance_for_full_score_m:
+    if scores["gt_dist_traveled_m"] < settings.min_gt_distance_for_full_score_m:
         progress = 1.0
-    reason = next((name for name in faults if found[name] != 0.0), None)
+    reason = next((name for name in faults if scores[name] != 0.0), None)
     return SceneScore(0.0 if reason else progress, progress, reason)
 
 
@@ -242,7 +252,7 @@ LATER_SCORE_METRICS = (*SCORE_METRICS, "lateral_dist_to_gt_trajectory", "left_co
 
 def combined_run_uuid(rollouts: Sequence[ScoredRollout]) -> str:
     """Return the id under which runs are put together: the SHA-256 of their sorted ids."""
-    ids = sorted({one.run_uuid for one in rollouts if one.run_uuid is not None})
+    ids = sorted({rollout.run_uuid for rollout in rollouts if rollout.run_uuid is not None})
     return hashlib.sha256("\x1f".join(ids).encode()).hexdigest()
 
 
@@ -257,13 +267,13 @@ def metrics_unprocessed_table(rollouts: Sequence[ScoredRollout]) -> pa.Table:
         name: [] for name in ("clipgt_id", "rollout_id", "run_uuid", "run_name")
     }
     for rollout in rollouts:
-        for one in rollout.series:
-            n = max(len(one.t_us), 1)
-            columns["name"] += [one.name] * n
-            columns["timestamps_us"] += one.t_us.tolist() or [None]
-            columns["values"] += one.value.tolist() or [None]
-            columns["valid"] += one.valid.tolist() or [None]
-            columns["time_aggregation"] += [one.metric.aggregation] * n
+        for metric_series in rollout.series:
+            n = max(len(metric_series.t_us), 1)
+            columns["name"] += [metric_series.name] * n
+            columns["timestamps_us"] += metric_series.t_us.tolist() or [None]
+            columns["values"] += metric_series.value.tolist() or [None]
+            columns["valid"] += metric_series.valid.tolist() or [None]
+            columns["time_aggregation"] += [metric_series.metric.aggregation] * n
             for name, value in zip(
                 ids,
                 (rollout.scene, rollout.rollout, rollout.run_uuid, rollout.run_name),
@@ -313,13 +323,13 @@ def results_summary(
         sweeps: What `over_sweeps` gave.
         settings: Of the scene score.
     """
-    run_uuid = combined_run_uuid([one.of for one in rollouts])
-    later = any("left_corridor_laterally" in one.values for one in rollouts)
+    run_uuid = combined_run_uuid([rollout.of for rollout in rollouts])
+    later = any("left_corridor_laterally" in rollout.values for rollout in rollouts)
     shown = LATER_SCORE_METRICS if later else SCORE_METRICS
-    counted = [(i, one) for i, one in enumerate(rollouts) if not one.dropped]
+    counted = [(i, rollout) for i, rollout in enumerate(rollouts) if not rollout.dropped]
     entries = [
-        _entry(one, scores.get(i), run_uuid, shown)
-        for i, one in sorted(counted, key=lambda item: (item[1].of.scene, item[1].of.rollout))
+        _entry(rollout, scores.get(i), run_uuid, shown)
+        for i, rollout in sorted(counted, key=lambda item: (item[1].of.scene, item[1].of.rollout))
     ]
     for failure in failed:
         ids = {key: failure.get(key) for key in ("run_uuid", "run_name", "clipgt_id", "rollout_id")}
@@ -363,15 +373,15 @@ def results_summary(
 
 
 def _entry(
-    one: ReducedRollout, score: SceneScore | None, run_uuid: str, shown: Sequence[str]
+    rollout: ReducedRollout, score: SceneScore | None, run_uuid: str, shown: Sequence[str]
 ) -> dict[str, Any]:
     ids = {
         "run_uuid": run_uuid,
-        "run_name": one.of.run_name,
-        "clipgt_id": one.of.scene,
-        "rollout_id": one.of.rollout,
+        "run_name": rollout.of.run_name,
+        "clipgt_id": rollout.of.scene,
+        "rollout_id": rollout.of.rollout,
     }
-    values = {name: _number(value) for name, value in one.values.items()}
+    values = {name: _number(value) for name, value in rollout.values.items()}
     status = "unscored" if score is None else "pass" if score.passed else "fail"
     own = {} if score is None else {"progress_score": score.progress_score}
     return ids | {

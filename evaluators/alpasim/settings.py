@@ -99,19 +99,19 @@ class EvalSettings(_Part):
 
     def preset(self, version: Preset = ALPASIM) -> Preset:
         """Return the preset of a version of AlpaSim with these settings."""
-        one = self.scorers
+        scorers = self.scorers
         return replace(
             version,
             shrink=self.vehicle.vehicle_shrink_factor,
             roundness=self.vehicle.vehicle_corner_roundness,
             stop_beyond_gt_m=self.aggregation_modifiers.max_dist_to_gt_trajectory,
-            open_loop_horizon_us=round(one.open_loop_collision.horizon_s * 1e6),
-            plan_decay=one.plan_deviation.avg_decay_rate,
-            plan_with_z=one.plan_deviation.incl_z,
-            min_ade_horizons_s=one.min_ade.time_deltas,
-            min_ade_with_z=one.min_ade.incl_z,
-            min_ade_target="gt" if one.min_ade.target == "GT" else "self",
-            image_camera=one.image.camera_logical_id,
+            open_loop_horizon_us=round(scorers.open_loop_collision.horizon_s * 1e6),
+            plan_decay=scorers.plan_deviation.avg_decay_rate,
+            plan_with_z=scorers.plan_deviation.incl_z,
+            min_ade_horizons_s=scorers.min_ade.time_deltas,
+            min_ade_with_z=scorers.min_ade.incl_z,
+            min_ade_target="gt" if scorers.min_ade.target == "GT" else "self",
+            image_camera=scorers.image.camera_logical_id,
         )
 
 

@@ -115,15 +115,15 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
     front = touched[FRONT]
     rear = touched[REAR]
     lateral = touched[LATERAL]
-    there = np.isfinite(gap_m)
+    is_present = np.isfinite(gap_m)
 
     def flag(name: str, fired: Bool) -> MetricSeries:
         return series(name, t_us, fired, fired | (scene.standing != "unknown"), NOT_LOOKED_FOR)
 
     gap_known, why = (
-        (there, "no other actor is present")
+        (is_present, "no other actor is present")
         if scene.standing != "unknown"
-        else (there & (gap_m == 0), NOT_LOOKED_FOR)
+        else (is_present & (gap_m == 0), NOT_LOOKED_FOR)
     )
     return [
         flag("collision_any", front | rear | lateral),
@@ -154,7 +154,11 @@ def _standing(actors: ActorTable, actor: I64, step: I64, count: int) -> Bool:
     """
     touched = np.zeros(count, dtype=np.bool_)
     touched[
-        [k for k, one in zip(step, actor, strict=True) if actors.ids[one].startswith(STANDING_ID)]
+        [
+            k
+            for k, index in zip(step, actor, strict=True)
+            if actors.ids[index].startswith(STANDING_ID)
+        ]
     ] = True
     return touched
 

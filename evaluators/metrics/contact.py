@@ -66,16 +66,18 @@ def find_contacts(ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[Conta
     none = np.zeros(0, dtype=np.int64)
     if len(actors) == 0:
         return Contacts(none, none, none), gap_m
-    there = actors.at(t_us)
-    centre_m = there.centre_distance_m(ego.xy)  # (A, T)
+    actors_at = actors.at(t_us)
+    centre_m = actors_at.centre_distance_m(ego.xy)  # (A, T)
     at_least = centre_m - ego.radius_m[None] - actors.radius_m[:, None]
     at_most = centre_m - ego.inner_radius_m[None] - actors.inner_radius_m[:, None]
     # The nearest footprint is among those that could be as near as the surest one; every touching
     # one is among them too.
-    candidate = there.present & (at_least <= np.maximum(at_most.min(axis=0), 0.0)[None] + _SLACK_M)
+    candidate = actors_at.present & (
+        at_least <= np.maximum(at_most.min(axis=0), 0.0)[None] + _SLACK_M
+    )
     step, actor = np.nonzero(candidate.T)
     ego_shapes = ego.shapes()
-    boxes = there.footprints(actor, step).shapes()
+    boxes = actors_at.footprints(actor, step).shapes()
     distance_m = shapely.distance(ego_shapes[step], boxes)
     np.minimum.at(gap_m, step, distance_m)
     # Distance 0 and "intersects" may differ by rounding; the predicate is exact and decides, and
@@ -102,13 +104,13 @@ def last_per_step(contacts: Contacts, ego: Footprints, actors: ActorTable, t_us:
     same way here, for the steps with more than one contact.
     """
     keep = np.ones(len(contacts.step), dtype=np.bool_)
-    there = actors.at(t_us)
+    actors_at = actors.at(t_us)
     for step in np.flatnonzero(np.bincount(contacts.step, minlength=len(t_us)) > 1):
-        present = np.flatnonzero(there.present[:, step])
+        present = np.flatnonzero(actors_at.present[:, step])
         shapes = np.concatenate(
             [
                 ego.take(np.array([step])).shapes(),
-                there.footprints(present, np.full(len(present), step)).shapes(),
+                actors_at.footprints(present, np.full(len(present), step)).shapes(),
             ]
         )
         order = [
@@ -172,29 +174,29 @@ def find_swept(
     """
     touch = np.zeros((len(actors), len(t_us)), dtype=np.bool_)
     touch[at_steps.actor, at_steps.step] = True
-    found = _between(ego, actors, t_us, touch)
-    forced = (found.t_s < (handover_us - t_us[0]) * 1e-6) & (
-        t_us[np.minimum(found.interval + 1, len(t_us) - 1)] >= handover_us
+    between = _between(ego, actors, t_us, touch)
+    forced = (between.t_s < (handover_us - t_us[0]) * 1e-6) & (
+        t_us[np.minimum(between.interval + 1, len(t_us) - 1)] >= handover_us
     )
-    row = np.where(forced, found.interval, found.interval + 1)
+    row = np.where(forced, between.interval, between.interval + 1)
     began = np.zeros_like(touch)
-    began[found.actor, np.minimum(found.interval + 1, len(t_us) - 1)] = True
+    began[between.actor, np.minimum(between.interval + 1, len(t_us) - 1)] = True
     before = np.zeros_like(touch)
     before[:, 1:] = touch[:, :-1]
     fresh = np.flatnonzero(~(before | began)[at_steps.actor, at_steps.step])
-    onsets, order = _onsets(found, at_steps, fresh, ego, actors, t_us)
+    onsets, order = _onsets(between, at_steps, fresh, ego, actors, t_us)
     place_of = np.empty(len(order), dtype=np.int64)
     place_of[order] = np.arange(len(order))
     # Rows with contact at their own time follow the latest beginning of that actor; the others are
     # the beginning's own row.
     span = (t_us[-1] - t_us[0]) * 1e-6 + 1.0
     keys = onsets.actor * span + onsets.t_s
-    at = at_steps.actor * span + (t_us[at_steps.step] - t_us[0]) * 1e-6
-    latest = np.searchsorted(keys, at + _SLACK_S, side="right") - 1
-    alone = np.flatnonzero(~touch[found.actor, row])
+    times = at_steps.actor * span + (t_us[at_steps.step] - t_us[0]) * 1e-6
+    latest = np.searchsorted(keys, times + _SLACK_S, side="right") - 1
+    alone = np.flatnonzero(~touch[between.actor, row])
     step, actor = (
         np.concatenate([at_steps.step, row[alone]]),
-        np.concatenate([at_steps.actor, found.actor[alone]]),
+        np.concatenate([at_steps.actor, between.actor[alone]]),
     )
     begin = np.concatenate([latest, place_of[alone]])
     rank = np.lexsort((actor, step))
@@ -202,7 +204,7 @@ def find_swept(
 
 
 def _onsets(
-    found: _Found, at_steps: Contacts, fresh: I64, ego: Footprints, actors: ActorTable, t_us: I64
+    between: _Found, at_steps: Contacts, fresh: I64, ego: Footprints, actors: ActorTable, t_us: I64
 ) -> tuple[ContactOnsets, I64]:
     """Join contacts found between steps with those that are there at once; also return how they
     were sorted (found ones first).
@@ -210,16 +212,18 @@ def _onsets(
     step, actor = at_steps.step[fresh], at_steps.actor[fresh]
     boxes = actors.boxes(actor, t_us[step])
     still = np.zeros((len(fresh), 2))
-    here = ego.take(step)
-    half = np.stack([here.size, boxes.size], axis=1) / 2
-    pairs = Motions(boxes.xy - here.xy, still, np.stack([here.yaw, boxes.yaw], axis=1), still, half)
+    bodies = ego.take(step)
+    half = np.stack([bodies.size, boxes.size], axis=1) / 2
+    pairs = Motions(
+        boxes.xy - bodies.xy, still, np.stack([bodies.yaw, boxes.yaw], axis=1), still, half
+    )
     at_once, xy = _place(pairs, np.zeros(len(fresh)))
-    who = np.concatenate([found.actor, actor])
-    t_s = np.concatenate([found.t_s, (t_us[step] - t_us[0]) * 1e-6])
-    side = np.concatenate([found.side, at_once])
+    who = np.concatenate([between.actor, actor])
+    t_s = np.concatenate([between.t_s, (t_us[step] - t_us[0]) * 1e-6])
+    side = np.concatenate([between.side, at_once])
     order = np.lexsort((t_s, who))
     return ContactOnsets(
-        who[order], t_s[order], side[order], np.concatenate([found.xy, xy])[order]
+        who[order], t_s[order], side[order], np.concatenate([between.xy, xy])[order]
     ), order
 
 
@@ -254,7 +258,7 @@ def near_in_time(ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[I64, I
         for a in range(len(actors))
     ]
     owner = np.repeat(np.arange(len(actors)), [len(low) for low, _ in boxes])
-    low, high = (np.concatenate([one[k] for one in boxes]) for k in (0, 1))
+    low, high = (np.concatenate([corners[k] for corners in boxes]) for k in (0, 1))
     tree = index.Index((np.arange(len(owner)), low, high), properties=index.Property(dimension=3))
     ego_low, ego_high = _stretches(ego.xy, t_us - t_us[0], float(ego.radius_m.max()) + _SLACK_M)
     ids, counts = tree.intersection_v(ego_low, ego_high)
@@ -287,13 +291,13 @@ def _pieces(actors: ActorTable, actor: I64, begin: I64, end: I64) -> tuple[I64, 
     start = []
     stop = []
     for a in np.unique(actor):
-        mine = np.flatnonzero(actor == a)
+        rows = np.flatnonzero(actor == a)
         logged = actors.times_of(int(a))
-        first, last = np.maximum(begin[mine], logged[0]), np.minimum(end[mine], logged[-1])
+        first, last = np.maximum(begin[rows], logged[0]), np.minimum(end[rows], logged[-1])
         # An interval that only meets the presence at one of its own ends is decided there, at the
         # step.
-        inside = (first < last) | ((first == last) & (first > begin[mine]) & (first < end[mine]))
-        mine = mine[inside]
+        inside = (first < last) | ((first == last) & (first > begin[rows]) & (first < end[rows]))
+        rows = rows[inside]
         first = first[inside]
         last = last[inside]
         low, high = (
@@ -301,10 +305,10 @@ def _pieces(actors: ActorTable, actor: I64, begin: I64, end: I64) -> tuple[I64, 
             np.searchsorted(logged, last, side="left"),
         )
         n = np.maximum(high - low, 0) + 1
-        row = np.repeat(np.arange(len(mine)), n)
+        row = np.repeat(np.arange(len(rows)), n)
         k = np.arange(len(row)) - np.repeat(np.cumsum(n) - n, n)
         knot = np.minimum(low[row] + k, len(logged) - 1)
-        pair.append(mine[row])
+        pair.append(rows[row])
         start.append(np.where(k == 0, first[row], logged[knot - 1]))
         stop.append(np.where(k == n[row] - 1, last[row], logged[knot]))
     none = [np.zeros(0, dtype=np.int64)]
@@ -343,10 +347,12 @@ def _place(pairs: Motions, tau: F64) -> tuple[I64, F64]:
     """Return side ``(M,)`` and place ``(M, 2)`` of touching pairs: the middle of what they share,
     in the ego's box frame.
     """
-    at = pairs.start + tau[:, None] * pairs.shift
+    center = pairs.start + tau[:, None] * pairs.shift
     yaw = pairs.yaw + tau[:, None] * pairs.turn
     c, s = np.cos(yaw[:, 0]), np.sin(yaw[:, 0])
-    seen = np.stack([c * at[:, 0] + s * at[:, 1], c * at[:, 1] - s * at[:, 0]], axis=1)
+    seen = np.stack(
+        [c * center[:, 0] + s * center[:, 1], c * center[:, 1] - s * center[:, 0]], axis=1
+    )
     half = pairs.half[:, 0]
     flat = np.zeros(len(tau))
     own = shapely.polygons(rectangle_corners(np.zeros_like(half), flat, 2 * (half + PLACE_M)))
@@ -362,12 +368,12 @@ def _sides(pairs: Motions, tau: F64) -> I64:
     turned = pairs.yaw[:, 1] - pairs.yaw[:, 0] + tau * (pairs.turn[:, 1] - pairs.turn[:, 0])
     c = np.cos(turned)
     s = np.sin(turned)
-    one = np.ones(len(tau))
+    ones = np.ones(len(tau))
     zero = np.zeros(len(tau))
     # Forward and left part of the directions that `gaps` looks along, ego's first; odd columns look
     # the other way.
-    forward = np.repeat(np.stack([one, zero, c, -s], axis=1), 2, axis=1) * np.tile([1.0, -1.0], 4)
-    left = np.repeat(np.stack([zero, one, s, c], axis=1), 2, axis=1)
+    forward = np.repeat(np.stack([ones, zero, c, -s], axis=1), 2, axis=1) * np.tile([1.0, -1.0], 4)
+    left = np.repeat(np.stack([zero, ones, s, c], axis=1), 2, axis=1)
     normal = gap >= gap.max(axis=1, keepdims=True) - PLACE_M
     along = np.abs(forward) >= np.abs(left)
     front, rear = (np.any(normal & along & (forward * sign > 0), axis=1) for sign in (1, -1))

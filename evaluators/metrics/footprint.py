@@ -127,8 +127,8 @@ class Footprints:
         """Return front and rear bumpers ``(N,)``: segments; with rounded corners the footprint's
         part within a corner radius of them.
         """
-        at = self.corners()
-        front, rear = shapely.linestrings(at[:, 0:2]), shapely.linestrings(at[:, 2:4])
+        corners = self.corners()
+        front, rear = shapely.linestrings(corners[:, 0:2]), shapely.linestrings(corners[:, 2:4])
         r = self._corner_radius_m()
         if r is None:
             return front, rear
@@ -198,8 +198,8 @@ class ActorTable:
         """Return the boxes ``(M,)`` of actors at times ``(M,)`` at which they are present."""
         row, fraction = np.zeros(len(actor), dtype=np.int64), np.zeros(len(actor))
         for a in np.unique(actor):
-            mine = np.flatnonzero(actor == a)
-            row[mine], fraction[mine], _ = self._locate(int(a), t_us[mine])
+            rows = np.flatnonzero(actor == a)
+            row[rows], fraction[rows], _ = self._locate(int(a), t_us[rows])
         return self.boxes_at(actor, row, fraction)
 
     def boxes_at(self, actor: I64, row: I64, fraction: F64) -> Footprints:

@@ -63,8 +63,8 @@ def frozen_times(images: Sequence[LoggedImage], rollout: RolloutLog) -> set[int]
     though the ego moved more than 0.1 m.
     """
     before: dict[str, LoggedImage] = {}
-    found: set[int] = set()
-    for image in sorted(images, key=lambda one: one.end_us):
+    frozen: set[int] = set()
+    for image in sorted(images, key=lambda picture: picture.end_us):
         last = before.get(image.camera)
         if last is None or last.data != image.data:
             before[image.camera] = image
@@ -76,8 +76,8 @@ def frozen_times(images: Sequence[LoggedImage], rollout: RolloutLog) -> set[int]
             for k in (0, 1)
         ]
         if float(np.hypot(*(np.diff(e)[0] for e in ends))) > FROZEN_MOVE_M:
-            found.add(image.end_us)
-    return found
+            frozen.add(image.end_us)
+    return frozen
 
 
 FACTORY = with_preset(evaluate_images)

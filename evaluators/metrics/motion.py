@@ -84,9 +84,9 @@ def evaluate_motion(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[M
         else np.zeros(len(t_us), dtype=np.bool_)
     )
     margin_m, impact_mps = rss_margin_m(drive.ego, drive.tracks), np.full(len(t_us), np.nan)
-    for one in drive.hits:
-        if t_us[one.step] >= handover_us(rollout) and np.isnan(impact_mps[one.step]):
-            impact_mps[one.step] = one.delta_v_mps / nuplan.MASS_SHARE
+    for hit in drive.hits:
+        if t_us[hit.step] >= handover_us(rollout) and np.isnan(impact_mps[hit.step]):
+            impact_mps[hit.step] = hit.delta_v_mps / nuplan.MASS_SHARE
     return [
         series(
             "hard_brake",

@@ -139,9 +139,9 @@ def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[
     ]
 
 
-def _no_map(rollout: RolloutLog, preset: Preset, found: str) -> EvaluatorError:
+def _no_map(rollout: RolloutLog, preset: Preset, problem: str) -> EvaluatorError:
     return EvaluatorError(
-        f"scene {rollout.scene_id!r}, preset {preset.name!r}: {found}",
+        f"scene {rollout.scene_id!r}, preset {preset.name!r}: {problem}",
         "score with a scene that has a map, or with a preset that can do without (paper, alpasim)",
     )
 

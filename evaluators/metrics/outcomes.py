@@ -80,7 +80,9 @@ def told(had: Iterable[str]) -> list[Outcome]:
     """Return the outcomes that are named, the gravest first."""
     names = set(had)
     return [
-        one for name, one in OUTCOMES.items() if name in names and not names & set(one.implied_by)
+        outcome
+        for name, outcome in OUTCOMES.items()
+        if name in names and not names & set(outcome.implied_by)
     ]
 
 
@@ -91,7 +93,7 @@ def in_words(had: Iterable[str]) -> str:
         >>> in_words({"collision_any", "collision_at_fault", "offroad"}), in_words(())
         ('at-fault collision and off-road', 'no event')
     """
-    return " and ".join(one.words for one in told(had)) or NO_OUTCOME
+    return " and ".join(outcome.words for outcome in told(had)) or NO_OUTCOME
 
 
 def first_failure(manifest: Mapping[str, Any]) -> Mapping[str, Any] | None:
@@ -103,11 +105,11 @@ def first_failure(manifest: Mapping[str, Any]) -> Mapping[str, Any] | None:
         5
     """
     failures = (
-        one
-        for one in manifest.get("events") or ()
-        if one["metric"] in OUTCOMES or one["metric"] in CONTACT_SIDES
+        event
+        for event in manifest.get("events") or ()
+        if event["metric"] in OUTCOMES or event["metric"] in CONTACT_SIDES
     )
-    return min(failures, key=lambda one: int(one["t_us"]), default=None)
+    return min(failures, key=lambda event: int(event["t_us"]), default=None)
 
 
 def event_words(metric: str) -> str:
@@ -252,11 +254,12 @@ def actor_ahead(
     way, ego_xy = shapely.linestrings(line), rollout.ego.xyz[steps, :2] - origin[:2]
     s, reach_m = s[steps], reach_m[steps]
     for soon_s in SOON_S:
-        there = actors.at(rollout.ego.t_us[steps] + round(soon_s * 1e6))
+        actors_at = actors.at(rollout.ego.t_us[steps] + round(soon_s * 1e6))
         actor, step = np.nonzero(
-            there.present & (there.centre_distance_m(ego_xy) < reach_m + actors.radius_m[:, None])
+            actors_at.present
+            & (actors_at.centre_distance_m(ego_xy) < reach_m + actors.radius_m[:, None])
         )
-        boxes = there.footprints(actor, step)
+        boxes = actors_at.footprints(actor, step)
         corners = to_path(line, boxes.corners().reshape(-1, 2))[1].reshape(-1, 4)
         gap_m = corners.max(axis=1) - s[step]
         near = (gap_m > 0.0) & (gap_m < reach_m[step] + boxes.size[:, 0])

@@ -50,8 +50,8 @@ class TrajectoryTable:
         poses.
         """
         t, xyz = self.t_us[self.rows(i)], self.xyz[self.rows(i)]
-        grid, at = (t - t[0]).astype(np.float64), (t_us - t[0]).astype(np.float64)
-        return np.stack([np.interp(at, grid, xyz[:, d]) for d in range(3)], axis=1)
+        grid, query = (t - t[0]).astype(np.float64), (t_us - t[0]).astype(np.float64)
+        return np.stack([np.interp(query, grid, xyz[:, d]) for d in range(3)], axis=1)
 
     @property
     def owner(self) -> I64:
@@ -63,13 +63,15 @@ def trajectory_table(
     trajectories: Sequence[Trajectory], T_rig_box: F64, origin: F64, preset: Preset
 ) -> TrajectoryTable:
     """Move rig trajectories in the world to the box centre and lay them end to end."""
-    sizes = [len(one) for one in trajectories]
-    xyz = np.concatenate([np.zeros((0, 3)), *(one.xyz for one in trajectories)])
-    quat = np.concatenate([np.zeros((0, 4)), *(one.quat for one in trajectories)])
+    sizes = [len(trajectory) for trajectory in trajectories]
+    xyz = np.concatenate([np.zeros((0, 3)), *(trajectory.xyz for trajectory in trajectories)])
+    quat = np.concatenate([np.zeros((0, 4)), *(trajectory.quat for trajectory in trajectories)])
     rotation = matrix_from_quat(quat)
     centre = held(xyz + rotation @ T_rig_box[:3, 3], preset) - origin
     forward = rotation @ T_rig_box[:3, 0]  # box x in the world
-    t_us = np.concatenate([np.zeros(0, dtype=np.int64), *(one.t_us for one in trajectories)])
+    t_us = np.concatenate(
+        [np.zeros(0, dtype=np.int64), *(trajectory.t_us for trajectory in trajectories)]
+    )
     start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     return TrajectoryTable(t_us, centre, np.arctan2(forward[:, 1], forward[:, 0]), start)
 
@@ -150,12 +152,13 @@ def open_loop_collisions(
     for low in range(0, len(rows), _CHUNK):
         part = rows[low : low + _CHUNK]
         ego = ego_footprints_at(table.xyz[part, :2], table.yaw[part], rollout, preset)
-        there = actors.at(table.t_us[part])
+        actors_at = actors.at(table.t_us[part])
         near = (
-            there.centre_distance_m(ego.xy) <= ego.radius_m[None] + actors.radius_m[:, None] + 1e-6
+            actors_at.centre_distance_m(ego.xy)
+            <= ego.radius_m[None] + actors.radius_m[:, None] + 1e-6
         )
         pose, actor = np.nonzero(near.T)
-        touch = shapely.intersects(ego.shapes()[pose], there.footprints(actor, pose).shapes())
+        touch = shapely.intersects(ego.shapes()[pose], actors_at.footprints(actor, pose).shapes())
         out[owner[part[pose[touch]]]] = 1.0
     return out
 
@@ -246,11 +249,9 @@ def _min_ade_by_index(
         for horizon_s in preset.min_ade_horizons_s
     ]
     return [
-        series(
-            name, np.array([t for t, _ in found], dtype=np.int64), np.array([v for _, v in found])
-        )
-        for name, found in zip(names, rows, strict=True)
-        if found
+        series(name, np.array([t for t, _ in row], dtype=np.int64), np.array([v for _, v in row]))
+        for name, row in zip(names, rows, strict=True)
+        if row
     ]
 
 
@@ -323,9 +324,9 @@ def first_divergence(one: Sequence[LoggedPlan], other: Sequence[LoggedPlan]) -> 
     for plan in one:
         if plan.now_us not in plans or not len(plan.trajectory):
             continue
-        mine, theirs = plan.trajectory, plans[plan.now_us]
-        at_us = min(plan.now_us + HORIZON_US, int(mine.t_us[-1]), int(theirs.t_us[-1]))
-        gap = float(plan_gap(mine, theirs, [at_us])[0][0])
+        first, theirs = plan.trajectory, plans[plan.now_us]
+        at_us = min(plan.now_us + HORIZON_US, int(first.t_us[-1]), int(theirs.t_us[-1]))
+        gap = float(plan_gap(first, theirs, [at_us])[0][0])
         if gap > DIVERGED_M:
             return Divergence(plan.now_us, gap, at_us - plan.now_us)
     return None

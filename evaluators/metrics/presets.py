@@ -200,7 +200,7 @@ def contact_note(name: str) -> str:
         f"{low} to {high} %{{}} at {{}}{step}" for step, (low, high) in UNSEEN.items()
     )
     missed = ", ".join(
-        [first.format(" of contacts", "steps of "), *(one.format("", "") for one in others)]
+        [first.format(" of contacts", "steps of "), *(note.format("", "") for note in others)]
     )
     return f"contact at logged instants only: missed are {missed}; --preset {DEFAULT} looks between them too"
 

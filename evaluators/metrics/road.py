@@ -70,8 +70,8 @@ class Polylines:
         for d in (0, 1):
             meet &= (most[:, d] >= low[:, [d]]) & (least[:, d] <= high[:, [d]])
         which, line = pairs_of(meet)
-        found, segment = spans(self._first[line], self._last[line])
-        which = which[found]
+        pair, segment = spans(self._first[line], self._last[line])
+        which = which[pair]
         least, most = np.minimum(self.start, self.end).T, np.maximum(self.start, self.end).T
         for d in (0, 1):
             keep = (most[d][segment] >= low[which, d]) & (least[d][segment] <= high[which, d])
@@ -89,8 +89,8 @@ class Polylines:
         """
         out = np.zeros((len(xyz), self.n_lines), dtype=np.bool_)
         if len(self.vertices):
-            found = scipy.spatial.cKDTree(self.vertices).query_ball_point(xyz, radius_m)
-            for i, vertices in enumerate(found):
+            near = scipy.spatial.cKDTree(self.vertices).query_ball_point(xyz, radius_m)
+            for i, vertices in enumerate(near):
                 out[i, self.vertex_owner[vertices]] = True
         return out
 

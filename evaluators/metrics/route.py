@@ -50,8 +50,10 @@ def to_path(path: F64, points: F64) -> tuple[F64, F64]:
         nearest ones the first.
     """
     line = shapely.linestrings(np.repeat(path, 2, axis=0) if len(path) == 1 else path)
-    at = shapely.points(points)
-    return np.asarray(shapely.distance(line, at)), np.asarray(shapely.line_locate_point(line, at))
+    positions = shapely.points(points)
+    return np.asarray(shapely.distance(line, positions)), np.asarray(
+        shapely.line_locate_point(line, positions)
+    )
 
 
 def moving(path: F64) -> I64:
@@ -78,18 +80,20 @@ def followed(path: F64, s: F64, points: F64, first_m: float) -> F64:
     Each is the nearest point of the path within 2 m, and twice what the point has moved, of the one
     before.
     """
-    at = arc_lengths(path)
+    lengths = arc_lengths(path)
     out, reach_m = np.array(s), 2.0 + 2.0 * np.hypot(*np.diff(points, axis=0, prepend=points[:1]).T)
-    reach_m[0] += 2.0 * float(np.hypot(*(points[0] - _at(path, at, first_m))))
+    reach_m[0] += 2.0 * float(np.hypot(*(points[0] - _at(path, lengths, first_m))))
     leaps = np.flatnonzero(np.abs(np.diff(s, prepend=first_m)) > reach_m)
     for k in range(int(leaps[0]), len(s)) if len(leaps) else ():
         before = float(out[k - 1]) if k else first_m
-        low, high = max(before - reach_m[k], 0.0), min(before + reach_m[k], float(at[-1]))
-        inner = path[np.searchsorted(at, low, "right") : np.searchsorted(at, high)]
+        low, high = max(before - reach_m[k], 0.0), min(before + reach_m[k], float(lengths[-1]))
+        inner = path[np.searchsorted(lengths, low, "right") : np.searchsorted(lengths, high)]
         out[k] = (
             low
             + to_path(
-                np.concatenate([_at(path, at, low)[None], inner, _at(path, at, high)[None]]),
+                np.concatenate(
+                    [_at(path, lengths, low)[None], inner, _at(path, lengths, high)[None]]
+                ),
                 points[[k]],
             )[1][0]
         )
@@ -112,12 +116,12 @@ def left_of(path: F64, s: F64, points: F64) -> F64:
 
     At a corner the direction is that of the segment which the nearest point ends.
     """
-    at = arc_lengths(path)
+    lengths = arc_lengths(path)
     steps = np.diff(path, axis=0)
-    long = np.flatnonzero(np.diff(at) > 0)
+    long = np.flatnonzero(np.diff(lengths) > 0)
     if not len(long):
         return np.full(len(points), np.nan)
-    segment = long[np.clip(np.searchsorted(at[long + 1], s), 0, len(long) - 1)]
+    segment = long[np.clip(np.searchsorted(lengths[long + 1], s), 0, len(long) - 1)]
     offset = points - path[segment]
     along = steps[segment]
     return np.asarray(np.sign(along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0]))
@@ -136,12 +140,12 @@ def beside(path: F64, s: F64, points: F64, distance_m: F64) -> F64:
     The direction at an end is that of the path's last `DIRECTION_M` metres. A path that stands at
     an end is cut by `moving` first.
     """
-    at = arc_lengths(path)
-    length_m = float(at[-1])
+    lengths = arc_lengths(path)
+    length_m = float(lengths[-1])
     if length_m < DIRECTION_M:
         return np.full(len(points), np.nan)
     out = np.array(distance_m)
-    inner, outer = _at(path, at, DIRECTION_M), _at(path, at, length_m - DIRECTION_M)
+    inner, outer = _at(path, lengths, DIRECTION_M), _at(path, lengths, length_m - DIRECTION_M)
     for end, inside, is_there in (
         (path[0], inner, s <= 0.0),
         (path[-1], outer, s >= length_m * (1 - 1e-12)),
@@ -191,13 +195,13 @@ def progress_so_far(path: F64, points: F64) -> F64:
     out = np.ones(n)
     for low in range(1, n, _ROWS):
         rows = np.arange(low, min(low + _ROWS, n))
-        there = slice(
+        window = slice(
             0, int(rows[-1])
         )  # segments that start at or after vertex k do not exist yet for point k
-        to_x, to_y = points[rows, :1] - x[there], points[rows, 1:] - y[there]  # (R, S)
-        f = np.clip((to_x * along_x[there] + to_y * along_y[there]) / over[there], 0.0, 1.0)
-        to_x -= f * along_x[there]
-        to_y -= f * along_y[there]
+        to_x, to_y = points[rows, :1] - x[window], points[rows, 1:] - y[window]  # (R, S)
+        f = np.clip((to_x * along_x[window] + to_y * along_y[window]) / over[window], 0.0, 1.0)
+        to_x -= f * along_x[window]
+        to_y -= f * along_y[window]
         distance2 = to_x**2 + to_y**2
         distance2[np.arange(rows[-1])[None] >= rows[:, None]] = np.inf
         best = np.argmin(distance2, axis=1)
@@ -249,14 +253,14 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
     distance_m, s = to_path(path, ego)
     length_m = float(arc_lengths(path)[-1])
     covered = (t_us >= recorded.t_us[0]) & (t_us <= recorded.t_us[-1])
-    there = (
+    recorded_xy = (
         held(
             interpolate(recorded, np.clip(t_us, recorded.t_us[0], recorded.t_us[-1]))[:, :3, 3],
             preset,
         )[:, :2]
         - origin[:2]
     )
-    away_m = np.hypot(*(ego - there).T)
+    away_m = np.hypot(*(ego - recorded_xy).T)
     on = None if preset.aliases else on_route(path, recorded.t_us, t_us, ego)
     share, of_m = (s, length_m) if on is None else (on.along_m, on.length_m)
     share = share / of_m if of_m > 0 else np.full(len(s), np.nan)
@@ -265,7 +269,7 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
     outside = "the recording does not cover this time"
     aside_m = from_corridor(path, s, ego, distance_m) if preset.corridor else None
     engaged = relevant(rollout)
-    so_far = progress_so_far(there, ego)
+    so_far = progress_so_far(recorded_xy, ego)
     driven_m = arc_lengths(ego)
     first = int(np.argmax(engaged)) if preset.distance_from == "handover" else 0
     traveled_m = np.maximum(driven_m - driven_m[first], 0.0)
@@ -291,7 +295,7 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
             out.append(series("lateral_dist_to_gt_trajectory", t_us, aside_m))
             out.append(series("left_corridor_laterally", t_us, aside_m >= preset.stop_beyond_gt_m))
         if preset.progress_of == "reachable" and length_m > 0:
-            reached_m = float(to_path(path, there[-1:])[1][0])
+            reached_m = float(to_path(path, recorded_xy[-1:])[1][0])
             share = share * (length_m / reached_m if reached_m > 0 else 1.0)
         return [*out, series("progress_rel_to_total", t_us, share, length_m > 0, no_length)]
     has_side = np.isfinite(on.aside_m)
@@ -309,9 +313,9 @@ def lateral_bias(rollout: RolloutLog) -> MetricSeries:
     """
     # The map plays no part in it.
     return next(
-        one
-        for one in evaluate_route(rollout, None, PRESETS["paper"])
-        if one.name == "lateral_bias_m"
+        metric_series
+        for metric_series in evaluate_route(rollout, None, PRESETS["paper"])
+        if metric_series.name == "lateral_bias_m"
     )
 
 

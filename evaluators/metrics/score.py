@@ -77,13 +77,15 @@ def score(
     specs = resolve_evaluators() if evaluators is None else evaluators
     known = table_of(specs)
     for spec in specs:
-        for one in run_evaluator(spec.name, build(spec, preset=chosen), rollout, scene, known):
-            if one.name in out:
+        for metric_series in run_evaluator(
+            spec.name, build(spec, preset=chosen), rollout, scene, known
+        ):
+            if metric_series.name in out:
                 raise EvaluatorError(
-                    f"evaluator {spec.name!r}: metric {one.name!r} was given twice",
+                    f"evaluator {spec.name!r}: metric {metric_series.name!r} was given twice",
                     "rename one of them",
                 )
-            out[one.name] = one
+            out[metric_series.name] = metric_series
     return list(out.values())
 
 
@@ -97,7 +99,10 @@ def run_evaluator(
             lengths; it is named.
     """
     try:
-        answer = [replace(one, metric=known.info(one.name)) for one in evaluator(rollout, scene)]
+        answer = [
+            replace(metric_series, metric=known.info(metric_series.name))
+            for metric_series in evaluator(rollout, scene)
+        ]
     except SimrunError:
         raise
     except Exception as exc:  # third-party code: the cause is chained, nothing is swallowed
@@ -105,12 +110,12 @@ def run_evaluator(
             f"evaluator {name!r}, scene {rollout.scene_id!r}: {type(exc).__name__}: {exc}",
             "run with --debug for the traceback",
         ) from exc
-    for one in answer:
-        if not (one.t_us.shape == one.value.shape == one.valid.shape) or (
-            one.reason == "" and not bool(np.all(one.valid))
-        ):
+    for metric_series in answer:
+        if not (
+            metric_series.t_us.shape == metric_series.value.shape == metric_series.valid.shape
+        ) or (metric_series.reason == "" and not bool(np.all(metric_series.valid))):
             raise EvaluatorError(
-                f"evaluator {name!r}, metric {one.name!r}: shapes {one.t_us.shape}, {one.value.shape}, {one.valid.shape}; {int(np.sum(~one.valid))} invalid steps, reason {one.reason!r}",
+                f"evaluator {name!r}, metric {metric_series.name!r}: shapes {metric_series.t_us.shape}, {metric_series.value.shape}, {metric_series.valid.shape}; {int(np.sum(~metric_series.valid))} invalid steps, reason {metric_series.reason!r}",
                 "give one time, value and validity per step, and a reason where any is invalid",
             )
     return answer
@@ -168,14 +173,14 @@ def check_rollout(rollout: RolloutLog) -> None:
         _check_track(f"actor {actor.actor_id!r}", actor.track, rollout)
         _check_size(f"actor {actor.actor_id!r}", actor.box.length_m, actor.box.width_m, rollout)
     plans = [
-        (plan.now_us, one)
+        (plan.now_us, track)
         for plan in rollout.plans
-        for one in (plan.trajectory, *plan.samples)
-        if len(one)
+        for track in (plan.trajectory, *plan.samples)
+        if len(track)
     ]
-    if not _all_sound([one for _, one in plans]):
-        for now_us, one in plans:
-            _check_track(f"the plan at {now_us} us", one, rollout)
+    if not _all_sound([track for _, track in plans]):
+        for now_us, track in plans:
+            _check_track(f"the plan at {now_us} us", track, rollout)
 
 
 def _all_sound(tracks: Sequence[Trajectory]) -> bool:
@@ -184,22 +189,26 @@ def _all_sound(tracks: Sequence[Trajectory]) -> bool:
     """
     if not tracks:
         return True
-    if any(one.xyz.shape != (len(one), 3) or one.quat.shape != (len(one), 4) for one in tracks):
+    if any(
+        track.xyz.shape != (len(track), 3) or track.quat.shape != (len(track), 4)
+        for track in tracks
+    ):
         return False
     t_us, xyz, quat = (
-        np.concatenate([getattr(one, name) for one in tracks]) for name in ("t_us", "xyz", "quat")
+        np.concatenate([getattr(track, name) for track in tracks])
+        for name in ("t_us", "xyz", "quat")
     )
     first = np.zeros(len(t_us), dtype=np.bool_)
-    first[np.cumsum([0, *(len(one) for one in tracks[:-1])])] = True
+    first[np.cumsum([0, *(len(track) for track in tracks[:-1])])] = True
     increasing = bool(np.all((np.diff(t_us) > 0) | first[1:]))
     unit = np.abs(np.linalg.norm(quat, axis=1) - 1.0) <= 1e-3
     return increasing and bool(np.isfinite(xyz).all()) and bool(unit.all())
 
 
 def _check_track(who: str, track: Trajectory, rollout: RolloutLog) -> None:
-    def refuse(found: str) -> EvaluatorError:
+    def refuse(problem: str) -> EvaluatorError:
         return EvaluatorError(
-            f"{who} in scene {rollout.scene_id!r}, session {rollout.session_uuid!r}: {found}",
+            f"{who} in scene {rollout.scene_id!r}, session {rollout.session_uuid!r}: {problem}",
             "repair or leave out this log",
         )
 

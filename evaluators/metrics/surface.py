@@ -180,9 +180,9 @@ class Region:
         other = nearest != nearest[a][piece]
         b = np.lexsort((np.where(other, distance, -1.0), piece))[last]
         lead = []  # by how much the border near a is nearer than the one near b, at a and at b
-        for at in (a, b):
+        for index in (a, b):
             to = [
-                segment_distance(self._start[nearest[k]], self._end[nearest[k]], corner[at])
+                segment_distance(self._start[nearest[k]], self._end[nearest[k]], corner[index])
                 for k in (a, b)
             ]
             lead.append(to[1] - to[0])

@@ -54,14 +54,14 @@ def gaps(pairs: Motions, tau: F64) -> F64:
     """Return the gaps ``(M, 8)`` along the sides' directions at ``(M,)``: the bodies are apart
     where the largest is positive.
     """
-    at = pairs.start + tau[:, None] * pairs.shift
+    center = pairs.start + tau[:, None] * pairs.shift
     yaw = pairs.yaw + tau[:, None] * pairs.turn
     c, s = np.abs(np.cos(yaw[:, 1] - yaw[:, 0])), np.abs(np.sin(yaw[:, 1] - yaw[:, 0]))
     out = np.empty((len(tau), _N_GAPS))
     for body in (0, 1):
         cos, sin = np.cos(yaw[:, body]), np.sin(yaw[:, body])
         own, other = pairs.half[:, body], pairs.half[:, 1 - body]
-        offsets = (cos * at[:, 0] + sin * at[:, 1], cos * at[:, 1] - sin * at[:, 0])
+        offsets = (cos * center[:, 0] + sin * center[:, 1], cos * center[:, 1] - sin * center[:, 0])
         reach = (
             own[:, 0] + other[:, 0] * c + other[:, 1] * s,
             own[:, 1] + other[:, 0] * s + other[:, 1] * c,
@@ -113,7 +113,7 @@ def first_contact(pairs: Motions) -> F64:
         none is given, they are apart throughout.
     """
     n = len(pairs.start)
-    found = np.full(n, np.inf)
+    first = np.full(n, np.inf)
     bend, steep = curvature(pairs), slope(pairs)
     owner = np.arange(n)
     low, width = np.zeros(n), np.ones(n)
@@ -121,12 +121,12 @@ def first_contact(pairs: Motions) -> F64:
     while len(owner):
         for tau, gap in ((low, at_low), (low + width, at_high)):
             touching = gap.max(axis=1) <= TOUCH_M
-            np.minimum.at(found, owner[touching], tau[touching])
+            np.minimum.at(first, owner[touching], tau[touching])
         hidden = bend[owner] * (width**2 / 8)[:, None]
         apart = np.any(np.minimum(at_low, at_high) > hidden, axis=1)
-        open_ = ~apart & (low < found[owner])
+        open_ = ~apart & (low < first[owner])
         short = open_ & (steep[owner] * width <= TOUCH_M / 4)
-        np.minimum.at(found, owner[short], low[short])
+        np.minimum.at(first, owner[short], low[short])
         rows = np.flatnonzero(open_ & ~short)
         owner = owner[rows]
         low = low[rows]
@@ -137,4 +137,4 @@ def first_contact(pairs: Motions) -> F64:
         low = np.concatenate([low, low + width])
         width = np.tile(width, 2)
         at_low, at_high = np.concatenate([at_low, at_middle]), np.concatenate([at_middle, at_high])
-    return found
+    return first

@@ -71,9 +71,9 @@ class MetricTable(Mapping[str, MetricInfo]):
             >>> METRICS.info("min_ade@3.0s(gt)").aggregation
             'mean'
         """
-        found = self.shown(name)
-        if found.help:
-            return found
+        facts = self.shown(name)
+        if facts.help:
+            return facts
         if self._is_read:
             raise InputError(
                 f"metric {name!r}: run.json does not say what it is",
@@ -193,12 +193,12 @@ class MetricTable(Mapping[str, MetricInfo]):
         """
         for name in names:
             if name in self and name in other:
-                here, there = (
+                mine, theirs = (
                     [getattr(table[name], key) for key in AGREE] for table in (self, other)
                 )
-                if here != there:
+                if mine != theirs:
                     raise InputError(
-                        f"{who}, metric {name!r}: unit, better side and reduction are {here} and {there}",
+                        f"{who}, metric {name!r}: unit, better side and reduction are {mine} and {theirs}",
                         "choose runs of one version of the metric",
                     )
         return MetricTable({**other._metrics, **self._metrics})

@@ -142,18 +142,20 @@ class Judged:
             return None
         front, t_us = self.ego.centre + self.ego.size[0] / 2 * self.ego.heading, self.ego.t_us
         out = np.zeros(len(t_us), dtype=np.bool_)
-        for one in self._signals:
-            start, along = one.stop[0] - self._origin, one.stop[1, :2] - one.stop[0, :2]
+        for signal in self._signals:
+            start, along = signal.stop[0] - self._origin, signal.stop[1, :2] - signal.stop[0, :2]
             normal = np.array([-along[1], along[0]])
-            normal *= np.sign(normal @ (np.cos(one.heading_rad), np.sin(one.heading_rad)))
+            normal *= np.sign(normal @ (np.cos(signal.heading_rad), np.sin(signal.heading_rad)))
             beyond = (front - start[:2]) @ normal
             for k in np.flatnonzero((beyond[:-1] < 0.0) & (beyond[1:] >= 0.0)).tolist():
                 share = beyond[k] / (beyond[k] - beyond[k + 1])
                 aside = (front[k] + share * (front[k + 1] - front[k]) - start[:2]) @ along
-                there = 0.0 <= aside <= along @ along and abs(self._xyz[k, 2] - start[2]) <= LEVEL_M
+                crosses = (
+                    0.0 <= aside <= along @ along and abs(self._xyz[k, 2] - start[2]) <= LEVEL_M
+                )
                 out[k + 1] |= (
-                    there
-                    and one.colour_at(round(float(t_us[k] + share * (t_us[k + 1] - t_us[k]))))
+                    crosses
+                    and signal.colour_at(round(float(t_us[k] + share * (t_us[k + 1] - t_us[k]))))
                     in RED
                 )
         return out

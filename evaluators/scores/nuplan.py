@@ -101,7 +101,7 @@ def collisions(ego: EgoStates, tracks: Tracks, astray: Bool | None = None) -> li
         out.append(
             Collision(a, k, kind, tracks.kinds[a], MASS_SHARE * float(np.hypot(*gone)), guilty)
         )
-    return sorted(out, key=lambda one: one.step)
+    return sorted(out, key=lambda collision: collision.step)
 
 
 def _type(ego: EgoStates, tracks: Tracks, a: int, k: int) -> Type:
@@ -109,19 +109,19 @@ def _type(ego: EgoStates, tracks: Tracks, a: int, k: int) -> Type:
         return "stopped_ego"
     if tracks.kinds[a] == "object" or tracks.speed[a, k] <= STOPPED_MPS:
         return "stopped_track"
-    at = np.array([k])
-    if bearing(ego, at, tracks.xy[a, at])[0] > BEHIND_RAD:
+    index = np.array([k])
+    if bearing(ego, index, tracks.xy[a, index])[0] > BEHIND_RAD:
         return "active_rear"
-    front = ego.boxes(ego.centre[at], ego.yaw[at]).bumpers()[0]
-    touches = shapely.intersects(front, tracks.boxes(np.array([a]), at).shapes())[0]
+    front = ego.boxes(ego.centre[index], ego.yaw[index]).bumpers()[0]
+    touches = shapely.intersects(front, tracks.boxes(np.array([a]), index).shapes())[0]
     return "active_front" if touches else "active_lateral"
 
 
-def collision_score(found: list[Collision]) -> float:
+def collision_score(collisions: list[Collision]) -> float:
     """Return 1, less for contacts at fault: none is allowed with a vehicle or a person, one with an
     object costs a half.
     """
-    guilty = [one.kind for one in found if one.at_fault]
+    guilty = [collision.kind for collision in collisions if collision.at_fault]
     if any(kind != "object" for kind in guilty):
         return 0.0
     return max(0.0, 1.0 - len(guilty) / (OBJECTS_ALLOWED + 1))
@@ -130,7 +130,7 @@ def collision_score(found: list[Collision]) -> float:
 def time_to_collision(
     ego: EgoStates,
     tracks: Tracks,
-    found: list[Collision],
+    collisions: list[Collision],
     beside: Bool | None = None,
     step_s: float = TTC_STEP_S,
     horizon_s: float = TTC_HORIZON_S,
@@ -140,7 +140,7 @@ def time_to_collision(
 
     Args:
         ego, tracks: The drive.
-        found: Its collisions: one at fault makes the time 0, and a road user that was touched
+        collisions: Its collisions: one at fault makes the time 0, and a road user that was touched
             counts no more.
         beside: ``(T,)`` where road users at the ego's side count as those ahead do: in several
             lanes, off the road, at a junction.
@@ -148,8 +148,8 @@ def time_to_collision(
     """
     out = np.full(len(ego.t_us), np.inf)
     counts = tracks.there & (ego.speed > STANDS_MPS)
-    for one in found:
-        counts[one.actor, one.step :] = False
+    for collision in collisions:
+        counts[collision.actor, collision.step :] = False
     actor, step = np.nonzero(counts)
     angle = bearing(ego, step, tracks.xy[actor, step])
     near = angle < AHEAD_RAD
@@ -160,9 +160,9 @@ def time_to_collision(
     after_s = step_s * np.maximum(np.ceil(first_s / step_s - 1e-9), 1.0)
     hit = (after_s <= last_s) & (after_s < horizon_s - 1e-9)
     np.minimum.at(out, step[hit], after_s[hit])
-    for one in found:
-        if one.at_fault and ego.speed[one.step] > STANDS_MPS:
-            out[one.step] = 0.0
+    for collision in collisions:
+        if collision.at_fault and ego.speed[collision.step] > STANDS_MPS:
+            out[collision.step] = 0.0
     return out
 
 
@@ -189,11 +189,13 @@ def touching_s(ego: EgoStates, tracks: Tracks, actor: I64, step: I64) -> tuple[F
             np.abs(size[:, 0] * np.cos(yaw - own) / 2) + np.abs(size[:, 1] * np.sin(yaw - own) / 2)
             for own, size in zip(yaws, sizes, strict=True)
         )
-        at, rate = (axis[0] * one[:, 0] + axis[1] * one[:, 1] for one in (apart, gone))
-        ends = np.sort([(-reach - at) / rate, (reach - at) / rate], axis=0)
+        distance, rate = (
+            axis[0] * vector[:, 0] + axis[1] * vector[:, 1] for vector in (apart, gone)
+        )
+        ends = np.sort([(-reach - distance) / rate, (reach - distance) / rate], axis=0)
         still = rate == 0.0
         ends[:, still] = np.where(
-            np.abs(at) <= reach, [[-np.inf], [np.inf]], [[np.inf], [-np.inf]]
+            np.abs(distance) <= reach, [[-np.inf], [np.inf]], [[np.inf], [-np.inf]]
         )[:, still]
         first_s, last_s = np.maximum(first_s, ends[0]), np.minimum(last_s, ends[1])
     return first_s, last_s
@@ -213,8 +215,8 @@ def motion(ego: EgoStates) -> dict[str, F64]:
     }
     out = {name: smooth(values) for name, values in accel.items()}
     out |= {
-        to: derivative(out[of], ego.t_us, window=15)
-        for to, of in (("lon_jerk", "lon_accel"), ("lat_jerk", "lat_accel"), ("jerk", "accel"))
+        to: derivative(out[source], ego.t_us, window=15)
+        for to, source in (("lon_jerk", "lon_accel"), ("lat_jerk", "lat_accel"), ("jerk", "accel"))
     }
     yaw = np.unwrap(ego.yaw)
     return out | {
@@ -280,6 +282,6 @@ def statistics(values: F64) -> dict[str, float]:
     """Return greatest, least and mean, and the 90th percentile of the magnitudes, to two digits, as
     the devkit reports a series.
     """
-    found = {"MAX": np.max(values), "MIN": np.min(values), "MEAN": np.mean(values)}
-    found["P90"] = np.percentile(np.abs(values), 90, method="inverted_cdf")
-    return {name: round(float(value), 2) for name, value in found.items()}
+    reduced = {"MAX": np.max(values), "MIN": np.min(values), "MEAN": np.mean(values)}
+    reduced["P90"] = np.percentile(np.abs(values), 90, method="inverted_cdf")
+    return {name: round(float(value), 2) for name, value in reduced.items()}

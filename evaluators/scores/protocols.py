@@ -61,11 +61,11 @@ def _route(rollout: RolloutLog, preset: Preset, centre: Trajectory) -> tuple[OnR
     """
     origin, recorded = origin_of(rollout.ego_log, preset), recorded_path(rollout, preset)
     path = recorded.xyz[:, :2] - origin[:2]
-    there = np.stack(
+    ends = np.stack(
         [np.interp(centre.t_us, recorded.t_us, path[:, axis]) for axis in (0, 1)], axis=1
     )
     return on_route(path, recorded.t_us, centre.t_us, centre.xyz[:, :2] - origin[:2]), on_route(
-        path, recorded.t_us, centre.t_us, there
+        path, recorded.t_us, centre.t_us, ends
     )
 
 
@@ -76,7 +76,7 @@ def _progress(
     made in the same time.
     """
     ego, expert = _route(rollout, preset, centre)
-    made = [float(one.along_m[-1] - one.along_m[0]) for one in (ego, expert)]
+    made = [float(track.along_m[-1] - track.along_m[0]) for track in (ego, expert)]
     return ratio(made[0], made[1]) if ego.length_m > 0 else NO_PATH
 
 
@@ -174,9 +174,9 @@ def _planned_motion(
     times.
     """
     states = ego_states(rollout, preset, rig, origin)
-    at = rig.t_us.astype(np.float64)
-    accel = smooth(np.interp(t_us, at, np.hypot(*states.accel.T)))
-    yaw = np.interp(t_us, at, states.yaw)
+    times = rig.t_us.astype(np.float64)
+    accel = smooth(np.interp(t_us, times, np.hypot(*states.accel.T)))
+    yaw = np.interp(t_us, times, states.yaw)
     return {
         "accel": accel,
         "jerk": derivative(accel, t_us, window=15),
@@ -233,10 +233,10 @@ def _hugsim(
     completed: Part = float(ego.along_m[-1]) / ego.length_m if ego.length_m > 0 else NO_PATH
     out: dict[str, Part] = {"rc": completed}
     for name in ("nc", "dac", "ttc", "com"):
-        of = [row[name] for row in rows]
+        values = [row[name] for row in rows]
         out[name] = next(
-            (one for one in of if isinstance(one, str)),
-            NO_PLANS if not of else float(np.mean([float(x) for x in of])),
+            (one for one in values if isinstance(one, str)),
+            NO_PLANS if not values else float(np.mean([float(x) for x in values])),
         )
     product = [
         _bounds(
@@ -289,16 +289,16 @@ def _impact_mps(rollout: RolloutLog, preset: Preset, centre: Trajectory) -> floa
     """Return the relative speed at the first contact at or between the times of a trajectory; None
     without one.
     """
-    found = contact_events(
+    events = contact_events(
         replace(rollout, ego=centre, render_start_us=int(centre.t_us[0]), force_gt_us=0), preset
     )
-    if not found:
+    if not events:
         return None
     ego, tracks = states_of(rollout, preset, centre, origin_of(rollout.ego, preset))
     k = max(
-        int(np.searchsorted(ego.t_us - ego.t_us[0], round(found[0].t_s * 1e6))) - 1, 0
+        int(np.searchsorted(ego.t_us - ego.t_us[0], round(events[0].t_s * 1e6))) - 1, 0
     )  # before it, when nothing is shoved yet
-    a = tracks.ids.index(found[0].actor_id)
+    a = tracks.ids.index(events[0].actor_id)
     k = k if tracks.there[a, k] else int(np.argmax(tracks.there[a]))
     return float(np.hypot(*(ego.velocity[k, 0] * ego.heading[k] - tracks.velocity[a, k])))
 

@@ -139,18 +139,18 @@ def states_of(
     t_us = centre.t_us
     ego = ego_states(rollout, preset, offset_trajectory(centre, inverse(rollout.T_rig_box)), origin)
     table = ActorTable(rollout, preset, origin)
-    at = table.at(t_us)
-    actor, step = np.nonzero(at.present)
+    actors_at = table.at(t_us)
+    actor, step = np.nonzero(actors_at.present)
     xy = np.zeros((len(table), len(t_us), 2))
-    yaws = np.zeros(at.present.shape)
+    yaws = np.zeros(actors_at.present.shape)
     v = np.zeros((len(table), len(t_us), 2))
-    boxes = at.footprints(actor, step)
+    boxes = actors_at.footprints(actor, step)
     xy[actor, step], yaws[actor, step] = boxes.xy, boxes.yaw
     for a in range(len(table)):
-        there = np.flatnonzero(at.present[a])
-        v[a, there] = _rate(xy[a, there], t_us[there])
+        present = np.flatnonzero(actors_at.present[a])
+        v[a, present] = _rate(xy[a, present], t_us[present])
     kinds = tuple(KINDS.get(one.label, "object") for one in rollout.actors.values())
-    return ego, Tracks(table.ids, kinds, at.present, xy, yaws, table.size, v)
+    return ego, Tracks(table.ids, kinds, actors_at.present, xy, yaws, table.size, v)
 
 
 def _rate(values: F64, t_us: I64) -> F64:
@@ -217,19 +217,19 @@ def savitzky_golay(values: F64, window: int, order: int, times: int = 0, step: f
     begin = (
         half - (window - 1) // 2
     )  # in the padded values: an even window reaches one value further ahead than back
-    at = [padded[begin + k : begin + k + n] for k in range(window)]
+    shifted = [padded[begin + k : begin + k + n] for k in range(window)]
     if window % 2 and np.all(np.abs(weights - weights[::-1]) <= eps):  # the order of the sum
-        out = at[half] * weights[half]
+        out = shifted[half] * weights[half]
         for k in range(half):
-            out = out + (at[k] + at[-1 - k]) * weights[k]
+            out = out + (shifted[k] + shifted[-1 - k]) * weights[k]
     elif window % 2 and np.all(np.abs(weights + weights[::-1]) <= eps):
-        out = at[half] * weights[half]
+        out = shifted[half] * weights[half]
         for k in range(half):
-            out = out + (at[k] - at[-1 - k]) * weights[k]
+            out = out + (shifted[k] - shifted[-1 - k]) * weights[k]
     else:
-        out = at[-1] * weights[-1]
+        out = shifted[-1] * weights[-1]
         for k in range(window - 1):
-            out = out + at[k] * weights[k]
+            out = out + shifted[k] * weights[k]
     for start, first, last in ((0, 0, half), (n - window, n - half, n)):
         fit = np.vander(np.arange(window, dtype=np.float64), order + 1)
         scale = np.sqrt(np.sum(fit * fit, axis=0))

@@ -83,19 +83,19 @@ def compare_within(
         )
     name = "" if by_renderer is None else by_renderer.renderer
     bases = {
-        one: below
-        for one, below in (run.info.get("bases") or {}).items()
-        if one in known and below in known
+        fixed: below
+        for fixed, below in (run.info.get("bases") or {}).items()
+        if fixed in known and below in known
     }
     partner = {other: str(name) for other in known if name and other != name}
-    below = {one: other for one, other in bases.items() if name not in (one, other)}
-    found = _pairs(table, table, partner, "", margins, run.table, listed)
+    below = {fixed: other for fixed, other in bases.items() if name not in (fixed, other)}
+    pairs = _pairs(table, table, partner, "", margins, run.table, listed)
     with_base = (
         {} if baseline is not None else _pairs(table, table, below, "", margins, run.table, listed)
     )
     between = [] if baseline is not None or by_policy is None else by_policy.pairs(arms)
     of_policies = paired_arms(table, between, run.table, margins=margins, listed=listed)
-    return Comparison(found, (), with_base, run.table, of_policies)
+    return Comparison(pairs, (), with_base, run.table, of_policies)
 
 
 def compare_runs(
@@ -140,14 +140,16 @@ def compare_runs(
             {ours[0]: theirs[0]},
             (f"policy {ours[0]} is compared with policy {theirs[0]}",),
         )
-    there, here = base.renderers, table.renderers
+    base_renderers, renderers = base.renderers, table.renderers
     notes += weights_note(first, second)
     if baseline is not None:
         theirs_arms = arms_of((r, policy) for policy in base.policies for r in base.sides(policy))
         named = base_named(baseline, theirs_arms, str(first.folder))
         if named.policy is not None:
-            mine = arms_of((r, policy) for policy in table.policies for r in table.sides(policy))
-            chosen_arms = [(arm, named.of(arm)) for arm in mine if named.of(arm) in theirs_arms]
+            own_arms = arms_of(
+                (r, policy) for policy in table.policies for r in table.sides(policy)
+            )
+            chosen_arms = [(arm, named.of(arm)) for arm in own_arms if named.of(arm) in theirs_arms]
             if not chosen_arms:
                 raise InputError(
                     f"baseline {baseline!r}: behind no renderer of {second.folder}",
@@ -158,12 +160,12 @@ def compare_runs(
                 table, chosen_arms, metrics, base, margins, listed, f"{first.folder}: "
             )
             return Comparison(pairs, weights_note(first, second), metrics=metrics)
-    alone = there[0] if len(there) == 1 else None
-    partner = {name: baseline or (name if name in there else alone) for name in here}
+    alone = base_renderers[0] if len(base_renderers) == 1 else None
+    partner = {name: baseline or (name if name in base_renderers else alone) for name in renderers}
     lone = [name for name, other in partner.items() if other is None]
     if lone:
         raise InputError(
-            f"renderers {lone} of {second.folder}: {first.folder} has {', '.join(there)}",
+            f"renderers {lone} of {second.folder}: {first.folder} has {', '.join(base_renderers)}",
             "name one by --baseline",
         )
     chosen = {name: other for name, other in partner.items() if other is not None}
@@ -217,17 +219,17 @@ def _pairs(
     out: dict[str, dict[str, Any]] = {}
     for policy in table.policies:
         of_base = policy if policy_of is None else policy_of.get(policy)
-        here, there = (
+        sides, base_sides = (
             table.sides(policy),
             base.sides(of_base, policy) if of_base in base.policies else {},
         )
         for renderer, other in partner.items():
-            if renderer in here and other in there:
+            if renderer in sides and other in base_sides:
                 variant = renderer if len(table.policies) == 1 else cell_name(renderer, policy)
                 out[variant] = {
                     name: compare(
-                        here[renderer],
-                        there[other],
+                        sides[renderer],
+                        base_sides[other],
                         metrics.info(name),
                         prefix + other,
                         (margins or {}).get(name),

@@ -96,13 +96,13 @@ def base_named(text: str, arms: Sequence[Arm], where: str) -> Base:
         return Base(renderer=text)
     if any(text == arm.policy for arm in arms):
         return Base(policy=text)
-    found = next((arm for arm in arms if text == arm.name), None)
-    if found is None:
+    match = next((arm for arm in arms if text == arm.name), None)
+    if match is None:
         raise InputError(
             f"baseline {text!r}: {where} does not have it",
             f"choose one of {', '.join(choices(arms)) or 'none'}",
         )
-    return Base(found.renderer, found.policy)
+    return Base(match.renderer, match.policy)
 
 
 def choices(arms: Sequence[Arm]) -> list[str]:

@@ -135,13 +135,13 @@ def write_baseline(run: Run, path: Path) -> None:
     """
     failed = [r for r in run.rollouts if not r.ok]
     if failed or not run.rollouts:
-        found = (
+        problem = (
             f"{len(failed)} of {len(run.rollouts)} rollouts failed"
             if failed
             else "it holds no rollouts"
         )
         raise InputError(
-            f"{run.folder}: {found}",
+            f"{run.folder}: {problem}",
             "store a run in which every rollout ran to its end",
         )
     write_json(path, asdict(baseline_of(run)))
@@ -309,23 +309,25 @@ def stored_side(
         InputError: It lacks the renderer or the policy, or more of the planned rollouts than
             allowed.
     """
-    mine = of_policy(rows, policy)
-    if not mine:
+    of_driven = of_policy(rows, policy)
+    if not of_driven:
         raise InputError(
             f"{path}: no rollout of policy {policy}",
             f"drive one of {', '.join(policies_of(rows))}",
         )
-    known = sorted({str(row["renderer"]) for row in mine})
+    known = sorted({str(row["renderer"]) for row in of_driven})
     if renderer not in known:
         raise InputError(
             f"{path}: no rollout of renderer {renderer}",
             f"name one of {', '.join(known)}: `baseline` of a gate, --baseline of decide",
         )
     side = StoredSide(
-        renderer, f"{renderer} of {path}", tuple(row for row in mine if row["renderer"] == renderer)
+        renderer,
+        f"{renderer} of {path}",
+        tuple(row for row in of_driven if row["renderer"] == renderer),
     )
-    there = {(str(row["scene"]), int(row["seed"])) for row in side.rows if is_ok(row)}
-    lacking = sorted(set(planned) - there)
+    stored = {(str(row["scene"]), int(row["seed"])) for row in side.rows if is_ok(row)}
+    lacking = sorted(set(planned) - stored)
     if len(lacking) > max_missing * len(planned):
         named = ", ".join(f"{scene} seed {seed}" for scene, seed in lacking[:NAMED])
         raise InputError(

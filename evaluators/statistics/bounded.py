@@ -33,17 +33,17 @@ TOLERANCE = 1e-9  # of a bound, as a share of the range
 BINS = 256
 
 
-def chance_above(values: F64, at: float, most: float) -> F64:
+def chance_above(values: F64, mean: float, most: float) -> F64:
     """Return the chance ``(...)`` that the weighted mean of the values and of ``most`` is at least
-    ``at``.
+    ``mean``.
 
     With weights E_i / sum E of independent exponential E_i it is the chance that sum E_i (x_i - at)
     is at least 0, which Gil-Pelaez' inversion of the characteristic function gives. It is a p-value
-    against "the mean is at least ``at``".
+    against "the mean is at least ``mean``".
 
     Args:
         values: ``(..., n)``, none above ``most``.
-        at: A mean.
+        mean: A mean.
         most: The greatest possible value.
 
     Example:
@@ -52,7 +52,9 @@ def chance_above(values: F64, at: float, most: float) -> F64:
     """
     rows = np.asarray(values, dtype=np.float64)
     flat = rows.reshape(-1, rows.shape[-1])
-    return np.array([_chance(*_with_worst(row, most), at) for row in flat]).reshape(rows.shape[:-1])
+    return np.array([_chance(*_with_worst(row, most), mean) for row in flat]).reshape(
+        rows.shape[:-1]
+    )
 
 
 def _with_worst(values: F64, most: float) -> tuple[F64, F64]:
@@ -62,21 +64,21 @@ def _with_worst(values: F64, most: float) -> tuple[F64, F64]:
     A value between two edges counts in shares for both, which widens the bounds a little and never
     narrows them.
     """
-    found, counts = np.unique(np.append(values, most), return_counts=True)
-    if len(found) <= BINS:
-        return found, counts.astype(np.float64)
-    edges = np.linspace(found[0], found[-2], BINS)
-    place = (found[:-1] - edges[0]) / (edges[1] - edges[0])
+    distinct, counts = np.unique(np.append(values, most), return_counts=True)
+    if len(distinct) <= BINS:
+        return distinct, counts.astype(np.float64)
+    edges = np.linspace(distinct[0], distinct[-2], BINS)
+    place = (distinct[:-1] - edges[0]) / (edges[1] - edges[0])
     left = np.minimum(place.astype(np.int64), BINS - 2)
     share = place - left
     filled = np.bincount(left, (1.0 - share) * counts[:-1], BINS) + np.bincount(
         left + 1, share * counts[:-1], BINS
     )
-    return np.append(edges, found[-1]), np.append(filled, counts[-1])
+    return np.append(edges, distinct[-1]), np.append(filled, counts[-1])
 
 
-def _chance(found: F64, counts: F64, at: float) -> float:
-    parts = found - at
+def _chance(values: F64, counts: F64, mean: float) -> float:
+    parts = values - mean
     if parts[-1] <= 0.0 or parts[0] >= 0.0:
         return float(parts[0] >= 0.0)
     angles = FREQUENCIES[:, None] * (parts / math.sqrt(float(counts @ parts**2)))
@@ -104,12 +106,12 @@ def upper_bound(values: F64, most: float, tail: float = TAIL) -> float:
     scale = max(float(np.max(np.abs(values))), abs(most))
     if scale == 0.0:
         return most
-    found, counts = _with_worst(np.asarray(values, dtype=np.float64) / scale, most / scale)
+    distinct, counts = _with_worst(np.asarray(values, dtype=np.float64) / scale, most / scale)
     low = float(np.mean(np.asarray(values) / scale))
-    if low >= found[-1]:
+    if low >= distinct[-1]:
         return most
     root = scipy.optimize.brentq(
-        lambda at: _chance(found, counts, at) - tail, low, found[-1], xtol=TOLERANCE
+        lambda mean: _chance(distinct, counts, mean) - tail, low, distinct[-1], xtol=TOLERANCE
     )
     return min(scale * float(root), most)
 

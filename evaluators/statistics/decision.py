@@ -177,11 +177,11 @@ def scene_differences(
         metric: Its name.
         scenes: In the order in which they were drawn.
     """
-    mine = dict(zip(candidate.cells, candidate.values(metric).tolist(), strict=True))
+    own = dict(zip(candidate.cells, candidate.values(metric).tolist(), strict=True))
     base = dict(zip(baseline.cells, baseline.values(metric).tolist(), strict=True))
     of_scene: dict[str, list[float]] = {scene: [] for scene in scenes}
-    for cell in dict.fromkeys([*mine, *base]):
-        of_scene.setdefault(cell[1], []).append(mine.get(cell, np.nan) - base.get(cell, np.nan))
+    for cell in dict.fromkeys([*own, *base]):
+        of_scene.setdefault(cell[1], []).append(own.get(cell, np.nan) - base.get(cell, np.nan))
     diff = [np.mean(of_scene[scene]) if of_scene[scene] else np.nan for scene in scenes]
     every = np.concatenate([of_scene[scene] or [np.nan] for scene in scenes])
     return SceneDifferences(np.array(diff), len(every), int(np.isnan(every).sum()))
@@ -276,13 +276,13 @@ def state_after(
     log_good = np.maximum.accumulate(np.array([good for good, _ in paths]), axis=1)
     log_bad = np.maximum.accumulate(closed(np.array([bad for _, bad in paths])), axis=1)
     bar = -math.log(question.alpha)
-    is_good = log_good >= bar
-    is_bad = log_bad >= bar
+    is_good: Bool = log_good >= bar
+    is_bad: Bool = log_bad >= bar
     answer: Answer = "open"
     if n >= question.min_scenes:
         binding = [asked.binding for asked in question.metrics]
         all_good = is_good[binding].all(axis=0) & any(binding)
-        answer = _first(all_good, is_bad.any(axis=0))
+        answer = _first(np.asarray(all_good), np.asarray(is_bad.any(axis=0)))
     states = []
     for i, (asked, metric_evidence) in enumerate(zip(question.metrics, evidence, strict=True)):
         x = values[asked.metric]

@@ -112,7 +112,9 @@ def load_gate(path_or_name: str | Path, known: MetricTable = METRICS) -> tuple[G
             column.
     """
     shipped = LIBRARY / f"{path_or_name}.yaml"
-    path = next((one for one in (Path(path_or_name), shipped) if one.is_file()), None)
+    path = next(
+        (candidate for candidate in (Path(path_or_name), shipped) if candidate.is_file()), None
+    )
     if path is None:
         raise InputError(
             f"{path_or_name}: no such file",
@@ -140,9 +142,9 @@ def _check_names(spec: GateSpec, document: Document, known: MetricTable) -> None
                 "simrun list metrics prints the known ones",
             ) from error
         if rule.margin == 0.0 and facts.direction == "none":
-            found = f"a margin of 0 for {name!r}, which has no better side"
+            problem = f"a margin of 0 for {name!r}, which has no better side"
             raise document.error(
-                ("metrics", name), found, "give the change to either side that is accepted"
+                ("metrics", name), problem, "give the change to either side that is accepted"
             )
     if spec.preset is not None and spec.preset not in PRESETS:
         raise document.error(("preset",), f"preset {spec.preset!r}", f"known: {', '.join(PRESETS)}")
@@ -259,14 +261,18 @@ def judge_sides(
     if not any(sides.values()):
         raise InputError("its rollouts: there are none", "give a run with rollouts")
     checks: list[Check] = []
-    arms = [Arm(renderer, policy) for policy, here in sides.items() for renderer in here]
+    arms = [
+        Arm(renderer, policy) for policy, by_renderer in sides.items() for renderer in by_renderer
+    ]
     has_margin = any(rule.margin is not None for rule in spec.metrics.values())
-    base, there = _base(arms, spec, stored, has_margin), sides if stored is None else stored
+    base, base_sides = _base(arms, spec, stored, has_margin), sides if stored is None else stored
     for arm in _judged(arms, spec, base, has_margin):
         side = sides[arm.policy][arm.renderer]
-        other = _partner(arm, base, there, stored is not None) if has_margin else arm
-        behind = as_policy(there[other.policy][other.renderer], arm.policy) if has_margin else side
-        found: dict[str, Check] = {}
+        other = _partner(arm, base, base_sides, stored is not None) if has_margin else arm
+        behind = (
+            as_policy(base_sides[other.policy][other.renderer], arm.policy) if has_margin else side
+        )
+        checks_of: dict[str, Check] = {}
         for wanted, rule in spec.metrics.items():
             metric = known.info(wanted)
             if rule.margin is not None:
@@ -274,14 +280,14 @@ def judge_sides(
                 against = (
                     name if stored is None else f"{name} of {stored_name or 'the baseline'}"
                 )  # else it reads "clean against clean"
-                found[wanted] = _margin(
+                checks_of[wanted] = _margin(
                     side, behind, (arm.renderer, arm.policy), name, against, metric, rule, spec
                 )
             if rule.max is not None or rule.min is not None:
                 checks.append(_limit(side, (arm.renderer, arm.policy), metric, rule))
         checks += [
-            _with_event(check, found, known) if spec.population == "scenes" else check
-            for check in found.values()
+            _with_event(check, checks_of, known) if spec.population == "scenes" else check
+            for check in checks_of.values()
         ]
     causes = [
         Outcome(check.cause, (check.text,))
@@ -324,12 +330,18 @@ def _base(
     if spec.baseline is None:
         by_policy_alone = len({arm.renderer for arm in arms}) == 1 and not has_margin
         return None if stored is not None or by_policy_alone else usual_base(arms)
-    there = (
+    arms_there = (
         arms
         if stored is None
-        else [Arm(renderer, policy) for policy, here in stored.items() for renderer in here]
+        else [
+            Arm(renderer, policy)
+            for policy, by_renderer in stored.items()
+            for renderer in by_renderer
+        ]
     )
-    return base_named(spec.baseline, there, "the run" if stored is None else "the stored baseline")
+    return base_named(
+        spec.baseline, arms_there, "the run" if stored is None else "the stored baseline"
+    )
 
 
 def _judged(arms: Sequence[Arm], spec: GateSpec, base: Base | None, has_margin: bool) -> list[Arm]:
@@ -351,21 +363,23 @@ def _judged(arms: Sequence[Arm], spec: GateSpec, base: Base | None, has_margin: 
     return judged or list(arms)  # a gate of limits alone needs no second arm
 
 
-def _partner(arm: Arm, base: Base | None, there: Mapping[str, Sides], is_stored: bool) -> Arm:
+def _partner(arm: Arm, base: Base | None, stored: Mapping[str, Sides], is_stored: bool) -> Arm:
     """Return the arm that an arm is compared with; of a stored baseline of one other policy, that
     policy's.
 
     Raises:
         InputError: There is none.
     """
-    known = [Arm(renderer, policy) for policy, here in there.items() for renderer in here]
+    known = [
+        Arm(renderer, policy) for policy, by_renderer in stored.items() for renderer in by_renderer
+    ]
     wanted = arm if base is None else base.of(arm)
-    if wanted not in known and base is None and len(there) == 1:
-        wanted = Arm(arm.renderer, next(iter(there)))
+    if wanted not in known and base is None and len(stored) == 1:
+        wanted = Arm(arm.renderer, next(iter(stored)))
     if wanted in known:
         return wanted
     where = "the stored baseline" if is_stored else "the run"
-    names = ", ".join(one.name for one in known)
+    names = ", ".join(arm_known.name for arm_known in known)
     raise InputError(
         f"baseline {wanted.name!r}: {where} does not have it",
         f"`baseline` of the gate may be one of: {names}",
@@ -389,29 +403,29 @@ def _margin(
     cause: Cause = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}[
         entry["verdict"]
     ]  # type: ignore[assignment]
-    said = _paired_text(entry, metric.name, variant[0], against)
+    text = _paired_text(entry, metric.name, variant[0], against)
     least = scenes_without_event(entry["margin"], reach_of(metric, entry["margin"])) or 0
     if entry["n_scenes"] < spec.min_scenes:
         cause = "undecided"
-        said += f"; {entry['n_scenes']} scene{'' if entry['n_scenes'] == 1 else 's'}, the gate asks for {spec.min_scenes}"
+        text += f"; {entry['n_scenes']} scene{'' if entry['n_scenes'] == 1 else 's'}, the gate asks for {spec.min_scenes}"
     elif cause == "undecided" and entry["n_scenes"] < least:
-        said += f"; fewer than {least} scenes cannot exclude harm in others"
+        text += f"; fewer than {least} scenes cannot exclude harm in others"
     elif cause != "regression" and entry["n_missing"] > spec.max_missing * planned:
         cause = "undecided"
-        said += f"; {entry['n_missing']} of {planned} cells have no pair, the gate allows {spec.max_missing:.0%}"
-    return Check(*variant, metric.name, "margin", cause, said, entry, rule.must_decide)
+        text += f"; {entry['n_missing']} of {planned} cells have no pair, the gate allows {spec.max_missing:.0%}"
+    return Check(*variant, metric.name, "margin", cause, text, entry, rule.must_decide)
 
 
-def _with_event(check: Check, found: Mapping[str, Check], known: MetricTable) -> Check:
+def _with_event(check: Check, checks: Mapping[str, Check], known: MetricTable) -> Check:
     """Return the check of a distance, which passes only together with the event that counts what
     lies beyond its cap.
     """
     event = known.info(check.metric).event
-    if check.cause != "pass" or not event or (event in found and found[event].cause == "pass"):
+    if check.cause != "pass" or not event or (event in checks and checks[event].cause == "pass"):
         return check
     why = (
-        f"{event} is {found[event].entry['verdict']}"
-        if event in found
+        f"{event} is {checks[event].entry['verdict']}"
+        if event in checks
         else f"the gate has no margin for {event}"
     )
     return replace(

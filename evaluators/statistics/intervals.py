@@ -174,9 +174,9 @@ def cluster_means(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> tuple
     ):  # names; numbers are not sorted, as a run may have millions of cells
         group = np.unique(group, return_inverse=True)[1].reshape(-1)
     size = np.bincount(group)
-    there = size > 0
+    is_used = size > 0
     total = np.bincount(group, weights=x)
-    return total[there] / size[there] * scale, size[there]
+    return total[is_used] / size[is_used] * scale, size[is_used]
 
 
 def n_clusters(clusters: I64) -> int:

@@ -26,37 +26,37 @@ def rollouts_of(manifests: Iterable[Mapping[str, Any]]) -> tuple[list[Rollout], 
     """Return manifests as rows, and when their outcomes began."""
     rows: list[Rollout] = []
     times: dict[tuple[str, str, str, int], dict[str, float]] = {}
-    for one in manifests:
+    for manifest in manifests:
         metrics = {
             name: facts["value"] if facts["valid"] else None
-            for name, facts in (one.get("metrics") or {}).items()
+            for name, facts in (manifest.get("metrics") or {}).items()
         }
         numbers = {
             name: value
             for name, value in metrics.items()
             if isinstance(value, int | float) or value is None
         }
-        error = one.get("error") or {}
+        error = manifest.get("error") or {}
         row = Rollout(
-            one["renderer"],
-            one["policy"],
-            one["scene"],
-            int(one["seed"]),
-            one["status"],
+            manifest["renderer"],
+            manifest["policy"],
+            manifest["scene"],
+            int(manifest["seed"]),
+            manifest["status"],
             str(error.get("failure_class") or ""),
             str(error.get("message") or ""),
             metrics=numbers,
         )
         rows.append(row)
-        found = {
+        began = {
             event["metric"]: float(event["t_s"])
-            for event in one.get("events") or []
+            for event in manifest.get("events") or []
             if "t_s" in event
         }
-        contact = [found[side] for side in CONTACT_SIDES if side in found]
+        contact = [began[side] for side in CONTACT_SIDES if side in began]
         if contact:
-            found |= dict.fromkeys(("collision_any", "collision_at_fault"), min(contact))
-        times.setdefault(row.cell, found)
+            began |= dict.fromkeys(("collision_any", "collision_at_fault"), min(contact))
+        times.setdefault(row.cell, began)
     return rows, times
 
 
@@ -78,17 +78,17 @@ def outcome_table(
     arms: dict[str, list[Rollout]] = {}
     for rollout in rollouts:
         arms.setdefault(rollout.variant, []).append(rollout)
-    return {name: _of_arm(mine, times or {}) for name, mine in arms.items()}
+    return {name: _of_arm(own, times or {}) for name, own in arms.items()}
 
 
 def _of_arm(rollouts: Sequence[Rollout], times: Times) -> dict[str, Any]:
     ended = [r for r in rollouts if has_ended(r)]
-    found: dict[str, list[dict[str, Any]]] = {}
+    cells: dict[str, list[dict[str, Any]]] = {}
     for rollout in ended:
         began = times.get(rollout.cell, {})
-        for one in told(outcomes_of(rollout)):
-            found.setdefault(one.name, []).append(
-                {"scene": rollout.scene, "seed": rollout.seed, "t_s": began.get(one.name)}
+        for outcome in told(outcomes_of(rollout)):
+            cells.setdefault(outcome.name, []).append(
+                {"scene": rollout.scene, "seed": rollout.seed, "t_s": began.get(outcome.name)}
             )
     return {
         "n_rollouts": len(rollouts),
@@ -96,9 +96,9 @@ def _of_arm(rollouts: Sequence[Rollout], times: Times) -> dict[str, Any]:
         "n_failed": sum(bool(outcomes_of(r)) for r in ended),
         "n_reached_end": sum(reached_end(r) for r in ended),
         "outcomes": {
-            name: {"n": len(found[name]), "cells": found[name][:LISTED]}
+            name: {"n": len(cells[name]), "cells": cells[name][:LISTED]}
             for name in OUTCOMES
-            if name in found
+            if name in cells
         },
     }
 

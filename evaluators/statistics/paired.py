@@ -267,7 +267,7 @@ def compare(
     else:
         entry["verdict"], entry["difference"] = shown
     others = sorted(
-        {UNDONE_BY[one] for one, other in zip(alone, shown, strict=True) if one != other}
+        {UNDONE_BY[answer] for answer, other in zip(alone, shown, strict=True) if answer != other}
     )
     if others and guarded is not None:
         many = f"{len(means)} scenes cannot exclude that a few others are {' or '.join(others)}"
@@ -379,13 +379,13 @@ class Pairs:
 
     def __init__(self, here: Side, there: Side, metric: str) -> None:
         self.sides = (here, here.values(metric)), (there, there.values(metric))
-        mine, base = self.sides[0][1], self.sides[1][1]
+        own, base = self.sides[0][1], self.sides[1][1]
         index = here.place_in(there)
         partner = (
-            np.where(index >= 0, base[index], np.nan) if len(base) else np.full(len(mine), np.nan)
+            np.where(index >= 0, base[index], np.nan) if len(base) else np.full(len(own), np.nan)
         )
-        both: Bool = np.isfinite(mine) & np.isfinite(partner)
-        self.mine, self.base, self.scenes = mine[both], partner[both], here.scene[both]
+        both: Bool = np.isfinite(own) & np.isfinite(partner)
+        self.mine, self.base, self.scenes = own[both], partner[both], here.scene[both]
         only_there = np.flatnonzero(there.place_in(here) < 0)
         self._lone = (here, np.flatnonzero(~both)), (there, only_there)
         self.n_missing = int(np.sum(~both)) + len(only_there)
@@ -398,12 +398,10 @@ class Pairs:
         return [_lost(cell, *self.sides, metric) for cell in lone[:listed]]
 
 
-def _lost(
-    cell: Cell, here: tuple[Side, F64], there: tuple[Side, F64], metric: str
-) -> dict[str, Any]:
+def _lost(cell: Cell, own: tuple[Side, F64], base: tuple[Side, F64], metric: str) -> dict[str, Any]:
     why = {
-        "here": here[0].why_missing(cell, metric, here[1]),
-        "baseline": there[0].why_missing(cell, metric, there[1]),
+        "here": own[0].why_missing(cell, metric, own[1]),
+        "baseline": base[0].why_missing(cell, metric, base[1]),
     }
     gone = {side: text for side, text in why.items() if text}
     policy, scene, seed = cell

@@ -90,13 +90,13 @@ class Reduction:
     def as_row(self) -> dict[str, Any]:
         """Return flat columns: METRIC and METRIC_valid, as in rollouts.parquet."""
         row: dict[str, Any] = {}
-        for name, one in self.values.items():
-            row[name], row[f"{name}_valid"] = one.value, one.valid
+        for name, value in self.values.items():
+            row[name], row[f"{name}_valid"] = value.value, value.valid
         return row
 
     def as_dict(self) -> dict[str, dict[str, Any]]:
         """Return METRIC -> value, valid, reason, unit, direction, for a manifest."""
-        return {name: one.as_dict() for name, one in self.values.items()}
+        return {name: value.as_dict() for name, value in self.values.items()}
 
 
 def rollout_values(
@@ -117,7 +117,7 @@ def rollout_values(
 def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = DEFAULT) -> Reduction:
     """Reduce a rollout and say what was dropped on the way; see `rollout_values`."""
     chosen = find_preset(preset)
-    table = {one.name: one for one in series}
+    table = {metric_series.name: metric_series for metric_series in series}
     if "eval_relevant" not in table:
         raise EvaluatorError(
             f"series {sorted(table)}: no eval_relevant",
@@ -130,8 +130,8 @@ def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = DEFAUL
     # eval_relevant selects steps; as a value of its own it says nothing, but AlpaSim's tables have
     # it.
     values = {
-        name: _reduce(one, first_us, last_us, chosen, ledger.dropped)
-        for name, one in table.items()
+        name: _reduce(metric_series, first_us, last_us, chosen, ledger.dropped)
+        for name, metric_series in table.items()
         if chosen.aliases or name != "eval_relevant"
     }
     if not ledger.dropped:
@@ -142,12 +142,12 @@ def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = DEFAUL
         )
     if "progress_rel_to_total" in values:
         values["progress_clipped_rel"] = values["progress_rel_to_total"]
-    found = (
+    begins = (
         []
         if ledger.dropped
         else [(_first_time(table[name], first_us), name) for name in EVENTS if name in table]
     )
-    times = [(t, name) for t, name in found if t is not None and t <= last_us]
+    times = [(t, name) for t, name in begins if t is not None and t <= last_us]
     events = ({"metric": name, "t_us": t} for t, name in sorted(times, key=lambda event: event[0]))
     return Reduction(values, ledger, tuple(events))
 
@@ -193,12 +193,14 @@ def _window(table: dict[str, MetricSeries], preset: Preset) -> tuple[int, int, L
     after_event = int(np.sum(line > event_us))
     last_us = event_us
     if preset.stop_beyond_gt_m is not None and "dist_to_gt_trajectory" in table:
-        one = table["dist_to_gt_trajectory"]
+        distance = table["dist_to_gt_trajectory"]
         far = (
-            (one.value >= preset.stop_beyond_gt_m) & (one.t_us >= first_us) & (one.t_us <= event_us)
+            (distance.value >= preset.stop_beyond_gt_m)
+            & (distance.t_us >= first_us)
+            & (distance.t_us <= event_us)
         )
         if far.any():
-            last_us = int(one.t_us[np.argmax(far)])
+            last_us = int(distance.t_us[np.argmax(far)])
     scored = int(np.sum((line >= first_us) & (line <= last_us)))
     return (
         first_us,
@@ -207,39 +209,48 @@ def _window(table: dict[str, MetricSeries], preset: Preset) -> tuple[int, int, L
     )
 
 
-def _first_time(one: MetricSeries, first_us: int) -> int | None:
-    fired = one.valid & (one.value > 0) & (one.t_us >= first_us)
-    return int(one.t_us[np.argmax(fired)]) if fired.any() else None
+def _first_time(metric_series: MetricSeries, first_us: int) -> int | None:
+    fired = metric_series.valid & (metric_series.value > 0) & (metric_series.t_us >= first_us)
+    return int(metric_series.t_us[np.argmax(fired)]) if fired.any() else None
 
 
 def _reduce(
-    one: MetricSeries, first_us: int, last_us: int, preset: Preset, dropped: str
+    metric_series: MetricSeries, first_us: int, last_us: int, preset: Preset, dropped: str
 ) -> RolloutValue:
     if dropped:
-        return _value(one.metric, None, dropped)
-    rows = (one.t_us >= first_us) & (one.t_us <= last_us)
-    value, valid = one.value[rows], one.valid[rows]
+        return _value(metric_series.metric, None, dropped)
+    rows = (metric_series.t_us >= first_us) & (metric_series.t_us <= last_us)
+    value, valid = metric_series.value[rows], metric_series.valid[rows]
     if not len(value):
-        return _value(one.metric, None, "no value among the scored steps")
+        return _value(metric_series.metric, None, "no value among the scored steps")
     # Combined events have no value where a part is unknown; such rows are empty in AlpaSim's tables
     # and never read.
-    if not preset.honour_valid and not one.metric.derived:
-        return _value(one.metric, _REDUCE[one.metric.aggregation](value, one.t_us[rows]))
-    if one.metric.aggregation == "last":
+    if not preset.honour_valid and not metric_series.metric.derived:
+        return _value(
+            metric_series.metric,
+            _REDUCE[metric_series.metric.aggregation](value, metric_series.t_us[rows]),
+        )
+    if metric_series.metric.aggregation == "last":
         return (
-            _value(one.metric, float(value[-1]))
+            _value(metric_series.metric, float(value[-1]))
             if valid[-1]
-            else _value(one.metric, None, one.reason)
+            else _value(metric_series.metric, None, metric_series.reason)
         )
     known = value[valid]
     fired = bool(np.any(known > 0))
     if not len(known) or (
-        one.metric.is_flag and one.metric.aggregation == "max" and not fired and not valid.all()
+        metric_series.metric.is_flag
+        and metric_series.metric.aggregation == "max"
+        and not fired
+        and not valid.all()
     ):
         # A flag that did not fire where it is known may have fired where it is not: unknown, never
         # zero.
-        return _value(one.metric, None, one.reason)
-    return _value(one.metric, _REDUCE[one.metric.aggregation](known, one.t_us[rows][valid]))
+        return _value(metric_series.metric, None, metric_series.reason)
+    return _value(
+        metric_series.metric,
+        _REDUCE[metric_series.metric.aggregation](known, metric_series.t_us[rows][valid]),
+    )
 
 
 _REDUCE: dict[Aggregation, Callable[[F64, I64], float]] = {

@@ -75,11 +75,11 @@ def aggregate_sides(
         known: What they are.
     """
     # Metric by metric: renderers share its column and its draws.
-    found = {
+    entries = {
         name: {renderer: _entry(side, known.info(name)) for renderer, side in sides.items()}
         for name in metrics
     }
-    return {renderer: {name: found[name][renderer] for name in metrics} for renderer in sides}
+    return {renderer: {name: entries[name][renderer] for name in metrics} for renderer in sides}
 
 
 def _entry(side: Side, metric: MetricInfo) -> dict[str, Any]:
@@ -126,8 +126,8 @@ def _entry(side: Side, metric: MetricInfo) -> dict[str, Any]:
     if entry["n_scenes"] > BOOTSTRAP_SCENES:
         why = f"not drawn for more than {BOOTSTRAP_SCENES} scenes; ci95_clustered needs no second opinion there"
     else:
-        found = cluster_bootstrap(values, scenes, partial(_redraws, metric.name))
-        entry["ci95_bootstrap"], why = found.bounds, found.reason
+        bootstrap = cluster_bootstrap(values, scenes, partial(_redraws, metric.name))
+        entry["ci95_bootstrap"], why = bootstrap.bounds, bootstrap.reason
     if why:
         entry["ci95_bootstrap_reason"] = why
     if metric.is_flag:
@@ -294,24 +294,33 @@ def numbers(
         known: What the metrics are.
     """
     sides = {policy: table.sides(policy) for policy in table.policies}
-    arms = [Arm(renderer, policy) for policy, here in sides.items() for renderer in here]
+    arms = [
+        Arm(renderer, policy)
+        for policy, by_renderer_sides in sides.items()
+        for renderer in by_renderer_sides
+    ]
     by_renderer_base, by_policy_base = axis_bases(arms, baseline)
     chosen: dict[str, str | None] = {}  # None where there is nothing to compare
-    for policy, here in sides.items():
-        first = next(iter(here), None) if len(here) > 1 else None
+    for policy, by_renderer_sides in sides.items():
+        first = next(iter(by_renderer_sides), None) if len(by_renderer_sides) > 1 else None
         named = None if by_renderer_base is None else by_renderer_base.renderer
-        chosen[policy] = named if len(here) > 1 and named in here else first
+        chosen[policy] = (
+            named if len(by_renderer_sides) > 1 and named in by_renderer_sides else first
+        )
     metrics = {
-        policy: aggregate_sides(here, table.metrics, known) for policy, here in sides.items()
+        policy: aggregate_sides(by_renderer_sides, table.metrics, known)
+        for policy, by_renderer_sides in sides.items()
     }
     paired: dict[str, Table] = {}
     with_base: dict[str, Table] = {}
-    for policy, here in sides.items():
+    for policy, by_renderer_sides in sides.items():
         base = chosen[policy]
         paired[policy] = (
-            {} if base is None else paired_sides(here, table.metrics, base, known=known)
+            {}
+            if base is None
+            else paired_sides(by_renderer_sides, table.metrics, base, known=known)
         )
-        with_base[policy] = base_pairs(here, table.metrics, base, bases, known)
+        with_base[policy] = base_pairs(by_renderer_sides, table.metrics, base, bases, known)
     parts = {"metrics": metrics, "paired": paired, "paired_with_base": with_base}
     arm_pairs = [] if by_policy_base is None else by_policy_base.pairs(arms)
     across = paired_arms(table, arm_pairs, known)
@@ -343,14 +352,14 @@ def paired_arms(
     base = table if base is None else base
     out: Table = {}
     for arm, other in pairs:
-        here, there = (
+        side, base_side = (
             table.sides(arm.policy)[arm.renderer],
             base.sides(other.policy, arm.policy)[other.renderer],
         )
         out[arm.name] = {
             name: compare(
-                here,
-                there,
+                side,
+                base_side,
                 known.info(name),
                 prefix + other.name,
                 (margins or {}).get(name),
@@ -361,20 +370,22 @@ def paired_arms(
     return out
 
 
-def by_policy(of: Mapping[str, Any], table: Callable[[Any], Mapping[str, Any]]) -> dict[str, Any]:
+def by_policy(
+    parts: Mapping[str, Any], table: Callable[[Any], Mapping[str, Any]]
+) -> dict[str, Any]:
     """Make a table per policy. With one policy its keys are RENDERER, with several RENDERER/POLICY:
     policies are never averaged.
 
     Args:
-        of: POLICY -> what the table is made of.
+        parts: POLICY -> what the table is made of.
         table: Gives RENDERER -> entry.
     """
     out: dict[str, Any] = {}
-    for policy, some in of.items():
+    for policy, some in parts.items():
         part = table(some)
         out |= (
             part
-            if len(of) == 1
+            if len(parts) == 1
             else {cell_name(renderer, policy): entry for renderer, entry in part.items()}
         )
     return out

@@ -76,9 +76,11 @@ def worst(outcomes: list[Outcome]) -> Outcome:
         3
     """
     for cause in SEVERITY:
-        mine = [one for one in outcomes if one.cause == cause]
-        if mine:
-            return Outcome(cause, tuple(reason for one in mine for reason in one.reasons))
+        same_cause = [outcome for outcome in outcomes if outcome.cause == cause]
+        if same_cause:
+            return Outcome(
+                cause, tuple(reason for outcome in same_cause for reason in outcome.reasons)
+            )
     return Outcome("pass")
 
 
@@ -96,11 +98,11 @@ def outcome_of_failures(failures: Mapping[str, Any], max_share: float = 0.0) -> 
     if n_failed <= max_share * n:
         return Outcome("pass")
     causes = ", ".join(f"{name} {count}" for name, count in by_class.items())
-    said = f"{n_failed} of {n} rollouts could not be run or scored ({causes})"
+    text = f"{n_failed} of {n} rollouts could not be run or scored ({causes})"
     alone: Cause | None = next(
         (cause for cause in ("evaluator", "policy") if set(by_class) == {cause}), None
     )
-    return Outcome(alone or "infrastructure", (said,))
+    return Outcome(alone or "infrastructure", (text,))
 
 
 Verdict = Literal["non-inferior", "worse", "undecided"]
@@ -268,8 +270,8 @@ def scenes_without_event(margin: float, reach: float = 1.0) -> int | None:
     """
     if margin <= 0.0 or margin / reach < 1.0 / MOST_SCENES:
         return None
-    found = scenes_to_exclude(margin, reach)
-    return found if found <= MOST_SCENES else None
+    needed = scenes_to_exclude(margin, reach)
+    return needed if needed <= MOST_SCENES else None
 
 
 def more_scenes(
