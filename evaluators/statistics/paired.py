@@ -41,7 +41,6 @@ from evaluators.statistics.verdicts import (
 
 Table = dict[str, dict[str, dict[str, Any]]]  # RENDERER -> METRIC -> numbers
 
-ROUNDING = 1e-12  # differences of no more than this, relative to values above 1, are none
 LISTED = 50  # missing cells named per metric; the count is always whole
 UNDONE_BY = {
     "non-inferior": "worse",
@@ -212,7 +211,6 @@ def compare(
         delta = pairs.mine - pairs.base
     if not np.isfinite(delta).all():
         return entry | {"reason": TOO_LARGE}
-    delta[np.abs(delta) <= ROUNDING * np.maximum(np.abs(pairs.base), 1.0)] = 0.0
     means, _ = cluster_means(delta, pairs.scenes)
     up, down = int(np.sum(means > 0)), int(np.sum(means < 0))
     entry["scenes"] = {
