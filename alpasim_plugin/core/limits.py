@@ -1,7 +1,7 @@
 """One bound per quantity: its name, unit, range, and why. Schemas, readers and the command line
 take their limits from here.
 
-docs/security.md shows this table; a test holds the two together. What a scene may cost as a whole
+What a scene may cost as a whole
 is in `scenarios.budget`.
 """
 

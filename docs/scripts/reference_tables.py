@@ -98,18 +98,6 @@ def metric_table() -> str:
     return table((*head, "invalid"), ((", ".join(some), *row) for row, some in names.items()))
 
 
-def score_table() -> str:
-    """Return one row for each score of another benchmark; bounds stand with their score."""
-    bounds = ("_least", "_most")
-    rows = []
-    for name, score in BENCHMARKS.items():
-        if name.endswith(bounds):
-            continue
-        names = [name, *(name + end for end in bounds if name + end in BENCHMARKS)]
-        rows.append((", ".join(f"`{one}`" for one in names), score.formula or score.help))
-    return table(("score or part", "of a rollout"), rows)
-
-
 def type_name(annotation: Any) -> str:
     """Return the words for a key's type."""
     origin, options = get_origin(annotation), get_args(annotation)
@@ -170,7 +158,7 @@ def written() -> dict[Path, str]:
     """Return the pages as they should be."""
     tables = {
         "cli.md": {"options": cli_tables()},
-        "metrics.md": {"metrics": metric_table(), "scores": score_table()},
+        "metrics.md": {"metrics": metric_table()},
         "scenario-files.md": {"keys": key_tables()},
     }
     pages = {}
