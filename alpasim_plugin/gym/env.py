@@ -47,7 +47,6 @@ PREDICTED_US, PREDICTED_STEP_US = (
     100_000,
 )  # of the plan that stands in the log for a held command
 FORWARD_M, BACKWARD_M, ASIDE_M = 200.0, 50.0, 100.0  # bounds of a trajectory, rig frame
-DOING = "making an environment"
 ROUTE_POINTS, ROUTE_M = 20, 200.0  # rows of the route, and the bound of its coordinates
 SPEED_MPS = 100.0
 ROLLOUT_SEEDS = 2**31

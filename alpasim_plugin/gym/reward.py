@@ -21,7 +21,6 @@ USED = (
     "offroad",
     "route",
 )  # evaluators whose values at an instant need no more of the drive than the instant before
-DOING = "rewarding a step"
 
 Instant = tuple[EgoState, Mapping[str, F64]]  # the ego, and T_world_box (4, 4) of the others by id
 

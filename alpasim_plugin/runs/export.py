@@ -62,7 +62,6 @@ RUN_METADATA = "run_metadata.yaml"
 EVAL_CONFIG = "eval-config.yaml"
 WIZARD_CONFIG = "wizard-config.yaml"
 SCENES = "scenes"
-DOING = "exporting to AlpaSim"
 COMPLETE, FAILED = "_complete", "failed_rollouts.json"
 # AlpaSim's longest minADE horizon; one shorter sample loses all four metrics of its rollout
 PLAN_US = 5_000_000

@@ -22,8 +22,6 @@ from alpasim_plugin.runs.plan import (
     refuse_commands,
 )
 
-DOING = "finding a logged rollout"
-
 
 @dataclass(frozen=True)
 class LoggedRollout:

@@ -4,8 +4,9 @@ keys.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,7 +22,6 @@ from evaluators.metrics.presets import DEFAULT, preset
 from scenarios.load import code_digest_of, load_scenario
 from scenarios.suite import ScenarioRef
 
-DOING = "planning a run"
 LOOP, SCORING = (
     "alpasim_plugin.runs.rollout",
     "alpasim_plugin.runs.scoring",
@@ -199,17 +199,43 @@ def make_plan(
     moving = {
         spec.name: resolve("controller", options.controller or spec.controller) for spec in driving
     }
-    scoring = resolve_evaluators(options.evaluators)
-    loaded = _load(refs)
-    scenarios = {scenario.scene_id: scenario for _, scenario in loaded}
-    code = _Code.of(scenarios.values(), options.preset, scoring)
-    cells = [
-        _cell(scenario, ref, renderer, policy, moving[policy.name], seed, scoring, options, code)
-        for ref, scenario in loaded
-        for renderer in rendering
-        for policy in driving
-        for seed in seeds
-    ]
+    evaluators = resolve_evaluators(options.evaluators)
+    loop = package_digest()
+    scoring = scoring_content(options.preset, evaluators)
+    stops = preset(options.preset).stop_at_path_end
+    scenarios = {}
+    sources: dict[str | None, str | None] = {}  # source of a recorded log -> digest of its code
+    cells = []
+    for ref, scenario in _load(refs):
+        scenarios[scenario.scene_id] = scenario
+        if scenario.source_part not in sources:
+            sources[scenario.source_part] = code_digest_of(scenario)
+        for renderer, policy, seed in product(rendering, driving, seeds):
+            controller = moving[policy.name]
+            content = {
+                f"renderer {renderer.name}": renderer.digest,
+                f"policy {policy.name}": policy.digest,
+                f"controller {controller.name}": controller.digest,
+                f"source of {scenario.scene_id}": sources[scenario.source_part],
+            }
+            rollout_key = digest(
+                [loop, scenario.content_hash, content, seed, options.images, options.device]
+            )
+            cells.append(
+                Cell(
+                    renderer,
+                    policy,
+                    controller,
+                    scenario.scene_id,
+                    seed,
+                    ref,
+                    evaluators,
+                    rollout_key,
+                    digest([rollout_key, *scoring]),
+                    scenario.stop_at_path_end and stops,
+                    tuple(part for part, known in content.items() if known is None),
+                )
+            )
     return RunPlan(tuple(cells), scenarios, rendering, driving, tuple(seeds), options)
 
 
@@ -285,72 +311,6 @@ def refuse_commands(policies: Sequence[str], where: str) -> None:
                 f"{where}: its policy is a command, {name}; no command is run because a file names it",
                 "give simrun run the same command again: it drives what is missing or damaged",
             )
-
-
-@dataclass(frozen=True)
-class _Code:
-    """What the keys of all cells of a plan share; to read it for each cell would cost milliseconds
-    a rollout.
-
-    Attributes:
-        loop: Digest of the loop's code.
-        scoring: What `scoring_content` gives.
-        sources: Scene id -> digest of the code that made the scenario.
-    """
-
-    loop: str
-    scoring: tuple[Any, ...]
-    sources: Mapping[str, str | None]
-
-    @classmethod
-    def of(
-        cls, scenarios: Iterable[Scenario], preset_name: str, evaluators: Sequence[PartSpec]
-    ) -> _Code:
-        by_source: dict[str | None, str | None] = {}
-        sources = {}
-        for scenario in scenarios:
-            if scenario.source_part not in by_source:
-                by_source[scenario.source_part] = code_digest_of(scenario)
-            sources[scenario.scene_id] = by_source[scenario.source_part]
-        return cls(package_digest(), scoring_content(preset_name, evaluators), sources)
-
-
-def _cell(
-    scenario: Scenario,
-    ref: ScenarioRef,
-    renderer: RendererSpec,
-    policy: PartSpec,
-    controller: PartSpec,
-    seed: int,
-    evaluators: tuple[PartSpec, ...],
-    options: RunOptions,
-    code: _Code,
-) -> Cell:
-    content: dict[str, str | None] = {
-        f"renderer {renderer.name}": renderer.digest,
-        f"policy {policy.name}": policy.digest,
-        f"controller {controller.name}": controller.digest,
-        f"source of {scenario.scene_id}": code.sources[scenario.scene_id],
-    }
-    rollout_key = digest(
-        [code.loop, scenario.content_hash, content, seed, options.images, options.device]
-    )
-    undigested = tuple(what for what, known in content.items() if known is None)
-    stops = scenario.stop_at_path_end and preset(options.preset).stop_at_path_end
-    scored = digest([rollout_key, *code.scoring])
-    return Cell(
-        renderer,
-        policy,
-        controller,
-        scenario.scene_id,
-        seed,
-        ref,
-        evaluators,
-        rollout_key,
-        scored,
-        stops,
-        undigested,
-    )
 
 
 def score_key(rollout_key: str, preset_name: str, evaluators: Sequence[PartSpec]) -> str:

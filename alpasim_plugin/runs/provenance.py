@@ -39,7 +39,6 @@ GIT = (
     "-c",
     "core.hooksPath=/dev/null",
 )
-STATUS = ("--porcelain=v2", "--branch", "--untracked-files=no", "--ignore-submodules=dirty")
 ALONE = {"GIT_ALLOW_PROTOCOL": "none", "GIT_NO_LAZY_FETCH": "1"}
 _COMMIT = re.compile(r"[0-9a-f]{7,64}")
 COUNTS = ("predicted", "hits", "exact", "drafts", "redrafts")

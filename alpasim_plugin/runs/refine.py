@@ -28,7 +28,6 @@ from alpasim_plugin.core.types import F32, U8, Frame
 from alpasim_plugin.fixers.refine import ChangeLimit, StreamStats, refine_frames
 from alpasim_plugin.log.video import UNSPECIFIED, TimedFrame, VideoFormat, VideoReader, VideoWriter
 
-DOING = "refining a video"
 CAMERA = "video"
 SAME_RATE = 5e-4  # relative; 29.97 and 30 differ by twice that
 PERIOD = Fraction(1, 10)  # seconds from picture to picture: they have no times of their own

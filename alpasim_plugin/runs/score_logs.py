@@ -30,7 +30,6 @@ from scenarios.load import load_scenario
 from scenarios.suite import load_suite
 from scenarios.usdz import read_usdz, usdz_scene_id
 
-DOING = "scoring logs"
 UNKNOWN = "unknown"  # renderer or policy that a log does not name
 SKIPPED = "<skip>"
 

@@ -19,7 +19,6 @@ from alpasim_plugin.core.reading.tables import Kind, check_columns, check_parque
 if TYPE_CHECKING:
     import pyarrow as pa
 
-DOING = "reading a run folder"
 AGAIN = "give a folder written by simrun run or simrun score, or write it again with the same command and --resume"
 # of a metric's value: a double holds no thousandths of larger ones, and no picture a thousand times
 # as much
