@@ -1,57 +1,326 @@
-"""``simrun check``: compare a run folder with the digests in its manifests."""
+"""``simrun check``: verify a run folder, a policy, a renderer or an AlpaSim driver before it is
+relied on.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
 
+import numpy as np
 import typer
 
-from alpasim_plugin.cli.options import Json, Run
+from alpasim_plugin.alpasim.client.driver import AlpasimPolicy
+from alpasim_plugin.alpasim.client.preflight import (
+    LIMIT_S,
+    DriveTimes,
+    Finding,
+    findings,
+    outside_view,
+    resident_mib,
+    tolerances,
+)
+from alpasim_plugin.cli.options import HELP_NAMES, Json, Run, command_of, run_or_newest
+from alpasim_plugin.core.errors import InfrastructureError, PolicyError, SimrunError
 from alpasim_plugin.core.escape import terminal
+from alpasim_plugin.core.flags import Flag, Positional
+from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.subprocesses import parts_print_to_stderr
+from alpasim_plugin.core.types import RenderRequest, Scenario
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.manifests import Damage, read_run_json
 from alpasim_plugin.log.run_folder.schema import MANIFEST
+from alpasim_plugin.runs.cell import make_renderer
+from alpasim_plugin.runs.guards import checked_frames
+from alpasim_plugin.runs.rollout import run_rollout
 from alpasim_plugin.runs.tables import again
+from evaluators import reduce_rollout, score
+from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT, in_words
+from policies.conformance import check_policy as run_checks
+from scenarios.load import load_scenario
+from scenarios.suite import expand
 
-DAMAGED = 1
+BROKEN = 1
+ATTEMPTS = 2  # at a scene in which the driver is lost
+FRAMES = 3  # that a renderer is asked for
 
-EPILOG = """
+RUN_EPILOG = """
+Example: `simrun check run runs/nightly`
+
+Exit codes: 0 whole; 1 damaged or unfinished, the command of the run repairs it; 2 not a run folder.
+"""
+POLICY_EPILOG = """
 Examples:
 
-- `simrun check runs/nightly`
+- `simrun check policy lane-camera`
 
-- `simrun check runs/nightly --json`
+- `simrun check policy my_policy.py:Mine --scenario smoke/curve`
 
-Exit codes: 0 whole; 1 damaged or unfinished; 2 not a run folder.
+Exit codes: 0 every check passed; 1 the policy breaks its contract, or could not be made; 2 it cannot be found.
+"""
+RENDERER_EPILOG = """
+Example: `simrun check renderer my_renderer.py:Mine --scenario smoke/curve`
+
+Exit codes: 0 its frames are valid; 2 the renderer breaks its contract or cannot be found.
+"""
+DRIVER_EPILOG = """
+Examples:
+
+- `simrun check driver 127.0.0.1:50052`
+
+- `simrun check driver my-driver:6000 --scenario scenes/one.usdz`
+
+Exit codes: 0 nothing failed; 1 a check failed; 4 the driver cannot be reached.
 """
 
+app = typer.Typer(
+    help="Verify a run folder, a policy, a renderer or an AlpaSim driver.",
+    context_settings=HELP_NAMES,
+)
 
-def check(run: Run, as_json: Json = False) -> None:
-    """Read every file of every rollout, compare it with its digest, and say what is damaged.
+
+def check_run(run: Run = None, as_json: Json = False) -> None:
+    """Read every file of every rollout, compare it with its digest, and list what is damaged.
 
     Nothing is written. The command of the run drives damaged and unfinished rollouts again.
     """
-    found = inspect_run(run, full=True)
-    problems = [*found.damage]
-    problems += [Damage(cell, MANIFEST, "the rollout is unfinished") for cell in found.unfinished]
+    root = run_or_newest(run)
+    inspection = inspect_run(root, full=True)
+    problems = [*inspection.damage]
+    problems += [
+        Damage(cell, MANIFEST, "the rollout is unfinished") for cell in inspection.unfinished
+    ]
+    code = 0 if inspection.whole else BROKEN
     if as_json:
         facts = {
-            "run": str(run),
-            "whole": found.whole,
-            "exit_code": 0 if found.whole else DAMAGED,
-            "rollouts": len(found.cells),
-            "unfinished": len(found.unfinished),
-            "tables_only": found.tables_only,
+            "run": str(root),
+            "whole": inspection.whole,
+            "exit_code": code,
+            "rollouts": len(inspection.cells),
+            "unfinished": len(inspection.unfinished),
+            "tables_only": inspection.tables_only,
             "damage": [vars(problem) for problem in problems],
         }
         print(json.dumps(facts))
     else:
         for problem in problems:
             print(terminal(str(problem)))
-        if found.tables_only:
+        if inspection.tables_only:
             print("the folder has no rollouts, only tables")
-        state = "whole" if found.whole else "damaged or unfinished"
-        print(f"{len(found.cells)} rollouts, {len(problems)} problems: {state}")
+        state = "whole" if inspection.whole else "damaged or unfinished"
+        print(f"{len(inspection.cells)} rollouts, {len(problems)} problems: {state}")
         if problems:
-            print(terminal(again(read_run_json(run))))
-    raise typer.Exit(0 if found.whole else DAMAGED)
+            print(terminal(again(read_run_json(root))))
+    raise typer.Exit(code)
+
+
+def check_policy(
+    policy: Annotated[str, Positional("A policy's name, package.module:Class, or file.py:Class.")],
+    scenario: Annotated[
+        str | None, Flag("Scenario whose cameras it gets; by default one camera ahead.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Call a policy in fixed situations and name every breach of its contract: shapes, frames,
+    units, time, determinism.
+
+    Nothing is rendered or scored; it takes seconds. Run it before the first rollout.
+    """
+    scene = None if scenario is None else load_scenario(scenario)
+    with parts_print_to_stderr():
+        report = run_checks(policy, scene)
+    if as_json:
+        facts = {
+            "policy": policy,
+            "ok": report.ok,
+            "checks": [
+                {"check": check.name, "ok": check.ok, "found": check.sentence}
+                for check in report.checks
+            ],
+            "notes": report.notes,
+            "latency_ms": dict(zip(("p50", "max"), report.latency_ms, strict=True)),
+        }
+        print(json.dumps(facts))
+    else:
+        print(report)
+    raise typer.Exit(0 if report.ok else BROKEN)
+
+
+def check_renderer(
+    renderer: Annotated[str, Positional("A renderer or fixer as for `run --renderer`.")],
+    scenario: Annotated[str, Flag("Scenario that it renders.")] = "smoke/curve",
+    as_json: Json = False,
+) -> None:
+    """Render a few frames along the recorded path and check them: shape, type, camera and time."""
+    scene = load_scenario(scenario)
+    with parts_print_to_stderr():
+        session = make_renderer(renderer, scene)
+        times = [scene.start_us + number * scene.rates.camera_us for number in range(FRAMES)]
+        shapes = []
+        for t_us in times:
+            frames = checked_frames(session, recorded_requests(scene, t_us))
+            shapes += [list(frame.rgb.shape) for frame in frames]
+    facts = {"renderer": renderer, "ok": True, "frames": len(shapes), "shapes": shapes}
+    if as_json:
+        print(json.dumps(facts))
+    else:
+        height, width, _ = shapes[0]
+        print(f"{renderer}: {len(shapes)} frames of {width}x{height}, every check passed")
+
+
+def recorded_requests(scene: Scenario, t_us: int) -> list[RenderRequest]:
+    """Return a request for each camera of a scene at an instant of its recorded path."""
+    pose = interpolate(scene.ego_log, np.array([t_us]))[0]
+    poses = {
+        actor.actor_id: interpolate(actor.track, t_us)
+        for actor in scene.actors
+        if actor.track.t_us[0] <= t_us <= actor.track.t_us[-1]
+    }
+    requests = []
+    for camera in scene.cameras:
+        T_world_camera = pose @ camera.T_rig_camera
+        shutter = np.stack([T_world_camera, T_world_camera])
+        requests.append(RenderRequest(t_us, camera, shutter, poses))
+    return requests
+
+
+def check_driver(
+    address: Annotated[
+        str, Positional("The driver, with options as after alpasim://.", metavar="HOST:PORT")
+    ],
+    scenario: Annotated[
+        str, Flag("What it drives through: a scenario, or a suite.")
+    ] = "smoke/curve",
+    limit_ms: Annotated[
+        float, Flag("Longest drive call; the challenge allows 100.", min=0.1)
+    ] = LIMIT_S * 1000,
+    as_json: Json = False,
+) -> None:
+    """Check an AlpaSim driver: rollouts in AlpaSim's order of calls, its times, its plans, and what
+    it must tolerate.
+    """
+    times = DriveTimes()
+    drives: list[Drive] = []
+    policy: AlpasimPolicy | None = None
+    for ref in expand(scenario, ("timing.timeline=alpasim",)):
+        scene = load_scenario(ref.path, ref.seed, ref.overrides)
+        try:
+            made = AlpasimPolicy(scene, address)
+        except InfrastructureError as error:
+            if policy is None:
+                raise
+            drives.append(Drive(scene.scene_id, 0, lost=1, failed=error))
+            break
+        if policy is not None:
+            policy.service.close()
+        policy = made
+        drives.append(rehearse(scene, policy, times))
+    assert policy is not None, "a scenario stands for one scene at least"
+    failed = next((drive.failed for drive in drives if drive.failed is not None), None)
+    checks = [
+        *findings(times, failed, sum(drive.warmup for drive in drives), limit_ms / 1000),
+        *over_scenes(drives),
+        *tolerances(policy.service, scene.scene_id),
+        *outside_view(),
+    ]
+    code = BROKEN if any(check.result == "failed" for check in checks) else 0
+    driver = policy.facts()["driver"]
+    if as_json:
+        facts = {
+            "driver": driver,
+            "checks": [check.__dict__ for check in checks],
+            "scenes": [drive.facts() for drive in drives],
+            "exit_code": code,
+        }
+        print(json.dumps(facts))
+    else:
+        print(f"driver  {driver}")
+        for check in checks:
+            print(f"{check.result:7} {check.name}: {check.text}")
+    raise typer.Exit(code)
+
+
+@dataclass
+class Drive:
+    """A scene of the rehearsal.
+
+    Attributes:
+        scene: Its id.
+        warmup: Queries in which empty plans are accepted.
+        outcomes: How it ended, by name; None where the driver was lost at every attempt.
+        lost: Attempts in which the connection was lost.
+        failed: What ended it early.
+        resident_mib: Memory of the driver afterwards, where it can be seen.
+    """
+
+    scene: str
+    warmup: int
+    outcomes: tuple[str, ...] | None = None
+    lost: int = 0
+    failed: SimrunError | None = None
+    resident_mib: float | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """Return what JSON says of it."""
+        ended = None if self.outcomes is None else in_words(self.outcomes)
+        return {
+            "scene": self.scene,
+            "ended": ended,
+            "lost": self.lost,
+            "resident_mib": self.resident_mib,
+        }
+
+
+def rehearse(scene: Scenario, policy: AlpasimPolicy, times: DriveTimes) -> Drive:
+    """Drive a scene and name its outcomes; where the driver is lost, wait until it is there again
+    and begin anew.
+    """
+    out = Drive(scene.scene_id, scene.warmup_us // scene.rates.policy_us + 1)
+    times.watch(policy.service)
+    for _ in range(ATTEMPTS):
+        try:
+            log = run_rollout(scene, make_renderer("clean", scene), policy).log()
+            values = reduce_rollout(score(log, scene.scene, preset="paper"), "paper").as_dict()
+            out.outcomes = tuple(
+                name
+                for name in OUTCOMES
+                if values.get(name, {}).get("valid") and values[name]["value"] >= 0.5
+            )
+            out.failed = None
+        except PolicyError as error:
+            out.outcomes, out.failed = (POLICY_FAULT,), error
+        except InfrastructureError as error:
+            out.lost, out.failed = out.lost + 1, error
+            policy.forget_session()
+        if out.failed is None or out.outcomes is not None or not _is_back(policy):
+            break
+    out.resident_mib = resident_mib(policy.service.target)
+    return out
+
+
+def _is_back(policy: AlpasimPolicy) -> bool:
+    try:
+        policy.service.wait_ready()
+    except InfrastructureError:
+        return False
+    return True
+
+
+def over_scenes(drives: Sequence[Drive]) -> list[Finding]:
+    """Return what the scenes show together: lost connections, and the driver's memory."""
+    lost = sum(one.lost for one in drives)
+    text = f"{lost} lost connections in {len(drives)} scenes; {sum(one.outcomes is None for one in drives)} scenes without an outcome"
+    found = [Finding("the connection lasts", "failed" if lost else "passed", text)]
+    seen = [one.resident_mib for one in drives if one.resident_mib is not None]
+    if len(seen) > 1:
+        text = f"{seen[0]:.0f} MiB after the first scene, {max(seen):.0f} at most, {seen[-1]:.0f} after the last; without children and GPU"
+        found.append(Finding("memory of the driver", "noted", text))
+    return found
+
+
+app.command("run", epilog=RUN_EPILOG)(command_of(check_run))
+app.command("policy", epilog=POLICY_EPILOG)(command_of(check_policy))
+app.command("renderer", epilog=RENDERER_EPILOG)(command_of(check_renderer))
+app.command("driver", epilog=DRIVER_EPILOG)(command_of(check_driver))

@@ -1,6 +1,4 @@
-"""``simrun compare``: paired differences within a run or between two runs. ``simrun aggregate``:
-the numbers of several runs as of one.
-"""
+"""``simrun compare``: means and paired differences within a run, between two runs, or over shards."""
 
 from __future__ import annotations
 
@@ -11,23 +9,20 @@ from typing import Annotated, Any
 
 from rich.console import Console
 
-from alpasim_plugin.cli.options import Every, Json
+from alpasim_plugin.cli.options import Every, Json, run_or_newest
 from alpasim_plugin.cli.progress import warn
-from alpasim_plugin.core.atomic import write_json
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.runs.summary import aggregate_runs, joined_metrics
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics import MetricTable
-from evaluators.opening import read_run
+from evaluators.opening import Run, read_run
 from evaluators.report import render_table
 from evaluators.report.numbers import plural
 from evaluators.report.tables import PairRow, pair_rows
 from evaluators.statistics.across import Comparison, compare_runs, compare_within
 from evaluators.statistics.decision import stopping_note
-from evaluators.statistics.gate import load_gate
 
-COMPARE_EPILOG = """
+EPILOG = """
 Examples:
 
 - `simrun compare runs/nightly --baseline clean`
@@ -38,7 +33,7 @@ Examples:
 
 - `simrun compare runs/main runs/change`: the second run minus the first, on shared cells
 
-- `simrun compare runs/main runs/change --gate configs/gates/default.yaml --json`
+- `simrun compare runs/night-1 runs/night-2 runs/night-3`: the shards of one run, as of one
 """
 EVERY_MISSING = 10**9
 SHOWN, NAMED = 10, 3  # lines about missing pairs; cells named in each
@@ -47,48 +42,73 @@ SHOWN, NAMED = 10, 3  # lines about missing pairs; cells named in each
 def compare(
     runs: Annotated[
         tuple[Path, ...],
-        Positional("One run folder, or two: the second is compared with the first."),
-    ],
+        Positional(
+            "One run, two of which the second is compared with the first, or the shards of one."
+        ),
+    ] = (),
     baseline: Annotated[
         str | None, Flag("RENDERER, POLICY or RENDERER/POLICY to compare with (of the first run).")
     ] = None,
-    gate: Annotated[str | None, Flag("Take the margins from this gate file.")] = None,
     every: Every = False,
     as_json: Json = False,
 ) -> None:
-    """Print paired differences on shared scene-seed cells, with verdicts; cells without a pair are
-    listed.
+    """Print means, paired differences with intervals, and verdicts.
+
+    Of two runs, the second is compared with the first on shared cells. The shards of one run are
+    joined.
     """
-    if len(runs) > 2:
-        raise InputError(f"{len(runs)} folders: more than two", "name one run, or two")
-    for run in runs:
+    folders = [run_or_newest(run) for run in runs] or [run_or_newest(None)]
+    for run in folders:
         ensure_tables(run, warn)
         if note := stopping_note(run):
             warn(note)
-    found = [read_run(run) for run in runs]
-    margins: dict[str, float] = {}
-    if gate is not None:
-        rules = load_gate(gate, found[-1].table)[0].metrics
-        margins = {name: rule.margin for name, rule in rules.items() if rule.margin is not None}
-    result = (
-        compare_within(found[0], baseline, margins, EVERY_MISSING)
-        if len(found) == 1
-        else compare_runs(found[0], found[1], baseline, margins, EVERY_MISSING)
-    )
-    if as_json:
-        print(
-            json.dumps(
-                {
-                    "runs": [str(run) for run in runs],
-                    "notes": list(result.notes),
-                    "paired": result.paired,
-                    "paired_with_base": result.with_base,
-                    "paired_arms": result.arms,
-                }
-            )
+    opened = [read_run(run) for run in folders]
+    if len(folders) == 2 and not are_shards(opened):
+        result = compare_runs(opened[0], opened[1], baseline, {}, EVERY_MISSING)
+        means = None
+    elif len(folders) > 1:
+        joined = aggregate_runs(folders, baseline)
+        result = Comparison(
+            joined["paired"],
+            with_base=joined["paired_with_base"],
+            metrics=joined_metrics(folders),
+            arms=joined["paired_arms"],
         )
+        means = joined
+    else:
+        result = compare_within(opened[0], baseline, {}, EVERY_MISSING)
+        means = opened[0].summary
+    if as_json:
+        facts = {
+            "runs": [str(run) for run in folders],
+            "notes": list(result.notes),
+            "paired": result.paired,
+            "paired_with_base": result.with_base,
+            "paired_arms": result.arms,
+        }
+        if means is not None:
+            facts |= {name: means[name] for name in ("preset", "metrics", "failures")}
+        print(json.dumps(facts))
         return
-    _print(result, [*result.metrics.headline, *margins] if not every else None)
+    if means is not None:
+        Console().print(render_table(means, headline_only=not every, known=result.metrics))
+        failures = means["failures"]
+        if failures["n_failed"]:
+            causes = ", ".join(f"{name} {n}" for name, n in failures["by_class"].items())
+            print(
+                f"{failures['n_failed']} of {failures['n_rollouts']} rollouts failed ({causes}) and are in no mean"
+            )
+    _print(result, None if every else result.metrics.headline)
+
+
+def are_shards(runs: Sequence[Run]) -> bool:
+    """Tell whether runs hold different rollouts of the same command: none is in two of them."""
+    first = runs[0].info
+    same = ("key", "renderers", "policies")
+    if any(run.info.get(name) != first.get(name) for run in runs for name in same):
+        return False
+    cells = [rollout.cell for run in runs for rollout in run.rollouts]
+    return len(set(cells)) == len(cells)
 
 
 def _print(result: Comparison, only: Sequence[str] | None) -> None:
@@ -172,52 +192,3 @@ def _missing(entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
         if len(lines) <= SHOWN
         else [*lines[:SHOWN], f"  {len(lines) - SHOWN} more lines: --json lists all"]
     )
-
-
-AGGREGATE_EPILOG = """
-Examples:
-
-- `simrun aggregate runs/night-*`
-
-- `simrun aggregate runs/night-* --baseline clean --out night.json`
-
-- `simrun aggregate runs/mine --all`
-"""
-
-
-def aggregate(
-    runs: Annotated[tuple[Path, ...], Positional("Finished run folders.")],
-    baseline: Annotated[
-        str | None, Flag("Renderer to compare against; by default the first run's.")
-    ] = None,
-    out: Annotated[
-        Path | None, Flag("Also write the numbers as JSON, in the form of summary.json.")
-    ] = None,
-    every: Every = False,
-    as_json: Json = False,
-) -> None:
-    """Print means, intervals and verdicts over the rollouts of several runs; tables of millions of
-    rows are streamed.
-    """
-    found = aggregate_runs(runs, baseline)
-    if out is not None:
-        write_json(out, found)
-    if as_json:
-        print(json.dumps(found))
-        return
-    known = joined_metrics(runs)
-    Console().print(render_table(found, headline_only=not every, known=known))
-    for row in pair_rows(found, known):
-        if every or known.shown(row.metric).is_headline:
-            numbers = f"{row.diff.text}, 95 % {row.interval.text}, p {row.p_value.text}".replace(
-                "\u00a0", " "
-            )
-            print(f"{row.variant} minus {row.baseline}: {row.metric} {numbers}: {row.verdict}")
-    failures = found["failures"]
-    if failures["n_failed"]:
-        causes = ", ".join(f"{name} {n}" for name, n in failures["by_class"].items())
-        print(
-            f"{failures['n_failed']} of {failures['n_rollouts']} rollouts failed ({causes}); they are in no average"
-        )
-    if out is not None:
-        print(f"numbers  {out}")

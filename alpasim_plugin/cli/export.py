@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from alpasim_plugin.cli.options import Json, Overwrite, Quiet, refuse_existing
+from alpasim_plugin.cli.options import Json, Overwrite, refuse_existing
 from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.cli.view import find_cell, is_run, narrowed
 from alpasim_plugin.core.errors import InputError
@@ -54,7 +54,6 @@ def export(
     ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
     """Write a run for other tools: AlpaSim run folders and scenes, or one scene, policy and seed as
     a recording for Foxglove and Rerun.
@@ -89,7 +88,7 @@ def export(
         done = export_run(
             Path(runs[0]),
             alpasim,
-            lambda text: None if quiet or as_json else print(text, file=sys.stderr, flush=True),
+            lambda text: None if as_json else print(text, file=sys.stderr, flush=True),
         )
     else:
         done = export_scenes(items, alpasim)
@@ -121,7 +120,7 @@ def export_recording(
             f"{' '.join(items)}: several items",
             "give one run folder, or the folder of one rollout",
         )
-    refuse_existing(path, overwrite, "")
+    refuse_existing(path, "--mcap", overwrite)
     require_mcap()  # before anything is read
     what = Path(items[0])
     root, of_rollout = find_cell(what)

@@ -24,7 +24,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from alpasim_plugin.cli.options import Json, command_of
+from alpasim_plugin.cli.options import HELP_NAMES, Json, command_of
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.seeding import stream
@@ -223,7 +223,8 @@ Examples:
 SPLAT_EPILOG = "Example: `simrun import splat street.ply --poses transforms.json -o street`: then `simrun --renderer 3dgs street/scenario.yaml`"
 
 app = typer.Typer(
-    no_args_is_help=True, help="Make a scenario of a recorded drive, or of a trained model."
+    help="Make a scenario of a recorded drive, or of a trained model.",
+    context_settings=HELP_NAMES,
 )
 
 Out = Annotated[

@@ -1,13 +1,12 @@
 """Entry point of ``simrun``: verbs, the default verb ``run``, and the mapping of errors and signals
 to exit codes.
 
-Only light modules are imported here: until a verb's own are loaded, a signal ends the process
-without a traceback.
+Only light modules are imported here. A verb's module is imported when the verb is used: some need
+torch, which takes seconds to load.
 """
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import difflib
 import errno
@@ -18,60 +17,100 @@ import sys
 import traceback
 from functools import cache
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
 
 from alpasim_plugin.core import places
 from alpasim_plugin.core.errors import InfrastructureError, InputError, InternalError, SimrunError
 from alpasim_plugin.core.lazy import installed_names
 from alpasim_plugin.core.signals import Stopped, leave_at_once, stoppable
 
-if TYPE_CHECKING:
-    import typer
-
-# Verb -> module of this package and its function, by the groups of the help page. Only the verb
-# that was typed is imported: some need torch, which takes seconds to load.
-GROUPS: dict[str, dict[str, str]] = {
-    "Bring in": {"import": "import_drive:app"},
+# Panel of the help page -> verb -> module of this package and its function, and one line of help,
+# which is the first of the function's docstring.
+PANELS: dict[str, dict[str, tuple[str, str]]] = {
+    "Bring in": {
+        "import": (
+            "import_drive:app",
+            "Make a scenario of a recorded drive, or of a trained model.",
+        ),
+        "refine": (
+            "refine:refine",
+            "Refine a video with a fixer, block by block, at any length in constant memory.",
+        ),
+    },
     "Drive": {
-        "run": "run:run",
-        "fork": "fork:fork",
-        "refine": "refine:refine",
+        "run": (
+            "run:run",
+            "Drive scenarios behind one or more renderers, score the rollouts and write a report.",
+        ),
+        "fork": (
+            "fork:fork",
+            "Continue a logged rollout from an instant on with another renderer, policy or seed.",
+        ),
     },
     "Read results": {
-        "score": "score:score",
-        "compare": "compare:compare",
-        "aggregate": "compare:aggregate",
-        "gate": "gate:gate",
-        "report": "view:report",
-        "runs": "runs:runs",
+        "compare": (
+            "compare:compare",
+            "Print means, paired differences with intervals, and verdicts.",
+        ),
+        "gate": (
+            "gate:gate",
+            "Judge a run by a gate, or test the gate itself on deliberately broken renderers.",
+        ),
+        "report": (
+            "view:report",
+            "Write report.html, summary.md and junit.xml of a run again and print its table.",
+        ),
+        "score": (
+            "score:score",
+            "Score rollout logs, AlpaSim's or ours, without rendering; the files are those of a run.",
+        ),
+        "view": (
+            "view:view",
+            "Replay rollouts on an offline page, or draw a scenario before it is driven.",
+        ),
+        "why": ("fork:why", "Show how a rollout failed, on one offline page."),
     },
-    "Look": {"why": "fork:why", "view": "view:view", "preview": "preview:preview"},
-    "AlpaSim": {
-        "serve": "serve:serve",
-        "serve-policy": "serve:serve_policy",
-        "check-driver": "check_policy:check_driver",
-        "export": "export:export",
+    "AlpaSim and other tools": {
+        "serve": (
+            "serve:serve",
+            "Serve AlpaSim's renderer service, or with `--policy` a policy as AlpaSim's driver.",
+        ),
+        "export": (
+            "export:export",
+            "Write a run for other tools: AlpaSim run folders and scenes, or one scene, policy and seed as a recording for Foxglove or Rerun.",
+        ),
     },
-    "Extend": {
-        "list": "new:list_parts",
-        "new": "new:new",
-        "check-policy": "check_policy:check_policy",
+    "Extend and check": {
+        "list": (
+            "list:list_names",
+            "List renderers, fixers, policies, scenarios, metrics, presets or runs, one a line.",
+        ),
+        "new": (
+            "new:new",
+            "Write a working policy, scenario, renderer, fixer or metric with a test, to begin from.",
+        ),
+        "check": (
+            "check:app",
+            "Verify a run folder, a policy, a renderer or an AlpaSim driver.",
+        ),
+        "doctor": (
+            "doctor:doctor",
+            "Test each part on a small case and report what works, what does not, and what to do.",
+        ),
+        "docs": ("docs:docs", "Read a page of the documentation in the terminal, or list all."),
     },
-    "Check and read": {"check": "check:check", "doctor": "doctor:doctor", "docs": "docs:docs"},
 }
-PLUGINS = "From installed packages"
-GROUP = "simrun.commands"
-OF_EXTRA = {
-    "adapt": "lab",
-    "train": "lab",
-    "judge": "lab",
-    "bench": "lab",
-}  # verbs that an optional package of ours brings
-OWN_OPTIONS = ("--help", "--version", "--install-completion", "--show-completion")
+PLUGIN_PANEL = "From installed packages"
+PLUGIN_GROUP = "simrun.commands"
+# Verbs that an optional package of ours brings.
+LABORATORY_VERBS = ("train", "bench")
+OWN_OPTIONS = ("--help", "-h", "--version", "--install-completion", "--show-completion")
+COMPLETION = "_SIMRUN_COMPLETE"  # set by a shell that asks what a Tab offers
 PIPE_CLOSED = 141  # as shells count a process that SIGPIPE ended
-READING = "reading the command line"
 HELP = """Closed-loop evaluation of driving policies behind a renderer.
 
 The default verb is `run`: `simrun --renderer clean,3dgs smoke/straight`.
@@ -84,17 +123,79 @@ simrun itself, 130, 143 or 129 stopped by SIGINT, SIGTERM or SIGHUP, 141 the rea
 @cache
 def verbs() -> dict[str, str]:
     """Return every verb and its ``module:attribute``: ours, and those that installed packages
-    register in the group `GROUP`.
+    register in the group `PLUGIN_GROUP`.
 
     Raises:
         InputError: A package claims a name that is taken.
     """
     own = {
         verb: f"alpasim_plugin.cli.{target}"
-        for group in GROUPS.values()
-        for verb, target in group.items()
+        for panel in PANELS.values()
+        for verb, (target, _) in panel.items()
     }
-    return own | installed_names(GROUP, own, "command")
+    return own | installed_names(PLUGIN_GROUP, own, "command")
+
+
+class Verb(TyperCommand):
+    """A verb whose module is imported when it is used; until then it has one line of help."""
+
+    def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
+        """Parse the words of the verb by its own command."""
+        return load_verb(str(self.name)).make_context(info_name, args, parent, **extra)
+
+
+class Verbs(TyperGroup):
+    """The group of all verbs."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of the verbs in the order of the help page."""
+        return list(verbs())
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a verb without importing its module."""
+        for panel, group in PANELS.items():
+            if cmd_name in group:
+                return Verb(cmd_name, help=group[cmd_name][1], rich_help_panel=panel)
+        if cmd_name in verbs():
+            text = f"See simrun {cmd_name} --help."
+            return Verb(cmd_name, help=text, rich_help_panel=PLUGIN_PANEL)
+        return None
+
+
+def load_verb(verb: str) -> Any:
+    """Import the module of a verb and return its command.
+
+    A verb is a `typer.Typer`, or a function whose parameters Typer or
+    `alpasim_plugin.cli.options.command_of` understands. Its help is its docstring; below it stands
+    ``VERB_EPILOG`` or ``EPILOG`` of its module.
+    """
+    from alpasim_plugin.cli.options import HELP_NAMES, command_of
+
+    module_name, _, name = verbs()[verb].partition(":")
+    module = import_module(module_name)
+    target = getattr(module, name)
+    if isinstance(target, typer.Typer):
+        return typer.main.get_command(target)
+    app = typer.Typer(add_completion=False, rich_markup_mode="markdown")
+    epilog = getattr(module, f"{name.upper()}_EPILOG", getattr(module, "EPILOG", None))
+    app.command(verb, epilog=epilog, context_settings=HELP_NAMES)(command_of(target))
+    return typer.main.get_command(app)
+
+
+app = typer.Typer(
+    cls=Verbs,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    help=HELP,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.callback()
+def own_options(
+    version: bool = typer.Option(False, "--version", help="Print the version and leave."),
+) -> None:
+    """Take the options that stand before a verb."""
 
 
 def with_verb(args: list[str]) -> list[str]:
@@ -112,89 +213,19 @@ def with_verb(args: list[str]) -> list[str]:
     """
     if not args or args[0] in verbs() or args[0] in OWN_OPTIONS:
         return args
-    if args[0] in OF_EXTRA:
-        extra = OF_EXTRA[args[0]]
+    if args[0] in LABORATORY_VERBS:
         raise InputError(
             f"simrun {args[0]}: the verb is not installed",
-            f"install the extra that brings it: pip install 'alpasim-onefixer[{extra}]'",
+            "Install the laboratory, which brings it: pip install alpasim-onefixer-lab.",
         )
-    near = (
-        []
-        if args[0].startswith("-") or Path(args[0]).exists()
-        else difflib.get_close_matches(args[0], verbs(), 1, 0.7)
-    )
-    if near:
-        raise InputError(
-            f"{args[0]}: neither a verb nor a scenario; {near[0]} is one",
-            f"type 'simrun {near[0]}', or 'simrun --help' for all verbs",
-        )
+    if not args[0].startswith("-") and not Path(args[0]).exists():
+        near = difflib.get_close_matches(args[0], verbs(), 1, 0.7)
+        if near:
+            raise InputError(
+                f"{args[0]}: neither a verb nor a scenario; {near[0]} is a verb",
+                f"Type 'simrun {near[0]}', or 'simrun --help' for all verbs.",
+            )
     return ["run", *args]
-
-
-def make_app(verb: str | None) -> typer.Typer:
-    """Return the command line with one verb, or with all verbs for the help page.
-
-    A verb is a `typer.Typer`, or a function whose parameters Typer or
-    `alpasim_plugin.cli.options.command_of` understands. Its help is its docstring; below it stands
-    ``VERB_EPILOG`` or ``EPILOG`` of its module.
-    """
-    import typer
-
-    app = typer.Typer(
-        no_args_is_help=True, rich_markup_mode="markdown", pretty_exceptions_enable=False, help=HELP
-    )
-
-    @app.callback()
-    def own(
-        version: bool = typer.Option(False, "--version", help="Print the version and leave."),
-    ) -> None:
-        """Take the options that stand before a verb."""
-
-    if verb in verbs():
-        from alpasim_plugin.cli.options import command_of
-
-        module_name, _, name = verbs()[verb].partition(":")
-        module = import_module(module_name)
-        found = getattr(module, name)
-        if isinstance(found, typer.Typer):
-            app.add_typer(found, name=verb)
-        else:
-            epilog = getattr(module, f"{name.upper()}_EPILOG", getattr(module, "EPILOG", None))
-            app.command(verb, epilog=epilog)(command_of(found))
-        return app
-    panels = {listed: panel for panel, group in GROUPS.items() for listed in group}
-    for listed in (*panels, *(name for name in verbs() if name not in panels)):
-        app.command(
-            listed, help=first_line(verbs()[listed]), rich_help_panel=panels.get(listed, PLUGINS)
-        )(lambda: None)
-    return app
-
-
-def first_line(target: str) -> str:
-    """Return the first line of a verb's help, read off its source: of a function's docstring, or of
-    the ``help`` of a `typer.Typer`.
-
-    The module is not imported; where it has no source, the line says where the verb comes from.
-    """
-    module, _, name = target.partition(":")
-    try:
-        spec = find_spec(module)
-    except ImportError:  # of the package that it lies in
-        spec = None
-    if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
-        return f"from {target}"
-    for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.FunctionDef) and node.name == name:
-            return (ast.get_docstring(node) or "").partition("\n")[0]
-        if (
-            isinstance(node, ast.Assign)
-            and ast.unparse(node.targets[0]) == name
-            and isinstance(node.value, ast.Call)
-        ):
-            for keyword in node.value.keywords:
-                if keyword.arg == "help" and isinstance(keyword.value, ast.Constant):
-                    return str(keyword.value.value).partition("\n")[0]
-    return f"from {target}"
 
 
 def _run(args: list[str]) -> int:
@@ -204,29 +235,19 @@ def _run(args: list[str]) -> int:
 
         print(json.dumps({"version": __version__}) if "--json" in args else f"simrun {__version__}")
         return 0
-    args = with_verb(args)
-    import typer
-
-    command = typer.main.get_command(make_app(next(iter(args), None)))
-    usage_error: Any = typer.BadParameter.__bases__[
-        0
-    ]  # its module is another one in other versions of typer
+    words = with_verb(args) or ["--help"]
+    if words[0] in verbs():
+        load_verb(words[0])  # until it is imported, a signal ends the process at once
+    command = typer.main.get_command(app)
     try:
-        with stoppable(), command.make_context("simrun", list(args)) as context:
+        with stoppable(), command.make_context("simrun", list(words)) as context:
             command.invoke(context)
     except typer.Exit as leaving:
-        return leaving.exit_code
-    except usage_error as error:
-        if (
-            type(error).__name__ == "NoArgsIsHelpError"
-        ):  # simrun alone, or a verb with verbs of its own
-            print(error.ctx.get_help(), file=sys.stderr)
-            return InputError.exit_code
-        where = error.ctx.command_path if error.ctx else "simrun"
-        raise InputError(
-            f"{where}: {error.format_message().replace('Value error, ', '')}",
-            f"'{where} --help' lists what it takes",
-        ) from error
+        return leaving.exit_code if args else InputError.exit_code
+    except typer.TyperException as error:
+        message = error.format_message().replace("Value error, ", "")
+        verb = f"simrun {words[0]}" if words[0] in verbs() else "simrun"
+        raise InputError(f"{verb}: {message}", f"See '{verb} --help'.") from error
     return 0
 
 
@@ -269,7 +290,7 @@ def run_command(args: list[str]) -> int:
 
 
 def _unforeseen(error: Exception, args: list[str]) -> SimrunError:
-    """Say in four parts what no part of the program has foreseen."""
+    """Return the error for what no part of the program has foreseen."""
     command = " ".join(["simrun", *args])
     if isinstance(error, MemoryError):
         return InfrastructureError(
@@ -317,29 +338,11 @@ def _drop_unwritten_output() -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _complete() -> None:
-    """Answer a Tab, for which a shell runs the program with the words so far in its environment;
-    only the typed verb is imported.
-    """
-    variable, joint = (
-        ("COMP_WORDS", "\n") if "COMP_WORDS" in os.environ else ("_TYPER_COMPLETE_ARGS", " ")
-    )
-    text = os.environ.get(variable, "")
-    number = int(os.environ.get("COMP_CWORD", "0")) or len(text.split()) - (not text.endswith(" "))
-    first = [*text.split(), "", ""][1]
-    verb: str | None = first
-    if first.startswith("-") or (number > 1 and first not in verbs()):
-        verb = "run"
-        os.environ[variable] = text.replace(joint, f"{joint}run{joint}", 1)
-        os.environ["COMP_CWORD"] = str(number + 1)
-    make_app(verb if number > 1 or verb == "run" else None)(prog_name="simrun")
-
-
 def main() -> None:
     """Run the process's command line and exit with its code."""
     leave_at_once()
-    if "_SIMRUN_COMPLETE" in os.environ:
-        _complete()
+    if COMPLETION in os.environ:
+        app(prog_name="simrun")
     sys.exit(run_command(sys.argv[1:]))
 
 

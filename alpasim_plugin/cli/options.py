@@ -20,6 +20,7 @@ from alpasim_plugin.core.limits import SEED, SEEDS
 from alpasim_plugin.log.run_folder.schema import RUN_INFO
 
 FIXER_PREFIX = "fixer."
+HELP_NAMES = {"help_option_names": ["-h", "--help"]}
 
 Run = Annotated[Path | None, Positional("A run folder; by default the newest below runs/.")]
 Json = Annotated[bool, Flag("Print one JSON document on stdout.", "--json")]
@@ -44,7 +45,6 @@ Workers = Annotated[
     int | None,
     Flag("Worker processes; by default one per core. The result does not depend on them.", min=1),
 ]
-Wait = Annotated[bool, Flag("Wait for a process that writes the run folder; otherwise refuse.")]
 Report = Annotated[
     bool,
     Flag("Write report.html now; `simrun report RUN` writes it later.", "--report/--no-report"),
@@ -367,17 +367,14 @@ def check_preset(preset: str) -> None:
         )
 
 
-def refuse_existing(path: Path | None, overwrite: bool, option: str) -> None:
-    """Refuse to write over a file without ``--overwrite``.
+def refuse_existing(path: Path | None, option: str, overwrite: bool = False) -> None:
+    """Refuse to write over a file.
 
     Raises:
-        InputError: It exists.
+        InputError: It exists, and ``--overwrite`` was not given.
     """
     if path is not None and path.exists() and not overwrite:
-        raise InputError(
-            f"{f'{option} {path}'.strip()}: it exists already",
-            "name another file, or pass --overwrite",
-        )
+        raise InputError(f"{option} {path}: the file exists already", "Name another file.")
 
 
 def run_or_newest(run: Path | None) -> Path:

@@ -1,15 +1,16 @@
-"""``simrun preview``: a scenario in one picture."""
+"""A scenario that has not been driven in one image: map, road users over time, and the camera along
+the recorded path.
+"""
 
 from __future__ import annotations
 
 import base64
 import html
 import io
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -18,24 +19,19 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
-from alpasim_plugin.cli.options import Json, Overrides, Overwrite, refuse_existing
 from alpasim_plugin.core.atomic import write_bytes
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.geometry import interpolate, yaw_of
 from alpasim_plugin.core.types import F64, U8, Actor, Box, RenderRequest, Scenario, Trajectory
-from alpasim_plugin.log.run_folder.schema import slug
 from alpasim_plugin.log.run_folder.writer import scene_as_json
 from alpasim_plugin.renderers.background import background_note
 from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.guards import checked_frames
 from evaluators.report.birdseye import chord_angle, corners
 from evaluators.viewer.drive_data import drawn_map, recorded_drive
-from scenarios.load import load_scenario
 
 Flatten = Callable[[F64], F64]  # (N, 2 or 3) metres, world -> (N, 2) metres on the page
 
-DOING = "previewing a scenario"
 MOMENTS = 5  # that are shown, evenly from the first frame to the end
 MARGIN_M = 15.0
 MAX_HEIGHT, MIN_HEIGHT = 5.0, 1.6  # of the map, inches
@@ -290,48 +286,3 @@ def _page(scenario: Scenario, png: bytes, facts: Sequence[str]) -> bytes:
     image = f'<img style="max-width:100%" src="data:image/png;base64,{picture}" alt="Map, road users and camera of {name}">'
     body = f'<body style="font-family:sans-serif"><h1>{name}</h1>{text}{image}</body>'
     return f'<!doctype html><html lang="en"><head>{head}</head>{body}</html>\n'.encode()
-
-
-EPILOG = """
-Examples:
-
-- `simrun preview smoke/lead_car`
-
-- `simrun preview my_scene.yaml --seed 3 --renderer 3dgs --out my_scene.html`
-"""
-
-
-def preview(
-    scenario: Annotated[str, Positional("Scenario YAML, a shipped name, or a recorded log.")],
-    out: Annotated[Path | None, Flag("PNG or HTML; by default SCENE.png here.", also="-o")] = None,
-    seed: Annotated[int | None, Flag("Scene seed; by default the file's.", min=0)] = None,
-    renderer: Annotated[
-        str | None, Flag("What renders the camera frames; clean, or 3dgs for an imported drive.")
-    ] = None,
-    overrides: Overrides = (),
-    overwrite: Overwrite = False,
-    as_json: Json = False,
-) -> None:
-    """Draw a scenario before it is driven: map, road users over time, and the camera along the
-    recorded drive.
-    """
-    loaded = load_scenario(scenario, seed, overrides)
-    path = out or Path(f"{slug(loaded.scene_id)}.png")
-    refuse_existing(path, overwrite, "")
-    made = draw_preview(loaded, path, renderer)
-    if as_json:
-        print(
-            json.dumps(
-                {
-                    "preview": str(path),
-                    "scene": loaded.scene_id,
-                    "times_s": made.times_s,
-                    "actors": made.actors,
-                    "facts": made.text,
-                }
-            )
-        )
-        return
-    for line in made.text:
-        print(line)
-    print(f"preview  {path}")

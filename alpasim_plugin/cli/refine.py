@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from alpasim_plugin.cli.options import Json, Overwrite, Quiet, fixer_overrides
+from alpasim_plugin.cli.options import Json, Overwrite, fixer_overrides
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.interfaces import Fixer
 from alpasim_plugin.core.signals import Stopped
@@ -56,14 +56,12 @@ def refine(
     ] = (),
     seed: Annotated[int, Flag("Seed of the fixer's noise.", min=0)] = 0,
     device: Annotated[Literal["cpu", "cuda"], Flag("Where the fixer computes.")] = "cpu",
-    threads: Annotated[int | None, Flag("Torch threads; by default one per core.", min=1)] = None,
     compare: Annotated[Path | None, Flag("Also write input and result side by side.")] = None,
     anyway: Annotated[
         bool, Flag("Take whatever the fixer makes, however much it changes.")
     ] = False,
     overwrite: Overwrite = False,
     as_json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
     """Refine a video with a fixer, block by block, at any length in constant memory.
 
@@ -73,9 +71,7 @@ def refine(
     settings = fixer_settings(fixer, fixer_overrides(overrides))
 
     def session() -> Fixer:
-        made = make_fixer(
-            fixer, settings, scene_id=SCENE, seed=seed, device=device, threads=threads
-        )
+        made = make_fixer(fixer, settings, scene_id=SCENE, seed=seed, device=device)
         if not made.trained and not as_json:
             print(untrained_notice(made.label), file=sys.stderr)
         return made
@@ -83,7 +79,7 @@ def refine(
     limited = settings.keeps_appearance and not (anyway or opacity or sdmap)
     files = RefineFiles(source, out, opacity, sdmap, compare, overwrite)
     try:
-        with frame_progress(quiet or as_json) as show:
+        with frame_progress(as_json) as show:
             summary = refine_video(files, session, show, ChangeLimit() if limited else None)
     except Stopped as stop:
         stop.kept = "nothing was written; the same command starts again"

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from alpasim_plugin.cli.options import Evaluators, Json, Presets, Quiet, Report, Wait
+from alpasim_plugin.cli.options import Evaluators, Json, Presets
 from alpasim_plugin.cli.progress import describe, report_line
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import EvaluatorError, InputError, error_text
@@ -71,8 +71,6 @@ def execute_score(
     root: Path | None,
     command: Sequence[str],
     on_done: Callable[[dict[str, Any]], None],
-    report: bool = True,
-    wait: bool = False,
 ) -> ScoreResult:
     """Score logs and write run.json, the tables, the reports, and with preset ``alpasim`` its
     aggregation.
@@ -86,8 +84,6 @@ def execute_score(
         root: Run folder; None makes one below ``runs/`` named after content and preset.
         command: The command line, for run.json.
         on_done: Called with each log's manifest.
-        report: Write ``report.html``.
-        wait: Wait for a process that writes the folder; otherwise refuse.
 
     Raises:
         InputError: The folder holds other results, or a log's scene is not among ``scenes``.
@@ -102,7 +98,7 @@ def execute_score(
         }
     )[:12]
     root = root or Path("runs", f"score-{slug(logs[0].resolve().parent.parent.name)}-{key}")
-    with writing(root, wait, lambda text: print(text, file=sys.stderr, flush=True)):
+    with writing(root):
         held = _held_key(root)
         if held not in (None, key):
             raise InputError(
@@ -130,7 +126,6 @@ def execute_score(
             root,
             manifests,
             more | ({} if aggregation is None else {"alpasim": aggregation}),
-            report,
         )
     return ScoreResult(root, summary, code)
 
@@ -329,10 +324,7 @@ def score(
     out: Annotated[
         Path | None, Flag("Run folder; by default one below runs/ named by logs and preset.")
     ] = None,
-    report: Report = True,
-    wait: Wait = False,
     as_json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
     """Score rollout logs, AlpaSim's or ours, without rendering; the files are those of a run.
 
@@ -358,9 +350,7 @@ def score(
             resolve_evaluators(evaluators),
             out if out is None or len(names) == 1 else out / name,
             ["simrun", *sys.argv[1:]],
-            _teller(len(found), quiet or as_json),
-            report,
-            wait,
+            _teller(len(found), as_json),
         )
     code = max(one.exit_code for one in results.values())
     said = {

@@ -1,23 +1,24 @@
-"""``simrun view``: replay rollouts in a browser. ``simrun report``: write a run's report again from
-its tables.
+"""``simrun view``: replay rollouts on an offline page, or draw a scenario. ``simrun report``: write a
+run's report again from its tables.
 """
 
 from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 from rich.console import Console
 
-from alpasim_plugin.cli.options import Json, Overwrite, Run, refuse_existing
+from alpasim_plugin.cli.options import Json, Overrides, Run, refuse_existing, run_or_newest
 from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
 from alpasim_plugin.log.run_folder.reader import read_json
-from alpasim_plugin.log.run_folder.schema import MANIFEST, RUN_INFO, SUMMARY
+from alpasim_plugin.log.run_folder.schema import MANIFEST, RUN_INFO, SUMMARY, slug
 from alpasim_plugin.runs.reports import write_reports
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics import MetricTable
@@ -26,7 +27,6 @@ from evaluators.report import render_table
 from evaluators.viewer.cells import Wanted
 from evaluators.viewer.page import DEFAULT_MB, MB, Options, write_page
 
-DOING = "watching rollouts"
 PAGE = "view.html"
 
 VIEW_EPILOG = """
@@ -38,69 +38,100 @@ Examples:
 
 - `simrun view runs/us101/rollouts/3dgs/lane-camera/smoke-curve/0`: the same by a rollout's folder
 
-Exit codes: 0 the page is written; 2 no such run or rollout; 4 the disk refuses.
+- `simrun view smoke/lead_car`: a scenario that has not been driven, as smoke-lead_car.png
+
+Exit codes: 0 the page is written; 2 no such run, rollout or scenario; 4 the disk refuses.
 """
 
 
 def view(
-    what: Annotated[
-        Path,
-        Positional("A run folder, or the folder of one of its rollouts.", metavar="RUN|ROLLOUT"),
-    ],
     asked: Wanted,
-    out: Annotated[
-        Path | None, Flag("The page; by default view.html in the run folder.", also="-o")
+    what: Annotated[
+        str | None,
+        Positional(
+            "A run, one of its rollouts, or a scenario; by default the newest run.",
+            metavar="RUN|ROLLOUT|SCENARIO",
+        ),
     ] = None,
-    camera: Annotated[str | None, Flag("Keep this camera alone.")] = None,
-    cells: Annotated[int | None, Flag("Most scene-policy-seed cells in the page.", min=1)] = None,
+    overrides: Overrides = (),
+    out: Annotated[
+        Path | None,
+        Flag("The file; by default view.html in the run folder, or SCENE.png here.", also="-o"),
+    ] = None,
     max_mb: Annotated[float, Flag("Size of the page, megabytes.", min=1.0)] = DEFAULT_MB,
-    overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
-    """Replay rollouts in a browser: cameras side by side, a map from above, metrics over time,
-    events.
+    """Replay rollouts on an offline page, or draw a scenario before it is driven.
+
+    The page shows cameras side by side, a map from above, metrics over time and events. The image of
+    a scenario shows its map, road users over time, and the camera along the recorded path.
     """
-    root, of_rollout = find_cell(what)
-    wanted = narrowed(what, of_rollout, asked)
-    options = Options(int(max_mb * MB), camera=camera)
+    folder = run_or_newest(None if what is None else Path(what))
+    refuse_existing(out, "--out")
+    if what is not None and not is_run(folder) and not (folder / MANIFEST).exists():
+        _view_scenario(what, asked, overrides, out, as_json)
+        return
+    root, of_rollout = find_cell(folder)
+    wanted = narrowed(folder, of_rollout, asked)
     if (root / SUMMARY).exists():
         ensure_tables(root, warn)
     so_far = read_so_far(root)
     for line in so_far.damage:
         warn(f"warning: damaged: {line}")
     if not so_far.finished:
-        warn(
-            f"note: the run is not finished: {len(so_far.run.rollouts)} of {so_far.planned} rollouts"
-        )
+        done = len(so_far.run.rollouts)
+        warn(f"note: the run is not finished: {done} of {so_far.planned} rollouts")
     if not so_far.run.rollouts:
-        raise InputError(
-            f"{root}: no rollout has finished",
-            "wait for the first",
-        )
+        raise InputError(f"{root}: no rollout has finished", "Wait for the first.")
     path = out or root / PAGE
-    refuse_existing(out, overwrite, "--out")
-    made = write_page(so_far.run, path, wanted, options, cells)
+    made = write_page(so_far.run, path, wanted, Options(int(max_mb * MB)), None)
     if as_json:
         shown = [
             {"scene": cell.scene, "policy": cell.policy, "seed": cell.seed} for cell in made.shown
         ]
-        print(
-            json.dumps(
-                {
-                    "page": str(path),
-                    "bytes": made.size,
-                    "cells": shown,
-                    "of": len(made.known),
-                    "notes": list(made.notes),
-                }
-            )
-        )
+        facts = {
+            "page": str(path),
+            "bytes": made.size,
+            "cells": shown,
+            "of": len(made.known),
+            "notes": list(made.notes),
+        }
+        print(json.dumps(facts))
         return
     for note in made.notes:
         print(f"note     {note}")
     print(
         f"page     {shlex.quote(str(path))}, {made.size / MB:.1f} MB, {len(made.shown)} of {len(made.known)} cells"
     )
+
+
+def _view_scenario(
+    what: str, asked: Wanted, overrides: Sequence[str], out: Path | None, as_json: bool
+) -> None:
+    from alpasim_plugin.cli.preview import draw_preview  # loads matplotlib and a renderer
+    from scenarios.load import load_scenario
+
+    if asked.scenes or asked.policies or len(asked.seeds) > 1 or len(asked.renderers) > 1:
+        raise InputError(
+            f"{what}: neither a run nor a rollout",
+            "Name a run folder, or for a scenario at most one --seed and one --renderer.",
+        )
+    scene = load_scenario(what, next(iter(asked.seeds), None), overrides)
+    path = out or Path(f"{slug(scene.scene_id)}.png")
+    made = draw_preview(scene, path, next(iter(asked.renderers), None))
+    if as_json:
+        facts = {
+            "preview": str(path),
+            "scene": scene.scene_id,
+            "times_s": made.times_s,
+            "actors": made.actors,
+            "facts": made.text,
+        }
+        print(json.dumps(facts))
+        return
+    for line in made.text:
+        print(line)
+    print(f"preview  {path}")
 
 
 def is_run(what: Path) -> bool:
@@ -154,10 +185,11 @@ REPORT_EPILOG = "Example: `simrun report runs/us101`"
 
 
 def report(
-    run: Run,
+    run: Run = None,
     as_json: Json = False,
 ) -> None:
     """Write report.html, summary.md and junit.xml of a run again and print its table."""
+    run = run_or_newest(run)
     ensure_tables(run, warn)
     summary = read_json(run / SUMMARY)
     page = write_reports(run, flips=read_run_json(run).get("kind") != "score")

@@ -19,7 +19,7 @@ LIBRARIES = (
     "site-packages",
     sysconfig.get_paths()["stdlib"],
 )  # in the paths of files that are nobody's own
-CHECK = "simrun check-policy finds all faults of a policy"
+CHECK = "simrun check policy finds all faults of a policy"
 TRACEBACK = "see the traceback in output.log of the rollout"
 
 

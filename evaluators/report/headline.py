@@ -466,6 +466,6 @@ def plan_warnings(summary: Mapping[str, Any]) -> list[str]:
         if entry.get("warning"):
             by_text.setdefault(str(entry["warning"]), []).append(name)
     return [
-        f"{', '.join(names)}: {text} (simrun check-policy tests units)"
+        f"{', '.join(names)}: {text} (simrun check policy tests units)"
         for text, names in by_text.items()
     ]

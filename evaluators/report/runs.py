@@ -5,15 +5,21 @@ found below a folder, and chosen.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.escape import shorten
+from alpasim_plugin.core.escape import terminal as escape
 from alpasim_plugin.core.lock import is_locked
 from alpasim_plugin.core.reading.files import read_json_as
 from alpasim_plugin.log.run_folder.manifests import read_run_json
@@ -26,12 +32,13 @@ from alpasim_plugin.log.run_folder.schema import (
 )
 from alpasim_plugin.log.run_folder.shapes import Summary
 from evaluators.metrics import MetricTable
+from evaluators.report.numbers import DASH, decimals, finite, fixed, interval
 
-DOING = "listing runs"
-CHECK = "simrun check RUN says what is damaged"
+CHECK = "simrun check run RUN says what is damaged"
 
 State = Literal["finished", "running", "unfinished", "damaged"]
-STATES: tuple[State, ...] = get_args(State)
+STYLES = {"finished": "", "running": "cyan", "unfinished": "yellow", "damaged": "red"}
+PROBLEM_LETTERS = 90
 
 
 @dataclass(frozen=True)
@@ -269,76 +276,33 @@ def _run_folders(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
             yield from _run_folders(Path(entry.path), seen)
 
 
-LEAST_DIGITS = 4  # of a commit or a digest: fewer name anything
-
-
 @dataclass(frozen=True)
 class Choice:
     """What a run must be; an empty member asks for nothing. Names may hold ``*`` and ``?``.
 
     Attributes:
-        commits: Beginnings of the project's commit.
-        weights: Beginnings of the SHA-256 of a weight file, or names of the file.
         renderers: The run has a renderer that each of these names.
         policies: Likewise.
         scenes: Likewise; a scene's id, or what the command named: a suite, a folder, a file.
-        presets: One of them.
-        states: One of them.
         since: Begun at or after.
-        until: Begun before.
     """
 
-    commits: tuple[str, ...] = ()
-    weights: tuple[str, ...] = ()
     renderers: tuple[str, ...] = ()
     policies: tuple[str, ...] = ()
     scenes: tuple[str, ...] = ()
-    presets: tuple[str, ...] = ()
-    states: tuple[State, ...] = ()
     since: datetime | None = None
-    until: datetime | None = None
-
-    def __post_init__(self) -> None:
-        for one in (*self.commits, *self.weights):
-            if len(one) < LEAST_DIGITS:
-                raise InputError(
-                    f"--commit or --weights {one!r}: too short",
-                    f"give at least {LEAST_DIGITS} characters",
-                )
 
     def takes(self, entry: RunEntry) -> bool:
         """Tell whether a run is all that is asked for."""
-        info, began = entry.info, entry.started_at
+        info = entry.info
+        began = entry.started_at
         named = [*entry.scenes, *map(str, info.get("asked") or ())]
         return (
-            _any_begins(self.commits, [entry.commit])
-            and _any_begins(self.weights, [text for pair in entry.weights for text in pair])
-            and _each_is_named(self.renderers, info.get("renderers") or ())
+            _each_is_named(self.renderers, info.get("renderers") or ())
             and _each_is_named(self.policies, info.get("policies") or ())
             and _each_is_named([_scene(one) for one in self.scenes], [_scene(one) for one in named])
-            and (not self.presets or info.get("preset") in self.presets)
-            and (not self.states or entry.state in self.states)
             and (self.since is None or (began is not None and began >= self.since))
-            and (self.until is None or (began is not None and began < self.until))
         )
-
-
-def chosen(entries: Iterable[RunEntry], choice: Choice) -> tuple[list[RunEntry], list[RunEntry]]:
-    """Split runs into those that a choice takes, and those of the rest whose ``run.json`` is lost,
-    so that nothing can be asked of them.
-    """
-    taken, lost = [], []
-    for entry in entries:
-        if choice.takes(entry):
-            taken.append(entry)
-        elif not entry.info and (not choice.states or entry.state in choice.states):
-            lost.append(entry)
-    return taken, lost
-
-
-def _any_begins(asked: Sequence[str], texts: Iterable[str]) -> bool:
-    known = [text.lower() for text in texts]
-    return not asked or any(text.startswith(one.lower()) for one in asked for text in known)
 
 
 def _each_is_named(asked: Sequence[str], known: Sequence[str]) -> bool:
@@ -385,3 +349,99 @@ def shown_folder(folder: Path, roots: Sequence[Path]) -> str:
     if len(roots) == 1 and folder != roots[0] and folder.is_relative_to(roots[0]):
         return folder.relative_to(roots[0]).as_posix()
     return str(folder)
+
+
+def runs_table(
+    entries: Sequence[RunEntry], roots: Sequence[Path], metrics: Sequence[str] = ()
+) -> Table:
+    """Lay out one run a row, in the order given; a metric's cell has a line for each renderer and
+    policy.
+    """
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("run", overflow="fold")
+    for name in ("begun (UTC)", "commit", "scenes x seeds", "preset", "rollouts"):
+        table.add_column(name)
+    for name in ("renderer", "policy"):
+        table.add_column(name, overflow="fold")
+    for metric in metrics:
+        table.add_column(Text(escape(metric)), no_wrap=True, justify="right")
+    between = "\n" if metrics else ", "
+    for entry in entries:
+        variants = variants_of(entry)
+        names = [[escape(variant[number]) for variant in variants] for number in (0, 1)]
+        began = entry.started_at
+        table.add_row(
+            Text(escape(shown_folder(entry.folder, roots)), style="bold"),
+            Text(began.strftime("%Y-%m-%d %H:%M") if began is not None else DASH),
+            Text(entry.commit_text or DASH),
+            Text(scenes_text(entry)),
+            Text(escape(str(entry.info.get("preset") or DASH))),
+            _state(entry),
+            *(
+                Text(between.join(column if metrics else dict.fromkeys(column)) or DASH)
+                for column in names
+            ),
+            *(
+                Text("\n".join(value_text(entry, metric, *one) for one in variants) or DASH)
+                for metric in metrics
+            ),
+        )
+    return table
+
+
+def variants_of(entry: RunEntry) -> list[tuple[str, str]]:
+    """List renderer and policy of each line of a run."""
+    return [
+        (str(r), str(p))
+        for p in entry.info.get("policies") or ()
+        for r in entry.info.get("renderers") or ()
+    ]
+
+
+def scenes_text(entry: RunEntry) -> str:
+    """Count a run's scenes and seeds, and name the first thing that the command named, else the
+    first scene.
+    """
+    if not entry.info:
+        return DASH
+    asked = [str(name) for name in entry.info.get("asked") or ()]
+    names = [
+        Path(name).name.removesuffix(".yaml") if Path(name).is_absolute() else name
+        for name in asked or entry.scenes
+    ]
+    more = f" + {len(names) - 1}" if len(names) > 1 else ""
+    return f"{len(entry.scenes)} x {len(entry.info.get('seeds') or ())} {escape(''.join(names[:1]))}{more}"
+
+
+def value_text(entry: RunEntry, metric: str, renderer: str, policy: str) -> str:
+    """Print a metric's mean with its 95 % interval over scenes, both as `summary.json` has them; a
+    dash where there is no mean.
+    """
+    found = entry.metric(metric, renderer, policy)
+    mean, bounds = finite(found.get("mean")), interval(found.get("ci95_clustered"))
+    if mean is None:
+        return DASH
+    percent = entry.table.shown(metric).in_percent
+    scale, tail = (
+        (100.0, " %") if percent else (1.0, f" {found['unit']}" if found.get("unit") else "")
+    )
+    places = 1 if percent else decimals(*(value * scale for value in (mean, *(bounds or ()))))
+    spread = (
+        ""
+        if bounds is None
+        else f" ({fixed(bounds[0] * scale, places)} to {fixed(bounds[1] * scale, places)})"
+    )
+    return f"{fixed(mean * scale, places)}{tail}{spread}"
+
+
+def _state(entry: RunEntry) -> Text:
+    planned = "" if entry.planned is None else str(entry.planned)
+    if entry.state == "finished":
+        failed = int(entry.outcome.get("n_failed") or 0)
+        return Text(planned) + Text(f", {failed} failed" if failed else "", style="red")
+    text = (
+        f"{entry.state}, {planned} planned" if planned and entry.state != "damaged" else entry.state
+    )
+    return Text(text, style=STYLES[entry.state]) + Text(
+        f"\n{escape(shorten(entry.problem, PROBLEM_LETTERS))}" if entry.problem else "", style="dim"
+    )

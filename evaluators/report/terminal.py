@@ -204,11 +204,12 @@ def next_command(run: Run, finding: Finding) -> tuple[list[str], str]:
     failed = [r for r in run.rollouts if not r.ok]
     if any(r.failure_class == "policy" for r in failed):
         policy = next(r.policy for r in failed if r.failure_class == "policy")
-        return ["simrun", "check-policy", policy], "finds every fault of the policy in seconds"
+        return ["simrun", "check", "policy", policy], "finds every fault of the policy in seconds"
     if failed:
         return [
             "simrun",
             "check",
+            "run",
             str(run.folder),
         ], "says what is damaged or missing; the same command runs it again"
     if all(r.frames == 0 for r in run.rollouts):
@@ -220,7 +221,7 @@ def next_command(run: Run, finding: Finding) -> tuple[list[str], str]:
     ended = next((one for one in [*changed, *run.rollouts] if outcomes_of(one)), None)
     if ended is not None:
         words = ["simrun", "why", f"{run.folder}/{_named(ended)}"]
-        return words, "what the policy saw and planned there, and which single change mends it"
+        return words, "what the policy saw and planned there"
     if not finding.points or len(run.renderers) * len(run.policies) == 1:
         more = _other(run)
         return _again(

@@ -249,7 +249,7 @@ def _notes(
             if all(cell.interest == "quiet" for cell in left)
             else "not chosen"
         )
-        how = "--scene, --policy and --seed choose, --cells sets how many."
+        how = "--scene, --policy and --seed choose."
         notes.append(f"{plural(len(left), 'cell')} {what} left out: {names(left)}. {how}")
     if failed:
         notes.append(

@@ -319,7 +319,7 @@ def test_abandoned_sessions_end_and_give_back_what_they_hold() -> None:
         stub.submit_egomotion_observation(moved("7", 1))
         stub.drive(egodriver_pb2.DriveRequest(session_uuid="7", time_now_us=1))
         code, text = failure(lambda: stub.start_session(opening("one more")))
-        assert (code, "--expiry-s" in text) == (Code.RESOURCE_EXHAUSTED, True)
+        assert (code, "60 s" in text) == (Code.RESOURCE_EXHAUSTED, True)
         now[0] = 40.0
         stub.submit_image_observation(seen("0", 2))  # still in use
         now[0] = 61.0

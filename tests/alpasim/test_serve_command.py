@@ -13,10 +13,9 @@ import sys
 from pathlib import Path
 
 import grpc
-import typer.main
 
 from alpasim_plugin.alpasim.server.hosting import Host
-from alpasim_plugin.cli.main import make_app, verbs
+from alpasim_plugin.cli.main import load_verb, verbs
 from alpasim_plugin.log.wire import common_pb2
 from alpasim_plugin.log.wire.services import Stub, methods
 from tests.alpasim.service_cases import answers, drive
@@ -67,11 +66,9 @@ def test_the_commands_of_the_page_are_valid(repo: Path) -> None:
     ]  # those of the laboratory are there where it is installed
     assert len(commands) >= 3
     for verb, *rest in commands:
-        command = typer.main.get_command(make_app(verb))
-        context = command.make_context("simrun", [verb, *rest], resilient_parsing=False)
-        one = command.get_command(context, verb)
-        while hasattr(one, "get_command"):
-            one, rest = one.get_command(context, rest[0]), rest[1:]
+        one = load_verb(verb)
+        while hasattr(one, "commands"):
+            one, rest = one.commands[rest[0]], rest[1:]
         one.make_context(verb, list(rest))
     modules = re.findall(r"python -m (alpasim_plugin[\w.]+)", page)
     assert modules

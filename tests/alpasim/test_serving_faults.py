@@ -417,7 +417,6 @@ def test_a_taken_port_is_an_infrastructure_error(upstream: Host) -> None:
         ([], "neither --scenes nor --upstream"),
         (["--upstream", "h:1", "--renderer", "3dgs"], "renders itself"),
         (["--upstream", "h:1", "--renderer", "onefixer-dit-tiny"], "blocks of frames"),
-        (["--scenes", "smoke/straight", "--reliability", "0.5"], "states its opacity"),
         (["--upstream", "127.0.0.1:1", "--render-width", "640"], "the upstream chooses the size"),
         (["--upstream", "h:1", "--mask", "front"], "no NAME=VALUE"),
         (["--upstream", "h:1?colour=red"], "an option that is unknown"),

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import pytest
 
 from alpasim_plugin.alpasim.client.preflight import DriveTimes
-from alpasim_plugin.cli import check_policy
-from alpasim_plugin.cli.check_policy import over_scenes, rehearse
+from alpasim_plugin.cli import check
+from alpasim_plugin.cli.check import over_scenes, rehearse
 from alpasim_plugin.core.errors import InfrastructureError
 from scenarios.load import load_scenario
 
@@ -24,15 +24,15 @@ def test_a_scene_in_which_the_driver_is_lost_is_driven_once_more(
             raise error
         return SimpleNamespace(log=lambda: None)
 
-    monkeypatch.setattr(check_policy, "run_rollout", drive)
-    monkeypatch.setattr(check_policy, "make_renderer", lambda *_: None)
-    monkeypatch.setattr(check_policy, "score", lambda *_, **__: None)
-    monkeypatch.setattr(check_policy, "reduce_rollout", lambda *_: SimpleNamespace(as_dict=dict))
+    monkeypatch.setattr(check, "run_rollout", drive)
+    monkeypatch.setattr(check, "make_renderer", lambda *_: None)
+    monkeypatch.setattr(check, "score", lambda *_, **__: None)
+    monkeypatch.setattr(check, "reduce_rollout", lambda *_: SimpleNamespace(as_dict=dict))
     service = SimpleNamespace(
         stub=SimpleNamespace(drive=None), target="elsewhere:1", wait_ready=lambda: waited.append(1)
     )
     policy = SimpleNamespace(service=service, forget_session=lambda: None)
-    found = rehearse(load_scenario("smoke/curve"), policy, "clean", DriveTimes())  # type: ignore[arg-type]
+    found = rehearse(load_scenario("smoke/curve"), policy, DriveTimes())  # type: ignore[arg-type]
     assert (found.outcomes, found.lost, len(waited)) == (outcomes, times_lost, times_lost)
     assert found.resident_mib is None
     (line,) = over_scenes([found])

@@ -54,7 +54,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def exported(run: Path) -> Path:
     out = run.parent / "exported"
-    assert run_command(["export", str(run), "--alpasim", str(out), "--quiet"]) == 0
+    assert run_command(["export", str(run), "--alpasim", str(out)]) == 0
     return out
 
 
@@ -136,7 +136,7 @@ def test_scores_of_the_export_are_those_of_the_run(
 ) -> None:
     before = pq.read_table(run / "rollouts.parquet").to_pylist()
     wanted = {(row["policy"], row["seed"]): row for row in before}
-    command = ["score", str(exported), "--preset", "alpasim", "--no-report", "--quiet"]
+    command = ["score", str(exported), "--preset", "alpasim"]
     for scene in ("smoke/straight", str(exported / "scenes")):
         out = tmp_path / Path(scene).name
         assert (
@@ -206,8 +206,6 @@ def test_refusals_say_what_to_do(
                 "smoke/straight",
                 "--out",
                 str(scored),
-                "--no-report",
-                "--quiet",
             ]
         )
         == 0

@@ -222,11 +222,10 @@ def test_a_gate_for_another_preset_and_bad_usage_are_refused(runs, tmp_path, cap
 # --- compare
 
 
-@pytest.mark.parametrize("verb", ["compare", "aggregate"])
-def test_other_metrics_than_those_of_the_headline_are_printed_on_demand(verb, runs, capsys):
-    assert run_command([verb, str(runs["good"])]) == 0
+def test_other_metrics_than_those_of_the_headline_are_printed_on_demand(runs, capsys):
+    assert run_command(["compare", str(runs["good"])]) == 0
     few = capsys.readouterr().out
-    assert run_command([verb, str(runs["good"]), "--all"]) == 0
+    assert run_command(["compare", str(runs["good"]), "--all"]) == 0
     every = capsys.readouterr().out
     assert len(every.splitlines()) > len(few.splitlines())
 
@@ -262,10 +261,8 @@ def test_compare_of_two_runs_pairs_the_same_renderer_on_shared_cells_and_lists_t
     assert with_one["onefixer"]["offroad"]["verdict"] == "worse"
 
 
-def test_compare_prints_verdicts_and_cells_without_a_pair(runs, gate_file, capsys):
-    assert (
-        run_command(["compare", str(runs["good"]), str(runs["failed"]), "--gate", gate_file]) == 0
-    )
+def test_compare_prints_verdicts_and_cells_without_a_pair(runs, capsys):
+    assert run_command(["compare", str(runs["good"]), str(runs["failed"])]) == 0
     out = capsys.readouterr().out
     assert "onefixer minus" in out
     assert "no pair: lane-camera, scene-03, seed 1: every metric: here: failed (renderer)" in out

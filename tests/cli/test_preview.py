@@ -1,4 +1,4 @@
-"""``simrun preview``: what the picture shows, checked by its pixels."""
+"""``simrun view SCENARIO``: what the image shows, checked by its pixels."""
 
 from __future__ import annotations
 
@@ -35,15 +35,14 @@ def test_a_preview_shows_the_ego_the_others_and_the_camera(
 ) -> None:
     (tmp_path / "scene.yaml").write_text(SCENE)
     out = tmp_path / "scene.png"
-    assert run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(out), "--json"]) == 0
+    assert run_command(["view", str(tmp_path / "scene.yaml"), "--out", str(out), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert (facts["actors"], facts["times_s"]) == (2, [0.0, 0.75, 1.5, 2.25, 3.0])
     picture = cv2.imread(str(out))
     assert near(picture, EGO) > 200
     assert near(picture, LEAD) > 200
     assert picture[-200:].std() > 20  # the camera frames are pictures, not emptiness
-    assert run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(out)]) == 2
-    assert "it exists already" in capsys.readouterr().err
+    assert run_command(["view", str(tmp_path / "scene.yaml"), "--out", str(out)]) == 2
 
 
 @pytest.mark.slow
@@ -53,8 +52,7 @@ def test_a_page_holds_the_picture_and_asks_for_nothing(
     (tmp_path / "scene.yaml").write_text(SCENE)
     out = tmp_path / "scene.html"
     assert (
-        run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(out), "--seed", "4"])
-        == 0
+        run_command(["view", str(tmp_path / "scene.yaml"), "--out", str(out), "--seed", "4"]) == 0
     )
     assert "scene seed 4 varies" in capsys.readouterr().out
     text = out.read_text()
@@ -90,7 +88,7 @@ def test_a_background_is_named_with_what_it_covers(
     (tmp_path / "scene.yaml").write_text(scene.replace("3000000", "1000000"))
     assert (
         run_command(
-            ["preview", str(tmp_path / "scene.yaml"), "--out", str(tmp_path / "p.png"), "--json"]
+            ["view", str(tmp_path / "scene.yaml"), "--out", str(tmp_path / "p.png"), "--json"]
         )
         == 0
     )

@@ -110,13 +110,13 @@ def ran(folder: Path) -> str:
     return (folder / "ran").read_text() if (folder / "ran").exists() else ""
 
 
-QUICK = (["runs", "."], ["report", "one"], ["list", "policies"])
+QUICK = (["list", "runs", "."], ["report", "one"], ["list", "policies"])
 MORE = (
     ["compare", "one"],
-    ["check", "one"],
+    ["check", "run", "one"],
     ["gate", "one"],
     ["view", "one"],
-    ["preview", "smoke/straight"],
+    ["view", "smoke/straight"],
     [*DRIVE, "--dry-run", "smoke/straight"],
     ["list", "metrics"],
     ["score", "one"],

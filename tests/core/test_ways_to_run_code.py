@@ -130,7 +130,7 @@ def pickles_of_a_run(folder: Path, bait: Bait) -> list[list[str]]:
         (folder / "run" / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / "run" / name).write_bytes(pickle.dumps(("success", bait)))
     return [
-        ["check", "run"],
+        ["check", "run", "run"],
         ["report", "run"],
         [*DRIVE, "--out", "run", "--resume", "smoke/straight"],
     ]
@@ -161,7 +161,7 @@ def object_arrays(folder: Path, bait: Bait) -> list[list[str]]:
     (folder / "evil.asl").write_bytes((folder / "evil.npy").read_bytes())
     return [
         ["score", "evil.asl", "--scene", "smoke/straight", "--out", "scored"],
-        ["preview", "evil.npz"],
+        ["view", "evil.npz"],
     ]
 
 
@@ -174,7 +174,7 @@ def archive_that_leaves_its_folder(folder: Path, bait: Bait) -> list[list[str]]:
             "metadata.yaml",
         ):
             archive.writestr(name, bait.python)
-    return [["run", "--dry-run", *DRIVE[1:], "evil.usdz"], ["preview", "evil.usdz"]]
+    return [["run", "--dry-run", *DRIVE[1:], "evil.usdz"], ["view", "evil.usdz"]]
 
 
 def links(folder: Path, bait: Bait) -> list[list[str]]:
@@ -197,7 +197,7 @@ def names_in_a_run(folder: Path, bait: Bait) -> list[list[str]]:
         ["compare", "run"],
         ["report", "run"],
         ["view", "run"],
-        ["check", "run"],
+        ["check", "run", "run"],
         ["gate", "run"],
     ]
 
@@ -220,7 +220,7 @@ def notebook_and_startup(folder: Path, bait: Bait) -> list[list[str]]:
     (folder / "setup.cfg").write_text(
         "[options.entry_points]\nsimrun.policies =\n  evil = evil:Evil\n"
     )
-    return [["report", "run"], ["preview", "smoke/straight", "--out", "p.png"]]
+    return [["report", "run"], ["view", "smoke/straight", "--out", "p.png"]]
 
 
 def shells(folder: Path, bait: Bait) -> list[list[str]]:

@@ -14,16 +14,14 @@ import subprocess
 import sys
 import venv
 from collections.abc import Iterator, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-import typer
 
-from alpasim_plugin.cli.main import GROUPS, make_app, verbs, with_verb
+from alpasim_plugin.cli.main import PANELS, load_verb, verbs, with_verb
 from alpasim_plugin.log import write_mp4
 from tests.docs.commands import (
     LONGER,
@@ -43,21 +41,15 @@ COMMANDS = [one for one in commands(REPO, pages(REPO)) if not one.is_of_lab]
 RUN = [command for command in COMMANDS if not command.why_not_run]
 
 
-@cache
-def _command(verb: str) -> Any:
-    return typer.main.get_command(make_app(verb))
-
-
 def parse(words: list[str]) -> None:
     """Parse a command line as `simrun` does, without running it."""
     args = with_verb(words)
-    command = _command(args[0])
-    context = command.make_context("simrun", args)
-    while hasattr(command, "resolve_command"):
-        rest = [*getattr(context, "_protected_args", ()), *context.args]
-        name, command, rest = command.resolve_command(context, rest)
-        assert command is not None
-        context = command.make_context(name, rest, parent=context)
+    command: Any = load_verb(args[0])
+    name, *rest = args
+    while hasattr(command, "commands"):
+        name, *rest = rest
+        command = command.commands[name]
+    command.make_context(name, rest)
 
 
 def not_understood(some: Sequence[Command]) -> list[str]:
@@ -86,7 +78,7 @@ def test_a_command_with_a_word_too_many_is_not_understood() -> None:
 
 def test_every_verb_is_on_a_page() -> None:
     text = "\n".join(page.read_text(encoding="utf-8") for page in pages(REPO))
-    own = [verb for group in GROUPS.values() for verb in group]
+    own = [verb for group in PANELS.values() for verb in group]
     assert [verb for verb in own if not re.search(rf"simrun {verb}\b", text)] == []
 
 

@@ -25,7 +25,7 @@ REPO = Path(__file__).resolve().parents[2]
 PAGES = ("docs/alpasim.md", "docs/policies.md", "docs/renderers.md", "docs/can.md")
 # other pages' subjects
 ELSEWHERE = r"^(?!.*(127\.0\.0\.1:|can://|^serve)).*$|exec:"
-CLEAN = ("serve", "--renderer", "clean", "--scenes", "scenes", "--threads", "1", "--listen")
+CLEAN = ("serve", "--renderer", "clean", "--scenes", "scenes", "--listen")
 BESIDE = {  # address in a command -> what answers there
     "--upstream 127.0.0.1:6789": (*CLEAN, "127.0.0.1:6789"),
     "nre://127.0.0.1:50051": (*CLEAN, "127.0.0.1:50051"),

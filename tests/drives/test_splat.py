@@ -86,7 +86,7 @@ def test_a_model_in_a_unit_of_its_own_and_upside_down(tmp_path: Path) -> None:
     assert (
         run_command(
             [
-                "preview",
+                "view",
                 str(tmp_path / "out" / "scenario.yaml"),
                 "--out",
                 str(tmp_path / "street.png"),

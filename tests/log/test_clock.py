@@ -29,8 +29,8 @@ def test_a_folder_of_another_time_is_whole_and_read(
     for path in (run, *run.rglob("*")):
         os.utime(path, (time_s, time_s))
     for words in (
-        ["check", str(run)],
+        ["check", "run", str(run)],
         ["compare", str(run)],
-        ["runs", str(tmp_path), "--since", "1d"],
+        ["list", "runs", str(tmp_path), "--since", "1d"],
     ):
         assert run_command(words) == 0

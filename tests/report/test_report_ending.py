@@ -94,14 +94,14 @@ def test_every_next_command_of_any_set_of_arms_can_be_given(tmp_path: Path) -> N
         run = read_run(make_run(tmp_path / str(number), plan))
         words = words_of(run)
         for flag, known in (
-            ("--renderers", run.renderers),
+            ("--renderer", [*run.renderers, "clean", "3dgs"]),
             ("--policy", [*run.policies, "lane-camera"]),
         ):
-            if flag in words and words[1] in ("probe", "fork"):
+            if flag in words and words[1] == "fork":
                 assert {*words[words.index(flag) + 1].split(",")} <= {*known}
-        if "--cell" in words:
-            assert words[words.index("--cell") + 1] in {
-                "/".join(map(str, rollout.cell)) for rollout in run.rollouts
+        if words[1] in ("why", "fork"):
+            assert words[2] in {
+                f"{run.folder}/{'/'.join(map(str, rollout.cell))}" for rollout in run.rollouts
             }
         if len(renderers) == 1 and len(policies) > 1:
             assert words[1] in ("why", "fork", "view", "--renderer")
@@ -120,7 +120,8 @@ def test_one_renderer_leads_to_a_comparison_and_a_failing_policy_to_its_check(
     ]
     assert words_of(dataclasses.replace(alone, rollouts=tuple(broken))) == [
         "simrun",
-        "check-policy",
+        "check",
+        "policy",
         alone.policies[0],
     ]
 

@@ -32,20 +32,13 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_parts_of_a_night_give_the_numbers_of_the_whole(
-    night: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    night: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole = aggregate_runs([night / "whole"])
     # All six scenes differ by exactly 0.4 m: there is no spread to go by.
     assert whole["paired"]["onefixer"]["lateral_distance_m"]["verdict"] == "undecided"
-    out = tmp_path / "night.json"
-    assert (
-        run_command(
-            ["aggregate", str(night / "part-1"), str(night / "part-2"), "--json", "--out", str(out)]
-        )
-        == 0
-    )
+    assert run_command(["compare", str(night / "part-1"), str(night / "part-2"), "--json"]) == 0
     parts = json.loads(capsys.readouterr().out)
-    assert json.loads(out.read_text()) == parts
     for block in ("preset", "paired", "failures"):
         assert parts[block] == whole[block]
     stored = json.loads((night / "whole" / "summary.json").read_text())[
@@ -57,14 +50,10 @@ def test_the_parts_of_a_night_give_the_numbers_of_the_whole(
 def test_the_verdicts_are_printed_one_a_line(
     night: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run_command(["aggregate", str(night / "part-1"), str(night / "part-2")]) == 0
-    lines = [
-        line
-        for line in capsys.readouterr().out.splitlines()
-        if line.startswith("onefixer minus clean: lateral_distance_m")
-    ]
-    assert len(lines) == 1
-    assert lines[0].endswith(": undecided")
+    assert run_command(["compare", str(night / "part-1"), str(night / "part-2")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "onefixer minus clean" in lines
+    assert any(line.strip().startswith("lateral_distance_m") for line in lines)
 
 
 def test_runs_that_do_not_belong_together_are_refused(night: Path, tmp_path: Path) -> None:

@@ -132,7 +132,7 @@ def test_another_question_in_the_same_folder_is_refused(decided_run) -> None:
 
 def test_other_commands_read_the_run_and_the_report_shows_the_decision(decided_run, capsys) -> None:
     root = str(decided_run[0])
-    assert run_command(["check", root]) == 0
+    assert run_command(["check", "run", root]) == 0
     assert run_command(["compare", root]) == 0
     said = capsys.readouterr()
     assert "lateral_distance_m" in said.out

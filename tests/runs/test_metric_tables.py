@@ -18,6 +18,7 @@ from alpasim_plugin.log.run_folder.manifests import (
     read_run_json,
     write_run_json,
 )
+from alpasim_plugin.runs.summary import aggregate_runs
 from evaluators import resolve_evaluators
 from evaluators.metrics import table_of
 from evaluators.opening import read_run
@@ -98,19 +99,14 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_the_same_metric_in_other_words_can_be_compared_aggregated_and_followed(
-    places: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+def test_the_same_metric_in_other_words_can_be_compared_and_aggregated(
+    places: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, words = str(places / "first"), str(places / "words")
     assert run_command(["compare", first, words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["paired"]["clean"]["height_m"]["diff"] == 0.0
-    assert run_command(["aggregate", first, words, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["metrics"]["clean"]["height_m"]["mean"] == 1.5
-    both = tmp_path / "both"
-    both.mkdir()
-    for name in ("first", "words"):
-        (both / name).symlink_to(places / name)
-    assert run_command(["runs", str(both), "--steps", "--metric", "height_m"]) == 0
+    joined = aggregate_runs([Path(first), Path(words)])
+    assert joined["metrics"]["clean"]["height_m"]["mean"] == 1.5
     assert read_run(first).table["height_m"].help == "height"
     assert read_run(words).table["height_m"].help == "height of the roof"
 
@@ -119,13 +115,8 @@ def test_another_unit_under_the_same_name_is_refused(
     places: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, unit = str(places / "first"), str(places / "unit")
-    for command in (
-        ["compare", first, unit],
-        ["aggregate", first, unit],
-        ["runs", str(places), "--steps", "--metric", "height_m"],
-    ):
-        assert run_command(command) == 2
-        assert "metric 'height_m'" in capsys.readouterr().err
+    assert run_command(["compare", first, unit]) == 2
+    assert "metric 'height_m'" in capsys.readouterr().err
 
 
 def test_what_a_plugin_says_about_its_metric_reaches_the_numbers(

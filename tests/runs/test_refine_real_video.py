@@ -37,9 +37,7 @@ def small(source: Path, to: Path, size: tuple[int, int], frames: int) -> Path:
 
 def refine(capsys: pytest.CaptureFixture[str], *arguments: Path | str) -> dict[str, object]:
     untrained = ["--set", "fixer.weights.bundle=null", "--set", "fixer.holes=render"]
-    assert (
-        run_command(["refine", *map(str, arguments), *untrained, "--threads", "1", "--json"]) == 0
-    )
+    assert run_command(["refine", *map(str, arguments), *untrained, "--json"]) == 0
     document: dict[str, object] = json.loads(capsys.readouterr().out)
     return document
 

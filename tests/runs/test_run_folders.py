@@ -110,7 +110,7 @@ def test_the_same_command_makes_only_the_damaged_rollout_again(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     damage(root / CELL / file)
-    assert run_command(["check", str(root), "--json"]) == 1
+    assert run_command(["check", "run", str(root), "--json"]) == 1
     found = json.loads(capsys.readouterr().out)
     assert not found["whole"]
     assert [(row["cell"], row["file"]) for row in found["damage"]] == [(CELL, file)]
@@ -119,7 +119,7 @@ def test_the_same_command_makes_only_the_damaged_rollout_again(
     assert announced.notices[0].endswith(remedy)
     assert announced.results.count(("ok", False)) == (remedy == DRIVE)
     assert comparable(root) == comparable(made)
-    assert run_command(["check", str(root)]) == 0
+    assert run_command(["check", "run", str(root)]) == 0
     assert run(root).notices == []
 
 
@@ -128,7 +128,7 @@ def test_a_damaged_description_is_written_again(
     made: Path, root: Path, damage: Callable[[Path], None]
 ) -> None:
     damage(root / "run.json")
-    assert run_command(["check", str(root)]) == 2
+    assert run_command(["check", "run", str(root)]) == 2
     announced = run(root)
     assert len(announced.notices) == 1
     assert announced.results == [("ok", True)] * 4

@@ -171,7 +171,7 @@ def tolerances(service: Service, scene_id: str) -> list[Finding]:
     driven.
     """
     out = []
-    name = str(uuid.uuid5(uuid.NAMESPACE_URL, "simrun check-driver"))
+    name = str(uuid.uuid5(uuid.NAMESPACE_URL, "simrun check driver"))
     out.append(
         _tried("close_session before any step", lambda: _open_and_close(service, name, scene_id))
     )

@@ -289,7 +289,7 @@ class Driving:
             if problem:
                 raise PolicyError(
                     f"{type(policy).__name__}: {problem}",
-                    "simrun check-policy finds all faults of a policy",
+                    "simrun check policy finds all faults of a policy",
                 )
             return self._answer(plan, ego.T_world_rig)
 

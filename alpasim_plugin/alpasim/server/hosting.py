@@ -53,10 +53,8 @@ class HostPolicy:
         None
     )
     token_file: Annotated[Path | None, Flag("File with the token that callers must send.")] = None
-    expiry_s: Annotated[
-        float, Flag("Sessions and histories unused for so long are forgotten.", min=1.0)
-    ] = 900.0
-    drain_s: Annotated[float, Flag("At the end, wait so long for running calls.", min=0.0)] = 30.0
+    expiry_s: float = 900.0
+    drain_s: float = 30.0
 
     def credentials(self) -> Any:
         """Return gRPC's server credentials, or None for plain text.
@@ -162,7 +160,7 @@ class Sessions(Generic[S]):
             if len(self._open) >= self._most:
                 raise Full(
                     f"session {name!r}: {self._most} sessions are open",
-                    f"close sessions that are over; abandoned ones end after {self._expiry_s:g} s (--expiry-s)",
+                    f"close sessions that are over; abandoned ones end after {self._expiry_s:g} s",
                 )
             self._open[name] = session, self._clock()
 
