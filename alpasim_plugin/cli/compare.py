@@ -15,7 +15,7 @@ from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.runs.summary import aggregate_runs, joined_metrics
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics import MetricTable
-from evaluators.opening import Run, read_run
+from evaluators.opening import read_run
 from evaluators.report import render_table
 from evaluators.report.numbers import plural
 from evaluators.report.tables import PairRow, pair_rows
@@ -54,8 +54,8 @@ def compare(
 ) -> None:
     """Print means, paired differences with intervals, and verdicts.
 
-    Of two runs, the second is compared with the first on shared cells. The shards of one run are
-    joined.
+    Of two runs with scenes in common, the second is compared with the first. Runs without, or more
+    than two, are joined: the shards of one run.
     """
     folders = [run_or_newest(run) for run in runs] or [run_or_newest(None)]
     for run in folders:
@@ -63,7 +63,7 @@ def compare(
         if note := stopping_note(run):
             warn(note)
     opened = [read_run(run) for run in folders]
-    if len(folders) == 2 and not are_shards(opened):
+    if len(folders) == 2 and {*opened[0].scenes} & {*opened[1].scenes}:
         result = compare_runs(opened[0], opened[1], baseline, {}, EVERY_MISSING)
         means = None
     elif len(folders) > 1:
@@ -99,16 +99,6 @@ def compare(
                 f"{failures['n_failed']} of {failures['n_rollouts']} rollouts failed ({causes}) and are in no mean"
             )
     _print(result, None if every else result.metrics.headline)
-
-
-def are_shards(runs: Sequence[Run]) -> bool:
-    """Tell whether runs hold different rollouts of the same command: none is in two of them."""
-    first = runs[0].info
-    same = ("key", "renderers", "policies")
-    if any(run.info.get(name) != first.get(name) for run in runs for name in same):
-        return False
-    cells = [rollout.cell for run in runs for rollout in run.rollouts]
-    return len(set(cells)) == len(cells)
 
 
 def _print(result: Comparison, only: Sequence[str] | None) -> None:

@@ -49,9 +49,6 @@ def list_names(
     policy: Annotated[
         tuple[str, ...], Flag("Runs with this policy; * and ? match. Repeatable.")
     ] = (),
-    scene: Annotated[
-        tuple[str, ...], Flag("Runs with this scene or suite; * and ? match. Repeatable.")
-    ] = (),
     since: Annotated[
         str | None, Flag("Runs begun at or after: 2026-03-01, 2026-03-01T18:00 (UTC), 7d, 12h.")
     ] = None,
@@ -64,13 +61,13 @@ def list_names(
         started = None if since is None else as_day(since, "--since", datetime.now(UTC))
         _list_runs(
             roots or (Path("runs"),),
-            Choice(renderer, policy, scene, started),
+            Choice(renderer, policy, started),
             last,
             metric,
             as_json,
         )
         return
-    if roots or renderer or policy or scene or since or last or metric:
+    if roots or renderer or policy or since or last or metric:
         raise InputError(f"simrun list {kind}: filters are for runs", "Leave them out.")
     tables: dict[Kind | None, Callable[[], dict[str, str]]] = {
         None: lambda: {name: f"simrun list {name}" for name in get_args(Kind)},

@@ -81,7 +81,7 @@ PANELS: dict[str, dict[str, tuple[str, str]]] = {
         ),
         "export": (
             "export:export",
-            "Write a run for other tools: AlpaSim run folders and scenes, or one scene, policy and seed as a recording for Foxglove or Rerun.",
+            "Write a run for other tools: AlpaSim run folders and scenes, or one scene, policy and seed as a recording for Foxglove and Rerun.",
         ),
     },
     "Extend and check": {

@@ -149,7 +149,7 @@ def find_cell(what: Path) -> tuple[Path, Wanted | None]:
     if is_run(what):
         return what, None
     if (what / MANIFEST).exists():
-        manifest, _ = read_manifest(what)
+        manifest = read_manifest(what)
         root = next(
             (folder for folder in what.resolve().parents if (folder / RUN_INFO).exists()), None
         )

@@ -283,37 +283,26 @@ class Choice:
     Attributes:
         renderers: The run has a renderer that each of these names.
         policies: Likewise.
-        scenes: Likewise; a scene's id, or what the command named: a suite, a folder, a file.
         since: Begun at or after.
     """
 
     renderers: tuple[str, ...] = ()
     policies: tuple[str, ...] = ()
-    scenes: tuple[str, ...] = ()
     since: datetime | None = None
 
     def takes(self, entry: RunEntry) -> bool:
         """Tell whether a run is all that is asked for."""
         info = entry.info
         began = entry.started_at
-        named = [*entry.scenes, *map(str, info.get("asked") or ())]
         return (
             _each_is_named(self.renderers, info.get("renderers") or ())
             and _each_is_named(self.policies, info.get("policies") or ())
-            and _each_is_named([_scene(one) for one in self.scenes], [_scene(one) for one in named])
             and (self.since is None or (began is not None and began >= self.since))
         )
 
 
 def _each_is_named(asked: Sequence[str], known: Sequence[str]) -> bool:
     return all(any(fnmatchcase(name, one) for name in known) for one in asked)
-
-
-def _scene(name: str) -> str:
-    """Spell a scene or a suite one way: ``smoke/curve`` has the id ``smoke-curve``, and a suite's
-    file ends with .yaml.
-    """
-    return name.removesuffix(".yaml").replace("/", "-").removeprefix("suites-")
 
 
 def as_day(text: str, option: str, now: datetime) -> datetime:

@@ -43,7 +43,16 @@ def called(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def test_a_run_gets_its_cluster_and_its_limit(called: Any, tmp_path: Path) -> None:
     words = ["--executor", "ray?cores=2&gpus=0.5&memory=7.5", "--time-limit", "90", "--no-report"]
-    words += ["--wait", "--workers", "3", "--out", str(tmp_path / "out"), "smoke/straight"]
+    words += [
+        "--shard",
+        "1/1",
+        "--wait",
+        "--workers",
+        "3",
+        "--out",
+        str(tmp_path / "out"),
+        "smoke/straight",
+    ]
     given = called(run, "execute_run", "--renderer", "clean", *words)
     assert given["executor"] == Executor("ray", "", 2, 0.5, 7.5)
     assert (given["workers"], given["limit_s"]) == (3, 90.0)

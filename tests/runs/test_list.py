@@ -83,8 +83,6 @@ def test_runs_are_found_at_any_depth_and_the_newest_comes_first(
         (("--renderer", "3dgs"), ["middle"]),
         (("--renderer", "clean", "--renderer", "one*"), ["new"]),
         (("--policy", "mine:*"), ["middle"]),
-        (("--scene", "suites/smoke"), ["new", "middle"]),
-        (("--scene", "smoke/curve"), ["new", "middle", "old"]),
         (("--since", "2026-02-10T08:00:00"), ["new", "middle"]),
     ],
 )
