@@ -10,7 +10,6 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runs.summary import aggregate_runs
 from tests.runs.make_many import SCENES, Many, make_one
@@ -31,29 +30,17 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_the_parts_of_a_night_give_the_numbers_of_the_whole(
-    night: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_parts_of_a_night_give_the_numbers_of_the_whole(night: Path) -> None:
     whole = aggregate_runs([night / "whole"])
     # All six scenes differ by exactly 0.4 m: there is no spread to go by.
     assert whole["paired"]["onefixer"]["lateral_distance_m"]["verdict"] == "undecided"
-    assert run_command(["compare", str(night / "part-1"), str(night / "part-2"), "--json"]) == 0
-    parts = json.loads(capsys.readouterr().out)
+    parts = aggregate_runs([night / "part-1", night / "part-2"])
     for block in ("preset", "paired", "failures"):
         assert parts[block] == whole[block]
     stored = json.loads((night / "whole" / "summary.json").read_text())[
         "metrics"
     ]  # as a run of all rollouts wrote it
     assert parts["metrics"] == whole["metrics"] == stored
-
-
-def test_the_verdicts_are_printed_one_a_line(
-    night: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run_command(["compare", str(night / "part-1"), str(night / "part-2")]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert "onefixer minus clean" in lines
-    assert any(line.strip().startswith("lateral_distance_m") for line in lines)
 
 
 def test_runs_that_do_not_belong_together_are_refused(night: Path, tmp_path: Path) -> None:
