@@ -14,11 +14,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-import typer
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from alpasim_plugin.cli.main import GROUPS, make_app
+from alpasim_plugin.cli.main import PANELS, load_verb
 from evaluators.metrics.table import METRICS
 from evaluators.scores.table import BENCHMARKS
 from scenarios.schema import models
@@ -68,10 +67,8 @@ def verb_section(name: str, command: Any) -> str:
 def cli_tables() -> str:
     """Return a section for each verb of this package, in the order of the help page."""
     sections = []
-    for verb in (verb for group in GROUPS.values() for verb in group):
-        app = typer.main.get_command(make_app(verb))
-        found = getattr(app, "commands", {}).get(verb, app)
-        sections += [verb_section(*one) for one in commands(found, f"simrun {verb}")]
+    for verb in (verb for panel in PANELS.values() for verb in panel):
+        sections += [verb_section(*one) for one in commands(load_verb(verb), f"simrun {verb}")]
     return "\n".join(sections)
 
 
