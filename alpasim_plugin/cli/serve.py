@@ -114,7 +114,6 @@ def serve(
         masks={camera: Path(file) for camera, file in masks.items()},
         shutter=shutter,
         render_width=render_width,
-        says_costs=device == "cpu",
     )
     made = assemble(settings)
     host = Host(

@@ -367,7 +367,6 @@ def test_the_pre_flight_check_of_a_good_and_of_a_bad_driver(
     told = json.loads(capsys.readouterr().out)
     good = {one["name"]: one["result"] for one in told["checks"]}
     assert [(one["ended"], one["lost"]) for one in told["scenes"]] == [("no event", 0)]
-    assert told["scenes"][0]["resident_mib"] > 10  # the service is in this process
     assert set(good.values()) == {"passed", "noted"}
     assert good["samples for minADE"] == "passed"
     late = egodriver_pb2.DriveResponse()

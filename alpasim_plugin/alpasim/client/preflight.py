@@ -10,10 +10,8 @@ from __future__ import annotations
 import time
 import uuid
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -183,47 +181,6 @@ def tolerances(service: Service, scene_id: str) -> list[Finding]:
         )
     )
     return out
-
-
-def resident_mib(target: str) -> float | None:
-    """Return the memory in MiB of the process that listens at ``HOST:PORT``; None where it is not
-    on this machine, or cannot be read.
-
-    It is looked for in Linux' /proc. Children of the process do not count, nor does memory of a
-    GPU.
-    """
-    host, _, port = target.rpartition(":")
-    if host not in ("127.0.0.1", "localhost", "[::1]"):
-        return None
-    try:
-        rows = [
-            line.split()
-            for name in ("tcp", "tcp6")
-            for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]
-        ]
-        sockets = {
-            f"socket:[{row[9]}]"
-            for row in rows
-            if row[3] == "0A" and int(row[1].rpartition(":")[2], 16) == int(port)
-        }  # 0A: listens
-        for process in Path("/proc").glob("[0-9]*"):
-            if any(name in sockets for name in _open_files(process)):
-                status = dict(
-                    line.split(":", 1) for line in (process / "status").read_text().splitlines()
-                )
-                return int(status["VmRSS"].split()[0]) / 1024
-    except (OSError, KeyError):  # no /proc, or the process has just ended
-        return None
-    return None
-
-
-def _open_files(process: Path) -> list[str]:
-    found = []
-    with suppress(OSError):  # another user's, or ended
-        for file in (process / "fd").iterdir():
-            with suppress(OSError):  # closed since, as the folder itself
-                found.append(str(file.readlink()))
-    return found
 
 
 def outside_view() -> Sequence[Finding]:

@@ -14,7 +14,7 @@ import grpc
 
 from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.server.caches import FixerCache, SceneCache, resolve_served
-from alpasim_plugin.alpasim.server.frames import Announced, Answered, FrameServer
+from alpasim_plugin.alpasim.server.frames import Answered, FrameServer
 from alpasim_plugin.alpasim.server.history import HistoryTree
 from alpasim_plugin.alpasim.server.hosting import read_pem, read_token
 from alpasim_plugin.alpasim.server.sensorsim import Sensorsim
@@ -147,7 +147,6 @@ class Settings:
         shutter: Which shutters roll; see `shutters.exposure_of`.
         render_width: Pixels; wider pictures are made at this width and enlarged. None: all are made
             as asked.
-        says_costs: Log what a size costs before its first frame.
     """
 
     renderer: str = "onefixer"
@@ -163,7 +162,6 @@ class Settings:
     kept_scenes: int = 4
     shutter: Shutter = "asked"
     render_width: int | None = None
-    says_costs: bool = False
 
 
 @dataclass(frozen=True)
@@ -256,12 +254,7 @@ def assemble(settings: Settings) -> Assembled:
             settings.shutter,
         )
     tree: HistoryTree[Answered] = HistoryTree(settings.history_bytes, settings.expiry_s)
-    costs = (
-        Announced(settings.render_width is None)
-        if settings.says_costs and settings.upstream is None
-        else None
-    )
-    frames = FrameServer(source, fixers, tree, busy, settings.render_width, costs)
+    frames = FrameServer(source, fixers, tree, busy, settings.render_width)
     shaping = {
         "device": settings.device,
         "reliability": settings.reliability,

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import threading
-import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import cv2
@@ -24,23 +21,13 @@ from alpasim_plugin.core.types import U8
 from alpasim_plugin.log.images import ImageEncoding, encode_image
 from alpasim_plugin.log.wire import sensorsim_pb2
 
-DOING = "answering a render request"
 ENCODINGS: dict[int, ImageEncoding] = {sensorsim_pb2.PNG: "png", sensorsim_pb2.JPEG: "jpeg"}
-NODE_BYTES, OBJECT_BYTES = (
-    4096,
-    512,
-)  # what a frame and each of its objects hold beside pictures and tensors, roughly
-MOST_PIXELS = (
-    2 * MAX_PIXELS
-)  # of all frames of a call: four cameras of 3840 x 2160, which are held until the last is done
+# What a frame and each of its objects hold beside images and tensors, roughly.
+NODE_BYTES = 4096
+OBJECT_BYTES = 512
+# Of all frames of a call: four cameras of 3840 x 2160, which are held until the last is done.
+MOST_PIXELS = 2 * MAX_PIXELS
 QUALITY = 95.0  # where a request leaves it unset; AlpaSim always asks for it
-SHARES = (
-    8,
-    4,
-)  # of a frame's sides, on which its time is measured: the first is so small that its time is the constant part
-# longer than this per frame is a warning: five times as long as the loop's time between frames
-SLOW_S = 0.5
-log = logging.getLogger("simrun.serve")
 
 
 @dataclass(frozen=True)
@@ -63,7 +50,6 @@ class FrameServer:
         busy: Held while something is computed.
         width: Wider pictures are made at this width and enlarged to the size asked for; None: all
             are made as asked.
-        costs: Says what a size costs before its first frame; None: nothing is said.
     """
 
     def __init__(
@@ -73,10 +59,12 @@ class FrameServer:
         tree: HistoryTree[Answered],
         busy: threading.Lock,
         width: int | None = None,
-        costs: Announced | None = None,
     ) -> None:
-        self.source, self.tree = source, tree
-        self._fixers, self._busy, self._width, self._costs = fixers, busy, width, costs
+        self.source = source
+        self.tree = tree
+        self._fixers = fixers
+        self._busy = busy
+        self._width = width
         self._in_work: dict[bytes, threading.Event] = {}
         self._in_work_lock = threading.Lock()
         self.events: Counter[str] = Counter()
@@ -89,7 +77,8 @@ class FrameServer:
         """
         forms = [image_form(request) for request in requests]
         views = [read_view(request) for request in requests]
-        if (pixels := sum(view.width * view.height for view in views)) > MOST_PIXELS:
+        pixels = sum(view.width * view.height for view in views)
+        if pixels > MOST_PIXELS:
             raise InputError(
                 f"{len(views)} frames: {pixels} pixels",
                 f"ask for at most {MOST_PIXELS} in one call",
@@ -99,9 +88,6 @@ class FrameServer:
             views = [
                 scaled(view, self._width) if view.width > self._width else view for view in views
             ]
-        if self._costs is not None:
-            for request, view in zip(requests, views, strict=True):
-                self._costs.before(view, partial(self._thrown_away, request, left))
         if self._fixers is None:
             rendered = self.source.render(requests, views, left)
             return [
@@ -113,13 +99,6 @@ class FrameServer:
             self._encoded(nodes[view.key], size, form)
             for view, size, form in zip(views, sizes, forms, strict=True)
         ]
-
-    def _thrown_away(self, request: Request, left: CallTime, view: View) -> None:
-        """Make a frame that nobody gets, and that is no part of a history."""
-        (item,) = self.source.render([request], [view], left)
-        if self._fixers is not None:
-            with left.holding(self._busy):
-                self._fixers.of(view.scene_id).advance(item.frame, item.sdmap, None)
 
     def _nodes(
         self, requests: Sequence[Request], views: Sequence[View], left: CallTime
@@ -233,51 +212,6 @@ def encode(image: U8, form: tuple[int, float]) -> bytes:
     return encode_image(image, ENCODINGS[form[0]], round(form[1]))
 
 
-def cost_s(
-    make: Callable[[View], object], view: View, clock: Callable[[], float] = time.perf_counter
-) -> float:
-    """Return the expected seconds of one frame, from two smaller ones of the same view, which take
-    a tenth of that.
-
-    A frame's time is nearly a constant plus a part that grows with its pixels.
-
-    Args:
-        make: Makes a frame of a view's size and throws it away.
-        view: The frame.
-        clock: Seconds.
-    """
-    pixels, seconds = [], []
-    for share in SHARES:
-        small = scaled(view, max(view.width // share, 1))
-        make(small)  # loads what the first frame alone waits for: kernels, recorded frames
-        began = clock()
-        make(small)
-        pixels.append(small.width * small.height)
-        seconds.append(clock() - began)
-    per_pixel = max(seconds[1] - seconds[0], 0.0) / max(pixels[1] - pixels[0], 1)
-    return seconds[1] + per_pixel * max(view.width * view.height - pixels[1], 0)
-
-
 def scaled(view: View, width: int) -> View:
     """Return a view at another width, its height in proportion."""
     return replace(view, width=width, height=max(round(view.height * width / view.width), 1))
-
-
-class Announced:
-    """Measures every size once and logs what it costs."""
-
-    def __init__(self, may_shrink: bool) -> None:
-        self._said: set[bytes] = set()
-        self._may_shrink = may_shrink
-
-    def before(self, view: View, make: Callable[[View], object]) -> None:
-        """Measure and log a view's size, unless that was done."""
-        if view.lens in self._said:
-            return
-        self._said.add(view.lens)
-        expected = cost_s(make, view)
-        text = f"camera {view.camera!r} at {view.width} x {view.height}: about {expected:.2g} s a frame on this machine"
-        half = scaled(view, view.width // 2)
-        if expected > SLOW_S and self._may_shrink:
-            text += f"; --render-width {half.width} makes frames of {half.width} x {half.height} and enlarges them, in about a quarter of that"
-        log.log(logging.WARNING if expected > SLOW_S else logging.INFO, text)

@@ -1,12 +1,12 @@
 """How every server of this package is reached, by whom, and how much of it a caller may take: one
-policy, for `serve` and `serve-policy`.
+policy for the renderer and the driver service.
 
-A caller may be hostile. So whatever lasts is bounded and ends: sessions here, messages that do not
-come and streams in `gate`.
+A caller may be hostile, so sessions, calls, handshakes and the size of messages have limits.
 """
 
 from __future__ import annotations
 
+import hmac
 import ipaddress
 import logging
 import threading
@@ -14,19 +14,21 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar
 
 import grpc
 
-from alpasim_plugin.alpasim.server.gate import Gate, Health
-from alpasim_plugin.alpasim.server.status import Full
+from alpasim_plugin.alpasim.server.status import CallTime, Full, Late
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.flags import Flag
-from alpasim_plugin.log.wire.services import OPTIONS, Reflection, handlers
+from alpasim_plugin.log.wire import SERVICE_PATHS, health_pb2
+from alpasim_plugin.log.wire.services import OPTIONS, V1ALPHA, Reflection, handlers
 
-DOING = "opening a port"
-CALLS = 512  # threads for calls that are worked on, or wait for that
+OPEN_CALLS = SERVICE_PATHS["Health"]  # a load balancer has no token
+LIGHT_CALLS = (OPEN_CALLS, SERVICE_PATHS["ServerReflection"], V1ALPHA)
+CALLS = 512  # threads for calls that are worked on, wait for that, or send their message
 STREAMS = 256  # calls at a time on one connection; further ones wait at the caller
 HANDSHAKE_S = 20.0  # from the connection to the end of the handshakes of TLS and HTTP/2
 SESSIONS = 64  # sessions at a time
@@ -176,9 +178,9 @@ class Sessions(Generic[S]):
     def close(self, name: str) -> None:
         """Close a session; one that is not open is fine."""
         with self._lock:
-            found = self._open.pop(name, None)
-        if found is not None:
-            self._close(found[0])
+            session, _ = self._open.pop(name, (None, 0.0))
+        if session is not None:
+            self._close(session)
 
     def expire(self) -> None:
         """Close the sessions that nobody used for long."""
@@ -190,6 +192,74 @@ class Sessions(Generic[S]):
             ]
         for name in old:
             self.close(name)
+
+
+class Health:
+    """The standard health service: the server as a whole (``""``) and every service by its public
+    name.
+    """
+
+    def __init__(self, services: Mapping[str, object]) -> None:
+        self._names = {"", *(SERVICE_PATHS[name].strip("/") for name in services)}
+        self.is_serving = True
+
+    def Check(
+        self, request: health_pb2.HealthCheckRequest, context: Any
+    ) -> health_pb2.HealthCheckResponse:
+        """Return SERVING until the server is stopped."""
+        if request.service not in self._names:
+            context.abort(grpc.StatusCode.NOT_FOUND, f"no service {request.service!r} here")
+        response = health_pb2.HealthCheckResponse
+        return response(status=response.SERVING if self.is_serving else response.NOT_SERVING)
+
+
+class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
+    """Check the token of every call, and limit how many calls are worked on at the same time.
+
+    Args:
+        token: None: no token is asked for.
+        workers: Calls that are worked on; health and reflection do not count.
+    """
+
+    def __init__(self, token: str | None, workers: int) -> None:
+        self._wanted = None if token is None else f"Bearer {token}".encode()
+        self._places = threading.Semaphore(workers)
+        # A handler of a stream starts before the message has come: a refused call holds no thread.
+        self._refusal = grpc.stream_unary_rpc_method_handler(unauthenticated)
+
+    def intercept_service(self, continuation: Callable[[Any], Any], details: Any) -> Any:
+        """Return the handler of a call, or the one that refuses it."""
+        if not details.method.startswith(OPEN_CALLS) and not self._admits(
+            details.invocation_metadata
+        ):
+            return self._refusal
+        handler = continuation(details)
+        if handler is None or details.method.startswith(LIGHT_CALLS):
+            return handler
+        return grpc.unary_unary_rpc_method_handler(
+            partial(self._answer, handler.unary_unary),
+            handler.request_deserializer,
+            handler.response_serializer,
+        )
+
+    def _admits(self, metadata: Any) -> bool:
+        if self._wanted is None:
+            return True
+        given = dict(metadata or ()).get("authorization", "")
+        given = given.encode() if isinstance(given, str) else given
+        return hmac.compare_digest(given, self._wanted)
+
+    def _answer(self, call: Callable[[Any, Any], Any], request: Any, context: Any) -> Any:
+        try:
+            with CallTime(context).holding(self._places):
+                return call(request, context)
+        except Late as late:
+            context.abort(grpc.StatusCode.CANCELLED, str(late))
+
+
+def unauthenticated(messages: Any, context: Any) -> None:
+    """Refuse a call without waiting for its message."""
+    context.abort(grpc.StatusCode.UNAUTHENTICATED, "send metadata 'authorization: Bearer TOKEN'")
 
 
 class Host:
@@ -215,18 +285,19 @@ class Host:
         workers: int = 16,
         every: Callable[[], None] = lambda: None,
     ) -> None:
-        self.health, self._gate = Health(services), Gate(read_token(policy.token_file), workers)
+        self.health = Health(services)
         # No maximum_concurrent_rpcs: beyond it gRPC answers RESOURCE_EXHAUSTED, which AlpaSim does
         # not retry. Calls wait instead.
-        limits = (
+        options = [
+            *OPTIONS,
+            ("grpc.so_reuseport", 0),
             ("grpc.max_concurrent_streams", STREAMS),
             ("grpc.server_handshake_timeout_ms", round(1000 * HANDSHAKE_S)),
-        )
-        options = [*OPTIONS, ("grpc.so_reuseport", 0), *limits]
+        ]
         self._server = grpc.server(
             ThreadPoolExecutor(CALLS, thread_name_prefix="serve"),
             options=options,
-            interceptors=(self._gate,),
+            interceptors=(Gate(read_token(policy.token_file), workers),),
         )
         made = [handlers(name, service) for name, service in services.items()]
         self._server.add_generic_rpc_handlers(
@@ -241,18 +312,18 @@ class Host:
                     f"--listen {listen}: no HOST:PORT",
                     "write for example 127.0.0.1:50051, or unix:PATH",
                 )
-            add = (
-                self._server.add_insecure_port(listen)
-                if credentials is None
-                else self._server.add_secure_port(listen, credentials)
-            )
+            if credentials is None:
+                bound = self._server.add_insecure_port(listen)
+            else:
+                bound = self._server.add_secure_port(listen, credentials)
         except RuntimeError as error:
             raise InfrastructureError(
                 f"{listen}: {error}", "choose a free port and an address of this machine"
             ) from error
-        self.address = listen if is_socket else f"{host}:{add}"
+        self.address = listen if is_socket else f"{host}:{bound}"
         policy.warn(self.address)
-        self._ended, self._every = threading.Event(), every
+        self._ended = threading.Event()
+        self._every = every
         self._upkeep = threading.Thread(target=self._repeat, daemon=True, name="serve-upkeep")
 
     def start(self) -> Host:
@@ -270,9 +341,8 @@ class Host:
         """Refuse new calls (UNAVAILABLE), let running ones finish within ``drain_s``, and close the
         port.
         """
-        self.health.stop()
+        self.health.is_serving = False
         self._server.stop(drain_s).wait()
-        self._gate.close()
         self._ended.set()
         if self._upkeep.is_alive():
             self._upkeep.join()
@@ -285,5 +355,4 @@ class Host:
 
     def _repeat(self) -> None:
         while not self._ended.wait(UPKEEP_S):
-            self._gate.expire()
             self._every()
