@@ -19,7 +19,6 @@ from alpasim_plugin.alpasim.client.preflight import (
     Finding,
     findings,
     outside_view,
-    resident_mib,
     tolerances,
 )
 from alpasim_plugin.cli.options import HELP_NAMES, Json, Run, command_of, run_or_newest
@@ -252,7 +251,6 @@ class Drive:
         outcomes: How it ended, by name; None where the driver was lost at every attempt.
         lost: Attempts in which the connection was lost.
         failed: What ended it early.
-        resident_mib: Memory of the driver afterwards, where it can be seen.
     """
 
     scene: str
@@ -260,7 +258,6 @@ class Drive:
     outcomes: tuple[str, ...] | None = None
     lost: int = 0
     failed: SimrunError | None = None
-    resident_mib: float | None = None
 
     def facts(self) -> dict[str, Any]:
         """Return what JSON says of it."""
@@ -269,7 +266,6 @@ class Drive:
             "scene": self.scene,
             "ended": ended,
             "lost": self.lost,
-            "resident_mib": self.resident_mib,
         }
 
 
@@ -296,7 +292,6 @@ def rehearse(scene: Scenario, policy: AlpasimPolicy, times: DriveTimes) -> Drive
             policy.forget_session()
         if out.failed is None or out.outcomes is not None or not _is_back(policy):
             break
-    out.resident_mib = resident_mib(policy.service.target)
     return out
 
 
@@ -309,15 +304,10 @@ def _is_back(policy: AlpasimPolicy) -> bool:
 
 
 def over_scenes(drives: Sequence[Drive]) -> list[Finding]:
-    """Return what the scenes show together: lost connections, and the driver's memory."""
+    """Return what the scenes show together: lost connections."""
     lost = sum(one.lost for one in drives)
     text = f"{lost} lost connections in {len(drives)} scenes; {sum(one.outcomes is None for one in drives)} scenes without an outcome"
-    found = [Finding("the connection lasts", "failed" if lost else "passed", text)]
-    seen = [one.resident_mib for one in drives if one.resident_mib is not None]
-    if len(seen) > 1:
-        text = f"{seen[0]:.0f} MiB after the first scene, {max(seen):.0f} at most, {seen[-1]:.0f} after the last; without children and GPU"
-        found.append(Finding("memory of the driver", "noted", text))
-    return found
+    return [Finding("the connection lasts", "failed" if lost else "passed", text)]
 
 
 app.command("run", epilog=RUN_EPILOG)(command_of(check_run))
