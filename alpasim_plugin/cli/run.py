@@ -43,7 +43,7 @@ from alpasim_plugin.runs.execute import Threads, thread_budget
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import RunResult, default_folder, execute_run
-from evaluators.report.verdict import metric_lines, verdict_line
+from evaluators.report.decision import decision_lines
 from evaluators.statistics.arms import arms_of, base_named
 from evaluators.statistics.decision import Question, metric_question
 from evaluators.statistics.gate import load_gate
@@ -207,7 +207,7 @@ def _print_decision(decided: Decided, as_json: bool) -> None:
         }
         print(json.dumps(facts))
         return
-    for line in (verdict_line(decided.record), *metric_lines(decided.record)):
+    for line in decision_lines(decided.record):
         print(line)
     print(report_line(decided.run.root))
 

@@ -11,9 +11,9 @@ from alpasim_plugin.core.lazy import lazy_names
 if TYPE_CHECKING:
     from evaluators.report.ci import write_junit, write_summary_md
     from evaluators.report.fixers import fixer_lines
-    from evaluators.report.headline import plan_warnings
     from evaluators.report.html import write_report
     from evaluators.report.terminal import ending_lines, next_line, render_presets, render_table
+    from evaluators.report.verdict import plan_warnings
 
 __all__ = [
     "ending_lines",
@@ -30,7 +30,7 @@ __all__ = [
 _HOMES = {
     ".ci": ("write_junit", "write_summary_md"),
     ".fixers": ("fixer_lines",),
-    ".headline": ("plan_warnings",),
+    ".verdict": ("plan_warnings",),
     ".html": ("write_report",),
     ".terminal": ("ending_lines", "next_line", "render_presets", "render_table"),
 }

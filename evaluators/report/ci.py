@@ -20,10 +20,10 @@ from evaluators.metrics.presets import contact_note
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
-from evaluators.report.headline import LEADING, find
+from evaluators.report.gate import worst_of, write_gate
 from evaluators.report.numbers import Cell, plural, short
 from evaluators.report.provenance import LEDGER_COLUMNS, failure_rows, ledger, provenance
-from evaluators.report.verdict import worst_of, write_gate
+from evaluators.report.verdict import LEADING, find
 from evaluators.statistics.gate import Check, GateVerdict
 
 MAX_BYTES = 1_000_000  # job pages refuse more than 1 MiB
@@ -294,7 +294,7 @@ def gate_md(
         verdict: What `judge` gave.
         gate: Name or file of the gate.
         run: Name or folder of the run.
-        worst: As `evaluators.report.verdict.worst_of` gives it.
+        worst: As `evaluators.report.gate.worst_of` gives it.
     """
     head = f"## Gate: {verdict.outcome.title}\n\n"
     head += f"Run {escape(run)}, gate {escape(gate)}, compared with {escape(verdict.baseline)}. Exit code {verdict.exit_code}.\n\n"

@@ -34,9 +34,10 @@ from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
 from evaluators.report.charts import forest, speed_against_error
+from evaluators.report.decision import decision_section
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
 from evaluators.report.flips import FlipKey, colours_of, comparisons, flip_bases, flip_rows
-from evaluators.report.headline import find
+from evaluators.report.gate import gate_section
 from evaluators.report.numbers import DASH, duration, fixed, plural
 from evaluators.report.provenance import (
     LEDGER_COLUMNS,
@@ -47,7 +48,7 @@ from evaluators.report.provenance import (
 )
 from evaluators.report.rollouts import drift_charts, read_series, rollout_block
 from evaluators.report.tables import SCENE_METRICS, scene_rows
-from evaluators.report.verdict import decision_section, gate_section
+from evaluators.report.verdict import find
 
 MAX_SCENE_PLOTS = 24
 OPEN_SCENE_PLOTS = 6

@@ -7,7 +7,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from evaluators.metrics import MetricInfo
 
 DASH, NARROW = "\u2014", "\u202f"
 LEAST_SPAN = {
@@ -91,6 +94,11 @@ def short(value: float | None, unit: str = "") -> str:
     if value is None:
         return DASH
     return fixed(value, decimals(value)) + (f"\u00a0{unit}" if unit else "")
+
+
+def scale_and_unit(metric: MetricInfo, unit: str) -> tuple[float, str]:
+    """Return factor and unit of a metric's printed differences: points where it is a share."""
+    return (100.0, "points") if metric.in_percent else (1.0, unit)
 
 
 def count_of(mean: float, n: int) -> str:

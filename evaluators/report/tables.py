@@ -15,7 +15,6 @@ from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.outcomes import POLICY_FAULT, in_words, outcomes_of, told
 from evaluators.opening import Run
 from evaluators.report.flips import colours_of
-from evaluators.report.headline import more_scenes_text, tone_of
 from evaluators.report.numbers import (
     ARROW_WORDS,
     ARROWS,
@@ -34,6 +33,7 @@ from evaluators.report.numbers import (
     short,
 )
 from evaluators.report.rollouts import COLLISION
+from evaluators.report.verdict import more_scenes_text, tone_of
 
 
 @dataclass(frozen=True)

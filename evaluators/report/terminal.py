@@ -15,19 +15,23 @@ from rich.table import Table
 from rich.text import Text
 
 from alpasim_plugin.core.escape import terminal as escape
-from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import cell_name
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.metrics.presets import contact_note
 from evaluators.opening import Run
-from evaluators.report.flips import find_flips, flip_bases
-from evaluators.report.headline import Finding, find
+from evaluators.report.flips import find_flips
 from evaluators.report.numbers import Cell, finite, fixed, plural
 from evaluators.report.tables import metric_rows
+from evaluators.report.verdict import Finding, find
 from evaluators.scores.table import SCORES
-from evaluators.statistics.arms import Arm
 
+LABEL = 9  # width of the labels
+MOST_VARIANTS = 12  # named at the end of a run
+MORE_SCENES = "suites/urban"
+SEEING = "lane-camera"  # a shipped policy with a camera
+KEPT = ("--set", "--preset", "--controller")  # options of a command that the next one has too
+OF_A_SCENE = r"(road|ego|actors)\b"  # settings that another scene cannot have
 MARGIN_NOTE = "a to b: 95 %, scenes as clusters"
 GAP_NOTE = (
     "; \u2014: one rollout or one scene is too few, or no valid value (report.html says which)"
@@ -138,39 +142,23 @@ def _cell(cell: Cell) -> Text:
     )
 
 
-LABEL = 9  # width of the labels
-MOST_ARMS = 12  # named at the end of a run
-MORE_SCENES = "suites/urban"
-FORK_AT_S = 1.0  # seconds of the drive that a suggested fork keeps
-SEEING = "lane-camera"  # a shipped policy with a camera
-KEPT = ("--set", "--preset", "--controller")  # options of a command that the next one has too
-OF_A_SCENE = ("road", "ego", "actors")  # settings that another scene cannot have
-
-
 def ending_lines(run: Run) -> list[str]:
-    """Return the last lines of a run's terminal output, without the path of its report.
-
-    Args:
-        run: A finished run.
-    """
+    """Return the last lines of a finished run's terminal output, without the path of its report."""
     finding = find(run)
-    several = len(finding.outcomes) > 1
-    lines = [
-        labelled("" if i else "outcome", f"{name}: {text}")
-        for i, (name, text) in enumerate(finding.outcomes[:MOST_ARMS])
-    ]
-    if len(finding.outcomes) > MOST_ARMS:
-        lines.append(
-            labelled("", f"and {len(finding.outcomes) - MOST_ARMS} more arms: report.html")
-        )
-    lines += [labelled("verdict", finding.title)] if several or not lines else []
+    outcomes = [f"{name}: {text}" for name, text in finding.outcomes]
+    if len(outcomes) > MOST_VARIANTS:
+        more = f"and {len(outcomes) - MOST_VARIANTS} more variants: report.html"
+        outcomes = [*outcomes[:MOST_VARIANTS], more]
+    lines = [labelled("" if row else "outcome", text) for row, text in enumerate(outcomes)]
+    if len(lines) != 1:
+        lines.append(labelled("verdict", finding.title))
     lines += [
         labelled("", f"{finding.name_of(point)}: {point.lead}")
         for point in finding.points
         if point.lead
     ]
     cost = cost_text(run.summary)
-    return [*lines, *([labelled("cost", cost)] if cost else [])]
+    return [*lines, labelled("cost", cost)] if cost else lines
 
 
 def next_line(run: Run) -> str:
@@ -180,135 +168,74 @@ def next_line(run: Run) -> str:
 
 
 def cost_text(summary: Mapping[str, Any]) -> str:
-    """Say what a camera frame costs behind each renderer: the mean, which is what a drive pays;
+    """Say what a camera frame costs behind each renderer: the mean, which is what a rollout pays;
     empty where nothing was timed.
     """
-    means = {
-        name: finite(times.get("ms_per_frame_mean"))
-        for name, times in (summary.get("speed") or {}).items()
-    }
-    parts = [
-        f"{name} {fixed(ms, 0 if ms >= 10 else 1)} ms"
-        for name, ms in means.items()
-        if ms is not None
-    ]
+    parts = []
+    for name, times in (summary.get("speed") or {}).items():
+        mean_ms = finite(times.get("ms_per_frame_mean"))
+        if mean_ms is not None:
+            parts.append(f"{name} {fixed(mean_ms, 0 if mean_ms >= 10 else 1)} ms")
     return f"{', '.join(parts)} a frame, the whole loop (mean)" if parts else ""
 
 
 def next_command(run: Run, finding: Finding) -> tuple[list[str], str]:
-    """Choose the command that most helps with what was found, and say why.
+    """Choose the command that most helps with what was found.
 
     Returns:
-        Its words, and the reason.
+        Its words, and why.
     """
-    failed = [r for r in run.rollouts if not r.ok]
-    if any(r.failure_class == "policy" for r in failed):
-        policy = next(r.policy for r in failed if r.failure_class == "policy")
-        return ["simrun", "check", "policy", policy], "finds every fault of the policy in seconds"
+    failed = [rollout for rollout in run.rollouts if not rollout.ok]
+    for rollout in failed:
+        if rollout.failure_class == "policy":
+            words = ["simrun", "check", "policy", rollout.policy]
+            return words, "finds every fault of the policy in seconds"
     if failed:
-        return [
-            "simrun",
-            "check",
-            "run",
-            str(run.folder),
-        ], "says what is damaged or missing; the same command runs it again"
-    if all(r.frames == 0 for r in run.rollouts):
-        names = run.renderers if len(run.renderers) > 1 else [*run.renderers, _other(run)]
+        words = ["simrun", "check", "run", str(run.folder)]
+        return words, "says what is damaged or missing; the same command runs it again"
+    scenes = run.scenes_asked or [MORE_SCENES]
+    other = next((name for name in ("3dgs", "onefixer") if name not in run.renderers), "clean")
+    if all(rollout.frames == 0 for rollout in run.rollouts):
+        names = run.renderers if len(run.renderers) > 1 else [*run.renderers, other]
         why = "a policy that looks: without a camera it drives alike behind every renderer"
-        return _again(run, names, run.scenes_asked or [MORE_SCENES], SEEING), why
+        return _again(run, names, scenes, SEEING), why
     flips, _ = find_flips(run)
-    changed = [one for flip in flips for one in (flip.other, flip.base)]
-    ended = next((one for one in [*changed, *run.rollouts] if outcomes_of(one)), None)
-    if ended is not None:
-        words = ["simrun", "why", f"{run.folder}/{_named(ended)}"]
-        return words, "what the policy saw and planned there"
-    if not finding.points or len(run.renderers) * len(run.policies) == 1:
-        more = _other(run)
-        return _again(
-            run, [*run.renderers, more], run.scenes_asked or [MORE_SCENES]
-        ), f"compares with {more}, pair by pair"
+    changed = [rollout for flip in flips for rollout in (flip.other, flip.base)]
+    for rollout in [*changed, *run.rollouts]:
+        if outcomes_of(rollout):
+            words = ["simrun", "why", f"{run.folder}/{cell_name(*rollout.cell)}"]
+            return words, "what the policy saw and planned there"
+    if not finding.points or len(run.variants) == 1:
+        return _again(run, [*run.renderers, other], scenes), f"compares with {other}, pair by pair"
     if finding.tone == "unclear":
-        return _again(
-            run, run.renderers, [MORE_SCENES]
-        ), "more scenes: the interval is too wide to decide"
-    point = finding.points[0]
-    worst = max(
-        run.rollouts_of(point.variant),
-        key=lambda r: r.metrics.get("lateral_distance_m") or 0.0,
-        default=run.rollouts[0],
-    )
-    arm = Arm(worst.renderer, worst.policy)
-    bases = (base.of(arm) for base in flip_bases(run))
-    other = next((base for base in bases if base != arm), arm)
-    partners = (
-        r
-        for r in run.rollouts
-        if (r.renderer, r.policy, r.scene, r.seed)
-        == (other.renderer, other.policy, worst.scene, worst.seed)
-    )
-    return _of_pair(run, next(partners, worst), worst)
+        why = "more scenes: the interval is too wide to decide"
+        return _again(run, run.renderers, [MORE_SCENES]), why
+    return ["simrun", "view", str(run.folder)], "replays the rollouts side by side in a browser"
 
 
-def _of_pair(run: Run, base: Rollout, other: Rollout) -> tuple[list[str], str]:
-    """Return what shows why two rollouts differ: the page of evidence for two renderers; for two
-    policies a fork of the first rollout to the second policy.
-    """
-    if base.renderer != other.renderer:
-        words = ["simrun", "why", f"{run.folder}/{_named(other)}"]
-        return words, "the same poses behind both: where the plans part"
-    if base.policy != other.policy:
-        words = [
-            "simrun",
-            "fork",
-            f"{run.folder}/{_named(other)}",
-            "--at",
-            f"{FORK_AT_S:g}",
-            "--policy",
-            base.policy,
-        ]
-        return words, f"from the same instant on: what {base.policy} does where {other.policy} was"
-    return ["simrun", "view", str(run.folder)], "replays the drives in a browser"
-
-
-def _named(rollout: Rollout) -> str:
-    return cell_name(*rollout.cell)
-
-
-def _other(run: Run) -> str:
-    return (
-        "3dgs"
-        if "3dgs" not in run.renderers
-        else "onefixer"
-        if "onefixer" not in run.renderers
-        else "clean"
-    )
-
-
-def _again(run: Run, renderers: Sequence[str], scenes: list[str], policy: str = "") -> list[str]:
-    seeds = max(1, len(run.info.get("seeds") or ()))
-    drivers = policy or ",".join(run.policies)
-    given = [
-        word
-        for text in run.info.get("command") or ()
-        for word in (text.split("=", 1) if text.startswith("--") else [text])
-    ]
-    kept = [(flag, value) for flag, value in pairwise(given) if flag in KEPT]
-    if scenes == [MORE_SCENES]:
-        kept = [
-            (flag, value)
-            for flag, value in kept
-            if not re.match(rf"({'|'.join(OF_A_SCENE)})\b", value)
-        ]
-    words = [
+def _again(
+    run: Run, renderers: Sequence[str], scenes: Sequence[str], policy: str = ""
+) -> list[str]:
+    """Return the command of a run with other renderers or scenes, its settings kept."""
+    words: list[str] = []
+    for text in run.info.get("command") or ():
+        words += text.split("=", 1) if text.startswith("--") else [text]
+    settings = []
+    for option, value in pairwise(words):
+        is_elsewhere = scenes == [MORE_SCENES] and re.match(OF_A_SCENE, value)
+        if option in KEPT and not is_elsewhere:
+            settings += [option, value]
+    return [
         "simrun",
         "--renderer",
         ",".join(dict.fromkeys(renderers)),
         "--policy",
-        drivers,
+        policy or ",".join(run.policies),
         "--seeds",
-        str(seeds),
+        str(max(1, len(run.info.get("seeds") or ()))),
+        *settings,
+        *scenes,
     ]
-    return [*words, *(word for pair in kept for word in pair), *scenes]
 
 
 def labelled(label: str, text: str) -> str:

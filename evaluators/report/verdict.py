@@ -1,376 +1,362 @@
-"""What a run was found to be, at the head of its report: by a gate, kept in the run folder, or by a
-decision that ended the run.
+"""Say in sentences what a run found, from the numbers of ``summary.json`` alone: the one builder of
+the verdict for the terminal, the report and Markdown.
 
-Of a gate: verdict, baseline, every check, the worst scenes first. Of a decision: the last lines on
-a terminal, the section with its picture, and the gate's verdict on a run decided so.
+The words of a difference come from the paired comparison and its correction for many questions
+from `evaluators.statistics.verdicts`; nothing is tested here. The title answers the one question
+that the run declared before it was driven (`MetricTable.primary`); everything else is secondary.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import numpy as np
-
-from alpasim_plugin.core.atomic import write_json
-from alpasim_plugin.core.checksums import checksums_of
-from alpasim_plugin.log.run_folder.reader import read_json
-from alpasim_plugin.log.run_folder.schema import ROLLOUTS, WHY_NAME
-from alpasim_plugin.log.run_folder.sides import Row, value_of
-from evaluators.metrics import METRICS, MetricInfo, MetricTable
+from alpasim_plugin.log.run_folder.shapes import pair_tables
 from evaluators.opening import Run
-from evaluators.report.numbers import decimals, fixed, short
-from evaluators.report.terminal import LABEL, labelled
-from evaluators.statistics.arms import Arm, short_name
-from evaluators.statistics.baselines import rows_of_run
-from evaluators.statistics.decision import CAUSES, Decision, read_decision
-from evaluators.statistics.gate import Check, GateVerdict
-from evaluators.statistics.verdicts import WORDS
+from evaluators.report.fixers import fixer_cautions
+from evaluators.report.numbers import (
+    count_of,
+    decimals,
+    finite,
+    fixed,
+    interval,
+    plural,
+    scale_and_unit,
+    short,
+)
+from evaluators.statistics.outcomes import outcome_table, sentence
+from evaluators.statistics.verdicts import shown_questions
 
-GATE_NAME = "gate.json"
-WORST = 5  # scenes of a check that are named
-TONES = {"pass": "better", "regression": "worse", "undecided": "unclear"}
-WORST_CASE = "any bound"
+Tone = Literal["worse", "better", "mixed", "unclear", "neutral", "broken"]
 
-
-def write_gate(
-    run: Run, verdict: GateVerdict, gate: str, worst: Sequence[Mapping[str, Any]]
-) -> Path:
-    """Keep a verdict in the run folder, for its report, and return the file.
-
-    Args:
-        run: The run that was judged.
-        verdict: What `evaluators.statistics.gate.judge` gave.
-        gate: Name or file of the gate.
-        worst: As `worst_of` gives it.
-    """
-    write_json(
-        run.folder / GATE_NAME,
-        {"of": _content(run), "gate": gate, "worst": list(worst), **verdict.as_dict()},
-    )
-    return run.folder / GATE_NAME
-
-
-def worst_of(
-    run: Run, verdict: GateVerdict, stored: Sequence[Row] | None = None
-) -> list[dict[str, Any]]:
-    """Return the pairs that did worst in every check that did not pass, once each, those of a shown
-    regression first.
-
-    Args:
-        run: The run.
-        verdict: Of a gate.
-        stored: Rows of a stored baseline.
-    """
-    rows = rows_of_run(run)
-    base_rows = rows if stored is None else stored
-    checks = sorted(
-        (check for check in verdict.checks if check.cause != "pass"),
-        key=lambda check: check.cause != "regression",
-    )
-    pairs: dict[tuple[str, ...], dict[str, Any]] = {}
-    for check in checks:
-        for pair in worst_pairs(check, run, rows, base_rows):
-            name = tuple(
-                str(pair[key]) for key in ("metric", "renderer", "policy", "scene", "seed")
-            )
-            if name not in pairs:
-                pairs[name] = pair
-            elif (
-                pairs[name]["was"] is None
-            ):  # a limit has no baseline, the margin of the same metric has
-                pairs[name] |= {"was": pair["was"]}
-    return list(pairs.values())
-
-
-def _content(run: Run) -> str:
-    """Return the digest of the rollouts' table: a verdict on other rollouts is not shown."""
-    return str(checksums_of(run.folder, [ROLLOUTS])[ROLLOUTS]["sha256"])
-
-
-def worst_pairs(
-    check: Check, run: Run, rows: Sequence[Row], base_rows: Sequence[Row]
-) -> list[dict[str, Any]]:
-    """Return the pairs in which an arm did worst against its baseline, or its worst rollouts where
-    a limit is broken.
-
-    Args:
-        check: One that did not pass.
-        run: The run, whose table says which side is better.
-        rows, base_rows: Rollouts of the run and of the baseline.
-    """
-    arm = Arm(check.renderer, check.policy)
-    sign = -1.0 if run.table.info(check.metric).direction == "higher" else 1.0
-    was: dict[tuple[str, int], float | None] = {}
-    for row in base_rows:
-        other = Arm(str(row["renderer"]), str(row["policy"]))
-        if check.kind == "margin" and short_name(other, arm) == check.entry["baseline"]:
-            was[str(row["scene"]), int(row["seed"])] = value_of(row, check.metric)
-    found: list[dict[str, Any]] = []
-    for row in rows:
-        key, now = (str(row["scene"]), int(row["seed"])), value_of(row, check.metric)
-        before = was.get(key)
-        if (
-            (row["renderer"], row["policy"]) != (check.renderer, check.policy)
-            or now is None
-            or (check.kind == "margin" and before is None)
-        ):
-            continue
-        worse = sign * (now - (before or 0.0))
-        if worse > 0.0:
-            pair: dict[str, Any] = {
-                "scene": key[0],
-                "seed": key[1],
-                "was": before,
-                "now": now,
-                "worse": worse,
-            }
-            found.append(
-                pair | {"metric": check.metric, "renderer": check.renderer, "policy": check.policy}
-            )
-    return sorted(found, key=lambda pair: -pair["worse"])[:WORST]
+GRAVEST_FIRST: tuple[Tone, ...] = ("worse", "mixed", "better", "unclear", "neutral")
+MANY_SCENES = 1000  # an estimate beyond this says no more than "many"
+LEADING = 4  # variants named in the headline
+COMPARED = 3  # comparisons named in the title
+FEW_SCENES = 10  # below this an interval over scenes leans heavily on its assumptions
+NO_PAIR = "no metric is valid in both members of any pair"
 
 
 @dataclass(frozen=True)
-class GateSection:
-    """What the report shows.
+class Point:
+    """What was found for one variant.
 
     Attributes:
-        tone: Colour of the verdict.
-        checks: A row a check: metric, arm, tone, result, sentence with the numbers.
-        worst: A row a pair: scene, seed, metric, value of the baseline, value, where it is shown.
+        name: What sentences call it.
+        tone: Of its differences.
+        sentence: The verdict; empty where it is compared with nothing.
+        text: Every difference that the verdict rests on, with intervals.
+        lead: The one difference that says most.
+        baseline: What it is compared with; empty where with nothing.
+        variant: Its key in ``summary.json``.
     """
 
-    title: str
-    tone: str
-    gate: str
-    baseline: str
-    exit_code: int
-    checks: list[tuple[str, str, str, str, str]]
-    worst: list[tuple[str, int, str, str, str, str | None]]
-
-
-def gate_section(run: Run) -> GateSection | None:
-    """Return the verdict of the last gate that judged these rollouts; None without one.
-
-    Raises:
-        InputError: gate.json is damaged.
-    """
-    path = run.folder / GATE_NAME
-    if not path.is_file():
-        return None
-    told = read_json(path)
-    if told["of"] != _content(run):
-        return None
-    places = {one.cell: run.href(one, WHY_NAME) or run.href(one) for one in run.rollouts}
-    order = {"regression": 0, "undecided": 1}
-    checks = sorted(
-        told["checks"], key=lambda one: (order.get(one["cause"], 2), not one["binding"])
-    )
-    return GateSection(
-        WORDS[told["outcome"]["cause"]],
-        TONES.get(told["outcome"]["cause"], "broken"),
-        told["gate"],
-        told["baseline"],
-        told["outcome"]["exit_code"],
-        [
-            (
-                one["metric"],
-                f"{one['renderer']}/{one['policy']}",
-                TONES.get(one["cause"], "broken"),
-                _result(one),
-                one["text"],
-            )
-            for one in checks
-        ],
-        [_worst(run, one, places) for one in told["worst"]],
-    )
-
-
-def _result(check: Mapping[str, Any]) -> str:
-    return f"{check['cause']}{'' if check['binding'] else ', not binding'}"
-
-
-def _worst(
-    run: Run, pair: Mapping[str, Any], places: Mapping[Any, str | None]
-) -> tuple[str, int, str, str, str, str | None]:
-    unit = run.table.shown(pair["metric"]).unit
-    was, now = (
-        "\u2014" if value is None else short(float(value), unit)
-        for value in (pair["was"], pair["now"])
-    )
-    place = places.get((pair["renderer"], pair["policy"], pair["scene"], pair["seed"]))
-    return pair["scene"], pair["seed"], pair["metric"], was, now, place
-
-
-# --- a decision
+    name: str
+    tone: Tone
+    text: str
+    sentence: str = ""
+    lead: str = ""
+    baseline: str = ""
+    variant: str = ""
 
 
 @dataclass(frozen=True)
-class MetricRow:
-    """One metric in the report's table, printed."""
+class Finding:
+    """The head of a report.
 
-    metric: str
-    verdict: str
-    tone: str
-    diff: str
-    interval: str
-    margin: str
-    evidence: str
-    n_scenes: int
-    binding: bool
+    Attributes:
+        title: The differences; of one variant alone how its rollouts ended.
+        tone: Of the differences.
+        points: One a comparison.
+        cautions: What a reader must know.
+        outcomes: Variant, as sentences call it, and how its rollouts ended.
+    """
+
+    title: str
+    tone: Tone
+    points: tuple[Point, ...] = ()
+    cautions: tuple[str, ...] = ()
+    outcomes: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def head(self) -> str:
+        """Give how the rollouts of all variants ended; the title where there is one variant."""
+        if len(self.outcomes) < 2:
+            return self.title
+        named = [f"{name}: {text}" for name, text in self.outcomes[:LEADING]]
+        more = len(self.outcomes) - LEADING
+        return "; ".join([*named, f"and {more} more"] if more > 0 else named)
+
+    def name_of(self, point: Point) -> str:
+        """Name a point, with its baseline where not all points have the same."""
+        several = len({one.baseline for one in self.points}) > 1
+        return f"{point.name} \u2212 {point.baseline}" if several and point.baseline else point.name
 
 
-def verdict_line(decision: Decision) -> str:
-    """Say in one line what was decided, after how much."""
-    n, most = len(decision["order"]), decision["ceiling"]
-    after = f"after {n} of {most['scenes']} scenes, {decision['rollouts']} of at most {most['rollouts']} rollouts"
-    cause = decision["outcome"]["cause"]
-    verdict = (
-        decision["verdict"]
-        if cause in ("pass", "regression", "undecided")
-        else WORDS[cause].lower()
+def find(run: Run) -> Finding:
+    """Derive the main finding of a run."""
+    if not run.rollouts:
+        return Finding("Nothing was run: the run folder holds no rollouts", "broken")
+    table = run.summary.get("outcomes") or outcome_table(run.rollouts)
+    outcomes = tuple((variant_name(run, name), sentence(entry)) for name, entry in table.items())
+    cautions = _cautions(run)
+    if not any(rollout.ok for rollout in run.rollouts):
+        title = f"Nothing could be scored: all {plural(len(run.rollouts), 'rollout')} failed"
+        return Finding(title, "broken", (), cautions, outcomes)
+    comparisons = list(pair_tables(run.summary))
+    if not comparisons:
+        title = f"{plural(len(outcomes), 'variant')} driven, none of which can be paired"
+        if len(outcomes) == 1:
+            title = ": ".join(outcomes[0])
+        alone = (
+            Point(variant_name(run, variant), "neutral", _alone(run, variant), variant=variant)
+            for variant in run.variants
+        )
+        return Finding(title, "neutral", tuple(alone), cautions, outcomes)
+    questions = [_questions(run, pairs) for _, pairs in comparisons]
+    primary = run.table.primary
+    if primary and not all(primary in names for names in questions):
+        words = run.table.shown(primary).words
+        cautions += (
+            f"Not every comparison has a value of the primary question, {words}: "
+            "the headline is about all questions, corrected together.",
+        )
+        primary = ""
+    p_values = {
+        (row, name): finite(pairs[name].get("p_value"))
+        for row, (_, pairs) in enumerate(comparisons)
+        for name in questions[row]
+    }
+    shown = shown_questions(p_values, primary)
+    points = tuple(
+        _point(
+            run, variant, pairs, questions[row], {name for i, name in shown if i == row}, primary
+        )
+        for row, (variant, pairs) in enumerate(comparisons)
     )
-    text = f"{decision['candidate']} against {decision['baseline']}: {verdict}, {after}"
-    why = "" if decision["stopped"] == "decided" else f" ({decision['stopped']})"
-    return labelled("verdict", text + why)
+    sentences = [point.sentence for point in points[:COMPARED]]
+    if len(points) > COMPARED:
+        sentences.append(f"and {len(points) - COMPARED} more")
+    title = "; ".join(sentences)
+    if points[0].tone == "unclear":
+        title = title[0].upper() + title[1:]
+    tones = {point.tone for point in points}
+    tone = next(tone for tone in GRAVEST_FIRST if tone in tones)
+    return Finding(title, tone, points, cautions, outcomes)
 
 
-def metric_lines(decision: Decision) -> list[str]:
-    """Return one line a metric, and one for the guarantee."""
-    lines = []
-    for row in metric_rows(decision):
-        note = "" if row.binding else ", not binding"
-        text = f"{row.metric}: {row.diff} ({row.interval}, margin {row.margin}{note}): {row.verdict}, e-values {row.evidence}"
-        lines.append(labelled("", text))
+def variant_name(run: Run, name: str) -> str:
+    """Return what sentences call a variant: its policy where a run has one renderer, its renderer
+    where it has one policy, else both.
+    """
+    if len(run.renderers) == 1 and len(run.policies) > 1:
+        return name.removeprefix(f"{run.renderers[0]}/")
+    return name.removesuffix(f"/{run.policies[0]}") if len(run.policies) == 1 else name
+
+
+def tone_of(entry: Mapping[str, Any], direction: str) -> Tone:
+    """Give the tone of one paired difference, or where no verdict is stated whether its interval
+    excludes zero.
+
+    Neutral means non-inferior: no worse than its margin, and not shown to be better.
+
+    Args:
+        entry: One metric of ``summary.json``'s ``paired``.
+        direction: "lower", "higher" or "none": which way is better.
+    """
+    stated = str(entry.get("verdict") or "").lower()
+    if stated:
+        shown = entry.get("difference")
+        if shown == "better" or (shown == "worse" and stated != "non-inferior"):
+            return "better" if shown == "better" else "worse"
+        known: dict[str, Tone] = {"worse": "worse", "better": "better", "undecided": "unclear"}
+        return known.get(stated, "neutral")
+    difference = finite(entry.get("diff"))
+    bounds = interval(entry.get("ci95"), difference)
+    if difference is None or bounds is None or bounds[0] <= 0.0 <= bounds[1]:
+        return "unclear"
+    if direction not in ("lower", "higher"):
+        return "neutral"
+    return "worse" if (difference > 0) == (direction == "lower") else "better"
+
+
+def more_scenes_text(more: Any) -> str:
+    """Say how many more scenes would decide an undecided verdict; empty where that is unknown."""
+    if not isinstance(more, int) or more <= 0:
+        return ""
+    if more > MANY_SCENES:
+        return f"more than {MANY_SCENES} more scenes would decide"
+    return f"about {plural(more, 'more scene')} would decide"
+
+
+def plan_warnings(summary: Mapping[str, Any]) -> list[str]:
+    """Say in one sentence each whose plans do not fit the vehicle; variants with the same sentence
+    share it.
+    """
+    by_text: dict[str, list[str]] = {}
+    for name, entry in (summary.get("plans") or {}).items():
+        if entry.get("warning"):
+            by_text.setdefault(str(entry["warning"]), []).append(name)
     return [
-        *lines,
-        *(labelled("error" if i == 0 else "", text) for i, text in enumerate(guarantee(decision))),
+        f"{', '.join(names)}: {text} (simrun check policy tests units)"
+        for text, names in by_text.items()
     ]
 
 
-def guarantee(decision: Decision) -> list[str]:
-    """Say what is guaranteed, of what, and how far."""
-    asked = decision["question"]
-    of_what = {
-        "scenes": "about the population that the scenes were drawn from",
-        "suite": f"about the mean over the {decision['ceiling']['scenes']} scenes of this suite with these seeds",
-    }[asked["population"]]
-    percent = 100 * asked["alpha"]
-    first = f"wrong in at most {percent:g} % of runs, over all interim analyses; {of_what}"
-    return [first, asked["rule"]]
+def _questions(run: Run, pairs: Mapping[str, Any]) -> list[str]:
+    """Return the metrics whose differences the head of a report is about."""
+    known = [name for name in pairs if finite(pairs[name].get("diff")) is not None]
+    headline = [name for name in run.table.headline if name in known]
+    return without_repeated(headline, "collision_any") or list(run.table.ordered(known))
 
 
-def metric_rows(decision: Decision, known: MetricTable = METRICS) -> list[MetricRow]:
-    """Return the table of the last look."""
-    if not decision["looks"]:
-        return []
-    last = decision["looks"][-1]["metrics"]
-    rows = []
-    for name, one in decision["question"]["metrics"].items():
-        now = last[name]
-        scale, unit, places = _print_as(
-            known.info(name), [now["diff"], one["margin"], *now["interval"]]
-        )
-        ends = [None if v is None else fixed(scale * v, places, sign=True) for v in now["interval"]]
-        tone = TONES[CAUSES[now["verdict"]]]
-        rows.append(
-            MetricRow(
-                name,
-                now["verdict"],
-                tone,
-                "no pair"
-                if now["diff"] is None
-                else f"{fixed(scale * now['diff'], places, sign=True)}{unit}",
-                "no bound yet"
-                if ends == [None, None]
-                else f"{ends[0] or WORST_CASE} to {ends[1] or WORST_CASE}",
-                f"{scale * one['margin']:g}",
-                f"{now['e_good']:.3g} and {now['e_bad']:.3g}",
-                now["n_scenes"],
-                one["binding"],
-            )
-        )
-    return rows
+def without_repeated(names: Sequence[str], dropped: str) -> list[str]:
+    """Leave out one of the two collision rates where both are there."""
+    both = "collision_any" in names and "collision_at_fault" in names
+    return [name for name in names if not (both and name == dropped)]
 
 
-@dataclass(frozen=True)
-class DecisionSection:
-    """What the report shows of a decision."""
-
-    decision: Decision
-    title: str
-    guarantee: list[str]
-    rows: list[MetricRow]
-    charts: list[Any]  # evaluators.report.charts.Chart
-
-
-def decision_section(run: Run) -> DecisionSection | None:
-    """Return the section of a decided run, None of any other.
-
-    Raises:
-        InputError: decision.json is damaged.
+def _point(
+    run: Run,
+    variant: str,
+    pairs: Mapping[str, Any],
+    questions: Sequence[str],
+    shown: AbstractSet[str],
+    primary: str,
+) -> Point:
+    """Describe one comparison; a difference that is not shown among so many questions is
+    undecided.
     """
-    decision = read_decision(run.folder)
-    if decision is None or not decision["looks"]:
-        return None
-    title = verdict_line(decision)[LABEL:]
-    return DecisionSection(
-        decision,
-        title,
-        guarantee(decision),
-        metric_rows(decision, run.table),
-        [chart(decision, run.table.info(name)) for name in decision["question"]["metrics"]],
+    stats = run.summary.get("metrics", {}).get(variant, {})
+    baseline = next((str(p["baseline"]) for p in pairs.values() if p.get("baseline")), "")
+    name, other = variant_name(run, variant), variant_name(run, baseline) or "the baseline"
+    if not questions:
+        nothing = f"nothing to compare between {name} and {other}"
+        return Point(name, "unclear", NO_PAIR, nothing, "", other, variant)
+    tones = {}
+    for metric in questions:
+        tone = tone_of(pairs[metric], str(stats.get(metric, {}).get("direction", "none")))
+        is_chance = tone in ("worse", "better") and metric not in shown
+        tones[metric] = "unclear" if is_chance else tone
+    asked = [primary] if primary else list(questions)
+    others = [metric for metric in questions if metric not in asked]
+    worse, better = (
+        _listing(run, [metric for metric in asked if tones[metric] == side])
+        for side in ("worse", "better")
     )
-
-
-def chart(decision: Decision, metric: MetricInfo) -> Any:
-    """Draw the confidence sequence of a metric over scenes, with the margin."""
-    from evaluators.report.charts import INK, MUTED, VARIANT, Axes, Chart
-
-    name, one = metric.name, decision["question"]["metrics"][metric.name]
-    looks = decision["looks"]
-    scale, unit, _ = _print_as(metric, [])
-    n = np.array([look["n_scenes"] for look in looks], dtype=np.float64)
-    seen = [look["metrics"][name] for look in looks]
-    diff, low, high = (
-        scale * np.array([[one["diff"], *one["interval"]] for one in seen], dtype=np.float64).T
-    )  # None becomes NaN
-    sign = -1.0 if metric.direction == "higher" else 1.0
-    threshold = scale * sign * one["margin"]
-    limits = [threshold, -threshold] if metric.direction == "none" else [threshold]
-    axes = Axes()
-    axes.band(n, low, high, VARIANT[1], 0.2)
-    axes.line(n, diff, VARIANT[1])
-    axes.points(n, diff, VARIANT[1], size=3.0)
-    axes.across(0.0, MUTED, 0.8)
-    for limit in limits:
-        axes.across(limit, INK, 1.0, "5 2")
-    late = len(looks) // 2  # the bounds of the first looks would make the rest flat
-    known = np.concatenate([diff, limits, [0.0], low[late:], high[late:]])
-    known = known[np.isfinite(known)]
-    room = 0.15 * max(float(np.ptp(known)), 1e-9)
-    axes.limits = [
-        (0.0, float(n[-1]) * 1.02),
-        (float(known.min()) - room, float(known.max()) + room),
+    where = f" in {_listing(run, asked)}" if primary else ""
+    tone = "unclear"
+    verdict = f"no difference shown between {name} and {other}{where}"
+    if worse and better:
+        tone = "mixed"
+        verdict = f"{name} is worse than {other} in {worse} and better in {better}"
+    elif worse:
+        tone = "worse"
+        verdict = f"{name} drives worse than {other} in {worse}"
+    elif better:
+        tone = "better"
+        verdict = f"{name} drives better than {other} in {better}"
+    elif all(tones[metric] == "neutral" for metric in asked):
+        tone = "neutral"
+        verdict = f"{name} drives no worse than {other}{where} by more than the margin"
+    texts = {metric: _difference(run, variant, metric, pairs[metric]) for metric in questions}
+    sides = [
+        f"{side} in {_listing(run, found)}"
+        for side in ("worse", "better")
+        if (found := [metric for metric in others if tones[metric] == side])
     ]
-    axes.labels = [
-        "scenes",
-        (f"{unit.strip()}, " if unit.strip() else "")
-        + f"{decision['candidate']} minus {decision['baseline']}",
+    secondary = " and ".join(sides)
+    first = next((metric for metric in asked if tones[metric] in ("worse", "better")), asked[0])
+    lead = ". Secondary: ".join(part for part in (texts[first], secondary) if part)
+    details = "; ".join(texts[metric] for metric in others)
+    rest = ": ".join(part for part in (secondary, details) if part)
+    asked_text = "; ".join(texts[metric] for metric in asked)
+    text = ". Secondary: ".join(part for part in (asked_text, rest) if part)
+    return Point(name, tone, text, verdict, lead, other, variant)
+
+
+def _listing(run: Run, metrics: Sequence[str]) -> str:
+    words = [run.table.shown(metric).words for metric in metrics]
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def _difference(run: Run, variant: str, metric: str, entry: Mapping[str, Any]) -> str:
+    """Say what both variants have, their difference, its interval, and what would decide it."""
+    levels = run.summary.get("metrics", {})
+    base = str(entry.get("baseline"))
+    if base not in levels:  # with several policies: the same policy behind the baseline's renderer
+        base = next((f"{base}/{p}" for p in run.policies if variant.endswith(f"/{p}")), base)
+    facts = run.table.shown(metric)
+    stats = levels.get(variant, {}).get(metric, {})
+    scale, unit = scale_and_unit(facts, str(stats.get("unit", "")))
+    difference = float(entry["diff"])
+    bounds = interval(entry.get("ci95"), difference) or ()
+    values = [value * scale for value in (difference, *bounds)]
+    places = 1 if facts.in_percent else decimals(*values)
+    numbers = [fixed(value, places, sign=True) for value in values]
+    text = f"{numbers[0]}\u00a0{unit}".strip("\u00a0")
+    if bounds:
+        text += f", 95\u00a0% interval {numbers[1]} to {numbers[2]}"
+    needed, margin = more_scenes_text(entry.get("more_scenes")), finite(entry.get("margin"))
+    if needed and margin is not None:
+        text += f"; {needed} on the margin of {short(margin * scale, unit)}"
+    here, there = _level(run, variant, metric), _level(run, base, metric)
+    return f"{facts.words}: {here} against {there} ({text})"
+
+
+def _level(run: Run, variant: str, metric: str) -> str:
+    stats = run.summary.get("metrics", {}).get(variant, {}).get(metric, {})
+    mean, facts = finite(stats.get("mean")), run.table.shown(metric)
+    if mean is None:
+        return "no valid value"
+    counted = count_of(mean, int(stats.get("n_rollouts") or 0)) if facts.is_flag else ""
+    if counted:
+        return counted
+    if facts.is_flag or facts.in_percent:
+        return f"{short(100 * mean)}\u00a0%"
+    return short(mean, str(stats.get("unit", "")))
+
+
+def _alone(run: Run, variant: str) -> str:
+    stats = run.summary.get("metrics", {}).get(variant, {})
+    names = [
+        name
+        for name in run.table.headline
+        if name in stats and name not in ("progress", run.table.primary)
     ]
-    return Chart(
-        name,
-        "Line: mean difference. Band: what is not refuted, at every look. Dashed: the margin.",
-        axes.svg(),
-    )
+    names = without_repeated(names, "collision_at_fault")
+    texts = [f"{run.table.shown(name).words}: {_level(run, variant, name)}" for name in names]
+    return "; ".join(texts) or "no metric"
 
 
-def _print_as(metric: MetricInfo, values: Sequence[float | None]) -> tuple[float, str, int]:
-    """Return scale, unit and decimals in which a metric's differences are printed."""
-    unit = metric.unit
-    if metric.in_percent:
-        return 100.0, " points", decimals(*(None if v is None else 100.0 * v for v in values))
-    return 1.0, f" {unit}" if unit else "", decimals(*values)
+def _cautions(run: Run) -> tuple[str, ...]:
+    cautions = [*fixer_cautions(run.summary), *(f"{line}." for line in plan_warnings(run.summary))]
+    failed = Counter(r.failure_class or "unknown cause" for r in run.rollouts if not r.ok)
+    if failed:
+        causes = ", ".join(f"{name} {count}" for name, count in failed.most_common())
+        cautions.append(
+            f"{failed.total()} of {plural(len(run.rollouts), 'rollout')} could not be run "
+            f"({causes}); they are in no average. See Failures."
+        )
+    repeat = run.info.get("repeat") or {}
+    if repeat.get("repeatable") is False:
+        first = repeat.get("first_difference") or {"component": "log", "step": None}
+        step = "" if first["step"] is None else f" at step {first['step']}"
+        cautions.append(
+            "The policy is not repeatable: a rollout that was driven twice differs first in "
+            f"{first['component']}{step}. Paired differences hold that noise too."
+        )
+    scenes = {rollout.scene for rollout in run.rollouts if rollout.ok}
+    if len(scenes) == 1:
+        cautions.append(
+            "One scene only: the result says nothing about other scenes, and no interval over "
+            "scenes exists."
+        )
+    elif 1 < len(scenes) < FEW_SCENES:
+        cautions.append(
+            f"Only {len(scenes)} scenes: intervals over scenes are wide and lean on few values."
+        )
+    return tuple(cautions)

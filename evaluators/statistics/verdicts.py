@@ -214,6 +214,29 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return out
 
 
+Question = tuple[int, str]  # number of a comparison, metric
+
+
+def shown_questions(p_values: Mapping[Question, float | None], primary: str) -> set[Question]:
+    """Return the questions whose difference holds among so many: the primary metric of all
+    comparisons shares one level, all other metrics share another (Holm's method).
+
+    Args:
+        p_values: Of every question; one without a test holds.
+        primary: The metric that the run declared; empty where all share one level.
+
+    Example:
+        >>> sorted(shown_questions({(0, "a"): 0.04, (0, "b"): 0.04, (0, "c"): 0.03}, "a"))
+        [(0, 'a')]
+    """
+    shown: set[Question] = set()
+    for is_primary in (True, False):
+        family = [one for one in p_values if (one[1] == primary) == is_primary]
+        corrected = holm([p_values[one] for one in family])
+        shown |= {one for one, p in zip(family, corrected, strict=True) if p is None or p <= ALPHA}
+    return shown
+
+
 POWER = 0.8
 MOST_SCENES = 100_000  # beyond, this suite cannot decide it
 

@@ -473,10 +473,8 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
 
 def _failed(row: dict[str, Any]) -> dict[str, Any]:
     error = {
-        "doing": "rendering a frame",
-        "with": "camera front <script>",
-        "found": row["failure"],
-        "do": "run with --set guard=off",
+        "message": f"camera front <script>: {row['failure']}",
+        "hint": "run with --set guard=off",
     }
     return {k: row[k] for k in ("renderer", "policy", "scene", "seed", "path")} | {"error": error}
 

@@ -10,7 +10,7 @@ import pytest
 
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.opening import Run, read_run
-from evaluators.report.headline import find
+from evaluators.report.verdict import find
 from evaluators.report.terminal import cost_text, ending_lines, next_command, next_line
 from tests.docs.test_commands import parse
 from tests.report.make_run import Plan, make_run

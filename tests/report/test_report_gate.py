@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 from evaluators.opening import read_run
 from evaluators.report import html
 from evaluators.report.ci import write_gate_files
-from evaluators.report.verdict import gate_section, worst_of
+from evaluators.report.gate import gate_section, worst_of
 from evaluators.statistics.baselines import rows_of_run
 from evaluators.statistics.gate import judge, load_gate
 
@@ -27,15 +27,15 @@ def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(
     assert [file.name for file in files] == ["gate.md", "gate.junit.xml", "gate.json"]
     section = gate_section(run)
     assert section is not None
-    assert (section.exit_code, section.baseline) == (verdict.exit_code, verdict.baseline)
-    assert len(section.checks) == len(verdict.checks)
-    assert section.worst
-    first = [row for row in section.worst if row[2] == section.worst[0][2]]
-    assert all((run.folder / str(row[5])).exists() for row in first)
+    assert (section["exit_code"], section["baseline"]) == (verdict.exit_code, verdict.baseline)
+    assert len(section["checks"]) == len(verdict.checks)
+    assert section["worst"]
+    first = [row for row in section["worst"] if row["metric"] == section["worst"][0]["metric"]]
+    assert all((run.folder / str(row["page"])).exists() for row in first)
     page = html.render_report(run)
     assert page.index('id="gate"') < page.index('id="results"')
-    assert section.worst[0][0] in page[page.index('id="table-gate-worst"') :]
-    assert section.worst[0][0] in (root / "gate.md").read_text()
+    assert section["worst"][0]["scene"] in page[page.index('id="table-gate-worst"') :]
+    assert section["worst"][0]["scene"] in (root / "gate.md").read_text()
     table = pq.read_table(root / "rollouts.parquet")
     pq.write_table(table.slice(0, table.num_rows - 1), root / "rollouts.parquet")
     assert gate_section(read_run(root)) is None

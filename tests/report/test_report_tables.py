@@ -169,10 +169,10 @@ def test_scene_without_a_finished_rollout_has_dashes(tmp_path: Path) -> None:
     assert row.values[0].note == "no rollout finished"
 
 
-def test_failures_carry_four_parts(usual_run: Path) -> None:
+def test_failures_carry_message_and_hint(usual_run: Path) -> None:
     rows, more = failure_rows(read_run(usual_run))
     assert (len(rows), more) == (4, 0)
-    assert [label for label, _ in rows[0].parts] == ["doing", "with", "found", "do"]
+    assert [label for label, _ in rows[0].parts] == ["message", "hint"]
 
 
 def test_speed_keeps_stages_that_only_some_renderers_have(usual_run: Path) -> None:
