@@ -10,8 +10,8 @@ import pytest
 
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.opening import Run, read_run
-from evaluators.report.verdict import find
 from evaluators.report.terminal import cost_text, ending_lines, next_command, next_line
+from evaluators.report.verdict import find
 from tests.docs.test_commands import parse
 from tests.report.make_run import Plan, make_run
 
