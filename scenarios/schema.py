@@ -160,9 +160,9 @@ class LatencySpec(Part):
 class DegradationSpec(Part):
     """How the renderer 3dgs differs from the scene as built."""
 
-    kind: Literal["reconstruction", "cycle", "surrogate", "none"] = Field(
+    kind: Literal["reconstruction", "cycle", "none"] = Field(
         default="reconstruction",
-        description="A model fitted to the logged drive and stopped early; one fitted to views beside it; seeded perturbations; none.",
+        description="A model fitted to the logged drive and stopped early; one fitted to views beside it; none.",
     )
     share: float = Field(
         default=0.15,
@@ -194,18 +194,6 @@ class DegradationSpec(Part):
         le=1,
         description="Reconstruction and cycle: spread of the poses of these views.",
     )
-    severity: float = Field(
-        default=1.5,
-        ge=0,
-        le=100,
-        description="Surrogate: scales all terms; 0 leaves the scene as built.",
-    )
-    onset_m: float = within(
-        b.GAP_M, "Surrogate: distance from the logged path where the error starts to grow.", 0.1
-    )
-    full_m: float = Field(
-        default=2.0, gt=0, le=b.GAP_M.high, description="Surrogate: distance where it is full."
-    )
 
     @model_validator(mode="after")
     def _fitting(self) -> DegradationSpec:
@@ -216,17 +204,12 @@ class DegradationSpec(Part):
                 raise ValueError(
                     f"{found}, to which it means nothing | say kind: {' or '.join(kinds)}, or remove {name}"
                 )
-        if self.full_m <= self.onset_m:
-            raise ValueError(
-                f"full_m = {self.full_m} is not beyond onset_m = {self.onset_m} | make full_m larger"
-            )
         return self
 
 
 DEGRADATION_KEYS = {
     "reconstruction": ("share", "views_per_s", "depth_error", "pose_error_m"),
     "cycle": ("share", "shift_m", "views_per_s", "depth_error", "pose_error_m"),
-    "surrogate": ("severity", "onset_m", "full_m"),
     "none": (),
 }
 

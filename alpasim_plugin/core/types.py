@@ -302,20 +302,14 @@ class Degradation:
 
     ``reconstruction``: an under-trained model fitted to the frames of the logged drive. ``cycle``:
         a model fitted to frames seen from
-    aside, rendered on the path (OneFixer, App. A). ``surrogate``: seeded stand-ins, nothing is
-    fitted. ``none``: the scene as built.
+    aside, rendered on the path (OneFixer, App. A). ``none``: the scene as built.
     """
 
-    kind: Literal["reconstruction", "cycle", "surrogate", "none"] = "reconstruction"
+    kind: Literal["reconstruction", "cycle", "none"] = "reconstruction"
     share: float = 0.15  # of the fit's schedule, 0..1; reconstruction and cycle
     shift_m: float = (
         1.0  # sideways, left positive, of the views that the cycle's model is fitted to
     )
-    severity: float = 1.5  # scales all terms of the surrogate; 0 leaves the scene as built
-    onset_m: float = (
-        0.1  # lateral distance from the logged path where the surrogate's error starts to grow
-    )
-    full_m: float = 2.0  # lateral distance where it is full
     # of the log, that the model is fitted to; reconstruction and cycle, as are the next two
     views_per_s: float = 6.0
     depth_error: float = 0.1  # spread of the distance of the points it starts from, as a share

@@ -1,5 +1,4 @@
-"""Render Gaussian scenes: ``clean``, the scene as built, and the surrogate of a bad reconstruction
-of it.
+"""Render Gaussian scenes: ``clean``, the scene as built.
 
 A frame is drawn at the shutter's end, unless its request says when its pixels are exposed
 (`renderers.rolling`). Runs of this project do not say so, and no policy here uses more than the
@@ -10,36 +9,23 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TypeVar
 
-import numpy as np
-
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate, inverse
 from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.types import F64, Frame, RecordedFrame, RenderRequest, Scenario
+from alpasim_plugin.core.types import F64, Frame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.fit.views import scaled_camera
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.raster.rasterize import Backend
 from alpasim_plugin.gaussians.scene.builder import build_scene, with_background
-from alpasim_plugin.gaussians.scene.degrade import GHOST, Surrogate, log_actors, log_times
-from alpasim_plugin.gaussians.scene.log_views import LogView, SkyMask
-from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, SceneNode
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.renderers.background import read_background
-from alpasim_plugin.renderers.recorded import built_recording
 from alpasim_plugin.renderers.rolling import draw_request
 from alpasim_plugin.world.ground import height_at
 
 CACHED_SCENES = 4
-LOG_VIEW_WIDTH = 160
-LOG_VIEW_SPACING_M = 2.5
-LOG_VIEWS = 60
-SOFT_CELL_PX = 4.5  # a bad reconstruction has fewer, larger Gaussians
 
 T = TypeVar("T")
 _cache: OrderedDict[str, object] = OrderedDict()
@@ -75,67 +61,11 @@ class CleanRenderer(Renderer):
                 camera, actors, self.threads, self.backend, sky_in_alpha=complete
             )
 
-        return self._frame(request, draw_request(request, draw, self.backend))
-
-    def _frame(self, request: RenderRequest, out: RasterOutput) -> Frame:
+        out = draw_request(request, draw, self.backend)
         self.stats = out.stats
         return Frame(
             request.t_us, request.camera.name, out.to_uint8(), out.alpha, out.surface_depth()
         )
-
-
-class SurrogateRenderer(CleanRenderer):
-    """Render the scene as a bad reconstruction of the logged drive would show it."""
-
-    def __init__(self, scenario: Scenario, seed: int, device: str, threads: int | None) -> None:
-        super().__init__(scenario, seed, device, threads)
-        self.surrogate, self.sky, self.ghosts, self._graphs = reconstruction_of(
-            scenario, self.scene
-        )
-
-    def render(self, request: RenderRequest) -> Frame:
-        """Render one frame; how bad it is follows the rig's lateral distance from the logged
-        path.
-        """
-        w = self.surrogate.weight(request.T_world_camera[1] @ inverse(request.camera.T_rig_camera))
-        graph = self._graph(w)
-        gain = self.surrogate.gain(request.t_us, self.seed, w)
-
-        def draw(camera: PinholeCamera, actors: Mapping[str, F64]) -> RasterOutput:
-            poses: dict[str, F64] = {}
-            for actor_id, pose in actors.items():
-                poses[actor_id] = self.surrogate.pose(actor_id, pose, request.t_us, self.seed, w)
-                if actor_id + GHOST in graph.actors:
-                    poses[actor_id + GHOST] = self.surrogate.ghost_pose(
-                        actor_id, pose, request.t_us, self.seed, w
-                    )
-            out = graph.render(camera, poses, self.threads, self.backend)
-            return replace(
-                out,
-                rgb=np.clip(out.rgb * gain, 0.0, 1.0),
-                alpha=np.maximum(out.alpha, self.sky.share(camera)),
-            )
-
-        return self._frame(request, draw_request(request, draw, self.backend))
-
-    def recorded(self) -> Sequence[RecordedFrame]:
-        """Return the scene as built, as its cameras saw it along the log; depth is the built
-        scene's too.
-        """
-        return built_recording(self.scenario, self.scene, self.scene.render, None)
-
-    def _graph(self, w: float) -> SceneGraph:
-        if w not in self._graphs:
-            self._graphs[w] = self.scene.changed(
-                partial(self._change, w), self.ghosts, SOFT_CELL_PX
-            )
-        return self._graphs[w]
-
-    # A bound method of the first renderer stays in the shared graphs; it uses only the surrogate,
-    # which is shared as well.
-    def _change(self, w: float, node: SceneNode, level: int) -> GaussianCloud:
-        change = self.surrogate.actor if node.kind == "actor" else self.surrogate.background
-        return change(node, level, node.levels[level].cloud, w)
 
 
 def backend_of(device: str) -> Backend:
@@ -152,39 +82,6 @@ def backend_of(device: str) -> Backend:
 def scene_of(scenario: Scenario) -> SceneGraph:
     """Return the scenario's scene, built once per process."""
     return in_memory(f"scene:{scene_key(scenario)}", partial(_build, scenario))
-
-
-def reconstruction_of(
-    scenario: Scenario, scene: SceneGraph
-) -> tuple[Surrogate, SkyMask, list[SceneNode], dict[float, SceneGraph]]:
-    """Return the surrogate, its sky, the ghosts of moving actors, and graphs by weight as they are
-    made, shared by a process.
-    """
-    key = f"surrogate:{scene_key(scenario)}:{scenario.degradation!r}"
-    moving = [a.actor_id for a in scenario.actors if not a.is_static]
-    ghosts = [SceneNode(i + GHOST, "actor", scene.actors[i].levels[1:]) for i in moving]
-
-    def make() -> tuple[Surrogate, SkyMask, list[SceneNode], dict[float, SceneGraph]]:
-        views = log_views(scenario, scene)
-        return Surrogate(scenario, views), SkyMask(views), ghosts, {}
-
-    return in_memory(key, make)
-
-
-def log_views(scenario: Scenario, scene: SceneGraph) -> list[LogView]:
-    """Render small depth images from the scenario's cameras along the log: what a reconstruction
-    could have learned from.
-    """
-    cameras = scenario.cameras
-    times = log_times(scenario, LOG_VIEW_SPACING_M, max(1, LOG_VIEWS // max(1, len(cameras))))
-    views = []
-    for t_us in times:
-        T_world_rig = interpolate(scenario.ego_log, t_us)
-        for spec in cameras:
-            camera = scaled_camera(spec, T_world_rig @ spec.T_rig_camera, LOG_VIEW_WIDTH)
-            out = scene.render(camera, log_actors(scenario, t_us))
-            views.append(LogView(camera, out.depth, out.alpha))
-    return views
 
 
 def scene_key(scenario: Scenario) -> str:

@@ -49,7 +49,6 @@ from alpasim_plugin.gaussians.scene.scene_graph import (
 )
 from alpasim_plugin.renderers.gaussian import (
     CleanRenderer,
-    SurrogateRenderer,
     backend_of,
     in_memory,
     scene_key,
@@ -128,11 +127,8 @@ def reconstruction_renderer(
     """
     if scenario.model is not None:
         return ImportedRenderer(scenario, device, threads)
-    amount = scenario.degradation
-    if amount.kind == "none" or (amount.kind == "surrogate" and amount.severity == 0):
+    if scenario.degradation.kind == "none":
         return CleanRenderer(scenario, seed, device, threads)
-    if amount.kind == "surrogate":
-        return SurrogateRenderer(scenario, seed, device, threads)
     return ReconstructionRenderer(scenario, device, threads)
 
 

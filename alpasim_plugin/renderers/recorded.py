@@ -23,7 +23,7 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Photograph, RecordedFrame, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.raster.output import RasterOutput
-from alpasim_plugin.gaussians.scene.degrade import log_actors
+from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe
 

@@ -21,7 +21,7 @@ ego: {speed_mps: 10}
 timing: {duration_us: 2_000_000}
 cameras: [{width: 64, height: 48}]
 environment: {buildings: 0.0, trees_per_100m: 0.0, poles_spacing_m: 0}
-degradation: {kind: surrogate}
+degradation: {share: 0.02}
 """
 
 

@@ -52,7 +52,7 @@ LONGER = (
 )  # for AlpaSim's time line, which drives by the log for 1.7 s
 NOTHING_FITTED = (
     "--set",
-    "degradation.kind=surrogate",
+    "degradation.kind=none",
 )  # for scenes that say nothing about their reconstruction
 
 

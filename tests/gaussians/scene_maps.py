@@ -115,7 +115,7 @@ def make_scenario(
         warmup_us=0,
         latency=Latency(),
         environment=environment or Environment(),
-        degradation=degradation or Degradation("surrogate"),
+        degradation=degradation or Degradation("none"),
         content_hash="",
     )
 

@@ -11,6 +11,7 @@ from alpasim_plugin.core.geometry import quat_from_yaw, se3
 from alpasim_plugin.core.types import Environment, LaneMap, Route, Scenario, Trajectory
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import placed_cloud
+from alpasim_plugin.gaussians.scene import scene_graph
 from alpasim_plugin.gaussians.scene.build_actors import build_actor
 from alpasim_plugin.gaussians.scene.builder import build_scene, with_background
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
@@ -123,12 +124,13 @@ def test_lane_lines_are_brighter_than_the_asphalt_beside_them(
 
 
 def test_coarser_levels_of_the_road_look_like_the_finer_ones(
-    street: tuple[Scenario, SceneGraph],
+    street: tuple[Scenario, SceneGraph], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scenario, graph = street
     camera = view(scenario, 2)
-    fine = SceneGraph(graph.background, [], graph.sky, cell_px=1.0).render(camera, {}).rgb
     usual = graph.render(camera, {}).rgb
+    monkeypatch.setattr(scene_graph, "CELL_PX", 1.0)
+    fine = graph.render(camera, {}).rgb
     assert np.sqrt(np.mean((fine - usual) ** 2)) < 0.05
 
 

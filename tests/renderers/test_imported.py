@@ -13,7 +13,7 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
-from alpasim_plugin.gaussians.scene.degrade import log_actors
+from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.reconstruction import Exposures, ImportedRenderer
 from alpasim_plugin.renderers.recorded import posed_photograph

@@ -25,7 +25,6 @@ from alpasim_plugin.gaussians.fit.views import logged_views
 from alpasim_plugin.renderers import make_renderer, recorded
 from alpasim_plugin.renderers.gaussian import (
     CleanRenderer,
-    SurrogateRenderer,
     clear_cache,
     scene_of,
 )
@@ -238,11 +237,9 @@ def test_key_follows_the_bytes_of_a_background_file_not_its_place(tmp_path: Path
 
 
 def test_kind_of_degradation_chooses_the_renderer() -> None:
-    assert isinstance(make_renderer("3dgs", street(Degradation("surrogate"))), SurrogateRenderer)
-    for amount in (Degradation("none"), Degradation("surrogate", severity=0.0)):
-        assert type(make_renderer("3dgs", street(amount))) is CleanRenderer
+    assert type(make_renderer("3dgs", street(Degradation("none")))) is CleanRenderer
     with pytest.raises(InputError):
-        recipe_of(street(Degradation("surrogate")))
+        recipe_of(street(Degradation("none")))
 
 
 def test_scene_without_a_camera_cannot_be_fitted(cache: Path) -> None:

@@ -24,8 +24,9 @@ def street(degradation: Degradation) -> Scenario:
 def test_a_built_scene_has_a_frame_of_every_camera_twice_a_second_never_at_the_time_of_a_rendered_one() -> (
     None
 ):
-    scenario = street(Degradation("surrogate"))
-    frames = make_renderer("3dgs", scenario).recorded()
+    scenario = street(Degradation("none"))
+    scene = scene_of(scenario)
+    frames = built_recording(scenario, scene, scene.render, None)
     times = [frame.t_us for frame in frames]
     log = scenario.ego_log.t_us
     assert times == list(range(int(log[0]) + FIRST_US, int(log[-1]), INTERVAL_US))

@@ -119,7 +119,7 @@ def straight_road() -> Scenario:
         warmup_us=1_000_000,
         latency=Latency(),
         environment=Environment(buildings=0.0, trees_per_100m=0.0, poles_spacing_m=0.0),
-        degradation=Degradation("surrogate"),
+        degradation=Degradation("none"),
         content_hash="straight-road-test",
     )
 

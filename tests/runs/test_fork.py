@@ -32,7 +32,7 @@ BARE = ("environment.buildings=0", "environment.trees_per_100m=0", "environment.
 SHORT = (
     "timing.duration_us=1200000",
     "timing.warmup_us=200000",
-    "degradation.kind=surrogate",
+    "degradation.kind=none",
     *BARE,
 )
 CELL = "clean/lane-camera/smoke-lead_car/0"

@@ -25,7 +25,7 @@ from alpasim_plugin.runs.run import RunResult, execute_run
 from scenarios.suite import expand
 from tests.runs.grey_renderer import GREY
 
-SHORT = ("timing.duration_us=1200000", "degradation.kind=surrogate")
+SHORT = ("timing.duration_us=1200000", "degradation.kind=none")
 
 
 class Announced:

@@ -125,16 +125,10 @@ def test_the_good_file_is_good(tmp_path: Path) -> None:
             "another name",
         ),
         (
-            GOOD + "degradation: {share: 0.5, severity: 2}\n",
+            GOOD + "degradation: {kind: none, share: 0.5}\n",
             ":8:1",
-            "severity = 2.0 with kind: reconstruction",
-            "say kind: surrogate, or",
-        ),
-        (
-            GOOD + "degradation: {kind: surrogate, onset_m: 4}\n",
-            ":8:1",
-            "full_m = 2.0 is not beyond onset_m = 4.0",
-            "make full_m larger",
+            "share = 0.5 with kind: none",
+            "say kind: reconstruction or cycle, or",
         ),
         (
             GOOD + "environment: {sky: claer}\n",

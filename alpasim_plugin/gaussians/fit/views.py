@@ -13,7 +13,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.types import F32, F64, Bool, CameraSpec, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.scene.degrade import log_actors
+from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 
 

@@ -1,3 +1,1 @@
-"""Scenes of Gaussians: a map dressed in clouds, its actors, its sky, and the surrogate
-degradation.
-"""
+"""Scenes of Gaussians: a map dressed in clouds, its actors, and its sky."""

@@ -74,7 +74,6 @@ def with_background(graph: SceneGraph, cloud: GaussianCloud, T_world_file: F64) 
         list(graph.actors.values()),
         graph.sky,
         graph.sh_frame,
-        graph.cell_px,
     )
 
 

@@ -15,7 +15,7 @@ opaque.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -111,10 +111,7 @@ def nodes_by_tile(
     ]
 
 
-CELL_PX = 3.5
-Change = Callable[
-    [SceneNode, int], GaussianCloud
-]  # (node, level index) -> the cloud to draw in its place
+CELL_PX = 3.5  # larger is faster and coarser
 
 
 class SceneGraph:
@@ -126,8 +123,6 @@ class SceneGraph:
         sky: What stands behind everything.
         sh_frame: Axes of the actors' view-dependent colour: ``object`` (it turns with the actor;
             scenes built here) or ``world`` (as reconstructions of recorded drives are optimised).
-        cell_px: Larger is faster and coarser.
-        change: Replaces a node's cloud at its first use; None draws the nodes as they are.
     """
 
     def __init__(
@@ -136,15 +131,11 @@ class SceneGraph:
         actors: Sequence[SceneNode],
         sky: Sky,
         sh_frame: ShFrame = "object",
-        cell_px: float = CELL_PX,
-        change: Change | None = None,
     ) -> None:
         self.background = tuple(background)
         self.actors = {node.name: node for node in sorted(actors, key=lambda node: node.name)}
         self.sky = sky
         self.sh_frame: ShFrame = sh_frame
-        self.cell_px = cell_px
-        self._change = change
         self._centre, self._radius = _spheres(self.background)
         self._far = np.array([node.far_m for node in self.background])
         self._actor_centre, self._actor_radius = _spheres(list(self.actors.values()))
@@ -196,27 +187,10 @@ class SceneGraph:
             out, alpha=np.ones_like(out.alpha) if sky_in_alpha else out.alpha, stats=stats
         )
 
-    def changed(
-        self, change: Change, more_actors: Sequence[SceneNode], cell_px: float
-    ) -> SceneGraph:
-        """Return a variant of the scene with other clouds in the same nodes, and further actors.
-
-        Culling uses the unchanged nodes' spheres, so a change should move Gaussians little compared
-        with their node.
-        """
-        return SceneGraph(
-            self.background,
-            [*self.actors.values(), *more_actors],
-            self.sky,
-            self.sh_frame,
-            cell_px,
-            change,
-        )
-
     def _joined(self, chosen: list[tuple[SceneNode, int, F64 | None]]) -> GaussianCloud:
         clouds = []
         for node, level, T in chosen:
-            cloud = self._cloud(node, level)
+            cloud = node.levels[level].cloud
             clouds.append(cloud if T is None else cloud.transformed(T, self.sh_frame == "object"))
         return GaussianCloud.concatenate(clouds)
 
@@ -252,18 +226,15 @@ class SceneGraph:
         return chosen
 
     def _level(self, node: SceneNode, distance_m: float, focal_px: float) -> int:
-        allowed_m = self.cell_px * max(distance_m, 0.0) / focal_px
+        allowed_m = CELL_PX * max(distance_m, 0.0) / focal_px
         fit = [i for i, level in enumerate(node.levels) if level.cell_m <= allowed_m]
         return fit[-1] if fit else 0
 
     def _prepare(self, node: SceneNode, level: int) -> PreparedCloud:
         key = (node.name, level)
         if key not in self._prepared:
-            self._prepared[key] = prepare(self._cloud(node, level), sh_frame=self.sh_frame)
+            self._prepared[key] = prepare(node.levels[level].cloud, sh_frame=self.sh_frame)
         return self._prepared[key]
-
-    def _cloud(self, node: SceneNode, level: int) -> GaussianCloud:
-        return node.levels[level].cloud if self._change is None else self._change(node, level)
 
 
 def in_view(camera: PinholeCamera, centre: F64, radius: F64) -> Bool:

@@ -22,7 +22,7 @@ from alpasim_plugin.core.image_metrics import psnr_db, ssim
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import F64, U8, CameraSpec, Photograph, RenderRequest, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.scene.degrade import log_actors
+from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.lab.bench.colour_video_vdp import ColourVideoVDP
 from alpasim_plugin.lab.bench.lane_paint import PaintCounts, Road, compare_paint, road_of
 from alpasim_plugin.lab.video_metrics.image_distance import ImageDistance, image_distances

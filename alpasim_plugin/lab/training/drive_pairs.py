@@ -40,7 +40,7 @@ from alpasim_plugin.gaussians.fit.drive import fit_drive
 from alpasim_plugin.gaussians.fit.photographs import read_points
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.views import PosedView
-from alpasim_plugin.gaussians.scene.degrade import log_actors
+from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.lab.training.pair_store import Pair, PairSequence, is_made, write_sequence
 from alpasim_plugin.lab.training.photograph_pairs import PhotographPairs, PhotographRecipe
 from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_references

@@ -17,7 +17,7 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, CameraSpec, RenderRequest, Scenario
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
 from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes, prepare_map
-from alpasim_plugin.gaussians.scene.degrade import log_actors
+from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.lab.training.pair_store import Pair, is_made, write_sequence
 from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_references
 from alpasim_plugin.renderers import make_renderer

@@ -15,7 +15,7 @@ import numpy as np
 from alpasim_plugin.core.geometry import ego_state_from_log, se3, yaw_of
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Actor, Scenario
-from alpasim_plugin.gaussians.scene.degrade import log_actors
+from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.lab.training.policy_expert import (
     STEP_S,
     DrivingStyle,

@@ -64,9 +64,9 @@ def test_sequence_holds_both_renders_opacity_map_and_how_it_was_made(
     assert sequence.info["moving_actors"] == 0
     assert not make_sequence(cycle, folder, recipe, 0, split="val", family="street")
     clear_cache()
-    other = replace(street, degradation=Degradation("surrogate"))
+    other = replace(street, degradation=Degradation("none"))
     assert make_sequence(other, folder, recipe, 0, split="val", family="street")
-    assert json.loads((folder / "sequence.json").read_text())["degradation"]["kind"] == "surrogate"
+    assert json.loads((folder / "sequence.json").read_text())["degradation"]["kind"] == "none"
 
 
 def test_actors_whose_tracks_are_long_count_as_moving(street: Scenario, tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_recorded_frames_lie_beside_the_channels_and_carry_the_truth_into_the_vi
     street: Scenario, tmp_path: Path
 ) -> None:
     folder = tmp_path / "pairs" / "val" / "s"
-    exact = replace(street, degradation=Degradation("surrogate", severity=1e-9))
+    exact = replace(street, degradation=Degradation("reconstruction", share=0.02))
     make_sequence(exact, folder, PairRecipe(offset_m=0.4), 0, split="val", family="street")
     sequence = PairSequence(folder)
     recorded = open_references(sequence)
@@ -116,7 +116,7 @@ def test_a_sequence_without_a_recording_has_no_references_and_a_damaged_one_is_r
     assert open_references(PairSequence(folder)) is None
     again = tmp_path / "pairs" / "val" / "t"
     make_sequence(
-        replace(street, degradation=Degradation("surrogate")),
+        replace(street, degradation=Degradation("reconstruction", share=0.02)),
         again,
         PairRecipe(),
         0,
