@@ -36,7 +36,7 @@ def read_run(run_dir: Path | str | Run) -> Run:
     if isinstance(run_dir, Run):
         return run_dir
     run = Run.of(reader.read_run(run_dir))
-    ROLLOUTS_TABLE.check(run.folder / ROLLOUTS, rates=run.table.rates)
+    ROLLOUTS_TABLE.check(reader.table_path(run.folder, ROLLOUTS), rates=run.table.rates)
     return run
 
 

@@ -17,7 +17,7 @@ from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
-from alpasim_plugin.log.run_folder.reader import read_json
+from alpasim_plugin.log.run_folder.reader import read_json, table_path
 from alpasim_plugin.log.run_folder.schema import MANIFEST, RUN_INFO, SUMMARY, slug
 from alpasim_plugin.runs.reports import write_reports
 from alpasim_plugin.runs.tables import ensure_tables
@@ -191,7 +191,7 @@ def report(
     """Write report.html, summary.md and junit.xml of a run again and print its table."""
     run = run_or_newest(run)
     ensure_tables(run, warn)
-    summary = read_json(run / SUMMARY)
+    summary = read_json(table_path(run, SUMMARY))
     page = write_reports(run, flips=read_run_json(run).get("kind") != "score")
     if as_json:
         print(json.dumps({"report": str(page), "summary": summary}))

@@ -12,6 +12,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import overrides_of, resolve_renderer
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import inspect_rollout, read_run_json
+from alpasim_plugin.log.run_folder.reader import table_path
 from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS, ROLLOUTS_TABLE, RUN_INFO, cell_name
 from alpasim_plugin.runs.plan import (
     Cell,
@@ -120,7 +121,7 @@ def named_row(root: Path, name: str) -> dict[str, Any]:
     Raises:
         InputError: The run has no such rollout.
     """
-    path = root / ROLLOUTS
+    path = table_path(root, ROLLOUTS)
     rows = ROLLOUTS_TABLE.read(
         path, "name a folder written by simrun run", (*KEYS, "status", "path", "failure")
     ).to_pylist()

@@ -19,7 +19,7 @@ from alpasim_plugin.core.subprocesses import end_children
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.check import cells_of_run
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
-from alpasim_plugin.log.run_folder.reader import read_json
+from alpasim_plugin.log.run_folder.reader import REMADE, read_json
 from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY, slug
 from alpasim_plugin.log.run_folder.writer import write_scene, writing
 from alpasim_plugin.renderers.reconstruction_key import model_key
@@ -181,7 +181,22 @@ def finish_run(
     if tuple(folders) != cells_of_run(info):
         info["rollouts"] = folders
     write_run_json(root, info)
-    summary = write_summary(
+    REMADE.pop(root.resolve(), None)
+    summary = summary_of_run(root, info, manifests)
+    from alpasim_plugin.runs.reports import write_reports  # `_load_ending` has loaded it
+
+    write_reports(root, flips=info.get("kind") != "score", page=report)
+    return summary
+
+
+def summary_of_run(
+    root: Path,
+    info: Mapping[str, Any],
+    manifests: Sequence[dict[str, Any]],
+    tables: Path | None = None,
+) -> dict[str, Any]:
+    """Write the tables of a run, by default into its folder, and return the summary."""
+    return write_summary(
         root,
         manifests,
         info["preset"],
@@ -189,11 +204,8 @@ def finish_run(
         {name: info[name] for name in IN_SUMMARY if name in info},
         info.get("bases") or {},
         MetricTable.of_run(info),
+        tables,
     )
-    from alpasim_plugin.runs.reports import write_reports  # `_load_ending` has loaded it
-
-    write_reports(root, flips=info.get("kind") != "score", page=report)
-    return summary
 
 
 def _finished_already(plan: RunPlan, root: Path) -> RunResult:

@@ -15,6 +15,7 @@ from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.manifests import read_run_json
+from alpasim_plugin.log.run_folder.reader import table_path
 from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS, ROLLOUTS_TABLE, SUMMARY
 from alpasim_plugin.log.run_folder.sides import AGAIN, RolloutTable
 from alpasim_plugin.log.run_folder.writer import write_tables
@@ -36,6 +37,7 @@ def write_summary(
     more: Mapping[str, Any],
     bases: Mapping[str, str] = NO_BASES,
     known: MetricTable = METRICS,
+    tables: Path | None = None,
 ) -> dict[str, Any]:
     """Write the tables and ``summary.json`` of a run folder and return the summary.
 
@@ -49,8 +51,10 @@ def write_summary(
         bases: Renderer with a fixer -> the renderer below it; where the run has both and it is not
             the baseline, the two are paired too.
         known: What the metrics are.
+        tables: Folder to write to; by default the run folder.
     """
-    rollouts = write_tables(root, manifests)
+    tables = tables or root
+    rollouts = write_tables(root, manifests, tables)
     done = [m for m in manifests if m["status"] == "ok"]
     summary = {
         "preset": preset,
@@ -63,7 +67,7 @@ def write_summary(
         "speed": by_policy(_of_policies([m for m in done if m.get("stage_ms")]), _speeds),
         **more,
     }
-    write_json(root / SUMMARY, summary)
+    write_json(tables / SUMMARY, summary)
     return summary
 
 
@@ -213,7 +217,7 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[st
     infos = {run: _info_of(run) for run in runs}
     _check_alike(infos)
     first = next(iter(infos.values()))
-    table = RolloutTable.of_files([run / ROLLOUTS for run in runs])
+    table = RolloutTable.of_files([table_path(run, ROLLOUTS) for run in runs])
     arms = arms_of((name, policy) for policy in table.policies for name in table.sides(policy))
     if baseline is not None:
         base_named(baseline, arms, "the runs together")
@@ -254,9 +258,9 @@ def _info_of(run: Path) -> dict[str, Any]:
         InputError: The run is not finished, or damaged.
     """
     info = read_run_json(run)
-    if not (run / SUMMARY).is_file():
+    if not table_path(run, SUMMARY).is_file():
         raise InputError(f"The run {run} is not finished.", AGAIN)
-    ROLLOUTS_TABLE.check(run / ROLLOUTS, AGAIN, MetricTable.of_run(info).rates)
+    ROLLOUTS_TABLE.check(table_path(run, ROLLOUTS), AGAIN, MetricTable.of_run(info).rates)
     return info
 
 

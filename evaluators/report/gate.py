@@ -10,7 +10,7 @@ from typing import Any
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.checksums import checksums_of
-from alpasim_plugin.log.run_folder.reader import read_json
+from alpasim_plugin.log.run_folder.reader import read_json, table_path
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS, WHY_NAME
 from alpasim_plugin.log.run_folder.sides import Row, value_of
 from evaluators.opening import Run
@@ -72,7 +72,9 @@ def worst_of(
 
 def _content(run: Run) -> str:
     """Return the digest of the rollouts' table: a verdict on other rollouts is not shown."""
-    return str(checksums_of(run.folder, [ROLLOUTS])[ROLLOUTS]["sha256"])
+    return str(
+        checksums_of(table_path(run.folder, ROLLOUTS).parent, [ROLLOUTS])[ROLLOUTS]["sha256"]
+    )
 
 
 def _worst_pairs(

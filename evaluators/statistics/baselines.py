@@ -16,6 +16,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.reading import read_json_object
 from alpasim_plugin.core.reading.files import as_shape, kind_of
+from alpasim_plugin.log.run_folder.reader import table_path
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS
 from alpasim_plugin.log.run_folder.sides import RolloutTable, Row, is_ok
 from evaluators.opening import Run, read_run
@@ -32,7 +33,7 @@ def table_of_run(run: Run) -> RolloutTable:
         InputError: ``rollouts.parquet`` cannot be read.
     """
     return RolloutTable.of_files(
-        [run.folder / ROLLOUTS],
+        [table_path(run.folder, ROLLOUTS)],
         lambda renderer, metric: run.invalid_reasons.get((renderer, metric), ""),
     )
 

@@ -10,6 +10,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Generic, TypeVar
 from urllib.parse import quote
 
@@ -40,6 +41,14 @@ from alpasim_plugin.log.run_folder.writer import rollout_table
 
 STEP_COLUMNS = (*KEYS, "t_us", "metric", "value", "valid")
 TEXT_AS_CODES = pads.ParquetFileFormat(dictionary_columns={"renderer", "policy", "scene", "metric"})
+
+REMADE: dict[Path, TemporaryDirectory[str]] = {}  # run folder -> tables that were made again
+
+
+def table_path(root: Path, name: str) -> Path:
+    """Return the file of a table of a run: in its folder, or where it was made again."""
+    remade = REMADE.get(root.resolve())
+    return root / name if remade is None else Path(remade.name, name)
 
 
 @dataclass(frozen=True)
@@ -171,7 +180,7 @@ class Run:
         keep = pc.field("metric").isin(list(metrics))
         if scenes is not None:
             keep = keep & pc.field("scene").isin(list(scenes))
-        return self._read_steps(self.folder / STEPS, STEP_COLUMNS, keep)
+        return self._read_steps(table_path(self.folder, STEPS), STEP_COLUMNS, keep)
 
     def steps_of(self, rollout: Rollout) -> pa.Table:
         """Read all series of one rollout, from the table in its own folder or else from the run's.
@@ -184,7 +193,9 @@ class Run:
         keep = None
         for name, value in zip(KEYS, rollout.cell, strict=True) if own is None else ():
             keep = pc.field(name) == value if keep is None else keep & (pc.field(name) == value)
-        return self._read_steps(own or self.folder / STEPS, (*STEP_COLUMNS, "reason"), keep)
+        return self._read_steps(
+            own or table_path(self.folder, STEPS), (*STEP_COLUMNS, "reason"), keep
+        )
 
     def _read_steps(
         self, path: Path, columns: Sequence[str], keep: pc.Expression | None, coded: bool = True
@@ -209,7 +220,9 @@ class Run:
         from the ledger or else the steps.
         """
         columns = ["renderer", "metric", "reason"]
-        table = self._read_steps(self.folder / STEPS, columns, ~pc.field("valid"), coded=False)
+        table = self._read_steps(
+            table_path(self.folder, STEPS), columns, ~pc.field("valid"), coded=False
+        )
         counts = table.group_by(columns).aggregate([([], "count_all")]).sort_by("count_all")
         rows = counts.to_pylist()  # ascending: the most frequent reason is written last
         found = {(row["renderer"], row["metric"]): row["reason"] for row in rows if row["reason"]}
@@ -270,8 +283,8 @@ def read_run(run_dir: Path | str) -> Run:
     """
     folder = Path(run_dir)
     info: Mapping[str, Any] = read_json_as(RunInfo, folder / RUN_INFO, do_this=AGAIN)
-    summary: Mapping[str, Any] = read_json_as(Summary, folder / SUMMARY, do_this=AGAIN)
-    path = folder / ROLLOUTS
+    summary: Mapping[str, Any] = read_json_as(Summary, table_path(folder, SUMMARY), do_this=AGAIN)
+    path = table_path(folder, ROLLOUTS)
     return Run(folder, info, summary, StoredRollouts(path), metrics_in(ROLLOUTS_TABLE.check(path)))
 
 
@@ -281,7 +294,7 @@ def read_so_far(root: Path) -> RunSoFar[Run]:
     Raises:
         InputError: It holds no run, or its description or its tables are damaged.
     """
-    if (root / SUMMARY).exists():
+    if table_path(root, SUMMARY).exists():
         run = read_run(root)
         return RunSoFar(run, len(run.rollouts), (), True)
     found = inspect_run(root)

@@ -130,21 +130,25 @@ def rollout_table(manifests: Sequence[dict[str, Any]]) -> pa.Table:
     return pa.Table.from_batches(batches, schema)
 
 
-def write_tables(root: Path, manifests: Sequence[dict[str, Any]]) -> pa.Table:
+def write_tables(
+    root: Path, manifests: Sequence[dict[str, Any]], tables: Path | None = None
+) -> pa.Table:
     """Write ``rollouts.parquet`` and ``steps.parquet`` of a run folder and return the first.
 
     Args:
         root: The run folder; the manifests' rollouts are below it.
         manifests: One per rollout, in the order of the tables.
+        tables: Folder to write to; by default the run folder.
 
     Raises:
         InfrastructureError: The disk refuses.
     """
+    tables = tables or root
     rollouts = rollout_table(manifests)
-    write_parquet(root / ROLLOUTS, rollouts)
+    write_parquet(tables / ROLLOUTS, rollouts)
     parts = (root / m["path"] / STEPS_NAME for m in manifests if m["status"] == "ok")
     _join_parquet(
-        root / STEPS, STEPS_TABLE.arrow(of_logs="rollout" in rollouts.column_names), parts
+        tables / STEPS, STEPS_TABLE.arrow(of_logs="rollout" in rollouts.column_names), parts
     )
     return rollouts
 

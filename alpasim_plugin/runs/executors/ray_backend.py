@@ -244,7 +244,7 @@ def differences_of(expected: Mapping[str, str], present: Mapping[str, str]) -> l
 
 def read_rollout(folder: Path, node: str) -> DrivenRollout:
     """Read the folder of a rollout that was just driven; of a failed one what its parts printed."""
-    manifest, _ = read_manifest(folder)
+    manifest = read_manifest(folder)
     names = [*manifest["files"]] or [OUTPUT_NAME]
     files = {name: (folder / name).read_bytes() for name in names if (folder / name).exists()}
     return DrivenRollout({"node": node, **manifest}, files)
