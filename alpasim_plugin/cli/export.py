@@ -15,7 +15,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.log.run_folder.schema import SUMMARY
 from alpasim_plugin.runs.export import Export, export_run, export_scenes
-from alpasim_plugin.runs.recordings import Recording, collect, require_mcap, write_mcap
+from alpasim_plugin.runs.recordings import export_mcap, require_mcap
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.opening import read_so_far
 from evaluators.viewer.cells import Wanted, cells_of, check_wanted, read_logs
@@ -69,7 +69,7 @@ def export(
         problem = "nothing to write" if alpasim is None else "--alpasim and --mcap together"
         raise InputError(f"{' '.join(items)}: {problem}", "give --alpasim DIR or --mcap FILE")
     if mcap is not None:
-        _print_recording(*export_recording(items, wanted, mcap, overwrite), as_json)
+        _print_recording(export_recording(items, wanted, mcap, overwrite), as_json)
         return
     assert alpasim is not None
     if not wanted.is_all:
@@ -97,7 +97,7 @@ def export(
 
 def export_recording(
     items: Sequence[str], asked: Wanted, path: Path, overwrite: bool
-) -> tuple[Recording, dict[str, Any]]:
+) -> dict[str, Any]:
     """Write an MCAP recording of one scene, policy and seed.
 
     Args:
@@ -107,8 +107,7 @@ def export_recording(
         overwrite: Replace a file that is there.
 
     Returns:
-        The recording, and ``file``, ``bytes``, ``messages``, and ``channels`` with the messages of
-        each.
+        As `export_mcap`.
 
     Raises:
         InputError: Not one run or rollout, several cells, a file that is there already, a damaged
@@ -141,26 +140,17 @@ def export_recording(
             f"{root}: {len(cells)} cells of scene, policy and seed: {names}",
             "choose one by --scene, --policy and --seed, or name a rollout's folder",
         )
-    recording = collect(run, cells[0], read_logs(run, cells[0]))
-    counts = write_mcap(recording, path)
-    facts = {
-        "file": str(path),
-        "bytes": path.stat().st_size,
-        "messages": sum(counts.values()),
-        "channels": counts,
-    }
-    return recording, facts
+    return export_mcap(run, cells[0], read_logs(run, cells[0]), path)
 
 
-def _print_recording(recording: Recording, file: dict[str, Any], as_json: bool) -> None:
+def _print_recording(facts: dict[str, Any], as_json: bool) -> None:
     if as_json:
-        facts = {"recording": recording.name, **file, "notes": list(recording.notes)}
         print(json.dumps(facts))
         return
-    for note in recording.notes:
+    for note in facts["notes"]:
         print(f"note     {note}")
-    size = f"{file['bytes'] / 1e6:.1f} MB, {file['messages']} messages"
-    print(f"mcap     {file['file']}  {size}: {recording.name}")
+    size = f"{facts['bytes'] / 1e6:.1f} MB, {facts['messages']} messages"
+    print(f"mcap     {facts['file']}  {size}: {facts['recording']}")
 
 
 def _print(done: Export, as_json: bool) -> None:
