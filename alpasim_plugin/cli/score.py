@@ -297,7 +297,7 @@ Examples:
 
 - `simrun score runs/smoke/rollouts/3dgs --scene suites/smoke --preset strict`
 
-- `simrun score runs/smoke --scene suites/smoke --preset strict,nuplan,navsim,hugsim,ncap` prints the scores side by side
+- `simrun score runs/smoke --scene suites/smoke --preset strict,nuplan,navsim` prints the scores side by side
 """
 
 

@@ -171,9 +171,8 @@ PRESETS: dict[str, Preset] = {
     # measured.
     **{
         name: Preset(name=name, protocol=name, seam_m=0.1, stop_after=())
-        for name in ("nuplan", "navsim", "hugsim")
+        for name in ("nuplan", "navsim")
     },
-    "ncap": Preset(name="ncap", protocol="ncap", contact="between_steps", seam_m=0.1),
 }
 
 
@@ -210,8 +209,6 @@ HELP = {
     "strict": "ours, and the default: contact between steps, a signed margin to the edge of the road; needs a map",
     "nuplan": "nuPlan's closed-loop score",
     "navsim": "NAVSIM's PDM score and extended PDM score",
-    "hugsim": "HUGSIM's HD-Score",
-    "ncap": "NeuroNCAP's score",
 }
 
 

@@ -271,17 +271,3 @@ def closed_loop_score(parts: Mapping[str, float]) -> float:
     """
     mean = sum(weight * parts[name] for name, weight in WEIGHTS.items()) / sum(WEIGHTS.values())
     return float(np.prod([parts[name] for name in MULTIPLIERS])) * mean
-
-
-def position_errors(xy: F64, expert_xy: F64) -> F64:
-    """Return the distances ``(T,)`` between the ego and the expert at the same times."""
-    return np.asarray(np.hypot(*(xy - expert_xy).T))
-
-
-def statistics(values: F64) -> dict[str, float]:
-    """Return greatest, least and mean, and the 90th percentile of the magnitudes, to two digits, as
-    the devkit reports a series.
-    """
-    reduced = {"MAX": np.max(values), "MIN": np.min(values), "MEAN": np.mean(values)}
-    reduced["P90"] = np.percentile(np.abs(values), 90, method="inverted_cdf")
-    return {name: round(float(value), 2) for name, value in reduced.items()}

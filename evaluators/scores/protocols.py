@@ -9,11 +9,10 @@ and how far our logs go is in docs/presets.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import offset_trajectory
 from alpasim_plugin.core.types import (
     F64,
     I64,
@@ -23,50 +22,31 @@ from alpasim_plugin.core.types import (
     Scene,
     Trajectory,
 )
-from evaluators.metrics.collision import NOT_LOOKED_FOR, contact_events
 from evaluators.metrics.footprint import origin_of
 from evaluators.metrics.presets import Preset
-from evaluators.metrics.route import OnRoute, on_route, recorded_path
+from evaluators.metrics.route import on_route, recorded_path
 from evaluators.metrics.score import relevant, series, with_preset
 from evaluators.metrics.surface import MARGIN_M
 from evaluators.scores import nuplan
 from evaluators.scores.judged import Judged, Part
-from evaluators.scores.states import derivative, ego_states, smooth, states_of
-from evaluators.scores.table import MOST, PARTS
+from evaluators.scores.states import derivative, ego_states, smooth
+from evaluators.scores.table import PARTS
 
 Values = Mapping[str, float]
+Rule = Callable[[Values], float]
+
 NO_PAIRS = "two plans 0.5 s apart that reach 4 s in steps of 0.1 s"
 NO_PATH = "a recorded path with a length"
-NO_PLANS = "a plan of more than three poses"
 NOT_DRIVEN = "a step that the policy drove"
 
-
-@dataclass(frozen=True)
-class Protocol:
-    """The score of one benchmark.
-
-    Attributes:
-        measure: Gives the parts of the scored part of a rollout, the ego's box centres;
-            `evaluators.scores.table` says what they are.
-        scores: Score -> its rule over the parts, never lower for a higher part.
-    """
-
-    measure: Callable[[RolloutLog, Scene, Preset, Trajectory], Mapping[str, Part]]
-    scores: Mapping[str, Callable[[Values], float]]
-
-
-def _route(rollout: RolloutLog, preset: Preset, centre: Trajectory) -> tuple[OnRoute, OnRoute]:
-    """Return where the scored ego is on the recorded path, and where the recording is at the same
-    times.
-    """
-    origin, recorded = origin_of(rollout.ego_log, preset), recorded_path(rollout, preset)
-    path = recorded.xyz[:, :2] - origin[:2]
-    ends = np.stack(
-        [np.interp(centre.t_us, recorded.t_us, path[:, axis]) for axis in (0, 1)], axis=1
-    )
-    return on_route(path, recorded.t_us, centre.t_us, centre.xyz[:, :2] - origin[:2]), on_route(
-        path, recorded.t_us, centre.t_us, ends
-    )
+LEAST_PROGRESS_M = 5.0
+PDMS = {"ep": 5.0, "ttc": 5.0, "hc": 2.0}
+EPDMS = {"ep": 5.0, "ttc": 5.0, "lk": 2.0, "hc": 2.0, "ec": 2.0}
+# Extended comfort: root mean squares, in m/s2, m/s3, rad/s and rad/s2.
+EXTENDED_COMFORT = {"accel": 0.7, "jerk": 0.5, "yaw_rate": 0.1, "yaw_accel": 0.1}
+APART_US = 500_000
+REACH_US = 4_000_000
+PLAN_STEP_US = 100_000
 
 
 def _progress(
@@ -75,9 +55,14 @@ def _progress(
     """Return the ratio of the metres along the recorded path that the ego and that the recording
     made in the same time.
     """
-    ego, expert = _route(rollout, preset, centre)
-    made = [float(track.along_m[-1] - track.along_m[0]) for track in (ego, expert)]
-    return ratio(made[0], made[1]) if ego.length_m > 0 else NO_PATH
+    origin = origin_of(rollout.ego_log, preset)[:2]
+    recorded = recorded_path(rollout, preset)
+    path = recorded.xyz[:, :2] - origin
+    expert_xy = [np.interp(centre.t_us, recorded.t_us, path[:, axis]) for axis in (0, 1)]
+    ego = on_route(path, recorded.t_us, centre.t_us, centre.xyz[:, :2] - origin)
+    expert = on_route(path, recorded.t_us, centre.t_us, np.stack(expert_xy, axis=1))
+    ego_m, expert_m = (float(track.along_m[-1] - track.along_m[0]) for track in (ego, expert))
+    return ratio(ego_m, expert_m) if ego.length_m > 0 else NO_PATH
 
 
 def ego_progress(ego_m: float, reference_m: float) -> float:
@@ -95,36 +80,35 @@ def ego_progress(ego_m: float, reference_m: float) -> float:
 
 def _nuplan(
     rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory
-) -> Mapping[str, Part]:
-    drive, made = (
-        Judged(rollout, scene, preset, centre),
-        _progress(rollout, preset, centre, nuplan.progress_ratio),
-    )
+) -> dict[str, Part]:
+    ego = Judged(rollout, scene, preset, centre)
+    progress = _progress(rollout, preset, centre, nuplan.progress_ratio)
+    is_known = not isinstance(progress, str)
     return {
-        "no_at_fault_collision": drive.contact(),
-        "drivable_area": drive.drivable(nuplan.OFF_AREA_M),
-        "making_progress": made if isinstance(made, str) else float(made >= nuplan.PROGRESS_SHARE),
-        "driving_direction": drive.direction(),
-        "progress": made,
-        "time_to_collision": drive.time_to_collision(),
-        "speed_limit": drive.speed_limit(),
-        "comfort": drive.comfort(),
+        "no_at_fault_collision": ego.contact(),
+        "drivable_area": ego.drivable(nuplan.OFF_AREA_M),
+        "making_progress": float(progress >= nuplan.PROGRESS_SHARE) if is_known else progress,
+        "driving_direction": ego.direction(),
+        "progress": progress,
+        "time_to_collision": ego.time_to_collision(),
+        "speed_limit": ego.speed_limit(),
+        "comfort": ego.comfort(),
     }
 
 
 def _navsim(
     rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory
-) -> Mapping[str, Part]:
-    drive = Judged(rollout, scene, preset, centre)
+) -> dict[str, Part]:
+    ego = Judged(rollout, scene, preset, centre)
     return {
-        "nc": drive.contact(),
-        "dac": drive.drivable(MARGIN_M),
-        "ddc": drive.direction(),
-        "tlc": drive.traffic_lights(),
+        "nc": ego.contact(),
+        "dac": ego.drivable(MARGIN_M),
+        "ddc": ego.direction(),
+        "tlc": ego.traffic_lights(),
         "ep": _progress(rollout, preset, centre, ego_progress),
-        "ttc": drive.time_to_collision(),
-        "lk": drive.lane_keeping(),
-        "hc": drive.comfort(),
+        "ttc": ego.time_to_collision(),
+        "lk": ego.lane_keeping(),
+        "hc": ego.comfort(),
         "ec": _extended_comfort(rollout, preset, centre),
     }
 
@@ -133,43 +117,33 @@ def _extended_comfort(rollout: RolloutLog, preset: Preset, centre: Trajectory) -
     """Return the share of plans that move as the one 0.5 s before meant to, over the 3.5 s that
     both reach.
     """
-    plans = [one for one in rollout.plans if _reaches(one)]
-    now_us, origin = (
-        np.array([one.now_us for one in plans], dtype=np.int64),
-        origin_of(rollout.ego_log, preset),
-    )
+    plans = [plan for plan in rollout.plans if _reaches(plan)]
+    now_us = np.array([plan.now_us for plan in plans], dtype=np.int64)
+    origin = origin_of(rollout.ego_log, preset)
     alike = []
     for plan in plans:
         k = int(np.searchsorted(now_us, plan.now_us - APART_US, "right")) - 1
         t_us = plan.now_us + np.arange(0, REACH_US - APART_US + 1, PLAN_STEP_US)
         if plan.now_us < centre.t_us[0] or k < 0 or plans[k].trajectory.t_us[-1] < t_us[-1]:
             continue
-        first, second = (
-            _planned_motion(rollout, preset, one.trajectory, t_us, origin)
-            for one in (plans[k], plan)
-        )
-        alike.append(
-            all(
-                np.sqrt(np.mean((first[name] - second[name]) ** 2)) <= most
-                for name, most in EXTENDED_COMFORT.items()
-            )
-        )
+        before = _planned_motion(rollout, preset, plans[k].trajectory, t_us, origin)
+        after = _planned_motion(rollout, preset, plan.trajectory, t_us, origin)
+        errors = {name: np.sqrt(np.mean((before[name] - after[name]) ** 2)) for name in before}
+        alike.append(all(errors[name] <= most for name, most in EXTENDED_COMFORT.items()))
     return float(np.mean(alike)) if alike else NO_PAIRS
 
 
 def _reaches(plan: LoggedPlan) -> bool:
     """Tell whether a plan reaches far enough, in steps that are short enough for accelerations."""
     t_us = plan.trajectory.t_us
-    return (
-        len(t_us) > 1
-        and t_us[-1] >= plan.now_us + REACH_US
-        and int(np.diff(t_us).max()) <= PLAN_STEP_US
-    )
+    if len(t_us) < 2 or t_us[-1] < plan.now_us + REACH_US:
+        return False
+    return int(np.diff(t_us).max()) <= PLAN_STEP_US
 
 
 def _planned_motion(
     rollout: RolloutLog, preset: Preset, rig: Trajectory, t_us: I64, origin: F64
-) -> Mapping[str, F64]:
+) -> dict[str, F64]:
     """Return acceleration, jerk, yaw rate and yaw acceleration ``(T,)`` of a plan at some of its
     times.
     """
@@ -189,202 +163,59 @@ def _weighted(values: Values, weights: Values) -> float:
     return sum(weight * values[name] for name, weight in weights.items()) / sum(weights.values())
 
 
-LEAST_PROGRESS_M = 5.0
-PDMS = {"ep": 5.0, "ttc": 5.0, "hc": 2.0}
-EXTENDED_COMFORT = {
-    "accel": 0.7,
-    "jerk": 0.5,
-    "yaw_rate": 0.1,
-    "yaw_accel": 0.1,
-}  # root mean squares: m/s2, m/s3, rad/s, rad/s2
-APART_US = 500_000
-REACH_US = 4_000_000
-PLAN_STEP_US = 100_000
-EPDMS = {"ep": 5.0, "ttc": 5.0, "lk": 2.0, "hc": 2.0, "ec": 2.0}
+def _pdms(parts: Values) -> float:
+    return parts["nc"] * parts["dac"] * _weighted(parts, PDMS)
 
 
-def _hugsim(
-    rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory
-) -> Mapping[str, Part]:
-    """Judge every plan by where the others really are at its times; each part is a mean over plans,
-    ``hd`` that of their product.
-    """
-    rows: list[dict[str, Part]] = []
-    for plan in rollout.plans:
-        inside = plan.trajectory.t_us <= rollout.ego.t_us[-1]
-        if plan.now_us < centre.t_us[0] or np.sum(inside) <= nuplan.LEAST_INSTANTS:
-            continue
-        rig = plan.trajectory
-        way = offset_trajectory(
-            replace(rig, t_us=rig.t_us[inside], xyz=rig.xyz[inside], quat=rig.quat[inside]),
-            rollout.T_rig_box,
-        )
-        drive = Judged(rollout, scene, preset, way)
-        nc = float(not drive.hits)
-        rows.append(
-            {
-                "nc": nc if nc == 0 or scene.standing != "unknown" else NOT_LOOKED_FOR,
-                "dac": drive.drivable(MARGIN_M),
-                "ttc": drive.time_to_collision(),
-                "com": drive.comfort(),
-            }
-        )
-    ego, _ = _route(rollout, preset, centre)
-    completed: Part = float(ego.along_m[-1]) / ego.length_m if ego.length_m > 0 else NO_PATH
-    out: dict[str, Part] = {"rc": completed}
-    for name in ("nc", "dac", "ttc", "com"):
-        values = [row[name] for row in rows]
-        out[name] = next(
-            (one for one in values if isinstance(one, str)),
-            NO_PLANS if not values else float(np.mean([float(x) for x in values])),
-        )
-    product = [
-        _bounds(
-            row, lambda one: one["nc"] * one["dac"] * _weighted(one, {"ttc": 5.0, "com": 2.0}), 1.0
-        )
-        for row in rows
-    ]
-    why = next((one for row in rows for one in row.values() if isinstance(one, str)), NO_PLANS)
-    out["hd"] = (
-        float(np.mean([low for low, _ in product]))
-        if product and all(low == high for low, high in product)
-        else why
-    )
-    return out
+def _epdms(parts: Values) -> float:
+    multipliers = parts["nc"] * parts["dac"] * parts["ddc"] * parts["tlc"]
+    return multipliers * _weighted(parts, EPDMS)
 
 
-def _ncap(
-    rollout: RolloutLog, scene: Scene, preset: Preset, centre: Trajectory
-) -> Mapping[str, Part]:
-    """Compare the speed of the impact with that of a drive that goes on as it was at the
-    handover.
-    """
-    impact = _impact_mps(rollout, preset, centre)
-    first = states_of(rollout, preset, rollout.ego, origin_of(rollout.ego, preset))[0]
-    k = int(np.searchsorted(rollout.ego.t_us, centre.t_us[0]))
-    after_s = (centre.t_us - centre.t_us[0]) * 1e-6
-    v = first.velocity[k, 0] * first.heading[k]
-    xyz = centre.xyz[0] + np.concatenate(
-        [after_s[:, None] * v, np.zeros((len(after_s), 1))], axis=1
-    )
-    still = replace(centre, xyz=xyz, quat=np.repeat(centre.quat[:1], len(after_s), axis=0))
-    passive = _impact_mps(rollout, preset, still)
-    if impact is None:
-        score: Part = 5.0 if scene.standing != "unknown" else NOT_LOOKED_FOR
-    else:
-        score = (
-            "an impact of a drive that does nothing"
-            if not passive
-            else 4.0 * max(0.0, 1.0 - impact / passive)
-        )
-    none = "an impact"
-    return {
-        "points": score,
-        "impact_mps": none if impact is None else impact,
-        "passive_impact_mps": none if passive is None else passive,
-    }
-
-
-def _impact_mps(rollout: RolloutLog, preset: Preset, centre: Trajectory) -> float | None:
-    """Return the relative speed at the first contact at or between the times of a trajectory; None
-    without one.
-    """
-    events = contact_events(
-        replace(rollout, ego=centre, render_start_us=int(centre.t_us[0]), force_gt_us=0), preset
-    )
-    if not events:
-        return None
-    ego, tracks = states_of(rollout, preset, centre, origin_of(rollout.ego, preset))
-    k = max(
-        int(np.searchsorted(ego.t_us - ego.t_us[0], round(events[0].t_s * 1e6))) - 1, 0
-    )  # before it, when nothing is shoved yet
-    a = tracks.ids.index(events[0].actor_id)
-    k = k if tracks.there[a, k] else int(np.argmax(tracks.there[a]))
-    return float(np.hypot(*(ego.velocity[k, 0] * ego.heading[k] - tracks.velocity[a, k])))
-
-
-PROTOCOLS = {
-    "nuplan": Protocol(_nuplan, {"score": nuplan.closed_loop_score}),
-    "navsim": Protocol(
-        _navsim,
-        {
-            "pdms": lambda one: one["nc"] * one["dac"] * _weighted(one, PDMS),
-            "epdms": lambda one: (
-                one["nc"] * one["dac"] * one["ddc"] * one["tlc"] * _weighted(one, EPDMS)
-            ),
-        },
-    ),
-    "hugsim": Protocol(_hugsim, {"hd_score": lambda one: one["hd"] * one["rc"]}),
-    "ncap": Protocol(_ncap, {"score": lambda one: one["points"]}),
+# Benchmark -> what gives the parts of the scored part of a rollout (the ego's box centres), which
+# `evaluators.scores.table` names; and score -> its rule, never lower for a higher part.
+MEASURES = {"nuplan": _nuplan, "navsim": _navsim}
+RULES: dict[str, dict[str, Rule]] = {
+    "nuplan": {"score": nuplan.closed_loop_score},
+    "navsim": {"pdms": _pdms, "epdms": _epdms},
 }
 
 
-def _bounds(
-    parts: Mapping[str, Part], rule: Callable[[Values], float], most: float
-) -> tuple[float, float]:
-    """Return the least and the greatest value of a rule over parts of which some are not
-    measured.
+def _scores(name: str, parts: Mapping[str, Part], rule: Rule) -> dict[str, Part]:
+    """Return a score and its least and greatest value; without a value it is the parts that would
+    decide it.
     """
-    low, high = (
-        {name: end if isinstance(part, str) else part for name, part in parts.items()}
-        for end in (0.0, most)
-    )
-    return rule(low), rule(high)
-
-
-def _matters(
-    parts: Mapping[str, Part], name: str, rule: Callable[[Values], float], most: float
-) -> bool:
-    """Tell whether a score reads a part: it is lower without it where all that is missing has full
-    marks.
-    """
-    return _bounds(dict(parts) | {name: 0.0}, rule, most)[1] < _bounds(parts, rule, most)[1]
+    known = {part: value for part, value in parts.items() if not isinstance(value, str)}
+    missing = {part: reason for part, reason in parts.items() if isinstance(reason, str)}
+    full_marks = known | dict.fromkeys(missing, 1.0)
+    least, most = rule(known | dict.fromkeys(missing, 0.0)), rule(full_marks)
+    reasons = [reason for part, reason in missing.items() if rule(full_marks | {part: 0.0}) < most]
+    score: Part = least if least == most else "; ".join(dict.fromkeys(reasons))
+    return {name: score, f"{name}_least": least, f"{name}_most": most}
 
 
 def evaluate_protocol(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
     """Give the parts and scores of the preset's benchmark, the same at every step; nothing by
     presets that are none's.
     """
-    if preset.protocol is None:
+    benchmark = preset.protocol
+    if benchmark is None:
         return []
-    protocol, rows = PROTOCOLS[preset.protocol], relevant(rollout)
+    ego, rows = rollout.ego, relevant(rollout)
+    parts: dict[str, Part] = dict.fromkeys(PARTS[benchmark], NOT_DRIVEN)
     if rows.any():
-        ego = rollout.ego
-        parts = protocol.measure(
-            rollout,
-            scene,
-            preset,
-            replace(ego, t_us=ego.t_us[rows], xyz=ego.xyz[rows], quat=ego.quat[rows]),
-        )
-    else:
-        parts = dict.fromkeys(PARTS[preset.protocol], NOT_DRIVEN)
-    out: dict[str, Part] = {}
-    for score, rule in protocol.scores.items():
-        most = MOST.get(preset.protocol, 1.0)
-        low, high = _bounds(parts, rule, most)
-        missing = "; ".join(
-            dict.fromkeys(
-                part
-                for name, part in parts.items()
-                if isinstance(part, str) and _matters(parts, name, rule, most)
-            )
-        )
-        out |= {
-            score: low if low == high else missing,
-            f"{score}_least": low,
-            f"{score}_most": high,
-        }
-    t_us = rollout.ego.t_us
-    return [
-        series(
-            f"{preset.protocol}_{name}",
-            t_us,
-            np.nan if isinstance(one, str) else one,
-            not isinstance(one, str),
-            f"not measured: {one}",
-        )
-        for name, one in (out | dict(parts)).items()
-    ]
+        scored = replace(ego, t_us=ego.t_us[rows], xyz=ego.xyz[rows], quat=ego.quat[rows])
+        parts = MEASURES[benchmark](rollout, scene, preset, scored)
+    values: dict[str, Part] = {}
+    for name, rule in RULES[benchmark].items():
+        values |= _scores(name, parts, rule)
+    out = []
+    for name, value in (values | parts).items():
+        is_known = not isinstance(value, str)
+        number = value if is_known else np.nan
+        reason = f"not measured: {value}"
+        out.append(series(f"{benchmark}_{name}", ego.t_us, number, is_known, reason))
+    return out
 
 
 FACTORY = with_preset(evaluate_protocol)

@@ -191,9 +191,8 @@ def savitzky_golay(values: F64, window: int, order: int, times: int = 0, step: f
     """Return values ``(T,)``, or a derivative of them, by polynomials fitted to a moving window
     (Savitzky and Golay 1964).
 
-    The half window at either end is read off the polynomial of the outermost window. It is
-    `scipy.signal.savgol_filter` to the last bit; its module takes longer to load than a drive takes
-    to score.
+    The half window at either end is read off the polynomial of the outermost window, as
+    `scipy.signal.savgol_filter` does; its module takes longer to load than a drive takes to score.
 
     Args:
         values: ``(T,)``, T not below ``window``.
@@ -202,46 +201,19 @@ def savitzky_golay(values: F64, window: int, order: int, times: int = 0, step: f
         times: How often it is differentiated, at most ``order``.
         step: Between two values.
     """
-    half, n = window // 2, len(values)
-    # The weights of a window's values: those of the polynomial's coefficient, from its oldest value
-    # to its newest.
-    offset = np.arange(
-        half - 0.5 if window % 2 == 0 else half, -half - 0.5 if window % 2 == 0 else -half - 1, -1.0
-    )
-    wanted = np.zeros(order + 1)
-    wanted[times] = math.factorial(times) / step**times
-    eps = np.finfo(np.float64).eps
-    design = offset ** np.arange(order + 1.0)[:, None]
-    weights = np.linalg.lstsq(design, wanted, rcond=eps * max(design.shape))[0][::-1]
-    padded = np.concatenate([np.zeros(half), values, np.zeros(half)])
-    begin = (
-        half - (window - 1) // 2
-    )  # in the padded values: an even window reaches one value further ahead than back
-    shifted = [padded[begin + k : begin + k + n] for k in range(window)]
-    if window % 2 and np.all(np.abs(weights - weights[::-1]) <= eps):  # the order of the sum
-        out = shifted[half] * weights[half]
-        for k in range(half):
-            out = out + (shifted[k] + shifted[-1 - k]) * weights[k]
-    elif window % 2 and np.all(np.abs(weights + weights[::-1]) <= eps):
-        out = shifted[half] * weights[half]
-        for k in range(half):
-            out = out + (shifted[k] - shifted[-1 - k]) * weights[k]
-    else:
-        out = shifted[-1] * weights[-1]
-        for k in range(window - 1):
-            out = out + shifted[k] * weights[k]
-    for start, first, last in ((0, 0, half), (n - window, n - half, n)):
-        fit = np.vander(np.arange(window, dtype=np.float64), order + 1)
-        scale = np.sqrt(np.sum(fit * fit, axis=0))
-        solved = np.linalg.lstsq(
-            fit / scale, values[start : start + window, None], rcond=window * eps
-        )[0]
-        polynomial = np.polyder(solved[:, 0] / scale, times)
-        out[first:last] = (
-            np.polyval(polynomial, np.arange(first - start, last - start, dtype=np.float64))
-            / step**times
-        )
-    return np.asarray(out)
+    half, before, n = window // 2, (window - 1) // 2, len(values)
+    powers = np.arange(order + 1)
+    offsets = np.arange(window) - (window - 1) / 2
+    coefficients = np.linalg.pinv(offsets[:, None] ** powers)
+    scales = np.array([math.perm(power, times) for power in powers]) / step**times
+    # Row k weighs a window's values for the polynomial at its k-th value, the last row at its middle.
+    evaluated = np.append(offsets, 0.0)[:, None] ** np.maximum(powers - times, 0)
+    weights = (scales * evaluated) @ coefficients
+    windows = np.lib.stride_tricks.sliding_window_view(values, window)
+    start = weights[:half] @ windows[0]
+    middle = windows[half - before : n - half - before] @ weights[-1]
+    end = weights[window - half : window] @ windows[-1]
+    return np.concatenate([start, middle, end])
 
 
 def _enough(values: F64, order: int) -> int:

@@ -94,7 +94,7 @@ def test_a_log_of_ours_scores_as_its_run_did(our_run, tmp_path, capsys):
 
 def test_several_presets_stand_side_by_side_and_say_what_is_missing(our_run, tmp_path, capsys):
     out = tmp_path / "scored"
-    presets = "strict,nuplan,navsim,ncap"
+    presets = "strict,nuplan,navsim"
     command = [
         "score",
         str(our_run),
@@ -109,17 +109,17 @@ def test_several_presets_stand_side_by_side_and_say_what_is_missing(our_run, tmp
     table = capsys.readouterr().out
     assert [
         line.split()[0] for line in table.splitlines() if "pdms" in line or "_score" in line
-    ] == ["nuplan", "navsim", "navsim", "ncap"]
+    ] == ["nuplan", "navsim", "navsim"]
     assert "strict" in table
     assert "speed limits" in table
-    assert {path.name for path in out.iterdir()} == {"strict", "nuplan", "navsim", "ncap"}
+    assert {path.name for path in out.iterdir()} == {"strict", "nuplan", "navsim"}
     assert run_command([*command, "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert (printed["exit_code"], list(printed["presets"])) == (
         0,
-        ["strict", "nuplan", "navsim", "ncap"],
+        ["strict", "nuplan", "navsim"],
     )
-    assert printed["presets"]["ncap"]["summary"]["metrics"]["clean"]["ncap_score"]["mean"] == 5.0
+    assert printed["presets"]["nuplan"]["summary"]["metrics"]["clean"]["nuplan_score_most"]["mean"] == 1.0
     assert run_command([*command[:5], "strict,waymax"]) == 2
 
 

@@ -363,7 +363,7 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
         ),
         "protocols": (
             "evaluators.scores.protocols:FACTORY",
-            "scores of nuPlan, NAVSIM, HUGSIM and NeuroNCAP",
+            "scores of nuPlan and NAVSIM",
         ),
         "plan": (
             "evaluators.metrics.plan:FACTORY",
