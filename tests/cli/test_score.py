@@ -119,7 +119,10 @@ def test_several_presets_stand_side_by_side_and_say_what_is_missing(our_run, tmp
         0,
         ["strict", "nuplan", "navsim"],
     )
-    assert printed["presets"]["nuplan"]["summary"]["metrics"]["clean"]["nuplan_score_most"]["mean"] == 1.0
+    assert (
+        printed["presets"]["nuplan"]["summary"]["metrics"]["clean"]["nuplan_score_most"]["mean"]
+        == 1.0
+    )
     assert run_command([*command[:5], "strict,waymax"]) == 2
 
 
