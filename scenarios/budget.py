@@ -29,13 +29,11 @@ from alpasim_plugin.core.types import (
     Trajectory,
 )
 from scenarios.recorded import RecordedLog
+from scenarios.schema import EnvironmentSpec
 from scenarios.schema_parts import IdmActor, NarrowGapSegment, ParkedActor
 from scenarios.variation import Drawn
 
-DOING = "checking what a scenario costs"
 REACH_M = 110.0  # the surroundings are built so far from the drive
-BYTES_PER_GAUSSIAN = 200
-SECONDS_PER_GAUSSIAN = 3e-6
 PLAN_CELL_M2 = 0.0625
 
 ACTORS = b.Bound("road users", "", 0, 1_000, "recorded scenes have a few hundred")
@@ -46,12 +44,15 @@ POSES = b.Bound(
     "poses of all tracks", "", 0, 5_000_000, "an hour of a hundred road users at 10 a second"
 )
 GAUSSIANS = b.Bound(
-    "Gaussians", "", 0, 20_000_000, "they would take more than 4 GB and a minute to build"
+    "Gaussians",
+    "",
+    0,
+    20_000_000,
+    "more would take 4 GB and a minute to build; shorten the drive, or lower environment.building_height_m or trees_per_100m",
 )
 PLAN_CELLS = b.Bound(
     "cells of the ground plan", "", 0, 50_000_000, "a square of 1.7 km at 0.25 m takes about 1 GB"
 )
-BUDGETS = (ACTORS, REACTIVE, LANES, VERTICES, POSES, GAUSSIANS, PLAN_CELLS)
 
 
 def check_specification(drawn: Drawn) -> None:
@@ -65,44 +66,25 @@ def check_specification(drawn: Drawn) -> None:
             number is named.
     """
     spec = drawn.spec
+    document = drawn.document
     assert spec.road is not None
-
-    def fail(key: tuple[str, ...], found: str, do_this: str) -> InputError:
-        return drawn.document.error(key, found, do_this)
-
-    lengths = [
+    segments = spec.road.segments
+    length_m = sum(
         getattr(segment, "length_m", 2 * getattr(segment, "arm_length_m", 0.0))
-        for segment in spec.road.segments
-    ]
-    if not b.ROAD_M.holds(sum(lengths)):
-        raise fail(
-            ("road", "segments"),
-            _found(b.ROAD_M, sum(lengths)),
-            "shorten segments, or make several scenarios",
-        )
-    gaps = sum(
-        s.cars_left + s.cars_right for s in spec.road.segments if isinstance(s, NarrowGapSegment)
+        for segment in segments
     )
-    actors = gaps + sum(
-        actor.count if isinstance(actor, ParkedActor) else 1 for actor in spec.actors
-    )
+    b.ROAD_M.check(length_m, document.mark(("road", "segments")))
+    gaps = sum(s.cars_left + s.cars_right for s in segments if isinstance(s, NarrowGapSegment))
+    parked = sum(actor.count - 1 for actor in spec.actors if isinstance(actor, ParkedActor))
     reactive = sum(isinstance(actor, IdmActor) for actor in spec.actors)
-    for bound, value in ((ACTORS, actors), (REACTIVE, reactive)):
-        if not bound.holds(value):
-            raise fail(
-                ("actors",), _found(bound, value), "leave out those that the ego never meets"
-            )
-    driven_m = min(
-        spec.built_until_us * 1e-6 * max(spec.ego.cruise_mps, spec.ego.speed_mps), sum(lengths)
-    )
+    place = document.mark(("actors",))
+    ACTORS.check(gaps + parked + len(spec.actors), place)
+    REACTIVE.check(reactive, place)
+    speed_mps = max(spec.ego.cruise_mps, spec.ego.speed_mps)
+    driven_m = min(spec.built_until_us * 1e-6 * speed_mps, length_m)
     if spec.background is None:
         count = gaussians(spec.environment, driven_m, driven_m, 0.0)
-        if not GAUSSIANS.holds(count):
-            raise fail(
-                ("environment",),
-                _cost(count),
-                "shorten timing.duration_us, lower building_height_m or trees_per_100m",
-            )
+        GAUSSIANS.check(count, document.mark(("environment",)))
 
 
 def check_record(record: RecordedLog, where: str) -> None:
@@ -149,20 +131,13 @@ def check_scenario(scenario: Scenario, where: str) -> None:
         return
     xy = scenario.ego_log.xyz[:, :2]
     wide, high = np.ptp(xy, axis=0) + 2 * REACH_M
-    count = gaussians(
-        scenario.environment, float(arc_lengths(scenario.ego_log.xyz)[-1]), float(wide), float(high)
-    )
-    if not GAUSSIANS.holds(count):
-        raise InputError(
-            f"{where}: {_cost(count)}",
-            "drive a shorter part of it, or lower environment.building_height_m",
-        )
-    cells = wide * high / PLAN_CELL_M2
-    PLAN_CELLS.check(float(cells), f"{where}: a drive through {wide:.0f} x {high:.0f} m")
+    driven_m = float(arc_lengths(scenario.ego_log.xyz)[-1])
+    GAUSSIANS.check(gaussians(scenario.environment, driven_m, float(wide), float(high)), where)
+    PLAN_CELLS.check(float(wide * high / PLAN_CELL_M2), where)
 
 
 def gaussians(
-    environment: Environment | object, driven_m: float, wide_m: float, high_m: float
+    environment: Environment | EnvironmentSpec, driven_m: float, wide_m: float, high_m: float
 ) -> float:
     """Estimate how many Gaussians a scene takes, within about half of the true number.
 
@@ -171,32 +146,15 @@ def gaussians(
         driven_m: Length of the logged path.
         wide_m, high_m: Sides of the rectangle around it, with what is built beside it.
     """
-    trees_per_100m, buildings = (
-        getattr(environment, "trees_per_100m", 0.0),
-        getattr(environment, "buildings", 0.0),
-    )
     length = driven_m + 40.0
     area = max(wide_m, 2 * REACH_M) * max(high_m, 2 * REACH_M)
-    trees = trees_per_100m * (0.02 * length + 0.00022 * area)
+    trees = environment.trees_per_100m * (0.02 * length + 0.00022 * area)
     walls_m2 = (
-        buildings
-        * 2
-        * length
-        * float(np.mean(getattr(environment, "building_height_m", (0.0, 0.0))))
-        * 2.3
+        environment.buildings * 2 * length * float(np.mean(environment.building_height_m)) * 2.3
     )
-    spacing = getattr(environment, "poles_spacing_m", 0.0)
+    spacing = environment.poles_spacing_m
     poles = 2 * length / spacing if spacing > 0 else 0.0
     return 1500.0 * (length + 100.0) + 760.0 * trees + 22.0 * walls_m2 + 100.0 * poles
-
-
-def _cost(count: float) -> str:
-    gib, seconds = count * BYTES_PER_GAUSSIAN / b.GIB, count * SECONDS_PER_GAUSSIAN
-    return f"{_found(GAUSSIANS, count)}: about {gib:.0f} GiB and {seconds:.0f} s to build"
-
-
-def _found(bound: b.Bound, value: float) -> str:
-    return f"{b.number(round(value))} {bound.unit or bound.name}{' of road' if bound is b.ROAD_M else ''}, at most {b.number(bound.high)}"
 
 
 def _lines(lane_map: LaneMap) -> Iterable[F64]:

@@ -41,7 +41,6 @@ DRIVE_FILE = "drive.json"
 TRANSFORMS_FILE = "transforms.json"
 GROUND_FILE = "ground.npy"
 MODEL_FOLDER = "model"
-DOING = "reading an imported drive"
 DO_THIS = "import the drive again: simrun import drive FOLDER -o OUT"
 Numbers = list[float]
 Rows = list[list[float]]

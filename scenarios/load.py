@@ -43,7 +43,6 @@ from scenarios.sources import open_document, recorded_drive, source_digest
 from scenarios.suite import find
 from scenarios.variation import Drawn, draw
 
-DOING = "reading a scenario"
 RECORDED_STREETS = ("usdz", "drive")  # sources whose street is recorded, whatever renders it
 ALPASIM_WARMUP_US = 1_700_000  # its default force_gt_duration_us
 # Columns: camera x (right), y (down), z (forward) seen in the rig's axes (x forward, y left, z up).

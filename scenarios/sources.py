@@ -17,7 +17,6 @@ from scenarios.recorded import RecordedLog
 from scenarios.schema_parts import SHIPPED
 from scenarios.variation import Drawn
 
-DOING = "reading a scenario"
 DRIVE_FILE = "drive.json"  # of an imported drive, as `scenarios.drive` has it
 
 

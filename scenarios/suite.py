@@ -90,7 +90,6 @@ def unknown(text: str, kind: str, names: Mapping[str, Path]) -> InputError:
     )
 
 
-DOING = "reading a suite"
 MOST_SUITES = 256  # read for one argument, through suites of suites
 
 

@@ -44,7 +44,6 @@ from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory
 from scenarios.usdz_archive import Archive
 from scenarios.usdz_tables import clipgt_map, without_rails
 
-DOING = "reading an AlpaSim scene"
 RECONSTRUCTIONS = ("checkpoint.ckpt", "nerf.ingp", "volume.nurec")
 GROUND_CELL_M = 2.0
 # Words in AlpaSim's free-text labels, the first match deciding; all else is "other".

@@ -35,7 +35,6 @@ from alpasim_plugin.world.ground import height_at
 from scenarios.ftheta import FRONT_WIDE, calibration_table
 from scenarios.usdz_tables import map_tables
 
-DOING = "writing an AlpaSim scene"
 SHUTTER_US = 30_000  # of a camera that has none: AlpaSim wants every frame's end after its start
 GROUND_MARGIN_M, GROUND_NODES = 30.0, 200_000
 _LABELS = {

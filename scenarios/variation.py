@@ -25,7 +25,6 @@ _CURVATURES = ("curvature_per_m", "start_curvature_per_m", "end_curvature_per_m"
 _TIMES = ("at_us", "brake_at_us", "resume_at_us")
 
 
-DOING = "reading a scenario"
 AS_WRITTEN = 0  # the scene seed that jitters nothing
 
 

@@ -21,7 +21,6 @@ import numpy as np
 from alpasim_plugin.control.can_codec import BadFrame, Codec, Received
 from alpasim_plugin.core.errors import InputError, PolicyError
 
-DOING = "opening a CAN bus"
 HOLD_US = 200_000  # how long the last command stands in for a missing one
 RAMP_MPS3, STOP_MPS2 = 2.0, -3.0  # then the brake grows at this rate up to this deceleration
 INTERFACES = ("virtual", "socketcan", "udp_multicast")
@@ -44,7 +43,7 @@ class Address:
         """Read an address.
 
         Example:
-            >>> Address.parse("udp_multicast:239.74.163.2?map=tesla&timeout_ms=20").timeout_s
+            >>> Address.parse("udp_multicast:239.74.163.2?map=toyota&timeout_ms=20").timeout_s
             0.02
 
         Raises:
@@ -174,15 +173,14 @@ class Exchange:
         return self._commands(t_us, not waiting)
 
     def facts(self) -> dict[str, Any]:
-        """Return counts, latency and rounding, for the rollout's manifest."""
+        """Return counts and latency, for the rollout's manifest."""
         ms = np.array(self.latencies_s) * 1000
         quantiles = (
             {f"p{q}": round(float(np.percentile(ms, q)), 3) for q in (50, 95, 99)}
             if len(ms)
             else {}
         )
-        rounding = {name: one.as_dict() for name, one in self.codec.rounding.items()}
-        return {"frames": dict(self.counts), "latency_ms": quantiles, "rounding": rounding}
+        return {"frames": dict(self.counts), "latency_ms": quantiles}
 
     def _drain(self, t_us: int) -> None:
         """Take in what came after the last deadline: too late for its instant, yet the newest that

@@ -4,9 +4,8 @@ check that the database allows.
 Which message and signal of a database carries which quantity stands in a map, one YAML file beside
 a DBC.
 
-Checksums are those of the manufacturers, as opendbc documents them: Toyota's sum of identifier,
-length and data bytes; Tesla's sum of identifier and data bytes; and CRC-8 SAE J1850 over identifier
-and data. Nothing of a frame is trusted before all checks have passed.
+A checksum is CRC-8 SAE J1850 over identifier and data. Nothing of a frame is trusted before all
+checks have passed.
 """
 
 from __future__ import annotations
@@ -21,6 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from alpasim_plugin.core.config import load_yaml, validate
 from alpasim_plugin.core.errors import InputError
 
+POLYNOMIAL = 0x1D  # CRC-8 SAE J1850
+START = 0xFF
 FOLDER = Path(__file__).resolve().parents[2] / "configs" / "can"
 
 Quantity = Literal[
@@ -41,18 +42,10 @@ Quantity = Literal[
     "path_curvature_rate_1pm2",
     "path_length_m",
 ]
-ChecksumKind = Literal["crc8_j1850", "sum_toyota", "sum_tesla"]
 
 
 class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Checksum(_Part):
-    """The signal that holds a message's checksum, and how it is computed; it fills one byte."""
-
-    signal: str
-    kind: ChecksumKind
 
 
 class Content(_Part):
@@ -72,7 +65,7 @@ class Sent(_Part):
     period_us: Annotated[int, Field(gt=0)]
     signals: dict[str, Quantity | Content]
     counter: str | None = None
-    checksum: Checksum | None = None
+    checksum: str | None = None  # the signal of one byte that holds it
 
     def contents(self) -> dict[str, Content]:
         """Give every signal's content."""
@@ -92,7 +85,7 @@ class Received(_Part):
     scale: float = 1.0
     enabled: dict[str, int] = {}  # the command counts only while these signals have these values
     counter: str | None = None
-    checksum: Checksum | None = None
+    checksum: str | None = None  # the signal of one byte that holds it
 
 
 class CanMap(_Part):
@@ -111,7 +104,7 @@ def load_map(name: str, dbc: str | None = None) -> tuple[CanMap, Path]:
     """Read a map and return it with the path of its database.
 
     Args:
-        name: A shipped map (``example``, ``tesla``, ``toyota``) or a YAML file.
+        name: A shipped map (``example``, ``toyota``) or a YAML file.
         dbc: The database; by default the one that the map names, beside it.
 
     Raises:
@@ -132,62 +125,16 @@ def load_map(name: str, dbc: str | None = None) -> tuple[CanMap, Path]:
     return found, database
 
 
-DOING = "opening a CAN database"
-_POLYNOMIAL, _START = 0x1D, 0xFF  # CRC-8 SAE J1850
-
-
 class BadFrame(Exception):
     """A frame that fails a check; the text says which."""
 
 
 @dataclass
-class Rounding:
-    """What encoding did to one signal: its resolution and the error, in the signal's unit."""
-
-    resolution: float
-    unit: str
-    count: int = 0
-    worst: float = 0.0
-    squares: float = 0.0
-    saturated: int = 0
-
-    def add(self, wanted: float, carried: float, cut: bool) -> None:
-        """Take in one value; one that was cut to the signal's range counts as saturated, not as
-        rounded.
-        """
-        if cut:
-            self.saturated += 1
-            return
-        error = abs(wanted - carried)
-        self.count, self.worst, self.squares = (
-            self.count + 1,
-            max(self.worst, error),
-            self.squares + error * error,
-        )
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the numbers for a report."""
-        rms = (self.squares / self.count) ** 0.5 if self.count else None
-        return {
-            "resolution": self.resolution,
-            "unit": self.unit,
-            "worst": self.worst,
-            "rms": rms,
-            "saturated": self.saturated,
-        }
-
-
-@dataclass
 class Codec:
-    """Encodes and decodes the messages of a map.
-
-    Attributes:
-        rounding: Per ``MESSAGE.SIGNAL`` that was encoded.
-    """
+    """Encodes and decodes the messages of a map."""
 
     map: CanMap
     database: Any
-    rounding: dict[str, Rounding] = field(default_factory=dict)
     _counters: dict[str, int] = field(default_factory=dict)
 
     def message(self, name: str) -> Any:
@@ -215,7 +162,7 @@ class Codec:
         return self.pack(received.message, values, received.counter, received.checksum)
 
     def pack(
-        self, name: str, values: Mapping[str, float], counter: str | None, checksum: Checksum | None
+        self, name: str, values: Mapping[str, float], counter: str | None, checksum: str | None
     ) -> tuple[int, bytes]:
         """Return identifier and data of given signal values; signals that are not named are at
         their lowest raw value, 0 in most.
@@ -228,11 +175,11 @@ class Codec:
                 1 << length
             )
         if checksum is not None:
-            full[checksum.signal] = 0
+            full[checksum] = 0
         data = bytearray(message.encode(full, strict=False))
         if checksum is not None:
-            at = _byte_of(message, checksum.signal)
-            data[at] = checksum_of(checksum.kind, message.frame_id, bytes(data), at)
+            position = _byte_of(message, checksum)
+            data[position] = checksum_of(message.frame_id, bytes(data), position)
         return message.frame_id, bytes(data)
 
     def decode(self, received: Received, data: bytes) -> tuple[float, int | None]:
@@ -260,20 +207,13 @@ class Codec:
         )
 
     def _carried(self, message: str, name: str, wanted: float) -> float:
-        """Return the value that a signal can hold nearest to the wanted one, and keep account of
-        the difference.
-        """
+        """Return the value that a signal can hold nearest to the wanted one."""
         signal = self.message(message).get_signal_by_name(name)
         low, high = _range(signal)
         held = min(max(wanted, low), high)
         raw = round((held - signal.offset) / signal.scale)
         first, last = _raw_range(signal)
-        carried = float(min(max(raw, first), last) * signal.scale + signal.offset)
-        account = self.rounding.setdefault(
-            f"{message}.{name}", Rounding(float(signal.scale), signal.unit or "")
-        )
-        account.add(wanted, carried, held != wanted)
-        return carried
+        return float(min(max(raw, first), last) * signal.scale + signal.offset)
 
 
 def open_codec(can_map: CanMap, database: Path) -> Codec:
@@ -306,11 +246,7 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
     ]
     for part in parts:
         signals = list(part.signals) if isinstance(part, Sent) else [part.signal, *part.enabled]
-        signals += [
-            name
-            for name in (part.counter, part.checksum.signal if part.checksum else None)
-            if name is not None
-        ]
+        signals += [name for name in (part.counter, part.checksum) if name is not None]
         try:
             message = codec.message(part.message)
             for name in signals:
@@ -323,7 +259,7 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
     return codec
 
 
-def checked_values(message: Any, data: bytes, checksum: Checksum | None) -> dict[str, float]:
+def checked_values(message: Any, data: bytes, checksum: str | None) -> dict[str, float]:
     """Return the signals of a frame.
 
     Raises:
@@ -332,10 +268,10 @@ def checked_values(message: Any, data: bytes, checksum: Checksum | None) -> dict
     if len(data) != message.length:
         raise BadFrame(f"{len(data)} bytes, not {message.length}")
     if checksum is not None:
-        at = _byte_of(message, checksum.signal)
-        wanted = checksum_of(checksum.kind, message.frame_id, data, at)
-        if data[at] != wanted:
-            raise BadFrame(f"checksum {data[at]:#04x}, not {wanted:#04x}")
+        position = _byte_of(message, checksum)
+        wanted = checksum_of(message.frame_id, data, position)
+        if data[position] != wanted:
+            raise BadFrame(f"checksum {data[position]:#04x}, not {wanted:#04x}")
     try:
         values: dict[str, float] = message.decode(data, decode_choices=False)
     except Exception as error:  # the decoder raises errors of many kinds
@@ -343,24 +279,13 @@ def checked_values(message: Any, data: bytes, checksum: Checksum | None) -> dict
     return values
 
 
-def checksum_of(kind: ChecksumKind, frame_id: int, data: bytes, at: int) -> int:
-    """Return the checksum of a frame whose byte ``at`` holds it.
-
-    Example:
-        >>> checksum_of("sum_toyota", 0x25, bytes([0, 1, 0, 0, 0, 0, 0, 0]), 7)  # 1 + 0x25 + a length of 8
-        46
-    """
-    rest = data[:at] + data[at + 1 :]
-    low, high = frame_id & 0xFF, frame_id >> 8
-    if kind == "sum_toyota":
-        return (low + high + len(data) + sum(rest)) & 0xFF
-    if kind == "sum_tesla":
-        return (low + high + sum(rest)) & 0xFF
-    crc = _START
-    for byte in bytes([low, high & 0xFF]) + rest:
+def checksum_of(frame_id: int, data: bytes, position: int) -> int:
+    """Return the checksum of a frame whose byte ``position`` holds it."""
+    crc = START
+    for byte in frame_id.to_bytes(4, "little")[:2] + data[:position] + data[position + 1 :]:
         crc ^= byte
         for _ in range(8):
-            crc = ((crc << 1) ^ _POLYNOMIAL if crc & 0x80 else crc << 1) & 0xFF
+            crc = ((crc << 1) ^ POLYNOMIAL if crc & 0x80 else crc << 1) & 0xFF
     return crc ^ 0xFF
 
 

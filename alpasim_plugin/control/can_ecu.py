@@ -93,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument(
         "address",
-        help="as after can://, such as udp_multicast:239.74.163.2 or socketcan:vcan0?map=tesla&dbc=FILE",
+        help="as after can://, such as udp_multicast:239.74.163.2 or socketcan:vcan0?map=MAP.yaml&dbc=FILE",
     )
     address = Address.parse(parser.parse_args(arguments).address)
     unit = LaneKeeper(open_codec(*load_map(address.map, address.dbc)))

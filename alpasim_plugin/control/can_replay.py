@@ -26,7 +26,6 @@ from alpasim_plugin.control.can_codec import BadFrame, Codec, checked_values, lo
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import check_regular, parsing
 
-DOING = "reading a recorded drive"
 ECHOES = 128  # buses from here on repeat what the recording device sent
 
 

@@ -1,8 +1,8 @@
 """Follow a plan: exactly, or with a vehicle that has limits (preview steering, preview speed,
 kinematic bicycle).
 
-What all controllers share stands first: the checks on a plan, and the move from a world pose to the
-plane and back.
+What all controllers share stands first: the move from a world pose to the plane and back. Plans are
+checked where they come from (`core.plan_check`).
 
 Steering minimises, over the next 20 nodes of the path, ``sum of lateral error^2 + rho * steer
 rate^2`` for the bicycle itself (not for a linear model of it), by Gauss-Newton. The nodes are
@@ -23,35 +23,12 @@ from functools import cached_property
 import numpy as np
 
 from alpasim_plugin.control.bicycle import BicycleState, Command, step
-from alpasim_plugin.core.errors import InputError, PolicyError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, se2, wrap_angle, yaw_from_quat, yaw_of
 from alpasim_plugin.core.interfaces import Controller
 from alpasim_plugin.core.types import F64, EgoState, Trajectory, Vehicle
 
 GENTLE_BRAKE_MPS2 = 2.0  # what a vehicle without a plan does
-
-
-def check_plan(plan: Trajectory) -> None:
-    """Raise PolicyError unless the plan has a pose, finite values, and strictly increasing
-    times.
-    """
-    found = ""
-    if len(plan) == 0 or plan.xyz.shape != (len(plan), 3) or plan.quat.shape != (len(plan), 4):
-        found = f"shapes t {plan.t_us.shape}, xyz {plan.xyz.shape}, quat {plan.quat.shape}"
-    elif (bad := ~np.isfinite(plan.xyz).all(axis=1)).any():
-        row = int(np.argmax(bad))
-        found = f"position {plan.xyz[row].tolist()} in row {row}"
-    elif (bad := ~np.isfinite(plan.quat).all(axis=1)).any():
-        row = int(np.argmax(bad))
-        found = f"rotation {plan.quat[row].tolist()} in row {row}"
-    elif (bad := np.diff(plan.t_us) <= 0).any():
-        row = int(np.argmax(bad))
-        found = f"times {int(plan.t_us[row])} and then {int(plan.t_us[row + 1])} us in rows {row} and {row + 1}"
-    if found:
-        raise PolicyError(
-            f"a plan of {len(plan)} poses: {found}",
-            "make the policy return at least one finite pose and strictly increasing times; `check_policy` finds such faults",
-        )
 
 
 def check_interval(state: EgoState, to_us: int) -> float:
@@ -105,7 +82,6 @@ class PerfectController(Controller):
         if plan is None:
             return coast_to_stop(state, to_us, self.vehicle)
         dt_s = check_interval(state, to_us)
-        check_plan(plan)
         at_us = min(max(to_us, int(plan.t_us[0])), int(plan.t_us[-1]))
         pose = interpolate(plan, at_us)
         moved = pose[:2, 3] - state.T_world_rig[:2, 3]
@@ -253,7 +229,6 @@ class PlanTracker(Controller):
         if plan is None:
             return coast_to_stop(state, to_us, self.vehicle)
         dt_s = check_interval(state, to_us)
-        check_plan(plan)
         origin = state.T_world_rig[:2, 3]
         reference = build_reference_path(plan, state.t_us, origin)
         before = planar(state)

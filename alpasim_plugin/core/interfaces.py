@@ -215,7 +215,6 @@ class Controller(Protocol):
             to_us: When to arrive; later than ``state.t_us``.
 
         Raises:
-            PolicyError: The plan is empty, not finite, or its times do not increase.
             InputError: ``to_us`` is not later than ``state.t_us``.
         """
 

@@ -76,9 +76,7 @@ NOTHING = quantities(BicycleState(0, 0, 0, 10.0, 0.0), 0.0, 0.0, np.zeros((0, 3)
 def test_checksums_by_hand() -> None:
     # CRC-8 SAE J1850 of the text 123456789 is 4B in the published catalogue; here identifier 0x3231
     # is its first two bytes.
-    assert checksum_of("crc8_j1850", 0x3231, b"3456789\0", 7) == 0x4B
-    assert checksum_of("sum_tesla", 0x488, bytes([1, 2, 0, 0]), 3) == (0x88 + 4 + 3) & 0xFF
-    assert checksum_of("sum_toyota", 0x25, bytes(8), 7) == 0x2D
+    assert checksum_of(0x3231, b"3456789\0", 7) == 0x4B
 
 
 def test_a_real_drive_decodes_to_what_its_publisher_states(shared_data: Path) -> None:
@@ -90,7 +88,7 @@ def test_a_real_drive_decodes_to_what_its_publisher_states(shared_data: Path) ->
         "WHEEL_SPEEDS": 3313,
         "KINEMATICS": 3314,
         "SPEED": 1657,
-    }  # no checksum fails
+    }
     stated = shared_data / "comma2k19" / "processed_log" / "CAN"
     np.testing.assert_array_equal(
         series["steering_wheel_deg"][1], np.load(stated / "steering_angle" / "value.npy").ravel()
@@ -121,45 +119,20 @@ def test_a_real_drive_replays_as_bus_traffic(
     assert len(heard) == count > 500
 
 
-@pytest.mark.parametrize(
-    ("name", "dbc"),
-    [("toyota", "_toyota_2017.dbc"), ("tesla", "tesla_model3_party.dbc"), ("example", None)],
-)
-def test_rounding_stays_within_half_a_step_of_the_signal(
-    name: str, dbc: str | None, request: pytest.FixtureRequest
-) -> None:
-    path = None if dbc is None else str(request.getfixturevalue("shared_data") / "opendbc" / dbc)
-    codec = open_codec(*load_map(name, path))
-    route = np.column_stack(
-        [np.linspace(0, 40, 20), 0.002 * np.linspace(0, 40, 20) ** 2, np.zeros(20)]
-    )
-    for i in range(200):
-        state = BicycleState(0.0, 0.0, 0.0, 0.1 + 0.113 * i, 0.05 * np.sin(i / 7))
-        for sent in codec.map.send:
-            frame_id, data = codec.encode(
-                sent, quantities(state, 0.01, 0.3, route, codec.map.steering_ratio, Vehicle())
-            )
-            assert (frame_id, len(data)) == (
-                codec.message(sent.message).frame_id,
-                codec.message(sent.message).length,
-            )
-    for signal, one in codec.rounding.items():
-        # 1.5 degrees from step to step of the coarse signal, and a fine one that reaches 0.7 either
-        # way: 0.05 are out of reach.
-        assert one.saturated <= (20 if signal.endswith("STEER_FRACTION") else 0), signal
-        assert one.worst <= one.resolution * (0.5 + 1e-6), signal
-        assert one.count + one.saturated == 200
-
-
-def test_a_value_beyond_the_signal_is_cut_and_counted(codec: Codec) -> None:
-    codec.encode(codec.map.send[0], NOTHING | {"speed_kph": 500.0})
-    assert codec.rounding["EGO_MOTION.SPEED"].saturated == 1
+def test_a_signal_carries_the_nearest_value_that_it_can_hold(codec: Codec) -> None:
+    message = codec.message("EGO_MOTION")
+    step = float(message.get_signal_by_name("SPEED").scale)
+    for speed_kph in np.linspace(0.1, 120.0, 50):
+        _, data = codec.encode(codec.map.send[0], NOTHING | {"speed_kph": speed_kph})
+        assert abs(message.decode(data)["SPEED"] - speed_kph) <= step * (0.5 + 1e-6)
+    _, data = codec.encode(codec.map.send[0], NOTHING | {"speed_kph": 1e6})
+    assert message.decode(data)["SPEED"] < 1000.0
 
 
 def test_databases_that_do_not_fit_are_refused(shared_data: Path, tmp_path: Path) -> None:
     folder = shared_data / "opendbc"
-    with pytest.raises(InputError, match="no 'DI_speed'"):
-        open_codec(*load_map("tesla", str(folder / "comma_body.dbc")))
+    with pytest.raises(InputError, match="KINEMATICS"):
+        open_codec(*load_map("toyota", str(folder / "comma_body.dbc")))
     with pytest.raises(
         InputError, match=r"1073808953|40140639|frame id"
     ):  # a pseudo message with an impossible identifier
@@ -167,10 +140,10 @@ def test_databases_that_do_not_fit_are_refused(shared_data: Path, tmp_path: Path
     (tmp_path / "no.dbc").write_text("not a database")
     with pytest.raises(InputError, match="repair the database"):
         open_codec(*load_map("example", str(tmp_path / "no.dbc")))
-    with pytest.raises(InputError, match="known: example, tesla, toyota"):
+    with pytest.raises(InputError, match="known: example, toyota"):
         load_map("volvo")
     with pytest.raises(InputError, match="dbc=FILE"):
-        load_map("tesla")
+        load_map("toyota")
 
 
 @pytest.mark.parametrize(

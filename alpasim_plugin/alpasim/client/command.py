@@ -29,7 +29,6 @@ from alpasim_plugin.core.types import Scenario
 
 MAX_PATH = 100  # of a socket file; the system's own limit is 104 (macOS) or 108 (Linux)
 LOOPBACK = "127.0.0.1"
-DOING = "starting a policy's command"
 VARIABLE = "SIMRUN_POLICY_ADDRESS"
 READY_S = 120.0  # a container starts, a network is loaded
 POLL_S = 0.02

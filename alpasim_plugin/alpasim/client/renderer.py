@@ -19,7 +19,6 @@ from alpasim_plugin.log.schema import wire_render_request
 from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
 
 OPTIONS = ("scene", "cameras", "encoding")
-DOING = "asking a renderer service"
 
 
 class NreRenderer(Renderer):

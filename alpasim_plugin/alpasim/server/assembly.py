@@ -31,7 +31,6 @@ from alpasim_plugin.core.parts.spec import digest, file_digest
 from alpasim_plugin.log.wire import api_version, common_pb2
 from alpasim_plugin.log.wire.services import OPTIONS, Stub
 
-DOING = "setting up a renderer service"
 RECONNECT = (
     ("grpc.min_reconnect_backoff_ms", 200),
     ("grpc.initial_reconnect_backoff_ms", 200),

@@ -28,7 +28,6 @@ from alpasim_plugin.runs.guards import checked_frames
 from scenarios.load import load_scenario
 from scenarios.usdz import usdz_scene_id
 
-DOING = "looking for a scene"
 FILES = (".usdz", ".yaml", ".yml", ".xml")
 
 

@@ -48,7 +48,6 @@ from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import increasing_times, read_poses, read_transform, wire_trajectory
 from alpasim_plugin.log.wire import api_version, common_pb2, egodriver_pb2, sensorsim_pb2
 
-DOING = "driving for AlpaSim"
 ADDRESS = "SIMRUN_POLICY_ADDRESS"
 ROUTE_POINTS = 20
 # AlpaSim sends zero speeds until it hands over; faster motion than this is believed against them

@@ -6,7 +6,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from functools import wraps
+from typing import Any
 
 import grpc
 import numpy as np
@@ -14,21 +15,46 @@ import numpy as np
 from alpasim_plugin.alpasim.server.caches import SceneCache, advertised
 from alpasim_plugin.alpasim.server.frames import FrameServer
 from alpasim_plugin.alpasim.server.sources import LocalSource
-from alpasim_plugin.alpasim.server.status import CallTime, Failures, answering
+from alpasim_plugin.alpasim.server.status import CallTime, Failures, Unimplemented, answering
 from alpasim_plugin.alpasim.server.views import read_view
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec
 from alpasim_plugin.log.schema import wire_trajectory
 from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
 
-DOING = "serving AlpaSim's renderer service"
 SCAN_PX = 900, 604  # of a picture of a quarter of the horizon: 0.13 degrees a pixel in its middle
 SCAN_MOST_M = 200.0
 ONE_SURFACE = 0.05  # neighbouring depths that differ by a smaller share are of one surface,
 # as are those whose step is at most so many times the smaller one beside it: a plane far away has
 # even steps
 EVEN_STEP = 1.5
-T = TypeVar("T")
+
+
+Call = Callable[[Any, Any, Any], Any]
+
+
+def forwarded(call: Call) -> Call:
+    """Let the upstream answer a call where there is one."""
+
+    @wraps(call)
+    def answer(service: Sensorsim, request: Any, context: Any) -> Any:
+        if service.upstream is not None:
+            return service.forward(call.__name__, request, context)
+        return call(service, request, context)
+
+    return answer
+
+
+def forwarded_verbatim(call: Call) -> Call:
+    """Let the upstream answer a call where its images are handed on as they are."""
+
+    @wraps(call)
+    def answer(service: Sensorsim, request: Any, context: Any) -> Any:
+        if service.verbatim:
+            return service.forward(call.__name__, request, context)
+        return call(service, request, context)
+
+    return answer
 
 
 class Sensorsim(Failures):
@@ -52,25 +78,27 @@ class Sensorsim(Failures):
         verbatim: bool = False,
     ) -> None:
         super().__init__()
-        self.frames, self._version, self._scenes, self._upstream, self._verbatim = (
-            frames,
-            version,
-            scenes,
-            upstream,
-            verbatim,
-        )
+        self.frames = frames
+        self._version = version
+        self._scenes = scenes
+        self.upstream = upstream
+        self.verbatim = verbatim
+
+    def forward(self, name: str, request: Any, context: Any) -> Any:
+        """Hand a call on to the upstream and return its answer."""
+        return getattr(self.upstream, name)(request, timeout=CallTime(context).left_s())
 
     @answering
+    @forwarded_verbatim
     def render_rgb(
         self, request: sensorsim_pb2.RGBRenderRequest, context: Any
     ) -> sensorsim_pb2.RGBRenderReturn:
         """Render one frame."""
         left = CallTime(context)
-        if self._verbatim:
-            return self._pass("render_rgb", request, context, sensorsim_pb2.RGBRenderReturn)
         return sensorsim_pb2.RGBRenderReturn(image_bytes=self.frames.answers([request], left)[0])
 
     @answering
+    @forwarded_verbatim
     def batch_render_rgb(
         self, request: sensorsim_pb2.BatchRGBRenderRequest, context: Any
     ) -> sensorsim_pb2.BatchRGBRenderReturn:
@@ -79,10 +107,6 @@ class Sensorsim(Failures):
         names = [item.camera_name for item in request.items]
         if len(set(names)) < len(names):
             raise InputError(f"a batch of {names}: a camera name twice", "send one item a camera")
-        if self._verbatim:
-            return self._pass(
-                "batch_render_rgb", request, context, sensorsim_pb2.BatchRGBRenderReturn
-            )
         images = self.frames.answers([item.request for item in request.items], left)
         item, result = sensorsim_pb2.BatchRGBRenderReturnItem, sensorsim_pb2.RGBRenderReturn
         made = [
@@ -92,6 +116,7 @@ class Sensorsim(Failures):
         return sensorsim_pb2.BatchRGBRenderReturn(items=made)
 
     @answering
+    @forwarded_verbatim
     def render_aggregated(
         self, request: sensorsim_pb2.AggregatedRenderRequest, context: Any
     ) -> sensorsim_pb2.AggregatedRenderReturn:
@@ -99,18 +124,12 @@ class Sensorsim(Failures):
         driver are handed on.
         """
         left = CallTime(context)
-        if self._verbatim:
-            return self._pass(
-                "render_aggregated", request, context, sensorsim_pb2.AggregatedRenderReturn
-            )
-        if self._upstream is None:
+        if self.upstream is None:
             scans = [self._scan(one, left) for one in request.lidar_requests]
             return sensorsim_pb2.AggregatedRenderReturn(
                 rgb_returns=self._returns(request, left), lidar_returns=scans
             )
-        reply = self._pass(
-            "render_aggregated", request, context, sensorsim_pb2.AggregatedRenderReturn
-        )
+        reply = self.forward("render_aggregated", request, context)
         if request.rgb_requests:
             del reply.rgb_returns[:]
             reply.rgb_returns.extend(self._returns(request, left))
@@ -125,13 +144,12 @@ class Sensorsim(Failures):
         ]
 
     @answering
+    @forwarded
     def render_lidar(
         self, request: sensorsim_pb2.LidarRenderRequest, context: Any
     ) -> sensorsim_pb2.LidarRenderReturn:
         """Return a lidar's points: from the depth of our renderer, or as the upstream answers."""
-        if self._upstream is None:
-            return self._scan(request, CallTime(context))
-        return self._pass("render_lidar", request, context, sensorsim_pb2.LidarRenderReturn)
+        return self._scan(request, CallTime(context))
 
     def _scan(
         self, request: sensorsim_pb2.LidarRenderRequest, left: CallTime
@@ -139,7 +157,10 @@ class Sensorsim(Failures):
         if request.lidar_config.lidar_type not in LIDARS or not isinstance(
             self.frames.source, LocalSource
         ):
-            raise NotHere(f"lidar of type {request.lidar_config.lidar_type}")
+            raise Unimplemented(
+                f"a lidar of type {request.lidar_config.lidar_type}",
+                "use --upstream with a server that has it",
+            )
         lidar = LIDARS[request.lidar_config.lidar_type]
         cameras = lidar.cameras()
         view = read_view(
@@ -156,7 +177,9 @@ class Sensorsim(Failures):
         frames = self.frames.source.scan(view, cameras, left)
         depths = [frame.depth for frame in frames if frame.depth is not None]
         if len(depths) < len(frames):
-            raise NotHere("lidar of a renderer without depth")
+            raise Unimplemented(
+                "a lidar of a renderer without depth", "use --upstream with a server that has it"
+            )
         xyz, brightness = points_of(lidar.rays(), cameras, depths, [frame.rgb for frame in frames])
         return sensorsim_pb2.LidarRenderReturn(
             num_points=len(xyz),
@@ -168,9 +191,7 @@ class Sensorsim(Failures):
     def get_version(self, request: common_pb2.Empty, context: Any) -> common_pb2.VersionId:
         """Return the triple."""
         return self._version(
-            None
-            if self._upstream is None
-            else self._pass("get_version", request, context, common_pb2.VersionId)
+            None if self.upstream is None else self.forward("get_version", request, context)
         )
 
     @answering
@@ -180,13 +201,10 @@ class Sensorsim(Failures):
         """Return the scene ids: those of ``--scenes``, and only those that the upstream has as
         well.
         """
-        if self._upstream is None:
-            assert self._scenes is not None
-            return common_pb2.AvailableScenesReturn(scene_ids=self._scenes.ids)
-        theirs = self._pass(
-            "get_available_scenes", request, context, common_pb2.AvailableScenesReturn
-        )
-        if self._scenes is None or self._verbatim:
+        if self.upstream is None:
+            return common_pb2.AvailableScenesReturn(scene_ids=self._own_scenes.ids)
+        theirs = self.forward("get_available_scenes", request, context)
+        if self._scenes is None or self.verbatim:
             return theirs
         known = set(theirs.scene_ids)
         return common_pb2.AvailableScenesReturn(
@@ -194,22 +212,18 @@ class Sensorsim(Failures):
         )
 
     @answering
+    @forwarded
     def get_loaded_scenes(
         self, request: common_pb2.Empty, context: Any
     ) -> sensorsim_pb2.LoadedScenesReturn:
         """Return the scenes in memory; each serves any number of rollouts."""
-        if self._upstream is not None:
-            return self._pass(
-                "get_loaded_scenes", request, context, sensorsim_pb2.LoadedScenesReturn
-            )
-        assert self._scenes is not None
         entry = sensorsim_pb2.LoadedSceneEntry
         scenes = [
             entry(scene_id=name, loaded_instance_count=1, reusable_instance_count=1)
-            for name in self._scenes.loaded
+            for name in self._own_scenes.loaded
         ]
         return sensorsim_pb2.LoadedScenesReturn(
-            scenes=scenes, loaded_instance_capacity=self._scenes.kept
+            scenes=scenes, loaded_instance_capacity=self._own_scenes.kept
         )
 
     @answering
@@ -221,41 +235,30 @@ class Sensorsim(Failures):
         """
         if self._scenes is not None:
             self._scenes.get(request.scene_id, CallTime(context))
-        if self._upstream is not None:
+        if self.upstream is not None:
             try:
-                self._upstream.prefetch_scene(request, timeout=CallTime(context).left_s())
+                self.forward("prefetch_scene", request, context)
             except grpc.RpcError as error:
                 if error.code() != grpc.StatusCode.UNIMPLEMENTED:
                     raise
         return common_pb2.Empty()
 
     @answering
+    @forwarded
     def get_available_cameras(
         self, request: sensorsim_pb2.AvailableCamerasRequest, context: Any
     ) -> sensorsim_pb2.AvailableCamerasReturn:
         """Return a scene's cameras."""
-        if self._upstream is not None:
-            return self._pass(
-                "get_available_cameras", request, context, sensorsim_pb2.AvailableCamerasReturn
-            )
-        assert self._scenes is not None
-        entry = self._scenes.get(request.scene_id, CallTime(context))
+        entry = self._own_scenes.get(request.scene_id, CallTime(context))
         return sensorsim_pb2.AvailableCamerasReturn(available_cameras=advertised(entry.scenario))
 
     @answering
+    @forwarded
     def get_available_trajectories(
         self, request: sensorsim_pb2.AvailableTrajectoriesRequest, context: Any
     ) -> sensorsim_pb2.AvailableTrajectoriesReturn:
         """Return a scene's recorded ego path, local to rig."""
-        if self._upstream is not None:
-            return self._pass(
-                "get_available_trajectories",
-                request,
-                context,
-                sensorsim_pb2.AvailableTrajectoriesReturn,
-            )
-        assert self._scenes is not None
-        entry = self._scenes.get(request.scene_id, CallTime(context))
+        entry = self._own_scenes.get(request.scene_id, CallTime(context))
         recorded = wire_trajectory(
             entry.scenario.ego_log, f"recorded path of scene {request.scene_id!r}"
         )
@@ -263,22 +266,17 @@ class Sensorsim(Failures):
         return sensorsim_pb2.AvailableTrajectoriesReturn(available_trajectories=[listed])
 
     @answering
+    @forwarded
     def get_available_ego_masks(
         self, request: common_pb2.Empty, context: Any
     ) -> sensorsim_pb2.AvailableEgoMasksReturn:
         """Return the ego masks: the upstream's; our own renderer shows no part of the ego."""
-        if self._upstream is not None:
-            return self._pass(
-                "get_available_ego_masks", request, context, sensorsim_pb2.AvailableEgoMasksReturn
-            )
         return sensorsim_pb2.AvailableEgoMasksReturn()
 
-    def _pass(self, name: str, request: Any, context: Any, reply: type[T]) -> T:
-        if self._upstream is None:
-            raise NotHere(name)
-        given = getattr(self._upstream, name)(request, timeout=CallTime(context).left_s())
-        assert isinstance(given, reply), "a stub parses what its method returns"
-        return given
+    @property
+    def _own_scenes(self) -> SceneCache:
+        assert self._scenes is not None, "a server without an upstream has scenes"
+        return self._scenes
 
 
 @dataclass(frozen=True)
@@ -384,19 +382,3 @@ def _is_one_surface(inverse: F64) -> Bool:
     beside = np.pad(step, ((1, 1), (0, 0)), constant_values=np.nan)
     alike = step <= ONE_SURFACE * np.fmax(inverse[1:], inverse[:-1])
     return np.asarray(alike | (step <= EVEN_STEP * np.fmin(beside[:-2], beside[2:])))
-
-
-class NotHere(grpc.RpcError):  # type: ignore[misc]  # grpc has no types
-    """A call that only an upstream can answer."""
-
-    def __init__(self, what: str) -> None:
-        super().__init__(what)
-        self._what = what
-
-    def code(self) -> Any:
-        """Return UNIMPLEMENTED."""
-        return grpc.StatusCode.UNIMPLEMENTED
-
-    def details(self) -> str:
-        """Say what is missing."""
-        return f"{self._what} needs an --upstream that has it"

@@ -44,7 +44,6 @@ NEAR_M, FAR_M = (
     3.0,
 )  # distance from the recorded path where trust begins to fall, and where it has fallen
 FAR = 0.6  # above 0.5: a hole is never invented
-DOING = "rendering a requested frame"
 MAP_OFF = "map-off"
 log = logging.getLogger("simrun.serve")
 MOST_NAMES = 4096  # scenes and cameras of an upstream that are remembered

@@ -42,8 +42,21 @@ class UpstreamFault(InfrastructureError):
     """The upstream sent something unusable; another attempt may go well."""
 
 
+class Unimplemented(InputError):
+    """A call that only an upstream can answer."""
+
+
 class Late(Exception):
     """The caller is gone, or its time is over."""
+
+
+STATUSES: tuple[tuple[type[SimrunError], Any], ...] = (
+    (UnknownScene, Code.NOT_FOUND),
+    (Unimplemented, Code.UNIMPLEMENTED),
+    (Full, Code.RESOURCE_EXHAUSTED),
+    (UpstreamFault, Code.UNAVAILABLE),
+    (InputError, Code.INVALID_ARGUMENT),
+)
 
 
 class CallTime:
@@ -102,22 +115,10 @@ def status_of(error: Exception) -> tuple[Any, str]:
         ), f"upstream: {code.name}: {text}"
     if isinstance(error, Late):
         return Code.CANCELLED, str(error)
-    if isinstance(error, UnknownScene):
-        return Code.NOT_FOUND, one_line(error)
-    if isinstance(error, Full):
-        return Code.RESOURCE_EXHAUSTED, one_line(error)
-    if isinstance(error, UpstreamFault):
-        return Code.UNAVAILABLE, one_line(error)
-    if isinstance(error, InputError):
-        return Code.INVALID_ARGUMENT, one_line(error)
     if isinstance(error, SimrunError):
-        return Code.INTERNAL, one_line(error)
+        code = next((code for kind, code in STATUSES if isinstance(error, kind)), Code.INTERNAL)
+        return code, f"{error.message}; {error.hint}"
     return Code.INTERNAL, f"{type(error).__name__}: {error}"
-
-
-def one_line(error: SimrunError) -> str:
-    """Return an error's four parts in one line."""
-    return f"{error.message}; {error.hint}"
 
 
 def answering(call: Callable[[Any, Any, Any], Any]) -> Callable[[Any, Any, Any], Any]:

@@ -24,7 +24,6 @@ from alpasim_plugin.core.geometry import se3
 from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec, Frame
 from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
 
-DOING = "reading a render request"
 QUAT_NORM_TOLERANCE = 1e-4  # of the squared norm, as AlpaSim checks it
 MAX_SIDE_PX, MAX_PIXELS = 8192, 1 << 24
 MAX_TIME_US = 2**62
