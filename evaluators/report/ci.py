@@ -41,7 +41,9 @@ MARKS = {
     "infrastructure": "error",
     "evaluator": "error",
 }
-INTERVAL_NOTE = "a to b is the 95 % interval with scenes as clusters."
+INTERVAL_NOTE = "a to b is the 95 % interval with scenes as clusters"
+SPEED_COLUMNS = ("ms per frame, mean", "95th percentile", "frames/s", "first frame, ms")
+CHECK_FACTS = ("diff", "ci95", "interval", "margin", "mean", "max", "min", "n_scenes")
 
 
 def write_summary_md(run_dir: Path | str | Run) -> Path:
@@ -63,88 +65,82 @@ def summary_md(run: Run) -> str:
     finding = find(run)
     parts = [f"## {escape(finding.head)}\n"]
     if len(finding.outcomes) > 1:
-        parts += [
-            f"- **{escape(name)}**: {escape(text)}\n" for name, text in finding.outcomes[LEADING:]
-        ]
-        parts += [f"\n**{escape(finding.title)}**\n\n"]
+        more = finding.outcomes[LEADING:]
+        parts += [f"- **{escape(name)}**: {escape(text)}\n" for name, text in more]
+        parts.append(f"\n**{escape(finding.title)}**\n\n")
     parts += [f"- **{escape(finding.name_of(p))}**: {escape(p.text)}\n" for p in finding.points]
     parts += [f"> {escape(caution)}\n" for caution in finding.cautions]
-    rows = tables.metric_rows(run.summary, run.invalid_reasons, run.table)
-    if rows:
-        head = [
+    preset = str(run.summary.get("preset"))
+    parts += _section(
+        f"Results, preset {escape(preset)}",
+        [
             "metric",
             *(
                 f"{c.variant} ({plural(c.n_rollouts, 'rollout')}, {plural(c.n_scenes, 'scene')})"
                 for c in tables.columns(run)
             ),
-        ]
-        body = [
-            [metric_label(r.name, r.unit, r.arrow), *(cell_text(c) for c in r.cells)] for r in rows
-        ]
-        preset = str(run.summary.get("preset"))
-        note = INTERVAL_NOTE + (f" Contact {said[8:]}." if (said := contact_note(preset)) else "")
-        parts.append(f"\n### Results, preset {escape(preset)}\n\n{table(head, body)}\n{note}\n")
+        ],
+        [
+            [metric_label(row.name, row.unit, row.arrow), *map(cell_text, row.cells)]
+            for row in tables.metric_rows(run.summary, run.invalid_reasons, run.table)
+        ],
+        ". ".join(filter(None, (INTERVAL_NOTE, contact_note(preset)))) + ".",
+    )
     pairs = tables.pair_rows(run.summary, run.table)
-    if pairs:
-        head = ["renderer", "metric", "difference", "95 % interval", "p", "verdict"]
-        for base in dict.fromkeys(p.baseline for p in pairs):
-            body = [
+    for base in dict.fromkeys(pair.baseline for pair in pairs):
+        parts += _section(
+            f"Paired differences from {escape(base)}",
+            ["renderer", "metric", "difference", "95 % interval", "p", "verdict"],
+            [
                 [p.variant, p.metric, p.diff.text, p.interval.text, p.p_value.text, p.verdict]
                 for p in pairs
                 if p.baseline == base
-            ]
-            parts.append(f"\n### Paired differences from {escape(base)}\n\n{table(head, body)}")
-    fixed = fixer_rows(run.summary)
-    if fixed:
-        head = ["renderer", *(name for name, _ in COLUMNS)]
-        parts.append(
-            f"\n### Fixers\n\n{table(head, [[row.renderer, *(c.text for c in row.cells)] for row in fixed])}"
+            ],
         )
+    parts += _section(
+        "Fixers",
+        ["renderer", *(name for name, _ in COLUMNS)],
+        [[row["renderer"], *_texts(row["cells"])] for row in fixer_rows(run.summary)],
+    )
     times = speed(run)
-    if times.rows:
-        head = [
-            "renderer",
-            "ms per frame, median",
-            "95th percentile",
-            "frames/s",
-            "first frame, ms",
-            *times.stages,
-        ]
-        body = [
-            [r.renderer, *(c.text for c in r.cells), *(c.text for c in r.stages)]
-            for r in times.rows
-        ]
-        parts.append(
-            f"\n### Speed\n\n{table(head, body)}"
-            + (f"{escape(times.pool)}\n" if times.pool else "")
-        )
-    removed = ledger(run, LEDGER_RATES)
-    if removed:
-        head = ["renderer", *(name for _, name, _ in LEDGER_COLUMNS), *LEDGER_RATES]
-        body = []
-        for r in removed:
-            counts = [
-                f"{c.text} ({c.note})" if c.note and c.text != "0" else c.text for c in r.counts
-            ]
-            body.append([r.renderer, *counts, *(c.text for c in r.bounds)])
-        parts.append(f"\n### What the numbers leave out\n\n{table(head, body)}\n{LEDGER_NOTE}\n")
-    failures, more = failure_rows(run)
-    if failures:
-        head = ["class", "renderer", "policy", "scene", "seed", "what happened"]
-        body = []
-        for failure in failures:
-            one = failure.rollout
-            what = "; ".join(f"{label}: {text}" for label, text in failure.parts)
-            body.append(
-                [one.failure_class, one.renderer, one.policy, one.scene, str(one.seed), what]
-            )
-        parts.append(
-            f"\n### Failures\n\n{table(head, body)}"
-            + (f"{more} more in rollouts.parquet.\n" if more else "")
-        )
-    command = provenance(run).command
-    parts.append(f"\n### Made with\n\n```\n{terminal(command).replace('```', '')}\n```\n")
-    return "".join(parts)
+    parts += _section(
+        "Speed",
+        ["renderer", *SPEED_COLUMNS, *times.stages],
+        [[row["renderer"], *_texts(row["cells"]), *_texts(row["stages"])] for row in times.rows],
+        escape(times.pool),
+    )
+    parts += _section(
+        "What the numbers leave out",
+        ["renderer", *(name for _, name, _ in LEDGER_COLUMNS), *LEDGER_RATES],
+        [
+            [row["renderer"], *map(cell_text, row["counts"]), *_texts(row["bounds"])]
+            for row in ledger(run, LEDGER_RATES)
+        ],
+        LEDGER_NOTE,
+    )
+    failures, n_more = failure_rows(run)
+    body = []
+    for failure in failures:
+        one = failure["rollout"]
+        text = "; ".join(f"{label}: {text}" for label, text in failure["parts"])
+        body.append([one.failure_class, one.renderer, one.policy, one.scene, str(one.seed), text])
+    parts += _section(
+        "Failures",
+        ["class", "renderer", "policy", "scene", "seed", "what happened"],
+        body,
+        f"{n_more} more in rollouts.parquet." if n_more else "",
+    )
+    command = terminal(provenance(run)["command"]).replace("```", "")
+    return "".join([*parts, f"\n### Made with\n\n```\n{command}\n```\n"])
+
+
+def _section(title: str, head: list[str], rows: list[list[str]], note: str = "") -> list[str]:
+    """Render a heading with its table; nothing without rows."""
+    return [f"\n### {title}\n\n{table(head, rows)}", f"\n{note}\n" if note else ""] if rows else []
+
+
+def _texts(cells: Iterable[Cell]) -> list[str]:
+    return [cell.text for cell in cells]
 
 
 def table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
@@ -205,24 +201,20 @@ def junit(run: Run, outcomes_fail: bool = True) -> ET.Element:
 
     Args:
         run: The run.
-        outcomes_fail: A drive with an outcome is a failed case; otherwise the outcome is a property
-            of the case alone.
+        outcomes_fail: A rollout with an outcome is a failed case; otherwise the outcome is a
+            property of the case alone.
     """
-    failed = [r for r in run.rollouts if not r.ok]
+    done = [rollout for rollout in run.rollouts if rollout.ok]
     counts = {
         "tests": str(len(run.rollouts)),
-        "failures": str(
-            sum(bool(outcomes_of(r)) for r in run.rollouts if r.ok) if outcomes_fail else 0
-        ),
-        "errors": str(len(failed)),
+        "failures": str(sum(bool(outcomes_of(r)) for r in done) if outcomes_fail else 0),
+        "errors": str(len(run.rollouts) - len(done)),
         "skipped": "0",
         "time": f"{sum(r.wall_s or 0.0 for r in run.rollouts):.3f}",
     }
     root = ET.Element("testsuites", {"name": "simrun", **counts})
-    asked = run.info.get("asked") or []
-    name = (
-        str(asked[0]) if len(asked) == 1 else run.folder.resolve().name
-    )  # what the command named, where that was one thing
+    asked = run.info.get("asked") or []  # what the command named, if that was one thing
+    name = str(asked[0]) if len(asked) == 1 else run.folder.resolve().name
     suite = ET.SubElement(root, "testsuite", {"name": clean(name), **counts})
     if run.info.get("started_at"):
         suite.set("timestamp", clean(str(run.info["started_at"])))
@@ -232,7 +224,7 @@ def junit(run: Run, outcomes_fail: bool = True) -> ET.Element:
         "key": run.info.get("key"),
         "command": " ".join(str(word) for word in run.info.get("command") or []),
     }
-    _properties(suite, {k: str(v) for k, v in facts.items() if v})
+    _properties(suite, {key: str(value) for key, value in facts.items() if value})
     with_values = len(run.rollouts) <= MAX_WITH_VALUES
     for rollout in run.rollouts:
         _case(suite, rollout, with_values, outcomes_fail)
@@ -240,44 +232,37 @@ def junit(run: Run, outcomes_fail: bool = True) -> ET.Element:
 
 
 def _case(suite: ET.Element, rollout: Rollout, with_values: bool, outcomes_fail: bool) -> None:
-    name = f"{rollout.renderer}/{rollout.policy}/{rollout.seed}"
-    case = ET.SubElement(
-        suite,
-        "testcase",
-        {
-            "classname": clean(rollout.scene),
-            "name": clean(name),
-            "time": f"{rollout.wall_s or 0.0:.3f}",
-        },
-    )
-    values = (
-        {m: "invalid" if v is None else repr(v) for m, v in rollout.metrics.items()}
-        if rollout.ok and with_values
-        else {}
-    )
-    had = outcomes_of(rollout) if rollout.ok else frozenset()
-    facts = ({"path": rollout.path} if rollout.path else {}) | (
-        {"outcome": in_words(had)} if rollout.ok else {}
-    )
-    _properties(case, facts | values)
-    if had and outcomes_fail:
-        ET.SubElement(
-            case, "failure", {"type": told(had)[0].name, "message": clean(in_words(had))}
-        ).text = clean(in_words(had))
+    names = {
+        "classname": clean(rollout.scene),
+        "name": clean(f"{rollout.renderer}/{rollout.policy}/{rollout.seed}"),
+        "time": f"{rollout.wall_s or 0.0:.3f}",
+    }
+    case = ET.SubElement(suite, "testcase", names)
+    facts = {"path": rollout.path} if rollout.path else {}
     if not rollout.ok:
-        first = next(
-            (line for line in rollout.failure.splitlines() if line.strip()),
-            "no message was recorded",
-        )
-        error = ET.SubElement(
-            case,
-            "error",
-            {"type": clean(rollout.failure_class or "unknown"), "message": clean(first)},
-        )
+        _properties(case, facts)
+        kind = clean(rollout.failure_class or "unknown")
+        lines = [line for line in rollout.failure.splitlines() if line.strip()]
+        message = clean(lines[0] if lines else "no message was recorded")
+        error = ET.SubElement(case, "error", {"type": kind, "message": message})
         error.text = clean(rollout.failure)
+        return
+    outcomes = outcomes_of(rollout)
+    facts["outcome"] = in_words(outcomes)
+    if with_values:
+        for name, value in rollout.metrics.items():
+            facts[name] = "invalid" if value is None else repr(value)
+    _properties(case, facts)
+    if outcomes and outcomes_fail:
+        _add_failure(case, told(outcomes)[0].name, in_words(outcomes))
 
 
-def _properties(parent: ET.Element, values: dict[str, str]) -> None:
+def _add_failure(case: ET.Element, kind: str, text: str) -> None:
+    failure = ET.SubElement(case, "failure", {"type": kind, "message": clean(text)})
+    failure.text = clean(text)
+
+
+def _properties(parent: ET.Element, values: Mapping[str, str]) -> None:
     if values:
         holder = ET.SubElement(parent, "properties")
         for name, value in values.items():
@@ -296,48 +281,32 @@ def gate_md(
         run: Name or folder of the run.
         worst: As `evaluators.report.gate.worst_of` gives it.
     """
-    head = f"## Gate: {verdict.outcome.title}\n\n"
-    head += f"Run {escape(run)}, gate {escape(gate)}, compared with {escape(verdict.baseline)}. Exit code {verdict.exit_code}.\n\n"
-    reasons = (
-        "".join(f"- {escape(reason)}\n" for reason in verdict.outcome.reasons)
-        if verdict.outcome.cause != "pass"
-        else ""
-    )
-    rows = [
-        [
-            check.metric,
-            _variant(check),
-            MARKS[check.cause] + ("" if check.binding else " (not binding)"),
-            check.kind,
-            check.text,
-        ]
-        for check in verdict.checks
+    parts = [
+        f"## Gate: {verdict.outcome.title}\n\n",
+        f"Run {escape(run)}, gate {escape(gate)}, compared with {escape(verdict.baseline)}. "
+        f"Exit code {verdict.exit_code}.\n\n",
     ]
-    checks = "\n" + table(["metric", "renderer", "result", "rule", "numbers"], rows) if rows else ""
-    failures = verdict.failures
-    failed = (
-        f"\n{failures['n_failed']} of {failures['n_rollouts']} rollouts failed.\n"
-        if failures["n_failed"]
-        else ""
-    )
-    pairs = [
-        [
-            pair["scene"],
-            f"{pair['renderer']}/{pair['policy']}",
-            str(pair["seed"]),
-            pair["metric"],
-            short(pair["was"]),
-            short(pair["now"]),
-        ]
-        for pair in worst
-    ]
-    scenes = (
-        "\nThe worst scenes:\n\n"
-        + table(["scene", "renderer", "seed", "metric", "baseline", "now"], pairs)
-        if pairs
-        else ""
-    )
-    return head + reasons + checks + scenes + failed
+    if verdict.outcome.cause != "pass":
+        parts += [f"- {escape(reason)}\n" for reason in verdict.outcome.reasons]
+    checks = []
+    for check in verdict.checks:
+        result = MARKS[check.cause] + ("" if check.binding else " (not binding)")
+        checks.append([check.metric, _variant(check), result, check.kind, check.text])
+    if checks:
+        head = ["metric", "renderer", "result", "rule", "numbers"]
+        parts.append(f"\n{table(head, checks)}")
+    pairs = []
+    for pair in worst:
+        variant = f"{pair['renderer']}/{pair['policy']}"
+        names = [pair["scene"], variant, str(pair["seed"]), pair["metric"]]
+        pairs.append([*names, short(pair["was"]), short(pair["now"])])
+    if pairs:
+        head = ["scene", "renderer", "seed", "metric", "baseline", "now"]
+        parts.append(f"\nThe worst scenes:\n\n{table(head, pairs)}")
+    n_failed, n_rollouts = (verdict.failures[key] for key in ("n_failed", "n_rollouts"))
+    if n_failed:
+        parts.append(f"\n{n_failed} of {n_rollouts} rollouts failed.\n")
+    return "".join(parts)
 
 
 def write_gate_files(
@@ -386,35 +355,21 @@ def gate_junit(verdict: GateVerdict, gate: str, run: Run) -> ET.Element:
     """
     root = junit(run, outcomes_fail=False)
     suite = ET.Element("testsuite", {"name": clean(f"gate {gate}")})
-    n_failures = n_skipped = 0
+    counts = {"tests": len(verdict.checks), "failures": 0, "errors": 0, "skipped": 0}
     for check in verdict.checks:
         names = {
             "classname": clean(f"gate.{_variant(check)}"),
             "name": clean(f"{check.metric} {check.kind}"),
         }
         case = ET.SubElement(suite, "testcase", names)
-        said = [
-            key
-            for key in ("diff", "ci95", "interval", "margin", "mean", "max", "min", "n_scenes")
-            if key in check.entry
-        ]
-        _properties(case, {key: str(check.entry[key]) for key in said})
-        if check.cause == "pass":
-            continue
+        facts = {key: str(check.entry[key]) for key in CHECK_FACTS if key in check.entry}
+        _properties(case, facts)
         if check.cause == "undecided" and not check.binding:
             ET.SubElement(case, "skipped", {"message": clean(check.text)})
-            n_skipped += 1
-            continue
-        ET.SubElement(
-            case, "failure", {"type": check.cause, "message": clean(check.text)}
-        ).text = clean(check.text)
-        n_failures += 1
-    counts = {
-        "tests": len(verdict.checks),
-        "failures": n_failures,
-        "errors": 0,
-        "skipped": n_skipped,
-    }
+            counts["skipped"] += 1
+        elif check.cause != "pass":
+            _add_failure(case, check.cause, check.text)
+            counts["failures"] += 1
     for key, value in counts.items():
         suite.set(key, str(value))
         root.set(key, str(value + int(root.get(key, "0"))))

@@ -147,7 +147,7 @@ def chart(decision: Decision, metric: MetricInfo) -> Chart:
     note = (
         "Line: mean difference. Band: what is not refuted, at every analysis. Dashed: the margin."
     )
-    return Chart(metric.name, note, axes.svg())
+    return axes.chart(metric.name, note)
 
 
 def _scale(metric: MetricInfo) -> tuple[float, str]:

@@ -1,5 +1,5 @@
-"""Arms side by side: strips of one cell at the same times, and the cells whose outcome differs from
-the baseline's.
+"""Variants side by side: strips of one cell at the same times, and the cells whose outcome differs
+from the baseline's.
 """
 
 from __future__ import annotations
@@ -18,50 +18,18 @@ from alpasim_plugin.core.reading import read_bytes
 from alpasim_plugin.core.reading.images import decode_image
 from alpasim_plugin.log.run_folder.reader import read_json
 from alpasim_plugin.log.run_folder.rows import Rollout
-from alpasim_plugin.log.run_folder.schema import cell_name
+from alpasim_plugin.log.run_folder.schema import STRIP_NAME, cell_name
 from evaluators.metrics.outcomes import has_ended, in_words, outcomes_of
 from evaluators.opening import Run
 from evaluators.report.numbers import Cell, fixed, missing, short
 from evaluators.statistics.arms import Arm, Base, axis_bases
 
 MAX_WIDTH = 1600  # pixels of an inlined strip
+FLIPS_NAME = "flips.json"
+MAX_FLIP_ROWS = 400
+# renderer, policy, scene, seed of the other side; RENDERER/POLICY of the baseline's
+FlipKey = tuple[str, str, str, int, str]
 MAX_BYTES = 90_000  # above this a strip is encoded again
-
-
-@dataclass(frozen=True)
-class Strip:
-    """One arm's frames.
-
-    Attributes:
-        name: The renderer, or the policy where a run has one renderer.
-        colour: Number of its colour.
-    """
-
-    name: str
-    colour: int
-    src: str  # data: address
-    width: int
-    height: int
-    clip: str | None
-    folder: str | None
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Strips of one scene and seed, and of one policy or one renderer."""
-
-    scene: str
-    of: str
-    seed: int
-    times: tuple[str, ...]
-    strips: tuple[Strip, ...]
-    absent: tuple[str, ...]  # arms without a strip in this cell
-    differing_times: bool
-
-    @property
-    def n_bytes(self) -> int:
-        """Give the size of the inlined pictures."""
-        return sum(len(s.src) for s in self.strips)
 
 
 def colours_of(run: Run) -> dict[tuple[str, str], tuple[int, int]]:
@@ -79,8 +47,8 @@ def colours_of(run: Run) -> dict[tuple[str, str], tuple[int, int]]:
 
 def comparisons(
     run: Run, scenes: Sequence[str], limit: int, budget_bytes: int
-) -> tuple[list[Comparison], list[str]]:
-    """Pick one cell per scene, the one that most arms finished, and inline its strips.
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Pick one cell per scene, the one that most variants finished, and inline its strips.
 
     Args:
         run: The run; renderers stand side by side, or policies where there is one renderer.
@@ -89,68 +57,66 @@ def comparisons(
         budget_bytes: Most bytes of pictures to inline; the first scene is always shown.
 
     Returns:
-        The comparisons and the scenes that have strips but were left out.
+        The comparisons (as `_comparison` gives them), and the scenes that have strips but were left
+        out.
     """
-    shown: list[Comparison] = []
-    left_out: list[str] = []
+    shown: list[dict[str, Any]] = []
+    left_out = []
     spent = 0
-    by_policy = len(run.renderers) == 1
     for scene in scenes:
         cells: dict[tuple[str, int], list[Rollout]] = {}
         for rollout in run.by_scene.get(scene, ()):
-            if run.file_of(rollout, "strip.jpg") is not None:
-                cells.setdefault(("" if by_policy else rollout.policy, rollout.seed), []).append(
-                    rollout
-                )
+            if run.file_of(rollout, STRIP_NAME) is not None:
+                fixed_side = rollout.renderer if len(run.renderers) == 1 else rollout.policy
+                cells.setdefault((fixed_side, rollout.seed), []).append(rollout)
         if not cells:
             continue
-        (policy, seed), members = max(
-            cells.items(), key=lambda item: len(item[1])
-        )  # the first of equals
         if shown and (len(shown) >= limit or spent >= budget_bytes):
             left_out.append(scene)
             continue
-        comparison = _comparison(run, scene, policy, seed, members)
-        if comparison is None:
-            continue
-        if shown and spent + comparison.n_bytes > budget_bytes:
+        comparison = _comparison(run, max(cells.values(), key=len))
+        size = sum(len(strip["src"]) for strip in comparison["strips"])
+        if shown and spent + size > budget_bytes:
             left_out.append(scene)
-            continue
-        shown.append(comparison)
-        spent += comparison.n_bytes
+        elif comparison["strips"]:
+            shown.append(comparison)
+            spent += size
     return shown, left_out
 
 
-def _comparison(
-    run: Run, scene: str, policy: str, seed: int, members: list[Rollout]
-) -> Comparison | None:
+def _comparison(run: Run, members: Sequence[Rollout]) -> dict[str, Any]:
+    """Return what the report shows of one cell: ``scene``, ``of`` (what all strips share), ``seed``,
+    ``times`` in words, ``strips``, and ``absent`` (variants without a strip).
+    """
     by_policy = len(run.renderers) == 1
     by_name = {r.policy if by_policy else r.renderer: r for r in members}
-    colours, names = colours_of(run), run.policies if by_policy else run.renderers
-    strips = []
-    absent = []
-    times = []
-    for name in names:
+    first = members[0]
+    strips, absent, times = [], [], []
+    for name in run.policies if by_policy else run.renderers:
         rollout = by_name.get(name)
-        path = run.file_of(rollout, "strip.jpg") if rollout else None
+        path = run.file_of(rollout, STRIP_NAME) if rollout else None
         encoded = inline_jpeg(path) if path else None
         if rollout is None or encoded is None:
             absent.append(name)
             continue
-        colour = colours[rollout.renderer, rollout.policy][0]
-        strips.append(
-            Strip(name, colour, *encoded, run.href(rollout, "front.mp4"), run.href(rollout))
-        )
-        times.append(tuple(int(t) for t in run.manifest(rollout).get("strip_t_us") or ()))
-    if not strips:
-        return None
+        src, width, height = encoded
+        links = {"clip": run.href(rollout, "front.mp4"), "folder": run.href(rollout)}
+        colour = colours_of(run)[rollout.renderer, rollout.policy][0]
+        picture = {"src": src, "width": width, "height": height}
+        strips.append({"name": name, "colour": colour} | picture | links)
+        times.append(tuple(int(t_us) for t_us in run.manifest(rollout).get("strip_t_us") or ()))
     differing = len(set(times)) > 1
-    zero = int((run.scene_data(scene) or {}).get("start_us") or 0)
-    printed = (
-        () if differing else tuple(f"t = {fixed((t - zero) * 1e-6, 1)}\u00a0s" for t in times[0])
-    )
-    where = policy or (run.renderers[0] if len(run.policies) > 1 else run.policies[0])
-    return Comparison(scene, where, seed, printed, tuple(strips), tuple(absent), differing)
+    zero_us = int((run.scene_data(first.scene) or {}).get("start_us") or 0)
+    printed = [] if differing or not times else times[0]
+    return {
+        "scene": first.scene,
+        "of": first.renderer if by_policy and len(run.policies) > 1 else first.policy,
+        "seed": first.seed,
+        "times": [f"t = {fixed((t_us - zero_us) * 1e-6, 1)}\u00a0s" for t_us in printed],
+        "strips": strips,
+        "absent": absent,
+        "differing_times": differing,
+    }
 
 
 def inline_jpeg(path: Path) -> tuple[str, int, int] | None:
@@ -164,14 +130,9 @@ def inline_jpeg(path: Path) -> tuple[str, int, int] | None:
         return None  # the report says that the picture is absent
     height, width = image.shape[:2]
     if len(data) > MAX_BYTES or width > MAX_WIDTH:
-        scale = min(1.0, MAX_WIDTH / width)
-        image = (
-            cv2.resize(
-                image, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA
-            )
-            if scale < 1.0
-            else image
-        )
+        if width > MAX_WIDTH:
+            size = (MAX_WIDTH, round(height * MAX_WIDTH / width))
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         done, buffer = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])
         if done and buffer.size < len(data):
             data = buffer.tobytes()
@@ -179,19 +140,12 @@ def inline_jpeg(path: Path) -> tuple[str, int, int] | None:
     return "data:image/jpeg;base64," + base64.b64encode(data).decode(), width, height
 
 
-FLIPS_NAME = "flips.json"
-MAX_FLIP_ROWS = 400
-FlipKey = tuple[
-    str, str, str, int, str
-]  # renderer, policy, scene, seed of the other side; RENDERER/POLICY of the baseline's
-
-
 @dataclass(frozen=True)
 class Flip:
-    """One scene and seed that end differently in two arms.
+    """One scene and seed that end differently in two variants.
 
     Attributes:
-        base, other: The rollouts of the baseline and of the other arm.
+        base, other: The rollouts of the baseline and of the other variant.
         was, now: Their outcomes in words.
         tone: "worse" where an event came and none went, "better" where one went and none came, else
             "mixed".
@@ -288,7 +242,6 @@ class FlipRow:
     flip: Flip
     time: Cell
     gap: Cell
-    source: str
     pictures: tuple[tuple[str, int, str, int, int], ...]
     why_not: str
     links: tuple[tuple[str, int, str | None, str | None], ...]
@@ -307,14 +260,16 @@ def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
     """
     flips, compared = find_flips(run)
     path = run.folder / FLIPS_NAME
-    told: dict[FlipKey, Mapping[str, Any]] = {}
+    entries = (read_json(path).get("cells") or []) if path.is_file() else []
+    known = {key_of_entry(entry): entry for entry in entries}
+    unknown = "the run folder has no logs to look for it in"
     if path.is_file():
-        told = {key_of_entry(c): c for c in read_json(path).get("cells") or []}
-    spent, rows = 0, []
+        unknown = "not looked for: there are too many flips"
+    spent = 0
+    rows = []
     for flip in flips[:MAX_FLIP_ROWS]:
-        entry = told.get(flip.key)
-        row = _row(run, flip, entry, spent < budget_bytes)
-        spent += sum(len(picture[2]) for picture in row.pictures)
+        row = _row(run, flip, known.get(flip.key) or {"reason": unknown}, spent < budget_bytes)
+        spent += sum(len(src) for _, _, src, _, _ in row.pictures)
         rows.append(row)
     return rows, len(flips) - len(rows), compared
 
@@ -327,48 +282,35 @@ def key_of_entry(entry: Mapping[str, Any]) -> FlipKey:
     return (entry["renderer"], entry["policy"], entry["scene"], entry["seed"], str(against))
 
 
-def _row(run: Run, flip: Flip, entry: Mapping[str, Any] | None, room: bool) -> FlipRow:
+def _row(run: Run, flip: Flip, entry: Mapping[str, Any], has_room: bool) -> FlipRow:
     colours = colours_of(run)
-    sides = tuple(
-        (name, r, colours[r.renderer, r.policy][0])
-        for name, r in zip(flip.sides, (flip.base, flip.other), strict=True)
-    )
+    sides = [
+        (name, colours[rollout.renderer, rollout.policy][0], rollout)
+        for name, rollout in zip(flip.sides, (flip.base, flip.other), strict=True)
+    ]
     links = tuple(
-        (name, colour, run.href(r, "front.mp4"), run.href(r)) for name, r, colour in sides
+        (name, colour, run.href(rollout, "front.mp4"), run.href(rollout))
+        for name, colour, rollout in sides
     )
-    if entry is None:
-        looked = (run.folder / FLIPS_NAME).is_file()
-        why = (
-            "not looked for: there are too many flips"
-            if looked
-            else "the run folder has no logs to look for it in"
-        )
-        return FlipRow(flip, missing(why), missing(why), "", (), why, links)
     if entry.get("t_us") is None:
         why = str(entry.get("reason") or "the plans never diverge by more than the threshold")
-        return FlipRow(flip, missing(why), missing(why), "", (), why, links)
-    seconds = float(entry["after_us"]) * 1e-6
-    time, gap = (
-        Cell(f"{fixed(seconds, 1)}\u00a0s", sort=seconds),
-        Cell(short(float(entry["gap_m"]), "m"), sort=float(entry["gap_m"])),
-    )
+        return FlipRow(flip, missing(why), missing(why), (), why, links)
+    seconds, gap_m = float(entry["after_us"]) * 1e-6, float(entry["gap_m"])
+    frames = entry.get("frames") or {}
     pictures = []
-    for side, _, colour in sides if room else ():
-        name = (entry.get("frames") or {}).get(side)
-        file = run.folder / name if name else None
-        inside = (
-            file is not None
-            and file.is_file()
-            and file.resolve().is_relative_to(run.folder.resolve())
-        )
-        encoded = inline_jpeg(file) if file is not None and inside else None
-        if encoded is not None:
-            pictures.append((side, colour, *encoded))
-    why = (
-        ""
-        if pictures
-        else str(
-            entry.get("frames_reason") or "left out to keep this file small; they are in flips/"
-        )
+    for name, colour, _ in sides:
+        path = run.folder / str(frames.get(name))
+        is_inside = path.resolve().is_relative_to(run.folder.resolve())
+        if has_room and is_inside and path.is_file():
+            encoded = inline_jpeg(path)
+            if encoded is not None:
+                pictures.append((name, colour, *encoded))
+    why = str(entry.get("frames_reason") or "left out to keep this file small; they are in flips/")
+    return FlipRow(
+        flip,
+        Cell(f"{fixed(seconds, 1)}\u00a0s", sort=seconds),
+        Cell(short(gap_m, "m"), sort=gap_m),
+        tuple(pictures),
+        "" if pictures else why,
+        links,
     )
-    return FlipRow(flip, time, gap, str(entry.get("source") or ""), tuple(pictures), why, links)

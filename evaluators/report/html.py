@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import marshal
-import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from datetime import datetime
 from functools import cache
-from importlib.util import MAGIC_NUMBER
 from pathlib import Path
 from typing import Any
 
 import cv2
-from jinja2 import BytecodeCache, ChoiceLoader, Environment, PackageLoader, StrictUndefined
-from jinja2 import __version__ as jinja_version
-from jinja2.bccache import Bucket
+from jinja2 import (
+    ChoiceLoader,
+    Environment,
+    FileSystemBytecodeCache,
+    PackageLoader,
+    StrictUndefined,
+)
 from markupsafe import Markup
 
-from alpasim_plugin.core.atomic import write_bytes, write_text
-from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.atomic import write_text
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.limits import SOURCE_BYTES
 from alpasim_plugin.core.reading import parsing, read_bytes
 from alpasim_plugin.core.reading.images import decode_image
@@ -33,7 +32,7 @@ from evaluators.metrics.outcomes import OUTCOMES, first_failure, has_ended, in_w
 from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
-from evaluators.report.charts import forest, speed_against_error
+from evaluators.report.charts import drift_charts, forest, speed_against_error
 from evaluators.report.decision import decision_section
 from evaluators.report.fixers import COLUMNS, fixer_rows, speed
 from evaluators.report.flips import FlipKey, colours_of, comparisons, flip_bases, flip_rows
@@ -46,9 +45,9 @@ from evaluators.report.provenance import (
     ledger,
     provenance,
 )
-from evaluators.report.rollouts import drift_charts, read_series, rollout_block
+from evaluators.report.rollouts import read_series, rollout_block
 from evaluators.report.tables import SCENE_METRICS, scene_rows
-from evaluators.report.verdict import find
+from evaluators.report.verdict import find, variant_name
 
 MAX_SCENE_PLOTS = 24
 OPEN_SCENE_PLOTS = 6
@@ -62,6 +61,8 @@ SHOTS = 3
 USUAL_FRAME = 2  # of a strip, where nothing happened
 SHOT_WIDTH_PX = 420
 NO_REPLAYS: Mapping[FlipKey, str] = {}
+STYLES = ("theme.css", "report.css")
+SCRIPTS = ("theme.js", "report.js", "rollouts.js")
 
 
 def write_report(run_dir: Path | str | Run, replays: Mapping[FlipKey, str] = NO_REPLAYS) -> Path:
@@ -86,58 +87,36 @@ def write_report(run_dir: Path | str | Run, replays: Mapping[FlipKey, str] = NO_
 
 
 def render_report(run: Run, replays: Mapping[FlipKey, str] = NO_REPLAYS) -> str:
-    """Render the report as a string; ``replays`` as in `write_report`."""
-    return render_page(
-        "report.html.j2",
-        ("theme", "report"),
-        ("theme", "report", "rollouts"),
+    """Render the report as a string; ``replays`` as in `write_report`.
+
+    Style sheets and scripts stand inside the page; the hash allows it to run this script and no
+    other.
+    """
+    environment = environment_of("evaluators.report")
+    style = "\n".join(asset(environment, name) for name in STYLES)
+    script = "\n".join(asset(environment, name) for name in SCRIPTS)
+    return environment.get_template("report.html.j2").render(
+        style=Markup(style),
+        script=Markup(script),
+        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        plural=plural,
         dash=DASH,
         replays=replays,
         **context(run),
     )
 
 
-class CompiledBeside(BytecodeCache):
-    """Keeps compiled templates in a ``__pycache__``, as Python does with modules, and where Python
-    does.
-
-    A file that is not whole, or of other versions, is made again; where none can be written, every
-    process compiles.
-    """
-
-    folder = Path(__file__).with_name("__pycache__")
-    head = MAGIC_NUMBER + f"{jinja_version}\n".encode()
-
-    def load_bytecode(self, bucket: Bucket) -> None:
-        """Take the code of a template of this source."""
-        with suppress(OSError):
-            found = (self.folder / f"{bucket.key}.template").read_bytes()
-            code = found[len(self.head) + 32 :]
-            if found == self._whole(bucket, code):
-                bucket.code = marshal.loads(code)
-
-    def dump_bytecode(self, bucket: Bucket) -> None:
-        """Keep the code of a template."""
-        if not sys.dont_write_bytecode:
-            with suppress(OSError, InfrastructureError):
-                write_bytes(
-                    self.folder / f"{bucket.key}.template",
-                    self._whole(bucket, marshal.dumps(bucket.code)),
-                )
-
-    def _whole(self, bucket: Bucket, code: bytes) -> bytes:
-        return self.head + hashlib.sha256(bucket.checksum.encode() + code).digest() + code
-
-
 @cache
 def environment_of(*packages: str) -> Environment:
-    """Return the templates of packages, the first that has a name; a process reads each template
-    once.
+    """Return the templates of packages, the first that has a name. Compiled templates are kept in
+    the system's folder for temporary files, where it can be written.
     """
-    loader = ChoiceLoader([PackageLoader(package) for package in packages])
+    compiled = None
+    with suppress(OSError, RuntimeError):
+        compiled = FileSystemBytecodeCache()
     return Environment(
-        loader=loader,
-        bytecode_cache=CompiledBeside(),
+        loader=ChoiceLoader([PackageLoader(package) for package in packages]),
+        bytecode_cache=compiled,
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -145,21 +124,11 @@ def environment_of(*packages: str) -> Environment:
     )
 
 
-def render_page(template: str, styles: Sequence[str], scripts: Sequence[str], **values: Any) -> str:
-    """Render a template with style sheets and scripts inside the page; the hash allows the page to
-    run this script and no other.
-    """
-    environment = environment_of("evaluators.report")
-    style = "\n".join(asset(environment, f"{name}.css") for name in styles)
-    script = "\n".join(asset(environment, f"{name}.js") for name in scripts)
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    page = {
-        "style": Markup(style),
-        "script": Markup(script),
-        "script_hash": digest,
-        "plural": plural,
-    }
-    return environment.get_template(template).render(page | values)
+def asset(environment: Environment, name: str) -> str:
+    """Return the source of a style sheet or a script among the templates."""
+    if environment.loader is None:
+        raise RuntimeError("the template environment has no loader")
+    return environment.loader.get_source(environment, name)[0]
 
 
 def context(run: Run) -> dict[str, Any]:
@@ -196,7 +165,7 @@ def context(run: Run) -> dict[str, Any]:
     return {
         "run": run,
         "title": ", ".join(run.renderers) or "empty run",
-        "when": _when(run.info.get("started_at")),
+        "when": str(run.info.get("started_at") or "")[:16].replace("T", " "),
         "finding": find(run),
         "shots": shots(run, interesting),
         "decision": decision_section(run),
@@ -308,126 +277,76 @@ def scene_views(
     return [drawn[s] for s in order if s in drawn], [s for s in run.scenes if s not in drawn]
 
 
-def asset(environment: Environment, name: str) -> str:
-    """Return the source of a style sheet or a script among the templates."""
-    if environment.loader is None:
-        raise RuntimeError("the template environment has no loader")
-    return environment.loader.get_source(environment, name)[0]
-
-
-def _when(text: Any) -> str:
-    try:
-        return datetime.fromisoformat(str(text)).strftime("%Y-%m-%d %H:%M %Z").strip()
-    except ValueError:
-        return str(text or "")
-
-
 def _facts(run: Run) -> list[tuple[str, str]]:
-    done = sum(r.ok for r in run.rollouts)
-    wall = (run.summary.get("pool") or {}).get("wall_s")
+    done = sum(rollout.ok for rollout in run.rollouts)
+    wall_s = (run.summary.get("pool") or {}).get("wall_s")
     facts = [
         ("rollouts", f"{done} of {len(run.rollouts)} completed"),
         ("scenes", str(len(run.scenes))),
-        ("seeds", str(len({r.seed for r in run.rollouts}))),
+        ("seeds", str(len({rollout.seed for rollout in run.rollouts}))),
         ("renderers", ", ".join(run.renderers) or DASH),
         ("policy" if len(run.policies) == 1 else "policies", ", ".join(run.policies) or DASH),
         ("preset", str(run.summary.get("preset") or run.info.get("preset") or DASH)),
     ]
-    return (
-        [*facts, ("wall time", duration(float(wall)))] if isinstance(wall, int | float) else facts
-    )
+    if isinstance(wall_s, int | float):
+        facts.append(("wall time", duration(wall_s)))
+    return facts
 
 
-@dataclass(frozen=True)
-class Shot:
-    """One picture at the head of the report.
-
-    Attributes:
-        said: How the drive ended, and when.
-        src: data: address.
-        link: Where the drive is shown.
-    """
-
-    arm: str
-    scene: str
-    said: str
-    src: str
-    link: str | None
-
-
-def shots(run: Run, interesting: Sequence[str]) -> list[Shot]:
-    """Pick at most three pictures: of drives that failed, one an arm first; else of the arms in the
-    most telling scene.
+def shots(run: Run, interesting: Sequence[str]) -> list[dict[str, Any]]:
+    """Pick at most three images: of rollouts that failed, one a variant first; else of the variants
+    in the most telling scene.
 
     Args:
         run: The run.
         interesting: Its scenes, the most telling first.
     """
-    rank = {scene: i for i, scene in enumerate(interesting)}
-    order = list(OUTCOMES)
-    done = [one for one in run.rollouts if one.ok]
+    gravity, rank = list(OUTCOMES), {scene: i for i, scene in enumerate(interesting)}
+    done = [rollout for rollout in run.rollouts if rollout.ok]
     failed = sorted(
-        (one for one in done if outcomes_of(one)),
-        key=lambda r: (min(order.index(o) for o in outcomes_of(r)), rank[r.scene]),
+        (rollout for rollout in done if outcomes_of(rollout)),
+        key=lambda r: (min(map(gravity.index, outcomes_of(r))), rank[r.scene]),
     )
-    firsts = {one.variant: one for one in reversed(failed)}.values()
-    rest = [one for one in done if interesting and one.scene == interesting[0]]
-    found: list[Shot] = []
-    for rollout in dict.fromkeys(
-        one.cell for one in [*list(firsts)[::-1], *failed, *(rest if not failed else [])]
-    ):
-        shot = (
-            _shot(run, next(one for one in done if one.cell == rollout))
-            if len(found) < SHOTS
-            else None
-        )
-        found += [shot] if shot else []
+    firsts = {rollout.variant: rollout for rollout in reversed(failed)}
+    chosen = [*reversed(firsts.values()), *failed]
+    chosen = chosen or [rollout for rollout in done if rollout.scene in interesting[:1]]
+    found: list[dict[str, Any]] = []
+    for rollout in {rollout.cell: rollout for rollout in chosen}.values():
+        shot = _shot(run, rollout) if len(found) < SHOTS else None
+        if shot is not None:
+            found.append(shot)
     return found
 
 
-def _shot(run: Run, rollout: Rollout) -> Shot | None:
+def _shot(run: Run, rollout: Rollout) -> dict[str, Any] | None:
+    """Return one image of a rollout: ``variant``, ``scene``, ``outcome`` and when, ``src`` (a data:
+    address), and ``link`` to where the rollout is shown.
+    """
     path = run.file_of(rollout, STRIP_NAME)
     manifest = run.manifest(rollout)
-    times = [int(t) for t in manifest.get("strip_t_us") or ()]
-    if path is None or not times:
+    times_us = [int(t_us) for t_us in manifest.get("strip_t_us") or ()]
+    if path is None or not times_us:
         return None
+    outcome = in_words(outcomes_of(rollout))
+    frame = min(USUAL_FRAME, len(times_us) - 1)
     first = first_failure(manifest)
-    k = min(USUAL_FRAME, len(times) - 1)
-    if (
-        first is not None
-    ):  # what led to it: after a contact the camera may be inside the other vehicle
-        k = max((i for i, t_us in enumerate(times) if t_us <= int(first["t_us"])), default=0)
+    if first is not None:
+        # what led to it: after a contact the camera may be inside the other vehicle
+        before = [i for i, t_us in enumerate(times_us) if t_us <= int(first["t_us"])]
+        frame = max(before, default=0)
+        outcome += f" at {fixed(float(first['t_s']), 1)}\u00a0s"
     try:
         strip = decode_image(read_bytes(path, SOURCE_BYTES), path)
     except InputError:
-        return None  # the report says elsewhere that the picture is absent
-    width = strip.shape[1] // len(times)
-    picture = strip[:, k * width : (k + 1) * width]
-    picture = cv2.resize(
-        picture,
-        (SHOT_WIDTH_PX, round(picture.shape[0] * SHOT_WIDTH_PX / width)),
-        interpolation=cv2.INTER_AREA,
-    )
-    done, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
-    said = in_words(outcomes_of(rollout)) + (
-        f" at {fixed(float(first['t_s']), 1)}\u00a0s" if first is not None else ""
-    )
-    arm = (
-        rollout.policy
-        if len(run.renderers) == 1
-        else rollout.renderer
-        if len(run.policies) == 1
-        else rollout.variant
-    )
-    link = run.href(rollout, WHY_NAME) or run.href(rollout)
-    return (
-        Shot(
-            arm,
-            rollout.scene,
-            said,
-            "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode(),
-            link,
-        )
-        if done
-        else None
-    )
+        return None  # the report says elsewhere that the image is absent
+    width = strip.shape[1] // len(times_us)
+    size = (SHOT_WIDTH_PX, round(strip.shape[0] * SHOT_WIDTH_PX / width))
+    image = cv2.resize(strip[:, frame * width :][:, :width], size, interpolation=cv2.INTER_AREA)
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])
+    return {
+        "variant": variant_name(run, rollout.variant),
+        "scene": rollout.scene,
+        "outcome": outcome,
+        "src": "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode(),
+        "link": run.href(rollout, WHY_NAME) or run.href(rollout),
+    }

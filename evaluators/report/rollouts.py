@@ -1,5 +1,5 @@
-"""Each rollout of a run: when and where its outcomes began, all of them over time, and as columns
-inside the page.
+"""Each rollout of a run: when and where its outcomes began, and all of them as columns inside the
+page.
 
 The browser draws the table row by row as it is scrolled, so it may have any length. The page holds
 one block: a header in JSON, then the columns as bytes, compressed together. 100,000 rollouts with
@@ -13,7 +13,7 @@ import base64
 import gzip
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import quote
@@ -21,7 +21,7 @@ from urllib.parse import quote
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.core.types import F64, U8
+from alpasim_plugin.core.types import U8
 from alpasim_plugin.log.run_folder.rows import Own, Rollout, Series, series_by_cell
 from alpasim_plugin.log.run_folder.schema import WHY_NAME
 from evaluators.metrics.outcomes import (
@@ -33,7 +33,6 @@ from evaluators.metrics.outcomes import (
     told,
 )
 from evaluators.opening import Run
-from evaluators.report.charts import Chart, Curve, line_chart
 
 COLLISION = (
     "collision_any",
@@ -291,85 +290,3 @@ def _states(run: Run, parents: Sequence[tuple[str, str]]) -> U8:
             )
         states.append(state)
     return np.array(states, dtype=np.uint8)
-
-
-N_BINS = 60  # of the time axis
-
-
-def drift_charts(
-    rollouts: Sequence[Rollout], series: Series, variant_of: dict[tuple[str, str], tuple[int, int]]
-) -> list[Chart]:
-    """Draw how far from the logged path the ego is over time, and how many rollouts are still
-    without an event.
-    """
-    charts = []
-    by_variant: dict[tuple[str, str], list[Rollout]] = {}
-    for rollout in rollouts:
-        if rollout.ok and "lateral_bias_m" in series.get(rollout.cell, {}):
-            by_variant.setdefault((rollout.renderer, rollout.policy), []).append(rollout)
-    by_variant = {variant: by_variant[variant] for variant in variant_of if variant in by_variant}
-    if not by_variant:
-        return []
-    several = len({policy for _, policy in by_variant}) > 1
-
-    def curves(make: Callable[[list[Rollout]], tuple[F64, ...]]) -> list[Curve]:
-        names = {key: " \u00b7 ".join(key) if several else key[0] for key in by_variant}
-        return [
-            Curve(names[key], *variant_of[key], *make(members))
-            for key, members in by_variant.items()
-        ]
-
-    charts.append(
-        Chart(
-            "Distance from the logged path over time",
-            "Line: median over rollouts. Band: 10th to 90th percentile. Drawn while at least half of the rollouts still run.",
-            line_chart(
-                curves(lambda members: _offset_band(members, series)),
-                "s since start",
-                "m beside the path",
-            ),
-        )
-    )
-    charts.append(
-        Chart(
-            "Rollouts without a collision or off-road event so far",
-            "Share of completed rollouts, by time of the first counted event.",
-            line_chart(
-                curves(lambda members: _survival(members, series)),
-                "s since start",
-                "% of rollouts",
-                y_top=104.0,
-            ),
-        )
-    )
-    return charts
-
-
-def _offset_band(members: list[Rollout], series: Series) -> tuple[F64, ...]:
-    own = [series[r.cell]["lateral_bias_m"] for r in members]
-    end_s = max(float(t[-1] - t[0]) for t, _ in own) * 1e-6
-    grid = np.linspace(0.0, end_s, N_BINS)
-    values = np.full((len(own), N_BINS), np.nan)  # (rollouts, times); NaN after a rollout's end
-    for row, (t_us, offset) in zip(values, own, strict=True):
-        seconds = (t_us - t_us[0]) * 1e-6
-        inside = grid <= seconds[-1] + 1e-9
-        row[inside] = np.abs(np.interp(grid[inside], seconds, offset))
-    enough = np.count_nonzero(np.isfinite(values), axis=0) * 2 >= len(
-        own
-    )  # later, the few long scenes would pass for a trend
-    low, middle, high = np.nanpercentile(values[:, enough], [10, 50, 90], axis=0)
-    return grid[enough], middle, low, high
-
-
-def _survival(members: list[Rollout], series: Series) -> tuple[F64, ...]:
-    ends = [series[r.cell]["lateral_bias_m"][0] for r in members]
-    end_s = max(float(t[-1] - t[0]) for t in ends) * 1e-6
-    firsts = [
-        min((e.t_s for e in events_of(r, series) if e.t_s is not None), default=np.inf)
-        for r in members
-    ]
-    times = np.array(sorted(t for t in firsts if np.isfinite(t)))
-    x = np.concatenate([[0.0], np.repeat(times, 2), [end_s]])
-    alive = 100.0 * (1.0 - np.arange(len(times) + 1) / len(members))
-    y = np.repeat(alive, 2)
-    return x, y

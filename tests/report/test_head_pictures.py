@@ -47,6 +47,6 @@ def test_a_failure_is_shown_by_the_last_picture_before_it(
     shot = _shot(run, rollout)
     assert shot is not None
     picture: Any = cv2.imdecode(
-        np.frombuffer(base64.b64decode(shot.src.split(",")[1]), np.uint8), cv2.IMREAD_COLOR
+        np.frombuffer(base64.b64decode(shot["src"].split(",")[1]), np.uint8), cv2.IMREAD_COLOR
     )
     assert abs(float(picture.mean()) - 60 * shown) < 3

@@ -49,15 +49,15 @@ def test_a_frame_that_the_render_itself_had_black_is_not_the_fixers_failure() ->
 
 def test_what_only_drafts_have_is_a_dash_for_whole_blocks() -> None:
     drafted, blocks = fixer_rows(SUMMARY)
-    assert [cell.text.replace("\u00a0", " ") for cell in drafted.cells[3:]] == [
+    assert [cell.text.replace("\u00a0", " ") for cell in drafted["cells"][3:]] == [
         "75.0 %",
         "2.00",
         "0.0190 m",
         "0",
     ]
-    assert [cell.text for cell in blocks.cells[3:6]] == [DASH] * 3
-    assert blocks.cells[6].text == "4"
-    assert len(drafted.cells) == len(COLUMNS)
+    assert [cell.text for cell in blocks["cells"][3:6]] == [DASH] * 3
+    assert blocks["cells"][6].text == "4"
+    assert len(drafted["cells"]) == len(COLUMNS)
 
 
 def test_the_terminal_line_says_label_mode_and_rate() -> None:

@@ -172,14 +172,16 @@ def test_scene_without_a_finished_rollout_has_dashes(tmp_path: Path) -> None:
 def test_failures_carry_message_and_hint(usual_run: Path) -> None:
     rows, more = failure_rows(read_run(usual_run))
     assert (len(rows), more) == (4, 0)
-    assert [label for label, _ in rows[0].parts] == ["message", "hint"]
+    assert [label for label, _ in rows[0]["parts"]] == ["message", "hint"]
 
 
 def test_speed_keeps_stages_that_only_some_renderers_have(usual_run: Path) -> None:
     run = read_run(usual_run)
     table = speed(run)
     assert table.stages == ("render", "policy", "log", "control", "actors")
-    assert sum(segment.width for segment in table.rows[-1].bar) == pytest.approx(100.0, abs=0.1)
+    assert sum(segment["width"] for segment in table.rows[-1]["bar"]) == pytest.approx(
+        100.0, abs=0.1
+    )
     assert table.pool.startswith(
         "2\u00a0workers with 1\u00a0thread each, 41.2 camera frames/s in total"
     )
@@ -199,16 +201,16 @@ def test_renderer_without_frames_has_no_speed() -> None:
     )
     speeds = {"a": nothing | {"stages": {}}}
     table = speed(Run(Path(), {}, {"speed": speeds}, (), ()))
-    assert all(cell.missing for cell in table.rows[0].cells)
-    assert table.rows[0].bar == ()
-    assert table.rows[0].sum_text == DASH
+    assert all(cell.missing for cell in table.rows[0]["cells"])
+    assert table.rows[0]["bar"] == []
+    assert table.rows[0]["sum_text"] == DASH
 
 
 def test_ledger_bounds_cover_what_failed(usual_run: Path) -> None:
-    rows = {row.renderer: row for row in ledger(read_run(usual_run), ("offroad",))}
-    assert rows["clean"].bounds[0].text == "0.0\u00a0%"
-    assert rows["onefixer"].bounds[0].text == "0.0 to 8.3\u00a0%"
-    assert rows["3dgs"].counts[1].detail == "renderer 2"
+    rows = {row["renderer"]: row for row in ledger(read_run(usual_run), ("offroad",))}
+    assert rows["clean"]["bounds"][0].text == "0.0\u00a0%"
+    assert rows["onefixer"]["bounds"][0].text == "0.0 to 8.3\u00a0%"
+    assert rows["3dgs"]["counts"][1].detail == "renderer 2"
 
 
 def test_terminal_table_prints_means_intervals_and_counts(usual_run: Path) -> None:
