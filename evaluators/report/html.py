@@ -46,7 +46,6 @@ from evaluators.report.provenance import (
     provenance,
 )
 from evaluators.report.rollouts import read_series, rollout_block
-from evaluators.report.tables import SCENE_METRICS, scene_rows
 from evaluators.report.verdict import find, variant_name
 
 MAX_SCENE_PLOTS = 24
@@ -147,7 +146,6 @@ def context(run: Run) -> dict[str, Any]:
     strips, no_strip = comparisons(run, interesting, MAX_STRIP_SCENES, STRIP_BUDGET_BYTES)
     rows = tables.metric_rows(run.summary, run.invalid_reasons, run.table)
     pairs = tables.pair_rows(run.summary, run.table)
-    by_scene, more_scene_rows = scene_rows(run, interesting)
     failures, more_failures = failure_rows(run)
     headline = [row for row in rows if row.is_headline] or rows
     # every column has the colour of its renderer, or of its policy where there is one renderer
@@ -204,9 +202,6 @@ def context(run: Run) -> dict[str, Any]:
         "fixers": fixer_rows(run.summary),
         "fixer_columns": COLUMNS,
         "speed": speed(run),
-        "scene_rows": by_scene,
-        "more_scene_rows": more_scene_rows,
-        "scene_metrics": SCENE_METRICS,
         "every_rollout": rollout_block(run),
         "of_sample": of_sample,
         "failures": failures,

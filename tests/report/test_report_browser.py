@@ -43,23 +43,6 @@ def test_no_complaint_and_no_outside_request(
     )  # tables scroll, the page does not
 
 
-def test_clicking_a_head_sorts_by_value_and_again_turns_it_round(
-    browser: Browser, usual_run: Path
-) -> None:
-    browser.open(write_report(usual_run))
-    click = "document.querySelectorAll('#table-scenes th .sort')[{}].click()"
-    distance = 6
-    browser.evaluate(click.format(distance - 1))  # the head "Seeds" does not sort
-    rising = [float(text.split()[0]) for text in column(browser, "table-scenes", distance)]
-    assert rising == sorted(rising)
-    assert len(set(rising)) > 5
-    browser.evaluate(click.format(distance - 1))
-    assert [float(text.split()[0]) for text in column(browser, "table-scenes", distance)] == rising[
-        ::-1
-    ]
-    assert browser.evaluate("document.querySelectorAll('#table-scenes th[aria-sort]').length") == 1
-
-
 def test_changed_outcomes_lead_to_their_frames(browser: Browser, usual_run: Path) -> None:
     browser.open(write_report(usual_run), width=390)
     opened = "[...document.querySelectorAll('.flip-card')].map(d => d.open)"
@@ -98,16 +81,6 @@ def test_missing_values_stay_last_both_ways(browser: Browser, usual_run: Path) -
     for _ in range(2):
         browser.evaluate("document.querySelectorAll('#table-more th .sort')[1].click()")
         assert column(browser, "table-more", 1)[-1] == "\u2014"
-
-
-def test_filter_keeps_rows_with_every_word(browser: Browser, usual_run: Path) -> None:
-    browser.open(write_report(usual_run))
-    browser.evaluate("document.querySelector('input[type=search]').value = '3DGS urban'")
-    browser.evaluate(
-        "document.querySelector('input[type=search]').dispatchEvent(new Event('input'))"
-    )
-    assert column(browser, "table-scenes", 0) == ["urban/left-turn"] * 2
-    assert {text.strip() for text in column(browser, "table-scenes", 1)} == {"3dgs"}
 
 
 def test_theme_follows_the_system_until_it_is_chosen(browser: Browser, usual_run: Path) -> None:

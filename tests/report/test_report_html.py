@@ -139,7 +139,6 @@ def test_verdict_comes_first(usual_run: Path, usual_page: Page) -> None:
         "Over time",
         "What the camera saw",
         "From above",
-        "Scene by scene",
     ]
     heads += [
         "Every rollout",

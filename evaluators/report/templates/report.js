@@ -28,17 +28,6 @@
     });
   }
 
-  // Filter: every word must occur in the row.
-  for (const input of all("input[data-filter]")) {
-    input.addEventListener("input", () => {
-      const words = input.value.toLowerCase().split(/\s+/).filter(Boolean);
-      for (const row of document.getElementById(input.dataset.filter).tBodies[0].rows) {
-        const text = row.textContent.toLowerCase();
-        row.hidden = !words.every((word) => text.includes(word));
-      }
-    });
-  }
-
   // Legend: show or hide one renderer's drives in every map.
   for (const toggle of all("button[data-variant]")) {
     toggle.addEventListener("click", () => {
