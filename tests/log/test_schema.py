@@ -17,9 +17,7 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log.run_folder.manifests import write_manifest
 from alpasim_plugin.log.run_folder.schema import (
-    ROLLOUT_FILES,
     ROLLOUTS_TABLE,
-    RUN_FILES,
     STEPS_TABLE,
     TableSchema,
     cell_name,
@@ -157,19 +155,6 @@ def test_the_page_of_tables_names_every_column_in_its_order_with_its_type(
     documented = {name: kind for name, kind in kinds.items() if name in wanted}
     assert documented == wanted
     assert list(documented) == list(wanted)
-
-
-def test_the_page_of_the_architecture_names_every_file_and_no_other() -> None:
-    page = (DOCS / "architecture.md").read_text()
-    table = page[page.index("| file | content |") :].split("\n\n")[0]
-    first = [line.split("|")[1] for line in table.splitlines()[2:]]
-    named = {name for cell in first for name in re.findall(r"`([^`]+)`", cell)}
-    top = {re.sub(r"/.*", "/", name) for name in named}
-    assert top == {file.name for file in RUN_FILES}
-    inside = next(line for line in table.splitlines() if "rollouts/RENDERER" in line).split("|")[2]
-    assert {name for name in re.findall(r"`([^`]+)`", inside)} == {
-        file.name for file in ROLLOUT_FILES
-    }
 
 
 def test_a_rollout_has_one_folder_and_one_name() -> None:

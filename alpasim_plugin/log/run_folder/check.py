@@ -53,7 +53,7 @@ def inspect_run(
     if not (root / ROLLOUTS_FOLDER).exists():
         return Inspection(cells, (), (), (), tables_only=True)
     manifests = []
-    damage = []
+    damage: list[Damage] = []
     unfinished = []
     for done, cell in enumerate(cells, 1):
         state = inspect_rollout(root, cell, full)

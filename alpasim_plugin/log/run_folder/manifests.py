@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.checksums import FileFacts, checksums_of, problem_of
@@ -87,7 +87,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         InputError: It is missing, damaged, or names a file that no rollout has.
     """
     path = folder / MANIFEST
-    manifest: dict[str, Any] = read_json_as(ManifestFile, path, do_this=AGAIN)  # type: ignore[assignment]
+    manifest = cast("dict[str, Any]", read_json_as(ManifestFile, path, do_this=AGAIN))
     others = sorted(set(manifest["files"]) - {*DRIVEN, *DERIVED})
     if others:
         raise InputError(f"{path} names {others[0]!r}, which no rollout has.", AGAIN)
@@ -131,7 +131,7 @@ def read_run_json(root: Path) -> dict[str, Any]:
         InputError: It is missing or damaged, or a member is missing or has another type.
     """
     path = root / RUN_INFO
-    info: dict[str, Any] = read_json_as(RunInfo, path, do_this=AGAIN)  # type: ignore[assignment]
+    info = cast("dict[str, Any]", read_json_as(RunInfo, path, do_this=AGAIN))
     missing = [name for name in REQUIRED_OF_RUN if name not in info]
     if missing:
         raise InputError(f"{path} lacks the member {missing[0]!r}.", AGAIN)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, overload
+from typing import overload
 
 import numpy as np
 import pyarrow as pa
@@ -114,50 +114,23 @@ Series = dict[tuple[str, str, str, int], Own]
 def series_by_cell(table: pa.Table) -> Series:
     """Split a step table into valid, finite, time-sorted series.
 
-    Works on integer codes of the text columns: a run has millions of steps and few names.
-
     Returns:
         cell -> metric -> (``t_us (T,)``, ``value (T,)``).
     """
-    table = (
-        table.filter(pc.and_(table["valid"], pc.is_finite(table["value"])))
-        if table.num_rows
-        else table
+    table = table.filter(pc.and_(table["valid"], pc.is_finite(table["value"])))
+    names = [*KEYS, "metric"]
+    groups = (
+        table.unify_dictionaries()
+        .sort_by("t_us")
+        .group_by(names, use_threads=False)
+        .aggregate([("t_us", "list"), ("value", "list")])
     )
-    if not table.num_rows:
-        return {}
-    codes, names = zip(*(_coded(table[name]) for name in (*KEYS, "metric")), strict=True)
-    t_us = table["t_us"].to_numpy().astype(np.int64, copy=False)
-    value = table["value"].to_numpy().astype(np.float64, copy=False)
-    group = np.zeros(len(t_us), np.int64)
-    for code, values in zip(codes, names, strict=True):
-        group = group * len(values) + code
-    order = np.lexsort((t_us, group))
-    group = group[order]
-    t_us = t_us[order]
-    value = value[order]
-    starts = np.flatnonzero(np.diff(group, prepend=-1))
-    stops = np.append(starts[1:], len(group))
-    found: Series = {}
-    for start, stop in zip(starts, stops, strict=True):
-        row = order[start]
-        renderer, policy, scene, seed, metric = (
-            values[code[row]] for code, values in zip(codes, names, strict=True)
-        )
-        found.setdefault((renderer, policy, scene, int(seed)), {})[metric] = (
-            t_us[start:stop],
-            value[start:stop],
-        )
-    return found
-
-
-def _coded(column: pa.ChunkedArray) -> tuple[I64, list[Any]]:
-    """Return per row the index into the list of distinct values, and that list."""
-    coded = column.combine_chunks()
-    if isinstance(coded, pa.ChunkedArray):  # several chunks too large for one
-        coded = pa.concat_arrays(coded.chunks)
-    if not pa.types.is_dictionary(coded.type):
-        coded = coded.dictionary_encode()
-    return coded.indices.to_numpy(zero_copy_only=False).astype(
-        np.int64, copy=False
-    ), coded.dictionary.to_pylist()
+    series: Series = {}
+    rows = zip(
+        groups.select(names).to_pylist(), groups["t_us_list"], groups["value_list"], strict=True
+    )
+    for row, t_us, value in rows:
+        cell = (row["renderer"], row["policy"], row["scene"], row["seed"])
+        own = series.setdefault(cell, {})
+        own[row["metric"]] = (t_us.values.to_numpy(), value.values.to_numpy())
+    return series

@@ -8,8 +8,10 @@ import math
 import re
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import or_
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import digest
@@ -18,6 +20,7 @@ from alpasim_plugin.core.reading.tables import Kind, check_columns, check_parque
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    import pyarrow.compute as pc
 
 AGAIN = "give a folder written by simrun run or simrun score, or write it again with the same command and --resume"
 # of a metric's value: a double holds no thousandths of larger ones, and no picture a thousand times
@@ -27,98 +30,27 @@ LATEST_US = 2.0**62  # of a time: the difference of two is one of 64 bits
 VALID = "_valid"  # ends the name of the column that tells where a metric is valid
 
 
-@dataclass(frozen=True)
-class File:
-    """A file or a folder of a run folder, or of the folder of a rollout.
-
-    Attributes:
-        name: Below the folder; a folder ends with ``/``.
-        holds: What is in it, for docs/architecture.md.
-        made_by: What writes it: the beginning of a run, the drive, the scoring of its log, the
-            tables, the reports, a command of its own, or the end of the run.
-        is_required: Finished runs, and finished rollouts, have it.
-    """
-
-    name: str
-    holds: str
-    made_by: Literal["start", "drive", "score", "tables", "report", "command", "end"]
-    is_required: bool = True
-
-
-LOG_NAME = "rollout.asl"
-FRAMES_NAME = "frames.jsonl"
-OUTPUT_NAME = "output.log"
-STEPS_NAME = "steps.parquet"
-STRIP_NAME = "strip.jpg"
-VIDEO_NAME = "front.mp4"
-MANIFEST = "manifest.json"
-WHY_NAME = "why.html"
-LOCK = ".simrun.lock"
-RUN_INFO = "run.json"
-SUMMARY = "summary.json"
-ROLLOUTS = "rollouts.parquet"
-STEPS = "steps.parquet"
-SCENES = "scenes"
+# Files of a run folder.
+RUN_INFO = "run.json"  # the command, and everything that decides the results
+SCENES = "scenes"  # lanes, edges and the logged path: a report needs no source files
 ROLLOUTS_FOLDER = "rollouts"
-AGGREGATE = "aggregate"
+ROLLOUTS = "rollouts.parquet"  # a row for each rollout
+STEPS = "steps.parquet"  # a row for each metric at each instant of a rollout
+SUMMARY = "summary.json"  # the last of the tables
 PAGES = ("report.html", "flips.html")
-REPORTS = (*PAGES, "summary.md", "junit.xml")  # made from the tables; nothing reads them
-
-ROLLOUT_FILES = (
-    File(LOG_NAME, "the log", "drive"),
-    File(FRAMES_NAME, "facts of every camera frame", "drive"),
-    File(OUTPUT_NAME, "what its parts printed", "drive", is_required=False),
-    File(STEPS_NAME, "its rows of the run's steps.parquet", "score"),
-    File(STRIP_NAME, "a few frames", "drive", is_required=False),
-    File(VIDEO_NAME, "the video, on request", "drive", is_required=False),
-    File(WHY_NAME, "of a drive that failed: the page that shows why", "report", is_required=False),
-    File(MANIFEST, "what it is, how it went, and the digests of the other files", "end"),
-)
-RUN_FILES = (
-    File(LOCK, "who writes the folder, while somebody does", "start", is_required=False),
-    File(
-        f"{SCENES}/",
-        "lanes, edges and the logged path, so that a report needs no source files",
-        "start",
-    ),
-    File(RUN_INFO, "the command, and everything that decides the results", "start"),
-    File(f"{ROLLOUTS_FOLDER}/", "a folder for each rollout", "drive"),
-    File(f"{AGGREGATE}/", "AlpaSim's aggregation of scored logs", "score", is_required=False),
-    File(
-        "decision.json",
-        "question, order of scenes, looks and verdict of a run driven until decided",
-        "drive",
-        is_required=False,
-    ),
-    File(ROLLOUTS, "a row for each rollout", "tables"),
-    File(STEPS, "a row for each metric at each instant of a rollout", "tables"),
-    File(
-        SUMMARY, "metrics with intervals, paired differences, censoring, failures, speed", "tables"
-    ),
-    File(
-        "flips.json",
-        "of every pair that ends differently: when the plans diverge",
-        "report",
-        is_required=False,
-    ),
-    File("flips/", "both frames at that time", "report", is_required=False),
-    *(
-        File(name, "reports for people and for CI", "report", is_required=False)
-        for name in reversed(REPORTS)
-    ),
-    File("view.html", "drives side by side", "command", is_required=False),
-    File("gate.json", "what the last gate found, for the report", "command", is_required=False),
-    File("forks/", "forks of logged rollouts", "command", is_required=False),
-)
-TABLES = tuple(
-    file.name for file in RUN_FILES if file.made_by == "tables"
-)  # made from the manifests
-DRIVEN = tuple(
-    file.name for file in ROLLOUT_FILES if file.made_by == "drive"
-)  # only driving makes them
-DERIVED = tuple(
-    file.name for file in ROLLOUT_FILES if file.made_by == "score"
-)  # scoring makes them from the log
+LOCK = ".simrun.lock"  # while somebody writes the folder
+AGGREGATE = "aggregate"  # AlpaSim's aggregation of scored logs
+# Files of the folder of a rollout.
+LOG_NAME = "rollout.asl"
+FRAMES_NAME = "frames.jsonl"  # facts of every camera frame
+OUTPUT_NAME = "output.log"  # what its parts printed
+STRIP_NAME = "strip.jpg"  # a few frames
+VIDEO_NAME = "front.mp4"
+STEPS_NAME = "steps.parquet"  # its rows of the run's table
+WHY_NAME = "why.html"
+MANIFEST = "manifest.json"  # written last, with the digests of DRIVEN and DERIVED
+DRIVEN = (LOG_NAME, FRAMES_NAME, OUTPUT_NAME, STRIP_NAME, VIDEO_NAME)  # only driving makes them
+DERIVED = (STEPS_NAME,)  # made from the log
 
 
 @dataclass(frozen=True)
@@ -140,6 +72,27 @@ class Column:
     least: float | None = None
     most: float = math.inf
     of_logs: bool = False
+
+    def faults(self) -> list[tuple[pc.Expression, str]]:
+        """Return what must not be, with what a row that has it lacks; a number that is not finite
+        counts as missing.
+        """
+        import pyarrow.compute as pc
+
+        value = pc.field(self.name)
+        faults = []
+        if self.is_required:
+            faults.append((value.is_null(), f"nothing, wanted {self.kind}"))
+        # Arrow compares an integer with a float as floats, and refuses integers that a float does
+        # not hold.
+        bound = int if self.kind == "integer" else float
+        if self.least is not None:
+            is_less = pc.is_finite(value) & (value < bound(self.least))
+            faults.append((is_less, f"a value below {self.least:g}"))
+        if math.isfinite(self.most):
+            is_greater = pc.is_finite(value) & (value > bound(self.most))
+            faults.append((is_greater, f"a value above {self.most:g}"))
+        return faults
 
 
 @dataclass(frozen=True)
@@ -185,30 +138,37 @@ class TableSchema:
         """Compare a file with the schema before any of it is used, and return the names of its
         columns.
 
-        Types are read from the header; so are missing values and values out of range, where the
-        header has statistics. Metrics that are ``rates`` lie in [0, 1].
+        Rows are read only where the statistics in the header do not tell. Metrics that are
+        ``rates`` lie in [0, 1].
 
         Raises:
             InputError: It is no such table: the error names the file, the column, and the first row
                 that is wrong.
         """
-        import pyarrow.parquet as pq
+        import pyarrow.compute as pc
+        import pyarrow.dataset as pads
 
         names = check_parquet(path, self.required, do_this)
         stated = [
             *(c for c in self.columns if c.name in names),
             *columns_of(metrics_in(names), rates),
         ]
+        kinds = {column.name: column.kind for column in stated}
         with parsing(path, do_this, "no readable parquet"):
-            facts = pq.read_metadata(path)
-            empty = pq.read_schema(path).empty_table()
-        check_columns(empty, {column.name: column.kind for column in stated}, path, do_this)
-        for column in stated:
-            if _is_suspicious(facts, column):
-                _check_values(path, column, do_this)
-        if identity := [name for name in self.identity if name in names]:
-            kinds = {column.name: column.kind for column in self.columns if column.name in identity}
-            _check_identity(read_parquet(path, kinds, do_this, only=True), path, do_this)
+            data = pads.dataset(path, format="parquet")
+        check_columns(data.schema.empty_table(), kinds, path, do_this)
+        faults = {column.name: column.faults() for column in stated}
+        wrong = reduce(or_, (fault for found in faults.values() for fault, _ in found))
+        with parsing(path, do_this, "no readable parquet"):
+            n_wrong = data.count_rows(filter=wrong)
+        for name, found in faults.items() if n_wrong else ():
+            for fault, text in found:
+                row = pc.index(data.to_table(columns={"wrong": fault})["wrong"], True).as_py()
+                if row >= 0:
+                    raise InputError(f"{path}, row {row}: column {name!r}: {text}", do_this)
+        identity = {name: kinds[name] for name in self.identity if name in names}
+        if identity:
+            _check_identity(read_parquet(path, identity, do_this, only=True), path, do_this)
         return names
 
     def read(
@@ -288,58 +248,6 @@ STEPS_TABLE = TableSchema(
         LOG_COLUMN,
     ),
 )
-
-
-def _is_suspicious(facts: Any, column: Column) -> bool:
-    """Tell whether the statistics in a file's header do not show that all values of a column are
-    there and in range.
-    """
-    if not column.is_required and column.least is None:
-        return False
-    (at,) = [i for i in range(facts.num_columns) if facts.schema.column(i).path == column.name]
-    for group in range(facts.num_row_groups):
-        stats = facts.row_group(group).column(at).statistics
-        if stats is None or not stats.has_null_count or (column.is_required and stats.null_count):
-            return True
-        if (
-            column.least is None or stats.num_values == 0
-        ):  # of a chunk of nothing but nulls no least value is stated
-            continue
-        if not stats.has_min_max or not column.least <= stats.min <= stats.max <= column.most:
-            return True
-    return False
-
-
-def _check_values(path: Path, column: Column, do_this: str) -> None:
-    """Refuse a column with a value that is missing or out of range; the first row with one is
-    named, counted from 0.
-    """
-    import pyarrow.compute as pc
-
-    values = read_parquet(path, {column.name: column.kind}, do_this, only=True)[column.name]
-    checks = [(pc.is_null(values), f"nothing, wanted {column.kind}")] if column.is_required else []
-    if column.least is not None:
-        # Arrow compares an integer with a float as floats, and refuses integers that a float does
-        # not hold.
-        bound = int if column.kind == "integer" else float
-        known = pc.is_finite(values)  # what is not finite counts as missing
-        checks.append(
-            (
-                pc.and_(known, pc.less(values, bound(column.least))),
-                f"a value below {column.least:g}",
-            )
-        )
-        if math.isfinite(column.most):
-            checks.append(
-                (
-                    pc.and_(known, pc.greater(values, bound(column.most))),
-                    f"a value above {column.most:g}",
-                )
-            )
-    for wrong, found in checks:
-        row = pc.index(wrong, True).as_py()
-        if row >= 0:
-            raise InputError(f"{path}, row {row}: column {column.name!r}: {found}", do_this)
 
 
 def _check_identity(keys: pa.Table, path: Path, do_this: str) -> None:

@@ -32,15 +32,6 @@ REQUIRED_OF_RUN = (  # every run.json has them
 )
 
 
-class SceneFacts(TypedDict, total=False):
-    """One scene of ``run.json``."""
-
-    source: str
-    content_hash: str
-    notes: list[str]
-    ref: Facts
-
-
 class MetricFacts(TypedDict):
     """What a metric of the run is, in ``run.json``; `alpasim_plugin.core.types.MetricInfo` has the
     members that may follow.
@@ -72,7 +63,7 @@ class RunInfo(TypedDict, total=False):
     preset: str
     suite: str | None
     config: Facts
-    scenes: dict[str, SceneFacts]
+    scenes: dict[str, Facts]
     renderers: list[str]
     policies: list[str]
     seeds: list[int]
@@ -94,31 +85,15 @@ class ManifestFile(TypedDict):
     status: str
 
 
-class Mean(TypedDict, total=False):
-    """A metric of a variant over rollouts, or its paired difference from the baseline."""
-
-    mean: float | None
-    diff: float | None
-    p_value: float | None
-    verdict: str | None
-    baseline: str
-    ci95: float | list[float | None] | None
-    ci95_clustered: list[float | None] | None
-    n_rollouts: int
-    n_scenes: int
-    unit: str
-    direction: str
-
-
 class Summary(TypedDict, total=False):
     """``summary.json``."""
 
     preset: str
     outcomes: dict[str, Facts]
-    metrics: dict[str, dict[str, Mean]]
-    paired: dict[str, dict[str, Mean]]
-    paired_with_base: dict[str, dict[str, Mean]]
-    paired_arms: dict[str, dict[str, Mean]]
+    metrics: dict[str, dict[str, Facts]]
+    paired: dict[str, dict[str, Facts]]
+    paired_with_base: dict[str, dict[str, Facts]]
+    paired_arms: dict[str, dict[str, Facts]]
     censoring: dict[str, Facts]
     failures: Facts
     speed: dict[str, Facts]

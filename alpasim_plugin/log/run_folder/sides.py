@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.types import F64, I64, Bool
-from alpasim_plugin.log.run_folder.schema import ROLLOUTS_TABLE, VALID, metrics_in
+from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS_TABLE, VALID, metrics_in
 
 AGAIN = "Write the tables of this run again with its own command."
 
@@ -26,31 +26,27 @@ Cell = tuple[str, str, int]  # policy, scene, seed: what two renderers share
 
 def value_of(row: Row, metric: str) -> float | None:
     """Return a metric of a row, None where absent, not valid, or not finite."""
-    nested = row.get("metrics")
-    if not isinstance(nested, Mapping):
-        value, valid = row.get(metric), row.get(metric + VALID, True)
-    else:
-        value, valid, _ = _entry_of(nested, metric)
+    value, valid, _ = _entry_of(row, metric)
     return float(value) if valid and value is not None and np.isfinite(float(value)) else None
 
 
 def reason_of(row: Row, metric: str) -> str:
     """Return why a metric of a rollout is not valid, as far as the row knows."""
-    nested = row.get("metrics")
-    if isinstance(nested, Mapping) and nested.get(metric) is not None:
-        return str(_entry_of(nested, metric)[2])
-    return str(row.get(f"{metric}_reason") or "not given")
+    return str(_entry_of(row, metric)[2] or "not given")
 
 
-def _entry_of(metrics: Mapping[str, Any], metric: str) -> tuple[Any, Any, Any]:
-    """Return value, valid and reason of a metric of a manifest, or of a reduction that was not
-    written yet.
+def _entry_of(row: Row, metric: str) -> tuple[Any, Any, Any]:
+    """Return value, valid and reason of a metric of a row: flat (``rollouts.parquet``), or nested
+    (a manifest, or a reduction that was not written yet).
     """
-    entry = metrics.get(metric)
+    nested = row.get("metrics")
+    if not isinstance(nested, Mapping):
+        return row.get(metric), row.get(metric + VALID, True), row.get(f"{metric}_reason")
+    entry = nested.get(metric)
     if entry is None:
-        return None, False, ""
+        return None, False, None
     facts = entry if isinstance(entry, Mapping) else vars(entry)
-    return facts["value"], facts["valid"], facts.get("reason", "")
+    return facts["value"], facts["valid"], facts.get("reason")
 
 
 def failure_of(row: Row) -> str:
@@ -62,13 +58,9 @@ def failure_of(row: Row) -> str:
 def metric_names(rows: Iterable[Row]) -> list[str]:
     """Return the metrics that any row carries, in order of appearance."""
     names: dict[str, None] = {}
-    seen: set[tuple[str, ...]] = set()
     for row in rows:
         nested = row.get("metrics")
-        keys = tuple(nested if isinstance(nested, Mapping) else row)
-        if keys not in seen:
-            seen.add(keys)
-            names.update(dict.fromkeys(keys if isinstance(nested, Mapping) else metrics_in(keys)))
+        names |= dict.fromkeys(nested if isinstance(nested, Mapping) else metrics_in(row))
     return list(names)
 
 
@@ -116,18 +108,9 @@ class Side:
         """Lay out rollouts by their cells; ``keys`` ``(R,)`` may repeat."""
         cells = tuple(sorted(set(keys)))
         number = {cell: i for i, cell in enumerate(cells)}
-        names = sorted({scene for _, scene, _ in cells})
-        scene_number = {scene: i for i, scene in enumerate(names)}
-        return cls(
-            ok,
-            cells,
-            np.array([number[key] for key in keys], dtype=np.int64),
-            np.array([scene_number[scene] for _, scene, _ in cells], dtype=np.int64),
-            raw,
-            reason,
-            failure,
-            rows,
-        )
+        _, scene = np.unique([scene for _, scene, _ in cells], return_inverse=True)
+        cell = np.array([number[key] for key in keys], dtype=np.int64)
+        return cls(ok, cells, cell, scene, raw, reason, failure, rows)
 
     @classmethod
     def of(cls, rows: Sequence[Row]) -> Side:
@@ -137,7 +120,7 @@ class Side:
 
         def raw(metric: str) -> F64:
             values = np.array([value_of(row, metric) for row in rows], dtype=np.float64)
-            return np.where(ok & np.isfinite(values), values, np.nan)
+            return np.where(ok, values, np.nan)
 
         return cls.laid_out(
             keys,
@@ -216,24 +199,21 @@ class RolloutTable:
         where: str,
         reasons: Callable[[str, str], str] = lambda renderer, metric: "",
     ) -> None:
-        self._data = data
+        self._data = pads.dataset(data) if isinstance(data, pa.Table) else data
         self._where = where
         self.reasons = reasons
-        names = data.schema.names
-        self.metrics = list(metrics_in(names))
         self._columns: dict[str, F64] = {}
-        wanted = [*ROLLOUTS_TABLE.required]
-        if "failure_class" in names:
-            wanted.append("failure_class")
-        keys = {name: column.to_pylist() for name, column in self._read(wanted).items()}
-        self._keys = list(
-            zip(keys["renderer"], keys["policy"], keys["scene"], keys["seed"], strict=True)
-        )
+        columns = self._data.schema.names
+        self.metrics = list(metrics_in(columns))
+        keys = self._read([*KEYS, "status"]).to_pydict()
+        self._keys = list(zip(*(keys[name] for name in KEYS), strict=True))
         self.n_rollouts = len(self._keys)
         self.renderers = list(dict.fromkeys(keys["renderer"]))
         self.policies = list(dict.fromkeys(keys["policy"]))
-        self._ok = np.array([status == "ok" for status in keys["status"]], dtype=bool)
-        self._failure_class = keys.get("failure_class") or [None] * self.n_rollouts
+        self._ok = np.array(keys["status"], dtype=object) == "ok"
+        self._failure_class = [None] * self.n_rollouts
+        if "failure_class" in columns:
+            self._failure_class = self._read(["failure_class"])[0].to_pylist()
 
     @classmethod
     def of_files(
@@ -288,24 +268,20 @@ class RolloutTable:
         if metric not in self._columns:
             values = np.full(self.n_rollouts, np.nan)
             if metric in self.metrics:
-                columns = self._read([metric, metric + VALID])
-                number = columns[metric].cast(pa.float64()).to_numpy()
-                valid = columns[metric + VALID].cast(pa.bool_()).fill_null(False).to_numpy()
-                known = valid & self._ok & np.isfinite(number)
-                values[known] = number[known]
+                number, flag = self._read([metric, metric + VALID]).columns
+                value = number.cast(pa.float64()).to_numpy()
+                known = flag.cast(pa.bool_()).fill_null(False).to_numpy() & self._ok
+                known &= np.isfinite(value)
+                values[known] = value[known]
             self._columns[metric] = values
         return self._columns[metric]
 
     def _failure(self, row: int) -> str:
         return self._failure_class[row] or "unknown"
 
-    def _read(self, names: Sequence[str]) -> dict[str, pa.ChunkedArray]:
-        if isinstance(self._data, pa.Table):
-            table = self._data.select(names)
-        else:
-            with parsing(self._where, AGAIN, "no readable parquet"):
-                table = self._data.to_table(columns=list(names))
-        return dict(zip(names, table.columns, strict=True))
+    def _read(self, names: Sequence[str]) -> pa.Table:
+        with parsing(self._where, AGAIN, "no readable parquet"):
+            return self._data.to_table(columns=list(names))
 
     def _side(self, renderer: str, policy: str, rows: I64) -> Side:
         keys = [(policy, *self._keys[row][2:]) for row in rows.tolist()]

@@ -19,7 +19,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.context import BaseContext
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.subprocesses import end_with_parent, forget_safe_path, safe_path
@@ -123,77 +123,6 @@ def map_jobs(work: Callable[[J], R], jobs: Sequence[J], workers: int) -> Iterato
         if isinstance(got, Lost):
             raise InfrastructureError(f"{job}: {got.reason}", got.hint)
         yield job, got
-
-
-class Task(Protocol):
-    """A job that may depend on others; pickled for another process."""
-
-    @property
-    def name(self) -> str:
-        """Unlike that of any other task."""
-        ...
-
-    @property
-    def after(self) -> tuple[str, ...]:
-        """Tasks that must be done before; names that no task has are done already."""
-        ...
-
-
-T = TypeVar("T", bound=Task)
-Send = Callable[[Any], None]
-
-
-def run_dependent(
-    work: Callable[[T, Send], None],
-    tasks: Sequence[T],
-    workers: int,
-    on_message: Callable[[str, Any], None],
-) -> None:
-    """Do all tasks, each after those it depends on; results do not depend on the workers.
-
-    Args:
-        work: A module-level function of a task and of what sends a message to this process.
-        tasks: Every one behind those it depends on.
-        workers: Processes. One is this process.
-        on_message: Called with the name of a task and what its work sent.
-
-    Raises:
-        InfrastructureError: A process ended before its work.
-        ValueError: A task before one that it depends on.
-        The first exception of ``work``; what still runs is ended.
-    """
-    names = [task.name for task in tasks]
-    for n, task in enumerate(tasks):
-        early = sorted(set(task.after) & set(names[n:]))
-        if early:
-            raise ValueError(f"task {task.name} comes before {', '.join(early)}, its condition")
-    if workers <= 1:
-        for task in tasks:
-            work(task, lambda message, name=task.name: on_message(name, message))  # type: ignore[misc]
-        return
-    with _environment(1):
-        manager = _context(1).Manager()
-    with manager, _pool(workers, 1) as pool:
-        messages = manager.Queue()
-        waiting = list(tasks)
-        running: dict[Future[None], str] = {}
-        while waiting or running:
-            unfinished = {*running.values(), *(task.name for task in waiting)}
-            for task in [one for one in waiting if not unfinished & set(one.after)]:
-                running[_submit(pool, 1, _send_from, work, task, messages)] = task.name
-                waiting.remove(task)
-            done, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
-            while not messages.empty():
-                on_message(*messages.get())
-            for future in done:
-                name = running.pop(future)
-                if _is_lost(future):
-                    raise InfrastructureError(f"{name}: its worker process ended", "use --jobs 1")
-                future.result()
-
-
-def _send_from(work: Callable[[T, Send], None], task: T, messages: Any) -> None:
-    work(task, lambda message: messages.put((task.name, message)))
 
 
 def _in_pools(
