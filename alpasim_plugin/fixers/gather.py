@@ -15,12 +15,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from alpasim_plugin.fixers.network.pixel_generator import (
-    DETAIL_IMAGES,
-    IMAGES,
-    GatheredCells,
-    PixelState,
-)
+from alpasim_plugin.fixers.network.pixel_generator import GatheredCells, PixelState
 from alpasim_plugin.fixers.network.reference_blend import (
     CELL,
     CHANNELS,
@@ -28,10 +23,10 @@ from alpasim_plugin.fixers.network.reference_blend import (
     HALF,
     MATCH_CELLS,
     NOWHERE,
-    OFFSET_PX,
     BlendHeads,
     Operations,
     ReferenceCells,
+    offsets,
 )
 
 LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow, and change nothing
@@ -46,70 +41,34 @@ def gather_cells(
     render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor
 ) -> GatheredCells:
     """Return the same as `network.pixel_generator.gather_cells`, bit for bit."""
-    b, h, w, _ = render.shape
-    images = render, opacity, sdmap, state.output, state.render, source, state.hidden
-    rows = [_array(x).reshape(*x.shape[:2], -1) for x in images]
-    coarse = torch.empty(b, h // CELL, w // CELL, CELL * CELL * IMAGES + state.hidden.shape[-1])
-    fine = torch.empty(b, h // DETAIL, w // DETAIL, DETAIL * DETAIL * DETAIL_IMAGES)
-    _gather_coarse(*rows, source is not render, coarse.numpy())
-    _gather_fine(rows[0], rows[1], rows[3], fine.numpy())
-    return GatheredCells(coarse, fine)
+    cover = 2 * opacity - 1
+    noise = torch.zeros_like(render) if source is render else source - render
+    coarse = render, cover, sdmap, state.output, state.render, noise
+    at4 = torch.cat([_joined_cells(coarse, CELL), state.hidden], dim=-1)
+    return GatheredCells(at4, _joined_cells((render, cover, state.output), DETAIL))
+
+
+def _joined_cells(images: tuple[Tensor, ...], side: int) -> Tensor:
+    """Return the cells of images ``(B, H, W, C)`` side by side."""
+    b, h, w, _ = images[0].shape
+    sizes = [side * side * image.shape[-1] for image in images]
+    out = torch.empty(b, h // side, w // side, sum(sizes))
+    first = 0
+    for image, size in zip(images, sizes, strict=True):
+        _put_cells(_array(image).reshape(b * h, -1), side, out.flatten(0, 1).numpy(), first)
+        first += size
+    return out
 
 
 @njit(cache=True, nogil=True)
-def _gather_coarse(render, opacity, sdmap, output, last_render, source, hidden, noise, coarse):
-    """Write the cells of 4 x 4 pixels of rows ``(B, H, W C)``; without ``noise`` the source is the
-    render.
-    """
-    batch, rows, columns, size = coarse.shape
-    side, run = CELL, 3 * CELL  # pixels and values of a cell's row
-    one, three = side * side, side * run  # values of a cell of one and of three channels
-    for b in range(batch):
-        for i in range(rows):
-            for j in range(columns):
-                cell = coarse[b, i, j]
-                for r in range(side):
-                    y = side * i + r
-                    x = run * j
-                    at = run * r
-                    for k in range(side):
-                        cell[three + side * r + k] = np.float32(2.0) * opacity[
-                            b, y, side * j + k
-                        ] - np.float32(1.0)
-                    for k in range(run):
-                        cell[at + k] = render[b, y, x + k]
-                        cell[three + one + at + k] = sdmap[b, y, x + k]
-                        cell[2 * three + one + at + k] = output[b, y, x + k]
-                        cell[3 * three + one + at + k] = last_render[b, y, x + k]
-                        cell[4 * three + one + at + k] = (
-                            source[b, y, x + k] - render[b, y, x + k] if noise else np.float32(0.0)
-                        )
-                channels = size - 5 * three - one
-                for c in range(channels):
-                    cell[5 * three + one + c] = hidden[b, i, channels * j + c]
-
-
-@njit(cache=True, nogil=True)
-def _gather_fine(render, opacity, output, fine):
-    """Write the cells of 2 x 2 pixels of rows ``(B, H, W C)``."""
-    batch, rows, columns, _ = fine.shape
-    side, run = DETAIL, 3 * DETAIL
-    one, three = side * side, side * run
-    for b in range(batch):
-        for i in range(rows):
-            for j in range(columns):
-                cell = fine[b, i, j]
-                for r in range(side):
-                    y = side * i + r
-                    x = run * j
-                    at = run * r
-                    for k in range(side):
-                        cell[three + side * r + k] = np.float32(2.0) * opacity[
-                            b, y, side * j + k
-                        ] - np.float32(1.0)
-                    for k in range(run):
-                        cell[at + k] = render[b, y, x + k]
-                        cell[three + one + at + k] = output[b, y, x + k]
+def _put_cells(rows, side, out, first):
+    """Write the cells of rows of pixels ``(B H, W C)`` into ``out``, from column ``first`` on."""
+    run = rows.shape[1] // out.shape[1]  # values of a cell's row
+    for y in range(rows.shape[0]):
+        begin = first + (y % side) * run
+        for j in range(out.shape[1]):
+            for k in range(run):
+                out[y // side, j, begin + k] = rows[y, run * j + k]
 
 
 def gather_references(references: Tensor, render: Tensor, scale: int = 1) -> ReferenceCells:
@@ -225,47 +184,6 @@ def _likeness(sought, shown, out):
             for j in range(width):
                 for place in range(reach * reach):
                     out[n, i, j, place] = alike[place, j]
-
-
-def offsets(at2: Tensor, at4: Tensor) -> Tensor:
-    """Return the same as `network.reference_blend.offsets`."""
-    out = torch.empty(at2.shape)
-    _offsets(_array(at2), _array(at4), out.flatten(2).numpy())
-    return out
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _offsets(at2, at4, out):
-    images, height, width, axes = at2.shape
-    own = np.float32(0.75)
-    next_to = np.float32(0.25)
-    one = np.float32(1.0)
-    two = np.float32(2.0)
-    most = np.float32(OFFSET_PX)
-    columns = at4.shape[2]
-    rows = np.empty((columns, axes), np.float32)
-    row = np.empty(width * axes, np.float32)
-    fallen = np.empty(width * axes, np.float32)
-    for n in range(images):
-        for y in range(height):
-            i = y // 2
-            other = max(i - 1, 0) if y % 2 == 0 else min(i + 1, at4.shape[1] - 1)
-            for j in range(columns):
-                for c in range(axes):
-                    rows[j, c] = own * at4[n, i, j, c] + next_to * at4[n, other, j, c]
-            for j in range(columns):
-                before, after = max(j - 1, 0), min(j + 1, columns - 1)
-                for c in range(axes):
-                    half = own * rows[j, c]
-                    row[2 * axes * j + c] = half + next_to * rows[before, c] + at2[n, y, 2 * j, c]
-                    row[2 * axes * j + axes + c] = (
-                        half + next_to * rows[after, c] + at2[n, y, 2 * j + 1, c]
-                    )
-            for x in range(len(row)):
-                fallen[x] = -two * abs(row[x])
-            _exponentials(fallen)
-            for x in range(len(row)):  # tanh |x| = (1 - exp(-2 |x|)) / (1 + exp(-2 |x|))
-                out[n, y, x] = np.copysign(most * (one - fallen[x]) / (one + fallen[x]), row[x])
 
 
 def blend(

@@ -30,7 +30,6 @@ from alpasim_plugin.core.geometry import interpolate, se2
 from alpasim_plugin.core.types import F64, U8, Box, CameraSpec, LaneMap, Marking
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
 from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, PreparedMap, prepare_map
-from alpasim_plugin.fixers.semantic_map.style import OPENGL
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import wire_pose
 from alpasim_plugin.log.wire import sensorsim_pb2
@@ -59,9 +58,9 @@ def prepared(aside_m: float = 0.0, **options: bool) -> PreparedMap:
 
 def photograph(contrast: int = 90, noise: float = 6.0, aside_m: float = 0.0, **options: bool) -> U8:
     """A grey road with the paint of `road`, as thin as paint is, and a textured roadside."""
-    thin = draw_map(
-        prepare_map(road(aside_m, **options), style=replace(OPENGL, line_px=5.0)), SPEC, AHEAD
-    )
+    scene = prepared(aside_m, **options)
+    scene.segments.style[:, 0] = 5.0  # the width in pixels
+    thin = draw_map(scene, SPEC, AHEAD)
     out = (
         80
         + np.random.default_rng(0).normal(0, noise, (270, 480, 1))

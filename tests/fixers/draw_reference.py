@@ -9,7 +9,7 @@ and shape: no bands, no shortcuts.
   1/depth is linear along a stroke and over a shape.
 - Colour and depth of a stroke belong to the pixel, depth of a shape to the sample. The nearer wins;
   of equals the one drawn first.
-- Colours fade with ``clamp(1 - depth / depth_max)``, half widths with ``min(1, gain * fade)``.
+- Colours fade with ``clamp(1 - depth / depth_max)``, half widths alike.
 """
 
 from __future__ import annotations
@@ -20,20 +20,12 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import transform_points
 from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec
-from alpasim_plugin.fixers.semantic_map.draw import (
-    MapCamera,
-    actor_geometry,
-    radius_of,
-    samples_of,
-    stretch_of,
-    view_of,
-)
+from alpasim_plugin.fixers.semantic_map.draw import actor_geometry, view_of
 from alpasim_plugin.fixers.semantic_map.kernels import (
     BACK,
     BIAS,
     FARTHEST,
     FRONT,
-    GAIN,
     HALF,
     NEAREST,
     RED,
@@ -42,12 +34,13 @@ from alpasim_plugin.fixers.semantic_map.kernels import (
     STROKE,
 )
 from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, PreparedMap, Segments, Triangles
-from alpasim_plugin.fixers.semantic_map.style import WIDTH_DEFINED_AT_PX, MapStyle
+from alpasim_plugin.fixers.semantic_map.raster import SAMPLES
+from alpasim_plugin.fixers.semantic_map.style import DEPTH_MAX_M, NEAR_M, WIDTH_DEFINED_AT_PX
 
 
 def draw_map_reference(
     scene: PreparedMap,
-    camera: MapCamera,
+    camera: CameraSpec,
     T_world_camera: F64,
     actors: Sequence[ActorBox] = (),
     *,
@@ -60,47 +53,33 @@ def draw_map_reference(
     Raises:
         InputError: As the fast one.
     """
-    _, _, pose = view_of(scene, camera, T_world_camera)
+    _, pose = view_of(scene, camera, T_world_camera)
     T_camera_scene = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
     faces, edges = actor_geometry(actors, scene, pose)
-    first = strokes_reference(
-        scene.segments, T_camera_scene, camera, scene.style, step_m, angle_rad
-    )
+    first = strokes_reference(scene.segments, T_camera_scene, camera, step_m, angle_rad)
     strokes = np.concatenate(
-        [first, strokes_reference(edges, T_camera_scene, camera, scene.style, step_m, angle_rad)]
+        [first, strokes_reference(edges, T_camera_scene, camera, step_m, angle_rad)]
     )
     shapes = [
-        shapes_reference(part, T_camera_scene, camera, scene.style, step_m, angle_rad)
+        shapes_reference(part, T_camera_scene, camera, step_m, angle_rad)
         for part in (scene.triangles, faces)
     ]
-    return draw_reference(strokes, len(first), np.concatenate(shapes), camera, scene.style)
+    return draw_reference(strokes, len(first), np.concatenate(shapes), camera)
 
 
-def project_points(camera: MapCamera, points: F64) -> F64:
-    """Project camera-frame points ``(N, 3)``, metres, to pixels ``(N, 2)`` in float64, without a
-    table.
-
-    A pinhole needs z > 0: points at or behind its plane give NaN. An f-theta lens sees behind
-    itself where its radius goes on.
-    """
+def project_points(camera: CameraSpec, points: F64) -> F64:
+    """Project camera-frame points ``(N, 3)``, metres, to pixels ``(N, 2)``; NaN behind the camera."""
     x, y, z = points.T
-    if isinstance(camera, CameraSpec):
-        z = np.where(z > 0, z, np.nan)
-        k = camera.K
-        return np.stack(
-            [k[0, 0] * x / z + k[0, 1] * y / z + k[0, 2], k[1, 1] * y / z + k[1, 2]], axis=1
-        )
-    across = np.hypot(x, y)
-    radius = radius_of(camera, np.arctan2(across, z))
-    unit = points[:, :2] / np.where(across > 0, across, 1.0)[:, None]
-    return np.asarray((unit * radius[:, None]) @ np.array(camera.A).T + (camera.cx, camera.cy))
+    z = np.where(z > 0, z, np.nan)
+    k = camera.K
+    u = k[0, 0] * x / z + k[0, 1] * y / z + k[0, 2]
+    return np.stack([u, k[1, 1] * y / z + k[1, 2]], axis=1)
 
 
 def strokes_reference(
     segments: Segments,
     T_camera_scene: F64,
-    camera: MapCamera,
-    style: MapStyle,
+    camera: CameraSpec,
     step_m: float,
     angle_rad: float,
 ) -> F64:
@@ -111,15 +90,15 @@ def strokes_reference(
         inside = [0.0, 1.0]
         if a[2] != b[2]:
             crossings = sorted(
-                ((style.near_m - a[2]) / (b[2] - a[2]), (style.depth_max_m - a[2]) / (b[2] - a[2]))
+                ((NEAR_M - a[2]) / (b[2] - a[2]), (DEPTH_MAX_M - a[2]) / (b[2] - a[2]))
             )
             inside = [max(0.0, crossings[0]), min(1.0, crossings[1])]
-        elif not style.near_m <= a[2] < style.depth_max_m:
+        elif not NEAR_M <= a[2] < DEPTH_MAX_M:
             continue
         if inside[0] > inside[1]:
             continue
         points = _along(a + inside[0] * (b - a), a + inside[1] * (b - a), step_m, angle_rad)
-        points[:, 2] = np.maximum(points[:, 2], style.near_m)
+        points[:, 2] = np.maximum(points[:, 2], NEAR_M)
         seen = np.column_stack([project_points(camera, points), 1.0 / points[:, 2]])
         half = width_px / 2 * camera.width / WIDTH_DEFINED_AT_PX
         rows.append(
@@ -131,8 +110,7 @@ def strokes_reference(
 def shapes_reference(
     triangles: Triangles,
     T_camera_scene: F64,
-    camera: MapCamera,
-    style: MapStyle,
+    camera: CameraSpec,
     side_m: float,
     angle_rad: float,
 ) -> F64:
@@ -142,7 +120,7 @@ def shapes_reference(
         triangles.corners, triangles.shade, triangles.style, strict=True
     ):
         polygon = clip_reference(
-            np.column_stack([transform_points(T_camera_scene, corners), shade]), style.near_m
+            np.column_stack([transform_points(T_camera_scene, corners), shade]), NEAR_M
         )
         for k in range(1, len(polygon) - 1):
             for piece in _cut(polygon[[0, k, k + 1]], side_m, angle_rad):
@@ -207,21 +185,18 @@ def _cut(triangle: F64, side_m: float, angle_rad: float) -> list[F64]:
     )
 
 
-def draw_reference(
-    strokes: F64, n_first: int, shapes: F64, camera: MapCamera, style: MapStyle
-) -> U8:
+def draw_reference(strokes: F64, n_first: int, shapes: F64, camera: CameraSpec) -> U8:
     """Draw strokes before ``n_first``, then all shapes, then the other strokes."""
-    samples = samples_of(style)
-    depth = np.zeros((camera.height, camera.width, len(samples)), np.float32)
-    colour = np.zeros((camera.height, camera.width, len(samples), 3))
-    stretch = stretch_of(style, camera)
+    depth = np.zeros((camera.height, camera.width, len(SAMPLES)), np.float32)
+    colour = np.zeros((camera.height, camera.width, len(SAMPLES), 3))
+    stretch = camera.width / camera.height
     for stroke in strokes[:n_first]:
-        _stroke(stroke, stretch, style.depth_max_m, samples, depth, colour)
+        _stroke(stroke, stretch, depth, colour)
     for shape in shapes:
-        _shape(shape, style.depth_max_m, samples, depth, colour)
+        _shape(shape, depth, colour)
     for stroke in strokes[n_first:]:
-        _stroke(stroke, stretch, style.depth_max_m, samples, depth, colour)
-    mean = (colour.sum(axis=2) + len(samples) // 2) // len(samples)
+        _stroke(stroke, stretch, depth, colour)
+    mean = (colour.sum(axis=2) + len(SAMPLES) // 2) // len(SAMPLES)
     return np.asarray(mean, dtype=np.uint8)
 
 
@@ -238,9 +213,7 @@ def _window(low: F64, high: F64, depth: F32) -> tuple[slice, slice, F64] | None:
     return slice(y0, y1), slice(x0, x1), np.stack([x, y], axis=-1)
 
 
-def _stroke(
-    stroke: F64, stretch: float, depth_max_m: float, samples: F64, depth: F32, colour: F64
-) -> None:
+def _stroke(stroke: F64, stretch: float, depth: F32, colour: F64) -> None:
     square = np.array([1.0, stretch])
     a, b = stroke[0:2], stroke[3:5]
     reach = stroke[HALF] / square
@@ -266,9 +239,9 @@ def _stroke(
 
     t, _ = nearest(centre)
     inverse = stroke[2] + t * (stroke[5] - stroke[2])
-    fade = np.maximum(0.0, 1.0 - 1.0 / (inverse * depth_max_m))
-    radius = stroke[HALF] * np.minimum(1.0, stroke[GAIN] * fade)
-    covered = np.stack([nearest(centre + offset)[1] <= radius**2 for offset in samples], axis=-1)
+    fade = np.maximum(0.0, 1.0 - 1.0 / (inverse * DEPTH_MAX_M))
+    radius = stroke[HALF] * fade
+    covered = np.stack([nearest(centre + offset)[1] <= radius**2 for offset in SAMPLES], axis=-1)
     here = inverse / np.maximum(1.0 - stroke[BIAS] * inverse, 1e-3)
     painted = np.floor(stroke[RED : RED + 3] * fade[..., None] + 0.5)
     _put(
@@ -280,7 +253,7 @@ def _stroke(
     )
 
 
-def _shape(shape: F64, depth_max_m: float, samples: F64, depth: F32, colour: F64) -> None:
+def _shape(shape: F64, depth: F32, colour: F64) -> None:
     corners = shape[:12].reshape(3, 4)
     xy = corners[:, :2]
     window = _window(xy.min(axis=0), xy.max(axis=0), depth)
@@ -295,13 +268,13 @@ def _shape(shape: F64, depth_max_m: float, samples: F64, depth: F32, colour: F64
 
     middle = parts(centre)
     inverse = np.clip(middle @ corners[:, 2], shape[FARTHEST], shape[NEAREST])
-    fade = np.maximum(0.0, 1.0 - 1.0 / inverse / depth_max_m)
+    fade = np.maximum(0.0, 1.0 - 1.0 / inverse / DEPTH_MAX_M)
     back = np.clip(middle @ corners[:, 3] / inverse, 0.0, 1.0)[..., None]
     painted = np.floor(
         (shape[FRONT : FRONT + 3] * (1 - back) + shape[BACK : BACK + 3] * back) * fade[..., None]
         + 0.5
     )
-    at_samples = np.stack([parts(centre + offset) for offset in samples], axis=-2)
+    at_samples = np.stack([parts(centre + offset) for offset in SAMPLES], axis=-2)
     here = np.clip(at_samples @ corners[:, 2], shape[FARTHEST], shape[NEAREST])
     here = here / np.maximum(1.0 - shape[S_BIAS] * here, 1e-3)
     _put(

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import shapely
@@ -9,15 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.types import Lane, LaneMap, Marking
-from alpasim_plugin.fixers.semantic_map.prepare import (
-    LaneLine,
-    MapExtras,
-    cut_dashes,
-    lane_lines,
-    prepare_map,
-    triangulate,
-)
-from alpasim_plugin.fixers.semantic_map.style import LUDUS, OPENGL, STYLES, box_class
+from alpasim_plugin.fixers.semantic_map.prepare import cut_dashes, prepare_map, triangulate
+from alpasim_plugin.fixers.semantic_map.style import COLOURS, box_class
+from alpasim_plugin.world.paint import painted_lines
 from tests.examples import examples
 
 
@@ -33,10 +25,8 @@ def lane(key, y, left_paint="unknown", right_paint="unknown", reverse=False, **m
 
 
 def drawn(*lanes, **more):
-    return [
-        (float(k.xyz[0, 1]), k.colour, k.patterns)
-        for k in lane_lines(LaneMap({k.lane_id: k for k in lanes}, **more))
-    ]
+    lane_map = LaneMap({k.lane_id: k for k in lanes}, **more)
+    return [(float(xyz[0, 1]), paint) for xyz, paint in painted_lines(lane_map)]
 
 
 def test_edge_shared_by_two_lanes_is_drawn_once_with_the_paint_that_is_known():
@@ -44,8 +34,8 @@ def test_edge_shared_by_two_lanes_is_drawn_once_with_the_paint_that_is_known():
         lane("1", 0.0, "dashed_white", "solid_white"), lane("2", 3.5, "unknown", "unknown")
     )
     assert sorted(found) == [
-        (-1.75, "white", ("solid",)),
-        (1.75, "white", ("long_dashed",)),
+        (-1.75, "solid_white"),
+        (1.75, "dashed_white"),
     ]
 
 
@@ -58,7 +48,7 @@ def test_edge_shared_with_oncoming_traffic_is_drawn_once():
         lane("1", 0.0, "double_yellow", "none"),
         lane("2", 3.5, "double_yellow", "none", reverse=True),
     )
-    assert found == [(1.75, "yellow", ("solid", "solid"))]
+    assert found == [(1.75, "double_yellow")]
 
 
 def test_edges_that_cross_are_both_drawn():
@@ -88,50 +78,26 @@ def test_marking_lines_are_drawn_with_the_lane_edges_of_known_paint_beside_which
         Marking(line[:1], "unknown"),
     )
     found = drawn(lane("1", 0.0, "solid_white"), markings=markings)
-    assert found == [(0.0, "yellow", ("long_dashed",)), (1.75, "white", ("solid",))]
+    assert found == [(0.0, "dashed_yellow"), (1.75, "solid_white")]
     along = (Marking(np.array([[-40.0, 1.75, 0], [80, 1.75, 0]]), "dashed_yellow"),)
-    assert drawn(lane("1", 0.0, "solid_white"), markings=along) == [
-        (1.75, "yellow", ("long_dashed",))
-    ]
-
-
-def test_untyped_style_draws_every_line_solid():
-    line = np.array([[0.0, 0, 0], [60, 0, 0]])
-    extras = MapExtras(lane_lines=(LaneLine(line, "white", ("long_dashed",)),))
-    typed = prepare_map(LaneMap({}), extras)
-    plain = prepare_map(LaneMap({}), extras, replace(OPENGL, typed_lines=False))
-    assert (len(typed.segments.ends), len(plain.segments.ends)) == (5, 1)
-    assert plain.segments.style[0, 3:].tolist() == [98, 183, 249]
-
-
-def test_line_of_no_known_pattern_is_three_times_as_wide():
-    line = np.array([[0.0, 0, 0], [60, 0, 0]])
-    scene = prepare_map(
-        LaneMap({}),
-        MapExtras(lane_lines=(LaneLine(line, "white", ("other",)), LaneLine(line, "other"))),
-    )
-    assert scene.segments.style[:, 0].tolist() == [36.0, 12.0]
-    assert scene.segments.style[:, 3:].tolist() == [[255, 255, 255], [181, 164, 71]]
+    assert drawn(lane("1", 0.0, "solid_white"), markings=along) == [(1.75, "dashed_yellow")]
 
 
 @pytest.mark.parametrize(
-    ("style", "pattern", "share"),
+    ("paint", "pieces", "colour"),
     [
-        (OPENGL, "long_dashed", 3 / 12),
-        (OPENGL, "short_dashed", 1.5 / 3),
-        (OPENGL, "dotted", 0.3 / 0.9),
-        (OPENGL, "dotted_1_9", 0.1),
-        (OPENGL, "dot_dashed", 0.3 / 3.65),
-        (LUDUS, "long_dashed", 3 / 12),
-        (LUDUS, "short_dashed", 1 / 2),
+        ("solid_white", 1, "line_white"),
+        ("dashed_yellow", 5, "line_yellow"),
+        ("double_yellow", 2, "line_yellow"),
     ],
 )
-def test_patterns_paint_their_share(style, pattern, share):
-    line = np.array([[0.0, 0, 0], [2628.0, 0, 0]])  # a whole number of periods of all of them
-    painted = sum(
-        np.linalg.norm(piece[-1] - piece[0]) for piece in cut_dashes(line, style.patterns[pattern])
-    )
-    assert painted / line[-1, 0] == pytest.approx(share, rel=2e-3)
+def test_paint_decides_pieces_and_colour(paint, pieces, colour):
+    line = np.array([[0.0, 0, 0], [60, 0, 0]])
+    segments = prepare_map(LaneMap({}, markings=(Marking(line, paint),))).segments
+    assert len(segments.ends) == pieces
+    assert segments.style[:, 2:].tolist() == [list(COLOURS[colour])] * pieces
+    if paint == "double_yellow":  # the left one first
+        assert segments.ends[:, 0, 1].tolist() == pytest.approx([0.1, -0.1])
 
 
 @settings(max_examples=examples(60), deadline=None)
@@ -145,7 +111,7 @@ def test_patterns_paint_their_share(style, pattern, share):
 def test_dashes_lie_on_their_line_and_are_as_long_as_they_should(points, on, off):
     line = np.array(points)
     length = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
-    pieces = cut_dashes(line, ((on, off),))
+    pieces = cut_dashes(line, on, off)
     lengths = [np.linalg.norm(np.diff(piece, axis=0), axis=1).sum() for piece in pieces]
     full, rest = divmod(length, on + off)
     assert sum(lengths) == pytest.approx(
@@ -160,8 +126,8 @@ def test_dashes_lie_on_their_line_and_are_as_long_as_they_should(points, on, off
 
 
 def test_dashes_of_a_line_without_length_are_none():
-    assert cut_dashes(np.zeros((3, 3)), ((3.0, 9.0),)) == []
-    assert cut_dashes(np.zeros((1, 3)), ((3.0, 9.0),)) == []
+    assert cut_dashes(np.zeros((3, 3)), 3.0, 9.0) == []
+    assert cut_dashes(np.zeros((1, 3)), 3.0, 9.0) == []
 
 
 RINGS = {
@@ -224,8 +190,7 @@ def test_ring_without_area_is_filled_with_nothing():
     assert filled(np.array([(0, 0), (1, 1), (2, 2.0)])) == []
 
 
-def test_styles_are_found_by_name_and_labels_by_any_case():
-    assert set(STYLES) == {"opengl", "ludus"}
+def test_labels_are_found_in_any_case():
     assert [box_class(k) for k in ("Car", "heavy_truck", "Person", "RIDER", "cone")] == [
         "car",
         "truck",

@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import Actor, Box, FTheta, Trajectory
+from alpasim_plugin.core.types import Actor, Box, Trajectory
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
-from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, LaneLine, actor_boxes, prepare_map
-from tests.fixers.views import CAR, EMPTY, FISH, PIN, at, fixed_lines, line
+from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, actor_boxes, prepare_map
+from tests.fixers.views import CAR, EMPTY, PIN, at, line
 
 NAN_LINE = line((0, 0, 0), (1, np.nan, 0))
 NAN_POSE = at()
 NAN_POSE[0, 3] = np.nan
-FOLDING = FTheta((0.0, 0.01), (0.0, 100.0, -80.0), 1.2)
 TRACK = Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]))
 KNOWN = (Actor("a", "car", CAR, TRACK), Actor("b", "bus", CAR, TRACK))
 
@@ -31,7 +30,6 @@ def draw(camera=PIN, pose=None, *boxes):
     [
         lambda: prepare_map(replace(EMPTY, road_edges=(NAN_LINE,))),
         lambda: prepare_map(replace(EMPTY, crosswalks=(NAN_LINE,))),
-        lambda: prepare_map(EMPTY, fixed_lines(LaneLine(NAN_LINE))),
         lambda: prepare_map(replace(EMPTY, poles=(np.zeros((2, 2)),))),
         lambda: prepare_map(replace(EMPTY, signs=((NAN_POSE, CAR),))),
         lambda: prepare_map(replace(EMPTY, crosswalks=(line((0, 0, 0), (1, 0, 0)),))),
@@ -41,8 +39,6 @@ def draw(camera=PIN, pose=None, *boxes):
         lambda: draw(PIN, None, ActorBox(np.eye(4), Box(1, -1, 1), "car")),
         lambda: draw(replace(PIN, K=np.diag([-1.0, 1, 1]))),
         lambda: draw(replace(PIN, width=0)),
-        lambda: draw(replace(FISH, lens=FTheta((0.0,), (0.0, 1.0), 0.0))),
-        lambda: draw(replace(FISH, lens=FOLDING)),
         lambda: actor_boxes({"x": np.eye(4)}, KNOWN),
     ],
 )

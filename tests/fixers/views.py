@@ -1,20 +1,16 @@
-"""A pinhole and an f-theta camera, and small parts of maps for them to look at."""
+"""A pinhole camera, and small parts of maps for it to look at."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.core.types import Box, CameraSpec, FTheta, LaneMap
-from alpasim_plugin.fixers.semantic_map.draw import FThetaCamera
-from alpasim_plugin.fixers.semantic_map.prepare import MapExtras
+from alpasim_plugin.core.types import Box, CameraSpec, LaneMap, Marking
 
 # Camera axes in a rig that looks along x.
 AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 PIN = CameraSpec("pin", 256, 144, np.array([[128.0, 0, 128], [0, 128, 72], [0, 0, 1]]), AHEAD)
-FISH = FThetaCamera(
-    "fish", 256, 144, 128.0, 72.0, FTheta((0.0, 1 / 122), (0.0, 122.0, 0.0, -4.0), 1.2)
-)
+BIG = CameraSpec("big", 1280, 720, np.array([[640.0, 0, 640], [0, 640, 360], [0, 0, 1]]), AHEAD)
 EMPTY = LaneMap({})
 CAR = Box(4.5, 1.9, 1.6)
 
@@ -28,5 +24,6 @@ def line(*points):
     return np.array(points, dtype=float)
 
 
-def fixed_lines(*lines):
-    return MapExtras(lane_lines=tuple(lines))
+def marked(*lines_and_paints):
+    """A map of lane markings alone."""
+    return LaneMap({}, markings=tuple(Marking(*pair) for pair in lines_and_paints))

@@ -16,54 +16,31 @@ import shapely
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, Actor, Bool, Box, LaneMap, Paint
 from alpasim_plugin.fixers.semantic_map.style import (
-    OPENGL,
-    AreaKind,
-    LightState,
-    LineColour,
-    MapStyle,
-    Pattern,
-    Rgb,
+    COLOURS,
+    DASH_M,
+    DOUBLE_OFFSET_M,
+    GAP_M,
+    LINE_PX,
+    POLE_PX,
 )
 from alpasim_plugin.gaussians.cloud import require_rigid
 from alpasim_plugin.world.paint import painted_lines
 
 POLE_HEIGHT_M = 3.0  # of poles given as one point
+GROUP = 32  # segments that share a bounding sphere
+# Depth bias of a crosswalk, so that lines on it stay visible.
+CROSSWALK_BIAS_M = -0.4
+# Corners of a unit box: bit 2 is +x, bit 1 is +y, bit 0 is +z.
+CORNERS = np.array([[(i >> 2 & 1) - 0.5, (i >> 1 & 1) - 0.5, (i & 1) - 0.5] for i in range(8)])
+FACES = np.array(
+    [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+)  # wound to the left from outside
+TRIANGLES = np.concatenate([FACES[:, [0, 1, 2]], FACES[:, [0, 2, 3]]])  # (12, 3)
+EDGES = np.array(
+    [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]]
+)
 
-_PAINT: Mapping[Paint, tuple[LineColour, tuple[Pattern, ...]]] = {
-    "solid_white": ("white", ("solid",)),
-    "dashed_white": ("white", ("long_dashed",)),
-    "solid_yellow": ("yellow", ("solid",)),
-    "dashed_yellow": ("yellow", ("long_dashed",)),
-    "double_yellow": ("yellow", ("solid", "solid")),
-}
-
-
-@dataclass(frozen=True)
-class LaneLine:
-    """A lane line: one pattern, or two for a double line, the left one first as seen along the
-    line.
-    """
-
-    xyz: F64  # (N, 3) metres, world
-    colour: LineColour = "untyped"
-    patterns: tuple[Pattern, ...] = ("solid",)
-
-
-@dataclass(frozen=True)
-class TrafficLight:
-    """A traffic light's housing and its state."""
-
-    T_world_box: F64  # (4, 4)
-    box: Box
-    state: LightState = "unknown"
-
-
-@dataclass(frozen=True)
-class Area:
-    """A filled patch of ground; concave outlines stay concave."""
-
-    ring: F64  # (N, 3) metres, world; closed or not
-    kind: AreaKind = "road_marking"
+Polyline = tuple[str, float, F64]  # colour, width at 1280 px, (N, 3) metres
 
 
 @dataclass(frozen=True)
@@ -73,17 +50,6 @@ class ActorBox:
     T_world_box: F64  # (4, 4) pose of the box centre
     box: Box
     label: str  # see `style.box_class`
-
-
-@dataclass(frozen=True)
-class MapExtras:
-    """Layers that `LaneMap` does not hold. ``lane_lines``, where given, replace those derived from
-    the lane map.
-    """
-
-    lane_lines: tuple[LaneLine, ...] | None = None
-    areas: tuple[Area, ...] = ()
-    lights: tuple[TrafficLight, ...] = ()
 
 
 def actor_boxes(poses: Mapping[str, F64], actors: Sequence[Actor]) -> tuple[ActorBox, ...]:
@@ -102,38 +68,12 @@ def actor_boxes(poses: Mapping[str, F64], actors: Sequence[Actor]) -> tuple[Acto
     return tuple(ActorBox(pose, known[key].box, known[key].label) for key, pose in poses.items())
 
 
-def lane_lines(lane_map: LaneMap) -> tuple[LaneLine, ...]:
-    """Return the lane lines of a map, each drawn once."""
-    return tuple(LaneLine(xyz, *_PAINT[paint]) for xyz, paint in painted_lines(lane_map))
-
-
-GROUP = 32  # segments that share a bounding sphere
-# Depth bias of ground areas, so that lines on them stay visible, and smaller areas on larger ones.
-GROUND_BIAS_M = {
-    "road_marking": 0.3,
-    "crosswalk": 0.4,
-    "road_island": 0.5,
-    "buffer_zone": 0.5,
-    "intersection": 0.6,
-}
-DOING = "preparing the semantic map"
-# Corners of a unit box: bit 2 is +x, bit 1 is +y, bit 0 is +z.
-CORNERS = np.array([[(i >> 2 & 1) - 0.5, (i >> 1 & 1) - 0.5, (i & 1) - 0.5] for i in range(8)])
-FACES = np.array(
-    [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-)  # wound to the left from outside
-TRIANGLES = np.concatenate([FACES[:, [0, 1, 2]], FACES[:, [0, 2, 3]]])  # (12, 3)
-EDGES = np.array(
-    [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]]
-)
-
-
 @dataclass(frozen=True)
 class Segments:
     """Straight pieces of line, relative to the scene's origin."""
 
     ends: F64  # (S, 2, 3) metres
-    style: F64  # (S, 6) width at 1280 px, fade gain, bias towards the camera in metres, r, g, b
+    style: F64  # (S, 5) width at 1280 px, bias towards the camera in metres, r, g, b
     spheres: F64  # (G, 4) centre and radius around each GROUP of segments
 
 
@@ -156,78 +96,49 @@ class PreparedMap:
     origin: F64  # (3,) metres, world
     segments: Segments
     triangles: Triangles
-    style: MapStyle
 
 
-def prepare_map(
-    lane_map: LaneMap, extras: MapExtras | None = None, style: MapStyle = OPENGL
-) -> PreparedMap:
+def prepare_map(lane_map: LaneMap) -> PreparedMap:
     """Prepare a scene's map for drawing.
 
     Args:
         lane_map: Coordinates may be UTM-sized: everything is stored relative to the middle of the
             map.
-        extras: Layers that the lane map does not hold.
-        style: Colours, widths, patterns.
 
     Raises:
         InputError: A coordinate that is not finite, an area without three corners, or a pose that
             is not rigid.
     """
-    extras = extras or MapExtras()
-    lines = lane_lines(lane_map) if extras.lane_lines is None else extras.lane_lines
-    areas = [("crosswalk", ring) for ring in lane_map.crosswalks] + [
-        (area.kind, area.ring) for area in extras.areas
+    painted = painted_lines(lane_map)
+    lines = [("road_boundary", LINE_PX, line) for line in lane_map.road_edges]
+    lines += [("stop_line", LINE_PX, line) for line in lane_map.stop_lines]
+    lines += [("pole", POLE_PX, _pole(line)) for line in lane_map.poles]
+    outlines = [("lane line", line) for line, _ in painted]
+    outlines += [(name, line) for name, _, line in lines]
+    outlines += [("crosswalk", ring) for ring in lane_map.crosswalks]
+    for name, outline in outlines:
+        _require_points(name, outline)
+    for pose, box in lane_map.signs:
+        require_box("sign", pose, box)
+    points = [outline for _, outline in outlines] + [
+        pose[None, :3, 3] for pose, _ in lane_map.signs
     ]
-    boxes = [("sign", pose, box) for pose, box in lane_map.signs]
-    boxes += [(f"light_{light.state}", light.T_world_box, light.box) for light in extras.lights]
-    poles = [_pole(line) for line in lane_map.poles]
-    plain: list[tuple[str, float, Sequence[F64]]] = [
-        ("road_boundary", style.line_px, lane_map.road_edges),
-        ("stop_line", style.line_px, lane_map.stop_lines),
-        ("pole", style.pole_px, poles),
-    ]
-
-    everything = (
-        [("lane line", line.xyz) for line in lines]
-        + areas
-        + [(name, line) for name, _, group in plain for line in group]
-    )
-    for name, xyz in everything:
-        _require_points(name, xyz)
-    for name, pose, box in boxes:
-        require_box(name, pose, box)
-    points = [xyz for _, xyz in everything if len(xyz)] + [
-        pose[None, :3, 3] for _, pose, _ in boxes
-    ]
-    origin = _middle(np.concatenate(points)) if points else np.zeros(3)
-
-    pieces: list[tuple[F64, float, float, Rgb]] = []  # polyline, width, gain, colour
-    gain = style.line_width_gain
-    for line in lines:
-        pieces += _lane_line(LaneLine(line.xyz - origin, line.colour, line.patterns), style)
-    for name, width_px, group in plain:
-        pieces += [
-            (line - origin, width_px, 1.0 if name == "pole" else gain, style.colours[name])
-            for line in group
-        ]
-    corners = [triangulate(name, ring - origin) for name, ring in areas]
-    colours = [
-        _flat(-GROUND_BIAS_M[name], style.colours[name], len(c))
-        for (name, _), c in zip(areas, corners, strict=True)
-    ]
-    for name, pose, box in boxes:
-        corners.append(box_corners(pose, box, origin)[TRIANGLES])
-        colours.append(_flat(0.0, style.colours[name], len(TRIANGLES)))
-    triangles = np.concatenate([np.zeros((0, 3, 3)), *corners])
-    open_ = np.zeros(len(triangles), dtype=bool)
-    filled = Triangles(
-        triangles,
-        open_,
-        np.zeros((len(triangles), 3)),
-        np.concatenate([np.zeros((0, 7)), *colours]),
-    )
-    return PreparedMap(origin, _segments(pieces), filled, style)
+    everywhere = np.concatenate([np.zeros((0, 3)), *points])
+    origin = np.zeros(3)
+    if len(everywhere):  # in whole metres, so that subtracting it loses nothing
+        origin = np.round((everywhere.min(axis=0) + everywhere.max(axis=0)) / 2)
+    pieces = [piece for line, paint in painted for piece in _painted(line - origin, paint)]
+    pieces += [(name, width_px, line - origin) for name, width_px, line in lines]
+    rings = [triangulate("crosswalk", ring - origin) for ring in lane_map.crosswalks]
+    signs = [box_corners(pose, box, origin)[TRIANGLES] for pose, box in lane_map.signs]
+    on_ground = np.concatenate([np.zeros((0, 3, 3)), *rings])
+    triangles = np.concatenate([on_ground, *signs])
+    style = np.empty((len(triangles), 7))
+    style[: len(on_ground)] = (CROSSWALK_BIAS_M, *COLOURS["crosswalk"], *COLOURS["crosswalk"])
+    style[len(on_ground) :] = (0.0, *COLOURS["sign"], *COLOURS["sign"])
+    is_closed = np.zeros(len(triangles), dtype=bool)
+    filled = Triangles(triangles, is_closed, np.zeros((len(triangles), 3)), style)
+    return PreparedMap(origin, _segments(pieces), filled)
 
 
 def box_corners(pose: F64, box: Box, origin: F64) -> F64:
@@ -246,18 +157,6 @@ def require_box(name: str, pose: F64, box: Box) -> None:
         )
 
 
-def _middle(points: F64) -> F64:
-    """Return the middle of the points' extent in whole metres, so that subtracting it loses
-    nothing.
-    """
-    return np.asarray(np.round((points.min(axis=0) + points.max(axis=0)) / 2))
-
-
-def _flat(bias_m: float, colour: Rgb, n: int) -> F64:
-    """Return ``(n, 7)`` rows of one colour from front to back."""
-    return np.tile(np.array((bias_m, *colour, *colour), dtype=np.float64), (n, 1))
-
-
 def _require_points(name: str, xyz: F64) -> None:
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise InputError(
@@ -270,56 +169,39 @@ def _require_points(name: str, xyz: F64) -> None:
 
 def _pole(line: F64) -> F64:
     """Make a vertical line of a pole given as one point."""
-    return (
-        np.concatenate([line, line + np.array([0.0, 0.0, POLE_HEIGHT_M])])
-        if len(line) == 1
-        else line
-    )
+    if len(line) == 1:
+        return np.concatenate([line, line + np.array([0.0, 0.0, POLE_HEIGHT_M])])
+    return line
 
 
-def _lane_line(line: LaneLine, style: MapStyle) -> list[tuple[F64, float, float, Rgb]]:
-    """Cut a lane line into the pieces that are painted."""
-    if len(line.xyz) < 2:
-        return []
-    if not style.typed_lines:
-        return [(line.xyz, style.line_px, style.line_width_gain, style.colours["line_untyped"])]
-    colour = style.colours[f"line_{line.colour}"]
-    offsets = (0.0,) if len(line.patterns) == 1 else (style.double_offset_m, -style.double_offset_m)
-    out: list[tuple[F64, float, float, Rgb]] = []
-    for pattern, left_m in zip(line.patterns, offsets, strict=True):
-        shifted = _offset_left(line.xyz, left_m) if left_m else line.xyz
-        width_px = style.line_px * (style.other_factor if pattern == "other" else 1.0)
-        out += [
-            (piece, width_px, style.line_width_gain, colour)
-            for piece in cut_dashes(shifted, style.patterns[pattern])
-        ]
-    return out
+def _painted(line: F64, paint: Paint) -> list[Polyline]:
+    """Return what is drawn of a lane line: two lines for a double one, the dashes of a dashed one."""
+    pattern, _, colour = paint.partition("_")
+    pieces = [line]
+    if len(line) < 2:
+        pieces = []
+    elif pattern == "double":
+        pieces = [_offset_left(line, DOUBLE_OFFSET_M), _offset_left(line, -DOUBLE_OFFSET_M)]
+    elif pattern == "dashed":
+        pieces = cut_dashes(line, DASH_M, GAP_M)
+    return [(f"line_{colour}", LINE_PX, piece) for piece in pieces]
 
 
-def cut_dashes(line: F64, pattern: Sequence[tuple[float, float]]) -> list[F64]:
-    """Return the painted pieces of a polyline ``(N, 3)``; an empty pattern paints all of it.
+def cut_dashes(line: F64, dash_m: float, gap_m: float) -> list[F64]:
+    """Return the dashes of a polyline ``(N, 3)``.
 
-    Dashes start at the first point, are measured along the line in space, and bend with it.
+    They start at the first point, are measured along the line in space, and bend with it.
     """
-    if not pattern:
-        return [line]
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     keep = np.concatenate([[True], np.diff(s) > 0])
-    s, line = s[keep], line[keep]
-    if len(s) < 2:
-        return []
-    period = sum(on + off for on, off in pattern)
-    first = np.cumsum([0.0, *(on + off for on, off in pattern)])[:-1]
-    starts = (np.arange(int(np.ceil(s[-1] / period)))[:, None] * period + first).ravel()
-    ends = np.minimum(
-        starts + np.tile([on for on, _ in pattern], len(starts) // len(pattern)), s[-1]
-    )
-    out = []
-    for a, b in zip(starts, ends, strict=True):
-        if b > a:
-            inner = np.concatenate([[a], s[(s > a) & (s < b)], [b]])
-            out.append(np.stack([np.interp(inner, s, line[:, k]) for k in range(3)], axis=1))
-    return out
+    s = s[keep]
+    line = line[keep]
+    dashes = []
+    for start in np.arange(np.ceil(s[-1] / (dash_m + gap_m))) * (dash_m + gap_m):
+        end = min(start + dash_m, s[-1])
+        inner = np.concatenate([[start], s[(s > start) & (s < end)], [end]])
+        dashes.append(np.stack([np.interp(inner, s, line[:, k]) for k in range(3)], axis=1))
+    return dashes
 
 
 def _offset_left(line: F64, left_m: float) -> F64:
@@ -342,15 +224,15 @@ def _offset_left(line: F64, left_m: float) -> F64:
     return out
 
 
-def _segments(pieces: Sequence[tuple[F64, float, float, Rgb]]) -> Segments:
-    pieces = [p for p in pieces if len(p[0]) > 1]
-    ends = [np.stack([line[:-1], line[1:]], axis=1) for line, _, _, _ in pieces]
-    style = [
-        np.tile(np.array((width, gain, 0.0, *rgb)), (len(line) - 1, 1))
-        for line, width, gain, rgb in pieces
-    ]
-    joined = np.concatenate([np.zeros((0, 2, 3)), *ends])
-    return Segments(joined, np.concatenate([np.zeros((0, 6)), *style]), _spheres(joined))
+def _segments(lines: Sequence[Polyline]) -> Segments:
+    ends = [np.zeros((0, 2, 3))]
+    style = [np.zeros((0, 5))]
+    for colour, width_px, line in lines:
+        if len(line) > 1:
+            ends.append(np.stack([line[:-1], line[1:]], axis=1))
+            style.append(np.tile((width_px, 0.0, *COLOURS[colour]), (len(line) - 1, 1)))
+    joined = np.concatenate(ends)
+    return Segments(joined, np.concatenate(style), _spheres(joined))
 
 
 def _spheres(ends: F64) -> F64:
