@@ -29,9 +29,6 @@ if TYPE_CHECKING:
     from alpasim_plugin.fixers.network.checkpoints import StateDict
 
 FORMAT = "simrun-fixer-1"
-# what the headers of shipped bundles have beside the settings of their weights
-RENAMED = {"onefixer-tiny": "onefixer-dit-tiny"}
-NOT_OF_WEIGHTS = ("precision", "codec_precision", "graphs", "fold", "generator.memory")
 FILES = ("bundle", "dit", "vae", "decoder", "prompt")  # of `WeightsSettings`
 S = TypeVar("S", bound=WeightedSettings)
 
@@ -169,7 +166,7 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
     """
     header, trained_with = _header(path)
     kind = settings.bundle_kind
-    found_kind = header.get("kind", "block")
+    found_kind = header.get("kind")
     if found_kind != kind.name:
         raise InputError(
             f"{path} with the settings of {settings.name}: a bundle of the kind {found_kind!r}, not {kind.name!r}",
@@ -220,7 +217,7 @@ def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
             f"{path}, settings in its header: name: {kind_of(name)}",
             "give a file that save_bundle wrote",
         )
-    return RENAMED.get(name, name), (
+    return name, (
         *(f"{key}={json.dumps(value)}" for key, value in _leaves(trained_with).items()),
         f"weights.bundle={json.dumps(str(Path(path).absolute()))}",
     )
@@ -261,12 +258,12 @@ def _defaults(settings: WeightedSettings) -> dict[str, object]:
 
 
 def _leaves(data: Mapping[str, object], prefix: str = "") -> dict[str, object]:
-    """Return the leaves of nested settings by dotted key, but those that are not of weights."""
+    """Return the leaves of nested settings by dotted key."""
     out: dict[str, object] = {}
     for key, value in data.items():
         if isinstance(value, Mapping):
             out |= _leaves(value, f"{prefix}{key}.")
-        elif f"{prefix}{key}" not in NOT_OF_WEIGHTS:
+        else:
             out[f"{prefix}{key}"] = value
     return out
 
