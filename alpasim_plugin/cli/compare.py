@@ -72,7 +72,7 @@ def compare(
             joined["paired"],
             with_base=joined["paired_with_base"],
             metrics=joined_metrics(folders),
-            arms=joined["paired_arms"],
+            policies=joined["paired_arms"],
         )
         means = joined
     else:
@@ -84,7 +84,7 @@ def compare(
             "notes": list(result.notes),
             "paired": result.paired,
             "paired_with_base": result.with_base,
-            "paired_arms": result.arms,
+            "paired_arms": result.policies,
         }
         if means is not None:
             facts |= {name: means[name] for name in ("preset", "metrics", "failures")}
@@ -107,7 +107,7 @@ def _print(result: Comparison, only: Sequence[str] | None) -> None:
     for variant, entries in (
         *result.paired.items(),
         *result.with_base.items(),
-        *result.arms.items(),
+        *result.policies.items(),
     ):
         mine = [
             row

@@ -35,7 +35,7 @@ from evaluators.statistics.baselines import (
     write_baseline,
 )
 from evaluators.statistics.decision import stopping_note
-from evaluators.statistics.gate import GateSpec, GateVerdict, judge, judge_table, load_gate
+from evaluators.statistics.gate import GateSpec, GateVerdict, judge, load_gate
 from evaluators.statistics.verdicts import Outcome, outcome_of_failures, worst
 from scenarios.suite import load_suite
 
@@ -208,7 +208,7 @@ def gate(
         baseline = read_baseline(baseline_file)
         check_matches(baseline, stored_run, baseline_file)
     rows = None if baseline is None else baseline.rows
-    verdict = judge_table(
+    verdict = judge(
         table_of_run(stored_run), spec, rows, str(baseline_file or ""), stored_run.table
     )
     files = write_gate_files(verdict, source, stored_run, out or run, rows)

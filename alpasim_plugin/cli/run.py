@@ -44,9 +44,9 @@ from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import RunResult, default_folder, execute_run
 from evaluators.report.decision import decision_lines
-from evaluators.statistics.arms import arms_of, base_named
 from evaluators.statistics.decision import Question, metric_question
 from evaluators.statistics.gate import load_gate
+from evaluators.statistics.variants import base_named, variants_of
 from scenarios.suite import ScenarioRef, expand, shipped_names
 
 TRACEBACK_LINES = 4  # of a failure, in the terminal
@@ -114,7 +114,7 @@ def run(
     )
     plan = replace(plan, asked=what.scenarios)
     if options.baseline is not None:
-        variants = arms_of((cell.renderer.name, cell.policy.name) for cell in plan.cells)
+        variants = variants_of((cell.renderer.name, cell.policy.name) for cell in plan.cells)
         base_named(options.baseline, variants, "the run")
     question = None
     if until_decided:

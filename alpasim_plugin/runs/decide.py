@@ -32,7 +32,6 @@ from alpasim_plugin.runs.run import (
     write_run_info,
 )
 from alpasim_plugin.runs.summary import pool_of
-from evaluators.statistics.arms import Arm, arms_of, as_policy, base_named, short_name, usual_base
 from evaluators.statistics.decision import (
     SCHEMA_VERSION,
     WORDS,
@@ -48,6 +47,14 @@ from evaluators.statistics.decision import (
     write_decision,
 )
 from evaluators.statistics.gate import failures_of
+from evaluators.statistics.variants import (
+    Variant,
+    as_policy,
+    base_named,
+    short_name,
+    usual_base,
+    variants_of,
+)
 from evaluators.statistics.verdicts import Outcome, outcome_of_failures
 
 KIND = "decide"  # of run.json
@@ -83,7 +90,7 @@ def plan_of_two(plan: RunPlan, question: Question) -> RunPlan:
     Raises:
         InputError: The plan has another number of variants, or fewer scenes than a decision takes.
     """
-    variants = arms_of((cell.renderer.name, cell.policy.name) for cell in plan.cells)
+    variants = variants_of((cell.renderer.name, cell.policy.name) for cell in plan.cells)
     named = plan.options.baseline
     base = usual_base(variants) if named is None else base_named(named, variants, "the plan")
     if len(variants) == 4 and base.renderer is not None and base.policy is not None:
@@ -180,7 +187,7 @@ def execute_decision(
     return Decided(result, test.record(), test.state, test.outcome)
 
 
-def _side(rows: Sequence[Mapping[str, Any]], variant: Arm) -> Side:
+def _side(rows: Sequence[Mapping[str, Any]], variant: Variant) -> Side:
     names = (variant.renderer, variant.policy)
     return Side.of([row for row in rows if (row["renderer"], row["policy"]) == names])
 
@@ -200,7 +207,7 @@ class _SequentialTest:
     stopped: str = ""
 
     def __post_init__(self) -> None:
-        variants = arms_of((cell.renderer.name, cell.policy.name) for cell in self.plan.cells)
+        variants = variants_of((cell.renderer.name, cell.policy.name) for cell in self.plan.cells)
         base = usual_base(variants, self.plan.options.baseline)
         self.candidate = next(variant for variant in variants if base.of(variant) != variant)
         self.baseline = base.of(self.candidate)

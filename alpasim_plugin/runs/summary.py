@@ -24,9 +24,9 @@ from alpasim_plugin.runs.provenance import fixers
 from alpasim_plugin.runs.recorder import plan_table
 from evaluators import censoring
 from evaluators.metrics import METRICS, MetricTable
-from evaluators.statistics.arms import arms_of, base_named
 from evaluators.statistics.outcomes import outcome_table, rollouts_of
 from evaluators.statistics.summary import NO_BASES, by_policy, numbers
+from evaluators.statistics.variants import base_named, variants_in
 
 
 def write_summary(
@@ -218,9 +218,8 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[st
     _check_alike(infos)
     first = next(iter(infos.values()))
     table = RolloutTable.of_files([table_path(run, ROLLOUTS) for run in runs])
-    arms = arms_of((name, policy) for policy in table.policies for name in table.sides(policy))
     if baseline is not None:
-        base_named(baseline, arms, "the runs together")
+        base_named(baseline, variants_in(table), "the runs together")
     known = _joined(infos, table.metrics)
     bases = {
         name: base for info in infos.values() for name, base in (info.get("bases") or {}).items()

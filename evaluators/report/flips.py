@@ -22,7 +22,7 @@ from alpasim_plugin.log.run_folder.schema import STRIP_NAME, cell_name
 from evaluators.metrics.outcomes import has_ended, in_words, outcomes_of
 from evaluators.opening import Run
 from evaluators.report.numbers import Cell, fixed, missing, short
-from evaluators.statistics.arms import Arm, Base, axis_bases
+from evaluators.statistics.variants import Base, Variant, axis_bases
 
 MAX_WIDTH = 1600  # pixels of an inlined strip
 FLIPS_NAME = "flips.json"
@@ -190,7 +190,7 @@ def find_flips(run: Run) -> tuple[list[Flip], int]:
     compared = 0
     for rollout in run.rollouts:
         for base in bases if has_ended(rollout) else ():
-            arm = Arm(rollout.renderer, rollout.policy)
+            arm = Variant(rollout.renderer, rollout.policy)
             other = base.of(arm)
             partner = known.get((other.renderer, other.policy, rollout.scene, rollout.seed))
             if other == arm or partner is None or not (rollout.ok or partner.ok):
@@ -210,7 +210,7 @@ def flip_bases(run: Run) -> list[Base]:
     """
     named = (run.info.get("config") or {}).get("baseline")
     _, by_policy = axis_bases(
-        [Arm(r, policy) for r in run.renderers for policy in run.policies], named
+        [Variant(r, policy) for r in run.renderers for policy in run.policies], named
     )
     found = [Base(renderer=baseline_of(run))] if len(run.renderers) > 1 else []
     return [*found, *([by_policy] if by_policy else [])]

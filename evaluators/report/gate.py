@@ -15,9 +15,9 @@ from alpasim_plugin.log.run_folder.schema import ROLLOUTS, WHY_NAME
 from alpasim_plugin.log.run_folder.sides import Row, value_of
 from evaluators.opening import Run
 from evaluators.report.numbers import DASH, short
-from evaluators.statistics.arms import Arm, short_name
 from evaluators.statistics.baselines import rows_of_run
 from evaluators.statistics.gate import Check, GateVerdict
+from evaluators.statistics.variants import Variant, short_name
 from evaluators.statistics.verdicts import WORDS
 
 GATE_NAME = "gate.json"
@@ -83,12 +83,12 @@ def _worst_pairs(
     """Return the pairs in which a variant did worst against its baseline, or its worst rollouts
     where a limit is broken.
     """
-    variant = Arm(check.renderer, check.policy)
+    variant = Variant(check.renderer, check.policy)
     sign = -1.0 if run.table.info(check.metric).direction == "higher" else 1.0
     before: dict[tuple[Any, Any], float | None] = {}
     if check.kind == "margin":
         for row in base_rows:
-            base = Arm(str(row["renderer"]), str(row["policy"]))
+            base = Variant(str(row["renderer"]), str(row["policy"]))
             if short_name(base, variant) == check.entry["baseline"]:
                 before[row["scene"], row["seed"]] = value_of(row, check.metric)
     found: list[dict[str, Any]] = []

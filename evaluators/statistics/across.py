@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.log.run_folder.schema import cell_name
-from alpasim_plugin.log.run_folder.sides import RolloutTable
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.opening import Run
-from evaluators.statistics.arms import arms_of, axis_bases, base_named, choices
 from evaluators.statistics.baselines import check_scenes, scene_hashes, table_of_run
-from evaluators.statistics.paired import LISTED, compare
-from evaluators.statistics.summary import paired_arms
+from evaluators.statistics.paired import LISTED, Pair, Table, compare_pairs, pairs_within
+from evaluators.statistics.variants import Variant, base_named, choices, variants_in
 
 
 @dataclass(frozen=True)
@@ -24,20 +20,20 @@ class Comparison:
     Attributes:
         paired: VARIANT -> METRIC -> what `statistics.paired.compare` gives; a variant is RENDERER,
             or RENDERER/POLICY where there are several policies.
+        notes: What a reader must know, such as policies that were paired although their names
+            differ.
         with_base: The same of renderers with a fixer against the renderer below it, where that is
             not the baseline.
         metrics: What the metrics are.
-        arms: The same of policies behind one renderer, RENDERER/POLICY -> METRIC; empty where one
-            arm is the baseline of all.
-        notes: What a reader must know, such as policies that were paired although their names
-            differ.
+        policies: The same of policies behind one renderer, RENDERER/POLICY -> METRIC; empty where
+            one variant is the baseline of all.
     """
 
-    paired: Mapping[str, Mapping[str, Mapping[str, Any]]]
-    notes: tuple[str, ...] = field(default=())
-    with_base: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
+    paired: Table
+    notes: tuple[str, ...] = ()
+    with_base: Table = field(default_factory=dict)
     metrics: MetricTable = field(default_factory=lambda: METRICS)
-    arms: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
+    policies: Table = field(default_factory=dict)
 
 
 def compare_within(
@@ -46,8 +42,8 @@ def compare_within(
     margins: Mapping[str, float] | None = None,
     listed: int = LISTED,
 ) -> Comparison:
-    """Compare the arms of one run with one of them, by default with the run's own baseline, or with
-    the first.
+    """Compare the variants of one run with one of them, by default with the run's own baseline, or
+    with the first.
 
     Args:
         run: The run.
@@ -56,46 +52,34 @@ def compare_within(
         margins, listed: As for `evaluators.statistics.paired.paired`.
 
     Raises:
-        InputError: Only one arm, or an unknown baseline.
+        InputError: Only one variant, or an unknown baseline.
     """
     table = table_of_run(run)
-    arms = arms_of((r, policy) for policy in table.policies for r in table.sides(policy))
-    where, known = str(run.folder), table.renderers
-    base = None if baseline is None else base_named(baseline, arms, where)
-    if len(arms) < 2:
-        only = arms[0].name if arms else "none"
+    variants = variants_in(table)
+    base = None if baseline is None else base_named(baseline, variants, str(run.folder))
+    if len(variants) < 2:
+        only = variants[0].name if variants else "none"
         raise InputError(
-            f"{where}: only one arm, {only}",
+            f"{run.folder}: only one variant, {only}",
             "name a second run, or run two renderers or two policies",
         )
     if base is not None and base.policy is not None:
-        return Comparison(
-            paired_arms(table, base.pairs(arms), run.table, margins=margins, listed=listed),
-            metrics=run.table,
-        )
-    by_renderer, by_policy = axis_bases(
-        arms, baseline or (run.info.get("config") or {}).get("baseline")
+        pairs = [Pair(own.name, own, other, other.name) for own, other in base.pairs(variants)]
+        blocks = [pairs, [], []]
+    else:
+        own_baseline = (run.info.get("config") or {}).get("baseline")
+        blocks = pairs_within(table, baseline or own_baseline, run.info.get("bases") or {})
+        if baseline is not None:
+            blocks = [[pair for pair in blocks[0] if pair.baseline == baseline], [], []]
+            if len(table.renderers) == 1:
+                raise InputError(
+                    f"{run.folder}: only one renderer, {baseline}",
+                    f"choose one of {', '.join(choices(variants))}",
+                )
+    paired, with_base, policies = (
+        compare_pairs(table, pairs, run.table, margins=margins, listed=listed) for pairs in blocks
     )
-    if base is not None and by_renderer is None:
-        raise InputError(
-            f"{where}: only one renderer, {known[0]}",
-            f"choose one of {', '.join(choices(arms))}",
-        )
-    name = "" if by_renderer is None else by_renderer.renderer
-    bases = {
-        fixed: below
-        for fixed, below in (run.info.get("bases") or {}).items()
-        if fixed in known and below in known
-    }
-    partner = {other: str(name) for other in known if name and other != name}
-    below = {fixed: other for fixed, other in bases.items() if name not in (fixed, other)}
-    pairs = _pairs(table, table, partner, "", margins, run.table, listed)
-    with_base = (
-        {} if baseline is not None else _pairs(table, table, below, "", margins, run.table, listed)
-    )
-    between = [] if baseline is not None or by_policy is None else by_policy.pairs(arms)
-    of_policies = paired_arms(table, between, run.table, margins=margins, listed=listed)
-    return Comparison(pairs, (), with_base, run.table, of_policies)
+    return Comparison(paired, (), with_base, run.table, policies)
 
 
 def compare_runs(
@@ -105,7 +89,7 @@ def compare_runs(
     margins: Mapping[str, float] | None = None,
     listed: int = LISTED,
 ) -> Comparison:
-    """Compare the second run with the first: each arm with the one of the same name, or all with
+    """Compare the second run with the first: each variant with the one of the same name, or all with
     ``baseline`` of the first run.
 
     A policy is paired with the policy of the same name; where the runs share none and have one
@@ -127,114 +111,58 @@ def compare_runs(
         scene_hashes(first), scene_hashes(second), both, "run both on the same scene files"
     )
     table, base = table_of_run(second), table_of_run(first)
-    partner_of = {policy: policy for policy in table.policies if policy in base.policies}
-    notes: tuple[str, ...] = ()
-    if not partner_of and not _names_policy(baseline, base):
-        theirs, ours = base.policies, table.policies
-        if len(theirs) != 1 or len(ours) != 1:
+    base_variants = variants_in(base)
+    named = None if baseline is None else base_named(baseline, base_variants, str(first.folder))
+    notes = weights_note(first, second)
+    pairs = []
+    if named is not None and named.policy is not None:
+        for variant in variants_in(table):
+            other = named.of(variant)
+            if other in base_variants:
+                pairs.append(Pair(variant.name, variant, other, f"{first.folder}: {other.name}"))
+        if not pairs:
             raise InputError(
-                f"policies {theirs} and {ours}: none in common",
-                "compare runs of one policy each or of the same policies, or name one with --baseline RENDERER/POLICY",
+                f"baseline {baseline!r}: behind no renderer of {second.folder}",
+                "name RENDERER/POLICY",
             )
-        partner_of, notes = (
-            {ours[0]: theirs[0]},
-            (f"policy {ours[0]} is compared with policy {theirs[0]}",),
-        )
-    base_renderers, renderers = base.renderers, table.renderers
-    notes += weights_note(first, second)
-    if baseline is not None:
-        theirs_arms = arms_of((r, policy) for policy in base.policies for r in base.sides(policy))
-        named = base_named(baseline, theirs_arms, str(first.folder))
-        if named.policy is not None:
-            own_arms = arms_of(
-                (r, policy) for policy in table.policies for r in table.sides(policy)
-            )
-            chosen_arms = [(arm, named.of(arm)) for arm in own_arms if named.of(arm) in theirs_arms]
-            if not chosen_arms:
+    else:
+        policy_of = {policy: policy for policy in table.policies if policy in base.policies}
+        if not policy_of:
+            if len(base.policies) != 1 or len(table.policies) != 1:
                 raise InputError(
-                    f"baseline {baseline!r}: behind no renderer of {second.folder}",
-                    "name RENDERER/POLICY",
+                    f"policies {base.policies} and {table.policies}: none in common",
+                    "compare runs of one policy each or of the same policies, or name one with "
+                    "--baseline RENDERER/POLICY",
                 )
-            metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, both)
-            pairs = paired_arms(
-                table, chosen_arms, metrics, base, margins, listed, f"{first.folder}: "
+            policy_of = {table.policies[0]: base.policies[0]}
+            note = f"policy {table.policies[0]} is compared with policy {base.policies[0]}"
+            notes = (note, *notes)
+        renderer_of = dict.fromkeys(table.renderers, baseline or base.renderers[0])
+        if baseline is None and len(base.renderers) > 1:
+            renderer_of = {name: name for name in table.renderers}
+        lone = [name for name, other in renderer_of.items() if other not in base.renderers]
+        if lone:
+            raise InputError(
+                f"renderers {lone} of {second.folder}: {first.folder} has "
+                f"{', '.join(base.renderers)}",
+                "name one by --baseline",
             )
-            return Comparison(pairs, weights_note(first, second), metrics=metrics)
-    alone = base_renderers[0] if len(base_renderers) == 1 else None
-    partner = {name: baseline or (name if name in base_renderers else alone) for name in renderers}
-    lone = [name for name, other in partner.items() if other is None]
-    if lone:
-        raise InputError(
-            f"renderers {lone} of {second.folder}: {first.folder} has {', '.join(base_renderers)}",
-            "name one by --baseline",
-        )
-    chosen = {name: other for name, other in partner.items() if other is not None}
+        several = len(table.policies) > 1
+        for variant in variants_in(table):
+            renderer = renderer_of[variant.renderer]
+            other = Variant(renderer, policy_of.get(variant.policy, ""))
+            if other in base_variants:
+                key = variant.name if several else variant.renderer
+                pairs.append(Pair(key, variant, other, f"{first.folder}: {renderer}"))
     metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, both)
-    return Comparison(
-        _pairs(table, base, chosen, f"{first.folder}: ", margins, metrics, listed, partner_of),
-        notes,
-        metrics=metrics,
-    )
+    paired = compare_pairs(table, pairs, metrics, base, margins, listed)
+    return Comparison(paired, notes, metrics=metrics)
 
 
 def weights_note(first: Run, second: Run) -> tuple[str, ...]:
-    """Say which files of weights are not the same in two runs: their arms differ in these, whatever
-    their names.
+    """Say which files of weights are not the same in two runs: their variants differ in these,
+    whatever their names.
     """
     before, after = (dict(run.info.get("weights") or {}) for run in (first, second))
     changed = sorted(name for name in before.keys() & after.keys() if before[name] != after[name])
     return (f"other weights: {', '.join(changed)}",) if changed else ()
-
-
-def _names_policy(baseline: str | None, table: RolloutTable) -> bool:
-    """Tell whether a baseline says with which policy to compare."""
-    arms = arms_of((r, policy) for policy in table.policies for r in table.sides(policy))
-    return (
-        baseline in {*table.policies, *(arm.name for arm in arms)}
-        and baseline not in table.renderers
-    )
-
-
-def _pairs(
-    table: RolloutTable,
-    base: RolloutTable,
-    partner: Mapping[str, str],
-    prefix: str,
-    margins: Mapping[str, float] | None,
-    metrics: MetricTable,
-    listed: int,
-    policy_of: Mapping[str, str] | None = None,
-) -> dict[str, dict[str, Any]]:
-    """Compare renderers with their partners, policy by policy.
-
-    Args:
-        table: The rollouts that are compared.
-        base: Those that they are compared with.
-        partner: RENDERER of ``table`` -> renderer of ``base``.
-        prefix: Of the partner's name.
-        margins, listed: As for `compare_runs`.
-        metrics: What the metrics are.
-        policy_of: POLICY of ``table`` -> policy of ``base``; None: the same.
-    """
-    out: dict[str, dict[str, Any]] = {}
-    for policy in table.policies:
-        of_base = policy if policy_of is None else policy_of.get(policy)
-        sides, base_sides = (
-            table.sides(policy),
-            base.sides(of_base, policy) if of_base in base.policies else {},
-        )
-        for renderer, other in partner.items():
-            if renderer in sides and other in base_sides:
-                variant = renderer if len(table.policies) == 1 else cell_name(renderer, policy)
-                out[variant] = {
-                    name: compare(
-                        sides[renderer],
-                        base_sides[other],
-                        metrics.info(name),
-                        prefix + other,
-                        (margins or {}).get(name),
-                        listed,
-                    )
-                    for name in dict.fromkeys([*table.metrics, *base.metrics])
-                }
-    return out

@@ -4,6 +4,7 @@ run, and the outcome that follows.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -25,9 +26,16 @@ from alpasim_plugin.log.run_folder.sides import (
 )
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.presets import PRESETS
-from evaluators.statistics.arms import Arm, Base, as_policy, base_named, short_name, usual_base
 from evaluators.statistics.baselines import of_policy, policies_of
 from evaluators.statistics.paired import compare, reach_of
+from evaluators.statistics.variants import (
+    Base,
+    Variant,
+    as_policy,
+    base_named,
+    short_name,
+    usual_base,
+)
 from evaluators.statistics.verdicts import (
     Cause,
     Outcome,
@@ -111,11 +119,10 @@ def load_gate(path_or_name: str | Path, known: MetricTable = METRICS) -> tuple[G
         InputError: No such file, bad YAML, an unknown key, metric or preset: with file, line and
             column.
     """
-    shipped = LIBRARY / f"{path_or_name}.yaml"
-    path = next(
-        (candidate for candidate in (Path(path_or_name), shipped) if candidate.is_file()), None
-    )
-    if path is None:
+    path = Path(path_or_name)
+    if not path.is_file():
+        path = LIBRARY / f"{path_or_name}.yaml"
+    if not path.is_file():
         raise InputError(
             f"{path_or_name}: no such file",
             f"name a YAML file, or a shipped gate: {', '.join(shipped_gates())}",
@@ -151,7 +158,8 @@ def _check_names(spec: GateSpec, document: Document, known: MetricTable) -> None
 
 
 Kind = Literal["margin", "limit"]
-Sides = Mapping[str, Side]  # RENDERER -> its rollouts
+Sides = Mapping[Variant, Side]
+CAUSES: dict[str, Cause] = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}
 
 
 @dataclass(frozen=True)
@@ -194,16 +202,16 @@ class GateVerdict:
 
 
 def judge(
-    rows: Sequence[Row],
+    rollouts: RolloutTable | Sequence[Row],
     spec: GateSpec,
     stored: Sequence[Row] | None = None,
     stored_name: str = "",
     known: MetricTable = METRICS,
 ) -> GateVerdict:
-    """Judge rollout rows.
+    """Judge rollouts.
 
     Args:
-        rows: Every planned rollout of the run (`rows_of_run`).
+        rollouts: Every planned rollout of the run, in columns or as rows (`rows_of_run`).
         spec: The gate.
         stored: Rows of a stored baseline; without it the baseline is a renderer of the run itself.
         stored_name: How to call the stored baseline.
@@ -212,140 +220,91 @@ def judge(
     Raises:
         InputError: A renderer that the gate names is not there, or nothing is left to judge.
     """
-    return judge_sides(
-        _sides(rows),
-        failures_of(rows),
-        spec,
-        None if stored is None else _sides(stored),
-        stored_name,
-        known,
-    )
-
-
-def judge_table(
-    table: RolloutTable,
-    spec: GateSpec,
-    stored: Sequence[Row] | None = None,
-    stored_name: str = "",
-    known: MetricTable = METRICS,
-) -> GateVerdict:
-    """Judge rollouts in columns; see `judge`."""
-    by_class = table.failures()
-    failures = {
-        "n_rollouts": table.n_rollouts,
-        "n_failed": sum(by_class.values()),
-        "by_class": by_class,
-    }
-    sides = {policy: table.sides(policy) for policy in table.policies}
-    return judge_sides(
-        sides, failures, spec, None if stored is None else _sides(stored), stored_name, known
-    )
-
-
-def judge_sides(
-    sides: Mapping[str, Sides],
-    failures: Mapping[str, Any],
-    spec: GateSpec,
-    stored: Mapping[str, Sides] | None,
-    stored_name: str,
-    known: MetricTable = METRICS,
-) -> GateVerdict:
-    """Judge rollouts that are laid out by cell; see `judge`.
-
-    Args:
-        sides: POLICY -> RENDERER -> its rollouts, in order of appearance.
-        failures: As `failures_of` gives them.
-        spec, stored_name, known: As for `judge`.
-        stored: The same of a stored baseline.
-    """
-    if not any(sides.values()):
+    sides = _sides(rollouts)
+    if not sides:
         raise InputError("its rollouts: there are none", "give a run with rollouts")
-    checks: list[Check] = []
-    arms = [
-        Arm(renderer, policy) for policy, by_renderer in sides.items() for renderer in by_renderer
-    ]
+    owner = "the run" if stored is None else "the stored baseline"
+    base_sides = sides if stored is None else _sides(stored)
     has_margin = any(rule.margin is not None for rule in spec.metrics.values())
-    base, base_sides = _base(arms, spec, stored, has_margin), sides if stored is None else stored
-    for arm in _judged(arms, spec, base, has_margin):
-        side = sides[arm.policy][arm.renderer]
-        other = _partner(arm, base, base_sides, stored is not None) if has_margin else arm
-        behind = (
-            as_policy(base_sides[other.policy][other.renderer], arm.policy) if has_margin else side
-        )
-        checks_of: dict[str, Check] = {}
-        for wanted, rule in spec.metrics.items():
-            metric = known.info(wanted)
+    base = _base(list(sides), spec, list(base_sides), owner, has_margin)
+    checks: list[Check] = []
+    for variant in _judged(list(sides), spec, base, has_margin):
+        side = sides[variant]
+        margins: dict[str, Check] = {}
+        for name, rule in spec.metrics.items():
+            metric = known.info(name)
             if rule.margin is not None:
-                name = short_name(other, arm)
-                against = (
-                    name if stored is None else f"{name} of {stored_name or 'the baseline'}"
-                )  # else it reads "clean against clean"
-                checks_of[wanted] = _margin(
-                    side, behind, (arm.renderer, arm.policy), name, against, metric, rule, spec
-                )
+                other = _partner(variant, base, list(base_sides), owner)
+                label = short_name(other, variant)
+                other_side = as_policy(base_sides[other], variant.policy)
+                is_sampled = spec.population == "scenes"
+                entry = compare(side, other_side, metric, label, rule.margin, sampled=is_sampled)
+                if stored is not None:
+                    label += f" of {stored_name or 'the baseline'}"
+                margins[name] = _margin(entry, variant, label, metric, rule, spec)
             if rule.max is not None or rule.min is not None:
-                checks.append(_limit(side, (arm.renderer, arm.policy), metric, rule))
-        checks += [
-            _with_event(check, checks_of, known) if spec.population == "scenes" else check
-            for check in checks_of.values()
-        ]
-    causes = [
+                checks.append(_limit(side, variant, metric, rule))
+        if spec.population == "scenes":
+            checks += [_with_event(check, margins, known) for check in margins.values()]
+        else:
+            checks += margins.values()
+    failures = failures_of(rollouts)
+    outcomes = [
         Outcome(check.cause, (check.text,))
         for check in checks
         if check.binding or check.cause == "regression"
     ]
-    outcome = worst([outcome_of_failures(failures, spec.max_failed), *causes])
-    kind = (
-        ""
-        if base is None or (base.renderer and base.policy)
-        else "renderer "
-        if base.renderer
-        else "policy "
-    )
-    name = (
-        stored_name if base is None or stored is not None else f"{kind}{base.name} of the same run"
-    )
-    return GateVerdict(outcome, tuple(checks), failures, name)
+    outcomes.append(outcome_of_failures(failures, spec.max_failed))
+    name = stored_name
+    if base is not None and stored is None:
+        kind = "" if base.renderer and base.policy else "renderer " if base.renderer else "policy "
+        name = f"{kind}{base.name} of the same run"
+    return GateVerdict(worst(outcomes), tuple(checks), failures, name)
 
 
-def _sides(rows: Sequence[Row]) -> dict[str, Sides]:
-    return {policy: by_renderer(of_policy(rows, policy)) for policy in policies_of(rows)}
+def _sides(rollouts: RolloutTable | Sequence[Row]) -> Sides:
+    """Return the rollouts of each variant, policy by policy."""
+    if isinstance(rollouts, RolloutTable):
+        by_policy = {policy: rollouts.sides(policy) for policy in rollouts.policies}
+    else:
+        by_policy = {
+            policy: by_renderer(of_policy(rollouts, policy)) for policy in policies_of(rollouts)
+        }
+    return {
+        Variant(renderer, policy): side
+        for policy, sides in by_policy.items()
+        for renderer, side in sides.items()
+    }
 
 
-def failures_of(rows: Sequence[Row]) -> dict[str, Any]:
+def failures_of(rollouts: RolloutTable | Sequence[Row]) -> dict[str, Any]:
     """Count rollouts that did not run to their end, as summary.json does."""
-    by_class: dict[str, int] = {}
-    for row in rows:
-        if not is_ok(row):
-            by_class[failure_of(row)] = by_class.get(failure_of(row), 0) + 1
-    return {"n_rollouts": len(rows), "n_failed": sum(by_class.values()), "by_class": by_class}
+    if isinstance(rollouts, RolloutTable):
+        n, by_class = rollouts.n_rollouts, rollouts.failures()
+    else:
+        n = len(rollouts)
+        by_class = dict(Counter(failure_of(row) for row in rollouts if not is_ok(row)))
+    return {"n_rollouts": n, "n_failed": sum(by_class.values()), "by_class": by_class}
 
 
 def _base(
-    arms: Sequence[Arm], spec: GateSpec, stored: Mapping[str, Sides] | None, has_margin: bool
+    variants: list[Variant], spec: GateSpec, others: list[Variant], owner: str, has_margin: bool
 ) -> Base | None:
-    """Return what arms are compared with; None: with the same arm of a stored baseline, or limits
-    alone hold for all policies.
+    """Return what variants are compared with; None: with the same variant of a stored baseline, or
+    limits alone hold for all policies.
     """
-    if spec.baseline is None:
-        by_policy_alone = len({arm.renderer for arm in arms}) == 1 and not has_margin
-        return None if stored is not None or by_policy_alone else usual_base(arms)
-    arms_there = (
-        arms
-        if stored is None
-        else [
-            Arm(renderer, policy)
-            for policy, by_renderer in stored.items()
-            for renderer in by_renderer
-        ]
-    )
-    return base_named(
-        spec.baseline, arms_there, "the run" if stored is None else "the stored baseline"
-    )
+    if spec.baseline is not None:
+        return base_named(spec.baseline, others, owner)
+    is_one_renderer = len({variant.renderer for variant in variants}) == 1
+    if owner != "the run" or (is_one_renderer and not has_margin):
+        return None
+    return usual_base(variants)
 
 
-def _judged(arms: Sequence[Arm], spec: GateSpec, base: Base | None, has_margin: bool) -> list[Arm]:
-    known = {arm.renderer for arm in arms}
+def _judged(
+    variants: list[Variant], spec: GateSpec, base: Base | None, has_margin: bool
+) -> list[Variant]:
+    known = {variant.renderer for variant in variants}
     absent = [name for name in spec.renderers if name not in known]
     if absent:
         raise InputError(
@@ -353,67 +312,63 @@ def _judged(arms: Sequence[Arm], spec: GateSpec, base: Base | None, has_margin: 
             f"it has {', '.join(sorted(known))}",
         )
     if spec.renderers:
-        return [arm for arm in arms if arm.renderer in spec.renderers]
-    judged = [arm for arm in arms if base is None or base.of(arm) != arm]
+        return [variant for variant in variants if variant.renderer in spec.renderers]
+    judged = [variant for variant in variants if base is None or base.of(variant) != variant]
     if not judged and has_margin and base is not None:
         raise InputError(
             f"baseline {base.name!r}: the run has nothing else to compare with it",
             "run two renderers or two policies, or give --baseline-file",
         )
-    return judged or list(arms)  # a gate of limits alone needs no second arm
+    return judged or variants  # a gate of limits alone needs no second variant
 
 
-def _partner(arm: Arm, base: Base | None, stored: Mapping[str, Sides], is_stored: bool) -> Arm:
-    """Return the arm that an arm is compared with; of a stored baseline of one other policy, that
-    policy's.
+def _partner(variant: Variant, base: Base | None, others: list[Variant], owner: str) -> Variant:
+    """Return the variant that a variant is compared with; of a stored baseline of one other policy,
+    that policy's.
 
     Raises:
         InputError: There is none.
     """
-    known = [
-        Arm(renderer, policy) for policy, by_renderer in stored.items() for renderer in by_renderer
-    ]
-    wanted = arm if base is None else base.of(arm)
-    if wanted not in known and base is None and len(stored) == 1:
-        wanted = Arm(arm.renderer, next(iter(stored)))
-    if wanted in known:
-        return wanted
-    where = "the stored baseline" if is_stored else "the run"
-    names = ", ".join(arm_known.name for arm_known in known)
-    raise InputError(
-        f"baseline {wanted.name!r}: {where} does not have it",
-        f"`baseline` of the gate may be one of: {names}",
-    )
+    wanted = variant if base is None else base.of(variant)
+    policies = {other.policy for other in others}
+    if wanted not in others and base is None and len(policies) == 1:
+        wanted = Variant(variant.renderer, *policies)
+    if wanted not in others:
+        raise InputError(
+            f"baseline {wanted.name!r}: {owner} does not have it",
+            f"`baseline` of the gate may be one of: {', '.join(other.name for other in others)}",
+        )
+    return wanted
 
 
 def _margin(
-    side: Side,
-    base: Side,
-    variant: tuple[str, str],
-    name: str,
+    entry: dict[str, Any],
+    variant: Variant,
     against: str,
     metric: MetricInfo,
     rule: MetricRule,
     spec: GateSpec,
 ) -> Check:
-    entry = compare(
-        side, base, metric, name, rule.margin or 0.0, sampled=spec.population == "scenes"
-    )
-    planned = entry["n_cells"] + entry["n_missing"]
-    cause: Cause = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}[
-        entry["verdict"]
-    ]  # type: ignore[assignment]
-    text = _paired_text(entry, metric.name, variant[0], against)
+    n_scenes, n_missing = entry["n_scenes"], entry["n_missing"]
+    planned = entry["n_cells"] + n_missing
+    cause = CAUSES[entry["verdict"]]
+    text = _paired_text(entry, metric.name, variant.renderer, against)
     least = scenes_without_event(entry["margin"], reach_of(metric, entry["margin"])) or 0
-    if entry["n_scenes"] < spec.min_scenes:
+    if n_scenes < spec.min_scenes:
         cause = "undecided"
-        text += f"; {entry['n_scenes']} scene{'' if entry['n_scenes'] == 1 else 's'}, the gate asks for {spec.min_scenes}"
-    elif cause == "undecided" and entry["n_scenes"] < least:
+        scenes = "1 scene" if n_scenes == 1 else f"{n_scenes} scenes"
+        text += f"; {scenes}, the gate asks for {spec.min_scenes}"
+    elif cause == "undecided" and n_scenes < least:
         text += f"; fewer than {least} scenes cannot exclude harm in others"
-    elif cause != "regression" and entry["n_missing"] > spec.max_missing * planned:
+    elif cause != "regression" and n_missing > spec.max_missing * planned:
         cause = "undecided"
-        text += f"; {entry['n_missing']} of {planned} cells have no pair, the gate allows {spec.max_missing:.0%}"
-    return Check(*variant, metric.name, "margin", cause, text, entry, rule.must_decide)
+        allowed = f"the gate allows {spec.max_missing:.0%}"
+        text += f"; {n_missing} of {planned} cells have no pair, {allowed}"
+    return _check(variant, metric, "margin", cause, text, entry, rule.must_decide)
+
+
+def _check(variant: Variant, metric: MetricInfo, *facts: Any) -> Check:
+    return Check(variant.renderer, variant.policy, metric.name, *facts)
 
 
 def _with_event(check: Check, checks: Mapping[str, Check], known: MetricTable) -> Check:
@@ -435,37 +390,25 @@ def _with_event(check: Check, checks: Mapping[str, Check], known: MetricTable) -
     )
 
 
-def _limit(side: Side, variant: tuple[str, str], metric: MetricInfo, rule: MetricRule) -> Check:
+def _limit(side: Side, variant: Variant, metric: MetricInfo, rule: MetricRule) -> Check:
     values = side.values(metric.name)
     known = values[np.isfinite(values)]
     bounds = {"max": rule.max, "min": rule.min}
     limits = " and ".join(
         f"{kind} {value:g}" for kind, value in bounds.items() if value is not None
     )
+    head = f"{variant.renderer}: {metric.name}"
     if not len(known):
-        text = f"{variant[0]}: {metric.name} has no valid value, its limit is {limits}"
-        return Check(
-            *variant,
-            metric.name,
-            "limit",
-            "undecided",
-            text,
-            {"mean": None, **bounds},
-            rule.must_decide,
-        )
+        text = f"{head} has no valid value, its limit is {limits}"
+        entry = {"mean": None, **bounds}
+        return _check(variant, metric, "limit", "undecided", text, entry, rule.must_decide)
     mean = float(known.mean())
-    broken = (rule.max is not None and mean > rule.max) or (
-        rule.min is not None and mean < rule.min
-    )
-    text = f"{variant[0]}: {metric.name} {_number(mean, metric.unit)}, limit {limits}"
-    return Check(
-        *variant,
-        metric.name,
-        "limit",
-        "regression" if broken else "pass",
-        text,
-        {"mean": mean, **bounds, "n_rollouts": len(known)},
-    )
+    is_above = rule.max is not None and mean > rule.max
+    is_below = rule.min is not None and mean < rule.min
+    cause = "regression" if is_above or is_below else "pass"
+    text = f"{head} {_number(mean, metric.unit)}, limit {limits}"
+    entry = {"mean": mean, **bounds, "n_rollouts": len(known)}
+    return _check(variant, metric, "limit", cause, text, entry)
 
 
 def _paired_text(entry: Mapping[str, Any], metric: str, renderer: str, against: str) -> str:
@@ -479,12 +422,10 @@ def _paired_text(entry: Mapping[str, Any], metric: str, renderer: str, against: 
     low, high = (_number(b, unit, sign=True) for b in entry["ci95"])
     text += f" (95 % {low} to {high}, margin {_number(entry['margin'], unit)}): {entry['verdict']}"
     if entry["verdict"] == "undecided":
-        more = entry["more_scenes"]
-        text += (
-            f", about {more} more scenes would decide it"
-            if more
-            else ", more scenes of this kind would not decide it"
-        )
+        if entry["more_scenes"]:
+            text += f", about {entry['more_scenes']} more scenes would decide it"
+        else:
+            text += ", more scenes of this kind would not decide it"
     return text
 
 

@@ -8,13 +8,21 @@ the scene is the unit of interval and test.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, I64, Bool
-from alpasim_plugin.log.run_folder.sides import Cell, Row, Side, by_renderer, metric_names
+from alpasim_plugin.log.run_folder.sides import (
+    Cell,
+    RolloutTable,
+    Row,
+    Side,
+    by_renderer,
+    metric_names,
+)
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.statistics.bounded import mean_bounds
 from evaluators.statistics.intervals import (
@@ -28,6 +36,7 @@ from evaluators.statistics.intervals import (
     t_interval,
     within,
 )
+from evaluators.statistics.variants import Variant, axis_bases, variants_in
 from evaluators.statistics.verdicts import (
     LEAST_SCENES,
     REACH,
@@ -48,6 +57,15 @@ UNDONE_BY = {
     "worse": "better",
 }  # what is seen -> what scenes that were not drawn may be
 NO_PAIR = "no scene-seed cell has this metric on both sides"
+
+
+class Pair(NamedTuple):
+    """A variant, the one that it is compared with, and what tables call the two."""
+
+    key: str
+    variant: Variant
+    other: Variant
+    baseline: str
 
 
 def paired(
@@ -75,78 +93,95 @@ def paired(
     Raises:
         InputError: No row has the baseline.
     """
-    return paired_sides(
-        by_renderer(rows),
-        metric_names(rows) if metrics is None else metrics,
-        baseline,
-        margins,
-        listed,
-        known,
-    )
-
-
-def paired_sides(
-    sides: Mapping[str, Side],
-    metrics: Sequence[str],
-    baseline: str,
-    margins: Mapping[str, float] | None = None,
-    listed: int = LISTED,
-    known: MetricTable = METRICS,
-) -> Table:
-    """Compare every renderer with a baseline; see `paired`.
-
-    Args:
-        sides: RENDERER -> its rollouts.
-        metrics: Which metrics.
-        baseline, margins, listed, known: As for `paired`.
-
-    Raises:
-        InputError: No side is the baseline.
-    """
+    sides = by_renderer(rows)
     if baseline not in sides:
         raise InputError(
             f"baseline {baseline!r}: no rollout has it",
             f"choose one of {', '.join(sides)}",
         )
+    names = metric_names(rows) if metrics is None else metrics
     return {
         renderer: {
             name: compare(
                 side, sides[baseline], known.info(name), baseline, (margins or {}).get(name), listed
             )
-            for name in metrics
+            for name in names
         }
         for renderer, side in sides.items()
         if renderer != baseline
     }
 
 
-def base_pairs(
-    sides: Mapping[str, Side],
-    metrics: Sequence[str],
-    baseline: str | None,
-    bases: Mapping[str, str],
-    known: MetricTable = METRICS,
-) -> Table:
-    """Compare every renderer with a fixer with the renderer below it: what the fixer itself does.
+def pairs_within(
+    table: RolloutTable, baseline: str | None, bases: Mapping[str, str]
+) -> list[list[Pair]]:
+    """Return what is compared within a run: renderers with a baseline, fixers with the renderer
+    below them, and policies with one policy.
 
     Args:
-        sides: RENDERER -> its rollouts, of one policy.
-        metrics: Which metrics.
-        baseline: What the others are compared with already; a fixer over it is left out here.
-        bases: Renderer with a fixer -> the renderer below it; pairs of which one was not driven are
-            left out.
+        table: The rollouts.
+        baseline: RENDERER, POLICY or RENDERER/POLICY that the others are compared with; what it
+            does not name, or a policy did not meet, is the first of its kind.
+        bases: Renderer with a fixer -> the renderer below it; where both were driven and neither is
+            the baseline, the two are paired too.
+    """
+    variants = variants_in(table)
+    by_renderer_base, by_policy_base = axis_bases(variants, baseline)
+    of_renderers, of_fixers, of_policies = [], [], []
+    for policy in table.policies:
+        own = {variant.renderer: variant for variant in variants if variant.policy == policy}
+        base = next(iter(own))
+        if by_renderer_base is not None and by_renderer_base.renderer in own:
+            base = by_renderer_base.renderer
+        others = {name: base for name in own if name != base}
+        below = {
+            name: other
+            for name, other in bases.items()
+            if {name, other} <= own.keys() and base not in (name, other)
+        }
+        for pairs, partners in ((of_renderers, others), (of_fixers, below)):
+            for name, other in partners.items():
+                key = name if len(table.policies) == 1 else own[name].name
+                pairs.append(Pair(key, own[name], own[other], other))
+    if by_policy_base is not None:
+        for variant, other in by_policy_base.pairs(variants):
+            of_policies.append(Pair(variant.name, variant, other, other.name))
+    return [of_renderers, of_fixers, of_policies]
+
+
+def compare_pairs(
+    table: RolloutTable,
+    pairs: Sequence[Pair],
+    known: MetricTable,
+    base: RolloutTable | None = None,
+    margins: Mapping[str, float] | None = None,
+    listed: int = LISTED,
+) -> Table:
+    """Compare variants with variants, scene by scene and seed by seed; their policies may differ.
+
+    Args:
+        table: The rollouts of the first variant of each pair.
+        pairs: What is compared.
         known: What the metrics are.
+        base: The rollouts of the second variant of each pair; None: the same table.
+        margins, listed: As for `paired`.
 
     Returns:
-        RENDERER -> METRIC -> what `compare` gives.
+        The pair's key -> METRIC -> what `compare` gives.
     """
-    out = {}
-    for name, base in bases.items():
-        if {name, base} <= sides.keys() and baseline not in (name, base):
-            out[name] = {
-                metric: compare(sides[name], sides[base], known.info(metric), base)
-                for metric in metrics
-            }
+    sides = cache(table.sides)
+    base_sides = sides if base is None else cache(base.sides)
+    names = dict.fromkeys([*table.metrics, *(base or table).metrics])
+    out: Table = {}
+    for key, variant, other, baseline in pairs:
+        side = sides(variant.policy, variant.policy)[variant.renderer]
+        base_side = base_sides(other.policy, variant.policy)[other.renderer]
+        out[key] = {
+            name: compare(
+                side, base_side, known.info(name), baseline, (margins or {}).get(name), listed
+            )
+            for name in names
+        }
     return out
 
 

@@ -24,7 +24,6 @@ from alpasim_plugin.log.run_folder.sides import (
     reason_of,
 )
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
-from evaluators.statistics.arms import Arm, axis_bases
 from evaluators.statistics.intervals import (
     cluster_bootstrap,
     clustered,
@@ -37,7 +36,7 @@ from evaluators.statistics.intervals import (
     wilson_rate,
     within,
 )
-from evaluators.statistics.paired import LISTED, Table, base_pairs, compare, paired_sides
+from evaluators.statistics.paired import Table, compare_pairs, pairs_within
 
 BOOTSTRAP_SCENES = 1000  # beyond, the bootstrap costs seconds and says what the t interval says
 
@@ -293,81 +292,19 @@ def numbers(
             the baseline, the two are paired too.
         known: What the metrics are.
     """
-    sides = {policy: table.sides(policy) for policy in table.policies}
-    arms = [
-        Arm(renderer, policy)
-        for policy, by_renderer_sides in sides.items()
-        for renderer in by_renderer_sides
-    ]
-    by_renderer_base, by_policy_base = axis_bases(arms, baseline)
-    chosen: dict[str, str | None] = {}  # None where there is nothing to compare
-    for policy, by_renderer_sides in sides.items():
-        first = next(iter(by_renderer_sides), None) if len(by_renderer_sides) > 1 else None
-        named = None if by_renderer_base is None else by_renderer_base.renderer
-        chosen[policy] = (
-            named if len(by_renderer_sides) > 1 and named in by_renderer_sides else first
-        )
     metrics = {
-        policy: aggregate_sides(by_renderer_sides, table.metrics, known)
-        for policy, by_renderer_sides in sides.items()
+        policy: aggregate_sides(table.sides(policy), table.metrics, known)
+        for policy in table.policies
     }
-    paired: dict[str, Table] = {}
-    with_base: dict[str, Table] = {}
-    for policy, by_renderer_sides in sides.items():
-        base = chosen[policy]
-        paired[policy] = (
-            {}
-            if base is None
-            else paired_sides(by_renderer_sides, table.metrics, base, known=known)
-        )
-        with_base[policy] = base_pairs(by_renderer_sides, table.metrics, base, bases, known)
-    parts = {"metrics": metrics, "paired": paired, "paired_with_base": with_base}
-    arm_pairs = [] if by_policy_base is None else by_policy_base.pairs(arms)
-    across = paired_arms(table, arm_pairs, known)
-    return {name: by_policy(part, dict) for name, part in parts.items()} | {"paired_arms": across}
-
-
-def paired_arms(
-    table: RolloutTable,
-    pairs: Sequence[tuple[Arm, Arm]],
-    known: MetricTable = METRICS,
-    base: RolloutTable | None = None,
-    margins: Mapping[str, float] | None = None,
-    listed: int = LISTED,
-    prefix: str = "",
-) -> Table:
-    """Compare arms with arms, scene by scene and seed by seed; their policies may differ.
-
-    Args:
-        table: The rollouts of the first arm of each pair.
-        pairs: Arm, and the arm that it is compared with.
-        known: What the metrics are.
-        base: The rollouts of the second arm of each pair; None: the same table.
-        margins, listed: As for `paired`.
-        prefix: Of the name of the arm that is compared with.
-
-    Returns:
-        RENDERER/POLICY -> METRIC -> what `compare` gives.
-    """
-    base = table if base is None else base
-    out: Table = {}
-    for arm, other in pairs:
-        side, base_side = (
-            table.sides(arm.policy)[arm.renderer],
-            base.sides(other.policy, arm.policy)[other.renderer],
-        )
-        out[arm.name] = {
-            name: compare(
-                side,
-                base_side,
-                known.info(name),
-                prefix + other.name,
-                (margins or {}).get(name),
-                listed,
-            )
-            for name in dict.fromkeys([*table.metrics, *base.metrics])
-        }
-    return out
+    paired, with_base, policies = (
+        compare_pairs(table, pairs, known) for pairs in pairs_within(table, baseline, bases)
+    )
+    return {
+        "metrics": by_policy(metrics, dict),
+        "paired": paired,
+        "paired_with_base": with_base,
+        "paired_arms": policies,
+    }
 
 
 def by_policy(

@@ -21,6 +21,7 @@ from alpasim_plugin.core.types import (
     Trajectory,
     Vehicle,
 )
+from evaluators import paired
 
 DT_US = 100_000
 CAR = Box(4.5, 1.8, 1.5)
@@ -105,3 +106,13 @@ TWO_LANES = road_map(
 
 def by_name(series) -> dict:
     return {one.name: one for one in series}
+
+
+def base_pairs(rows, baseline, bases):
+    """Renderers with a fixer against the renderer below it, where neither is the baseline."""
+    renderers = {row["renderer"] for row in rows}
+    return {
+        name: paired([row for row in rows if row["renderer"] in (name, base)], base)[name]
+        for name, base in bases.items()
+        if {name, base} <= renderers and baseline not in (name, base)
+    }

@@ -15,11 +15,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.log.run_folder.sides import RolloutTable, Side, by_renderer, metric_names
+from alpasim_plugin.log.run_folder.sides import RolloutTable, Side
 from evaluators import aggregate, paired
-from evaluators.statistics.gate import GateSpec, judge, judge_table
-from evaluators.statistics.paired import base_pairs
+from evaluators.statistics.gate import GateSpec, judge
 from evaluators.statistics.summary import numbers
+from tests.evaluators.eval_build import base_pairs
 
 METRICS = ("offroad", "progress", "lateral_distance_m", "min_distance_to_obstacle_m")
 KEYS = ("renderer", "policy", "scene", "seed", "status", "failure_class")
@@ -96,9 +96,7 @@ def by_rows(
             "metrics": aggregate(mine),
             "paired": paired(mine, chosen) if len(there) > 1 else {},
         }
-        parts["paired_with_base"] = base_pairs(
-            by_renderer(mine), metric_names(mine), chosen if len(there) > 1 else None, bases
-        )
+        parts["paired_with_base"] = base_pairs(mine, chosen if len(there) > 1 else None, bases)
         for block, part in parts.items():
             out[block] |= {
                 name if len(policies) == 1 else f"{name}/{policy}": entry
@@ -201,7 +199,7 @@ SPEC = GateSpec.model_validate(
 )
 def test_a_gate_judges_columns_as_rows_beside_stored_rows_too(stored):
     rows = rows_like_a_run(("clean", "3dgs", "onefixer"), ("a", "c"), 6, (0, 1, 2), 11)
-    assert judge_table(RolloutTable.of_table(table_of(rows)), SPEC, stored, "before") == judge(
+    assert judge(RolloutTable.of_table(table_of(rows)), SPEC, stored, "before") == judge(
         rows, SPEC, stored, "before"
     )
 
@@ -211,7 +209,7 @@ def test_a_gate_of_rows_and_of_columns_refuses_a_baseline_that_is_not_there():
     spec = SPEC.model_copy(update={"baseline": "absent"})
     for call in (
         lambda: judge(rows, spec),
-        lambda: judge_table(RolloutTable.of_table(table_of(rows)), spec),
+        lambda: judge(RolloutTable.of_table(table_of(rows)), spec),
     ):
         with pytest.raises(InputError, match="absent"):
             call()

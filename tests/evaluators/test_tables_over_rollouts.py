@@ -7,11 +7,12 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from scipy import stats
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.log.run_folder.sides import by_renderer, metric_names
+from alpasim_plugin.log.run_folder.sides import RolloutTable
 from evaluators import aggregate, censoring, paired
 from evaluators.statistics.intervals import (
     clustered,
@@ -20,7 +21,7 @@ from evaluators.statistics.intervals import (
     t_interval,
     wilson_rate,
 )
-from evaluators.statistics.paired import base_pairs
+from evaluators.statistics.summary import numbers
 
 
 def rows_of(values, metric="route_distance_m", renderer="3dgs", status="ok"):
@@ -422,16 +423,12 @@ def test_a_fixer_is_compared_with_what_it_repairs_too():
         [[1.5], [2.6], [3.4]], renderer="3dgs"
     )
     rows += rows_of([[1.2], [2.1], [3.2]], renderer="onefixer")
-    found = base_pairs(
-        by_renderer(rows),
-        metric_names(rows),
-        "clean",
-        {"onefixer": "3dgs", "onefixer+clean": "clean"},
-    )
+    table = RolloutTable.of_table(pa.Table.from_pylist(rows))
+    bases = {"onefixer": "3dgs", "onefixer+clean": "clean"}
+    found = numbers(table, "clean", bases)["paired_with_base"]
     assert list(found) == ["onefixer"]
     entry = found["onefixer"]["route_distance_m"]
     assert (entry["baseline"], entry["diff"]) == ("3dgs", pytest.approx(-1.0 / 3.0))
     assert entry == paired(rows, "3dgs")["onefixer"]["route_distance_m"]
-    assert (
-        base_pairs(by_renderer(rows), metric_names(rows), "3dgs", {"onefixer": "3dgs"}) == {}
-    )  # paired with it already
+    # Paired with it already.
+    assert numbers(table, "3dgs", bases)["paired_with_base"] == {}

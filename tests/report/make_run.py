@@ -17,11 +17,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.interpolate import CubicSpline
 
-from alpasim_plugin.log.run_folder.sides import by_renderer, metric_names
 from evaluators.opening import read_run
 from evaluators.report.flips import find_flips
-from evaluators.statistics.paired import base_pairs, paired
+from evaluators.statistics.paired import paired
 from evaluators.statistics.summary import aggregate, censoring
+from tests.evaluators.eval_build import base_pairs
 
 METRICS = (
     "collision_any",
@@ -451,9 +451,7 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
         "preset": "paper",
         "metrics": aggregate(rows),
         "paired": paired(rows, baseline) if len(ran) > 1 else {},
-        "paired_with_base": base_pairs(
-            by_renderer(rows), metric_names(rows), baseline, {"onefixer": "3dgs"}
-        ),
+        "paired_with_base": base_pairs(rows, baseline, {"onefixer": "3dgs"}),
         "censoring": censoring(rows),
         "failures": {
             "n_failed": len(failed),
