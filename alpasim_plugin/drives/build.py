@@ -439,7 +439,7 @@ def fitted(
 
     Args:
         views: To fit to.
-        kept: Held out, to measure with on the way.
+        kept: Held out.
         points: To start from.
         scene_id: Key of the random streams.
         folder: Keeps the fit's state; the same call goes on from it.
@@ -458,15 +458,6 @@ def fitted(
         scene_id=scene_id,
         folder=folder,
         seed=SEED,
-        report=lambda stage, at, all, numbers: tell(_words(stage, numbers), at, all),
+        report=lambda stage, at, all, numbers: tell(stage, at, all),
     )
     return done.model, dict(done.exposures)
-
-
-def _words(stage: str, numbers: Mapping[str, float]) -> str:
-    """Return a stage with how well held-out photographs are shown, where that was just measured."""
-    return (
-        f"{stage}, held-out photographs {numbers['held_out_db']:.1f} dB"
-        if "held_out_db" in numbers
-        else stage
-    )

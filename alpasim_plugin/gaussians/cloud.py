@@ -84,17 +84,12 @@ class GaussianCloud:
             value.flags.writeable = False
             object.__setattr__(self, name, value)
         n = self.means.shape[0] if self.means.ndim else -1
-        wanted = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
-        found = {name: getattr(self, name).shape for name in wanted}
-        sh_ok = (
-            self.sh.ndim == 3
-            and self.sh.shape[0] == n
-            and self.sh.shape[1] in SH_SIZES
-            and self.sh.shape[2] == 3
-        )
-        if n < 0 or found != wanted or not sh_ok:
+        found = {name: value.shape for name, value in vars(self).items()}
+        colours = [(n, size, 3) for size in SH_SIZES]
+        wanted = ((n, 3), (n, 4), (n, 3), (n,))
+        if n < 0 or tuple(found.values())[:4] != wanted or found["sh"] not in colours:
             raise InputError(
-                f"{n} means: {', '.join((f'{k} {v}' for k, v in {**found, 'sh': self.sh.shape}.items()))}",
+                f"{n} means: {', '.join(f'{name} {shape}' for name, shape in found.items())}",
                 "give means (N,3), quats (N,4), scales (N,3), opacities (N,) and sh (N,K,3) with K in 1, 4, 9, 16",
             )
 
@@ -247,14 +242,11 @@ class GaussianCloud:
             self.means[i], self.quats[i], self.scales[i], self.opacities[i], self.sh[i]
         )
 
-    def transformed(self, T: F64, rotate_colour: bool = True) -> GaussianCloud:
+    def transformed(self, T: F64) -> GaussianCloud:
         """Return the cloud moved by a rigid transform, colours turning with the object.
 
         Args:
             T: ``(4, 4)`` rigid transform applied to the cloud.
-            rotate_colour: Turn the spherical harmonics too. False keeps them in the old axes, as
-                checkpoints of Street Gaussians, drivestudio and MTGS expect (they evaluate world
-                directions for moving objects).
 
         Raises:
             InputError: ``T`` is not rigid.
@@ -263,8 +255,7 @@ class GaussianCloud:
         rotation = np.asarray(T[:3, :3], dtype=np.float64)
         means = self.means.astype(np.float64) @ rotation.T + T[:3, 3]
         quats = quat_multiply(quat_from_matrix(rotation), self.quats.astype(np.float64))
-        sh = rotate_sh(self.sh, rotation) if rotate_colour else self.sh
-        return replace(self, means=means, quats=quats, sh=sh)
+        return replace(self, means=means, quats=quats, sh=rotate_sh(self.sh, rotation))
 
     def rotations(self) -> F64:
         """Return ``(N, 3, 3)`` float64 rotation matrices, quaternions normalised."""

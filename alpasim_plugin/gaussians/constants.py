@@ -35,16 +35,14 @@ CAM_SLOPE_HIGH_X = 5
 CAM_SLOPE_LOW_Y = 6
 CAM_SLOPE_HIGH_Y = 7
 CAM_WIDTH, CAM_HEIGHT = 8, 9
-CAM_LOD = 10
 
-# A node's pose, one float64 array: rotation node to camera, camera centre in the node, rotation
-# from the node to the axes of its colours, and the depth range.
+# A node's pose, one float64 array: rotation node to camera, camera centre in the node, and the depth
+# range.
 POSE_ROTATION = 0
 POSE_CENTRE = 9
-POSE_COLOUR = 12
-POSE_NEAR = 21
-POSE_FAR = 22
-POSE_SIZE = 23
+POSE_NEAR = 12
+POSE_FAR = 13
+POSE_SIZE = 14
 
 # One group of sixteen prepared Gaussians: columns of sixteen lanes each.
 GEO_FACTOR = 0  # nine columns: R_q diag(s), row by row

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, SupportsFloat
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, NamedTuple, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -39,9 +39,6 @@ from alpasim_plugin.runs.rollout import Loop
 from alpasim_plugin.runs.scoring import score_log
 from scenarios.load import load_scenario
 
-if TYPE_CHECKING:
-    from tempfile import TemporaryDirectory
-
 PREDICTED_US, PREDICTED_STEP_US = (
     2_000_000,
     100_000,
@@ -52,23 +49,7 @@ SPEED_MPS = 100.0
 ROLLOUT_SEEDS = 2**31
 
 
-class Actions(ABC):
-    """One way to act.
-
-    Attributes:
-        space: Of the actions.
-        controller: Moves the ego.
-    """
-
-    space: Box
-    controller: Controller
-
-    @abstractmethod
-    def plan(self, action: F64, observation: Observation) -> Plan:
-        """Return the plan that an action stands for."""
-
-
-class Controls(Actions):
+class Controls:
     """``(2,)`` in -1..1: steering angle of the wheels as a share of the vehicle's limit, left
     positive; throttle above 0, brake below.
 
@@ -77,18 +58,16 @@ class Controls(Actions):
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.space = Box(-1.0, 1.0, (2,), np.float32)
-        self.controller: HeldCommand = HeldCommand(vehicle)
+        self.controller = HeldCommand(vehicle)
         self._vehicle = vehicle
 
     def plan(self, action: F64, observation: Observation) -> Plan:
         """Hold the command, and return where it leads in two seconds."""
         steer, pedal = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
-        drive, brake = (
-            max(pedal, 0.0) * self._vehicle.max_accel_mps2,
-            max(-pedal, 0.0) * self._vehicle.max_brake_mps2,
-        )
         self.controller.command = Command(
-            float(steer) * self._vehicle.max_steer_rad, float(drive), float(brake)
+            float(steer) * self._vehicle.max_steer_rad,
+            float(max(pedal, 0.0) * self._vehicle.max_accel_mps2),
+            float(max(-pedal, 0.0) * self._vehicle.max_brake_mps2),
         )
         times = observation.t_us + np.arange(0, PREDICTED_US + 1, PREDICTED_STEP_US, dtype=np.int64)
         step_s = PREDICTED_STEP_US * 1e-6
@@ -115,7 +94,7 @@ class HeldCommand(Controller):
         return spatial(after, to_us, z_m, accel, self._vehicle)
 
 
-class Trajectories(Actions):
+class Trajectories:
     """``(T, 3)``: x, y (metres) and yaw (radians) in the rig frame, at equal steps after now, the
     first step ahead.
 
@@ -136,7 +115,14 @@ class Trajectories(Actions):
         return Plan(observation.t_us, observation.t_us + self._after_us, rows[:, :2], rows[:, 2])
 
 
-Actions_ = Literal["controls", "trajectory"]
+class _Episode(NamedTuple):
+    """An episode: the loop of its rollout, and what records and scores it."""
+
+    folder: TemporaryDirectory[str]
+    recorder: _Watching
+    loop: Loop
+    driving: Generator[Observation, Plan, None]
+    scorer: Scorer
 
 
 class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gymnasium is an extra
@@ -173,7 +159,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
     def __init__(
         self,
         scenario: str | Path = "smoke/curve",
-        actions: Actions_ = "controls",
+        actions: Literal["controls", "trajectory"] = "controls",
         renderer: str = "clean",
         camera: str | None = None,
         scene_seeds: Sequence[int] = (0,),
@@ -186,12 +172,8 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
     ) -> None:
         self._scenarios = [load_scenario(scenario, seed, tuple(overrides)) for seed in scene_seeds]
         _check(self._scenarios, actions, preset, horizon_us, step_us)
-        self._preset, self._reward, self._renderer, self.render_mode = (
-            preset,
-            reward,
-            renderer,
-            render_mode,
-        )
+        self._preset, self._reward = preset, reward
+        self._renderer, self.render_mode = renderer, render_mode
         self._scenario = self._scenarios[0]
         known = [one.name for one in self._scenario.cameras]
         name = camera if camera is not None else known[0] if known else ""
@@ -210,18 +192,15 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
             )
         self._camera = next((one for one in self._scenario.cameras if one.name == name), None)
         vehicle = self._scenario.vehicle
-        self._actions: Actions = (
+        self._actions = (
             Controls(vehicle)
             if actions == "controls"
             else Trajectories(vehicle, horizon_us, step_us)
         )
         self.action_space = self._actions.space
         self.observation_space = self._space()
-        self._driving: Generator[Observation, Plan, None] | None = None
-        self._folder: TemporaryDirectory[str] | None = None
-        self._recorder: _Watching | None = None
-        self._loop: Loop | None = None
-        self._judge: Scorer | None = None
+        self._episode: _Episode | None = None
+        self._over = True
         self._observation: Observation | None = None
 
     @property
@@ -249,37 +228,27 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         """
         super().reset(seed=seed)
         self.close()
-        wanted = dict(options or {})
-        drawn_scene = int(
-            self.np_random.integers(len(self._scenarios))
-        )  # drawn in any case, so that options change one episode only
+        # Both are drawn in any case, so that options change one episode only.
+        drawn_scene = int(self.np_random.integers(len(self._scenarios)))
         drawn_seed = int(self.np_random.integers(ROLLOUT_SEEDS))
-        self._scenario = self._scenarios[int(wanted.get("scene_seed", drawn_scene))]
-        rollout_seed = int(
-            wanted.get(
-                "seed", derive_seed(self._scenario.scene_id, drawn_seed, "gym") % ROLLOUT_SEEDS
-            )
-        )
-        self._folder = temporary_folder("simrun-gym-")
-        self._recorder = _Watching(self._scenario, rollout_seed, Path(self._folder.name))
-        session = make_renderer(self._renderer, self._scenario, rollout_seed, threads=1)
-        self._loop = Loop(
-            self._scenario, session, self._sensors, self._actions.controller, self._recorder
-        )
-        self._judge = Scorer(self._scenario, self._preset, self._reward)
-        self._driving = self._loop.drive()
-        self._observation = next(self._driving)
-        while (
-            self._observation.t_us < self._scenario.start_us + self._scenario.warmup_us
-        ):  # the recording is forced: nothing to decide
-            self._observation = self._driving.send(self._recorded())
-        *_, facts = self._judge.judge(self._recorder.taken())
-        return self._seen(), {
-            "seed": rollout_seed,
-            "scene": self._scenario.scene_id,
-            "t_us": self._observation.t_us,
-            **facts,
-        }
+        wanted = {"scene_seed": drawn_scene, **(options or {})}
+        scenario = self._scenario = self._scenarios[int(wanted["scene_seed"])]
+        derived = derive_seed(scenario.scene_id, drawn_seed, "gym") % ROLLOUT_SEEDS
+        seed = int(wanted.get("seed", derived))
+        folder = temporary_folder("simrun-gym-")
+        recorder = _Watching(scenario, seed, Path(folder.name))
+        session = make_renderer(self._renderer, scenario, seed, threads=1)
+        loop = Loop(scenario, session, self._sensors, self._actions.controller, recorder)
+        driving, scorer = loop.drive(), Scorer(scenario, self._preset, self._reward)
+        self._episode, self._over = _Episode(folder, recorder, loop, driving, scorer), False
+        observation = next(driving)
+        while observation.t_us < scenario.start_us + scenario.warmup_us:
+            # The recording is forced: nothing to decide.
+            observation = driving.send(_straight_on(observation))
+        self._observation = observation
+        *_, facts = scorer.judge(recorder.taken())
+        info = {"seed": seed, "scene": scenario.scene_id, "t_us": observation.t_us, **facts}
+        return self._seen(), info
 
     def step(self, action: Any) -> tuple[dict[str, Any], SupportsFloat, bool, bool, dict[str, Any]]:
         """Act for one policy period.
@@ -287,34 +256,28 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         Raises:
             InputError: No episode runs, or the action is none.
         """
-        if (
-            self._driving is None
-            or self._judge is None
-            or self._recorder is None
-            or self._loop is None
-        ):
+        episode = self._episode
+        if episode is None or self._over:
             raise InputError("an environment: no episode runs", "call reset() first")
         plan = self._actions.plan(np.asarray(action), self.observation)
         problem = plan_problem(plan, self.observation.t_us)
         if problem:
             raise InputError(f"an action: {problem}", "give finite numbers within the action space")
-        over = False
         try:
-            self._observation = self._driving.send(plan)
+            self._observation = episode.driving.send(plan)
         except StopIteration:
-            over = True
-        worth, ended, facts = self._judge.judge(self._recorder.taken())
-        terminated = bool(ended) or (over and self._loop.path_end.passed)
-        info: dict[str, Any] = {"t_us": self._loop.state.ego.t_us, **facts}
-        if over or terminated:
-            info |= {
-                "ended": ended or ("path_end" if terminated else "time"),
-                "metrics": self._finish(),
-            }
-            self._observation = self._loop.state.observe(
-                {} if self._camera is None else {self._camera.name: self._camera}
-            )
-        return self._seen(), worth, terminated, over and not terminated, info
+            self._over = True
+        worth, ended, facts = episode.scorer.judge(episode.recorder.taken())
+        timed_out = self._over and not ended and not episode.loop.path_end.passed
+        if self._over and not ended:
+            ended = "time" if timed_out else "path_end"
+        info: dict[str, Any] = {"t_us": episode.loop.state.ego.t_us, **facts}
+        if ended:
+            self._over = True
+            info |= {"ended": ended, "metrics": self._finish(episode)}
+            cameras = {} if self._camera is None else {self._camera.name: self._camera}
+            self._observation = episode.loop.state.observe(cameras)
+        return self._seen(), worth, bool(ended) and not timed_out, timed_out, info
 
     def render(self) -> U8 | None:
         """Return the newest frame ``(H, W, 3)``; None without render mode."""
@@ -325,41 +288,26 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
 
     def close(self) -> None:
         """End the episode, if one runs."""
-        if self._recorder is not None and self._driving is not None:
-            self._driving.close()
-            self._recorder.__exit__(
-                GeneratorExit, GeneratorExit(), None
-            )  # the log of an episode that was left is not kept
-        self._driving = self._recorder = None
-        if self._folder is not None:
-            self._folder.cleanup()
-            self._folder = None
+        if self._episode is None:
+            return
+        if not self._over:  # the log of an episode that was left is not kept
+            self._episode.driving.close()
+            self._episode.recorder.__exit__(GeneratorExit, GeneratorExit(), None)
+        self._episode.folder.cleanup()
+        self._episode = None
 
-    def _finish(self) -> dict[str, float | None]:
+    def _finish(self, episode: _Episode) -> dict[str, float | None]:
         """Close the log and return the scores of the whole rollout; None where a metric is not
         valid.
         """
-        assert self._recorder is not None
-        assert self._driving is not None
-        assert self._loop is not None
-        self._driving.close()
-        self._recorder.finish(self._loop.path_end)
-        folder = self._recorder.folder
+        episode.driving.close()
+        episode.recorder.finish(episode.loop.path_end)
+        folder = episode.recorder.folder
         scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, self._scenario, self._preset)
-        self._driving = None
         return {
             name: entry["value"] if entry["valid"] else None
             for name, entry in scored.metrics.items()
         }
-
-    def _recorded(self) -> Plan:
-        """Return a plan for the warm-up, in which none is driven: straight on."""
-        observation = self.observation
-        times = observation.t_us + np.arange(0, 2_000_001, 100_000, dtype=np.int64)
-        xy = np.column_stack(
-            [observation.ego.speed_mps * (times - times[0]) * 1e-6, np.zeros(len(times))]
-        )
-        return Plan(observation.t_us, times, xy, np.zeros(len(times)))
 
     def _space(self) -> Dict:
         spaces: dict[str, Any] = {
@@ -372,12 +320,8 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
 
     def _seen(self) -> dict[str, Any]:
         observation = self.observation
-        seen = {
-            "speed": np.array(
-                [np.clip(observation.ego.speed_mps, -SPEED_MPS, SPEED_MPS)], np.float32
-            )
-        }
-        seen["route"] = _route(observation.route_rig)
+        speed = np.clip([observation.ego.speed_mps], -SPEED_MPS, SPEED_MPS)
+        seen = {"speed": speed.astype(np.float32), "route": _route(observation.route_rig)}
         if self._camera is not None:
             seen["camera"] = np.array(observation.frames[self._camera.name].rgb)
         return seen
@@ -400,6 +344,14 @@ class _Watching(Recorder):
         return new
 
 
+def _straight_on(observation: Observation) -> Plan:
+    """Return a plan that keeps heading and speed for two seconds."""
+    times = observation.t_us + np.arange(0, PREDICTED_US + 1, PREDICTED_STEP_US, dtype=np.int64)
+    ahead = observation.ego.speed_mps * (times - times[0]) * 1e-6
+    still = np.zeros(len(times))
+    return Plan(observation.t_us, times, np.column_stack([ahead, still]), still)
+
+
 def _route(route_rig: F64) -> np.ndarray[Any, np.dtype[np.float32]]:
     known = np.isfinite(route_rig).all(axis=1)
     out = np.zeros((ROUTE_POINTS, 3), np.float32)
@@ -411,20 +363,14 @@ def _route(route_rig: F64) -> np.ndarray[Any, np.dtype[np.float32]]:
 def _check(
     scenarios: Sequence[Scenario], actions: str, preset: str, horizon_us: int, step_us: int
 ) -> None:
-    latencies = {one.latency.kind for one in scenarios}
-    problems = {
-        "scene_seeds": "" if scenarios else "none",
-        "latency": "measured, so that a step depends on how long the learner thinks"
-        if "measured" in latencies
-        else "",
-        "actions": "" if actions in ("controls", "trajectory") else f"{actions!r}",
-        "preset": ""
-        if preset in ("paper", "strict")
-        else f"{preset!r}, which scores whole rollouts only",
-        "horizon_us and step_us": ""
-        if 0 < step_us <= horizon_us and horizon_us % step_us == 0
-        else f"{horizon_us} and {step_us}",
+    faults = {
+        f"scene_seeds={()}": not scenarios,
+        "latency=measured": "measured" in {one.latency.kind for one in scenarios},
+        f"actions={actions!r}": actions not in ("controls", "trajectory"),
+        f"preset={preset!r}": preset not in ("paper", "strict"),
+        f"horizon_us={horizon_us}, step_us={step_us}": not 0 < step_us <= horizon_us
+        or horizon_us % step_us > 0,
     }
-    for name, found in problems.items():
-        if found:
-            raise InputError(f"{name}: {found}", "see docs/gym.md")
+    for argument, wrong in faults.items():
+        if wrong:
+            raise InputError(f"an environment cannot have {argument}", "see docs/gym.md")

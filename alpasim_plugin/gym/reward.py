@@ -16,11 +16,8 @@ from evaluators import resolve_evaluators
 from evaluators.metrics.presets import preset as find_preset
 from evaluators.metrics.score import check_rollout, run_evaluator
 
-USED = (
-    "collision",
-    "offroad",
-    "route",
-)  # evaluators whose values at an instant need no more of the drive than the instant before
+# Evaluators whose values at an instant need no more of the drive than the instant before.
+USED = ("collision", "offroad", "route")
 
 Instant = tuple[EgoState, Mapping[str, F64]]  # the ego, and T_world_box (4, 4) of the others by id
 
@@ -78,16 +75,16 @@ class Scorer:
         is_first, self._before = self._before is None, instants[-1]
         lateral_m = float(self._value(found["lateral_distance_m"])[-1])
         share, length_m = self._value(found["progress"]), self._value(found["gt_dist_traveled_m"])
-        flags = {
-            name: bool((self._value(found[name])[0 if is_first else 1 :] > 0.5).any())
+        collision, offroad = (
+            bool((self._value(found[name])[0 if is_first else 1 :] > 0.5).any())
             for name in ("collision_any", "offroad")
-        }
+        )
         gained_m = 0.0 if is_first else float((share[-1] - share[0]) * length_m[-1])
         seconds = (window[-1][0].t_us - window[0][0].t_us) * 1e-6
         weights = self._reward
         worth = weights.progress_per_m * gained_m - weights.lateral_per_m_s * lateral_m * seconds
-        worth -= weights.collision * flags["collision_any"] + weights.offroad * flags["offroad"]
-        ended = "collision" if flags["collision_any"] else "offroad" if flags["offroad"] else ""
+        worth -= weights.collision * collision + weights.offroad * offroad
+        ended = "collision" if collision else "offroad" if offroad else ""
         return worth, ended, {"lateral_distance_m": lateral_m, "progress": float(share[-1])}
 
     def _value(self, series: MetricSeries) -> F64:

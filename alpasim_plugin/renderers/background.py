@@ -1,8 +1,8 @@
 """The background file of a scenario: read, placed, and refused where nothing of it could be seen on
 the drive.
 
-`Coverage` says whether a Gaussian file stands where the drive is: its bounds, the share of the path
-near it, a place where it might belong.
+`Coverage` says whether a Gaussian file stands where the drive is: its bounds, and the share of the
+path near it.
 """
 
 from __future__ import annotations
@@ -66,35 +66,6 @@ def coverage_of(cloud: GaussianCloud, path: F64) -> Coverage:
     return Coverage(low, high, float(np.mean(covered)))
 
 
-def suggested_transform(cloud: GaussianCloud, path: F64) -> F64:
-    """Guess where a file belongs: ``(4, 4)`` from its frame to the world, without scale.
-
-    The axis of least spread is taken as vertical, its dense end as the ground; the longer
-    horizontal axis is laid along the path, the middle on the path's middle, the ground at its
-    height. A start to correct by eye: a file does not say which end of it is the front.
-    """
-    points = _bulk(cloud)
-    low, middle, high = np.percentile(points, (5.0, 50.0, 95.0), axis=0)
-    vertical = int(np.argmin(high - low))
-    sign = 1.0 if middle[vertical] - low[vertical] <= high[vertical] - middle[vertical] else -1.0
-    up = sign * np.eye(3)[vertical]
-    one = np.eye(3)[(vertical + 1) % 3]
-    R_flat_file = np.stack(
-        [one, np.cross(up, one), up]
-    )  # (3, 3): its rows are the flat frame's axes in the file
-    flat = points @ R_flat_file.T
-    turn = _heading(path[:, :2]) - _heading(flat[:, :2])
-    c, s = np.cos(turn), np.sin(turn)
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R_flat_file
-    placed = points @ R.T
-    at = _along(path)
-    target = np.array([*at[len(at) // 2, :2], np.median(at[:, 2])])
-    source = np.array([*np.median(placed[:, :2], axis=0), np.percentile(placed[:, 2], 5.0)])
-    T_world_file = np.eye(4)
-    T_world_file[:3, :3], T_world_file[:3, 3] = R, target - source
-    return T_world_file
-
-
 def _bulk(cloud: GaussianCloud) -> F64:
     return np.asarray(cloud.means[cloud.opacities > VISIBLE], dtype=np.float64)
 
@@ -112,13 +83,6 @@ def _count_near(points: F64, at: F64) -> int:
     return int(np.sum(flat & (rise >= -BELOW_M) & (rise <= ABOVE_M)))
 
 
-def _heading(xy: F64) -> float:
-    """Return the direction of the longest extent of points ``(N, 2)``, radians in (-pi/2, pi/2]."""
-    centred = xy - xy.mean(axis=0)
-    _, vectors = np.linalg.eigh(centred.T @ centred)
-    return float(np.arctan2(vectors[1, -1], vectors[0, -1]))
-
-
 LEAST = 0.05  # share of the route with Gaussians near it; below it the cameras look into emptiness
 
 
@@ -134,7 +98,7 @@ def read_background(background: BackgroundFile, path: F64) -> tuple[GaussianClou
 
     Raises:
         InputError: It cannot be read, no Gaussian of it can be drawn, or it covers next to nothing
-            of the path; then the error suggests a transform.
+            of the path.
     """
     cloud, report = read_gaussians(background.path)
     if report.n_kept == 0:
@@ -150,7 +114,7 @@ def read_background(background: BackgroundFile, path: F64) -> tuple[GaussianClou
         )
         raise InputError(
             f"{background.path}: {coverage}, which runs through {drive} m: nothing of it would be seen",
-            _advice(cloud, path),
+            "give background.transform, from the file's frame to the world (docs/scenario-files.md)",
         )
     return cloud, coverage
 
@@ -170,13 +134,3 @@ def background_note(scenario: Scenario) -> str:
         else "it replaces the built road, markings and houses"
     )
     return f"background {scenario.background.path}: {coverage}; {road}"
-
-
-def _advice(cloud: GaussianCloud, path: F64) -> str:
-    guess = suggested_transform(cloud, path)
-    if coverage_of(placed_cloud(cloud, guess), path).covered < LEAST:
-        return "give background.transform; the file is too small or too sparse for the route as it stands, its scale may be wrong"
-    # With fewer digits the rotation would be refused.
-    numbers = np.round(guess, 7) + 0.0
-    rows = ", ".join("[" + ", ".join(f"{value:.8g}" for value in row) + "]" for row in numbers)
-    return f"a transform to start from: transform: [{rows}]"

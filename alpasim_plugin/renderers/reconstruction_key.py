@@ -93,7 +93,6 @@ def recipe_for(amount: Degradation, watched_s: float) -> ReconstructionRecipe:
         width=160,
         points=points,
         cap=points,
-        hold_out_every=0,
         sh_degree=1,
         lr_means=4e-4,
         lr_means_end=4e-5,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.core.errors import InputError, RendererError
+from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
 from alpasim_plugin.gaussians.raster import rasterize_gsplat
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
@@ -153,11 +153,6 @@ def test_empty_cloud_needs_no_kernel_call(fresh):
     assert np.all(
         draw(GaussianCloud.empty(), camera(), (0.1, 0.2, 0.3)).rgb == np.float32([0.1, 0.2, 0.3])
     )
-
-
-def test_level_of_detail_is_refused_not_ignored(fresh):
-    with pytest.raises(InputError):
-        rasterize(splats([0, 0, 3.0]), camera(), backend="gsplat", lod_px=2.0)
 
 
 @pytest.mark.gpu

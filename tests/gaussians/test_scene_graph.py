@@ -89,18 +89,6 @@ def test_camera_and_actor_turned_together_see_the_same_image() -> None:
     np.testing.assert_allclose(still.rgb[covered], moved.rgb[covered], atol=0.02)
 
 
-def test_world_frame_colours_stay_while_the_actor_turns() -> None:
-    sheen = blobs((0, 0, 0.5), sheen=True)
-    turned = {"a": se2(8, 0, np.pi)}
-    in_object = (
-        SceneGraph([], [node("a", sheen, "actor")], SKY, "object").render(camera(), turned).rgb
-    )
-    in_world = (
-        SceneGraph([], [node("a", sheen, "actor")], SKY, "world").render(camera(), turned).rgb
-    )
-    assert np.abs(in_object - in_world).max() > 0.05
-
-
 def test_node_out_of_view_is_not_drawn_and_does_not_change_the_image() -> None:
     ahead, behind = node("ahead", blobs((10, 0, 1))), node("behind", blobs((-30, 0, 1), seed=3))
     both, one = (

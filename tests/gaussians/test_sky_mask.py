@@ -1,18 +1,15 @@
 """What the log views say: when, who was there, and which holes are sky."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
 import numpy as np
-import pytest
 
 from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.scene.log_views import SkyMask, SkyView, log_actors, log_times
+from alpasim_plugin.gaussians.scene.log_views import SkyMask, SkyView, log_actors
 from alpasim_plugin.gaussians.scene.sky import STEP_PX, _upsample
-from tests.gaussians.scene_maps import curve, parked, straight
+from tests.gaussians.scene_maps import parked, straight
 
 
 def camera(width: int, height: int, yaw_rad: float = 0.0, x_m: float = 0.0) -> PinholeCamera:
@@ -65,15 +62,6 @@ def test_directions_between_corners_are_those_at_the_middles_of_pixels() -> None
         grid.astype(np.float32), (columns + 0.5) / STEP_PX, (rows + 0.5) / STEP_PX, cv2.INTER_LINEAR
     )
     np.testing.assert_allclose(_upsample(grid, height, width), plain, rtol=1e-6, atol=2e-4)
-
-
-@pytest.mark.parametrize("make", [straight, curve])
-def test_log_times_are_inside_the_log_and_few(make: Callable[..., Scenario]) -> None:
-    scenario = make()
-    times = log_times(scenario, 4.0, 20)
-    assert 10 < len(times) <= 20
-    assert times[0] == scenario.ego_log.t_us[0]
-    assert times[-1] == scenario.ego_log.t_us[-1]
 
 
 def test_only_actors_present_are_posed() -> None:

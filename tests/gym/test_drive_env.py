@@ -84,7 +84,7 @@ def test_stepping_with_a_policys_plans_is_the_rollout_of_a_run() -> None:
         plan = policy.act(env.observation)
         _, _, terminated, truncated, info = env.step(np.column_stack([plan.xy, plan.yaw])[1:])
         over = terminated or truncated
-    stepped = read_asl(Path(env._folder.name) / LOG_NAME)  # type: ignore[union-attr]
+    stepped = read_asl(Path(env._episode.folder.name) / LOG_NAME)  # type: ignore[union-attr]
 
     class Recorded(Policy):
         """The same policy as the environment lets it drive: with a straight plan while the
@@ -123,7 +123,7 @@ def test_stepping_with_a_policys_plans_is_the_rollout_of_a_run() -> None:
             stepped.seed,
             recorder,
         )
-    assert (Path(env._folder.name) / LOG_NAME).read_bytes() == (
+    assert (Path(env._episode.folder.name) / LOG_NAME).read_bytes() == (
         recorder.folder / LOG_NAME
     ).read_bytes()  # type: ignore[union-attr]
     assert info["ended"] == "path_end"
@@ -142,7 +142,7 @@ def test_the_reward_is_that_of_the_evaluators_and_leaving_the_road_ends_the_epis
             break
     assert (terminated, info["ended"]) == (True, "offroad")
     assert info["metrics"]["offroad"] == 1.0
-    log = read_asl(Path(env._folder.name) / LOG_NAME)  # type: ignore[union-attr]
+    log = read_asl(Path(env._episode.folder.name) / LOG_NAME)  # type: ignore[union-attr]
     found = {one.name: one for one in score(log, env.scenario.scene, "paper")}
     at = np.searchsorted(log.ego.t_us, [one["t_us"] for one in facts])
     for name in ("lateral_distance_m", "progress"):
@@ -178,7 +178,7 @@ def test_a_contact_ends_the_episode() -> None:
 def test_episodes_follow_from_the_seed_and_a_left_episode_leaves_nothing_behind() -> None:
     env = DriveEnv("smoke/curve", camera="", scene_seeds=(0, 1), overrides=SHORT)
     env.reset(seed=12)
-    folder = Path(env._folder.name)  # type: ignore[union-attr]
+    folder = Path(env._episode.folder.name)  # type: ignore[union-attr]
     first = [env.reset()[1] for _ in range(3)]
     assert not folder.exists()
     env.reset(seed=12)

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from alpasim_plugin.gaussians.fit.start import cloud_from_points as cloud_from_points
     from alpasim_plugin.gaussians.fit.start import start_from_depth as start_from_depth
     from alpasim_plugin.gaussians.fit.views import PosedView as PosedView
-    from alpasim_plugin.gaussians.fit.views import held_out as held_out
     from alpasim_plugin.gaussians.fit.views import logged_views as logged_views
 
 __all__ = [
@@ -26,7 +25,6 @@ __all__ = [
     "SplatRecipe",
     "Start",
     "cloud_from_points",
-    "held_out",
     "logged_views",
     "start_from_depth",
 ]
@@ -39,7 +37,6 @@ __getattr__ = lazy_names(
         "SplatRecipe": ".recipe",
         "Start": ".start",
         "cloud_from_points": ".start",
-        "held_out": ".views",
         "logged_views": ".views",
         "start_from_depth": ".start",
     },

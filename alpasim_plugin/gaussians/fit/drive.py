@@ -64,13 +64,13 @@ def fit_drive(
         views: To fit to, +z of the world up; names sort them along the way, and up to the last
             ``-`` they name the camera.
         points: Measured or triangulated points; None starts from what the views' own depth gives.
-        kept: Held out. The fit never sees their pixels; it only tells how well it shows them.
+        kept: Held out. The fit never sees their pixels; their gains are those of their neighbours.
         boxes: Sizes of the road users that views show, which are fitted as nodes.
         scene_id: Key of the random streams.
         folder: Keeps the fit's state; the same call goes on from it.
         seed: Of the start, the order of views and the splits.
-        report: Called with stage, done and all; while fitting also with loss, psnr_db, gaussians
-            and, now and then, held_out_db.
+        report: Called with stage, done and all; while fitting also with loss, psnr_db and
+            gaussians.
         threads: Of the rasteriser.
         recipe: How to fit; None is `SplatRecipe.street`.
 
@@ -94,7 +94,6 @@ def fit_drive(
         _start(train, guesses, points, recipe, scene_id),
         start_in_boxes(shown, recipe.actor_points, scene_id, recipe.seed),
     )
-    held = [replace(view, gain=_between(train, view)) for view in every if view.name not in known]
     model = fit(
         train,
         start,
@@ -102,12 +101,11 @@ def fit_drive(
         scene_id=scene_id,
         folder=folder,
         threads=threads,
-        checked=held,
         report=lambda step, numbers: tell("fitting", step, recipe.steps, numbers),
     )
     after = [replace(view, gain=model.gains[i]) for i, view in enumerate(train)]
     exposures = {view.name: view.gain for view in after} | {
-        view.name: _between(after, view) for view in held
+        view.name: _between(after, view) for view in every if view.name not in known
     }
     return FittedDrive(model, exposures)
 

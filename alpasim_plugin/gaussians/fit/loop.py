@@ -32,7 +32,6 @@ from alpasim_plugin.gaussians.fit.model import (
     SplatModel,
     densify,
     needles,
-    reset_opacities,
 )
 from alpasim_plugin.gaussians.fit.quality import SsimTarget
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
@@ -56,9 +55,7 @@ def fit(
     scene_id: str = "",
     folder: Path | None = None,
     report: Report | None = None,
-    device: str = "cpu",
     threads: int | None = None,
-    checked: Sequence[PosedView] = (),
 ) -> Reconstruction:
     """Fit a background, and the actors that ``start`` holds, to posed views.
 
@@ -70,11 +67,9 @@ def fit(
         scene_id: Key of the random streams, with ``recipe.seed``: order of views and splits.
         folder: Receives checkpoints; the same call with the same folder continues, and ends with
             the same bits. None keeps none.
-        report: Called after every update with loss, psnr_db (of the training view just seen),
-            gaussians and, where views are ``checked``, now and then held_out_db.
-        device: ``cpu``, or ``cuda`` through gsplat.
+        report: Called after every update with loss, psnr_db (of the training view just seen) and
+            gaussians.
         threads: Of the CPU rasteriser; None leaves it as it is.
-        checked: Views that are not learned from, to tell on the way how well they are shown.
 
     Returns:
         Background, actors, the sky that the views saw, and their exposures.
@@ -93,11 +88,9 @@ def fit(
             "a start cloud: no Gaussian in the background",
             "start from points that the views see",
         )
-    run = SplatFit(views, begin, recipe, scene_id, device, threads, folder)
+    run = SplatFit(views, begin, recipe, scene_id, threads, folder)
     while run.step < recipe.steps:
         numbers = run.update()
-        if checked and (run.step % recipe.save_every == 0 or run.step == recipe.steps):
-            numbers["held_out_db"] = run.shows_db(checked)
         if report is not None:
             report(run.step, numbers)
         if folder is not None and (run.step % recipe.save_every == 0 or run.step == recipe.steps):
@@ -134,7 +127,6 @@ class SplatFit:
         start: Start,
         recipe: SplatRecipe,
         scene_id: str,
-        device: str,
         threads: int | None,
         folder: Path | None,
     ) -> None:
@@ -145,18 +137,16 @@ class SplatFit:
             1.1 * float(np.linalg.norm(centres - origin, axis=1).max()), SMALLEST_EXTENT_M
         )
         self.sky = sky_of(views)
-        self.model = SplatModel.from_start(start, origin, recipe.sh_degree, device)
+        self.model = SplatModel.from_start(start, origin, recipe.sh_degree)
         self.adam = RowAdam(self.model.params)
-        self.gradients = ScreenGradients(len(self.model), device)
+        self.gradients = ScreenGradients(len(self.model))
         self.step = 0
-        self.targets = [
-            _target(i, view, self.model, self.sky, device, recipe) for i, view in enumerate(views)
-        ]
         small = [halved(view) for view in views] if recipe.coarse_share > 0 else []
-        self.coarse = [
-            _target(i, view, self.model, self.sky, device, recipe) for i, view in enumerate(small)
-        ]
-        self.exposure = Exposure(np.array([view.gain for view in views]), device)
+        self.targets, self.coarse = (
+            [_target(i, view, self.model, self.sky, recipe) for i, view in enumerate(some)]
+            for some in (views, small)
+        )
+        self.exposure = Exposure(np.array([view.gain for view in views]))
         self._facts = json.dumps(
             {"recipe": asdict(recipe), "scene": scene_id, "views": _digest(views, start)},
             sort_keys=True,
@@ -196,29 +186,8 @@ class SplatFit:
         self.exposure.update(recipe.lr_exposure)
         self.step += 1
         self._control_density()
-        psnr = psnr_db(rgb.detach().clamp(0, 1).cpu().numpy(), target.rgb.cpu().numpy(), peak=1.0)
+        psnr = psnr_db(rgb.detach().clamp(0, 1).numpy(), target.rgb.numpy(), peak=1.0)
         return {"loss": float(loss.detach()), "psnr_db": psnr, "gaussians": len(self.model)}
-
-    @torch.no_grad()
-    def shows_db(self, views: Sequence[PosedView]) -> float:
-        """Return the mean PSNR of views, of the pixels that count, each by its own gain."""
-        found = []
-        for view in views:
-            target = _target(
-                0, view, self.model, self.sky, str(self.model.node.device), self.recipe
-            )
-            splats, _ = self.model.placed(target.motion, self.recipe.sh_size_at(self.step))
-            out = rasterize_gradient(
-                splats, target.camera, background=target.behind, threads=self.threads
-            )
-            rgb = (out.rgb * torch.tensor(view.gain)).clamp(0, 1)
-            shown = rgb if target.counts is None else torch.where(target.counts, rgb, target.rgb)
-            share = 1.0 if view.mask is None else max(float(view.mask.mean()), 1e-9)
-            found.append(
-                psnr_db(shown.cpu().numpy(), target.rgb.cpu().numpy(), peak=1.0)
-                + 10 * float(np.log10(share))
-            )
-        return float(np.mean(found))
 
     def save(self) -> None:
         """Write the checkpoint, whole or not at all."""
@@ -236,18 +205,9 @@ class SplatFit:
     def _next_view(self) -> _Target:
         """Return the view of this step: all in a random order, then all in another."""
         turn, i = divmod(self.step, len(self.targets))
-        targets = (
-            self.coarse
-            if self.step < self.recipe.coarse_share * self.recipe.steps
-            else self.targets
-        )
-        return targets[
-            int(
-                stream(self.scene_id, self.recipe.seed, "fit.order", turn).permutation(
-                    len(self.targets)
-                )[i]
-            )
-        ]
+        begins = self.step < self.recipe.coarse_share * self.recipe.steps
+        rng = stream(self.scene_id, self.recipe.seed, "fit.order", turn)
+        return (self.coarse if begins else self.targets)[rng.permutation(len(self.targets))[i]]
 
     def _rates(self) -> dict[str, float]:
         r = self.recipe
@@ -264,9 +224,7 @@ class SplatFit:
         if self.recipe.densifies_after(self.step):
             rng = stream(self.scene_id, self.recipe.seed, "fit.split", self.step)
             densify(self.model, self.adam, self.gradients, self.recipe, self.extent_m, rng)
-            self.gradients = ScreenGradients(len(self.model), self.model.node.device)
-        if self.recipe.resets_after(self.step):
-            reset_opacities(self.model, self.adam, self.recipe.reset_opacity)
+            self.gradients = ScreenGradients(len(self.model))
 
     def _stop(self, target: _Target, found: str) -> None:
         if self.folder is not None:
@@ -282,26 +240,23 @@ def _target(
     view: PosedView,
     model: SplatModel,
     sky: Sky | None,
-    device: str,
     recipe: SplatRecipe,
 ) -> _Target:
     camera = view.camera
     T = camera.T_camera_world.copy()
     T[:3, 3] += T[:3, :3] @ model.origin
-    behind = None if sky is None else torch.as_tensor(sky.image(camera), device=device)
-    rgb = torch.as_tensor(view.rgb.astype(np.float32) / 255, device=device)
+    behind = None if sky is None else torch.as_tensor(sky.image(camera))
+    rgb = torch.as_tensor(view.rgb.astype(np.float32) / 255)
     return _Target(
         view.name,
         replace(camera, T_camera_world=T),
         rgb,
         behind,
-        None if view.sky is None else torch.as_tensor(view.sky.astype(np.float32), device=device),
-        None if view.mask is None else torch.as_tensor(view.mask, device=device)[..., None],
+        None if view.sky is None else torch.as_tensor(view.sky.astype(np.float32)),
+        None if view.mask is None else torch.as_tensor(view.mask)[..., None],
         model.motion(view.actors),
         SsimTarget(rgb),
-        None
-        if view.depth is None or recipe.depth_weight == 0
-        else torch.as_tensor(view.depth, device=device),
+        None if view.depth is None or recipe.depth_weight == 0 else torch.as_tensor(view.depth),
         index,
     )
 
@@ -406,10 +361,8 @@ def load_state(
             file is damaged.
     """
     path = folder / STATE_FILE
-    meta, stored = read_checkpoint(path, facts)
-    device = model.node.device
+    meta, tensors = read_checkpoint(path, facts)
     with parsing(path, START_ANEW, "not a whole checkpoint"):
-        tensors = {name: t.to(device) for name, t in stored.items()}
         model.node = tensors["node"]
         model.params = {name: tensors[f"value.{name}"].requires_grad_() for name in NAMES}
         adam.first = {name: tensors[f"first.{name}"] for name in NAMES}

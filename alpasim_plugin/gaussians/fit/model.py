@@ -67,9 +67,7 @@ class SplatModel:
         self.params = {name: params[name].detach().requires_grad_() for name in NAMES}
 
     @classmethod
-    def from_start(
-        cls, start: Start, origin: F64, sh_degree: int, device: str = "cpu"
-    ) -> SplatModel:
+    def from_start(cls, start: Start, origin: F64, sh_degree: int) -> SplatModel:
         """Take over a start's Gaussians; their colours are padded or cut to the degree."""
         names = tuple(sorted(start.actors))
         clouds = [start.background, *(start.actors[name] for name in names)]
@@ -88,10 +86,9 @@ class SplatModel:
         }
         node = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds])
         tensors = {
-            name: torch.as_tensor(np.array(a, dtype=np.float32), device=device)
-            for name, a in arrays.items()
+            name: torch.as_tensor(np.array(a, dtype=np.float32)) for name, a in arrays.items()
         }
-        return cls(names, origin, tensors, torch.as_tensor(node, device=device))
+        return cls(names, origin, tensors, torch.as_tensor(node))
 
     def __len__(self) -> int:
         """Return N."""
@@ -111,12 +108,11 @@ class SplatModel:
                     _left_product(quat_from_matrix(T[i, :3, :3])),
                     _harmonics(T[i, :3, :3].tobytes(), size),
                 )
-        device = self.node.device
         tensors = (
-            torch.as_tensor(a, dtype=torch.float32, device=device)
+            torch.as_tensor(a, dtype=torch.float32)
             for a in (T[:, :3, :3], T[:, :3, 3], quat, harmonics)
         )
-        return Motion(torch.as_tensor(present, device=device), *tensors)
+        return Motion(torch.as_tensor(present), *tensors)
 
     def placed(self, motion: Motion, sh_size: int) -> tuple[Splats, Tensor]:
         """Move every node to its place.
@@ -138,19 +134,7 @@ class SplatModel:
         )
         moving = still + torch.nonzero(motion.present[self.node[still:]])[:, 0]
         if not len(moving):
-            rows = torch.arange(still, device=self.node.device)
-            return Splats(
-                *(
-                    t[:still]
-                    for t in (
-                        p["means"],
-                        p["log_scales"],
-                        p["quaternions"],
-                        p["logit_opacities"],
-                        sh,
-                    )
-                )
-            ), rows
+            return Splats(*(p[name][:still] for name in NAMES[:4]), sh[:still]), torch.arange(still)
         node = self.node[moving]
         means = (
             torch.einsum("nij,nj->ni", motion.rotation[node], p["means"][moving])
@@ -167,15 +151,15 @@ class SplatModel:
             torch.cat([p["logit_opacities"][:still], p["logit_opacities"][moving]]),
             torch.cat([sh[:still], turned]),
         )
-        return splats, torch.cat([torch.arange(still, device=moving.device), moving])
+        return splats, torch.cat([torch.arange(still), moving])
 
     def clouds(self) -> tuple[GaussianCloud, dict[str, GaussianCloud]]:
         """Return the background in world coordinates and each actor in its box frame, as ordinary
         clouds; actors without Gaussians too.
         """
-        p = {name: t.detach().cpu().double().numpy() for name, t in self.params.items()}
+        p = {name: t.detach().double().numpy() for name, t in self.params.items()}
         sh = np.concatenate([p["sh_dc"], p["sh_rest"]], axis=1).astype(np.float32)
-        first = np.searchsorted(self.node.cpu().numpy(), np.arange(len(self.actors) + 2))
+        first = np.searchsorted(self.node.numpy(), np.arange(len(self.actors) + 2))
         out: list[GaussianCloud] = []
         for low, high in pairwise(first.tolist()):
             part = slice(low, high)
@@ -258,11 +242,6 @@ class RowAdam:
                 chosen[fresh] = 0
                 moments[name] = chosen
 
-    def forget(self, name: str) -> None:
-        """Begin the moments of one tensor again."""
-        self.first[name].zero_()
-        self.second[name].zero_()
-
 
 EXPOSURE_PULL = 1.0  # towards where a gain began, per update, in rates
 
@@ -273,15 +252,14 @@ class Exposure:
 
     Args:
         begin: ``(V, 3)`` of red, green and blue.
-        device: Of the tensors.
 
     Attributes:
         log_gain: ``(V, 3)``.
         plain: All gains are 1 and stay so.
     """
 
-    def __init__(self, begin: F64, device: str | torch.device = "cpu") -> None:
-        self.begin = torch.as_tensor(np.log(begin), dtype=torch.float32, device=device)
+    def __init__(self, begin: F64) -> None:
+        self.begin = torch.as_tensor(np.log(begin), dtype=torch.float32)
         self.log_gain = self.begin.clone().requires_grad_()
         self.plain = bool((self.begin == 0).all())
         self._adam = RowAdam({"log_gain": self.log_gain})
@@ -292,7 +270,7 @@ class Exposure:
 
     def gains(self) -> F64:
         """Return all gains ``(V, 3)``."""
-        return np.asarray(self.log_gain.detach().cpu().double().exp().numpy(), np.float64)
+        return np.asarray(self.log_gain.detach().double().exp().numpy(), np.float64)
 
     @torch.no_grad()
     def update(self, rate: float) -> None:
@@ -342,8 +320,8 @@ class ScreenGradients:
         count: ``(N,)`` views that showed it.
     """
 
-    def __init__(self, n: int, device: str | torch.device = "cpu") -> None:
-        self.total, self.count = torch.zeros(n, device=device), torch.zeros(n, device=device)
+    def __init__(self, n: int) -> None:
+        self.total, self.count = torch.zeros(n), torch.zeros(n)
 
     def add(self, rows: Tensor, gradient_norm_px: Tensor, radii: Tensor, width_px: int) -> None:
         """Count one view: its Gaussians' rows ``(M,)``, the norms by pixels ``(M,)`` and the radii
@@ -378,22 +356,15 @@ def densify(
     wanted = wanted[torch.sort(pull[wanted], descending=True, stable=True).indices[:room]]
     large = size[wanted] > math.log(max(recipe.dense_share * extent_m, 1e-9))
     clones, splits = wanted[~large], wanted[large]
-    kept = torch.ones(len(model), dtype=torch.bool, device=size.device)
+    kept = torch.ones(len(model), dtype=torch.bool)
     kept[splits] = False
     old = torch.nonzero(kept)[:, 0]
     rows = torch.cat([old, clones, splits, splits])
-    fresh = torch.arange(len(rows), device=rows.device) >= len(old)
+    fresh = torch.arange(len(rows)) >= len(old)
     _take(model, adam, rows, fresh)
     halves = slice(len(old) + len(clones), len(rows))
     _scatter(model, halves, rng)
     _prune(model, adam, recipe, extent_m)
-
-
-@torch.no_grad()
-def reset_opacities(model: SplatModel, adam: RowAdam, to: float) -> None:
-    """Lower all opacities to at most ``to``; what the views need comes back, floaters do not."""
-    model.params["logit_opacities"].clamp_(max=math.log(to / (1 - to)))
-    adam.forget("logit_opacities")
 
 
 def _take(model: SplatModel, adam: RowAdam, rows: Tensor, fresh: Tensor) -> None:
@@ -405,9 +376,7 @@ def _take(model: SplatModel, adam: RowAdam, rows: Tensor, fresh: Tensor) -> None
 def _scatter(model: SplatModel, part: slice, rng: np.random.Generator) -> None:
     """Draw new centres from the Gaussians of a part, and shrink them."""
     p = model.params
-    draw = torch.as_tensor(
-        rng.standard_normal(p["means"][part].shape, dtype=np.float32), device=p["means"].device
-    )
+    draw = torch.as_tensor(rng.standard_normal(p["means"][part].shape, dtype=np.float32))
     w, x, y, z = torch.nn.functional.normalize(p["quaternions"][part], dim=1).unbind(1)
     along = draw * p["log_scales"][part].exp()
     # v + 2 u x (u x v + w v) turns v by the quaternion (w, u).
@@ -424,4 +393,4 @@ def _prune(model: SplatModel, adam: RowAdam, recipe: SplatRecipe, extent_m: floa
     large = p["log_scales"].max(dim=1).values > math.log(recipe.prune_share * extent_m)
     rows = torch.nonzero(~(faint | large))[:, 0]
     rows = rows[torch.sort(model.node[rows], stable=True).indices]
-    _take(model, adam, rows, torch.zeros(len(rows), dtype=torch.bool, device=rows.device))
+    _take(model, adam, rows, torch.zeros(len(rows), dtype=torch.bool))

@@ -16,15 +16,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d
 
-from alpasim_plugin.core.image_metrics import (
-    C1,
-    C2,
-    SIGMA_PX,
-    WINDOW_PX,
-    gaussian_blur,
-)
+from alpasim_plugin.core.image_metrics import C1, C2, gaussian_blur
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,15 +86,4 @@ class _Ssim(torch.autograd.Function):
 
 
 def _blur(image: Tensor) -> Tensor:
-    if image.device.type == "cpu":
-        return torch.from_numpy(gaussian_blur(image.numpy()))
-    x = torch.arange(WINDOW_PX, dtype=torch.float64) - WINDOW_PX // 2
-    weight = torch.exp(-(x**2) / (2 * SIGMA_PX**2))
-    kernel = (weight / weight.sum()).to(image)
-    channels, pad = image.permute(2, 0, 1)[:, None], WINDOW_PX // 2  # (3, 1, H, W)
-    blurred = conv2d(
-        conv2d(channels, kernel[None, None, :, None], padding=(pad, 0)),
-        kernel[None, None, None, :],
-        padding=(0, pad),
-    )
-    return blurred[:, 0].permute(1, 2, 0)
+    return torch.from_numpy(gaussian_blur(image.numpy()))

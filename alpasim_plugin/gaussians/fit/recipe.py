@@ -18,15 +18,13 @@ class SplatRecipe:
 
     Attributes:
         steps: Updates; each sees one view.
-        views: Views rendered from a scenario's log; those held out are among them.
+        views: Views rendered from a scenario's log.
         width: Pixels across of rendered views; their height follows from the camera.
         points: Gaussians of the background at the start, drawn from the views' depth.
         actor_points: Most Gaussians of an actor at the start.
         start_size: Of the Gaussians at the start, in distances to their neighbours.
         cap: Where densification stops, the largest screen gradients first; a start with more is not
             cut.
-        hold_out_every: Every such view is kept for measuring (the eighth, as is usual); 0 trains on
-            all.
         sh_degree: Highest degree of view-dependent colour, reached by one degree every ``sh_share``
             of the steps.
         sh_share: See ``sh_degree``.
@@ -56,9 +54,6 @@ class SplatRecipe:
         dense_share: Gaussians larger than this share of the extent are split, others cloned.
         prune_opacity: Gaussians fainter than this are removed whenever Gaussians are densified.
         prune_share: Gaussians larger than this share of the extent are removed as well.
-        reset_every: Share of the steps after which opacities are lowered to ``reset_opacity``,
-            until ``densify_until``; 0 never.
-        reset_opacity: See ``reset_every``.
         save_every: Steps between checkpoints.
         seed: Of the start, the order of views and the splits.
 
@@ -73,7 +68,6 @@ class SplatRecipe:
     actor_points: int = 400
     start_size: float = 0.6
     cap: int = 30_000
-    hold_out_every: int = 8
     sh_degree: int = 2
     sh_share: float = 0.25
     lr_means: float = 6e-4
@@ -96,8 +90,6 @@ class SplatRecipe:
     dense_share: float = 0.01
     prune_opacity: float = 0.005
     prune_share: float = 0.1
-    reset_every: float = 0.0
-    reset_opacity: float = 0.01
     save_every: int = 250
     seed: int = 0
 
@@ -108,7 +100,6 @@ class SplatRecipe:
             "width": self.width >= 16,
             "points": self.points >= 1,
             "cap": self.cap >= 1,
-            "hold_out_every": self.hold_out_every == 0 or self.hold_out_every >= 2,
             "sh_degree": 0 <= self.sh_degree <= 3,
             "ssim_weight": 0 <= self.ssim_weight <= 1,
             "save_every": self.save_every >= 1,
@@ -154,8 +145,3 @@ class SplatRecipe:
         """Return whether Gaussians are densified and pruned when ``done`` updates are made."""
         inside = self.densify_from * self.steps < done <= self.densify_until * self.steps
         return inside and self.densify_every > 0 and done % self.densify_every == 0
-
-    def resets_after(self, done: int) -> bool:
-        """Return whether opacities are lowered when ``done`` updates are made."""
-        every = round(self.reset_every * self.steps)
-        return every > 0 and done % every == 0 and 0 < done <= self.densify_until * self.steps

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import cv2
@@ -170,13 +170,3 @@ def halved(view: PosedView) -> PosedView:
         view.actors,
         view.gain,
     )
-
-
-def held_out(views: Sequence[PosedView], every: int) -> tuple[list[PosedView], list[PosedView]]:
-    """Split views into those to train on and those to measure with: the middle one of every
-    ``every``; 0 holds none out.
-    """
-    if every == 0:
-        return list(views), []
-    chosen = {i for i in range(len(views)) if i % every == every // 2}
-    return [v for i, v in enumerate(views) if i not in chosen], [views[i] for i in sorted(chosen)]

@@ -39,23 +39,10 @@ class Splats:
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim else -1
-        found = {
-            name: tuple(getattr(self, name).shape)
-            for name in ("means", "log_scales", "quaternions", "logit_opacities", "sh")
-        }
-        wanted = {
-            "means": (n, 3),
-            "log_scales": (n, 3),
-            "quaternions": (n, 4),
-            "logit_opacities": (n,),
-        }
-        sh_ok = (
-            self.sh.ndim == 3
-            and self.sh.shape[0] == n
-            and self.sh.shape[1] in SH_SIZES
-            and self.sh.shape[2] == 3
-        )
-        if n < 0 or any(found[name] != shape for name, shape in wanted.items()) or not sh_ok:
+        found = {name: tuple(tensor.shape) for name, tensor in vars(self).items()}
+        wanted = ((n, 3), (n, 3), (n, 4), (n,))
+        colours = [(n, size, 3) for size in SH_SIZES]
+        if n < 0 or tuple(found.values())[:4] != wanted or found["sh"] not in colours:
             raise InputError(
                 f"{n} means: {', '.join((f'{name} {shape}' for name, shape in found.items()))}",
                 "give means (N,3), log_scales (N,3), quaternions (N,4), logit_opacities (N,) and sh (N,K,3) with K in 1, 4, 9, 16",
@@ -66,9 +53,7 @@ class Splats:
         return int(self.means.shape[0])
 
     @classmethod
-    def from_cloud(
-        cls, cloud: GaussianCloud, dtype: torch.dtype = torch.float32, device: str = "cpu"
-    ) -> Splats:
+    def from_cloud(cls, cloud: GaussianCloud, dtype: torch.dtype = torch.float32) -> Splats:
         """Copy a cloud; scales below ``exp(-20)`` m are raised to it and opacities kept 1e-6 away
         from 0 and 1.
 
@@ -81,7 +66,7 @@ class Splats:
             np.clip(cloud.opacities.astype(np.float64), _OPACITY_LIMIT, 1 - _OPACITY_LIMIT)
         )
         arrays = (cloud.means, scales, cloud.quats, logits, cloud.sh)
-        return cls(*(torch.as_tensor(np.array(a), dtype=dtype, device=device) for a in arrays))
+        return cls(*(torch.as_tensor(np.array(a), dtype=dtype) for a in arrays))
 
 
 @dataclass(eq=False)

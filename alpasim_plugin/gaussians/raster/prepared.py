@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,6 @@ from alpasim_plugin.gaussians.constants import (
 )
 from alpasim_plugin.gaussians.raster.project_kernels import colours_in_lanes
 
-ShFrame = Literal["object", "world"]
 Node = tuple["PreparedCloud", npt.NDArray[np.floating] | None]
 F32 = npt.NDArray[np.float32]
 _LANES = 16
@@ -37,7 +36,6 @@ class PreparedCloud:
     Attributes:
         n_input: Gaussians of the cloud.
         n_kept: Those of them that can reach the alpha cut.
-        sh_frame: Axes in which view directions meet the colour coefficients.
         sh_size: Coefficients per colour.
         means: float64, groups of 3 x 16 lanes; Gaussians are ordered along a space-filling curve,
             so that whole bundles leave the view.
@@ -50,7 +48,6 @@ class PreparedCloud:
 
     n_input: int
     n_kept: int
-    sh_frame: ShFrame
     sh_size: int
     means: F64
     geometry: F32
@@ -68,15 +65,12 @@ class PreparedCloud:
         return self.means, self.geometry, self.sh, self.sh_size, self.index, self.spheres
 
 
-def prepare(cloud: GaussianCloud, *, sh_frame: ShFrame = "object") -> PreparedCloud:
+def prepare(cloud: GaussianCloud) -> PreparedCloud:
     """Prepare a cloud for `rasterize_prepared`; costs about as much as drawing a few frames and
     holds its own copy.
 
     Args:
         cloud: Gaussians in their own frame (the world for a background, the box of an actor).
-        sh_frame: ``object`` turns view-dependent colour with the node, which is right for poses
-            that were not trained; ``world`` evaluates world directions, as checkpoints of Street
-            Gaussians, drivestudio and MTGS were optimised.
 
     Raises:
         InputError: The cloud holds Gaussians that cannot be drawn.
@@ -116,7 +110,6 @@ def prepare(cloud: GaussianCloud, *, sh_frame: ShFrame = "object") -> PreparedCl
     return PreparedCloud(
         len(cloud),
         n,
-        sh_frame,
         size,
         _in_lanes(means, np.nan),
         np.asarray(_in_lanes(geometry, 0.0), np.float32),

@@ -19,7 +19,6 @@ from alpasim_plugin.gaussians.constants import (
     CAM_FX,
     CAM_FY,
     CAM_HEIGHT,
-    CAM_LOD,
     CAM_SLOPE_HIGH_X,
     CAM_SLOPE_HIGH_Y,
     CAM_SLOPE_LOW_X,
@@ -38,7 +37,6 @@ from alpasim_plugin.gaussians.constants import (
     L22,
     PEAK,
     POSE_CENTRE,
-    POSE_COLOUR,
     POSE_FAR,
     POSE_NEAR,
     POSE_ROTATION,
@@ -227,7 +225,7 @@ def _project_group(group, means, geometry, sh, sh_size, pose, camera, basis, lan
     d = v.to_f32(dx), v.to_f32(dy), v.to_f32(dz)
     chosen = _project_shape(group, mask, d, v.to_f32(z64), geometry, pose, camera, lanes)
     if chosen != 0:
-        _colour_group(group, d, sh, sh_size, pose, basis, lanes)
+        _colour_group(group, d, sh, sh_size, basis, lanes)
     return chosen
 
 
@@ -268,7 +266,6 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     mask = mask & (u + radius_x + margin >= half) & (w + radius_y + margin >= half)
     mask = mask & (u - radius_x - margin <= v.splat(camera[CAM_WIDTH] - _f(0.5)))
     mask = mask & (w - radius_y - margin <= v.splat(camera[CAM_HEIGHT] - _f(0.5)))
-    mask = mask & (extent * v.sqrt(v.maximum(mm, nn)) >= v.splat(camera[CAM_LOD]))
     chosen = v.bits(mask)
     if chosen == 0:
         return 0
@@ -314,14 +311,12 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
 
 
 @njit(cache=True, nogil=True)
-def _colour_group(group, d, sh, sh_size, pose, basis, lanes):
+def _colour_group(group, d, sh, sh_size, basis, lanes):
     """Write the colours of sixteen Gaussians at ``d`` from the camera's centre, clamped at 0
     below.
     """
-    c = POSE_COLOUR
-    t = _dot(_row(pose, c), d), _dot(_row(pose, c + 3), d), _dot(_row(pose, c + 6), d)
-    length = v.splat(_f(1.0)) / v.sqrt(_dot(t, t))
-    _write_basis(basis, t[0] * length, t[1] * length, t[2] * length, sh_size)
+    length = v.splat(_f(1.0)) / v.sqrt(_dot(d, d))
+    _write_basis(basis, d[0] * length, d[1] * length, d[2] * length, sh_size)
     half, zero = v.splat(_f(0.5)), v.splat(_f(0.0))
     red = half
     green = half

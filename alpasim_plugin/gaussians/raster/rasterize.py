@@ -20,7 +20,6 @@ def rasterize(
     backend: Backend = "cpu",
     *,
     near_m: float = NEAR_M,
-    lod_px: float = 0.0,
 ) -> RasterOutput:
     """Render a cloud.
 
@@ -31,8 +30,6 @@ def rasterize(
         backend: ``cpu`` (fast), ``reference`` (float64, slow, the definition), ``torch``
             (that of the differentiable `rasterize_gradient`) or ``gsplat`` (GPU).
         near_m: Gaussians whose centre is nearer are left out.
-        lod_px: Gaussians whose screen radius before the low-pass is smaller are left out; 0 draws
-            all.
 
     Returns:
         Colour, accumulated alpha and depth.
@@ -53,19 +50,19 @@ def rasterize(
     if backend == "cpu":
         from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_cpu
 
-        return rasterize_cpu(cloud, camera, background, near_m=near_m, lod_px=lod_px)
+        return rasterize_cpu(cloud, camera, background, near_m=near_m)
     if backend == "reference":
         from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
 
-        return rasterize_reference(cloud, camera, background, near_m=near_m, lod_px=lod_px)
+        return rasterize_reference(cloud, camera, background, near_m=near_m)
     if backend == "torch":
         from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_torch
 
-        return rasterize_torch(cloud, camera, background, near_m=near_m, lod_px=lod_px)
+        return rasterize_torch(cloud, camera, background, near_m=near_m)
     if backend == "gsplat":
         from alpasim_plugin.gaussians.raster.rasterize_gsplat import rasterize_gsplat
 
-        return rasterize_gsplat(cloud, camera, background, near_m=near_m, lod_px=lod_px)
+        return rasterize_gsplat(cloud, camera, background, near_m=near_m)
     raise InputError(
         f"backend {backend!r}: no such backend",
         f"choose one of {', '.join(get_args(Backend))}",

@@ -28,7 +28,6 @@ from alpasim_plugin.gaussians.constants import (
     FAR_M,
     NEAR_M,
     POSE_CENTRE,
-    POSE_COLOUR,
     POSE_FAR,
     POSE_NEAR,
     POSE_ROTATION,
@@ -78,7 +77,6 @@ def rasterize_prepared(
     background: Background = (0.0, 0.0, 0.0),
     *,
     near_m: float = NEAR_M,
-    lod_px: float = 0.0,
     threads: int | None = None,
 ) -> RasterOutput:
     """Render several prepared clouds, each at its rigid pose, in one image.
@@ -89,7 +87,6 @@ def rasterize_prepared(
         camera: From where.
         background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything.
         near_m: Gaussians whose centre is nearer are left out.
-        lod_px: Gaussians whose radius before the low-pass is smaller are left out; 0 draws all.
         threads: How many threads to use; None takes ``numba.get_num_threads()``. The image does not
             depend on it.
 
@@ -100,9 +97,8 @@ def rasterize_prepared(
     require_kernels()
     threads = thread_count(threads)
     behind = background_image(background, camera)
-    view = camera_numbers(camera, lod_px)
-    turned = np.array([prepared.sh_frame == "world" for prepared, _ in nodes], dtype=bool)
-    poses = node_poses([T for _, T in nodes], turned, camera, near_m)
+    view = camera_numbers(camera)
+    poses = node_poses([T for _, T in nodes], camera, near_m)
     spheres = np.array([prepared.sphere for prepared, _ in nodes], np.float64).reshape(-1)
     ends = np.cumsum([prepared.n_input for prepared, _ in nodes])
     parts: list[Part] = []
@@ -173,14 +169,14 @@ def project_parts(
     return int(cursor[0])
 
 
-def camera_numbers(camera: PinholeCamera, lod_px: float = 0.0) -> F32:
+def camera_numbers(camera: PinholeCamera) -> F32:
     """Return a camera as the kernels read it, columns ``CAM_*``."""
     low_x, high_x, low_y, high_y = camera.slope_limits()
     return np.array(
         [
             *(camera.fx, camera.fy, camera.cx, camera.cy),
             *(low_x, high_x, low_y, high_y),
-            *(camera.width, camera.height, lod_px),
+            *(camera.width, camera.height),
         ],
         np.float32,
     )
@@ -261,7 +257,6 @@ def list_per_tile(
 
 def node_poses(
     T_world_nodes: Sequence[npt.NDArray[np.floating] | None],
-    turned: npt.NDArray[np.bool_],
     camera: PinholeCamera,
     near_m: float,
 ) -> F64:
@@ -270,8 +265,6 @@ def node_poses(
 
     Args:
         T_world_nodes: Rigid transforms; None is the identity.
-        turned: ``(N,)``, which nodes' colours are seen along world directions instead of the node's
-            own.
         camera: Seen from where.
         near_m: Near plane, metres.
 
@@ -289,17 +282,14 @@ def node_poses(
     rotation = T_world_node[:, :3, :3]
     placed = np.empty((len(given), POSE_SIZE))
     placed[:, POSE_ROTATION:POSE_CENTRE] = (camera.T_camera_world[:3, :3] @ rotation).reshape(-1, 9)
-    placed[:, POSE_CENTRE:POSE_COLOUR] = np.einsum(
+    placed[:, POSE_CENTRE:POSE_NEAR] = np.einsum(
         "nji,nj->ni", rotation, camera.centre_world - T_world_node[:, :3, 3]
     )
-    placed[:, POSE_COLOUR:POSE_NEAR] = rotation.reshape(-1, 9)
     placed[:, POSE_NEAR], placed[:, POSE_FAR] = near_m, FAR_M
     moved = np.array([T is not None for T in T_world_nodes], dtype=bool)
-    poses = placed[
+    return placed[
         np.where(moved, np.cumsum(moved), 0)
     ]  # all that stand in the world share the first
-    poses[~turned, POSE_COLOUR:POSE_NEAR] = np.eye(3).reshape(9)
-    return poses
 
 
 def rasterize_cpu(
@@ -308,7 +298,6 @@ def rasterize_cpu(
     background: Background = (0.0, 0.0, 0.0),
     *,
     near_m: float = NEAR_M,
-    lod_px: float = 0.0,
     threads: int | None = None,
 ) -> RasterOutput:
     """Render one cloud in world coordinates.
@@ -321,7 +310,7 @@ def rasterize_cpu(
     if prepared is None:
         prepared = _prepared[cloud] = prepare(cloud)
     return rasterize_prepared(
-        [(prepared, None)], camera, background, near_m=near_m, lod_px=lod_px, threads=threads
+        [(prepared, None)], camera, background, near_m=near_m, threads=threads
     )
 
 

@@ -1,7 +1,6 @@
 """Render splats for training: one `torch.autograd.Function` whose forward and backward passes are
 compiled CPU kernels.
 
-On a GPU the same function goes through gsplat (`alpasim_plugin.gaussians.raster.rasterize_gsplat`).
 `rasterize_reference` is the definition.
 """
 
@@ -276,7 +275,6 @@ def rasterize_gradient(
     *,
     background: Tensor | None = None,
     near_m: float = NEAR_M,
-    lod_px: float = 0.0,
     threads: int | None = None,
 ) -> GradientOutput:
     """Render splats by the rule of `rasterize_reference`, with gradients of every parameter and of
@@ -287,12 +285,10 @@ def rasterize_gradient(
     covariance's Jacobian, a colour clamped at 0.
 
     Args:
-        splats: What to draw; tensors on the CPU, or on a GPU where gsplat works.
+        splats: What to draw; tensors on the CPU.
         camera: From where.
         background: ``(3,)`` or ``(H, W, 3)``, 0..1; None is black. May require gradients.
         near_m: Gaussians whose centre is nearer are left out.
-        lod_px: On the CPU, Gaussians whose radius before the low-pass is smaller are left out; 0
-            draws all.
         threads: CPU threads; None takes ``numba.get_num_threads()``. Neither image nor gradients
             depend on it.
 
@@ -301,9 +297,7 @@ def rasterize_gradient(
         ``retain_graph=True`` as usual; second derivatives are not available.
 
     Raises:
-        InputError: A splat that cannot be drawn, tensors on different devices, or a background that
-            does not fit.
-        RendererError: The tensors are on a GPU and gsplat does not work there.
+        InputError: A splat that cannot be drawn, or a background that does not fit.
 
     Example:
         >>> import numpy as np, torch
@@ -316,14 +310,14 @@ def rasterize_gradient(
         >>> bool(splats.means.grad[0, 0] < 0), out.screen.gradient_norm.shape
         (True, torch.Size([1]))
     """
-    behind = _checked_background(background, splats, camera)
-    if splats.means.device.type != "cpu":
-        # Imported on use: it loads gsplat.
-        from alpasim_plugin.gaussians.raster.rasterize_gsplat import rasterize_gradient_gsplat
-
-        return rasterize_gradient_gsplat(splats, camera, behind, near_m)
-    pose = node_poses([None], np.array([False]), camera, near_m)[0]
-    view = _View(camera, camera_numbers(camera, lod_px), pose, thread_count(threads))
+    size = (camera.height, camera.width, 3)
+    if background is not None and background.shape not in ((3,), size):
+        raise InputError(
+            f"a background of shape {tuple(background.shape)}: a camera of {camera.width} x {camera.height} pixels",
+            f"give a tensor of shape (3,) or {size}",
+        )
+    pose = node_poses([None], camera, near_m)[0]
+    view = _View(camera, camera_numbers(camera), pose, thread_count(threads))
     screen = ScreenStatistics(torch.zeros(len(splats), dtype=torch.int32))
     colour, alpha, depth_sum = _Rasterize.apply(
         splats.means,
@@ -334,7 +328,7 @@ def rasterize_gradient(
         view,
         screen,
     )  # type: ignore[no-untyped-call]
-    rgb = colour if behind is None else colour + (1 - alpha)[..., None] * behind
+    rgb = colour if background is None else colour + (1 - alpha)[..., None] * background.float()
     depth = torch.where(alpha > 0, depth_sum / torch.where(alpha > 0, alpha, 1.0), 0.0)
     return GradientOutput(rgb, alpha, depth, screen)
 
@@ -345,7 +339,6 @@ def rasterize_torch(
     background: Background = (0.0, 0.0, 0.0),
     *,
     near_m: float = NEAR_M,
-    lod_px: float = 0.0,
 ) -> RasterOutput:
     """Render a cloud by `rasterize_gradient`, without gradients.
 
@@ -357,42 +350,7 @@ def rasterize_torch(
         camera.height, camera.width, 3
     )
     with torch.no_grad():
-        out = rasterize_gradient(
-            Splats.from_cloud(cloud), camera, background=behind, near_m=near_m, lod_px=lod_px
-        )
+        out = rasterize_gradient(Splats.from_cloud(cloud), camera, background=behind, near_m=near_m)
     return RasterOutput(
         out.rgb.clamp(0, 1).numpy(), out.alpha.numpy(), out.depth.numpy(), {"gaussians": len(cloud)}
     )
-
-
-def _checked_background(
-    background: Tensor | None, splats: Splats, camera: PinholeCamera
-) -> Tensor | None:
-    """Return the background in the type and on the device of the splats.
-
-    Raises:
-        InputError: Its shape does not fit, or the splats' tensors lie on different devices.
-    """
-    devices = {
-        str(t.device)
-        for t in (
-            splats.means,
-            splats.log_scales,
-            splats.quaternions,
-            splats.logit_opacities,
-            splats.sh,
-        )
-    }
-    if len(devices) > 1:
-        raise InputError(
-            f"{len(splats)} splats: tensors on {', '.join(sorted(devices))}",
-            "move them all to one device",
-        )
-    if background is None:
-        return None
-    if background.shape not in ((3,), (camera.height, camera.width, 3)):
-        raise InputError(
-            f"a background of shape {tuple(background.shape)}: a camera of {camera.width} x {camera.height} pixels",
-            f"give a tensor of shape (3,) or ({camera.height}, {camera.width}, 3)",
-        )
-    return background.to(splats.sh.device, torch.float32)

@@ -1,56 +1,27 @@
-"""Render on a GPU through gsplat, where it works; with gradients for training through its own
-forward and backward kernels.
+"""Render on a GPU through gsplat, where it works.
 
 gsplat compiles CUDA code on first use, so a successful import does not show that it works. The
 backend first draws one Gaussian and checks the result. It never falls back to another backend; the
 error says what is missing.
 
-State of testing: arguments, results and gradients have been checked against a stand-in for gsplat
-on the CPU; the path has not been run on a GPU. Differences to the CPU: gsplat up to 1.5.3 saturates
-alpha at 0.999, this package and gsplat 1.6 at 0.99, and gsplat's kernels sum gradients in an order
-that changes from run to run.
+State of testing: arguments and results have been checked against a stand-in for gsplat on the CPU;
+the path has not been run on a GPU. Difference to the CPU: gsplat up to 1.5.3 saturates alpha at
+0.999, this package and gsplat 1.6 at 0.99.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from alpasim_plugin.core.errors import InputError, RendererError
+from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import EPS2D_PX2, FAR_M, NEAR_M
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
-from alpasim_plugin.gaussians.sh import SH_SIZES
-
-if TYPE_CHECKING:
-    from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput, Splats
-
-
-def view_arguments(camera: PinholeCamera, near_m: float, device: str) -> dict[str, Any]:
-    """Return those keyword arguments of ``gsplat.rasterization`` that describe one view, with the
-    camera at the origin.
-    """
-    view = np.eye(4)
-    view[:3, :3] = camera.T_camera_world[:3, :3]
-    return {
-        "viewmats": _tensor(view, device)[None],
-        "Ks": _tensor(camera.K, device)[None],
-        "width": camera.width,
-        "height": camera.height,
-        "near_plane": near_m,
-        "far_plane": FAR_M,
-        "radius_clip": 0.0,
-        "eps2d": EPS2D_PX2,
-        "packed": True,
-        "tile_size": 16,
-        "render_mode": "RGB+ED",
-        "rasterize_mode": "classic",
-    }
 
 
 def gsplat_arguments(
@@ -63,6 +34,8 @@ def gsplat_arguments(
     directions, and so colours, stay those of the world's axes.
     """
     quats = cloud.quats.astype(np.float64)
+    view = np.eye(4)
+    view[:3, :3] = camera.T_camera_world[:3, :3]
     return {
         "means": _tensor(cloud.means.astype(np.float64) - camera.centre_world, device),
         "quats": _tensor(quats / np.linalg.norm(quats, axis=1, keepdims=True), device),
@@ -70,7 +43,18 @@ def gsplat_arguments(
         "opacities": _tensor(cloud.opacities, device),
         "colors": _tensor(cloud.sh, device),
         "sh_degree": cloud.sh_degree,
-        **view_arguments(camera, near_m, device),
+        "viewmats": _tensor(view, device)[None],
+        "Ks": _tensor(camera.K, device)[None],
+        "width": camera.width,
+        "height": camera.height,
+        "near_plane": near_m,
+        "far_plane": FAR_M,
+        "radius_clip": 0.0,
+        "eps2d": EPS2D_PX2,
+        "packed": True,
+        "tile_size": 16,
+        "render_mode": "RGB+ED",
+        "rasterize_mode": "classic",
     }
 
 
@@ -150,21 +134,14 @@ def rasterize_gsplat(
     background: Background = (0.0, 0.0, 0.0),
     *,
     near_m: float = NEAR_M,
-    lod_px: float = 0.0,
     device: str = "cuda",
 ) -> RasterOutput:
     """Render a cloud on the GPU.
 
     Raises:
-        InputError: The cloud cannot be drawn, or ``lod_px`` is given, which gsplat does not support
-            with this meaning.
+        InputError: The cloud cannot be drawn.
         RendererError: gsplat does not work here.
     """
-    if lod_px:
-        raise InputError(
-            f"lod_px={lod_px}: gsplat has no level of detail of this meaning",
-            "leave lod_px at 0, or choose --device cpu (backend='cpu' in code)",
-        )
     gsplat = require_gsplat(device)
     cloud.require_drawable()
     if len(cloud) == 0:
@@ -176,47 +153,3 @@ def rasterize_gsplat(
             rgb, np.zeros(shape, np.float32), np.zeros(shape, np.float32), {"gaussians": 0}
         )
     return _draw(gsplat, cloud, camera, background, near_m, device)
-
-
-def rasterize_gradient_gsplat(
-    splats: Splats, camera: PinholeCamera, background: Tensor | None, near_m: float
-) -> GradientOutput:
-    """Render splats whose tensors lie on one GPU; see `rasterize_gradient`, which calls this.
-
-    Raises:
-        RendererError: gsplat does not work on that device.
-    """
-    from alpasim_plugin.gaussians.raster.gradient_types import (
-        GradientOutput,
-        ScreenStatistics,  # which imports this module
-    )
-
-    device = str(splats.means.device)
-    gsplat = require_gsplat(device)
-    centre = torch.as_tensor(camera.centre_world, device=device)
-    image, alphas, meta = gsplat.rasterization(
-        means=(splats.means.double() - centre).float(),
-        quats=torch.nn.functional.normalize(splats.quaternions, dim=1),
-        scales=splats.log_scales.exp(),
-        opacities=splats.logit_opacities.sigmoid(),
-        colors=splats.sh,
-        sh_degree=SH_SIZES.index(splats.sh.shape[1]),
-        **{
-            **view_arguments(camera, near_m, device),
-            "packed": False,
-        },  # so that what is returned per Gaussian has N rows
-    )
-    rgb = image[0, ..., :3]
-    alpha = alphas[0, ..., 0]
-    depth = image[0, ..., 3]
-    radii = meta["radii"][0]
-    screen = ScreenStatistics((radii if radii.ndim == 1 else radii.amax(dim=1)).int())
-    if meta["means2d"].requires_grad:
-
-        def keep_norm(gradient: Tensor) -> None:
-            screen.gradient_norm = gradient[0].norm(dim=1)
-
-        meta["means2d"].register_hook(keep_norm)
-    if background is not None:
-        rgb = rgb + (1 - alpha)[..., None] * background
-    return GradientOutput(rgb, alpha, depth, screen)

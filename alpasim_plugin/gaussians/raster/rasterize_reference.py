@@ -65,13 +65,10 @@ def project_gaussians(
     cloud: GaussianCloud,
     camera: PinholeCamera,
     near_m: float = NEAR_M,
-    lod_px: float = 0.0,
 ) -> Projection:
     """Project a cloud and sort it by depth.
 
-    Dropped: centres nearer than ``near_m`` or beyond 1e10 m, opacities below 1/255, and with
-    ``lod_px`` splats whose radius before the low-pass (`Projection.extent` times the larger of the
-    two axis-aligned deviations) is below it. Depth order is that of
+    Dropped: centres nearer than ``near_m`` or beyond 1e10 m and opacities below 1/255. Depth order is that of
     the float32 depths, ties in input order: two surfaces that coincide then keep one order while
     the camera moves, instead of one decided by rounding.
 
@@ -94,17 +91,11 @@ def project_gaussians(
 
     low_x, high_x, low_y, high_y = camera.slope_limits()
     zero = np.zeros_like(z)
-    jacobian = np.stack(
-        [
-            np.stack(
-                [camera.fx / z, zero, -camera.fx * np.clip(x / z, low_x, high_x) / z], axis=-1
-            ),
-            np.stack(
-                [zero, camera.fy / z, -camera.fy * np.clip(y / z, low_y, high_y) / z], axis=-1
-            ),
-        ],
-        axis=-2,
+    rows = (
+        [camera.fx / z, zero, -camera.fx * np.clip(x / z, low_x, high_x) / z],
+        [zero, camera.fy / z, -camera.fy * np.clip(y / z, low_y, high_y) / z],
     )
+    jacobian = np.moveaxis(np.array(rows), 2, 0)  # (N, 2, 3)
     # With rows m, n of M = J R_camera R_q diag(s) the covariance is M M^T and its determinant a sum
     # of squares (Cauchy-Binet), which cannot cancel for needles as C11 C22 - C12^2 does.
     m, n = np.moveaxis(
@@ -116,9 +107,7 @@ def project_gaussians(
     extent = np.minimum(EXTENT_MAX_SIGMA, np.sqrt(2 * np.log(np.maximum(opacity / ALPHA_MIN, 1.0))))
     uv = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
 
-    keep = extent * np.sqrt(np.maximum(raw[:, 0], raw[:, 2])) >= lod_px
-    order = np.flatnonzero(keep)
-    order = order[np.argsort(z[order].astype(np.float32), kind="stable")]
+    order = np.argsort(z.astype(np.float32), kind="stable")
     direction = relative[order] / np.linalg.norm(relative[order], axis=1, keepdims=True)
     return Projection(
         index[order],
@@ -138,7 +127,6 @@ def rasterize_reference(
     background: Background = (0.0, 0.0, 0.0),
     *,
     near_m: float = NEAR_M,
-    lod_px: float = 0.0,
     brute: bool = False,
 ) -> RasterOutput:
     """Render by the definition: every Gaussian in depth order, over all of its pixels.
@@ -148,7 +136,6 @@ def rasterize_reference(
         camera: From where.
         background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything.
         near_m: Gaussians whose centre is nearer are left out.
-        lod_px: Gaussians whose radius before the low-pass is smaller are left out; 0 draws all.
         brute: Evaluate all pixels of the image for each Gaussian. By default only the box around
             its ellipse (grown by a pixel) is evaluated; outside of it alpha is below the cut, so
             the image is the same and large clouds stay affordable.
@@ -156,7 +143,7 @@ def rasterize_reference(
     Raises:
         InputError: The cloud holds Gaussians that cannot be drawn, or the background does not fit.
     """
-    splats = project_gaussians(cloud, camera, near_m, lod_px)
+    splats = project_gaussians(cloud, camera, near_m)
     behind = background_image(background, camera).astype(np.float64)
     colour, alpha, depth, blends = composite_reference(splats, camera, behind, brute)
     stats = {"gaussians": len(cloud), "visible": len(splats), "blends": blends}

@@ -6,11 +6,26 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from alpasim_plugin.core.types import F64
 
 Top = Literal["body", "glass", "bed"]
+YZ = tuple[float, float]
+
+
+def _flank(stations: list[tuple[float, list[YZ]]], k: int, side: float) -> list[list[float]]:
+    """Return the corners between two stations and between lines k and k + 1 of their outlines."""
+    (a, before), (b, after) = stations
+    ring = [(b, after[k]), (a, before[k]), (a, before[k + 1]), (b, after[k + 1])]
+    if side > 0:  # outward must be first edge x second edge on both flanks
+        ring = [ring[1], ring[0], ring[3], ring[2]]
+    return [[x, side * y, z] for x, (y, z) in ring]
+
+
+def _end(x: float, sign: float, lower: YZ, upper: YZ) -> list[list[float]]:
+    """Return the corners of a face at one end of the vehicle."""
+    (y, z), (upper_y, upper_z) = (sign * lower[0], lower[1]), (sign * upper[0], upper[1])
+    return [[x, -y, z], [x, y, z], [x, upper_y, upper_z], [x, -upper_y, upper_z]]
 
 
 @dataclass(frozen=True)
@@ -50,94 +65,53 @@ class Loft:
             Corners ``(M, 4, 3)`` as shares of length, width and height (z from the ground), colours
             ``(M, 3)`` and gloss ``(M,)``.
         """
-        faces: list[npt.NDArray[np.float64]] = []
+        faces: list[list[list[float]]] = []
         colours: list[F64] = []
         gloss: list[float] = []
 
         def add(corners: list[list[float]], rgb: F64, shine: float) -> None:
-            faces.append(np.array(corners))
+            faces.append(corners)
             colours.append(rgb)
             gloss.append(shine)
 
-        low, half = self.clearance, 0.5
-        n = len(self.x)
-        narrow = [half * (0.90 if i in (0, n - 1) else 1.0) for i in range(n)]
-        for i in range(n - 1):
-            a, b = self.x[i], self.x[i + 1]
-            wa, wb = narrow[i], narrow[i + 1]
-            ra, rb = self._roof_half(i, wa), self._roof_half(i + 1, wb)
-            ba = self.belt[i]
-            bb = self.belt[i + 1]
-            ta = self.roof[i]
-            tb = self.roof[i + 1]
-            for side in (1.0, -1.0):
-                lower = [
-                    [b, side * wb, low],
-                    [a, side * wa, low],
-                    [a, side * wa, ba],
-                    [b, side * wb, bb],
-                ]
-                upper = [
-                    [b, side * wb, bb],
-                    [a, side * wa, ba],
-                    [a, side * ra, ta],
-                    [b, side * rb, tb],
-                ]
-                sill = [
-                    [b, side * wb * 0.98, 0.6 * low],
-                    [a, side * wa * 0.98, 0.6 * low],
-                    [a, side * wa, low],
-                    [b, side * wb, low],
-                ]
-                if side > 0:  # outward must be first edge x second edge on both flanks
-                    lower, upper, sill = ([q[1], q[0], q[3], q[2]] for q in (lower, upper, sill))
-                add(lower, body, 0.16)
-                add(sill, 0.35 * body, 0.0)
-                if ta - ba > 0.02 or tb - bb > 0.02:
-                    add(
-                        upper,
-                        glass if self.side_glass[i] else body,
-                        0.30 if self.side_glass[i] else 0.16,
-                    )
-            cover = [[b, -rb, tb], [a, -ra, ta], [a, ra, ta], [b, rb, tb]]
-            rgb = glass if self.top[i] == "glass" else 0.30 * body if self.top[i] == "bed" else body
-            add(cover, rgb, 0.30 if self.top[i] == "glass" else 0.20)
-        for i, sign in ((0, 1.0), (n - 1, -1.0)):
-            x = self.x[i]
-            w = narrow[i]
-            t = self.roof[i]
-            belt = min(self.belt[i], t)
-            ring = [
-                [x, -sign * -w, low],
-                [x, -sign * w, low],
-                [x, -sign * w, belt],
-                [x, -sign * -w, belt],
-            ]
-            # Seen from outside the first edge runs to the left; reversed at the front.
-            add([ring[1], ring[0], ring[3], ring[2]], body, 0.12)
-            if t - belt > 0.05:
-                r = self._roof_half(i, w)
-                glazed = sign > 0 or self.rear_glass
-                upper = [
-                    [x, -sign * w, belt],
-                    [x, sign * w, belt],
-                    [x, sign * r, t],
-                    [x, -sign * r, t],
-                ]
-                add(upper, glass if glazed else body, 0.25 if glazed else 0.12)
-            b, high = 0.95 * w, 1.6 * low
-            bumper = [
-                [x, -sign * b, 0.6 * low],
-                [x, sign * b, 0.6 * low],
-                [x, sign * w, high],
-                [x, -sign * w, high],
-            ]
-            add(bumper, 0.30 * body + 0.04, 0.0)
-        return np.stack(faces), np.stack(colours), np.array(gloss)
+        low, last = self.clearance, len(self.x) - 1
+        stations = []  # x, and the outline: y and z of: lower edge, sill, belt line, roof
+        for i, (belt, roof) in enumerate(zip(self.belt, self.roof, strict=True)):
+            half = 0.45 if i in (0, last) else 0.5
+            lift = min(max((roof - belt) / 0.3, 0.0), 1.0)
+            top = half * (1 - self.tuck * lift)
+            outline = [(half * 0.98, 0.6 * low), (half, low), (half, belt), (top, roof)]
+            stations.append((self.x[i], outline))
+        for i, (top, glazed) in enumerate(zip(self.top, self.side_glass, strict=True)):
+            (a, before), (b, after) = stations[i : i + 2]
 
-    def _roof_half(self, i: int, half: float) -> float:
-        lift = min(max((self.roof[i] - self.belt[i]) / 0.3, 0.0), 1.0)
-        return half * (1 - self.tuck * lift)
+            for side in (1.0, -1.0):
+                add(_flank(stations[i : i + 2], 1, side), body, 0.16)
+                add(_flank(stations[i : i + 2], 0, side), 0.35 * body, 0.0)
+                if max(before[3][1] - before[2][1], after[3][1] - after[2][1]) > 0.02:
+                    add(
+                        _flank(stations[i : i + 2], 2, side),
+                        *((glass, 0.30) if glazed else (body, 0.16)),
+                    )
+            (ra, ta), (rb, tb) = before[3], after[3]
+            cover = [[b, -rb, tb], [a, -ra, ta], [a, ra, ta], [b, rb, tb]]
+            rgb, shine = {"glass": (glass, 0.30), "bed": (0.30 * body, 0.20), "body": (body, 0.20)}[
+                top
+            ]
+            add(cover, rgb, shine)
+        for i, sign in ((0, 1.0), (last, -1.0)):
+            (w, _), (_, belt), (roof_half, roof) = stations[i][1][1:]
+            belt, x = min(belt, roof), self.x[i]
+
+            add(_end(x, sign, (w, low), (w, belt)), body, 0.12)
+            if roof - belt > 0.05:
+                glazed = sign > 0 or self.rear_glass
+                add(
+                    _end(x, sign, (w, belt), (roof_half, roof)),
+                    *((glass, 0.25) if glazed else (body, 0.12)),
+                )
+            add(_end(x, sign, (0.95 * w, 0.6 * low), (w, 1.6 * low)), 0.30 * body + 0.04, 0.0)
+        return np.array(faces), np.stack(colours), np.array(gloss)
 
 
 STATIONS: dict[str, Loft] = {

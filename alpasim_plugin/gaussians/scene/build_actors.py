@@ -88,14 +88,11 @@ def _shadow(box: Box, label: str) -> GaussianCloud:
     return cloud_of(means, IDENTITY, scales, (0.05, 0.05, 0.05), 0.75 if wheels else 0.45)
 
 
-def _lofted(box: Box, draw: F64, noise: F64, cell_m: float, loft: Loft, body: F64) -> GaussianCloud:
+def _lofted(box: Box, noise: F64, cell_m: float, loft: Loft, body: F64) -> GaussianCloud:
     """Cover a loft with Gaussians and add wheels, lights and plates."""
-    length = box.length_m
-    width = box.width_m
-    height = box.height_m
     corners, rgb, gloss = loft.quads(body, GLASS_RGB)
-    scale = np.array([length, width, height])
-    quads = corners * scale + np.array([0.0, 0.0, -height / 2])
+    scale = np.array([box.length_m, box.width_m, box.height_m])
+    quads = corners * scale - np.array([0.0, 0.0, box.height_m / 2])
     cloud, owner, normals = quad_surfels(quads, rgb, cell_m, noise, 0.72)
     # Light from above: roofs bright, flanks in between, undersides dark.
     shade = (0.80 + 0.24 * normals[:, 2])[owner][:, None, None]
@@ -112,15 +109,10 @@ def _lofted(box: Box, draw: F64, noise: F64, cell_m: float, loft: Loft, body: F6
 def _wheels(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
     """Draw wheels as dark discs with a pale hub, just proud of the flanks."""
     radius = loft.wheel_m
-    x = np.repeat([loft.axles[0] * box.length_m, loft.axles[1] * box.length_m], 2)
-    y = np.tile([1.0, -1.0], 2) * (box.width_m / 2 - 0.02)
-    z = np.full(4, radius - box.height_m / 2)
-    if len(loft.axles) == 3:
-        x = np.append(x, [loft.axles[2] * box.length_m] * 2)
-        y = np.append(y, y[:2])
-        z = np.append(z, z[:2])
+    x = np.repeat(np.array(loft.axles) * box.length_m, 2)
     n = len(x)
-    centre = np.column_stack([x, y, z])
+    y = np.tile([1.0, -1.0], n // 2) * (box.width_m / 2 - 0.02)
+    centre = np.column_stack([x, y, np.full(n, radius - box.height_m / 2)])
     disc = _blobs(centre, (0.52 * radius, 0.05, 0.52 * radius), TYRE_RGB)
     if cell_m > 0.3:
         return disc
@@ -162,27 +154,20 @@ def _lights(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
     return GaussianCloud.concatenate(parts)
 
 
-def _car(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
-    kind = (
-        "van"
-        if box.height_m > 1.95
-        else "suv"
-        if box.height_m > 1.65
-        else ("hatch" if draw[1] < 0.4 else "sedan")
-    )
-    return _lofted(box, draw, noise, cell_m, STATIONS[kind], BODY_RGB[int(draw[0] * len(BODY_RGB))])
+def _vehicle(box: Box, draw: F64, noise: F64, cell_m: float, label: str) -> GaussianCloud:
+    kind, colours = label, {"truck": TRUCK_RGB, "bus": BUS_RGB}.get(label, BODY_RGB)
+    if label == "truck" and box.length_m < 6.0 and box.height_m < 2.3:
+        kind, colours = "pickup", BODY_RGB
+    if label == "car":
+        kind = "hatch" if draw[1] < 0.4 else "sedan"
+        if box.height_m > 1.65:
+            kind = "van" if box.height_m > 1.95 else "suv"
+    return _lofted(box, noise, cell_m, STATIONS[kind], _drawn(colours, draw[0]))
 
 
-def _truck(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
-    if box.length_m < 6.0 and box.height_m < 2.3:
-        return _lofted(
-            box, draw, noise, cell_m, STATIONS["pickup"], BODY_RGB[int(draw[0] * len(BODY_RGB))]
-        )
-    return _lofted(box, draw, noise, cell_m, STATIONS["truck"], TRUCK_RGB[int(draw[0] * 3)])
-
-
-def _bus(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
-    return _lofted(box, draw, noise, cell_m, STATIONS["bus"], BUS_RGB[int(draw[0] * 3)])
+def _drawn(colours: F64, draw: float) -> F64:
+    """Return the colour that a number 0..1 chooses."""
+    return np.asarray(colours[int(draw * len(colours))])
 
 
 def _person(
@@ -198,9 +183,9 @@ def _person(
     are shares of its height.
     """
     h, w = height_m, min(max(width_m, 0.45), 0.75)
-    coat = CLOTHES_RGB[int(draw[2] * len(CLOTHES_RGB))]
-    legs = CLOTHES_RGB[int(draw[3] * len(CLOTHES_RGB))] * 0.8
-    skin = SKIN_RGB[int(draw[4] * len(SKIN_RGB))]
+    coat = _drawn(CLOTHES_RGB, draw[2])
+    legs = _drawn(CLOTHES_RGB, draw[3]) * 0.8
+    skin = _drawn(SKIN_RGB, draw[4])
     body = [  # x, y, z as shares of height, then sigma x, y, z as shares, then colour
         (0.5 * lean, 0.0, 0.92, 0.040, 0.036, 0.048, skin),
         (0.5 * lean - 0.01, 0.0, 0.955, 0.042, 0.038, 0.026, np.array([0.16, 0.12, 0.09])),
@@ -240,7 +225,7 @@ def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) ->
     at = (centres[:, None] + ring[None]).reshape(-1, 3)
     thick = (0.05 if heavy else 0.022) * (20 / len(angle)) ** 0.5
     tyres = _blobs(at, (2.2 * thick, 1.2 * thick, 2.2 * thick), TYRE_RGB)
-    body = BODY_RGB[int(draw[0] * len(BODY_RGB))]
+    body = _drawn(BODY_RGB, draw[0])
     seat, bar = (
         np.array([-0.12 * length, 0, bottom + 0.52 * height]),
         np.array([0.26 * length, 0, bottom + 0.60 * height]),
@@ -263,9 +248,7 @@ def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) ->
 
 def _other(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
     """Draw a traffic cone where the box is small and slim, else a crate with warning stripes."""
-    length = box.length_m
-    width = box.width_m
-    height = box.height_m
+    length, width, height = box.length_m, box.width_m, box.height_m
     if max(length, width) < 1.0:
         n = 8 if cell_m < 0.3 else 4
         z = (np.arange(n) + 0.5) / n
@@ -280,30 +263,27 @@ def _other(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
 
 def _crate(x: float, y: float, z: float, noise: F64, cell_m: float) -> GaussianCloud:
     """Return a striped box of half sizes x, y, z."""
-    faces, rgb_rows = [], []
-    for sx, sy in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
+    faces, colours = [], []
+    for turn in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        middle = np.array([*turn, 0]) * [x, y, 0]
+        side = np.array([-turn[1] * x, turn[0] * y, 0.0])
         for k in range(4):
             low, high = np.array([0, 0, -z + z * k / 2]), np.array([0, 0, -z + z * (k + 1) / 2])
-            side = np.array([-sy * x, sx * y, 0.0])
-            middle = np.array([sx * x, sy * y, 0.0])
-            faces.append(
-                [
-                    middle - side + low,
-                    middle + side + low,
-                    middle + side + high,
-                    middle - side + high,
-                ]
+            ring = (
+                middle - side + low,
+                middle + side + low,
+                middle + side + high,
+                middle - side + high,
             )
-            rgb_rows.append([0.86, 0.84, 0.80] if k % 2 else [0.80, 0.42, 0.14])
-    faces.append([np.array(corner) for corner in ((-x, -y, z), (x, -y, z), (x, y, z), (-x, y, z))])
-    rgb_rows.append([0.80, 0.60, 0.40])
-    return quad_surfels(np.array(faces), np.array(rgb_rows), cell_m, noise)[0]
+            faces.append(np.stack(ring))
+            colours.append([0.86, 0.84, 0.80] if k % 2 else [0.80, 0.42, 0.14])
+    faces.append(np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]) * [x, y, z])
+    colours.append([0.80, 0.60, 0.40])
+    return quad_surfels(np.array(faces), np.array(colours), cell_m, noise)[0]
 
 
 _SHAPES: dict[str, Callable[[Box, F64, F64, float], GaussianCloud]] = {
-    "car": _car,
-    "truck": _truck,
-    "bus": _bus,
+    **{label: partial(_vehicle, label=label) for label in ("car", "truck", "bus")},
     "pedestrian": _pedestrian,
     "cyclist": partial(_two_wheeler, heavy=False),
     "motorcycle": partial(_two_wheeler, heavy=True),

@@ -113,9 +113,7 @@ def place_houses(site: Site) -> Houses:
     environment = site.scenario.environment
     rng = site.rng("houses")
     free = ((site.off_road_m > CLEAR_M) & ~site.taken).astype(np.uint8)
-    fronts = []
-    aways = []
-    heights = []
+    fronts, aways, heights = [], [], []
     low_m, high_m = environment.building_height_m
     for line in contours(site, SETBACK_M[site.highway], WITHIN_M):
         length = float(arc_lengths(line)[-1])
@@ -174,10 +172,7 @@ def _walls(
     wall, u, v = grid_cells(bays * cells, floors * cells)
     nu, nv = (bays * cells)[wall], (floors * cells)[wall]
     iu, iv = np.floor(u * nu).astype(np.int64), np.floor(v * nv).astype(np.int64)
-    bay = iu // cells
-    floor = iv // cells
-    cu = iu % cells
-    cv = iv % cells
+    (bay, cu), (floor, cv) = np.divmod(iu, cells), np.divmod(iv, cells)
     house = owner[wall]
     # One number per window, the same at every level of detail.
     key = (wall * 7919 + bay * 104_729 + floor * 1_299_709 + seed) % 2_147_483_647
@@ -189,7 +184,7 @@ def _walls(
     front = is_front[wall]
     shop = (floor == 0) & front & style["shop"][house]
     entrance = (floor == 0) & front & ~style["shop"][house] & (bay == bays[wall] // 2)
-    nothing = np.zeros(len(wall), dtype=bool)
+    sill = door = np.zeros(len(wall), dtype=bool)
     if cells >= 6:
         share = ((fu > first) & (fu < 0.83) & (fv > 0.33) & (fv < 0.83)).astype(np.float64)
         sill = (fu > first) & (fu < 0.83) & (fv > 0.17) & (fv < 0.33)
@@ -207,14 +202,11 @@ def _walls(
             np.where(cv == 1, 1.0, np.where(cv == 2, 0.5, 0.0)),
             np.where(wide & (cv == 1), 0.3, 0.0),
         )
-        sill = nothing
         band = shop & (cv == 2)
         door = entrance & (cu == 1) & (cv <= 1)
     else:
         share = np.where(wide, 0.33, 0.25)
-        sill = nothing
         band = shop
-        door = nothing
     # Walls away from the street have fewer windows.
     share = np.where(front, share, 0.6 * share * (bay % 2 == 0))
     shop_share = ((fu > 0.12) & (fv < 0.66)) * 1.0 if cells >= 6 else np.where(cv <= 1, 0.75, 0.0)
@@ -241,14 +233,18 @@ def _walls(
     plan = starts[wall] + u[:, None] * (ends - starts)[wall]
     z = base[wall] - 0.2 + v * (height[wall] + 0.2)
     means = np.column_stack([site.frame.to_world(plan), z])
-    heading = site.frame.to_world(ends) - site.frame.to_world(starts)
-    direction = np.column_stack([heading, np.zeros(len(heading))])
-    quats = quats_along(direction)
-    scales = np.stack(
-        [SPREAD * length[wall] / nu, np.full(len(wall), 0.05), SPREAD * (height[wall] + 0.2) / nv],
-        axis=1,
+    scales = (
+        SPREAD * length[wall] / nu,
+        np.full(len(wall), 0.05),
+        SPREAD * (height[wall] + 0.2) / nv,
     )
-    return cloud_of(means, quats[wall], scales, rgb), wall
+    return cloud_of(means, _facing(site, starts, ends)[wall], np.stack(scales, axis=1), rgb), wall
+
+
+def _facing(site: Site, start: F64, end: F64) -> F64:
+    """Return the rotations ``(N, 4)`` whose x axis runs along walls on the plan."""
+    heading = site.frame.to_world(end) - site.frame.to_world(start)
+    return quats_along(np.column_stack([heading, np.zeros(len(heading))]))
 
 
 def _roofs(
@@ -262,11 +258,11 @@ def _roofs(
     house, u, v = grid_cells(n_u, n_v)
     plan = a[house] + u[:, None] * (b - a)[house] + v[:, None] * DEPTH_M * houses.away[house]
     xy = site.frame.to_world(plan)
-    heading = site.frame.to_world(b) - site.frame.to_world(a)
-    quats = quats_along(np.column_stack([heading, np.zeros(len(heading))]))
-    scales = np.stack(
-        [SPREAD * (length / n_u)[house], SPREAD * DEPTH_M / n_v[house], np.full(len(house), 0.05)],
-        axis=1,
+    scales = (
+        SPREAD * (length / n_u)[house],
+        SPREAD * DEPTH_M / n_v[house],
+        np.full(len(house), 0.05),
     )
     means = np.column_stack([xy, (base + houses.height_m)[house] - 0.05])
-    return cloud_of(means, quats[house], scales, 0.55 * wall_rgb[house]), house
+    quats = _facing(site, a, b)[house]
+    return cloud_of(means, quats, np.stack(scales, axis=1), 0.55 * wall_rgb[house]), house

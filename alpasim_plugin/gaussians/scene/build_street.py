@@ -12,12 +12,11 @@ from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.build_facades import DEPTH_M, Houses
 from alpasim_plugin.gaussians.scene.build_road import KERB_M
 from alpasim_plugin.gaussians.scene.scene_graph import SceneNode, nodes_by_tile, tile_numbers
-from alpasim_plugin.gaussians.scene.site import CELL_M, Site, contours, places
+from alpasim_plugin.gaussians.scene.site import CELL_M, Roadside, Site, contours, places
 from alpasim_plugin.gaussians.scene.surfels import (
     IDENTITY,
     SPREAD,
     cloud_of,
-    grid_cells,
     quad_surfels,
     quats_along,
     rods,
@@ -33,55 +32,62 @@ TREE_LINE_M = {
     True: 7.0,
 }  # distance of street trees from the road's edge, by highway or not
 TILE_M = 32.0
+RIM_RGB = (0.88, 0.88, 0.86)
+SIGN_RGB = ((0.75, 0.12, 0.10), (0.10, 0.28, 0.62), (0.88, 0.72, 0.12), (0.10, 0.42, 0.26))
 LEAVES = np.array([[0.24, 0.38, 0.15], [0.30, 0.43, 0.18], [0.20, 0.33, 0.17], [0.38, 0.43, 0.17]])
 Item = tuple[float, GaussianCloud, F64]  # cell size, cloud, plan position of each Gaussian's owner
 
 
 def build_street(site: Site, houses: Houses) -> list[SceneNode]:
     """Return the nodes of everything beside the road but the houses."""
-    nodes = _nodes(
-        site,
-        "guard-rail" if site.highway else "kerb",
-        _rails(site) if site.highway else _kerbs(site),
-    )
-    nodes += _nodes(site, "tree", _trees(site, houses))
-    return nodes + _nodes(site, "pole", _poles(site, houses)) + _nodes(site, "sign", _signs(site))
+    edge = ("guard-rail", _rails(site)) if site.highway else ("kerb", _kerbs(site))
+    parts = [edge, ("tree", _trees(site, houses)), ("pole", _poles(site, houses))]
+    nodes = []
+    for name, items in [*parts, ("sign", _signs(site))]:
+        levels = [
+            (cell_m, cloud, tile_numbers(at - site.low, TILE_M))
+            for cell_m, cloud, at in items
+            if len(cloud)
+        ]
+        nodes += nodes_by_tile(name, levels)
+    return nodes
 
 
-def _nodes(site: Site, name: str, items: list[Item]) -> list[SceneNode]:
-    levels = []
-    for cell_m, cloud, at in items:
-        if len(cloud):
-            levels.append((cell_m, cloud, tile_numbers(at - site.low, TILE_M)))
-    return nodes_by_tile(name, levels)
+def _spots(site: Site, beyond_m: float, step_m: float, shortest_m: float) -> Roadside | None:
+    """Return places every ``step_m`` along the road's edge; None where it is too short for one."""
+    lines = contours(site, beyond_m, 60.0)
+    spots = [
+        places(line, step_m, step_m / 2) for line in lines if arc_lengths(line)[-1] > shortest_m
+    ]
+    if not spots:
+        return None
+    return Roadside(*(np.concatenate(column) for column in zip(*spots, strict=True)))
 
 
 def _kerbs(site: Site) -> list[Item]:
     """Place a kerb along the road's edge: a face towards the road and a top."""
     items: list[Item] = []
-    lines = contours(site, 0.0, 60.0)
     for cell_m, step in ((0.25, 0.5), (0.7, 1.0), (1.6, 2.0)):
-        spots = [places(line, step, step / 2) for line in lines if arc_lengths(line)[-1] > 2 * step]
-        if not spots:
+        spots = _spots(site, 0.0, step, 2 * step)
+        if spots is None:
             return []
-        xy, along, away = (np.concatenate(c) for c in zip(*spots, strict=True))
-        rng = site.rng(f"kerb-{step}")
-        rgb = np.array(KERB_RGB) * (1 + 0.03 * rng.standard_normal((len(xy), 1)))
-        quats = quats_along(site.frame.turned(along))
+        n = len(spots.xy)
+        rgb = np.array(KERB_RGB) * (1 + 0.03 * site.rng(f"kerb-{step}").standard_normal((n, 1)))
+        quats = quats_along(site.frame.turned(spots.along))
         # Contours run through the centres of the first cells off the road: half a cell behind the
         # edge.
-        xy = xy - 0.5 * CELL_M * away
-        face = site.world(xy, 0.4 * KERB_M)
-        top = site.world(xy + 0.08 * away, KERB_M)
-        n = len(xy)
-        size = np.full(n, SPREAD * step)
+        xy = spots.xy - 0.5 * CELL_M * spots.away
         clouds = [
             cloud_of(
-                face, quats, np.column_stack([size, np.full(n, 0.05), np.full(n, 0.08)]), 0.80 * rgb
-            ),
-            cloud_of(
-                top, quats, np.column_stack([size, np.full(n, 0.09), np.full(n, 0.015)]), 1.05 * rgb
-            ),
+                site.world(xy + back_m * spots.away, above_m),
+                quats,
+                (SPREAD * step, *size),
+                shade * rgb,
+            )
+            for back_m, above_m, size, shade in (
+                (0.0, 0.4 * KERB_M, (0.05, 0.08), 0.80),
+                (0.08, KERB_M, (0.09, 0.015), 1.05),
+            )
         ]
         items.append((cell_m, GaussianCloud.concatenate(clouds), np.tile(xy, (2, 1))))
     return items
@@ -90,26 +96,25 @@ def _kerbs(site: Site) -> list[Item]:
 def _rails(site: Site) -> list[Item]:
     """Place a guard rail along a highway."""
     items: list[Item] = []
-    lines = contours(site, 1.2, 60.0)
     for cell_m, step in ((0.3, 1.0), (0.9, 2.0), (2.0, 4.0)):
-        spots = [places(line, step, step / 2) for line in lines if arc_lengths(line)[-1] > 8.0]
-        if not spots:
+        spots = _spots(site, 1.2, step, 8.0)
+        if spots is None:
             return []
-        xy, along, _ = (np.concatenate(c) for c in zip(*spots, strict=True))
-        n = len(xy)
-        quats = quats_along(site.frame.turned(along))
-        scales = np.column_stack([np.full(n, SPREAD * step), np.full(n, 0.03), np.full(n, 0.05)])
-        clouds, at = [], []
-        for height, shade in ((0.56, 0.8), (0.72, 1.0)):
-            clouds.append(
-                cloud_of(site.world(xy, height), quats, scales, np.array(RAIL_RGB) * shade)
+        xy = spots.xy
+        quats = quats_along(site.frame.turned(spots.along))
+        clouds = [
+            cloud_of(
+                site.world(xy, height),
+                quats,
+                (SPREAD * step, 0.03, 0.05),
+                np.array(RAIL_RGB) * shade,
             )
-            at.append(xy)
+            for height, shade in ((0.56, 0.8), (0.72, 1.0))
+        ]
         posts = xy[:: max(1, round(4.0 / step))]
         foot = site.world(posts, 0.0)
         clouds.append(rods(foot, foot + np.array([0, 0, 0.62]), 0.06, POST_RGB, 0.7))
-        at.append(posts)
-        items.append((cell_m, GaussianCloud.concatenate(clouds), np.concatenate(at)))
+        items.append((cell_m, GaussianCloud.concatenate(clouds), np.concatenate([xy, xy, posts])))
     return items
 
 
@@ -145,21 +150,10 @@ def _trees(site: Site, houses: Houses) -> list[Item]:
         crowns, owner = _crowns(site, foot, crown, stem, leaf, count)
         top = foot + np.column_stack([np.zeros(m), np.zeros(m), stem + 0.5 * crown])
         trunks = rods(foot, top, 0.13, TRUNK_RGB, 0.5 if count > 100 else 4.0)
-        trunk_owner = _nearest(trunks.means.astype(np.float64), foot)
-        items.append(
-            (
-                cell_m,
-                GaussianCloud.concatenate([crowns, trunks]),
-                at[np.concatenate([owner, trunk_owner])],
-            )
-        )
+        away = np.linalg.norm(trunks.means[:, None, :2] - foot[None, :, :2], axis=2)
+        owners = np.concatenate([owner, np.argmin(away, axis=1)])
+        items.append((cell_m, GaussianCloud.concatenate([crowns, trunks]), at[owners]))
     return items
-
-
-def _nearest(means: F64, foot: F64) -> I64:
-    return np.asarray(
-        np.argmin(np.linalg.norm(means[:, None, :2] - foot[None, :, :2], axis=2), axis=1)
-    )
 
 
 def _crowns(
@@ -246,12 +240,9 @@ def _poles(site: Site, houses: Houses) -> list[Item]:
     owner = np.concatenate([at, at, *[site.frame.to_ground(p[:-1]) for p in mapped]])
     items: list[Item] = []
     for cell_m, step in ((0.3, 0.45), (1.2, 1.6)):
-        length = np.linalg.norm(end - start, axis=1)
         poles = rods(start, end, 0.085, POLE_RGB, step)
-        piece, _, _ = grid_cells(
-            np.maximum(np.round(length / step), 1).astype(np.int64),
-            np.ones(len(start), dtype=np.int64),
-        )
+        links = np.maximum(np.round(np.linalg.norm(end - start, axis=1) / step), 1).astype(np.int64)
+        piece = np.repeat(np.arange(len(start)), links)
         lamp = cloud_of(tip, IDENTITY, (0.22, 0.22, 0.07), (0.85, 0.85, 0.80))
         items.append(
             (cell_m, GaussianCloud.concatenate([poles, lamp]), np.concatenate([owner[piece], at]))
@@ -267,11 +258,7 @@ def _signs(site: Site) -> list[Item]:
     if not signs:
         return []
     rng = site.rng("signs")
-    corners = []
-    rgbs = []
-    feet = []
-    tops = []
-    at = []
+    corners, rgbs, feet, tops, at = [], [], [], [], []
     for T, box in signs:
         sizes = np.array([box.length_m, box.width_m])
         thin = int(np.argmin(sizes))
@@ -280,18 +267,10 @@ def _signs(site: Site) -> list[Item]:
         up = np.array([0, 0, max(box.height_m, 0.3) / 2])
         normal = np.zeros(3)
         normal[thin] = 0.03
-        colour = np.array(
-            [[0.75, 0.12, 0.10], [0.10, 0.28, 0.62], [0.88, 0.72, 0.12], [0.10, 0.42, 0.26]]
-        )[rng.integers(4)]
-        for shift, share, rgb in (
-            (0.0, 1.0, np.array([0.88, 0.88, 0.86])),
-            (1.0, 0.72, colour),
-            (-1.0, 0.72, colour),
-        ):
-            local = (
-                np.stack([-side - up, side - up, side + up, -side + up]) * share + shift * normal
-            )
-            corners.append(local @ T[:3, :3].T + T[:3, 3])
+        colour = SIGN_RGB[rng.integers(4)]
+        plate = np.stack([-side - up, side - up, side + up, -side + up])
+        for shift, share, rgb in ((0.0, 1.0, RIM_RGB), (1.0, 0.72, colour), (-1.0, 0.72, colour)):
+            corners.append((plate * share + shift * normal) @ T[:3, :3].T + T[:3, 3])
             rgbs.append(rgb)
             at.append(T[:2, 3])
         foot = site.world(site.frame.to_ground(T[None, :2, 3]))[0]

@@ -73,7 +73,6 @@ def with_background(graph: SceneGraph, cloud: GaussianCloud, T_world_file: F64) 
         [*graph.background, *nodes],
         list(graph.actors.values()),
         graph.sky,
-        graph.sh_frame,
     )
 
 

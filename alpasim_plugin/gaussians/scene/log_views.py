@@ -1,4 +1,4 @@
-"""What the log's cameras saw: when they looked, who was there, and where there was sky.
+"""What the log's cameras saw: who was there, and where there was sky.
 
 A transparent pixel of a reconstruction is open sky or a hole; alpha alone cannot tell them apart.
 Pipelines on recorded drives fill the sky from segmented log images (OneFixer, App. A). Here the log
@@ -15,19 +15,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.geometry import arc_lengths, interpolate, inverse
+from alpasim_plugin.core.geometry import interpolate, inverse
 from alpasim_plugin.core.types import F32, F64, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
-
-
-def log_times(scenario: Scenario, spacing_m: float, most: int) -> list[int]:
-    """Return times of the log at which the ego has moved ``spacing_m`` since the last one, at most
-    ``most`` of them.
-    """
-    s = arc_lengths(scenario.ego_log.xyz)
-    n = int(np.clip(s[-1] / spacing_m + 1, 1, most))
-    index = np.searchsorted(s, np.linspace(0.0, s[-1], n)).clip(0, len(s) - 1)
-    return [int(t) for t in np.unique(scenario.ego_log.t_us[index])]
 
 
 def log_actors(scenario: Scenario, t_us: int) -> dict[str, F64]:

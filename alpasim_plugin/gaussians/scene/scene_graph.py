@@ -27,7 +27,7 @@ from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.raster.output import RasterOutput
-from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, ShFrame, prepare
+from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.raster.rasterize import Backend, rasterize
 from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared
 from alpasim_plugin.gaussians.scene.sky import Sky
@@ -121,8 +121,6 @@ class SceneGraph:
         background: Nodes in world coordinates.
         actors: Nodes in box frames; the name is the actor's id.
         sky: What stands behind everything.
-        sh_frame: Axes of the actors' view-dependent colour: ``object`` (it turns with the actor;
-            scenes built here) or ``world`` (as reconstructions of recorded drives are optimised).
     """
 
     def __init__(
@@ -130,12 +128,10 @@ class SceneGraph:
         background: Sequence[SceneNode],
         actors: Sequence[SceneNode],
         sky: Sky,
-        sh_frame: ShFrame = "object",
     ) -> None:
         self.background = tuple(background)
         self.actors = {node.name: node for node in sorted(actors, key=lambda node: node.name)}
         self.sky = sky
-        self.sh_frame: ShFrame = sh_frame
         self._centre, self._radius = _spheres(self.background)
         self._far = np.array([node.far_m for node in self.background])
         self._actor_centre, self._actor_radius = _spheres(list(self.actors.values()))
@@ -191,7 +187,7 @@ class SceneGraph:
         clouds = []
         for node, level, T in chosen:
             cloud = node.levels[level].cloud
-            clouds.append(cloud if T is None else cloud.transformed(T, self.sh_frame == "object"))
+            clouds.append(cloud if T is None else cloud.transformed(T))
         return GaussianCloud.concatenate(clouds)
 
     def _choose(
@@ -233,7 +229,7 @@ class SceneGraph:
     def _prepare(self, node: SceneNode, level: int) -> PreparedCloud:
         key = (node.name, level)
         if key not in self._prepared:
-            self._prepared[key] = prepare(node.levels[level].cloud, sh_frame=self.sh_frame)
+            self._prepared[key] = prepare(node.levels[level].cloud)
         return self._prepared[key]
 
 

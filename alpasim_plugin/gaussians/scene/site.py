@@ -75,7 +75,6 @@ class Site:
         path: ``(N, 2)`` logged path and what the route adds to it, ground coordinates, points 1 m
             apart.
         road: ``(H, W)`` bool, paved for vehicles.
-        junction: ``(H, W)`` bool, inside an intersection lane.
         taken: ``(H, W)`` bool, ground that actors stand on or drive over at any time.
         highway: Fast road without pavements and houses at its edge.
     """
@@ -86,7 +85,6 @@ class Site:
     low: F64
     path: F64
     road: Bool
-    junction: Bool
     taken: Bool
     highway: bool
 
@@ -168,8 +166,11 @@ def make_site(scenario: Scenario, height_at: HeightAt) -> Site:
     lanes = list(scenario.lane_map.lanes.values())
     high = low + size * CELL_M
     near = [lane for lane in lanes if _touches(frame.to_ground(lane.centre), low, high)]
-    road = _fill(shape, low, frame, _lane_rings(near))
-    _fill_into(road, low, frame, [ring[:, :2] for ring in scenario.lane_map.drivable_areas])
+    road = np.zeros(shape, dtype=np.uint8)
+    for ring in (*_lane_rings(near), *scenario.lane_map.drivable_areas):
+        if len(ring) >= 3:
+            corners = to_pixels(frame.to_ground(ring), low, CELL_M)
+            cv2.fillPoly(road, [corners], 1, cv2.LINE_8, SHIFT_BITS)
     half = scenario.vehicle.box.width_m / 2 + 0.6
     thickness = max(1, round(2 * half / CELL_M))
     cv2.polylines(road, [to_pixels(path, low, CELL_M)], False, 1, thickness, cv2.LINE_8, SHIFT_BITS)
@@ -179,21 +180,9 @@ def make_site(scenario: Scenario, height_at: HeightAt) -> Site:
     )
     # A soft edge instead of the raster's staircase: kerbs and grass follow the half-way line.
     road = (cv2.GaussianBlur(road.astype(np.float32), (0, 0), 1.5) > 0.5).astype(np.uint8)
-    junction = _fill(
-        shape, low, frame, _lane_rings([lane for lane in near if lane.is_intersection])
-    )
     taken = _taken(scenario, frame, low, shape)
-    return Site(
-        scenario,
-        height_at,
-        frame,
-        low,
-        path,
-        road.astype(bool),
-        junction.astype(bool),
-        taken,
-        _is_highway(scenario, near),
-    )
+    highway = _is_highway(scenario, near)
+    return Site(scenario, height_at, frame, low, path, road.astype(bool), taken, highway)
 
 
 def _path(scenario: Scenario) -> F64:
@@ -230,22 +219,6 @@ def _lane_rings(lanes: Iterable[Lane]) -> list[F64]:
         ]
         rings += [shapely.get_coordinates(shapely.get_exterior_ring(area)) for area in areas]
     return rings
-
-
-def _fill(
-    shape: tuple[int, int], low: F64, frame: GroundFrame, rings: list[F64]
-) -> npt.NDArray[np.uint8]:
-    mask = np.zeros(shape, dtype=np.uint8)
-    _fill_into(mask, low, frame, rings)
-    return mask
-
-
-def _fill_into(mask: npt.NDArray[np.uint8], low: F64, frame: GroundFrame, rings: list[F64]) -> None:
-    for ring in rings:
-        if len(ring) >= 3:
-            cv2.fillPoly(
-                mask, [to_pixels(frame.to_ground(ring), low, CELL_M)], 1, cv2.LINE_8, SHIFT_BITS
-            )
 
 
 def _taken(scenario: Scenario, frame: GroundFrame, low: F64, shape: tuple[int, int]) -> Bool:

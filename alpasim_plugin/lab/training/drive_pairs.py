@@ -207,7 +207,7 @@ def _fitted(
 ) -> Scenario:
     """Return the scenario with a model that was fitted to these photographs alone."""
     views = [shot.view(scenario, i) for i, shot in enumerate(shots)]
-    splat = replace(SplatRecipe.street(), steps=recipe.steps, hold_out_every=0)
+    splat = replace(SplatRecipe.street(), steps=recipe.steps)
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

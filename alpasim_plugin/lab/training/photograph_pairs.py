@@ -68,7 +68,6 @@ class PhotographRecipe:
         return SplatRecipe(
             steps=self.steps,
             cap=self.cap,
-            hold_out_every=0,
             sh_degree=1,
             densify_until=0.8,
             densify_every=30,

@@ -49,15 +49,6 @@ def fitted(views: list[PosedView]) -> tuple[FittedDrive, list[tuple[str, dict[st
     return done, told
 
 
-def test_a_view_that_was_kept_is_shown_and_reported_on_the_way(
-    fitted: tuple[FittedDrive, list[tuple[str, dict[str, float]]]],
-) -> None:
-    heard = [numbers["held_out_db"] for _, numbers in fitted[1] if "held_out_db" in numbers]
-    assert len(heard) == 3
-    assert heard[-1] > 18.0
-    assert heard[-1] > heard[0]
-
-
 def test_after_few_steps_the_depth_of_the_fit_is_already_near_the_street_s(
     fitted: tuple[FittedDrive, object], views: list[PosedView]
 ) -> None:

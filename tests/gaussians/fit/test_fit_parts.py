@@ -17,7 +17,6 @@ from alpasim_plugin.gaussians.fit import (
     SplatRecipe,
     Start,
     cloud_from_points,
-    held_out,
     start_from_depth,
 )
 from alpasim_plugin.gaussians.fit.model import (
@@ -25,7 +24,6 @@ from alpasim_plugin.gaussians.fit.model import (
     ScreenGradients,
     SplatModel,
     densify,
-    reset_opacities,
 )
 from alpasim_plugin.gaussians.fit.quality import SsimTarget
 from alpasim_plugin.gaussians.fit.reconstruction import sky_of
@@ -227,14 +225,6 @@ def test_faint_and_oversized_ones_are_removed() -> None:
     assert [round(float(x), 3) for x in model.params["means"].detach()[:, 0]] == [0.0, 0.0]
 
 
-def test_reset_lowers_opacities_and_forgets_their_moments() -> None:
-    model, adam, _, _ = density_case()
-    adam.second["logit_opacities"] += 1.0
-    reset_opacities(model, adam, 0.01)
-    assert torch.allclose(model.params["logit_opacities"].sigmoid(), torch.tensor(0.01))
-    assert not adam.second["logit_opacities"].any()
-
-
 def test_a_gaussian_that_no_view_showed_has_no_pull() -> None:
     gradients = ScreenGradients(2)
     gradients.add(torch.tensor([0, 1]), torch.tensor([0.5, 0.0]), torch.tensor([2, 0]), 4)
@@ -302,13 +292,6 @@ def test_the_panorama_shows_the_sky_that_the_views_saw(posed: Posed) -> None:
     assert sky_of([replace(v, sky=None) for v in posed.views]) is None
 
 
-def test_views_are_held_out_evenly(posed: Posed) -> None:
-    train, kept = held_out(posed.views, 4)
-    assert [v.name for v in kept] == ["view-2", "view-6"]
-    assert len(train) == 6
-    assert held_out(posed.views, 0) == (posed.views, [])
-
-
 def test_a_view_whose_image_has_another_size_is_refused(posed: Posed) -> None:
     with pytest.raises(InputError):
         replace(posed.views[0], rgb=np.zeros((HEIGHT + 1, WIDTH, 3), np.uint8))
@@ -319,22 +302,18 @@ def test_a_view_whose_image_has_another_size_is_refused(posed: Posed) -> None:
 
 def test_the_schedule_stretches_with_the_steps() -> None:
     short, long = (
-        SplatRecipe(steps=100, reset_every=0.3, densify_every=10),
-        SplatRecipe(steps=1000, reset_every=0.3, densify_every=100),
+        SplatRecipe(steps=100, densify_every=10),
+        SplatRecipe(steps=1000, densify_every=100),
     )
     assert [i for i in range(101) if short.densifies_after(i)] == [20, 30, 40, 50, 60]
-    assert (
-        [10 * i for i in range(101) if short.resets_after(i)]
-        == [i for i in range(1001) if long.resets_after(i)]
-        == [300, 600]
-    )
+    assert [i // 10 for i in range(1001) if long.densifies_after(i)] == [20, 30, 40, 50, 60]
     assert short.lr_means_at(0) == pytest.approx(short.lr_means)
     assert short.lr_means_at(100) == pytest.approx(short.lr_means_end)
     assert [short.sh_size_at(i) for i in (0, 24, 25, 50, 99)] == [1, 1, 4, 9, 9]
 
 
 @pytest.mark.parametrize(
-    "change", [{"steps": 0}, {"sh_degree": 4}, {"hold_out_every": 1}, {"ssim_weight": 1.5}]
+    "change", [{"steps": 0}, {"sh_degree": 4}, {"ssim_weight": 1.5}]
 )
 def test_a_recipe_outside_its_range_is_refused(change: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(change))):
