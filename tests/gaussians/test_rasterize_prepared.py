@@ -123,9 +123,7 @@ def test_many_parts_of_all_kinds_in_one_call_equal_the_reference_and_their_copie
         if T is not None:
             T[2, 3] += 4.0
         nodes.append((prepare(cloud), T))
-        clouds.append(
-            cloud if T is None else cloud.transformed(T)
-        )
+        clouds.append(cloud if T is None else cloud.transformed(T))
     found = rasterize_prepared(nodes, camera(), threads=1)
     size = max(cloud.sh.shape[1] for cloud in clouds)
     whole = GaussianCloud.concatenate(

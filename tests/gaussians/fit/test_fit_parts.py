@@ -312,9 +312,7 @@ def test_the_schedule_stretches_with_the_steps() -> None:
     assert [short.sh_size_at(i) for i in (0, 24, 25, 50, 99)] == [1, 1, 4, 9, 9]
 
 
-@pytest.mark.parametrize(
-    "change", [{"steps": 0}, {"sh_degree": 4}, {"ssim_weight": 1.5}]
-)
+@pytest.mark.parametrize("change", [{"steps": 0}, {"sh_degree": 4}, {"ssim_weight": 1.5}])
 def test_a_recipe_outside_its_range_is_refused(change: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(change))):
         replace(SplatRecipe(), **change)

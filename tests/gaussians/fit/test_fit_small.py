@@ -23,9 +23,7 @@ from alpasim_plugin.gaussians.fit import (
 from alpasim_plugin.gaussians.fit.loop import STATE_FILE, fit
 from tests.gaussians.fit.conftest import BOX, Posed, actor_pose, at, camera_at
 
-QUICK = SplatRecipe(
-    steps=40, points=300, cap=420, densify_every=10, save_every=15, sh_degree=1
-)
+QUICK = SplatRecipe(steps=40, points=300, cap=420, densify_every=10, save_every=15, sh_degree=1)
 
 
 def mean_psnr(model: Reconstruction, views: list[PosedView]) -> float:
