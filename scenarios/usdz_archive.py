@@ -10,11 +10,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from alpasim_plugin.core.config import parse
 from alpasim_plugin.core.limits import ARCHIVE_BYTES, SOURCE_BYTES, YAML_BYTES
 from alpasim_plugin.core.reading import parsing
 from alpasim_plugin.core.reading.files import check_names, open_regular
 from alpasim_plugin.core.reading.tables import parse_parquet
-from alpasim_plugin.core.yaml_positions import parse
 from scenarios.recorded import SourceFiles
 
 
@@ -96,7 +96,7 @@ class Archive:
         YAML_BYTES.check(len(data), where)
         with parsing(where, "fetch the file again", "broken YAML"):
             text = data.decode("utf-8")
-        return parse(text, where)[0]
+        return parse(text, where).data
 
     def table(self, member: str) -> list[dict[str, Any]]:
         """Read a parquet member as rows."""

@@ -115,16 +115,15 @@ def _wire() -> str:
     return f"compiled messages load: {wire.__name__}"
 
 
-def _writable(place: places.Place) -> str:
-    """Say which folder was chosen and why; it may not exist yet.
+def _writable(folder: Path) -> str:
+    """Return a folder's path; it may not exist yet.
 
     Raises:
-        InfrastructureError: It cannot be written, or others may.
+        InfrastructureError: It cannot be written.
     """
-    trouble = places.trouble_of(place)
-    if trouble:
-        raise InfrastructureError(f"{place}: {place}: {trouble}", places.DO_THIS)
-    return str(place)
+    if not places.is_writable(folder):
+        raise InfrastructureError(f"{folder}: it cannot be written", places.HINT)
+    return str(folder)
 
 
 def _disk() -> str:

@@ -23,7 +23,6 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from alpasim_plugin.core import places
 from alpasim_plugin.core.errors import InfrastructureError, InputError, InternalError, SimrunError
 from alpasim_plugin.core.lazy import installed_names
 from alpasim_plugin.core.signals import Stopped, leave_at_once, stoppable
@@ -308,10 +307,6 @@ def _unforeseen(error: Exception, args: list[str]) -> SimrunError:
             f"{error.filename}: {error.strerror}",
             "let this user read and write it, or name another",
         )
-    if (
-        isinstance(error, OSError) and places.nothing_is_writable()
-    ):  # of a library that needs a folder for itself
-        return InfrastructureError(f"{command}: no folder can be written: {error}", places.DO_THIS)
     failure = InternalError.of(error, command)
     failure.__cause__ = error
     return failure

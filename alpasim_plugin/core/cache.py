@@ -15,26 +15,11 @@ from typing import TypeVar
 
 from alpasim_plugin.core import places
 from alpasim_plugin.core.atomic import atomic_folder
-from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lock import one_writer
 
 T = TypeVar("T")
-DOING, DO_THIS = (
-    "writing to the cache",
-    "free disk space, or name a writable folder in SIMRUN_CACHE",
-)
-
-
-def cache_root() -> Path:
-    """Return the folder of the cache (`alpasim_plugin.core.places.cache`).
-
-    Raises:
-        InfrastructureError: No folder can be written.
-    """
-    found = places.cache().path
-    if found is None:
-        raise InfrastructureError("the cache: no folder can be written", places.DO_THIS)
-    return found
+DO_THIS = "free disk space, or name a writable folder in SIMRUN_CACHE"
 
 
 def cached(
@@ -63,7 +48,7 @@ def cached(
         InfrastructureError: The cache cannot be written.
         InputError: What was just made cannot be read.
     """
-    folder = cache_root() / kind / key
+    folder = places.cache() / kind / key
     if not again and folder.exists():
         found = _readable(folder, read, what)
         if found is not None:

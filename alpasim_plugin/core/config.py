@@ -1,32 +1,99 @@
-"""Configuration files: YAML with positions, ``extends``, dotted overrides, and pydantic validation
-with four-part errors.
+"""Configuration files: YAML in which every key keeps its file, line and column, ``extends``, dotted
+overrides, and validation by pydantic.
 
-An error of a file says where in it, and the nearest valid key.
+libyaml reads the text in linear time and limits its nesting. Scalars follow the YAML 1.2 core
+schema (``no`` is a word, ``1e-3`` a number, ``12:30`` a string), with ``_`` allowed inside
+integers. Duplicate keys, merge keys, tags, recursive aliases and numbers that are not finite are
+refused.
 """
 
 from __future__ import annotations
 
+import copy
 import difflib
-import hashlib
 import json
 import math
-import types as pytypes
+import re
+import types
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
+import yaml
 from pydantic import BaseModel, ValidationError
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import shorten
-from alpasim_plugin.core.limits import YAML_BYTES
-from alpasim_plugin.core.reading import read_bytes
-from alpasim_plugin.core.yaml_positions import Document, Key, Mark, parse
+from alpasim_plugin.core.limits import YAML_BYTES, YAML_VALUES
+from alpasim_plugin.core.reading import read_text
 
-__all__ = ["Document", "Mark", "apply_overrides", "load_yaml", "parse_scalar", "validate"]
+MOST_FILES = 64  # of one document, through extends
+MOST_LEVELS = 40
+MOST_PROBLEMS = 200  # of one file that are put in order
+SHOWN_PROBLEMS = 4
+TAG = "tag:yaml.org,2002:"
+
+Key = tuple[str | int, ...]
+M = TypeVar("M", bound=BaseModel)
 
 
-MOST_READ = 64  # files of one document, through extends
+@dataclass(frozen=True, order=True)
+class Mark:
+    """Where a key was written. Line and column count from 1; line 0 stands for a command-line
+    override.
+    """
+
+    file: str
+    line: int
+    column: int
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+
+
+@dataclass(frozen=True)
+class Document:
+    """Plain data (dict, list, str, int, float, bool, None) with the position of every key path."""
+
+    data: Any
+    marks: Mapping[Key, Mark]
+    path: str
+
+    def mark(self, loc: Sequence[str | int]) -> Mark:
+        """Return the position of the deepest existing key on the way to ``loc``."""
+        for n in range(len(loc), -1, -1):
+            if tuple(loc[:n]) in self.marks:
+                return self.marks[tuple(loc[:n])]
+        return Mark(self.path, 1, 1)
+
+    def error(self, loc: Sequence[str | int], message: str, hint: str) -> InputError:
+        """Return an error at a key path."""
+        return InputError(f"{self.mark(loc)}: {message}", hint)
+
+    def folder_of(self, loc: Sequence[str | int]) -> Path:
+        """Return the folder against which a relative path written at ``loc`` is resolved."""
+        mark = self.mark(loc)
+        return Path(mark.file).resolve().parent if mark.line else Path.cwd()
+
+
+class CoreLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # a base chosen at run time
+    """Safe loader with YAML 1.2 core scalars; compiled where PyYAML comes with libyaml."""
+
+    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012  # not those of YAML 1.1
+
+
+for _kind, _pattern, _first in (
+    ("bool", r"^(?:true|True|TRUE|false|False|FALSE)$", "tTfF"),
+    ("null", r"^(?:~|null|Null|NULL|)$", ["~", "n", "N", ""]),
+    ("int", r"^(?:[-+]?[0-9][0-9_]*|0o[0-7]+|0x[0-9a-fA-F]+)$", "-+0123456789"),
+    (
+        "float",
+        r"^(?:[-+]?(?:\.[0-9]+|[0-9][0-9_]*(?:\.[0-9_]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$",
+        "-+0123456789.",
+    ),
+):
+    CoreLoader.add_implicit_resolver(f"{TAG}{_kind}", re.compile(_pattern), list(_first))
 
 
 def load_yaml(path: str | Path) -> Document:
@@ -39,184 +106,221 @@ def load_yaml(path: str | Path) -> Document:
         InputError: Missing or unreadable file, YAML syntax (with line and column), duplicate or
             non-text key, a bound exceeded, or a cycle of ``extends``.
     """
-    return _load(Path(path), (), [])
+    return _load(Path(path), [])
 
 
-def parse_scalar(text: str, with_what: str) -> Any:
-    """Parse one YAML value from a string, for overrides.
+def _load(path: Path, read: list[Path]) -> Document:
+    """Read a file and its bases; ``read`` collects every reading, since files that name each other
+    twice double at each step.
+    """
+    read.append(path.resolve())
+    if len(read) > MOST_FILES:
+        raise InputError(
+            f"{path}: more than {MOST_FILES} files through extends, {len(set(read))} different ones",
+            "name each base once, and no file that extends itself",
+        )
+    document = parse(read_text(path, YAML_BYTES), str(path))
+    if not isinstance(document.data, dict) or "extends" not in document.data:
+        return document
+    names = document.data.pop("extends")
+    names = [names] if isinstance(names, str) else names
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise document.error(
+            ("extends",), f"extends: {names!r}", "give a list of paths, relative to this file"
+        )
+    merged: Any = {}
+    marks: dict[Key, Mark] = {}
+    for name in names:
+        base_path = path.resolve().parent / name
+        if not base_path.is_file():
+            raise document.error(
+                ("extends",),
+                f"extends {name!r}, but {base_path} does not exist",
+                "correct the path",
+            )
+        base = _load(base_path, read)
+        merged = _merge(merged, base.data)
+        marks.update(base.marks)
+    return Document(_merge(merged, document.data), {**marks, **document.marks}, str(path))
+
+
+def _merge(a: Any, b: Any) -> Any:
+    """Merge b over a: mappings key by key, all else replaced."""
+    if not (isinstance(a, dict) and isinstance(b, dict)):
+        return b
+    return a | {key: _merge(a[key], value) if key in a else value for key, value in b.items()}
+
+
+def parse(text: str, file: str) -> Document:
+    """Parse YAML text; ``file`` is its name for positions and messages.
 
     Raises:
-        InputError: Not valid YAML.
+        InputError: Not valid YAML, or outside the bounds.
     """
-    data, _ = parse(text, with_what, override=True)
-    return data
+    try:
+        node = yaml.compose(text, Loader=CoreLoader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = file if mark is None else f"{file}:{mark.line + 1}:{mark.column + 1}"
+        if "nesting depth" in str(error.problem):
+            raise _too_deep(place) from error
+        problem = " ".join(part for part in (error.context, error.problem) if part)
+        raise InputError(
+            f"{place}: not valid YAML: {problem}",
+            "correct the syntax (indentation, colon, quote or bracket)",
+        ) from error
+    except RecursionError as error:  # of the loader that is not compiled
+        raise _too_deep(file) from error
+    except yaml.YAMLError as error:
+        raise InputError(
+            f"{file}: not valid YAML: {error}", "save the file as plain UTF-8 text"
+        ) from error
+    builder = _Builder(file)
+    data = None if node is None else builder.build(node, (), ())
+    return Document(data, builder.marks, file)
+
+
+def _too_deep(place: object) -> InputError:
+    return InputError(f"{place}: nested deeper than {MOST_LEVELS} levels", "flatten the file")
+
+
+class _Builder:
+    """Turns a node tree into plain data and positions, within bounds."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+        self.marks: dict[Key, Mark] = {}
+        self.n_values = 0
+
+    def position(self, node: yaml.Node) -> Mark:
+        return Mark(self.file, node.start_mark.line + 1, node.start_mark.column + 1)
+
+    def error(self, node: yaml.Node, message: str, hint: str) -> InputError:
+        return InputError(f"{self.position(node)}: {message}", hint)
+
+    def build(self, node: yaml.Node, loc: Key, parents: tuple[yaml.Node, ...]) -> Any:
+        """Return the data of a node at a path, below the nodes that hold it."""
+        self.n_values += 1
+        if not YAML_VALUES.holds(self.n_values):
+            raise self.error(
+                node,
+                f"more than {YAML_VALUES.high:.0f} values once aliases are expanded",
+                "remove nested aliases, split the file, or use a data file",
+            )
+        if node in parents:
+            raise self.error(node, "an alias that contains itself", "remove the recursive alias")
+        if len(parents) > MOST_LEVELS:
+            raise _too_deep(self.position(node))
+        self.marks.setdefault(loc, self.position(node))
+        below = (*parents, node)
+        if node.tag == f"{TAG}seq":
+            return [self.build(child, (*loc, i), below) for i, child in enumerate(node.value)]
+        if node.tag != f"{TAG}map":
+            return self.scalar(node)
+        data: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            name = self.key(key_node)
+            if name in data:
+                raise self.error(
+                    key_node,
+                    f"duplicate key {name!r}, first at line {self.marks[(*loc, name)].line}",
+                    "keep one of the two",
+                )
+            self.marks[(*loc, name)] = self.position(key_node)
+            data[name] = self.build(value_node, (*loc, name), below)
+        return data
+
+    def key(self, node: yaml.Node) -> str:
+        if node.value == "<<":
+            raise self.error(node, "the merge key '<<'", "use extends: or write the keys out")
+        if node.tag not in (f"{TAG}str", f"{TAG}int"):
+            raise self.error(node, "a key that is not text", "write keys as plain words")
+        return str(self.scalar(node))
+
+    def scalar(self, node: yaml.Node) -> Any:
+        text = str(node.value)
+        try:
+            match node.tag.removeprefix(TAG):
+                case "str":
+                    return text
+                case "null":
+                    return None
+                case "bool":
+                    return text.lower() == "true"
+                case "int":
+                    return int(text, 0) if text.startswith(("0x", "0o")) else int(text)
+                case "float":
+                    number = float(
+                        text.replace("_", "").lower().replace(".inf", "inf").replace(".nan", "nan")
+                    )
+                    if math.isfinite(number):
+                        return number
+        except ValueError as error:
+            raise self.error(node, f"{text!r} is not a number", "correct the number") from error
+        if node.tag == f"{TAG}float":
+            raise self.error(node, f"the number {text}", "give a finite number")
+        raise self.error(node, f"the tag {node.tag!r}", "use plain YAML values without tags")
 
 
 def apply_overrides(
-    document: Document,
-    overrides: Sequence[str],
-    origin: str = "--set",
+    document: Document, overrides: Sequence[str], origin: str = "--set"
 ) -> Document:
     """Set dotted keys: ``road.lane_width_m=3.2``, ``actors.lead.speed_mps=8`` (list items by index
     or by their ``id``).
 
     Raises:
-        InputError: An override without ``=``, a path through a scalar, or a list item that does not
-            exist.
+        InputError: An override without ``=`` or whose value is not valid YAML, a path through a
+            scalar, or a list item that does not exist.
     """
-    if not overrides:
-        return document
-    data, marks = _copy(document.data), dict(document.marks)
+    data = copy.deepcopy(document.data)
+    marks = dict(document.marks)
     for text in overrides:
-        key, equals, value_text = text.partition("=")
         where = f"{origin} {text}"
+        key, equals, value = text.partition("=")
         if not equals or not key.strip():
             raise InputError(
                 f"{where}: no KEY=VALUE", "write for example --set road.lane_width_m=3.2"
             )
-        value = parse_scalar(value_text, where)
-        loc, before = _assign(data, key.strip(), value, where)
-        for old in _paths(before, loc):
-            marks.pop(old, None)
+        loc = _assign(data, key.strip().split("."), parse(value, where).data, where)
+        marks = {other: mark for other, mark in marks.items() if other[: len(loc)] != loc}
         marks[loc] = Mark(where, 0, 0)
-    return Document(data, marks, document.path, document.sources, (*document.overrides, *overrides))
+    return Document(data, marks, document.path)
 
 
-def _load(path: Path, chain: tuple[Path, ...], read: list[Path]) -> Document:
-    """Read a file and its bases; ``read`` counts every reading: files that name each other twice
-    double at each step.
-    """
-    resolved = path.resolve()
-    if resolved in chain:
-        raise InputError(
-            f"{path}: extends itself through {' -> '.join(str(p) for p in chain)}",
-            "break the cycle of extends",
-        )
-    read.append(resolved)
-    if len(read) > MOST_READ:
-        raise InputError(
-            f"{path}: more than {MOST_READ} files to read, {len(set(read))} different ones",
-            "name each base once in extends",
-        )
-    raw = read_bytes(path, YAML_BYTES)
-    try:
-        text = raw.decode("utf-8")
-    except UnicodeDecodeError as e:
-        raise InputError(
-            f"{path}: byte {e.start} is not UTF-8", "save the file as UTF-8 text"
-        ) from e
-    data, marks = parse(text, str(path))
-    sources: list[tuple[str, str]] = []
-    if isinstance(data, dict) and "extends" in data:
-        at = marks.get(("extends",), Mark(str(path), 1, 1))
-        names = data.pop("extends")
-        marks = {k: m for k, m in marks.items() if k[:1] != ("extends",)}
-        names = [names] if isinstance(names, str) else names
-        if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
-            raise InputError(
-                f"{at}: extends: {names!r}", "give a list of paths, relative to this file"
-            )
-        merged: Any = {}
-        merged_marks: dict[Key, Mark] = {}
-        for name in names:
-            base_path = resolved.parent / name
-            if not base_path.is_file():
-                raise InputError(
-                    f"{at}: extends {name!r}, but {base_path} does not exist",
-                    "correct the path",
-                )
-            base = _load(base_path, (*chain, resolved), read)
-            merged, merged_marks = _merged(merged, merged_marks, base.data, base.marks)
-            sources.extend(base.sources)
-        data, marks = _merged(merged, merged_marks, data, marks)
-    sources.append((str(path), hashlib.sha256(raw).hexdigest()))
-    return Document(data, marks, str(path), tuple(sources))
-
-
-def _merged(
-    a: Any, a_marks: Mapping[Key, Mark], b: Any, b_marks: Mapping[Key, Mark]
-) -> tuple[Any, dict[Key, Mark]]:
-    """Merge b over a, with the positions of what is left of both."""
-    replaced: set[Key] = set()
-    data = _merge(a, b, (), replaced)
-    kept = {
-        key: mark
-        for key, mark in a_marks.items()
-        if not any(key[:n] in replaced for n in range(len(key) + 1))
-    }
-    return data, {**kept, **b_marks}
-
-
-def _merge(a: Any, b: Any, loc: Key, replaced: set[Key]) -> Any:
-    """Merge b over a: mappings key by key, all else replaced; notes the paths that were."""
-    if not (isinstance(a, dict) and isinstance(b, dict)):
-        replaced.add(loc)
-        return b
-    return a | {
-        key: _merge(a[key], value, (*loc, key), replaced) if key in a else value
-        for key, value in b.items()
-    }
-
-
-def _copy(data: Any) -> Any:
-    if isinstance(data, dict):
-        return {k: _copy(v) for k, v in data.items()}
-    return [_copy(v) for v in data] if isinstance(data, list) else data
-
-
-def _assign(data: Any, key: str, value: Any, where: str) -> tuple[Key, Any]:
-    """Set a dotted key in place; return its path and what stood there, None if nothing did."""
-    parts = key.split(".")
-    loc: list[str | int] = []
-    node, before = data, None
-    for n, part in enumerate(parts):
-        last = n == len(parts) - 1
-        if isinstance(node, dict):
-            step: str | int = part
-            if not last:
-                node.setdefault(part, {})
-        elif isinstance(node, list):
-            step = _item(node, part, where)
-        else:
-            raise InputError(
-                f"{where}: {'.'.join(map(str, loc)) or 'the file'} holds a value, not keys",
-                "shorten the path",
-            )
-        loc.append(step)
-        if last:
-            before = node.get(step) if isinstance(node, dict) else node[int(step)]
-            node[step] = value
-        else:
+def _assign(data: Any, keys: list[str], value: Any, where: str) -> Key:
+    """Set a dotted key in place; return its path."""
+    loc: Key = ()
+    node = data
+    for n, key in enumerate(keys, 1):
+        step: Any = key
+        if isinstance(node, list):
+            step = _item(node, key, where)
+        elif not isinstance(node, dict):
+            raise InputError(f"{where}: {dotted(loc)} holds a value, not keys", "shorten the path")
+        elif n < len(keys):
+            node.setdefault(key, {})
+        loc = (*loc, step)
+        if n < len(keys):
             node = node[step]
-    return tuple(loc), before
+    node[step] = value
+    return loc
 
 
-def _paths(value: Any, loc: Key) -> Iterator[Key]:
-    """Yield the path of a value and of everything in it."""
-    yield loc
-    inside = (
-        value.items()
-        if isinstance(value, dict)
-        else enumerate(value)
-        if isinstance(value, list)
-        else ()
-    )
-    for key, child in inside:
-        yield from _paths(child, (*loc, key))
-
-
-def _item(items: list[Any], part: str, where: str) -> int:
+def _item(items: list[Any], key: str, where: str) -> int:
+    """Return the index of the list item that a key names by its ``id`` or its index."""
     ids = [item.get("id") if isinstance(item, dict) else None for item in items]
-    if part in ids:
-        return ids.index(part)
-    if part.isdecimal() and int(part) < len(items):
-        return int(part)
-    known = ", ".join(str(i) for i in ids if i) or f"0..{len(items) - 1}"
-    raise InputError(f"{where}: no list item {part!r}", f"use one of: {known}")
+    if key in ids:
+        return ids.index(key)
+    if key.isdecimal() and int(key) < len(items):
+        return int(key)
+    known = ", ".join(str(name) for name in ids if name) or f"0..{len(items) - 1}"
+    raise InputError(f"{where}: no list item {key!r}", f"use one of: {known}")
 
 
-EXAMINED, EXPLAINED = 200, 4  # problems of one file: those put in order, and those put into words
-M = TypeVar("M", bound=BaseModel)
+def dotted(loc: Sequence[str | int]) -> str:
+    """Write a key path as ``actors[0].speed_mps``."""
+    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)
+    return text.removeprefix(".") or "the file"
 
 
 def validate(model: type[M], document: Document) -> M:
@@ -226,215 +330,116 @@ def validate(model: type[M], document: Document) -> M:
         InputError: The first problem in file order, with its position and a hint; the others are
             listed after it.
     """
-    _refuse_non_finite(document, document.data, ())
     try:
         # JSON mode is strict about types and still lets a list fill a tuple.
         return model.model_validate_json(json.dumps(document.data), strict=True)
-    except ValidationError as e:
-        raise _as_input_error(model, document, e) from None
-
-
-def _refuse_non_finite(document: Document, data: Any, loc: Key) -> None:
-    if isinstance(data, dict):
-        for key, value in data.items():
-            _refuse_non_finite(document, value, (*loc, key))
-    elif isinstance(data, list):
-        for i, value in enumerate(data):
-            _refuse_non_finite(document, value, (*loc, i))
-    elif isinstance(data, float) and not math.isfinite(data):
-        raise document.error(loc, f"{dotted(loc)} = {data}", "give a finite number")
-
-
-def dotted(loc: Sequence[str | int]) -> str:
-    """Write a key path as ``actors[0].speed_mps``."""
-    out = ""
-    for part in loc:
-        out += f"[{part}]" if isinstance(part, int) else f".{part}" if out else str(part)
-    return out or "the file"
-
-
-def _as_input_error(
-    model: type[BaseModel], document: Document, error: ValidationError
-) -> InputError:
-    items = error.errors(include_url=False)[:EXAMINED]
+    except ValidationError as error:
+        problems = error.errors(include_url=False)
+    # Wrong items make a list too short, and a misspelt key leaves the right one missing.
+    problems = [p for p in problems if p["type"] != "too_short"] or problems
     placed = []
-    for item in items:
-        loc = tuple(item["loc"])
-        if not _follows_from_another(item, items):
-            known = _in_document(document.data, loc)
-            placed.append((document.mark(known), item, loc, known))
-    # File order, so that the first problem shown is the first that a reader of the file meets.
-    placed.sort(key=lambda p: (p[0].file, p[0].line, p[0].column))
-    texts = [
-        (mark, *_explain(model, document, item, loc, known))
-        for mark, item, loc, known in placed[:EXPLAINED]
+    for problem in problems[:MOST_PROBLEMS]:
+        loc = _in_document(document.data, problem["loc"])
+        is_missing = problem["type"] == "missing"
+        placed.append((is_missing, document.mark(loc), len(placed), loc, problem))
+    placed.sort(key=lambda place: place[:3])
+    shown = [
+        (mark, *_explain(model, problem, loc))
+        for _, mark, _, loc, problem in placed[:SHOWN_PROBLEMS]
     ]
-    mark, found, hint = texts[0]
-    if len(placed) > 1:
-        rest = "; ".join(f"{m}: {f}" for m, f, _ in texts[1:])
-        found = f"{shorten(found, 180)} (and {error.error_count() - len(items) + len(placed) - 1} more: {rest})"
-    return InputError(f"{mark}: {found}", hint)
-
-
-def _follows_from_another(item: Any, items: Sequence[Any]) -> bool:
-    """Say whether a problem is only the shadow of another one.
-
-    A list whose items are wrong counts as too short as well; a misspelt key leaves the right one
-    missing.
-    """
-    loc = tuple(item["loc"])
-    if item["type"] == "too_short":
-        return any(len(o["loc"]) > len(loc) and tuple(o["loc"][: len(loc)]) == loc for o in items)
-    if item["type"] == "missing":
-        extra = [
-            str(o["loc"][-1])
-            for o in items
-            if o["type"] == "extra_forbidden" and tuple(o["loc"][:-1]) == loc[:-1]
-        ]
-        return bool(difflib.get_close_matches(str(loc[-1]), extra, n=1, cutoff=0.6))
-    return False
+    mark, message, hint = shown[0]
+    if len(problems) > 1:
+        rest = "; ".join(f"{mark}: {message}" for mark, message, _ in shown[1:])
+        message = f"{shorten(message, 180)} (and {len(problems) - 1} more: {rest})"
+    raise InputError(f"{mark}: {message}", hint)
 
 
 def _in_document(data: Any, loc: Key) -> Key:
     """Drop the parts of a pydantic location that are union tags or missing keys."""
-    out: list[str | int] = []
+    present: Key = ()
     for part in loc:
-        if isinstance(data, dict) and part in data:
-            data = data[str(part)]
-        elif isinstance(data, list) and isinstance(part, int) and part < len(data):
+        is_key = isinstance(data, dict) and part in data
+        if is_key or (isinstance(data, list) and isinstance(part, int) and part < len(data)):
             data = data[part]
-        else:
-            continue
-        out.append(part)
-    return tuple(out)
+            present = (*present, part)
+    return present
 
 
-def _explain(
-    model: type[BaseModel], document: Document, item: Any, loc: Key, known: Key
-) -> tuple[str, str]:
-    kind = item["type"]
-    ctx = item.get("ctx", {})
-    value = item.get("input")
-    name = dotted(known)
+def _explain(model: type[BaseModel], problem: Any, loc: Key) -> tuple[str, str]:
+    """Return message and hint of a problem at a path of the document."""
+    kind = problem["type"]
+    context = problem.get("ctx", {})
+    name = dotted(loc)
+    last = str(problem["loc"][-1]) if problem["loc"] else ""
     if kind == "extra_forbidden":
-        keys = sorted({k for m in _models_at(model, loc[:-1]) for k in m.model_fields})
-        near = difflib.get_close_matches(str(loc[-1]), keys, n=1, cutoff=0.6)
-        hint = f"did you mean {near[0]!r}? " if near else ""
-        place = f"in {dotted(known[:-1])}" if known[:-1] else "at the top level"
-        return f"unknown key {str(loc[-1])!r} {place}", f"{hint}valid keys: {', '.join(keys)}"
+        keys = sorted({k for m in _models_at(model, problem["loc"][:-1]) for k in m.model_fields})
+        return f"unknown key {last!r} in {dotted(loc[:-1])}", _nearest(last, keys)
     if kind == "missing":
-        return f"{name} has no {str(loc[-1])!r}", f"add {loc[-1]}: {_wanted(model, loc)}"
-    if kind in ("union_tag_invalid", "literal_error", "enum"):
-        given = str(ctx.get("tag", value))
-        options = [
-            o.strip("' ")
-            for o in str(ctx.get("expected_tags") or ctx.get("expected", ""))
-            .replace(" or ", ", ")
-            .split(",")
-        ]
-        near = difflib.get_close_matches(given, options, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]!r}? " if near else ""
-        key = (
-            f"{name}.{str(ctx['discriminator']).strip(chr(39))}" if "discriminator" in ctx else name
-        )
-        return f"{key} is {given!r}", f"{hint}valid: {', '.join(options)}"
+        fields = [m.model_fields.get(last) for m in _models_at(model, problem["loc"][:-1])]
+        wanted = next((field.description for field in fields if field), None) or "see the schema"
+        return f"{name} has no {last!r}", f"add {last}: {wanted.partition('. ')[0].rstrip('.')}"
+    if kind in ("union_tag_invalid", "literal_error"):
+        value = str(context.get("tag", problem["input"]))
+        expected = str(context.get("expected_tags") or context["expected"])
+        choices = [choice.strip("' ") for choice in re.split(", | or ", expected)]
+        key = f"{name}.kind" if "tag" in context else name
+        return f"{key} is {value!r}", _nearest(value, choices)
     if kind == "union_tag_not_found":
-        options = sorted({str(t) for m in _models_at(model, loc) for t in _tags(m)})
-        return f"{name} has no 'kind'", f"add kind: {' | '.join(options)}"
-    if kind in ("value_error", "assertion_error"):
-        text = str(ctx.get("error", item["msg"]))
-        found, _, hint = text.partition(" | ")
-        return f"{name}: {found}", hint or "correct the value"
-    if kind.endswith("_type") or kind.endswith("_parsing"):
-        return (
-            f"{name} = {_short(value)} ({_kind_of(value)})",
-            f"{item['msg'].replace('Input should be', 'give')}",
-        )
-    if kind in ("too_short", "too_long"):
-        bound = (
-            f"at least {ctx['min_length']}"
-            if kind == "too_short"
-            else f"at most {ctx['max_length']}"
-        )
-        return f"{name} = {_short(value)}", f"give {bound} item{'s' if bound[-2:] != ' 1' else ''}"
-    return f"{name} = {_short(value)}", item["msg"].replace(
-        "Input should be", "give a value"
-    ).replace("Input should", "the value should")
+        kinds = sorted({str(tag) for m in _models_at(model, problem["loc"]) for tag in _tags(m)})
+        return f"{name} has no 'kind'", f"add kind: {' | '.join(kinds)}"
+    if kind == "value_error":
+        message, _, hint = str(context["error"]).partition(" | ")
+        return f"{name}: {message}", hint or "correct the value"
+    message = problem["msg"]
+    return (
+        f"{name} = {shorten(repr(problem['input']), 80)}",
+        message.replace("Input should be", "give").replace("Input should", "the value should"),
+    )
 
 
-def _short(value: Any) -> str:
-    """Write a value of a file; only the beginning of a long list or object."""
-    if isinstance(value, list | dict) and len(value) > 8:
-        return f"{'list' if isinstance(value, list) else 'keys'} of {len(value)}"
-    return shorten(repr(value), 80)
+def _nearest(name: str, choices: Sequence[str]) -> str:
+    """Return a hint that names the nearest of the valid choices, and all of them."""
+    near = difflib.get_close_matches(name, choices, n=1, cutoff=0.5)
+    return f"{f'did you mean {near[0]!r}? ' if near else ''}valid: {', '.join(choices)}"
 
 
-def _kind_of(value: Any) -> str:
-    names = {
-        dict: "keys",
-        list: "a list",
-        str: "text",
-        bool: "true or false",
-        int: "a whole number",
-        float: "a number",
-    }
-    return names.get(type(value), "nothing")
-
-
-def _wanted(model: type[BaseModel], loc: Key) -> str:
-    for m in _models_at(model, loc[:-1]):
-        field = m.model_fields.get(str(loc[-1]))
-        if field is not None:
-            return (field.description or "see the schema").split(". ")[0].rstrip(".")
-    return "see the schema"
-
-
-def _tags(model: type[BaseModel]) -> list[Any]:
-    field = model.model_fields.get("kind")
-    return list(get_args(field.annotation)) if field is not None else []
-
-
-def _models_at(model: type[BaseModel], loc: Key) -> list[type[BaseModel]]:
+def _models_at(model: Any, loc: Key) -> list[type[BaseModel]]:
     """Return the models that may stand at a pydantic location (several where a union is not decided
     by a tag).
     """
-    current: list[Any] = [model]
+    options = [model]
     for part in loc:
-        current = [deeper for node in current for deeper in _step(node, part)]
-    return [m for node in current for m in _unwrap(node)]
+        options = [below for option in options for below in _below(option, part)]
+    return [option for option in options if _is_model(option)]
 
 
-def _step(node: Any, part: str | int) -> Iterator[Any]:
-    if isinstance(part, int):
-        for plain in _plain(node):
-            if get_origin(plain) in (list, tuple):
-                yield from [a for a in get_args(plain) if a is not Ellipsis][:1]
-        return
-    models = list(_unwrap(node))
-    tagged = [m for m in models if part in _tags(m)]
-    if tagged:
-        yield from tagged
-        return
-    for m in models:
-        if part in m.model_fields:
-            yield m.model_fields[part].annotation
-    for plain in _plain(node):
-        if get_origin(plain) is dict:
-            yield get_args(plain)[1]
+def _below(option: Any, part: str | int) -> Iterator[Any]:
+    """Yield the plain types that may stand at a key, an index or a union's tag below a type."""
+    arguments = get_args(option)
+    if isinstance(part, int) or get_origin(option) is dict:
+        yield from _plain(arguments[-1 if get_origin(option) is dict else 0]) if arguments else ()
+    elif _is_model(option) and part in _tags(option):
+        yield option
+    elif _is_model(option) and part in option.model_fields:
+        yield from _plain(option.model_fields[part].annotation)
 
 
 def _plain(annotation: Any) -> Iterator[Any]:
+    """Yield the types that an annotation allows, without ``Annotated`` and unions."""
     origin = get_origin(annotation)
     if origin is Annotated:
         yield from _plain(get_args(annotation)[0])
-    elif origin in (Union, pytypes.UnionType):
+    elif origin in (Union, types.UnionType):
         for option in get_args(annotation):
             yield from _plain(option)
     elif origin is not Literal:
         yield annotation
 
 
-def _unwrap(annotation: Any) -> Iterator[type[BaseModel]]:
-    for plain in _plain(annotation):
-        if isinstance(plain, type) and issubclass(plain, BaseModel):
-            yield plain
+def _is_model(option: Any) -> bool:
+    return isinstance(option, type) and issubclass(option, BaseModel)
+
+
+def _tags(model: type[BaseModel]) -> tuple[Any, ...]:
+    field = model.model_fields.get("kind")
+    return () if field is None else get_args(field.annotation)

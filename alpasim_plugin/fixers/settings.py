@@ -11,9 +11,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from alpasim_plugin.core.config import apply_overrides, load_yaml, validate
+from alpasim_plugin.core.config import Document, apply_overrides, load_yaml, validate
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.yaml_positions import Document
 from alpasim_plugin.fixers.network import schedule
 
 DOING = "reading the settings of a fixer"
@@ -295,7 +294,7 @@ def _override(document: Document, overrides: Sequence[str]) -> Document:
     )
     done = apply_overrides(nested, [f"fixer.{text}" for text in overrides])
     marks = {loc[1:]: mark for loc, mark in done.marks.items()}
-    return Document(done.data["fixer"], marks, document.path, document.sources, tuple(overrides))
+    return Document(done.data["fixer"], marks, document.path)
 
 
 def _absolute(document: Document) -> Document:

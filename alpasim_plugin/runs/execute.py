@@ -17,8 +17,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.core import kernels
-from alpasim_plugin.core.cache import cache_root, cached
+from alpasim_plugin.core import kernels, places
+from alpasim_plugin.core.cache import cached
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.parts.source import package_digest
@@ -60,7 +60,7 @@ def compile_for(todo: Sequence[Cell], scenarios: Mapping[str, Scenario], workers
 
 def is_cold(subject: str) -> bool:
     """Tell whether the kernels of a subject are still to be compiled."""
-    return not (cache_root() / KERNELS / _key(subject)).exists()
+    return not (places.cache() / KERNELS / _key(subject)).exists()
 
 
 def needed(todo: Iterable[Cell], scenarios: Mapping[str, Scenario]) -> list[str]:

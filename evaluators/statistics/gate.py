@@ -13,9 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from alpasim_plugin.core.config import load_yaml, validate
+from alpasim_plugin.core.config import Document, load_yaml, validate
 from alpasim_plugin.core.errors import EvaluatorError, InputError
-from alpasim_plugin.core.yaml_positions import Document
 from alpasim_plugin.log.run_folder.sides import (
     RolloutTable,
     Row,

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.core.cache import cache_root
 from alpasim_plugin.core.kernels import SUBJECTS
+from alpasim_plugin.core.places import cache
 from alpasim_plugin.runs.execute import KERNELS, compile_for, compile_kernels, needed
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from scenarios.suite import ScenarioRef
@@ -43,11 +43,11 @@ def test_one_worker_compiles_while_it_drives_and_two_beforehand(
     monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path))
     plan = plan_of("clean")
     compile_for(plan.cells, plan.scenarios, 1)
-    assert not (cache_root() / KERNELS).exists()
+    assert not (cache() / KERNELS).exists()
     compile_kernels("rasteriser")
-    assert [
-        path.name.split("-")[0] for path in (cache_root() / KERNELS).iterdir() if path.is_dir()
-    ] == ["rasteriser"]
+    assert [path.name.split("-")[0] for path in (cache() / KERNELS).iterdir() if path.is_dir()] == [
+        "rasteriser"
+    ]
     before = sys.modules.copy()
     compile_for(plan.cells, plan.scenarios, 2)  # nothing is left to do: no process is started
     assert sys.modules.keys() == before.keys()

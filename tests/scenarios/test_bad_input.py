@@ -61,7 +61,7 @@ def test_the_good_file_is_good(tmp_path: Path) -> None:
             "unknown key 'lenght_m'",
             "did you mean 'length_m'?",
         ),
-        (swap("length_m: 200", "length_m: long"), ":4:24", "length_m = 'long' (text)", "number"),
+        (swap("length_m: 200", "length_m: long"), ":4:24", "length_m = 'long'", "number"),
         (
             swap("length_m: 200", "length_m: -5"),
             ":4:24",
@@ -145,9 +145,9 @@ def test_the_good_file_is_good(tmp_path: Path) -> None:
         (GOOD + "scene_id: 'a b/c'\n", ":8:1", "scene_id = 'a b/c'", "match"),
         (GOOD + "seed: -1\n", ":8:1", "seed = -1", "greater than or equal to 0"),
         (GOOD + "seed: 1.5\n", ":8:1", "seed = 1.5", "integer"),
-        ("", ":1:1", "nothing", "object"),
+        ("", ":1:1", "None", "object"),
         ("version: 1\nscenarios: [a.yaml]\n", ":2:1", "a suite, not a scenario", "load_suite"),
-        ("just words\n", ":1:1", "'just words' (text)", "object"),
+        ("just words\n", ":1:1", "'just words'", "object"),
     ],
 )
 def test_wrong_content_is_placed_and_explained(

@@ -19,7 +19,7 @@ def test_files_that_extend_the_next_one_four_times_are_refused(tmp_path: Path) -
     for i in range(DEPTH):
         (tmp_path / f"{i}.yaml").write_text(f"extends: [{', '.join([f'{i + 1}.yaml'] * 4)}]\n")
     (tmp_path / f"{DEPTH}.yaml").write_text("a: 1\n")
-    with pytest.raises(InputError, match=r"more than 64 files to read, 13 different ones"):
+    with pytest.raises(InputError, match=r"more than 64 files"):
         load_yaml(tmp_path / "0.yaml")
 
 

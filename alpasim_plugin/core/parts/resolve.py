@@ -15,7 +15,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from alpasim_plugin.core.config import apply_overrides, validate
+from alpasim_plugin.core.config import Document, apply_overrides, validate
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Declaration
 from alpasim_plugin.core.lazy import installed, installed_names
@@ -38,7 +38,6 @@ from alpasim_plugin.core.parts.spec import (
     file_digest,
     part_digest,
 )
-from alpasim_plugin.core.yaml_positions import Document
 
 
 @dataclass(frozen=True)

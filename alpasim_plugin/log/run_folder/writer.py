@@ -20,7 +20,6 @@ import pyarrow.parquet as pq
 from alpasim_plugin.core.atomic import atomic_file, write_bytes, write_json
 from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.lock import one_writer
-from alpasim_plugin.core.processes import is_running
 from alpasim_plugin.core.types import F64, Actor, Scenario, Scene
 from alpasim_plugin.log.run_folder.schema import (
     KEYS,
@@ -82,7 +81,7 @@ def remove_left_overs(root: Path, before_ns: int | None = None) -> list[Path]:
             continue
         for name in [*files, *folders]:
             matched = _TEMPORARY.fullmatch(name)
-            if matched is None or is_running(int(matched[1])):
+            if matched is None or _is_running(int(matched[1])):
                 continue
             path = here / name
             if before_ns is not None and path.lstat().st_mtime_ns >= before_ns:
@@ -294,3 +293,14 @@ def _actor(scenario: Scenario | LoggedScene, actor: Actor) -> dict[str, Any]:
 def _xy(line: F64) -> list[list[float]]:
     rounded: list[list[float]] = np.round(line[:, :2], 2).tolist()
     return rounded
+
+
+def _is_running(pid: int) -> bool:
+    """Tell whether this machine has a process of this number."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # another user's
+        return True
+    return True
