@@ -7,9 +7,6 @@ lengths metres.
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 
@@ -45,28 +42,19 @@ def yaw_from_quat(quat: npt.ArrayLike) -> F64:
 
 def matrix_from_quat(quat: npt.ArrayLike) -> F64:
     """Return rotation matrices ``(..., 3, 3)`` of unit quaternions ``(..., 4)``."""
-    q = np.asarray(quat, dtype=np.float64)
-    w = q[..., 0]
-    x = q[..., 1]
-    y = q[..., 2]
-    z = q[..., 3]
-    m = np.empty((*q.shape[:-1], 3, 3))
-    m[..., 0, 0], m[..., 0, 1], m[..., 0, 2] = (
+    w, x, y, z = np.moveaxis(np.asarray(quat, dtype=np.float64), -1, 0)
+    entries = [
         1 - 2 * (y * y + z * z),
         2 * (x * y - w * z),
         2 * (x * z + w * y),
-    )
-    m[..., 1, 0], m[..., 1, 1], m[..., 1, 2] = (
         2 * (x * y + w * z),
         1 - 2 * (x * x + z * z),
         2 * (y * z - w * x),
-    )
-    m[..., 2, 0], m[..., 2, 1], m[..., 2, 2] = (
         2 * (x * z - w * y),
         2 * (y * z + w * x),
         1 - 2 * (x * x + y * y),
-    )
-    return m
+    ]
+    return np.stack(entries, axis=-1).reshape(*w.shape, 3, 3)
 
 
 def quat_from_matrix(rotation: npt.ArrayLike) -> F64:
@@ -75,58 +63,22 @@ def quat_from_matrix(rotation: npt.ArrayLike) -> F64:
     Takes the largest of the four candidate components, so it is stable at 180 degrees (Shepperd
     1978).
     """
-    r = np.asarray(rotation, dtype=np.float64)
-    batch = r.shape[:-2]
-    m = r.reshape(-1, 9)
-    if len(m) == 1:
-        return np.array(_quat_of(*m.ravel().tolist())).reshape(*batch, 4)
-    trace = m[:, 0] + m[:, 4] + m[:, 8]
-    largest = np.argmax(np.stack([trace, m[:, 0], m[:, 4], m[:, 8]], axis=1), axis=1)
-    quat = np.empty((len(m), 4))
-    for k in range(4):
-        rows = np.flatnonzero(largest == k)
-        if len(rows):
-            quat[rows] = np.stack(_long_quat(k, *m[rows].T), axis=1)
-    quat = quat / np.linalg.norm(quat, axis=1, keepdims=True)
-    quat = np.where(quat[:, :1] < 0, -quat, quat)
-    return np.asarray(quat.reshape(*batch, 4), dtype=np.float64)
-
-
-def _long_quat(
-    largest: int, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any, i: Any
-) -> tuple[Any, Any, Any, Any]:
-    """Return the quaternion, not yet of unit length, of matrices given row by row, of whose
-    candidates one is known to be the largest.
-    """
-    if largest == 0:
-        return 1 + (a + e + i), h - f, c - g, d - b
-    if largest == 1:
-        return h - f, 1 + a - e - i, b + d, c + g
-    if largest == 2:
-        return c - g, d + b, 1 + e - i - a, f + h
-    return d - b, g + c, h + f, 1 + i - a - e
-
-
-def _quat_of(
-    a: float, b: float, c: float, d: float, e: float, f: float, g: float, h: float, i: float
-) -> tuple[float, float, float, float]:
-    """Return the quaternion of one matrix, given row by row: the arithmetic of `quat_from_matrix`
-    without arrays, a tenth of its time.
-    """
+    m = np.asarray(rotation, dtype=np.float64)
+    batch = m.shape[:-2]
+    a, b, c, d, e, f, g, h, i = m.reshape(-1, 9).T
     trace = a + e + i
-    candidates = (trace, a, e, i)
-    largest = (
-        candidates.index(max(candidates)) if trace == trace else 0
-    )  # NaN is the largest, as for arrays
-    w, x, y, z = _long_quat(largest, a, b, c, d, e, f, g, h, i)
-    norm = math.sqrt(w * w + x * x + y * y + z * z)
-    if norm == 0.0:
-        return math.nan, math.nan, math.nan, math.nan
-    w = w / norm
-    x = x / norm
-    y = y / norm
-    z = z / norm
-    return (-w, -x, -y, -z) if w < 0 else (w, x, y, z)
+    largest = np.argmax([trace, a, e, i], axis=0)
+    candidates = np.array(
+        [
+            [1 + trace, h - f, c - g, d - b],
+            [h - f, 1 + a - e - i, b + d, c + g],
+            [c - g, d + b, 1 + e - i - a, f + h],
+            [d - b, g + c, h + f, 1 + i - a - e],
+        ]
+    )
+    quat = candidates[largest, :, np.arange(len(largest))]
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    return np.where(quat[:, :1] < 0, -quat, quat).reshape(*batch, 4)
 
 
 def se3(xyz: npt.ArrayLike, quat: npt.ArrayLike) -> F64:

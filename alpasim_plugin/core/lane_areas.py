@@ -4,20 +4,23 @@ policy needs no shapely.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 
 from alpasim_plugin.core.types import F64, Lane
 
 HALF_WIDTH_M = 1.85
+WORLD_ORIGIN = np.zeros(3)
 
 
-def lane_polygon(lane: Lane, half_width_m: float = HALF_WIDTH_M) -> Any:
+def lane_polygon(
+    lane: Lane,
+    half_width_m: float = HALF_WIDTH_M,
+    even_odd: bool = False,
+    origin: F64 = WORLD_ORIGIN,
+) -> Any:
     """Return the plan-view area of a lane as a shapely Polygon or MultiPolygon (empty where nothing
     has area).
 
@@ -29,57 +32,27 @@ def lane_polygon(lane: Lane, half_width_m: float = HALF_WIDTH_M) -> Any:
     Args:
         lane: The lane; coordinates in metres, world.
         half_width_m: Buffer of the centre where an edge is missing.
+        even_odd: What the ring winds round twice is a hole, as in AlpaSim.
+        origin: ``(3,)`` world point that becomes (0, 0) of the area.
     """
     if lane.left is None or lane.right is None:
-        xy = np.ascontiguousarray(lane.centre[:, :2])
+        xy = np.ascontiguousarray(lane.centre[:, :2] - origin[:2])
         line = shapely.linestrings(xy) if len(xy) > 1 else shapely.points(xy[0])
         return shapely.buffer(line, half_width_m, quad_segs=16)
-    return ring_area(np.concatenate([lane.left[:, :2], lane.right[::-1, :2]]))
+    ring = np.concatenate([lane.left[:, :2], lane.right[::-1, :2]])
+    return ring_area(ring - origin[:2], even_odd)
 
 
-def lane_polygons(
-    lanes: Sequence[Lane], origin: F64, half_width_m: float = HALF_WIDTH_M, even_odd: bool = False
-) -> npt.NDArray[Any]:
-    """Return the areas ``(L,)`` of lanes, as `lane_polygon` gives them for lanes moved to an origin
-    ``(3,)``, all in a few calls.
-
-    By ``even_odd`` what a ring winds round twice is a hole, as in AlpaSim.
-    """
-    out = np.full(len(lanes), None, dtype=object)
-    edged = [
-        (k, one.left[:, :2], one.right[::-1, :2])
-        for k, one in enumerate(lanes)
-        if one.left is not None and one.right is not None
-    ]
-    rings = {
-        k: np.concatenate([left, right]) for k, left, right in edged if len(left) + len(right) > 2
-    }
-    if rings:
-        ringed = np.array(list(rings))
-        owner = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings.values()])
-        out[ringed] = shapely.polygons(
-            shapely.linearrings(np.concatenate(list(rings.values())) - origin[:2], indices=owner)
-        )
-        for k in ringed[~shapely.is_valid(out[ringed])]:
-            out[k] = areal_parts(shapely.make_valid(out[k])) if even_odd else _wound(out[k])
-    for k in [k for k, area in enumerate(out) if area is None]:
-        left, right = (
-            None if edge is None else edge - origin for edge in (lanes[k].left, lanes[k].right)
-        )
-        out[k] = lane_polygon(
-            replace(lanes[k], centre=lanes[k].centre - origin, left=left, right=right), half_width_m
-        )
-    return out
-
-
-def ring_area(ring: F64) -> Any:
+def ring_area(ring: F64, even_odd: bool = False) -> Any:
     """Return the plan-view area that a ring ``(N, 2+)`` winds round at least once: a lane on a ramp
-    may lie above itself.
+    may lie above itself. By ``even_odd`` what it winds round twice is a hole.
     """
     if len(ring) < 3:
         return shapely.Polygon()
     polygon = shapely.polygons(np.ascontiguousarray(ring[:, :2]))
-    return polygon if shapely.is_valid(polygon) else _wound(polygon)
+    if shapely.is_valid(polygon):
+        return polygon
+    return areal_parts(shapely.make_valid(polygon)) if even_odd else _wound(polygon)
 
 
 def _wound(polygon: Any) -> Any:

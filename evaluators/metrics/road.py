@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 import shapely
 
-from alpasim_plugin.core.lane_areas import lane_polygons, ring_area
+from alpasim_plugin.core.lane_areas import lane_polygon, ring_area
 from alpasim_plugin.core.types import F64, I64, Bool, LaneMap
 from evaluators.metrics.footprint import Geometries, pairs_of, spans
 from evaluators.metrics.presets import Preset
@@ -158,13 +158,13 @@ class Road:
         asked[lane] = True
         new = [k for k in np.flatnonzero(asked).tolist() if self._areas[k] is None]
         if new:
-            preset = self._preset
-            self._areas[new] = lane_polygons(
-                [self._lanes[k] for k in new],
-                self.origin,
-                preset.lane_half_width_m,
-                preset.alpasim_map,
-            )
+            for k in new:
+                self._areas[k] = lane_polygon(
+                    self._lanes[k],
+                    self._preset.lane_half_width_m,
+                    self._preset.alpasim_map,
+                    self.origin,
+                )
             shapely.prepare(self._areas[new])
         return np.asarray(self._areas[lane])
 

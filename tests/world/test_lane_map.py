@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, centre_line, densify
-from alpasim_plugin.core.lane_areas import lane_polygon, lane_polygons
+from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import Lane, LaneMap
 from alpasim_plugin.world.route import LaneIndex
 from tests.examples import examples
@@ -87,11 +87,11 @@ def test_a_lane_that_turns_450_degrees_covers_where_it_passes_over_itself():
         return np.stack([r * np.cos(angle), r * np.sin(angle), 2.0 * angle], axis=1)
 
     lane = Lane("ramp", at(20.0), at(18.25), at(21.75))
-    for shape in (lane_polygon(lane), lane_polygons([lane], np.zeros(3))[0]):
-        assert shape.is_valid
-        assert shapely.contains_xy(shape, at(20.0)[1:-1, :2]).all()
-        assert not shapely.contains_xy(shape, 0.0, 0.0)
-    alpasim = lane_polygons([lane], np.zeros(3), even_odd=True)[0]
+    shape = lane_polygon(lane)
+    assert shape.is_valid
+    assert shapely.contains_xy(shape, at(20.0)[1:-1, :2]).all()
+    assert not shapely.contains_xy(shape, 0.0, 0.0)
+    alpasim = lane_polygon(lane, even_odd=True)
     assert not shapely.contains_xy(alpasim, at(20.0)[1:-1, :2]).all()
 
 

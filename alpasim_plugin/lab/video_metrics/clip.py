@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from alpasim_plugin.core.image_metrics import grid_ratio
 from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.lab.video_metrics.facts import DRIFT, GRID, PSNR, SSIM, WARP, WARP_LATE
 from alpasim_plugin.lab.video_metrics.frames import psnr_db, ssim
@@ -80,3 +79,43 @@ def drift_of(psnr: F64 | None) -> float | None:
     if psnr is None or len(psnr) < SETTLED.stop + END:
         return None
     return float(psnr[-END:].mean() - psnr[SETTLED].mean())
+
+
+def grid_ratio(images: U8, truths: U8, side: int = 4, flat_levels: float = 3.0) -> float | None:
+    """Return how much stronger a picture's steps are across the borders of a grid than elsewhere,
+    on surfaces that are flat in the truth.
+
+    A network that makes cells of pixels at a time may leave their grid in the picture; 1 is none.
+    Both axes count alike.
+
+    Args:
+        images: ``(..., H, W, 3)`` what a network made, 8 bits.
+        truths: Like ``images``; they say which surfaces are flat.
+        side: Pixels of a cell.
+        flat_levels: A step between neighbouring pixels of the truth up to which it counts as flat.
+
+    Returns:
+        Mean step at borders over mean step elsewhere; None where nothing is flat, or the image does
+        not change there.
+
+    Example:
+        >>> column = np.arange(64)
+        >>> cells = np.tile((column % 2 + 2 * (column // 4 % 2)).astype(np.uint8)[None, :, None], (64, 1, 3))
+        >>> round(grid_ratio(cells, np.zeros_like(cells)), 2), round(grid_ratio(cells, np.zeros_like(cells), side=3), 2)
+        (1.93, 0.96)
+    """
+    border, elsewhere = np.zeros(2), np.zeros(2)  # sum of steps, their number
+    for axis in (-3, -2):
+        step, flat = (
+            np.abs(np.diff(x.astype(np.int16), axis=axis)).mean(axis=-1) for x in (images, truths)
+        )
+        at = (
+            np.arange(1, step.shape[axis + 1] + 1) % side == 0
+        )  # the step from pixel k to k + 1 crosses a border where side divides k + 1
+        at = at[:, None] if axis == -3 else at
+        for total, chosen in ((border, at), (elsewhere, ~at)):
+            counted = step[(flat <= flat_levels) & chosen]
+            total += (counted.sum(), counted.size)
+    if not border[1] or not elsewhere[0]:
+        return None
+    return float(border[0] / border[1] / (elsewhere[0] / elsewhere[1]))
