@@ -25,7 +25,7 @@ from evaluators.metrics import MetricTable
 from evaluators.opening import read_so_far
 from evaluators.report import render_table
 from evaluators.viewer.cells import Wanted
-from evaluators.viewer.page import DEFAULT_MB, MB, Options, write_page
+from evaluators.viewer.page import DEFAULT_MB, MB, write_page
 
 PAGE = "view.html"
 
@@ -84,7 +84,7 @@ def view(
     if not so_far.run.rollouts:
         raise InputError(f"{root}: no rollout has finished", "Wait for the first.")
     path = out or root / PAGE
-    made = write_page(so_far.run, path, wanted, Options(int(max_mb * MB)), None)
+    made = write_page(so_far.run, path, wanted, int(max_mb * MB))
     if as_json:
         shown = [
             {"scene": cell.scene, "policy": cell.policy, "seed": cell.seed} for cell in made.shown

@@ -30,7 +30,6 @@ from evaluators.viewer.drive_data import MAX_SAMPLES, PLAN_STEP_US, Place
 from evaluators.viewer.page import as_json, fill
 from evaluators.viewer.pictures import frame_rows, jpeg, seen_before, smaller
 
-DOING = "writing the page of a cause"
 WIDTH_PX = 640
 JPEG_START = b"\xff\xd8"
 BEFORE_US, AFTER_US = 6_000_000, 1_000_000  # of the failure, that are shown
@@ -38,6 +37,13 @@ MOST_LOOKS = 48
 CROP_SHARE = 3  # the crop is a third as wide and as high as the picture
 SCRIPTS = ("theme.js", "timeline.js", "overlay.js", "cause.js")
 STYLES = ("theme.css", "report.css", "cause.css")
+# How a value of `Plan.debug` is shown: kind, prefix of its name, dtype, least shape, last size
+KINDS: tuple[tuple[str, str, str, tuple[int, ...], int | None], ...] = (
+    ("images", "", "uint8", (1, 1, 3), 3),
+    ("boxes", "boxes", "", (1, 4), 4),
+    ("lines", "line", "", (1, 2), None),
+    ("heat", "", "", (4, 4), None),
+)
 Item = TypeVar("Item")
 
 
@@ -191,60 +197,69 @@ def _look(look: Look, place: Place, scale: float) -> dict[str, Any]:
             name: {"jpeg": picture(frame), "t": place.ms([t_us])[0]}
             for name, (t_us, frame) in look.frames.items()
         },
-        "said": said(look.debug, scale, line),
+        "said": debug_views(look.debug, scale, line),
     }
 
 
-def said(debug: Mapping[str, Any], scale: float, line: Any) -> dict[str, Any]:
-    """Sort what a policy says of itself in ``Plan.debug`` by what it can be shown as.
+def kind_of(name: str, value: Any) -> str:
+    """Return as what a value of ``Plan.debug`` is shown: the first of `KINDS` that fits, else
+    ``text``.
+    """
+    array = np.asarray(value) if isinstance(value, np.ndarray | list | tuple) else np.empty(0)
+    if array.dtype.kind in "fiub" and array.size > 0 and np.isfinite(array).any():
+        for kind, prefix, dtype, least, last in KINDS:
+            if (
+                name.startswith(prefix)
+                and dtype in ("", array.dtype.name)
+                and array.ndim == len(least)
+                and all(np.greater_equal(array.shape, least))
+                and last in (None, array.shape[-1])
+            ):
+                return kind
+    return "text"
+
+
+def debug_views(debug: Mapping[str, Any], scale: float, line: Any) -> dict[str, Any]:
+    """Return what a policy says of itself in ``Plan.debug``, by kind.
 
     Args:
-        debug: By name. Pictures are ``(H, W, 3)`` uint8; heat maps ``(H, W)`` numbers, over the
-            first camera's picture; ``boxes...`` are ``(N, 4)`` pixels of it, x0 y0 x1 y1;
-            ``line...`` are ``(N, 2)`` metres, rig frame. Numbers, words and short lists are text;
-            anything else is named with its type.
-        scale: Of the page's picture against the camera's.
+        debug: By name; `KINDS` is the contract. Boxes are x0 y0 x1 y1 in pixels of the first
+            camera, lines are metres in the rig frame.
+        scale: Of the page's image against the camera's.
         line: Brings rig coordinates into the page's.
     """
-    out: dict[str, Any] = {"text": [], "images": [], "heat": [], "boxes": [], "lines": []}
+    views: dict[str, Any] = {"text": [], "images": [], "heat": [], "boxes": [], "lines": []}
     for name, value in debug.items():
-        array = np.asarray(value) if isinstance(value, (np.ndarray, list, tuple)) else None
-        numeric = array is not None and array.dtype.kind in "fiub" and array.size > 0
-        if numeric and array is not None:
-            if array.dtype == np.uint8 and array.ndim == 3 and array.shape[2] == 3:
-                out["images"].append([str(name), jpeg(smaller(array, WIDTH_PX))])
-                continue
-            if name.startswith("boxes") and array.ndim == 2 and array.shape[1] == 4:
-                out["boxes"] += [
-                    [str(name), *(round(float(v) * scale, 1) for v in row)] for row in array
-                ]
-                continue
-            if name.startswith("line") and array.ndim == 2 and array.shape[1] >= 2:
-                out["lines"].append([str(name), line(array[:, :2].astype(np.float64))])
-                continue
-            if array.ndim == 2 and min(array.shape) >= 4 and np.isfinite(array).any():
-                out["heat"].append(
-                    [
-                        str(name),
-                        heat_png(array),
-                        *(f"{v:.3g}" for v in (np.nanmin(array), np.nanmax(array))),
-                    ]
-                )
-                continue
-        out["text"].append([str(name), _words(value, array)])
-    return out
+        kind = kind_of(name, value)
+        if kind == "text":
+            views["text"].append([name, _words(value)])
+            continue
+        array = np.asarray(value)
+        if kind == "images":
+            views["images"].append([name, jpeg(smaller(array, WIDTH_PX))])
+        elif kind == "boxes":
+            corners = np.round(array * scale, 1).tolist()
+            views["boxes"] += [[name, *box] for box in corners]
+        elif kind == "lines":
+            views["lines"].append([name, line(array[:, :2].astype(np.float64))])
+        else:
+            ends = [f"{value:.3g}" for value in (np.nanmin(array), np.nanmax(array))]
+            views["heat"].append([name, heat_png(array), *ends])
+    return views
 
 
-def _words(value: Any, array: npt.NDArray[Any] | None) -> str:
+def _words(value: Any) -> str:
+    """Write numbers, words and short lists; name anything else with its type."""
     if isinstance(value, float):
         return f"{value:.4g}"
-    if value is None or isinstance(value, (str, int, bool, np.generic)):
+    if value is None or isinstance(value, str | int | np.generic):
         return str(value)[:300]
-    if array is not None and array.dtype.kind in "fiubU" and array.size <= 12:
+    if not isinstance(value, np.ndarray | list | tuple):
+        return f"not shown: {type(value).__name__}"
+    array = np.asarray(value)
+    if array.dtype.kind in "fiubU" and array.size <= 12:
         return np.array2string(array, precision=3, separator=", ")
-    return f"not shown: {type(value).__name__}" + (
-        "" if array is None else f" of shape {array.shape}"
-    )
+    return f"not shown: {type(value).__name__} of shape {array.shape}"
 
 
 def heat_png(values: npt.NDArray[Any]) -> str:
@@ -253,17 +268,14 @@ def heat_png(values: npt.NDArray[Any]) -> str:
     """
     known = np.where(np.isfinite(values), values, np.nan).astype(np.float64)
     low, high = np.nanmin(known), np.nanmax(known)
-    share = np.nan_to_num((known - low) / (high - low) if high > low else known * 0.0)
+    share = np.nan_to_num((known - low) / ((high - low) or 1.0))
     bgra = np.stack(
-        [40 * np.ones_like(share), 60 + 170 * share, 250 * np.ones_like(share), 200 * share], axis=2
+        [np.full_like(share, 40), 60 + 170 * share, 0 * share + 250, 200 * share], axis=2
     )
     done, png = cv2.imencode(".png", bgra.astype(np.uint8))
     if not done:
         raise InputError(f"heat map {values.shape}: the encoder refused", "give a smaller one")
     return base64.b64encode(png.tobytes()).decode()
-
-
-# --- from a log alone
 
 
 def failed_at(manifest: Mapping[str, Any]) -> int | None:
@@ -288,130 +300,108 @@ def looks_of(log: RolloutLog, renderer: str, failed_us: int | None) -> list[Look
     """Return the queries of a log that the page shows, with what the log holds of them."""
     camera = next(iter(log.info["cameras"]), None)
     images = [image for image in log.images if camera is not None and image.camera == camera.name]
-    ends, found = np.array([image.end_us for image in images]), []
-    moved = np.hypot(
-        *np.gradient(log.ego.xyz[:, :2], (log.ego.t_us - log.ego.t_us[0]) * 1e-6, axis=0).T
-    )
+    ends_us = np.array([image.end_us for image in images])
+    seconds = (log.ego.t_us - log.ego.t_us[0]) * 1e-6
+    speeds = np.linalg.norm(np.gradient(log.ego.xyz[:, :2], seconds, axis=0), axis=1)
     plans = [plan for plan in log.plans if len(plan.trajectory) > 1]
-    for plan in chosen(plans, failed_us, [one.now_us for one in plans]):
+    looks = []
+    for plan in chosen(plans, failed_us, [plan.now_us for plan in plans]):
         pose = interpolate(log.ego, [plan.now_us])[0] @ inverse(log.T_rig_box)
         lines = [
-            half_seconds(one.t_us, transform_points(inverse(pose), one.xyz))
-            for one in (plan.trajectory, *plan.samples[:MAX_SAMPLES])
+            half_seconds(line.t_us, transform_points(inverse(pose), line.xyz))
+            for line in (plan.trajectory, *plan.samples[:MAX_SAMPLES])
         ]
-        newest = int(np.searchsorted(ends, plan.now_us, "right")) - 1
+        newest = int(np.searchsorted(ends_us, plan.now_us, "right")) - 1
         seen = {renderer: (images[newest].end_us, images[newest].data)} if newest >= 0 else {}
-        speed = float(np.interp(plan.now_us, log.ego.t_us, moved))
-        found.append(Look(plan.now_us, pose, speed, np.zeros((0, 2)), {renderer: lines}, seen, {}))
-    return found
+        speed_mps = float(np.interp(plan.now_us, log.ego.t_us, speeds))
+        no_route = np.zeros((0, 2))
+        looks.append(Look(plan.now_us, pose, speed_mps, no_route, {renderer: lines}, seen, {}))
+    return looks
 
 
-def cause_of_log(run: Run, rollout: Rollout, told: Sequence[Mapping[str, Any]]) -> Cause | None:
+def cause_of_log(run: Run, rollout: Rollout, entries: Sequence[Mapping[str, Any]]) -> Cause | None:
     """Return what the files of a run say of how a drive failed; None without a log.
 
     Args:
         run: The run.
         rollout: One that ended with an event.
-        told: Entries of ``flips.json`` about it: when its plans part from those of others.
+        entries: Entries of ``flips.json`` about it: when its plans part from those of others.
     """
     path = run.file_of(rollout, LOG_NAME)
     if path is None:
         return None
     log, failed_us = read_log(path), failed_at(run.manifest(rollout))
-    partings = []
-    for entry in told:
-        kind = "renderer" if entry["baseline"] != rollout.renderer else "policy"
-        name = (
-            str(entry["baseline"])
-            if kind == "renderer"
-            else str(entry["against"]).removeprefix(rollout.renderer + "/")
+    partings = [
+        _parting_of(run, rollout, entry) for entry in entries if entry.get("t_us") is not None
+    ]
+    sentences = behind_others(run, rollout)
+    for one in partings:
+        at_s = (one.t_us - log.render_start_us) * 1e-6
+        sentences.append(
+            f"Plans part from those of the {one.kind} {one.name} at {at_s:.1f} s, "
+            f"by {one.gap_m:.2f} m."
         )
-        files = [run.folder / one for one in (entry.get("frames") or {}).values()]
-        frames = [
-            decode_image(file.read_bytes(), str(file))
-            for file in files
-            if kind == "renderer" and file.is_file()
-        ]
-        pair = (
-            (frames[0], frames[1])
-            if len(frames) == 2 and frames[0].shape == frames[1].shape
-            else None
-        )
-        if entry.get("t_us") is not None:
-            partings.append(Parting(name, kind, int(entry["t_us"]), float(entry["gap_m"]), pair))
+    if failed_us is not None:
+        made_up = seen_before(frame_rows(run, rollout), failed_us)
+        sentences += [f"{made_up}."] if made_up else []
     return Cause(
         rollout=rollout,
         outcome=in_words(outcomes_of(rollout)),
         failed_us=failed_us,
         start_us=log.render_start_us,
-        sentences=[
-            *behind_others(run, rollout),
-            *(sentence(one, log.render_start_us) for one in partings),
-            *_seen_before(run, rollout, failed_us),
-        ],
+        sentences=sentences,
         looks=looks_of(log, rollout.renderer, failed_us),
         partings=partings,
         commands=commands(run, rollout, log.render_start_us, failed_us, partings),
     )
 
 
+def _parting_of(run: Run, rollout: Rollout, entry: Mapping[str, Any]) -> Parting:
+    """Return where plans part by an entry of ``flips.json``; a policy sees the same images."""
+    t_us, gap_m = int(entry["t_us"]), float(entry["gap_m"])
+    if entry["baseline"] == rollout.renderer:
+        name = str(entry["against"]).removeprefix(rollout.renderer + "/")
+        return Parting(name, "policy", t_us, gap_m)
+    paths = [run.folder / name for name in (entry.get("frames") or {}).values()]
+    frames = [decode_image(path.read_bytes(), str(path)) for path in paths if path.is_file()]
+    is_pair = len(frames) == 2 and frames[0].shape == frames[1].shape
+    pair = (frames[0], frames[1]) if is_pair else None
+    return Parting(str(entry["baseline"]), "renderer", t_us, gap_m, pair)
+
+
 def behind_others(run: Run, rollout: Rollout) -> list[str]:
     """Say behind which renderers of the run the same rollout ends without an event."""
-    same = [
-        r
-        for r in run.rollouts
-        if (r.policy, r.scene, r.seed) == (rollout.policy, rollout.scene, rollout.seed)
+    better = [
+        other.renderer
+        for other in run.rollouts
+        if other.ok and other.cell[1:] == rollout.cell[1:] and not outcomes_of(other)
     ]
-    better = [r.renderer for r in same if r.ok and not outcomes_of(r)]
     if not better or not outcomes_of(rollout):
         return []
     return [f"Behind {' and '.join(better)} the same rollout ends without an event."]
-
-
-def _seen_before(run: Run, rollout: Rollout, failed_us: int | None) -> list[str]:
-    text = "" if failed_us is None else seen_before(frame_rows(run, rollout), failed_us)
-    return [f"{text}."] if text else []
-
-
-def sentence(one: Parting, start_us: int) -> str:
-    """Say when plans part."""
-    at_s = (one.t_us - start_us) * 1e-6
-    return (
-        f"Plans part from those of the {one.kind} {one.name} at {at_s:.1f} s, by {one.gap_m:.2f} m."
-    )
 
 
 def commands(
     run: Run, rollout: Rollout, start_us: int, failed_us: int | None, partings: Sequence[Parting]
 ) -> list[tuple[str, str, str]]:
     """Return what can be asked next: a key, what it shows, the command."""
-    root, name = shlex.quote(str(run.folder)), shlex.quote(cell_name(*rollout.cell))
-    parted = next((one.t_us for one in partings), failed_us or start_us)
-    own, at = rollout.renderer, max(0.0, (parted - start_us) * 1e-6)
-    other = next(
-        (one.name for one in partings if one.kind == "renderer"),
-        "clean" if own != "clean" else "3dgs",
-    )
+    cell = shlex.quote(f"{run.folder}/{cell_name(*rollout.cell)}")
+    folder = shlex.quote(str(run.folder / rollout.path))
+    parted_us = partings[0].t_us if partings else failed_us or start_us
+    at_s = max(0.0, (parted_us - start_us) * 1e-6)
+    others = [one.name for one in partings if one.kind == "renderer"]
+    other = [*others, "3dgs" if rollout.renderer == "clean" else "clean"][0]
+    shown = "other renderers at the same poses, and the policy's own debug output"
+    fork = f"simrun fork {cell} --at {at_s:.1f} --renderer {other}"
     return [
-        (
-            "w",
-            "replay the rollout: other renderers at the same poses, and the policy's own debug output",
-            f"simrun why {shlex.quote(str(run.folder / rollout.path))}",
-        ),
-        (
-            "f",
-            f"drive on from there behind {other}",
-            f"simrun fork {root}/{name} --at {at:.1f} --renderer {other}",
-        ),
-        ("v", "watch the drive", f"simrun view {shlex.quote(str(run.folder / rollout.path))}"),
+        ("w", f"replay the rollout: {shown}", f"simrun why {folder}"),
+        ("f", f"drive on from there behind {other}", fork),
+        ("v", "watch the rollout", f"simrun view {folder}"),
     ]
 
 
-# --- where plans part
-
-
 def most_different(one: U8, other: U8) -> tuple[int, int, int, int]:
-    """Return the part of two pictures that differs most: x, y, width and height in pixels."""
+    """Return the part of two images that differs most: x, y, width and height in pixels."""
     height, width = one.shape[:2]
     size = (max(1, width // CROP_SHARE), max(1, height // CROP_SHARE))
     apart = np.abs(one.astype(np.float32) - other.astype(np.float32)).mean(axis=2)
@@ -422,30 +412,20 @@ def most_different(one: U8, other: U8) -> tuple[int, int, int, int]:
 
 
 def _parting(one: Parting, start_us: int) -> dict[str, Any]:
-    at = (one.t_us - start_us) * 1e-6
-    entry: dict[str, Any] = {
-        "name": one.name,
-        "kind": one.kind,
-        "at_s": at,
-        "gap_m": one.gap_m,
-        "pictures": [],
-    }
-    if one.frames is not None:
-        x, y, w, h = most_different(*one.frames)
-        for rgb in one.frames:
-            marked = rgb.copy()
-            cv2.rectangle(
-                marked, (x, y), (x + w - 1, y + h - 1), (255, 210, 0), max(1, rgb.shape[1] // 200)
-            )
-            crop = cv2.resize(
-                rgb[y : y + h, x : x + w], (w * 2, h * 2), interpolation=cv2.INTER_CUBIC
-            )
-            entry["pictures"].append(
-                [jpeg(smaller(picture, WIDTH_PX)) for picture in (marked, crop)]
-            )
-        entry["levels"] = float(
-            np.abs(
-                np.subtract(*(f[y : y + h, x : x + w].astype(np.int16) for f in one.frames))
-            ).mean()
-        )
-    return entry
+    """Return a parting for the template; of each image the whole, marked where they differ most,
+    and that part enlarged.
+    """
+    entry = {"name": one.name, "at_s": (one.t_us - start_us) * 1e-6, "gap_m": one.gap_m}
+    if one.frames is None:
+        return entry | {"pictures": []}
+    x, y, width, height = most_different(*one.frames)
+    parts = [frame[y : y + height, x : x + width] for frame in one.frames]
+    pictures = []
+    for frame, part in zip(one.frames, parts, strict=True):
+        box = (x, y, width, height)
+        line_px = max(1, frame.shape[1] // 200)
+        marked = cv2.rectangle(frame.copy(), box, (255, 210, 0), line_px)
+        large = cv2.resize(part, (width * 2, height * 2), interpolation=cv2.INTER_CUBIC)
+        pictures.append([jpeg(smaller(image, WIDTH_PX)) for image in (marked, large)])
+    apart = np.abs(parts[0].astype(np.float32) - parts[1].astype(np.float32))
+    return entry | {"pictures": pictures, "levels": float(apart.mean())}

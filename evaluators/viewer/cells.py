@@ -7,7 +7,8 @@ Changed outcomes come first, then events, then a few quiet ones, the most differ
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -35,13 +36,13 @@ from evaluators.viewer.drive_data import (
 from evaluators.viewer.pictures import (
     NO_FRAMES,
     Fineness,
+    Rows,
     encoded,
     frame_rows,
     sources,
     trust_by_time,
 )
 
-DOING, READING = "choosing rollouts to watch", "reading a rollout to watch"
 QUIET_CELLS = 3  # cells in which nothing happened, shown by default
 
 Interest = Literal["flip", "event", "failure", "quiet"]
@@ -75,16 +76,14 @@ class WatchedCell:
     @property
     def id(self) -> str:
         """Give a name for addresses and elements: letters and digits."""
-        return hashlib.sha256(
-            repr((self.scene, self.policy, self.seed, self.take)).encode()
-        ).hexdigest()[:12]
+        key = repr((self.scene, self.policy, self.seed, self.take))
+        return hashlib.sha256(key.encode()).hexdigest()[:12]
 
     @property
     def name(self) -> str:
         """Give the name for people."""
-        return f"{self.scene}, {self.policy}, seed {self.seed}" + (
-            f", log {self.take + 1}" if self.take else ""
-        )
+        take = f", log {self.take + 1}" if self.take else ""
+        return f"{self.scene}, {self.policy}, seed {self.seed}{take}"
 
     @property
     def interest(self) -> Interest:
@@ -97,12 +96,15 @@ class WatchedCell:
 
     @property
     def apart_m(self) -> float:
-        """Say how different the drives are: between the longest and the shortest, and the largest
+        """Say how different the rollouts are: between the longest and the shortest, and the largest
         distance from the recorded path.
         """
-        driven = [m for r in self.rollouts if (m := r.metrics.get("dist_traveled_m")) is not None]
-        aside = [m for r in self.rollouts if (m := r.metrics.get("lateral_distance_m")) is not None]
-        return max(driven, default=0.0) - min(driven, default=0.0) + max(aside, default=0.0)
+        driven_m, offsets_m = (
+            [r.metrics[name] or 0.0 for r in self.rollouts if r.metrics.get(name) is not None]
+            or [0.0]
+            for name in ("dist_traveled_m", "lateral_distance_m")
+        )
+        return max(driven_m) - min(driven_m) + max(offsets_m)
 
     @property
     def watchable(self) -> bool:
@@ -111,14 +113,11 @@ class WatchedCell:
 
     def outcomes(self) -> dict[str, str]:
         """Give the outcome of each rollout in words, by what it is called."""
-        failed = {
-            self.side(r): f"failed: {r.failure_class or 'unknown'}"
-            for r in self.rollouts
-            if not has_ended(r)
-        }
         return {
-            self.side(r): failed.get(self.side(r)) or in_words(outcomes_of(r))
-            for r in self.rollouts
+            self.side(rollout): in_words(outcomes_of(rollout))
+            if has_ended(rollout)
+            else f"failed: {rollout.failure_class or 'unknown'}"
+            for rollout in self.rollouts
         }
 
 
@@ -147,27 +146,20 @@ def check_wanted(run: Run, wanted: Wanted) -> None:
     Raises:
         InputError: Something of that kind was asked for.
     """
-    for flag, asked, known in (
-        ("--scene", wanted.scenes, run.scenes),
-        ("--policy", wanted.policies, run.policies),
-        ("--renderer", wanted.renderers, run.renderers),
-        (
-            "--seed",
-            wanted.seeds,
-            sorted({*(run.info.get("seeds") or ()), *(r.seed for r in run.rollouts)}),
-        ),
-    ):
-        strange = [one for one in asked if not _spellings(one) & {*known}]
-        if strange:
-            raise InputError(
-                f"{flag} {strange[0]}: the run has none; it has {', '.join(map(str, known[:8]))}",
-                "name one of these",
-            )
-
-
-def has_policies_alone(run: Run) -> bool:
-    """Tell whether a run compares policies and not renderers."""
-    return len(run.renderers) == 1 and len(run.policies) > 1
+    seeds = sorted({*(run.info.get("seeds") or ()), *(r.seed for r in run.rollouts)})
+    choices: dict[str, tuple[Sequence[object], Sequence[object]]] = {
+        "--scene": (wanted.scenes, run.scenes),
+        "--policy": (wanted.policies, run.policies),
+        "--renderer": (wanted.renderers, run.renderers),
+        "--seed": (wanted.seeds, seeds),
+    }
+    for option, (names, known) in choices.items():
+        for name in names:
+            if not _spellings(name) & {*known}:
+                some = ", ".join(map(str, known[:8]))
+                raise InputError(
+                    f"{option} {name}: the run has none; it has {some}", "Name one of these."
+                )
 
 
 def cells_of(run: Run, wanted: Wanted = Wanted(), arms: bool = False) -> list[WatchedCell]:
@@ -178,97 +170,72 @@ def cells_of(run: Run, wanted: Wanted = Wanted(), arms: bool = False) -> list[Wa
         wanted: What was asked for.
         arms: Where the run has one renderer, its policies stand side by side.
     """
-    by_policy = arms and has_policies_alone(run)
-    grouped: dict[tuple[str, str, int, int], list[Rollout]] = {}
+    by_policy = arms and len(run.renderers) == 1 and len(run.policies) > 1
     base = baseline_of(run)
-    rank = {
-        name: i
-        for i, name in enumerate(
-            run.policies if by_policy else sorted(run.renderers, key=lambda name: name != base)
-        )
-    }
-    scene = {name: i for i, name in enumerate(run.scenes)}
-    for rollout in sorted(
-        run.rollouts,
-        key=lambda r: (
-            scene[r.scene],
-            *((r.seed, rank[r.policy]) if by_policy else (r.policy, r.seed, rank[r.renderer])),
-        ),
-    ):
-        if not _asked(rollout, wanted):
-            continue
-        key, take = (
-            (rollout.scene, rollout.renderer if by_policy else rollout.policy, rollout.seed),
-            0,
-        )
-        while any(
-            (r.renderer, r.policy) == (rollout.renderer, rollout.policy)
-            for r in grouped.get((*key, take), ())
-        ):
-            take += 1
-        grouped.setdefault((*key, take), []).append(rollout)
+    sides = run.policies if by_policy else sorted(run.renderers, key=lambda name: name != base)
+
+    def split(rollout: Rollout) -> tuple[str, str]:
+        """Return what a cell holds fixed, and what stands side by side in it."""
+        names = rollout.renderer, rollout.policy
+        return names if by_policy else names[::-1]
+
+    def place(rollout: Rollout) -> tuple[int, str, int, int]:
+        """Return the order of rollouts."""
+        fixed, side = split(rollout)
+        return run.scenes.index(rollout.scene), fixed, rollout.seed, sides.index(side)
+
+    grouped: dict[tuple[str, str, int, int], list[Rollout]] = {}
+    takes: Counter[tuple[str, str, str, int]] = Counter()
+    for rollout in sorted(run.rollouts, key=place):
+        if _is_wanted(rollout, wanted):
+            key = (rollout.scene, split(rollout)[0], rollout.seed, takes[rollout.cell])
+            takes[rollout.cell] += 1
+            grouped.setdefault(key, []).append(rollout)
     flips: dict[tuple[str, str, int], list[Flip]] = {}
     for flip in find_flips(run)[0]:
-        inside = (
-            flip.base.renderer == flip.other.renderer
-            if by_policy
-            else flip.base.policy == flip.other.policy
-        )
-        if inside and _asked(
-            flip.other, wanted
-        ):  # a cell shows one policy behind all renderers, or the other way round
-            fixed = flip.other.renderer if by_policy else flip.other.policy
+        fixed = split(flip.other)[0]
+        # a cell shows one policy behind all renderers, or the other way round
+        if split(flip.base)[0] == fixed and _is_wanted(flip.other, wanted):
             flips.setdefault((flip.other.scene, fixed, flip.other.seed), []).append(flip)
     cells = [
         WatchedCell(*key, tuple(members), tuple(flips.get(key[:3], ())), by_policy)
         for key, members in grouped.items()
     ]
-    return sorted(
-        cells, key=lambda cell: (ORDER.index(cell.interest), -cell.apart_m)
-    )  # stable: equal ones stay in the run's order
+    # stable: equal ones stay in the run's order
+    return sorted(cells, key=lambda cell: (ORDER.index(cell.interest), -cell.apart_m))
 
 
-def shown_by_default(
-    cells: Sequence[WatchedCell], wanted: Wanted, at_most: int | None
-) -> list[WatchedCell]:
+def shown_by_default(cells: Sequence[WatchedCell], wanted: Wanted) -> list[WatchedCell]:
     """Return the cells that a page tries to hold: all that are telling and `QUIET_CELLS` others, or
     all that were asked for.
 
     Args:
         cells: As `cells_of` returns them.
         wanted: What was asked for.
-        at_most: Most cells; None is no limit.
     """
     watchable = [cell for cell in cells if cell.watchable]
-    if wanted.is_all and at_most is None:
-        quiet = [cell for cell in watchable if cell.interest == "quiet"]
-        dropped = {cell.id for cell in quiet[QUIET_CELLS:]}
-        watchable = [cell for cell in watchable if cell.id not in dropped]
-    return watchable[:at_most]
+    if not wanted.is_all:
+        return watchable
+    quiet = [cell for cell in watchable if cell.interest == "quiet"]
+    left_out = {cell.id for cell in quiet[QUIET_CELLS:]}
+    return [cell for cell in watchable if cell.id not in left_out]
 
 
-def telling(
-    cells: Iterable[WatchedCell], kinds: Sequence[Interest] = ("flip",)
-) -> list[WatchedCell]:
-    """Return the watchable cells of some kinds."""
-    return [cell for cell in cells if cell.interest in kinds and cell.watchable]
-
-
-def _asked(rollout: Rollout, wanted: Wanted) -> bool:
-    pairs: tuple[tuple[object, Sequence[object]], ...] = (
+def _is_wanted(rollout: Rollout, wanted: Wanted) -> bool:
+    choices: tuple[tuple[object, Sequence[object]], ...] = (
         (rollout.scene, wanted.scenes),
         (rollout.policy, wanted.policies),
         (rollout.seed, wanted.seeds),
         (rollout.renderer, wanted.renderers),
     )
     return all(
-        not asked or any(value in _spellings(one) for one in asked) for value, asked in pairs
+        not names or any(value in _spellings(name) for name in names) for value, names in choices
     )
 
 
-def _spellings(asked: object) -> set[object]:
+def _spellings(name: object) -> set[object]:
     """Return what a name that was asked for may be in the tables."""
-    return {asked, asked.replace("/", "-")} if isinstance(asked, str) else {asked}
+    return {name, name.replace("/", "-")} if isinstance(name, str) else {name}
 
 
 Logs = Mapping[
@@ -308,9 +275,7 @@ def _log_as_of(path: Path, mtime_ns: int) -> RolloutLog:
     return read_asl(path)
 
 
-def cell_data(
-    run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, camera: str | None = None
-) -> dict[str, Any]:
+def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None) -> dict[str, Any]:
     """Return everything that a page shows of a cell.
 
     Args:
@@ -318,7 +283,6 @@ def cell_data(
         cell: One of its cells.
         logs: Its logs.
         fine: How finely camera frames are kept; None for none.
-        camera: The camera whose frames are kept; None is all.
 
     Raises:
         InputError: A file is damaged, or the run has no map of the scene.
@@ -327,49 +291,26 @@ def cell_data(
     if content is None:
         raise InputError(
             f"{cell.name}: no file of scene {cell.scene} in {run.folder / 'scenes'}",
-            "make the run again; runs of earlier versions kept no maps",
+            "Make the run again; runs of earlier versions kept no maps.",
         )
     recorded = recorded_drive(content, cell.scene)
     place = Place(recorded[0], clock_zero_us(content, _first_us(run, cell, logs)))
     tracks = Tracks()
     drives: list[dict[str, Any]] = []
     for rollout in cell.rollouts:
+        name = {"renderer": cell.side(rollout)}
+        log = logs.get(rollout.path)
         if not rollout.ok:
-            drives.append(
-                {
-                    "renderer": cell.side(rollout),
-                    "failed": f"{rollout.failure_class}: {rollout.failure}",
-                }
-            )
-            continue
-        log = logs[rollout.path]
-        if isinstance(log, SimrunError):
-            drives.append(
-                {"renderer": cell.side(rollout), "failed": f"its log cannot be read: {log.message}"}
-            )
-            continue
-        facts = frame_rows(run, rollout)
-        drive = {"renderer": cell.side(rollout)} | drive_data(
-            run, rollout, log, content, place, tracks, facts
-        )
-        drive |= {"why": run.href(rollout, WHY_NAME) or ""}
-        if fine is not None:
-            kept = [one for one in sources(run, rollout, log) if camera in (None, one.camera)]
-            drive["cameras"] = [encoded(one, fine, place.zero_us) for one in kept]
-            known = {} if log is None else {camera.name: camera for camera in log.info["cameras"]}
-            for one in drive["cameras"]:
-                trusted = {
-                    place.ms([t_us])[0]: text
-                    for t_us, text in trust_by_time(facts, one["name"]).items()
-                }
-                if trusted:
-                    one["trust"] = [trusted.get(t, "") for t in one["t"]]
-                if one["name"] in known:
-                    one["lens"] = lens_data(known[one["name"]], one["width"])
-            drive["no_frames"] = (
-                "" if kept else no_frames(run.manifest(rollout), log is not None, camera)
-            )
-        drives.append(drive)
+            drives.append(name | {"failed": f"{rollout.failure_class}: {rollout.failure}"})
+        elif isinstance(log, SimrunError):
+            drives.append(name | {"failed": f"its log cannot be read: {log.message}"})
+        else:
+            facts = frame_rows(run, rollout)
+            drive = drive_data(run, rollout, log, content, place, tracks, facts)
+            drive["why"] = run.href(rollout, WHY_NAME) or ""
+            if fine is not None:
+                drive |= _camera_data(run, rollout, log, facts, fine, place)
+            drives.append(name | drive)
     ends = [drive["ego"]["t"][-1] for drive in drives if "ego" in drive]
     return {
         "id": cell.id,
@@ -382,6 +323,25 @@ def cell_data(
         "origin": place.origin.tolist(),
         "zero_us": place.zero_us,
     }
+
+
+def _camera_data(
+    run: Run, rollout: Rollout, log: RolloutLog | None, facts: Rows, fine: Fineness, place: Place
+) -> dict[str, Any]:
+    """Return a rollout's camera frames for a page, with lenses and trust maps where known, or why
+    there are none.
+    """
+    cameras = [encoded(one, fine, place.zero_us) for one in sources(run, rollout, log)]
+    lenses = {} if log is None else {camera.name: camera for camera in log.info["cameras"]}
+    for camera in cameras:
+        trust = trust_by_time(facts, camera["name"])
+        by_ms = dict(zip(place.ms(list(trust)), trust.values(), strict=True))
+        if by_ms:
+            camera["trust"] = [by_ms.get(t_ms, "") for t_ms in camera["t"]]
+        if camera["name"] in lenses:
+            camera["lens"] = lens_data(lenses[camera["name"]], camera["width"])
+    absent = "" if cameras else no_frames(run.manifest(rollout), log is not None)
+    return {"cameras": cameras, "no_frames": absent}
 
 
 def lens_data(camera: CameraSpec, width_px: int) -> dict[str, Any]:
@@ -404,47 +364,50 @@ def _first_us(run: Run, cell: WatchedCell, logs: Logs) -> int:
     return min([*firsts, *(min(t.to_pylist()) for t in tables if len(t))], default=0)
 
 
-def no_frames(manifest: Mapping[str, Any], has_log: bool, camera: str | None) -> str:
-    """Say why a rollout has no pictures, and how to get them."""
-    if not has_log and manifest.get("log"):
-        return f"The log that this rollout was scored from is not at {manifest['log']}. Run simrun view where simrun score was run."
-    return NO_FRAMES if camera is None else f"This rollout has no frames of a camera {camera}."
+def no_frames(manifest: Mapping[str, Any], has_log: bool) -> str:
+    """Say why a rollout has no images, and how to get them."""
+    if has_log or not manifest.get("log"):
+        return NO_FRAMES
+    return (
+        f"The log that this rollout was scored from is not at {manifest['log']}. "
+        "Run simrun view where simrun score was run."
+    )
 
 
 def index_data(
-    run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCell], state: Mapping[str, Any]
+    run: Run,
+    cells: Sequence[WatchedCell],
+    here: Sequence[WatchedCell],
+    notes: Sequence[str],
+    report: str,
 ) -> dict[str, Any]:
     """Return what a page must know before it shows a cell.
 
     Args:
         run: The run.
         cells: All cells that were asked for, the most telling first.
-        here: Those whose documents the page has or can get.
-        state: ``notes`` (what was left out, one sentence each) and ``report`` (its address, or "").
+        here: Those whose documents the page has.
+        notes: What was left out, one sentence each.
+        report: Address of the run's report, or "".
     """
-    ids, by_policy = {cell.id for cell in here}, any(cell.by_policy for cell in cells)
-    units = {
-        name: facts
-        for table in (run.summary.get("metrics") or {}).values()
-        for name, facts in table.items()
-    }
+    ids = {cell.id for cell in here}
+    stated: dict[str, Mapping[str, Any]] = {}
+    for table in (run.summary.get("metrics") or {}).values():
+        stated |= table
     metrics = {}
-    for name in run.table.ordered({*run.table, *units}):
-        metric, stated = run.table.shown(name), units.get(name) or {}
-        metrics[name] = {
-            "unit": metric.unit or str(stated.get("unit") or ""),
-            "help": metric.help,
-            "flag": metric.is_flag,
-        }
-    return {
-        "run": run.folder.resolve().name,
-        "renderers": run.policies if by_policy else run.renderers,
-        "baseline": next(
-            (cell.side(flip.base) for cell in cells for flip in cell.flips), baseline_of(run)
-        ),
-        "first_curves": run.table.first_curves(),
-        "metrics": metrics,
-        "cells": [
+    for name in run.table.ordered({*run.table, *stated}):
+        metric = run.table.shown(name)
+        unit = metric.unit or str(stated.get(name, {}).get("unit") or "")
+        metrics[name] = {"unit": unit, "help": metric.help, "flag": metric.is_flag}
+    bases = [cell.side(flip.base) for cell in cells for flip in cell.flips]
+    rows = []
+    for cell in cells:
+        flips = [
+            {"renderer": cell.side(flip.other)}
+            | {"was": flip.was, "now": flip.now, "tone": flip.tone}
+            for flip in cell.flips
+        ]
+        rows.append(
             {
                 "id": cell.id,
                 "scene": cell.scene,
@@ -453,20 +416,19 @@ def index_data(
                 "take": cell.take,
                 "interest": cell.interest,
                 "outcomes": cell.outcomes(),
-                "flips": [
-                    {
-                        "renderer": cell.side(flip.other),
-                        "was": flip.was,
-                        "now": flip.now,
-                        "tone": flip.tone,
-                    }
-                    for flip in cell.flips
-                ],
+                "flips": flips,
                 "here": cell.id in ids,
             }
-            for cell in cells
-        ],
-        **state,
+        )
+    return {
+        "run": run.folder.resolve().name,
+        "renderers": run.policies if any(cell.by_policy for cell in cells) else run.renderers,
+        "baseline": bases[0] if bases else baseline_of(run),
+        "first_curves": run.table.first_curves(),
+        "metrics": metrics,
+        "cells": rows,
+        "notes": list(notes),
+        "report": report,
     }
 
 

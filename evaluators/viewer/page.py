@@ -1,5 +1,5 @@
-"""The page: one HTML file without outside requests that holds cells as far as its size allows, or
-the shell that a server fills.
+"""The replay of a run as one HTML file without outside requests: it holds cells as far as its size
+allows.
 """
 
 from __future__ import annotations
@@ -7,8 +7,8 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -31,108 +31,19 @@ from evaluators.viewer.cells import (
     index_data,
     read_logs,
     shown_by_default,
-    telling,
 )
 from evaluators.viewer.pictures import Fineness
 
-MOST_STRIDE = 4  # coarser frames than this are worse to watch than fewer cells
-NOTES_BYTES = 600  # what notes of what was left out may add to a page
-
-
-@dataclass(frozen=True)
-class Fitted:
-    """What a page holds.
-
-    Attributes:
-        cells: In the order asked for.
-        documents: Their JSON, one each.
-        fine: How finely frames are kept.
-        too_many: Cells for which there was no room.
-    """
-
-    cells: tuple[WatchedCell, ...]
-    documents: tuple[str, ...]
-    fine: Fineness
-    too_many: tuple[WatchedCell, ...]
-
-
-def fit(
-    run: Run, cells: Sequence[WatchedCell], budget_bytes: int, wanted: Fineness, camera: str | None
-) -> Fitted:
-    """Choose how finely frames are kept, and how many cells there is room for; the first cell is
-    always kept.
-
-    Frames are thinned out evenly, down to every `MOST_STRIDE`-th, before cells are left out from
-    the end.
-
-    Args:
-        run: The run.
-        cells: The most telling first.
-        budget_bytes: Most bytes of all documents.
-        wanted: The finest that is kept.
-        camera: As for `cell_data`.
-    """
-    factors = range(1, max(1, MOST_STRIDE // wanted.stride) + 1)
-    made: list[dict[str, Any]] = []
-    used = dict.fromkeys(factors, 0)  # bytes of what is made, by how much it is thinned
-    for cell in cells:
-        document = cell_data(run, cell, read_logs(run, cell), wanted, camera)
-        sizes = {factor: len(as_json(thinned(document, factor))) for factor in factors}
-        if made and used[factors[-1]] + sizes[factors[-1]] > budget_bytes:
-            break
-        made.append(document)
-        used = {factor: used[factor] + sizes[factor] for factor in factors}
-    factor = next((factor for factor in factors if used[factor] <= budget_bytes), factors[-1])
-    fine = replace(wanted, stride=wanted.stride * factor)
-    kept = len(made)
-    return Fitted(
-        tuple(cells[:kept]),
-        tuple(as_json(thinned(one, factor)) for one in made),
-        fine,
-        tuple(cells[kept:]),
-    )
-
-
-def thinned(document: Mapping[str, Any], factor: int) -> dict[str, Any]:
-    """Return a cell's document with every factor-th camera frame alone."""
-    drives = [
-        {
-            **drive,
-            "cameras": [
-                {**one, "t": one["t"][::factor], "jpeg": one["jpeg"][::factor]}
-                for one in drive["cameras"]
-            ],
-        }
-        if "cameras" in drive
-        else drive
-        for drive in document["drives"]
-    ]
-    return {**document, "drives": drives}
-
-
-def as_json(value: Any) -> str:
-    """Write compact JSON that can stand in a script element: nothing in it can end the element or
-    begin another.
-
-    Example:
-        >>> as_json({"scene": "</script><!--"})
-        '{"scene":"\\\\u003c/script\\\\u003e\\\\u003c!--"}'
-    """
-    text = json.dumps(
-        value, separators=(",", ":"), allow_nan=False
-    )  # ASCII: line separators of JavaScript are escaped too
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def names(cells: Iterable[WatchedCell], at_most: int = 12) -> str:
-    """List cells in words."""
-    listed = [cell.name for cell in cells]
-    more = len(listed) - at_most
-    return "; ".join(listed[:at_most]) + (f"; and {more} more" if more > 0 else "")
-
-
 MB = 1_000_000
 DEFAULT_MB = 15.0  # megabytes, not mebibytes
+MOST_STRIDE = 4  # coarser frames than this are worse to watch than fewer cells
+NOTES_BYTES = 600  # what notes of what was left out may add to a page
+NAMED = 12  # cells that a note names
+FLIPS_PAGE, REPORT = "flips.html", "report.html"
+FLIPS_BYTES = 6 * MB
+FLIPS_FRAMES = Fineness(stride=2, width_px=384)
+MAX_FLIP_CELLS = 8  # a run must not wait for its page
+ORDINALS = {2: "second", 3: "third"}
 SCRIPTS = (
     "theme.js",
     "timeline.js",
@@ -147,135 +58,12 @@ STYLES = ("theme.css", "viewer.css")
 
 
 @dataclass(frozen=True)
-class Options:
-    """How a page is made.
-
-    Attributes:
-        max_bytes: Size of the file.
-        fine: The finest camera frames that are kept.
-        camera: Keep this camera alone.
-    """
-
-    max_bytes: int = int(DEFAULT_MB * MB)
-    fine: Fineness = Fineness()
-    camera: str | None = None
-
-
-@dataclass(frozen=True)
 class Page:
-    """A page, and what is in it."""
+    """A page, the cells that it replays, and what it leaves out, a sentence each."""
 
     html: str
     cells: tuple[WatchedCell, ...]
     notes: tuple[str, ...]
-
-
-def make_page(
-    run: Run,
-    cells: Sequence[WatchedCell],
-    shown: Sequence[WatchedCell],
-    options: Options,
-    report: str = "",
-) -> Page:
-    """Return an offline page.
-
-    Args:
-        run: The run.
-        cells: All that were asked for, the most telling first.
-        shown: Those that the page holds as far as its size allows.
-        options: Bounds.
-        report: Address of the run's report, relative to the page.
-
-    Raises:
-        InputError: A rollout's files are damaged.
-    """
-    shell = len(render(as_json(index_data(run, cells, (), {"notes": [], "report": report})), {}))
-    fitted = fit(run, shown, options.max_bytes - shell - NOTES_BYTES, options.fine, options.camera)
-    notes = _notes(cells, shown, fitted.too_many, fitted.fine)
-    index = index_data(run, cells, fitted.cells, {"notes": notes, "report": report})
-    documents = dict(zip((cell.id for cell in fitted.cells), fitted.documents, strict=True))
-    return Page(render(as_json(index), documents), fitted.cells, tuple(notes))
-
-
-def render(index: str, documents: Mapping[str, str]) -> str:
-    """Fill the template.
-
-    Args:
-        index: JSON of `index_data`.
-        documents: Cell id -> JSON of `cell_data`.
-    """
-    filled = {name: Markup(text) for name, text in documents.items()}
-    return fill("viewer.html.j2", SCRIPTS, STYLES, index=Markup(index), documents=filled)
-
-
-def fill(template: str, scripts: Sequence[str], styles: Sequence[str], **values: Any) -> str:
-    """Fill a template of a page that holds its scripts and styles and allows no others."""
-    environment = environment_of(
-        "evaluators.viewer", "evaluators.report"
-    )  # colours are the report's
-    script = "\n".join(asset(environment, name) for name in scripts)
-    style = "\n".join(asset(environment, name) for name in styles)
-    own = {
-        "style": Markup(style),
-        "style_hash": _sha256(style),
-        "script": Markup(script),
-        "script_hash": _sha256(script),
-    }
-    return environment.get_template(template).render(**own, **values)
-
-
-def _sha256(text: str) -> str:
-    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-
-
-def _notes(
-    cells: Sequence[WatchedCell],
-    shown: Sequence[WatchedCell],
-    too_many: Sequence[WatchedCell],
-    fine: Fineness,
-) -> list[str]:
-    """Say what the page does not hold, one sentence each."""
-    ids = {cell.id for cell in shown}
-    left = [cell for cell in cells if cell.id not in ids and cell.watchable]
-    failed = [cell for cell in cells if not cell.watchable]
-    notes = []
-    if too_many:
-        notes.append(
-            f"No room for {plural(len(too_many), 'cell')}: {names(too_many)}. --max-mb makes room."
-        )
-    if left:
-        what = (
-            "in which nothing happened"
-            if all(cell.interest == "quiet" for cell in left)
-            else "not chosen"
-        )
-        how = "--scene, --policy and --seed choose."
-        notes.append(f"{plural(len(left), 'cell')} {what} left out: {names(left)}. {how}")
-    if failed:
-        notes.append(
-            f"Nothing to see of {plural(len(failed), 'cell')} in which every rollout failed: {names(failed)}."
-        )
-    if fine.stride > 1:
-        notes.append(
-            f"Every {ordinal(fine.stride)} camera frame is kept: --max-mb makes room. Poses, plans and metrics are whole."
-        )
-    return notes
-
-
-def ordinal(number: int) -> str:
-    """Name a small number in order.
-
-    Example:
-        >>> ordinal(2), ordinal(3), ordinal(4)
-        ('second', 'third', '4th')
-    """
-    return {2: "second", 3: "third"}.get(number, f"{number}th")
-
-
-DOING = "writing a page to watch"
-FLIPS_PAGE, REPORT = "flips.html", "report.html"
-FLIPS_OPTIONS = Options(max_bytes=6 * MB, fine=Fineness(stride=2, width_px=384))
-MAX_FLIP_CELLS = 8  # a run must not wait for its page
 
 
 @dataclass(frozen=True)
@@ -298,7 +86,7 @@ class Written:
 
 
 def write_page(
-    run: Run, path: Path, wanted: Wanted, options: Options, at_most: int | None
+    run: Run, path: Path, wanted: Wanted, max_bytes: int = int(DEFAULT_MB * MB)
 ) -> Written:
     """Write an offline page.
 
@@ -306,8 +94,7 @@ def write_page(
         run: The run.
         path: The file.
         wanted: Which rollouts.
-        options: Size and frames.
-        at_most: Most cells; None as `shown_by_default` says.
+        max_bytes: Size of the file.
 
     Raises:
         InputError: Nothing was asked for that the run has, or a file of the run is damaged.
@@ -318,13 +105,12 @@ def write_page(
     if not any(cell.watchable for cell in cells):
         raise InputError(
             f"{run.folder}: no finished rollout that was asked for",
-            "ask for others; simrun report lists failures",
+            "Ask for others; simrun report lists failures.",
         )
+    is_beside = path.resolve().parent == run.folder.resolve() and (run.folder / REPORT).is_file()
     with reporting(run):
-        beside = path.resolve().parent == run.folder.resolve() and (run.folder / REPORT).is_file()
-        page = make_page(
-            run, cells, shown_by_default(cells, wanted, at_most), options, REPORT if beside else ""
-        )
+        shown = shown_by_default(cells, wanted)
+        page = make_page(run, cells, shown, max_bytes, report=REPORT if is_beside else "")
     write_text(path, page.html)
     return Written(path, path.stat().st_size, page.cells, tuple(cells), page.notes)
 
@@ -340,22 +126,149 @@ def write_flips_page(run_dir: Path | Run) -> Mapping[FlipKey, str]:
         InputError: The run folder is not complete enough to be read.
     """
     run = read_run(run_dir)
-    flipped = telling(cells_of(run, arms=True))
+    path = run.folder / FLIPS_PAGE
+    flipped = [cell for cell in cells_of(run, arms=True) if cell.flips and cell.watchable]
     if not flipped:
-        (run.folder / FLIPS_PAGE).unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
         return {}
     with reporting(run):
-        page = make_page(run, flipped, flipped[:MAX_FLIP_CELLS], FLIPS_OPTIONS, REPORT)
-    write_text(run.folder / FLIPS_PAGE, page.html)
-    return {
-        flip.key: f"{FLIPS_PAGE}#{address(cell, cell.side(flip.other))}"
-        for cell in page.cells
-        for flip in cell.flips
+        shown = flipped[:MAX_FLIP_CELLS]
+        page = make_page(run, flipped, shown, FLIPS_BYTES, FLIPS_FRAMES, REPORT)
+    write_text(path, page.html)
+    addresses = {}
+    for cell in page.cells:
+        for flip in cell.flips:
+            place = {"scene": cell.scene, "policy": cell.policy, "seed": cell.seed}
+            place["renderer"] = cell.side(flip.other)
+            addresses[flip.key] = f"{FLIPS_PAGE}#{urlencode(place)}"
+    return addresses
+
+
+def make_page(
+    run: Run,
+    cells: Sequence[WatchedCell],
+    shown: Sequence[WatchedCell],
+    max_bytes: int = int(DEFAULT_MB * MB),
+    fine: Fineness = Fineness(),
+    report: str = "",
+) -> Page:
+    """Return an offline page.
+
+    Frames are thinned out evenly, down to every `MOST_STRIDE`-th, before cells are left out from
+    the end; the first cell is always kept.
+
+    Args:
+        run: The run.
+        cells: All that were asked for, the most telling first.
+        shown: Those that the page holds as far as its size allows.
+        max_bytes: Size of the file.
+        fine: The finest camera frames that are kept.
+        report: Address of the run's report, relative to the page.
+
+    Raises:
+        InputError: A rollout's files are damaged.
+    """
+    shell = len(render(as_json(index_data(run, cells, (), [], report)), {}))
+    room = max_bytes - shell - NOTES_BYTES
+    factors = range(1, max(1, MOST_STRIDE // fine.stride) + 1)
+    used = dict.fromkeys(factors, 0)  # bytes of the documents, by how much they are thinned
+    documents: list[dict[str, Any]] = []
+    for cell in shown:
+        document = cell_data(run, cell, read_logs(run, cell), fine)
+        sizes = {factor: len(as_json(thinned(document, factor))) for factor in factors}
+        if documents and used[factors[-1]] + sizes[factors[-1]] > room:
+            break
+        documents.append(document)
+        used = {factor: used[factor] + sizes[factor] for factor in factors}
+    factor = next((factor for factor in factors if used[factor] <= room), factors[-1])
+    kept = tuple(shown[: len(documents)])
+    notes = _notes(cells, shown, shown[len(kept) :], fine.stride * factor)
+    index = as_json(index_data(run, cells, kept, notes, report))
+    texts = {
+        cell.id: as_json(thinned(document, factor))
+        for cell, document in zip(kept, documents, strict=True)
     }
+    return Page(render(index, texts), kept, tuple(notes))
 
 
-def address(cell: WatchedCell, renderer: str) -> str:
-    """Return the part of an address that opens a cell with one of its drives followed."""
-    return urlencode(
-        {"scene": cell.scene, "policy": cell.policy, "seed": cell.seed, "renderer": renderer}
-    )
+def thinned(document: Mapping[str, Any], factor: int) -> dict[str, Any]:
+    """Return a cell's document with every factor-th camera frame alone."""
+    drives = []
+    for drive in document["drives"]:
+        cameras = [
+            camera | {"t": camera["t"][::factor], "jpeg": camera["jpeg"][::factor]}
+            for camera in drive.get("cameras", ())
+        ]
+        drives.append(drive | {"cameras": cameras} if cameras else drive)
+    return {**document, "drives": drives}
+
+
+def as_json(value: Any) -> str:
+    """Write compact JSON that can stand in a script element: nothing in it can end the element or
+    begin another.
+
+    Example:
+        >>> as_json({"scene": "</script><!--"})
+        '{"scene":"\\\\u003c/script\\\\u003e\\\\u003c!--"}'
+    """
+    # ASCII: line separators of JavaScript are escaped too
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def render(index: str, documents: Mapping[str, str]) -> str:
+    """Fill the template.
+
+    Args:
+        index: JSON of `index_data`.
+        documents: Cell id -> JSON of `cell_data`.
+    """
+    texts = {name: Markup(text) for name, text in documents.items()}
+    return fill("viewer.html.j2", SCRIPTS, STYLES, index=Markup(index), documents=texts)
+
+
+def fill(template: str, scripts: Sequence[str], styles: Sequence[str], **values: Any) -> str:
+    """Fill a template of a page that holds its scripts and styles and allows no others."""
+    environment = environment_of("evaluators.viewer", "evaluators.report")  # shared colours
+    for kind, names in (("script", scripts), ("style", styles)):
+        text = "\n".join(asset(environment, name) for name in names)
+        values[kind] = Markup(text)
+        values[f"{kind}_hash"] = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    return environment.get_template(template).render(**values)
+
+
+def _notes(
+    cells: Sequence[WatchedCell],
+    shown: Sequence[WatchedCell],
+    too_many: Sequence[WatchedCell],
+    stride: int,
+) -> list[str]:
+    """Say what the page does not hold, one sentence each."""
+    ids = {cell.id for cell in shown}
+    left = [cell for cell in cells if cell.id not in ids and cell.watchable]
+    failed = [cell for cell in cells if not cell.watchable]
+    notes = []
+    if too_many:
+        notes.append(f"No room for {_named(too_many)}. --max-mb makes room.")
+    if left:
+        why = "not chosen"
+        if all(cell.interest == "quiet" for cell in left):
+            why = "in which nothing happened"
+        notes.append(f"Left out {why}: {_named(left)}. --scene, --policy and --seed choose.")
+    if failed:
+        notes.append(f"Every rollout failed, so that nothing is shown: {_named(failed)}.")
+    if stride > 1:
+        ordinal = ORDINALS.get(stride, f"{stride}th")
+        notes.append(
+            f"Every {ordinal} camera frame is kept: --max-mb makes room. "
+            "Poses, plans and metrics are whole."
+        )
+    return notes
+
+
+def _named(cells: Sequence[WatchedCell]) -> str:
+    """Count cells and list the first."""
+    names = [cell.name for cell in cells[:NAMED]]
+    if len(cells) > NAMED:
+        names.append(f"and {len(cells) - NAMED} more")
+    return f"{plural(len(cells), 'cell')}: {'; '.join(names)}"

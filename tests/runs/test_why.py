@@ -14,7 +14,7 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import execute_run
-from evaluators.viewer.cause import failed_at, most_different, said
+from evaluators.viewer.cause import debug_views, failed_at, most_different
 from scenarios.suite import expand
 from tests.runs.grey_renderer import GREY
 from tests.runs.test_runs import Announced
@@ -214,7 +214,7 @@ def test_what_a_policy_says_is_sorted_by_what_it_is() -> None:
         "flat": np.ones((5, 5)),
         "gaps": np.full((4, 4), np.nan),
     }
-    shown = said(debug, 0.5, lambda xy: xy.tolist())
+    shown = debug_views(debug, 0.5, lambda xy: xy.tolist())
     assert [one[0] for one in shown["images"]] == ["picture"]
     assert [one[0] for one in shown["heat"]] == ["heat", "flat"]
     assert shown["boxes"] == [["boxes_cars", 0.0, 0.0, 5.0, 10.0]]

@@ -13,7 +13,7 @@ import pytest
 from evaluators.opening import read_run
 from evaluators.report import write_report
 from evaluators.viewer.cells import Wanted
-from evaluators.viewer.page import Options, write_page
+from evaluators.viewer.page import write_page
 from tests.report.browser import Browser
 from tests.report.make_run import Plan
 from tests.viewer.axe import MISSING, SERIOUS, find_axe, findings
@@ -35,7 +35,7 @@ SEEN = f"""(() => {{
 @pytest.fixture(scope="module")
 def page(watched_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("page") / "view.html"
-    return write_page(read_run(watched_run), path, Wanted(), Options(), None).path
+    return write_page(read_run(watched_run), path, Wanted()).path
 
 
 def settled(browser: Browser) -> None:
@@ -261,7 +261,7 @@ def test_curves_show_where_no_value_is_valid_and_what_is_not_chosen_is_gone(
 def test_another_camera_is_chosen_for_all_renderers(browser: Browser, tmp_path: Path) -> None:
     plan = Plan(renderers=("clean", "3dgs"), scenes=("smoke-straight",), seeds=(0,), steps=8)
     root = make_watched(tmp_path / "run", plan, cameras=("front", "left"))
-    browser.open(write_page(read_run(root), tmp_path / "view.html", Wanted(), Options(), None).path)
+    browser.open(write_page(read_run(root), tmp_path / "view.html", Wanted()).path)
     settled(browser)
     seek(browser, 300)
     assert browser.evaluate(SEEN) == [3, 3]
@@ -277,7 +277,7 @@ def test_a_page_without_frames_says_so(browser: Browser, tmp_path: Path) -> None
         Plan(renderers=("clean", "3dgs"), scenes=("smoke-straight",), seeds=(0,), steps=8),
         cameras=(),
     )
-    browser.open(write_page(read_run(root), tmp_path / "view.html", Wanted(), Options(), None).path)
+    browser.open(write_page(read_run(root), tmp_path / "view.html", Wanted()).path)
     settled(browser)
     assert (
         browser.evaluate(
@@ -302,7 +302,7 @@ def test_two_hundred_road_users_are_drawn_fast(browser: Browser, tmp_path: Path)
         ),
         ACTORS,
     )
-    browser.open(write_page(read_run(root), tmp_path / "view.html", Wanted(), Options(), None).path)
+    browser.open(write_page(read_run(root), tmp_path / "view.html", Wanted()).path)
     settled(browser)
     browser.evaluate("player.birdseye.setFollow(false)")
     drawing = f"""(async () => {{
