@@ -16,21 +16,20 @@ from typing import Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.types import F64, I64
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.rows import Rollout, Series
 from evaluators.report.numbers import fixed
 from evaluators.report.rollouts import Event, clock_zero_us, events_of
 
-Variants = Mapping[
-    tuple[str, str], tuple[int, int]
-]  # (renderer, policy) -> (colour index, dash index)
+# (renderer, policy) -> (colour index, dash index)
+Variants = Mapping[tuple[str, str], tuple[int, int]]
 UNITS_ACROSS = 4000  # width of the drawing in integer units
 MARGIN_M = 10.0
-MAX_OFFSET_M = (
-    5.0  # one rollout that is far away must not flatten the others; the map shows where it went
-)
 STRAY_M = 40.0  # how far from the log's bounds the view follows a rollout
 MIN_ASPECT = 0.12  # height / width
+BARS_M = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+LEAST_PATH_M = 1.0
+MAX_ACTORS = 60  # the nearest ones to the logged drive
 
 
 @dataclass(frozen=True)
@@ -45,26 +44,15 @@ class Track:
 
 @dataclass(frozen=True)
 class Mark:
-    """One event on the map, in drawing units."""
+    """One event on the map, in drawing units; without a place where no step shows it."""
 
     variant: int
     kind: str
     text: str
-    x: int | None
-    y: int | None
+    folder: str  # of the rollout
+    x: int | None = None
+    y: int | None = None
     footprint: str = ""
-    folder: str = ""  # of the rollout
-
-
-@dataclass(frozen=True)
-class OffsetChart:
-    """Signed distance from the logged path over time; width 1000, height 200, zero in the
-    middle.
-    """
-
-    tracks: tuple[Track, ...]
-    reach: str
-    end_s: str
 
 
 @dataclass(frozen=True)
@@ -86,9 +74,8 @@ class SceneView:
     bar_units: int
     bar_label: str
     north_deg: float
-    offset: OffsetChart | None
-    road_users: tuple[RoadUser, ...] = ()
-    road_users_at: str = ""  # when the road users are drawn
+    road_users: list[dict[str, str]]
+    road_users_at: str  # when the road users are drawn
 
     @property
     def is_wide(self) -> bool:
@@ -181,46 +168,52 @@ def scene_view(
     Returns:
         The drawing; None where the scene has no logged drive of at least two points.
     """
-    log = np.stack([np.asarray(content["ego_log"][k], float) for k in ("x_m", "y_m")], 1)
+    log = np.column_stack([content["ego_log"]["x_m"], content["ego_log"]["y_m"]]).astype(float)
     if len(log) < 2:
         return None
-    driven: dict[tuple[str, str, str, int], F64] = {}
-    for r in rollouts:
-        own = series.get(r.cell, {})
+    driven: list[tuple[Rollout, F64]] = []
+    for rollout in rollouts:
+        own = series.get(rollout.cell, {})
         if "ego_x_m" in own and "ego_y_m" in own:
-            (tx, x), (ty, y) = own["ego_x_m"], own["ego_y_m"]
-            if len(x) > 1 and np.array_equal(tx, ty):
-                driven[r.cell] = np.stack([x, y], 1)
-    frame = _Frame(log, list(driven.values()))
-    names_policy = len({r.policy for r in rollouts}) > 1
+            (t_us, x), (ty_us, y) = own["ego_x_m"], own["ego_y_m"]
+            if len(x) > 1 and np.array_equal(t_us, ty_us):
+                driven.append((rollout, np.column_stack([x, y])))
+    frame = _Frame(log, [path for _, path in driven])
+    several = len({rollout.policy for rollout in rollouts}) > 1
 
     def label(rollout: Rollout) -> str:
-        return " \u00b7 ".join(
-            [rollout.renderer, *([rollout.policy] if names_policy else []), f"seed {rollout.seed}"]
-        )
+        names = [rollout.renderer, rollout.policy] if several else [rollout.renderer]
+        return " \u00b7 ".join([*names, f"seed {rollout.seed}"])
 
-    tracks = [
-        Track(*variant_of[r.renderer, r.policy], label(r), path_data(frame.units(driven[r.cell])))
-        for r in rollouts
-        if r.cell in driven and (r.renderer, r.policy) in variant_of
+    tracks = []
+    for rollout, path in driven:
+        variant = variant_of.get((rollout.renderer, rollout.policy))
+        if variant is not None:
+            tracks.append(Track(*variant, label(rollout), path_data(frame.units(path))))
+    times_us = [
+        series[rollout.cell]["ego_x_m"][0]
+        for rollout in rollouts
+        if "ego_x_m" in series.get(rollout.cell, {})
     ]
-    vehicle = content.get("vehicle") or {}
-    logged = [series[r.cell]["ego_x_m"][0] for r in rollouts if "ego_x_m" in series.get(r.cell, {})]
-    zero_us = clock_zero_us(content, min((int(t_us[0]) for t_us in logged), default=0))
-    bar_m = next(
-        b
-        for b in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 1e9)
-        if b * frame.scale > 0.08 * UNITS_ACROSS
-    )
-    lanes = content.get("lanes") or []
+    first_us = min((int(t_us[0]) for t_us in times_us), default=0)
+    zero_us = clock_zero_us(content, first_us)
     events = [event for rollout in rollouts for event in events_of(rollout, series)]
-    at_us, at_text = _moment(logged, events, zero_us)
+    known = [event for event in events if event.t_us is not None]
+    # road users are drawn at the scene's first event, else half way through
+    if known and times_us:
+        first = min(known, key=lambda event: event.t_us or 0)
+        at_us, moment = int(first.t_us or 0), f"when the first {first.what} happens"
+    else:
+        last_us = max((int(t_us[-1]) for t_us in times_us), default=0)
+        at_us, moment = (first_us + last_us) // 2, "half way"
+    bar_m = next((b for b in BARS_M if b * frame.scale > 0.08 * UNITS_ACROSS), BARS_M[-1])
+    lanes = content.get("lanes") or []
+    vehicle = content.get("vehicle") or {}
 
     def draw(xy: F64, closed: bool) -> str:
         units = frame.units(xy)
-        return (
-            path_data(units, closed, tolerance=0.0 if closed else 1.5) if frame.sees(units) else ""
-        )
+        tolerance = 0.0 if closed else 1.5
+        return path_data(units, closed, tolerance) if frame.sees(units) else ""
 
     return SceneView(
         scene=scene,
@@ -239,30 +232,11 @@ def scene_view(
             for event in events
         ),
         bar_units=round(bar_m * frame.scale),
-        bar_label=f"{bar_m:.0f}\u00a0m",
+        bar_label=f"{bar_m}\u00a0m",
         north_deg=round(frame.north_deg, 1),
-        offset=_offset_chart(rollouts, series, variant_of, label),
-        road_users=tuple(road_users(content, at_us, log, draw)),
-        road_users_at=at_text,
+        road_users=road_users(content, at_us, log, draw),
+        road_users_at=f"at {fixed((at_us - zero_us) * 1e-6, 1)}\u00a0s, {moment}",
     )
-
-
-def _moment(logged: Sequence[I64], events: Sequence[Event], zero_us: int) -> tuple[int, str]:
-    """Return when road users are drawn: at the scene's first event, else half way through.
-
-    Args:
-        logged: Times of each rollout's poses.
-        events: Of all rollouts.
-        zero_us: The instant that the scene's times count from.
-    """
-    firsts = [(event.t_us, event.what) for event in events if event.t_us is not None]
-    if not logged:
-        return 0, ""
-    if firsts:
-        t_us, what = min(firsts)
-        return t_us, f"at {fixed((t_us - zero_us) * 1e-6, 1)}\u00a0s, when the first {what} happens"
-    middle_us = (min(int(t[0]) for t in logged) + max(int(t[-1]) for t in logged)) // 2
-    return middle_us, f"at {fixed((middle_us - zero_us) * 1e-6, 1)}\u00a0s, half way"
 
 
 def lane_ring(lane: Mapping[str, Any]) -> list[list[float]]:
@@ -318,137 +292,61 @@ def _mark(
     zero_us: int,
 ) -> Mark:
     variant = variant_of.get((event.rollout.renderer, event.rollout.policy), (0, 0))[0]
-    when = (
-        f"at {fixed((event.t_us - zero_us) * 1e-6, 1)}\u00a0s"
-        if event.t_us is not None
-        else "at a time that no step shows"
-    )
+    text, folder = f"{label}: {event.what}", event.rollout.path
+    if event.t_us is None:
+        return Mark(variant, event.kind, f"{text} at a time that no step shows", folder)
+    text += f" at {fixed((event.t_us - zero_us) * 1e-6, 1)}\u00a0s"
     if event.x_m is None or event.y_m is None:
-        return Mark(
-            variant,
-            event.kind,
-            f"{label}: {event.what} {when}",
-            None,
-            None,
-            folder=event.rollout.path,
-        )
-    yaw = event.yaw_rad or 0.0
-    turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
-    ahead = float(vehicle.get("rear_axle_to_centre_m") or 0.0) if event.yaw_rad is not None else 0.0
-    centre = np.array([[ahead, 0.0]]) @ turn + [event.x_m, event.y_m]
-    at = frame.units(centre)[0]
+        return Mark(variant, event.kind, text, folder)
+    centre = np.array([event.x_m, event.y_m])
     footprint = ""
-    if event.yaw_rad is not None and vehicle.get("length_m"):
-        box = corners(centre[0], event.yaw_rad, vehicle["length_m"], vehicle["width_m"])
-        footprint = path_data(frame.units(box), closed=True, tolerance=0.0)
-    where = f"x {fixed(centre[0, 0], 1)}, y {fixed(centre[0, 1], 1)}\u00a0m"
-    return Mark(
-        variant,
-        event.kind,
-        f"{label}: {event.what} {when}, {where}",
-        round(at[0]),
-        round(at[1]),
-        footprint,
-        event.rollout.path,
-    )
-
-
-def _offset_chart(
-    rollouts: Sequence[Rollout], series: Series, variant_of: Variants, label: Any
-) -> OffsetChart | None:
-    own = {
-        r.cell: series[r.cell]["lateral_bias_m"]
-        for r in rollouts
-        if "lateral_bias_m" in series.get(r.cell, {})
-    }
-    if not own:
-        return None
-    reach = max(0.5, *(float(np.abs(v).max()) for _, v in own.values()))
-    shown = next((step for step in (0.5, 1.0, 2.0, 3.0) if reach <= step), MAX_OFFSET_M)
-    end_us = max(1, *(int(t[-1] - t[0]) for t, _ in own.values()))
-    tracks = []
-    for rollout in rollouts:
-        if rollout.cell in own and (rollout.renderer, rollout.policy) in variant_of:
-            t_us, offset = own[rollout.cell]
-            units = np.stack(
-                [(t_us - t_us[0]) / end_us * 1000.0, 100.0 - offset / shown * 100.0], 1
-            )
-            tracks.append(
-                Track(
-                    *variant_of[rollout.renderer, rollout.policy],
-                    label(rollout),
-                    path_data(units, tolerance=0.7),
-                )
-            )
-    return OffsetChart(
-        tuple(tracks),
-        f"{shown:g}\u00a0m" + (" and more" if reach > shown else ""),
-        f"{end_us * 1e-6:.1f}",
-    )
-
-
-LEAST_PATH_M = 1.0
-MAX_ACTORS = 60  # the nearest ones to the logged drive
-
-
-@dataclass(frozen=True)
-class RoadUser:
-    """One road user, in drawing units.
-
-    Attributes:
-        text: For the hover.
-        body: Its box at the picture's time, as SVG path data.
-        way: The path that it goes during the scene; empty if it stands.
-    """
-
-    text: str
-    body: str
-    way: str
+    if event.yaw_rad is not None:
+        ahead = np.array([math.cos(event.yaw_rad), math.sin(event.yaw_rad)])
+        centre = centre + float(vehicle.get("rear_axle_to_centre_m") or 0.0) * ahead
+        if vehicle.get("length_m"):
+            box = corners(centre, event.yaw_rad, vehicle["length_m"], vehicle["width_m"])
+            footprint = path_data(frame.units(box), closed=True, tolerance=0.0)
+    text += f", x {fixed(centre[0], 1)}, y {fixed(centre[1], 1)}\u00a0m"
+    x, y = np.rint(frame.units(centre[None])[0]).astype(int).tolist()
+    return Mark(variant, event.kind, text, folder, x, y, footprint)
 
 
 def road_users(
     content: Mapping[str, Any], at_us: int, log: F64, draw: Callable[[F64, bool], str]
-) -> list[RoadUser]:
+) -> list[dict[str, str]]:
     """Lay out the road users of a scene; empty for scene files of earlier versions, which have no
     tracks.
 
     Args:
         content: ``scenes/SCENE.json``.
-        at_us: Time of the picture; a road user that is not there then is drawn at its nearest time.
+        at_us: Time of the image; a road user that is not there then is drawn at its nearest time.
         log: ``(N, 2)`` the logged drive, metres, world.
         draw: From ``(N, 2)`` world metres and whether the line is closed to SVG path data; empty
-            where nothing of it is in the picture.
+            where nothing of it is in the image.
+
+    Returns:
+        Of each: ``text`` for the hover, ``body`` (its box at that time) and ``way`` (its path during
+        the scene; empty if it stands) as SVG path data.
     """
-    known = [
-        actor for actor in content.get("actors") or [] if actor.get("x_m") and actor.get("length_m")
-    ]
-
-    def distance(actor: Mapping[str, Any]) -> float:
-        xy = np.column_stack([actor["x_m"], actor["y_m"]])
-        return float(np.min(np.hypot(*(xy[:, None] - log[None, ::10]).transpose(2, 0, 1))))
-
-    nearest = sorted(known, key=distance)[:MAX_ACTORS]
-    found = (_road_user(actor, at_us, draw) for actor in nearest)
-    return [one for one in found if one.body or one.way]
-
-
-def _road_user(actor: Mapping[str, Any], at_us: int, draw: Callable[[F64, bool], str]) -> RoadUser:
-    xy = np.column_stack([actor["x_m"], actor["y_m"]]).astype(float)
-    moves = float(np.ptp(xy, axis=0).max()) > LEAST_PATH_M
-    k = int(np.argmin(np.abs(np.asarray(actor["t_us"]) - at_us)))
-    body = draw(
-        corners(xy[k], float(actor["yaw_rad"][k]), actor["length_m"], actor["width_m"]), True
-    )
-    how = (
-        ("reacts once the policy drives" if actor.get("reacts") else "as recorded or scripted")
-        if moves
-        else "stands"
-    )
-    return RoadUser(
-        f"{actor.get('label') or 'road user'} {actor.get('id') or ''}, {how}".strip(),
-        body,
-        draw(xy, False) if moves else "",
-    )
+    near: list[tuple[float, dict[str, str]]] = []
+    for actor in content.get("actors") or []:
+        if not (actor.get("x_m") and actor.get("length_m")):
+            continue
+        xy = np.column_stack([actor["x_m"], actor["y_m"]]).astype(float)
+        step = int(np.argmin(np.abs(np.asarray(actor["t_us"]) - at_us)))
+        yaw_rad = float(actor["yaw_rad"][step])
+        how, way = "stands", ""
+        if float(np.ptp(xy, axis=0).max()) > LEAST_PATH_M:
+            how = "as recorded or scripted"
+            if actor.get("reacts"):
+                how = "reacts once the policy drives"
+            way = draw(xy, False)
+        body = draw(corners(xy[step], yaw_rad, actor["length_m"], actor["width_m"]), True)
+        name = f"{actor.get('label') or 'road user'} {actor.get('id') or ''}".strip()
+        distance_m = float(np.linalg.norm(xy[:, None] - log[None, ::10], axis=2).min())
+        near.append((distance_m, {"text": f"{name}, {how}", "body": body, "way": way}))
+    near.sort(key=lambda pair: pair[0])
+    return [user for _, user in near[:MAX_ACTORS] if user["body"] or user["way"]]
 
 
 def corners(centre: F64 | Sequence[float], yaw_rad: float, length_m: float, width_m: float) -> F64:

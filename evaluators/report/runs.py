@@ -4,6 +4,7 @@ found below a folder, and chosen.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -39,6 +40,8 @@ CHECK = "simrun check run RUN says what is damaged"
 State = Literal["finished", "running", "unfinished", "damaged"]
 STYLES = {"finished": "", "running": "cyan", "unfinished": "yellow", "damaged": "red"}
 PROBLEM_LETTERS = 90
+MARKS = frozenset((RUN_INFO, LOCK))  # the first file of a run folder is its lock
+SKIPPED = frozenset(("node_modules", "__pycache__", "site-packages"))
 
 
 @dataclass(frozen=True)
@@ -58,61 +61,26 @@ class RunEntry:
     problem: str
     info: Mapping[str, Any]
 
-    @cached_property
-    def table(self) -> MetricTable:
-        """Give what the run's metrics are, as the run itself says."""
-        return MetricTable.of_run(self.info)
-
-    @property
-    def kind(self) -> str:
-        """Give what the folder holds: ``run``, ``score`` (of logs) or ``fork``."""
-        return str(self.info.get("kind") or "run")
-
     @property
     def started_at(self) -> datetime | None:
-        """Give when the run was begun."""
-        return as_time(self.info.get("started_at"))
-
-    @property
-    def project(self) -> Mapping[str, Any]:
-        """Give what `alpasim_plugin.runs.provenance.Project` names; empty for a run of an earlier
-        version.
-        """
-        return self.info.get("project") or {}
-
-    @property
-    def commit(self) -> str:
-        """Give the project's commit, or ""."""
-        return str(self.project.get("commit") or "")
+        """Give when the run was begun, in UTC where it names no zone."""
+        try:
+            return as_utc(datetime.fromisoformat(str(self.info.get("started_at"))))
+        except ValueError:
+            return None
 
     @property
     def commit_text(self) -> str:
-        """Give the commit for a table: seven digits, and ``+`` where files differed from it; ""
-        without one.
+        """Give the project's commit for a table: seven digits, and ``+`` where files differed from
+        it; "" without one.
         """
-        return self.commit[:7] + ("+" if self.commit and self.project.get("dirty") else "")
-
-    @property
-    def weights(self) -> frozenset[tuple[str, str]]:
-        """Give name of a weight file and its SHA-256; where the file lay does not matter."""
-        return frozenset(
-            (Path(path).name, str(digest))
-            for path, digest in (self.info.get("weights") or {}).items()
-        )
-
-    @property
-    def scenes(self) -> dict[str, str]:
-        """Give scene id -> content hash."""
-        return {
-            name: str(facts.get("content_hash") or "")
-            for name, facts in (self.info.get("scenes") or {}).items()
-        }
+        project = self.info.get("project") or {}
+        commit = str(project.get("commit") or "")[:7]
+        return f"{commit}+" if commit and project.get("dirty") else commit
 
     @property
     def outcome(self) -> Mapping[str, Any]:
-        """Give ``n_rollouts`` and ``n_failed``, from ``run.json`` or, for a run of an earlier
-        version, from the summary; else empty.
-        """
+        """Give ``n_rollouts`` and ``n_failed``, from ``run.json`` or else the summary."""
         if self.state != "finished":
             return {}
         stated: Mapping[str, Any] = self.info.get("outcome") or self.summary.get("failures") or {}
@@ -125,12 +93,10 @@ class RunEntry:
         """
         if "n_rollouts" in self.outcome:
             return int(self.outcome["n_rollouts"])
-        if not self.info or self.kind == "score":
+        if not self.info or self.info.get("kind") == "score":
             return None
-        sizes = [
-            len(self.info.get(name) or ()) for name in ("renderers", "policies", "scenes", "seeds")
-        ]
-        return sizes[0] * sizes[1] * sizes[2] * sizes[3]
+        axes = ("renderers", "policies", "scenes", "seeds")
+        return math.prod(len(self.info.get(axis) or ()) for axis in axes)
 
     @cached_property
     def summary(self) -> Mapping[str, Any]:
@@ -147,44 +113,33 @@ class RunEntry:
     def metric(self, metric: str, renderer: str, policy: str) -> Mapping[str, Any]:
         """Return the entry of a metric in ``summary.json``; empty where it has none."""
         table = self.summary.get("metrics") or {}
-        of = (
-            table.get(cell_name(renderer, policy))
-            or (table.get(renderer) if len(self.info.get("policies") or ()) == 1 else None)
-            or {}
-        )
-        return of.get(metric) or {}
+        alone = renderer if len(self.info.get("policies") or ()) == 1 else ""
+        entries = table.get(cell_name(renderer, policy)) or table.get(alone) or {}
+        return entries.get(metric) or {}
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything for JSON."""
         info = self.info
-        listed = {
-            name: list(info.get(name) or ()) for name in ("renderers", "policies", "seeds", "asked")
-        }
+        scenes = info.get("scenes") or {}
+        lists = ("renderers", "policies", "seeds", "asked")
         return {
             "folder": str(self.folder),
             "state": self.state,
             "problem": self.problem,
-            "kind": self.kind,
-            "key": info.get("key"),
-            "started_at": info.get("started_at"),
-            "project": dict(self.project) or None,
-            "version": info.get("version"),
-            "preset": info.get("preset"),
-            **listed,
-            "scenes": self.scenes,
+            "kind": info.get("kind") or "run",
+            "project": info.get("project") or None,
+            **{name: info.get(name) for name in ("key", "started_at", "version", "preset")},
+            **{name: list(info.get(name) or ()) for name in lists},
+            "scenes": {name: facts.get("content_hash") or "" for name, facts in scenes.items()},
             "weights": dict(info.get("weights") or {}),
             "rollouts": self.planned,
             "failed": self.outcome.get("n_failed"),
         }
 
 
-def as_time(text: object) -> datetime | None:
-    """Return a time of ISO 8601, in UTC where it names no zone; None where it is no time."""
-    try:
-        found = datetime.fromisoformat(str(text))
-    except ValueError:
-        return None
-    return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
+def as_utc(time: datetime) -> datetime:
+    """Return a time in UTC where it names no zone."""
+    return time if time.tzinfo is not None else time.replace(tzinfo=UTC)
 
 
 def read_entry(folder: Path, with_summary: bool = False) -> RunEntry:
@@ -217,10 +172,6 @@ def read_entry(folder: Path, with_summary: bool = False) -> RunEntry:
     return entry
 
 
-MARKS = frozenset((RUN_INFO, LOCK))  # the first file of a run folder is its lock
-SKIPPED = frozenset(("node_modules", "__pycache__", "site-packages"))
-
-
 def find_runs(roots: Sequence[Path], with_summary: bool = False) -> list[RunEntry]:
     """Describe every run folder below some folders, or those folders themselves, the newest first.
 
@@ -237,21 +188,18 @@ def find_runs(roots: Sequence[Path], with_summary: bool = False) -> list[RunEntr
     found: dict[tuple[int, int], Path] = {}
     for root in roots:
         if not root.is_dir():
-            what = "a file" if root.exists() else "no such folder"
             raise InputError(
-                f"{root}: {what}",
+                f"{root}: not a folder",
                 "name the folder that holds the run folders; simrun run writes them below runs/",
             )
         for folder in _run_folders(root, set()):
             state = folder.stat()
             found.setdefault((state.st_dev, state.st_ino), folder)
 
-    def newest_first(entry: RunEntry) -> tuple[float, str]:
-        """Sort by start; a folder that does not say when it was begun comes last."""
-        began = entry.started_at
-        return (-began.timestamp() if began is not None else float("inf"), str(entry.folder))
-
-    return sorted((read_entry(folder, with_summary) for folder in found.values()), key=newest_first)
+    entries = [read_entry(folder, with_summary) for folder in found.values()]
+    never = datetime.min.replace(tzinfo=UTC)
+    entries.sort(key=lambda entry: str(entry.folder))
+    return sorted(entries, key=lambda entry: entry.started_at or never, reverse=True)
 
 
 def _run_folders(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
@@ -292,17 +240,16 @@ class Choice:
 
     def takes(self, entry: RunEntry) -> bool:
         """Tell whether a run is all that is asked for."""
-        info = entry.info
         began = entry.started_at
         return (
-            _each_is_named(self.renderers, info.get("renderers") or ())
-            and _each_is_named(self.policies, info.get("policies") or ())
+            _each_is_named(self.renderers, entry.info.get("renderers") or ())
+            and _each_is_named(self.policies, entry.info.get("policies") or ())
             and (self.since is None or (began is not None and began >= self.since))
         )
 
 
-def _each_is_named(asked: Sequence[str], known: Sequence[str]) -> bool:
-    return all(any(fnmatchcase(name, one) for name in known) for one in asked)
+def _each_is_named(patterns: Sequence[str], names: Sequence[str]) -> bool:
+    return all(any(fnmatchcase(name, pattern) for name in names) for pattern in patterns)
 
 
 def as_day(text: str, option: str, now: datetime) -> datetime:
@@ -322,13 +269,12 @@ def as_day(text: str, option: str, now: datetime) -> datetime:
     try:
         if hours is not None:
             return now - timedelta(hours=hours * float(text[:-1]))
-        found = datetime.fromisoformat(text)
+        return as_utc(datetime.fromisoformat(text))
     except (ValueError, OverflowError):
         raise InputError(
             f"{option} {text}: neither a date nor an age",
             "write 2026-03-01, 2026-03-01T18:00, 7d or 12h",
         ) from None
-    return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
 
 
 def shown_folder(folder: Path, roots: Sequence[Path]) -> str:
@@ -354,26 +300,25 @@ def runs_table(
         table.add_column(name, overflow="fold")
     for metric in metrics:
         table.add_column(Text(escape(metric)), no_wrap=True, justify="right")
-    between = "\n" if metrics else ", "
     for entry in entries:
         variants = variants_of(entry)
-        names = [[escape(variant[number]) for variant in variants] for number in (0, 1)]
+        names = [[escape(variant[axis]) for variant in variants] for axis in (0, 1)]
+        texts = [", ".join(dict.fromkeys(column)) for column in names]
+        if metrics:
+            texts = ["\n".join(column) for column in names]
+            texts += [
+                "\n".join(value_text(entry, metric, *variant) for variant in variants)
+                for metric in metrics
+            ]
         began = entry.started_at
         table.add_row(
             Text(escape(shown_folder(entry.folder, roots)), style="bold"),
-            Text(began.strftime("%Y-%m-%d %H:%M") if began is not None else DASH),
-            Text(entry.commit_text or DASH),
+            began.strftime("%Y-%m-%d %H:%M") if began is not None else DASH,
+            entry.commit_text or DASH,
             Text(scenes_text(entry)),
             Text(escape(str(entry.info.get("preset") or DASH))),
             _state(entry),
-            *(
-                Text(between.join(column if metrics else dict.fromkeys(column)) or DASH)
-                for column in names
-            ),
-            *(
-                Text("\n".join(value_text(entry, metric, *one) for one in variants) or DASH)
-                for metric in metrics
-            ),
+            *(Text(text or DASH) for text in texts),
         )
     return table
 
@@ -393,34 +338,30 @@ def scenes_text(entry: RunEntry) -> str:
     """
     if not entry.info:
         return DASH
-    asked = [str(name) for name in entry.info.get("asked") or ()]
-    names = [
-        Path(name).name.removesuffix(".yaml") if Path(name).is_absolute() else name
-        for name in asked or entry.scenes
-    ]
+    scenes = entry.info.get("scenes") or {}
+    names = [str(name) for name in entry.info.get("asked") or scenes]
+    if names and Path(names[0]).is_absolute():
+        names[0] = Path(names[0]).name.removesuffix(".yaml")
     more = f" + {len(names) - 1}" if len(names) > 1 else ""
-    return f"{len(entry.scenes)} x {len(entry.info.get('seeds') or ())} {escape(''.join(names[:1]))}{more}"
+    seeds = entry.info.get("seeds") or ()
+    return f"{len(scenes)} x {len(seeds)} {escape(''.join(names[:1]))}{more}"
 
 
 def value_text(entry: RunEntry, metric: str, renderer: str, policy: str) -> str:
     """Print a metric's mean with its 95 % interval over scenes, both as `summary.json` has them; a
     dash where there is no mean.
     """
-    found = entry.metric(metric, renderer, policy)
-    mean, bounds = finite(found.get("mean")), interval(found.get("ci95_clustered"))
+    numbers = entry.metric(metric, renderer, policy)
+    mean = finite(numbers.get("mean"))
     if mean is None:
         return DASH
-    percent = entry.table.shown(metric).in_percent
-    scale, tail = (
-        (100.0, " %") if percent else (1.0, f" {found['unit']}" if found.get("unit") else "")
-    )
-    places = 1 if percent else decimals(*(value * scale for value in (mean, *(bounds or ()))))
-    spread = (
-        ""
-        if bounds is None
-        else f" ({fixed(bounds[0] * scale, places)} to {fixed(bounds[1] * scale, places)})"
-    )
-    return f"{fixed(mean * scale, places)}{tail}{spread}"
+    facts = MetricTable.of_run(entry.info).shown(metric)
+    scale, unit = (100.0, "%") if facts.in_percent else (1.0, str(numbers.get("unit") or ""))
+    values = [value * scale for value in (mean, *(interval(numbers.get("ci95_clustered")) or ()))]
+    places = 1 if facts.in_percent else decimals(*values)
+    texts = [fixed(value, places) for value in values]
+    spread = f"({' to '.join(texts[1:])})" if len(texts) > 1 else ""
+    return " ".join(filter(None, (texts[0], unit, spread)))
 
 
 def _state(entry: RunEntry) -> Text:
@@ -428,9 +369,9 @@ def _state(entry: RunEntry) -> Text:
     if entry.state == "finished":
         failed = int(entry.outcome.get("n_failed") or 0)
         return Text(planned) + Text(f", {failed} failed" if failed else "", style="red")
-    text = (
-        f"{entry.state}, {planned} planned" if planned and entry.state != "damaged" else entry.state
-    )
-    return Text(text, style=STYLES[entry.state]) + Text(
-        f"\n{escape(shorten(entry.problem, PROBLEM_LETTERS))}" if entry.problem else "", style="dim"
-    )
+    text = Text(entry.state, style=STYLES[entry.state])
+    if planned and entry.state != "damaged":
+        text += Text(f", {planned} planned")
+    if entry.problem:
+        text += Text(f"\n{escape(shorten(entry.problem, PROBLEM_LETTERS))}", style="dim")
+    return text

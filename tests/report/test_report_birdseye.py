@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.log.run_folder.rows import Rollout
-from evaluators.opening import Run, read_run
 from evaluators.report.birdseye import path_data, scene_view
-from evaluators.report.rollouts import events_of, read_series
-from tests.report.make_run import Plan, make_run
+from evaluators.report.rollouts import events_of
 
 VARIANTS = {("a", "p"): (0, 0)}
 
@@ -207,37 +204,3 @@ def test_edge_without_paint_gives_no_line() -> None:
     assert view is not None
     assert view.lines.count("M") == 1
     assert view.lanes.count("z") == 1
-
-
-def test_one_far_rollout_does_not_flatten_the_offsets_of_the_others() -> None:
-    x = np.linspace(0, 50, 51).tolist()
-    near, far = Rollout("a", "p", "s", 0, "ok"), Rollout("a", "p", "s", 1, "ok")
-    series = {
-        r.cell: series_of(x, [0.0] * 51, lateral_bias_m=[d] * 51)
-        for r, d in ((near, 1.0), (far, 300.0))
-    }
-    view = scene_view("s", scene(x, [0.0] * 51), [near, far], series, VARIANTS)
-    assert view is not None
-    assert view.offset is not None
-    assert view.offset.reach == "5\u00a0m and more"
-    assert decode(view.offset.tracks[0].d)[0, 1] == 80
-
-
-def test_offset_chart_keeps_the_worst_rollout_inside(tmp_path: Path) -> None:
-    run: Run = read_run(
-        make_run(
-            tmp_path, Plan(scenes=("hard/x",), harm={"3dgs": 1.0}, pictures=False, clips=False)
-        )
-    )
-    content = run.scene_data("hard/x")
-    assert content is not None
-    variants = {(name, "lane-camera"): (i, 0) for i, name in enumerate(run.renderers)}
-    view = scene_view("hard/x", content, run.rollouts, read_series(run), variants)
-    assert view is not None
-    assert view.offset is not None
-    assert len(view.offset.tracks) == len(view.tracks) == 9
-    for track in view.offset.tracks:
-        points = decode(track.d)
-        assert points.min() >= 0
-        assert (points[:, 1] <= 200).all()
-        assert points[0, 0] == 0

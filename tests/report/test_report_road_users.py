@@ -17,7 +17,7 @@ def write(xy: np.ndarray, closed: bool) -> str:
 def users_of(scenario: Scenario, at_us: int) -> dict[str, tuple[str, str]]:
     log = scenario.ego_log.xyz[:, :2]
     found = road_users(scene_as_json(scenario), at_us, log, write)
-    return {one.text.split(",")[0]: (one.body, one.way) for one in found}
+    return {one["text"].split(",")[0]: (one["body"], one["way"]) for one in found}
 
 
 def test_a_leader_is_where_it_is_at_that_time_and_leaves_its_way() -> None:
