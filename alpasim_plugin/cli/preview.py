@@ -27,8 +27,8 @@ from alpasim_plugin.log.run_folder.writer import scene_as_json
 from alpasim_plugin.renderers.background import background_note
 from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.guards import checked_frames
-from evaluators.report.birdseye import chord_angle, corners
-from evaluators.viewer.drive_data import drawn_map, recorded_drive
+from evaluators.report.birdseye import chord_angle, corners, drawn_map
+from evaluators.viewer.drive_data import recorded_drive
 
 Flatten = Callable[[F64], F64]  # (N, 2 or 3) metres, world -> (N, 2) metres on the page
 

@@ -207,7 +207,7 @@ def scene_view(
         last_us = max((int(t_us[-1]) for t_us in times_us), default=0)
         at_us, moment = (first_us + last_us) // 2, "half way"
     bar_m = next((b for b in BARS_M if b * frame.scale > 0.08 * UNITS_ACROSS), BARS_M[-1])
-    lanes = content.get("lanes") or []
+    shapes = drawn_map(content)
     vehicle = content.get("vehicle") or {}
 
     def draw(xy: F64, closed: bool) -> str:
@@ -221,10 +221,10 @@ def scene_view(
         width=UNITS_ACROSS,
         height=frame.height,
         unit_per_m=frame.scale,
-        lanes=_areas([lane_ring(lane) for lane in lanes], frame),
-        lines=_lines([edge for lane in lanes for edge in painted_edges(lane)], frame),
-        edges=_lines(content.get("road_edges") or [], frame),
-        crosswalks=_areas(content.get("crosswalks") or [], frame),
+        lanes=_areas(shapes["lanes"], frame),
+        lines=_lines(shapes["paint"], frame),
+        edges=_lines(shapes["edges"], frame),
+        crosswalks=_areas(shapes["crosswalks"], frame),
         log=path_data(frame.units(log)),
         tracks=tuple(tracks),
         marks=tuple(
@@ -239,48 +239,52 @@ def scene_view(
     )
 
 
-def lane_ring(lane: Mapping[str, Any]) -> list[list[float]]:
-    """Return a lane's outline, its left edge first; empty where an edge is not known."""
-    left, right = lane.get("left"), lane.get("right")
-    return [*left, *reversed(right)] if left and right else []
+def drawn_map(content: Mapping[str, Any]) -> dict[str, list[F64]]:
+    """Return what every view from above draws of a map: ``lanes``, ``paint`` (edges of lanes that
+    carry markings), ``edges`` and ``crosswalks``.
 
+    Args:
+        content: ``scenes/SCENE.json``.
 
-def painted_edges(lane: Mapping[str, Any]) -> list[list[list[float]] | None]:
-    """List a lane's edges without those that carry no paint, such as the paths across an
-    intersection.
+    Returns:
+        Lines, and rings of areas without their first point again, each ``(N, 2)`` metres, world.
     """
-    sides = zip(
-        (lane.get("left"), lane.get("right")),
-        lane.get("paint") or ("unknown", "unknown"),
-        strict=True,
-    )
-    return [edge for edge, paint in sides if paint != "none"]
+    rings, painted = [], []
+    for lane in content.get("lanes") or []:
+        left, right = lane.get("left"), lane.get("right")
+        if left and right:
+            rings.append([*left, *reversed(right)])
+        paint = lane.get("paint") or ("unknown", "unknown")
+        painted += [edge for edge, kind in zip((left, right), paint, strict=True) if kind != "none"]
+
+    def arrays(lines: Sequence[Any], least: int) -> list[F64]:
+        """Return the lines of at least so many points."""
+        return [
+            np.asarray(line, dtype=np.float64)[:, :2]
+            for line in lines
+            if line is not None and len(line) >= least
+        ]
+
+    return {
+        "lanes": arrays(rings, 3),
+        "paint": arrays(painted, 2),
+        "edges": arrays(content.get("road_edges") or [], 2),
+        "crosswalks": arrays(content.get("crosswalks") or [], 3),
+    }
 
 
-def _lines(lines: Sequence[Sequence[Sequence[float]] | None], frame: _Frame) -> str:
-    drawn = []
-    for line in lines:
-        if line is not None and len(line) > 1:
-            units = frame.units(np.asarray(line, float)[:, :2])
-            if frame.sees(units):
-                drawn.append(path_data(units))
-    return "".join(dict.fromkeys(drawn))  # a boundary shared by two lanes is drawn once
+def _lines(lines: Sequence[F64], frame: _Frame) -> str:
+    seen = [units for units in map(frame.units, lines) if frame.sees(units)]
+    return "".join(dict.fromkeys(map(path_data, seen)))  # shared by two lanes: drawn once
 
 
-def _areas(rings: Sequence[Sequence[Sequence[float]]], frame: _Frame) -> str:
+def _areas(rings: Sequence[F64], frame: _Frame) -> str:
     """Write rings into one path, all turning the same way, so that overlapping rings add up instead
     of cutting holes.
     """
-    drawn = []
-    for ring in rings:
-        if len(ring) < 3:
-            continue
-        units = frame.units(np.asarray(ring, float)[:, :2])
-        if frame.sees(units):
-            x, y = units.T
-            turns_left = float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) > 0
-            drawn.append(path_data(units if turns_left else units[::-1], closed=True))
-    return "".join(drawn)
+    seen = [units for units in map(frame.units, rings) if frame.sees(units)]
+    turned = [ring if shapely.is_ccw(shapely.linearrings(ring)) else ring[::-1] for ring in seen]
+    return "".join(path_data(ring, closed=True) for ring in turned)
 
 
 def _mark(

@@ -103,9 +103,8 @@ class Speed:
     """The speed table.
 
     Attributes:
-        rows: Per renderer: ``renderer``, ``variant`` (its colour), ``cells`` in the order of
-            `TIMES`, ``stages`` (their cells), ``bar`` (stages with their share of the slowest
-            renderer's sum, in percent) and ``sum_text``.
+        rows: Per renderer: ``renderer``, ``cells`` in the order of `TIMES`, and ``stages`` (their
+            cells).
         stages: Names of the stages.
         pool: Workers, frames per second and wall time of the run.
     """
@@ -119,34 +118,15 @@ def speed(run: Run) -> Speed:
     """Lay out milliseconds per frame, whole and by stage."""
     entries: Mapping[str, Mapping[str, Any]] = run.summary.get("speed") or {}
     names = list(dict.fromkeys(stage for e in entries.values() for stage in e.get("stages") or {}))
-    means = {
-        renderer: [_per_frame((entry.get("stages") or {}).get(name) or {}) for name in names]
-        for renderer, entry in entries.items()
-    }
-    sums = {renderer: sum(filter(None, of_stages)) for renderer, of_stages in means.items()}
-    longest = max(sums.values(), default=0.0)
+    absent = "no finished rollout has a frame after its first"
     rows = []
     for renderer, entry in entries.items():
         stages = entry.get("stages") or {}
-        bar = [
-            {
-                "stage": i,
-                "name": name,
-                "text": short(ms, "ms"),
-                "width": round(100 * ms / longest, 2),
-            }
-            for i, (name, ms) in enumerate(zip(names, means[renderer], strict=True))
-            if ms
-        ]
-        absent = "no finished rollout has a frame after its first"
         rows.append(
             {
                 "renderer": renderer,
-                "variant": run.renderers.index(renderer) if renderer in run.renderers else 0,
                 "cells": [_cell(finite(entry.get(key)), absent) for key in TIMES],
                 "stages": [_stage(stages.get(name) or {}) for name in names],
-                "bar": bar,
-                "sum_text": short(sums[renderer] or None, "ms"),
             }
         )
     pool = run.summary.get("pool") or {}
@@ -170,11 +150,3 @@ def _stage(entry: Mapping[str, Any]) -> Cell:
     texts += [] if share is None else [f"{fixed(100 * share, 0)}\u00a0%"]
     note = "median; 95th percentile; share of the loop's time"
     return Cell(short(p50), note, " \u00b7 ".join(texts), sort=p50)
-
-
-def _per_frame(stage: Mapping[str, Any]) -> float | None:
-    """Return what a stage costs per frame: its mean where it is stated, since some stages run once
-    for several frames.
-    """
-    mean = finite(stage.get("per_frame_ms"))
-    return finite(stage.get("p50_ms")) if mean is None else mean

@@ -71,21 +71,17 @@ def render_presets(
 
 def _score_cell(summary: Mapping[str, Any], variant: str, name: str, in_percent: bool) -> Text:
     metrics = (summary.get("metrics") or {}).get(variant) or {}
-    means = [(metrics.get(name + end) or {}).get("mean") for end in ("", "_least", "_most")]
-    why = (
-        ((summary.get("censoring") or {}).get(variant) or {})
-        .get("invalid", {})
-        .get(name, {})
-        .get("reasons", {})
+    invalid = ((summary.get("censoring") or {}).get(variant) or {}).get("invalid") or {}
+    reasons = "; ".join((invalid.get(name) or {}).get("reasons") or ())
+    mean, least, most = (
+        "" if value is None else f"{100 * value:.1f} %" if in_percent else f"{value:.3f}"
+        for value in (
+            (metrics.get(name + end) or {}).get("mean") for end in ("", "_least", "_most")
+        )
     )
-    texts = [
-        "" if mean is None else f"{100 * mean:.1f} %" if in_percent else f"{mean:.3f}"
-        for mean in means
-    ]
-    reason = Text(escape("; ".join(why) or ("" if texts[0] else "not measured")), style="dim")
-    if not why or not texts[1]:  # known in all rollouts, or without a range
-        return Text(f"{texts[0]} ").append_text(reason)
-    return Text(f"{texts[1]} to {texts[2]} ").append_text(reason)
+    number = f"{least} to {most}" if reasons and least else mean
+    note = reasons or ("" if mean else "not measured")
+    return Text(f"{number} ").append(escape(note), style="dim")
 
 
 def render_table(

@@ -34,7 +34,6 @@ WIDTH_PX = 640
 JPEG_START = b"\xff\xd8"
 BEFORE_US, AFTER_US = 6_000_000, 1_000_000  # of the failure, that are shown
 MOST_LOOKS = 48
-CROP_SHARE = 3  # the crop is a third as wide and as high as the picture
 SCRIPTS = ("theme.js", "timeline.js", "overlay.js", "cause.js")
 STYLES = ("theme.css", "report.css", "cause.css")
 # How a value of `Plan.debug` is shown: kind, prefix of its name, dtype, least shape, last size
@@ -400,32 +399,8 @@ def commands(
     ]
 
 
-def most_different(one: U8, other: U8) -> tuple[int, int, int, int]:
-    """Return the part of two images that differs most: x, y, width and height in pixels."""
-    height, width = one.shape[:2]
-    size = (max(1, width // CROP_SHARE), max(1, height // CROP_SHARE))
-    apart = np.abs(one.astype(np.float32) - other.astype(np.float32)).mean(axis=2)
-    mean = cv2.blur(apart, size, borderType=cv2.BORDER_REPLICATE)
-    inside = mean[size[1] // 2 : height - size[1] // 2, size[0] // 2 : width - size[0] // 2]
-    y, x = np.unravel_index(int(np.argmax(inside)), inside.shape)
-    return int(x), int(y), *size
-
-
 def _parting(one: Parting, start_us: int) -> dict[str, Any]:
-    """Return a parting for the template; of each image the whole, marked where they differ most,
-    and that part enlarged.
-    """
-    entry = {"name": one.name, "at_s": (one.t_us - start_us) * 1e-6, "gap_m": one.gap_m}
-    if one.frames is None:
-        return entry | {"pictures": []}
-    x, y, width, height = most_different(*one.frames)
-    parts = [frame[y : y + height, x : x + width] for frame in one.frames]
-    pictures = []
-    for frame, part in zip(one.frames, parts, strict=True):
-        box = (x, y, width, height)
-        line_px = max(1, frame.shape[1] // 200)
-        marked = cv2.rectangle(frame.copy(), box, (255, 210, 0), line_px)
-        large = cv2.resize(part, (width * 2, height * 2), interpolation=cv2.INTER_CUBIC)
-        pictures.append([jpeg(smaller(image, WIDTH_PX)) for image in (marked, large)])
-    apart = np.abs(parts[0].astype(np.float32) - parts[1].astype(np.float32))
-    return entry | {"pictures": pictures, "levels": float(apart.mean())}
+    """Return a parting for the template, with the other's image and the own one."""
+    images = [jpeg(smaller(frame, WIDTH_PX)) for frame in one.frames or ()]
+    at_s = (one.t_us - start_us) * 1e-6
+    return {"name": one.name, "at_s": at_s, "gap_m": one.gap_m, "images": images}

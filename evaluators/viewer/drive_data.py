@@ -20,7 +20,7 @@ from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.types import F64, I64, LoggedPlan, RolloutLog, Trajectory
 from alpasim_plugin.log.run_folder.rows import Rollout, series_by_cell
 from evaluators.opening import Run
-from evaluators.report.birdseye import chord_angle, lane_ring, painted_edges
+from evaluators.report.birdseye import chord_angle, drawn_map
 from evaluators.report.rollouts import SERIES, Event, events_of
 from evaluators.viewer.pictures import Rows, seen_before
 
@@ -99,34 +99,6 @@ def recorded_drive(content: Mapping[str, Any], scene: str) -> F64:
     if len(log) < 2:
         raise InputError(f"{scene}: a recorded drive of {len(log)} points", "make the run again")
     return log
-
-
-def drawn_map(content: Mapping[str, Any]) -> dict[str, list[F64]]:
-    """Return what every view from above draws of a map, as the report's does: ``lanes``, ``paint``,
-    ``edges`` and ``crosswalks``.
-
-    Args:
-        content: ``scenes/SCENE.json``.
-
-    Returns:
-        Lines, and rings of areas without their first point again, each ``(N, 2)`` metres, world.
-    """
-    lanes = content.get("lanes") or []
-
-    def arrays(lines: Sequence[Any], least: int) -> list[F64]:
-        """Return the lines of at least so many points."""
-        return [
-            np.asarray(line, dtype=np.float64)[:, :2]
-            for line in lines
-            if line is not None and len(line) >= least
-        ]
-
-    return {
-        "lanes": arrays([lane_ring(lane) for lane in lanes], 3),
-        "paint": arrays([edge for lane in lanes for edge in painted_edges(lane)], 2),
-        "edges": arrays(content.get("road_edges") or [], 2),
-        "crosswalks": arrays(content.get("crosswalks") or [], 3),
-    }
 
 
 def map_data(content: Mapping[str, Any], log: F64, place: Place) -> dict[str, Any]:

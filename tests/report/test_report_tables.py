@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import pytest
 from rich.console import Console
 
 from evaluators.opening import read_run
@@ -130,9 +129,6 @@ def test_speed_keeps_stages_that_only_some_renderers_have(usual_run: Path) -> No
     run = read_run(usual_run)
     table = speed(run)
     assert table.stages == ("render", "policy", "log", "control", "actors")
-    assert sum(segment["width"] for segment in table.rows[-1]["bar"]) == pytest.approx(
-        100.0, abs=0.1
-    )
     assert table.pool.startswith(
         "2\u00a0workers with 1\u00a0thread each, 41.2 camera frames/s in total"
     )
@@ -153,8 +149,6 @@ def test_renderer_without_frames_has_no_speed() -> None:
     speeds = {"a": nothing | {"stages": {}}}
     table = speed(Run(Path(), {}, {"speed": speeds}, (), ()))
     assert all(cell.missing for cell in table.rows[0]["cells"])
-    assert table.rows[0]["bar"] == []
-    assert table.rows[0]["sum_text"] == DASH
 
 
 def test_ledger_bounds_cover_what_failed(usual_run: Path) -> None:

@@ -14,7 +14,7 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import execute_run
-from evaluators.viewer.cause import debug_views, failed_at, most_different
+from evaluators.viewer.cause import debug_views, failed_at
 from scenarios.suite import expand
 from tests.runs.grey_renderer import GREY
 from tests.runs.test_runs import Announced
@@ -222,14 +222,3 @@ def test_what_a_policy_says_is_sorted_by_what_it_is() -> None:
     assert dict(shown["text"])["speed"] == "7.25"
     assert dict(shown["text"])["net"] == "not shown: object"
     assert "not shown" in dict(shown["text"])["gaps"]
-
-
-def test_the_part_that_differs_most_is_found() -> None:
-    one = np.zeros((60, 90, 3), np.uint8)
-    other = one.copy()
-    other[30:45, 50:70] = 200
-    x, y, w, h = most_different(one, other)
-    assert x <= 50
-    assert y <= 30
-    assert x + w >= 70
-    assert y + h >= 45
