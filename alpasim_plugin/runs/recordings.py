@@ -25,7 +25,7 @@ from alpasim_plugin.log import encode_image
 from alpasim_plugin.log.run_folder.rows import Own, Rollout, series_by_cell
 from evaluators.opening import Run
 from evaluators.report.rollouts import events_of
-from evaluators.viewer.cells import Logs, WatchedCell, no_frames
+from evaluators.viewer.cells import Logs, WatchedCell
 from evaluators.viewer.pictures import Source, sources
 
 Rgb = tuple[float, float, float]
@@ -109,7 +109,7 @@ def export_mcap(run: Run, cell: WatchedCell, logs: Logs, path: Path) -> dict[str
         items += _rollout_items(run, rollout, log, label, color)
         cameras = sources(run, rollout, log)
         if not cameras:
-            notes.append(f"{rollout.renderer}: {no_frames(run.manifest(rollout), True, None)}")
+            notes.append(f"{rollout.renderer}: {NO_FRAMES}")
         for camera in cameras:
             items += _camera_items(camera, log, label)
     if not recorded:

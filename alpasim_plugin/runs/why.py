@@ -26,8 +26,8 @@ from alpasim_plugin.runs.reports import divergences_of
 from alpasim_plugin.runs.rollout import run_rollout
 from evaluators.metrics.outcomes import OUTCOMES, outcomes_of
 from evaluators.opening import Run
-from evaluators.viewer.cause import Cause, Look, cause_of_log, chosen, half_seconds
-from evaluators.viewer.drive_data import MAX_SAMPLES
+from evaluators.viewer.cause import Cause, Look, cause_of_log, chosen
+from evaluators.viewer.drive_data import MAX_SAMPLES, half_seconds
 
 
 def worst_failure(run: Run) -> Rollout:

@@ -19,14 +19,14 @@ from markupsafe import Markup
 from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse, transform_points
-from alpasim_plugin.core.types import F64, I64, U8, RolloutLog
+from alpasim_plugin.core.types import F64, U8, RolloutLog
 from alpasim_plugin.log import decode_image
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, WHY_NAME, cell_name
 from evaluators.metrics.outcomes import first_failure, in_words, outcomes_of
 from evaluators.opening import Run
 from evaluators.viewer.cells import Wanted, cell_data, cells_of, lens_data, read_log, read_logs
-from evaluators.viewer.drive_data import MAX_SAMPLES, PLAN_STEP_US, Place
+from evaluators.viewer.drive_data import MAX_SAMPLES, Place, half_seconds
 from evaluators.viewer.page import as_json, fill
 from evaluators.viewer.pictures import frame_rows, jpeg, seen_before, smaller
 
@@ -67,12 +67,6 @@ class Look:
     plans: Mapping[str, Sequence[F64]]
     frames: Mapping[str, tuple[int, U8 | bytes]]
     debug: Mapping[str, Any]
-
-
-def half_seconds(times_us: I64, xy: F64) -> F64:
-    """Return positions ``(T, 2+)`` every half second ``(N, 2)``, on which the page counts."""
-    at = np.arange(times_us[0], times_us[-1] + 1, PLAN_STEP_US)
-    return np.stack([np.interp(at, times_us, xy[:, k]) for k in (0, 1)], axis=1)
 
 
 @dataclass(frozen=True)

@@ -294,7 +294,8 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None) ->
             "Make the run again; runs of earlier versions kept no maps.",
         )
     recorded = recorded_drive(content, cell.scene)
-    place = Place(recorded[0], clock_zero_us(content, _first_us(run, cell, logs)))
+    firsts_us = [int(log.ego.t_us[0]) for log in logs.values() if isinstance(log, RolloutLog)]
+    place = Place(recorded[0], clock_zero_us(content, min(firsts_us, default=0)))
     tracks = Tracks()
     drives: list[dict[str, Any]] = []
     for rollout in cell.rollouts:
@@ -302,11 +303,12 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None) ->
         log = logs.get(rollout.path)
         if not rollout.ok:
             drives.append(name | {"failed": f"{rollout.failure_class}: {rollout.failure}"})
-        elif isinstance(log, SimrunError):
-            drives.append(name | {"failed": f"its log cannot be read: {log.message}"})
+        elif not isinstance(log, RolloutLog):
+            why = missing_log(run.manifest(rollout)) if log is None else log.message
+            drives.append(name | {"failed": f"its log cannot be read: {why}"})
         else:
             facts = frame_rows(run, rollout)
-            drive = drive_data(run, rollout, log, content, place, tracks, facts)
+            drive = drive_data(run, rollout, log, place, tracks, facts)
             drive["why"] = run.href(rollout, WHY_NAME) or ""
             if fine is not None:
                 drive |= _camera_data(run, rollout, log, facts, fine, place)
@@ -326,13 +328,13 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None) ->
 
 
 def _camera_data(
-    run: Run, rollout: Rollout, log: RolloutLog | None, facts: Rows, fine: Fineness, place: Place
+    run: Run, rollout: Rollout, log: RolloutLog, facts: Rows, fine: Fineness, place: Place
 ) -> dict[str, Any]:
     """Return a rollout's camera frames for a page, with lenses and trust maps where known, or why
     there are none.
     """
     cameras = [encoded(one, fine, place.zero_us) for one in sources(run, rollout, log)]
-    lenses = {} if log is None else {camera.name: camera for camera in log.info["cameras"]}
+    lenses = {camera.name: camera for camera in log.info["cameras"]}
     for camera in cameras:
         trust = trust_by_time(facts, camera["name"])
         by_ms = dict(zip(place.ms(list(trust)), trust.values(), strict=True))
@@ -340,8 +342,7 @@ def _camera_data(
             camera["trust"] = [by_ms.get(t_ms, "") for t_ms in camera["t"]]
         if camera["name"] in lenses:
             camera["lens"] = lens_data(lenses[camera["name"]], camera["width"])
-    absent = "" if cameras else no_frames(run.manifest(rollout), log is not None)
-    return {"cameras": cameras, "no_frames": absent}
+    return {"cameras": cameras, "no_frames": "" if cameras else NO_FRAMES}
 
 
 def lens_data(camera: CameraSpec, width_px: int) -> dict[str, Any]:
@@ -353,25 +354,11 @@ def lens_data(camera: CameraSpec, width_px: int) -> dict[str, Any]:
     return {"k": k, "T": camera.T_rig_camera[:3].round(5).ravel().tolist()}
 
 
-def _first_us(run: Run, cell: WatchedCell, logs: Logs) -> int:
-    """Return the time of a cell's first logged pose."""
-    firsts = [int(log.ego.t_us[0]) for log in logs.values() if isinstance(log, RolloutLog)]
-    tables = (
-        run.steps_of(rollout)["t_us"]
-        for rollout in cell.rollouts
-        if logs.get(rollout.path, "") is None
-    )
-    return min([*firsts, *(min(t.to_pylist()) for t in tables if len(t))], default=0)
-
-
-def no_frames(manifest: Mapping[str, Any], has_log: bool) -> str:
-    """Say why a rollout has no images, and how to get them."""
-    if has_log or not manifest.get("log"):
-        return NO_FRAMES
-    return (
-        f"The log that this rollout was scored from is not at {manifest['log']}. "
-        "Run simrun view where simrun score was run."
-    )
+def missing_log(manifest: Mapping[str, Any]) -> str:
+    """Say that a rollout has no log, and where it should be."""
+    if not manifest.get("log"):
+        return f"{LOG_NAME} is missing"
+    return f"{manifest['log']} is missing; run simrun view where simrun score was run"
 
 
 def index_data(

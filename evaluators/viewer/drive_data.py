@@ -17,7 +17,7 @@ import shapely
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import yaw_from_quat
-from alpasim_plugin.core.types import F64, I64, LoggedPlan, RolloutLog, Trajectory
+from alpasim_plugin.core.types import F64, I64, Actor, LoggedPlan, RolloutLog, Trajectory
 from alpasim_plugin.log.run_folder.rows import Rollout, series_by_cell
 from evaluators.opening import Run
 from evaluators.report.birdseye import chord_angle, drawn_map
@@ -154,130 +154,52 @@ class Tracks:
 
 
 def drive_data(
-    run: Run,
-    rollout: Rollout,
-    log: RolloutLog | None,
-    content: Mapping[str, Any],
-    place: Place,
-    tracks: Tracks,
-    frames: Rows,
+    run: Run, rollout: Rollout, log: RolloutLog, place: Place, tracks: Tracks, frames: Rows
 ) -> dict[str, Any]:
     """Return what a page draws of a rollout, without its camera frames.
 
     Args:
         run: The run.
         rollout: One that ran to its end.
-        log: Its log; None where the run folder has none: then nothing is planned and road users go
-            as recorded.
-        content: ``scenes/SCENE.json``.
+        log: Its log.
         place: Where numbers count from.
         tracks: Gets the ways of the road users.
         frames: Facts of its camera frames.
     """
     steps = run.steps_of(rollout)
-    manifest = run.manifest(rollout)
-    ego, size_m = _ego(log, steps, content, place)
     return {
-        "ego": ego,
-        "size": [round(100 * side) for side in size_m],
-        "rear": 0 if log is None else round(100 * float(log.T_rig_box[0, 3])),
-        "users": _road_users(log, content, place, tracks),
-        "as_driven": log is not None,
-        "plans": [] if log is None else [_plan(plan, place) for plan in log.plans],
+        "ego": place.track(log.ego),
+        "size": [round(100 * side) for side in (log.ego_box.length_m, log.ego_box.width_m)],
+        "rear": round(100 * float(log.T_rig_box[0, 3])),
+        "users": [tracks.add(_user(actor, place)) for actor in log.actors.values()],
+        "plans": [_plan(plan, place) for plan in log.plans],
         "curves": curves(steps, place),
-        "moments": moments(rollout, steps, manifest, place, frames),
+        "moments": moments(rollout, steps, run.manifest(rollout), place, frames),
     }
 
 
-def _ego(
-    log: RolloutLog | None, steps: pa.Table, content: Mapping[str, Any], place: Place
-) -> tuple[dict[str, list[int]], F64]:
-    """Return the way of the ego's box centre, and its length and width in metres."""
-    if log is not None:
-        return place.track(log.ego), np.array([log.ego_box.length_m, log.ego_box.width_m])
-    vehicle = content.get("vehicle") or {}
-    own = (
-        next(
-            iter(
-                series_by_cell(
-                    steps.filter(pc.is_in(steps["metric"], pa.array(POSE_SERIES)))
-                ).values()
-            ),
-            {},
-        )
-        if len(steps)
-        else {}
-    )
-    if any(name not in own for name in POSE_SERIES) or "length_m" not in vehicle:
-        raise InputError(
-            "the table of steps: neither a log nor the ego's poses",
-            "run it again",
-        )
-    (t_us, x), (_, y), (_, yaw) = (own[name] for name in POSE_SERIES)
-    ahead_m = float(vehicle["rear_axle_to_centre_m"])
-    x_cm, y_cm = place.cm(np.stack([x + ahead_m * np.cos(yaw), y + ahead_m * np.sin(yaw)], axis=1))
-    return {"t": place.ms(t_us), "x": x_cm, "y": y_cm, "a": mrad(yaw)}, np.array(
-        [vehicle["length_m"], vehicle["width_m"]]
-    )
-
-
-def _road_users(
-    log: RolloutLog | None, content: Mapping[str, Any], place: Place, tracks: Tracks
-) -> list[int]:
-    if log is not None:
-        boxes = {
-            a.actor_id: (a.box.length_m, a.box.width_m, a.box.height_m) for a in log.actors.values()
-        }
-        return [
-            tracks.add(_user(a.actor_id, a.label, boxes[a.actor_id], place.track(a.track)))
-            for a in log.actors.values()
-        ]
-    found = []
-    for actor in content.get("actors") or []:
-        if actor.get("x_m") and actor.get("length_m"):
-            x, y = place.cm(np.column_stack([actor["x_m"], actor["y_m"]]))
-            way = {"t": place.ms(actor["t_us"]), "x": x, "y": y, "a": mrad(actor["yaw_rad"])}
-            found.append(
-                tracks.add(
-                    _user(
-                        actor.get("id") or "",
-                        actor.get("label") or "",
-                        (actor["length_m"], actor["width_m"]),
-                        way,
-                    )
-                )
-            )
-    return found
-
-
-def _user(
-    name: str, label: str, size_m: tuple[float, ...], way: dict[str, list[int]]
-) -> dict[str, Any]:
-    if (
-        len({*zip(way["x"], way["y"], way["a"], strict=True)}) == 1
-    ):  # it stands: two poses say when it is there
+def _user(actor: Actor, place: Place) -> dict[str, Any]:
+    way, box = place.track(actor.track), actor.box
+    poses = set(zip(way["x"], way["y"], way["a"], strict=True))
+    if len(poses) == 1:  # it stands: two poses say when it is there
         way = {key: [values[0], values[-1]] for key, values in way.items()}
-    return {
-        "id": name,
-        "label": label or "other",
-        "size": [round(100 * side) for side in size_m],
-        **way,
-    }
+    size = [round(100 * side) for side in (box.length_m, box.width_m, box.height_m)]
+    return {"id": actor.actor_id, "label": actor.label or "other", "size": size, **way}
 
 
 def _plan(plan: LoggedPlan, place: Place) -> dict[str, Any]:
     """Return a plan and its samples, every half second: points from now on."""
-    lines = []
-    for line in (plan.trajectory, *plan.samples[:MAX_SAMPLES]):
-        times = (
-            np.arange(line.t_us[0], line.t_us[-1] + 1, PLAN_STEP_US) if len(line) else np.empty(0)
-        )
-        lines.append(
-            place.cm(
-                np.stack([np.interp(times, line.t_us, line.xyz[:, k]) for k in (0, 1)], axis=1)
-            )
-        )
-    return {"t": round((plan.now_us - place.zero_us) / 1000), "lines": lines}
+    lines = [
+        place.cm(half_seconds(line.t_us, line.xyz) if len(line) else np.empty((0, 2)))
+        for line in (plan.trajectory, *plan.samples[:MAX_SAMPLES])
+    ]
+    return {"t": place.ms([plan.now_us])[0], "lines": lines}
+
+
+def half_seconds(times_us: I64, xy: F64) -> F64:
+    """Return positions ``(T, 2+)`` every half second ``(N, 2)``, on which the pages count."""
+    steps_us = np.arange(times_us[0], times_us[-1] + 1, PLAN_STEP_US)
+    return np.stack([np.interp(steps_us, times_us, xy[:, axis]) for axis in (0, 1)], axis=1)
 
 
 def curves(steps: pa.Table, place: Place) -> dict[str, Any]:

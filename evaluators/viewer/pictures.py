@@ -90,25 +90,17 @@ class Source:
                     )
 
 
-def sources(run: Run, rollout: Rollout, log: RolloutLog | None) -> list[Source]:
+def sources(run: Run, rollout: Rollout, log: RolloutLog) -> list[Source]:
     """Return the cameras of a rollout that have frames, in the log's order; empty where none was
     kept.
     """
-    if log is not None and log.images:
-        cameras = dict.fromkeys(image.camera for image in log.images)
-        return [
-            Source(name, tuple(image for image in log.images if image.camera == name))
-            for name in cameras
-        ]
+    cameras: dict[str, list[LoggedImage]] = {}
+    for image in log.images:
+        cameras.setdefault(image.camera, []).append(image)
     video = run.file_of(rollout, VIDEO_NAME)
-    if video is None:
-        return []
-    return [
-        Source(
-            VIDEO_NAME.removesuffix(".mp4"),
-            video=(video, log.render_start_us if log is not None else 0),
-        )
-    ]
+    if cameras or video is None:
+        return [Source(name, tuple(images)) for name, images in cameras.items()]
+    return [Source(VIDEO_NAME.removesuffix(".mp4"), video=(video, log.render_start_us))]
 
 
 def encoded(source: Source, fine: Fineness, zero_us: int) -> dict[str, Any]:

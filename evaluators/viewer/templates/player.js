@@ -111,7 +111,6 @@ const player = {
       item.append(make("i", `kind ${shape}${shape === "disc" ? " strong" : ""}`), named.join(", "));
       return item;
     }));
-    byId("as-recorded").hidden = drive?.as_driven !== false;
     byId("outlines").hidden = !this.cell.drives.some((one, i) => i !== this.focus && one.users?.some((user) => !drive?.users?.includes(user)));
   },
 
