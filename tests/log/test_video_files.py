@@ -82,13 +82,13 @@ def test_rate_must_be_positive(tmp_path: Path) -> None:
 
 
 def test_missing_folder_is_an_infrastructure_failure(tmp_path: Path) -> None:
-    with pytest.raises(InfrastructureError, match="writing a video"):
+    with pytest.raises(InfrastructureError):
         write_mp4(tmp_path / "absent" / "a.mp4", frames(1), 10)
 
 
 def test_unreadable_videos_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(b"no video at all")
-    with pytest.raises(InputError, match="reading a video"):
+    with pytest.raises(InputError):
         read_mp4(tmp_path / "a.mp4")
-    with pytest.raises(InputError, match="reading a video"):
+    with pytest.raises(InputError):
         read_mp4(tmp_path / "absent.mp4")

