@@ -10,12 +10,20 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.geometry import inverse, se2
+from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import F32, F64, U8, CameraSpec
 
 Colour = tuple[int, int, int]
-WHITE, YELLOW = (235, 235, 235), (230, 190, 60)
-DASH_M, PERIOD_M = 3.0, 9.0
+WHITE = (235, 235, 235)
+YELLOW = (230, 190, 60)
+ASPHALT = (95, 95, 98)
+GRASS = (80, 110, 60)
+SKY = (170, 195, 225)
+LINE_WIDTH_M = 0.15
+DASH_M = 3.0
+PERIOD_M = 9.0
+NOISE = 4.0  # grey levels
+SUPERSAMPLE = 2
 
 
 def pinhole_camera(
@@ -47,27 +55,6 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Patch:
-    """A flat patch of another colour, such as a crosswalk or a stain."""
-
-    s_m: tuple[float, float]
-    offset_m: tuple[float, float]
-    colour: Colour
-
-
-@dataclass(frozen=True)
-class Block:
-    """A cuboid on the road; its face towards the ego is darker and stands on a dark edge, as cars
-    do.
-    """
-
-    s_m: float  # of its centre
-    offset_m: float = 0.0
-    size_m: tuple[float, float, float] = (4.5, 1.8, 1.5)  # length, width, height
-    colour: Colour = (150, 30, 30)
-
-
-@dataclass(frozen=True)
 class PaintedRoad:
     """A road of constant curvature through the world's origin, where its ego lane runs along x;
     grass and sky around it.
@@ -76,13 +63,6 @@ class PaintedRoad:
     curvature_1pm: float = 0.0  # left positive
     lines: tuple[Line, ...] = (Line(1.75, dashed=True), Line(-1.75), Line(5.25, colour=YELLOW))
     road_m: tuple[float, float] = (-3.0, 6.5)
-    patches: tuple[Patch, ...] = ()
-    blocks: tuple[Block, ...] = ()
-    line_width_m: float = 0.15
-    noise: float = 4.0  # grey levels
-    asphalt: Colour = (95, 95, 98)
-    grass: Colour = (80, 110, 60)
-    sky: Colour = (170, 195, 225)
 
     def pose(self, s_m: float, offset_m: float = 0.0, yaw_rad: float = 0.0) -> F64:
         """Return the pose ``(4, 4)`` at arc length s of the ego lane, ``offset_m`` to its left and
@@ -107,15 +87,18 @@ class PaintedRoad:
         angle = np.arctan2(x_m * sign, (1 / k - y_m) * sign)
         return np.asarray(angle / k * sign), np.asarray(sign * (abs(1 / k) - radius))
 
-    def image(
-        self, camera: CameraSpec, T_world_rig: F64, seed: int = 0, supersample: int = 2
-    ) -> U8:
+    def image(self, camera: CameraSpec, T_world_rig: F64, seed: int = 0) -> U8:
         """Draw the road ``(H, W, 3)`` as the camera sees it from a rig pose."""
-        n = supersample
-        T = T_world_rig @ camera.T_rig_camera
+        painted = self.painted(camera, T_world_rig @ camera.T_rig_camera)
+        small = cv2.resize(painted, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        noise = np.random.Generator(np.random.Philox(key=seed)).normal(0.0, NOISE, small.shape)
+        return np.asarray(np.clip(small + noise, 0, 255).astype(np.uint8))
+
+    def painted(self, camera: CameraSpec, T: F64) -> F32:
+        """Draw the road at `SUPERSAMPLE` times the camera's size, seen from the pose ``(4, 4)``."""
         K, rotation = camera.K, T[:3, :3]
-        u = (np.arange(camera.width * n) + 0.5) / n
-        v = (np.arange(camera.height * n) + 0.5) / n
+        u = (np.arange(camera.width * SUPERSAMPLE) + 0.5) / SUPERSAMPLE
+        v = (np.arange(camera.height * SUPERSAMPLE) + 0.5) / SUPERSAMPLE
         # A ray is linear in the pixel: one outer sum per axis.
         across, down = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
         ray = [
@@ -123,59 +106,25 @@ class PaintedRoad:
             for i in range(3)
         ]
         image = np.empty((len(v), len(u), 3), dtype=np.float32)
-        image[:] = self.sky
+        image[:] = SKY
         ground = ray[2] < -T[2, 3] / 400.0
         depth = -T[2, 3] / ray[2][ground]
         s, offset = self.coordinates(
             T[0, 3] + depth * ray[0][ground], T[1, 3] + depth * ray[1][ground]
         )
-        image[ground] = self._colours(s, offset)
-        for block in sorted(self.blocks, key=lambda b: -b.s_m):
-            self._draw(image, K, T, block, n)
-        small = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        noise = np.random.Generator(np.random.Philox(key=seed)).normal(0.0, self.noise, small.shape)
-        return np.asarray(np.clip(small + noise, 0, 255).astype(np.uint8))
+        image[ground] = self.colours(s, offset)
+        return image
 
-    def _colours(self, s_m: F64, offset_m: F64) -> F32:
+    def colours(self, s_m: F64, offset_m: F64) -> F32:
         """Return the colours ``(N, 3)`` of ground points in road coordinates."""
         # Numbers of paints are drawn, a quarter of the bytes of colours.
-        paints: list[Colour] = [self.grass, self.asphalt]
+        paints: list[Colour] = [GRASS, ASPHALT]
         on_road = (offset_m > self.road_m[0]) & (offset_m < self.road_m[1])
         index = on_road.astype(np.uint8)
         for line in self.lines:
-            paint = on_road & (np.abs(offset_m - line.offset_m) < self.line_width_m / 2)
+            paint = on_road & (np.abs(offset_m - line.offset_m) < LINE_WIDTH_M / 2)
             if line.dashed:
                 paint[paint] = np.mod(s_m[paint], PERIOD_M) < DASH_M
             index[paint] = len(paints)
             paints.append(line.colour)
-        for patch in self.patches:
-            inside = (
-                (s_m > patch.s_m[0])
-                & (s_m < patch.s_m[1])
-                & (offset_m > patch.offset_m[0])
-                & (offset_m < patch.offset_m[1])
-            )
-            index[on_road & inside] = len(paints)
-            paints.append(patch.colour)
         return np.asarray(np.array(paints, dtype=np.float32)[index])
-
-    def _draw(self, image: F32, K: F64, T_world_camera: F64, block: Block, n: int) -> None:
-        length, width, height = block.size_m
-        ends = [
-            (sx * length / 2, sy * width / 2, z, 1.0)
-            for sx in (-1, 1)
-            for z in (0.0, height)
-            for sy in (-1, 1)
-        ]
-        T = inverse(T_world_camera) @ self.pose(block.s_m, block.offset_m)
-        corners = (T @ np.array(ends).T).T[:, :3]
-        if (corners[:, 2] < 0.2).all():
-            return
-        corners[:, 2] = np.maximum(corners[:, 2], 0.2)
-        uv = ((corners / corners[:, 2:]) @ K.T)[:, :2] * n
-        shades = ((uv, 1.0), (uv[:4], 0.8))  # the whole outline, then the face towards the ego
-        for points, shade in shades:
-            hull = cv2.convexHull(points.astype(np.float32)).astype(np.int32)
-            cv2.fillConvexPoly(image, hull, tuple(shade * c for c in block.colour))
-        foot = [tuple(int(c) for c in uv[i]) for i in (0, 1)]
-        cv2.line(image, foot[0], foot[1], (20.0, 20.0, 20.0), n)

@@ -42,6 +42,11 @@ TRANSFORMS_FILE = "transforms.json"
 GROUND_FILE = "ground.npy"
 MODEL_FOLDER = "model"
 DO_THIS = "import the drive again: simrun import drive FOLDER -o OUT"
+LINES: tuple[Literal["road_edges", "crosswalks", "stop_lines"], ...] = (
+    "road_edges",
+    "crosswalks",
+    "stop_lines",
+)
 Numbers = list[float]
 Rows = list[list[float]]
 
@@ -185,7 +190,7 @@ def write_drive(
     """
     write_array(folder / GROUND_FILE, log.ground.z)
     box = log.vehicle.box
-    document: DriveDocument = {
+    document = {
         "format": "simrun drive",
         "version": 1,
         "scene_id": log.scene_id,
@@ -212,7 +217,18 @@ def write_drive(
             {"id": a.actor_id, "label": a.label, "size_m": _size(a.box), "poses": _poses(a.track)}
             for a in tracks
         ],
-        "obstacles": None if obstacles is None else [_obstacle_document(one) for one in obstacles],
+        "obstacles": None
+        if obstacles is None
+        else [
+            {
+                "id": one.obstacle_id,
+                "size_m": _size(one.box),
+                "xyz": one.xyz.tolist(),
+                "yaw_rad": one.yaw_rad,
+                "uncertainty_m": one.uncertainty_m,
+            }
+            for one in obstacles
+        ],
         "world_origin": list(log.world_origin),
         "notes": list(log.notes),
     }
@@ -262,11 +278,7 @@ def read_drive(folder: Path) -> RecordedLog:
             )
             for c in document["cameras"]
         ),
-        world_origin=(
-            document["world_origin"][0],
-            document["world_origin"][1],
-            document["world_origin"][2],
-        ),
+        world_origin=(*document["world_origin"],),  # type: ignore[arg-type]  # three numbers
         content_hash=files.content_hash,
         notes=tuple(document["notes"]),
         recording=_recording(files, folder),
@@ -288,58 +300,33 @@ def _rows(values: Any, width: int = 3) -> F64:
     return np.array(values, dtype=np.float64).reshape(-1, width)
 
 
-def _map_document(lane_map: LaneMap) -> _Map:
-    lanes: list[_Lane] = [
-        {
-            "lane_id": lane.lane_id,
-            "centre": lane.centre.tolist(),
-            "left": None if lane.left is None else lane.left.tolist(),
-            "right": None if lane.right is None else lane.right.tolist(),
-            "kind": lane.kind,
-            "successors": list(lane.successors),
-            "left_neighbour": lane.left_neighbour,
-            "right_neighbour": lane.right_neighbour,
-            "left_paint": lane.left_paint,
-            "right_paint": lane.right_paint,
-            "is_intersection": lane.is_intersection,
-            "speed_limit_mps": lane.speed_limit_mps,
-        }
-        for lane in lane_map.lanes.values()
-    ]
+def _map_document(lane_map: LaneMap) -> dict[str, Any]:
     return {
-        "lanes": lanes,
-        "road_edges": [line.tolist() for line in lane_map.road_edges],
-        "crosswalks": [line.tolist() for line in lane_map.crosswalks],
-        "stop_lines": [line.tolist() for line in lane_map.stop_lines],
-        "markings": [{"xyz": one.xyz.tolist(), "paint": one.paint} for one in lane_map.markings],
+        "lanes": [
+            {name: _plain(getattr(lane, name)) for name in _Lane.__annotations__}
+            for lane in lane_map.lanes.values()
+        ],
+        **{name: [line.tolist() for line in getattr(lane_map, name)] for name in LINES},
+        "markings": [{"xyz": m.xyz.tolist(), "paint": m.paint} for m in lane_map.markings],
     }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _map_of(document: _Map) -> LaneMap:
-    lanes = {
-        lane["lane_id"]: Lane(
-            lane["lane_id"],
-            _rows(lane["centre"]),
-            None if lane["left"] is None else _rows(lane["left"]),
-            None if lane["right"] is None else _rows(lane["right"]),
-            lane["kind"],
-            tuple(lane["successors"]),
-            lane["left_neighbour"],
-            lane["right_neighbour"],
-            lane["left_paint"],
-            lane["right_paint"],
-            lane["is_intersection"],
-            lane["speed_limit_mps"],
-        )
-        for lane in document["lanes"]
-    }
-    return LaneMap(
-        lanes,
-        road_edges=tuple(_rows(line) for line in document["road_edges"]),
-        crosswalks=tuple(_rows(line) for line in document["crosswalks"]),
-        stop_lines=tuple(_rows(line) for line in document["stop_lines"]),
-        markings=tuple(Marking(_rows(one["xyz"]), one["paint"]) for one in document["markings"]),
-    )
+    lanes = {}
+    for lane in document["lanes"]:
+        fields: dict[str, Any] = {**lane, "successors": tuple(lane["successors"])}
+        for name in ("centre", "left", "right"):
+            fields[name] = None if fields[name] is None else _rows(fields[name])
+        lanes[lane["lane_id"]] = Lane(**fields)
+    lines: dict[str, Any] = {name: tuple(map(_rows, document[name])) for name in LINES}
+    markings = tuple(Marking(_rows(one["xyz"]), one["paint"]) for one in document["markings"])
+    return LaneMap(lanes, **lines, markings=markings)
 
 
 def _ground_of(files: SourceFiles, folder: Path, grid: _Grid) -> HeightField:
@@ -367,16 +354,6 @@ def _track_actor(files: SourceFiles, path: Path, track: _Track) -> Actor:
         one,
         stands_still(one.t_us, one.xyz, track["label"]),
     )
-
-
-def _obstacle_document(one: Obstacle) -> _Obstacle:
-    return {
-        "id": one.obstacle_id,
-        "size_m": _size(one.box),
-        "xyz": one.xyz.tolist(),
-        "yaw_rad": one.yaw_rad,
-        "uncertainty_m": one.uncertainty_m,
-    }
 
 
 def _obstacle_actor(one: _Obstacle, ego: Trajectory) -> Actor:

@@ -12,8 +12,9 @@ from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import trajectory_from_poses
 from alpasim_plugin.core.types import EgoState, Route
 from policies.lane_camera import LaneCamera
-from policies.painted_road import Block, Line, PaintedRoad, Patch, pinhole_camera
+from policies.painted_road import Line, PaintedRoad, pinhole_camera
 from tests.examples import first_of, first_rows_of
+from tests.policies.busy_road import Block, BusyRoad, Patch
 from tests.policies.policy_world import CAMERA, close_loop, look, observe, route_of, scenario_with
 
 ROAD = PaintedRoad()
@@ -120,7 +121,7 @@ def test_route_half_a_lane_off_does_not_pull_the_car_out_of_its_lane() -> None:
 
 
 def test_car_ahead_is_stopped_for_and_the_car_stays_standing() -> None:
-    road = PaintedRoad(blocks=(Block(42.0),))
+    road = BusyRoad(blocks=(Block(42.0),))
     drive = close_loop(policy(), road, 9.0, 8.0)
     front_m = drive.s_m[-1] + 1.4 + 4.855 / 2
     assert drive.speed_mps[-1] == 0.0
@@ -132,7 +133,7 @@ def test_car_ahead_is_stopped_for_and_the_car_stays_standing() -> None:
 def test_slower_car_is_followed_at_a_distance() -> None:
     drive = close_loop(
         policy(),
-        lambda t: PaintedRoad(blocks=(Block(30.0 + 6.0 * t, colour=(210, 210, 215)),)),
+        lambda t: BusyRoad(blocks=(Block(30.0 + 6.0 * t, colour=(210, 210, 215)),)),
         10.0,
         7.0,
     )
@@ -155,16 +156,14 @@ def test_slower_car_is_followed_at_a_distance() -> None:
     ids=["crosswalk", "stop line", "shadow"],
 )
 def test_flat_things_on_the_road_are_not_braked_for(flat: tuple[Patch, ...]) -> None:
-    drive = close_loop(policy(), replace(ROAD, patches=flat), 10.0, 4.5)
+    drive = close_loop(policy(), BusyRoad(patches=flat), 10.0, 4.5)
     assert drive.speed_mps.min() > 8.5
     assert np.abs(drive.offset_m).max() < 0.6
 
 
 @pytest.mark.slow
 def test_car_in_the_next_lane_is_passed() -> None:
-    drive = close_loop(
-        policy(), PaintedRoad(blocks=(Block(40.0, 3.5), Block(55.0, 3.5))), 10.0, 5.0
-    )
+    drive = close_loop(policy(), BusyRoad(blocks=(Block(40.0, 3.5), Block(55.0, 3.5))), 10.0, 5.0)
     assert drive.speed_mps.min() > 8.5
 
 

@@ -14,7 +14,7 @@ from alpasim_plugin.core.geometry import arc_lengths, inverse
 from policies.base import _targets
 from policies.lane_filter import LaneState, predict, search, shift, start, update
 from policies.obstacle_vision import anomaly, find_foot, learn_road, track_obstacle
-from policies.painted_road import Block, Line, PaintedRoad, pinhole_camera
+from policies.painted_road import Line, PaintedRoad, pinhole_camera
 from policies.road_vision import (
     PaintPoints,
     RidgeFilter,
@@ -24,6 +24,7 @@ from policies.road_vision import (
     make_grid,
 )
 from tests.examples import examples
+from tests.policies.busy_road import Block, BusyRoad
 
 CAMERA = pinhole_camera()
 GRID = make_grid(CAMERA)
@@ -259,7 +260,7 @@ def foot_in(road: PaintedRoad, seed: int = 0) -> tuple[float, float] | None:
 @pytest.mark.parametrize("distance", [8.0, 12.0, 20.0, 30.0, 40.0])
 @pytest.mark.parametrize("colour", [(150, 30, 30), (235, 235, 235), (25, 25, 30), (30, 60, 160)])
 def test_foot_of_a_car_gives_its_distance(distance: float, colour: tuple[int, int, int]) -> None:
-    found = foot_in(PaintedRoad(blocks=(Block(distance + 2.25, colour=colour),)))
+    found = foot_in(BusyRoad(blocks=(Block(distance + 2.25, colour=colour),)))
     assert found is not None
     assert found[0] == pytest.approx(distance, abs=0.35 + 2.0 * found[1])
     assert found[1] < 0.15 * distance
@@ -267,8 +268,8 @@ def test_foot_of_a_car_gives_its_distance(distance: float, colour: tuple[int, in
 
 def test_pedestrian_in_the_corridor_is_seen_and_beside_it_is_not() -> None:
     person = (0.4, 0.5, 1.75)
-    assert foot_in(PaintedRoad(blocks=(Block(15.0, 0.3, person, (40, 40, 90)),))) is not None
-    assert foot_in(PaintedRoad(blocks=(Block(15.0, 2.2, person, (40, 40, 90)),))) is None
+    assert foot_in(BusyRoad(blocks=(Block(15.0, 0.3, person, (40, 40, 90)),))) is not None
+    assert foot_in(BusyRoad(blocks=(Block(15.0, 2.2, person, (40, 40, 90)),))) is None
 
 
 def test_free_road_has_no_foot() -> None:
@@ -276,13 +277,11 @@ def test_free_road_has_no_foot() -> None:
 
 
 def test_low_kerb_stone_is_not_taken_for_a_car() -> None:
-    assert (
-        foot_in(PaintedRoad(blocks=(Block(20.0, 0.0, (0.5, 1.8, 0.15), (200, 200, 200)),))) is None
-    )
+    assert foot_in(BusyRoad(blocks=(Block(20.0, 0.0, (0.5, 1.8, 0.15), (200, 200, 200)),))) is None
 
 
 def test_road_colour_is_not_learned_from_the_car_in_front() -> None:
-    road = PaintedRoad(lines=(Line(1.75), Line(-1.75)), blocks=(Block(9.0),))
+    road = BusyRoad(lines=(Line(1.75), Line(-1.75)), blocks=(Block(9.0),))
     lab = cv2.cvtColor(GRID.warp(road.image(CAMERA, np.eye(4))), cv2.COLOR_RGB2LAB)
     centre = np.zeros(len(GRID.x_m))
     assert learn_road(None, lab, GRID, centre, free_to_m=6.5) is None

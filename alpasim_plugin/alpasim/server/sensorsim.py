@@ -129,6 +129,7 @@ class Sensorsim(Failures):
             return sensorsim_pb2.AggregatedRenderReturn(
                 rgb_returns=self._returns(request, left), lidar_returns=scans
             )
+        reply: sensorsim_pb2.AggregatedRenderReturn
         reply = self.forward("render_aggregated", request, context)
         if request.rgb_requests:
             del reply.rgb_returns[:]
@@ -203,6 +204,7 @@ class Sensorsim(Failures):
         """
         if self.upstream is None:
             return common_pb2.AvailableScenesReturn(scene_ids=self._own_scenes.ids)
+        theirs: common_pb2.AvailableScenesReturn
         theirs = self.forward("get_available_scenes", request, context)
         if self._scenes is None or self.verbatim:
             return theirs
