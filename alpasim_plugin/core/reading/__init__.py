@@ -1,5 +1,5 @@
 """One way to read a file: regular files only, capped in size before a byte is read, and every
-failure a four-part error.
+failure an error that names the file.
 
 Anything that a parser raises becomes an `InputError` that names the file (`parsing`). Which module
 reads what:

@@ -1,22 +1,23 @@
-"""Parquet and Arrow tables: rows and bytes by their header, columns by type."""
+"""Parquet tables: rows and bytes by their header, columns by type."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.limits import FILE_BYTES, TABLE_BYTES, TABLE_COLUMNS, TABLE_ROWS
+from alpasim_plugin.core.limits import TABLE_BYTES, TABLE_COLUMNS, TABLE_ROWS
 from alpasim_plugin.core.reading.files import FETCH_AGAIN, check_regular, parsing
+
+NO_PARQUET = "no readable parquet"
 
 Kind = Literal["text", "integer", "number", "flag"]
 
 
 def read_parquet(
     path: Path | str,
-    columns: Mapping[str, Kind] | None = None,
+    columns: Mapping[str, Kind],
     do_this: str = FETCH_AGAIN,
     only: bool = False,
 ) -> Any:
@@ -24,70 +25,31 @@ def read_parquet(
 
     Args:
         path: File.
-        columns: Columns that must be there, by type; null values are allowed. None checks none.
-        do_this: Last part of the errors.
+        columns: Columns that must be there, by type; null values are allowed.
+        do_this: Hint of the errors.
         only: Read these columns alone.
 
     Raises:
         InputError: Unreadable or no parquet, more rows or bytes than the bounds, a column missing
             or of another type.
     """
-    check_regular(path, FILE_BYTES, do_this)
-    return _read(str(path), path, columns, do_this, only)
+    file = _open(path, path, do_this)
+    with parsing(path, do_this, NO_PARQUET):
+        table = file.read(columns=list(columns) if only else None)
+        table.validate(full=True)
+    check_columns(table, columns, path, do_this)
+    return table
 
 
-def parse_parquet(
-    data: bytes,
-    where: Path | str,
-    columns: Mapping[str, Kind] | None = None,
-    do_this: str = FETCH_AGAIN,
-) -> Any:
+def parse_parquet(data: bytes, where: Path | str, do_this: str = FETCH_AGAIN) -> Any:
     """Return a parquet document as an Arrow table; see `read_parquet`."""
-    return _read(io.BytesIO(data), where, columns, do_this, False)
-
-
-def check_columns(
-    table: Any,
-    columns: Mapping[str, Kind],
-    where: Path | str,
-    do_this: str = FETCH_AGAIN,
-) -> None:
-    """Refuse a table that lacks a column or has one of another type.
-
-    Raises:
-        InputError: It does; the columns that are there are named.
-    """
-    names: Sequence[str] = table.column_names
-    for name, kind in columns.items():
-        if names.count(name) != 1:
-            shown = ", ".join(names[:12])
-            found = (
-                f"no column {name!r}, only {shown}"
-                if name not in names
-                else f"column {name!r} {names.count(name)} times"
-            )
-            raise InputError(f"{where}: {found}", do_this)
-        type_ = table.schema.field(name).type
-        if not _is(type_, kind):
-            raise InputError(f"{where}: column {name!r} of {type_}, wanted {kind}", do_this)
-
-
-def _is(type_: Any, kind: Kind) -> bool:
     import pyarrow as pa
 
-    t = pa.types
-    if t.is_dictionary(type_):
-        type_ = type_.value_type
-    if t.is_null(type_):  # a column of nothing but nulls
-        return True
-    match kind:
-        case "text":
-            return bool(t.is_string(type_) or t.is_large_string(type_))
-        case "integer":
-            return bool(t.is_integer(type_))
-        case "number":
-            return bool(t.is_integer(type_) or t.is_floating(type_))
-    return bool(t.is_boolean(type_))
+    file = _open(pa.BufferReader(data), where, do_this)
+    with parsing(where, do_this, NO_PARQUET):
+        table = file.read()
+        table.validate(full=True)
+    return table
 
 
 def check_parquet(
@@ -96,53 +58,67 @@ def check_parquet(
     """Check the header of a parquet file that is read in parts later, and return its columns; see
     `read_parquet` for what is refused.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    check_regular(path, FILE_BYTES, do_this)
-    _check_size(str(path), path, do_this)
-    with parsing(path, do_this, "no readable parquet"):
-        empty = pq.read_schema(str(path)).empty_table()
-    assert isinstance(empty, pa.Table)
+    empty = _open(path, path, do_this).schema_arrow.empty_table()
     check_columns(empty, columns, path, do_this)
     return list(empty.column_names)
 
 
-def _read(
-    source: Any,
-    where: Path | str,
-    columns: Mapping[str, Kind] | None,
-    do_this: str,
-    only: bool,
-) -> Any:
+def _open(source: Any, where: Path | str, do_this: str) -> Any:
+    """Open a parquet file; refuse more rows, columns or unpacked bytes than the bounds, by its
+    header.
+    """
     import pyarrow.parquet as pq
 
-    _check_size(source, where, do_this)
-    with parsing(where, do_this, "no readable parquet"):
-        if hasattr(source, "seek"):
-            source.seek(0)
-        table = pq.ParquetFile(source).read(columns=list(columns) if only and columns else None)
-        table.validate(full=True)
-    if columns is not None:
-        check_columns(table, columns, where, do_this)
-    return table
-
-
-def _check_size(source: Any, where: Path | str, do_this: str) -> None:
-    """Refuse more rows, columns or unpacked bytes than the bounds, by the header."""
-    import pyarrow.parquet as pq
-
-    with parsing(where, do_this, "no readable parquet"):
-        facts = pq.read_metadata(source)
+    if source is where:
+        check_regular(source, do_this=do_this)
+    with parsing(where, do_this, NO_PARQUET):
+        file = pq.ParquetFile(source)
+        facts = file.metadata
         TABLE_ROWS.check(facts.num_rows, where)
         TABLE_COLUMNS.check(facts.num_columns, where)
-        chunks = [
-            facts.row_group(i).column(j)
-            for i in range(facts.num_row_groups)
-            for j in range(facts.num_columns)
-        ]
-        # Runs of equal values take no space in the file: what they become in memory counts.
-        TABLE_BYTES.check(
-            sum(max(chunk.total_uncompressed_size, 8 * chunk.num_values) for chunk in chunks),
-            where,
-        )
+        size = 0
+        for i in range(facts.num_row_groups):
+            for j in range(facts.num_columns):
+                chunk = facts.row_group(i).column(j)
+                # Runs of equal values take no space in the file: what they become in memory counts.
+                size += max(chunk.total_uncompressed_size, 8 * chunk.num_values)
+        TABLE_BYTES.check(size, where)
+    return file
+
+
+def check_columns(
+    table: Any,
+    columns: Mapping[str, Kind],
+    where: Path | str,
+    do_this: str = FETCH_AGAIN,
+) -> None:
+    """Refuse a table that lacks a column, has it twice, or has one of another type.
+
+    Raises:
+        InputError: It does; the columns that are there are named.
+    """
+    names = table.column_names
+    for name, kind in columns.items():
+        if names.count(name) != 1:
+            raise InputError(
+                f"{where}: {names.count(name)} columns {name!r} among {', '.join(names[:12])}",
+                do_this,
+            )
+        type_ = table.schema.field(name).type
+        if not _is(type_, kind):
+            raise InputError(f"{where}: column {name!r} of {type_}, wanted {kind}", do_this)
+
+
+def _is(type_: Any, kind: Kind) -> bool:
+    import pyarrow.types as t
+
+    if t.is_dictionary(type_):
+        type_ = type_.value_type
+    tests = {
+        "text": (t.is_string, t.is_large_string),
+        "integer": (t.is_integer,),
+        "number": (t.is_integer, t.is_floating),
+        "flag": (t.is_boolean,),
+    }
+    # a column of nothing but nulls has a type of its own
+    return any(test(type_) for test in (t.is_null, *tests[kind]))

@@ -64,7 +64,7 @@ READERS: dict[str, tuple[Callable[[Path], bytes], Callable[[Path], Any]]] = {
     "a.png": (lambda folder: png_header(7, 5), read_image),
     "a.parquet": (
         by(lambda p: pq.write_table(pa.table({"a": [1, 2]}), p), "v.parquet"),
-        read_parquet,
+        lambda path: read_parquet(path, {"a": "integer"}),
     ),
     "a.safetensors": (lambda folder: save({"a": np.zeros(3, np.float32)}), read_metadata),
     "a.ply": (by(lambda p: write_ply(p, random_cloud(6, degree=1)), "v.ply"), read_gaussians),
