@@ -5,12 +5,8 @@ one.
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
 
-import pytest
-
-from alpasim_plugin.core import checksums
 from alpasim_plugin.core.checksums import checksums_of, problem_of
 
 
@@ -41,20 +37,3 @@ def test_content_that_rots_under_the_same_size_and_time_is_found_when_everything
     os.utime(path, ns=(0, facts["mtime_ns"]))
     assert problem_of(path, facts) is None
     assert problem_of(path, facts, full=True) == "not the content that was written"
-
-
-def test_a_copy_is_read_once_and_then_taken_by_its_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "a").write_bytes(b"0123456789")
-    facts = checksums_of(tmp_path, ["a"])["a"]
-    copy = tmp_path / "copy"
-    shutil.copyfile(tmp_path / "a", copy)
-    os.utime(copy, ns=(0, facts["mtime_ns"] + 5 * 10**9))
-    read_in_full: list[Path] = []
-    digest = checksums.sha256_of
-    monkeypatch.setattr(
-        checksums, "sha256_of", lambda path: (read_in_full.append(path), digest(path))[1]
-    )
-    assert [problem_of(copy, facts) for _ in range(3)] == [None, None, None]
-    assert read_in_full == [copy]

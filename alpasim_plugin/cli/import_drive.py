@@ -25,10 +25,10 @@ from rich.progress import (
 )
 
 from alpasim_plugin.cli.options import HELP_NAMES, Json, command_of
+from alpasim_plugin.cli.signals import Stopped
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.signals import Stopped
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.drives.build import (
     Report,

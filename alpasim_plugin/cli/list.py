@@ -143,9 +143,7 @@ def _fixers() -> dict[str, str]:
         spec = unidentified("fixer", name)
         factory = load(spec.target, "fixer")
         help_text = getattr(factory, "help", {}).get(name, help_text)
-        listed[name] = (
-            f"{help_text} [{note_of(spec, declaration_of(factory, spec.settings, Path()))}]"
-        )
+        listed[name] = f"{help_text} [{note_of(spec, declaration_of(factory, spec.settings))}]"
     return listed
 
 

@@ -23,9 +23,9 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from alpasim_plugin.cli.signals import Stopped, leave_at_once, stoppable
 from alpasim_plugin.core.errors import InfrastructureError, InputError, InternalError, SimrunError
 from alpasim_plugin.core.lazy import installed_names
-from alpasim_plugin.core.signals import Stopped, leave_at_once, stoppable
 
 # Panel of the help page -> verb -> module of this package and its function, and one line of help,
 # which is the first of the function's docstring.

@@ -15,9 +15,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from alpasim_plugin.cli.options import Json, Overwrite, fixer_overrides
+from alpasim_plugin.cli.signals import Stopped
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.interfaces import Fixer
-from alpasim_plugin.core.signals import Stopped
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.refine import UNLIKE, ChangeLimit
 from alpasim_plugin.runs.refine import RefineFiles, RefineSummary, refine_video

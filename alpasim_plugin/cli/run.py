@@ -31,12 +31,12 @@ from alpasim_plugin.cli.progress import (
     report_line,
     varied_lines,
 )
+from alpasim_plugin.cli.signals import Stopped
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.limits import SOURCE_BYTES
 from alpasim_plugin.core.reading import read_bytes
-from alpasim_plugin.core.signals import Stopped
 from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME
 from alpasim_plugin.runs.decide import Decided, execute_decision, plan_of_two
 from alpasim_plugin.runs.execute import Threads, thread_budget

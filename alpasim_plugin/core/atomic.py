@@ -11,7 +11,6 @@ import contextlib
 import errno
 import json
 import os
-import re
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -25,21 +24,17 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-DOING = "writing a result"
 
 
 def disk_error(path: Path, error: OSError, do_this: str | None = None) -> InfrastructureError:
-    """Return a failed write as an error with four parts; the advice follows from the cause unless
-    ``do_this`` is given.
+    """Return the error of a failed write; the hint follows from the cause unless ``do_this`` is
+    given.
     """
-    if do_this is None:
-        full = "free disk space and run the same command again"
-        missing = "check that the folder exists, or name another one"
-        other = "make the folder writable, or name another one"
-        do_this = (
-            full if error.errno in DISK_FULL else missing if error.errno == errno.ENOENT else other
-        )
-    return InfrastructureError(f"{path}: {error.strerror or str(error)}", do_this)
+    if error.errno in DISK_FULL:
+        hint = "free disk space and run the same command again"
+    else:
+        hint = "check that the folder exists and is writable, or name another one"
+    return InfrastructureError(f"{path}: {error.strerror or str(error)}", do_this or hint)
 
 
 def temporary_path(path: Path) -> Path:
@@ -55,8 +50,7 @@ def atomic_file(path: Path | str, do_this: str | None = None) -> Iterator[Path]:
     The folder must exist. The data are on the disk (fsync) before the rename.
 
     Raises:
-        InfrastructureError: The disk refuses; ``doing`` and ``do_this`` are the first and last part
-            of the error.
+        InfrastructureError: The disk refuses; its hint is ``do_this``.
 
     Example:
         >>> with atomic_file("scene.png") as partial:     # doctest: +SKIP
@@ -171,8 +165,5 @@ def write_safetensors(
                 partial,
                 dict(metadata or {}),
             )
-        # the library reports a refused write as its own error, with the number in the text
-        except SafetensorError as error:
-            found = re.search(r"os error (\d+)", str(error))
-            code = int(found[1]) if found else errno.EIO
-            raise OSError(code, os.strerror(code)) from error
+        except SafetensorError as error:  # a refused write, among others
+            raise OSError(errno.EIO, str(error)) from error

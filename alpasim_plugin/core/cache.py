@@ -18,8 +18,9 @@ from alpasim_plugin.core.atomic import atomic_folder
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.lock import one_writer
 
-T = TypeVar("T")
 DO_THIS = "free disk space, or name a writable folder in SIMRUN_CACHE"
+
+T = TypeVar("T")
 
 
 def cached(
@@ -50,44 +51,28 @@ def cached(
     """
     folder = places.cache() / kind / key
     if not again and folder.exists():
-        found = _readable(folder, read, what)
-        if found is not None:
-            return found
-    lock = folder.with_name(f"{key}.lock")
+        try:
+            return read(folder)
+        except InputError as error:
+            _say(f"warning: {what} is damaged ({error.message}); making it again")
     with one_writer(
-        lock,
-        what,
-        wait=True,
-        waiting=lambda text: print(text, file=sys.stderr, flush=True),
-        do_this=DO_THIS,
+        folder.with_name(f"{key}.lock"), what, wait=True, waiting=_say, do_this=DO_THIS
     ):
-        for left_over in folder.parent.glob(
-            f".{key}.*.tmp"
-        ):  # of a process that was killed while it made this entry
+        # of a process that was killed while it made this entry
+        for left_over in folder.parent.glob(f".{key}.*.tmp"):
             shutil.rmtree(left_over)
-        found = None if again or not folder.exists() else _readable(folder, read, what, warn=False)
-        if found is None:
-            _make(folder, make, what)
-            found = read(folder)
-        return found
-
-
-def _readable(folder: Path, read: Callable[[Path], T], what: str, warn: bool = True) -> T | None:
-    try:
+        if not again and folder.exists():
+            try:
+                return read(folder)
+            except InputError:
+                pass  # damaged, and said above
+        _say(f"{what} ...")
+        began = time.perf_counter()
+        with atomic_folder(folder, DO_THIS) as partial:
+            make(partial)
+        _say(f"{what}: {time.perf_counter() - began:.1f} s")
         return read(folder)
-    except InputError as error:
-        if warn:
-            print(
-                f"warning: {what} is damaged ({error.message}); making it again",
-                file=sys.stderr,
-                flush=True,
-            )
-        return None
 
 
-def _make(folder: Path, make: Callable[[Path], None], what: str) -> None:
-    print(f"{what} ...", file=sys.stderr, flush=True)
-    began = time.perf_counter()
-    with atomic_folder(folder, DO_THIS) as partial:
-        make(partial)
-    print(f"{what}: {time.perf_counter() - began:.1f} s", file=sys.stderr, flush=True)
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

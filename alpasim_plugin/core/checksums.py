@@ -1,22 +1,16 @@
 """Digests of files, so that damage is noticed before a file is trusted.
 
 A file with the stated size and time is taken as it is, since reading gigabytes before every command
-would cost more than it finds; any other is read in full. A copy has other times: they are set back
-once its content is found to be the same.
+would cost more than it finds; any other is read in full.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import os
-import stat
 from collections.abc import Iterable
 from pathlib import Path
 
 from typing_extensions import TypedDict
-
-MTIME_STEP_NS = 1000  # file systems keep times to a microsecond or better
 
 
 class FileFacts(TypedDict):
@@ -37,17 +31,15 @@ def sha256_of(path: Path) -> str:
 
 def checksums_of(folder: Path, names: Iterable[str]) -> dict[str, FileFacts]:
     """Return the facts of those of the named files that are there."""
-    found: dict[str, FileFacts] = {}
+    facts: dict[str, FileFacts] = {}
     for name in names:
         path = folder / name
         if path.is_file():
             state = path.stat()
-            found[name] = {
-                "bytes": state.st_size,
-                "mtime_ns": state.st_mtime_ns,
-                "sha256": sha256_of(path),
-            }
-    return found
+            facts[name] = FileFacts(
+                bytes=state.st_size, mtime_ns=state.st_mtime_ns, sha256=sha256_of(path)
+            )
+    return facts
 
 
 def problem_of(path: Path, facts: FileFacts, full: bool = False) -> str | None:
@@ -58,22 +50,17 @@ def problem_of(path: Path, facts: FileFacts, full: bool = False) -> str | None:
         facts: What was stated of it when it was written.
         full: Read its content even if size and time are as stated.
     """
+    if not path.exists():
+        return "missing"
+    if not path.is_file():
+        return "not a file"
     try:
         state = path.stat()
-        if not stat.S_ISREG(state.st_mode):
-            return "not a file"
         if state.st_size != facts["bytes"]:
             return f"{state.st_size} bytes, written with {facts['bytes']}"
-        same_time = abs(state.st_mtime_ns - facts["mtime_ns"]) < MTIME_STEP_NS
-        if same_time and not full:
+        if state.st_mtime_ns == facts["mtime_ns"] and not full:
             return None
-        if sha256_of(path) != facts["sha256"]:
-            return "not the content that was written"
-    except FileNotFoundError:
-        return "missing"
+        digest = sha256_of(path)
     except OSError as error:
-        return f"cannot be read: {error.strerror or error}"
-    if not same_time:
-        with contextlib.suppress(OSError):  # a read-only folder is read in full every time
-            os.utime(path, ns=(state.st_atime_ns, facts["mtime_ns"]))
-    return None
+        return f"cannot be read: {error.strerror}"
+    return None if digest == facts["sha256"] else "not the content that was written"

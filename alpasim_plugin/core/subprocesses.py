@@ -33,7 +33,6 @@ SUPERVISOR = Path(__file__).with_name("supervisor.py")
 GRACE_S = 5.0  # between asking the command to end and ending it
 LAST_LINES = 20
 LINE_BYTES = 8192  # longer lines are cut into several
-DOING = "starting a command"
 
 
 @contextmanager

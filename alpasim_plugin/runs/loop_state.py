@@ -18,7 +18,6 @@ import numpy as np
 from alpasim_plugin.control import Controller
 from alpasim_plugin.core.geometry import (
     arc_lengths,
-    ego_state_from_log,
     interpolate,
     project,
     quat_from_matrix,
@@ -40,6 +39,7 @@ from alpasim_plugin.core.types import (
     Scenario,
     Trajectory,
 )
+from alpasim_plugin.runs.recorded_state import ego_state_from_log
 from alpasim_plugin.world.actors import ActorForecast, Actors
 from alpasim_plugin.world.ground import ground_pose
 from alpasim_plugin.world.route import route_in_rig

@@ -17,7 +17,6 @@ import numpy as np
 
 from alpasim_plugin.core.atomic import write_bytes
 from alpasim_plugin.core.clock import Clock
-from alpasim_plugin.core.geometry import ego_states_from_log
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.places import temporary_folder
 from alpasim_plugin.core.plan_check import unit_guess
@@ -47,6 +46,7 @@ from alpasim_plugin.log import (
 from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME, STRIP_NAME, VIDEO_NAME
 from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.runs.loop_state import PathEnd
+from alpasim_plugin.runs.recorded_state import ego_states_from_log
 
 REACH_S = 1.0
 MOVING_MPS = 1.0  # below, a plan's speed says nothing about its unit

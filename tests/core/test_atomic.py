@@ -53,7 +53,8 @@ def test_a_full_disk_leaves_the_old_file_and_no_litter(
     monkeypatch.setattr(atomic.os, "fsync", full)
     with pytest.raises(InfrastructureError, match="No space left on device") as caught:
         write(path, 2)
-    assert (caught.value.message, caught.value.exit_code) == (str(path), 4)
+    assert caught.value.message.startswith(str(path))
+    assert caught.value.exit_code == 4
     assert "free disk space" in caught.value.hint
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
@@ -163,7 +164,7 @@ def test_a_missing_folder_is_named_with_advice(name: str, tmp_path: Path) -> Non
 
 def test_the_folder_of_bytes_is_made_and_a_file_in_its_place_is_refused(tmp_path: Path) -> None:
     write_bytes(tmp_path / "new" / "a", b"x")
-    with pytest.raises(InfrastructureError, match="make the folder writable"):
+    with pytest.raises(InfrastructureError, match="writable, or name another"):
         write_bytes(tmp_path / "new" / "a" / "b", b"x")
 
 
@@ -178,7 +179,7 @@ def test_a_read_only_folder_is_an_error_with_four_parts(
     monkeypatch.setattr(Path, "unlink", refuse)  # refused even where there is no file
     with pytest.raises(InfrastructureError, match="Read-only file system") as caught:
         write(tmp_path / "out", 1)
-    assert "make the folder writable" in caught.value.hint
+    assert "writable, or name another" in caught.value.hint
 
 
 def test_nan_is_refused_in_json(tmp_path: Path) -> None:

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import shapely
 
-from alpasim_plugin.core.geometry import ego_state_from_log, interpolate, yaw_from_quat, yaw_of
+from alpasim_plugin.core.geometry import interpolate, yaw_from_quat, yaw_of
 from alpasim_plugin.core.types import F64, Box, Scenario
+from alpasim_plugin.runs.recorded_state import ego_state_from_log
 from alpasim_plugin.world.actors import make_actors
 from scenarios.load import load_scenario
 from scenarios.suite import LIBRARY, load_suite, shipped, shipped_names, suites

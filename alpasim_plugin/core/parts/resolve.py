@@ -8,7 +8,7 @@ import difflib
 import inspect
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ from alpasim_plugin.core.interfaces import Declaration
 from alpasim_plugin.core.lazy import installed, installed_names
 from alpasim_plugin.core.parts.source import (
     absolute_target,
-    code_digest,
     file_of,
     is_target,
     load,
@@ -60,12 +59,10 @@ def entries(kind: KindName) -> Mapping[str, Entry]:
     Raises:
         InputError: Two packages claim one name.
     """
-    found = {
-        name: Entry(name, target, help_text) for name, (target, help_text) in BUILTIN[kind].items()
-    }
-    taken = {name: entry.target for name, entry in found.items()}
+    taken = {name: target for name, (target, _) in BUILTIN[kind].items()}
     others = installed_names(KINDS[kind].group, taken, kind)
-    return found | {name: Entry(name, target, f"from {target}") for name, target in others.items()}
+    known = {name: Entry(name, *part) for name, part in BUILTIN[kind].items()}
+    return known | {name: Entry(name, target, f"from {target}") for name, target in others.items()}
 
 
 def find(kind: KindName, name: str) -> Entry:
@@ -77,16 +74,19 @@ def find(kind: KindName, name: str) -> Entry:
     known = entries(kind)
     if name in known:
         return known[name]
+    raise _unknown(kind, name, known)
+
+
+def _unknown(kind: str, name: str, known: Iterable[str]) -> InputError:
     near = difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    raise InputError(
+    guess = f"did you mean {near[0]!r}? " if near else ""
+    return InputError(
         f"name {name!r}: no {kind} has that name",
-        f"{hint}known: {', '.join(known)}; or name one of your own as package.module:Class",
+        f"{guess}known: {', '.join(known)}; or name one of your own as package.module:Class",
     )
 
 
 BASE = "3dgs"  # the renderer below a fixer where nothing else is said
-DOING = "choosing a renderer"
 PLAIN_KINDS = (
     "renderer",
     "evaluator",
@@ -178,31 +178,42 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
             without the weights that it needs.
     """
     plain, own = split_settings(name)
-    overrides = (*overrides_of(name, overrides), *own)
     front, plus, base = plain.partition("+")
-    if not plus:
-        if own and front in entries("renderer"):
+    steps = re.fullmatch(r"(.+)@([0-9]+)", base)
+    if steps is not None and "@" not in front:  # they stand at the end, and belong to the fixer
+        front, base = f"{front}@{steps[2]}", steps[1]
+    renderers = entries("renderer")
+    if not plus and (front in renderers or "://" in front or _is_renderer(front)):
+        if own:
             raise InputError(
                 f"renderer {name!r}: {front!r} is no fixer: it has no settings for brackets",
                 "leave the brackets out, or name a fixer: onefixer[references=0]",
             )
-        if (
-            front in entries("renderer")
-            or "://" in front
-            or (is_target(front) and not _is_fixer(front))
-        ):
-            return RendererSpec(name, resolve("renderer", front))
-        base = BASE
-    else:
-        front, base = _steps_to_front(front, base)
-    if not is_target(front):
-        _require_fixer(plain, front, bool(plus))
-    fixer = _in_the_loop(resolve("fixer", front, overrides))
-    return RendererSpec(
-        name,
-        resolve("renderer", base),
-        replace(fixer, name=f"{fixer.name}[{','.join(own)}]") if own else fixer,
-    )
+        return RendererSpec(name, resolve("renderer", front))
+    fixers = entries("fixer")
+    if not is_target(front) and split_steps(front)[0] not in fixers:
+        raise _unknown("fixer" if plus else "renderer or fixer", front, [*renderers, *fixers])
+    fixer = resolve("fixer", front, (*overrides_of(name, overrides), *own))
+    if own:
+        fixer = replace(fixer, name=f"{fixer.name}[{','.join(own)}]")
+    settings: Any = fixer.settings
+    if getattr(settings, "is_offline", False):
+        raise InputError(
+            f"fixer {fixer.name!r}: its first frame needs {settings.unit.lookahead_frames} frames "
+            "after it, which a closed loop has not driven yet",
+            f"fix recorded clips with it: simrun refine --fixer {fixer.name}",
+        )
+    if fixer.missing:
+        raise InputError(f"fixer {fixer.name!r}: {fixer.note}", fixer.missing)
+    return RendererSpec(name, resolve("renderer", base or BASE), fixer)
+
+
+def _is_renderer(name: str) -> bool:
+    """Tell whether a target is a renderer, by what it can do."""
+    if not is_target(name):
+        return False
+    part = load(absolute_target(name), "renderer or fixer")
+    return hasattr(part, "render") or not hasattr(part, "step")
 
 
 def split_settings(name: str) -> tuple[str, tuple[str, ...]]:
@@ -265,28 +276,28 @@ def split_steps(name: str) -> tuple[str, int | None]:
     return plain, int(count) if at else None
 
 
-def declaration_of(factory: Any, settings: BaseModel | None, folder: Path) -> Declaration:
+def declaration_of(factory: Any, settings: BaseModel | None) -> Declaration:
     """Return what a factory declares: the result of its ``describe(settings)``, or its attributes
     of the same names as `Declaration`'s.
-
-    Relative files start at the folder of the factory's module.
     """
-    describe = getattr(factory, "describe", None)
-    if describe is not None:
-        declared: Declaration = describe(settings)
-        files = declared.files
-    else:
-        given = getattr(factory, "files", {})
-        files = given if isinstance(given, Mapping) else {str(path): Path(path) for path in given}
-        attributes = ("trained", "note", "is_remote", "missing")
-        declared = Declaration(
-            **{
-                key: getattr(factory, key)
-                for key in attributes
-                if isinstance(getattr(factory, key, None), bool | str)
-            }
-        )
-    return replace(declared, files={key: folder / path for key, path in files.items()})
+    if hasattr(factory, "describe"):
+        declared: Declaration = factory.describe(settings)
+        return declared
+    files = getattr(factory, "files", {})
+    if not isinstance(files, Mapping):
+        files = {str(path): Path(path) for path in files}
+    given = {
+        key: getattr(factory, key, None) for key in ("trained", "note", "is_remote", "missing")
+    }
+    stated = {key: value for key, value in given.items() if isinstance(value, bool | str)}
+    return Declaration(files=files, **stated)
+
+
+def note_of(spec: PartSpec, declared: Declaration) -> str:
+    """Return what a part is in a few words, where it does not say so itself."""
+    if declared.note or declared.trained is None:
+        return declared.note or ("no network" if spec.kind == "fixer" else "")
+    return "trained" if declared.trained else "untrained"
 
 
 def _declares_nothing(kind: KindName, target: str) -> bool:
@@ -300,46 +311,38 @@ def _declares_nothing(kind: KindName, target: str) -> bool:
     )
 
 
-def note_of(spec: PartSpec, declared: Declaration) -> str:
-    """Return what a part is in a few words, where it does not say so itself."""
-    trained = "" if declared.trained is None else "trained" if declared.trained else "untrained"
-    return declared.note or trained or ("no network" if spec.kind == "fixer" else "")
-
-
 def _described(spec: PartSpec, factory: Any) -> PartSpec:
     module = file_of(spec.target)
     modules = [] if module is None else [module]
-    if inspect.isclass(factory) or inspect.isfunction(
-        factory
-    ):  # a package may only pass on what another module defines
+    if inspect.isclass(factory) or inspect.isfunction(factory):
+        # a package may only pass on what another module defines
         home = getattr(sys.modules.get(factory.__module__), "__file__", None)
         modules += [Path(home)] if home is not None and Path(home) not in modules else []
     mode = installed(MODES).get(str(getattr(spec.settings, "loop_mode", "")))
-    if (
-        mode is not None
-    ):  # what calls a fixer of blocks shapes its frames, and no import leads there
-        modules += [file for file in [file_of(mode.value)] if file is not None]
-    for file in modules if factory is not None else ():
-        require_unedited(file, code_digest(file))
-    declared = declaration_of(factory, spec.settings, module.parent if module else Path())
-    shas = {
-        key: file_digest(path, f"{spec.kind} {spec.name!r}, {key}")
-        for key, path in declared.files.items()
-    }
-    attribute = spec.target.rpartition(":")[2]
-    return PartSpec(
-        spec.kind,
-        spec.name,
-        spec.target,
-        spec.settings,
-        None if declared.is_remote else part_digest(modules, attribute, spec.settings, shas),
-        note_of(spec, declared),
-        declared.trained,
-        {str(declared.files[key]): sha for key, sha in shas.items()},
-        dict(getattr(factory, "metrics", {})) if spec.kind == "evaluator" else {},
-        str(getattr(factory, "controller", "bicycle")) if spec.kind == "policy" else "",
-        spec.address,
-        declared.missing,
+    mode_file = None if mode is None else file_of(mode.value)
+    if mode_file is not None:
+        # what calls a fixer of blocks shapes its frames, and no import leads there
+        modules.append(mode_file)
+    if factory is not None:
+        for file in modules:
+            require_unedited(file)
+    declared = declaration_of(factory, spec.settings)
+    folder = module.parent if module else Path()
+    paths = {key: folder / path for key, path in declared.files.items()}
+    shas = {key: file_digest(path, f"{spec.kind} {spec.name!r}") for key, path in paths.items()}
+    digest = None
+    if not declared.is_remote:
+        attribute = spec.target.rpartition(":")[2]
+        digest = part_digest(modules, attribute, spec.settings, shas)
+    return replace(
+        spec,
+        digest=digest,
+        note=note_of(spec, declared),
+        trained=declared.trained,
+        files={str(paths[key]): sha for key, sha in shas.items()},
+        metrics=dict(getattr(factory, "metrics", {})) if spec.kind == "evaluator" else {},
+        controller=str(getattr(factory, "controller", "bicycle")) if spec.kind == "policy" else "",
+        missing=declared.missing,
     )
 
 
@@ -361,49 +364,3 @@ def _settings(
         model, apply_overrides(Document({}, {}, f"the defaults of {name}"), overrides)
     )
     return validated
-
-
-def _steps_to_front(front: str, base: str) -> tuple[str, str]:
-    """Move ``@STEPS`` from the end of a composite name to the fixer, which it belongs to."""
-    match = re.fullmatch(r"(.+)@([0-9]+)", base)
-    return (front, base) if match is None or "@" in front else (f"{front}@{match[2]}", match[1])
-
-
-def _in_the_loop(fixer: PartSpec) -> PartSpec:
-    """Refuse a fixer without weights, and one that needs frames which a closed loop has not
-    rendered yet.
-    """
-    named = f"fixer {fixer.name!r}"
-    settings: Any = fixer.settings
-    if getattr(settings, "is_offline", False):
-        ahead = settings.unit.lookahead_frames
-        raise InputError(
-            f"{named}: its first frame needs {ahead} frames after it, which a closed loop has not driven yet",
-            f"fix recorded clips with it: simrun refine --fixer {fixer.name}, simrun bench quality --fixer {fixer.name}",
-        )
-    if fixer.missing:
-        raise InputError(f"{named}: {fixer.note}", fixer.missing)
-    return fixer
-
-
-def _is_fixer(target: str) -> bool:
-    part = load(absolute_target(target), "renderer or fixer")
-    return hasattr(part, "step") and not hasattr(part, "render")
-
-
-def _require_fixer(name: str, front: str, is_composite: bool) -> None:
-    plain, steps = split_steps(front)
-    fixers, renderers = names("fixer"), names("renderer")
-    if plain in fixers:
-        return
-    if steps is not None and plain in renderers:
-        raise InputError(
-            f"renderer {name!r}: {plain!r} has no step count",
-            f"write {plain}, or FIXER@STEPS",
-        )
-    near = difflib.get_close_matches(plain, [*renderers, *fixers], n=1)
-    raise InputError(
-        f"renderer {name!r}: no {'fixer' if is_composite else 'renderer or fixer'} has the name {plain!r}",
-        (f"did you mean {near[0]!r}? " if near else "")
-        + "'simrun list renderers' and 'simrun list fixers' name them; together FIXER+RENDERER; your own as package.module:Class",
-    )

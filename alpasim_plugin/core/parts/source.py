@@ -16,7 +16,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from alpasim_plugin import OWN_PACKAGES
@@ -57,9 +56,10 @@ def code_digest(file: str | Path) -> str:
     path = os.path.realpath(file)
     if Path(os.path.relpath(path, OWN_ROOT)).parts[0] in OWN_PACKAGES:
         return package_digest()
-    texts = [Path(one).read_bytes() for one in sorted(reached(path))]
-    digests = [hashlib.sha256(text).hexdigest() for text in texts]
-    return hashlib.sha256("\n".join([package_digest(), *digests]).encode()).hexdigest()
+    hashed = hashlib.sha256(package_digest().encode())
+    for module in sorted(reached(path)):
+        hashed.update(hashlib.sha256(Path(module).read_bytes()).digest())
+    return hashed.hexdigest()
 
 
 def reached(file: str | Path) -> set[str]:
@@ -68,13 +68,19 @@ def reached(file: str | Path) -> set[str]:
     """
     start = os.path.realpath(file)
     root = top_folder(start)
+    own = Path(os.path.relpath(start, root)).parts[0].removesuffix(".py")
+    is_shared = not INSTALLED.isdisjoint(Path(root).parts)
     seen: set[str] = set()
     todo = [start]
     while todo:
         path = todo.pop()
-        if path not in seen:
-            seen.add(path)
-            todo += _imported_files(path, root)
+        if path in seen:
+            continue
+        seen.add(path)
+        for module in _imports(path, root):
+            if module[0] == own or not (is_shared or _is_installed(module[0], root)):
+                files = (module_file(root, module[:n]) for n in range(1, len(module) + 1))
+                todo += [file for file in files if file is not None]
     return seen
 
 
@@ -95,24 +101,9 @@ def module_file(root: str, parts: Sequence[str]) -> str | None:
     return next((file for file in candidates if os.path.isfile(file)), None)
 
 
-def _imported_files(path: str, root: str) -> Iterator[str]:
+def _imports(path: str, root: str) -> Iterator[list[str]]:
+    """Yield the dotted name of everything that a module may import, relative ones made absolute."""
     package = list(Path(os.path.relpath(path, root)).parent.parts)
-    top = package[0] if package else Path(path).stem
-    is_shared = not INSTALLED.isdisjoint(Path(root).parts)
-    for level, dotted in _imports(path):
-        parts = [*package[: len(package) - level + 1], *dotted] if level else dotted
-        first = module_file(root, parts[:1]) if parts else None
-        if first is None or parts[0] in OWN_PACKAGES or (is_shared and parts[0] != top):
-            continue
-        if parts[0] == top or not _is_hidden(parts[0], first):
-            for depth in range(1, len(parts) + 1):
-                file = module_file(root, parts[:depth])
-                if file is not None:
-                    yield file
-
-
-def _imports(path: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number of leading dots and the name of everything that a module may import."""
     try:
         tree = ast.parse(Path(path).read_bytes())
     except (SyntaxError, ValueError):  # the import itself will say so
@@ -120,11 +111,29 @@ def _imports(path: str) -> Iterator[tuple[int, list[str]]]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:
-                yield 0, alias.name.split(".")
+                yield alias.name.split(".")
         elif isinstance(node, ast.ImportFrom):
-            module = node.module.split(".") if node.module else []
+            module = package[: len(package) - node.level + 1] if node.level else []
+            module = [*module, *(node.module.split(".") if node.module else [])]
             for alias in node.names:
-                yield node.level, [*module, alias.name]
+                yield [*module, alias.name]
+
+
+def _is_installed(name: str, root: str | None = None) -> bool:
+    """Tell whether Python finds a module without the folders that were named, elsewhere than below
+    ``root``; our own packages it always does.
+    """
+    if name in OWN_PACKAGES:
+        return True
+    if name in _served:
+        return False
+    try:
+        spec = importlib.util.find_spec(name)
+    except ValueError:  # a module that was made, not found: __main__
+        return True
+    if spec is None or root is None:
+        return spec is not None
+    return os.path.realpath(spec.origin or "") != module_file(root, [name])
 
 
 def is_target(name: str) -> bool:
@@ -161,13 +170,11 @@ def absolute_target(target: str) -> str:
         return f"{Path(module).absolute()}:{attribute}"
     parts = module.split(".")
     is_own = parts[0] in OWN_PACKAGES
-    if not is_own and _is_installed(parts[0]):
-        return target
     file = module_file(os.getcwd(), parts)
-    if file is None or (
-        is_own
-        and (os.path.realpath(file) == module_file(OWN_ROOT, parts) or file.endswith("__init__.py"))
-    ):
+    if file is None or (not is_own and _is_installed(parts[0])):
+        return target
+    is_ours = os.path.realpath(file) == module_file(OWN_ROOT, parts)
+    if is_own and (is_ours or file.endswith("__init__.py")):
         return target
     return f"{file}:{attribute}"
 
@@ -206,16 +213,17 @@ def make_importable(target: str) -> str:
     if not file.endswith(".py"):
         return file
     root = top_folder(file)
-    own_name = os.path.basename(file)
+    real_root = os.path.realpath(root)
     if INSTALLED.isdisjoint(Path(root).parts):
-        for path in sorted(reached(file) - {os.path.join(os.path.realpath(root), own_name)}):
-            top = Path(os.path.relpath(path, os.path.realpath(root))).parts[0].removesuffix(".py")
-            if top not in OWN_PACKAGES and not _is_installed(top):
+        for path in sorted(reached(file) - {os.path.join(real_root, os.path.basename(file))}):
+            top = Path(os.path.relpath(path, real_root)).parts[0].removesuffix(".py")
+            if not _is_installed(top):
                 _serve(top, module_file(root, [top]))
-    parts = Path(os.path.relpath(file, root)).with_suffix("").parts
-    in_package = parts[:-1] if parts[-1] == "__init__" else parts
-    if len(parts) > 1 and _served.get(in_package[0]) == module_file(root, in_package[:1]):
-        return ".".join(in_package)
+    parts = list(Path(os.path.relpath(file, root)).with_suffix("").parts)
+    if parts[-1] == "__init__":
+        parts.pop()
+    if len(parts) > 1 and _served.get(parts[0]) == module_file(root, parts[:1]):
+        return ".".join(parts)
     own = f"simrun_file_{hashlib.sha256(file.encode()).hexdigest()[:12]}"
     _serve(own, file)
     return own
@@ -235,13 +243,11 @@ def _serve(name: str, file: str | None) -> None:
             f"{file}: a module named {name} was imported from {other} before",
             "rename one of the two",
         )
-    if name in sys.modules:
-        return
     spec = importlib.util.spec_from_file_location(name, file)
-    assert spec is not None
-    assert spec.loader is not None
+    if name in sys.modules or spec is None or spec.loader is None:
+        return
     spec.loader = importlib.util.LazyLoader(spec.loader)
-    module: ModuleType = importlib.util.module_from_spec(spec)
+    module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     spec.loader.exec_module(module)
     _served[name] = file
@@ -255,39 +261,18 @@ def file_of(target: str) -> Path | None:
     if name.endswith(".py"):
         return Path(name)
     spec = importlib.util.find_spec(name)
-    if spec is None or spec.origin is None or not spec.has_location:
-        return None
-    return Path(spec.origin)
+    return Path(spec.origin) if spec and spec.origin and spec.has_location else None
 
 
-def require_unedited(file: Path, digest: str) -> None:
+def require_unedited(file: Path) -> None:
     """Refuse a module whose code on disk is no longer the code that this process has imported.
 
-    Args:
-        file: The module's source file; it has been imported.
-        digest: Its `code_digest` now.
-
     Raises:
-        InputError: The digest is another than when the part was first resolved in this process.
+        InputError: Its `code_digest` is another than when a part of it was first resolved here.
     """
+    digest = code_digest(file)
     if _imported_code.setdefault(file, digest) != digest:
         raise InputError(
             f"{file}: it, or a module that it imports, was edited after this process imported it",
             "start a new process",
         )
-
-
-def _is_hidden(name: str, file: str) -> bool:
-    """Tell whether another file than this one is imported under its name."""
-    spec = None if name in _served or not _is_installed(name) else importlib.util.find_spec(name)
-    return spec is not None and os.path.realpath(spec.origin or "") != os.path.realpath(file)
-
-
-def _is_installed(name: str) -> bool:
-    """Tell whether Python finds a module without the folders that were named."""
-    if name in _served:
-        return False
-    try:
-        return importlib.util.find_spec(name) is not None
-    except ValueError:  # a module that was made, not found: __main__
-        return True

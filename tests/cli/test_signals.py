@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from alpasim_plugin.core.signals import Stopped, stoppable
+from alpasim_plugin.cli.signals import Stopped, stoppable
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def test_a_signal_that_was_ignored_stays_ignored() -> None:
 def test_a_second_signal_ends_a_process_that_hangs_while_it_unwinds() -> None:
     code = (
         "import os, signal\n"
-        "from alpasim_plugin.core.signals import stoppable\n"
+        "from alpasim_plugin.cli.signals import stoppable\n"
         "with stoppable():\n"
         "    try:\n"
         "        os.kill(os.getpid(), signal.SIGTERM)\n"
