@@ -14,9 +14,9 @@ import typer
 from alpasim_plugin.cli.options import Json
 from alpasim_plugin.core import places
 from alpasim_plugin.core.errors import InfrastructureError, SimrunError
-from alpasim_plugin.core.kernels import SUBJECTS
 from alpasim_plugin.core.places import temporary_folder
 from alpasim_plugin.runs.execute import compile_kernels
+from alpasim_plugin.runs.kernels import SUBJECTS
 from alpasim_plugin.runs.provenance import hardware, versions
 
 EPILOG = "Example: `simrun doctor --json`"

@@ -301,15 +301,6 @@ def _members(interface: Any) -> tuple[list[str], dict[str, Any]]:
     """Return the names of the required members, and the optional ones with their defaults."""
     own = vars(interface)
     required = [name for name in interface.__annotations__ if name not in own]
-    required += [
-        name for name, member in own.items() if getattr(member, "__isabstractmethod__", False)
-    ]
-    optional = {name: own[name] for name in interface.__annotations__ if name in own}
-    public = {
-        name: member
-        for name, member in own.items()
-        if inspect.isfunction(member) and not name.startswith("_")
-    }
-    return required, optional | {
-        name: member for name, member in public.items() if name not in required
-    }
+    required += [name for name in own if getattr(own[name], "__isabstractmethod__", False)]
+    optional = [name for name in own if not name.startswith("_") and name not in required]
+    return required, {name: own[name] for name in optional}

@@ -13,10 +13,10 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.subprocesses import end_children
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
 from alpasim_plugin.log.run_folder.sides import Side
 from alpasim_plugin.log.run_folder.writer import rollout_rows, writing

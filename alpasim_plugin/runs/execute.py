@@ -17,7 +17,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.core import kernels, places
+from alpasim_plugin.core import places
 from alpasim_plugin.core.cache import cached
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.parts import digest
@@ -25,6 +25,7 @@ from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import write_manifest
 from alpasim_plugin.renderers.reconstruction_key import is_reconstructed
+from alpasim_plugin.runs import kernels
 from alpasim_plugin.runs.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
 from alpasim_plugin.runs.executors.choice import LOCAL, Executor
 from alpasim_plugin.runs.executors.local import Lost, run_jobs

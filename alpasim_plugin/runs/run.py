@@ -13,9 +13,9 @@ from threading import Thread
 from typing import Any, Protocol
 
 from alpasim_plugin import __version__
+from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.parts.source import package_digest
-from alpasim_plugin.core.subprocesses import end_children
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.check import cells_of_run
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json

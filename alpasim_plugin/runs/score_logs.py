@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.core.checksums import problem_of
 from alpasim_plugin.core.config import load_yaml
 from alpasim_plugin.core.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
 from alpasim_plugin.core.parts import PartSpec
 from alpasim_plugin.core.types import RolloutLog, Scenario, Scene
 from alpasim_plugin.log import read_asl
+from alpasim_plugin.log.run_folder.checksums import problem_of
 from alpasim_plugin.log.run_folder.manifests import read_manifest
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, MANIFEST, RUN_INFO, rollout_folder
 from alpasim_plugin.log.run_folder.writer import LoggedScene, write_steps

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.atomic import write_json
-from alpasim_plugin.core.checksums import checksums_of
+from alpasim_plugin.log.run_folder.checksums import checksums_of
 from alpasim_plugin.log.run_folder.reader import read_json, table_path
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS, WHY_NAME
 from alpasim_plugin.log.run_folder.sides import Row, value_of

@@ -16,21 +16,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alpasim_plugin.alpasim.client import child as children
+from alpasim_plugin.alpasim.client.child import Child, end_children, exit_reason
 from alpasim_plugin.alpasim.client.command import Command
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.cli.options import split_policies
-from alpasim_plugin.core import subprocesses as children
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.parts import build, resolve
-from alpasim_plugin.core.subprocesses import (
-    MOST_BYTES,
-    Child,
-    end_children,
-    exit_reason,
-    parts_print_to_stderr,
-    say,
-)
+from alpasim_plugin.core.subprocesses import MOST_BYTES, parts_print_to_stderr, say
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
 from policies.conformance import STRAIGHT, canned_scenario, observations
@@ -251,7 +245,7 @@ def test_a_command_ends_with_the_process_that_started_it_however_that_ends(
 ) -> None:
     starting = """
 import sys, time
-from alpasim_plugin.core.subprocesses import Child
+from alpasim_plugin.alpasim.client.child import Child
 code = "import os, time; print(os.getpid()); time.sleep(60)"
 Child([sys.executable, "-S", "-c", code], {}, lambda line: print(line, flush=True), lambda: None)
 time.sleep(60)

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.core.kernels import SUBJECTS
 from alpasim_plugin.core.places import cache
 from alpasim_plugin.runs.execute import KERNELS, compile_for, compile_kernels, needed
+from alpasim_plugin.runs.kernels import SUBJECTS
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from scenarios.suite import ScenarioRef
 
@@ -58,7 +58,7 @@ def test_one_worker_compiles_while_it_drives_and_two_beforehand(
 COMPILED_LATER = """
 import sys
 from numba.core import event
-from alpasim_plugin.core.kernels import SUBJECTS
+from alpasim_plugin.runs.kernels import SUBJECTS
 from alpasim_plugin.runs.execute import compile_kernels
 
 class Compiled(event.Listener):

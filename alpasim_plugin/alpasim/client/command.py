@@ -22,9 +22,10 @@ from typing import Any, Protocol
 from urllib.parse import parse_qs
 
 from alpasim_plugin.alpasim.client.channel import Address
+from alpasim_plugin.alpasim.client.child import Child, exit_reason
 from alpasim_plugin.alpasim.client.driver import OPTIONS, DriverPolicy
 from alpasim_plugin.core.errors import InputError, PolicyError, SimrunError
-from alpasim_plugin.core.subprocesses import Child, exit_reason, say
+from alpasim_plugin.core.subprocesses import say
 from alpasim_plugin.core.types import Scenario
 
 MAX_PATH = 100  # of a socket file; the system's own limit is 104 (macOS) or 108 (Linux)

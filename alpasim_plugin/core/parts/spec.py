@@ -233,25 +233,15 @@ def _arguments(
         parameters = inspect.signature(factory).parameters.values()
     except ValueError:  # some built-in callables have no signature
         return {}
-    named = [
-        p
-        for p in parameters
-        if p.kind in (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-    ]
-    positional = [
-        p.name
-        for p in parameters
-        if p.kind is inspect.Parameter.POSITIONAL_ONLY and p.default is inspect.Parameter.empty
-    ]
-    unknown = positional + [
-        p.name for p in named if p.name not in known and p.default is inspect.Parameter.empty
-    ]
+    asked = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    by_name = {p.name: p for p in asked if p.kind is not p.POSITIONAL_ONLY and p.name in known}
+    unknown = [p.name for p in asked if p.default is p.empty and p.name not in by_name]
     if unknown:
         raise contract_error(spec.kind)(
             f"{spec.kind} {spec.name!r}: its factory asks for {', '.join(unknown)}",
             f"give the parameter a default; a {spec.kind} may ask for {', '.join(KINDS[spec.kind].arguments) or 'nothing'}",
         )
-    return {p.name: known[p.name] for p in named if p.name in known}
+    return {name: known[name] for name in by_name}
 
 
 _PER_FRAME = "alpasim_plugin.fixers.identity:per_frame"

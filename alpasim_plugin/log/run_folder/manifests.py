@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from alpasim_plugin.core.atomic import write_json
-from alpasim_plugin.core.checksums import FileFacts, checksums_of, problem_of
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.reading import read_json_as
+from alpasim_plugin.log.run_folder.checksums import FileFacts, checksums_of, problem_of
 from alpasim_plugin.log.run_folder.schema import (
     DERIVED,
     DRIVEN,

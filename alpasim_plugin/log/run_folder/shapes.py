@@ -13,8 +13,8 @@ from typing import Annotated, Any
 from pydantic import Field
 from typing_extensions import TypedDict
 
-from alpasim_plugin.core.checksums import FileFacts
 from alpasim_plugin.core.types import Aggregation, Direction
+from alpasim_plugin.log.run_folder.checksums import FileFacts
 
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 Line = list[Annotated[list[Coordinate], Field(min_length=2, max_length=3)]]

@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from alpasim_plugin.core.checksums import checksums_of, problem_of
+from alpasim_plugin.log.run_folder.checksums import checksums_of, problem_of
 
 
 def test_missing_cut_and_changed_files_are_told_apart(tmp_path: Path) -> None:
