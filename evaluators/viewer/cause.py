@@ -125,21 +125,18 @@ def write_cause(run: Run, cause: Cause) -> Path:
     rollout = cause.rollout
     path = run.folder / rollout.path / WHY_NAME
     report = "../" * len(Path(rollout.path).parts) + "report.html"
-    cell = cells_of(
-        run, Wanted((rollout.scene,), (rollout.policy,), (rollout.seed,), (rollout.renderer,))
-    )[0]
+    wanted = Wanted((rollout.scene,), (rollout.policy,), (rollout.seed,), (rollout.renderer,))
+    cell = cells_of(run, wanted)[0]
     logs = read_logs(run, cell)
-    document = cell_data(run, cell, logs, None)
+    document = cell_data(run, cell, logs, None) | {"own": rollout.renderer, "lens": None}
     place = Place(np.array(document.pop("origin")), document.pop("zero_us"))
-    document |= {
-        "failed": None if cause.failed_us is None else place.ms([cause.failed_us])[0],
-        "own": rollout.renderer,
-    }
-    log = next(iter(logs.values()))
-    camera = next(iter(log.info["cameras"]), None) if isinstance(log, RolloutLog) else None
-    scale = 1.0 if camera is None else min(1.0, WIDTH_PX / camera.width)
-    document |= {"looks": [_look(look, place, scale) for look in cause.looks]}
-    document["lens"] = None if camera is None else lens_data(camera, WIDTH_PX)
+    document["failed"] = None if cause.failed_us is None else place.ms([cause.failed_us])[0]
+    log, scale = logs[rollout.path], 1.0
+    if isinstance(log, RolloutLog) and log.info["cameras"]:
+        camera = log.info["cameras"][0]
+        scale = min(1.0, WIDTH_PX / camera.width)
+        document["lens"] = lens_data(camera, WIDTH_PX)
+    document["looks"] = [_look(look, place, scale) for look in cause.looks]
     html = fill(
         "cause.html.j2",
         SCRIPTS,
@@ -162,32 +159,24 @@ def _look(look: Look, place: Place, scale: float) -> dict[str, Any]:
 
     def line(xy: F64) -> list[list[int]]:
         """Return rig coordinates ``(N, 2)`` in world centimetres, without rows of NaN."""
-        known = xy[np.isfinite(xy).all(axis=1)]
-        return place.cm(
-            transform_points(
-                look.T_world_rig, np.column_stack([known[:, :2], np.zeros(len(known))])
-            )[:, :2]
-        )
+        known = xy[np.isfinite(xy).all(axis=1), :2]
+        rig = np.column_stack([known, np.zeros(len(known))])
+        return place.cm(transform_points(look.T_world_rig, rig)[:, :2])
 
-    def picture(frame: U8 | bytes) -> str:
-        if isinstance(frame, bytes) and scale == 1.0 and frame.startswith(JPEG_START):
-            return base64.b64encode(frame).decode()
-        return jpeg(
-            smaller(
-                decode_image(frame, "a camera frame") if isinstance(frame, bytes) else frame,
-                WIDTH_PX,
-            )
-        )
+    def image(frame: U8 | bytes) -> str:
+        if isinstance(frame, bytes):
+            if scale == 1.0 and frame.startswith(JPEG_START):
+                return base64.b64encode(frame).decode()
+            frame = decode_image(frame, "a camera frame")
+        return jpeg(smaller(frame, WIDTH_PX))
 
     return {
         "t": place.ms([look.t_us])[0],
         "speed": round(look.speed_mps, 2),
         "route": line(look.route),
-        "plans": {
-            name: {"lines": [line(one) for one in lines]} for name, lines in look.plans.items()
-        },
+        "plans": {name: {"lines": list(map(line, lines))} for name, lines in look.plans.items()},
         "seen": {
-            name: {"jpeg": picture(frame), "t": place.ms([t_us])[0]}
+            name: {"jpeg": image(frame), "t": place.ms([t_us])[0]}
             for name, (t_us, frame) in look.frames.items()
         },
         "said": debug_views(look.debug, scale, line),

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,10 +20,17 @@ from alpasim_plugin.core.types import F64, I64, Actor, LoggedPlan, RolloutLog, T
 from alpasim_plugin.log.run_folder.rows import Rollout, series_by_cell
 from evaluators.opening import Run
 from evaluators.report.birdseye import chord_angle, drawn_map
-from evaluators.report.rollouts import SERIES, Event, events_of
+from evaluators.report.rollouts import SERIES, events_of
 from evaluators.viewer.pictures import Rows, seen_before
 
 METRIC_DIGITS = 5
+PLAN_STEP_US = 500_000
+MAX_SAMPLES = 8  # of a plan; the first ones
+POSE_SERIES = ("ego_x_m", "ego_y_m", "ego_yaw_rad")
+MAX_FRAME_EVENTS = 20
+CONTACT_TOLERANCE_S = 0.25  # between a contact and the step that counts it
+AROUND_M = 120.0  # what is farther from the recorded drive is not drawn
+TOLERANCE_M = 0.04  # of simplified lines
 
 
 @dataclass(frozen=True)
@@ -85,10 +91,6 @@ def rounded(values: F64) -> list[float | None]:
     return [float(f"{v:.{METRIC_DIGITS}g}") if np.isfinite(v) else None for v in values.tolist()]
 
 
-AROUND_M = 120.0  # what is farther from the recorded drive is not drawn
-TOLERANCE_M = 0.04  # of simplified lines
-
-
 def recorded_drive(content: Mapping[str, Any], scene: str) -> F64:
     """Return the recorded drive of ``scenes/SCENE.json``, ``(N, 2)`` metres, world.
 
@@ -128,13 +130,6 @@ def map_data(content: Mapping[str, Any], log: F64, place: Place) -> dict[str, An
         "log": place.cm(log),
         "source": str(content.get("source") or ""),
     }
-
-
-PLAN_STEP_US = 500_000
-MAX_SAMPLES = 8  # of a plan; the first ones
-POSE_SERIES = ("ego_x_m", "ego_y_m", "ego_yaw_rad")
-MAX_FRAME_EVENTS = 20
-CONTACT_TOLERANCE_S = 0.25  # between a contact and the step that counts it
 
 
 class Tracks:
@@ -210,24 +205,19 @@ def curves(steps: pa.Table, place: Place) -> dict[str, Any]:
         steps: As `Run.steps_of` returns them.
         place: Where times count from.
     """
-    if not steps.num_rows:
-        return {}
-    names = np.asarray(steps["metric"].to_pylist())
-    order = np.lexsort((steps["t_us"].to_numpy(), names))
-    names, t_us = names[order], steps["t_us"].to_numpy()[order]
-    value = np.where(steps["valid"].to_numpy(), steps["value"].to_numpy(), np.nan)[order]
-    reason = np.asarray([text or "" for text in steps["reason"].to_pylist()])[order]
-    borders = [0, *(np.flatnonzero(names[1:] != names[:-1]) + 1).tolist(), len(names)]
-    out = {}
-    for start, stop in pairwise(borders):
-        if names[start] in POSE_SERIES:
-            continue
-        here = slice(start, stop)
-        why = list(dict.fromkeys(str(text) for text in reason[here] if text))
-        out[str(names[start])] = {"t": place.ms(t_us[here]), "v": rounded(value[here])} | (
-            {"why": "; ".join(why)} if why else {}
-        )
-    return out
+    rows: dict[str, list[tuple[int, float | None, str | None]]] = {}
+    for row in sorted(steps.to_pylist(), key=lambda row: (row["metric"], row["t_us"])):
+        if row["metric"] not in POSE_SERIES:
+            value = row["value"] if row["valid"] else None
+            rows.setdefault(row["metric"], []).append((row["t_us"], value, row["reason"]))
+    metrics: dict[str, Any] = {}
+    for metric, of_metric in rows.items():
+        times_us, values, reasons = zip(*of_metric, strict=True)
+        metrics[metric] = {"t": place.ms(times_us), "v": rounded(np.array(values, dtype=float))}
+        why = "; ".join(dict.fromkeys(filter(None, reasons)))
+        if why:
+            metrics[metric]["why"] = why
+    return metrics
 
 
 def moments(
@@ -237,29 +227,23 @@ def moments(
     guard replaced or named.
     """
     known = steps.filter(pc.is_in(steps["metric"], pa.array(SERIES))) if steps.num_rows else steps
-    series = series_by_cell(known)
-    first_us = min(
-        (int(t[0]) for own in series.values() for t, _ in own.values()), default=place.zero_us
-    )
     found: list[dict[str, Any]] = []
-    for event in events_of(rollout, series):
-        ms = None if event.t_us is None else round((event.t_us - place.zero_us) / 1000)
-        seen = "" if event.t_us is None else seen_before(frames, event.t_us)
-        text = event.what + _with_whom(event, manifest, first_us) + (f"; {seen}" if seen else "")
-        found.append({"t": ms, "kind": event.kind, "text": text})
+    for event in events_of(rollout, series_by_cell(known)):
+        text, t_ms = event.what, None
+        if event.t_us is not None and event.t_s is not None:
+            t_ms = place.ms([event.t_us])[0]
+            if event.kind == "collision":
+                text += _with_whom(event.t_s, manifest)
+            text = "; ".join(filter(None, (text, seen_before(frames, event.t_us))))
+        found.append({"t": t_ms, "kind": event.kind, "text": text})
     return found + _frame_events(frames, place)
 
 
-def _with_whom(event: Event, manifest: Mapping[str, Any], first_us: int) -> str:
-    if event.kind != "collision" or event.t_us is None:
-        return ""
-    at_s = (event.t_us - first_us) * 1e-6
-    near = [
-        c
-        for c in manifest.get("contacts") or []
-        if abs(float(c["t_s"]) - at_s) <= CONTACT_TOLERANCE_S
-    ]
-    return f" with {near[0]['actor_id']}" if near else ""
+def _with_whom(t_s: float, manifest: Mapping[str, Any]) -> str:
+    for contact in manifest.get("contacts") or ():
+        if abs(float(contact["t_s"]) - t_s) <= CONTACT_TOLERANCE_S:
+            return f" with {contact['actor_id']}"
+    return ""
 
 
 def _frame_events(frames: Rows, place: Place) -> list[dict[str, Any]]:
@@ -270,13 +254,10 @@ def _frame_events(frames: Rows, place: Place) -> list[dict[str, Any]]:
     before: set[str] = set()
     for row in frames:
         now = set(str(row.get("events") or "").split())
-        t_us = row.get("t_us")
-        if isinstance(t_us, int):
-            t_ms = round((t_us - place.zero_us) / 1000)
-            found += [
-                {"t": t_ms, "kind": "frame", "text": f"frame: {name}"}
-                for name in sorted(now - before)
-            ]
+        if isinstance(row.get("t_us"), int):
+            t_ms = place.ms([row["t_us"]])[0]
+            started = sorted(now - before)
+            found += [{"t": t_ms, "kind": "frame", "text": f"frame: {name}"} for name in started]
         before = now
     return found[:MAX_FRAME_EVENTS]
 
@@ -287,20 +268,14 @@ def plans_part(
     """Return when plans first diverged, of entries of ``flips.json``; ``by_policy`` as in
     `WatchedCell`.
     """
-
-    def sides(entry: Mapping[str, Any]) -> tuple[str, str]:
-        """Return what the two are called."""
+    moments = []
+    for entry in flips:
+        if entry.get("t_us") is None:
+            continue
+        side, other = entry["renderer"], entry["baseline"]
         if by_policy:
-            return str(entry["policy"]), str(entry["against"]).removeprefix(f"{entry['renderer']}/")
-        return str(entry["renderer"]), str(entry["baseline"])
-
-    return [
-        {
-            "t": round((int(entry["t_us"]) - place.zero_us) / 1000),
-            "kind": "plans",
-            "text": f"plans part by {float(entry['gap_m']):.2f} m from {sides(entry)[1]}",
-            "renderer": sides(entry)[0],
-        }
-        for entry in flips
-        if entry.get("t_us") is not None
-    ]
+            side, other = entry["policy"], str(entry["against"]).removeprefix(f"{side}/")
+        text = f"plans part by {float(entry['gap_m']):.2f} m from {other}"
+        moment = {"t": place.ms([entry["t_us"]])[0], "kind": "plans", "text": text}
+        moments.append(moment | {"renderer": side})
+    return moments
