@@ -229,7 +229,7 @@ def test_many_scenes_are_capped_and_the_rest_is_named(tmp_path: Path) -> None:
     text = write_report(folder).read_text()
     assert text.count('<article class="card pad view') == html.MAX_SCENE_PLOTS
     assert "16 more scenes not drawn here" in text
-    assert text.count('<img src="data:') == 2 * html.MAX_STRIP_SCENES
+    assert text.count('<img src="data:') == 2 * html.MAX_STRIP_SCENES + html.SHOTS
     assert "32 more scenes with strips not shown here" in text
     assert len(text.encode()) < 1_000_000
     drawn = set(re.findall(r"<h3>(city/block-\d+)</h3>", text))

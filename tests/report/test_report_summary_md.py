@@ -67,7 +67,7 @@ def test_huge_summary_is_cut_with_a_note(usual_run: Path, tmp_path: Path) -> Non
     folder = make_run(tmp_path, Plan(renderers=("clean",), scenes=("a",), seeds=(0,), steps=3))
     summary = json.loads((folder / "summary.json").read_text())
     entry = summary["metrics"]["clean"]["offroad"]
-    summary["metrics"]["clean"] |= {f"metric_{k:06d}": entry for k in range(24_000)}
+    summary["metrics"]["clean"] |= {f"metric_{k:06d}": entry for k in range(40_000)}
     (folder / "summary.json").write_text(json.dumps(summary))
     data = write_summary_md(folder).read_bytes()
     assert MAX_BYTES - 2000 < len(data) <= MAX_BYTES
