@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,21 +80,22 @@ class Axes:
         style = (
             f"fill:none;stroke:{colour};stroke-width:{width:g};stroke-dasharray:{dash or 'none'}"
         )
-        self._lines.append(lambda: self._path(x, y, style))
+        self._lines.append(partial(self._path, x, y, style))
 
     def band(
         self, x: Values, low: Values, high: Values, colour: str, opacity: float = 0.16
     ) -> None:
         """Add the area between two lines, without places where one is not finite."""
-        x, low, high = (np.asarray(values, np.float64) for values in (x, low, high))
         known = np.isfinite(low) & np.isfinite(high)
         style = f"fill:{colour};fill-opacity:{opacity:g};stroke:none"
-        for part in np.split(np.arange(len(x)), np.flatnonzero(np.diff(known)) + 1):
+        for part in np.split(np.arange(len(known)), np.flatnonzero(np.diff(known)) + 1):
             if known[part].all():
-                around = np.concatenate([part, part[::-1]])
-                edge = np.concatenate([low[part], high[part][::-1]])
-                self._note(x[around], edge)
-                self._lines.append(lambda x=x[around], y=edge: self._path(x, y, style))
+                xs = np.asarray(x)[part]
+                lower, upper = np.asarray(low)[part], np.asarray(high)[part]
+                around = np.concatenate([xs, xs[::-1]])
+                edge = np.concatenate([lower, upper[::-1]])
+                self._note(around, edge)
+                self._lines.append(partial(self._path, around, edge, style))
 
     def points(self, x: Values, y: Values, colour: str, size: float = 6.0) -> None:
         """Add round markers; those outside the axes are not drawn."""

@@ -39,14 +39,16 @@ def fixer_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
         hits, blocks, redrafts = (finite(entry.get(k)) for k in ("hit_rate", "blocks", "redrafts"))
         frames = finite(entry.get("frames"))
         pose_error_m = finite((entry.get("shown_error") or {}).get("camera_m"))
-        is_drafted = entry.get("mode") == "speculative" and redrafts is not None and blocks
+        per_block = None
+        if entry.get("mode") == "speculative" and redrafts is not None and blocks:
+            per_block = redrafts / blocks
         undrafted = "only where blocks are drafted"
         cells = (
             Cell(str(entry.get("label"))),
             Cell(str(entry.get("mode"))),
             _cell(frames, "not counted", f"{frames or 0:.0f}"),
             _cell(hits, undrafted, f"{fixed(100 * (hits or 0.0), 1)}\u00a0%"),
-            _cell(redrafts / blocks if is_drafted else None, undrafted),
+            _cell(per_block, undrafted),
             _cell(pose_error_m, undrafted, short(pose_error_m, "m")),
             Cell(str(sum(events.values())), _kinds(events), sort=sum(events.values())),
         )
