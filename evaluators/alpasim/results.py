@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
-from alpasim_plugin.core.types import MetricInfo, MetricSeries
+from alpasim_plugin.core.types import F64, MetricInfo, MetricSeries
 from evaluators.alpasim.settings import SceneScoreSettings
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.score import series
@@ -143,10 +143,10 @@ def over_sweeps(rollouts: Sequence[ReducedRollout]) -> dict[str, float | int | N
     out: dict[str, float | int | None] = {}
     spread: dict[str, float | int | None] = {}
     for name in dict.fromkeys(name for row in rows for name in row):
-        found = np.array([row[name] for row in rows if row.get(name) is not None], dtype=np.float64)
+        column = _column(rows, name)
         with np.errstate(invalid="ignore"):  # the spread of inf is NaN, as in AlpaSim's table
-            out[name] = float(np.mean(found)) if len(found) else None
-            spread[f"{name}_std"] = float(np.std(found, ddof=1)) if len(found) > 1 else None
+            out[name] = float(np.mean(column)) if len(column) else None
+            spread[f"{name}_std"] = float(np.std(column, ddof=1)) if len(column) > 1 else None
     return {**out, **spread, "n_rollouts": len(rows)}
 
 
@@ -166,12 +166,13 @@ def _ranks(rollouts: Sequence[ReducedRollout]) -> list[int]:
     return [names[rollout.of.scene].index(rollout.of.rollout) for rollout in rollouts]
 
 
+def _column(rows: Sequence[Mapping[str, float | None]], name: str) -> F64:
+    return np.array([row[name] for row in rows if row.get(name) is not None], dtype=np.float64)
+
+
 def _sweep(rows: Sequence[dict[str, float | None]]) -> dict[str, float | None]:
     names = dict.fromkeys(name for row in rows for name in row)
-    columns = {
-        name: np.array([row[name] for row in rows if row.get(name) is not None], dtype=np.float64)
-        for name in names
-    }
+    columns = {name: _column(rows, name) for name in names}
     out: dict[str, float | None] = {
         name: float(np.mean(column)) if len(column) else None for name, column in columns.items()
     }

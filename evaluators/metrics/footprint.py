@@ -32,7 +32,7 @@ def spans(first: I64, last: I64) -> tuple[I64, I64]:
     """Return for spans ``(N,)`` of an array, each from ``first`` to before ``last``, the span and
     the place of all their members.
 
-    >>> [one.tolist() for one in spans(np.array([5, 0]), np.array([7, 3]))]
+    >>> [ends.tolist() for ends in spans(np.array([5, 0]), np.array([7, 3]))]
     [[0, 0, 1, 1, 1], [5, 6, 0, 1, 2]]
     """
     n = last - first

@@ -46,8 +46,8 @@ class Outcome:
 
 POLICY_FAULT = "policy"  # the failure class of a rollout that the policy broke
 OUTCOMES = {  # the gravest first
-    one.name: one
-    for one in (
+    outcome.name: outcome
+    for outcome in (
         Outcome(POLICY_FAULT, "policy fault", "P"),
         Outcome("collision_at_fault", "at-fault collision", "C"),
         Outcome("collision_any", "collision", "C", ("collision_at_fault",)),

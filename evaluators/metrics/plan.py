@@ -1,5 +1,5 @@
-"""Quality of the policy's plans: consistency, open-loop collisions, minADE of their samples; and
-the gap between two plans of one query.
+"""Quality of the policy's plans: consistency, open-loop collisions, minADE of their samples;
+and where the plans of two rollouts part.
 
 Plans are rig poses; for the metrics they are moved to the box centre. All errors are in plan view.
 One row per policy query, at its time.
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import interpolate, matrix_from_quat, wrap_angle
+from alpasim_plugin.core.geometry import interpolate, matrix_from_quat
 from alpasim_plugin.core.types import (
     F64,
     I64,
@@ -289,44 +289,25 @@ class Divergence:
     ahead_us: int
 
 
-def plan_gap(one: Trajectory, other: Trajectory, at_us: Sequence[int]) -> tuple[F64, F64]:
-    """Compare two plans of rig poses in the world.
-
-    Args:
-        one: A plan.
-        other: Another one.
-        at_us: ``(H,)`` absolute times.
-
-    Returns:
-        Distance ``(H,)`` in plan view, metres, and heading of ``other`` less that of ``one``
-        ``(H,)``, radians in (-pi, pi]; NaN at times that either plan does not reach.
-    """
-    times = np.asarray(at_us, dtype=np.int64)
-    first, last = max(one.t_us[0], other.t_us[0]), min(one.t_us[-1], other.t_us[-1])
-    inside = (times >= first) & (times <= last)
-    gap, turn = np.full(times.shape, np.nan), np.full(times.shape, np.nan)
-    if inside.any():
-        a, b = interpolate(one, times[inside]), interpolate(other, times[inside])
-        gap[inside] = np.linalg.norm(b[:, :2, 3] - a[:, :2, 3], axis=1)
-        turn[inside] = wrap_angle(
-            np.arctan2(b[:, 1, 0], b[:, 0, 0]) - np.arctan2(a[:, 1, 0], a[:, 0, 0])
-        )
-    return gap, turn
-
-
-def first_divergence(one: Sequence[LoggedPlan], other: Sequence[LoggedPlan]) -> Divergence | None:
+def first_divergence(
+    plans: Sequence[LoggedPlan], others: Sequence[LoggedPlan]
+) -> Divergence | None:
     """Return the first query common to both at which their plans lie more than `DIVERGED_M` apart
     at `HORIZON_US`; None if there is none.
 
     Plans that end before the horizon are compared at the end of the shorter one.
     """
-    plans = {plan.now_us: plan.trajectory for plan in other if len(plan.trajectory)}
-    for plan in one:
-        if plan.now_us not in plans or not len(plan.trajectory):
+    partners = {plan.now_us: plan.trajectory for plan in others if len(plan.trajectory)}
+    for plan in plans:
+        if plan.now_us not in partners or not len(plan.trajectory):
             continue
-        first, theirs = plan.trajectory, plans[plan.now_us]
-        at_us = min(plan.now_us + HORIZON_US, int(first.t_us[-1]), int(theirs.t_us[-1]))
-        gap = float(plan_gap(first, theirs, [at_us])[0][0])
-        if gap > DIVERGED_M:
-            return Divergence(plan.now_us, gap, at_us - plan.now_us)
+        pair = (plan.trajectory, partners[plan.now_us])
+        begin_us = max(int(trajectory.t_us[0]) for trajectory in pair)
+        t_us = min(plan.now_us + HORIZON_US, *(int(trajectory.t_us[-1]) for trajectory in pair))
+        if t_us < begin_us:
+            continue
+        xy = [interpolate(trajectory, np.array([t_us]))[0, :2, 3] for trajectory in pair]
+        gap_m = float(np.linalg.norm(xy[1] - xy[0]))
+        if gap_m > DIVERGED_M:
+            return Divergence(plan.now_us, gap_m, t_us - plan.now_us)
     return None

@@ -30,7 +30,7 @@ AGREE = (
     "direction",
     "aggregation",
 )  # facts without which values of two runs cannot be set side by side
-_FIELDS = frozenset(one.name for one in fields(MetricInfo)) - {"name"}
+_FIELDS = frozenset(field.name for field in fields(MetricInfo)) - {"name"}
 
 
 class MetricTable(Mapping[str, MetricInfo]):
@@ -117,19 +117,14 @@ class MetricTable(Mapping[str, MetricInfo]):
         """Sort names: headline metrics, then the others of the table in its order, then those that
         it does not hold by name.
         """
-        headline = self.headline
-        rank = {
-            name: index
-            for index, name in enumerate(
-                (*headline, *(name for name in self if name not in headline))
-            )
-        }
+        order = dict.fromkeys([*self.headline, *self])
+        rank = {name: index for index, name in enumerate(order)}
         return sorted(set(names), key=lambda name: (rank.get(name, len(rank)), name))
 
     def first_curves(self) -> tuple[str, ...]:
         """Return the series over time that a viewer shows first."""
         chosen = [facts for facts in (*self.values(), *STEP_SERIES.values()) if facts.curve]
-        return tuple(one.name for one in sorted(chosen, key=lambda one: one.curve))
+        return tuple(facts.name for facts in sorted(chosen, key=lambda facts: facts.curve))
 
     def adding(self, metrics: Mapping[str, MetricInfo]) -> MetricTable:
         """Return a table with more metrics.
@@ -155,12 +150,11 @@ class MetricTable(Mapping[str, MetricInfo]):
         always = ("unit", "direction", "aggregation", "help")
         out = {}
         for name, facts in self.items():
-            said = {
+            out[name] = {
                 key: value
                 for key, value in asdict(facts).items()
-                if key in always or value != plain[key]
+                if key in always or (value != plain[key] and key != "name")
             }
-            out[name] = {key: value for key, value in said.items() if key != "name"}
         return out
 
     @classmethod

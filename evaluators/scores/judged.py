@@ -168,7 +168,7 @@ class Judged:
         """Return nuPlan's score of the speed limit: the highest of the lanes under the ego, where
         one is known.
         """
-        limits = np.array([one.speed_limit_mps or np.nan for one in self._lanes])
+        limits = np.array([lane.speed_limit_mps or np.nan for lane in self._lanes])
         if not self.has_map or np.isnan(limits).all():
             return NO_LIMITS
         step, lane = self._in_lanes

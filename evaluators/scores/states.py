@@ -149,7 +149,7 @@ def states_of(
     for a in range(len(table)):
         present = np.flatnonzero(actors_at.present[a])
         v[a, present] = _rate(xy[a, present], t_us[present])
-    kinds = tuple(KINDS.get(one.label, "object") for one in rollout.actors.values())
+    kinds = tuple(KINDS.get(actor.label, "object") for actor in rollout.actors.values())
     return ego, Tracks(table.ids, kinds, actors_at.present, xy, yaws, table.size, v)
 
 

@@ -1,10 +1,10 @@
-"""Rows of a run, stored as a baseline with what they were made with, refused where that differs,
-and used as one side of a decision.
+"""Rows of a run, stored as a baseline with what they were made with, and refused where that
+differs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,17 +13,28 @@ from typing_extensions import TypedDict
 
 from alpasim_plugin.core.atomic import write_json
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.reading import read_json_object
 from alpasim_plugin.core.reading.files import as_shape, kind_of
 from alpasim_plugin.log.run_folder.reader import table_path
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS
-from alpasim_plugin.log.run_folder.sides import RolloutTable, Row, is_ok
+from alpasim_plugin.log.run_folder.sides import RolloutTable, Row
 from evaluators.opening import Run, read_run
 
 SCHEMA_VERSION = 1
+MADE_WITH = tuple(
+    [
+        "key",
+        "command",
+        "version",
+        "started_at",
+        "versions",
+        "hardware",
+        "renderers",
+        "policies",
+        "seeds",
+    ]
+)
 APPROVE = "make the run again as the baseline was made, or approve a new baseline with simrun gate RUN --write-baseline FILE"
-NAMED = 3  # missing rollouts in an error
 
 
 def table_of_run(run: Run) -> RolloutTable:
@@ -106,18 +117,7 @@ class Baseline:
 
 def baseline_of(run: Run) -> Baseline:
     """Return a run's results as a baseline."""
-    kept = (
-        "key",
-        "command",
-        "version",
-        "started_at",
-        "versions",
-        "hardware",
-        "renderers",
-        "policies",
-        "seeds",
-    )
-    made_with = {key: run.info[key] for key in kept if key in run.info}
+    made_with = {key: run.info[key] for key in MADE_WITH if key in run.info}
     return Baseline(
         _preset(run),
         scene_hashes(run),
@@ -134,16 +134,11 @@ def write_baseline(run: Run, path: Path) -> None:
         InputError: A rollout of the run failed: a baseline with holes would hide regressions.
         InfrastructureError: The disk refused.
     """
-    failed = [r for r in run.rollouts if not r.ok]
-    if failed or not run.rollouts:
-        problem = (
-            f"{len(failed)} of {len(run.rollouts)} rollouts failed"
-            if failed
-            else "it holds no rollouts"
-        )
+    n_failed = sum(not rollout.ok for rollout in run.rollouts)
+    if n_failed or not run.rollouts:
         raise InputError(
-            f"{run.folder}: {problem}",
-            "store a run in which every rollout ran to its end",
+            f"{run.folder}: {n_failed} of {len(run.rollouts)} rollouts failed",
+            "store a run with rollouts that all ran to their end",
         )
     write_json(path, asdict(baseline_of(run)))
 
@@ -167,16 +162,9 @@ def read_baseline(path: Path) -> Baseline:
     as_shape(StoredBaseline, content, path, do)
     for i, row in enumerate(content["rows"]):
         as_shape(BaselineRow, row, f"{path}, row {i}", do)
-        odd = next(
-            (
-                name
-                for name, value in row.items()
-                if f"{name}_valid" in row and not isinstance(value, float | int | None)
-            ),
-            None,
-        )
-        if odd is not None:
-            raise InputError(f"{path}, row {i}: {odd}: {kind_of(row[odd])}, wanted a number", do)
+        for name, value in row.items():
+            if f"{name}_valid" in row and not isinstance(value, float | int | None):
+                raise InputError(f"{path}, row {i}: {name}: {kind_of(value)}, wanted a number", do)
     return Baseline(**content)
 
 
@@ -189,56 +177,35 @@ def check_matches(baseline: Baseline, run: Run, path: Path) -> None:
         InputError: Other preset, other weights, a scene with another content, or no scene in
             common.
     """
-    check_made_alike(
-        baseline, _preset(run), scene_hashes(run), dict(run.info.get("weights") or {}), path
-    )
-
-
-def check_made_alike(
-    baseline: Baseline,
-    preset: str,
-    hashes: Mapping[str, str],
-    weights: Mapping[str, Any],
-    path: Path,
-) -> None:
-    """Refuse a baseline that was made with something else than a run, which need not have been
-    driven yet.
-
-    Args:
-        baseline: The baseline.
-        preset: Of the run.
-        hashes: SCENE -> hash of its content, of the run.
-        weights: FILE -> digest, of the run's parts.
-        path: The baseline's file or folder, for errors.
-
-    Raises:
-        InputError: As `check_matches`.
-    """
-    if baseline.preset != preset:
-        raise InputError(f"{path}: preset {baseline.preset!r}, the run has {preset!r}", APPROVE)
-    if dict(baseline.weights) != weights:
-        names = sorted(
-            name
-            for name in {*baseline.weights, *weights}
-            if baseline.weights.get(name) != weights.get(name)
+    if baseline.preset != _preset(run):
+        raise InputError(
+            f"{path}: preset {baseline.preset!r}, the run has {_preset(run)!r}", APPROVE
         )
-        raise InputError(f"{path}: other weights: {', '.join(names)}", APPROVE)
-    check_scenes(baseline.scenes, hashes, str(path), APPROVE)
+    weights = run.info.get("weights") or {}
+    changed = [
+        name
+        for name in sorted({*baseline.weights, *weights})
+        if baseline.weights.get(name) != weights.get(name)
+    ]
+    if changed:
+        raise InputError(f"{path}: other weights: {', '.join(changed)}", APPROVE)
+    check_scenes(baseline.scenes, scene_hashes(run), str(path), APPROVE)
 
 
 def check_scenes(
-    here: Mapping[str, str], there: Mapping[str, str], with_what: str, do_this: str
+    scenes: Mapping[str, str], others: Mapping[str, str], owner: str, hint: str
 ) -> None:
     """Refuse two sets of scenes that share none, or share a name with another content.
 
     Raises:
         InputError: They do.
     """
-    changed = sorted(name for name in here.keys() & there.keys() if here[name] != there[name])
+    shared = scenes.keys() & others.keys()
+    changed = sorted(name for name in shared if scenes[name] != others[name])
     if changed:
-        raise InputError(f"{with_what}: scenes with another content: {', '.join(changed)}", do_this)
-    if not here.keys() & there.keys():
-        raise InputError(f"{with_what}: no scene in common", do_this)
+        raise InputError(f"{owner}: scenes with another content: {', '.join(changed)}", hint)
+    if not shared:
+        raise InputError(f"{owner}: no scene in common", hint)
 
 
 def scene_hashes(run: Run) -> dict[str, str]:
@@ -249,9 +216,8 @@ def scene_hashes(run: Run) -> dict[str, str]:
     """
     scenes = run.info.get("scenes") or {}
     hashes = {name: str(facts.get("content_hash") or "") for name, facts in scenes.items()}
-    bare = sorted(
-        name for name in {r.scene for r in run.rollouts} | set(hashes) if not hashes.get(name)
-    )
+    names = {rollout.scene for rollout in run.rollouts} | hashes.keys()
+    bare = sorted(name for name in names if not hashes.get(name))
     if bare:
         raise InputError(
             f"{run.folder / 'run.json'}: no content hash for {', '.join(bare)}",
@@ -262,77 +228,3 @@ def scene_hashes(run: Run) -> dict[str, str]:
 
 def _preset(run: Run) -> str:
     return str(run.summary.get("preset") or run.info.get("preset") or "")
-
-
-@dataclass(frozen=True)
-class StoredSide:
-    """Rollouts of the baseline that were driven earlier.
-
-    Attributes:
-        renderer: Its renderer.
-        name: What it is, in words.
-        rows: One a rollout, of one renderer and policy.
-    """
-
-    renderer: str
-    name: str
-    rows: tuple[Row, ...]
-
-    @property
-    def digest(self) -> str:
-        """Give a digest of all values."""
-        return digest([[key, row[key]] for row in self.rows for key in sorted(row)])
-
-    def of_cells(self, driven: Collection[tuple[str, int]]) -> list[Row]:
-        """Return the rows of the scenes and seeds that are driven on the other side."""
-        return [row for row in self.rows if (str(row["scene"]), int(row["seed"])) in driven]
-
-
-def stored_side(
-    rows: Sequence[Row],
-    renderer: str,
-    policy: str,
-    planned: Collection[tuple[str, int]],
-    max_missing: float,
-    path: Path,
-) -> StoredSide:
-    """Return the side of a renderer from the rows of a stored baseline.
-
-    Args:
-        rows: All of the baseline.
-        renderer: Whose rows are wanted.
-        policy: The policy that is driven.
-        planned: Scenes and seeds that may be driven.
-        max_missing: Share of them that it may lack.
-        path: The baseline's file or folder.
-
-    Raises:
-        InputError: It lacks the renderer or the policy, or more of the planned rollouts than
-            allowed.
-    """
-    of_driven = of_policy(rows, policy)
-    if not of_driven:
-        raise InputError(
-            f"{path}: no rollout of policy {policy}",
-            f"drive one of {', '.join(policies_of(rows))}",
-        )
-    known = sorted({str(row["renderer"]) for row in of_driven})
-    if renderer not in known:
-        raise InputError(
-            f"{path}: no rollout of renderer {renderer}",
-            f"name one of {', '.join(known)}: `baseline` of a gate, --baseline of decide",
-        )
-    side = StoredSide(
-        renderer,
-        f"{renderer} of {path}",
-        tuple(row for row in of_driven if row["renderer"] == renderer),
-    )
-    stored = {(str(row["scene"]), int(row["seed"])) for row in side.rows if is_ok(row)}
-    lacking = sorted(set(planned) - stored)
-    if len(lacking) > max_missing * len(planned):
-        named = ", ".join(f"{scene} seed {seed}" for scene, seed in lacking[:NAMED])
-        raise InputError(
-            f"{path}: {len(lacking)} of the {len(planned)} scenes and seeds that may be driven are not in it: {named}",
-            "make the baseline on all scenes and seeds of the suite, or name a smaller suite",
-        )
-    return side

@@ -20,7 +20,7 @@ Sources: Waudby-Smith and Ramdas, Estimating means of bounded random variables b
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy  # its submodules load on first use
@@ -67,11 +67,6 @@ class Draws:
     def mirrored(self) -> Draws:
         """Return the draws of the negated difference."""
         return replace(self, x=-self.x, offset=-self.offset)
-
-    def first(self, n: int) -> Draws:
-        """Return the first n scenes."""
-        arrays = {f.name: getattr(self, f.name)[..., :n] for f in fields(self) if f.name != "reach"}
-        return replace(self, **arrays)
 
 
 def independent(x: F64, reach: float) -> Draws:

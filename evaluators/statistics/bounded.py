@@ -33,30 +33,6 @@ TOLERANCE = 1e-9  # of a bound, as a share of the range
 BINS = 256
 
 
-def chance_above(values: F64, mean: float, most: float) -> F64:
-    """Return the chance ``(...)`` that the weighted mean of the values and of ``most`` is at least
-    ``mean``.
-
-    With weights E_i / sum E of independent exponential E_i it is the chance that sum E_i (x_i - at)
-    is at least 0, which Gil-Pelaez' inversion of the characteristic function gives. It is a p-value
-    against "the mean is at least ``mean``".
-
-    Args:
-        values: ``(..., n)``, none above ``most``.
-        mean: A mean.
-        most: The greatest possible value.
-
-    Example:
-        >>> round(float(chance_above(np.zeros(72), 0.05, 1.0)), 4)  # 0.95^72
-        0.0249
-    """
-    rows = np.asarray(values, dtype=np.float64)
-    flat = rows.reshape(-1, rows.shape[-1])
-    return np.array([_chance(*_with_worst(row, most), mean) for row in flat]).reshape(
-        rows.shape[:-1]
-    )
-
-
 def _with_worst(values: F64, most: float) -> tuple[F64, F64]:
     """Return the different values and their counts ``(k,)``, with the worst as one more; many are
     put into bins that keep their mean.
@@ -77,7 +53,17 @@ def _with_worst(values: F64, most: float) -> tuple[F64, F64]:
     return np.append(edges, distinct[-1]), np.append(filled, counts[-1])
 
 
-def _chance(values: F64, counts: F64, mean: float) -> float:
+def chance_above(values: F64, counts: F64, mean: float) -> float:
+    """Return the chance that the weighted mean of values ``(k,)`` with counts is at least ``mean``.
+
+    With weights E_i / sum E of independent exponential E_i it is the chance that sum E_i (x_i -
+    mean) is at least 0, which Gil-Pelaez' inversion of the characteristic function gives. It is a
+    p-value against "the mean is at least ``mean``".
+
+    Example:
+        >>> round(chance_above(np.array([0.0, 1.0]), np.array([72.0, 1.0]), 0.05), 4)  # 0.95^72
+        0.0249
+    """
     parts = values - mean
     if parts[-1] <= 0.0 or parts[0] >= 0.0:
         return float(parts[0] >= 0.0)
@@ -111,7 +97,7 @@ def upper_bound(values: F64, most: float, tail: float = TAIL) -> float:
     if low >= distinct[-1]:
         return most
     root = scipy.optimize.brentq(
-        lambda mean: _chance(distinct, counts, mean) - tail, low, distinct[-1], xtol=TOLERANCE
+        lambda mean: chance_above(distinct, counts, mean) - tail, low, distinct[-1], xtol=TOLERANCE
     )
     return min(scale * float(root), most)
 
@@ -141,8 +127,6 @@ def scenes_to_exclude(distance: float, reach: float, tail: float = TAIL) -> int:
         >>> scenes_to_exclude(0.05, 1.0), scenes_to_exclude(0.1, 4.0)
         (72, 146)
     """
-    return (
-        2
-        if distance >= reach
-        else max(2, math.ceil(math.log(tail) / math.log1p(-distance / reach)))
-    )
+    if distance >= reach:
+        return 2
+    return max(2, math.ceil(math.log(tail) / math.log1p(-distance / reach)))

@@ -489,19 +489,16 @@ def question_as_dict(question: Question) -> AskedRecord:
 
 def look_as_dict(state: State, rollouts: int) -> Look:
     """Return an interim analysis for JSON."""
-    metrics: dict[str, MetricLook] = {
-        metric.metric: {
-            "verdict": metric.answer,
-            "n_scenes": metric.n_scenes,
-            "diff": metric.diff,
-            "interval": list(metric.interval),
-            "e_good": metric.e_good,
-            "e_bad": metric.e_bad,
-        }
-        for metric in state.metrics
+    metrics: dict[str, MetricLook] = {}
+    for metric in state.metrics:
+        facts = vars(metric) | {"verdict": metric.answer, "interval": list(metric.interval)}
+        metrics[metric.metric] = {key: facts[key] for key in MetricLook.__annotations__}  # type: ignore[assignment]
+    return {
+        "n_scenes": state.n_scenes,
+        "rollouts": rollouts,
+        "answer": state.answer,
+        "metrics": metrics,
     }
-    answer = state.answer
-    return {"n_scenes": state.n_scenes, "rollouts": rollouts, "answer": answer, "metrics": metrics}
 
 
 def write_decision(root: Path, decision: Decision) -> None:

@@ -98,30 +98,30 @@ def mean_of(values: F64) -> float:
     return float(np.mean(x)) * scale
 
 
-def t_interval(values: npt.ArrayLike, what: str = "values") -> Interval:
+def t_interval(values: npt.ArrayLike, unit: str = "values") -> Interval:
     """Return mean and t interval of independent ``(n,)`` values.
 
     Example:
-        >>> one = t_interval([1.0, 2.0, 3.0])
-        >>> round(one.low, 4), round(one.high, 4)
+        >>> interval = t_interval([1.0, 2.0, 3.0])
+        >>> round(interval.low, 4), round(interval.high, 4)
         (-0.4841, 4.4841)
     """
     x, scale = scaled(np.asarray(values, dtype=np.float64))
     centre = float(np.mean(x)) * scale
     if len(x) < 2:
-        return Interval(centre, reason=f"needs at least two {what}, found {len(x)}")
+        return Interval(centre, reason=f"needs at least two {unit}, found {len(x)}")
     if are_alike(x):
         return Interval(
             centre,
             centre,
             centre,
-            note=f"all {len(x)} {what} are equal: the interval has no width",
-            method=f"t on {what}",
+            note=f"all {len(x)} {unit} are equal: the interval has no width",
+            method=f"t on {unit}",
         )
     low, high = (float(bound) * scale for bound in t_bounds(x))
     if not np.isfinite([low, high]).all():
         return Interval(centre, reason=TOO_LARGE)
-    return Interval(centre, low, high, method=f"t on {what}")
+    return Interval(centre, low, high, method=f"t on {unit}")
 
 
 def t_bounds(means: F64) -> tuple[F64, F64]:
@@ -169,9 +169,8 @@ def cluster_means(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> tuple
     """
     group = np.asarray(clusters)
     x, scale = scaled(np.asarray(values, dtype=np.float64))
-    if not np.issubdtype(
-        group.dtype, np.integer
-    ):  # names; numbers are not sorted, as a run may have millions of cells
+    # Names become numbers; numbers are not sorted, as a run may have millions of cells.
+    if not np.issubdtype(group.dtype, np.integer):
         group = np.unique(group, return_inverse=True)[1].reshape(-1)
     size = np.bincount(group)
     is_used = size > 0
@@ -282,7 +281,6 @@ def _expit(x: F64) -> F64:
 
 
 DRAWS = 2000
-BLOCK = 4_000_000  # drawn scenes held in memory at once
 
 
 def redraws(scenes: int, generator: np.random.Generator, draws: int = DRAWS) -> I64:
@@ -307,8 +305,8 @@ def cluster_bootstrap(
 
     Example:
         >>> g = np.random.Generator(np.random.Philox(1))
-        >>> one = cluster_bootstrap([0.0, 1.0, 2.0, 3.0], ["a", "b", "c", "d"], lambda scenes: redraws(scenes, g))
-        >>> 0.0 <= one.low < 1.5 < one.high <= 3.0
+        >>> drawn = cluster_bootstrap([0.0, 1.0, 2.0, 3.0], ["a", "b", "c", "d"], lambda scenes: redraws(scenes, g))
+        >>> 0.0 <= drawn.low < 1.5 < drawn.high <= 3.0
         True
     """
     means, scale = scaled(cluster_means(values, clusters)[0])
@@ -323,13 +321,3 @@ def cluster_bootstrap(
     return Interval(
         centre, float(low), float(high), note=note, method=f"cluster bootstrap, {len(places)} draws"
     )
-
-
-def resampled_means(means: F64, generator: np.random.Generator, draws: int = DRAWS) -> F64:
-    """Return the mean ``(draws,)`` of each draw of G scenes out of ``(G,)``."""
-    rows = max(1, BLOCK // len(means))
-    parts = [
-        means.take(redraws(len(means), generator, min(rows, draws - start))).mean(axis=1)
-        for start in range(0, draws, rows)
-    ]
-    return np.concatenate(parts)

@@ -186,8 +186,8 @@ def compare_pairs(
 
 
 def compare(
-    here: Side,
-    there: Side,
+    side: Side,
+    base: Side,
     metric: MetricInfo,
     baseline: str,
     margin: float | None = None,
@@ -197,16 +197,16 @@ def compare(
     """Compare one metric of two renderers on their shared cells.
 
     Args:
-        here, there: Their rollouts.
+        side, base: Their rollouts.
         metric: What is compared.
-        baseline: What to call ``there``.
+        baseline: What to call ``base``.
         margin: How much worse is accepted, in the metric's unit; None: its own margin.
         listed: How many missing cells to name.
         sampled: Scenes are draws from a population. False: they are all that is asked about, and no
             unseen one needs a guard.
 
     Returns:
-        ``baseline``; ``diff`` (here minus there: mean over scenes of the scene's mean difference);
+        ``baseline``; ``diff`` (``side`` minus ``base``: mean over scenes of the scene's mean difference);
         ``ci95`` ([low, high], scenes as unit) and its ``method``; ``guarded`` (the bounds that a
         verdict and a difference must hold for as well, or None, with which nothing is decided:
         `difference_bounds`); ``p_value`` and ``test``; ``margin`` and ``verdict`` (non-inferior,
@@ -220,7 +220,7 @@ def compare(
         they need care.
     """
     margin = metric.accepted if margin is None else margin
-    pairs = Pairs(here, there, metric.name)
+    pairs = Pairs(side, base, metric.name)
     entry: dict[str, Any] = {
         "baseline": baseline,
         "diff": None,
@@ -247,18 +247,17 @@ def compare(
     if not np.isfinite(delta).all():
         return entry | {"reason": TOO_LARGE}
     means, _ = cluster_means(delta, pairs.scenes)
+    n = len(means)
     up, down = int(np.sum(means > 0)), int(np.sum(means < 0))
     entry["scenes"] = {
         "up": up,
         "down": down,
-        "same": len(means) - up - down,
+        "same": n - up - down,
         "p_value": sign_test(up, down),
     }
     if metric.is_flag:
-        gained, lost = (
-            int(np.sum((pairs.mine > 0) & (pairs.base == 0))),
-            int(np.sum((pairs.mine == 0) & (pairs.base > 0))),
-        )
+        gained = int(np.sum((pairs.mine > 0) & (pairs.base == 0)))
+        lost = int(np.sum((pairs.mine == 0) & (pairs.base > 0)))
         entry["cells"] = {
             "only_here": gained,
             "only_baseline": lost,
@@ -266,56 +265,48 @@ def compare(
         }
     interval, guarded = difference_bounds(delta, pairs.scenes, metric, margin)
     interval = within(interval, *metric.difference_range)
-    entry["diff"], entry["ci95"], entry["method"] = (
-        interval.centre,
-        interval.bounds,
-        interval.method or None,
-    )
+    bounds = interval.bounds
+    entry |= {"diff": interval.centre, "ci95": bounds, "method": interval.method or None}
     if interval.reason:
         return entry | {"reason": interval.reason}
-    entry["guarded"], entry["spread"] = (
-        guarded,
-        scaled(means)[1] * float(np.std(scaled(means)[0], ddof=1)),
-    )
-    entry["p_value"], entry["test"] = p_value(means, metric.is_flag)
+    small, scale = scaled(means)
+    p, test = p_value(means, metric.is_flag)
+    spread = scale * float(np.std(small, ddof=1))
+    entry |= {"guarded": guarded, "spread": spread, "p_value": p, "test": test}
+    both = _both(bounds, guarded) if sampled else bounds
+    # A flag's sign test needs no bound of what was not drawn.
+    shown = bounds if metric.is_flag else both
+    answers = {
+        "verdict": verdict(both, p, margin, metric.direction),
+        "difference": difference(shown, p, metric.direction),
+    }
     notes = [interval.note] if interval.note else []
-
-    def said(*bounds: list[float] | None) -> tuple[str, str]:
-        p = entry["p_value"]
-        return verdict(bounds[0], p, margin, metric.direction), difference(
-            bounds[-1], p, metric.direction
-        )
-
-    seen, both = interval.bounds, _both(interval.bounds, guarded) if sampled else interval.bounds
-    alone, shown = (
-        said(seen),
-        said(both, seen if metric.is_flag else both),
-    )  # a flag's sign test needs no bound of what was not drawn
-    if len(means) < LEAST_SCENES:
-        notes.append(f"{len(means)} scenes: a verdict needs at least {LEAST_SCENES}")
+    if n < LEAST_SCENES:
+        notes.append(f"{n} scenes: a verdict needs at least {LEAST_SCENES}")
     elif guarded is None and sampled:
         notes.append(
             "nothing says how much a scene can differ, so that nothing is decided without a margin"
         )
     else:
-        entry["verdict"], entry["difference"] = shown
-    others = sorted(
-        {UNDONE_BY[answer] for answer, other in zip(alone, shown, strict=True) if answer != other}
-    )
-    if others and guarded is not None:
-        many = f"{len(means)} scenes cannot exclude that a few others are {' or '.join(others)}"
-        notes.append(f"{many} by up to {reach_of(metric, margin):g} {metric.unit}".rstrip())
+        entry |= answers
+    if guarded is not None:
+        unguarded = {
+            "verdict": verdict(bounds, p, margin, metric.direction),
+            "difference": difference(bounds, p, metric.direction),
+        }
+        unseen = {UNDONE_BY[unguarded[key]] for key in answers if unguarded[key] != answers[key]}
+        if unseen:
+            others = f"a few others are {' or '.join(sorted(unseen))}"
+            reach = f"{reach_of(metric, margin):g} {metric.unit}".rstrip()
+            notes.append(f"{n} scenes cannot exclude that {others} by up to {reach}")
     if notes:
         entry["note"] = "; ".join(notes)
     if entry["verdict"] == "undecided" and (metric.direction != "none" or margin > 0.0):
-        mean = (
-            abs(interval.centre)
-            if metric.direction == "none"
-            else harm([interval.centre] * 2, metric.direction)[0]
-        )
-        entry["more_scenes"] = more_scenes(
-            mean, entry["spread"], len(means), margin, reach_of(metric, margin) or None
-        )
+        worse = abs(interval.centre)
+        if metric.direction != "none":
+            worse, _ = harm([interval.centre] * 2, metric.direction)
+        most = reach_of(metric, margin) or None
+        entry["more_scenes"] = more_scenes(worse, spread, n, margin, most)
     return entry
 
 
@@ -410,40 +401,40 @@ def reach_of(metric: MetricInfo, margin: float) -> float:
 class Pairs:
     """Cells with a value on both sides, and those without."""
 
-    def __init__(self, here: Side, there: Side, metric: str) -> None:
-        self.sides = (here, here.values(metric)), (there, there.values(metric))
-        own, base = self.sides[0][1], self.sides[1][1]
-        index = here.place_in(there)
-        partner = (
-            np.where(index >= 0, base[index], np.nan) if len(base) else np.full(len(own), np.nan)
-        )
-        both: Bool = np.isfinite(own) & np.isfinite(partner)
-        self.mine, self.base, self.scenes = own[both], partner[both], here.scene[both]
-        only_there = np.flatnonzero(there.place_in(here) < 0)
-        self._lone = (here, np.flatnonzero(~both)), (there, only_there)
-        self.n_missing = int(np.sum(~both)) + len(only_there)
+    def __init__(self, side: Side, base: Side, metric: str) -> None:
+        own_values, base_values = side.values(metric), base.values(metric)
+        index = side.place_in(base)
+        # The last value stands for cells that the base does not have: index -1.
+        partner = np.append(base_values, np.nan)[index]
+        both: Bool = np.isfinite(own_values) & np.isfinite(partner)
+        self.mine = own_values[both]
+        self.base = partner[both]
+        self.scenes = side.scene[both]
+        self._sides = {"here": (side, own_values), "baseline": (base, base_values)}
+        only_base = np.flatnonzero(base.place_in(side) < 0)
+        self._lone = ((side, np.flatnonzero(~both)), (base, only_base))
+        self.n_missing = int(np.sum(~both)) + len(only_base)
 
     def missing(self, metric: str, listed: int) -> list[dict[str, Any]]:
         """Name the first cells without a pair, with side and cause."""
-        lone = sorted(
-            side.cells[i] for side, places in self._lone for i in places[:listed].tolist()
-        )  # both are sorted already
-        return [_lost(cell, *self.sides, metric) for cell in lone[:listed]]
+        # Both sides are sorted already.
+        cells = [side.cells[i] for side, places in self._lone for i in places[:listed].tolist()]
+        return [self._cause(cell, metric) for cell in sorted(cells)[:listed]]
 
-
-def _lost(cell: Cell, own: tuple[Side, F64], base: tuple[Side, F64], metric: str) -> dict[str, Any]:
-    why = {
-        "here": own[0].why_missing(cell, metric, own[1]),
-        "baseline": base[0].why_missing(cell, metric, base[1]),
-    }
-    gone = {side: text for side, text in why.items() if text}
-    policy, scene, seed = cell
-    return {
-        "policy": policy,
-        "scene": scene,
-        "seed": seed,
-        "missing": "both" if len(gone) == 2 else next(iter(gone)),
-        "why": f"both: {why['here']}"
-        if len(set(why.values())) == 1
-        else "; ".join(f"{side}: {text}" for side, text in gone.items()),
-    }
+    def _cause(self, cell: Cell, metric: str) -> dict[str, Any]:
+        policy, scene, seed = cell
+        causes = {
+            name: side.why_missing(cell, metric, values)
+            for name, (side, values) in self._sides.items()
+        }
+        reasons = {name: text for name, text in causes.items() if text}
+        why = "; ".join(f"{name}: {text}" for name, text in reasons.items())
+        if causes["here"] == causes["baseline"]:
+            why = f"both: {causes['here']}"
+        return {
+            "policy": policy,
+            "scene": scene,
+            "seed": seed,
+            "missing": "both" if len(reasons) == 2 else next(iter(reasons)),
+            "why": why,
+        }

@@ -5,6 +5,7 @@ of a run with its exit code.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -231,9 +232,13 @@ def shown_questions(p_values: Mapping[Question, float | None], primary: str) -> 
     """
     shown: set[Question] = set()
     for is_primary in (True, False):
-        family = [one for one in p_values if (one[1] == primary) == is_primary]
-        corrected = holm([p_values[one] for one in family])
-        shown |= {one for one, p in zip(family, corrected, strict=True) if p is None or p <= ALPHA}
+        family = [question for question in p_values if (question[1] == primary) == is_primary]
+        corrected = holm([p_values[question] for question in family])
+        shown |= {
+            question
+            for question, p in zip(family, corrected, strict=True)
+            if p is None or p <= ALPHA
+        }
     return shown
 
 
@@ -241,20 +246,16 @@ POWER = 0.8
 MOST_SCENES = 100_000  # beyond, this suite cannot decide it
 
 
-def scenes_needed(
-    distance: float, spread: float, power: float = POWER, tail: float = TAIL
-) -> int | None:
+def scenes_needed(distance: float, spread: float) -> int | None:
     """Return the number of scenes at which a 95 % t interval leaves out the margin with probability
-    ``power``.
+    `POWER`.
 
-    N is the least with N >= ((t(0.975, N-1) + t(power, N-1)) spread / distance)^2, the usual sample
+    N is the least with N >= ((t(0.975, N-1) + t(POWER, N-1)) spread / distance)^2, the usual sample
     size of a one-sample t test.
 
     Args:
         distance: Of the true difference from the margin, in the metric's unit.
         spread: Standard deviation of the difference between scenes (seeds averaged), same unit.
-        power: Wanted probability.
-        tail: Probability of the interval's one end, 2.5 % for one of 95 %.
 
     Returns:
         At least 2; None where more than `MOST_SCENES` would be needed, or the difference lies on
@@ -268,15 +269,9 @@ def scenes_needed(
         return 2
     if distance == 0.0 or not math.isfinite(spread / distance):
         return None
-    low, high = 2, MOST_SCENES
-    if not _decides(high, distance, spread, power, tail):
-        return None
-    while low < high:
-        middle = (low + high) // 2
-        low, high = (
-            (low, middle) if _decides(middle, distance, spread, power, tail) else (middle + 1, high)
-        )
-    return low
+    numbers = range(2, MOST_SCENES + 1)
+    index = bisect_left(numbers, True, key=lambda n: _decides(n, distance, spread))
+    return numbers[index] if index < len(numbers) else None
 
 
 def scenes_without_event(margin: float, reach: float = 1.0) -> int | None:
@@ -323,6 +318,6 @@ def more_scenes(
     return None if needed is None else max(1, max(needed, LEAST_SCENES) - n_scenes)
 
 
-def _decides(n: int, distance: float, spread: float, power: float, tail: float) -> bool:
-    quantiles = float(scipy.special.stdtrit(n - 1, 1 - tail) + scipy.special.stdtrit(n - 1, power))
+def _decides(n: int, distance: float, spread: float) -> bool:
+    quantiles = float(np.sum(scipy.special.stdtrit(n - 1, [1 - TAIL, POWER])))
     return math.sqrt(n) * abs(distance) >= quantiles * spread

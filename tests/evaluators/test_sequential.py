@@ -82,6 +82,10 @@ def plain_log_capital(
 # --- the line
 
 
+def first(draws: Draws, n: int) -> Draws:
+    return Draws(draws.x[..., :n], draws.reach, draws.offset[..., :n], draws.slope[..., :n])
+
+
 @pytest.mark.parametrize("slope", [0.0, 0.33, 1.4, 4.05, 9.7, 25.0])
 @pytest.mark.parametrize("gap", [1e-3, 0.2, 1.0, 2.0, 5.0, 9.0])
 def test_the_chance_is_that_of_the_formula_and_bets_follow_its_derivative(gap, slope):
@@ -180,7 +184,7 @@ def test_the_capital_falls_with_the_hypothesis_and_bounds_are_nested(values):
     )
     assert np.all(np.diff(ladder, axis=0) <= 1e-9)
     lows = [
-        float(betting.lower_bound(draws.first(n), sizes[:n], PLAN.log_bar))
+        float(betting.lower_bound(first(draws, n), sizes[:n], PLAN.log_bar))
         for n in range(1, draws.n + 1)
     ]
     assert np.all(np.diff(lows) >= -1e-9)
