@@ -199,56 +199,41 @@ def _write(path: Path, rgb: U8) -> None:
 def _page(
     drive: SourceDrive, quality: Mapping[str, Any], shown: Sequence[tuple[str, Comparison, str]]
 ) -> str:
-    lines = [f"# Quality of {drive.scene_id}", "", "## What is missing or assumed", ""]
-    lines += [f"- {note}" for note in quality["notes"]]
-    lines += ["- no tracks of other road users: nobody moves"]
-    lines += [
-        "",
-        f"## Photographs that the fit never saw, of {quality['fitted']} that it saw",
-        "",
-        "| photographs | number | PSNR, dB | SSIM |",
-        "|---|---|---|---|",
-    ]
-    for use, count in quality["photographs"].items():
-        lines.append(
-            f"| {use} | {count} | {quality[use]['psnr_db']:.2f} | {quality[use]['ssim']:.3f} |"
-        )
-    lines += [
-        "",
-        "## Coverage of the lower half of the picture",
-        "",
-        "| metres to the left of the path | covered |",
-        "|---|---|",
-    ]
-    lines += [f"| {row['aside_m']:g} | {100 * row['share']:.1f} % |" for row in quality["coverage"]]
-    ground = quality["ground"]
-    if ground:
-        errors = (
-            f"median {100 * ground['median_error_m']:.1f} cm, worst {100 * ground['worst_error_m']:.1f} cm"
-            if ground["sections"]
-            else "-"
-        )
-        lines += [
-            "",
-            f"Ground: {ground['points']} points, camera {ground['camera_height_m']:.2f} m above it; against them by section: {errors}.",
-        ]
-    found = quality["obstacles"]
-    sides = (
-        f", whose sides are known to {found['uncertainty_m']} m (median)" if found["boxes"] else ""
+    rows = "\n".join(
+        f"| {use} | {count} | {quality[use]['psnr_db']:.2f} | {quality[use]['ssim']:.3f} |"
+        for use, count in quality["photographs"].items()
     )
-    lines += [
-        "",
-        f"Standing obstacles: {found['boxes']} boxes{sides}. On the driven path {found['cleared_cells']} cells of 0.2 m were opaque",
+    covered = "\n".join(
+        f"| {row['aside_m']:g} | {100 * row['share']:.1f} % |" for row in quality["coverage"]
+    )
+    notes = [*quality["notes"], "no tracks of other road users: nobody moves"]
+    boxes, ground = quality["obstacles"], quality["ground"]
+    sides = (
+        f", whose sides are known to {boxes['uncertainty_m']} m (median)" if boxes["boxes"] else ""
+    )
+    sections = [
+        f"# Quality of {drive.scene_id}",
+        "## What is missing or assumed",
+        "\n".join(f"- {note}" for note in notes),
+        f"## Photographs that the fit never saw, of {quality['fitted']} that it saw",
+        f"| photographs | number | PSNR, dB | SSIM |\n|---|---|---|---|\n{rows}".rstrip(),
+        "## Coverage of the lower half of the picture",
+        f"| metres to the left of the path | covered |\n|---|---|\n{covered}",
     ]
-    lines += ["by mistake and were taken as free."]
-    lines += [
-        "",
+    if ground:
+        errors = "-"
+        if ground["sections"]:
+            errors = f"median {100 * ground['median_error_m']:.1f} cm, worst {100 * ground['worst_error_m']:.1f} cm"
+        sections.append(
+            f"Ground: {ground['points']} points, camera {ground['camera_height_m']:.2f} m above it; against them by section: {errors}."
+        )
+    sections += [
+        f"Standing obstacles: {boxes['boxes']} boxes{sides}. On the driven path {boxes['cleared_cells']} cells of 0.2 m were opaque\n"
+        "by mistake and were taken as free.",
         "## From above",
-        "",
         f"![from above]({PICTURES}/plan.png)",
-        "",
         "## Photograph above, reconstruction below",
     ]
     for use, row, name in shown:
-        lines += ["", f"{use}, {row.name}: {row.psnr_db:.2f} dB", "", f"![{row.name}]({name})"]
-    return "\n".join(lines) + "\n"
+        sections += [f"{use}, {row.name}: {row.psnr_db:.2f} dB", f"![{row.name}]({name})"]
+    return "\n\n".join(sections) + "\n"

@@ -143,13 +143,7 @@ class GaussianCloud:
             >>> len(cloud), report.dropped["non-finite mean"]
             (0, 1)
         """
-        raw = cls(
-            np.asarray(means),
-            np.asarray(quats),
-            np.asarray(scales),
-            np.asarray(opacities),
-            np.asarray(sh),
-        )
+        raw = cls(*(np.asarray(array) for array in (means, quats, scales, opacities, sh)))
         n = len(raw)
         q = raw.quats.astype(np.float64)
         # Scaling by the largest component first keeps tiny quaternions of float32 files from
@@ -232,15 +226,12 @@ class GaussianCloud:
                     "build it with GaussianCloud.cleaned, which drops and counts them",
                 )
 
-    def take(self, index: npt.ArrayLike) -> GaussianCloud:
-        """Return the Gaussians chosen by an index or mask array, in that order."""
-        return self.part(np.asarray(index))
-
-    def part(self, i: slice | npt.NDArray[np.integer | np.bool_]) -> GaussianCloud:
-        """Return the Gaussians of an index, or a view of those of a slice."""
-        return GaussianCloud(
-            self.means[i], self.quats[i], self.scales[i], self.opacities[i], self.sh[i]
-        )
+    def take(self, index: npt.ArrayLike | slice) -> GaussianCloud:
+        """Return the Gaussians chosen by an index or mask array, in that order, or a view of those
+        of a slice.
+        """
+        i = index if isinstance(index, slice) else np.asarray(index)
+        return GaussianCloud(*(array[i] for array in vars(self).values()))
 
     def transformed(self, T: F64) -> GaussianCloud:
         """Return the cloud moved by a rigid transform, colours turning with the object.
@@ -276,13 +267,8 @@ class GaussianCloud:
             return GaussianCloud.empty()
         size = max(cloud.sh.shape[1] for cloud in clouds)
         sh = [np.pad(c.sh, ((0, 0), (0, size - c.sh.shape[1]), (0, 0))) for c in clouds]
-        return GaussianCloud(
-            np.concatenate([c.means for c in clouds]),
-            np.concatenate([c.quats for c in clouds]),
-            np.concatenate([c.scales for c in clouds]),
-            np.concatenate([c.opacities for c in clouds]),
-            np.concatenate(sh),
-        )
+        columns = zip(*((c.means, c.quats, c.scales, c.opacities) for c in clouds), strict=True)
+        return GaussianCloud(*map(np.concatenate, columns), np.concatenate(sh))
 
 
 def quat_multiply(a: F64, b: F64) -> F64:

@@ -87,20 +87,6 @@ class LaneIndex:
         hits = self._kd[len(point)].query_ball_point(np.asarray(point, dtype=np.float64), radius_m)
         return tuple(self.ids[j] for j in np.unique(self._owner[np.asarray(hits, dtype=np.int64)]))
 
-    def nearest(self, point: F64) -> tuple[str, float]:
-        """Return the lane owning the nearest centre vertex, and that vertex's distance in metres.
-
-        Raises:
-            InputError: The map has no lanes.
-        """
-        if not self._kd:
-            raise InputError(
-                "a lane map: it has no lanes",
-                "use a map with at least one lane",
-            )
-        distance, vertex = self._kd[len(point)].query(np.asarray(point, dtype=np.float64))
-        return self.ids[int(self._owner[int(vertex)])], float(distance)
-
     def heading_rad(self, lane_id: str, point: F64) -> float:
         """Return the driving direction of a lane at the place nearest to the point, in plan
         view.

@@ -127,16 +127,14 @@ def test_trained_model_cut_short_is_refused_in_four_parts(
 
 
 @pytest.mark.parametrize("k", [1, 4, 9, 16])
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_every_degree_survives_a_round_trip(tmp_path: Path, k: int, precision: str) -> None:
+def test_every_degree_survives_a_round_trip(tmp_path: Path, k: int) -> None:
     cloud = make_cloud(k=k)
-    write_ply(tmp_path / "a.ply", cloud, precision=precision)
+    write_ply(tmp_path / "a.ply", cloud)
     back = read_ply_arrays(tmp_path / "a.ply")
     for name in ("means", "quats", "sh"):
         np.testing.assert_array_equal(getattr(back, name), getattr(cloud, name))
-    exact = 0 if precision == "float64" else 5e-7
-    np.testing.assert_allclose(back.scales, cloud.scales, rtol=max(exact, 1e-15))
-    np.testing.assert_allclose(back.opacities, cloud.opacities, rtol=max(exact, 1e-15))
+    np.testing.assert_allclose(back.scales, cloud.scales, rtol=5e-7)
+    np.testing.assert_allclose(back.opacities, cloud.opacities, rtol=5e-7)
 
 
 @settings(max_examples=examples(50), deadline=None)

@@ -6,7 +6,6 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, centre_line, densify
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import Lane, LaneMap
@@ -109,20 +108,10 @@ def test_bridge_does_not_answer_for_the_road_below():
     index = LaneIndex(make(straight("road", 0, 50), straight("bridge", 0, 50, z=7.0)))
     assert index.within(np.array([20.0, 0.0, 0.2]), 6.0) == ("road",)
     assert index.within(np.array([20.0, 0.0]), 6.0) == ("road", "bridge")
-    assert index.nearest(np.array([20.0, 0.0, 6.0]))[0] == "bridge"
 
 
 def test_long_segments_are_found_by_their_middle():
     assert LaneIndex(make(straight("a", 0, 400))).within(np.array([203.3, 3.0, 0.0]), 3.1) == ("a",)
-
-
-@given(st.floats(-20, 100), st.floats(-20, 40))
-@settings(deadline=None, max_examples=examples(50))
-def test_nearest_lane_is_the_one_a_search_over_all_vertices_finds(x, y):
-    point = np.array([x, y, 0.0])
-    _, distance = LaneIndex(GRID).nearest(point)
-    dense = np.concatenate([densify(lane.centre, 1.0) for lane in GRID.lanes.values()])
-    assert distance == pytest.approx(np.linalg.norm(dense - point, axis=1).min(), abs=1e-9)
 
 
 def test_heading_follows_the_curve_at_the_point():
@@ -135,8 +124,6 @@ def test_empty_map_says_so():
     index = LaneIndex(LaneMap({}))
     assert index.containing(np.zeros(2)) == ()
     assert index.within(np.zeros(3), 5.0) == ()
-    with pytest.raises(InputError):
-        index.nearest(np.zeros(2))
 
 
 def test_path_goes_straight_on_at_a_fork_and_has_the_asked_length():

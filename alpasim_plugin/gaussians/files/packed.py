@@ -13,7 +13,6 @@ import struct
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,7 +200,6 @@ MAGIC = 0x5053474E  # "NGSP" in file order
 _GZIP = b"\x1f\x8b"
 _COLOUR_SCALE = 0.15
 _EXPORT_AGAIN = "copy or export the file again"
-Axes = Literal["rdf", "rub"]
 
 # Sign of each basis function (degree 0 to 4, order of the 3DGS PLY) when y and z change sign: the
 # parity of its y z factor.
@@ -213,13 +211,12 @@ _FLIP_YZ = np.array(
 
 @dataclass(frozen=True)
 class SpzHeader:
-    """Hold the fields of an SPZ header."""
+    """Hold the fields of an SPZ header that are read."""
 
     version: int
     count: int
     sh_degree: int
     fractional_bits: int
-    flags: int
 
     @property
     def stream_bytes(self) -> tuple[int, int, int, int, int, int]:
@@ -228,13 +225,12 @@ class SpzHeader:
         return 9 * n, n, 3 * n, 3 * n, rotation * n, 3 * n * ((self.sh_degree + 1) ** 2 - 1)
 
 
-def read_spz(path: Path | str, axes: Axes = "rdf") -> GaussianArrays:
-    """Read an SPZ file of version 2, 3 or 4.
+def read_spz(path: Path | str) -> GaussianArrays:
+    """Read an SPZ file of version 2, 3 or 4, turned into the axes of a 3DGS PLY: ``(x, y, z) ->
+    (x, -y, -z)``.
 
     Args:
         path: The file.
-        axes: ``rdf`` turns the model into the axes of a 3DGS PLY, ``(x, y, z) -> (x, -y, -z)``;
-            ``rub`` leaves it as stored.
 
     Raises:
         InputError: Missing or truncated file, wrong magic, unknown version, or sizes that do not
@@ -250,7 +246,7 @@ def read_spz(path: Path | str, axes: Axes = "rdf") -> GaussianArrays:
         if header.version == 4
         else _plain_streams(path, data, header)
     )
-    return _decode(header, streams, axes)
+    return _decode(header, streams)
 
 
 def unpack_smallest_three(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -268,7 +264,7 @@ def unpack_smallest_three(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
     return with_largest(others, largest)[:, [3, 0, 1, 2]]
 
 
-def _decode(header: SpzHeader, streams: list[NDArray[np.uint8]], axes: Axes) -> GaussianArrays:
+def _decode(header: SpzHeader, streams: list[NDArray[np.uint8]]) -> GaussianArrays:
     n, k = header.count, (header.sh_degree + 1) ** 2
     positions, alphas, colours, scales, rotations, harmonics = streams
     parts = positions.reshape(n, 3, 3).astype(np.int32)
@@ -283,16 +279,13 @@ def _decode(header: SpzHeader, streams: list[NDArray[np.uint8]], axes: Axes) -> 
     dc = (colours.reshape(n, 1, 3) / 255.0 - 0.5) / _COLOUR_SCALE
     rest = (harmonics.reshape(n, k - 1, 3).astype(np.float64) - 128.0) / 128.0
     sh = np.concatenate([dc, rest], axis=1).astype(np.float32)
-    if axes == "rdf":
-        means = means * np.array([1.0, -1.0, -1.0])
-        quats = quats * np.array([1.0, 1.0, -1.0, -1.0])  # conjugation by half a turn about x
-        sh = sh * _FLIP_YZ[:k, None]
     return GaussianArrays(
-        means=means.astype(np.float32),
-        quats=quats.astype(np.float32),
+        means=(means * np.array([1.0, -1.0, -1.0])).astype(np.float32),
+        # Conjugation by half a turn about x.
+        quats=(quats * np.array([1.0, 1.0, -1.0, -1.0])).astype(np.float32),
         scales=np.exp(scales.reshape(n, 3) / 16.0 - 10.0),
         opacities=alphas / 255.0,
-        sh=sh,
+        sh=sh * _FLIP_YZ[:k, None],
     )
 
 
@@ -322,7 +315,7 @@ def _gunzip(path: Path, data: bytes) -> bytes:
 def _parse_header(path: Path, data: bytes) -> SpzHeader:
     if len(data) < 16:
         raise _failure(path, f"{len(data)} bytes, shorter than any header", _EXPORT_AGAIN)
-    magic, version, count, degree, bits, flags, _ = struct.unpack_from("<IIIBBBB", data)
+    magic, version, count, degree, bits, _, _ = struct.unpack_from("<IIIBBBB", data)
     if magic != MAGIC:
         raise _failure(path, f"magic {data[:4]!r}, expected b'NGSP'", "give an SPZ file")
     if version not in (2, 3, 4):
@@ -336,7 +329,7 @@ def _parse_header(path: Path, data: bytes) -> SpzHeader:
         raise _failure(
             path, f"{count} Gaussians of degree {degree} with {bits} fractional bits", _EXPORT_AGAIN
         )
-    return SpzHeader(version, count, degree, bits, flags)
+    return SpzHeader(version, count, degree, bits)
 
 
 def _plain_streams(path: Path, data: bytes, header: SpzHeader) -> list[NDArray[np.uint8]]:
@@ -358,33 +351,21 @@ def _zstd_streams(path: Path, data: bytes, header: SpzHeader) -> list[NDArray[np
             path, f"{len(data)} bytes, shorter than the header of version 4", _EXPORT_AGAIN
         )
     n_streams, table = data[15], struct.unpack_from("<I", data, 16)[0]
-    expected = [size for size in header.stream_bytes if size] if header.count else []
-    wanted = [size for size in header.stream_bytes[:5]] + (
-        [header.stream_bytes[5]] if header.sh_degree else []
-    )
+    wanted = header.stream_bytes if header.sh_degree else header.stream_bytes[:5]
     if n_streams < len(wanted) or table < 32 or table + 16 * n_streams > len(data):
-        found = f"{n_streams} streams with a table at byte {table} in {len(data)} bytes, {len(expected)} are needed"
+        found = f"{n_streams} streams with a table at byte {table} in {len(data)} bytes, {len(wanted)} are needed"
         raise _failure(path, found, _EXPORT_AGAIN)
     sizes = [struct.unpack_from("<QQ", data, table + 16 * i) for i in range(n_streams)]
     at, streams = table + 16 * n_streams, []
     for i, need in enumerate(wanted):
         packed, unpacked = sizes[i]
         if unpacked != need or at + packed > len(data):
-            found = (
-                f"stream {i} announces {unpacked} bytes, {header.count} Gaussians need {need}"
-                if unpacked != need
-                else f"stream {i} ends at byte {at + packed}, the file at {len(data)}"
-            )
+            found = f"stream {i} announces {unpacked} bytes up to byte {at + packed} of {len(data)}, {header.count} Gaussians need {need}"
             raise _failure(path, found, _EXPORT_AGAIN)
-        streams.append(_unzstd(path, i, data[at : at + packed], need))
+        plain = unzstd(data[at : at + packed], need, f"{path}, stream {i}", _EXPORT_AGAIN)
+        streams.append(np.frombuffer(plain, dtype=np.uint8))
         at += packed
     return streams if header.sh_degree else [*streams, np.zeros(0, dtype=np.uint8)]
-
-
-def _unzstd(path: Path, index: int, packed: bytes, need: int) -> NDArray[np.uint8]:
-    return np.frombuffer(
-        unzstd(packed, need, f"{path}, stream {index}", _EXPORT_AGAIN), dtype=np.uint8
-    )
 
 
 def _failure(path: Path, found: str, do_this: str) -> InputError:

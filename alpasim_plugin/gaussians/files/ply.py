@@ -13,7 +13,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,22 +30,10 @@ from alpasim_plugin.gaussians.cloud import (
 )
 
 _REQUIRED = (
-    "x",
-    "y",
-    "z",
-    "f_dc_0",
-    "f_dc_1",
-    "f_dc_2",
-    "opacity",
-    "scale_0",
-    "scale_1",
-    "scale_2",
-    "rot_0",
-    "rot_1",
-    "rot_2",
-    "rot_3",
+    *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
-Precision = Literal["float32", "float64"]
+COLOURS = ("red", "green", "blue")
 
 
 def read_ply(path: Path | str, element: str | None = None) -> GaussianCloud:
@@ -89,54 +76,42 @@ def read_ply_arrays(path: Path | str, element: str | None = None) -> GaussianArr
     )
 
 
-def write_ply(path: Path | str, cloud: GaussianCloud, precision: Precision = "float32") -> None:
+def write_ply(path: Path | str, cloud: GaussianCloud) -> None:
     """Write a cloud as a binary little-endian PLY that other 3DGS tools read.
 
     Means, rotations and colours survive a round trip bit for bit. Scales and opacities pass through
-    a logarithm, which float32 cannot hold exactly (relative error up to 5e-7);
-    ``precision="float64"`` keeps them exact too, for tools that accept doubles.
+    a logarithm, which float32 cannot hold exactly (relative error up to 5e-7).
 
     Args:
         path: The file; it appears under its name only once complete.
         cloud: What to write.
-        precision: Type of every property.
 
     Raises:
         InfrastructureError: The folder is missing or not writable, or the disk is full.
     """
     path = Path(path)
-    rows = ply_rows(cloud, precision)
-    word = {"float32": "float", "float64": "double"}[precision]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    lines += [f"property {word} {name}" for name in rows.dtype.names or ()]
+    rows = ply_rows(cloud)
+    header = _header(len(rows), [f"float {name}" for name in rows.dtype.names or ()])
     with atomic_file(path) as partial, partial.open("wb") as stream:
-        stream.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii"))
+        stream.write(header)
         stream.write(rows.tobytes())
+
+
+def _header(count: int, properties: Sequence[str]) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property {name}" for name in properties]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
 def write_points(path: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -> None:
     """Write points ``(N, 3)`` with colours ``(N, 3)`` as a binary PLY."""
-    kinds = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    rows = np.empty(len(xyz), dtype=kinds)
-    for i, name in enumerate("xyz"):
-        rows[name] = xyz[:, i]
-    for i, name in enumerate(("red", "green", "blue")):
-        rows[name] = rgb[:, i]
-    names = [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in kinds]
-    header = "\n".join(
-        [
-            "ply",
-            "format binary_little_endian 1.0",
-            f"element vertex {len(rows)}",
-            *names,
-            "end_header",
-            "",
-        ]
-    )
-    write_bytes(path, header.encode() + rows.tobytes())
+    rows = np.empty(len(xyz), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    rows["xyz"], rows["rgb"] = xyz, rgb
+    words = [*(f"float {name}" for name in "xyz"), *(f"uchar {name}" for name in COLOURS)]
+    write_bytes(path, _header(len(rows), words) + rows.tobytes())
 
 
-def ply_rows(cloud: GaussianCloud, precision: Precision = "float32") -> NDArray[np.void]:
+def ply_rows(cloud: GaussianCloud) -> NDArray[np.void]:
     """Return the rows ``(N,)`` of the vertex element that `write_ply` stores."""
     n, k = cloud.sh.shape[:2]
     rest = np.swapaxes(np.asarray(cloud.sh)[:, 1:, :], 1, 2).reshape(n, 3 * (k - 1))
@@ -152,9 +127,7 @@ def ply_rows(cloud: GaussianCloud, precision: Precision = "float32") -> NDArray[
         ([f"rot_{i}" for i in range(4)], np.asarray(cloud.quats)),
     ]
     names = [name for group, _ in groups for name in group]
-    table = np.concatenate([values for _, values in groups], axis=1).astype(
-        "<f4" if precision == "float32" else "<f8"
-    )
+    table = np.concatenate([values for _, values in groups], axis=1).astype("<f4")
     return np.ascontiguousarray(table).view([(name, table.dtype) for name in names]).reshape(n)
 
 
@@ -182,12 +155,9 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> int:
     have = set(element.properties)
     missing = [name for name in _REQUIRED if name not in have]
     if missing:
-        compressed = "packed_position" in have
         raise InputError(
-            f"{header.path}, element {element.name!r}: {f'missing properties {missing}' + (' (it is a compressed PLY)' if compressed else '')}",
-            "use read_gaussians, which knows compressed PLY"
-            if compressed
-            else "give a 3DGS PLY, not a mesh or points",
+            f"{header.path}, element {element.name!r}: missing properties {missing}",
+            "give a 3DGS PLY, not a mesh or points; read_gaussians also knows compressed PLY",
         )
     time_terms = sorted(name for name in have if name.startswith("f_dc_") and name not in _REQUIRED)
     if time_terms:
@@ -225,24 +195,17 @@ def _sh_from_columns(rows: NDArray[np.void], n_rest: int) -> NDArray[np.floating
 
 _MAX_HEADER_BYTES = 1 << 20
 MAX_PROPERTIES = 512  # the highest degree of colour takes 62
-_SCALAR_CODES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
+_KINDS = {
+    "i1": ("char", "int8"),
+    "u1": ("uchar", "uint8"),
+    "i2": ("short", "int16"),
+    "u2": ("ushort", "uint16"),
+    "i4": ("int", "int32"),
+    "u4": ("uint", "uint32"),
+    "f4": ("float", "float32"),
+    "f8": ("double", "float64"),
 }
+_SCALAR_CODES = {word: kind for kind, words in _KINDS.items() for word in words}
 _ENDIAN = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _EXPORT_AGAIN = "export the file again as a binary PLY, or copy it again if the transfer broke off"
 

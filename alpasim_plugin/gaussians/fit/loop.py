@@ -24,7 +24,6 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.model import (
-    NAMES,
     Exposure,
     Motion,
     RowAdam,
@@ -44,6 +43,7 @@ from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 
 Report = Callable[[int, Mapping[str, float]], None]  # (updates made, numbers of the last one)
 DEPTH_CLIP = 0.5  # of a share: a measured depth may be wrong altogether
+STATE_FILE = "state.safetensors"
 SMALLEST_EXTENT_M = 5.0  # of a drive that hardly moves
 
 
@@ -152,9 +152,7 @@ class SplatFit:
             sort_keys=True,
         )
         if folder is not None and (folder / STATE_FILE).exists():
-            self.step = load_state(
-                folder, self.model, self.adam, self.gradients, self.exposure, self._facts
-            )
+            self._load(folder / STATE_FILE)
 
     def update(self) -> dict[str, float]:
         """Learn from one view.
@@ -190,17 +188,46 @@ class SplatFit:
         return {"loss": float(loss.detach()), "psnr_db": psnr, "gaussians": len(self.model)}
 
     def save(self) -> None:
-        """Write the checkpoint, whole or not at all."""
+        """Write everything that later updates depend on, whole or not at all."""
         assert self.folder is not None
-        save_state(
-            self.folder,
-            self.model,
-            self.adam,
-            self.gradients,
-            self.exposure,
-            self.step,
-            self._facts,
-        )
+        self.folder.mkdir(parents=True, exist_ok=True)
+        tensors = {"node": self.model.node, "log_gain": self.exposure.log_gain.detach()}
+        tensors |= {"total": self.gradients.total, "count": self.gradients.count}
+        for name, parts in self._named().items():
+            tensors |= {f"{name}.{part}": value.detach() for part, value in parts.items()}
+        steps = {"step": self.step, "adam": self.adam.step, "exposure": self.exposure.adam.step}
+        meta = {name: str(step) for name, step in steps.items()} | {"facts": self._facts}
+        write_safetensors(self.folder / STATE_FILE, tensors, meta)
+
+    def _named(self) -> dict[str, dict[str, Tensor]]:
+        """Return the tensors of the model and of both optimisers, by where they belong."""
+        adam, exposure = self.adam, self.exposure.adam
+        moments = {"first": adam.first, "second": adam.second}
+        return {
+            "value": self.model.params,
+            **moments,
+            "exposure_first": exposure.first,
+            "exposure_second": exposure.second,
+        }
+
+    def _load(self, path: Path) -> None:
+        """Go on from a saved state.
+
+        Raises:
+            InputError: The folder was begun with other views, another start or another recipe, or
+                its file is damaged.
+        """
+        meta, tensors = read_checkpoint(path, self._facts)
+        with parsing(path, START_ANEW, "not a whole checkpoint"):
+            self.model.node = tensors["node"]
+            for name, parts in self._named().items():
+                parts.update({part: tensors[f"{name}.{part}"] for part in parts})
+            for value in self.model.params.values():
+                value.requires_grad_()
+            self.exposure.log_gain = tensors["log_gain"].requires_grad_()
+            self.gradients.total, self.gradients.count = tensors["total"], tensors["count"]
+            self.step, self.adam.step = int(meta["step"]), int(meta["adam"])
+            self.exposure.adam.step = int(meta["exposure"])
 
     def _next_view(self) -> _Target:
         """Return the view of this step: all in a random order, then all in another."""
@@ -310,70 +337,3 @@ def _digest(views: Sequence[PosedView], start: Start) -> str:
         for part in (cloud.means, cloud.scales, cloud.sh):
             add(part)
     return digest.hexdigest()
-
-
-STATE_FILE = "state.safetensors"
-
-
-def save_state(
-    folder: Path,
-    model: SplatModel,
-    adam: RowAdam,
-    gradients: ScreenGradients,
-    exposure: Exposure,
-    step: int,
-    facts: str,
-) -> None:
-    """Write everything that later updates depend on; the file appears complete or not at all."""
-    folder.mkdir(parents=True, exist_ok=True)
-    tensors = {
-        "node": model.node,
-        "gradients.total": gradients.total,
-        "gradients.count": gradients.count,
-    }
-    tensors |= {f"exposure.{name}": value for name, value in exposure.state().items()}
-    for name in NAMES:
-        tensors |= {
-            f"value.{name}": model.params[name].detach(),
-            f"first.{name}": adam.first[name],
-            f"second.{name}": adam.second[name],
-        }
-    write_safetensors(
-        folder / STATE_FILE,
-        tensors,
-        {"step": str(step), "adam_step": str(adam.step), "facts": facts},
-    )
-
-
-def load_state(
-    folder: Path,
-    model: SplatModel,
-    adam: RowAdam,
-    gradients: ScreenGradients,
-    exposure: Exposure,
-    facts: str,
-) -> int:
-    """Put a saved state into objects made from the same start, and return the number of updates
-    made.
-
-    Raises:
-        InputError: The folder was begun with other views, another start or another recipe, or its
-            file is damaged.
-    """
-    path = folder / STATE_FILE
-    meta, tensors = read_checkpoint(path, facts)
-    with parsing(path, START_ANEW, "not a whole checkpoint"):
-        model.node = tensors["node"]
-        model.params = {name: tensors[f"value.{name}"].requires_grad_() for name in NAMES}
-        adam.first = {name: tensors[f"first.{name}"] for name in NAMES}
-        adam.second = {name: tensors[f"second.{name}"] for name in NAMES}
-        adam.step = int(meta["adam_step"])
-        exposure.restore(
-            {
-                name.removeprefix("exposure."): t
-                for name, t in tensors.items()
-                if name.startswith("exposure.")
-            }
-        )
-        gradients.total, gradients.count = tensors["gradients.total"], tensors["gradients.count"]
-        return int(meta["step"])

@@ -255,6 +255,7 @@ class Exposure:
 
     Attributes:
         log_gain: ``(V, 3)``.
+        adam: Its optimiser.
         plain: All gains are 1 and stay so.
     """
 
@@ -262,7 +263,7 @@ class Exposure:
         self.begin = torch.as_tensor(np.log(begin), dtype=torch.float32)
         self.log_gain = self.begin.clone().requires_grad_()
         self.plain = bool((self.begin == 0).all())
-        self._adam = RowAdam({"log_gain": self.log_gain})
+        self.adam = RowAdam({"log_gain": self.log_gain})
 
     def gain(self, view: int) -> Tensor:
         """Return the gain ``(3,)`` of a view, with graph."""
@@ -276,29 +277,11 @@ class Exposure:
     def update(self, rate: float) -> None:
         """Make one update; a rate of 0 makes none."""
         if rate > 0:
-            self._adam.update({"log_gain": self.log_gain}, {"log_gain": rate})
+            self.adam.update({"log_gain": self.log_gain}, {"log_gain": rate})
             self.log_gain.lerp_(self.begin, EXPOSURE_PULL * rate)
             self.log_gain -= (self.log_gain - self.begin).mean(dim=0)
         elif self.log_gain.grad is not None:
             self.log_gain.grad = None
-
-    def state(self) -> dict[str, Tensor]:
-        """Return what `restore` needs."""
-        return {
-            "value": self.log_gain.detach(),
-            "first": self._adam.first["log_gain"],
-            "second": self._adam.second["log_gain"],
-            "step": torch.tensor(self._adam.step),
-        }
-
-    def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Take over a saved state."""
-        self.log_gain = state["value"].clone().requires_grad_()
-        self._adam.first, self._adam.second = (
-            {"log_gain": state["first"].clone()},
-            {"log_gain": state["second"].clone()},
-        )
-        self._adam.step = int(state["step"])
 
 
 def needles(log_scales: Tensor, ratio: float) -> Tensor:

@@ -78,7 +78,7 @@ def split_by_tile(cloud: GaussianCloud, tile: I64) -> dict[int, GaussianCloud]:
     ids, first = np.unique(tile[order], return_index=True)
     ordered, ends = cloud.take(order), [*first[1:], len(order)]
     return {
-        int(i): ordered.part(slice(begin, end))
+        int(i): ordered.take(slice(begin, end))
         for i, begin, end in zip(ids, first, ends, strict=True)
     }
 

@@ -140,7 +140,7 @@ def test_a_weight_of_depth_moves_gaussians_to_the_measured_depth(views: list[Pos
         recipe = SplatRecipe(
             steps=60, densify_every=0, depth_weight=weight, lr_means=0.05, lr_means_end=0.05
         )
-        run = SplatFit([flat], Start(cloud, {}), recipe, "s", "cpu", 1, None)
+        run = SplatFit([flat], Start(cloud, {}), recipe, "s", 1, None)
         while run.step < recipe.steps:
             run.update()
         return float(np.median(run.model.clouds()[0].means[:, 0]))
@@ -165,9 +165,3 @@ def test_an_exposure_learns_its_gain_and_keeps_the_mean() -> None:
     gains = exposure.gains()
     assert gains[0, 0] == pytest.approx(1.2, abs=0.03)
     assert np.allclose(np.log(gains).sum(axis=0), 0, atol=1e-4)
-    again = Exposure(np.ones((2, 3)))
-    again.restore(exposure.state())
-    for one in (exposure, again):
-        ((one.gain(1) - 1.1) ** 2).sum().backward()
-        one.update(0.01)
-    assert np.array_equal(exposure.gains(), again.gains())

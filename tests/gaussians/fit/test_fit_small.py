@@ -164,7 +164,7 @@ def test_a_loss_that_is_not_finite_stops_the_fit_with_the_state_before_it(
 
 
 def test_a_gradient_that_is_not_finite_stops_it_too(posed: Posed) -> None:
-    run = loop.SplatFit(posed.views, posed.start, QUICK, "", "cpu", None, None)
+    run = loop.SplatFit(posed.views, posed.start, QUICK, "", None, None)
     run.model.params["means"].register_hook(lambda gradient: gradient * float("inf"))
     before = {name: p.detach().clone() for name, p in run.model.params.items()}
     with pytest.raises(InfrastructureError):
