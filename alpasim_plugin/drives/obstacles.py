@@ -75,9 +75,7 @@ def standing_obstacles(
         & (s > frame.s[0])
         & (s < frame.s[-1])
     )
-    places = places[near]
-    area = area[near]
-    above = above[near]
+    places, area, above = places[near], area[near], above[near]
     low = ego.xyz[:, :2].min(axis=0) - REACH_M - 30.0
     cells = np.floor((places[:, :2] - low) / CELL_M).astype(np.int64)
     if not len(cells):
@@ -107,31 +105,17 @@ def _samples(cloud: GaussianCloud) -> tuple[F64, F64]:
     """Return points ``(N, 3)`` on the opaque Gaussians, their middles and their ends, and the
     surface ``(N,)`` that each stands for.
     """
-    scales = np.asarray(cloud.scales, dtype=np.float64)
-    chosen = (np.asarray(cloud.opacities) > OPAQUE) & (scales.max(axis=1) < LARGEST_M)
-    means, scales = np.asarray(cloud.means, dtype=np.float64)[chosen], scales[chosen]
-    order = np.argsort(-scales, axis=1)[:, :2]
-    axes = np.take_along_axis(
-        matrix_from_quat(np.asarray(cloud.quats, dtype=np.float64)[chosen]),
-        order[:, None, :],
-        axis=2,
-    )  # (N, 3, 2)
-    sizes = np.take_along_axis(scales, order, axis=1)
-    ends = axes * sizes[:, None, :]
-    shown = [
-        means,
-        means + ends[:, :, 0],
-        means - ends[:, :, 0],
-        means + ends[:, :, 1],
-        means - ends[:, :, 1],
-    ]
-    surface = (
-        np.pi
-        * sizes[:, 0]
-        * sizes[:, 1]
-        * np.asarray(cloud.opacities, dtype=np.float64)[chosen]
-        / len(shown)
+    cloud = cloud.take((cloud.opacities > OPAQUE) & (cloud.scales.max(axis=1) < LARGEST_M))
+    means, quats, scales, opacities = (
+        np.asarray(array, dtype=np.float64)
+        for array in (cloud.means, cloud.quats, cloud.scales, cloud.opacities)
     )
+    order = np.argsort(-scales, axis=1)[:, :2]
+    axes = np.take_along_axis(matrix_from_quat(quats), order[:, None, :], axis=2)  # (N, 3, 2)
+    sizes = np.take_along_axis(scales, order, axis=1)
+    ends = np.moveaxis(axes * sizes[:, None, :], 2, 0)
+    shown = [means, *(means + sign * end for end in ends for sign in (1, -1))]
+    surface = np.pi * sizes[:, 0] * sizes[:, 1] * opacities / len(shown)
     return np.concatenate(shown), np.tile(surface, len(shown))
 
 

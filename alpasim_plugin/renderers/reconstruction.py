@@ -26,7 +26,6 @@ from alpasim_plugin.core.types import (
     F32,
     F64,
     STANDING_ID,
-    Bool,
     Frame,
     Photograph,
     RecordedFrame,
@@ -205,14 +204,14 @@ class ImportedRenderer(Renderer):
         self.scenario, self.threads = scenario, threads
         self.backend = backend_of(device)
         self.graph = graph_of(scenario)
-        self.exposures = Exposures.of(scenario.recording)
+        self.fitted = [one for one in scenario.recording if one.use == "fitted"]
         self.stats: Mapping[str, int] = {}
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame."""
         out = draw_request(request, self._drawn, self.backend)
         place = camera_at(request, request.T_world_camera[1]).centre_world
-        rgb = np.clip(out.rgb * self.exposures.near(request.camera.name, place), 0.0, 1.0)
+        rgb = np.clip(out.rgb * exposure_near(self.fitted, request.camera.name, place), 0.0, 1.0)
         shown = replace(out, rgb=np.asarray(rgb, np.float32))
         self.stats = out.stats
         return Frame(request.t_us, request.camera.name, shown.to_uint8(), out.alpha, out.depth)
@@ -229,7 +228,7 @@ class ImportedRenderer(Renderer):
         """Render with the sky as an opaque layer without depth."""
         known = {name: T for name, T in actors.items() if name in self.graph.actors}
         out = self.graph.render(camera, known, self.threads, self.backend)
-        sky = (out.alpha < OPAQUE) & above_horizon(camera)
+        sky = (out.alpha < OPAQUE) & camera.above_horizon()
         return replace(
             out,
             alpha=np.where(sky, np.float32(1), out.alpha),
@@ -260,44 +259,10 @@ def graph_of(scenario: Scenario) -> SceneGraph:
     return in_memory(f"imported:{scene_key(scenario)}:{folder}", read)
 
 
-def above_horizon(camera: PinholeCamera) -> Bool:
-    """Return which pixels ``(H, W)`` look up, towards +z of the world."""
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
-    up = camera.T_camera_world[:3, 2]
-    return np.asarray(
-        (u - camera.cx) / camera.fx * up[0] + (v - camera.cy) / camera.fy * up[1] + up[2] > 0
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class Exposures:
-    """The gains of the photographs that a model was fitted to, by place.
-
-    Attributes:
-        cameras: ``N`` names.
-        centres: ``(N, 3)`` metres, world.
-        gains: ``(N, 3)`` of red, green and blue.
+def exposure_near(fitted: Sequence[Photograph], camera: str, place: F64) -> F32:
+    """Return the gain ``(3,)`` at a place: of the two nearest fitted photographs of that camera, or
+    of all where it took none.
     """
-
-    cameras: tuple[str, ...]
-    centres: F64
-    gains: F64
-
-    @classmethod
-    def of(cls, recording: Sequence[Photograph]) -> Exposures:
-        """Take those of the fitted photographs: others were not explained by the fit."""
-        fitted = [one for one in recording if one.use == "fitted"]
-        centres = np.array([one.T_world_camera[:3, 3] for one in fitted]).reshape(-1, 3)
-        return cls(
-            tuple(one.camera for one in fitted),
-            centres,
-            np.array([one.exposure for one in fitted]).reshape(-1, 3),
-        )
-
-    def near(self, camera: str, place: F64) -> F32:
-        """Return the gain ``(3,)`` at a place: of the two nearest photographs of that camera, or of
-        all where it took none.
-        """
-        mine = np.array([name == camera for name in self.cameras], dtype=bool)
-        rows = np.flatnonzero(mine) if mine.any() else np.arange(len(self.cameras))
-        return gain_between(self.centres[rows], self.gains[rows], place)
+    mine = [one for one in fitted if one.camera == camera] or fitted
+    centres = np.array([one.T_world_camera[:3, 3] for one in mine]).reshape(-1, 3)
+    return gain_between(centres, np.array([one.exposure for one in mine]).reshape(-1, 3), place)

@@ -19,10 +19,10 @@ from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Degradation, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
+from alpasim_plugin.gaussians.scene.log_views import SkyView
 
 if TYPE_CHECKING:
     from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
-    from alpasim_plugin.gaussians.scene.log_views import SkyView
 
 # By second of the log and camera, so that a longer drive is fitted no worse.
 POINTS_PER_S, FULL_STEPS_PER_S = 2_400, 50.0
@@ -226,14 +226,9 @@ def read_model(folder: Path) -> tuple[Reconstruction, list[SkyView]]:
 
 
 def _read_sky_views(path: Path) -> list[SkyView]:
-    from alpasim_plugin.gaussians.scene.log_views import SkyView
-
     try:
         with np.load(path, allow_pickle=False) as file:
-            sizes = file["size"]
-            Ks = file["K"]
-            Ts = file["T_camera_world"]
-            bits = file["sky"]
+            sizes, Ks, Ts, bits = (file[key] for key in ("size", "K", "T_camera_world", "sky"))
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: {error}", DO_THIS) from error
     views, first = [], 0

@@ -10,7 +10,6 @@ of its registration, so a recorded frame is no better placed than a user's own.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -20,7 +19,7 @@ import numpy as np
 from alpasim_plugin.core.geometry import interpolate, inverse
 from alpasim_plugin.core.reading.images import read_image
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Photograph, RecordedFrame, Scenario
+from alpasim_plugin.core.types import F32, F64, U8, Photograph, RecordedFrame, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.log_views import log_actors
@@ -49,28 +48,6 @@ DepthFrom = Callable[
 ]  # camera, actor poses -> depth (H, W) metres, 0 where there is none
 
 
-@dataclass(frozen=True, eq=False)
-class _Shot:
-    """One recorded frame of a built scene: where it was taken, and where the reconstruction
-    believes that it was.
-    """
-
-    scene: SceneGraph
-    model: Model
-    true: PinholeCamera
-    believed: PinholeCamera
-    actors: Mapping[str, F64]
-
-    def read(self) -> tuple[U8, F32]:
-        """Return the built scene's picture, and the model's depth from the believed pose."""
-        return self.scene.render(self.true, self.actors, 1).to_uint8(), self.model(
-            self.believed, self.actors
-        ).surface_depth()
-
-
-Read = Callable[[_Shot], tuple[U8, F32]]
-
-
 def built_recording(
     scenario: Scenario, scene: SceneGraph, model: Model, recipe: ReconstructionRecipe | None
 ) -> tuple[RecordedFrame, ...]:
@@ -96,21 +73,27 @@ def built_recording(
     aside = np.eye(4)
     aside[1, 3] = recipe.aside_m if recipe else 0.0
     largest = max(spec.width * spec.height for spec in scenario.cameras) if scenario.cameras else 1
-    read = lru_cache(maxsize=max(1, KEPT_BYTES // (largest * BYTES_PER_PX)))(_Shot.read)
-    return tuple(
-        _frame(
-            scenario,
-            scene,
-            model,
-            read,
-            spec,
-            t_us,
-            interpolate(log, t_us) @ aside @ spec.T_rig_camera,
-            error,
-        )
-        for t_us, error in zip(times, errors, strict=True)
-        for spec in scenario.cameras
-    )
+    shots: list[tuple[PinholeCamera, PinholeCamera, Mapping[str, F64]]] = []
+
+    @lru_cache(maxsize=max(1, KEPT_BYTES // (largest * BYTES_PER_PX)))
+    def read(number: int) -> tuple[U8, F32]:
+        """Return the built scene's image, and the model's depth from the believed pose."""
+        true, believed, actors = shots[number]
+        picture = scene.render(true, actors, 1).to_uint8()
+        return picture, model(believed, actors).surface_depth()
+
+    frames = []
+    for t_us, error in zip(times, errors, strict=True):
+        actors = log_actors(scenario, t_us)
+        for spec in scenario.cameras:
+            T_world_camera = interpolate(log, t_us) @ aside @ spec.T_rig_camera
+            true = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_camera)
+            T_world_believed = inverse(error @ true.T_camera_world)
+            believed = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_believed)
+            once = partial(read, len(shots))
+            shots.append((true, believed, actors))
+            frames.append(RecordedFrame(t_us, spec.name, spec.K, T_world_believed, actors, once))
+    return tuple(frames)
 
 
 def pose_errors(scene_id: str, seed: int, spread_m: float, views: int, at: F64) -> F64:
@@ -135,30 +118,6 @@ def pose_errors(scene_id: str, seed: int, spread_m: float, views: int, at: F64) 
     out[:, :3, :3] = [cv2.Rodrigues(TURN_RAD_PER_M * error[3:])[0] for error in errors]
     out[:, :3, 3] = errors[:, :3]
     return out
-
-
-def _frame(
-    scenario: Scenario,
-    scene: SceneGraph,
-    model: Model,
-    read: Read,
-    spec: CameraSpec,
-    t_us: int,
-    T_world_camera: F64,
-    error: F64,
-) -> RecordedFrame:
-    true = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_camera)
-    T_world_believed = inverse(error @ true.T_camera_world)
-    believed = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_believed)
-    actors = dict(log_actors(scenario, t_us))
-    return RecordedFrame(
-        t_us,
-        spec.name,
-        spec.K,
-        T_world_believed,
-        actors,
-        partial(read, _Shot(scene, model, true, believed, actors)),
-    )
 
 
 def photograph_recording(scenario: Scenario, depth_from: DepthFrom) -> tuple[RecordedFrame, ...]:

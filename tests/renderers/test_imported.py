@@ -15,7 +15,7 @@ from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.renderers import make_renderer
-from alpasim_plugin.renderers.reconstruction import Exposures, ImportedRenderer
+from alpasim_plugin.renderers.reconstruction import ImportedRenderer, exposure_near
 from alpasim_plugin.renderers.recorded import posed_photograph
 from tests.renderers.recorded_drive import EXPOSURE, HIGH, SKY_LEVEL, WIDE, recorded_drive
 
@@ -102,12 +102,11 @@ def test_a_missing_photograph_is_named(drive: Scenario, tmp_path: Path) -> None:
 def test_exposure_follows_the_place_and_the_camera(drive: Scenario) -> None:
     one, other = drive.recording[0], drive.recording[8]
     recording = (replace(one, exposure=(1.0, 1.0, 1.0)), replace(other, exposure=(2.0, 1.0, 0.5)))
-    exposures = Exposures.of(recording)
-    assert np.allclose(exposures.near("front", one.T_world_camera[:3, 3]), 1.0, atol=1e-2)
+    assert np.allclose(exposure_near(recording, "front", one.T_world_camera[:3, 3]), 1.0, atol=1e-2)
     assert np.allclose(
-        exposures.near("front", other.T_world_camera[:3, 3]), [2.0, 1.0, 0.5], atol=1e-2
+        exposure_near(recording, "front", other.T_world_camera[:3, 3]), [2.0, 1.0, 0.5], atol=1e-2
     )
     assert np.allclose(
-        exposures.near("roof", other.T_world_camera[:3, 3]), [2.0, 1.0, 0.5], atol=1e-2
+        exposure_near(recording, "roof", other.T_world_camera[:3, 3]), [2.0, 1.0, 0.5], atol=1e-2
     )
-    assert np.allclose(Exposures.of(()).near("front", np.zeros(3)), 1.0)
+    assert np.allclose(exposure_near((), "front", np.zeros(3)), 1.0)

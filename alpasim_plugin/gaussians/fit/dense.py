@@ -224,10 +224,7 @@ def _agreed(views: Sequence[PosedView], maps: Sequence[DepthMap], i: int) -> Dep
     rows, columns = np.nonzero(depth)
     camera = views[i].camera
     z = depth[rows, columns].astype(np.float64)
-    local = np.stack(
-        [(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z],
-        axis=1,
-    )
+    local = camera.unprojected(rows, columns, z)
     confirmed, asked = np.zeros(len(z), bool), np.zeros(len(z), bool)
     for gap in GAPS:
         if 0 <= i + gap < len(views):
@@ -295,7 +292,7 @@ def _regions(view: PosedView) -> I32:
         )
         / 4
     )
-    smooth = (step < SMOOTH_LEVELS) & _above_horizon(view.camera)
+    smooth = (step < SMOOTH_LEVELS) & view.camera.above_horizon()
     if view.mask is not None:
         smooth &= view.mask
     _, label = cv2.connectedComponents(smooth.astype(np.uint8), connectivity=4)
@@ -328,11 +325,3 @@ def _of_colour(view: PosedView, label: I32, usual: F32) -> Bool:
                 (label == i) & (np.abs(view.rgb - middle).max(axis=2) < 1.5 * COLOUR_LEVELS)
             ).astype(np.uint8)
     return np.asarray(cv2.morphologyEx(out, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0)
-
-
-def _above_horizon(camera: PinholeCamera) -> Bool:
-    """Return which pixels ``(H, W)`` look up, towards +z of the world."""
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
-    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    up = camera.T_camera_world[:3, 2]
-    return np.asarray(x * up[0] + y * up[1] + up[2] > 0)

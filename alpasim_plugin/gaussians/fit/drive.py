@@ -158,24 +158,19 @@ def _of_one_camera(views: Sequence[PosedView]) -> tuple[list[PosedView], list[F3
         else 0.0
     )
     masks = sky_masks(measured) if way > LEAST_WAY_M else [None] * len(views)
-    gains = balances(views, tracks)
-    skies = [
-        mask if view.sky is None else view.sky for view, mask in zip(measured, masks, strict=True)
-    ]
-    free = [
-        view.depth
-        if sky is None or view.depth is None
-        else np.where(sky, np.float32(0), view.depth)
-        for view, sky in zip(measured, skies, strict=True)
-    ]
-    done = [
-        replace(view, sky=sky, depth=depth, gain=(float(r), float(g), float(b)))
-        for view, sky, depth, (r, g, b) in zip(measured, skies, free, gains, strict=True)
-    ]
-    guesses = [between_points(view.camera, tracks, placed, i) for i, view in enumerate(views)]
-    return done, [
-        None if q is None else np.asarray(1 / np.maximum(q, 1e-3), np.float32) for q in guesses
-    ]
+    done: list[PosedView] = []
+    guesses: list[F32 | None] = []
+    for i, (view, mask, gain) in enumerate(
+        zip(measured, masks, balances(views, tracks), strict=True)
+    ):
+        assert view.depth is not None
+        sky = mask if view.sky is None else view.sky
+        depth = view.depth if sky is None else np.where(sky, np.float32(0), view.depth)
+        red, green, blue = gain.tolist()
+        done.append(replace(view, sky=sky, depth=depth, gain=(red, green, blue)))
+        q = between_points(view.camera, tracks, placed, i)
+        guesses.append(None if q is None else np.asarray(1 / np.maximum(q, 1e-3), np.float32))
+    return done, guesses
 
 
 def _start(

@@ -190,12 +190,10 @@ def _sample(view: PosedView, count: int, rng: np.random.Generator, noise: bool =
     z = view.depth[rows, columns].astype(np.float64)
     if noise:
         z += rng.standard_normal(len(z)) * (RANGE_ERROR_M + RANGE_ERROR_SHARE * z)
-    camera = view.camera
-    local = np.stack(
-        [(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z],
-        axis=1,
-    )
-    return transform_points(inverse(camera.T_camera_world), local), view.rgb[rows, columns] / 255.0
+    local = view.camera.unprojected(rows, columns, z)
+    return transform_points(inverse(view.camera.T_camera_world), local), view.rgb[
+        rows, columns
+    ] / 255.0
 
 
 def _joined(parts: Sequence[_Points]) -> _Points:
