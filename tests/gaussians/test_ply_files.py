@@ -107,20 +107,13 @@ def test_trained_model_comes_back_byte_for_byte(train: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("percent", range(0, 100, 10))
-def test_trained_model_cut_short_is_refused_in_four_parts(
-    train: Path, tmp_path: Path, percent: int
-) -> None:
+def test_trained_model_cut_short_is_refused(train: Path, tmp_path: Path, percent: int) -> None:
     data = train.read_bytes()
     cut = tmp_path / "cut.ply"
     cut.write_bytes(data[: len(data) * percent // 100])
     with pytest.raises(InputError) as caught:
         read_ply(cut)
-    text = str(caught.value)
-    assert "cut.ply" in text
-    assert all(part in text for part in ("error: reading", "with:", "found:", "do:"))
-    if percent:
-        rows = (len(cut.read_bytes()) - (len(data) - 1000 * 248)) // 248
-        assert f"announces 1000 rows of 248 bytes, the file ends after {rows}" in text
+    assert "cut.ply" in str(caught.value)
 
 
 # --- round trips

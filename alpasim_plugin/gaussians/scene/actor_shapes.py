@@ -82,7 +82,7 @@ class Loft:
             top = half * (1 - self.tuck * lift)
             outline = [(half * 0.98, 0.6 * low), (half, low), (half, belt), (top, roof)]
             stations.append((self.x[i], outline))
-        for i, (top, glazed) in enumerate(zip(self.top, self.side_glass, strict=True)):
+        for i, (cover_kind, glazed) in enumerate(zip(self.top, self.side_glass, strict=True)):
             (a, before), (b, after) = stations[i : i + 2]
 
             for side in (1.0, -1.0):
