@@ -84,7 +84,6 @@ class Loft:
             stations.append((self.x[i], outline))
         for i, (cover_kind, glazed) in enumerate(zip(self.top, self.side_glass, strict=True)):
             (a, before), (b, after) = stations[i : i + 2]
-
             for side in (1.0, -1.0):
                 add(_flank(stations[i : i + 2], 1, side), body, 0.16)
                 add(_flank(stations[i : i + 2], 0, side), 0.35 * body, 0.0)
@@ -95,14 +94,11 @@ class Loft:
                     )
             (ra, ta), (rb, tb) = before[3], after[3]
             cover = [[b, -rb, tb], [a, -ra, ta], [a, ra, ta], [b, rb, tb]]
-            rgb, shine = {"glass": (glass, 0.30), "bed": (0.30 * body, 0.20), "body": (body, 0.20)}[
-                top
-            ]
-            add(cover, rgb, shine)
+            covers = {"glass": (glass, 0.30), "bed": (0.30 * body, 0.20), "body": (body, 0.20)}
+            add(cover, *covers[cover_kind])
         for i, sign in ((0, 1.0), (last, -1.0)):
             (w, _), (_, belt), (roof_half, roof) = stations[i][1][1:]
             belt, x = min(belt, roof), self.x[i]
-
             add(_end(x, sign, (w, low), (w, belt)), body, 0.12)
             if roof - belt > 0.05:
                 glazed = sign > 0 or self.rear_glass
