@@ -266,9 +266,11 @@ class GaussianCloud:
         if not clouds:
             return GaussianCloud.empty()
         size = max(cloud.sh.shape[1] for cloud in clouds)
-        sh = [np.pad(c.sh, ((0, 0), (0, size - c.sh.shape[1]), (0, 0))) for c in clouds]
-        columns = zip(*((c.means, c.quats, c.scales, c.opacities) for c in clouds), strict=True)
-        return GaussianCloud(*map(np.concatenate, columns), np.concatenate(sh))
+        rows = []
+        for c in clouds:
+            sh = np.pad(c.sh, ((0, 0), (0, size - c.sh.shape[1]), (0, 0)))
+            rows.append((c.means, c.quats, c.scales, c.opacities, sh))
+        return GaussianCloud(*(np.concatenate(column) for column in zip(*rows, strict=True)))
 
 
 def quat_multiply(a: F64, b: F64) -> F64:
