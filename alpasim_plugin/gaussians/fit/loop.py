@@ -234,7 +234,8 @@ class SplatFit:
         turn, i = divmod(self.step, len(self.targets))
         begins = self.step < self.recipe.coarse_share * self.recipe.steps
         rng = stream(self.scene_id, self.recipe.seed, "fit.order", turn)
-        return (self.coarse if begins else self.targets)[rng.permutation(len(self.targets))[i]]
+        chosen = int(rng.permutation(len(self.targets))[i])
+        return (self.coarse if begins else self.targets)[chosen]
 
     def _rates(self) -> dict[str, float]:
         r = self.recipe

@@ -134,7 +134,8 @@ class SplatModel:
         )
         moving = still + torch.nonzero(motion.present[self.node[still:]])[:, 0]
         if not len(moving):
-            return Splats(*(p[name][:still] for name in NAMES[:4]), sh[:still]), torch.arange(still)
+            parts = [*(p[name][:still] for name in NAMES[:4]), sh[:still]]
+            return Splats(*parts), torch.arange(still)
         node = self.node[moving]
         means = (
             torch.einsum("nij,nj->ni", motion.rotation[node], p["means"][moving])
