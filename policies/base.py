@@ -21,6 +21,15 @@ from alpasim_plugin.core.types import F64, I64, CameraSpec, Frame, Observation, 
 PLAN_HORIZON_S = 5.0
 PLAN_STEP_US = 100_000
 
+MIN_CRUISE_MPS = 6.0  # where the drive begins at standstill there is no speed to keep
+MAX_LATERAL_MPS2 = 2.5  # comfort in curves
+MIN_LOOKAHEAD_M = 3.0
+CUT_M = 0.15
+LOOKAHEAD_S = 0.7
+SMOOTH_S = 0.8
+MAX_CURVATURE_1PM = 0.2  # turning radius 5 m
+MAX_PURSUIT_MPS2 = 4.0  # a target far to the side is met no harder than this
+
 
 def make_policy(name: str, scenario: Scenario) -> Policy:
     """Return a policy for a scenario.
@@ -94,16 +103,6 @@ def camera_frame(observation: Observation, camera: CameraSpec, policy: str) -> F
             "render the cameras that the policy names in `sensors`, at the scenario's size",
         )
     return frame
-
-
-MIN_CRUISE_MPS = 6.0  # where the drive begins at standstill there is no speed to keep
-MAX_LATERAL_MPS2 = 2.5  # comfort in curves
-MIN_LOOKAHEAD_M = 3.0
-CUT_M = 0.15
-LOOKAHEAD_S = 0.7
-SMOOTH_S = 0.8
-MAX_CURVATURE_1PM = 0.2  # turning radius 5 m
-MAX_PURSUIT_MPS2 = 4.0  # a target far to the side is met no harder than this
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,15 @@ COMMANDS: tuple[Command, ...] = get_args(Command)
 TURN_RADIUS_M = 28.0  # tighter curves are turns and are announced; wider ones belong to the road
 AHEAD_M, NOW_M = 40.0, 6.0
 
+WIDTH, HEIGHT = 192, 80  # pixels
+FOCAL_PX = 125.0  # 75 degrees across
+HORIZON_ROW = 18.0
+CHANNELS = 4  # red, green, blue now; brightness of an earlier frame
+MEAN, STD = 115.0, 64.0  # grey levels
+_K = np.array([[FOCAL_PX, 0.0, WIDTH / 2], [0.0, FOCAL_PX, HORIZON_ROW], [0.0, 0.0, 1.0]])
+_RIG_FROM_LEVEL_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_GREY = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
+
 
 def route_command(route_rig: F64, late_m: float = 0.0) -> Command:
     """Return the command for a route ahead ``(20, 3)`` in the rig frame, NaN where it ends.
@@ -48,17 +57,6 @@ def route_command(route_rig: F64, late_m: float = 0.0) -> Command:
     if bend[first] > 0:
         return "left-now" if now else "left-ahead"
     return "right-now" if now else "right-ahead"
-
-
-WIDTH, HEIGHT = 192, 80  # pixels
-FOCAL_PX = 125.0  # 75 degrees across
-HORIZON_ROW = 18.0
-CHANNELS = 4  # red, green, blue now; brightness of an earlier frame
-MEAN, STD = 115.0, 64.0  # grey levels
-
-_K = np.array([[FOCAL_PX, 0.0, WIDTH / 2], [0.0, FOCAL_PX, HORIZON_ROW], [0.0, 0.0, 1.0]])
-_RIG_FROM_LEVEL_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-_GREY = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 
 
 def view_homography(camera: CameraSpec, yaw_rad: float = 0.0) -> F64:

@@ -21,6 +21,15 @@ HALF_WIDTH_M = 8.0
 CELL_M = 0.05
 MAX_ROWS = 72
 
+PAINT_WIDTH_M = 0.15
+MIN_CONTRAST = 7.0  # grey levels
+NOISE_FACTOR = 4.0
+BAR_M = (0.4, 2.3)  # how far bars of a crosswalk stand from the next and the next but one
+SIDE_NOT_ROAD = 0.8
+BAR_HALF_M = 0.45
+CROSSWALK_M = 2.5  # wider than a car, whose lights and plate are bright spots in a row as well
+MERGE_M = 0.3  # ridges closer than this are one line (both strokes of a double line)
+
 
 @dataclass(frozen=True)
 class GroundGrid:
@@ -135,16 +144,6 @@ def _project(camera: CameraSpec, T_camera_rig: F64, points: F64) -> F64:
     z = np.where(at[:, 2] > 0.1, at[:, 2], np.nan)
     uvw = at @ camera.K.T
     return np.asarray(uvw[:, :2] / z[:, None] - 0.5)
-
-
-PAINT_WIDTH_M = 0.15
-MIN_CONTRAST = 7.0  # grey levels
-NOISE_FACTOR = 4.0
-BAR_M = (0.4, 2.3)  # how far bars of a crosswalk stand from the next and the next but one
-SIDE_NOT_ROAD = 0.8
-BAR_HALF_M = 0.45
-CROSSWALK_M = 2.5  # wider than a car, whose lights and plate are bright spots in a row as well
-MERGE_M = 0.3  # ridges closer than this are one line (both strokes of a double line)
 
 
 @dataclass(frozen=True)

@@ -64,6 +64,36 @@ KINDS = {"VEHICLE": "vehicle", "BIKE": "bike", "BUS": "bus"}
 RASTER_BLOCK = 5
 GROUND_CELL_M = 1.5
 
+EGO_CATEGORY = "EGO_VEHICLE"
+# Ford Fusion Hybrid of the recording fleet; size as annotated in logs that carry EGO_VEHICLE rows.
+VEHICLE = Vehicle(box=Box(4.877, 2.0, 1.473), rear_axle_to_centre_m=1.422, wheelbase_m=2.85)
+# The recorded frame sits in the rear axle, one wheel radius above the road: measured against the
+# ground rasters of three logs the median height is 0.324, 0.324 and 0.321 m.
+WHEEL_RADIUS_M = 0.33
+POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_NUMBERS: dict[str, Kind] = dict.fromkeys(POSE, "number")
+_CATEGORIES = {
+    "car": "REGULAR_VEHICLE",
+    "truck": "LARGE_VEHICLE BOX_TRUCK TRUCK TRUCK_CAB VEHICULAR_TRAILER",
+    "bus": "BUS ARTICULATED_BUS SCHOOL_BUS",
+    "pedestrian": "PEDESTRIAN OFFICIAL_SIGNALER WHEELCHAIR",
+    "cyclist": "BICYCLE BICYCLIST WHEELED_RIDER",
+    "motorcycle": "MOTORCYCLE MOTORCYCLIST",
+    "other": "RAILED_VEHICLE ANIMAL DOG STROLLER WHEELED_DEVICE MESSAGE_BOARD_TRAILER TRAFFIC_LIGHT_TRAILER BOLLARD "
+    "CONSTRUCTION_BARREL CONSTRUCTION_CONE MOBILE_PEDESTRIAN_CROSSING_SIGN SIGN STOP_SIGN",
+}
+LABELS = {category: label for label, names in _CATEGORIES.items() for category in names.split()}
+FIXED = frozenset(
+    {
+        "BOLLARD",
+        "CONSTRUCTION_BARREL",
+        "CONSTRUCTION_CONE",
+        "MOBILE_PEDESTRIAN_CROSSING_SIGN",
+        "SIGN",
+        "STOP_SIGN",
+    }
+)
+
 
 def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tuple[str, ...]]:
     """Read ``log_map_archive_*.json`` into a lane map around ``origin (3,)``, with notes on what
@@ -249,37 +279,6 @@ def _same_way_neighbours(lane: Lane, lanes: dict[str, Lane]) -> Lane:
 
     left, right = keep(str(lane.left_neighbour)), keep(str(lane.right_neighbour))
     return replace(lane, left_neighbour=left, right_neighbour=right)
-
-
-EGO_CATEGORY = "EGO_VEHICLE"
-# Ford Fusion Hybrid of the recording fleet; size as annotated in logs that carry EGO_VEHICLE rows.
-VEHICLE = Vehicle(box=Box(4.877, 2.0, 1.473), rear_axle_to_centre_m=1.422, wheelbase_m=2.85)
-# The recorded frame sits in the rear axle, one wheel radius above the road: measured against the
-# ground rasters of three logs the median height is 0.324, 0.324 and 0.321 m.
-WHEEL_RADIUS_M = 0.33
-POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-_NUMBERS: dict[str, Kind] = dict.fromkeys(POSE, "number")
-_CATEGORIES = {
-    "car": "REGULAR_VEHICLE",
-    "truck": "LARGE_VEHICLE BOX_TRUCK TRUCK TRUCK_CAB VEHICULAR_TRAILER",
-    "bus": "BUS ARTICULATED_BUS SCHOOL_BUS",
-    "pedestrian": "PEDESTRIAN OFFICIAL_SIGNALER WHEELCHAIR",
-    "cyclist": "BICYCLE BICYCLIST WHEELED_RIDER",
-    "motorcycle": "MOTORCYCLE MOTORCYCLIST",
-    "other": "RAILED_VEHICLE ANIMAL DOG STROLLER WHEELED_DEVICE MESSAGE_BOARD_TRAILER TRAFFIC_LIGHT_TRAILER BOLLARD "
-    "CONSTRUCTION_BARREL CONSTRUCTION_CONE MOBILE_PEDESTRIAN_CROSSING_SIGN SIGN STOP_SIGN",
-}
-LABELS = {category: label for label, names in _CATEGORIES.items() for category in names.split()}
-FIXED = frozenset(
-    {
-        "BOLLARD",
-        "CONSTRUCTION_BARREL",
-        "CONSTRUCTION_CONE",
-        "MOBILE_PEDESTRIAN_CROSSING_SIGN",
-        "SIGN",
-        "STOP_SIGN",
-    }
-)
 
 
 @dataclass(frozen=True)

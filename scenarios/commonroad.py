@@ -56,6 +56,9 @@ HEIGHTS_M = {
     "other": 1.5,
 }
 
+VERSIONS = ("2018b", "2020a")
+DEFAULT = Vehicle()
+
 
 @dataclass(frozen=True)
 class Obstacle:
@@ -206,10 +209,6 @@ def _rectangle(
 def _centre(files: SourceFiles, where: str, part: Element) -> tuple[float, float]:
     centre = part.find("center")
     return (0.0, 0.0) if centre is None else point(files, where, centre)[:2]
-
-
-VERSIONS = ("2018b", "2020a")
-DEFAULT = Vehicle()
 
 
 def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:

@@ -16,6 +16,8 @@ from alpasim_plugin.core.types import F64, I64, Box, Trajectory
 from alpasim_plugin.world.path import Path, smooth_path, smoothstep
 from alpasim_plugin.world.roads import Road
 
+STEP_US = 50_000  # a 20 Hz track: linear interpolation errs by less than 3 mm at 7 m/s^2
+
 
 @dataclass(frozen=True)
 class LaneChange:
@@ -198,9 +200,6 @@ def _follow(road: Road, lane_id: str) -> list[str]:
             break
         out.append(following)
     return out
-
-
-STEP_US = 50_000  # a 20 Hz track: linear interpolation errs by less than 3 mm at 7 m/s^2
 
 
 def grid(start_us: int, end_us: int, step_us: int = STEP_US) -> I64:

@@ -37,6 +37,16 @@ HORIZON_M = 80.0
 SIDE_M = 0.3
 STANDING_M = 0.05  # a track that never moves farther than this stands
 
+LOG_STEP_US = 10_000  # 100 Hz
+DECISION_US = 50_000
+LOOKAHEAD_US = 100_000
+MAX_ACCEL_MPS2 = 2.0
+MAX_BRAKE_MPS2 = 7.0
+MAX_JERK_MPS3 = 10.0
+STOP_JERK_MPS3 = 5.0
+COMFORT_BRAKE_MPS2 = 1.5
+MIN_GAP_M = 2.5
+
 
 class ScriptedTracks:
     """Poses of all scripted tracks on a time grid; those that never move apart.
@@ -165,17 +175,6 @@ def yielding_acceleration(
         return float("inf")
     allowed = rear - (min_gap_m + 0.5 * speed) - front_s - speed_mps * tau
     return float(np.min(2.0 * allowed[counts] / np.broadcast_to(tau, counts.shape)[counts] ** 2))
-
-
-LOG_STEP_US = 10_000  # 100 Hz
-DECISION_US = 50_000
-LOOKAHEAD_US = 100_000
-MAX_ACCEL_MPS2 = 2.0
-MAX_BRAKE_MPS2 = 7.0
-MAX_JERK_MPS3 = 10.0
-STOP_JERK_MPS3 = 5.0
-COMFORT_BRAKE_MPS2 = 1.5
-MIN_GAP_M = 2.5
 
 
 @dataclass(frozen=True)

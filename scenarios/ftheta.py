@@ -23,6 +23,11 @@ FRONT_WIDE = "camera_front_wide_120fov"
 WIDTH, HEIGHT = 512, 288  # rendered size; the recorded frames are 1920 x 1080
 HORIZONTAL_FOV_RAD = np.pi / 2
 
+TABLES = tuple(f"{folder}/calibration_estimate.parquet" for folder in ("clipgt", "map_data"))
+# Columns: camera x (right), y (down), z (forward) seen in the sensor's axes forward, left, up.
+FLU_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+DEGREE = 5  # of the polynomial, as in the calibrations of AlpaSim's scenes
+
 
 @dataclass(frozen=True)
 class RecordedLens:
@@ -108,11 +113,6 @@ def orthonormal(transform: F64) -> F64:
     return out
 
 
-TABLES = tuple(f"{folder}/calibration_estimate.parquet" for folder in ("clipgt", "map_data"))
-# Columns: camera x (right), y (down), z (forward) seen in the sensor's axes forward, left, up.
-FLU_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-
-
 def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...]]:
     """Return the front wide camera where the scene holds its calibration, with notes.
 
@@ -187,9 +187,6 @@ def _rotation(roll_pitch_yaw_deg: Any) -> F64:
     y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     return np.asarray(z @ y @ x)
-
-
-DEGREE = 5  # of the polynomial, as in the calibrations of AlpaSim's scenes
 
 
 def calibration_table(cameras: Mapping[str, CameraSpec], clip_id: str) -> bytes:

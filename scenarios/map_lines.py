@@ -25,6 +25,13 @@ from alpasim_plugin.core.types import F64, Lane, LaneMap
 
 MAX_STEP_M = 2.0
 
+NO_LANES_OF_CARS = (
+    "sidewalk",
+)  # every other kind counts: without shoulders the distance to the lane boundary is half a metre off
+SEAM_M = 0.1  # neighbouring areas drawn with gaps up to this wide are one surface
+MIN_HOLE_M2 = 0.5  # smaller holes are seams too
+STEP_M = 2.0  # AlpaSim's loaders keep the vertices of edges at most this far apart
+
 
 def lane_edges(lanes: Mapping[str, Lane]) -> list[F64]:
     """Return the edges ``(N, 3)`` that lanes have, left before right, lane by lane."""
@@ -67,11 +74,6 @@ def with_vertices(line: F64) -> F64:
     points = line[segment] + (segments / pieces[:, None])[segment] * nth[:, None]
     points[nth == pieces[segment]] = line[1:]
     return np.concatenate([line[:1], points])
-
-
-NO_LANES_OF_CARS = (
-    "sidewalk",
-)  # every other kind counts: without shoulders the distance to the lane boundary is half a metre off
 
 
 def alpasim_view(lane_map: LaneMap) -> LaneMap:
@@ -137,11 +139,6 @@ def _beside(centre: F64, left_m: float) -> F64:
     out = centre.copy()
     out[:, :2] += left_m * np.stack([-along[:, 1], along[:, 0]], axis=1)
     return out
-
-
-SEAM_M = 0.1  # neighbouring areas drawn with gaps up to this wide are one surface
-MIN_HOLE_M2 = 0.5  # smaller holes are seams too
-STEP_M = 2.0  # AlpaSim's loaders keep the vertices of edges at most this far apart
 
 
 def merge_areas(areas: Sequence[Any], seam_m: float = SEAM_M) -> Any:

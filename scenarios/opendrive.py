@@ -36,6 +36,34 @@ from scenarios.opendrive_road import (
 )
 from scenarios.recorded import SourceFiles
 
+# WGS 84 ellipsoid (NIMA TR8350.2).
+SEMI_MAJOR_M = 6378137.0
+FLATTENING = 1.0 / 298.257223563
+STEP_M = 0.5  # stations on bends and where widths change
+STRAIGHT_STEP_M = 2.0
+MAX_ASIDE_M = ASIDE_M.high
+MIN_WIDTH_M = 0.1  # lanes that never reach this width are ignored
+KINDS = {
+    **dict.fromkeys(
+        (
+            "driving",
+            "entry",
+            "exit",
+            "onRamp",
+            "offRamp",
+            "connectingRamp",
+            "slipLane",
+            "bidirectional",
+        ),
+        "vehicle",
+    ),
+    **dict.fromkeys(("bus", "taxi", "HOV"), "bus"),
+    **dict.fromkeys(("shoulder", "stop"), "shoulder"),
+    "biking": "bike",
+    "parking": "parking",
+}
+_SOLID = ("solid", "solid solid", "solid broken", "broken solid")
+
 
 def following(odr: OdrMap, lanes: Mapping[str, Lane]) -> dict[str, Lane]:
     """Return the lanes with their successors in driving direction; links to lanes that are not in
@@ -87,11 +115,6 @@ def _ahead(
     if target is None:
         return []
     return [lane_key(target, 0 if link.at_start else len(target.sections) - 1, i) for i in linked]
-
-
-# WGS 84 ellipsoid (NIMA TR8350.2).
-SEMI_MAJOR_M = 6378137.0
-FLATTENING = 1.0 / 298.257223563
 
 
 def T_local_map(geo_reference: str, T_earth_local: F64) -> F64:
@@ -158,32 +181,6 @@ def T_enu_earth(lat_deg: float, lon_deg: float, height_m: float) -> F64:
     out[:3, :3] = [east, north, up]
     out[:3, 3] = -out[:3, :3] @ place
     return out
-
-
-STEP_M = 0.5  # stations on bends and where widths change
-STRAIGHT_STEP_M = 2.0
-MAX_ASIDE_M = ASIDE_M.high
-MIN_WIDTH_M = 0.1  # lanes that never reach this width are ignored
-KINDS = {
-    **dict.fromkeys(
-        (
-            "driving",
-            "entry",
-            "exit",
-            "onRamp",
-            "offRamp",
-            "connectingRamp",
-            "slipLane",
-            "bidirectional",
-        ),
-        "vehicle",
-    ),
-    **dict.fromkeys(("bus", "taxi", "HOV"), "bus"),
-    **dict.fromkeys(("shoulder", "stop"), "shoulder"),
-    "biking": "bike",
-    "parking": "parking",
-}
-_SOLID = ("solid", "solid solid", "solid broken", "broken solid")
 
 
 def lane_map_of(

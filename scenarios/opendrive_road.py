@@ -26,6 +26,16 @@ KINDS: tuple[Kind, ...] = ("line", "arc", "spiral", "poly3", "paramPoly3")
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
 _TABLE = 257  # stations at which a cubic's arc length is tabulated before it is inverted
 
+MAX_ROAD_M = MAP_ROAD_M.high
+_ABCD = ("a", "b", "c", "d")
+_PARAMETERS = {
+    "line": (),
+    "arc": ("curvature",),
+    "spiral": ("curvStart", "curvEnd"),
+    "poly3": _ABCD,
+    "paramPoly3": tuple(f"{k}{axis}" for axis in "UV" for k in _ABCD),
+}
+
 
 @dataclass(frozen=True)
 class Cubic:
@@ -145,17 +155,6 @@ def beside(line: F64, t_m: F64) -> F64:
     return np.column_stack(
         [line[:, 0] - t_m * np.sin(line[:, 2]), line[:, 1] + t_m * np.cos(line[:, 2])]
     )
-
-
-MAX_ROAD_M = MAP_ROAD_M.high
-_ABCD = ("a", "b", "c", "d")
-_PARAMETERS = {
-    "line": (),
-    "arc": ("curvature",),
-    "spiral": ("curvStart", "curvEnd"),
-    "poly3": _ABCD,
-    "paramPoly3": tuple(f"{k}{axis}" for axis in "UV" for k in _ABCD),
-}
 
 
 @dataclass(frozen=True)

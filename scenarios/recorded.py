@@ -41,6 +41,15 @@ from alpasim_plugin.core.types import (
 
 MAX_REACH_M = COORDINATE_M.high
 
+MAX_GAP_US = 500_000  # a track is not interpolated across a longer hole: it becomes two actors
+STATIC_REACH_M = {
+    "pedestrian": 0.5,
+    "cyclist": 0.5,
+    "motorcycle": 0.75,
+}  # largest distance from the median position
+STATIC_REACH_DEFAULT_M = 1.0  # annotated boxes of far parked cars drift by up to 0.8 m in 15 s
+STATIC_SPEED_MPS = 0.3
+
 
 class SourceFiles:
     """Reads the files of one recorded log and hashes what it read.
@@ -189,16 +198,6 @@ class RecordedLog:
     recording: tuple[Photograph, ...] = ()  # see `Scenario.recording`
     model: str | None = None  # see `Scenario.model`
     standing: Standing = "known"
-
-
-MAX_GAP_US = 500_000  # a track is not interpolated across a longer hole: it becomes two actors
-STATIC_REACH_M = {
-    "pedestrian": 0.5,
-    "cyclist": 0.5,
-    "motorcycle": 0.75,
-}  # largest distance from the median position
-STATIC_REACH_DEFAULT_M = 1.0  # annotated boxes of far parked cars drift by up to 0.8 m in 15 s
-STATIC_SPEED_MPS = 0.3
 
 
 def checked_trajectory(

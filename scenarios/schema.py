@@ -17,6 +17,12 @@ from scenarios.schema_parts import ActorSpec, BuildingHeight, LogSpec, Part, Roa
 SCHEMA_FILE = Path(__file__).with_name("schema.json")
 DEFAULT_DURATION_US = 8_000_000  # of the drive on a built road
 
+DEGRADATION_KEYS = {
+    "reconstruction": ("share", "views_per_s", "depth_error", "pose_error_m"),
+    "cycle": ("share", "shift_m", "views_per_s", "depth_error", "pose_error_m"),
+    "none": (),
+}
+
 
 class LaneChangeSpec(Part):
     """A lane change of the ego."""
@@ -205,13 +211,6 @@ class DegradationSpec(Part):
                     f"{found}, to which it means nothing | say kind: {' or '.join(kinds)}, or remove {name}"
                 )
         return self
-
-
-DEGRADATION_KEYS = {
-    "reconstruction": ("share", "views_per_s", "depth_error", "pose_error_m"),
-    "cycle": ("share", "shift_m", "views_per_s", "depth_error", "pose_error_m"),
-    "none": (),
-}
 
 
 class BackgroundSpec(Part):

@@ -11,6 +11,17 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from alpasim_plugin.core import limits as b
 
+Angle = Annotated[float, Field(ge=-1e4, le=1e4)]  # radians, not wrapped
+Turn = Literal["left", "straight", "right"]
+CentrePaint = Literal[
+    "double_yellow", "solid_yellow", "dashed_yellow", "dashed_white", "solid_white", "none"
+]
+SHIPPED = ("argoverse", "commonroad", "drive", "usdz")
+Label = Literal["car", "truck", "bus", "motorcycle", "cyclist", "pedestrian", "other"]
+ActorId = Annotated[
+    str, Field(max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", description="Unique name.")
+]
+
 
 def within(bound: b.Bound, description: str | None = None, default: Any = ...) -> Any:
     """Return the field of a number within a bound, which is required without a default; alone, the
@@ -24,19 +35,12 @@ Side = Annotated[float, within(b.BODY_M)]  # of a body
 Speed = Annotated[float, within(b.SPEED_MPS)]
 Moment = Annotated[float, within(b.MOMENT_S)]
 Coordinate = Annotated[float, within(b.COORDINATE_M)]
-Angle = Annotated[float, Field(ge=-1e4, le=1e4)]  # radians, not wrapped
 
 
 class Part(BaseModel):
     """A section: frozen, and no key that the schema does not know."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-Turn = Literal["left", "straight", "right"]
-CentrePaint = Literal[
-    "double_yellow", "solid_yellow", "dashed_yellow", "dashed_white", "solid_white", "none"
-]
 
 
 class StraightSegment(Part):
@@ -181,9 +185,6 @@ class RoadSpec(Part):
     )
 
 
-SHIPPED = ("argoverse", "commonroad", "drive", "usdz")
-
-
 class LogSpec(Part):
     """A recorded drive. Exactly one of the sources is given; relative paths start at this file's
     folder.
@@ -233,12 +234,6 @@ class LogSpec(Part):
             return self.source, str(self.path), "path"
         (kind,) = (kind for kind in SHIPPED if getattr(self, kind) is not None)
         return kind, str(getattr(self, kind)), kind
-
-
-Label = Literal["car", "truck", "bus", "motorcycle", "cyclist", "pedestrian", "other"]
-ActorId = Annotated[
-    str, Field(max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", description="Unique name.")
-]
 
 
 class _Actor(Part):

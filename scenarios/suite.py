@@ -24,6 +24,8 @@ from scenarios.sources import source_of
 
 LIBRARY = Path(__file__).resolve().parent
 
+MOST_SUITES = 256  # read for one argument, through suites of suites
+
 
 def shipped_names() -> dict[str, Path]:
     """Return the shipped scenarios: name without ending, to file. Suites are not among them."""
@@ -88,9 +90,6 @@ def unknown(text: str, kind: str, names: Mapping[str, Path]) -> InputError:
     return InputError(
         f"{text}: {found}", f"{hint}give a path, or a name that 'simrun list scenarios' shows"
     )
-
-
-MOST_SUITES = 256  # read for one argument, through suites of suites
 
 
 @dataclass(frozen=True)

@@ -63,6 +63,13 @@ LABELS = (
     ("vehicle", "car"),
 )
 
+STEP_M = 0.5
+CROSSING_M = 0.2  # an edge nearer than this to a lane centre crosses it
+LANE_STRIDE = 3
+SAME_MIDDLE_M = 2.0
+PARALLEL_RAD = math.radians(11.0)
+LONE_EDGE_M = 0.01
+
 
 @dataclass(frozen=True)
 class RoadMap:
@@ -357,14 +364,6 @@ def label_of(text: str) -> str:
         ('truck', 'pedestrian', 'other')
     """
     return next((label for word, label in LABELS if word in text.lower()), "other")
-
-
-STEP_M = 0.5
-CROSSING_M = 0.2  # an edge nearer than this to a lane centre crosses it
-LANE_STRIDE = 3
-SAME_MIDDLE_M = 2.0
-PARALLEL_RAD = math.radians(11.0)
-LONE_EDGE_M = 0.01
 
 
 def alpasim_map(odr: OdrMap, T_local_map: F64) -> LaneMap:

@@ -32,6 +32,25 @@ FOLDERS = ("map_data", "clipgt", "fastmap")  # the first usable one counts
 TABLES = ("lane", "association", "road_boundary", "clip", "traffic_sign", "wait_line")
 SIGN = Box(0.1, 0.75, 0.75)  # the table has no size
 
+_XYZ = pa.struct([("x", pa.float64()), ("y", pa.float64()), ("z", pa.float64())])
+_LINE = pa.list_(_XYZ)
+_KEY = pa.struct(
+    [
+        (name, pa.string())
+        for name in ("clip_id", "label_class_id", "map_id", "map_id_version", "kind")
+    ]
+)
+_OWN = {
+    "lane": pa.struct([("left_rail", _LINE), ("right_rail", _LINE)]),
+    "association": pa.struct([("subjects", pa.string()), ("objects", pa.list_(pa.string()))]),
+    "road_boundary": pa.struct([("location", _LINE)]),
+    "clip": pa.struct([("label_class_id", pa.string())]),
+    "traffic_sign": pa.struct([("center", _XYZ), ("category", pa.string())]),
+    "wait_line": pa.struct(
+        [("location", _LINE), ("category", pa.string()), ("is_implicit", pa.bool_())]
+    ),
+}
+
 
 def clipgt_map(archive: Archive) -> tuple[LaneMap | None, tuple[str, ...]]:
     """Return the lane map of the first usable folder of tables, with notes; None where there is
@@ -210,26 +229,6 @@ def _sign(archive: Archive, row: _Row) -> tuple[F64, Box] | None:
     pose = np.eye(4)
     pose[:3, 3] = points(archive, row.where, [centre])[0]
     return pose, SIGN
-
-
-_XYZ = pa.struct([("x", pa.float64()), ("y", pa.float64()), ("z", pa.float64())])
-_LINE = pa.list_(_XYZ)
-_KEY = pa.struct(
-    [
-        (name, pa.string())
-        for name in ("clip_id", "label_class_id", "map_id", "map_id_version", "kind")
-    ]
-)
-_OWN = {
-    "lane": pa.struct([("left_rail", _LINE), ("right_rail", _LINE)]),
-    "association": pa.struct([("subjects", pa.string()), ("objects", pa.list_(pa.string()))]),
-    "road_boundary": pa.struct([("location", _LINE)]),
-    "clip": pa.struct([("label_class_id", pa.string())]),
-    "traffic_sign": pa.struct([("center", _XYZ), ("category", pa.string())]),
-    "wait_line": pa.struct(
-        [("location", _LINE), ("category", pa.string()), ("is_implicit", pa.bool_())]
-    ),
-}
 
 
 def map_tables(lane_map: LaneMap, clip_id: str) -> dict[str, bytes]:

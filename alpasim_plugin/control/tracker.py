@@ -30,6 +30,25 @@ from alpasim_plugin.core.types import F64, EgoState, Trajectory, Vehicle
 
 GENTLE_BRAKE_MPS2 = 2.0  # what a vehicle without a plan does
 
+MIN_SPACING_M = 0.25  # closer poses say nothing about the path's direction
+_SEARCHED = np.arange(41.0)
+MAX_LATERAL_MPS2 = 8.0  # beyond it tyres slip and a kinematic bicycle is no model of a car
+CONTROL_S = 0.05  # how often the law looks again within one call
+NODES = 20
+NODE_S = 0.1
+BANDWIDTH_RADPS = 2.5
+MIN_PREVIEW_MPS = 5.0  # below it the nodes stay this speed's distance apart: 10 m of preview
+GAUSS_NEWTON_STEPS = 2
+PREVIEW_S = np.linspace(0.2, 0.8, 4)
+HOLD_SPEED_MPS = 0.5
+HOLD_MOVE_M = 0.3  # a plan that moves less than this in HOLD_S is a stop
+HOLD_S = 2.0
+_BEFORE = np.tril(
+    np.ones((NODES, NODES)), -1
+)  # d steer at the start of step k / d change in step j
+_MIDDLE = _BEFORE + 0.5 * np.eye(NODES)
+_UP_TO = np.tril(np.ones((NODES, NODES), dtype=bool))
+
 
 def check_interval(state: EgoState, to_us: int) -> float:
     """Return the seconds from the state to ``to_us``; raise InputError unless they are positive."""
@@ -96,10 +115,6 @@ class PerfectController(Controller):
             else state.steer_rad
         )
         return EgoState(to_us, pose, speed, (speed - state.speed_mps) / dt_s, yaw_rate, steer)
-
-
-MIN_SPACING_M = 0.25  # closer poses say nothing about the path's direction
-_SEARCHED = np.arange(41.0)
 
 
 @dataclass(frozen=True)
@@ -192,25 +207,6 @@ def build_reference_path(plan: Trajectory, t_us: int, origin_xy: F64) -> Referen
     elif sign < 0:
         path_s, path_xy = path_s[::-1], path_xy[::-1]
     return ReferencePath((plan.t_us - t_us).astype(np.float64) * 1e-6, s, path_s, path_xy)
-
-
-MAX_LATERAL_MPS2 = 8.0  # beyond it tyres slip and a kinematic bicycle is no model of a car
-CONTROL_S = 0.05  # how often the law looks again within one call
-NODES = 20
-NODE_S = 0.1
-BANDWIDTH_RADPS = 2.5
-MIN_PREVIEW_MPS = 5.0  # below it the nodes stay this speed's distance apart: 10 m of preview
-GAUSS_NEWTON_STEPS = 2
-PREVIEW_S = np.linspace(0.2, 0.8, 4)
-HOLD_SPEED_MPS = 0.5
-HOLD_MOVE_M = 0.3  # a plan that moves less than this in HOLD_S is a stop
-HOLD_S = 2.0
-
-_BEFORE = np.tril(
-    np.ones((NODES, NODES)), -1
-)  # d steer at the start of step k / d change in step j
-_MIDDLE = _BEFORE + 0.5 * np.eye(NODES)
-_UP_TO = np.tril(np.ones((NODES, NODES), dtype=bool))
 
 
 class PlanTracker(Controller):

@@ -28,6 +28,8 @@ _COPY_AGAIN = (
     "copy the log again from where it was written; nothing after this point can be trusted"
 )
 
+Stage = Callable[[logging_pb2.LogEntry], Iterable[logging_pb2.LogEntry]]
+
 
 @dataclass(frozen=True)
 class TruncatedTail:
@@ -260,9 +262,6 @@ class Renaming:
                 if old in self.cameras:
                     setattr(holder, name, self.cameras[old])
         return [entry]
-
-
-Stage = Callable[[logging_pb2.LogEntry], Iterable[logging_pb2.LogEntry]]
 
 
 def copy_log(source: Path, target: Path, *stages: Stage) -> int:

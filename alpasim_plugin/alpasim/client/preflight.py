@@ -21,7 +21,8 @@ from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.log.wire import egodriver_pb2
 
 LIMIT_S = 0.1  # of a drive call, in the public challenge
-HORIZON_US, MINADE_US = 2_000_000, 5_000_000  # what AlpaSim's controller needs, and its evaluation
+HORIZON_US = 2_000_000  # what AlpaSim's controller needs
+MINADE_US = 5_000_000  # what its evaluation needs
 Result = Literal["passed", "failed", "noted"]
 
 
@@ -111,56 +112,36 @@ def findings(
         warmup_steps: Queries in which empty plans are accepted.
         limit_s: Of a drive call.
     """
-    out = [
-        Finding(
-            "a session from start to close",
-            "failed" if failed else "passed",
-            failed.message if failed else "answered throughout",
-        )
-    ]
+    out: list[Finding] = []
+
+    def add(name: str, is_failed: bool, text: str) -> None:
+        out.append(Finding(name, "failed" if is_failed else "passed", text))
+
+    session = failed.message if failed else "answered throughout"
+    add("a session from start to close", failed is not None, session)
     if times.seconds:
         ms = np.array(times.seconds) * 1000
         over = int((ms > limit_s * 1000).sum())
-        text = f"p50 {np.percentile(ms, 50):.1f} ms, p95 {np.percentile(ms, 95):.1f} ms, longest {ms.max():.1f} ms; {over} of {len(ms)} over"
-        out.append(
-            Finding(
-                f"a drive call within {limit_s * 1000:.0f} ms", "failed" if over else "passed", text
-            )
-        )
-    text = "; ".join(f"{kind} ({example})" for kind, example in times.problems.items())
-    out.append(
-        Finding(
-            "the shape of plans",
-            "failed" if text else "passed",
-            text or "first pose now, times increase, unit quaternions",
-        )
-    )
-    too_many = times.empty > warmup_steps
-    out.append(
-        Finding(
-            "empty plans in the warm-up only",
-            "failed" if too_many else "passed",
-            f"{times.empty} of {len(times.seconds)}",
-        )
-    )
+        p50, p95 = np.percentile(ms, (50, 95))
+        text = f"p50 {p50:.1f} ms, p95 {p95:.1f} ms, longest {ms.max():.1f} ms; {over} of {len(ms)} over"
+        add(f"a drive call within {limit_s * 1000:.0f} ms", over > 0, text)
+    problems = "; ".join(f"{kind} ({example})" for kind, example in times.problems.items())
+    fine = "first pose now, times increase, unit quaternions"
+    add("the shape of plans", bool(problems), problems or fine)
+    text = f"{times.empty} of {len(times.seconds)}"
+    add("empty plans in the warm-up only", times.empty > warmup_steps, text)
     if times.reach_us is not None:
-        short = times.reach_us < HORIZON_US
         text = f"the shortest reaches {times.reach_us * 1e-6:g} s; where a plan ends the car brakes"
-        out.append(Finding("plans of at least 2 s", "failed" if short else "passed", text))
+        add("plans of at least 2 s", times.reach_us < HORIZON_US, text)
     if times.samples_us is None:
-        out.append(
-            Finding(
-                "samples for minADE",
-                "noted",
-                "no sampled_trajectories: AlpaSim's tables will hold no minADE",
-            )
-        )
-    else:
-        short = times.samples_us < MINADE_US
-        text = f"the shortest reaches {times.samples_us * 1e-6:g} s" + (
-            "; one below 5 s loses all minADE metrics of its rollout" * short
-        )
-        out.append(Finding("samples for minADE", "failed" if short else "passed", text))
+        text = "no sampled_trajectories: AlpaSim's tables will hold no minADE"
+        out.append(Finding("samples for minADE", "noted", text))
+        return out
+    is_short = times.samples_us < MINADE_US
+    text = f"the shortest reaches {times.samples_us * 1e-6:g} s"
+    if is_short:
+        text += "; one below 5 s loses all minADE metrics of its rollout"
+    add("samples for minADE", is_short, text)
     return out
 
 

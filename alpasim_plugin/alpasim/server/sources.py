@@ -48,6 +48,8 @@ MAP_OFF = "map-off"
 log = logging.getLogger("simrun.serve")
 MOST_NAMES = 4096  # scenes and cameras of an upstream that are remembered
 
+Request = sensorsim_pb2.RGBRenderRequest
+
 
 def path_reliability(path_xy: F64, xy: F64) -> float:
     """Return the trust in a frame seen from ``xy`` ``(2,)`` beside the recorded path ``(N, 2)``,
@@ -87,9 +89,6 @@ def trusted_opacity(trust: float, mask: U8 | None, height: int, width: int) -> F
             / 255.0,
         )
     return out
-
-
-Request = sensorsim_pb2.RGBRenderRequest
 
 
 @dataclass(frozen=True)
