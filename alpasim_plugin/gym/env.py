@@ -303,10 +303,10 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         episode.driving.close()
         episode.recorder.finish(episode.loop.path_end)
         folder = episode.recorder.folder
-        scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, self._scenario, self._preset)
+        _, scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, self._scenario, self._preset)
         return {
             name: entry["value"] if entry["valid"] else None
-            for name, entry in scored.metrics.items()
+            for name, entry in scored["metrics"].items()
         }
 
     def _space(self) -> Dict:

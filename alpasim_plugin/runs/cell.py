@@ -275,16 +275,11 @@ def find_rollout_state(
 
 
 def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> dict[str, Any]:
-    scored = score_log(
+    rows, facts = score_log(
         folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset, cell.evaluators
     )
-    write_steps(folder, [cell.names | row for row in scored.steps])
-    return {
-        "metrics": scored.metrics,
-        "events": scored.events,
-        "contacts": scored.contacts,
-        "censored": scored.censored,
-    }
+    write_steps(folder, [cell.names | row for row in rows])
+    return facts
 
 
 @contextmanager

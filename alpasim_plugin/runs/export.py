@@ -18,6 +18,7 @@ import uuid
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -190,15 +191,13 @@ def _copy(path: Path, source: Path, scenario: Scenario) -> None:
 
 def _with_vehicle(data: bytes, scenario: Scenario) -> bytes:
     rigs = json.loads(data)
-    wanted, (rig,) = rig_box(scenario.vehicle), rigs["rig_trajectories"]
-    held = rig.get("rig_bbox") or {}
-    same = all(
-        abs(a - b) < 1e-6
-        for key in ("dim",)
-        for a, b in zip(held.get(key, [0.0] * 3), wanted[key], strict=True)
-    )
-    if held and same and abs(held["centroid"][0] - wanted["centroid"][0]) < 1e-6:
-        return data
+    (rig,) = rigs["rig_trajectories"]
+    wanted = rig_box(scenario.vehicle)
+    held = rig.get("rig_bbox")
+    if held:
+        before, after = ([*box["dim"], box["centroid"][0]] for box in (held, wanted))
+        if np.allclose(before, after, rtol=0.0, atol=1e-6):
+            return data  # the scene's file stays as it is, byte for byte
     rig["rig_bbox"] = wanted
     return json.dumps(rigs).encode()
 
@@ -307,19 +306,27 @@ def _export_rollout(
     check_vouched(source)
     rollout = read_asl(source)
     uuid = session_uuid(int(manifest["seed"]), str(manifest["rollout_key"]))
-    cameras = {
-        camera.name: name
-        for name, camera in alpasim_cameras(scenario.cameras).items()
-        if name != camera.name
-    }
+    cameras = alpasim_cameras(scenario.cameras)
+    names = {camera.name: name for name, camera in cameras.items() if name != camera.name}
     stages: list[Stage] = []
     if not rollout.images:
-        stages.append(_added(rollout, manifest, scenario, info))
+        if not cameras:
+            raise InputError(
+                f"{manifest['path']}: no camera in the scenario, and no image in the log",
+                "Add a camera to the scenario.",
+            )
+        options = options_of(info)
+        spec = resolve_renderer(manifest["renderer"], options.fixer)
+        seed = int(manifest["seed"])
+        threads = thread_budget(1, 1).per_worker
+        make = partial(make_renderer, spec, scenario, seed, options.device, threads)
+        main = next(iter(cameras.values()))
+        stages.append(AddedFrames(rollout, main, scenario.rates.camera_us, make))
         _note(
             run,
             "the log holds no camera image: frames of the main camera were rendered along the drive",
         )
-    stages.append(Renaming(uuid, cameras))
+    stages.append(Renaming(uuid, names))
     target = folder / "rollouts" / manifest["scene"] / uuid
     target.mkdir(parents=True)
     copy_log(source, target / LOG_NAME, *stages)
@@ -327,36 +334,17 @@ def _export_rollout(
     _note_plans(rollout, run)
 
 
-def _added(
-    rollout: RolloutLog, manifest: Mapping[str, Any], scenario: Scenario, info: Mapping[str, Any]
-) -> AddedFrames:
-    options = options_of(info)
-    spec = resolve_renderer(manifest["renderer"], options.fixer)
-    (main,) = list(alpasim_cameras(scenario.cameras).values())[:1] or (None,)
-    if main is None:
-        raise InputError(
-            f"{manifest['path']}: no camera in the scenario, and no image in the log",
-            "add a camera to the scenario",
-        )
-    threads = thread_budget(1, 1).per_worker
-    return AddedFrames(
-        rollout,
-        main,
-        scenario.rates.camera_us,
-        lambda: make_renderer(spec, scenario, int(manifest["seed"]), options.device, threads),
-    )
-
-
 def _note_plans(rollout: RolloutLog, run: ExportedRun) -> None:
     """Note what AlpaSim's minADE will lack."""
-    samples = [(plan.now_us, sample) for plan in rollout.plans for sample in plan.samples]
-    if not samples:
+    reach_us = [
+        int(sample.t_us[-1]) - plan.now_us for plan in rollout.plans for sample in plan.samples
+    ]
+    if not reach_us:
         _note(run, "no minADE: the policy gives no sampled plans")
-    elif min(int(sample.t_us[-1]) - now for now, sample in samples) < PLAN_US:
-        shortest = min(int(sample.t_us[-1]) - now for now, sample in samples) * 1e-6
+    elif min(reach_us) < PLAN_US:
+        shortest = f"{min(reach_us) * 1e-6:g} s"
         _note(
-            run,
-            f"no minADE where a sampled plan ends before 5 s: the shortest reaches {shortest:g} s",
+            run, f"no minADE where a sampled plan ends before 5 s: the shortest reaches {shortest}"
         )
 
 
@@ -417,9 +405,6 @@ class AddedFrames:
         camera: The camera to add.
         interval_us: Time from frame to frame; the first is at the log's render start.
         make_renderer: Makes the rollout's renderer; called once, at the first frame.
-
-    Attributes:
-        frames: How many were added.
     """
 
     def __init__(
@@ -429,13 +414,14 @@ class AddedFrames:
         interval_us: int,
         make_renderer: Callable[[], Renderer],
     ) -> None:
-        self._rollout, self._camera, self._make = rollout, camera, make_renderer
+        self._rollout = rollout
+        self._camera = camera
+        self._make = make_renderer
         self._requests = logged_requests(rollout, camera, interval_us)
         self._index = {request.t_us: i for i, request in enumerate(self._requests)}
         self._renderer: Renderer | None = None
         self._waiting: list[RenderRequest] = []
         self._blocks = 0
-        self.frames = 0
 
     def __call__(self, entry: logging_pb2.LogEntry) -> list[logging_pb2.LogEntry]:
         """Return the entry, with its cameras extended, and the frames that are due after it."""
@@ -462,27 +448,25 @@ class AddedFrames:
             return []
         requests, self._waiting = self._waiting, []
         self._blocks += 1
-        out = []
+        entries = []
         for request, frame in zip(requests, checked_frames(renderer, requests), strict=True):
-            one = wire_render_request(self._rollout.scene_id, request, "jpeg")
             item = sensorsim_pb2.BatchRGBRenderRequestItem(
-                camera_name=self._camera.name, request=one
+                camera_name=self._camera.name,
+                request=wire_render_request(self._rollout.scene_id, request, "jpeg"),
             )
-            out.append(
-                logging_pb2.LogEntry(
-                    batch_render_request=sensorsim_pb2.BatchRGBRenderRequest(items=[item])
-                )
-            )
-            image, start_us = (
-                encode_image(frame.rgb, "jpeg"),
+            batch = sensorsim_pb2.BatchRGBRenderRequest(items=[item])
+            image = wire_image(
+                self._rollout.session_uuid,
+                self._camera.name,
                 request.t_us - self._camera.shutter_us,
+                request.t_us,
+                encode_image(frame.rgb, "jpeg"),
             )
-            own = wire_image(
-                self._rollout.session_uuid, self._camera.name, start_us, request.t_us, image
-            )
-            out.append(logging_pb2.LogEntry(driver_camera_image=own))
-        self.frames += len(requests)
-        return out
+            entries += [
+                logging_pb2.LogEntry(batch_render_request=batch),
+                logging_pb2.LogEntry(driver_camera_image=image),
+            ]
+        return entries
 
 
 def logged_requests(
@@ -492,11 +476,8 @@ def logged_requests(
     render start.
     """
     rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
-    due = [
-        int(t)
-        for t in rig.t_us
-        if t >= rollout.render_start_us and (t - rollout.render_start_us) % interval_us == 0
-    ]
+    after_us = rig.t_us - rollout.render_start_us
+    due = rig.t_us[(after_us >= 0) & (after_us % interval_us == 0)].tolist()
     actors: dict[int, dict[str, F64]] = {t: {} for t in due}
     for name, actor in rollout.actors.items():
         poses = se3(actor.track.xyz, actor.track.quat)

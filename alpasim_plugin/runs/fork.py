@@ -216,13 +216,20 @@ def fork_rollout(
             a run.
         InfrastructureError: The replay is not equal to the log up to the instant, or a part failed.
     """
-    _check(past, change, root)
+    length_us = int(past.manifest["steps"]) * past.scenario.rates.control_us
+    if not 0 <= change.after_us < length_us:
+        raise InputError(
+            f"--at {change.after_us * 1e-06:g}: the rollout lasts {length_us * 1e-06:g} s",
+            "Choose an instant within it, in seconds after the first frame.",
+        )
+    past.check_repeatable()
+    if (root / RUN_INFO).exists():
+        raise InputError(f"--out {root}: it holds a run already", "Choose another --out.")
     with writing(root):
         return _fork(past, change, root, command)
 
 
 def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str]) -> RunResult:
-    _check(past, change, root)  # once more: another process may have been first
     began = time.perf_counter()
     options = replace(past.options, baseline=past.cell.renderer.name)
     then = change.apply(past.cell, options.fixer)
@@ -269,19 +276,6 @@ def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str
     pool = pool_of([original, manifest], threads, time.perf_counter() - began, None)
     summary = finish_run(root, [original, manifest], {"pool": pool})
     return RunResult(root, summary, 2, summary["failures"]["n_failed"])
-
-
-def _check(past: LoggedRollout, change: Change, root: Path) -> None:
-    scenario = past.scenario
-    length_us = int(past.manifest["steps"]) * scenario.rates.control_us
-    if not 0 <= change.after_us < length_us:
-        raise InputError(
-            f"--at {change.after_us * 1e-06:g}: the rollout lasts {length_us * 1e-06:g} s",
-            "choose an instant within it, in seconds after the first frame",
-        )
-    past.check_repeatable()
-    if (root / RUN_INFO).exists():
-        raise InputError(f"--out {root}: it holds a run already", "choose another --out")
 
 
 def _copied(past: LoggedRollout, root: Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import overload
+from typing import Any
 
 import numpy as np
 
@@ -331,11 +331,7 @@ class PredictedRequests(Sequence[RenderRequest]):
     def __len__(self) -> int:
         return len(self.times_us)
 
-    @overload
-    def __getitem__(self, index: int) -> RenderRequest: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[RenderRequest]: ...
-    def __getitem__(self, index: int | slice) -> RenderRequest | Sequence[RenderRequest]:
+    def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         t_us = self.times_us[index]

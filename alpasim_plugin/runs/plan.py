@@ -22,11 +22,6 @@ from evaluators.metrics.presets import DEFAULT, preset
 from scenarios.load import code_digest_of, load_scenario
 from scenarios.suite import ScenarioRef
 
-LOOP, SCORING = (
-    "alpasim_plugin.runs.rollout",
-    "alpasim_plugin.runs.scoring",
-)  # modules whose code, with its imports, decides
-
 
 @dataclass(frozen=True)
 class RunOptions:

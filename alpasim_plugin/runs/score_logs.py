@@ -19,11 +19,11 @@ from alpasim_plugin.core.types import RolloutLog, Scenario, Scene
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.checksums import problem_of
 from alpasim_plugin.log.run_folder.manifests import read_manifest
-from alpasim_plugin.log.run_folder.schema import LOG_NAME, MANIFEST, RUN_INFO, rollout_folder
+from alpasim_plugin.log.run_folder.schema import KEYS, LOG_NAME, MANIFEST, RUN_INFO, rollout_folder
 from alpasim_plugin.log.run_folder.writer import LoggedScene, write_steps
 from alpasim_plugin.runs.loop_state import PathEnd
-from alpasim_plugin.runs.scoring import contacts_of, tabulate
-from evaluators import reduce_rollout, score
+from alpasim_plugin.runs.scoring import tabulate
+from evaluators import score
 from evaluators.alpasim import ScoredRollout
 from evaluators.metrics.presets import Preset
 from scenarios.load import load_scenario
@@ -32,6 +32,8 @@ from scenarios.usdz import read_usdz, usdz_scene_id
 
 UNKNOWN = "unknown"  # renderer or policy that a log does not name
 SKIPPED = "<skip>"
+# A seed other than the file's is part of the id.
+SEEDED = re.compile(r"(?P<own>.+)-seed(?P<seed>\d+)")
 
 
 @dataclass(frozen=True)
@@ -90,16 +92,16 @@ def score_logs(
         InputError: A log of a scene that is not among the given ones, or a scene that cannot be
             read.
     """
-    out: list[LogScore] = []
+    scores: list[LogScore] = []
     taken: set[str] = set()
     names: set[str] = set()
     for log in logs:
         began = time.perf_counter()
         one = _score(log, scenes, preset, evaluators, root, taken, names)
         one.manifest["wall_s"] = round(time.perf_counter() - began, 4)
-        out.append(one)
+        scores.append(one)
         on_done(one.manifest)
-    return out
+    return scores
 
 
 def _score(
@@ -144,26 +146,17 @@ def _score(
         "steps": _steps(rollout),
         "warnings": list(rollout.warnings),
     }
-    known = scenes.of(
-        rollout.scene_id
-    )  # a wrong --scene is an error of the command, not of the log
+    # A wrong --scene is an error of the command, not of the log.
+    scene = scenes.of(rollout.scene_id).scene
     try:
         check_complete(log, rollout)
-        series = tuple(score(rollout, known.scene, preset, evaluators))
-        one = tabulate(
-            rollout, series, reduce_rollout(series, preset), contacts=contacts_of(rollout, preset)
-        )
+        series = tuple(score(rollout, scene, preset, evaluators))
+        rows, facts = tabulate(rollout, series, preset)
     except SimrunError as error:
         return _failed(manifest, error, root, taken)
-    manifest |= {
-        "status": "ok",
-        "metrics": one.metrics,
-        "events": one.events,
-        "censored": one.censored,
-    }
-    manifest |= {"contacts": one.contacts, "path": _folder(manifest, taken)}
-    keys = {key: manifest[key] for key in ("renderer", "policy", "scene", "seed", "rollout")}
-    write_steps(root / manifest["path"], [keys | row for row in one.steps], of_logs=True)
+    manifest |= {"status": "ok", "path": _folder(manifest, taken)} | facts
+    keys = {key: manifest[key] for key in (*KEYS, "rollout")}
+    write_steps(root / manifest["path"], [keys | row for row in rows], of_logs=True)
     run_uuid, run_name = run_names(log)
     return LogScore(
         manifest, ScoredRollout(rollout.scene_id, manifest["rollout"], series, run_uuid, run_name)
@@ -261,12 +254,13 @@ def _folder(manifest: dict[str, Any], taken: set[str]) -> str:
     """Return the folder of a log's results, relative to the run folder; logs with the same names
     get numbers.
     """
-    base = rollout_folder(
-        *(str(manifest[key]) for key in ("renderer", "policy", "scene", "rollout"))
-    ).as_posix()
-    path, n = base, 2
+    names = [str(manifest[key]) for key in ("renderer", "policy", "scene", "rollout")]
+    base = rollout_folder(*names).as_posix()
+    path = base
+    number = 2
     while path in taken:
-        path, n = f"{base}-{n}", n + 1
+        path = f"{base}-{number}"
+        number += 1
     taken.add(path)
     return path
 
@@ -291,12 +285,6 @@ def exit_code(
     return 4 if classes and not failures_allowed else 0
 
 
-_SEEDED = re.compile(
-    r"(?P<own>.+)-seed(?P<seed>\d+)"
-)  # a seed other than the file's is part of the id
-MOST_SEEDED = 256
-
-
 class KnownScenes:
     """Finds scenes in files and folders; each is read once, on first use.
 
@@ -309,22 +297,25 @@ class KnownScenes:
     """
 
     def __init__(self, places: Sequence[str | Path], rails: bool = True) -> None:
-        self.places, self._rails = [str(place) for place in places], rails
+        self.places = [str(place) for place in places]
+        self._rails = rails
         self._archives: dict[str, Path] = {}
         self._others: list[str] = []
-        self._read: dict[str, LoggedScene] = {}
+        self._read: dict[str, LoggedScene | Scenario] = {}
         self._own: dict[str, str] = {}  # file -> id of its scene
-        self._seeded: list[
-            str
-        ] = []  # of other seeds, oldest first: whoever asks may name any number of them
         for place in self.places:
             for path in _scene_files(place):
-                if Path(path).suffix == ".usdz":
-                    self._add_archive(Path(path))
-                else:
+                if not path.endswith(".usdz"):
                     self._others.append(path)
+                    continue
+                scene_id = usdz_scene_id(Path(path))
+                before = self._archives.setdefault(scene_id, Path(path))
+                if before.resolve() != Path(path).resolve():
+                    raise InputError(
+                        f"{before} and {path}: both have the id {scene_id!r}", "Remove one of them."
+                    )
 
-    def of(self, scene_id: str) -> LoggedScene:
+    def of(self, scene_id: str) -> LoggedScene | Scenario:
         """Return the scene with an id.
 
         Raises:
@@ -344,31 +335,17 @@ class KnownScenes:
 
     def _search(self, scene_id: str) -> None:
         """Read scenario files until one has the id, or the id of another seed of it."""
-        seeded = _SEEDED.fullmatch(scene_id)
+        seeded = SEEDED.fullmatch(scene_id)
         for path in self._others:
             if path not in self._own:
-                found = _from_scenario(load_scenario(path))
-                self._own[path] = found.scene.scene_id
-                self._read[found.scene.scene_id] = found
+                scenario = load_scenario(path)
+                self._own[path] = scenario.scene_id
+                self._read[scenario.scene_id] = scenario
             if seeded and self._own[path] == seeded["own"]:
-                found = _from_scenario(load_scenario(path, int(seeded["seed"])))
-                if found.scene.scene_id not in self._read:  # seed007 and seed7 are one scene
-                    self._seeded.append(found.scene.scene_id)
-                self._read[found.scene.scene_id] = found
+                scenario = load_scenario(path, int(seeded["seed"]))
+                self._read[scenario.scene_id] = scenario
             if scene_id in self._read:
-                break
-        while len(self._seeded) > MOST_SEEDED:
-            del self._read[self._seeded.pop(0)]
-
-    def _add_archive(self, path: Path) -> None:
-        scene_id = usdz_scene_id(path)
-        before = self._archives.get(scene_id)
-        if before is not None and before.resolve() != path.resolve():
-            raise InputError(
-                f"{before} and {path}: both have the id {scene_id!r}",
-                "remove one of them",
-            )
-        self._archives[scene_id] = path
+                return
 
 
 def _scene_files(place: str) -> list[str]:
@@ -387,20 +364,6 @@ def _from_archive(path: Path, rails: bool) -> LoggedScene:
     )
     return LoggedScene(
         scene, record.source, record.content_hash, record.notes, record.actors, record.world_origin
-    )
-
-
-def _from_scenario(one: Scenario) -> LoggedScene:
-    return LoggedScene(
-        one.scene,
-        one.source,
-        one.content_hash,
-        one.notes,
-        one.actors,
-        one.world_origin,
-        one.start_us,
-        one.end_us,
-        one.warmup_us,
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from alpasim_plugin.core.types import (
     Scenario,
 )
 from alpasim_plugin.log import read_asl, read_facts
-from evaluators import ContactEvent, Preset, Reduction, contact_events, reduce_rollout, score
+from evaluators import Preset, Reduction, contact_events, reduce_rollout, score
 from evaluators import preset as find_preset
 from evaluators.metrics.route import lateral_bias
 
@@ -30,114 +29,78 @@ from evaluators.metrics.route import lateral_bias
 FIXER_FACTS = ("pose_error_m", "forecast_error_m", RECORDED_SHARE, GUESSED_SHARE)
 
 
-@dataclass(frozen=True)
-class TabulatedScores:
-    """Scores of one rollout, as rows and JSON."""
-
-    steps: list[dict[str, Any]]  # rows of steps.parquet without the rollout's key
-    metrics: dict[str, dict[str, Any]]  # metric -> value, valid, reason, unit, direction
-    events: list[
-        dict[str, Any]
-    ]  # when outcomes began: metric, t_us, t_s (after the first frame), x_m, y_m
-    censored: dict[str, Any]  # number of steps that each rule removed
-    contacts: list[
-        dict[str, Any]
-    ]  # contact onsets, if contact is searched between steps: actor_id, t_s, side, x_m, y_m (rig frame)
-
-
 def score_log(
     log: Path,
     frames: Path,
     scenario: Scenario,
     preset: str,
     evaluators: Sequence[PartSpec] | None = None,
-) -> TabulatedScores:
-    """Read a log and score it; the scores depend on the written log alone.
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Read a log and score it as `tabulate` does; the scores depend on the written log alone.
 
     Raises:
         EvaluatorError: An evaluator could not compute a required value.
     """
     rollout = read_asl(log)
     series = score(rollout, scenario.scene, preset, evaluators)
-    return tabulate(
-        rollout,
-        series,
-        reduce_rollout(series, preset),
-        read_facts(frames),
-        contacts_of(rollout, preset),
-    )
+    return tabulate(rollout, series, preset, read_facts(frames))
 
 
 def tabulate(
     rollout: RolloutLog,
     series: Sequence[MetricSeries],
-    reduction: Reduction,
+    preset: str | Preset,
     frames: Sequence[Mapping[str, Any]] = (),
-    contacts: Sequence[ContactEvent] = (),
-) -> TabulatedScores:
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Flatten a scored rollout for the tables.
 
     Args:
         rollout: The log.
         series: Result of `evaluators.score`.
-        reduction: Their reduction.
+        preset: By which they are reduced.
         frames: Facts per camera frame, if known.
-        contacts: Result of `contacts_of`.
+
+    Returns:
+        Rows of ``steps.parquet`` without the rollout's key; and for the manifest ``metrics`` (value,
+        valid, reason, unit and direction of each), ``events`` (when and where outcomes began),
+        ``contacts`` (onsets, if contact is searched between steps) and ``censored`` (how many steps
+        each rule removed).
     """
+    reduction = reduce_rollout(series, preset)
+    chosen = find_preset(preset)
+    contacts = contact_events(rollout, chosen) if chosen.contact == "between_steps" else ()
     # Reports draw the distance from the recorded path also of runs whose preset does not score it.
     drawn = [] if any(one.name == "lateral_bias_m" for one in series) else [lateral_bias(rollout)]
     rows = []
     for one in (*series, *drawn):
-        for t, value, valid in zip(
+        reason = one.reason
+        for t_us, value, valid in zip(
             one.t_us.tolist(), one.value.tolist(), one.valid.tolist(), strict=True
         ):
-            number = (
-                None if np.isnan(value) else value
-            )  # an infinite one stays, as in AlpaSim's tables
-            rows.append(
-                {
-                    "t_us": t,
-                    "metric": one.name,
-                    "value": number,
-                    "valid": valid,
-                    "reason": "" if valid else one.reason,
-                }
-            )
+            row = _row(t_us, one.name, None if np.isnan(value) else value)
+            rows.append(row | {"valid": valid, "reason": "" if valid else reason})
     rows += _state_rows(rollout)
-    rows += [
-        _row(
-            int(f["t_us"] or 0), "opacity_mean", f["opacity_mean"], "the renderer gives no opacity"
-        )
-        for f in frames
-    ]
-    rows += [
-        _row(int(f["t_us"] or 0), name, f[name])
-        for name in FIXER_FACTS
-        for f in frames
-        if name in f
-    ]
-    begun = [one.as_dict() for one in contacts]
-    return TabulatedScores(
-        rows, reduction.as_dict(), _placed(rollout, reduction), reduction.ledger.as_dict(), begun
-    )
+    for facts in frames:
+        opacity = facts["opacity_mean"]
+        rows.append(_row(facts["t_us"], "opacity_mean", opacity, "the renderer gives no opacity"))
+    for name in FIXER_FACTS:
+        rows += [_row(facts["t_us"], name, facts[name]) for facts in frames if name in facts]
+    return rows, {
+        "metrics": reduction.as_dict(),
+        "events": _placed(rollout, reduction),
+        "contacts": [contact.as_dict() for contact in contacts],
+        "censored": reduction.ledger.as_dict(),
+    }
 
 
-def contacts_of(rollout: RolloutLog, preset: str | Preset) -> tuple[ContactEvent, ...]:
-    """Return the contact onsets of the ego if the preset searches contact between steps; else
-    none.
-    """
-    chosen = find_preset(preset)
-    return contact_events(rollout, chosen) if chosen.contact == "between_steps" else ()
-
-
-def _row(t_us: int, metric: str, value: Any, why_missing: str = "") -> dict[str, Any]:
-    missing = value is None
+def _row(t_us: int | None, metric: str, value: Any, why_missing: str = "") -> dict[str, Any]:
+    is_missing = value is None
     return {
-        "t_us": t_us,
+        "t_us": t_us or 0,
         "metric": metric,
         "value": value,
-        "valid": not missing,
-        "reason": why_missing if missing else "",
+        "valid": not is_missing,
+        "reason": why_missing if is_missing else "",
     }
 
 

@@ -28,6 +28,14 @@ from evaluators.statistics.outcomes import outcome_table, rollouts_of
 from evaluators.statistics.summary import NO_BASES, by_policy, numbers
 from evaluators.statistics.variants import base_named, variants_in
 
+SPEEDS = (
+    "ms_per_frame_p50",
+    "ms_per_frame_p95",
+    "ms_per_frame_mean",
+    "frames_per_s",
+    "first_frame_ms",
+)
+
 
 def write_summary(
     root: Path,
@@ -93,10 +101,8 @@ def speed(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
     stages: dict[str, list[float]] = {}
     first, per_frame = [], []
     for manifest in manifests:
-        frames, opening = (
-            max(int(manifest["frames"]), 1),
-            max(int(manifest.get("first_call_frames", 1)), 1),
-        )
+        frames = max(int(manifest["frames"]), 1)
+        opening = max(int(manifest.get("first_call_frames", 1)), 1)
         total = np.zeros(frames)
         for stage, durations in manifest["stage_ms"].items():
             total += resample_durations(durations, frames)
@@ -106,16 +112,7 @@ def speed(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
         first.append(float(total[:opening].sum()))
         per_frame.extend(total[opening:].tolist())
     if not per_frame:
-        nothing = dict.fromkeys(
-            (
-                "ms_per_frame_p50",
-                "ms_per_frame_p95",
-                "ms_per_frame_mean",
-                "frames_per_s",
-                "first_frame_ms",
-            )
-        )
-        return nothing | {"stages": {}}
+        return dict.fromkeys(SPEEDS) | {"stages": {}}
     all_ms = sum(sum(d) for d in stages.values())
     return {
         "ms_per_frame_p50": round(float(np.percentile(per_frame, 50)), 3),
@@ -207,13 +204,9 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[st
         InputError: A run is not finished or its tables are damaged; presets differ, or a scene or a
             metric is another one in another run; a folder is named twice; no run has the baseline.
     """
-    twice = [
-        run
-        for i, run in enumerate(runs)
-        if run.resolve() in {other.resolve() for other in runs[:i]}
-    ]
-    if twice:
-        raise InputError(f"{twice[0]}: named twice", "name every run once")
+    for number, run in enumerate(runs):
+        if run.resolve() in {other.resolve() for other in runs[:number]}:
+            raise InputError(f"{run}: named twice", "Name every run once.")
     infos = {run: _info_of(run) for run in runs}
     _check_alike(infos)
     first = next(iter(infos.values()))

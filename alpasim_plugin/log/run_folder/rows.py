@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import overload
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -78,11 +78,7 @@ class StoredRollouts(Sequence[Rollout]):
     def __len__(self) -> int:
         return len(self._rows)
 
-    @overload
-    def __getitem__(self, index: int) -> Rollout: ...
-    @overload
-    def __getitem__(self, index: slice) -> tuple[Rollout, ...]: ...
-    def __getitem__(self, index: int | slice) -> Rollout | tuple[Rollout, ...]:
+    def __getitem__(self, index: Any) -> Any:
         return self._rows[index]
 
     def __iter__(self) -> Iterator[Rollout]:

@@ -159,11 +159,7 @@ def write_steps(folder: Path, rows: Sequence[Mapping[str, Any]], of_logs: bool =
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> None:
     """Write rows as parquet atomically, in the order given."""
-    columns = {
-        field.name: pa.array([row.get(field.name) for row in rows], type=field.type)
-        for field in schema
-    }
-    write_parquet(path, pa.table(columns, schema=schema))
+    write_parquet(path, pa.Table.from_pylist(rows, schema))
 
 
 def write_parquet(path: Path, table: pa.Table) -> None:
@@ -259,21 +255,16 @@ def _actor(scenario: Scenario | LoggedScene, actor: Actor) -> dict[str, Any]:
     while the scene runs.
     """
     track = actor.track
-    is_timed = (
-        scenario.end_us > scenario.start_us
-    )  # a scene that logs are scored against need not say when it runs
-    inside = (
-        np.flatnonzero((track.t_us >= scenario.start_us) & (track.t_us <= scenario.end_us))
-        if is_timed
-        else np.arange(len(track))
-    )
+    inside = np.arange(len(track))
+    if scenario.end_us > scenario.start_us:  # a scene that logs are scored against may not say
+        is_inside = (track.t_us >= scenario.start_us) & (track.t_us <= scenario.end_us)
+        inside = np.flatnonzero(is_inside)
     if actor.is_static:
         inside = inside[:1] if len(inside) else np.array([0])
-    step = (
-        max(1, round(ACTOR_STEP_US / max(1.0, float(np.median(np.diff(track.t_us))))))
-        if len(track) > 1
-        else 1
-    )
+    step = 1
+    if len(track) > 1:
+        period_us = max(1.0, float(np.median(np.diff(track.t_us))))
+        step = max(1, round(ACTOR_STEP_US / period_us))
     keep = np.unique(np.concatenate([inside[::step], inside[-1:]]))
     yaw = yaw_from_quat(track.quat[keep])
     return {
