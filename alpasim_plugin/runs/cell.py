@@ -106,9 +106,8 @@ def run_cell(
     """
     folder = root / cell.folder
     began = time.perf_counter()
-    cv2.setNumThreads(
-        1
-    )  # OpenCV's pool is outside the thread budget, and frames are too small to gain from it
+    # OpenCV's pool is outside the thread budget, and frames are too small to gain from it.
+    cv2.setNumThreads(1)
     manifest = _begun(cell) | {
         "preset": options.preset,
         "stops_at_path_end": cell.stops_at_path_end,
@@ -116,12 +115,8 @@ def run_cell(
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (
-            MANIFEST,
-            *DRIVEN,
-            *DERIVED,
-            WHY_NAME,
-        ):  # the manifest first: without it nothing is trusted
+        # The manifest first: without it nothing is trusted.
+        for name in (MANIFEST, *DRIVEN, *DERIVED, WHY_NAME):
             (folder / name).unlink(missing_ok=True)
         scenario = replace((load or _scenario)(cell.ref), stop_at_path_end=cell.stops_at_path_end)
         with parts_print_to_stderr(folder / OUTPUT_NAME):
@@ -129,9 +124,9 @@ def run_cell(
             recorder = _drive(parts, cell, options, scenario, folder)
         manifest |= recorder.facts() | _facts_of(parts, has_fixer=cell.renderer.fixer is not None)
         manifest |= _score(folder, cell, options, scenario)
+        has_failed = bool(manifest["events"])
         recorder.save_pictures(
-            video=options.video == "all"
-            or (options.video == "failures" and bool(manifest["events"]))
+            options.video == "all" or (options.video == "failures" and has_failed)
         )
         manifest["status"] = "ok"
     except Exception as error:
@@ -188,18 +183,19 @@ def _facts_of(parts: RolloutParts, has_fixer: bool) -> dict[str, Any]:
 
 def _failure(error: Exception, folder: Path) -> dict[str, Any]:
     """Return what the manifest says of a rollout that failed; called where the error is handled."""
-    trace = {"traceback": traceback.format_exc()}
-    if isinstance(error, SimrunError):
-        final = isinstance(error, PolicyError) and error.is_final
-        return {"status": "failed", "error": error.as_dict(), "final": final} | trace
+    facts: dict[str, Any] = {"status": "failed", "traceback": traceback.format_exc()}
     if isinstance(error, OSError):
-        return {"status": "failed", "error": disk_error(folder, error).as_dict()} | trace
-    found = {
-        "message": f"{type(error).__name__}: {error}",
-        "hint": "read the traceback in the manifest and report it",
-        "failure_class": "infrastructure",
+        error = disk_error(folder, error)
+    if isinstance(error, SimrunError):
+        facts["final"] = isinstance(error, PolicyError) and error.is_final
+        return facts | {"error": error.as_dict()}
+    return facts | {
+        "error": {
+            "message": f"{type(error).__name__}: {error}",
+            "hint": "Read the traceback in the manifest and report it.",
+            "failure_class": "infrastructure",
+        }
     }
-    return {"status": "failed", "error": found} | trace
 
 
 def _log_traceback(error: Exception, folder: Path) -> None:
@@ -258,14 +254,10 @@ def find_rollout_state(
         return "drive", state
     if manifest["status"] != "ok":
         return "none", state
-    if (
-        manifest.get("passed_path_end")
-        and manifest.get("stops_at_path_end") != cell.stops_at_path_end
-    ):
-        return (
-            "drive",
-            state,
-        )  # the only rollouts that differ between presets that stop there and those that drive on
+    # Presets that stop at the end of the path and those that drive on differ in these alone.
+    stops_alike = manifest.get("stops_at_path_end") == cell.stops_at_path_end
+    if manifest.get("passed_path_end") and not stops_alike:
+        return "drive", state
     wants_video = video == "all" or (video == "failures" and bool(manifest.get("events")))
     if wants_video and VIDEO_NAME not in manifest["files"] and manifest.get("video") != video:
         return "drive", state
@@ -288,9 +280,7 @@ def _closing(part: Policy | Controller) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        with suppress(
-            SimrunError
-        ):  # what failed first is the rollout's failure; a service that is gone cannot be closed either
+        with suppress(SimrunError):  # what failed first is the rollout's failure
             part.close()
         raise
     part.close()

@@ -4,6 +4,7 @@ keys.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import product
@@ -136,9 +137,8 @@ class RunPlan:
             [*cell.names.values(), cell.ref.path, cell.ref.seed, cell.ref.overrides]
             for cell in self.cells
         ]
-        return digest([named, asdict(self.options), *([self.question] if self.question else [])])[
-            :12
-        ]
+        question = [self.question] if self.question else []
+        return digest([named, asdict(self.options), *question])[:12]
 
     @property
     def content(self) -> str:
@@ -235,13 +235,11 @@ def make_plan(
 
 
 def _check_named_once(what: str, values: Sequence[object]) -> None:
-    twice = sorted({str(value) for value in values if list(values).count(value) > 1})
-    if not values or twice:
-        found = f"{', '.join(twice)} twice" if twice else "none"
-        raise InputError(
-            f"{what}s {', '.join(map(str, values)) or '(none)'}: {found}",
-            f"name every {what} once",
-        )
+    if not values:
+        raise InputError(f"no {what} is named", f"Name at least one {what}.")
+    for value, count in Counter(values).items():
+        if count > 1:
+            raise InputError(f"{what} {value} is named {count} times", f"Name every {what} once.")
 
 
 def _check_fixer_settings(

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
@@ -50,11 +50,11 @@ from alpasim_plugin.runs.recorded_state import ego_states_from_log
 
 REACH_S = 1.0
 MOVING_MPS = 1.0  # below, a plan's speed says nothing about its unit
-SLACK, SLACK_M = (
-    2.0,
-    5.0,
-)  # a plan may ask for more than the vehicle gives: only what is far beyond counts
-WARN_SHARE, MIN_PLANS = 0.2, 5
+SLACK = 2.0  # a plan may ask for more than the vehicle gives: only what is far beyond counts
+SLACK_M = 5.0
+WARN_SHARE = 0.2
+MIN_PLANS = 5
+STRIP_FRACTIONS = (0.1, 0.37, 0.63, 0.9)  # times of the strip's frames, of the rollout
 NO_PLAN = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
 
 
@@ -62,7 +62,7 @@ class StageTimes:
     """Collects durations by stage name."""
 
     def __init__(self) -> None:
-        self.durations_s: dict[str, list[float]] = defaultdict(list)
+        self._ms: dict[str, list[float]] = defaultdict(list)
 
     @contextmanager
     def measure(
@@ -81,18 +81,15 @@ class StageTimes:
             yield
         finally:
             parts = dict(within()) if within is not None and shares else {}
-            parts[stage] = (
-                parts.get(stage, 0.0) + 1e3 * (time.perf_counter() - began) - sum(parts.values())
-            )
+            all_ms = 1e3 * (time.perf_counter() - began)
+            parts[stage] = parts.get(stage, 0.0) + all_ms - sum(parts.values())
             for name, part_ms in parts.items():
-                self.durations_s[name] += [1e-3 * part_ms / shares] * shares if shares else []
+                self._ms[name] += [part_ms / max(shares, 1)] * shares
 
     def as_ms(self) -> dict[str, list[float]]:
         """Return all durations in milliseconds, rounded to a microsecond."""
         return {
-            stage: [round(1e3 * d, 3) for d in durations]
-            for stage, durations in self.durations_s.items()
-            if durations
+            stage: [round(ms, 3) for ms in all_ms] for stage, all_ms in self._ms.items() if all_ms
         }
 
 
@@ -118,11 +115,8 @@ class PlanMotion:
         if reach_s <= 0.0:
             return  # one pose: the ego is to stand
         self._plans += 1
-        advance_m = float(
-            np.hypot(
-                *(np.interp(reach_s, t_s, plan.xy[:, axis]) - plan.xy[0, axis] for axis in (0, 1))
-            )
-        )
+        end = [np.interp(reach_s, t_s, plan.xy[:, axis]) for axis in (0, 1)]
+        advance_m = float(np.hypot(*(end - plan.xy[0])))
         speed = abs(ego.speed_mps)
         accel = self._vehicle.max_accel_mps2
         brake = self._vehicle.max_brake_mps2
@@ -171,24 +165,19 @@ def plan_table(manifests: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _warning(entry: Mapping[str, Any]) -> str:
-    plans, beyond, below, ratio = (
-        entry[key] for key in ("plans", "beyond", "below", "speed_ratio")
-    )
-    found = max(beyond, below)
-    if plans < MIN_PLANS or found < WARN_SHARE * plans:
+    far = entry["beyond"]
+    short = entry["below"]
+    if entry["plans"] < MIN_PLANS or max(far, short) < WARN_SHARE * entry["plans"]:
         return ""
-    how = (
-        "further than the vehicle can drive in that time"
-        if beyond >= below
-        else "less far than its braking distance"
-    )
-    said = f"{found} of {plans} plans reach {how}"
-    if ratio is None:
-        return said
-    unit = unit_guess(ratio)
-    return (
-        f"{said}; their speed is {ratio:.3g} times the ego's{f', as if in {unit}' if unit else ''}"
-    )
+    how = "less far than its braking distance"
+    if far >= short:
+        how = "further than the vehicle can drive in that time"
+    text = f"{max(far, short)} of {entry['plans']} plans reach {how}"
+    if entry["speed_ratio"] is None:
+        return text
+    unit = unit_guess(entry["speed_ratio"])
+    guess = f", as if in {unit}" if unit else ""
+    return f"{text}; their speed is {entry['speed_ratio']:.3g} times the ego's{guess}"
 
 
 class Recorder:
@@ -217,16 +206,20 @@ class Recorder:
     ) -> None:
         self._temporary = temporary_folder("simrun-") if folder is None else None
         self.folder = Path(self._temporary.name) if self._temporary else folder or Path()
-        self._scenario, self._seed = scenario, seed
+        self._scenario = scenario
+        self._seed = seed
         self._session = session_uuid(seed, session or f"{scenario.scene_id}/{seed}")
-        self._images, self._keep_frames, self._versions = images, keep_frames, dict(versions or {})
+        self._images = images
+        self._keep_frames = keep_frames
+        self._versions = dict(versions or {})
         self._times = StageTimes()
         self.plan_motion = PlanMotion(scenario.vehicle)
         self._frames: list[dict[str, Any]] = []
         self._pictures: Pictures | None = None
         self._only_watched = False
         self._last_query_us = -1
-        self._steps = self._first_call = 0
+        self._steps = 0
+        self._first_call = 0
         self._passed = False
         self._writer: AslWriter | None = None
 
@@ -284,28 +277,25 @@ class Recorder:
 
     def frame(self, frame: Frame, request: RenderRequest) -> None:
         """Log one camera frame."""
-        if self._only_watched:
-            if self._pictures is not None:
-                self._pictures.add(frame)
-            return
-        with self.stage("log"):
-            if self._images != "none":
-                self._log.render_request([request], self._images)
-                self._log.camera_image(frame, self._images, request.camera.shutter_us)
-            self._frames.append(
-                {
-                    "t_us": frame.t_us,
-                    "camera": frame.camera,
-                    "opacity_mean": None
-                    if frame.alpha is None
-                    else round(float(frame.alpha.mean()), 5),
-                    "rgb_sha256": hashlib.sha256(frame.rgb.tobytes()).hexdigest()[:16],
-                    "events": " ".join(frame.events),
-                }
-                | dict(frame.facts)
-            )
-            if self._pictures is not None:
-                self._pictures.add(frame)
+        if not self._only_watched:
+            with self.stage("log"):
+                self._log_frame(frame, request)
+        if self._pictures is not None:
+            self._pictures.add(frame)
+
+    def _log_frame(self, frame: Frame, request: RenderRequest) -> None:
+        if self._images != "none":
+            self._log.render_request([request], self._images)
+            self._log.camera_image(frame, self._images, request.camera.shutter_us)
+        opacity = None if frame.alpha is None else round(float(frame.alpha.mean()), 5)
+        facts = {
+            "t_us": frame.t_us,
+            "camera": frame.camera,
+            "opacity_mean": opacity,
+            "rgb_sha256": hashlib.sha256(frame.rgb.tobytes()).hexdigest()[:16],
+            "events": " ".join(frame.events),
+        }
+        self._frames.append(facts | dict(frame.facts))
 
     def policy_query(self, observation: Observation, clock: Clock) -> None:
         """Log a policy query: ego motion and route."""
@@ -351,22 +341,18 @@ class Recorder:
 
     def facts(self) -> dict[str, Any]:
         """Return counts and stage times for the manifest."""
-        events: dict[str, int] = {}
-        for frame in self._frames:
-            for event in frame["events"].split():
-                events[event] = events.get(event, 0) + 1
+        events = Counter(event for frame in self._frames for event in frame["events"].split())
+        strip = [] if self._pictures is None else self._pictures.strip()
         return {
             "frames": len(self._frames),
             "first_call_frames": self._first_call,
             "steps": self._steps,
-            "frame_events": events,
+            "frame_events": dict(events),
             "passed_path_end": self._passed,
             "plan_motion": self.plan_motion.facts(),
             "stage_ms": self._times.as_ms(),
             "session_uuid": self._session,
-            "strip_t_us": []
-            if self._pictures is None
-            else [t_us for t_us, _ in self._pictures.strip()],
+            "strip_t_us": [t_us for t_us, _ in strip],
         }
 
     def save_pictures(self, video: bool) -> None:
@@ -381,9 +367,6 @@ class Recorder:
         return self._writer
 
 
-STRIP_FRACTIONS = (0.1, 0.37, 0.63, 0.9)  # times of the strip's frames, as fractions of the rollout
-
-
 class Pictures:
     """Collects the frames of the strip and of the video.
 
@@ -394,7 +377,9 @@ class Pictures:
     """
 
     def __init__(self, clock: Clock, camera: str, all_frames: bool) -> None:
-        self._camera, self._all, self._period_us = camera, all_frames, clock.rates.camera_us
+        self._camera = camera
+        self._all = all_frames
+        self._period_us = clock.rates.camera_us
         self._strip_us = [
             clock.start_us + round(fraction * clock.n_steps) * clock.rates.control_us
             for fraction in STRIP_FRACTIONS

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -14,16 +13,15 @@ from typing import Any, Protocol
 
 from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.client.child import end_children
-from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.check import cells_of_run
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
-from alpasim_plugin.log.run_folder.reader import REMADE, read_json
+from alpasim_plugin.log.run_folder.reader import REMADE
 from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY, slug
 from alpasim_plugin.log.run_folder.writer import write_scene, writing
 from alpasim_plugin.renderers.reconstruction_key import model_key
-from alpasim_plugin.runs.cell import find_rollout_state
 from alpasim_plugin.runs.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runs.executors.choice import LOCAL, Executor
 from alpasim_plugin.runs.plan import RunPlan
@@ -124,12 +122,9 @@ def execute_run(
 
     Raises:
         InputError: The folder holds the run of another command and ``resume`` is not set.
-        InfrastructureError: Another process writes the folder, or it is read-only and the run is
-            not finished.
+        InfrastructureError: Another process writes the folder, or it is read-only.
     """
     threads = thread_budget(workers, len(plan.cells), executor)
-    if root.exists() and not os.access(root, os.W_OK):
-        return _finished_already(plan, root)
     with writing(root, wait, progress.noticed):
         held = claim(root, plan, command, threads, resume, progress.noticed)
         progress.started(plan, root, threads)
@@ -206,25 +201,6 @@ def summary_of_run(
         MetricTable.of_run(info),
         tables,
     )
-
-
-def _finished_already(plan: RunPlan, root: Path) -> RunResult:
-    """Return the result of a finished run in a read-only folder.
-
-    Raises:
-        InfrastructureError: It is not finished, or damaged.
-    """
-    summary = root / SUMMARY
-    actions = [find_rollout_state(cell, root, reuse_undigested=True)[0] for cell in plan.cells]
-    left = sum(action != "none" for action in actions)
-    if left or not summary.is_file() or read_run_json(root).get("content") != plan.content:
-        raise InfrastructureError(
-            f"The folder {root} is read-only, and {left} of {len(plan.cells)} rollouts or its "
-            "tables are missing or out of date.",
-            "Name another --out, or copy the folder to where it can be written.",
-        )
-    facts = read_json(summary)
-    return RunResult(root, facts, len(plan.cells), facts["failures"]["n_failed"])
 
 
 def claim(
@@ -316,15 +292,9 @@ def origin_of(command: Sequence[str]) -> dict[str, Any]:
 
 
 def _scene_facts(scenario: Scenario, ref: ScenarioRef) -> dict[str, Any]:
-    where = {
-        "path": str(Path(ref.path).absolute()),
-        "seed": ref.seed,
-        "overrides": ref.overrides,
-        "source": ref.source,
-    }
     return {
         "source": scenario.source,
-        "ref": where,
+        "ref": vars(ref) | {"path": str(Path(ref.path).absolute())},
         "content_hash": scenario.content_hash,
         "seed": scenario.seed,
         "varied": {key: list(values) for key, values in scenario.varied.items()},

@@ -80,7 +80,7 @@ def test_results_do_not_depend_on_the_number_of_workers(workers: int) -> None:
 
 
 def test_a_result_that_is_lost_ends_work_that_needs_all_of_them() -> None:
-    with pytest.raises(InfrastructureError, match="dies"):
+    with pytest.raises(InfrastructureError):
         list(map_jobs(work, ["a", "dies", "b"], 2))
 
 

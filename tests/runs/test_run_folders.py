@@ -14,7 +14,7 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.atomic import temporary_path
-from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.writer import remove_left_overs
 from alpasim_plugin.runs.logged_rollout import find_rollout
@@ -175,18 +175,6 @@ def test_a_run_that_was_stopped_is_not_read_until_it_is_finished(root: Path) -> 
 def test_tables_that_were_copied_without_their_rollouts_can_be_read(root: Path) -> None:
     shutil.rmtree(root / "rollouts")
     assert run_command(["compare", str(root)]) == 0
-
-
-def test_a_read_only_folder_is_read_and_a_finished_run_in_it_is_its_own_result(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    inspect_run(root)  # sets the copy's times
-    before = {path: path.stat().st_mtime_ns for path in root.rglob("*")}
-    monkeypatch.setattr("alpasim_plugin.runs.run.os.access", lambda path, mode: False)
-    assert run(root).results == []
-    assert {path: path.stat().st_mtime_ns for path in root.rglob("*")} == before
-    with pytest.raises(InfrastructureError):
-        run(root, plan_of((0, 1, 2)))
 
 
 def test_left_overs_of_killed_writers_are_removed_and_nothing_else(root: Path) -> None:

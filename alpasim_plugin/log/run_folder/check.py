@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -36,15 +36,12 @@ class Inspection:
         return not self.damage and not self.unfinished
 
 
-def inspect_run(
-    root: Path, full: bool = False, on_cell: Callable[[int, int], None] | None = None
-) -> Inspection:
+def inspect_run(root: Path, full: bool = False) -> Inspection:
     """Compare the rollouts of a run folder with their manifests.
 
     Args:
         root: The run folder.
         full: Read every file, even where size and time are as stated.
-        on_cell: Called with the number of rollouts that were compared, and of all.
 
     Raises:
         InputError: The folder holds no run, or its ``run.json`` is damaged.
@@ -55,15 +52,13 @@ def inspect_run(
     manifests = []
     damage: list[Damage] = []
     unfinished = []
-    for done, cell in enumerate(cells, 1):
+    for cell in cells:
         state = inspect_rollout(root, cell, full)
         damage += state.damage
         if state.manifest is not None:
             manifests.append(state.manifest)
         elif not state.damage:
             unfinished.append(cell)
-        if on_cell is not None:
-            on_cell(done, len(cells))
     return Inspection(cells, tuple(manifests), tuple(damage), tuple(unfinished))
 
 
