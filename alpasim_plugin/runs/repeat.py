@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.atomic import scratch_folder
+from alpasim_plugin.core.checksums import checksums_of
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME
 from alpasim_plugin.log.trace import Key, first_difference, trace_log
@@ -59,7 +59,10 @@ def repeat_rollout(
             return _not_compared(f"the second rollout failed: {again['error']['message']}")
         first = log_trace(folder)
         second = log_trace(scratch / cell.folder)
-        digests = [_digest(path / LOG_NAME) for path in (folder, scratch / cell.folder)]
+        digests = [
+            checksums_of(path, [LOG_NAME])[LOG_NAME]["sha256"]
+            for path in (folder, scratch / cell.folder)
+        ]
     scenario = plan.scenarios[cell.scene]
     difference = first_difference(first, second, scenario.start_us, scenario.rates.control_us)
     return {
@@ -89,8 +92,3 @@ def repeat_line(repeat: Mapping[str, Any]) -> str:
 
 def _not_compared(reason: str) -> dict[str, Any]:
     return {"repeatable": None, "reason": reason}
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
