@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.atomic import scratch_folder
-from alpasim_plugin.core.checksums import checksums_of
 from alpasim_plugin.log import read_facts
+from alpasim_plugin.log.run_folder.checksums import checksums_of
 from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME
 from alpasim_plugin.log.trace import Key, first_difference, trace_log
 from alpasim_plugin.runs.cell import run_cell
