@@ -337,7 +337,7 @@ def validate(model: type[M], document: Document) -> M:
         problems = error.errors(include_url=False)
     # Wrong items make a list too short, and a misspelt key leaves the right one missing.
     problems = [p for p in problems if p["type"] != "too_short"] or problems
-    placed = []
+    placed: list[tuple[bool, Mark, int, Key, Any]] = []
     for problem in problems[:MOST_PROBLEMS]:
         loc = _in_document(document.data, problem["loc"])
         is_missing = problem["type"] == "missing"

@@ -289,7 +289,9 @@ def declaration_of(factory: Any, settings: BaseModel | None) -> Declaration:
     given = {
         key: getattr(factory, key, None) for key in ("trained", "note", "is_remote", "missing")
     }
-    stated = {key: value for key, value in given.items() if isinstance(value, bool | str)}
+    stated: dict[str, Any] = {
+        key: value for key, value in given.items() if isinstance(value, bool | str)
+    }
     return Declaration(files=files, **stated)
 
 
