@@ -100,10 +100,8 @@ def check_columns(
     names = table.column_names
     for name, kind in columns.items():
         if names.count(name) != 1:
-            raise InputError(
-                f"{where}: {names.count(name)} columns {name!r} among {', '.join(names[:12])}",
-                do_this,
-            )
+            found = "several columns" if name in names else "no column"
+            raise InputError(f"{where}: {found} {name!r} among {', '.join(names[:12])}", do_this)
         type_ = table.schema.field(name).type
         if not _is(type_, kind):
             raise InputError(f"{where}: column {name!r} of {type_}, wanted {kind}", do_this)
