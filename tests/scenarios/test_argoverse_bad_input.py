@@ -160,7 +160,7 @@ def without(document, layer, key=None):
             | {"lane_segments": {"1": lane(1, 0, 10, 0, left_lane_boundary=line((0, 2)))}},
             "boundary with 1 finite points",
         ),
-        (vector_map() | {"lane_segments": {"1": lane(1, 0, float("nan"), 0)}}, "the number nan"),
+        (vector_map() | {"lane_segments": {"1": lane(1, 0, float("nan"), 0)}}, "broken JSON"),
     ],
 )
 def test_map_without_what_every_map_has(tmp_path, document, found):
