@@ -4,12 +4,10 @@ relied on.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 from alpasim_plugin.alpasim.client.driver import AlpasimPolicy
@@ -21,16 +19,16 @@ from alpasim_plugin.alpasim.client.preflight import (
     outside_view,
     tolerances,
 )
-from alpasim_plugin.cli.options import HELP_NAMES, Json, Run, command_of, run_or_newest
+from alpasim_plugin.cli.options import Json, Run, run_or_newest, typer_of
+from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.errors import InfrastructureError, PolicyError, SimrunError
 from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
-from alpasim_plugin.core.types import RenderRequest, Scenario
+from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.check import inspect_run
-from alpasim_plugin.log.run_folder.manifests import Damage, read_run_json
-from alpasim_plugin.log.run_folder.schema import MANIFEST
+from alpasim_plugin.log.run_folder.manifests import read_run_json
+from alpasim_plugin.runs.cameras import recorded_requests
 from alpasim_plugin.runs.cell import make_renderer
 from alpasim_plugin.runs.guards import checked_frames
 from alpasim_plugin.runs.rollout import run_rollout
@@ -74,11 +72,6 @@ Examples:
 Exit codes: 0 nothing failed; 1 a check failed; 4 the driver cannot be reached.
 """
 
-app = typer.Typer(
-    help="Verify a run folder, a policy, a renderer or an AlpaSim driver.",
-    context_settings=HELP_NAMES,
-)
-
 
 def check_run(run: Run = None, as_json: Json = False) -> None:
     """Read every file of every rollout, compare it with its digest, and list what is damaged.
@@ -87,31 +80,26 @@ def check_run(run: Run = None, as_json: Json = False) -> None:
     """
     root = run_or_newest(run)
     inspection = inspect_run(root, full=True)
-    problems = [*inspection.damage]
-    problems += [
-        Damage(cell, MANIFEST, "the rollout is unfinished") for cell in inspection.unfinished
-    ]
+    problems = [str(damage) for damage in inspection.damage]
+    problems += [f"{cell}: the rollout is unfinished" for cell in inspection.unfinished]
     code = 0 if inspection.whole else BROKEN
-    if as_json:
-        facts = {
-            "run": str(root),
-            "whole": inspection.whole,
-            "exit_code": code,
-            "rollouts": len(inspection.cells),
-            "unfinished": len(inspection.unfinished),
-            "tables_only": inspection.tables_only,
-            "damage": [vars(problem) for problem in problems],
-        }
-        print(json.dumps(facts))
-    else:
-        for problem in problems:
-            print(terminal(str(problem)))
-        if inspection.tables_only:
-            print("the folder has no rollouts, only tables")
-        state = "whole" if inspection.whole else "damaged or unfinished"
-        print(f"{len(inspection.cells)} rollouts, {len(problems)} problems: {state}")
-        if problems:
-            print(terminal(again(read_run_json(root))))
+    facts = {
+        "run": str(root),
+        "whole": inspection.whole,
+        "exit_code": code,
+        "rollouts": len(inspection.cells),
+        "unfinished": len(inspection.unfinished),
+        "tables_only": inspection.tables_only,
+        "damage": problems,
+    }
+    lines = problems
+    if inspection.tables_only:
+        lines = [*lines, "the folder has no rollouts, only tables"]
+    state = "whole" if inspection.whole else "damaged or unfinished"
+    lines = [*lines, f"{len(inspection.cells)} rollouts, {len(problems)} problems: {state}"]
+    if problems:
+        lines.append(again(read_run_json(root)))
+    show(as_json, facts, *map(terminal, lines))
     raise typer.Exit(code)
 
 
@@ -130,20 +118,17 @@ def check_policy(
     scene = None if scenario is None else load_scenario(scenario)
     with parts_print_to_stderr():
         report = run_checks(policy, scene)
-    if as_json:
-        facts = {
-            "policy": policy,
-            "ok": report.ok,
-            "checks": [
-                {"check": check.name, "ok": check.ok, "found": check.sentence}
-                for check in report.checks
-            ],
-            "notes": report.notes,
-            "latency_ms": dict(zip(("p50", "max"), report.latency_ms, strict=True)),
-        }
-        print(json.dumps(facts))
-    else:
-        print(report)
+    facts = {
+        "policy": policy,
+        "ok": report.ok,
+        "checks": [
+            {"check": check.name, "ok": check.ok, "found": check.sentence}
+            for check in report.checks
+        ],
+        "notes": report.notes,
+        "latency_ms": dict(zip(("p50", "max"), report.latency_ms, strict=True)),
+    }
+    show(as_json, facts, str(report))
     raise typer.Exit(0 if report.ok else BROKEN)
 
 
@@ -156,33 +141,16 @@ def check_renderer(
     scene = load_scenario(scenario)
     with parts_print_to_stderr():
         session = make_renderer(renderer, scene)
-        times = [scene.start_us + number * scene.rates.camera_us for number in range(FRAMES)]
         shapes = []
-        for t_us in times:
+        for number in range(FRAMES):
+            t_us = scene.start_us + number * scene.rates.camera_us
             frames = checked_frames(session, recorded_requests(scene, t_us))
             shapes += [list(frame.rgb.shape) for frame in frames]
     facts = {"renderer": renderer, "ok": True, "frames": len(shapes), "shapes": shapes}
-    if as_json:
-        print(json.dumps(facts))
-    else:
-        height, width, _ = shapes[0]
-        print(f"{renderer}: {len(shapes)} frames of {width}x{height}, every check passed")
-
-
-def recorded_requests(scene: Scenario, t_us: int) -> list[RenderRequest]:
-    """Return a request for each camera of a scene at an instant of its recorded path."""
-    pose = interpolate(scene.ego_log, np.array([t_us]))[0]
-    poses = {
-        actor.actor_id: interpolate(actor.track, t_us)
-        for actor in scene.actors
-        if actor.track.t_us[0] <= t_us <= actor.track.t_us[-1]
-    }
-    requests = []
-    for camera in scene.cameras:
-        T_world_camera = pose @ camera.T_rig_camera
-        shutter = np.stack([T_world_camera, T_world_camera])
-        requests.append(RenderRequest(t_us, camera, shutter, poses))
-    return requests
+    height, width, _ = shapes[0]
+    show(
+        as_json, facts, f"{renderer}: {len(shapes)} frames of {width}x{height}, every check passed"
+    )
 
 
 def check_driver(
@@ -226,18 +194,14 @@ def check_driver(
     ]
     code = BROKEN if any(check.result == "failed" for check in checks) else 0
     driver = policy.facts()["driver"]
-    if as_json:
-        facts = {
-            "driver": driver,
-            "checks": [check.__dict__ for check in checks],
-            "scenes": [drive.facts() for drive in drives],
-            "exit_code": code,
-        }
-        print(json.dumps(facts))
-    else:
-        print(f"driver  {driver}")
-        for check in checks:
-            print(f"{check.result:7} {check.name}: {check.text}")
+    facts = {
+        "driver": driver,
+        "checks": [vars(check) for check in checks],
+        "scenes": [drive.facts() for drive in drives],
+        "exit_code": code,
+    }
+    lines = [f"{check.result:7} {check.name}: {check.text}" for check in checks]
+    show(as_json, facts, f"driver  {driver}", *lines)
     raise typer.Exit(code)
 
 
@@ -310,7 +274,12 @@ def over_scenes(drives: Sequence[Drive]) -> list[Finding]:
     return [Finding("the connection lasts", "failed" if lost else "passed", text)]
 
 
-app.command("run", epilog=RUN_EPILOG)(command_of(check_run))
-app.command("policy", epilog=POLICY_EPILOG)(command_of(check_policy))
-app.command("renderer", epilog=RENDERER_EPILOG)(command_of(check_renderer))
-app.command("driver", epilog=DRIVER_EPILOG)(command_of(check_driver))
+app = typer_of(
+    {
+        "run": (check_run, RUN_EPILOG),
+        "policy": (check_policy, POLICY_EPILOG),
+        "renderer": (check_renderer, RENDERER_EPILOG),
+        "driver": (check_driver, DRIVER_EPILOG),
+    },
+    "Verify a run folder, a policy, a renderer or an AlpaSim driver.",
+)

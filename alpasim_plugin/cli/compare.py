@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from rich.console import Console
-
-from alpasim_plugin.cli.options import Every, Json, run_or_newest
-from alpasim_plugin.cli.progress import warn
+from alpasim_plugin.cli.options import Json, run_or_newest
+from alpasim_plugin.cli.output import show, warn
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.runs.summary import aggregate_runs, joined_metrics
 from alpasim_plugin.runs.tables import ensure_tables
@@ -36,7 +33,7 @@ Examples:
 - `simrun compare runs/night-1 runs/night-2 runs/night-3`: the shards of one run, as of one
 """
 EVERY_MISSING = 10**9
-SHOWN, NAMED = 10, 3  # lines about missing pairs; cells named in each
+SHOWN = 10  # lines about missing pairs
 
 
 def compare(
@@ -49,7 +46,9 @@ def compare(
     baseline: Annotated[
         str | None, Flag("RENDERER, POLICY or RENDERER/POLICY to compare with (of the first run).")
     ] = None,
-    every: Every = False,
+    every: Annotated[
+        bool, Flag("Print every metric, not only the headline ones.", "--all")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Print means, paired differences with intervals, and verdicts.
@@ -78,46 +77,35 @@ def compare(
     else:
         result = compare_within(opened[0], baseline, {}, EVERY_MISSING)
         means = opened[0].summary
-    if as_json:
-        facts = {
-            "runs": [str(run) for run in folders],
-            "notes": list(result.notes),
-            "paired": result.paired,
-            "paired_with_base": result.with_base,
-            "paired_arms": result.policies,
-        }
-        if means is not None:
-            facts |= {name: means[name] for name in ("preset", "metrics", "failures")}
-        print(json.dumps(facts))
-        return
+    facts: dict[str, Any] = {
+        "runs": [str(run) for run in folders],
+        "notes": list(result.notes),
+        "paired": result.paired,
+        "paired_with_base": result.with_base,
+        "paired_arms": result.policies,
+    }
+    lines: list[Any] = []
     if means is not None:
-        Console().print(render_table(means, headline_only=not every, known=result.metrics))
+        facts |= {name: means[name] for name in ("preset", "metrics", "failures")}
+        lines.append(render_table(means, headline_only=not every, known=result.metrics))
         failures = means["failures"]
         if failures["n_failed"]:
-            causes = ", ".join(f"{name} {n}" for name, n in failures["by_class"].items())
-            print(
-                f"{failures['n_failed']} of {failures['n_rollouts']} rollouts failed ({causes}) and are in no mean"
-            )
-    _print(result, None if every else result.metrics.headline)
-
-
-def _print(result: Comparison, only: Sequence[str] | None) -> None:
-    for note in result.notes:
-        print(f"note: {note}")
-    for variant, entries in (
-        *result.paired.items(),
-        *result.with_base.items(),
-        *result.policies.items(),
-    ):
-        mine = [
-            row
-            for row in pair_rows({"paired": {variant: entries}}, result.metrics)
-            if only is None or row.metric in only
-        ]
-        baseline = next((str(entry["baseline"]) for entry in entries.values()), "nothing")
-        print(f"\n{variant} minus {baseline}")
-        for line in [*_table(mine, entries, result.metrics), *_missing(entries)]:
-            print(line)
+            causes = ", ".join(f"{name} {count}" for name, count in failures["by_class"].items())
+            number = f"{failures['n_failed']} of {failures['n_rollouts']}"
+            lines.append(f"{number} rollouts failed ({causes}) and are in no mean")
+    lines += [f"note: {note}" for note in result.notes]
+    for tables in (result.paired, result.with_base, result.policies):
+        for variant, entries in tables.items():
+            baseline = next((entry["baseline"] for entry in entries.values()), "nothing")
+            lines.append(f"\n{variant} minus {baseline}")
+            rows = [
+                row
+                for row in pair_rows({"paired": {variant: entries}}, result.metrics)
+                if every or row.metric in result.metrics.headline
+            ]
+            lines += _table(rows, entries, result.metrics)
+            lines += _missing(entries)
+    show(as_json, facts, *lines)
 
 
 def _table(
@@ -127,28 +115,22 @@ def _table(
     lines = [("metric", "difference", "95 %", "p", "margin", "pairs", "verdict")]
     for row in rows:
         entry = entries[row.metric]
-        more = entry["more_scenes"]
-        verdict = f"{entry['verdict']}, about {more} more scenes" if more else str(entry["verdict"])
-        verdict += " (better)" if entry["difference"] == "better" else ""
+        verdict = str(entry["verdict"])
+        if entry["more_scenes"]:
+            verdict += f", about {entry['more_scenes']} more scenes"
+        if entry["difference"] == "better":
+            verdict += " (better)"
         scale = 100.0 if known.shown(row.metric).in_percent else 1.0
+        margin = f"{scale * entry['margin']:g}"
         pairs = f"{entry['n_cells']} in {plural(int(entry['n_scenes']), 'scene')}"
-        lines.append(
-            (
-                row.metric,
-                row.diff.text,
-                row.interval.text,
-                row.p_value.text,
-                f"{scale * entry['margin']:g}",
-                pairs,
-                verdict,
-            )
-        )
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    padded = (zip(line, widths, strict=True) for line in lines)
-    return [
-        "  " + "  ".join(cell.ljust(width) for cell, width in line).replace("\u00a0", " ").rstrip()
-        for line in padded
-    ]
+        numbers = (row.diff.text, row.interval.text, row.p_value.text)
+        lines.append((row.metric, *numbers, margin, pairs, verdict))
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    texts = []
+    for line in lines:
+        cells = [cell.ljust(width) for cell, width in zip(line, widths, strict=True)]
+        texts.append("  " + "  ".join(cells).replace("\u00a0", " ").rstrip())
+    return texts
 
 
 def _missing(entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -166,19 +148,9 @@ def _missing(entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
         for cell in entry["missing"]:
             name = f"{cell['policy']}, {cell['scene']}, seed {cell['seed']}"
             lacking.setdefault((name, cell["why"]), []).append(metric)
-    partly: dict[tuple[str, str], list[str]] = {}  # (metrics, reason) -> cells
-    for (name, why), metrics in lacking.items():
-        if len(metrics) == len(paired):
-            lines.append(f"  no pair: {name}: every metric: {why}")
-        else:
-            partly.setdefault((", ".join(metrics), why), []).append(name)
-    for (metrics_text, why), names in partly.items():
-        where = "; ".join(names[:NAMED]) + (
-            f"; {len(names) - NAMED} more" if len(names) > NAMED else ""
-        )
-        lines.append(f"  no pair: {metrics_text} in {plural(len(names), 'cell')} ({where}): {why}")
-    return (
-        lines
-        if len(lines) <= SHOWN
-        else [*lines[:SHOWN], f"  {len(lines) - SHOWN} more lines: --json lists all"]
-    )
+    for (name, reason), metrics in lacking.items():
+        which = "every metric" if len(metrics) == len(paired) else ", ".join(metrics)
+        lines.append(f"  no pair: {name}: {which}: {reason}")
+    if len(lines) > SHOWN:
+        lines = [*lines[:SHOWN], f"  {len(lines) - SHOWN} more lines: --json lists all"]
+    return lines

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import difflib
-import json
 import sys
 from pathlib import Path
 from typing import Annotated
 
+from rich.console import Console
+from rich.markdown import Markdown
+
 from alpasim_plugin.cli.options import Json
+from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Positional
 
@@ -32,40 +35,28 @@ def docs(
     as_json: Json = False,
 ) -> None:
     """Read a page of the documentation in the terminal, or list all."""
-    folder = next((one for one in FOLDERS if (one / "index.md").is_file()), None)
+    folder = next((path for path in FOLDERS if (path / "index.md").is_file()), None)
     if folder is None:
         raise InputError(
             f"{FOLDERS[1]}: this installation has no pages",
-            "install the wheel with pip, or use a checkout",
+            "Install the wheel with pip, or use a checkout.",
         )
-    pages = {path.stem: path for path in sorted(folder.glob("*.md"))}
+    texts = {path.stem: path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.md"))}
     if page is None:
-        titles = {
-            name: path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
-            for name, path in pages.items()
-        }
-        print(
-            json.dumps(titles)
-            if as_json
-            else "\n".join(f"{name:<24}{title}" for name, title in titles.items())
-        )
+        titles = {name: text.partition("\n")[0].removeprefix("# ") for name, text in texts.items()}
+        show(as_json, titles, *(f"{name:<24}{title}" for name, title in titles.items()))
         return
     name = Path(page).stem
-    if name not in pages:
-        near = difflib.get_close_matches(name, pages, 1) or ["index"]
+    if name not in texts:
+        near = difflib.get_close_matches(name, texts, 1) or ["index"]
         raise InputError(
-            f"{page}: no such page among {len(pages)}",
+            f"{page}: no such page among {len(texts)}",
             f"did you mean {near[0]!r}? simrun docs lists all",
         )
-    text = pages[name].read_text(encoding="utf-8")
-    if as_json:
-        print(json.dumps({"page": name, "path": str(pages[name]), "text": text}))
-    elif sys.stdout.isatty():
-        from rich.console import Console
-        from rich.markdown import Markdown
-
-        console = Console()
-        with console.pager(styles=True):
-            console.print(Markdown(text))
-    else:
-        print(text, end="")
+    facts = {"page": name, "path": str(folder / f"{name}.md"), "text": texts[name]}
+    if as_json or not sys.stdout.isatty():
+        show(as_json, facts, texts[name].rstrip("\n"))
+        return
+    console = Console()
+    with console.pager(styles=True):
+        console.print(Markdown(texts[name]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 import typer
 
 from alpasim_plugin.cli.options import Json
+from alpasim_plugin.cli.output import show
 from alpasim_plugin.core import places
 from alpasim_plugin.core.errors import InfrastructureError, SimrunError
 from alpasim_plugin.core.places import temporary_folder
@@ -26,46 +26,23 @@ def doctor(
     as_json: Json = False,
 ) -> None:
     """Test each part on a small case and report what works, what does not, and what to do."""
-    checks: dict[str, Callable[[], str]] = {
-        "rasteriser (cpu)": lambda: _raster("cpu"),
-        "rasteriser (gsplat)": lambda: _raster("gsplat"),
-        "fixer": _fixer,
-        "video": _video,
-        "log messages": _wire,
-        "disk": _disk,
-        "cache": lambda: _writable(places.cache()),
-        "kernels": _kernels,
-    }
-    needed = {"rasteriser (cpu)", "fixer", "video", "log messages", "disk", "kernels"}
     rows = []
-    for name, check in checks.items():
+    for name, check in CHECKS.items():
+        row = {"check": name, "ok": True, "needed": name in NEEDED, "found": "", "do": ""}
         try:
-            rows.append(
-                {"check": name, "ok": True, "needed": name in needed, "found": check(), "do": ""}
-            )
+            row["found"] = check()
         except SimrunError as error:
-            rows.append(
-                {
-                    "check": name,
-                    "ok": False,
-                    "needed": name in needed,
-                    "found": error.message,
-                    "do": error.hint,
-                }
-            )
-    broken = [row for row in rows if row["needed"] and not row["ok"]]
-    if as_json:
-        print(json.dumps({"hardware": hardware(), "versions": versions(), "checks": rows}))
-    else:
-        for key, value in (hardware() | versions()).items():
-            print(f"{key:>32}  {value}")
-        for row in rows:
-            mark = "ok" if row["ok"] else "BROKEN" if row["needed"] else "absent"
-            print(
-                f"{row['check']:>32}  {mark}: {row['found']}"
-                + (f" -> {row['do']}" if row["do"] else "")
-            )
-    raise typer.Exit(4 if broken else 0)
+            row |= {"ok": False, "found": error.message, "do": error.hint}
+        rows.append(row)
+    machine = hardware() | versions()
+    lines = [f"{key:>32}  {value}" for key, value in machine.items()]
+    for row in rows:
+        mark = "ok" if row["ok"] else "BROKEN" if row["needed"] else "absent"
+        advice = f" -> {row['do']}" if row["do"] else ""
+        lines.append(f"{row['check']:>32}  {mark}: {row['found']}{advice}")
+    facts = {"hardware": hardware(), "versions": versions(), "checks": rows}
+    show(as_json, facts, *lines)
+    raise typer.Exit(4 if any(row["needed"] and not row["ok"] for row in rows) else 0)
 
 
 def _raster(backend: Literal["cpu", "gsplat"]) -> str:
@@ -127,13 +104,25 @@ def _writable(folder: Path) -> str:
 
 
 def _disk() -> str:
-    free = shutil.disk_usage(Path.cwd()).free / 2**30
-    return f"{free:.1f} GiB free here"
+    return f"{shutil.disk_usage(Path.cwd()).free / 2**30:.1f} GiB free here"
 
 
 def _kernels() -> str:
     """Compile the kernels of every renderer and of the fixer, unless that was done."""
-    where = _writable(places.kernels())
+    folder = _writable(places.kernels())
     for subject in SUBJECTS:
         compile_kernels(subject)
-    return f"compiled in {where}"
+    return f"compiled in {folder}"
+
+
+CHECKS: dict[str, Callable[[], str]] = {
+    "rasteriser (cpu)": lambda: _raster("cpu"),
+    "rasteriser (gsplat)": lambda: _raster("gsplat"),
+    "fixer": _fixer,
+    "video": _video,
+    "log messages": _wire,
+    "disk": _disk,
+    "cache": lambda: _writable(places.cache()),
+    "kernels": _kernels,
+}
+NEEDED = CHECKS.keys() - {"rasteriser (gsplat)", "cache"}

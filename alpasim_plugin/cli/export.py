@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from alpasim_plugin.cli.options import Json, Overwrite, refuse_existing
-from alpasim_plugin.cli.progress import warn
-from alpasim_plugin.cli.view import find_cell, is_run, narrowed
+from alpasim_plugin.cli.options import Json, Overwrite, refuse_existing, run_and_cell
+from alpasim_plugin.cli.output import Progress, show, warn
+from alpasim_plugin.cli.view import wanted_of
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.log.run_folder.schema import SUMMARY
-from alpasim_plugin.runs.export import Export, export_run, export_scenes
+from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY
+from alpasim_plugin.runs.export import export_run, export_scenes
 from alpasim_plugin.runs.recordings import export_mcap, require_mcap
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.opening import read_so_far
 from evaluators.viewer.cells import Wanted, cells_of, check_wanted, read_logs
 
-NAMED = 4  # cells in the message that there are several
+SHOWN_CELLS = 4  # in the message that there are several
 
 EPILOG = """
 Examples:
@@ -66,33 +64,43 @@ def export(
     renderer on one time line.
     """
     if (alpasim is None) == (mcap is None):
-        problem = "nothing to write" if alpasim is None else "--alpasim and --mcap together"
-        raise InputError(f"{' '.join(items)}: {problem}", "give --alpasim DIR or --mcap FILE")
-    if mcap is not None:
-        _print_recording(export_recording(items, wanted, mcap, overwrite), as_json)
+        raise InputError(f"{' '.join(items)}: --alpasim or --mcap", "Give one of both.")
+    if alpasim is not None:
+        if not wanted.is_all:
+            raise InputError(
+                "--alpasim: --scene, --policy, --seed or --renderer beside it",
+                "Leave them out: a run is exported whole.",
+            )
+        _export_to_alpasim(items, alpasim, as_json)
         return
-    assert alpasim is not None
-    if not wanted.is_all:
-        raise InputError(
-            "--alpasim: --scene, --policy, --seed or --renderer beside it",
-            "leave them out: a run is exported whole",
-        )
-    runs = [item for item in items if is_run(Path(item))]
+    assert mcap is not None
+    facts = export_recording(items, wanted, mcap, overwrite)
+    size = f"{facts['bytes'] / 1e6:.1f} MB, {facts['messages']} messages"
+    lines = [f"note     {note}" for note in facts["notes"]]
+    show(as_json, facts, *lines, f"mcap     {mcap}  {size}: {facts['recording']}")
+
+
+def _export_to_alpasim(items: Sequence[str], folder: Path, as_json: bool) -> None:
+    runs = [item for item in items if (Path(item) / RUN_INFO).exists()]
     if runs and len(items) > 1:
         raise InputError(
-            f"{' '.join(items)}: a run folder among several items",
-            "export one run at a time",
+            f"{' '.join(items)}: a run folder among several items", "Export one run at a time."
         )
     if runs:
-        ensure_tables(Path(runs[0]), warn)
-        done = export_run(
-            Path(runs[0]),
-            alpasim,
-            lambda text: None if as_json else print(text, file=sys.stderr, flush=True),
-        )
+        run = Path(runs[0])
+        ensure_tables(run, warn)
+        done = export_run(run, folder, Progress(as_json).say)
     else:
-        done = export_scenes(items, alpasim)
-    _print(done, as_json)
+        done = export_scenes(items, folder)
+    lines = []
+    for one in done.runs:
+        failed = f", {one.failed} failed" if one.failed else ""
+        lines.append(f"run     {done.root / one.folder}  {one.rollouts} rollouts{failed}")
+        lines += [f"  note  {note}" for note in one.notes]
+    lines += [f"scene   {done.root / scene}" for scene in done.scenes]
+    exported = [{**vars(one), "notes": list(one.notes)} for one in done.runs]
+    facts = {"out": str(done.root), "runs": exported, "scenes": list(done.scenes)}
+    show(as_json, facts, *lines)
 
 
 def export_recording(
@@ -117,51 +125,21 @@ def export_recording(
     if len(items) > 1:
         raise InputError(
             f"{' '.join(items)}: several items",
-            "give one run folder, or the folder of one rollout",
+            "Give one run folder, or the folder of one rollout.",
         )
     refuse_existing(path, "--mcap", overwrite)
     require_mcap()  # before anything is read
-    what = Path(items[0])
-    root, of_rollout = find_cell(what)
+    root, cell = run_and_cell(Path(items[0]))
+    wanted = wanted_of(root, cell, asked)
     if (root / SUMMARY).exists():
         ensure_tables(root, warn)
     run = read_so_far(root).run
-    wanted = narrowed(what, of_rollout, asked)
     check_wanted(run, wanted)
     cells = cells_of(run, wanted)
-    if not cells:
+    if len(cells) != 1:
+        names = "; ".join(one.name for one in cells[:SHOWN_CELLS])
         raise InputError(
-            f"{root}: no finished rollout that was asked for",
-            "choose others by --scene, --policy and --seed",
-        )
-    if len(cells) > 1:
-        names = "; ".join(cell.name for cell in cells[:NAMED])
-        raise InputError(
-            f"{root}: {len(cells)} cells of scene, policy and seed: {names}",
-            "choose one by --scene, --policy and --seed, or name a rollout's folder",
+            f"{root}: {len(cells)} finished cells of scene, policy and seed: {names}",
+            "Choose one by --scene, --policy and --seed, or name a rollout's folder.",
         )
     return export_mcap(run, cells[0], read_logs(run, cells[0]), path)
-
-
-def _print_recording(facts: dict[str, Any], as_json: bool) -> None:
-    if as_json:
-        print(json.dumps(facts))
-        return
-    for note in facts["notes"]:
-        print(f"note     {note}")
-    size = f"{facts['bytes'] / 1e6:.1f} MB, {facts['messages']} messages"
-    print(f"mcap     {facts['file']}  {size}: {facts['recording']}")
-
-
-def _print(done: Export, as_json: bool) -> None:
-    if as_json:
-        runs = [{**one.__dict__, "notes": list(one.notes)} for one in done.runs]
-        print(json.dumps({"out": str(done.root), "runs": runs, "scenes": list(done.scenes)}))
-        return
-    for one in done.runs:
-        failed = f", {one.failed} failed" if one.failed else ""
-        print(f"run     {done.root / one.folder}  {one.rollouts} rollouts{failed}")
-        for note in one.notes:
-            print(f"  note  {note}")
-    for scene in done.scenes:
-        print(f"scene   {done.root / scene}")

@@ -4,7 +4,6 @@ for a rollout that failed.
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Annotated
 import typer
 
 from alpasim_plugin.cli.options import Json, run_and_cell
-from alpasim_plugin.cli.progress import warn
+from alpasim_plugin.cli.output import show, warn
 from alpasim_plugin.cli.run import last_lines
 from alpasim_plugin.core.errors import InputError, error_text
 from alpasim_plugin.core.flags import Flag, Positional
@@ -79,27 +78,24 @@ def fork(
     root = out or run / "forks" / slug(f"{past.name} {change.label}")
     result = fork_rollout(past, change, root, ["simrun", *sys.argv[1:]])
     fork_facts = read_json(root / "run.json")["fork"]
-    if as_json:
-        facts = {
-            "out": str(root),
-            "fork": fork_facts,
-            "exit_code": result.exit_code,
-            "summary": result.summary,
-        }
-        print(json.dumps(facts))
-        raise typer.Exit(result.exit_code)
-    for failed in result.summary["failures"]["cells"]:
-        print(f"{failed['path']}\n{error_text(failed['error'])}", file=sys.stderr)
+    facts = {
+        "out": str(root),
+        "fork": fork_facts,
+        "exit_code": result.exit_code,
+        "summary": result.summary,
+    }
+    lines = []
     if fork_facts:
-        print(f"replay to {at:g} s   equal to the log, bit for bit")
+        lines.append(f"replay to {at:g} s   equal to the log, bit for bit")
         after = fork_facts.get("continuation")
         if after == "equal":
-            print("continuation      equal to the log, bit for bit")
+            lines.append("continuation      equal to the log, bit for bit")
         elif after is not None:
-            print(
-                f"continuation      differs first in {after['component']} at step {after['step']} ({after['what']})"
-            )
-    print(f"report   {root / 'report.html'}")
+            where = f"{after['component']} at step {after['step']} ({after['what']})"
+            lines.append(f"continuation      differs first in {where}")
+    show(as_json, facts, *lines, f"report   {root / 'report.html'}")
+    for failed in () if as_json else result.summary["failures"]["cells"]:
+        warn(f"{failed['path']}\n{error_text(failed['error'])}")
     raise typer.Exit(result.exit_code)
 
 
@@ -128,20 +124,20 @@ def why(
         rollout = worst_failure(run)
     cause = explain(run, rollout)
     page = None if cause is None else write_cause(run, cause)
+    outcome = rollout.failure
+    evidence = [] if cause is None else list(cause.sentences)
+    if not rollout.ok:
+        evidence += last_lines(root / rollout.path / OUTPUT_NAME)
+    elif cause is not None:
+        outcome = cause.outcome
     facts = {
         "rollout": rollout.path,
-        "page": None if page is None else str(page),
-        "outcome": rollout.failure if cause is None or not rollout.ok else cause.outcome,
-        "found": [] if cause is None else list(cause.sentences),
+        "page": page and str(page),
+        "outcome": outcome,
+        "found": evidence,
     }
-    if not rollout.ok:
-        facts["found"] = [*facts["found"], *last_lines(root / rollout.path / OUTPUT_NAME)]
-    if as_json:
-        print(json.dumps(facts))
-        return
-    print(f"rollout  {rollout.path}")
-    print(f"outcome  {facts['outcome']}")
-    for text in facts["found"]:
-        print(f"         {text}")
+    lines = [f"rollout  {rollout.path}", f"outcome  {outcome}"]
+    lines += [f"         {text}" for text in evidence]
     if page is not None:
-        print(f"page     {shlex.quote(str(page))}")
+        lines.append(f"page     {shlex.quote(str(page))}")
+    show(as_json, facts, *lines)

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from alpasim_plugin.cli.options import Json, Run, run_or_newest
-from alpasim_plugin.cli.progress import make_progress, warn
+from alpasim_plugin.cli.output import Progress, show, warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
-from alpasim_plugin.core.parts import names
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.schema import PAGES
-from alpasim_plugin.log.run_folder.sides import Row
-from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.reports import write_reports
-from alpasim_plugin.runs.run import Progress, execute_run
+from alpasim_plugin.runs.self_test import run_self_test
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics.presets import DEFAULT
 from evaluators.opening import read_run
@@ -30,122 +24,11 @@ from evaluators.report.ci import write_gate_files
 from evaluators.statistics.baselines import (
     check_matches,
     read_baseline,
-    rows_of_run,
     table_of_run,
     write_baseline,
 )
 from evaluators.statistics.decision import stopping_note
-from evaluators.statistics.gate import GateSpec, GateVerdict, judge, load_gate
-from evaluators.statistics.verdicts import Outcome, outcome_of_failures, worst
-from scenarios.suite import load_suite
-
-SUITE = "suites/gate_self_test"
-POLICY = "lane-camera"  # the shipped policy that drives from camera frames
-REFERENCE = "clean"
-CONTROL = "clean, other noise"
-SEED, OTHER_SEED = 0, 1
-
-
-@dataclass(frozen=True)
-class Trial:
-    """The gate's verdict on one renderer, and whether it is right."""
-
-    renderer: str
-    is_broken: bool
-    verdict: GateVerdict
-
-    @property
-    def is_right(self) -> bool:
-        """Return whether a broken renderer is caught, or the control is not called worse."""
-        return (self.verdict.outcome.cause == "regression") == self.is_broken
-
-    @property
-    def caught_by(self) -> list[str]:
-        """Name the metrics whose rule was broken."""
-        return [check.metric for check in self.verdict.checks if check.cause == "regression"]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the trial for JSON."""
-        facts = {
-            "renderer": self.renderer,
-            "is_broken": self.is_broken,
-            "is_right": self.is_right,
-            "caught_by": self.caught_by,
-        }
-        return facts | {"verdict": self.verdict.as_dict()}
-
-
-@dataclass(frozen=True)
-class SelfTest:
-    """All trials and their outcome."""
-
-    trials: tuple[Trial, ...]
-    outcome: Outcome
-    root: Path
-
-
-def broken_renderers() -> list[str]:
-    """Return the registered renderers with a deliberate fault."""
-    return [name for name in names("renderer") if name.startswith("broken-")]
-
-
-def run_self_test(
-    spec: GateSpec,
-    root: Path,
-    command: Sequence[str],
-    progress: Callable[[], Progress],
-) -> SelfTest:
-    """Drive the suite behind the reference and every broken renderer and judge each pair by the
-    gate.
-
-    The gate's rules apply unchanged, except that the reference is `REFERENCE`, that ``min_scenes``
-    is at most the suite's size and that its scenes are all that is asked about. As a control the
-    reference is compared with itself under another seed: a gate that fails everything fails its
-    test.
-
-    Args:
-        spec: The gate under test.
-        root: Run folder; finished rollouts in it are reused.
-        command: Written to run.json.
-        progress: Creates a progress display, once for each of the two runs.
-    """
-    broken = broken_renderers()
-    options = RunOptions(preset=spec.preset or DEFAULT, baseline=REFERENCE)
-    plan = make_plan(load_suite(SUITE), [REFERENCE, *broken], [POLICY], [SEED], options)
-    control = make_plan(load_suite(SUITE), [REFERENCE], [POLICY], [OTHER_SEED], options)
-    runs = [(plan, root), (control, root / "control")]
-    results = [execute_run(one, folder, None, command, progress()) for one, folder in runs]
-    rows = rows_of_run(read_run(root))
-    # The rollouts of the other seed get the first seed, so that they are paired with its rollouts.
-    again = [
-        {**row, "renderer": CONTROL, "seed": SEED}
-        for row in rows_of_run(read_run(root / "control"))
-    ]
-    trials = [Trial(name, True, _judge(spec, rows, name, len(plan.scenarios))) for name in broken]
-    trials.append(
-        Trial(CONTROL, False, _judge(spec, [*rows, *again], CONTROL, len(plan.scenarios)))
-    )
-    failed = worst([outcome_of_failures(result.summary["failures"]) for result in results])
-    if failed.cause != "pass":
-        return SelfTest(tuple(trials), failed, root)
-    wrong = [trial for trial in trials if not trial.is_right]
-    reasons = tuple(
-        f"{t.renderer} is {'not caught' if t.is_broken else 'wrongly called worse'}" for t in wrong
-    )
-    return SelfTest(tuple(trials), Outcome("regression" if wrong else "pass", reasons), root)
-
-
-def _judge(spec: GateSpec, rows: Sequence[Row], name: str, n_scenes: int) -> GateVerdict:
-    fields = {
-        "renderers": (name,),
-        "baseline": REFERENCE,
-        "min_scenes": min(spec.min_scenes, n_scenes),
-        "max_failed": 0.0,
-    }
-    fields["population"] = "suite"
-    only = [row for row in rows if row["renderer"] in (REFERENCE, name)]
-    return judge(only, spec.model_copy(update=fields))
-
+from evaluators.statistics.gate import GateVerdict, judge, load_gate
 
 EPILOG = """
 Examples:
@@ -192,7 +75,7 @@ def gate(
     stored_run = read_run(run)
     if approve is not None:
         write_baseline(stored_run, approve)
-        print(json.dumps({"baseline": str(approve)}) if as_json else f"baseline  {approve}")
+        show(as_json, {"baseline": str(approve)}, f"baseline  {approve}")
         return
     if note := stopping_note(run):
         warn(note)
@@ -214,55 +97,48 @@ def gate(
     files = write_gate_files(verdict, source, stored_run, out or run, rows)
     if out is None and (run / PAGES[0]).is_file():
         write_reports(run, flips=read_run_json(run).get("kind") != "score")
-    if as_json:
-        print(json.dumps({**verdict.as_dict(), "files": [str(path) for path in files]}))
-    else:
-        print_verdict(verdict)
+    facts = {**verdict.as_dict(), "files": [str(path) for path in files]}
+    show(as_json, facts, *verdict_lines(verdict))
     raise typer.Exit(verdict.exit_code)
 
 
-def print_verdict(verdict: GateVerdict) -> None:
-    """Print every check, other reasons, and the verdict."""
+def verdict_lines(verdict: GateVerdict) -> list[str]:
+    """Return a line for every check and every other reason, and the verdict."""
+    lines = []
     for check in verdict.checks:
         note = "" if check.binding else " (not binding)"
-        print(f"{check.cause:>10}  {check.policy}, {check.text}{note}")
-    shown = {check.text for check in verdict.checks}
-    for reason in verdict.outcome.reasons:
-        if reason not in shown:
-            print(f"{verdict.outcome.cause:>10}  {reason}")
-    print(
-        f"{verdict.outcome.title} (exit code {verdict.exit_code}), compared with {verdict.baseline}"
-    )
+        lines.append(f"{check.cause:>10}  {check.policy}, {check.text}{note}")
+    outcome = verdict.outcome
+    texts = {check.text for check in verdict.checks}
+    lines += [f"{outcome.cause:>10}  {text}" for text in outcome.reasons if text not in texts]
+    code = verdict.exit_code
+    return [*lines, f"{outcome.title} (exit code {code}), compared with {verdict.baseline}"]
 
 
 def _self_test(gate_file: str, out: Path | None, as_json: bool) -> int:
     spec, source = load_gate(gate_file)
     root = out or Path("runs", f"gate-self-test-{spec.preset or DEFAULT}")
     began = time.perf_counter()
-    result = run_self_test(spec, root, ["simrun", *sys.argv[1:]], lambda: make_progress(as_json))
-    took_s = time.perf_counter() - began
-    if as_json:
-        trials = [trial.as_dict() for trial in result.trials]
-        print(
-            json.dumps(
-                {
-                    "gate": source,
-                    "outcome": result.outcome.as_dict(),
-                    "wall_s": round(took_s, 1),
-                    "trials": trials,
-                }
-            )
+    with Progress(as_json) as progress:
+        trials, outcome = run_self_test(spec, root, ["simrun", *sys.argv[1:]], progress)
+    wall_s = time.perf_counter() - began
+    lines = []
+    for trial in trials:
+        caught = (
+            f"caught by {', '.join(trial.caught_by)}" if trial.caught_by else "not called worse"
         )
-        return result.outcome.exit_code
-    for trial in result.trials:
-        found = f"caught by {', '.join(trial.caught_by)}" if trial.caught_by else "not called worse"
-        print(f"{'ok' if trial.is_right else 'WRONG':>5}  {trial.renderer}: {found}")
+        lines.append(f"{'ok' if trial.is_right else 'WRONG':>5}  {trial.renderer}: {caught}")
         if not trial.is_right:
-            for check in trial.verdict.checks:
-                print(f"       {check.text}")
-    for reason in result.outcome.reasons:
-        print(f"self-test: {reason}", file=sys.stderr)
-    print(
-        f"self-test of {source}: {result.outcome.title} (exit code {result.outcome.exit_code}) in {took_s:.0f} s; rollouts in {root}"
+            lines += [f"       {check.text}" for check in trial.verdict.checks]
+    code = outcome.exit_code
+    verdict = f"self-test of {source}: {outcome.title} (exit code {code})"
+    facts = {
+        "gate": source,
+        "outcome": outcome.as_dict(),
+        "wall_s": round(wall_s, 1),
+        "trials": [trial.as_dict() for trial in trials],
+    }
+    show(
+        as_json, facts, *lines, *outcome.reasons, f"{verdict} in {wall_s:.0f} s; rollouts in {root}"
     )
-    return result.outcome.exit_code
+    return code

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from rich.console import Console
-
 from alpasim_plugin.cli.options import Json
-from alpasim_plugin.cli.progress import warn
+from alpasim_plugin.cli.output import show, warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.parts import names, unidentified
 from alpasim_plugin.core.parts.resolve import declaration_of, note_of
 from alpasim_plugin.core.parts.source import load
-from evaluators.metrics import METRICS
+from evaluators.metrics import METRICS, table_of
+from evaluators.metrics.presets import described
+from evaluators.metrics.score import resolve_plugins
 from evaluators.report.numbers import plural
 from evaluators.report.runs import Choice, RunEntry, as_day, find_runs, runs_table, variants_of
+from scenarios.suite import shipped
 
 EPILOG = """
 Examples:
@@ -69,22 +69,24 @@ def list_names(
         return
     if roots or renderer or policy or since or last or metric:
         raise InputError(f"simrun list {kind}: filters are for runs", "Leave them out.")
-    tables: dict[Kind | None, Callable[[], dict[str, str]]] = {
-        None: lambda: {name: f"simrun list {name}" for name in get_args(Kind)},
-        "renderers": _renderers,
-        "fixers": _fixers,
-        "policies": lambda: names("policy"),
-        "scenarios": _scenarios,
-        "metrics": _metrics,
-        "presets": _presets,
-    }
-    known = tables[kind]()
-    if as_json:
-        print(json.dumps(known))
-        return
+    if kind is None:
+        known = {name: f"simrun list {name}" for name in get_args(Kind)}
+    elif kind == "renderers":
+        known = names("renderer")
+        for name, text in names("fixer").items():
+            known[name] = f"3dgs, repaired by the fixer {name}: {text}"
+    elif kind == "fixers":
+        known = _fixers()
+    elif kind == "policies":
+        known = names("policy")
+    elif kind == "scenarios":
+        known = shipped()
+    elif kind == "metrics":
+        known = {name: facts.help for name, facts in table_of(resolve_plugins()).items()}
+    else:
+        known = described()
     width = max((len(name) for name in known), default=0)
-    for name, help_text in known.items():
-        print(f"{name:<{width}}  {help_text}")
+    show(as_json, known, *(f"{name:<{width}}  {text}" for name, text in known.items()))
 
 
 def _list_runs(
@@ -92,29 +94,22 @@ def _list_runs(
 ) -> None:
     entries = find_runs(roots, bool(metrics))
     chosen = [entry for entry in entries if choice.takes(entry)][:last]
-    stored = (
-        {
-            name
-            for entry in chosen
-            for table in (entry.summary.get("metrics") or {}).values()
-            for name in table
-        }
-        if metrics
-        else set()
-    )
+    stored = {
+        name
+        for entry in chosen
+        for table in (entry.summary.get("metrics") or {}).values()
+        for name in table
+    }
     for name in metrics:
         if name not in METRICS and name not in stored:
             raise InputError(f"--metric {name}: no such metric", "simrun list metrics names them.")
-    if as_json:
-        rows = [entry.as_dict() | {"metrics": _values(entry, metrics)} for entry in chosen]
-        print(json.dumps({"runs": rows, "found": len(entries)}))
-        return
-    if chosen:
-        Console().print(runs_table(chosen, roots, metrics))
-    print(f"{plural(len(chosen), 'run')} of {len(entries)} below {', '.join(map(str, roots))}")
+    rows = [entry.as_dict() | {"metrics": _values(entry, metrics)} for entry in chosen]
+    lines: list[Any] = [runs_table(chosen, roots, metrics)] if chosen else []
+    count = f"{plural(len(chosen), 'run')} of {len(entries)} below {', '.join(map(str, roots))}"
+    show(as_json, {"runs": rows, "found": len(entries)}, *lines, count)
     for entry in entries:
-        if not entry.info:
-            warn(f"not judged, its run.json cannot be read: {entry.folder}: {entry.problem}")
+        if not as_json and not entry.info:
+            warn(f"left out, its run.json cannot be read: {entry.folder}: {entry.problem}")
 
 
 def _values(entry: RunEntry, metrics: Sequence[str]) -> list[dict[str, Any]]:
@@ -127,15 +122,6 @@ def _values(entry: RunEntry, metrics: Sequence[str]) -> list[dict[str, Any]]:
     return rows
 
 
-def _renderers() -> dict[str, str]:
-    """Return every renderer, and the fixers that a renderer may be named by: each stands for
-    ``NAME+3dgs``.
-    """
-    return names("renderer") | {
-        name: f"3dgs, repaired by the fixer {name}: {text}" for name, text in names("fixer").items()
-    }
-
-
 def _fixers() -> dict[str, str]:
     """Return every fixer with its help and whose weights it has."""
     listed = {}
@@ -145,22 +131,3 @@ def _fixers() -> dict[str, str]:
         help_text = getattr(factory, "help", {}).get(name, help_text)
         listed[name] = f"{help_text} [{note_of(spec, declaration_of(factory, spec.settings))}]"
     return listed
-
-
-def _scenarios() -> dict[str, str]:
-    from scenarios.suite import shipped
-
-    return shipped()
-
-
-def _presets() -> dict[str, str]:
-    from evaluators.metrics.presets import described
-
-    return described()
-
-
-def _metrics() -> dict[str, str]:
-    from evaluators.metrics import table_of
-    from evaluators.metrics.score import resolve_plugins
-
-    return {name: facts.help for name, facts in table_of(resolve_plugins()).items()}

@@ -12,7 +12,6 @@ import difflib
 import errno
 import json
 import os
-import select
 import sys
 import traceback
 from functools import cache
@@ -168,17 +167,15 @@ def load_verb(verb: str) -> Any:
     `alpasim_plugin.cli.options.command_of` understands. Its help is its docstring; below it stands
     ``VERB_EPILOG`` or ``EPILOG`` of its module.
     """
-    from alpasim_plugin.cli.options import HELP_NAMES, command_of
+    from alpasim_plugin.cli.options import click_command, typer_of
 
     module_name, _, name = verbs()[verb].partition(":")
     module = import_module(module_name)
     target = getattr(module, name)
-    if isinstance(target, typer.Typer):
-        return typer.main.get_command(target)
-    app = typer.Typer(add_completion=False, rich_markup_mode="markdown")
-    epilog = getattr(module, f"{name.upper()}_EPILOG", getattr(module, "EPILOG", None))
-    app.command(verb, epilog=epilog, context_settings=HELP_NAMES)(command_of(target))
-    return typer.main.get_command(app)
+    if not isinstance(target, typer.Typer):
+        epilog = getattr(module, f"{name.upper()}_EPILOG", getattr(module, "EPILOG", None))
+        target = typer_of({verb: (target, epilog)})
+    return click_command(target)
 
 
 app = typer.Typer(
@@ -263,63 +260,47 @@ def run_command(args: list[str]) -> int:
             sys.stdout.flush()  # here a full disk is still an error with a text
         return code
     except SystemExit as leaving:
-        if isinstance(
-            leaving.__context__, BrokenPipeError
-        ):  # rich leaves with 1, which would read as a failed gate
-            return PIPE_CLOSED
-        return leaving.code if isinstance(leaving.code, int) else 0 if leaving.code is None else 2
+        if isinstance(leaving.__context__, BrokenPipeError):
+            return PIPE_CLOSED  # rich leaves with 1, which would read as a failed gate
+        return leaving.code if isinstance(leaving.code, int) else 2 * (leaving.code is not None)
+    except BrokenPipeError:
+        _drop_unwritten_output()
+        return PIPE_CLOSED
     except (SimrunError, Stopped) as error:
         failure = error
     except Exception as error:
-        if isinstance(error, BrokenPipeError) and _reader_is_gone():
-            _drop_unwritten_output()
-            return PIPE_CLOSED
-        failure = _unforeseen(error, args)
+        failure = _unforeseen(error, " ".join(["simrun", *args]))
+        failure.__cause__ = error
     if "--debug" in args and isinstance(failure, SimrunError):
         traceback.print_exception(failure)
     with contextlib.suppress(OSError):  # nobody can be told; the exit code still says it
         if "--json" in args:
-            print(
-                json.dumps({"error": failure.as_dict(), "exit_code": failure.exit_code}), flush=True
-            )
+            facts = {"error": failure.as_dict(), "exit_code": failure.exit_code}
+            print(json.dumps(facts), flush=True)
         else:
             print(failure, file=sys.stderr, flush=True)
     _drop_unwritten_output()
     return failure.exit_code
 
 
-def _unforeseen(error: Exception, args: list[str]) -> SimrunError:
+def _unforeseen(error: Exception, command: str) -> SimrunError:
     """Return the error for what no part of the program has foreseen."""
-    command = " ".join(["simrun", *args])
     if isinstance(error, MemoryError):
         return InfrastructureError(
-            f"{command}: out of memory: {error}",
-            "use fewer --workers, or free memory",
+            f"{command}: out of memory: {error}", "Use fewer --workers, or free memory."
         )
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        where = error.filename or "where the output goes"
-        return InfrastructureError(
-            f"{command}: {error.strerror}: {where}",
-            "free space, then give the same command again",
-        )
-    if isinstance(error, PermissionError) and error.filename:
-        return InputError(
-            f"{error.filename}: {error.strerror}",
-            "let this user read and write it, or name another",
-        )
-    failure = InternalError.of(error, command)
-    failure.__cause__ = error
-    return failure
-
-
-def _reader_is_gone() -> bool:
-    """Tell whether standard output is a pipe or socket whose other end is closed."""
-    try:
-        poll = select.poll()
-        poll.register(sys.stdout.fileno(), 0)
-        return any(event & select.POLLERR for _, event in poll.poll(0))
-    except (OSError, ValueError, AttributeError):  # closed, or no file at all
-        return False
+    if isinstance(error, OSError):
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return InfrastructureError(
+                f"{command}: {error.strerror}: {error.filename or 'where the output goes'}",
+                "Free space, then give the same command again.",
+            )
+        if isinstance(error, PermissionError) and error.filename:
+            return InputError(
+                f"{error.filename}: {error.strerror}",
+                "Let this user read and write it, or name another file.",
+            )
+    return InternalError.of(error, command)
 
 
 def _drop_unwritten_output() -> None:

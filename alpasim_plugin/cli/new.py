@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import keyword
 import re
 from importlib.resources import files
@@ -12,6 +11,7 @@ from string import Template
 from typing import Annotated, Literal
 
 from alpasim_plugin.cli.options import Json
+from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
@@ -60,20 +60,12 @@ def new(
             raise InputError(f"{path}: it exists already", "choose another name or --folder")
     templates = files("alpasim_plugin.cli") / "templates"
     for path, template in targets.items():
-        write_text(
-            path,
-            Template((templates / template).read_text(encoding="utf-8")).substitute(words),
-        )
+        text = (templates / template).read_text(encoding="utf-8")
+        write_text(path, Template(text).substitute(words))
     command = TRY[kind].format(file=folder / words["file"], cls=words["Class"])
-    if as_json:
-        print(json.dumps({"files": [str(path) for path in targets], "try": command}))
-        return
-    for path in targets:
-        print(f"wrote    {path}")
     test = f"python -m pytest {folder / words['test']}"
-    print(
-        f"test     {test}"
-        if find_spec("pytest")
-        else f"test     {test}   # after: pip install pytest"
-    )
-    print(f"next     {command}")
+    if not find_spec("pytest"):
+        test += "   # after: pip install pytest"
+    lines = [f"wrote    {path}" for path in targets]
+    facts = {"files": [str(path) for path in targets], "try": command}
+    show(as_json, facts, *lines, f"test     {test}", f"next     {command}")

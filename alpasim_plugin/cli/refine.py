@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from alpasim_plugin.cli.options import Json, Overwrite, fixer_overrides
-from alpasim_plugin.cli.signals import Stopped
+from alpasim_plugin.cli.output import Progress, show, warn
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.interfaces import Fixer
+from alpasim_plugin.cli.signals import Stopped
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.refine import UNLIKE, ChangeLimit
 from alpasim_plugin.runs.refine import RefineFiles, RefineSummary, refine_video
 
-LINE_EVERY_S = 10.0
 LARGE_CHANGE_DB = 30.0
 SCENE = "video"  # key of the noise, the same for every file: a renamed video gives the same result
 
@@ -73,32 +65,27 @@ def refine(
     def session() -> Fixer:
         made = make_fixer(fixer, settings, scene_id=SCENE, seed=seed, device=device)
         if not made.trained and not as_json:
-            print(untrained_notice(made.label), file=sys.stderr)
+            warn(f"UNTRAINED: {made.label}. The result only shows that the pipeline runs.")
         return made
 
     limited = settings.keeps_appearance and not (anyway or opacity or sdmap)
     files = RefineFiles(source, out, opacity, sdmap, compare, overwrite)
     try:
-        with frame_progress(as_json) as show:
-            summary = refine_video(files, session, show, ChangeLimit() if limited else None)
+        with Progress(as_json) as progress:
+            summary = refine_video(
+                files,
+                session,
+                lambda done, total: progress.show("refining, frames", done, total),
+                ChangeLimit() if limited else None,
+            )
     except Stopped as stop:
         stop.kept = "nothing was written; the same command starts again"
         raise
-    if as_json:
-        print(
-            json.dumps(
-                {
-                    "input": str(source),
-                    "output": str(out),
-                    "compare": compare and str(compare),
-                    **asdict(summary),
-                }
-            )
-        )
-    else:
-        print(describe(summary, out))
+    facts = {"input": str(source), "output": str(out), "compare": compare and str(compare)}
+    show(as_json, facts | asdict(summary), *summary_lines(summary, out))
+    if not as_json:
         for line in warnings(summary):
-            print(line, file=sys.stderr)
+            warn(line)
 
 
 def warnings(summary: RefineSummary) -> list[str]:
@@ -106,25 +93,20 @@ def warnings(summary: RefineSummary) -> list[str]:
     if summary.refused_psnr_db is not None:
         kept = summary.events.get(UNLIKE, 0)
         return [
-            f"warning: {summary.fixer} changes this video too much for a repair: PSNR {summary.refused_psnr_db:.1f} dB against a frame",
-            "that was given as reliable. It was trained on another kind of picture.",
+            f"warning: {summary.fixer} changes this video too much for a repair: PSNR "
+            f"{summary.refused_psnr_db:.1f} dB against a frame that was given as reliable.",
             f"{kept} of {summary.frames} frames of the result are the input's own.",
-            "--opacity tells it what is reliable; --anyway takes what it makes.",
+            "--opacity says what is reliable; --anyway takes what the fixer makes.",
         ]
     if summary.psnr_db is not None and summary.psnr_db < LARGE_CHANGE_DB:
-        said = f"PSNR {summary.psnr_db:.1f} dB, mean {summary.mean_levels:.1f} grey levels"
+        change = f"PSNR {summary.psnr_db:.1f} dB, mean {summary.mean_levels:.1f} grey levels"
         return [
-            f"warning: the fixer changed this video by much ({said}): compare with --compare before you use the result"
+            f"warning: the fixer changed this video by much ({change}): look at it with --compare"
         ]
     return []
 
 
-def untrained_notice(label: str) -> str:
-    """Return a warning that the weights are untrained."""
-    return f"UNTRAINED: {label}. The result only shows that the pipeline runs."
-
-
-def describe(summary: RefineSummary, out: Path) -> str:
+def summary_lines(summary: RefineSummary, out: Path) -> list[str]:
     """Return the summary as lines of text."""
     rate = "" if summary.fps is None else f" at {summary.fps:g} frames per second"
     psnr = "equal" if summary.psnr_db is None else f"PSNR {summary.psnr_db:.2f} dB"
@@ -132,7 +114,7 @@ def describe(summary: RefineSummary, out: Path) -> str:
         ", ".join(f"{name} {count}" for name, count in sorted(summary.events.items())) or "none"
     )
     times = f"p50 {summary.ms_per_frame_p50:.1f}, p95 {summary.ms_per_frame_p95:.1f}, first block {summary.ms_per_frame_first:.1f}"
-    lines = [
+    return [
         f"     fixer  {summary.fixer}" + ("" if summary.trained else "   UNTRAINED"),
         f"    frames  {summary.frames} of {summary.width}x{summary.height}{rate}",
         f"  ms/frame  {times}; with the files {summary.wall_s * 1e3 / summary.frames:.1f}",
@@ -140,57 +122,3 @@ def describe(summary: RefineSummary, out: Path) -> str:
         f"    events  {events}",
         f"    output  {out}" + ("   (without the input's sound)" if summary.audio_left_out else ""),
     ]
-    return "\n".join(lines)
-
-
-@contextmanager
-def frame_progress(silent: bool) -> Iterator[Callable[[int, int | None], None]]:
-    """Show frames done on standard error: a bar on a terminal, a line every ten seconds on a pipe.
-
-    Yields:
-        A function of the number of frames done and of the number that the file states.
-    """
-    begin = last = time.perf_counter()
-    terminal = sys.stderr.isatty()
-    columns = (
-        TextColumn("refining"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[speed]}"),
-        TimeRemainingColumn(),
-    )
-    with Progress(
-        *columns, console=Console(stderr=True), transient=True, disable=silent or not terminal
-    ) as bar:
-        task = bar.add_task("refining", total=None, speed="")
-
-        def show(done: int, claimed: int | None) -> None:
-            nonlocal last
-            now = time.perf_counter()
-            speed = f"{done / (now - begin):.1f} frames/s"
-            left_s = None if claimed is None else (claimed - done) * (now - begin) / done
-            bar.update(task, completed=done, total=claimed, speed=speed)
-            if not silent and not terminal and now - last > LINE_EVERY_S:
-                last = now
-                of = "" if claimed is None else f"/{claimed}"
-                print(
-                    f"refined {done}{of} frames, {speed}{time_left(left_s)}",
-                    file=sys.stderr,
-                    flush=True,
-                )
-
-        yield show
-
-
-def time_left(seconds: float | None) -> str:
-    """Say how long it will take from here; empty where the length of the video is not known.
-
-    Example:
-        >>> time_left(42.0), time_left(600.0), time_left(None)
-        (', about 42 s left', ', about 10 min left', '')
-    """
-    if seconds is None:
-        return ""
-    return (
-        f", about {seconds:.0f} s left" if seconds < 120 else f", about {seconds / 60:.0f} min left"
-    )

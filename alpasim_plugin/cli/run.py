@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 from collections.abc import Sequence
@@ -11,44 +10,44 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from alpasim_plugin.cli.options import (
-    Care,
     Json,
-    Quiet,
-    RunFolder,
-    What,
-    Where,
-    check_preset,
     parse_seeds,
+    split_overrides,
     split_policies,
 )
-from alpasim_plugin.cli.progress import (
+from alpasim_plugin.cli.output import (
+    Progress,
     background_lines,
     fixer_labels,
-    make_progress,
     report_line,
+    show,
     varied_lines,
+    warn,
 )
 from alpasim_plugin.cli.signals import Stopped
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import terminal
-from alpasim_plugin.core.flags import Flag
+from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.limits import SOURCE_BYTES
+from alpasim_plugin.core.parts import split_names
 from alpasim_plugin.core.reading import read_bytes
 from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME
 from alpasim_plugin.runs.decide import Decided, execute_decision, plan_of_two
 from alpasim_plugin.runs.execute import Threads, thread_budget
+from alpasim_plugin.runs.executors.choice import parse_executor
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import RunResult, default_folder, execute_run
+from evaluators import preset as find_preset
 from evaluators.report.decision import decision_lines
 from evaluators.statistics.decision import Question, metric_question
 from evaluators.statistics.gate import load_gate
 from evaluators.statistics.variants import base_named, variants_of
 from scenarios.suite import ScenarioRef, expand, shipped_names
 
+SHOWN_FAILURES = 5
 TRACEBACK_LINES = 4  # of a failure, in the terminal
 
 EPILOG = """
@@ -69,18 +68,78 @@ Examples:
 
 
 def run(
-    what: What,
+    scenarios: Annotated[
+        tuple[str, ...],
+        Positional(
+            "Scenario or suite YAML, a folder of them, a shipped name, or a recorded log.",
+            metavar="SCENARIO...",
+            names="scenario",
+        ),
+    ],
     options: RunOptions,
-    where: Where,
-    care: Care,
-    out: RunFolder = None,
+    renderer: Annotated[
+        str,
+        Flag(
+            "Renderers, comma-separated: a name, `FIXER`, `FIXER+RENDERER`, or `package.module:Class`.",
+            names="renderer",
+        ),
+    ] = "3dgs",
+    policy: Annotated[
+        str,
+        Flag(
+            "Policies, comma-separated: a name, `package.module:Class`, `file.py:Class` or `exec:COMMAND`.",
+            names="policy",
+        ),
+    ] = "lane-camera",
+    seeds: Annotated[str, Flag("How many seeds (3 means 0,1,2), or a list such as 4,7.")] = "1",
+    overrides: Annotated[
+        tuple[str, ...],
+        Flag(
+            "Override a key of the scenarios, key=value, or of a fixer, [RENDERER:]fixer.key=value. Repeatable.",
+            "--set",
+        ),
+    ] = (),
+    source: Annotated[
+        str | None,
+        Flag("Reader of the recorded log: a name, or package.module:Class.", names="source"),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        Flag(
+            "Worker processes; by default one per core. The result does not depend on them.", min=1
+        ),
+    ] = None,
+    executor: Annotated[
+        str,
+        Flag("`local`, or `ray[:HOST:PORT]` with what a worker needs: `ray?cores=2&memory=8`."),
+    ] = "local",
+    report: Annotated[
+        bool,
+        Flag("Write report.html now; `simrun report RUN` writes it later.", "--report/--no-report"),
+    ] = True,
+    wait: Annotated[
+        bool,
+        Flag("If another process writes the run folder, wait instead of failing.", "--wait"),
+    ] = False,
+    time_limit: Annotated[
+        float | None,
+        Flag("Seconds after which a rollout that hangs is ended and reported.", min=0.001),
+    ] = None,
+    out: Annotated[
+        Path | None, Flag("Run folder; by default one below runs/ named after the command.")
+    ] = None,
     shard: Annotated[
         str | None, Flag("Drive only this part of the scenes, for job arrays.", metavar="I/N")
     ] = None,
-    resume: Annotated[bool, Flag("Continue in a folder that another command has written.")] = False,
+    resume: Annotated[
+        bool, Flag("Continue in a folder that another command has written.", "--resume")
+    ] = False,
     until_decided: Annotated[
         bool,
-        Flag("Sequential test: drive scenes in random order and stop as soon as it is decided."),
+        Flag(
+            "Sequential test: drive scenes in random order and stop as soon as A versus B is decided.",
+            "--until-decided",
+        ),
     ] = False,
     metric: Annotated[
         tuple[str, ...],
@@ -90,29 +149,31 @@ def run(
         ),
     ] = (),
     repeat: Annotated[
-        bool, Flag("Drive one rollout twice and say whether the policy is repeatable.")
+        bool,
+        Flag("Drive one rollout twice and say whether the policy is repeatable.", "--repeat"),
     ] = False,
-    dry_run: Annotated[bool, Flag("Resolve and print the plan, run nothing.")] = False,
+    dry_run: Annotated[bool, Flag("Print the plan and run nothing.", "--dry-run")] = False,
     as_json: Json = False,
-    quiet: Quiet = False,
+    quiet: Annotated[bool, Flag("Print only the result.", "--quiet")] = False,
 ) -> None:
     """Drive scenarios behind one or more renderers, score the rollouts and write a report.
 
     An interrupted run continues when the same command is given again.
     """
-    how = where.arguments() | care.arguments()
-    check_preset(options.preset)
-    refs = [ref for item in what.scenarios for ref in expand(item, what.of_scene, what.source)]
+    ray = parse_executor(executor)
+    find_preset(options.preset)
+    of_scene, of_fixer = split_overrides(overrides)
+    refs = [ref for item in scenarios for ref in expand(item, of_scene, source)]
     if shard is not None:
         refs = shard_of(refs, shard)
     plan = make_plan(
         refs,
-        what.renderers,
-        split_policies(what.policy),
-        parse_seeds(what.seeds),
-        replace(options, fixer=what.of_fixer),
+        split_names(renderer),
+        split_policies(policy),
+        parse_seeds(seeds),
+        replace(options, fixer=of_fixer),
     )
-    plan = replace(plan, asked=what.scenarios)
+    plan = replace(plan, asked=scenarios)
     if options.baseline is not None:
         variants = variants_of((cell.renderer.name, cell.policy.name) for cell in plan.cells)
         base_named(options.baseline, variants, "the run")
@@ -124,30 +185,52 @@ def run(
         raise InputError("--metric: without --until-decided", "Add --until-decided.")
     root = out or default_folder(plan)
     if dry_run:
-        threads = thread_budget(where.workers, len(plan.cells), how["executor"])
-        _print_plan(plan, root, threads, as_json)
+        _print_plan(plan, root, thread_budget(workers, len(plan.cells), ray), as_json)
         return
-    progress = make_progress(quiet or as_json)
     command = ["simrun", *sys.argv[1:]]
     try:
-        if question is not None:
-            decided = execute_decision(
-                plan, question, root, command=command, progress=progress, **how
-            )
-            _print_decision(decided, as_json)
-            raise typer.Exit(decided.outcome.exit_code)
-        result = execute_run(
-            plan, root, command=command, progress=progress, resume=resume, repeat=repeat, **how
-        )
+        with Progress(quiet or as_json) as progress:
+            if question is not None:
+                decided = execute_decision(
+                    plan,
+                    question,
+                    root,
+                    workers=workers,
+                    command=command,
+                    progress=progress,
+                    report=report,
+                    wait=wait,
+                    limit_s=time_limit,
+                    executor=ray,
+                )
+            else:
+                result = execute_run(
+                    plan,
+                    root,
+                    workers,
+                    command,
+                    progress,
+                    resume,
+                    repeat,
+                    report,
+                    wait=wait,
+                    limit_s=time_limit,
+                    executor=ray,
+                )
     except Stopped as stop:
         stop.kept = f"finished rollouts are kept in {root}; the same command continues"
         raise
-    _print_result(result, as_json, options.video)
-    if plan.undigested and not as_json:
-        names = ", ".join(plan.undigested)
-        print(
-            f"not reused by the next command: {names} has no digest (--resume reuses its rollouts)"
-        )
+    if question is not None:
+        _print_decision(decided, as_json)
+        raise typer.Exit(decided.outcome.exit_code)
+    if as_json:
+        facts = {"out": str(root), "exit_code": result.exit_code, "summary": result.summary}
+        show(as_json, facts)
+    else:
+        _print_result(result, options.video)
+        if plan.undigested:
+            names = ", ".join(plan.undigested)
+            warn(f"--resume reuses the rollouts of {names}; the same command drives them again.")
     raise typer.Exit(result.exit_code)
 
 
@@ -199,22 +282,15 @@ def question_of(metrics: Sequence[str]) -> Question:
 
 
 def _print_decision(decided: Decided, as_json: bool) -> None:
-    if as_json:
-        facts = {
-            "out": str(decided.run.root),
-            "exit_code": decided.outcome.exit_code,
-            "decision": decided.record,
-        }
-        print(json.dumps(facts))
-        return
-    for line in decision_lines(decided.record):
-        print(line)
-    print(report_line(decided.run.root))
+    record = decided.record
+    root = decided.run.root
+    facts = {"out": str(root), "exit_code": decided.outcome.exit_code, "decision": record}
+    show(as_json, facts, *decision_lines(record), report_line(root))
 
 
 def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> None:
-    frames = sum((s.end_us - s.start_us) // s.rates.camera_us for s in plan.scenarios.values())
-    per_cell = len(plan.renderers) * len(plan.policies) * len(plan.seeds)
+    scenarios = plan.scenarios.values()
+    frames = sum((s.end_us - s.start_us) // s.rates.camera_us for s in scenarios)
     facts = {
         "out": str(root),
         "key": plan.command_key,
@@ -224,63 +300,50 @@ def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> N
         "fixers": fixer_labels(plan),
         "policies": [spec.name for spec in plan.policies],
         "seeds": list(plan.seeds),
-        "varied": {
-            name: {key: list(pair) for key, pair in s.varied.items()}
-            for name, s in plan.scenarios.items()
-            if s.varied
-        },
+        "varied": {name: s.varied for name, s in plan.scenarios.items() if s.varied},
         "never_reused": list(plan.undigested),
-        "camera_frames": int(frames * per_cell),
+        "camera_frames": int(frames) * len(plan.cells) // len(plan.scenarios),
         "workers": threads.workers,
         "threads_per_worker": threads.per_worker,
     }
-    if as_json:
-        print(json.dumps(facts))
-        return
-    facts["varied"], facts["backgrounds"] = varied_lines(plan), background_lines(plan)
-    for key, value in facts.items():
-        print(
-            f"{key:>18}  {(', '.join(map(str, value)) or '-') if isinstance(value, list) else value}"
-        )
+    shown = facts | {"varied": varied_lines(plan), "backgrounds": background_lines(plan)}
+    lines = []
+    for key, value in shown.items():
+        text = ", ".join(map(str, value)) or "-" if isinstance(value, list) else value
+        lines.append(f"{key:>18}  {text}")
+    show(as_json, facts, *lines)
 
 
-def _print_result(result: RunResult, as_json: bool, video: str) -> None:
-    if as_json:
-        print(
-            json.dumps(
-                {"out": str(result.root), "exit_code": result.exit_code, "summary": result.summary}
-            )
-        )
-        return
+def _print_result(result: RunResult, video: str) -> None:
     from evaluators.opening import read_run  # what a run ends with is loaded while it is driven
     from evaluators.report import ending_lines, fixer_lines, next_line, plan_warnings, render_table
 
-    run = read_run(result.root)
-    Console().print(render_table(result.summary, headline_only=True, known=run.table))
-    for line in fixer_lines(result.summary):
-        print(line)
-    for line in plan_warnings(result.summary):
-        print(f"warning  {line}")
-    for cell in result.summary["failures"]["cells"][:5]:
-        print(
-            f"failed: {cell['path']}: {cell['error']['message']} -> {cell['error']['hint']}",
-            file=sys.stderr,
-        )
-        for line in last_lines(result.root / cell["path"] / OUTPUT_NAME):
-            print(f"        {line}", file=sys.stderr)
-    if result.n_failed:
-        print(_failed_line(result), file=sys.stderr)
-    videos = len(list(result.root.glob("rollouts/*/*/*/*/front.mp4"))) if video != "none" else 0
+    root = result.root
+    summary = result.summary
+    run = read_run(root)
+    lines = [*fixer_lines(summary), *(f"warning  {line}" for line in plan_warnings(summary))]
     if video != "none":
-        print(
-            f"videos   {videos} of {result.n_rollouts} rollouts have a front.mp4 below {result.root}/rollouts"
+        count = len(list(root.glob("rollouts/*/*/*/*/front.mp4")))
+        lines.append(
+            f"videos   {count} of {result.n_rollouts} rollouts have a front.mp4 below {root}/rollouts"
         )
-    if "repeat" in result.summary:
-        print(f"repeat   {repeat_line(result.summary['repeat'])}")
-    for line in ending_lines(run):
-        print(line)
-    print(report_line(result.root))
-    print(_by_name(next_line(run)))
+    if "repeat" in summary:
+        lines.append(f"repeat   {repeat_line(summary['repeat'])}")
+    following = next_line(run)
+    for name, path in shipped_names().items():
+        following = following.replace(str(path.absolute()), name)
+    table = render_table(summary, headline_only=True, known=run.table)
+    show(False, {}, table, *lines, *ending_lines(run), report_line(root), following)
+    for cell in summary["failures"]["cells"][:SHOWN_FAILURES]:
+        warn(f"failed: {cell['path']}: {cell['error']['message']} -> {cell['error']['hint']}")
+        for line in last_lines(root / cell["path"] / OUTPUT_NAME):
+            warn(f"        {line}")
+    if result.n_failed:
+        by_policy = summary["failures"]["by_class"].get("policy", 0)
+        advice = "the same command runs them again"
+        if by_policy:
+            advice = f"{by_policy} by the policy's own fault: simrun check policy tests it"
+        warn(f"{result.n_failed} of {result.n_rollouts} rollouts failed; {advice}")
 
 
 def last_lines(log: Path) -> list[str]:
@@ -290,24 +353,5 @@ def last_lines(log: Path) -> list[str]:
     if not log.is_file():
         return []
     text = read_bytes(log, SOURCE_BYTES).decode("utf-8", "replace")
-    return [terminal(line.rstrip()) for line in text.rstrip().splitlines()[-TRACEBACK_LINES:]] + [
-        f"log {log}"
-    ]
-
-
-def _by_name(line: str) -> str:
-    """Write the paths of shipped scenarios as their names."""
-    for name, path in shipped_names().items():
-        line = line.replace(str(path.absolute()), name)
-    return line
-
-
-def _failed_line(result: RunResult) -> str:
-    """Say how many rollouts failed, and whether the same command would try them again."""
-    said = f"{result.n_failed} of {result.n_rollouts} rollouts failed"
-    by_policy = result.summary["failures"]["by_class"].get("policy", 0)
-    if not by_policy:
-        return f"{said}; the same command runs them again"
-    whose = "all" if by_policy == result.n_failed else f"{by_policy} of them"
-    cure = "simrun check policy tests the policy; after a change of it the same command runs them again"
-    return f"{said}, {whose} by the policy's own fault; {cure}"
+    lines = text.rstrip().splitlines()[-TRACEBACK_LINES:]
+    return [*(terminal(line.rstrip()) for line in lines), f"log {log}"]

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,12 +13,12 @@ import numpy as np
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.driver_service import ADDRESS, DriverService
 from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
-from alpasim_plugin.cli.options import Device
-from alpasim_plugin.cli.signals import Stopped
+from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.parts import PartSpec, build, resolve
+from alpasim_plugin.core.parts import build, resolve
+from alpasim_plugin.cli.signals import Stopped
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.runs.score_logs import scenario_finder
 
@@ -72,7 +70,7 @@ def serve(
     set_: Annotated[
         tuple[str, ...], Flag("A setting of the fixer; repeatable.", "--set", metavar="KEY=VALUE")
     ] = (),
-    device: Device = "cpu",
+    device: Annotated[Literal["cpu", "cuda"], Flag("Where to compute.")] = "cpu",
     history_mb: Annotated[int, Flag("Most memory of the histories, MiB.", min=16)] = 2048,
     mask: Annotated[
         tuple[str, ...], Flag("Grey image, white is trusted; repeatable.", metavar="CAMERA=FILE")
@@ -120,19 +118,20 @@ def serve(
         made.services, listen or RENDERER_ADDRESS, host_policy, CALLS_AT_A_TIME, made.expire
     )
     text = f"serving {', '.join(made.services)} at {host.address}: {made.spec.name}"
-    what = {
+    facts = {
         "serving": list(made.services),
         "at": host.address,
         "renderer": renderer,
         "upstream": upstream,
     }
+    if upstream:
+        text += f" in front of {upstream}"
     try:
-        _host(
-            host, what, f"{text} in front of {upstream}" if upstream else text, host_policy, as_json
-        )
+        _host(host, facts, text, host_policy, as_json)
     finally:
         made.close()
-    counts = vars(made.tree.counts) | {
+    counts = {
+        **vars(made.tree.counts),
         "events": dict(made.service.frames.events),
         "failed": dict(made.service.statuses),
     }
@@ -143,38 +142,39 @@ def _serve_policy(
     policy: str, listen: str, scenes: Sequence[str], host_policy: HostPolicy, as_json: bool
 ) -> None:
     spec = resolve("policy", policy)
-    service = DriverService(
-        spec.name, spec.digest, partial(_made, spec), scenario_finder(scenes), host_policy.expiry_s
-    )
+
+    def make(scenario: Scenario) -> Policy:
+        made: Policy = build(spec, scenario=scenario)
+        return made
+
+    finder = scenario_finder(scenes)
+    service = DriverService(spec.name, spec.digest, make, finder, host_policy.expiry_s)
     host = Host({"EgodriverService": service}, listen, host_policy, every=service.sessions.expire)
-    what = {"serving": "EgodriverService", "at": host.address, "policy": policy}
+    facts = {"serving": "EgodriverService", "at": host.address, "policy": policy}
     text = f"serving EgodriverService at {host.address}: {policy}"
-    _host(host, what, text, host_policy, as_json)
+    _host(host, facts, text, host_policy, as_json)
     counts = dict(service.counts)
     if service.drives_s:
-        times_ms = np.array(service.drives_s) * 1000
-        counts |= {
-            f"drive_ms_p{percent}": round(float(np.percentile(times_ms, percent)), 2)
-            for percent in (50, 95, 99)
-        }
+        for percent in (50, 95, 99):
+            time_ms = float(np.percentile(service.drives_s, percent)) * 1000
+            counts[f"drive_ms_p{percent}"] = round(time_ms, 2)
     _print_counts(counts, as_json)
 
 
 def _host(
-    host: Host, what: Mapping[str, Any], text: str, host_policy: HostPolicy, as_json: bool
+    host: Host, facts: Mapping[str, Any], text: str, host_policy: HostPolicy, as_json: bool
 ) -> None:
     """Serve until a signal stops the process."""
     try:
         host.start()
-        print(json.dumps(what) if as_json else text, flush=True)
+        show(as_json, facts, text)
         host.wait()
     except Stopped:
         host.stop(host_policy.drain_s)
 
 
 def _print_counts(counts: Mapping[str, Any], as_json: bool) -> None:
-    text = ", ".join(f"{key} {value}" for key, value in counts.items())
-    print(json.dumps(counts) if as_json else text, flush=True)
+    show(as_json, counts, ", ".join(f"{key} {value}" for key, value in counts.items()))
 
 
 def parted(text: str, option: str) -> tuple[str, str]:
@@ -190,8 +190,3 @@ def parted(text: str, option: str) -> tuple[str, str]:
             "Write for example --mask camera_front_wide_120fov=hood.png.",
         )
     return name, value
-
-
-def _made(spec: PartSpec, scenario: Scenario) -> Policy:
-    policy: Policy = build(spec, scenario=scenario)
-    return policy

@@ -4,21 +4,25 @@ run's report again from its tables.
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from rich.console import Console
-
-from alpasim_plugin.cli.options import Json, Overrides, Run, refuse_existing, run_or_newest
-from alpasim_plugin.cli.progress import warn
+from alpasim_plugin.cli.options import (
+    Json,
+    Overrides,
+    Run,
+    refuse_existing,
+    run_and_cell,
+    run_or_newest,
+)
+from alpasim_plugin.cli.output import show, warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
 from alpasim_plugin.log.run_folder.reader import read_json, table_path
-from alpasim_plugin.log.run_folder.schema import MANIFEST, RUN_INFO, SUMMARY, slug
+from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY, slug
 from alpasim_plugin.runs.reports import write_reports
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics import MetricTable
@@ -66,13 +70,13 @@ def view(
     The page shows cameras side by side, a map from above, metrics over time and events. The image of
     a scenario shows its map, road users over time, and the camera along the recorded path.
     """
-    folder = run_or_newest(None if what is None else Path(what))
     refuse_existing(out, "--out")
-    if what is not None and not is_run(folder) and not (folder / MANIFEST).exists():
-        _view_scenario(what, asked, overrides, out, as_json)
+    path = run_or_newest(None if what is None else Path(what))
+    if not any((folder / RUN_INFO).exists() for folder in (path, *path.parents)):
+        _view_scenario(str(what), asked, overrides, out, as_json)
         return
-    root, of_rollout = find_cell(folder)
-    wanted = narrowed(folder, of_rollout, asked)
+    root, cell = run_and_cell(path)
+    wanted = wanted_of(root, cell, asked)
     if (root / SUMMARY).exists():
         ensure_tables(root, warn)
     so_far = read_so_far(root)
@@ -83,26 +87,23 @@ def view(
         warn(f"note: the run is not finished: {done} of {so_far.planned} rollouts")
     if not so_far.run.rollouts:
         raise InputError(f"{root}: no rollout has finished", "Wait for the first.")
-    path = out or root / PAGE
-    made = write_page(so_far.run, path, wanted, int(max_mb * MB))
-    if as_json:
-        shown = [
+    page = out or root / PAGE
+    made = write_page(so_far.run, page, wanted, int(max_mb * MB))
+    facts = {
+        "page": str(page),
+        "bytes": made.size,
+        "cells": [
             {"scene": cell.scene, "policy": cell.policy, "seed": cell.seed} for cell in made.shown
-        ]
-        facts = {
-            "page": str(path),
-            "bytes": made.size,
-            "cells": shown,
-            "of": len(made.known),
-            "notes": list(made.notes),
-        }
-        print(json.dumps(facts))
-        return
-    for note in made.notes:
-        print(f"note     {note}")
-    print(
-        f"page     {shlex.quote(str(path))}, {made.size / MB:.1f} MB, {len(made.shown)} of {len(made.known)} cells"
-    )
+        ],
+        "of": len(made.known),
+        "notes": list(made.notes),
+    }
+    size = f"{made.size / MB:.1f} MB, {len(made.shown)} of {len(made.known)} cells"
+    lines = [
+        *(f"note     {note}" for note in made.notes),
+        f"page     {shlex.quote(str(page))}, {size}",
+    ]
+    show(as_json, facts, *lines)
 
 
 def _view_scenario(
@@ -119,66 +120,26 @@ def _view_scenario(
     scene = load_scenario(what, next(iter(asked.seeds), None), overrides)
     path = out or Path(f"{slug(scene.scene_id)}.png")
     made = draw_preview(scene, path, next(iter(asked.renderers), None))
-    if as_json:
-        facts = {
-            "preview": str(path),
-            "scene": scene.scene_id,
-            "times_s": made.times_s,
-            "actors": made.actors,
-            "facts": made.text,
-        }
-        print(json.dumps(facts))
-        return
-    for line in made.text:
-        print(line)
-    print(f"preview  {path}")
+    facts = {"preview": str(path), "scene": scene.scene_id, **made}
+    show(as_json, facts, *made["facts"], f"preview  {path}")
 
 
-def is_run(what: Path) -> bool:
-    """Tell whether a folder is a run folder."""
-    return (what / RUN_INFO).exists()
-
-
-def find_cell(what: Path) -> tuple[Path, Wanted | None]:
-    """Return the run folder of a run or a rollout, and which rollouts to show if a rollout was
-    named.
+def wanted_of(root: Path, cell: str, asked: Wanted) -> Wanted:
+    """Return which rollouts to show: of a run what was asked for, of a rollout those of its scene,
+    policy and seed behind the renderers that were.
 
     Raises:
-        InputError: Neither.
+        InputError: There is no such rollout, or more than renderers is asked for beside it.
     """
-    if is_run(what):
-        return what, None
-    if (what / MANIFEST).exists():
-        manifest = read_manifest(what)
-        root = next(
-            (folder for folder in what.resolve().parents if (folder / RUN_INFO).exists()), None
-        )
-        if root is not None:
-            return root, Wanted(
-                (str(manifest["scene"]),), (str(manifest["policy"]),), (int(manifest["seed"]),)
-            )
-    found = "no run.json and no manifest.json" if what.exists() else "no such folder"
-    raise InputError(
-        f"{what}: {found}",
-        "give a folder that simrun run wrote, or RUN/rollouts/RENDERER/POLICY/SCENE/SEED",
-    )
-
-
-def narrowed(what: Path, rollout: Wanted | None, asked: Wanted) -> Wanted:
-    """Return which rollouts to show: all that was asked for of a run, of a rollout's cell the
-    renderers that were.
-
-    Raises:
-        InputError: More than renderers is asked for beside a rollout.
-    """
-    if rollout is None:
+    if not cell:
         return asked
     if asked.scenes or asked.policies or asked.seeds:
         raise InputError(
-            f"{what}: --scene, --policy or --seed beside a rollout, which has one of each",
-            "name its run folder",
+            f"{cell}: --scene, --policy or --seed beside a rollout, which has one of each",
+            "Name its run folder.",
         )
-    return Wanted(rollout.scenes, rollout.policies, rollout.seeds, asked.renderers)
+    manifest = read_manifest(root / "rollouts" / cell)
+    return Wanted((manifest["scene"],), (manifest["policy"],), (manifest["seed"],), asked.renderers)
 
 
 REPORT_EPILOG = "Example: `simrun report runs/us101`"
@@ -192,9 +153,7 @@ def report(
     run = run_or_newest(run)
     ensure_tables(run, warn)
     summary = read_json(table_path(run, SUMMARY))
-    page = write_reports(run, flips=read_run_json(run).get("kind") != "score")
-    if as_json:
-        print(json.dumps({"report": str(page), "summary": summary}))
-    else:
-        Console().print(render_table(summary, known=MetricTable.of_run(read_run_json(run))))
-        print(f"report   {page}")
+    info = read_run_json(run)
+    page = write_reports(run, flips=info.get("kind") != "score")
+    facts = {"report": str(page), "summary": summary}
+    show(as_json, facts, render_table(summary, known=MetricTable.of_run(info)), f"report   {page}")

@@ -20,7 +20,6 @@ class Flag:
         min: Least value.
         max: Largest value.
         metavar: What stands for the value in the help.
-        variable: Environment variable that gives it.
         names: Kind of parts, or ``scenario`` or ``preset``, whose names a Tab offers; empty: none.
     """
 
@@ -30,17 +29,13 @@ class Flag:
     min: float | None = None
     max: float | None = None
     metavar: str | None = None
-    variable: str | None = None
     names: str = ""
 
 
 @dataclass(frozen=True)
 class Positional:
-    """One argument without a name of its own; ``required`` where the field has a default all the
-    same. The others are those of `Flag`.
-    """
+    """One argument without a name of its own; the attributes are those of `Flag`."""
 
     help: str
     metavar: str | None = None
     names: str = ""
-    required: bool = False

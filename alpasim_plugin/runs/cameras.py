@@ -10,6 +10,7 @@ import numpy as np
 
 from alpasim_plugin.core.clock import Clock, Tick
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.interfaces import BlockRule
 from alpasim_plugin.core.types import (
     F64,
@@ -189,3 +190,17 @@ class CameraRig:
         end_us = self._clock.start_us + self._clock.n_steps * self._clock.rates.control_us
         coming = (t for t in range(t_us + period, end_us, period) if self._is_due(t, period))
         return tuple(islice(coming, self._lookahead))
+
+
+def recorded_requests(scenario: Scenario, t_us: int) -> list[RenderRequest]:
+    """Return a request for each camera of a scenario at an instant of its recorded path."""
+    poses = {
+        actor.actor_id: interpolate(actor.track, t_us)
+        for actor in scenario.actors
+        if actor.track.t_us[0] <= t_us <= actor.track.t_us[-1]
+    }
+    T_world_rig = interpolate(scenario.ego_log, t_us)
+    return [
+        RenderRequest(t_us, camera, np.stack([T_world_rig @ camera.T_rig_camera] * 2), poses)
+        for camera in scenario.cameras
+    ]

@@ -14,7 +14,7 @@ import typer
 
 from alpasim_plugin.cli import run, serve
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.cli.options import Json, Only, command_of
+from alpasim_plugin.cli.options import Json, command_of
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.runs.executors.choice import Executor
 
@@ -117,7 +117,7 @@ def test_callers_of_every_server_are_let_in_as_asked(
 class Job:
     """A job."""
 
-    files: Annotated[tuple[str, ...], Positional("Files.", required=True)] = ()
+    files: Annotated[tuple[str, ...], Positional("Files.")]
     times: Annotated[int, Flag("How often.", min=1, also="-t")] = 2
     names: Annotated[tuple[str, ...], Flag("Names.", "--name")] = ()
     loud: Annotated[bool, Flag("Whether.", "--loud/--quiet")] = True
@@ -143,17 +143,3 @@ def test_a_dataclass_becomes_options_and_comes_back_whole() -> None:
         call(work)
     with pytest.raises(Exception, match=r"greater than or equal to 1|not in the range"):
         call(work, "a", "--times", "0")
-
-
-def test_a_verb_may_take_a_part_of_a_jobs_options() -> None:
-    found = []
-
-    def work(
-        job: Annotated[Job, Only("times")], more: Annotated[tuple[Path, ...], Flag("More.")] = ()
-    ) -> None:
-        found.append((job, more))
-
-    call(work, "--times", "4", "--more", "p")
-    assert found == [(Job(times=4), (Path("p"),))]
-    with pytest.raises(Exception, match="No such option"):
-        call(work, "--name", "x")

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from alpasim_plugin.cli import refine
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.log.video import VideoReader, VideoWriter
 
@@ -218,19 +217,3 @@ def test_opacity_says_what_may_change(tmp_path: Path, capsys: pytest.CaptureFixt
     ]
     assert run_command([*command, "--opacity", str(alpha)]) == 0
     assert "the input's own" not in capsys.readouterr().err
-
-
-def test_a_pipe_is_told_the_time_left(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    seconds = iter([0.0, 20.0, 21.0, 40.0])
-    monkeypatch.setattr(refine.time, "perf_counter", lambda: next(seconds))
-    with refine.frame_progress(silent=False) as show:
-        show(10, 100)
-        show(11, 100)
-        show(20, None)
-    lines = capsys.readouterr().err.splitlines()
-    assert lines == [
-        "refined 10/100 frames, 0.5 frames/s, about 3 min left",
-        "refined 20 frames, 0.5 frames/s",
-    ]

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.cli.import_drive import import_splat
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.drives.splat import import_splat
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.packed import write_splat
 from alpasim_plugin.gaussians.files.ply import write_ply

@@ -8,8 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.cli.gate import CONTROL, REFERENCE, SUITE, Trial, _judge, broken_renderers
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.runs.self_test import (
+    CONTROL,
+    REFERENCE,
+    SUITE,
+    Trial,
+    broken_renderers,
+    judge_pair,
+)
 from evaluators.statistics.gate import GateSpec, MetricRule, load_gate
 from scenarios.suite import load_suite
 from tests.evaluators.test_gate import rows
@@ -18,7 +25,7 @@ from tests.evaluators.test_gate import rows
 def trial(spec: GateSpec, is_broken: bool, **candidate: float) -> Trial:
     name = "broken-black" if is_broken else CONTROL
     both = [*rows(renderer=REFERENCE, n_scenes=12), *rows(renderer=name, n_scenes=12, **candidate)]
-    return Trial(name, is_broken, _judge(spec, both, name, 12))
+    return Trial(name, is_broken, judge_pair(spec, both, name, 12))
 
 
 def test_a_sensitive_gate_is_right_about_both() -> None:

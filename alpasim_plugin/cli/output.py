@@ -1,0 +1,193 @@
+"""What verbs print: results on standard output, progress and warnings on standard error."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich import progress
+from rich.console import Console
+
+from evaluators.metrics.outcomes import NO_OUTCOME, event_words
+from evaluators.report.numbers import plural
+
+if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its kernels
+    from alpasim_plugin.runs.execute import Threads
+    from alpasim_plugin.runs.plan import RunPlan
+    from evaluators.statistics.decision import State
+
+SHOWN_CHANGES, SHOWN_SCENES = 4, 5
+MAX_LINES = 1000  # of finished rollouts on a pipe
+LINE_EVERY_S = 10.0  # on a pipe, within one stage
+
+
+def show(as_json: bool, facts: Mapping[str, Any], *lines: Any) -> None:
+    """Print a result: its facts as one JSON document, or lines of text and tables of rich."""
+    if as_json:
+        print(json.dumps(facts), flush=True)
+        return
+    for line in lines:
+        if isinstance(line, str):
+            print(line, flush=True)
+        else:
+            Console().print(line)
+
+
+def warn(text: str) -> None:
+    """Print a line on standard error."""
+    print(text, file=sys.stderr, flush=True)
+
+
+class Progress(progress.Progress):
+    """Progress on standard error: a bar on a terminal, lines on a pipe; silent, only warnings."""
+
+    def __init__(self, silent: bool = False) -> None:
+        console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
+        super().__init__(
+            progress.TextColumn("{task.description}"),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+            progress.TimeElapsedColumn(),
+            progress.TimeRemainingColumn(),
+            console=console,
+            transient=True,
+            disable=silent or not console.is_terminal,
+        )
+        self.silent = silent
+        self.printed_s = 0.0
+
+    def say(self, text: str) -> None:
+        """Print a line above the bar."""
+        if not self.silent:
+            self.console.print(text)
+
+    def show(self, stage: str, done: int, total: int | None) -> None:
+        """Show how much of a stage is done; on a pipe when it begins, and every ten seconds."""
+        is_new = not self.tasks or self.tasks[-1].description != stage
+        if is_new:
+            self.add_task(stage)
+        task = self.tasks[-1]
+        self.update(task.id, completed=done, total=total)
+        now_s = time.monotonic()
+        if self.disable and (is_new or now_s - self.printed_s > LINE_EVERY_S):
+            self.printed_s = now_s
+            whole = "" if total is None else f"/{total}"
+            left = task.time_remaining
+            self.say(f"{stage} {done}{whole}" + (f", about {left:.0f} s left" if left else ""))
+
+    def started(self, plan: RunPlan, root: Path, threads: Threads) -> None:
+        """Announce a run."""
+        self.say(headline(plan, root, threads))
+        self.add_task("rollouts", total=len(plan.cells))
+
+    def rollout_done(self, manifest: dict[str, Any], reused: bool) -> None:
+        """Count a rollout and print its result; on a terminal only failures."""
+        task = self.tasks[-1]
+        self.advance(task.id)
+        done, total = int(task.completed), int(task.total or 0)
+        is_shown = done == total or done % max(1, total // MAX_LINES) == 0
+        if manifest["status"] != "ok" or (self.disable and is_shown):
+            self.say(f"[{done}/{total}] {describe(manifest, reused)}")
+
+    def looked(self, state: State, rollouts: int, ceiling: int) -> None:
+        """Print an interim analysis: scenes, and each metric's interval and verdict."""
+        scenes = plural(state.n_scenes, "scene").replace("\u00a0", " ")
+        parts = []
+        for one in state.metrics:
+            low, high = ("unbounded" if end is None else f"{end:+.4g}" for end in one.interval)
+            parts.append(f"{one.metric} {low} to {high} {one.answer}")
+        self.say(f"{scenes}, {rollouts} of at most {ceiling} rollouts: {'; '.join(parts)}")
+
+    def noticed(self, text: str) -> None:
+        """Print a warning, even if silent: what is damaged, or who is waited for."""
+        self.console.print(f"warning: {text}")
+
+
+def report_line(root: Path) -> str:
+    """Return the lines that name a run's report and the command that replays its rollouts."""
+    page, run = root / "report.html", shlex.quote(str(root))
+    report = shlex.quote(str(page)) if page.exists() else f"not written; simrun report {run}"
+    return f"report   {report}\nwatch    simrun view {run}"
+
+
+def headline(plan: RunPlan, root: Path, threads: Threads) -> str:
+    """Return one line with the size of the run, its workers and its folder, and notes below it."""
+    axes = (
+        plural(len(plan.renderers), "renderer"),
+        plural(len(plan.policies), "policy", "policies"),
+        plural(len(plan.scenarios), "scene"),
+        plural(len(plan.seeds), "seed"),
+    )
+    cores = f"{plural(threads.workers, 'worker')} x {plural(threads.per_worker, 'thread')}"
+    size = f"{plural(len(plan.cells), 'rollout')} ({' x '.join(axes)}), {cores}"
+    notes = [*fixer_labels(plan), *varied_lines(plan), *background_lines(plan)]
+    return "\n".join([f"{size} -> {root}".replace("\u00a0", " "), *notes])
+
+
+def background_lines(plan: RunPlan) -> list[str]:
+    """Return where the background file of each scene stands, and what it replaces."""
+    return [
+        f"{name}: {note}"
+        for name, scenario in plan.scenarios.items()
+        for note in scenario.notes
+        if note.startswith("background ")
+    ]
+
+
+def varied_lines(plan: RunPlan) -> list[str]:
+    """Return one line per scene whose numbers the scene seed has changed."""
+    lines = []
+    for name, scenario in plan.scenarios.items():
+        changes = varied_numbers(scenario.varied)
+        if changes:
+            more = f", and {len(changes) - SHOWN_CHANGES} more" * (len(changes) > SHOWN_CHANGES)
+            shown = ", ".join(changes[:SHOWN_CHANGES])
+            lines.append(f"{name}: scene seed {scenario.seed} varies {shown}{more}")
+    hidden = len(lines) - SHOWN_SCENES
+    if hidden > 0:
+        more_scenes = plural(hidden, "more scene")
+        lines = [*lines[:SHOWN_SCENES], f"{more_scenes} with varied numbers: see run.json"]
+    return lines
+
+
+def varied_numbers(varied: Mapping[str, tuple[Any, Any]]) -> list[str]:
+    """Return what the scene seed has made of the numbers of a scenario file.
+
+    Example:
+        >>> varied_numbers({"actors.0.s_m": (30.0, 31.25)})
+        ['actors.0.s_m 30 -> 31.25']
+    """
+    texts = {
+        key: [f"{value:.4g}" if isinstance(value, float) else str(value) for value in pair]
+        for key, pair in varied.items()
+    }
+    return [f"{key} {' -> '.join(pair)}" for key, pair in texts.items()]
+
+
+def fixer_labels(plan: RunPlan) -> list[str]:
+    """Return one line per fixer: label, with the origin of its weights, and mode."""
+    lines = []
+    for spec in plan.renderers:
+        if spec.fixer is not None:
+            mode = getattr(spec.fixer.settings, "loop_mode", "")
+            lines.append(f"{spec.name}: {spec.fixer.label}" + (f", {mode}" if mode else ""))
+    return lines
+
+
+def describe(manifest: dict[str, Any], reused: bool) -> str:
+    """Return one line with a rollout's result."""
+    names = [manifest["renderer"], manifest["policy"], manifest["scene"]]
+    cell = f"{' '.join(names)} seed {manifest['seed']}"
+    if "rollout" in manifest:  # of a log that is scored
+        cell = f"{manifest['rollout']}: {cell}"
+    if manifest["status"] != "ok":
+        error = manifest["error"]
+        return f"{cell}: FAILED ({error['failure_class']}) {error['message']}"
+    events = dict.fromkeys(event_words(event["metric"]) for event in manifest.get("events", []))
+    cost = " (reused)" if reused else f", {manifest['wall_s']:.1f} s"
+    return f"{cell}: {', '.join(events) or NO_OUTCOME}{cost}"

@@ -1,0 +1,256 @@
+"""Score logs into a run folder: run.json, the tables, the reports, and AlpaSim's aggregation."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.core.atomic import write_json
+from alpasim_plugin.core.errors import EvaluatorError, InputError
+from alpasim_plugin.core.parts import PartSpec, digest
+from alpasim_plugin.core.parts.source import package_digest
+from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifest, write_run_json
+from alpasim_plugin.log.run_folder.schema import AGGREGATE, SUMMARY, slug
+from alpasim_plugin.log.run_folder.writer import write_parquet, write_scene, writing
+from alpasim_plugin.runs.execute import Threads
+from alpasim_plugin.runs.provenance import hardware, versions
+from alpasim_plugin.runs.run import SCHEMA_VERSION, finish_run, origin_of
+from alpasim_plugin.runs.score_logs import KnownScenes, LogScore, exit_code, score_logs
+from alpasim_plugin.runs.summary import pool_of
+from evaluators.alpasim import (
+    EvalSettings,
+    SceneScore,
+    metrics_results_table,
+    metrics_unprocessed_table,
+    over_sweeps,
+    reduce_run,
+    results_summary,
+    scene_score,
+)
+from evaluators.metrics import METRICS, MetricTable, table_of
+from evaluators.metrics.presets import Preset
+from evaluators.statistics.reduce import RolloutValue
+
+
+@dataclass(frozen=True)
+class ScoreResult:
+    """Result of scoring: the run folder, its summary and the process exit code."""
+
+    root: Path
+    summary: dict[str, Any]
+    exit_code: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the result for JSON."""
+        return {"out": str(self.root), "exit_code": self.exit_code, "summary": self.summary}
+
+
+def execute_score(
+    logs: Sequence[Path],
+    scenes: KnownScenes,
+    preset: Preset,
+    settings: EvalSettings | None,
+    evaluators: Sequence[PartSpec],
+    root: Path | None,
+    command: Sequence[str],
+    on_done: Callable[[dict[str, Any]], None],
+) -> ScoreResult:
+    """Score logs and write run.json, the tables, the reports, and with preset ``alpasim`` its
+    aggregation.
+
+    Args:
+        logs: The logs.
+        scenes: Their scenes.
+        preset: Evaluator preset.
+        settings: AlpaSim's settings; None for other presets.
+        evaluators: From `evaluators.resolve_evaluators`.
+        root: Run folder; None makes one below ``runs/`` named after content and preset.
+        command: The command line, for run.json.
+        on_done: Called with each log's manifest.
+
+    Raises:
+        InputError: The folder holds other results, or a log's scene is not among ``scenes``.
+        InfrastructureError: Another process writes the folder.
+    """
+    began = time.perf_counter()
+    facts = {
+        "logs": sorted(_digest(log) for log in logs),
+        "scenes": scenes.places,
+        "preset": preset.as_dict(),
+    }
+    key = digest(facts)[:12]
+    root = root or Path("runs", f"score-{slug(logs[0].resolve().parent.parent.name)}-{key}")
+    with writing(root):
+        _check_key(root, key)
+        (root / SUMMARY).unlink(missing_ok=True)  # from here on the folder is unfinished
+        scores = score_logs(logs, scenes, preset, evaluators, root, on_done)
+        more: dict[str, Any] = {}
+        error: EvaluatorError | None = None
+        if settings is not None:
+            more["alpasim"], error = _aggregate(scores, preset, settings, root / AGGREGATE)
+        manifests = [one.manifest for one in scores]
+        for manifest in manifests:
+            write_manifest(root / manifest["path"], manifest)
+        _write_info(root, key, scores, scenes, preset, settings, command, table_of(evaluators))
+        allowed = settings is not None and settings.allow_aggregation_with_failed_rollouts
+        code = exit_code(scores, allowed, error)
+        more["pool"] = pool_of(manifests, Threads(1, 1), time.perf_counter() - began, None)
+        summary = finish_run(root, manifests, more | {"exit_code": code})
+    return ScoreResult(root, summary, code)
+
+
+def _check_key(root: Path, key: str) -> None:
+    """Refuse a folder that holds other results; a damaged run.json is written again."""
+    try:
+        held = str(read_run_json(root)["key"])
+    except InputError:
+        return
+    if held != key:
+        raise InputError(
+            f"{root}: the folder holds other results (key {held})", "Name another --out."
+        )
+
+
+def _aggregate(
+    scores: Sequence[LogScore], preset: Preset, settings: EvalSettings, folder: Path
+) -> tuple[dict[str, Any], EvaluatorError | None]:
+    """Aggregate as AlpaSim does, put its rollout values into the manifests, and write its files.
+
+    An error of the scene score leaves the values of the rollouts.
+    """
+    good = [one.manifest for one in scores if one.scored is not None]
+    failed = [one.manifest for one in scores if one.scored is None]
+    reduced: Sequence[Any] = []
+    marks: dict[int, SceneScore] | None = {}
+    error: EvaluatorError | None = None
+    try:
+        if good:
+            reduced = reduce_run([one.scored for one in scores if one.scored is not None], preset)
+        marks = {
+            number: scene_score(one.values, settings.scene_score)
+            for number, one in enumerate(reduced)
+            if settings.scene_score.enabled and not one.dropped
+        }
+    except EvaluatorError as caught:
+        error = caught
+        marks = None
+    for number, (manifest, one) in enumerate(zip(good, reduced, strict=False)):
+        values = dict(one.reduction.values)
+        mark = (marks or {}).get(number)
+        if mark is not None:
+            metric = METRICS["scene_score"]
+            values["scene_score"] = RolloutValue(
+                mark.score, True, "", metric.unit, metric.direction
+            )
+        manifest["metrics"] = {name: value.as_dict() for name, value in values.items()}
+        manifest["scene_score"] = mark and {"failure_reason": mark.failure_reason}
+    facts: dict[str, Any] = {
+        "folder": AGGREGATE,
+        "files": [],
+        "skipped": "",
+        "error": error and error.as_dict(),
+    }
+    if failed and not settings.allow_aggregation_with_failed_rollouts:
+        facts["skipped"] = (
+            f"{len(failed)} of {len(scores)} rollouts failed, and "
+            "allow_aggregation_with_failed_rollouts is false"
+        )
+    elif reduced:
+        facts["files"] = _write_aggregate(folder, reduced, marks, failed, settings)
+    return facts, error
+
+
+def _write_aggregate(
+    folder: Path,
+    reduced: Sequence[Any],
+    marks: dict[int, SceneScore] | None,
+    failed: Sequence[dict[str, Any]],
+    settings: EvalSettings,
+) -> list[str]:
+    """Write AlpaSim's files and return their names; without ``marks`` no summary."""
+    own = [one.of for one in reduced]
+    sweeps = over_sweeps(reduced)
+    write_parquet(folder / "metrics_unprocessed.parquet", metrics_unprocessed_table(own))
+    write_parquet(folder / "metrics_results.parquet", metrics_results_table(sweeps, own))
+    files = ["metrics_unprocessed.parquet", "metrics_results.parquet"]
+    if marks is None:
+        return files
+    rows = [
+        {
+            "clipgt_id": manifest["scene"],
+            "rollout_id": manifest["rollout"],
+            "run_uuid": None,
+            "run_name": own[0].run_name,
+            "error": manifest["error"]["message"],
+        }
+        for manifest in failed
+    ]
+    summary = results_summary(reduced, marks, rows, sweeps, settings.scene_score)
+    write_json(folder / "results-summary.json", summary)
+    return [*files, "results-summary.json"]
+
+
+def _write_info(
+    root: Path,
+    key: str,
+    scores: Sequence[LogScore],
+    scenes: KnownScenes,
+    preset: Preset,
+    settings: EvalSettings | None,
+    command: Sequence[str],
+    metrics: MetricTable,
+) -> None:
+    used = {
+        one.manifest["scene"]: scenes.of(one.manifest["scene"])
+        for one in scores
+        if one.scored is not None
+    }
+    for scene in used.values():
+        write_scene(root, scene)
+
+    def names(column: str) -> list[Any]:
+        return list(dict.fromkeys(one.manifest[column] for one in scores))
+
+    write_run_json(
+        root,
+        {
+            **origin_of(command),
+            "schema_version": SCHEMA_VERSION,
+            "kind": "score",
+            "key": key,
+            "config": {
+                "preset": preset.as_dict(),
+                "settings": None if settings is None else settings.model_dump(mode="json"),
+            },
+            "preset": preset.name,
+            "renderers": names("renderer"),
+            "policies": names("policy"),
+            "seeds": names("seed"),
+            "logs": names("log"),
+            "scenes": {
+                name: {
+                    "source": one.source,
+                    "content_hash": one.content_hash,
+                    "notes": list(one.notes),
+                }
+                for name, one in used.items()
+            },
+            "code": {"scoring": package_digest()[:12]},
+            "metrics": metrics.as_dict(),
+            "weights": {},
+            "hardware": hardware(),
+            "versions": versions(),
+            "left_out": sorted({note for one in used.values() for note in one.notes}),
+        },
+    )
+
+
+def _digest(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot open: {error.strerror}", "Check the path.") from error

@@ -1,0 +1,118 @@
+"""The self-test of a gate: drive renderers with a known fault and see whether the gate catches each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.core.parts import names
+from alpasim_plugin.log.run_folder.sides import Row
+from alpasim_plugin.runs.plan import RunOptions, make_plan
+from alpasim_plugin.runs.run import Progress, execute_run
+from evaluators.metrics.presets import DEFAULT
+from evaluators.opening import read_run
+from evaluators.statistics.baselines import rows_of_run
+from evaluators.statistics.gate import GateSpec, GateVerdict, judge
+from evaluators.statistics.verdicts import Outcome, outcome_of_failures, worst
+from scenarios.suite import load_suite
+
+SUITE = "suites/gate_self_test"
+POLICY = "lane-camera"  # the shipped policy that drives from camera frames
+REFERENCE = "clean"
+CONTROL = "clean, other noise"
+SEED, OTHER_SEED = 0, 1
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The gate's verdict on one renderer, and whether it is right."""
+
+    renderer: str
+    is_broken: bool
+    verdict: GateVerdict
+
+    @property
+    def is_right(self) -> bool:
+        """Return whether a broken renderer is caught, or the control is not called worse."""
+        return (self.verdict.outcome.cause == "regression") == self.is_broken
+
+    @property
+    def caught_by(self) -> list[str]:
+        """Name the metrics whose rule was broken."""
+        return [check.metric for check in self.verdict.checks if check.cause == "regression"]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the trial for JSON."""
+        return {
+            **vars(self),
+            "is_right": self.is_right,
+            "caught_by": self.caught_by,
+            "verdict": self.verdict.as_dict(),
+        }
+
+
+def broken_renderers() -> list[str]:
+    """Return the registered renderers with a deliberate fault."""
+    return [name for name in names("renderer") if name.startswith("broken-")]
+
+
+def run_self_test(
+    spec: GateSpec, root: Path, command: Sequence[str], progress: Progress
+) -> tuple[list[Trial], Outcome]:
+    """Drive the suite behind the reference and every broken renderer and judge each pair by the
+    gate.
+
+    The gate's rules apply unchanged, except that the reference is `REFERENCE`, that ``min_scenes``
+    is at most the suite's size and that its scenes are all that is asked about. As a control the
+    reference is compared with itself under another seed: a gate that fails everything fails its
+    test.
+
+    Args:
+        spec: The gate under test.
+        root: Run folder; finished rollouts in it are reused.
+        command: Written to run.json.
+        progress: Shows both runs.
+    """
+    broken = broken_renderers()
+    suite = load_suite(SUITE)
+    options = RunOptions(preset=spec.preset or DEFAULT, baseline=REFERENCE)
+    plan = make_plan(suite, [REFERENCE, *broken], [POLICY], [SEED], options)
+    control = make_plan(suite, [REFERENCE], [POLICY], [OTHER_SEED], options)
+    results = [
+        execute_run(plan, root, None, command, progress),
+        execute_run(control, root / "control", None, command, progress),
+    ]
+    failed = worst([outcome_of_failures(result.summary["failures"]) for result in results])
+    rows = rows_of_run(read_run(root))
+    # The rollouts of the other seed get the first seed, so that they are paired with its rollouts.
+    rows += [
+        {**row, "renderer": CONTROL, "seed": SEED}
+        for row in rows_of_run(read_run(root / "control"))
+    ]
+    trials = [
+        Trial(name, name != CONTROL, judge_pair(spec, rows, name, len(suite)))
+        for name in (*broken, CONTROL)
+    ]
+    reasons = tuple(
+        f"{trial.renderer} is {'not caught' if trial.is_broken else 'wrongly called worse'}"
+        for trial in trials
+        if not trial.is_right
+    )
+    if failed.cause != "pass":
+        return trials, failed
+    return trials, Outcome("regression" if reasons else "pass", reasons)
+
+
+def judge_pair(spec: GateSpec, rows: Sequence[Row], name: str, n_scenes: int) -> GateVerdict:
+    """Judge one renderer against the reference."""
+    fields = {
+        "renderers": (name,),
+        "baseline": REFERENCE,
+        "min_scenes": min(spec.min_scenes, n_scenes),
+        "max_failed": 0.0,
+        "population": "suite",
+    }
+    pair = [row for row in rows if row["renderer"] in (REFERENCE, name)]
+    return judge(pair, spec.model_copy(update=fields))
