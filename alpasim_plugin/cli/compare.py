@@ -76,7 +76,7 @@ def compare(
         means = joined
     else:
         result = compare_within(opened[0], baseline, {}, EVERY_MISSING)
-        means = opened[0].summary
+        means = dict(opened[0].summary)
     facts: dict[str, Any] = {
         "runs": [str(run) for run in folders],
         "notes": list(result.notes),

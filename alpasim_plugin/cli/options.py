@@ -93,11 +93,11 @@ def typer_of(
 
 
 def click_command(app: typer.Typer) -> Any:
-    """Return the command of an application; the help shows no Python type beside an argument."""
+    """Return the command of an application; the help shows no Python type beside a list of arguments."""
     command = typer.main.get_command(app)
     for inner in (command, *getattr(command, "commands", {}).values()):
         for parameter in inner.params:
-            if isinstance(parameter, TyperArgument):
+            if isinstance(parameter, TyperArgument) and parameter.nargs != 1:
                 vars(parameter)["display_type_rich"] = lambda ctx: None
     return command
 

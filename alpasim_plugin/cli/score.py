@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -97,7 +97,7 @@ def score(
     facts = {"exit_code": code, "presets": documents}
     if len(names) == 1:
         facts = documents[names[0]]
-    lines = []
+    lines: list[Any] = []
     for result in results.values():
         if len(names) == 1:
             known = MetricTable.of_run(read_run_json(result.root))

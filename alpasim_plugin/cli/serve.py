@@ -153,7 +153,7 @@ def _serve_policy(
     facts = {"serving": "EgodriverService", "at": host.address, "policy": policy}
     text = f"serving EgodriverService at {host.address}: {policy}"
     _host(host, facts, text, host_policy, as_json)
-    counts = dict(service.counts)
+    counts: dict[str, float] = dict(service.counts)
     if service.drives_s:
         for percent in (50, 95, 99):
             time_ms = float(np.percentile(service.drives_s, percent)) * 1000
