@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 
 from alpasim_plugin.cli.options import Json, Overwrite, fixer_overrides
 from alpasim_plugin.cli.output import Progress, show, warn
+from alpasim_plugin.cli.signals import Stopped
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.interfaces import Fixer
-from alpasim_plugin.cli.signals import Stopped
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.refine import UNLIKE, ChangeLimit
 from alpasim_plugin.runs.refine import RefineFiles, RefineSummary, refine_video

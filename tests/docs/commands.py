@@ -16,12 +16,8 @@ SHELL = ("bash", "sh", "console", "")
 SIMRUN = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?simrun\s+(.*)$")
 OTHER = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(?:python3?(?:\.\d+)?|pip|pytest)\s")
 STEP = re.compile(r"^\s*- run: (.*)$", re.M)
-# The command line is about to understand these; drop each as it does.
 NO_COMMAND = (
     r"──",  # a picture of the order of commands
-    r"^view$|^gate --gate default$",
-    r"--(repeat|from|vary)\b",
-    r"^check (policy|driver|run|renderer)|^serve --policy|^list runs",
 )
 NOT_RUN: tuple[tuple[str, str], ...] = (  # the first rule that fits counts
     *((pattern, "not understood yet") for pattern in NO_COMMAND),
