@@ -53,13 +53,13 @@ def at_precision(net: Net, precision: Precision, float32: Sequence[str] = ()) ->
     Raises:
         InputError: A weight that overflows the precision.
     """
-    cast: dict[int, object] = {}
+    copies: dict[int, object] = {}
     for key, value in net.named_parameters():
         is_float32 = any(part in key for part in float32)
         dtype = torch.float32 if is_float32 else DTYPES[precision]
         converted = checkpoints.convert(key, value.detach(), dtype, "network")
-        cast[id(value)] = nn.Parameter(converted, requires_grad=False)
-    return copy.deepcopy(net, cast)
+        copies[id(value)] = nn.Parameter(converted, requires_grad=False)
+    return copy.deepcopy(net, copies)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,12 +89,8 @@ def load_networks(settings: LatentFixerSettings, device: str = "cpu") -> Network
     """
     require_device(device)
     loop = FixerSettings(name="")  # settings of the loop do not change the networks
-    return _load(
-        settings.model_copy(
-            update={key: getattr(loop, key) for key in ("mode", "tolerance_m", "tolerance_deg")}
-        ),
-        device,
-    )
+    usual = {key: getattr(loop, key) for key in ("mode", "tolerance_m", "tolerance_deg")}
+    return _load(settings.model_copy(update=usual), device)
 
 
 def streaming_dit(
@@ -116,7 +112,7 @@ def streaming_dit(
     found = {key: getattr(net.sizes, key) for key in expected}
     if found != expected:
         raise InputError(
-            f"{source}: {_listed(found)}, streaming gives {_listed(expected)}",
+            f"{source}: {found}, streaming gives {expected}",
             "set fixer.render_input and fixer.opacity_input as in its training; its bundle has them",
         )
     return net
@@ -132,10 +128,6 @@ def condition_sizes(settings: LatentFixerSettings) -> dict[str, int]:
         "map_channels": LATENT * (1 + settings.render_input),
         "opacity_channels": OPACITY_CHANNELS if settings.opacity_input else 0,
     }
-
-
-def _listed(sizes: Mapping[str, int]) -> str:
-    return ", ".join(f"{key} {value}" for key, value in sizes.items())
 
 
 def decode(
@@ -175,17 +167,16 @@ def _load(settings: LatentFixerSettings, device: str) -> Networks:
 def build_networks(parts: Parts, dit_device: str, codec_device: str) -> Networks:
     """Build and cast the networks; nothing is kept for the next call."""
     settings = parts.settings
-    codec_precision = settings.codec_precision
     plain = parts.dit().to(dit_device)
     dtype = DTYPES[settings.precision]
     with torch.no_grad():
         text = plain.encode_text(parts.prompt(plain.sizes).to(dit_device))
     text = TextContext(tuple((k.to(dtype), v.to(dtype)) for k, v in text.keys_values))
     dit = at_precision(plain, settings.precision, FLOAT32_KEYS)
-    vae = at_precision(parts.vae(), codec_precision).to(codec_device)
+    vae = at_precision(parts.vae(), settings.codec_precision).to(codec_device)
     decoder: Codec | TinyDecoder = vae
     if settings.decoder.kind == "taehv":
-        decoder = at_precision(parts.decoder(), codec_precision).to(codec_device)
+        decoder = at_precision(parts.decoder(), settings.codec_precision).to(codec_device)
     return Networks(dit, vae, decoder, text, parts.trained, parts.note)
 
 
@@ -195,45 +186,38 @@ class Parts:
     """
 
     def __init__(self, settings: LatentFixerSettings) -> None:
-        self.settings, self.weights = settings, settings.weights
-        self.bundle = (
-            read_bundle(self.weights.bundle, settings) if self.weights.bundle is not None else None
-        )
-        self.trained = self.bundle.trained if self.bundle else self.weights.dit is not None
-        self.note = (
-            self.bundle.note
-            if self.bundle
-            else f"weights of {Path(self.weights.dit).name}"
-            if self.weights.dit
-            else ""
-        )
-        self.note = self.note or f"untrained ({settings.untrained})"
+        self.settings = settings
+        self.weights = settings.weights
         self.seed = derive_seed("fixer", 0, settings.name)
+        self.bundle = None
+        self.trained = self.weights.dit is not None
+        self.note = f"untrained ({settings.untrained})"
+        if self.weights.dit is not None:
+            self.note = f"weights of {Path(self.weights.dit).name}"
+        if self.weights.bundle is not None:
+            self.bundle = read_bundle(self.weights.bundle, settings)
+            self.trained = self.bundle.trained
+            self.note = self.bundle.note
 
-    def tensors(self, part: str) -> tuple[Mapping[str, Tensor], str] | None:
-        """Return a part's tensors and where they come from; None where no file is named."""
+    def tensors(self, part: str) -> tuple[Mapping[str, Tensor] | None, str]:
+        """Return a part's tensors, None where no file is named, and where they come from."""
         if self.bundle is not None:
-            found = self.bundle.parts.get(part)
-            return None if found is None else (found, f"{self.weights.bundle} ({part})")
+            return self.bundle.parts.get(part), f"{self.weights.bundle} ({part})"
         path: str | None = getattr(self.weights, part)
-        return (
-            None
-            if path is None
-            else (load_weights(path, sha256=getattr(self.weights.sha256, part)), path)
-        )
+        if path is None:
+            return None, self.settings.name
+        return load_weights(path, sha256=getattr(self.weights.sha256, part)), path
 
     def dit(self) -> CosmosCausalDiT:
         """Build the transformer."""
         settings = self.settings
-        given = self.tensors("dit")
-        if given is None:
+        weights, source = self.tensors("dit")
+        if weights is None:
             self.allow_untrained("dit")
             sizes = DiTSizes(**settings.dit.model_dump(), **condition_sizes(settings))
-            given = (
-                initial_weights(sizes, self.seed, zero_velocity=settings.untrained == "identity"),
-                "initial weights",
-            )
-        return streaming_dit(given[0], settings, given[1])
+            is_identity = settings.untrained == "identity"
+            weights = initial_weights(sizes, self.seed, zero_velocity=is_identity)
+        return streaming_dit(weights, settings, source)
 
     def prompt(self, sizes: DiTSizes) -> Tensor:
         """Return the prompt's features ``(1, tokens, text_width)``; a zero token for untrained
@@ -244,12 +228,12 @@ class Parts:
         """
         settings = self.settings
         name = settings.prompt if isinstance(settings, OneFixerSettings) else None
-        given = self.tensors("prompt")
-        if given is None and name is None:
+        prompts, source = self.tensors("prompt")
+        if prompts is None and name is None:
             if self.trained and self.bundle is None:
                 self.refuse("prompt", "its transformer needs the features of its prompt")
             return torch.zeros(1, 1, sizes.text_width)
-        prompts, source = given or ({}, settings.name)
+        prompts = prompts or {}
         text = prompts.get(name or "text")
         if text is None or text.ndim != 2 or text.shape[1] != sizes.text_width:
             known = ", ".join(sorted(prompts)) or "none"
@@ -261,19 +245,21 @@ class Parts:
 
     def vae(self) -> Codec:
         """Build the autoencoder."""
-        given, tiny = self.tensors("vae"), self.settings.vae.kind == "tiny"
-        if given is not None:
-            return (TinyVAE if tiny else WanVAE).from_state_dict(given[0], source=given[1])
-        self.allow_untrained("vae", always_random=not tiny)
-        if tiny:
+        weights, source = self.tensors("vae")
+        is_tiny = self.settings.vae.kind == "tiny"
+        if weights is not None:
+            return (TinyVAE if is_tiny else WanVAE).from_state_dict(weights, source=source)
+        self.allow_untrained("vae", always_random=not is_tiny)
+        if is_tiny:
             return TinyVAE.random(TinySizes(*self.settings.vae.widths), self.seed)
         return WanVAE.random(WanLayout.of_base(self.settings.vae.base), self.seed)
 
     def decoder(self) -> TinyDecoder:
         """Build the tiny Wan decoder."""
-        given, scaled = self.tensors("decoder"), self.settings.decoder.scaled
-        if given is not None:
-            return TinyDecoder.from_state_dict(given[0], scaled=scaled, source=given[1])
+        weights, source = self.tensors("decoder")
+        scaled = self.settings.decoder.scaled
+        if weights is not None:
+            return TinyDecoder.from_state_dict(weights, scaled=scaled, source=source)
         self.allow_untrained("decoder", always_random=True)
         return TinyDecoder.random(LATENT, TAEHV_WIDTHS, scaled, self.seed)
 

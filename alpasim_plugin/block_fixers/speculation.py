@@ -46,12 +46,29 @@ class Deviation:
         return max(self.camera_m, self.actor_m) <= tolerance_m and self.camera_deg <= tolerance_deg
 
 
+EXACT = Deviation(0.0, 0.0, 0.0)
+
+
 def deviation(predicted: RenderRequest, true: RenderRequest) -> Deviation:
     """Compare two requests of one camera and instant."""
-    a, b = predicted.T_world_camera, true.T_world_camera
-    moved = float(np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1).max())
-    turned = max(rotation_rad(a[i], b[i]) for i in range(len(a)))
-    return Deviation(moved, math.degrees(turned), _actors(predicted, true))
+    before = predicted.T_world_camera
+    now = true.T_world_camera
+    moved = float(np.linalg.norm(before[:, :3, 3] - now[:, :3, 3], axis=1).max())
+    turned = max(rotation_rad(one, two) for one, two in zip(before, now, strict=True))
+    actors = [0.0]
+    for key in predicted.actors.keys() | true.actors.keys():
+        one = predicted.actors.get(key)
+        two = true.actors.get(key)
+        latest = predicted.actors[key] if two is None else two
+        ray = latest[:3, 3] - now[-1, :3, 3]
+        if float(ray @ now[-1, :3, 2]) < -BEHIND_M:
+            continue
+        if one is None or two is None:
+            actors.append(math.inf)
+            continue
+        apart = float(np.linalg.norm(one[:3, 3] - two[:3, 3])) + ARM_M * rotation_rad(one, two)
+        actors.append(apart * NEAR_M / max(NEAR_M, float(np.linalg.norm(ray))))
+    return Deviation(moved, math.degrees(turned), max(actors))
 
 
 def same_view(predicted: RenderRequest, true: RenderRequest) -> bool:
@@ -69,22 +86,6 @@ def rotation_rad(a: F64, b: F64) -> float:
     """
     chord = float(np.linalg.norm(a[:3, :3] - b[:3, :3]))
     return 2.0 * math.asin(min(1.0, chord / math.sqrt(8.0)))
-
-
-def _actors(predicted: RenderRequest, true: RenderRequest) -> float:
-    camera = true.T_world_camera[-1]
-    worst = 0.0
-    for key in predicted.actors.keys() | true.actors.keys():
-        one, two = predicted.actors.get(key), true.actors.get(key)
-        there = two if two is not None else predicted.actors[key]
-        seen = there[:3, 3] - camera[:3, 3]
-        if float(seen @ camera[:3, 2]) < -BEHIND_M:
-            continue
-        if one is None or two is None:
-            return math.inf
-        moved = float(np.linalg.norm(one[:3, 3] - two[:3, 3])) + ARM_M * rotation_rad(one, two)
-        worst = max(worst, moved * NEAR_M / max(NEAR_M, float(np.linalg.norm(seen))))
-    return worst
 
 
 @dataclass
@@ -107,14 +108,12 @@ class SpeculationStats:
         """Return the counts and, in metres and degrees, the errors of the forecasts and of the
         frames shown.
         """
-        counts = {
-            name: getattr(self, name)
-            for name in ("frames", "blocks", "predicted", "hits", "exact", "drafts", "redrafts")
-        }
-        return counts | {
+        counts = {key: value for key, value in vars(self).items() if isinstance(value, int)}
+        errors = {
             "forecast_error": _percentiles(self.forecasts),
             "shown_error": _percentiles(self.shown),
         }
+        return counts | errors
 
 
 class SpeculativeRenderer(Renderer):
@@ -137,17 +136,15 @@ class SpeculativeRenderer(Renderer):
         settings: FixerSettings,
         first: Fixer | None = None,
     ) -> None:
-        self.runner, self.settings = runner, settings
+        self.runner = runner
+        self.settings = settings
         self._make = make_fixer
-        self._spare: Fixer | None = first or make_fixer()
-        self.label, self.trained, blocks = (
-            self._spare.label,
-            self._spare.trained,
-            self._spare.blocks,
-        )
-        self.lookahead = max(
-            1, max(blocks.first, blocks.then) - 1
-        )  # at least the next frame, which tells cameras of other rates apart
+        fixer = first or make_fixer()
+        self._spare: Fixer | None = fixer
+        self.label = fixer.label
+        self.trained = fixer.trained
+        # At least the next frame, which distinguishes cameras of other rates.
+        self.lookahead = max(1, fixer.blocks.first - 1, fixer.blocks.then - 1)
         self._groups: dict[tuple[int, ...], _CameraGroup] = {}
         self._group_of: dict[str, _CameraGroup] = {}
         self.stats = SpeculationStats()
@@ -159,11 +156,8 @@ class SpeculativeRenderer(Renderer):
 
     def facts(self) -> dict[str, Any]:
         """Return the fixer's label and the counts so far."""
-        return {
-            "label": self.label,
-            "trained": self.trained,
-            "mode": "speculative",
-        } | self.stats.as_dict()
+        facts = {"label": self.label, "trained": self.trained, "mode": "speculative"}
+        return facts | self.stats.as_dict()
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame; see `render_batch`."""
@@ -190,7 +184,8 @@ class SpeculativeRenderer(Renderer):
         if name not in self._group_of:
             times = (request.t_us, *(coming.t_us for coming in request.ahead))
             if times not in self._groups:
-                fixer, self._spare = self._spare or self._make(), None
+                fixer = self._spare or self._make()
+                self._spare = None
                 self._groups[times] = _CameraGroup(self.runner, fixer, self.settings, self.stats)
             self._group_of[name] = self._groups[times]
             self._groups[times].cameras.append(name)
@@ -220,45 +215,46 @@ class _CameraGroup:
         requests = sorted(requests, key=lambda request: request.camera.name)
         self._check(requests)
         place = len(self.true)
-        predicted = self.draft[place] if place < len(self.draft) else None
-        self.true.append(
-            [self._true_frame(request, predicted, i) for i, request in enumerate(requests)]
-        )
-        exact = [Deviation(0.0, 0.0, 0.0)] * len(requests)
+        predicted = self.draft[place] if place < len(self.draft) else []
+        frames_now = []
+        for i, request in enumerate(requests):
+            if predicted and same_view(predicted[i][0].request, request):
+                frames_now.append(predicted[i][0])
+                self.stats.exact += 1
+            else:
+                frames_now.append(self.runner.render(request))
+        self.true.append(frames_now)
         forecasts = [
-            deviation(item.request, now)
-            for (item, _), now in zip(predicted or (), requests, strict=predicted is not None)
+            deviation(item.request, request)
+            for (item, _), request in zip(predicted, requests, strict=bool(predicted))
         ]
-        hit = bool(forecasts) and all(
-            d.within(self.settings.tolerance_m, self.settings.tolerance_deg) for d in forecasts
-        )
-        self._count(len(requests), forecasts, hit, predicted)
+        limits = self.settings.tolerance_m, self.settings.tolerance_deg
+        is_hit = bool(predicted) and all(error.within(*limits) for error in forecasts)
+        shown = [EXACT] * len(requests)
         if place + 1 == self.fixer.blocks.frames(self.done):
-            frames, shown = self._complete(), exact
-        elif hit and predicted is not None:
-            frames, shown = [frame for _, frame in predicted], forecasts
+            frames = self._complete()
+        elif is_hit:
+            frames = [frame for _, frame in predicted]
+            shown = forecasts
         else:
-            frames, shown = self._make_draft(requests), exact
+            frames = self._make_draft(requests)
+        self.stats.frames += len(requests)
+        self.stats.predicted += len(forecasts)
+        self.stats.hits += len(requests) if is_hit else 0
+        self.stats.forecasts += forecasts
         self.stats.shown += shown
-        missed: Sequence[Deviation | None] = forecasts or [None] * len(frames)
         return {
-            frame.camera: _measured(frame, off, miss)
-            for frame, off, miss in zip(frames, shown, missed, strict=True)
+            frame.camera: _measured(frame, shown[i], forecasts[i] if forecasts else None)
+            for i, frame in enumerate(frames)
         }
-
-    def _true_frame(
-        self, request: RenderRequest, predicted: list[tuple[ConditionedFrame, Frame]] | None, i: int
-    ) -> ConditionedFrame:
-        if predicted is not None and same_view(predicted[i][0].request, request):
-            return predicted[i][0]
-        return self.runner.render(request)
 
     def _complete(self) -> list[Frame]:
         """Add the block of true poses to the history and return its last frames."""
         fixed = self._fix(self.fixer.step, self.true)
         self.done += 1
         self.stats.blocks += 1
-        self.true, self.draft = [], []
+        self.true = []
+        self.draft = []
         return fixed[-1]
 
     def _make_draft(self, requests: Sequence[RenderRequest]) -> list[Frame]:
@@ -267,18 +263,12 @@ class _CameraGroup:
         """
         left = self.fixer.blocks.frames(self.done) - len(self.true)
         coming = min(left, *(len(request.ahead) for request in requests))
-        block = [
-            *self.true,
-            *(
-                [self.runner.render(request.ahead[k]) for request in requests]
-                for k in range(coming)
-            ),
+        block = list(self.true)
+        block += [
+            [self.runner.render(request.ahead[k]) for request in requests] for k in range(coming)
         ]
         fixed = self._fix(self.fixer.preview, block)
-        self.draft = [
-            list(zip(items, frames, strict=True))
-            for items, frames in zip(block, fixed, strict=True)
-        ]
+        self.draft = [list(zip(*pair, strict=True)) for pair in zip(block, fixed, strict=True)]
         self.stats.drafts += 1
         self.stats.redrafts += len(self.true) > 1
         return fixed[len(self.true) - 1]
@@ -290,39 +280,20 @@ class _CameraGroup:
         n = len(self.cameras)
         return [flat[i : i + n] for i in range(0, len(flat), n)]
 
-    def _count(
-        self,
-        n: int,
-        off: Sequence[Deviation],
-        hit: bool,
-        predicted: list[tuple[ConditionedFrame, Frame]] | None,
-    ) -> None:
-        self.stats.frames += n
-        self.stats.predicted += len(off)
-        self.stats.hits += n if hit else 0
-        self.stats.forecasts += off
-        if predicted is not None:
-            self.stats.exact += sum(
-                item is before for item, (before, _) in zip(self.true[-1], predicted, strict=True)
-            )
-
     def _check(self, requests: Sequence[RenderRequest]) -> None:
-        names, t_us = (
-            sorted(request.camera.name for request in requests),
-            {request.t_us for request in requests},
-        )
-        if names != sorted(self.cameras) or len(t_us) > 1:
+        names = [request.camera.name for request in requests]
+        times = sorted({request.t_us for request in requests})
+        if names != sorted(self.cameras) or len(times) > 1:
             raise RendererError(
-                f"cameras {', '.join(names)} at {sorted(t_us)} us: the block in progress belongs to {', '.join(self.cameras)} at one instant",
+                f"cameras {', '.join(names)} at {times} us: the block in progress belongs to {', '.join(self.cameras)} at one instant",
                 "request cameras with the same frame times together",
             )
-        now = next(iter(t_us))
-        if self.last_us is not None and now <= self.last_us:
+        if self.last_us is not None and times[0] <= self.last_us:
             raise RendererError(
-                f"{now} us: the last frame was of {self.last_us} us",
+                f"{times[0]} us: the last frame was of {self.last_us} us",
                 "make a new renderer for every rollout",
             )
-        self.last_us = now
+        self.last_us = times[0]
 
 
 def _measured(frame: Frame, shown: Deviation, forecast: Deviation | None) -> Frame:
@@ -334,9 +305,8 @@ def _measured(frame: Frame, shown: Deviation, forecast: Deviation | None) -> Fra
     }
     if forecast is not None:
         facts |= {"forecast_error_m": forecast.camera_m, "forecast_error_deg": forecast.camera_deg}
-    return replace(
-        frame, facts={**frame.facts, **{name: round(value, 6) for name, value in facts.items()}}
-    )
+    rounded = {name: round(value, 6) for name, value in facts.items()}
+    return replace(frame, facts={**frame.facts, **rounded})
 
 
 def _percentiles(errors: Sequence[Deviation]) -> dict[str, dict[str, float] | None]:
@@ -345,10 +315,10 @@ def _percentiles(errors: Sequence[Deviation]) -> dict[str, dict[str, float] | No
     """
     out: dict[str, dict[str, float] | None] = {}
     for name in ("camera_m", "camera_deg", "actor_m"):
-        values = [getattr(error, name) for error in errors]
-        finite = [value for value in values if math.isfinite(value)]
+        values = np.array([getattr(error, name) for error in errors])
+        finite = values[np.isfinite(values)]
         out[name] = None
-        if finite:
-            p50, p95, top = (round(float(v), 6) for v in np.percentile(finite, (50, 95, 100)))
-            out[name] = {"p50": p50, "p95": p95, "max": top}
+        if len(finite):
+            levels = np.percentile(finite, (50, 95, 100)).round(6).tolist()
+            out[name] = dict(zip(("p50", "p95", "max"), levels, strict=True))
     return out

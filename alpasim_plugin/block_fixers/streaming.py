@@ -36,13 +36,11 @@ class StreamingState:
 
     Args:
         state: State after the previous pass, or None before the first frame.
-        detach: Cut gradients at the pass boundary.
     """
 
-    def __init__(self, state: State | None, detach: bool = False) -> None:
+    def __init__(self, state: State | None) -> None:
         self._old = state
         self._new: list[Tensor] = []
-        self._detach = detach
 
     @property
     def first(self) -> bool:
@@ -76,9 +74,7 @@ class StreamingState:
             )
         joined = torch.cat([past, x], dim=1) if past.shape[1] else x
         kept = joined[:, max(0, joined.shape[1] - frames) :]
-        self._new.append(
-            (kept.detach() if self._detach else kept).clone()
-        )  # a view would keep the memory of the whole pass
+        self._new.append(kept.clone())  # a view would keep the memory of the whole pass
         return joined
 
     def shift(self, x: Tensor) -> Tensor:
@@ -86,11 +82,9 @@ class StreamingState:
         video.
         """
         joined = self.extend(x, 1)
-        return (
-            joined[:, :-1]
-            if joined.shape[1] > x.shape[1]
-            else torch.cat([torch.zeros_like(x[:, :1]), x[:, :-1]], dim=1)
-        )
+        if joined.shape[1] == x.shape[1]:
+            joined = torch.cat([torch.zeros_like(x[:, :1]), x], dim=1)
+        return joined[:, :-1]
 
 
 def in_passes(
@@ -268,8 +262,8 @@ class StreamingCodec(StreamingDecoder):
 
     @abstractmethod
     def encode_next(self, *args: Any, **options: Any) -> tuple[Tensor, State]:
-        """Encode the next frames of a stream; a pure function ``(frames, state, detach=False) ->
-        (latents, state)``.
+        """Encode the next frames of a stream; a pure function ``(frames, state) -> (latents,
+        state)``.
         """
 
     def encode(self, video: Tensor) -> Tensor:

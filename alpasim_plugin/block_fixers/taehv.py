@@ -14,7 +14,6 @@ Source: madebyollin/taehv ``taehv.py``; ModelTC/LightX2V ``vae_tiny.py`` for the
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Self
 
 import torch
@@ -22,8 +21,6 @@ from torch import Tensor, nn
 
 from alpasim_plugin.block_fixers.clips import GROUP, check_latents, pass_ends
 from alpasim_plugin.block_fixers.codec_weights import (
-    WAN_MEAN,
-    WAN_STD,
     LatentStats,
     fill_random,
 )
@@ -48,7 +45,6 @@ COLOURS = 3
 DROPPED = GROUP - 1  # frames dropped at the start of a video
 STAGE = 6  # entries of one stage: three memory blocks, upsampling, growth, convolution
 FIRST = 3  # entry of the first stage
-DOING = "loading tiny decoder weights"
 DO = "give the state dict of TAEHV or LightTAE for Wan 2.1 (keys decoder.*)"
 
 
@@ -134,8 +130,6 @@ class TinyDecoder(StreamingDecoder):
         scaled: bool = False,
         *,
         dtype: torch.dtype = torch.float32,
-        mean: Sequence[float] = WAN_MEAN,
-        std: Sequence[float] = WAN_STD,
         source: str = "a state dict",
     ) -> Self:
         """Build the decoder that ``sd`` holds, at whatever widths it has (256, 128, 64, 64 as
@@ -146,12 +140,10 @@ class TinyDecoder(StreamingDecoder):
                 Of a temporal upsampling layer with more rows than needed, the last ones are used.
             scaled: True for LightTAE, whose weights expect ``z * std + mean``.
             dtype: Precision of the network.
-            mean, std: Latent statistics, used when ``scaled``.
             source: Where ``sd`` comes from, for messages.
 
         Raises:
-            InputError: Missing, unexpected, mis-shaped or transposed keys, or statistics of another
-                length than the latent.
+            InputError: Missing, unexpected, mis-shaped or transposed keys.
         """
         tensors = {
             key: value
@@ -159,15 +151,10 @@ class TinyDecoder(StreamingDecoder):
             if not key.startswith("encoder.")
         }
         latent, widths = _read_widths(tensors, source)
-        if scaled and len(mean) != latent:
-            raise InputError(
-                f"{source}: {latent} latent channels, {len(mean)} latent means",
-                "pass mean= and std=, a value a channel",
-            )
         with torch.device("meta"):
             net = cls(latent, widths, scaled)
         load_checked(net, _last_rows(tensors, widths), dtype, source, DO)
-        net.stats = LatentStats(mean, std) if scaled else None
+        net.stats = LatentStats() if scaled else None
         return net
 
     @classmethod
@@ -182,7 +169,7 @@ class TinyDecoder(StreamingDecoder):
         return net
 
     def decode_next(
-        self, z: Tensor, state: State | None, *, clamp: bool = True, detach: bool = False
+        self, z: Tensor, state: State | None, *, clamp: bool = True
     ) -> tuple[Tensor, State]:
         """Decode the next latents of a stream; a pure function.
 
@@ -190,7 +177,6 @@ class TinyDecoder(StreamingDecoder):
             z: ``(B, 16, m, h, w)``, any m.
             state: State after the previous call, None at the start of the video.
             clamp: Whether to cut the result to [-1, 1].
-            detach: Whether to cut gradients after every pass.
 
         Returns:
             Frames ``(B, 3, n, 8h, 8w)``, n = 4m, or 1 + 4 (m - 1) at the start; and the state for
@@ -201,15 +187,15 @@ class TinyDecoder(StreamingDecoder):
         """
         check_latents(z, self.latent)
         video, state = in_passes(
-            partial(self._pass, detach=detach),
+            self._pass,
             z.to(self.dtype),
             state,
             pass_ends(z.shape[2], self.latents_per_pass),
         )
         return (video.clamp(0, 1) if clamp else video) * 2 - 1, state
 
-    def _pass(self, z: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
-        streaming = StreamingState(state, detach)
+    def _pass(self, z: Tensor, state: State | None) -> tuple[Tensor, State]:
+        streaming = StreamingState(state)
         frames = run_layers(
             self.decoder,
             channels_last(z if self.stats is None else self.stats.denormalise(z)),

@@ -25,7 +25,6 @@ Frames: 1 + 4k, as Wan's. The first latent's group is the first frame four times
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -67,7 +66,6 @@ from alpasim_plugin.core.atomic import write_safetensors
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.checkpoints import load_checked, load_weights, unwrap
 
-DOING = "loading tiny VAE weights"
 DO = "give a file that TinyVAE.save wrote (keys encoder.*, decoder.*, stats.*)"
 
 
@@ -140,15 +138,13 @@ class TinyVAE(StreamingCodec):
         """Write a safetensors file atomically."""
         write_safetensors(path, self.state_dict(), metadata)
 
-    def encode_next(
-        self, frames: Tensor, state: State | None, *, detach: bool = False
-    ) -> tuple[Tensor, State]:
+    def encode_next(self, frames: Tensor, state: State | None) -> tuple[Tensor, State]:
         """Encode the next frames of a stream; a pure function, with the same rules as
         `WanVAE.encode_next`.
         """
         check_frames(frames, first=state is None)
         ends = group_ends(frames.shape[2], state is None, self.latents_per_pass)
-        return in_passes(partial(self._encode_pass, detach=detach), frames.float(), state, ends)
+        return in_passes(self._encode_pass, frames.float(), state, ends)
 
     def decode_next(
         self,
@@ -158,7 +154,6 @@ class TinyVAE(StreamingCodec):
         render: Tensor | None = None,
         opacity: Tensor | None = None,
         clamp: bool = True,
-        detach: bool = False,
     ) -> tuple[Tensor, State]:
         """Decode the next latents of a stream; a pure function, with the same rules as
         `WanVAE.decode_next`.
@@ -170,7 +165,6 @@ class TinyVAE(StreamingCodec):
             opacity: ``(B, 1, n, 8h, 8w)``, 0 to 1: coverage of the render; None is opaque
                 everywhere.
             clamp: Whether to cut the result to [-1, 1].
-            detach: Whether to cut gradients after every pass.
 
         Returns:
             Frames ``(B, 3, n, 8h, 8w)``, n = 4m, or 1 + 4 (m - 1) at the start; and the state for
@@ -183,10 +177,8 @@ class TinyVAE(StreamingCodec):
         b, _, m, h, w = z.shape
         frames = GROUP * m - (DROPPED if state is None else 0)
         _check_condition(render, opacity, (b, frames, h * SIDE, w * SIDE))
-        latent_ends, frame_ends = (
-            pass_ends(m, self.latents_per_pass),
-            group_ends(frames, state is None, self.latents_per_pass),
-        )
+        latent_ends = pass_ends(m, self.latents_per_pass)
+        frame_ends = group_ends(frames, state is None, self.latents_per_pass)
         parts = []
         start = 0
         first = 0
@@ -195,18 +187,17 @@ class TinyVAE(StreamingCodec):
                 None if x is None else x[:, :, first:last].float() for x in (render, opacity)
             ]
             part, state = self._decode_pass(
-                z[:, :, start:end].float(), condition[0], condition[1], state, detach
+                z[:, :, start:end].float(), condition[0], condition[1], state
             )
             parts.append(part)
-            start, first = end, last
+            start = end
+            first = last
         assert state is not None
         video = torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]
         return video.clamp(-1, 1) if clamp else video, state
 
-    def _encode_pass(
-        self, frames: Tensor, state: State | None, detach: bool
-    ) -> tuple[Tensor, State]:
-        streaming = StreamingState(state, detach)
+    def _encode_pass(self, frames: Tensor, state: State | None) -> tuple[Tensor, State]:
+        streaming = StreamingState(state)
         grid = to_grid(_whole_groups(frames, streaming.first))
         mu = self.transform.analyse(grid) + self.encoder.next(grid.to(self.dtype), streaming)
         return self.stats.normalise(channels_first(mu)).to(self.dtype), streaming.state
@@ -217,9 +208,8 @@ class TinyVAE(StreamingCodec):
         render: Tensor | None,
         opacity: Tensor | None,
         state: State | None,
-        detach: bool,
     ) -> tuple[Tensor, State]:
-        streaming = StreamingState(state, detach)
+        streaming = StreamingState(state)
         mu = channels_last(self.stats.denormalise(z))
         grid = self.transform.synthesise(mu)
         skipped = DROPPED if streaming.first else 0

@@ -7,8 +7,7 @@ it, and groups of 4 afterwards; a decoder stream takes any number of latents.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping
 from typing import Self
 
 import torch
@@ -16,8 +15,6 @@ from torch import Tensor, nn
 
 from alpasim_plugin.block_fixers.clips import check_frames, check_latents, group_ends, pass_ends
 from alpasim_plugin.block_fixers.codec_weights import (
-    WAN_MEAN,
-    WAN_STD,
     LatentStats,
     fill_random,
 )
@@ -44,7 +41,6 @@ from alpasim_plugin.block_fixers.wan_vae_blocks import (
     WanLayout,
     read_layout,
 )
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network.checkpoints import load_checked, unwrap
 
 
@@ -119,16 +115,14 @@ class WanVAE(StreamingCodec):
         ((1, 16, 2, 2, 3), (1, 3, 5, 16, 24))
     """
 
-    def __init__(
-        self, layout: WanLayout, mean: Sequence[float] = WAN_MEAN, std: Sequence[float] = WAN_STD
-    ) -> None:
+    def __init__(self, layout: WanLayout) -> None:
         super().__init__()
         self.layout = layout
         self.encoder = Encoder(layout)
         self.conv1 = PointwiseConv(2 * layout.latent, 2 * layout.latent, axes=3)
         self.conv2 = PointwiseConv(layout.latent, layout.latent, axes=3)
         self.decoder = Decoder(layout)
-        self.stats = LatentStats(mean, std)
+        self.stats = LatentStats()
         self.eval().requires_grad_(False)
 
     @classmethod
@@ -137,8 +131,6 @@ class WanVAE(StreamingCodec):
         sd: Mapping[str, Tensor],
         *,
         dtype: torch.dtype = torch.float32,
-        mean: Sequence[float] = WAN_MEAN,
-        std: Sequence[float] = WAN_STD,
         source: str = "a state dict",
     ) -> Self:
         """Build the network that ``sd`` holds, at whatever width it has (96 as published, 24 for
@@ -148,24 +140,17 @@ class WanVAE(StreamingCodec):
             sd: Original keys, alone or under ``model`` or ``state_dict``; any floating precision,
                 also mixed.
             dtype: Precision of the network.
-            mean, std: Latent statistics, one value a channel.
             source: Where ``sd`` comes from, for messages.
 
         Raises:
-            InputError: Missing, unexpected, mis-shaped or transposed keys, or statistics of another
-                length than the latent.
+            InputError: Missing, unexpected, mis-shaped or transposed keys.
         """
         tensors = unwrap(sd, source)
         layout = read_layout(tensors, source)
-        if len(mean) != layout.latent:
-            raise InputError(
-                f"{source}: {layout.latent} latent channels, {len(mean)} latent means",
-                "pass mean= and std=, one value a channel",
-            )
         with torch.device("meta"):
             vae = cls(layout)
         load_checked(vae, tensors, dtype, source, DO)
-        vae.stats = LatentStats(mean, std)
+        vae.stats = LatentStats()
         return vae
 
     @classmethod
@@ -174,19 +159,16 @@ class WanVAE(StreamingCodec):
         with torch.device("meta"):
             vae = cls(layout)
         fill_random(vae, seed, "wan_vae")
-        vae.stats = LatentStats(WAN_MEAN, WAN_STD)
+        vae.stats = LatentStats()
         return vae
 
-    def encode_next(
-        self, frames: Tensor, state: State | None, *, detach: bool = False
-    ) -> tuple[Tensor, State]:
+    def encode_next(self, frames: Tensor, state: State | None) -> tuple[Tensor, State]:
         """Encode the next frames of a stream; a pure function.
 
         Args:
             frames: ``(B, 3, n, H, W)``: n = 1 + 4k if ``state`` is None (the video starts here),
                 else 4k.
             state: State after the previous call.
-            detach: Whether to cut gradients after every pass.
 
         Returns:
             Latents ``(B, 16, m, H/8, W/8)`` and the state for the next call.
@@ -196,12 +178,10 @@ class WanVAE(StreamingCodec):
         """
         check_frames(frames, first=state is None, channels=self.layout.colours)
         ends = group_ends(frames.shape[2], state is None, self.latents_per_pass)
-        return in_passes(
-            partial(self._encode_pass, detach=detach), frames.to(self.dtype), state, ends
-        )
+        return in_passes(self._encode_pass, frames.to(self.dtype), state, ends)
 
     def decode_next(
-        self, z: Tensor, state: State | None, *, clamp: bool = True, detach: bool = False
+        self, z: Tensor, state: State | None, *, clamp: bool = True
     ) -> tuple[Tensor, State]:
         """Decode the next latents of a stream; a pure function.
 
@@ -209,8 +189,6 @@ class WanVAE(StreamingCodec):
             z: ``(B, 16, m, h, w)``, any m.
             state: State after the previous call, None at the start of the video.
             clamp: Whether to cut the result to [-1, 1].
-            detach: Whether to cut gradients after every pass (one latent a pass is a truncation
-                distance of 1).
 
         Returns:
             Frames ``(B, 3, n, 8h, 8w)``, n = 4m, or 1 + 4 (m - 1) at the start; and the state for
@@ -221,22 +199,18 @@ class WanVAE(StreamingCodec):
         """
         check_latents(z, self.layout.latent)
         ends = pass_ends(z.shape[2], self.latents_per_pass)
-        video, state = in_passes(
-            partial(self._decode_pass, detach=detach), z.to(self.dtype), state, ends
-        )
+        video, state = in_passes(self._decode_pass, z.to(self.dtype), state, ends)
         return video.clamp(-1, 1) if clamp else video, state
 
-    def _encode_pass(
-        self, frames: Tensor, state: State | None, detach: bool
-    ) -> tuple[Tensor, State]:
-        streaming = StreamingState(state, detach)
+    def _encode_pass(self, frames: Tensor, state: State | None) -> tuple[Tensor, State]:
+        streaming = StreamingState(state)
         moments = self.conv1(self.encoder.next(channels_last(frames), streaming))
         return self.stats.normalise(
             channels_first(moments[..., : self.layout.latent])
         ), streaming.state
 
-    def _decode_pass(self, z: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
-        streaming = StreamingState(state, detach)
+    def _decode_pass(self, z: Tensor, state: State | None) -> tuple[Tensor, State]:
+        streaming = StreamingState(state)
         return channels_first(
             self.decoder.next(self.conv2(channels_last(self.stats.denormalise(z))), streaming)
         ), streaming.state

@@ -65,8 +65,11 @@ class FixerFactory(Generic[S]):
         Raises:
             InputError: Weights that are named but not there.
         """
-        paths = {f"weights.{part}": settings.weights.path(part) for part in FILES}
-        files = {key: path for key, path in paths.items() if path is not None}
+        files = {}
+        for part in FILES:
+            path = settings.weights.path(part)
+            if path is not None:
+                files[f"weights.{part}"] = path
         for key, path in files.items():
             if not path.is_file():
                 raise InputError(
@@ -77,22 +80,13 @@ class FixerFactory(Generic[S]):
             trained = read_metadata(files["weights.bundle"]).get("trained") == "true"
             return Declaration(files, trained, "trained" if trained else "untrained")
         trained = "weights.dit" in files
-        missing = next(
-            (part for part in settings.needed_weights if f"weights.{part}" not in files), None
-        )
-        if settings.untrained == "refuse" and missing is not None:
-            note = f"weights missing: {missing}" if files else "weights missing"
-            return Declaration(
-                files,
-                trained,
-                note,
-                missing=weights_to_give(missing, getattr(settings, "trained_by", None)),
-            )
-        return Declaration(
-            files,
-            trained,
-            "weights of a checkpoint" if trained else f"untrained ({settings.untrained})",
-        )
+        note = "weights of a checkpoint" if trained else f"untrained ({settings.untrained})"
+        lacking = [part for part in settings.needed_weights if f"weights.{part}" not in files]
+        if settings.untrained != "refuse" or not lacking:
+            return Declaration(files, trained, note)
+        note = f"weights missing: {lacking[0]}" if files else "weights missing"
+        do = weights_to_give(lacking[0], getattr(settings, "trained_by", None))
+        return Declaration(files, trained, note, missing=do)
 
 
 def weights_to_give(part: str, trained_by: str | None = None) -> str:
@@ -172,12 +166,14 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
             f"{path} with the settings of {settings.name}: a bundle of the kind {found_kind!r}, not {kind.name!r}",
             f"take a fixer of that kind: `simrun list fixers`, this bundle is for {trained_with['name']}",
         )
-    # A header written before a setting existed lacks it: its weights were trained at its default.
     used = settings.model_dump(mode="json")
-    trained_with = {**_defaults(settings), **trained_with}
-    wrong, others = [], []
+    # A header written before a setting existed lacks it: its weights were trained at its default.
+    defaults = {key: field.get_default() for key, field in type(settings).model_fields.items()}
+    wrong = []
+    others = []
     for key in (*kind.must_match, *kind.may_differ):
-        due, found = _at(trained_with, key), _at(used, key)
+        found = _at(used, key)
+        due = _at({**defaults, **trained_with}, key)
         if due != found and key in kind.must_match:
             wrong.append(f"{key} is {found} for {due}")
         elif due != found:
@@ -197,10 +193,8 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
             f"write it with save_bundle (parts {', '.join(sorted(kind.needed | kind.optional))})",
         )
     trained = header.get("trained") == "true"
-    note = ", ".join(
-        text for text in ("" if trained else "untrained", header.get("note", ""), *others) if text
-    )
-    return Bundle(parts, trained, note or "trained")
+    notes = ["" if trained else "untrained", header.get("note", ""), *others]
+    return Bundle(parts, trained, ", ".join(filter(None, notes)) or "trained")
 
 
 def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
@@ -246,15 +240,6 @@ def _header(path: str | Path) -> tuple[Mapping[str, str], dict[str, object]]:
             f"give a file that save_bundle wrote ({FORMAT}), or the parts as weights.dit and weights.vae",
         )
     return header, settings
-
-
-def _defaults(settings: WeightedSettings) -> dict[str, object]:
-    """Return the settings that have a default, at it, as JSON has them."""
-    fields = type(settings).model_fields.items()
-    plain = {key: field.get_default() for key, field in fields}
-    return {
-        key: value for key, value in plain.items() if isinstance(value, str | bool | int | float)
-    }
 
 
 def _leaves(data: Mapping[str, object], prefix: str = "") -> dict[str, object]:

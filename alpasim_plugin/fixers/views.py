@@ -14,7 +14,6 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.types import F32, U8, Frame
 
-DOING = "giving a block of frames to a fixer"
 SLACK = 1e-3  # opacity outside [0, 1] by rounding is clipped; more is an error
 HALF = 127.5  # grey levels from 0 to 1 on the scale of [-1, 1]
 
@@ -47,8 +46,12 @@ class Views:
 
     def equals(self, other: Views | None) -> bool:
         """Return whether two blocks are equal bit for bit."""
-        return other is not None and all(
-            _same(getattr(self, field.name), getattr(other, field.name)) for field in fields(self)
+        if other is None:
+            return False
+        pairs = [(getattr(self, part.name), getattr(other, part.name)) for part in fields(self)]
+        return all(
+            (a is None) == (b is None) and np.array_equal(np.asarray(a), np.asarray(b))
+            for a, b in pairs
         )
 
 
@@ -89,11 +92,8 @@ def group_views(block: Sequence[Frame], maps: Sequence[U8], frames_due: int) -> 
             f"semantic maps: {len(maps)} for {len(block)} frames",
             "give one per frame in the same order, or none",
         )
-    order = sorted(
-        range(len(block)), key=lambda i: (block[i].rgb.shape, block[i].camera, block[i].t_us)
-    )
     index: dict[str, list[int]] = {}
-    for i in order:
+    for i in sorted(range(len(block)), key=lambda i: (block[i].camera, block[i].t_us)):
         index.setdefault(block[i].camera, []).append(i)
     counts = {camera: len(mine) for camera, mine in index.items()}
     if len(set(counts.values())) > 1 or max(counts.values()) > frames_due:
@@ -101,12 +101,18 @@ def group_views(block: Sequence[Frame], maps: Sequence[U8], frames_due: int) -> 
             f"frames by camera: {counts}",
             f"give each camera the same number of frames, at most {frames_due}",
         )
-    for camera, mine in index.items():
-        _check_view(camera, [block[i] for i in mine], [maps[i] for i in mine] if maps else [])
     sizes: dict[tuple[int, ...], list[str]] = {}
     for camera, mine in index.items():
-        sizes.setdefault(block[mine[0]].rgb.shape, []).append(camera)
-    return tuple(_stack(block, maps, cameras, index) for cameras in sizes.values())
+        times = [block[i].t_us for i in mine]
+        if len(set(times)) < len(times):
+            raise InputError(
+                f"camera {camera!r}: two frames at one time: {times}", "give every frame once"
+            )
+        shape = block[mine[0]].rgb.shape
+        for i in mine:
+            _check_frame(block[i], maps[i] if maps else None, shape)
+        sizes.setdefault(shape, []).append(camera)
+    return tuple(_stack(block, maps, sizes[shape], index) for shape in sorted(sizes))
 
 
 def check_continues(view: Views, pasts: Mapping[str, Past]) -> None:
@@ -127,56 +133,41 @@ def check_continues(view: Views, pasts: Mapping[str, Past]) -> None:
             )
 
 
-def _check_view(camera: str, frames: Sequence[Frame], maps: Sequence[U8]) -> None:
-    times = [frame.t_us for frame in frames]
-    shape = frames[0].rgb.shape
-    if len(set(times)) < len(times):
+def _check_frame(frame: Frame, sdmap: U8 | None, shape: tuple[int, ...]) -> None:
+    """Refuse a frame, its map and its references unless they have the size ``shape``."""
+    what = f"camera {frame.camera!r} at {frame.t_us} us"
+    is_image = frame.rgb.ndim == 3 and frame.rgb.shape[2] == 3 and 0 not in frame.rgb.shape
+    if not is_image or frame.rgb.dtype != np.uint8:
         raise InputError(
-            f"camera {camera!r}: two frames at one time: {times}", "give every frame once"
+            f"{what}: rgb is {frame.rgb.dtype} {frame.rgb.shape}", "give (height, width, 3) uint8"
         )
-    for frame in frames:
-        what = f"camera {camera!r} at {frame.t_us} us"
-        if (
-            frame.rgb.ndim != 3
-            or frame.rgb.shape[2] != 3
-            or 0 in frame.rgb.shape
-            or frame.rgb.dtype != np.uint8
-        ):
-            raise InputError(
-                f"{what}: rgb is {frame.rgb.dtype} {frame.rgb.shape}",
-                "give (height, width, 3) uint8",
-            )
-        if frame.rgb.shape != shape:
-            raise InputError(
-                f"{what}: rgb of {frame.rgb.shape[:2]} after {shape[:2]} (height, width)",
-                "keep a camera's image size for the whole rollout",
-            )
-        if frame.alpha is not None:
-            _check_alpha(what, frame.alpha, shape[:2])
-        for image in frame.references:
-            if image.shape != (*shape[:2], 4) or image.dtype != np.uint8:
-                raise InputError(
-                    f"{what}: a reference of {image.dtype} {image.shape}",
-                    f"give uint8 {(*shape[:2], 4)}, the size of the frame",
-                )
-    for t_us, image in zip(times, maps, strict=False):
-        if image.shape != shape or image.dtype != np.uint8:
-            raise InputError(
-                f"map of camera {camera!r} at {t_us} us: {image.dtype} {image.shape}",
-                f"give uint8 {shape}, the size of the frame",
-            )
-
-
-def _check_alpha(what: str, alpha: F32, shape: tuple[int, ...]) -> None:
-    if alpha.shape != shape:
+    if frame.rgb.shape != shape:
         raise InputError(
-            f"{what}: alpha of {alpha.shape} with rgb of {shape} (height, width)",
+            f"{what}: rgb of {frame.rgb.shape[:2]} after {shape[:2]} (height, width)",
+            "keep a camera's image size for the whole rollout",
+        )
+    given = [("a reference", image, (*shape[:2], 4)) for image in frame.references]
+    if sdmap is not None:
+        given.append(("the map", sdmap, shape))
+    for name, image, due in given:
+        if image.shape != due or image.dtype != np.uint8:
+            raise InputError(
+                f"{what}: {name} is {image.dtype} {image.shape}",
+                f"give uint8 {due}, the size of the frame",
+            )
+    alpha = frame.alpha
+    if alpha is None:
+        return
+    if alpha.shape != shape[:2]:
+        raise InputError(
+            f"{what}: alpha of {alpha.shape} with rgb of {shape[:2]} (height, width)",
             "give both at one size",
         )
-    low, high = float(alpha.min()), float(alpha.max())
+    low = float(alpha.min())
+    high = float(alpha.max())
     if not (low >= -SLACK and high <= 1 + SLACK):  # also refuses NaN, which min and max propagate
         raise RendererError(
-            f"{what}: opacity with {int(np.isnan(alpha).sum())} NaN, values from {np.nanmin(alpha):.4g} to {np.nanmax(alpha):.4g}",
+            f"{what}: opacity from {low:.4g} to {high:.4g}",
             "repair the renderer: its opacity is accumulated alpha, 0 to 1",
         )
 
@@ -192,11 +183,19 @@ def _stack(
     frames = [block[i] for i in flat]
     alpha = None
     if any(frame.alpha is not None and frame.alpha.min() < 1 for frame in frames):
-        alphas = [
-            np.ones(shape[:2], np.float32) if frame.alpha is None else frame.alpha
-            for frame in frames
-        ]
-        alpha = np.stack(alphas, dtype=np.float32).clip(0, 1).reshape(*lead, *shape[:2])
+        alpha = np.ones((len(frames), *shape[:2]), np.float32)
+        for i, frame in enumerate(frames):
+            if frame.alpha is not None:
+                alpha[i] = frame.alpha.clip(0, 1)
+        alpha = alpha.reshape(*lead, *shape[:2])
+    references = None
+    count = max(len(frame.references) for frame in frames)
+    if count:
+        references = np.zeros((len(frames), count, *shape[:2], 4), np.uint8)
+        for i, frame in enumerate(frames):
+            for k, image in enumerate(frame.references):
+                references[i, k] = image
+        references = references.reshape(*lead, *references.shape[1:])
     return Views(
         names,
         order,
@@ -204,25 +203,8 @@ def _stack(
         np.stack([frame.rgb for frame in frames]).reshape(*lead, *shape),
         alpha,
         np.stack([maps[i] for i in flat]).reshape(*lead, *shape) if maps else None,
-        _references(frames, lead),
+        references,
     )
-
-
-def _references(frames: Sequence[Frame], lead: tuple[int, int]) -> U8 | None:
-    count = max(len(frame.references) for frame in frames)
-    if not count:
-        return None
-    out = np.zeros((len(frames), count, *frames[0].rgb.shape[:2], 4), np.uint8)
-    for i, frame in enumerate(frames):
-        for k, image in enumerate(frame.references):
-            out[i, k] = image
-    return out.reshape(*lead, *out.shape[1:])
-
-
-def _same(a: object, b: object) -> bool:
-    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
-        return np.array_equal(a, b)
-    return a is b if a is None or b is None else bool(a == b)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -69,10 +68,10 @@ class Stream:
 
 
 def encoder_stream(codec: Any) -> Stream:
-    """Return a stream of frames to latents, gradients cut at every pass."""
-    return Stream(partial(codec.encode_next, detach=True))
+    """Return a stream of frames to latents."""
+    return Stream(codec.encode_next)
 
 
 def decoder_stream(codec: Any) -> Stream:
-    """Return a stream of latents to frames, gradients cut at every pass."""
-    return Stream(partial(codec.decode_next, detach=True))
+    """Return a stream of latents to frames."""
+    return Stream(codec.decode_next)

@@ -124,7 +124,7 @@ def test_a_bundle_without_an_autoencoder_is_refused(bundle: Path) -> None:
         **{key.replace(".", "__"): None for key in load_file(bundle) if key.startswith("vae.")},
     )
     assert "no vae.*" in refusal(at(bundle))
-    with pytest.raises(InputError, match="give dit, vae"):
+    with pytest.raises(InputError):
         save_bundle(bundle, {"dit": {}}, at(bundle), trained=False)
 
 

@@ -93,15 +93,14 @@ def unwrap(content: object, source: str) -> StateDict:
     for wrapper in WRAPPERS:
         if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
             content = content[wrapper]
-    do = "give a dictionary of tensors, alone or under the key 'model' or 'state_dict'"
-    if not isinstance(content, Mapping) or not any(
-        isinstance(value, Tensor) for value in content.values()
-    ):
-        raise InputError(f"{source}: a {type(content).__name__} without tensors", do)
-    tensors = {str(key): value for key, value in content.items() if not _is_bookkeeping(str(key))}
-    for key, value in tensors.items():
-        if not isinstance(value, Tensor):
-            raise InputError(f"{source}: {key} is a {type(value).__name__}", do)
+    tensors = dict(content) if isinstance(content, Mapping) else {}
+    tensors = {str(key): value for key, value in tensors.items() if not _is_bookkeeping(str(key))}
+    others = [key for key, value in tensors.items() if not isinstance(value, Tensor)]
+    if others or not tensors:
+        raise InputError(
+            f"{source}: {', '.join(others[:LISTED]) or type(content).__name__} without tensors",
+            "give a dictionary of tensors, alone or under the key 'model' or 'state_dict'",
+        )
     return tensors
 
 
@@ -180,13 +179,14 @@ def load_checked(
         InputError: Keys that are missing, unexpected or of another shape (all in one message), or
             values that are integers, not finite, or beyond ``dtype``.
     """
-    expected = {key: tuple(value.shape) for key, value in net.state_dict().items()}
+    expected = net.state_dict()
     wrong = []
     for key in sorted(expected.keys() & tensors.keys()):
-        shape = tuple(tensors[key].shape)
-        if shape != expected[key]:
-            transposed = ", transposed" if sorted(shape) == sorted(expected[key]) else ""
-            wrong.append(f"{key} is {list(shape)} for {list(expected[key])}{transposed}")
+        shape = list(tensors[key].shape)
+        due = list(expected[key].shape)
+        if shape != due:
+            transposed = ", transposed" if sorted(shape) == sorted(due) else ""
+            wrong.append(f"{key} is {shape} for {due}{transposed}")
     problems = [
         listed("missing", sorted(expected.keys() - tensors.keys())),
         listed("unexpected", sorted(tensors.keys() - expected.keys())),
@@ -230,15 +230,12 @@ def _load_pickle(path: Path, device: str) -> object:
         with path.open("rb") as file, torch.serialization.safe_globals([io.BytesIO]):
             return torch.load(file, map_location=device, weights_only=True)
     except pickle.UnpicklingError as error:
-        reason = (
-            str(error).split("WeightsUnpickler error:")[-1].strip().split(". ")[0].split("\n")[0]
-        )
         raise InputError(
-            f"{path}: a pickle that holds more than tensors ({reason}); loading it could run code",
+            f"{path}: a pickle that holds more than tensors; loading it could run code",
             "save the tensors alone, best as safetensors",
         ) from error
     except Exception as error:  # whatever the unpickler raises on damaged bytes
         raise InputError(
-            f"{path}: a truncated or damaged torch file: {(str(error).splitlines() or [type(error).__name__])[0]}",
+            f"{path}: a truncated or damaged torch file ({type(error).__name__})",
             "download or copy the file again",
         ) from error
