@@ -18,21 +18,18 @@ from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F32, F64, I64, U8, Bool, Box
 
 INFINITY_M = 1e5  # how far a pixel without depth is: nothing moves by parallax there
-NEAREST_M = (
-    0.3  # a point that is nearer to the recorded camera, or behind it, is not in its picture
-)
-SLACK, SLACK_M = (
-    0.12,
-    0.4,
-)  # two depths agree within this share and this length: reconstructions are no better
+# A point that is nearer to the recorded camera, or behind it, is not in its image.
+NEAREST_M = 0.3
+# Two depths agree within this share and this length: reconstructions are no better.
+SLACK = 0.12
+SLACK_M = 0.4
 AROUND_M = (0.25, 0.25, 0.2)  # a point this far outside of a box still moves with it
 # stands for the slope of a ray along a wall, so that it meets that wall's plane nowhere near
 PARALLEL = 1e-300
 SOLE_M = 0.05  # but not the ground below: a box's lowest layer of this height stays where it is
-VALID, INCONSISTENT = (
-    255,
-    128,
-)  # last channel of a reference: validity: the depths agree; they do not
+# Validity, the last channel of a reference: the depths agree, or do not; 0 elsewhere.
+VALID = 255
+INCONSISTENT = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,14 +120,22 @@ def warp(picture: Picture, target: WarpTarget, free_share: float = np.inf) -> U8
         depths is wrong), 0 where the point lies outside of the recorded frame or belongs to an
         actor that was not there.
     """
-    now, T_box_world, sizes, seen = target.placed
+    placed = target.placed
     absent = np.full((4, 4), np.nan)
-    T_then_box = np.array([picture.actors.get(name, absent) for name in now]).reshape(-1, 4, 4)
-    view, then = (
-        (target.depth, target.K, target.T_world_camera),
-        (picture.K, inverse(picture.T_world_camera), picture.depth),
+    T_then_box = np.array([picture.actors.get(name, absent) for name in placed.names])
+    lookup = Lookup(
+        target.depth,
+        target.K,
+        target.T_world_camera,
+        picture.K,
+        inverse(picture.T_world_camera),
+        picture.depth,
+        placed.T_box_world,
+        T_then_box.reshape(-1, 4, 4),
+        placed.sizes,
+        free_share,
+        placed.seen,
     )
-    lookup = Lookup(*view, *then, T_box_world, T_then_box, sizes, free_share, seen)
     x, y, held = warp_coordinates(lookup)
     rgb = cv2.remap(picture.rgb, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.dstack([rgb, held])
@@ -157,12 +162,11 @@ def place_boxes(
     """
     names = [name for name in sorted(actors) if name in boxes]
     T_box_world = inverse(np.array([actors[name] for name in names]).reshape(-1, 4, 4))
-    sizes = np.array(
-        [[boxes[n].length_m, boxes[n].width_m, boxes[n].height_m] for n in names]
-    ).reshape(-1, 3)
-    return PlacedBoxes(
-        names, T_box_world, sizes, _seen_boxes(K, T_world_camera, T_box_world, sizes, shape)
-    )
+    present = [boxes[name] for name in names]
+    lengths = [(box.length_m, box.width_m, box.height_m) for box in present]
+    sizes = np.array(lengths).reshape(-1, 3)
+    seen = _seen_boxes(K, T_world_camera, T_box_world, sizes, shape)
+    return PlacedBoxes(names, T_box_world, sizes, seen)
 
 
 def warp_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
@@ -173,47 +177,29 @@ def warp_coordinates(lookup: Lookup) -> tuple[F32, F32, U8]:
         Column and row ``(H, W)``, counted from the centre of the first pixel, and `VALID`,
         `INCONSISTENT` or 0 ``(H, W)``.
     """
-    (
-        depth,
-        K,
-        T_world_camera,
-        K_then,
-        T_then_world,
-        depth_then,
-        T_box_world,
-        T_then_box,
-        sizes,
-        free_share,
-        seen,
-    ) = lookup
-    height, width = depth.shape
-    x = np.empty((height, width), np.float32)
-    y = np.empty((height, width), np.float32)
-    held = np.empty((height, width), np.uint8)
+    shape = lookup.depth.shape
+    x = np.empty(shape, np.float32)
+    y = np.empty(shape, np.float32)
+    held = np.empty(shape, np.uint8)
     # A pixel p at depth z lies at z A p + b in the recorded frame's homogeneous pixels; A p is
     # linear along a row.
-    ray = T_world_camera[:3, :3] @ np.linalg.inv(K)
-    project = K_then @ T_then_world[:3]
-    A, b = project[:, :3] @ ray, project[:, :3] @ T_world_camera[:3, 3] + project[:, 3]
-    lines, then = np.ascontiguousarray(depth), np.ascontiguousarray(depth_then)
-    _coordinates(lines, then, A, b, free_share, x, y, held)
-    seen = _seen_boxes(K, T_world_camera, T_box_world, sizes, depth.shape) if seen is None else seen
-    to_then: F64 = project @ T_then_box
+    project = lookup.K_then @ lookup.T_then_world[:3]
+    A = project[:, :3] @ (lookup.T_world_camera[:3, :3] @ np.linalg.inv(lookup.K))
+    b = project[:, :3] @ lookup.T_world_camera[:3, 3] + project[:, 3]
+    depth = np.ascontiguousarray(lookup.depth)
+    depth_then = np.ascontiguousarray(lookup.depth_then)
+    _coordinates(depth, depth_then, A, b, lookup.free_share, x, y, held)
+    seen = lookup.seen
+    if seen is None:
+        boxes = lookup.T_box_world, lookup.sizes
+        seen = _seen_boxes(lookup.K, lookup.T_world_camera, *boxes, shape)
+    to_then: F64 = project @ lookup.T_then_box
     shown = np.flatnonzero((seen.pixels[:, ::2] < seen.pixels[:, 1::2]).all(axis=1))
     for i in reversed(shown):  # of two boxes the first counts
         part = slice(*seen.pixels[i, :2]), slice(*seen.pixels[i, 2:])
+        box = seen.ray[i], seen.eye[i], seen.walls[i], to_then[i], seen.pixels[i]
         images = x[part], y[part], held[part]
-        _coordinates_on_box(
-            lines[part],
-            then,
-            seen.ray[i],
-            seen.eye[i],
-            seen.walls[i],
-            to_then[i],
-            seen.pixels[i],
-            free_share,
-            *images,
-        )
+        _coordinates_on_box(depth[part], depth_then, *box, lookup.free_share, *images)
     return x, y, held
 
 
