@@ -146,13 +146,13 @@ def test_a_refused_step_leaves_the_history(bundle: Path) -> None:
     run(fixer, FRAMES[:2])
     holes = np.ones(SIZE, np.float32)
     holes[3, 4] = np.nan
-    with pytest.raises(RendererError, match="NaN"):
+    with pytest.raises(RendererError):
         fixer.step([replace(FRAMES[2], alpha=holes)], ())
-    with pytest.raises(InputError, match="after one at 100000 us"):
+    with pytest.raises(InputError):
         fixer.step(FRAMES[1:2], ())
-    with pytest.raises(InputError, match="keep a camera's image size"):
+    with pytest.raises(InputError):
         fixer.step([replace(moving_picture(3, (16, 32))[2], t_us=FRAMES[2].t_us)], ())
-    with pytest.raises(InputError, match="at most 1"):
+    with pytest.raises(InputError):
         fixer.step(FRAMES[2:4], ())
     assert np.array_equal(fixer.step(FRAMES[2:3], ())[0].rgb, expected[2].rgb)
 
@@ -171,13 +171,13 @@ def test_a_frame_that_is_not_finite_is_passed_raw_and_forgotten(bundle: Path) ->
 
 def test_bundles_of_the_two_kinds_are_told_apart(bundle: Path, tmp_path: Path) -> None:
     assert bundle_fixer(bundle)[0] == "onefixer"
-    with pytest.raises(InputError, match="a bundle of the kind 'per-frame', not 'block'"):
+    with pytest.raises(InputError):
         read_bundle(bundle, small_settings())
-    with pytest.raises(InputError, match=r"no generator\.\*"):
+    with pytest.raises(InputError):
         save_bundle(tmp_path / "none.safetensors", {}, at(bundle), trained=False)
-    with pytest.raises(InputError, match="one frame at a time has no blocks"):
+    with pytest.raises(InputError):
         at(bundle, "mode=chunk")
-    with pytest.raises(InputError, match=r"give weights\.bundle"):
+    with pytest.raises(InputError):
         fixer_settings("onefixer", ["weights.bundle=null", "weights.dit=a"])
 
 
@@ -188,7 +188,7 @@ def test_an_untrained_generator_returns_the_render(bundle: Path) -> None:
     fixer = make_fixer("onefixer", settings, scene_id="scene")
     assert not fixer.trained
     assert np.array_equal(pixels([fixer.step(FRAMES[:1], ())[0]]), pixels(FRAMES[:1]))
-    with pytest.raises(InputError, match="untrained is 'refuse'"):
+    with pytest.raises(InputError):
         make_fixer(
             "onefixer",
             fixer_settings("onefixer", ["weights.bundle=null", "untrained=refuse"]),
@@ -300,7 +300,7 @@ def test_the_guard_never_keeps_the_render_where_a_reference_is_shown(reading: Pa
 
 def test_a_reference_of_another_size_is_refused(reading: Path) -> None:
     wrong = replace(FRAMES[0], references=(np.zeros((4, 4, 4), np.uint8),))
-    with pytest.raises(InputError, match="a reference of uint8"):
+    with pytest.raises(InputError):
         session(reading).step([wrong], MAPS[:1])
 
 

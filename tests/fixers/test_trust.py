@@ -59,7 +59,7 @@ def test_a_render_that_stays_is_neither_recorded_nor_guessed_and_a_reference_is_
 
 @pytest.mark.parametrize("text", ["", "2x1:00", "2x1:00zz", "2:0000", "-2x-1:0000"])
 def test_a_text_that_is_none_is_refused(text: str) -> None:
-    with pytest.raises(InputError, match="is damaged"):
+    with pytest.raises(InputError):
         trust_cells(text)
 
 
