@@ -83,11 +83,13 @@ def _nuplan(
 ) -> dict[str, Part]:
     ego = Judged(rollout, scene, preset, centre)
     progress = _progress(rollout, preset, centre, nuplan.progress_ratio)
-    is_known = not isinstance(progress, str)
+    is_made: Part = progress
+    if not isinstance(progress, str):
+        is_made = float(progress >= nuplan.PROGRESS_SHARE)
     return {
         "no_at_fault_collision": ego.contact(),
         "drivable_area": ego.drivable(nuplan.OFF_AREA_M),
-        "making_progress": float(progress >= nuplan.PROGRESS_SHARE) if is_known else progress,
+        "making_progress": is_made,
         "driving_direction": ego.direction(),
         "progress": progress,
         "time_to_collision": ego.time_to_collision(),

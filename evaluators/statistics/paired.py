@@ -127,7 +127,9 @@ def pairs_within(
     """
     variants = variants_in(table)
     by_renderer_base, by_policy_base = axis_bases(variants, baseline)
-    of_renderers, of_fixers, of_policies = [], [], []
+    of_renderers: list[Pair] = []
+    of_fixers: list[Pair] = []
+    of_policies: list[Pair] = []
     for policy in table.policies:
         own = {variant.renderer: variant for variant in variants if variant.policy == policy}
         base = next(iter(own))
@@ -144,8 +146,10 @@ def pairs_within(
                 key = name if len(table.policies) == 1 else own[name].name
                 pairs.append(Pair(key, own[name], own[other], other))
     if by_policy_base is not None:
-        for variant, other in by_policy_base.pairs(variants):
-            of_policies.append(Pair(variant.name, variant, other, other.name))
+        of_policies += [
+            Pair(variant.name, variant, partner, partner.name)
+            for variant, partner in by_policy_base.pairs(variants)
+        ]
     return [of_renderers, of_fixers, of_policies]
 
 
