@@ -107,4 +107,4 @@ def test_a_factory_that_asks_for_something_else_is_told_what_there_is(
     failed = json.loads(capsys.readouterr().out)["summary"]["failures"]["cells"][0]["error"]
     assert "gain" in failed["message"]
     assert failed["failure_class"] == "policy"
-    assert "scenario" in failed["do"]
+    assert "scenario" in failed["hint"]

@@ -93,7 +93,7 @@ def test_both_bikers_are_one_model_in_one_place(biker: Path) -> None:
 
 @pytest.mark.parametrize("name", ["biker.compressed.ply", "biker.spz"])
 @pytest.mark.parametrize("percent", range(0, 100, 10))
-def test_biker_cut_short_is_refused_in_four_parts(
+def test_biker_cut_short_is_refused_by_its_path(
     biker: Path, tmp_path: Path, name: str, percent: int
 ) -> None:
     data = (biker / name).read_bytes()

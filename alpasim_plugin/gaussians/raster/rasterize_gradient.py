@@ -6,7 +6,7 @@ compiled CPU kernels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -342,6 +342,9 @@ def rasterize_torch(
 ) -> RasterOutput:
     """Render a cloud by `rasterize_gradient`, without gradients.
 
+    Splats are float32, so the cloud and the camera are moved to the camera's centre first:
+    UTM-sized coordinates cost no precision.
+
     Raises:
         InputError: The cloud holds Gaussians that cannot be drawn, or the background does not fit.
     """
@@ -349,8 +352,14 @@ def rasterize_torch(
     behind = torch.as_tensor(background_image(background, camera)).expand(
         camera.height, camera.width, 3
     )
+    rotation = camera.T_camera_world[:3, :3]
+    centre = -rotation.T @ camera.T_camera_world[:3, 3]
+    T_camera_local = np.eye(4)
+    T_camera_local[:3, :3] = rotation
+    splats = Splats.from_cloud(replace(cloud, means=cloud.means - centre))
+    local_camera = replace(camera, T_camera_world=T_camera_local)
     with torch.no_grad():
-        out = rasterize_gradient(Splats.from_cloud(cloud), camera, background=behind, near_m=near_m)
+        out = rasterize_gradient(splats, local_camera, background=behind, near_m=near_m)
     return RasterOutput(
         out.rgb.clamp(0, 1).numpy(), out.alpha.numpy(), out.depth.numpy(), {"gaussians": len(cloud)}
     )

@@ -131,13 +131,13 @@ def test_learning_rate_falls_exponentially_or_stays() -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="this system has no /dev/full")
-def test_full_disk_under_the_log_has_four_parts(tmp_path: Path) -> None:
+def test_full_disk_under_the_log_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "log.jsonl").symlink_to("/dev/full")
     with pytest.raises(InfrastructureError):
         trainer(tmp_path, Schedule(steps=2)).run()
 
 
-def test_full_disk_under_the_checkpoint_has_four_parts_and_keeps_the_old_one(
+def test_full_disk_under_the_checkpoint_is_an_error_and_keeps_the_old_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     t = trainer(tmp_path, Schedule(steps=4, save_every=2))

@@ -118,7 +118,7 @@ def test_command_writes_both_parts_once_with_the_frames_of_the_video(tmp_path: P
     write_mp4(source, moving(20), 10, crf=4)
     command = [
         "train",
-        "video",
+        "pairs",
         str(source),
         "--out",
         str(out),
