@@ -92,11 +92,12 @@ def list_names(
 def _list_runs(
     roots: Sequence[Path], choice: Choice, last: int | None, metrics: Sequence[str], as_json: bool
 ) -> None:
-    entries = find_runs(roots, bool(metrics))
+    entries = find_runs(roots, with_summary=True)
     chosen = [entry for entry in entries if choice.takes(entry)][:last]
     stored = {
         name
         for entry in chosen
+        if entry.state != "damaged"
         for table in (entry.summary.get("metrics") or {}).values()
         for name in table
     }

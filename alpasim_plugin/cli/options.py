@@ -264,10 +264,12 @@ def run_or_newest(run: Path | None) -> Path:
 def run_and_cell(path: Path | None) -> tuple[Path, str]:
     """Return the run folder of ``RUN/CELL`` and the cell, which is empty where a run was named.
 
+    ``.`` stands for the newest run below ``runs/`` where the working folder is no run folder.
+
     Raises:
         InputError: No run folder is at or above the path.
     """
-    folder = run_or_newest(path)
+    folder = run_or_newest(None if path == Path() and not Path(RUN_INFO).exists() else path)
     for root in (folder, *folder.parents):
         if (root / RUN_INFO).exists():
             return root, "/".join(folder.relative_to(root).parts).removeprefix("rollouts/")

