@@ -86,7 +86,7 @@ def test_a_map_that_is_aside_is_off_and_the_answer_says_where_the_paint_is(aside
     assert found is not None
     assert found.here < DOUBT
     assert found.there >= FITS
-    assert found.aside_m == pytest.approx(-aside_m, abs=0.01)
+    assert found.offset_m == pytest.approx(-aside_m, abs=0.01)
 
 
 def test_a_picture_without_paint_is_no_evidence() -> None:
@@ -126,10 +126,10 @@ def test_paint_that_stays_where_the_recording_shows_it_is_no_evidence() -> None:
     Others still are evidence.
     """
     unmoved = photograph(aside_m=0.9)
-    assert judged(unmoved, prepared()).aside_m == pytest.approx(0.9)
-    assert contradiction(prepared(), SPEC, AHEAD, (), unmoved, beside_m=1.0) is None
+    assert judged(unmoved, prepared()).offset_m == pytest.approx(0.9)
+    assert contradiction(prepared(), SPEC, AHEAD, (), unmoved, camera_offset_m=1.0) is None
     assert (
-        contradiction(prepared(), SPEC, AHEAD, (), photograph(aside_m=1.75), beside_m=1.0)
+        contradiction(prepared(), SPEC, AHEAD, (), photograph(aside_m=1.75), camera_offset_m=1.0)
         is not None
     )
     path = np.array([[0.0, 0.0], [50.0, 0.0]])

@@ -1,19 +1,19 @@
-"""The truth gate: does the map belong to the picture? A fixer paints what a map draws, and a wrong
-map would have it paint a wrong road.
+"""Detect a semantic map that does not match the rendered image.
 
-Paint is brighter than the road on both sides of it. So the lines of the drawn map are laid over the
-picture, and each piece of a line in a row of pixels is compared with equal pieces beside it: how
-often is it the brighter one, by `top hat`, which leaves what is narrower than `PAINT_SHARE` of the
-width? Half of the time by chance, nearly always where the line is there. That number is the
-*agreement* of a map.
+A fixer draws what a map shows, so a wrong map would make it draw a wrong road.
 
-A picture may show no paint at all: an unmarked street, glare, a poor reconstruction. That is no
-evidence against the map. A map is contradicted where its lines are not found where it has them
-(agreement below `DOUBT`) and the same lines are found to one side of it (`FITS` or more at one of
-`ASIDE_M`): then the picture shows paint, and somewhere else. A map of another street whose lines
-fit nowhere is not told from a street without paint. A poor reconstruction, seen from beside the
-recorded path, leaves paint where the recording shows it: lines that are aside by as much as the
-camera is (within `UNMOVED_M`) are no evidence either.
+Lane markings are brighter than the road on both sides of them. The lines of the drawn map are laid
+over the image, and each piece of a line in a row of pixels is compared with equal pieces to its
+left and right: how often is it the brighter one in the image's white top hat, which keeps what is
+narrower than `MARKING_SHARE` of the width? By chance in half of the comparisons, nearly always
+where the line is in the image. That share is the *agreement* of a map.
+
+An image without lane markings (an unmarked street, glare, a poor reconstruction) is no evidence
+against the map. A map is contradicted where its agreement is below `DOUBT` and the same lines,
+shifted by one of `LATERAL_OFFSETS_M`, reach `FITS`: then the image shows the markings elsewhere. A
+map of another street whose lines fit nowhere cannot be distinguished from a street without
+markings. A blurred reconstruction keeps lane markings at their recorded pixels when the camera
+moves sideways; a shift within `UNMOVED_M` of the camera's own lateral offset is therefore ignored.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from alpasim_plugin.core.types import F64, U8, Bool, CameraSpec, LaneMap
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
 from alpasim_plugin.fixers.semantic_map.prepare import ActorBox, PreparedMap, prepare_map
 
-WIDTH_PX = 480  # pictures are compared at this width
-PAINT_SHARE = 0.035  # of the width: what is broader is no paint
+WIDTH_PX = 480  # images are compared at this width
+MARKING_SHARE = 0.035  # of the width: what is broader is no lane marking
 # of the width: a run of line colour that is broader is a line across the view, without sides
 WIDEST_SHARE = 0.08
-BESIDE = (-4, -3, -2, 2, 3, 4)  # pieces beside a line, in its own widths
+NEIGHBOURS = (-4, -3, -2, 2, 3, 4)  # pieces beside a line, in its own widths
 LEAST_PIECES = 40  # of lines in rows; fewer say nothing
 DOUBT, FITS = 0.56, 0.64
 NOTHING = prepare_map(LaneMap({}))
-ASIDE_M = (-2.2, -1.75, -1.3, -0.9, 0.9, 1.3, 1.75, 2.2)
+LATERAL_OFFSETS_M = (-2.2, -1.75, -1.3, -0.9, 0.9, 1.3, 1.75, 2.2)
 UNMOVED_M = 0.45
 
 
@@ -54,16 +54,16 @@ class Pieces:
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A picture that shows a map's lines beside where the map has them.
+    """An image that shows a map's lines beside where the map has them.
 
     Attributes:
         here, there: Agreement where the map has its lines, and at the place that fits best.
-        aside_m: How far that is to the left, metres.
+        offset_m: How far that is to the left, metres.
     """
 
     here: float
     there: float
-    aside_m: float
+    offset_m: float
 
 
 def contradiction(
@@ -72,54 +72,56 @@ def contradiction(
     T_world_camera: F64,
     boxes: Sequence[ActorBox],
     rgb: U8,
-    beside_m: float = 0.0,
+    camera_offset_m: float = 0.0,
     threads: int | None = None,
 ) -> Contradiction | None:
-    """Compare a picture with the map; None: they do not contradict each other.
+    """Compare an image with the map; None: they do not contradict each other.
 
     Args:
         scene_map: The map.
-        camera: The pinhole that made the picture.
+        camera: The pinhole that made the image.
         T_world_camera: ``(4, 4)``.
         boxes: Road users, which hide lines.
-        rgb: ``(H, W, 3)`` the picture.
-        beside_m: How far to the left of the recorded path the camera stands (`beside`).
+        rgb: ``(H, W, 3)`` the image.
+        camera_offset_m: How far to the left of the recorded path the camera stands (`beside`).
         threads: Of the map rasteriser.
     """
     small = shrunk(camera)
-    paint = top_hat(cv2.resize(rgb, (small.width, small.height), interpolation=cv2.INTER_AREA))
+    markings = top_hat(cv2.resize(rgb, (small.width, small.height), interpolation=cv2.INTER_AREA))
     open_road = ~draw_map(NOTHING, small, T_world_camera, boxes, threads=threads).any(axis=2)
 
-    def found(aside_m: float) -> float | None:
+    def agreement_at(offset_m: float) -> float | None:
         T = T_world_camera.copy()
-        T[:3, 3] -= aside_m * leftwards(
+        T[:3, 3] -= offset_m * leftwards(
             T_world_camera
         )  # who stands to the right sees the lines to the left
         return agreement(
             pieces_of(line_pixels(draw_map(scene_map, small, T, threads=threads)) & open_road),
-            paint,
+            markings,
         )
 
-    return decided(found, beside_m)
+    return decided(agreement_at, camera_offset_m)
 
 
-def decided(found: Callable[[float], float | None], beside_m: float) -> Contradiction | None:
+def decided(
+    agreement_at: Callable[[float], float | None], camera_offset_m: float
+) -> Contradiction | None:
     """Decide from the agreement of a map's lines, moved to the left by some metres, and where the
     camera stands.
     """
-    here = found(0.0)
+    here = agreement_at(0.0)
     if here is None or here >= DOUBT:
         return None
-    best, aside_m = max(
-        (found(aside_m) or 0.0, aside_m)
-        for aside_m in ASIDE_M
-        if abs(aside_m - beside_m) > UNMOVED_M
+    best, offset_m = max(
+        (agreement_at(offset_m) or 0.0, offset_m)
+        for offset_m in LATERAL_OFFSETS_M
+        if abs(offset_m - camera_offset_m) > UNMOVED_M
     )
-    return Contradiction(here, best, aside_m) if best >= FITS else None
+    return Contradiction(here, best, offset_m) if best >= FITS else None
 
 
 def shrunk(camera: CameraSpec) -> CameraSpec:
-    """Return the camera of a picture `WIDTH_PX` wide, or of the picture itself where it is no
+    """Return the camera of an image `WIDTH_PX` wide, or of the image itself where it is no
     wider.
     """
     if camera.width <= WIDTH_PX:
@@ -154,7 +156,7 @@ def beside(path: F64, T_world_rig: F64, T_world_camera: F64) -> float:
 
 
 def line_pixels(drawn: U8) -> Bool:
-    """Return the pixels ``(H, W)`` of a drawn map that are paint: white or yellow, however
+    """Return the pixels ``(H, W)`` of a drawn map that are lane markings: white or yellow, however
     faded.
     """
     red, green, blue = (drawn[..., c].astype(np.int16) for c in range(3))
@@ -167,8 +169,8 @@ def top_hat(rgb: U8) -> U8:
     """Return how much brighter ``(H, W)`` each pixel is than what lies on both sides of it in its
     row.
     """
-    side = max(5, int(rgb.shape[1] * PAINT_SHARE) | 1)
-    bright = np.ascontiguousarray(rgb[..., :2].max(axis=2))  # white and yellow paint alike
+    side = max(5, int(rgb.shape[1] * MARKING_SHARE) | 1)
+    bright = np.ascontiguousarray(rgb[..., :2].max(axis=2))  # white and yellow markings alike
     return np.asarray(cv2.morphologyEx(bright, cv2.MORPH_TOPHAT, np.ones((1, side), np.uint8)))
 
 
@@ -180,36 +182,38 @@ def pieces_of(lines: Bool) -> Pieces:
     return Pieces(row[fits], first[fits], end[fits])
 
 
-def agreement(pieces: Pieces, paint: U8) -> float | None:
+def agreement(pieces: Pieces, markings: U8) -> float | None:
     """Return how often a piece of a line is brighter than a piece beside it, 0 to 1; ties count
     half. None: too few pieces.
 
     Example:
-        >>> paint = np.zeros((60, 90), np.uint8)
-        >>> paint[:, 41] = 9
+        >>> markings = np.zeros((60, 90), np.uint8)
+        >>> markings[:, 41] = 9
         >>> rows, ones = np.arange(60), np.ones(60, int)
-        >>> agreement(Pieces(rows, 40 * ones, 43 * ones), paint), agreement(Pieces(rows, 50 * ones, 53 * ones), paint)
+        >>> agreement(Pieces(rows, 40 * ones, 43 * ones), markings), agreement(Pieces(rows, 50 * ones, 53 * ones), markings)
         (1.0, 0.4166666666666667)
     """
     if len(pieces.row) < LEAST_PIECES:
         return None
-    width = paint.shape[1]
+    width = markings.shape[1]
     size = pieces.end - pieces.first
-    own = _brightest(paint, pieces.row, pieces.first, pieces.end)
+    own = _brightest(markings, pieces.row, pieces.first, pieces.end)
     wins = compared = 0.0
-    for times in BESIDE:
+    for times in NEIGHBOURS:
         first, end = pieces.first + times * size, pieces.end + times * size
         inside = (first >= 0) & (end <= width)
-        beside = _brightest(paint, pieces.row[inside], first[inside], end[inside])
+        beside = _brightest(markings, pieces.row[inside], first[inside], end[inside])
         wins += float(np.sum(own[inside] > beside) + 0.5 * np.sum(own[inside] == beside))
         compared += float(inside.sum())
     return wins / compared if compared else None
 
 
-def _brightest(paint: U8, row: np.ndarray, first: np.ndarray, end: np.ndarray) -> np.ndarray:
+def _brightest(markings: U8, row: np.ndarray, first: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the largest value of each run."""
     if not len(row):
         return np.zeros(0, np.uint8)
-    flat = np.append(paint.ravel(), np.uint8(0))  # so that a run may end with the picture
-    places = np.stack([row * paint.shape[1] + first, row * paint.shape[1] + end], axis=1).ravel()
+    flat = np.append(markings.ravel(), np.uint8(0))  # so that a run may end with the image
+    places = np.stack(
+        [row * markings.shape[1] + first, row * markings.shape[1] + end], axis=1
+    ).ravel()
     return np.asarray(np.maximum.reduceat(flat, places)[::2])

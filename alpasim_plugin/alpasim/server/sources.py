@@ -208,9 +208,7 @@ def gated(
     if found is None:
         return rendered
     what = f"scene {view.scene_id!r}, camera {view.camera!r} at {view.t_us} us"
-    found_at = (
-        f"{abs(found.aside_m)} m {'left' if found.aside_m > 0 else 'right'} of where the map has it"
-    )
+    found_at = f"{abs(found.offset_m)} m {'left' if found.offset_m > 0 else 'right'} of where the map has it"
     log.warning(
         "%s: the map is off: paint agrees %.2f with the map and %.2f %s",
         what,
