@@ -1,25 +1,20 @@
-"""``simrun list``: names for the command line, and the runs below a folder."""
+"""``simrun list``: names for the command line, and the runs below a folder.
+
+What a kind needs is imported where it is listed, so that a short list loads no numerical library.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from alpasim_plugin.cli.options import Json
-from alpasim_plugin.cli.output import show, warn
+from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.parts import names, unidentified
 from alpasim_plugin.core.parts.resolve import declaration_of, note_of
 from alpasim_plugin.core.parts.source import load
-from evaluators.metrics import METRICS, table_of
-from evaluators.metrics.presets import described
-from evaluators.metrics.score import resolve_plugins
-from evaluators.report.numbers import plural
-from evaluators.report.runs import Choice, RunEntry, as_day, find_runs, runs_table, variants_of
-from scenarios.suite import shipped
 
 EPILOG = """
 Examples:
@@ -30,7 +25,6 @@ Examples:
 
 - `simrun list runs nightly --renderer onefixer --since 7d --metric offroad`
 """
-VALUES = ("mean", "ci95_clustered", "n_rollouts")
 
 Kind = Literal["renderers", "fixers", "policies", "scenarios", "metrics", "presets", "runs"]
 
@@ -58,14 +52,9 @@ def list_names(
 ) -> None:
     """List renderers, fixers, policies, scenarios, metrics, presets or runs, one a line."""
     if kind == "runs":
-        started = None if since is None else as_day(since, "--since", datetime.now(UTC))
-        _list_runs(
-            roots or (Path("runs"),),
-            Choice(renderer, policy, started),
-            last,
-            metric,
-            as_json,
-        )
+        from alpasim_plugin.cli.list_runs import list_runs
+
+        list_runs(roots or (Path("runs"),), renderer, policy, since, last, metric, as_json)
         return
     if roots or renderer or policy or since or last or metric:
         raise InputError(f"simrun list {kind}: filters are for runs", "Leave them out.")
@@ -80,47 +69,20 @@ def list_names(
     elif kind == "policies":
         known = names("policy")
     elif kind == "scenarios":
+        from scenarios.suite import shipped
+
         known = shipped()
     elif kind == "metrics":
+        from evaluators.metrics import table_of
+        from evaluators.metrics.score import resolve_plugins
+
         known = {name: facts.help for name, facts in table_of(resolve_plugins()).items()}
     else:
+        from evaluators.metrics.presets import described
+
         known = described()
     width = max((len(name) for name in known), default=0)
     show(as_json, known, *(f"{name:<{width}}  {text}" for name, text in known.items()))
-
-
-def _list_runs(
-    roots: Sequence[Path], choice: Choice, last: int | None, metrics: Sequence[str], as_json: bool
-) -> None:
-    entries = find_runs(roots, with_summary=True)
-    chosen = [entry for entry in entries if choice.takes(entry)][:last]
-    stored = {
-        name
-        for entry in chosen
-        if entry.state != "damaged"
-        for table in (entry.summary.get("metrics") or {}).values()
-        for name in table
-    }
-    for name in metrics:
-        if name not in METRICS and name not in stored:
-            raise InputError(f"--metric {name}: no such metric", "simrun list metrics names them.")
-    rows = [entry.as_dict() | {"metrics": _values(entry, metrics)} for entry in chosen]
-    lines: list[Any] = [runs_table(chosen, roots, metrics)] if chosen else []
-    count = f"{plural(len(chosen), 'run')} of {len(entries)} below {', '.join(map(str, roots))}"
-    show(as_json, {"runs": rows, "found": len(entries)}, *lines, count)
-    for entry in entries:
-        if not as_json and not entry.info:
-            warn(f"left out, its run.json cannot be read: {entry.folder}: {entry.problem}")
-
-
-def _values(entry: RunEntry, metrics: Sequence[str]) -> list[dict[str, Any]]:
-    rows = []
-    for renderer, policy in variants_of(entry):
-        for name in metrics:
-            values = entry.metric(name, renderer, policy)
-            row = {"renderer": renderer, "policy": policy, "metric": name}
-            rows.append(row | {key: values.get(key) for key in VALUES})
-    return rows
 
 
 def _fixers() -> dict[str, str]:

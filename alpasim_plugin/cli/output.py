@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from rich import progress
 from rich.console import Console
 
-from evaluators.metrics.outcomes import NO_OUTCOME, event_words
 from evaluators.report.numbers import plural
 
 if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its kernels
@@ -188,6 +187,8 @@ def describe(manifest: dict[str, Any], reused: bool) -> str:
     if manifest["status"] != "ok":
         error = manifest["error"]
         return f"{cell}: FAILED ({error['failure_class']}) {error['message']}"
+    from evaluators.metrics.outcomes import NO_OUTCOME, event_words  # a listing needs no metrics
+
     events = dict.fromkeys(event_words(event["metric"]) for event in manifest.get("events", []))
     cost = " (reused)" if reused else f", {manifest['wall_s']:.1f} s"
     return f"{cell}: {', '.join(events) or NO_OUTCOME}{cost}"

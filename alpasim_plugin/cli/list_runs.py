@@ -1,0 +1,71 @@
+"""``simrun list runs``: run folders with their verdicts, filtered."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.cli.output import show, warn
+from alpasim_plugin.core.errors import InputError
+from evaluators.metrics import METRICS
+from evaluators.report.numbers import plural
+from evaluators.report.runs import Choice, RunEntry, as_day, find_runs, runs_table, variants_of
+
+VALUES = ("mean", "ci95_clustered", "n_rollouts")
+
+
+def list_runs(
+    roots: Sequence[Path],
+    renderers: tuple[str, ...],
+    policies: tuple[str, ...],
+    since: str | None,
+    last: int | None,
+    metrics: Sequence[str],
+    as_json: bool,
+) -> None:
+    """Print the run folders below some folders, the newest first.
+
+    Args:
+        roots: Folders that are searched.
+        renderers, policies: Patterns that a run must match.
+        since: Earliest start, as a date or an age (``7d``).
+        last: Only the newest of them.
+        metrics: Metrics of ``summary.json`` to print beside each run.
+        as_json: Print one JSON document.
+
+    Raises:
+        InputError: A root is no folder, or no run has the metric.
+    """
+    started = None if since is None else as_day(since, "--since", datetime.now(UTC))
+    choice = Choice(renderers, policies, started)
+    entries = find_runs(roots, with_summary=True)
+    chosen = [entry for entry in entries if choice.takes(entry)][:last]
+    stored = {
+        name
+        for entry in chosen
+        if entry.state != "damaged"
+        for table in (entry.summary.get("metrics") or {}).values()
+        for name in table
+    }
+    for name in metrics:
+        if name not in METRICS and name not in stored:
+            raise InputError(f"--metric {name}: no such metric", "simrun list metrics names them.")
+    rows = [entry.as_dict() | {"metrics": _values(entry, metrics)} for entry in chosen]
+    lines: list[Any] = [runs_table(chosen, roots, metrics)] if chosen else []
+    count = f"{plural(len(chosen), 'run')} of {len(entries)} below {', '.join(map(str, roots))}"
+    show(as_json, {"runs": rows, "found": len(entries)}, *lines, count)
+    for entry in entries:
+        if not as_json and not entry.info:
+            warn(f"left out, its run.json cannot be read: {entry.folder}: {entry.problem}")
+
+
+def _values(entry: RunEntry, metrics: Sequence[str]) -> list[dict[str, Any]]:
+    rows = []
+    for renderer, policy in variants_of(entry):
+        for name in metrics:
+            values = entry.metric(name, renderer, policy)
+            row = {"renderer": renderer, "policy": policy, "metric": name}
+            rows.append(row | {key: values.get(key) for key in VALUES})
+    return rows
