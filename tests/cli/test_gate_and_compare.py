@@ -203,7 +203,8 @@ def test_a_run_with_holes_cannot_become_a_baseline(runs, tmp_path, capsys):
     assert not (tmp_path / "b.json").exists()
 
 
-def test_a_gate_for_another_preset_and_bad_usage_are_refused(runs, tmp_path, capsys):
+def test_a_gate_for_another_preset_and_bad_usage_are_refused(runs, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # no runs/ below it
     other = tmp_path / "strict.yaml"
     other.write_text(EASY + "preset: strict\n")
     for command in (
