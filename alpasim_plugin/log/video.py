@@ -118,7 +118,10 @@ class VideoReader:
         check_regular(self.path, ARCHIVE_BYTES)
         self._av = load_av()
         try:
-            self._container = self._av.open(str(self.path), metadata_errors="replace")
+            # Up to PyAV 18 text that is not UTF-8 is an error unless it is replaced; later, never.
+            is_strict = int(self._av.__version__.partition(".")[0]) < 19
+            replaced = {"metadata_errors": "replace"} if is_strict else {}
+            self._container = self._av.open(str(self.path), **replaced)
         except (OSError, self._av.FFmpegError) as error:
             raise self._refusal(error.strerror or str(error)) from error
         try:
