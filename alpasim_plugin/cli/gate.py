@@ -63,7 +63,7 @@ def gate(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Judge a run by a gate, or test the gate itself on deliberately broken renderers."""
+    """Check a run against a gate, or test the gate itself on deliberately broken renderers."""
     if self_test:
         if run is not None or baseline_file is not None or approve is not None:
             raise InputError(

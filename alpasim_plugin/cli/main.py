@@ -56,7 +56,7 @@ PANELS: dict[str, dict[str, tuple[str, str]]] = {
         ),
         "gate": (
             "gate:gate",
-            "Judge a run by a gate, or test the gate itself on deliberately broken renderers.",
+            "Check a run against a gate, or test the gate itself on deliberately broken renderers.",
         ),
         "report": (
             "view:report",

@@ -212,7 +212,7 @@ def assemble(settings: Settings) -> Assembled:
         )
     if settings.upstream is None and (settings.masks or settings.reliability is not None):
         raise InputError(
-            "--reliability, --mask: our own renderer states its opacity",
+            "--mask: our own renderer states its opacity",
             "use them with --upstream",
         )
     if settings.upstream is not None and settings.render_width is not None:

@@ -210,7 +210,7 @@ def gated(
     what = f"scene {view.scene_id!r}, camera {view.camera!r} at {view.t_us} us"
     found_at = f"{abs(found.offset_m)} m {'left' if found.offset_m > 0 else 'right'} of where the map has it"
     log.warning(
-        "%s: the map is off: paint agrees %.2f with the map and %.2f %s",
+        "%s: the map is off: lane markings agree %.2f with the map and %.2f %s",
         what,
         found.here,
         found.there,
@@ -426,7 +426,7 @@ class UpstreamSource:
                 if not listed or len(listed[0].trajectory.poses) < 2:
                     raise InputError(
                         f"scene {view.scene_id!r}: the upstream lists no recorded path",
-                        "give --scenes with the scene's file, or a fixed --reliability",
+                        "give --scenes with the scene's file",
                     )
                 path = read_trajectory(
                     listed[0].trajectory, f"recorded path of scene {view.scene_id!r}"
