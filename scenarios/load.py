@@ -286,6 +286,8 @@ def _hash(drawn: Drawn, scene_id: str, source_hash: str) -> str:
     content = spec.model_dump(
         mode="json", exclude={"description": True, "tags": True, "timing": {"stop_at_path_end"}}
     )
+    if spec.cameras is not None:
+        content["cameras"].sort(key=lambda camera: camera["name"])
     if spec.log is not None:
         content["log"][spec.log.recorded[2]] = "given by its content"
     if spec.background is not None:

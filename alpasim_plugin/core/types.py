@@ -371,7 +371,7 @@ class Scenario:
     vehicle: Vehicle
     route: Route
     actors: tuple[Actor, ...]
-    cameras: tuple[CameraSpec, ...]
+    cameras: tuple[CameraSpec, ...]  # however they are listed: ahead first, wide first, by name
     rates: Rates
     start_us: int  # first frame; the log before it is context
     end_us: int
@@ -405,6 +405,9 @@ class Scenario:
         True  # a rollout ends where the recorded path does, unless the recorded car stands there
     )
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cameras", tuple(sorted(self.cameras, key=_camera_order)))
+
     @property
     def scene(self) -> Scene:
         """Give the part that evaluators may see."""
@@ -416,6 +419,11 @@ class Scenario:
             self.alpasim_map,
             self.standing,
         )
+
+
+def _camera_order(camera: CameraSpec) -> tuple[float, float, str]:
+    ahead = round(float(camera.T_rig_camera[0, 2]), 3)  # cosine between the optical axis and rig x
+    return -ahead, float(camera.K[0, 0]) / camera.width, camera.name
 
 
 # --- log and scores

@@ -113,7 +113,7 @@ def read_colmap(folder: Path, photographs: bool = True) -> SourceDrive:
         )
         for one in images
     ]
-    names = list(dict.fromkeys(str(shot.camera) for shot in shots))
+    names = sorted({str(shot.camera) for shot in shots})
     every = tuple(
         shot
         for name in names

@@ -75,7 +75,7 @@ def _transforms(folder: Path, photographs: bool) -> SourceDrive:
         notes.append(
             f"{len(missing)} of {len(listed)} listed photographs are missing and left out: {', '.join(missing[:4])}..."
         )
-    names = list(dict.fromkeys(one.camera or "front" for one in there))
+    names = sorted({one.camera or "front" for one in there})
     front = next((name for name in names if "front" in name), names[0])
     pictures: list[Picture] = []
     for name in names:

@@ -99,14 +99,10 @@ class SourceDrive:
     @property
     def cameras(self) -> list[str]:
         """Return the cameras, the front one first."""
-        names = dict.fromkeys(str(picture.camera) for picture in self.pictures)
+        names = {str(picture.camera) for picture in self.pictures}
         return sorted(
             names,
-            key=lambda name: (
-                name != self.front,
-                name in self.never_fitted,
-                list(names).index(name),
-            ),
+            key=lambda name: (name != self.front, name in self.never_fitted, name),
         )
 
     @property

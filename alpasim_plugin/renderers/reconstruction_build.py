@@ -27,7 +27,7 @@ from alpasim_plugin.gaussians.fit.views import PosedView, logged_views
 from alpasim_plugin.gaussians.scene.log_views import SkyView
 from alpasim_plugin.renderers.gaussian import scene_of
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe, write_model
-from alpasim_plugin.renderers.recorded import pose_errors
+from alpasim_plugin.renderers.recorded import pose_error
 
 FEWEST_GAUSSIANS = 40  # an actor with fewer was hardly seen: the scene's own is spliced in
 
@@ -124,22 +124,19 @@ def misplaced(
     of normal spread.
 
     Args:
-        views: In order of time.
+        views: With camera and time.
         spread_m: Along each axis of the camera; directions turn by `TURN_RAD_PER_M` of it about
             each axis. 0 changes nothing.
         scene_id, seed: Key of the random stream.
     """
     if spread_m == 0:
         return list(views)
-    errors = pose_errors(
-        scene_id, seed, spread_m, len(views), np.arange(len(views), dtype=np.float64)
-    )
-    return [
-        replace(
-            view, camera=replace(view.camera, T_camera_world=error @ view.camera.T_camera_world)
-        )
-        for view, error in zip(views, errors, strict=True)
-    ]
+    moved = []
+    for view in views:
+        error = pose_error(scene_id, seed, spread_m, view.camera_name, view.t_us)
+        camera = replace(view.camera, T_camera_world=error @ view.camera.T_camera_world)
+        moved.append(replace(view, camera=camera))
+    return moved
 
 
 def rough_start(
@@ -164,17 +161,13 @@ def rough_start(
         InputError: No view has depth.
     """
     splat = recipe.splat
-    chosen = [
-        replace(
-            view,
-            depth=view.depth
-            * _factors(
-                view, recipe.range_error, stream(scene_id, splat.seed, "reconstruction.range", i)
-            ),
-        )
-        for i, view in enumerate(views)
-        if view.depth is not None and i % recipe.depth_every == 0
-    ]
+    instants = sorted({view.t_us for view in views})[:: recipe.depth_every]
+    chosen = []
+    for view in views:
+        if view.depth is not None and view.t_us in instants:
+            rng = stream(scene_id, splat.seed, f"reconstruction.range.{view.name}")
+            wrong = view.depth * _factors(view, recipe.range_error, rng)
+            chosen.append(replace(view, depth=wrong))
     start = start_from_depth(chosen, boxes, splat.points, scene_id, splat.seed)
     return Start(
         _sized(start.background, recipe),

@@ -40,7 +40,7 @@ class ReconstructionRecipe:
         splat: How Gaussians are fitted.
         aside_m: Where the views lie that they are fitted to: to the left of the logged path.
         fit_actors: Fit actors as rigid nodes; otherwise all are spliced in from the scene as built.
-        depth_every: Every such view gives points to start from.
+        depth_every: At every such instant all cameras' views give points to start from.
         range_error: Spread of these points' distance from their view, as a share of it.
         size: Of the Gaussians at the start, in distances to their neighbours: below one, the ground
             shows through until they have grown.

@@ -31,9 +31,8 @@ INTERVAL_US, FIRST_US = (
     500_000,
     50_000,
 )  # from the log's start; between the frames of a camera at 10 Hz, of which none is a recorded one
-# the error of poses is drawn every so many views and interpolated: registration drifts, it does not
-# jump
-POSE_KNOT_VIEWS = 4
+# the error of poses is drawn this often and interpolated: registration drifts, it does not jump
+POSE_KNOT_US = 700_000
 # of rendered pictures and depths that a built scene's recording keeps: 48 of 512x288, three of
 # 1920x1080
 KEPT_BYTES = 50_000_000
@@ -63,13 +62,6 @@ def built_recording(
     """
     log = scenario.ego_log
     times = range(int(log.t_us[0]) + FIRST_US, int(log.t_us[-1]), INTERVAL_US)
-    errors = np.broadcast_to(np.eye(4), (len(times), 4, 4))
-    if recipe:
-        last_view = max(recipe.splat.views - 1, 1)
-        at = (np.array(times) - log.t_us[0]) / (log.t_us[-1] - log.t_us[0]) * last_view
-        errors = pose_errors(
-            scenario.scene_id, recipe.splat.seed, recipe.pose_error_m, recipe.splat.views, at
-        )
     aside = np.eye(4)
     aside[1, 3] = recipe.aside_m if recipe else 0.0
     largest = max(spec.width * spec.height for spec in scenario.cameras) if scenario.cameras else 1
@@ -83,11 +75,16 @@ def built_recording(
         return picture, model(believed, actors).surface_depth()
 
     frames = []
-    for t_us, error in zip(times, errors, strict=True):
+    for t_us in times:
         actors = log_actors(scenario, t_us)
         for spec in scenario.cameras:
             T_world_camera = interpolate(log, t_us) @ aside @ spec.T_rig_camera
             true = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_camera)
+            error = np.eye(4)
+            if recipe:
+                error = pose_error(
+                    scenario.scene_id, recipe.splat.seed, recipe.pose_error_m, spec.name, t_us
+                )
             T_world_believed = inverse(error @ true.T_camera_world)
             believed = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_believed)
             once = partial(read, len(shots))
@@ -96,27 +93,26 @@ def built_recording(
     return tuple(frames)
 
 
-def pose_errors(scene_id: str, seed: int, spread_m: float, views: int, at: F64) -> F64:
-    """Return by what registration misplaces views: ``(N, 4, 4)``, from the true camera to the
+def pose_error(scene_id: str, seed: int, spread_m: float, camera: str, t_us: int) -> F64:
+    """Return by what registration misplaces a view: ``(4, 4)``, from the true camera to the
     believed one.
 
     Args:
-        scene_id, seed: Key of the random stream.
+        scene_id, seed: Key of the random streams, with the camera's name and the time.
         spread_m: Along each axis of the camera; directions turn by `TURN_RAD_PER_M` of it about
             each axis.
-        views: How many were registered.
-        at: ``(N,)`` places in the order of the views, between 0 and ``views - 1``.
+        camera: Its name.
+        t_us: When it was taken.
     """
-    knots = stream(scene_id, seed, "reconstruction.poses").standard_normal(
-        (views // POSE_KNOT_VIEWS + 2, 6)
+    knot, after_us = divmod(t_us, POSE_KNOT_US)
+    before, after = (
+        stream(scene_id, seed, f"reconstruction.poses.{camera}", at).standard_normal(6)
+        for at in (knot, knot + 1)
     )
-    errors = spread_m * np.stack(
-        [np.interp(at / POSE_KNOT_VIEWS, np.arange(len(knots)), column) for column in knots.T],
-        axis=1,
-    )  # (N, 6)
-    out = np.broadcast_to(np.eye(4), (len(at), 4, 4)).copy()
-    out[:, :3, :3] = [cv2.Rodrigues(TURN_RAD_PER_M * error[3:])[0] for error in errors]
-    out[:, :3, 3] = errors[:, :3]
+    error = spread_m * (before + (after - before) * after_us / POSE_KNOT_US)
+    out = np.eye(4)
+    out[:3, :3] = cv2.Rodrigues(TURN_RAD_PER_M * error[3:])[0]
+    out[:3, 3] = error[:3]
     return out
 
 

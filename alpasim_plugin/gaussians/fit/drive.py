@@ -122,22 +122,17 @@ def prepared_views(
     """
     ordered: list[PosedView] = []
     guesses: list[F32 | None] = []
-    cameras = {camera_of(view) for view in views}
+    cameras = {view.camera_name for view in views}
     for number, camera in enumerate(sorted(cameras)):
         tell("measuring depth, sky and exposure", number, len(cameras), {})
         mine = sorted(
-            (view for view in views if camera_of(view) == camera), key=lambda view: view.name
+            (view for view in views if view.camera_name == camera), key=lambda view: view.name
         )
         done, guess = _of_one_camera(mine)
         ordered += done
         guesses += guess
     tell("measuring depth, sky and exposure", len(cameras), len(cameras), {})
     return ordered, guesses
-
-
-def camera_of(view: PosedView) -> str:
-    """Return the name of the camera that took a view."""
-    return view.name.rpartition("-")[0]
 
 
 def _of_one_camera(views: Sequence[PosedView]) -> tuple[list[PosedView], list[F32 | None]]:
@@ -226,7 +221,7 @@ def _between(views: Sequence[PosedView], view: PosedView) -> tuple[float, float,
     """Return the gain of a view that was not fitted: that of its camera's nearest ones that
     were.
     """
-    mine = [other for other in views if camera_of(other) == camera_of(view)] or list(views)
+    mine = [other for other in views if other.camera_name == view.camera_name] or list(views)
     centres, gains = (
         np.array([other.camera.centre_world for other in mine]),
         np.array([other.gain for other in mine]),

@@ -85,7 +85,9 @@ def start_from_depth(
     rest: list[_Points] = []
     for i, view in enumerate(views):
         share = count * (i + 1) // len(views) - count * i // len(views)
-        points, rgb = _sample(view, DENSER * share, stream(scene_id, seed, "fit.start", i))
+        points, rgb = _sample(
+            view, DENSER * share, stream(scene_id, seed, f"fit.start.view.{view.name}")
+        )
         free = np.ones(len(points), dtype=bool)
         for actor_id in sorted(set(view.actors) & set(boxes)):
             local = transform_points(inverse(view.actors[actor_id]), points)
@@ -129,8 +131,8 @@ def start_from_maps(
         size: See `cloud_from_points`.
     """
     parts = []
-    for i, (view, guess) in enumerate(zip(views, more, strict=True)):
-        rng = stream(scene_id, seed, "fit.start", i)
+    for view, guess in zip(views, more, strict=True):
+        rng = stream(scene_id, seed, f"fit.start.view.{view.name}")
         share = count // len(views)
         parts += [_drawn(view, share - share // 6, rng), _drawn(guess, share // 6, rng)]
     return cloud_from_points(*_joined(parts), size)

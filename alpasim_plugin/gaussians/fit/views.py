@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -24,7 +24,7 @@ class PosedView:
     Attributes:
         camera: From where.
         rgb: ``(H, W, 3)`` uint8 sRGB.
-        name: For messages and file names.
+        name: For messages and file names; up to the last ``-`` it names the camera.
         sky: ``(H, W)`` bool, where the image shows sky; None where that is unknown.
         mask: ``(H, W)`` bool, which pixels count (not the bonnet, say); None counts all.
         depth: ``(H, W)`` float32, metres along the optical axis, 0 where unknown; a start is drawn
@@ -32,6 +32,7 @@ class PosedView:
         actors: Actor id to ``T_world_box (4, 4)`` of the actors present.
         gain: Of red, green and blue over the model's colours: the photograph's exposure and white
             balance.
+        t_us: When it was taken, where that is known.
 
     Raises:
         InputError: An array does not have the camera's size.
@@ -45,6 +46,7 @@ class PosedView:
     depth: F32 | None = None
     actors: Mapping[str, F64] = field(default_factory=dict)
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    t_us: int = 0
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
@@ -56,6 +58,11 @@ class PosedView:
                     f"{self.name!r}, {name}: shape {value.shape}, the camera has {shape}",
                     "give images of the camera's size",
                 )
+
+    @property
+    def camera_name(self) -> str:
+        """Return the name of the camera that took it."""
+        return self.name.rpartition("-")[0]
 
 
 def scaled_camera(spec: CameraSpec, T_world_camera: F64, width: int) -> PinholeCamera:
@@ -113,7 +120,8 @@ def logged_views(
         )
         for spec in scenario.cameras:
             camera = scaled_camera(spec, T_world_rig @ spec.T_rig_camera, width)
-            views.append(seen_from(camera, scene, actors, f"{spec.name}-{t_us}", threads))
+            view = seen_from(camera, scene, actors, f"{spec.name}-{t_us}", threads)
+            views.append(replace(view, t_us=t_us))
     return views
 
 
@@ -130,10 +138,9 @@ def seen_from(
         camera,
         out.to_uint8(),
         name,
-        out.alpha <= 0.5,
-        None,
-        np.where(out.alpha > 0.5, out.depth, 0),
-        dict(actors),
+        sky=out.alpha <= 0.5,
+        depth=np.where(out.alpha > 0.5, out.depth, 0),
+        actors=dict(actors),
     )
 
 
@@ -160,13 +167,11 @@ def halved(view: PosedView) -> PosedView:
         None if view.depth is None else np.ascontiguousarray(view.depth[: 2 * h : 2, : 2 * w : 2])
     )
     small = PinholeCamera(w, h, K, camera.T_camera_world)
-    return PosedView(
-        small,
-        np.asarray(rgb, np.uint8),
-        view.name,
-        all_four(view.sky),
-        all_four(view.mask),
-        depth,
-        view.actors,
-        view.gain,
+    return replace(
+        view,
+        camera=small,
+        rgb=np.asarray(rgb, np.uint8),
+        sky=all_four(view.sky),
+        mask=all_four(view.mask),
+        depth=depth,
     )

@@ -62,6 +62,7 @@ def read_photographs(folder: Path, width: int = 256) -> Photographs:
         )
     _, pictures = read_pictures(folder, "opengl")
     there, missing = present(folder, pictures)
+    there = sorted(there, key=lambda one: one.camera or "")  # camera by camera, as files list them
     poses = _scaled(np.array([picture.T_world_camera for picture in there]))
     views = [
         _cut(replace(one, T_world_camera=pose).view(), width, one.where)
