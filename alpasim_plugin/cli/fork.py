@@ -1,10 +1,7 @@
-"""``simrun fork``: continue a logged rollout with another part. ``simrun why``: the page of evidence
-for a rollout that failed.
-"""
+"""``simrun fork``: continue a logged rollout with another part."""
 
 from __future__ import annotations
 
-import shlex
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -13,34 +10,21 @@ import typer
 
 from alpasim_plugin.cli.options import Json, run_and_cell
 from alpasim_plugin.cli.output import show, warn
-from alpasim_plugin.cli.run import last_lines
 from alpasim_plugin.core.errors import InputError, error_text
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.parts import resolve, resolve_renderer, split_names
 from alpasim_plugin.log.run_folder.reader import read_json
-from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME, slug
+from alpasim_plugin.log.run_folder.schema import slug
 from alpasim_plugin.runs.fork import Change, fork_rollout
-from alpasim_plugin.runs.logged_rollout import find_rollout, named_row
+from alpasim_plugin.runs.logged_rollout import find_rollout
 from alpasim_plugin.runs.tables import ensure_tables
-from alpasim_plugin.runs.why import explain, worst_failure
-from evaluators.opening import read_run
-from evaluators.viewer.cause import write_cause
 
-FORK_EPILOG = """
+EPILOG = """
 Examples:
 
 - `simrun fork runs/us101/3dgs/lane-camera/us101/0 --at 2.2 --renderer clean`
 
 - `simrun fork runs/us101/3dgs/lane-camera/us101/0 --at 2.2`: continue unchanged and check that the result equals the log
-"""
-WHY_EPILOG = """
-Examples:
-
-- `simrun why`: the worst failure of the newest run
-
-- `simrun why runs/us101`: the worst failure of that run
-
-- `simrun why runs/us101/3dgs/lane-camera/us101/0`
 """
 
 
@@ -97,47 +81,3 @@ def fork(
     for failed in () if as_json else result.summary["failures"]["cells"]:
         warn(f"{failed['path']}\n{error_text(failed['error'])}")
     raise typer.Exit(result.exit_code)
-
-
-def why(
-    cell: Annotated[
-        Path | None,
-        Positional(
-            "A rollout, or a run whose worst failure is shown; by default the newest run.",
-            metavar="RUN|RUN/CELL",
-        ),
-    ] = None,
-    as_json: Json = False,
-) -> None:
-    """Show how a rollout failed, on one offline page.
-
-    The page holds camera images with plan, route and road users, what the run's other renderers
-    show at the same poses, where plans part, and behind which renderers the same rollout ends well.
-    """
-    root, name = run_and_cell(cell)
-    ensure_tables(root, warn)
-    run = read_run(root)
-    if name:
-        row = named_row(root, name)
-        rollout = next(one for one in run.rollouts if one.path == row["path"])
-    else:
-        rollout = worst_failure(run)
-    cause = explain(run, rollout)
-    page = None if cause is None else write_cause(run, cause)
-    outcome = rollout.failure
-    evidence = [] if cause is None else list(cause.sentences)
-    if not rollout.ok:
-        evidence += last_lines(root / rollout.path / OUTPUT_NAME)
-    elif cause is not None:
-        outcome = cause.outcome
-    facts = {
-        "rollout": rollout.path,
-        "page": page and str(page),
-        "outcome": outcome,
-        "found": evidence,
-    }
-    lines = [f"rollout  {rollout.path}", f"outcome  {outcome}"]
-    lines += [f"         {text}" for text in evidence]
-    if page is not None:
-        lines.append(f"page     {shlex.quote(str(page))}")
-    show(as_json, facts, *lines)

@@ -70,7 +70,7 @@ PANELS: dict[str, dict[str, tuple[str, str]]] = {
             "view:view",
             "Replay rollouts on an offline page, or draw a scenario before it is driven.",
         ),
-        "why": ("fork:why", "Show how a rollout failed, on one offline page."),
+        "why": ("why:why", "Show how a rollout failed, on one offline page."),
     },
     "AlpaSim and other tools": {
         "serve": (

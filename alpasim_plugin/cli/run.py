@@ -28,11 +28,9 @@ from alpasim_plugin.cli.output import (
 )
 from alpasim_plugin.cli.signals import Stopped
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.core.limits import SOURCE_BYTES
 from alpasim_plugin.core.parts import split_names
-from alpasim_plugin.core.reading import read_bytes
+from alpasim_plugin.log.run_folder.reader import last_output
 from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME
 from alpasim_plugin.runs.decide import Decided, execute_decision, plan_of_two
 from alpasim_plugin.runs.execute import Threads, thread_budget
@@ -49,7 +47,6 @@ from evaluators.statistics.variants import base_named, variants_of
 from scenarios.suite import ScenarioRef, expand, shipped_names
 
 SHOWN_FAILURES = 5
-TRACEBACK_LINES = 4  # of a failure, in the terminal
 
 EPILOG = """
 Examples:
@@ -337,7 +334,7 @@ def _print_result(result: RunResult, video: str) -> None:
     show(False, {}, table, *lines, *ending_lines(run), report_line(root), following)
     for cell in summary["failures"]["cells"][:SHOWN_FAILURES]:
         warn(f"failed: {cell['path']}: {cell['error']['message']} -> {cell['error']['hint']}")
-        for line in last_lines(root / cell["path"] / OUTPUT_NAME):
+        for line in last_output(root / cell["path"] / OUTPUT_NAME):
             warn(f"        {line}")
     if result.n_failed:
         by_policy = summary["failures"]["by_class"].get("policy", 0)
@@ -345,14 +342,3 @@ def _print_result(result: RunResult, video: str) -> None:
         if by_policy:
             advice = f"{by_policy} by the policy's own fault: simrun check policy tests it"
         warn(f"{result.n_failed} of {plural(result.n_rollouts, 'rollout')} failed; {advice}")
-
-
-def last_lines(log: Path) -> list[str]:
-    """Return the end of the traceback in a rollout's log, and the log's name; nothing where there
-    is no log.
-    """
-    if not log.is_file():
-        return []
-    text = read_bytes(log, SOURCE_BYTES).decode("utf-8", "replace")
-    lines = text.rstrip().splitlines()[-TRACEBACK_LINES:]
-    return [*(terminal(line.rstrip()) for line in lines), f"log {log}"]

@@ -437,6 +437,8 @@ class LoggedPlan:
     query_us: int
     trajectory: Trajectory  # rig poses, world, the first at now_us
     samples: tuple[Trajectory, ...] = ()
+    # (N, 2) metres, rig frame: the route that the driver received; NaN where a point is missing
+    route: F64 = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 @dataclass(frozen=True)

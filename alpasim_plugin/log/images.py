@@ -61,3 +61,12 @@ def decode_image(data: bytes, what: str = "a camera image") -> U8:
     """
     bgr = images.decode_image(data, what, "store PNG or JPEG images in the log")
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
+
+
+def smaller(rgb: U8, width_px: int) -> U8:
+    """Return an image no wider than this, with its shape kept."""
+    height, width = rgb.shape[:2]
+    if width <= width_px:
+        return rgb
+    size = (width_px, max(1, round(height * width_px / width)))
+    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)

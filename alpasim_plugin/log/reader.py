@@ -37,6 +37,7 @@ class _Collected:
     requests: list[egodriver_pb2.DriveRequest] = field(default_factory=list)
     plans: list[LoggedPlan] = field(default_factory=list)
     images: list[LoggedImage] = field(default_factory=list)
+    route: egodriver_pb2.Route = field(default_factory=egodriver_pb2.Route)
     static_ids: set[str] = field(default_factory=set)
     counts: Counter[str] = field(default_factory=Counter)
     info: dict[str, Any] = field(
@@ -107,6 +108,10 @@ def _actor_poses(got: _Collected, message: logging_pb2.ActorPoses, where: str) -
         got.poses.setdefault(pose.actor_id, []).append((message.timestamp_us, pose.actor_pose))
 
 
+def _route(got: _Collected, message: egodriver_pb2.RouteRequest, where: str) -> None:
+    got.route = message.route
+
+
 def _driver_request(got: _Collected, message: egodriver_pb2.DriveRequest, where: str) -> None:
     got.requests.append(message)
 
@@ -135,6 +140,7 @@ def _driver_return(got: _Collected, message: egodriver_pb2.DriveResponse, where:
             request.time_query_us,
             read_trajectory(message.trajectory, what),
             samples,
+            np.array([[p.x, p.y] for p in got.route.waypoints]).reshape(-1, 2),
         )
     )
 
@@ -159,6 +165,7 @@ _HANDLERS: dict[str, Any] = {
     "rollout_metadata": _metadata,
     "actor_poses": _actor_poses,
     "driver_request": _driver_request,
+    "route_request": _route,
     "driver_return": _driver_return,
     "driver_session_request": _driver_session,
     "traffic_session_request": _traffic_session,

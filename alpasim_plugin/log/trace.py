@@ -24,7 +24,7 @@ Key = tuple[int, str]  # time in microseconds, part of the component, such as a 
 Trace = Mapping[str, Mapping[Key, str]]  # component -> key -> SHA-256
 
 
-def write_facts(path: Path | str, rows: Iterable[Mapping[str, Fact]]) -> None:
+def write_facts(path: Path | str, rows: Iterable[Mapping[str, Any]]) -> None:
     """Write one JSON object a line, such as ``{"t_us": 100000, "camera": "front", "alpha_mean":
     0.98, "render_ms": 12.1}``.
 

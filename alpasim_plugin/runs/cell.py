@@ -34,6 +34,7 @@ from alpasim_plugin.log.run_folder.schema import (
     LOG_NAME,
     MANIFEST,
     OUTPUT_NAME,
+    SAME_POSES,
     VIDEO_NAME,
     WHY_NAME,
 )
@@ -116,7 +117,7 @@ def run_cell(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # The manifest first: without it nothing is trusted.
-        for name in (MANIFEST, *DRIVEN, *DERIVED, WHY_NAME):
+        for name in (MANIFEST, *DRIVEN, *DERIVED, SAME_POSES, WHY_NAME):
             (folder / name).unlink(missing_ok=True)
         scenario = replace((load or _scenario)(cell.ref), stop_at_path_end=cell.stops_at_path_end)
         with parts_print_to_stderr(folder / OUTPUT_NAME):

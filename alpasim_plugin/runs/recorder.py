@@ -8,7 +8,7 @@ import hashlib
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -17,6 +17,7 @@ import numpy as np
 
 from alpasim_plugin.core.atomic import write_bytes
 from alpasim_plugin.core.clock import Clock
+from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.places import temporary_folder
 from alpasim_plugin.core.plan_check import unit_guess
@@ -43,7 +44,14 @@ from alpasim_plugin.log import (
     write_facts,
     write_mp4,
 )
-from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME, STRIP_NAME, VIDEO_NAME
+from alpasim_plugin.log.debug import debug_row
+from alpasim_plugin.log.run_folder.schema import (
+    DEBUG_NAME,
+    FRAMES_NAME,
+    LOG_NAME,
+    STRIP_NAME,
+    VIDEO_NAME,
+)
 from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.runs.loop_state import PathEnd
 from alpasim_plugin.runs.recorded_state import ego_states_from_log
@@ -215,6 +223,7 @@ class Recorder:
         self._times = StageTimes()
         self.plan_motion = PlanMotion(scenario.vehicle)
         self._frames: list[dict[str, Any]] = []
+        self._debug: list[dict[str, Any]] = []
         self._pictures: Pictures | None = None
         self._only_watched = False
         self._last_query_us = -1
@@ -234,6 +243,8 @@ class Recorder:
     ) -> None:
         if error is not None and self._writer is not None:
             self._writer.abandon()
+            with suppress(SimrunError):  # the failure of the rollout says more
+                self._write_rows()
 
     def stage(self, name: str) -> AbstractContextManager[None]:
         """Time one pass through a stage of the loop."""
@@ -310,10 +321,14 @@ class Recorder:
             self._log.route(observation.t_us, observation.route_rig)
             self._log.driver_request(observation.t_us, observation.t_us + clock.rates.control_us)
 
-    def policy_plan(self, plan: Trajectory, samples: Sequence[Trajectory]) -> None:
-        """Log the policy's plan and its samples, in world coordinates."""
+    def policy_plan(
+        self, plan: Trajectory, samples: Sequence[Trajectory], debug: Mapping[str, Any]
+    ) -> None:
+        """Log the policy's plan and its samples, in world coordinates, and what it says of them."""
         with self.stage("log"):
             self._log.driver_return(plan, samples)
+            if debug:
+                self._debug.append({"t_us": int(plan.t_us[0]), **debug_row(debug)})
 
     def control_step(
         self, before: EgoState, plan: Trajectory | None, after: EgoState, forced: bool
@@ -331,7 +346,13 @@ class Recorder:
         self._passed = path_end.passed
         with self.stage("log"):
             self._log.finish()
-            write_facts(self.folder / FRAMES_NAME, self._frames)
+            self._write_rows()
+
+    def _write_rows(self) -> None:
+        """Write what the log has no place for: facts of frames, and the policy's debug output."""
+        write_facts(self.folder / FRAMES_NAME, self._frames)
+        if self._debug:
+            write_facts(self.folder / DEBUG_NAME, self._debug)
 
     # --- after the rollout
 

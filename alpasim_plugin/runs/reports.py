@@ -10,18 +10,18 @@ from alpasim_plugin.core.atomic import write_bytes, write_json
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import decode_image, encode_image
+from alpasim_plugin.log.images import smaller
 from alpasim_plugin.log.run_folder.reader import read_json
 from alpasim_plugin.log.run_folder.rows import Rollout
-from alpasim_plugin.log.run_folder.schema import LOG_NAME, PAGES, WHY_NAME
+from alpasim_plugin.log.run_folder.schema import LOG_NAME, PAGES
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, first_divergence
 from evaluators.opening import Run, read_run
 from evaluators.report import write_junit, write_report, write_summary_md
 from evaluators.report.flips import FLIPS_NAME, Flip, FlipKey, find_flips, key_of_entry
-from evaluators.viewer.cause import cause_of_log, write_cause
+from evaluators.viewer.cause import cause_of, write_cause
 from evaluators.viewer.cells import read_log
 from evaluators.viewer.page import write_flips_page
-from evaluators.viewer.pictures import smaller
 
 
 def write_reports(root: Path, flips: bool = True, page: bool = True) -> Path | None:
@@ -54,15 +54,10 @@ MAX_CAUSES = 12  # a run must not wait for its pages; `simrun why` writes any ot
 
 
 def write_causes(run: Run) -> None:
-    """Write the page of evidence for the first rollouts that failed, one a scene and variant; those
-    of `simrun why` are kept.
-    """
-    failed = {one.cell[:3]: one for one in reversed(run.rollouts) if one.ok and outcomes_of(one)}
+    """Write the page of evidence for the first rollouts that failed, one a scene and variant."""
+    failed = {one.cell[:3]: one for one in reversed(run.rollouts) if outcomes_of(one)}
     for rollout in list(failed.values())[::-1][:MAX_CAUSES]:
-        if run.file_of(rollout, WHY_NAME) is None:
-            cause = cause_of_log(run, rollout, divergences_of(run, rollout))
-            if cause is not None:
-                write_cause(run, cause)
+        write_cause(run, cause_of(run, rollout, divergences_of(run, rollout)))
 
 
 def divergences_of(run: Run, rollout: Rollout) -> list[Mapping[str, Any]]:

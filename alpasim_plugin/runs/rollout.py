@@ -156,7 +156,7 @@ class Loop:
                 recorder.plan_motion.add(plan, state.ego)
                 plan_world, *samples = state.to_world(plan)
                 plans.submit(plan_world, tick.t_us, int((time.perf_counter() - began) * 1e6))
-                recorder.policy_plan(plan_world, samples)
+                recorder.policy_plan(plan_world, samples, plan.debug)
             before, active = state.ego, plans.active(tick.t_us)
             with recorder.stage("control"):
                 forced = state.advance(self._controller, active, tick.t_us + clock.rates.control_us)

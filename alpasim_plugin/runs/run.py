@@ -27,6 +27,7 @@ from alpasim_plugin.runs.executors.choice import LOCAL, Executor
 from alpasim_plugin.runs.plan import RunPlan
 from alpasim_plugin.runs.provenance import hardware, project, versions
 from alpasim_plugin.runs.repeat import repeat_rollout
+from alpasim_plugin.runs.same_poses import store_same_poses
 from alpasim_plugin.runs.summary import pool_of, write_summary
 from evaluators.metrics import MetricTable, table_of
 from evaluators.statistics.verdicts import Outcome, outcome_of_failures
@@ -140,6 +141,7 @@ def execute_run(
             }
             if repeat:
                 more["repeat"] = repeat_rollout(plan, root, manifests, how.cores_here)
+            store_same_poses(plan, root, manifests, how.cores_here)
         finally:
             end_children()
         summary = finish_run(root, manifests, more, report)

@@ -1,5 +1,6 @@
-"""The page of evidence for one rollout, a self-contained HTML file: how it ended, what the policy
-saw, planned and said of itself, where plans part, and what to ask next.
+"""The page of evidence for one rollout, a self-contained HTML file made of what the run stored: how
+it ended, what the policy saw, planned and said of itself, what other renderers show at the same
+poses, where plans part, and what to ask next.
 """
 
 from __future__ import annotations
@@ -11,61 +12,68 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 from markupsafe import Markup
 
 from alpasim_plugin.core.atomic import write_text
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse, transform_points
 from alpasim_plugin.core.types import F64, U8, RolloutLog
-from alpasim_plugin.log import decode_image
+from alpasim_plugin.log import decode_image, read_facts
+from alpasim_plugin.log.debug import WIDTH_PX, debug_row
+from alpasim_plugin.log.images import smaller
+from alpasim_plugin.log.run_folder.reader import last_output, read_json
 from alpasim_plugin.log.run_folder.rows import Rollout
-from alpasim_plugin.log.run_folder.schema import LOG_NAME, WHY_NAME, cell_name
-from evaluators.metrics.outcomes import first_failure, in_words, outcomes_of
+from alpasim_plugin.log.run_folder.schema import (
+    DEBUG_NAME,
+    LOG_NAME,
+    OUTPUT_NAME,
+    SAME_POSES,
+    WHY_NAME,
+    cell_name,
+)
+from evaluators.metrics.outcomes import OUTCOMES, first_failure, in_words, outcomes_of
 from evaluators.opening import Run
-from evaluators.viewer.cells import Wanted, cell_data, cells_of, lens_data, read_log, read_logs
-from evaluators.viewer.drive_data import MAX_SAMPLES, Place, half_seconds
+from evaluators.report.rollouts import clock_zero_us
+from evaluators.viewer.cells import lens_data, read_log
+from evaluators.viewer.drive_data import (
+    MAX_SAMPLES,
+    Place,
+    half_seconds,
+    map_data,
+    recorded_drive,
+    user_data,
+)
 from evaluators.viewer.page import as_json, fill
-from evaluators.viewer.pictures import frame_rows, jpeg, seen_before, smaller
+from evaluators.viewer.pictures import frame_rows, jpeg, seen_before
 
-WIDTH_PX = 640
 JPEG_START = b"\xff\xd8"
 BEFORE_US, AFTER_US = 6_000_000, 1_000_000  # of the failure, that are shown
-MOST_LOOKS = 48
+MOST_QUERIES = 48
 SCRIPTS = ("theme.js", "timeline.js", "overlay.js", "cause.js")
 STYLES = ("theme.css", "report.css", "cause.css")
-# How a value of `Plan.debug` is shown: kind, prefix of its name, dtype, least shape, last size
-KINDS: tuple[tuple[str, str, str, tuple[int, ...], int | None], ...] = (
-    ("images", "", "uint8", (1, 1, 3), 3),
-    ("boxes", "boxes", "", (1, 4), 4),
-    ("lines", "line", "", (1, 2), None),
-    ("heat", "", "", (4, 4), None),
-)
 Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
-class Look:
+class Query:
     """One query of the policy.
 
     Attributes:
         T_world_rig: ``(4, 4)``: where the ego was.
-        speed_mps: Along the rig.
-        route: ``(N, 2)`` metres, rig frame, as it was given; empty where that is not known.
-        plans: Behind each renderer at that pose: the plan and its samples, each ``(N, 2)`` metres,
-            rig frame, every half second.
-        frames: What each renderer showed of the first camera: time, and ``(H, W, 3)`` or its JPEG.
-        debug: What the policy said of itself, `Plan.debug`.
+        speed_mps: Of the ego.
+        route: ``(N, 2)`` metres, rig frame, as the policy received it; empty where unknown.
+        lines: The plan and its samples, each ``(N, 2)`` metres, rig frame, every half second.
+        images: What each renderer showed of the first camera at that pose: time, encoded image.
+        debug: A row of `alpasim_plugin.log.debug.debug_row`.
     """
 
     t_us: int
     T_world_rig: F64
     speed_mps: float
     route: F64
-    plans: Mapping[str, Sequence[F64]]
-    frames: Mapping[str, tuple[int, U8 | bytes]]
+    lines: Sequence[F64]
+    images: Mapping[str, tuple[int, bytes]]
     debug: Mapping[str, Any]
 
 
@@ -78,7 +86,7 @@ class Parting:
         kind: ``renderer`` or ``policy``.
         t_us: The first query at which they are apart.
         gap_m: How far apart they are then.
-        frames: The other's picture and the own one at that query, ``(H, W, 3)`` each; none of a
+        images: The other's image and the own one at that query, ``(H, W, 3)`` each; none of a
             policy, which sees the same.
     """
 
@@ -86,22 +94,22 @@ class Parting:
     kind: str
     t_us: int
     gap_m: float
-    frames: tuple[U8, U8] | None = None
+    images: Sequence[U8] = ()
 
 
 @dataclass(frozen=True)
 class Cause:
-    """What is known of how a drive ended.
+    """What is known of how a rollout ended.
 
     Attributes:
         outcome: In words.
         failed_us: When it failed first; None where it did not.
         start_us: The first camera frame.
         sentences: What the run shows, the most telling first.
-        looks: Queries to show, in order of time.
+        queries: Those to show, in order of time.
         partings: When plans part from others'.
         commands: What can be asked next: a key, what it shows, the command.
-        notes: What is missing, a sentence each.
+        log: As far as it was written; None where there is none.
     """
 
     rollout: Rollout
@@ -109,10 +117,178 @@ class Cause:
     failed_us: int | None
     start_us: int
     sentences: Sequence[str]
-    looks: Sequence[Look]
+    queries: Sequence[Query]
     partings: Sequence[Parting]
     commands: Sequence[tuple[str, str, str]]
-    notes: Sequence[str] = ()
+    log: RolloutLog | None
+
+
+def worst_failure(run: Run) -> Rollout:
+    """Return the rollout of a run that failed worst: one that broke off, then the gravest outcome.
+
+    Raises:
+        InputError: No rollout failed.
+    """
+    gravity = {name: number for number, name in enumerate(OUTCOMES)}
+
+    def rank(rollout: Rollout) -> int:
+        if not rollout.ok:
+            return -1
+        return min((gravity[name] for name in outcomes_of(rollout)), default=len(gravity))
+
+    worst = min(run.rollouts, key=rank, default=None)
+    if worst is None or rank(worst) == len(gravity):
+        raise InputError(
+            f"{run.folder}: no rollout of this run failed",
+            "Name a rollout: simrun why RUN/RENDERER/POLICY/SCENE/SEED.",
+        )
+    return worst
+
+
+def cause_of(run: Run, rollout: Rollout, entries: Sequence[Mapping[str, Any]]) -> Cause:
+    """Return what the files of a run say of how a rollout ended.
+
+    Args:
+        run: The run.
+        rollout: One of its rollouts.
+        entries: Entries of ``flips.json`` about it: when its plans part from those of others.
+
+    Raises:
+        InputError: A file of the run is damaged.
+    """
+    log = _log_so_far(run, rollout)
+    start_us, failed_us = 0, failed_at(run.manifest(rollout))
+    queries: list[Query] = []
+    if log is not None:
+        start_us = log.render_start_us
+        if not rollout.ok:
+            failed_us = int(log.ego.t_us[-1])
+        queries = _queries(run, rollout, log, failed_us)
+    partings = [
+        _parting_of(run, rollout, entry) for entry in entries if entry.get("t_us") is not None
+    ]
+    outcome = in_words(outcomes_of(rollout))
+    sentences = list(_checked(run, rollout))
+    if not rollout.ok:
+        outcome = f"{rollout.failure_class}: {rollout.failure}"
+        sentences = [*last_output(run.folder / rollout.path / OUTPUT_NAME), *sentences]
+    sentences += behind_others(run, rollout)
+    for one in partings:
+        at_s = (one.t_us - start_us) * 1e-6
+        sentences.append(
+            f"Plans part from those of the {one.kind} {one.name} at {at_s:.1f} s, "
+            f"by {one.gap_m:.2f} m."
+        )
+    if failed_us is not None:
+        made_up = seen_before(frame_rows(run, rollout), failed_us)
+        sentences += [f"{made_up}."] if made_up else []
+    return Cause(
+        rollout=rollout,
+        outcome=outcome,
+        failed_us=failed_us,
+        start_us=start_us,
+        sentences=sentences,
+        queries=queries,
+        partings=partings,
+        commands=commands(run, rollout, start_us, failed_us, partings),
+        log=log,
+    )
+
+
+def _log_so_far(run: Run, rollout: Rollout) -> RolloutLog | None:
+    """Return the log of a rollout; of one that broke off, the part that was written."""
+    path = run.file_of(rollout, LOG_NAME) or run.file_of(rollout, f"{LOG_NAME}.part")
+    if path is None:
+        return None
+    try:
+        return read_log(path)
+    except InputError:
+        if rollout.ok:
+            raise
+        return None  # it broke off before there was anything to show
+
+
+def _checked(run: Run, rollout: Rollout) -> list[str]:
+    """Return what the check of the policy found before the run drove."""
+    return list((run.info.get("policy_checks") or {}).get(rollout.policy) or ())
+
+
+def failed_at(manifest: Mapping[str, Any]) -> int | None:
+    """Return when a rollout failed first, microseconds; None where it did not."""
+    first = first_failure(manifest)
+    return None if first is None else int(first["t_us"])
+
+
+def chosen(all_of: Sequence[Item], failed_us: int | None, times_us: Sequence[int]) -> list[Item]:
+    """Return at most `MOST_QUERIES` of what has these times: what lies before the failure, or an
+    even choice.
+    """
+    near = [
+        one
+        for one, t in zip(all_of, times_us, strict=True)
+        if failed_us is None or failed_us - BEFORE_US <= t <= failed_us + AFTER_US
+    ]
+    return near[::-1][:: -(-len(near) // MOST_QUERIES) or 1][::-1]
+
+
+def _queries(run: Run, rollout: Rollout, log: RolloutLog, failed_us: int | None) -> list[Query]:
+    """Return the queries of a log that the page shows, with what the run stored of them."""
+    camera = next(iter(log.info["cameras"]), None)
+    images = [image for image in log.images if camera is not None and image.camera == camera.name]
+    ends_us = np.array([image.end_us for image in images])
+    speeds = np.zeros(len(log.ego))
+    if len(log.ego) > 1:
+        seconds = (log.ego.t_us - log.ego.t_us[0]) * 1e-6
+        speeds = np.linalg.norm(np.gradient(log.ego.xyz[:, :2], seconds, axis=0), axis=1)
+    said = run.file_of(rollout, DEBUG_NAME)
+    debug: dict[Any, Any] = {}
+    if said is not None:
+        debug = {row["t_us"]: row for row in read_facts(said)}
+    others = same_poses(run, rollout)
+    plans = [plan for plan in log.plans if len(plan.trajectory) > 1]
+    queries = []
+    for plan in chosen(plans, failed_us, [plan.now_us for plan in plans]):
+        pose = interpolate(log.ego, [plan.now_us])[0] @ inverse(log.T_rig_box)
+        lines = [
+            half_seconds(line.t_us, transform_points(inverse(pose), line.xyz))
+            for line in (plan.trajectory, *plan.samples[:MAX_SAMPLES])
+        ]
+        newest = int(np.searchsorted(ends_us, plan.now_us, "right")) - 1
+        shown: dict[str, tuple[int, bytes]] = {}
+        if newest >= 0:
+            t_us = images[newest].end_us
+            shown[rollout.renderer] = t_us, images[newest].data
+            shown |= {name: (t_us, at[t_us]) for name, at in others.items() if t_us in at}
+        queries.append(
+            Query(
+                t_us=plan.now_us,
+                T_world_rig=pose,
+                speed_mps=float(np.interp(plan.now_us, log.ego.t_us, speeds)),
+                route=plan.route,
+                lines=lines,
+                images=shown,
+                debug=debug.get(plan.now_us) or debug_row({}),
+            )
+        )
+    return queries
+
+
+def same_poses(run: Run, rollout: Rollout) -> dict[str, dict[int, bytes]]:
+    """Return what the run stored of its other renderers at the poses of a rollout: by renderer and
+    time, encoded images.
+    """
+    path = run.file_of(rollout, SAME_POSES)
+    if path is None:
+        return {}
+    try:
+        return {
+            name: {int(t_us): base64.b64decode(image) for t_us, image in images}
+            for name, images in read_json(path).items()
+        }
+    except (AttributeError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: {error}", "Delete the file; the page is made without it."
+        ) from error
 
 
 def write_cause(run: Run, cause: Cause) -> Path:
@@ -125,24 +301,15 @@ def write_cause(run: Run, cause: Cause) -> Path:
     rollout = cause.rollout
     path = run.folder / rollout.path / WHY_NAME
     report = "../" * len(Path(rollout.path).parts) + "report.html"
-    wanted = Wanted((rollout.scene,), (rollout.policy,), (rollout.seed,), (rollout.renderer,))
-    cell = cells_of(run, wanted)[0]
-    logs = read_logs(run, cell)
-    document = cell_data(run, cell, logs, None) | {"own": rollout.renderer, "lens": None}
-    place = Place(np.array(document.pop("origin")), document.pop("zero_us"))
-    document["failed"] = None if cause.failed_us is None else place.ms([cause.failed_us])[0]
-    log, scale = logs[rollout.path], 1.0
-    if isinstance(log, RolloutLog) and log.info["cameras"]:
-        camera = log.info["cameras"][0]
-        scale = min(1.0, WIDTH_PX / camera.width)
-        document["lens"] = lens_data(camera, WIDTH_PX)
-    document["looks"] = [_look(look, place, scale) for look in cause.looks]
+    names = dict.fromkeys(name for query in cause.queries for name in query.images)
     html = fill(
         "cause.html.j2",
         SCRIPTS,
         STYLES,
         cause=cause,
-        document=Markup(as_json(document)),
+        document=Markup(as_json(_document(run, cause))),
+        renderers=[name for name in names if name != rollout.renderer],
+        has_images=bool(names),
         partings=[_parting(one, cause.start_us) for one in cause.partings],
         run=run.folder.resolve().name,
         report=report,
@@ -152,190 +319,71 @@ def write_cause(run: Run, cause: Cause) -> Path:
     return path
 
 
-def _look(look: Look, place: Place, scale: float) -> dict[str, Any]:
-    """Return a query for the page: times in milliseconds, lines in world centimetres, pictures as
-    JPEG.
+def _document(run: Run, cause: Cause) -> dict[str, Any]:
+    """Return what the script of the page draws; without a log, no query."""
+    rollout, log = cause.rollout, cause.log
+    if log is None:
+        return {"queries": [], "lens": None, "failed": None}
+    content = run.scene_data(rollout.scene)
+    if content is None:
+        raise InputError(
+            f"{rollout.path}: no file of scene {rollout.scene} in {run.folder / 'scenes'}",
+            "Make the run again; runs of earlier versions kept no maps.",
+        )
+    recorded = recorded_drive(content, rollout.scene)
+    place = Place(recorded[0], clock_zero_us(content, int(log.ego.t_us[0])))
+    lens, scale = None, 1.0
+    if log.info["cameras"]:
+        camera = log.info["cameras"][0]
+        scale = min(1.0, WIDTH_PX / camera.width)
+        lens = lens_data(camera, WIDTH_PX)
+    return {
+        "own": rollout.renderer,
+        "map": map_data(content, recorded, place),
+        "users": [user_data(actor, place) for actor in log.actors.values()],
+        "ego": place.track(log.ego),
+        "rear": round(100 * float(log.T_rig_box[0, 3])),
+        "lens": lens,
+        "failed": None if cause.failed_us is None else place.ms([cause.failed_us])[0],
+        "queries": [_query(query, place, scale) for query in cause.queries],
+    }
+
+
+def _query(query: Query, place: Place, scale: float) -> dict[str, Any]:
+    """Return a query for the page: times in milliseconds, lines in world centimetres, boxes in
+    pixels of the page's image.
     """
 
     def line(xy: F64) -> list[list[int]]:
         """Return rig coordinates ``(N, 2)`` in world centimetres, without rows of NaN."""
-        known = xy[np.isfinite(xy).all(axis=1), :2]
+        known = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
+        known = known[np.isfinite(known).all(axis=1)]
         rig = np.column_stack([known, np.zeros(len(known))])
-        return place.cm(transform_points(look.T_world_rig, rig)[:, :2])
+        return place.cm(transform_points(query.T_world_rig, rig)[:, :2])
 
-    def image(frame: U8 | bytes) -> str:
-        if isinstance(frame, bytes):
-            if scale == 1.0 and frame.startswith(JPEG_START):
-                return base64.b64encode(frame).decode()
-            frame = decode_image(frame, "a camera frame")
-        return jpeg(smaller(frame, WIDTH_PX))
+    def image(data: bytes) -> str:
+        if scale == 1.0 and data.startswith(JPEG_START):
+            return base64.b64encode(data).decode()
+        return jpeg(smaller(decode_image(data, "a camera frame"), WIDTH_PX))
 
+    debug = dict(query.debug)
+    debug["lines"] = [[name, line(xy)] for name, xy in debug["lines"]]
+    debug["boxes"] = [
+        [name, *(round(scale * side, 1) for side in box)]
+        for name, boxes in debug["boxes"]
+        for box in boxes
+    ]
     return {
-        "t": place.ms([look.t_us])[0],
-        "speed": round(look.speed_mps, 2),
-        "route": line(look.route),
-        "plans": {name: {"lines": list(map(line, lines))} for name, lines in look.plans.items()},
+        "t": place.ms([query.t_us])[0],
+        "speed": round(query.speed_mps, 2),
+        "route": line(query.route),
+        "plan": [line(one) for one in query.lines],
         "seen": {
-            name: {"jpeg": image(frame), "t": place.ms([t_us])[0]}
-            for name, (t_us, frame) in look.frames.items()
+            name: {"jpeg": image(data), "t": place.ms([t_us])[0]}
+            for name, (t_us, data) in query.images.items()
         },
-        "said": debug_views(look.debug, scale, line),
+        "said": debug,
     }
-
-
-def kind_of(name: str, value: Any) -> str:
-    """Return as what a value of ``Plan.debug`` is shown: the first of `KINDS` that fits, else
-    ``text``.
-    """
-    array = np.asarray(value) if isinstance(value, np.ndarray | list | tuple) else np.empty(0)
-    if array.dtype.kind in "fiub" and array.size > 0 and np.isfinite(array).any():
-        for kind, prefix, dtype, least, last in KINDS:
-            if (
-                name.startswith(prefix)
-                and dtype in ("", array.dtype.name)
-                and array.ndim == len(least)
-                and all(np.greater_equal(array.shape, least))
-                and last in (None, array.shape[-1])
-            ):
-                return kind
-    return "text"
-
-
-def debug_views(debug: Mapping[str, Any], scale: float, line: Any) -> dict[str, Any]:
-    """Return what a policy says of itself in ``Plan.debug``, by kind.
-
-    Args:
-        debug: By name; `KINDS` is the contract. Boxes are x0 y0 x1 y1 in pixels of the first
-            camera, lines are metres in the rig frame.
-        scale: Of the page's image against the camera's.
-        line: Brings rig coordinates into the page's.
-    """
-    views: dict[str, Any] = {"text": [], "images": [], "heat": [], "boxes": [], "lines": []}
-    for name, value in debug.items():
-        kind = kind_of(name, value)
-        if kind == "text":
-            views["text"].append([name, _words(value)])
-            continue
-        array = np.asarray(value)
-        if kind == "images":
-            views["images"].append([name, jpeg(smaller(array, WIDTH_PX))])
-        elif kind == "boxes":
-            corners = np.round(array * scale, 1).tolist()
-            views["boxes"] += [[name, *box] for box in corners]
-        elif kind == "lines":
-            views["lines"].append([name, line(array[:, :2].astype(np.float64))])
-        else:
-            ends = [f"{value:.3g}" for value in (np.nanmin(array), np.nanmax(array))]
-            views["heat"].append([name, heat_png(array), *ends])
-    return views
-
-
-def _words(value: Any) -> str:
-    """Write numbers, words and short lists; name anything else with its type."""
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if value is None or isinstance(value, str | int | np.generic):
-        return str(value)[:300]
-    if not isinstance(value, np.ndarray | list | tuple):
-        return f"not shown: {type(value).__name__}"
-    array = np.asarray(value)
-    if array.dtype.kind in "fiubU" and array.size <= 12:
-        return np.array2string(array, precision=3, separator=", ")
-    return f"not shown: {type(value).__name__} of shape {array.shape}"
-
-
-def heat_png(values: npt.NDArray[Any]) -> str:
-    """Return a heat map as PNG in base64: yellow where values are high, clear where they are low or
-    missing.
-    """
-    known = np.where(np.isfinite(values), values, np.nan).astype(np.float64)
-    low, high = np.nanmin(known), np.nanmax(known)
-    share = np.nan_to_num((known - low) / ((high - low) or 1.0))
-    bgra = np.stack(
-        [np.full_like(share, 40), 60 + 170 * share, 0 * share + 250, 200 * share], axis=2
-    )
-    done, png = cv2.imencode(".png", bgra.astype(np.uint8))
-    if not done:
-        raise InputError(f"heat map {values.shape}: the encoder refused", "give a smaller one")
-    return base64.b64encode(png.tobytes()).decode()
-
-
-def failed_at(manifest: Mapping[str, Any]) -> int | None:
-    """Return when a drive failed first, microseconds; None where it did not."""
-    first = first_failure(manifest)
-    return None if first is None else int(first["t_us"])
-
-
-def chosen(all_of: Sequence[Item], failed_us: int | None, times_us: Sequence[int]) -> list[Item]:
-    """Return at most `MOST_LOOKS` of what has these times: what lies before the failure, or an even
-    choice.
-    """
-    near = [
-        one
-        for one, t in zip(all_of, times_us, strict=True)
-        if failed_us is None or failed_us - BEFORE_US <= t <= failed_us + AFTER_US
-    ]
-    return near[::-1][:: -(-len(near) // MOST_LOOKS) or 1][::-1]
-
-
-def looks_of(log: RolloutLog, renderer: str, failed_us: int | None) -> list[Look]:
-    """Return the queries of a log that the page shows, with what the log holds of them."""
-    camera = next(iter(log.info["cameras"]), None)
-    images = [image for image in log.images if camera is not None and image.camera == camera.name]
-    ends_us = np.array([image.end_us for image in images])
-    seconds = (log.ego.t_us - log.ego.t_us[0]) * 1e-6
-    speeds = np.linalg.norm(np.gradient(log.ego.xyz[:, :2], seconds, axis=0), axis=1)
-    plans = [plan for plan in log.plans if len(plan.trajectory) > 1]
-    looks = []
-    for plan in chosen(plans, failed_us, [plan.now_us for plan in plans]):
-        pose = interpolate(log.ego, [plan.now_us])[0] @ inverse(log.T_rig_box)
-        lines = [
-            half_seconds(line.t_us, transform_points(inverse(pose), line.xyz))
-            for line in (plan.trajectory, *plan.samples[:MAX_SAMPLES])
-        ]
-        newest = int(np.searchsorted(ends_us, plan.now_us, "right")) - 1
-        seen = {renderer: (images[newest].end_us, images[newest].data)} if newest >= 0 else {}
-        speed_mps = float(np.interp(plan.now_us, log.ego.t_us, speeds))
-        no_route = np.zeros((0, 2))
-        looks.append(Look(plan.now_us, pose, speed_mps, no_route, {renderer: lines}, seen, {}))
-    return looks
-
-
-def cause_of_log(run: Run, rollout: Rollout, entries: Sequence[Mapping[str, Any]]) -> Cause | None:
-    """Return what the files of a run say of how a drive failed; None without a log.
-
-    Args:
-        run: The run.
-        rollout: One that ended with an event.
-        entries: Entries of ``flips.json`` about it: when its plans part from those of others.
-    """
-    path = run.file_of(rollout, LOG_NAME)
-    if path is None:
-        return None
-    log, failed_us = read_log(path), failed_at(run.manifest(rollout))
-    partings = [
-        _parting_of(run, rollout, entry) for entry in entries if entry.get("t_us") is not None
-    ]
-    sentences = behind_others(run, rollout)
-    for one in partings:
-        at_s = (one.t_us - log.render_start_us) * 1e-6
-        sentences.append(
-            f"Plans part from those of the {one.kind} {one.name} at {at_s:.1f} s, "
-            f"by {one.gap_m:.2f} m."
-        )
-    if failed_us is not None:
-        made_up = seen_before(frame_rows(run, rollout), failed_us)
-        sentences += [f"{made_up}."] if made_up else []
-    return Cause(
-        rollout=rollout,
-        outcome=in_words(outcomes_of(rollout)),
-        failed_us=failed_us,
-        start_us=log.render_start_us,
-        sentences=sentences,
-        looks=looks_of(log, rollout.renderer, failed_us),
-        partings=partings,
-        commands=commands(run, rollout, log.render_start_us, failed_us, partings),
-    )
 
 
 def _parting_of(run: Run, rollout: Rollout, entry: Mapping[str, Any]) -> Parting:
@@ -345,10 +393,9 @@ def _parting_of(run: Run, rollout: Rollout, entry: Mapping[str, Any]) -> Parting
         name = str(entry["against"]).removeprefix(rollout.renderer + "/")
         return Parting(name, "policy", t_us, gap_m)
     paths = [run.folder / name for name in (entry.get("frames") or {}).values()]
-    frames = [decode_image(path.read_bytes(), str(path)) for path in paths if path.is_file()]
-    is_pair = len(frames) == 2 and frames[0].shape == frames[1].shape
-    pair = (frames[0], frames[1]) if is_pair else None
-    return Parting(str(entry["baseline"]), "renderer", t_us, gap_m, pair)
+    images = [decode_image(path.read_bytes(), str(path)) for path in paths if path.is_file()]
+    is_pair = len(images) == 2 and images[0].shape == images[1].shape
+    return Parting(str(entry["baseline"]), "renderer", t_us, gap_m, images if is_pair else ())
 
 
 def behind_others(run: Run, rollout: Rollout) -> list[str]:
@@ -367,23 +414,22 @@ def commands(
     run: Run, rollout: Rollout, start_us: int, failed_us: int | None, partings: Sequence[Parting]
 ) -> list[tuple[str, str, str]]:
     """Return what can be asked next: a key, what it shows, the command."""
+    if not rollout.ok:
+        return [
+            ("c", "test the policy alone", f"simrun check policy {shlex.quote(rollout.policy)}")
+        ]
     cell = shlex.quote(f"{run.folder}/{cell_name(*rollout.cell)}")
-    folder = shlex.quote(str(run.folder / rollout.path))
     parted_us = partings[0].t_us if partings else failed_us or start_us
     at_s = max(0.0, (parted_us - start_us) * 1e-6)
     others = [one.name for one in partings if one.kind == "renderer"]
     other = [*others, "3dgs" if rollout.renderer == "clean" else "clean"][0]
-    shown = "other renderers at the same poses, and the policy's own debug output"
     fork = f"simrun fork {cell} --at {at_s:.1f} --renderer {other}"
-    return [
-        ("w", f"replay the rollout: {shown}", f"simrun why {folder}"),
-        ("f", f"drive on from there behind {other}", fork),
-        ("v", "watch the rollout", f"simrun view {folder}"),
-    ]
+    view = f"simrun view {shlex.quote(str(run.folder / rollout.path))}"
+    return [("f", f"drive on from there behind {other}", fork), ("v", "watch the rollout", view)]
 
 
 def _parting(one: Parting, start_us: int) -> dict[str, Any]:
     """Return a parting for the template, with the other's image and the own one."""
-    images = [jpeg(smaller(frame, WIDTH_PX)) for frame in one.frames or ()]
+    images = [jpeg(smaller(image, WIDTH_PX)) for image in one.images]
     at_s = (one.t_us - start_us) * 1e-6
     return {"name": one.name, "at_s": at_s, "gap_m": one.gap_m, "images": images}

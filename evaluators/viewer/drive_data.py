@@ -166,14 +166,15 @@ def drive_data(
         "ego": place.track(log.ego),
         "size": [round(100 * side) for side in (log.ego_box.length_m, log.ego_box.width_m)],
         "rear": round(100 * float(log.T_rig_box[0, 3])),
-        "users": [tracks.add(_user(actor, place)) for actor in log.actors.values()],
+        "users": [tracks.add(user_data(actor, place)) for actor in log.actors.values()],
         "plans": [_plan(plan, place) for plan in log.plans],
         "curves": curves(steps, place),
         "moments": moments(rollout, steps, run.manifest(rollout), place, frames),
     }
 
 
-def _user(actor: Actor, place: Place) -> dict[str, Any]:
+def user_data(actor: Actor, place: Place) -> dict[str, Any]:
+    """Return a road user: its label, its size in centimetres, its way."""
     way, box = place.track(actor.track), actor.box
     poses = set(zip(way["x"], way["y"], way["a"], strict=True))
     if len(poses) == 1:  # it stands: two poses say when it is there

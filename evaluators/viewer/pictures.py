@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import (
@@ -24,6 +23,7 @@ from alpasim_plugin.core.types import (
     RolloutLog,
 )
 from alpasim_plugin.log import decode_image, read_facts
+from alpasim_plugin.log.images import smaller
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, VIDEO_NAME
 from alpasim_plugin.log.video import VideoReader
@@ -138,15 +138,6 @@ def jpeg(rgb: U8) -> str:
             "use smaller images",
         )
     return base64.b64encode(data.tobytes()).decode()
-
-
-def smaller(rgb: U8, width_px: int) -> U8:
-    """Return a picture no wider than this, with its shape kept."""
-    height, width = rgb.shape[:2]
-    if width <= width_px:
-        return rgb
-    size = (width_px, max(1, round(height * width_px / width)))
-    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def frame_rows(run: Run, rollout: Rollout) -> Rows:

@@ -1,4 +1,4 @@
-"""Going back into a logged rollout: continue it, or show what another renderer gives at its poses."""
+"""Going back into a logged rollout and continuing it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.repeat import log_trace
 from alpasim_plugin.runs.reports import write_flips
 from alpasim_plugin.runs.run import RunResult, execute_run
-from alpasim_plugin.runs.why import replay
 from scenarios.suite import expand
 from tests.examples import first_of
 from tests.runs.test_runs import Announced
@@ -160,8 +159,6 @@ def test_a_replay_that_leaves_the_log_names_component_and_step(
     with pytest.raises(InfrastructureError, match=r"frames at step 3 \(camera front"):
         go(moved, tmp_path / "out")
     assert not (tmp_path / "out" / "run.json").exists()
-    with pytest.raises(InfrastructureError, match=r"frames at step 3"):
-        replay(moved, ["3dgs"])
 
 
 def test_instants_outside_and_folders_in_use_are_refused(
@@ -194,15 +191,6 @@ def test_a_scenario_that_has_changed_is_refused(
     write_run_json(tmp_path, info)
     with pytest.raises(InputError, match="has changed since the log was written"):
         find_rollout(tmp_path, CELL)
-
-
-def test_a_replay_shows_every_renderer_at_the_same_poses(past: LoggedRollout) -> None:
-    looks = replay(past, ["broken-frozen"])
-    assert len(looks) == 12
-    assert set(looks[0].frames) == set(looks[0].plans) == {"clean", "broken-frozen"}
-    first, last = ([rgb for _, rgb in looks[number].frames.values()] for number in (0, -1))
-    np.testing.assert_array_equal(*first)  # the first frame is the true one
-    assert not np.array_equal(*last)
 
 
 def test_two_policies_share_a_camera_at_the_shorter_period() -> None:

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core import parts
 from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
+from alpasim_plugin.log.debug import debug_row
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import execute_run
-from evaluators.viewer.cause import debug_views, failed_at
+from evaluators.viewer.cause import failed_at
 from scenarios.suite import expand
 from tests.runs.grey_renderer import GREY
 from tests.runs.test_runs import Announced
@@ -79,6 +83,15 @@ class Raises(Right):
         raise ValueError("seven")
 
 
+class RaisesLater(Right):
+    """Raises after a second."""
+
+    def act(self, observation: Observation) -> Plan:
+        if observation.t_us > observation.history.t_us[0] + 1_500_000:
+            raise ValueError("eight")
+        return super().act(observation)
+
+
 class ByContrast(Right):
     """Follows the route where a picture shows anything, and loses its way where it is grey."""
 
@@ -116,15 +129,25 @@ def rollout(run: Path, policy: str) -> Path:
     )
 
 
-def test_a_replay_adds_the_route_the_debug_output_and_no_cause(
-    run: Path, capsys: pytest.CaptureFixture[str]
+def queries_of(page: str) -> list[dict[str, Any]]:
+    """Return the queries that a page draws."""
+    found = re.search(r'<script type="application/json" id="cause">(.*?)</script>', page)
+    assert found is not None
+    return list(json.loads(found[1])["queries"])
+
+
+def test_the_page_holds_the_route_and_the_debug_output_and_runs_nothing(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr(parts, "build", pytest.fail)
+    monkeypatch.setattr(ByRoute, "act", pytest.fail)
     assert run_command(["why", str(rollout(run, "ByRoute")), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     page = Path(found["page"]).read_text()
     assert "http" not in page.replace("http://www.w3.org/2000/svg", "").replace("http-equiv", "")
-    assert "boxes_car" in page
-    assert "not replayed" not in page
+    query = queries_of(page)[-1]
+    assert len(query["route"][0]) > 1
+    assert query["said"]["boxes"] == [["boxes_car", 4.0, 5.0, 20.0, 15.0]]
     assert 'data-key="f"' in page
     assert page.count('class="card scroll"') == page.count(
         'class="card scroll" tabindex="0" role="region"'
@@ -150,13 +173,16 @@ def test_a_rollout_that_broke_off_shows_its_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "bend.yaml").write_text(BEND)
-    plan = make_plan(
-        expand(str(tmp_path / "bend.yaml")), (GREY,), (f"{HERE}:Raises",), (0,), RunOptions()
-    )
+    both = tuple(f"{HERE}:{name}" for name in ("Raises", "RaisesLater"))
+    plan = make_plan(expand(str(tmp_path / "bend.yaml")), (GREY,), both, (0,), RunOptions())
     execute_run(plan, tmp_path / "run", 1, ["simrun"], Announced())
-    assert run_command(["why", str(tmp_path / "run"), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert any("seven" in text for text in found["found"])
+    for name, text, some in (("Raises", "seven", False), ("RaisesLater", "eight", True)):
+        assert run_command(["why", str(rollout(tmp_path / "run", name)), "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert any(text in line for line in found["found"])
+        page = Path(found["page"]).read_text()
+        assert text in page
+        assert bool(queries_of(page)) == some
 
 
 def test_where_a_drive_ends_well_behind_another_renderer_the_pictures_are_named_first(
@@ -173,7 +199,9 @@ def test_where_a_drive_ends_well_behind_another_renderer_the_pictures_are_named_
     execute_run(plan, tmp_path / "run", 1, ["simrun"], Announced())
     failed = next((tmp_path / "run").glob("rollouts/*/*/*/*/why.html")).parent
     words = "Behind clean the same rollout ends without an event."
-    assert words in (failed / "why.html").read_text()
+    page = (failed / "why.html").read_text()
+    assert words in page
+    assert set(queries_of(page)[-20]["seen"]) == {GREY, "clean"}
     assert run_command(["why", str(failed), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["found"]
     assert found[0] == words
@@ -214,11 +242,12 @@ def test_what_a_policy_says_is_sorted_by_what_it_is() -> None:
         "flat": np.ones((5, 5)),
         "gaps": np.full((4, 4), np.nan),
     }
-    shown = debug_views(debug, 0.5, lambda xy: xy.tolist())
+    shown = debug_row(debug)
     assert [one[0] for one in shown["images"]] == ["picture"]
     assert [one[0] for one in shown["heat"]] == ["heat", "flat"]
-    assert shown["boxes"] == [["boxes_cars", 0.0, 0.0, 5.0, 10.0]]
+    assert shown["boxes"] == [["boxes_cars", [[0.0, 0.0, 10.0, 20.0]]]]
     assert shown["lines"][0][0] == "line_left"
-    assert dict(shown["text"])["speed"] == "7.25"
-    assert dict(shown["text"])["net"] == "not shown: object"
-    assert "not shown" in dict(shown["text"])["gaps"]
+    text = {name: words for name, words in shown["text"]}
+    assert text["speed"] == "7.25"
+    assert text["net"] == "not shown: object"
+    assert "not shown" in text["gaps"]

@@ -18,7 +18,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as pads
 
-from alpasim_plugin.core.reading import parsing, read_json_as, read_json_object
+from alpasim_plugin.core.escape import terminal
+from alpasim_plugin.core.limits import SOURCE_BYTES
+from alpasim_plugin.core.reading import parsing, read_bytes, read_json_as, read_json_object
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.rows import Rollout, StoredRollouts, rollouts_of_table
@@ -39,6 +41,7 @@ from alpasim_plugin.log.run_folder.schema import (
 from alpasim_plugin.log.run_folder.shapes import RunInfo, SceneFile, Summary
 from alpasim_plugin.log.run_folder.writer import rollout_table
 
+TRACEBACK_LINES = 4
 STEP_COLUMNS = (*KEYS, "t_us", "metric", "value", "valid")
 TEXT_AS_CODES = pads.ParquetFileFormat(dictionary_columns={"renderer", "policy", "scene", "metric"})
 
@@ -261,6 +264,16 @@ def read_json(path: Path) -> dict[str, Any]:
         InputError: Absent, not JSON, or not an object.
     """
     return read_json_object(path, do_this=AGAIN)
+
+
+def last_output(path: Path) -> list[str]:
+    """Return the end of what a rollout printed, its traceback, and the name of the file; nothing
+    where there is none.
+    """
+    if not path.is_file():
+        return []
+    lines = read_bytes(path, SOURCE_BYTES).decode("utf-8", "replace").rstrip().splitlines()
+    return [*(terminal(line.rstrip()) for line in lines[-TRACEBACK_LINES:]), f"log {path}"]
 
 
 def reporting(run: Run) -> AbstractContextManager[None]:

@@ -5,53 +5,52 @@ const why = {
   data: JSON.parse(byId("cause").textContent), i: 0, wanted: new Set(),
 
   start() {
-    const { data } = this, { looks } = data, scrub = byId("scrub");
-    this.drive = data.drives.find((drive) => drive.renderer === data.own);
+    const { data } = this, { queries } = data, scrub = byId("scrub");
     document.addEventListener("keydown", (event) => this.key(event));
     for (const button of document.querySelectorAll("[data-copy]")) button.addEventListener("click", () => this.copy(button));
-    if (!looks.length || !data.lens) return;
+    if (!queries.length || !data.lens) return;
     const boxes = [...document.querySelectorAll("#layers input")];
     const read = () => { this.wanted = new Set(boxes.filter((one) => one.checked).map((one) => one.value)); };
     boxes.forEach((one) => one.addEventListener("change", () => { read(); this.show(this.i); }));
     read();
     this.stages = [...document.querySelectorAll("figure[data-renderer]")].map((figure) => ({ name: figure.dataset.renderer, canvas: figure.querySelector("canvas"), said: figure.querySelector("small") }));
-    scrub.max = String(looks.length - 1);
+    scrub.max = String(queries.length - 1);
     scrub.addEventListener("input", () => this.show(Number(scrub.value)));
     byId("before").addEventListener("click", () => this.show(this.i - 1));
     byId("after").addEventListener("click", () => this.show(this.i + 1));
-    const first = data.failed === null ? looks.length - 1 : looks.findLastIndex((look) => look.t <= data.failed - 800);
+    const first = data.failed === null ? queries.length - 1 : queries.findLastIndex((query) => query.t <= data.failed - 800);
     this.show(Math.max(0, first));
   },
 
   show(i) {
     const { data } = this;
-    this.i = Math.max(0, Math.min(data.looks.length - 1, i));
-    const look = data.looks[this.i];
+    this.i = Math.max(0, Math.min(data.queries.length - 1, i));
+    const query = data.queries[this.i];
     byId("scrub").value = String(this.i);
-    const before = data.failed === null ? "" : look.t <= data.failed ? `, ${seconds(data.failed - look.t)} s before the failure` : ", after the failure";
-    byId("when").textContent = `${seconds(look.t)} s${before}; ${look.speed} m/s`;
+    const before = data.failed === null ? "" : query.t <= data.failed ? `, ${seconds(data.failed - query.t)} s before the failure` : ", after the failure";
+    byId("when").textContent = `${seconds(query.t)} s${before}; ${query.speed} m/s`;
     byId("scrub").setAttribute("aria-valuetext", byId("when").textContent);
-    this.drawn = Promise.all(this.stages.map((stage) => this.draw(stage, look, this.i)));
-    this.tell(look);
+    this.drawn = Promise.all(this.stages.map((stage) => this.draw(stage, query, this.i)));
+    this.tell(query);
   },
 
-  async draw({ name, canvas, said }, look, i) {
-    const seen = look.seen[name];
+  async draw({ name, canvas, said }, query, i) {
+    const seen = query.seen[name];
+    if (said) said.textContent = seen ? "" : "stored for the last second before the failure";
+    canvas.hidden = !seen;
     if (!seen) return;
-    const picture = await load("jpeg", seen.jpeg), heat = name === this.data.own && this.wanted.has("policy") ? await Promise.all(look.said.heat.map(([, png]) => load("png", png))) : [];
+    const picture = await load("jpeg", seen.jpeg), heat = name === this.data.own && this.wanted.has("policy") ? await Promise.all(query.said.heat.map(([, png]) => load("png", png))) : [];
     if (this.i !== i) return;
     Object.assign(canvas, { width: picture.width, height: picture.height });
     const context = canvas.getContext("2d");
     context.drawImage(picture, 0, 0);
     for (const one of heat) context.drawImage(one, 0, 0, canvas.width, canvas.height);
-    const overlay = new Overlay(context, this.data.lens, this.drive.rear), { wanted } = this;
-    overlay.at(heldPose(this.drive.ego, seen.t));
-    overlay.scene(this.data, this.drive.users, seen.t, wanted);
-    if (wanted.has("route")) overlay.lines([look.route], { colour: "#6ee787", width: 3, dash: [2, 6] });
-    const plan = look.plans[name];
-    if (plan && wanted.has("plan")) overlay.plan(plan.lines, name === this.data.own ? "#2f81f7" : "#f0883e", wanted.has("samples"));
-    if (name === this.data.own && wanted.has("policy")) this.own(context, overlay, look.said);
-    if (said) said.textContent = plan ? this.apart(look, name) : "";
+    const overlay = new Overlay(context, this.data.lens, this.data.rear), { wanted } = this;
+    overlay.at(heldPose(this.data.ego, seen.t));
+    overlay.scene(this.data, this.data.users.keys(), seen.t, wanted);
+    if (wanted.has("route")) overlay.lines([query.route], { colour: "#6ee787", width: 3, dash: [2, 6] });
+    if (wanted.has("plan")) overlay.plan(query.plan, "#2f81f7", wanted.has("samples"));
+    if (name === this.data.own && wanted.has("policy")) this.own(context, overlay, query.said);
   },
 
   own(context, overlay, said) {
@@ -63,22 +62,16 @@ const why = {
     }
   },
 
-  // How far the plan behind another renderer ends from the own one, two seconds ahead.
-  apart(look, name) {
-    const [one, other] = [look.plans[this.data.own].lines[0], look.plans[name].lines[0]], k = Math.min(4, one[0].length - 1, other[0].length - 1);
-    return name === this.data.own || k < 0 ? "" : `plan ${(Math.hypot(one[0][k] - other[0][k], one[1][k] - other[1][k]) / 100).toFixed(2)} m apart, 2 s ahead`;
-  },
-
-  tell(look) {
-    const rows = [...look.said.text, ...look.said.heat.map(([name, , low, high]) => [name, `heat map from ${low} to ${high}`])];
+  tell(query) {
+    const rows = [...query.said.text, ...query.said.heat.map(([name, , low, high]) => [name, `heat map from ${low} to ${high}`])];
     byId("said").replaceChildren(...rows.flatMap(([name, text]) => [make("dt", "", name), make("dd", "num", text)]));
-    byId("own-pictures").replaceChildren(...look.said.images.map(([name, jpeg]) => {
+    byId("own-images").replaceChildren(...query.said.images.map(([name, jpeg]) => {
       const figure = make("figure"), image = make("img");
       Object.assign(image, { src: "data:image/jpeg;base64," + jpeg, alt: name });
       figure.append(image, make("figcaption", "small muted", name));
       return figure;
     }));
-    byId("says-nothing").hidden = rows.length + look.said.images.length + look.said.boxes.length + look.said.lines.length > 0;
+    byId("says-nothing").hidden = rows.length + query.said.images.length + query.said.boxes.length + query.said.lines.length > 0;
   },
 
   async copy(button) {

@@ -1,0 +1,64 @@
+"""``simrun why``: the page of evidence for a rollout that failed, made of what its run stored."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Annotated
+
+from alpasim_plugin.cli.options import Json, run_and_cell
+from alpasim_plugin.cli.output import show, warn
+from alpasim_plugin.core.flags import Positional
+from alpasim_plugin.runs.logged_rollout import named_row
+from alpasim_plugin.runs.reports import divergences_of
+from alpasim_plugin.runs.tables import ensure_tables
+from evaluators.opening import read_run
+from evaluators.viewer.cause import cause_of, worst_failure, write_cause
+
+EPILOG = """
+Examples:
+
+- `simrun why`: the worst failure of the newest run
+
+- `simrun why runs/us101`: the worst failure of that run
+
+- `simrun why runs/us101/3dgs/lane-camera/us101/0`
+"""
+
+
+def why(
+    cell: Annotated[
+        Path | None,
+        Positional(
+            "A rollout, or a run whose worst failure is shown; by default the newest run.",
+            metavar="RUN|RUN/CELL",
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Show how a rollout failed, on one offline page.
+
+    The page is made of what the run stored; nothing is driven or rendered. It holds what the check
+    of the policy found, camera images with plan, route and road users, what the run's other
+    renderers show at the same poses, where plans part, and behind which renderers the same rollout
+    ends well.
+    """
+    root, name = run_and_cell(cell)
+    ensure_tables(root, warn)
+    run = read_run(root)
+    if name:
+        row = named_row(root, name)
+        rollout = next(one for one in run.rollouts if one.path == row["path"])
+    else:
+        rollout = worst_failure(run)
+    cause = cause_of(run, rollout, divergences_of(run, rollout))
+    page = write_cause(run, cause)
+    facts = {
+        "rollout": rollout.path,
+        "page": str(page),
+        "outcome": cause.outcome,
+        "found": list(cause.sentences),
+    }
+    lines = [f"rollout  {rollout.path}", f"outcome  {cause.outcome}"]
+    lines += [f"         {text}" for text in cause.sentences]
+    show(as_json, facts, *lines, f"page     {shlex.quote(str(page))}")

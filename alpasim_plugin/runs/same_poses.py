@@ -1,0 +1,83 @@
+"""Store what the other renderers of a run show at the last poses of its first failures."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.core.atomic import write_json
+from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.geometry import interpolate, inverse
+from alpasim_plugin.core.parts import RendererSpec
+from alpasim_plugin.core.types import CameraSpec, LoggedImage, RenderRequest, RolloutLog
+from alpasim_plugin.log import encode_image, read_asl
+from alpasim_plugin.log.debug import WIDTH_PX
+from alpasim_plugin.log.images import smaller
+from alpasim_plugin.log.run_folder.schema import LOG_NAME, SAME_POSES
+from alpasim_plugin.runs.cell import make_renderer
+from alpasim_plugin.runs.guards import checked_frames
+from alpasim_plugin.runs.loop_state import drawn
+from alpasim_plugin.runs.plan import Cell, RunPlan
+from evaluators.metrics.outcomes import first_failure
+
+MOST_FAILURES = 3
+FRAMES = 10  # before the failure, one after the other: a fixer has a history
+
+
+def store_same_poses(
+    plan: RunPlan, root: Path, manifests: Sequence[Mapping[str, Any]], threads: int
+) -> None:
+    """Write ``same_poses.json`` for the first failures of a run with several renderers: by renderer,
+    time and JPEG of each image in base64, of the policy's first camera.
+
+    A renderer that works in blocks of frames, or that fails, is left out.
+    """
+    cells = {cell.folder.as_posix(): cell for cell in plan.cells}
+    failures = [one for one in manifests if one["status"] == "ok" and first_failure(one)]
+    for manifest in failures[:MOST_FAILURES] if len(plan.renderers) > 1 else ():
+        cell = cells[manifest["path"]]
+        path = root / cell.folder / SAME_POSES
+        if path.exists():
+            continue
+        log = read_asl(root / cell.folder / LOG_NAME)
+        failed_us = int((first_failure(manifest) or {})["t_us"])
+        shown = {}
+        for spec in plan.renderers:
+            if spec.name != cell.renderer.name:
+                shown[spec.name] = _images(plan, cell, spec, log, failed_us, threads)
+        write_json(path, {name: images for name, images in shown.items() if images})
+
+
+def _images(
+    plan: RunPlan, cell: Cell, spec: RendererSpec, log: RolloutLog, failed_us: int, threads: int
+) -> list[tuple[int, str]]:
+    """Return time and image of a renderer at the last logged frames up to an instant."""
+    scenario = plan.scenarios[cell.scene]
+    cameras = {camera.name: camera for camera in scenario.cameras}
+    first = next((image.camera for image in log.images), None)
+    until = [image for image in log.images if image.camera == first and image.end_us <= failed_us]
+    images = []
+    try:
+        renderer = make_renderer(spec, scenario, cell.seed, plan.options.device, threads)
+        for image in until[-FRAMES:] if renderer.block is None else ():
+            request = _request(log, image, cameras[image.camera])
+            frame = checked_frames(renderer, [request])[0]
+            data = encode_image(smaller(frame.rgb, WIDTH_PX), "jpeg", 85)
+            images.append((image.end_us, base64.b64encode(data).decode()))
+    except SimrunError:
+        return []  # its own rollouts show the error
+    return images
+
+
+def _request(log: RolloutLog, image: LoggedImage, camera: CameraSpec) -> RenderRequest:
+    """Return the request for an image of a log, from the logged poses."""
+    t_us = image.end_us
+    poses = {
+        name: interpolate(actor.track, t_us)
+        for name, actor in log.actors.items()
+        if actor.track.t_us[0] <= t_us <= actor.track.t_us[-1]
+    }
+    shutter = interpolate(log.ego, [image.start_us, t_us]) @ inverse(log.T_rig_box)
+    return RenderRequest(t_us, camera, shutter @ camera.T_rig_camera, drawn(poses))
