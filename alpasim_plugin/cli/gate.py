@@ -23,6 +23,7 @@ from evaluators.opening import read_run
 from evaluators.report.ci import write_gate_files
 from evaluators.statistics.baselines import (
     check_matches,
+    is_repeatable,
     read_baseline,
     table_of_run,
     write_baseline,
@@ -86,13 +87,21 @@ def gate(
             f"{run}: preset {preset!r}, the gate {source} is for {spec.preset!r}",
             "Score the run with that preset.",
         )
-    baseline = None
+    rows = None
+    repeatable = [is_repeatable(stored_run)]
     if baseline_file is not None:
         baseline = read_baseline(baseline_file)
         check_matches(baseline, stored_run, baseline_file)
-    rows = None if baseline is None else baseline.rows
+        rows = baseline.rows
+        repeatable.append(baseline.repeatable)
     verdict = judge(
-        table_of_run(stored_run), spec, rows, str(baseline_file or ""), stored_run.table
+        table_of_run(stored_run),
+        spec,
+        rows,
+        str(baseline_file or ""),
+        stored_run.table,
+        preset,
+        is_noisy=False in repeatable,
     )
     files = write_gate_files(verdict, source, stored_run, out or run, rows)
     if out is None and (run / PAGES[0]).is_file():
@@ -112,7 +121,8 @@ def verdict_lines(verdict: GateVerdict) -> list[str]:
     texts = {check.text for check in verdict.checks}
     lines += [f"{outcome.cause:>10}  {text}" for text in outcome.reasons if text not in texts]
     code = verdict.exit_code
-    return [*lines, f"{outcome.title} (exit code {code}), compared with {verdict.baseline}"]
+    title = f"{outcome.title} (exit code {code}), compared with {verdict.baseline}"
+    return [*lines, f"{title}; {verdict.about}"]
 
 
 def _self_test(gate_file: str, out: Path | None, as_json: bool) -> int:

@@ -37,6 +37,7 @@ MARKS = {
     "pass": "pass",
     "regression": "FAIL",
     "undecided": "undecided",
+    "incomplete": "error",
     "policy": "error",
     "infrastructure": "error",
     "evaluator": "error",

@@ -25,7 +25,8 @@ from evaluators.report.numbers import (
     scale_and_unit,
     short,
 )
-from evaluators.report.verdict import more_scenes_text, tone_of
+from evaluators.report.verdict import tone_of
+from evaluators.statistics.sentences import more_scenes_text
 
 # verdict against the margin, and the difference that is shown -> words
 VERDICT_WORDS = {

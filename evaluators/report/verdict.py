@@ -19,21 +19,18 @@ from evaluators.opening import Run
 from evaluators.report.fixers import fixer_cautions
 from evaluators.report.numbers import (
     count_of,
-    decimals,
     finite,
-    fixed,
     interval,
     plural,
-    scale_and_unit,
     short,
 )
 from evaluators.statistics.outcomes import outcome_table, sentence
+from evaluators.statistics.sentences import difference_text
 from evaluators.statistics.verdicts import shown_questions
 
 Tone = Literal["worse", "better", "mixed", "unclear", "neutral", "broken"]
 
 GRAVEST_FIRST: tuple[Tone, ...] = ("worse", "mixed", "better", "unclear", "neutral")
-MANY_SCENES = 1000  # an estimate beyond this says no more than "many"
 LEADING = 4  # variants named in the headline
 COMPARED = 3  # comparisons named in the title
 FEW_SCENES = 10  # below this an interval over scenes leans heavily on its assumptions
@@ -183,15 +180,6 @@ def tone_of(entry: Mapping[str, Any], direction: str) -> Tone:
     return "worse" if (difference > 0) == (direction == "lower") else "better"
 
 
-def more_scenes_text(more: Any) -> str:
-    """Say how many more scenes would decide an undecided verdict; empty where that is unknown."""
-    if not isinstance(more, int) or more <= 0:
-        return ""
-    if more > MANY_SCENES:
-        return f"more than {MANY_SCENES} more scenes would decide"
-    return f"about {plural(more, 'more scene')} would decide"
-
-
 def plan_warnings(summary: Mapping[str, Any]) -> list[str]:
     """Say in one sentence each whose plans do not fit the vehicle; variants with the same sentence
     share it.
@@ -290,21 +278,8 @@ def _difference(run: Run, variant: str, metric: str, entry: Mapping[str, Any]) -
     if base not in levels:  # with several policies: the same policy behind the baseline's renderer
         base = next((f"{base}/{p}" for p in run.policies if variant.endswith(f"/{p}")), base)
     facts = run.table.shown(metric)
-    stats = levels.get(variant, {}).get(metric, {})
-    scale, unit = scale_and_unit(facts, str(stats.get("unit", "")))
-    difference = float(entry["diff"])
-    bounds = interval(entry.get("ci95"), difference) or ()
-    values = [value * scale for value in (difference, *bounds)]
-    places = 1 if facts.in_percent else decimals(*values)
-    numbers = [fixed(value, places, sign=True) for value in values]
-    text = f"{numbers[0]}\u00a0{unit}".strip("\u00a0")
-    if bounds:
-        text += f", 95\u00a0% interval {numbers[1]} to {numbers[2]}"
-    needed, margin = more_scenes_text(entry.get("more_scenes")), finite(entry.get("margin"))
-    if needed and margin is not None:
-        text += f"; {needed} on the margin of {short(margin * scale, unit)}"
     here, there = _level(run, variant, metric), _level(run, base, metric)
-    return f"{facts.words}: {here} against {there} ({text})"
+    return f"{facts.words}: {here} against {there} ({difference_text(entry, facts)})"
 
 
 def _level(run: Run, variant: str, metric: str) -> str:

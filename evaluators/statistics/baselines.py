@@ -18,9 +18,10 @@ from alpasim_plugin.core.reading.files import as_shape, kind_of
 from alpasim_plugin.log.run_folder.reader import table_path
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS
 from alpasim_plugin.log.run_folder.sides import RolloutTable, Row
+from evaluators.metrics import MetricTable
 from evaluators.opening import Run, read_run
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 MADE_WITH = tuple(
     [
         "key",
@@ -88,6 +89,8 @@ class StoredBaseline(TypedDict):
     weights: dict[str, Any]
     rows: list[dict[str, Any]]
     made_with: dict[str, Any]
+    metrics: dict[str, Any]
+    repeatable: bool | None
     schema_version: int
 
 
@@ -112,6 +115,8 @@ class Baseline:
     weights: Mapping[str, Any]  # as in run.json
     rows: Sequence[Row]
     made_with: Mapping[str, Any]  # command, versions, hardware, start: for people, not compared
+    metrics: Mapping[str, Any]  # what each is, as in run.json
+    repeatable: bool | None  # what ``run --repeat`` found; None: not tried
     schema_version: int = SCHEMA_VERSION
 
 
@@ -124,7 +129,14 @@ def baseline_of(run: Run) -> Baseline:
         dict(run.info.get("weights") or {}),
         rows_of_run(run),
         made_with,
+        dict(run.info.get("metrics") or {}),
+        is_repeatable(run),
     )
+
+
+def is_repeatable(run: Run) -> bool | None:
+    """Return what ``run --repeat`` found of the run's policies; None where it was not tried."""
+    return (run.info.get("repeat") or {}).get("repeatable")
 
 
 def write_baseline(run: Run, path: Path) -> None:
@@ -174,8 +186,8 @@ def check_matches(baseline: Baseline, run: Run, path: Path) -> None:
     Scenes that only one side has are missing cells, not a mismatch.
 
     Raises:
-        InputError: Other preset, other weights, a scene with another content, or no scene in
-            common.
+        InputError: Other preset, other weights, a scene with another content, no scene in
+            common, or a metric that is another quantity.
     """
     if baseline.preset != _preset(run):
         raise InputError(
@@ -190,6 +202,8 @@ def check_matches(baseline: Baseline, run: Run, path: Path) -> None:
     if changed:
         raise InputError(f"{path}: other weights: {', '.join(changed)}", APPROVE)
     check_scenes(baseline.scenes, scene_hashes(run), str(path), APPROVE)
+    stored = MetricTable.of_run({"metrics": baseline.metrics})
+    run.table.joined(stored, baseline.metrics, str(path))
 
 
 def check_scenes(

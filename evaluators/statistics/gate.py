@@ -1,12 +1,15 @@
-"""The gate: margins, limits and the least amount of data as YAML (docs/ci.md); its verdict on a
-run, and the outcome that follows.
+"""The gate: margins and limits as YAML (docs/ci.md); its verdict on a run, and the outcome that
+follows.
+
+A gate is about its suite (`evaluators.statistics.suite`), or about the scenes that the suite's
+were drawn from (`evaluators.statistics.paired`).
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,9 +27,21 @@ from alpasim_plugin.log.run_folder.sides import (
     is_ok,
 )
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
-from evaluators.metrics.presets import PRESETS
+from evaluators.metrics.presets import DEFAULT, PRESETS
+from evaluators.metrics.presets import preset as find_preset
+from evaluators.report.numbers import plural, short
 from evaluators.statistics.baselines import of_policy, policies_of
+from evaluators.statistics.intervals import TAIL
 from evaluators.statistics.paired import compare, reach_of
+from evaluators.statistics.sentences import change_text, difference_text
+from evaluators.statistics.suite import (
+    LISTED,
+    Change,
+    chances,
+    change_of,
+    is_within,
+    seeds_that_decide,
+)
 from evaluators.statistics.variants import (
     Base,
     Variant,
@@ -60,17 +75,25 @@ class MetricRule(_Strict):
     )
     max: float | None = Field(default=None, description="Largest mean accepted.")
     min: float | None = Field(default=None, description="Smallest mean accepted.")
+    max_new: int | None = Field(
+        default=None, ge=0, description="New events accepted; none: as the gate says."
+    )
     must_decide: bool = Field(
         default=True, description="Undecided fails the gate with code 3; false: only worse does."
     )
 
     @model_validator(mode="after")
     def _says_something(self) -> MetricRule:
-        if self.margin is None and self.max is None and self.min is None:
+        if not self.is_paired and self.max is None and self.min is None:
             raise ValueError(
-                "a rule without margin, max or min | add one of them, or remove the metric"
+                "a rule without margin, max_new, max or min | add one of them, or remove the metric"
             )
         return self
+
+    @property
+    def is_paired(self) -> bool:
+        """Tell whether the rule compares with a baseline."""
+        return self.margin is not None or self.max_new is not None
 
 
 class GateSpec(_Strict):
@@ -88,13 +111,12 @@ class GateSpec(_Strict):
     renderers: tuple[str, ...] = Field(
         default=(), description="Renderers to judge; none: all but the baseline."
     )
-    min_scenes: int = Field(
-        default=2, ge=2, description="Fewest scenes with a pair that a paired verdict may stand on."
+    min_scenes: int = Field(default=1, ge=1, description="Fewest scenes that both sides must have.")
+    population: Literal["suite", "scenes"] = Field(
+        default="suite",
+        description="suite: what changed in these scenes; scenes: the mean over all scenes that these were drawn from.",
     )
-    population: Literal["scenes", "suite"] = Field(
-        default="scenes",
-        description="suite: these scenes are all that is asked about; else they are draws, and others may be far worse.",
-    )
+    max_new: int = Field(default=0, ge=0, description="New events accepted of a suite, per metric.")
     max_failed: float = Field(
         default=0.0, ge=0.0, lt=1.0, description="Share of rollouts that may fail to run."
     )
@@ -152,12 +174,21 @@ def _check_names(spec: GateSpec, document: Document, known: MetricTable) -> None
             raise document.error(
                 ("metrics", name), problem, "give the change to either side that is accepted"
             )
+        if rule.max_new is not None and not facts.is_flag:
+            problem = f"max_new for {name!r}, which is no event"
+            raise document.error(("metrics", name, "max_new"), problem, "give a margin")
     if spec.preset is not None and spec.preset not in PRESETS:
         raise document.error(("preset",), f"preset {spec.preset!r}", f"known: {', '.join(PRESETS)}")
 
 
 Kind = Literal["margin", "limit"]
 Sides = Mapping[Variant, Side]
+UNNAMED = MetricRule(margin=0.0)  # of an event that ends the scored part
+ABOUT = {
+    "suite": "about these scenes and seeds: what changed is a fact",
+    "noise": "about these scenes; the policy is not repeatable: exact tests over seeds",
+    "scenes": "about all scenes that these were drawn from",
+}
 CAUSES: dict[str, Cause] = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}
 
 
@@ -172,7 +203,7 @@ class Check:
     cause: Cause
     text: str  # one sentence with the numbers
     entry: Mapping[str, Any]  # the paired comparison, or mean and bounds
-    binding: bool = True  # an undecided check that does not bind leaves the gate open
+    binding: bool = True  # a check that does not bind leaves the gate open
 
 
 @dataclass(frozen=True)
@@ -183,6 +214,7 @@ class GateVerdict:
     checks: tuple[Check, ...]
     failures: Mapping[str, Any]
     baseline: str  # what was compared with, in words
+    about: str  # what it is about, in words
 
     @property
     def exit_code(self) -> int:
@@ -195,6 +227,7 @@ class GateVerdict:
         return {
             "outcome": self.outcome.as_dict(),
             "baseline": self.baseline,
+            "about": self.about,
             "failures": dict(self.failures),
             "checks": checks,
         }
@@ -206,6 +239,8 @@ def judge(
     stored: Sequence[Row] | None = None,
     stored_name: str = "",
     known: MetricTable = METRICS,
+    preset: str = DEFAULT,
+    is_noisy: bool = False,
 ) -> GateVerdict:
     """Judge rollouts.
 
@@ -215,50 +250,47 @@ def judge(
         stored: Rows of a stored baseline; without it the baseline is a renderer of the run itself.
         stored_name: How to call the stored baseline.
         known: What the metrics are.
+        preset: With which both sides were scored.
+        is_noisy: ``run --repeat`` found a policy that is not repeatable on either side.
 
     Raises:
-        InputError: A renderer that the gate names is not there, or nothing is left to judge.
+        InputError: A renderer that the gate names is not there, nothing is left to judge, or the
+            scenes are too few to pass a gate about others.
     """
     sides = _sides(rollouts)
     if not sides:
         raise InputError("its rollouts: there are none", "give a run with rollouts")
     owner = "the run" if stored is None else "the stored baseline"
     base_sides = sides if stored is None else _sides(stored)
-    has_margin = any(rule.margin is not None for rule in spec.metrics.values())
-    base = _base(list(sides), spec, list(base_sides), owner, has_margin)
+    is_paired = any(rule.is_paired for rule in spec.metrics.values())
+    base = _base(list(sides), spec, list(base_sides), owner, is_paired)
     checks: list[Check] = []
-    for variant in _judged(list(sides), spec, base, has_margin):
+    for variant in _judged(list(sides), spec, base, is_paired):
         side = sides[variant]
-        margins: dict[str, Check] = {}
+        if is_paired:
+            other = _partner(variant, base, list(base_sides), owner)
+            label = short_name(other, variant)
+            other_side = as_policy(base_sides[other], variant.policy)
+            against = label
+            if stored is not None:
+                against += f" of {stored_name or 'the baseline'}"
+            pair = _Pair(variant, side, other_side, label, against)
+            if spec.population == "scenes":
+                checks += _of_scenes(pair, spec, known)
+            else:
+                checks += _of_suite(pair, spec, known, find_preset(preset).stop_after, is_noisy)
         for name, rule in spec.metrics.items():
-            metric = known.info(name)
-            if rule.margin is not None:
-                other = _partner(variant, base, list(base_sides), owner)
-                label = short_name(other, variant)
-                other_side = as_policy(base_sides[other], variant.policy)
-                is_sampled = spec.population == "scenes"
-                entry = compare(side, other_side, metric, label, rule.margin, sampled=is_sampled)
-                if stored is not None:
-                    label += f" of {stored_name or 'the baseline'}"
-                margins[name] = _margin(entry, variant, label, metric, rule, spec)
             if rule.max is not None or rule.min is not None:
-                checks.append(_limit(side, variant, metric, rule))
-        if spec.population == "scenes":
-            checks += [_with_event(check, margins, known) for check in margins.values()]
-        else:
-            checks += margins.values()
+                checks.append(_limit(side, variant, known.info(name), rule))
     failures = failures_of(rollouts)
-    outcomes = [
-        Outcome(check.cause, (check.text,))
-        for check in checks
-        if check.binding or check.cause == "regression"
-    ]
+    outcomes = [Outcome(check.cause, (check.text,)) for check in checks if check.binding]
     outcomes.append(outcome_of_failures(failures, spec.max_failed))
     name = stored_name
     if base is not None and stored is None:
         kind = "" if base.renderer and base.policy else "renderer " if base.renderer else "policy "
         name = f"{kind}{base.name} of the same run"
-    return GateVerdict(worst(outcomes), tuple(checks), failures, name)
+    about = "noise" if is_noisy and spec.population == "suite" else spec.population
+    return GateVerdict(worst(outcomes), tuple(checks), failures, name, ABOUT[about])
 
 
 def _sides(rollouts: RolloutTable | Sequence[Row]) -> Sides:
@@ -287,7 +319,7 @@ def failures_of(rollouts: RolloutTable | Sequence[Row]) -> dict[str, Any]:
 
 
 def _base(
-    variants: list[Variant], spec: GateSpec, others: list[Variant], owner: str, has_margin: bool
+    variants: list[Variant], spec: GateSpec, others: list[Variant], owner: str, is_paired: bool
 ) -> Base | None:
     """Return what variants are compared with; None: with the same variant of a stored baseline, or
     limits alone hold for all policies.
@@ -295,13 +327,13 @@ def _base(
     if spec.baseline is not None:
         return base_named(spec.baseline, others, owner)
     is_one_renderer = len({variant.renderer for variant in variants}) == 1
-    if owner != "the run" or (is_one_renderer and not has_margin):
+    if owner != "the run" or (is_one_renderer and not is_paired):
         return None
     return usual_base(variants)
 
 
 def _judged(
-    variants: list[Variant], spec: GateSpec, base: Base | None, has_margin: bool
+    variants: list[Variant], spec: GateSpec, base: Base | None, is_paired: bool
 ) -> list[Variant]:
     known = {variant.renderer for variant in variants}
     absent = [name for name in spec.renderers if name not in known]
@@ -313,7 +345,7 @@ def _judged(
     if spec.renderers:
         return [variant for variant in variants if variant.renderer in spec.renderers]
     judged = [variant for variant in variants if base is None or base.of(variant) != variant]
-    if not judged and has_margin and base is not None:
+    if not judged and is_paired and base is not None:
         raise InputError(
             f"baseline {base.name!r}: the run has nothing else to compare with it",
             "run two renderers or two policies, or give --baseline-file",
@@ -340,53 +372,137 @@ def _partner(variant: Variant, base: Base | None, others: list[Variant], owner: 
     return wanted
 
 
-def _margin(
-    entry: dict[str, Any],
-    variant: Variant,
-    against: str,
-    metric: MetricInfo,
-    rule: MetricRule,
-    spec: GateSpec,
-) -> Check:
-    n_scenes, n_missing = entry["n_scenes"], entry["n_missing"]
-    planned = entry["n_cells"] + n_missing
-    cause = CAUSES[entry["verdict"]]
-    text = _paired_text(entry, metric.name, variant.renderer, against)
-    least = scenes_without_event(entry["margin"], reach_of(metric, entry["margin"])) or 0
-    if n_scenes < spec.min_scenes:
-        cause = "undecided"
-        scenes = "1 scene" if n_scenes == 1 else f"{n_scenes} scenes"
-        text += f"; {scenes}, the gate asks for {spec.min_scenes}"
-    elif cause == "undecided" and n_scenes < least:
-        text += f"; fewer than {least} scenes cannot exclude harm in others"
-    elif cause != "regression" and n_missing > spec.max_missing * planned:
-        cause = "undecided"
-        allowed = f"the gate allows {spec.max_missing:.0%}"
-        text += f"; {n_missing} of {planned} cells have no pair, {allowed}"
-    return _check(variant, metric, "margin", cause, text, entry, rule.must_decide)
+@dataclass(frozen=True)
+class _Pair:
+    """A variant, its baseline, and what the baseline is called in entries and in sentences."""
+
+    variant: Variant
+    side: Side
+    base: Side
+    label: str
+    against: str
 
 
-def _check(variant: Variant, metric: MetricInfo, *facts: Any) -> Check:
-    return Check(variant.renderer, variant.policy, metric.name, *facts)
+def _of_scenes(pair: _Pair, spec: GateSpec, known: MetricTable) -> list[Check]:
+    """Test what others of the population may show.
 
-
-def _with_event(check: Check, checks: Mapping[str, Check], known: MetricTable) -> Check:
-    """Return the check of a distance, which passes only together with the event that counts what
-    lies beyond its cap.
+    Raises:
+        InputError: There are too few scenes for any answer that passes.
     """
-    event = known.info(check.metric).event
-    if check.cause != "pass" or not event or (event in checks and checks[event].cause == "pass"):
-        return check
-    why = (
-        f"{event} is {checks[event].entry['verdict']}"
-        if event in checks
-        else f"the gate has no margin for {event}"
-    )
-    return replace(
-        check,
-        cause="undecided",
-        text=f"{check.text}, but a distance decides only together with its event: {why}",
-    )
+    n_scenes = len({scene for _, scene, _ in set(pair.side.cells) & set(pair.base.cells)})
+    rules = {name: rule for name, rule in spec.metrics.items() if rule.is_paired}
+    checks = []
+    for name, rule in rules.items():
+        metric = known.info(name)
+        margin = metric.accepted if rule.margin is None else rule.margin
+        least = scenes_without_event(margin, reach_of(metric, margin)) if margin else None
+        if rule.must_decide and n_scenes < max(spec.min_scenes, least or 0):
+            raise InputError(
+                f"{n_scenes} scenes: a gate about other scenes needs at least "
+                f"{max(spec.min_scenes, least or 0)} to pass {name}",
+                "run more scenes, accept a larger margin, or use population: suite",
+            )
+        entry = compare(pair.side, pair.base, metric, pair.label, margin)
+        cause = CAUSES[entry["verdict"]]
+        binding = rule.must_decide or cause == "regression"
+        if entry["n_missing"] > spec.max_missing * (entry["n_cells"] + entry["n_missing"]):
+            cause = "incomplete"
+        text = f"{difference_text(entry, metric)}: {entry['verdict']}"
+        checks.append(_check(pair, metric, cause, text, entry, binding))
+    return checks
+
+
+def _of_suite(
+    pair: _Pair, spec: GateSpec, known: MetricTable, stops: Sequence[str], is_noisy: bool
+) -> list[Check]:
+    """Say what changed in these scenes; an event that ends the scored part counts although the gate
+    does not name it, since nothing after it was scored.
+    """
+    rules = {name: rule for name, rule in spec.metrics.items() if rule.is_paired}
+    unnamed = [stop for stop in stops if stop not in rules]
+    changes = []
+    for name in (*rules, *unnamed):
+        metric = known.info(name)
+        margin = rules[name].margin if name in rules else None
+        accepted = metric.accepted if margin is None else margin
+        changes.append(change_of(pair.side, pair.base, metric, accepted, stops))
+    is_equal = not any(change.diff.any() or change.cut for change in changes)
+    p_values: Sequence[float | None] = [None] * len(changes)
+    if is_noisy and not is_equal:
+        p_values = chances(changes)
+    checks = [
+        _suite_check(pair, change, rules.get(change.metric.name, UNNAMED), p, spec)
+        for change, p in zip(changes, p_values, strict=True)
+    ]
+    named, others = checks[: len(rules)], checks[len(rules) :]
+    if any(check.cause == "regression" for check in named):
+        return named
+    return [*named, *(check for check in others if check.cause == "regression")]
+
+
+def _suite_check(
+    pair: _Pair, change: Change, rule: MetricRule, p: float | None, spec: GateSpec
+) -> Check:
+    metric = change.metric
+    max_new = spec.max_new if rule.max_new is None else rule.max_new
+    n_new = len(change.new) if metric.is_flag else 0
+    far = [] if metric.is_flag else change.far_scenes
+    if p is None:
+        is_worse = n_new > max_new if metric.is_flag else bool(far) or change.is_beyond
+        is_shown = True
+    else:
+        is_worse = p <= TAIL and (not metric.is_flag or n_new - change.n_gone > max_new)
+        is_shown = not far and is_within(change)
+    verdict = "worse" if is_worse else "non-inferior" if is_shown else "undecided"
+    mean = -change.mean if metric.direction == "higher" else change.mean
+    n_missing = len(change.missing)
+    entry = {
+        "baseline": pair.label,
+        "diff": mean,
+        "margin": change.margin,
+        "max_new": max_new,
+        "p_value": p,
+        "verdict": verdict,
+        "unit": metric.unit,
+        "direction": metric.direction,
+        "n_cells": len(change.cells),
+        "n_scenes": len(change.scenes[0]),
+        "n_missing": n_missing,
+        "n_neither": change.n_neither,
+        "n_far": len(far),
+        "counts": change.counts(),
+        "worst": change.worst(),
+        "cut": [f"{scene} seed {seed}" for _, scene, seed in change.cut],
+        "missing": [
+            {"scene": scene, "seed": seed, "why": why}
+            for (_, scene, seed), why in list(change.missing.items())[:LISTED]
+        ],
+        "seeds": seeds_that_decide(change) if verdict == "undecided" else None,
+    }
+    text = change_text(entry, metric)
+    cause = CAUSES[verdict]
+    n_scenes = len({scene for _, scene, _ in (*change.cells, *change.cut)})
+    is_missing = n_missing > spec.max_missing * (len(change.cells) + n_missing)
+    if is_missing:
+        cause = "incomplete"
+    elif n_scenes < spec.min_scenes:
+        cause = "incomplete"
+        text += f"; {plural(n_scenes, 'scene')}, the gate asks for {spec.min_scenes}"
+    binding = rule.must_decide or is_missing or cause == "regression"
+    return _check(pair, metric, cause, text, entry, binding)
+
+
+def _check(
+    pair: _Pair,
+    metric: MetricInfo,
+    cause: Cause,
+    text: str,
+    entry: Mapping[str, Any],
+    binding: bool,
+) -> Check:
+    renderer, policy = pair.variant.renderer, pair.variant.policy
+    sentence = f"{renderer}: {metric.name} against {pair.against}: {text}"
+    return Check(renderer, policy, metric.name, "margin", cause, sentence, entry, binding)
 
 
 def _limit(side: Side, variant: Variant, metric: MetricInfo, rule: MetricRule) -> Check:
@@ -396,38 +512,17 @@ def _limit(side: Side, variant: Variant, metric: MetricInfo, rule: MetricRule) -
     limits = " and ".join(
         f"{kind} {value:g}" for kind, value in bounds.items() if value is not None
     )
-    head = f"{variant.renderer}: {metric.name}"
-    if not len(known):
-        text = f"{head} has no valid value, its limit is {limits}"
-        entry = {"mean": None, **bounds}
-        return _check(variant, metric, "limit", "undecided", text, entry, rule.must_decide)
-    mean = float(known.mean())
-    is_above = rule.max is not None and mean > rule.max
-    is_below = rule.min is not None and mean < rule.min
-    cause = "regression" if is_above or is_below else "pass"
-    text = f"{head} {_number(mean, metric.unit)}, limit {limits}"
+    cause: Cause = "incomplete"
+    mean, text = None, f"no valid value, its limit is {limits}"
+    if len(known):
+        mean = float(known.mean())
+        is_above = rule.max is not None and mean > rule.max
+        is_below = rule.min is not None and mean < rule.min
+        cause = "regression" if is_above or is_below else "pass"
+        text = f"{short(mean, metric.unit)}, limit {limits}"
     entry = {"mean": mean, **bounds, "n_rollouts": len(known)}
-    return _check(variant, metric, "limit", cause, text, entry)
-
-
-def _paired_text(entry: Mapping[str, Any], metric: str, renderer: str, against: str) -> str:
-    unit = entry["unit"]
-    head = f"{renderer}: {metric}"
-    if entry["diff"] is None:
-        return f"{head} cannot be compared with {against}: {entry['reason']}"
-    text = f"{head} {_number(entry['diff'], unit, sign=True)} against {against}"
-    if entry["ci95"] is None:
-        return f"{text}: {entry['reason']}"
-    low, high = (_number(b, unit, sign=True) for b in entry["ci95"])
-    text += f" (95 % {low} to {high}, margin {_number(entry['margin'], unit)}): {entry['verdict']}"
-    if entry["verdict"] == "undecided":
-        if entry["more_scenes"]:
-            text += f", about {entry['more_scenes']} more scenes would decide it"
-        else:
-            text += ", more scenes of this kind would not decide it"
-    return text
-
-
-def _number(value: float, unit: str, sign: bool = False) -> str:
-    text = f"{value:+.4g}" if sign else f"{value:.4g}"
-    return f"{text} {unit}".rstrip()
+    text = f"{variant.renderer}: {metric.name} {text}"
+    binding = rule.must_decide or cause == "regression"
+    return Check(
+        variant.renderer, variant.policy, metric.name, "limit", cause, text, entry, binding
+    )

@@ -17,11 +17,14 @@ from alpasim_plugin.core.types import F64, Direction
 from evaluators.statistics.bounded import scenes_to_exclude
 from evaluators.statistics.intervals import TAIL, are_alike, scaled
 
-Cause = Literal["pass", "regression", "policy", "undecided", "infrastructure", "evaluator"]
+Cause = Literal[
+    "pass", "regression", "incomplete", "policy", "undecided", "infrastructure", "evaluator"
+]
 
 EXIT_CODES: dict[Cause, int] = {
     "pass": 0,
     "regression": 1,
+    "incomplete": 2,
     "policy": 2,
     "undecided": 3,
     "infrastructure": 4,
@@ -30,6 +33,7 @@ EXIT_CODES: dict[Cause, int] = {
 WORDS: dict[Cause, str] = {
     "pass": "PASS",
     "regression": "FAIL",
+    "incomplete": "INCOMPLETE",
     "policy": "POLICY FAILURE",
     "undecided": "UNDECIDED",
     "infrastructure": "INFRASTRUCTURE FAILURE",
@@ -41,6 +45,7 @@ SEVERITY: tuple[Cause, ...] = (
     "evaluator",
     "infrastructure",
     "policy",
+    "incomplete",
     "regression",
     "undecided",
     "pass",
